@@ -1,0 +1,192 @@
+"""The YAML of a cell: pydantic models and :func:`load_config`.
+
+Every key has a unit and a range here; ``config/dual_iiwa7.yaml`` shows them all with comments.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from q2r2_control.control.settings import ControllerSettings
+from q2r2_control.errors import ConfigError
+from q2r2_control.resources import find_resource
+from q2r2_control.teleop.settings import TeleopSettings
+
+Side = Literal["left", "right"]
+Metres3 = Annotated[tuple[float, float, float], Field(description="x, y, z [m]")]
+Radians3 = Annotated[tuple[float, float, float], Field(description="roll, pitch, yaw [rad]")]
+Colour = tuple[
+    Annotated[float, Field(ge=0, le=1)],
+    Annotated[float, Field(ge=0, le=1)],
+    Annotated[float, Field(ge=0, le=1)],
+    Annotated[float, Field(ge=0, le=1)],
+]
+
+
+class _Model(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class PoseConfig(_Model):
+    """A fixed placement in the parent frame."""
+
+    position: Metres3 = (0.0, 0.0, 0.0)
+    rpy: Radians3 = (0.0, 0.0, 0.0)
+
+
+class ToolConfig(_Model):
+    """What is mounted on an arm's last link."""
+
+    model: str | None = Field(
+        None, description="a file of robots/ without .urdf, or a path; none: bare flange"
+    )
+    link: str | None = Field(None, description="arm link that carries the tool; default: the arm's last link")
+    mount: PoseConfig = PoseConfig()
+    frame: str | None = Field(
+        None, description="link of the tool that the operator moves; default: the last link"
+    )
+
+
+class GripperConfig(_Model):
+    """How an opening of 0..1 becomes finger joint positions."""
+
+    joints: tuple[str, ...] = Field((), description="finger joints of the tool, all driven alike")
+    open_position: float = Field(0.0, ge=-3.15, le=3.15, description="of each finger joint, open [m or rad]")
+    closed_position: float = Field(
+        0.0, ge=-3.15, le=3.15, description="of each finger joint, closed [m or rad]"
+    )
+    speed: float = Field(0.1, gt=0, le=5, description="of each finger joint [m/s or rad/s]")
+    force: float = Field(60.0, gt=0, le=500, description="of each finger joint [N or Nm]")
+
+
+class ArmConfig(_Model):
+    """One arm: model, mount, tool, home posture."""
+
+    model: str = Field(description="a file of robots/ without .urdf, example-robot-data:NAME, or a path")
+    mount: PoseConfig = PoseConfig()
+    tool: ToolConfig = ToolConfig()
+    gripper: GripperConfig = GripperConfig()
+    home: tuple[float, ...] = Field(description="joint positions [rad]")
+
+
+class ObstacleConfig(_Model):
+    """A fixed body of the cell. Cylinders and capsules stand along z; a capsule's length is its segment's."""
+
+    shape: Literal["box", "cylinder", "sphere", "capsule"]
+    size: tuple[float, ...] = Field(
+        description="box: x y z; cylinder, capsule: radius length; sphere: radius [m]",
+        min_length=1,
+        max_length=3,
+    )
+    position: Metres3 = (0.0, 0.0, 0.0)
+    rpy: Radians3 = (0.0, 0.0, 0.0)
+    colour: Colour = (0.55, 0.45, 0.35, 1.0)
+
+    @model_validator(mode="after")
+    def _size_fits_shape(self) -> ObstacleConfig:
+        count = {"box": 3, "cylinder": 2, "sphere": 1, "capsule": 2}[self.shape]
+        if len(self.size) != count or min(self.size) <= 0:
+            raise ValueError(f"a {self.shape} takes {count} positive size value(s), got {list(self.size)}")
+        return self
+
+
+class HeadsetConfig(_Model):
+    """The TCP server that the Quest2ROS app connects to."""
+
+    host: str = Field("127.0.0.1", description="address to bind; 0.0.0.0 admits the network")
+    port: int = Field(10000, ge=0, le=65535, description="0 takes any free port")
+
+
+class MujocoConfig(_Model):
+    """The simulated cell."""
+
+    timestep: float = Field(0.001, gt=0, le=0.001, description="physics step [s]")
+    position_stiffness: float = Field(4000.0, gt=0, le=1e6, description="of the position servos [Nm/rad]")
+    position_damping_ratio: float = Field(1.0, gt=0, le=5, description="of the position servos")
+
+
+class Config(_Model):
+    """One cell: everything a user tunes."""
+
+    name: str = Field(min_length=1)
+    arms: dict[Side, ArmConfig] = Field(min_length=1)
+    obstacles: dict[str, ObstacleConfig] = Field(default_factory=dict)
+    loop_rate_hz: float = Field(1000.0, ge=50, le=2000, description="control loop [Hz]")
+    control: ControllerSettings = ControllerSettings()
+    teleop: TeleopSettings = TeleopSettings()
+    headset: HeadsetConfig = HeadsetConfig()
+    mujoco: MujocoConfig = MujocoConfig()
+
+
+def load_config(path: str | os.PathLike[str]) -> Config:
+    """Read and check a cell's YAML.
+
+    ``path`` is looked up from the working directory first, then among the files shipped with the package.
+    Raises :class:`ConfigError` with one line that names file, key, value and what is allowed.
+    """
+    file = find_resource(path)
+    try:
+        data = yaml.load(file.read_text(encoding="utf-8"), Loader=_UniqueKeyLoader)
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: cannot be read: {error}") from error
+    except yaml.YAMLError as error:
+        raise ConfigError(f"{path}: not YAML: {' '.join(str(error).split())}") from error
+    if not isinstance(data, dict):
+        raise ConfigError(
+            f"{path}: expected a mapping of keys such as name, arms, obstacles; got {data!r:.60}"
+        )
+    try:
+        return Config.model_validate(data)
+    except ValidationError as error:
+        raise ConfigError(f"{path}: {_first_fault(error)}") from error
+
+
+class _UniqueKeyLoader(yaml.SafeLoader):
+    """Plain YAML lets a later key silently replace an earlier one; in a safety setting that is a fault."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        seen: set[Any] = set()
+        for key_node, _ in node.value:
+            key = self.construct_object(key_node, deep=True)  # type: ignore[no-untyped-call]
+            if key in seen:
+                raise yaml.constructor.ConstructorError(
+                    None, None, f"key {key!r} is given twice", key_node.start_mark
+                )
+            seen.add(key)
+        return super().construct_mapping(node, deep)
+
+
+def _first_fault(error: ValidationError) -> str:
+    """One line about the first fault: key, value, what is allowed, and how many more there are."""
+    faults = error.errors()
+    fault = faults[0]
+    key = ".".join(str(part) for part in fault["loc"] if part != "[key]") or "(top level)"
+    allowed = fault["msg"].removeprefix("Value error, ")
+    if fault["type"] == "extra_forbidden":
+        allowed = f"unknown key; allowed here: {', '.join(_keys_at(fault['loc'][:-1]))}"
+    elif fault["type"] == "missing":
+        return f"{key}: missing, and has no default" + _count(faults)
+    return f"{key} = {fault['input']!r:.60}: {allowed}" + _count(faults)
+
+
+def _count(faults: list[Any]) -> str:
+    return f" (and {len(faults) - 1} more)" if len(faults) > 1 else ""
+
+
+def _keys_at(location: tuple[int | str, ...]) -> list[str]:
+    """Names of the keys that the model at ``location`` accepts."""
+    model: Any = Config
+    for part in location:
+        annotation = (
+            model.model_fields[part].annotation if part in getattr(model, "model_fields", {}) else None
+        )
+        if annotation is None:
+            continue
+        arguments = getattr(annotation, "__args__", ())
+        model = arguments[-1] if arguments else annotation
+    return sorted(getattr(model, "model_fields", {}))

@@ -1,0 +1,141 @@
+"""The dataclasses that cross a border between layers: input, teleop, control, plant.
+
+SI units, radians, quaternions x y z w, right-handed frames with z up (REP-103). Stamps are seconds on one monotonic
+clock that is passed in. An arm or hand is named ``"left"`` or ``"right"``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+import numpy as np
+import numpy.typing as npt
+import pinocchio as pin
+
+Array = npt.NDArray[np.float64]
+
+SIDES = ("left", "right")
+
+
+@dataclass(frozen=True, slots=True)
+class HandInputs:
+    """Buttons, triggers and stick of one hand controller, as the headset names them.
+
+    ``button_lower`` is A (right) or X (left), ``button_upper`` B or Y; triggers 0..1, sticks -1..1.
+    """
+
+    button_upper: bool = False
+    button_lower: bool = False
+    thumb_stick_horizontal: float = 0.0
+    thumb_stick_vertical: float = 0.0
+    press_index: float = 0.0
+    press_middle: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class HandSample:
+    """One reading of one hand. Numbers are as received: nothing has been checked or normalised yet.
+
+    Pose and inputs travel in separate messages; each sample carries the newest of both with its own receipt time, so
+    that a stream that stops is noticed even while the other goes on.
+    """
+
+    hand: str
+    position: Array  # (3,) [m], in the input's own frame
+    quaternion: Array  # (4,) x y z w, not necessarily normalised
+    pose_stamp: float  # receipt time of the pose [s]
+    inputs: HandInputs = field(default_factory=HandInputs)
+    inputs_stamp: float = float("-inf")  # receipt time of the inputs [s]; -inf: none received yet
+
+
+@dataclass(frozen=True, slots=True)
+class HapticFeedback:
+    """Vibration of one hand controller: frequency and amplitude, both 0..1."""
+
+    hand: str
+    frequency: float
+    amplitude: float
+
+
+@dataclass(frozen=True, slots=True)
+class RobotState:
+    """What the plant measured, in the joint order of ``Robot.model``."""
+
+    q: Array  # (nv,) [rad]
+    v: Array  # (nv,) [rad/s]
+    tau: Array  # (nv,) measured joint torque [Nm]
+    tau_external: Array | None  # (nv,) torque from contacts [Nm]; None where the plant cannot tell
+    stamp: float  # [s]
+
+
+class CommandMode(StrEnum):
+    """How a plant follows a command."""
+
+    POSITION = "position"
+    TORQUE = "torque"
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """What goes to the plant, in the joint order of ``Robot.model``."""
+
+    mode: CommandMode
+    q: Array  # (nv,) [rad]; in torque mode the reference the torque is about
+    v: Array  # (nv,) [rad/s]
+    tau: Array  # (nv,) [Nm]; ignored in position mode
+    grippers: dict[str, float]  # arm -> opening, 0 closed .. 1 fully open
+
+
+class StepStatus(StrEnum):
+    """What one control tick did."""
+
+    OK = "ok"
+    TARGET_REJECTED = "target_rejected"  # a bad target was held
+    DT_REJECTED = "dt_rejected"  # dt was not in (0, 0.1] s
+    RECOVERING = "recovering"  # outside a limit or closer than min_distance, on the way back
+    FALLBACK = "fallback"  # the stopping motion was executed instead of the QP's solution
+
+
+@dataclass(frozen=True, slots=True)
+class StepReport:
+    """What one control tick did and why. Distances in metres, joints by name."""
+
+    status: StepStatus
+    rejected: tuple[str, ...]  # arms whose target was not usable and is held
+    binding: tuple[str, ...]  # limits active at the solution, e.g. "left_A2 velocity", "left_link_5|table"
+    closest_pair: tuple[str, str]  # geometry names
+    closest_distance: float  # [m]
+    certified: bool  # a stopping motion that keeps limits and separation is known
+    fallback: bool
+    slack: float  # largest violation of a separation row [m/s]
+    solve_time: float  # solver's own time [s]
+
+
+@dataclass(frozen=True, slots=True)
+class Reference:
+    """Joint motion that the QP allows, once per tick; acceleration is constant from the previous tick to this one."""
+
+    q: Array  # (nv,) [rad]
+    v: Array  # (nv,) [rad/s]
+    a: Array  # (nv,) [rad/s^2]
+    report: StepReport
+
+
+@dataclass(frozen=True, slots=True)
+class ArmTarget:
+    """What the teleop layer asks of one arm."""
+
+    pose: pin.SE3 | None  # tool pose in the world frame; None: hold
+    gripper: float  # opening, 0 closed .. 1 fully open
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """A change of an arm's teleop state."""
+
+    t: float  # [s]
+    arm: str
+    source: str  # state before
+    destination: str  # state after
+    reason: str
