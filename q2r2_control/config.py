@@ -6,7 +6,6 @@ Every key has a unit and a range here; ``config/dual_iiwa7.yaml`` shows them all
 from __future__ import annotations
 
 import os
-from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import yaml
@@ -42,14 +41,10 @@ class PoseConfig(_Model):
 class ToolConfig(_Model):
     """What is mounted on an arm's last link."""
 
-    model: str | None = Field(
-        None, description="a file of robots/ without .urdf, or a path; none: bare flange"
-    )
+    model: str | None = Field(None, description="a file of robots/ without .urdf, or a path; none: bare flange")
     link: str | None = Field(None, description="arm link that carries the tool; default: the arm's last link")
     mount: PoseConfig = PoseConfig()
-    frame: str | None = Field(
-        None, description="link of the tool that the operator moves; default: the last link"
-    )
+    frame: str | None = Field(None, description="link of the tool that the operator moves; default: the last link")
 
 
 class GripperConfig(_Model):
@@ -57,9 +52,7 @@ class GripperConfig(_Model):
 
     joints: tuple[str, ...] = Field((), description="finger joints of the tool, all driven alike")
     open_position: float = Field(0.0, ge=-3.15, le=3.15, description="of each finger joint, open [m or rad]")
-    closed_position: float = Field(
-        0.0, ge=-3.15, le=3.15, description="of each finger joint, closed [m or rad]"
-    )
+    closed_position: float = Field(0.0, ge=-3.15, le=3.15, description="of each finger joint, closed [m or rad]")
     speed: float = Field(0.1, gt=0, le=5, description="of each finger joint [m/s or rad/s]")
     force: float = Field(60.0, gt=0, le=500, description="of each finger joint [N or Nm]")
 
@@ -137,9 +130,7 @@ def load_config(path: str | os.PathLike[str]) -> Config:
     except yaml.YAMLError as error:
         raise ConfigError(f"{path}: not YAML: {' '.join(str(error).split())}") from error
     if not isinstance(data, dict):
-        raise ConfigError(
-            f"{path}: expected a mapping of keys such as name, arms, obstacles; got {data!r:.60}"
-        )
+        raise ConfigError(f"{path}: expected a mapping of keys such as name, arms, obstacles; got {data!r:.60}")
     try:
         return Config.model_validate(data)
     except ValidationError as error:
@@ -154,9 +145,7 @@ class _UniqueKeyLoader(yaml.SafeLoader):
         for key_node, _ in node.value:
             key = self.construct_object(key_node, deep=True)  # type: ignore[no-untyped-call]
             if key in seen:
-                raise yaml.constructor.ConstructorError(
-                    None, None, f"key {key!r} is given twice", key_node.start_mark
-                )
+                raise yaml.constructor.ConstructorError(None, None, f"key {key!r} is given twice", key_node.start_mark)
             seen.add(key)
         return super().construct_mapping(node, deep)
 
@@ -182,9 +171,7 @@ def _keys_at(location: tuple[int | str, ...]) -> list[str]:
     """Names of the keys that the model at ``location`` accepts."""
     model: Any = Config
     for part in location:
-        annotation = (
-            model.model_fields[part].annotation if part in getattr(model, "model_fields", {}) else None
-        )
+        annotation = model.model_fields[part].annotation if part in getattr(model, "model_fields", {}) else None
         if annotation is None:
             continue
         arguments = getattr(annotation, "__args__", ())

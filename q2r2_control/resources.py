@@ -13,9 +13,7 @@ _CHECKOUT = Path(__file__).resolve().parent.parent
 
 def resource_roots() -> list[Path]:
     """Folders that can hold config/ and robots/, nearest first."""
-    installed = [
-        Path(sysconfig.get_path("data", scheme)) for scheme in ("venv", "posix_user", "posix_prefix")
-    ]
+    installed = [Path(sysconfig.get_path("data", scheme)) for scheme in ("venv", "posix_user", "posix_prefix")]
     # pip --target puts share/ beside the package.
     installed.append(_CHECKOUT)
     return [_CHECKOUT, *(root / "share" / "q2r2_control" for root in installed)]

@@ -10,49 +10,31 @@ class ControllerSettings(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
-    solver: str = Field(
-        "daqp", description="daqp, osqp, or the name of any solver that qpsolvers has installed"
-    )
+    solver: str = Field("daqp", description="daqp, osqp, or the name of any solver that qpsolvers has installed")
     nominal_dt: float = Field(0.001, gt=0, le=0.02, description="loop period that gains are made for [s]")
-    max_substep: float = Field(
-        0.002, gt=0, le=0.02, description="a longer dt is split into equal parts below this [s]"
-    )
+    max_substep: float = Field(0.002, gt=0, le=0.02, description="a longer dt is split into equal parts below this [s]")
 
     acceleration_limit: float = Field(10.0, gt=0, le=100, description="every joint [rad/s^2]")
     velocity_scale: float = Field(1.0, gt=0, le=1, description="fraction of the robot's velocity limits")
     position_margin: float = Field(0.01, ge=0, le=0.5, description="distance kept from position limits [rad]")
     recovery_velocity: float = Field(0.2, gt=0, le=1, description="inward speed when outside a limit [rad/s]")
 
-    min_distance: float = Field(
-        0.02, ge=0, le=0.2, description="every monitored pair stays this far apart [m]"
-    )
-    distance_buffer: float = Field(
-        0.002, gt=0, le=0.05, description="the QP aims to stop this much earlier [m]"
-    )
+    min_distance: float = Field(0.02, ge=0, le=0.2, description="every monitored pair stays this far apart [m]")
+    distance_buffer: float = Field(0.002, gt=0, le=0.05, description="the QP aims to stop this much earlier [m]")
     influence_distance: float = Field(0.15, gt=0, le=1, description="pairs closer than this get a row [m]")
-    separation_gain: float = Field(
-        4.0, gt=0, le=50, description="approach speed per metre of free distance [1/s]"
-    )
-    separation_recovery_speed: float = Field(
-        0.05, gt=0, le=0.5, description="when too close, moving apart [m/s]"
-    )
+    separation_gain: float = Field(4.0, gt=0, le=50, description="approach speed per metre of free distance [1/s]")
+    separation_recovery_speed: float = Field(0.05, gt=0, le=0.5, description="when too close, moving apart [m/s]")
     contact_speed: float = Field(0.05, gt=0, le=1, description="tool speed at min_distance [m/s]")
 
     position_gain: float = Field(8.0, gt=0, le=50, description="[1/s]")
     rotation_gain: float = Field(8.0, gt=0, le=50, description="[1/s]")
     max_linear_speed: float = Field(1.0, gt=0, le=3, description="tool speed [m/s]")
     max_angular_speed: float = Field(2.5, gt=0, le=10, description="tool speed [rad/s]")
-    linear_deceleration: float = Field(
-        2.0, gt=0, le=50, description="planned when approaching a target [m/s^2]"
-    )
-    angular_deceleration: float = Field(
-        5.0, gt=0, le=100, description="planned when approaching a target [rad/s^2]"
-    )
+    linear_deceleration: float = Field(2.0, gt=0, le=50, description="planned when approaching a target [m/s^2]")
+    angular_deceleration: float = Field(5.0, gt=0, le=100, description="planned when approaching a target [rad/s^2]")
     feed_forward: bool = Field(True, description="follow the target's own velocity")
 
     posture_gain: float = Field(1.0, ge=0, le=20, description="pull towards the home posture [1/s]")
     posture_weight: float = Field(1e-3, ge=0, le=1, description="against the tool task's 1")
     damping: float = Field(1e-4, gt=0, le=1, description="regularisation of joint velocities")
-    error_damping: float = Field(
-        1.0, ge=0, le=100, description="extra damping per squared tool error [1/m^2]"
-    )
+    error_damping: float = Field(1.0, ge=0, le=100, description="extra damping per squared tool error [1/m^2]")
