@@ -1,0 +1,245 @@
+"""A robot description as it comes from outside: found, parsed, checked, its meshes resolved. Nothing is joined here.
+
+Everything later relies on what is checked here: one tree, unique names, finite numbers, meshes that exist.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import xml.etree.ElementTree as ET
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from q2r2_control.errors import ConfigError, RobotError
+from q2r2_control.resources import find_resource
+
+EXAMPLE_ROBOT_DATA = "example-robot-data:"
+
+# Range given to a joint without limits. A bound that the real joint does not have only takes postures away, and two
+# turns each way are more than any task of an arm winds up.
+CONTINUOUS_RANGE = 4 * math.pi
+
+_JOINT_TYPES = ("fixed", "revolute", "prismatic", "continuous", "planar", "floating")
+_NUMBERS = ("xyz", "rpy", "radius", "length", "size", "scale", "ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+_NUMBERS_OF = {
+    "mass": ("value",),
+    "limit": ("lower", "upper", "velocity", "effort"),
+    "rotor": ("inertia", "gear"),
+    "mimic": ("multiplier", "offset"),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Description:
+    """One robot model: URDF tree (meshes absolute), SRDF tree if it has one, and where it came from."""
+
+    urdf: ET.Element
+    srdf: ET.Element | None
+    file: Path
+
+    @property
+    def name(self) -> str:
+        """The model's own name."""
+        return self.urdf.get("name", self.file.stem)
+
+
+def load_description(model: str) -> Description:
+    """Find and parse ``model``: a file of robots/ without .urdf, ``example-robot-data:NAME``, or a path to a .urdf.
+
+    An SRDF of the same name beside the URDF belongs to it. Raises :class:`ConfigError` where there is no such model and
+    :class:`RobotError` where its files cannot be used.
+    """
+    if model.startswith(EXAMPLE_ROBOT_DATA):
+        file, srdf_file = _example_robot(model.removeprefix(EXAMPLE_ROBOT_DATA))
+    else:
+        file = _urdf_file(model)
+        srdf_file = file.with_suffix(".srdf")
+    urdf = parse_urdf(_read(file), str(file), file.parent)
+    srdf = parse_srdf(_read(srdf_file), str(srdf_file)) if srdf_file is not None and srdf_file.is_file() else None
+    return Description(urdf=urdf, srdf=srdf, file=file)
+
+
+def parse_urdf(text: str, where: str, folder: Path | None = None) -> ET.Element:
+    """Parse a URDF, check that it is one tree with unique names and finite numbers, and make mesh paths absolute.
+
+    Continuous joints become revolute ones with :data:`CONTINUOUS_RANGE` each way, since the controller's guarantees
+    need a bound. ``where`` names the text in errors, ``folder`` is what relative mesh paths start from.
+    Raises :class:`RobotError`.
+    """
+    root = _parse(text, where)
+    _check_numbers(root, where)
+    links = _unique_names(root, "link", where)
+    _unique_names(root, "joint", where)
+    for joint in root.findall("joint"):
+        if joint.get("type") not in _JOINT_TYPES:
+            raise RobotError(
+                f"{where}: joint {joint.get('name')} has type {joint.get('type')!r}; allowed: {', '.join(_JOINT_TYPES)}"
+            )
+        for end in ("parent", "child"):
+            if joint_end(joint, end) not in links:
+                raise RobotError(f"{where}: joint {joint.get('name')} has no {end} link among the model's links")
+        if joint.get("type") == "continuous":
+            _bound(joint)
+    LinkTree(root, where)
+    for mesh in root.iter("mesh"):
+        mesh.set("filename", _mesh_file(mesh.get("filename", ""), where, folder))
+    return root
+
+
+def parse_srdf(text: str, where: str) -> ET.Element:
+    """Parse an SRDF. Raises :class:`RobotError`."""
+    return _parse(text, where)
+
+
+class LinkTree:
+    """Who hangs on whom. Building one raises :class:`RobotError` unless the links form exactly one tree."""
+
+    def __init__(self, robot: ET.Element, where: str) -> None:
+        links = [link.get("name", "") for link in robot.findall("link")]
+        self.joint_to: dict[str, ET.Element] = {}  # child link -> the joint that carries it
+        for joint in robot.findall("joint"):
+            child = joint_end(joint, "child")
+            if child in self.joint_to:
+                raise RobotError(f"{where}: link {child} hangs on two joints; a robot has to be one tree")
+            self.joint_to[child] = joint
+        roots = [link for link in links if link not in self.joint_to]
+        if len(roots) != 1:
+            raise RobotError(f"{where}: expected one root link, found {len(roots)}: {', '.join(roots) or 'a loop'}")
+        self.root = roots[0]
+        for link in links:
+            if self.path(link)[0] != self.root:
+                raise RobotError(f"{where}: link {link} is part of a loop; a robot has to be one tree")
+
+    def path(self, link: str) -> list[str]:
+        """Links from the root to ``link``, both included."""
+        path = [link]
+        while path[-1] in self.joint_to and len(path) <= len(self.joint_to) + 1:
+            path.append(joint_end(self.joint_to[path[-1]], "parent"))
+        return path[::-1]
+
+    def chain(self, link: str) -> list[ET.Element]:
+        """Movable joints from the root to ``link``."""
+        joints = [self.joint_to[name] for name in self.path(link)[1:]]
+        return [joint for joint in joints if joint.get("type") != "fixed"]
+
+
+def joint_end(joint: ET.Element, end: str) -> str:
+    """Name of the joint's ``parent`` or ``child`` link; empty where it has none."""
+    element = joint.find(end)
+    return "" if element is None else element.get("link", "")
+
+
+def joint_limits(joint: ET.Element) -> tuple[float, float]:
+    """Position limits of a joint, as written."""
+    limit = joint.find("limit")
+    return (0.0, 0.0) if limit is None else (float(limit.get("lower", "0")), float(limit.get("upper", "0")))
+
+
+def _parse(text: str, where: str) -> ET.Element:
+    try:
+        root = ET.fromstring(text)
+    except (ET.ParseError, ValueError) as error:
+        raise RobotError(f"{where}: not XML: {error}") from error
+    if root.tag != "robot":
+        raise RobotError(f"{where}: the root element is <{root.tag}>; a robot description starts with <robot>")
+    return root
+
+
+def _check_numbers(root: ET.Element, where: str) -> None:
+    for element in root.iter():
+        for attribute in (*_NUMBERS, *_NUMBERS_OF.get(element.tag, ())):
+            text = element.get(attribute)
+            if text is None:
+                continue
+            try:
+                finite = all(math.isfinite(float(part)) for part in text.split())
+            except ValueError:
+                finite = False
+            if not finite:
+                raise RobotError(f"{where}: <{element.tag}> has {attribute} = {text!r:.40}; allowed: finite numbers")
+
+
+def _unique_names(root: ET.Element, tag: str, where: str) -> set[str]:
+    names: set[str] = set()
+    for element in root.findall(tag):
+        name = element.get("name", "")
+        if not name or name in names:
+            raise RobotError(f"{where}: {tag} name {name!r} is {'given twice' if name else 'missing'}")
+        names.add(name)
+    return names
+
+
+def _bound(joint: ET.Element) -> None:
+    joint.set("type", "revolute")
+    limit = joint.find("limit")
+    if limit is None:
+        limit = ET.SubElement(joint, "limit", velocity="0", effort="0")
+    limit.set("lower", repr(-CONTINUOUS_RANGE))
+    limit.set("upper", repr(CONTINUOUS_RANGE))
+
+
+def _example_robot(name: str) -> tuple[Path, Path | None]:
+    from example_robot_data.robots_loader import ROBOTS, getModelPath
+
+    if name not in ROBOTS:
+        raise ConfigError(f"{EXAMPLE_ROBOT_DATA}{name}: no such robot; allowed: {', '.join(sorted(ROBOTS))}")
+    loader = ROBOTS[name]
+    if not loader.urdf_filename:
+        raise ConfigError(f"{EXAMPLE_ROBOT_DATA}{name}: has no URDF; choose another robot or give a path")
+    folder = Path(getModelPath(loader.path)) / loader.path
+    srdf = folder / loader.srdf_subpath / loader.srdf_filename if loader.srdf_filename else None
+    return folder / loader.urdf_subpath / loader.urdf_filename, srdf
+
+
+def _urdf_file(model: str) -> Path:
+    if model.endswith(".xacro"):
+        raise ConfigError(f"{model}: xacro has to be expanded to .urdf first")
+    if model.startswith("package://"):
+        return _package_file(model, None)
+    if model.endswith(".urdf"):
+        return find_resource(model).resolve()
+    return find_resource(f"robots/{model}.urdf")
+
+
+def _read(file: Path) -> str:
+    try:
+        return file.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise RobotError(f"{file}: cannot be read: {error}") from error
+
+
+def _mesh_file(name: str, where: str, folder: Path | None) -> str:
+    if name.startswith("package://"):
+        try:
+            return str(_package_file(name, folder))
+        except ConfigError as error:
+            raise RobotError(f"{where}: mesh {error}") from error
+    file = Path(name.removeprefix("file://"))
+    file = file if file.is_absolute() or folder is None else folder / file
+    if not file.is_file():
+        raise RobotError(f"{where}: mesh {name!r:.200}: no such file")
+    return str(file.resolve())
+
+
+def _package_file(url: str, folder: Path | None) -> Path:
+    """A ``package://NAME/PATH``: in the ROS paths, around ``folder``, or in example-robot-data."""
+    package, _, path = url.removeprefix("package://").partition("/")
+    places: list[Callable[[], list[Path]]] = [
+        lambda: [Path(root) / "share" for root in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if root],
+        lambda: [Path(root) for root in os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep) if root],
+        lambda: [] if folder is None else [*folder.resolve().parents],
+        _example_robot_data_share,
+    ]
+    for place in places:
+        for root in place():
+            if package and path and (file := root / package / path).is_file():
+                return file.resolve()
+    raise ConfigError(f"{url}: not found in AMENT_PREFIX_PATH, ROS_PACKAGE_PATH or beside the file that names it")
+
+
+def _example_robot_data_share() -> list[Path]:
+    from example_robot_data.robots_loader import getModelPath
+
+    return [Path(getModelPath("panda_description")).parent.parent]
