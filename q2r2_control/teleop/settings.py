@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from enum import StrEnum
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, field_validator
+
+from q2r2_control.teleop.axes import axes_matrix
 
 
 class Stance(StrEnum):
@@ -23,13 +25,19 @@ class RotationFrame(StrEnum):
 
 
 class FilterSettings(BaseModel):
-    """One-Euro filter (Casiez, Roussel, Vogel, CHI 2012). Its delay at rest is about 1 / (2 pi min_cutoff)."""
+    """Interpolation between samples, then a One-Euro filter (Casiez, Roussel, Vogel, CHI 2012).
+
+    The hand's delay is interpolation_delay + smoothing_delay, at any speed.
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
-    min_cutoff: float = Field(3.0, gt=0, le=100, description="cutoff frequency at rest [Hz]")
-    beta: float = Field(5.0, ge=0, le=1000, description="cutoff added per unit of speed [Hz s/m, Hz s/rad]")
-    derivative_cutoff: float = Field(5.0, gt=0, le=100, description="cutoff of the speed estimate [Hz]")
+    interpolation_delay: float = Field(0.02, ge=0, le=0.2, description="1.5 periods of a 75 Hz headset [s]")
+    smoothing_delay: float = Field(0.025, ge=0, le=0.2, description="of a motion at constant speed [s]")
+    min_cutoff: float = Field(1.5, gt=0, le=100, description="cutoff frequency at rest; tremor is 8-12 Hz [Hz]")
+    beta: float = Field(10.0, ge=0, le=1000, description="cutoff added per speed [Hz s/m]")
+    rotation_beta: float = Field(3.0, ge=0, le=1000, description="cutoff added per speed [Hz s/rad]")
+    derivative_cutoff: float = Field(2.0, gt=0, le=100, description="cutoff of the speed estimate [Hz]")
 
 
 class GateSettings(BaseModel):
@@ -53,8 +61,17 @@ class TeleopSettings(BaseModel):
     rotation_frame: RotationFrame = Field(RotationFrame.BASE, description="base or tool")
     axes: tuple[str, str, str] = Field(
         ("+x", "+y", "+z"),
-        description="hand axes that become the world's x, y, z; e.g. [+z, -x, +y] for raw Unity",
+        description="hand axes that become the world's x, y, z; e.g. [+z, -x, +y] for raw Unity (left-handed)",
+    )
+    chord_window: float = Field(
+        0.08, ge=0, le=0.5, description="a button waits this long for the other, which makes it a chord [s]"
     )
     linked: bool = Field(True, description="a fault of one hand disengages both arms")
     filter: FilterSettings = Field(default_factory=FilterSettings)
     gate: GateSettings = Field(default_factory=GateSettings)
+
+    @field_validator("axes")
+    @classmethod
+    def _axes_are_a_signed_permutation(cls, axes: tuple[str, str, str]) -> tuple[str, str, str]:
+        axes_matrix(axes)
+        return axes

@@ -1,0 +1,147 @@
+"""The state machine of one arm: what its hand, its buttons and the faults of both make of it."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+
+import numpy as np
+import pinocchio as pin
+
+from q2r2_control.teleop.buttons import ButtonArbiter, Press
+from q2r2_control.teleop.filters import PoseFilter
+from q2r2_control.teleop.gate import PoseGate
+from q2r2_control.teleop.relative import RelativeMotion
+from q2r2_control.teleop.settings import TeleopSettings
+from q2r2_control.types import Event, HandSample
+
+OPEN, CLOSED = 1.0, 0.0
+
+
+class ArmState(StrEnum):
+    """Only an engaged arm follows its hand; in every other state it holds."""
+
+    PAUSED = "paused"
+    ENGAGED = "engaged"
+    PAUSING = "pausing"  # stopped by the lower button, which may still turn out to be half a chord
+    ALIGNING = "aligning"  # stopped by the alignment chord; an anchor is owed when the buttons are released
+
+
+class ArmTeleop:
+    """Teleoperation of one arm by one hand.
+
+    Every way into ENGAGED leads through :meth:`_anchor`, which takes hand and tool as they are at that moment and
+    starts the filter at rest there. So there is no catch-up motion: what the hand did before is not in any state that
+    could replay it.
+    """
+
+    def __init__(self, arm: str, settings: TeleopSettings) -> None:
+        self.arm = arm
+        self.state = ArmState.PAUSED
+        self.gripper = OPEN
+        self.events: list[Event] = []
+        self._timeout = settings.gate.timeout
+        self._gate = PoseGate(settings.gate)
+        self._buttons = ButtonArbiter(settings.chord_window)
+        self._filter = PoseFilter(settings.filter)
+        self._motion = RelativeMotion(
+            settings.stance,
+            settings.position_scale,
+            settings.rotation_frame,
+            settings.rotation_scale,
+            settings.axes,
+        )
+        self._presses: list[Press] = []
+        self._aligned_at = 0.0
+
+    @property
+    def chord(self) -> bool:
+        """Whether this hand's alignment chord is held."""
+        return self._buttons.chord
+
+    def receive(self, sample: HandSample, now: float) -> str | None:
+        """Take one sample of this arm's hand; returns the fault that forbids to go on following it, if any."""
+        self._presses += self._buttons.receive(sample.inputs, sample.inputs_stamp, now)
+        usable, fault = self._gate.receive(sample, now)
+        if usable and fault is None and self.state is ArmState.ENGAGED and self._gate.pose is not None:
+            self._filter.add(self._gate.pose, self._gate.stamp, now)
+        if usable and self.state is ArmState.ALIGNING:
+            return None  # a jump is what the chord is for, and the arm is not following
+        return fault
+
+    def watchdog(self, now: float) -> str | None:
+        """The fault of a stream that stopped, if any."""
+        if self._gate.stale(now):
+            return f"no pose for {self._timeout:g} s"
+        if self._buttons.stale(now, self._timeout):
+            return f"no button data for {self._timeout:g} s"
+        return None
+
+    def disengage(self, now: float, reason: str) -> None:
+        """Hold until a new press; one that began before does not count."""
+        self._buttons.cancel()
+        self._presses.clear()
+        self._go(ArmState.PAUSED, now, reason)
+
+    def forget(self) -> None:
+        """Trust nothing received so far: poses are gone, buttons count as held until seen released."""
+        self._gate.reset()
+        self._buttons.forget()
+        self._presses.clear()
+
+    def act(self, tool: pin.SE3 | None, now: float, chord: bool) -> None:
+        """Let buttons and chords change the state.
+
+        ``tool``: pose to anchor to, None if not known; ``chord``: whether an alignment chord stops this arm.
+        """
+        if chord:
+            self._align(now)
+        elif self.state is ArmState.ALIGNING and self._gate.pose is not None and self._gate.stamp >= self._aligned_at:
+            self._engage(tool, now, "aligned anew")
+        for press in self._presses + self._buttons.due(now):
+            self._press(press, tool, now)
+        self._presses.clear()
+
+    def target(self, now: float) -> pin.SE3 | None:
+        """Where the tool should be at ``now`` in the world frame; None: hold."""
+        if self.state is not ArmState.ENGAGED:
+            return None
+        return self._motion.target(self._filter.at(now))
+
+    def _align(self, now: float) -> None:
+        self._aligned_at = now
+        if self.state is ArmState.ENGAGED or (self.state is ArmState.PAUSING and self.chord):
+            self._go(ArmState.ALIGNING, now, "alignment chord")
+
+    def _press(self, press: Press, tool: pin.SE3 | None, now: float) -> None:
+        if press is Press.UPPER:
+            self.gripper = CLOSED if self.gripper == OPEN else OPEN
+        elif press is Press.LOWER_DOWN:
+            if self.state is ArmState.ENGAGED:
+                self._go(ArmState.PAUSING, now, "lower button")
+        elif self.state is ArmState.PAUSING:
+            self._go(ArmState.PAUSED, now, "lower button")
+        elif self.state is ArmState.PAUSED:
+            self._engage(tool, now, "lower button")
+
+    def _engage(self, tool: pin.SE3 | None, now: float, reason: str) -> None:
+        obstacle = self.watchdog(now)
+        if self._gate.pose is None:
+            obstacle = obstacle or "the newest pose is not usable"
+        elif tool is None or not np.isfinite(tool.homogeneous).all():
+            obstacle = obstacle or "the tool's pose is not known"
+        else:
+            self._anchor(self._gate.pose, tool, now)
+        if obstacle is None:
+            self._go(ArmState.ENGAGED, now, reason)
+        else:
+            self.events.append(Event(now, self.arm, self.state, ArmState.PAUSED, f"not engaged: {obstacle}"))
+            self.state = ArmState.PAUSED
+
+    def _anchor(self, hand: pin.SE3, tool: pin.SE3, now: float) -> None:
+        self._filter.reset(hand, now)
+        self._motion.anchor(hand, tool)
+
+    def _go(self, state: ArmState, now: float, reason: str) -> None:
+        if state is not self.state:
+            self.events.append(Event(now, self.arm, self.state, state, reason))
+            self.state = state

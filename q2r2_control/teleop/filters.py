@@ -1,0 +1,145 @@
+"""From jittery samples of a shaking hand to a smooth pose at every control tick, with one known delay.
+
+Two stages. :class:`Interpolator` plays the samples back a constant time after their receipt, so that the control loop
+sees straight lines instead of 13 ms steps. :class:`OneEuro` then takes the tremor out. Everything is in seconds and
+takes the dt of each tick, so neither the headset's rate nor the loop's changes what the operator feels.
+
+Rotations are filtered as rotations, by their logarithm, so q and -q are the same and nothing is averaged over signs.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+
+import numpy as np
+import pinocchio as pin
+
+from q2r2_control.teleop.settings import FilterSettings
+from q2r2_control.types import Array
+
+# Closer samples are merged: over so short a time receipt jitter would look like speed [s].
+_MIN_SPACING = 0.005
+
+
+class Interpolator:
+    """Plays samples back ``delay`` seconds after their receipt, straight from each to the next.
+
+    When samples stay out for longer than ``delay`` it rests at the newest, and sets off from there when they return:
+    the output is continuous whatever arrives, and nothing is ever extrapolated.
+    """
+
+    def __init__(self, delay: float) -> None:
+        self.delay = delay
+        self._knots: deque[tuple[float, pin.SE3]] = deque()
+
+    def reset(self, pose: pin.SE3, now: float) -> None:
+        """Rest at ``pose``."""
+        self._knots = deque([(now - self.delay, pose)])
+
+    def add(self, pose: pin.SE3, stamp: float, now: float) -> None:
+        """Append a sample received at ``stamp`` <= ``now`` [s]; ``reset`` has to come first."""
+        playhead = now - self.delay
+        here = self.at(now)
+        if len(self._knots) > 1 and stamp - self._knots[-1][0] < _MIN_SPACING:
+            self._knots.pop()
+        while self._knots and self._knots[0][0] <= playhead:
+            self._knots.popleft()
+        # Lines already begun start anew from where the output is, so a merged or late sample cannot make it step.
+        self._knots.appendleft((playhead, here))
+        self._knots.append((max(stamp, self._knots[-1][0] + _MIN_SPACING), pose))
+
+    def at(self, now: float) -> pin.SE3:
+        """The pose played back at ``now`` [s]."""
+        playhead = now - self.delay
+        while len(self._knots) > 1 and self._knots[1][0] <= playhead:
+            self._knots.popleft()
+        start, first = self._knots[0]
+        if len(self._knots) == 1 or playhead <= start:
+            return first
+        end, second = self._knots[1]
+        fraction = (playhead - start) / (end - start)
+        position = first.translation + fraction * (second.translation - first.translation)
+        turn = pin.log3(second.rotation @ first.rotation.T)
+        return pin.SE3(pin.exp3(fraction * turn) @ first.rotation, position)
+
+
+class OneEuro:
+    """One-Euro filter (Casiez, Roussel, Vogel, CHI 2012) of a vector or a rotation, with the same delay at every speed.
+
+    The cutoff rises with speed: f = min_cutoff + beta |v|. The original lags by tau = 1 / (2 pi f), thus by an amount
+    that changes along the path and bends it. Here the input is led by (tau - delay) v, v being the velocity estimate
+    that the filter has anyway, so at any constant velocity the output lags by exactly ``delay``. Since
+    tau v <= 1 / (2 pi beta), the lead is bounded, and so is what it adds when the hand stops dead.
+    """
+
+    def __init__(self, min_cutoff: float, beta: float, derivative_cutoff: float, delay: float) -> None:
+        self.delay = delay
+        self._min_cutoff = min_cutoff
+        self._beta = beta
+        self._derivative_tau = 1.0 / (2.0 * math.pi * derivative_cutoff)
+        self._velocity = np.zeros(3)
+
+    def reset(self) -> None:
+        """Start from rest."""
+        self._velocity = np.zeros(3)
+
+    def correction(self, error: Array, step: Array, dt: float) -> Array:
+        """What to add to the output, (3,), over a tick of ``dt`` > 0 [s].
+
+        ``error`` is input minus output before the tick, ``step`` input minus previous input; rotation vectors for
+        rotations. Backward Euler: stable for every dt, and the lag at constant velocity is exact for any constant dt.
+        """
+        self._velocity = self._velocity + (step - self._velocity * dt) / (self._derivative_tau + dt)
+        cutoff = self._min_cutoff + self._beta * math.hypot(*self._velocity)
+        tau = 1.0 / (2.0 * math.pi * cutoff)
+        return (dt / (tau + dt)) * (error + (tau - self.delay) * self._velocity)
+
+
+class PoseFilter:
+    """Interpolation and One-Euro filter of one hand's pose.
+
+    A hand that moves at constant velocity comes out ``delay`` seconds late, whatever its speed: interpolation delay
+    plus smoothing delay. Velocity changes are followed within about 1 / (2 pi derivative_cutoff).
+    """
+
+    def __init__(self, settings: FilterSettings) -> None:
+        smoothing = settings.derivative_cutoff, settings.smoothing_delay
+        self._interpolator = Interpolator(settings.interpolation_delay)
+        self._position = OneEuro(settings.min_cutoff, settings.beta, *smoothing)
+        self._rotation = OneEuro(settings.min_cutoff, settings.rotation_beta, *smoothing)
+        self._input = self._output = pin.SE3.Identity()
+        self._now = 0.0
+
+    @property
+    def delay(self) -> float:
+        """Low-frequency delay from a sample's receipt to the output [s]."""
+        return self._interpolator.delay + self._position.delay
+
+    def reset(self, pose: pin.SE3, now: float) -> None:
+        """Rest at ``pose``; what came before is forgotten."""
+        self._interpolator.reset(pose, now)
+        self._position.reset()
+        self._rotation.reset()
+        self._input = self._output = pose
+        self._now = now
+
+    def add(self, pose: pin.SE3, stamp: float, now: float) -> None:
+        """Take a sample received at ``stamp`` [s]."""
+        self._interpolator.add(pose, stamp, now)
+
+    def at(self, now: float) -> pin.SE3:
+        """The filtered pose at ``now`` [s]; a time that does not advance returns the same pose again."""
+        dt = now - self._now
+        if dt <= 0.0:
+            return self._output
+        played, before, output = self._interpolator.at(now), self._input, self._output
+        shift = self._position.correction(
+            played.translation - output.translation, played.translation - before.translation, dt
+        )
+        turn = self._rotation.correction(
+            pin.log3(played.rotation @ output.rotation.T), pin.log3(played.rotation @ before.rotation.T), dt
+        )
+        self._now, self._input = now, played
+        self._output = pin.SE3(pin.exp3(turn) @ output.rotation, output.translation + shift)
+        return self._output

@@ -1,0 +1,99 @@
+"""The gate every hand pose passes before it may move an arm."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pinocchio as pin
+
+from q2r2_control.teleop.settings import GateSettings
+from q2r2_control.types import Array, HandSample
+
+# Beyond this, doubles no longer resolve a tenth of a nanometre, and no tracking system reaches as far [m].
+_MAX_COORDINATE = 1e6
+# A quaternion of a length outside this range is not a rotation that lost some digits on the way.
+_QUATERNION_LENGTHS = (1e-6, 1e6)
+
+
+class PoseGate:
+    """Lets usable poses of one hand through and says what is wrong with the others.
+
+    Time is receipt time: a stamp later than ``now`` counts as ``now``, so that it cannot hold the watchdog off. A stamp
+    older than the last one's is a message overtaken by a newer one and is passed over in silence.
+    """
+
+    def __init__(self, settings: GateSettings) -> None:
+        self._settings = settings
+        self._pose: pin.SE3 | None = None
+        self._stamp = -math.inf
+
+    @property
+    def pose(self) -> pin.SE3 | None:
+        """The newest pose, in the input's frame; None when there is none or the newest was not usable."""
+        return self._pose
+
+    @property
+    def stamp(self) -> float:
+        """Receipt time of the newest pose [s], usable or not; -inf before the first."""
+        return self._stamp
+
+    def reset(self) -> None:
+        """Forget everything received."""
+        self._pose = None
+        self._stamp = -math.inf
+
+    def stale(self, now: float) -> bool:
+        """Whether the watchdog has run out: no pose received for ``timeout``."""
+        return now - self._stamp > self._settings.timeout
+
+    def receive(self, sample: HandSample, now: float) -> tuple[bool, str | None]:
+        """Take one sample; returns whether its pose is new and usable, and what forbids to follow it, if anything.
+
+        A jump is usable (an arm may be anchored to it) and yet forbids to follow: the arm must not go where it leads.
+        """
+        stamp = min(float(sample.pose_stamp), now)
+        if math.isnan(stamp):
+            return False, "a pose without a receipt time"
+        if stamp < self._stamp or stamp == -math.inf:
+            return False, None
+        pose = _pose_of(sample)
+        previous, gap = self._pose, stamp - self._stamp
+        self._pose, self._stamp = pose, stamp
+        if pose is None:
+            return False, "a pose that is not finite or not a rotation"
+        if previous is None:
+            return True, None
+        return True, self._jump(previous, pose, gap)
+
+    def _jump(self, previous: pin.SE3, pose: pin.SE3, gap: float) -> str | None:
+        limits = self._settings
+        if gap > limits.timeout:
+            return f"no pose for {gap:.3f} s"
+        distance = math.dist(pose.translation, previous.translation)
+        if distance > limits.max_jump:
+            return f"the hand jumped {distance:.3f} m"
+        angle = math.hypot(*pin.log3(previous.rotation.T @ pose.rotation))
+        if angle > limits.max_rotation_jump:
+            return f"the hand's rotation jumped {angle:.2f} rad"
+        return None
+
+
+def _pose_of(sample: HandSample) -> pin.SE3 | None:
+    """The sample's pose with its quaternion normalised; None when that is not possible."""
+    position, quaternion = _vector(sample.position, 3), _vector(sample.quaternion, 4)
+    if position is None or quaternion is None or np.abs(position).max() > _MAX_COORDINATE:
+        return None
+    length = math.hypot(*quaternion)
+    if not _QUATERNION_LENGTHS[0] <= length <= _QUATERNION_LENGTHS[1]:
+        return None
+    return pin.SE3(pin.Quaternion(quaternion / length).toRotationMatrix(), position)
+
+
+def _vector(values: object, size: int) -> Array | None:
+    """``values`` as ``size`` finite numbers, or None."""
+    try:
+        vector = np.array(values, dtype=np.float64)
+    except (TypeError, ValueError):
+        return None
+    return vector if vector.shape == (size,) and np.isfinite(vector).all() else None

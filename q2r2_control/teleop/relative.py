@@ -1,0 +1,121 @@
+"""Relative motion: the tool repeats what the hand has done since both were anchored."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import pinocchio as pin
+from pydantic import ValidationError
+
+from q2r2_control.errors import ConfigError, Q2R2Error
+from q2r2_control.teleop.axes import axes_matrix
+from q2r2_control.teleop.settings import RotationFrame, Stance, TeleopSettings
+from q2r2_control.types import Array
+
+# Left and right change sign, forward and up do not.
+_REFLECTION = np.diag([1.0, -1.0, 1.0])
+# Past this angle the anchor moves along: a rotation vector has no continuous continuation past a full turn.
+_REANCHOR_ANGLE = 1.5 * math.pi
+# Two rotation vectors of one continuous motion are closer than this between two calls [rad].
+_CONTINUOUS = 1.0
+
+
+class RelativeMotion:
+    """Maps hand poses to tool poses, relative to an anchor of both.
+
+    With M the signed permutation ``axes``, preceded by S = diag(1, -1, 1) in the stance ``mirror_reflected``, a hand
+    pose (p, R) counts in the world as (M p, M R M'). With anchors hand0 and tool0, ``target`` is
+
+        position  tool0 + scale (hand - hand0)
+        rotation  base frame:  exp(rotation_scale log(R R0')) Rtool0
+                  tool frame:  Rtool0 exp(rotation_scale log(R0' R))
+
+    as in Quest2ROS2 (HRI 2026) for scales of 1 in the base frame. Which hand drives which arm is not decided here.
+
+    Every rotation has a second, longer rotation vector; the one that continues the previous call's is used, so that
+    with a scale other than 1 the tool does not flip when the hand passes half a turn.
+
+    Raises :class:`ConfigError` for a value that is not allowed in :class:`TeleopSettings`.
+    """
+
+    def __init__(
+        self,
+        stance: str = "side_by_side",
+        scale: float = 1.0,
+        rotation_frame: str = "base",
+        rotation_scale: float = 1.0,
+        axes: Sequence[str] = ("+x", "+y", "+z"),
+    ) -> None:
+        try:
+            settings = TeleopSettings.model_validate(
+                {
+                    "stance": stance,
+                    "position_scale": scale,
+                    "rotation_frame": rotation_frame,
+                    "rotation_scale": rotation_scale,
+                    "axes": axes,
+                }
+            )
+        except ValidationError as error:
+            fault = error.errors()[0]
+            key = ".".join(str(part) for part in fault["loc"])
+            raise ConfigError(f"RelativeMotion: {key} = {fault['input']!r:.60}: {fault['msg']}") from error
+        self._scale = settings.position_scale
+        self._rotation_scale = settings.rotation_scale
+        self._in_tool_frame = settings.rotation_frame is RotationFrame.TOOL
+        self._map = axes_matrix(settings.axes)
+        if settings.stance is Stance.MIRROR_REFLECTED:
+            self._map = _REFLECTION @ self._map
+        self._hand: pin.SE3 | None = None
+        self._tool = pin.SE3.Identity()
+        self._vector = np.zeros(3)
+
+    def anchor(self, hand: pin.SE3, tool: pin.SE3) -> None:
+        """Make ``hand`` (finite, input's frame) and ``tool`` (world frame) correspond from now on."""
+        self._hand = self._in_world(hand)
+        self._tool = pin.SE3(_orthonormal(tool.rotation), tool.translation)
+        self._vector = np.zeros(3)
+
+    def target(self, hand: pin.SE3) -> pin.SE3:
+        """Tool pose in the world frame for a hand pose in the input's frame.
+
+        Raises :class:`Q2R2Error` when nothing has been anchored.
+        """
+        if self._hand is None:
+            raise Q2R2Error("RelativeMotion.target: call anchor(hand, tool) first")
+        now = self._in_world(hand)
+        position = self._tool.translation + self._scale * (now.translation - self._hand.translation)
+        if self._in_tool_frame:
+            rotation = self._tool.rotation @ self._scaled(self._hand.rotation.T @ now.rotation)
+        else:
+            rotation = self._scaled(now.rotation @ self._hand.rotation.T) @ self._tool.rotation
+        target = pin.SE3(rotation, position)
+        if np.linalg.norm(self._vector) > _REANCHOR_ANGLE:
+            self.anchor(hand, target)
+        return target
+
+    def _in_world(self, hand: pin.SE3) -> pin.SE3:
+        return pin.SE3(self._map @ hand.rotation @ self._map.T, self._map @ hand.translation)
+
+    def _scaled(self, rotation: Array) -> Array:
+        if self._rotation_scale == 1.0:
+            return rotation
+        self._vector = _continued(pin.log3(rotation), self._vector)
+        return pin.exp3(self._rotation_scale * self._vector)
+
+
+def _continued(vector: Array, previous: Array) -> Array:
+    """Of the two rotation vectors of one rotation, shorter than a turn, the one that continues ``previous``."""
+    angle = float(np.linalg.norm(vector))
+    if angle == 0.0:
+        return vector
+    longer = vector * (1.0 - 2.0 * math.pi / angle)
+    gap = float(np.linalg.norm(longer - previous))
+    return longer if gap < min(_CONTINUOUS, float(np.linalg.norm(vector - previous))) else vector
+
+
+def _orthonormal(rotation: Array) -> Array:
+    """Keeps rounding from adding up over any number of anchors."""
+    return pin.Quaternion(rotation).normalized().toRotationMatrix()

@@ -1,0 +1,140 @@
+"""Teleoperation of all arms: from hand samples to tool targets, once per control tick."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+import pinocchio as pin
+
+from q2r2_control.teleop.arm import ArmState, ArmTeleop
+from q2r2_control.teleop.settings import Stance, TeleopSettings
+from q2r2_control.types import ArmTarget, Event, HandSample
+
+
+class Teleop:
+    """Hands drive arms relative to anchors; faults stop them.
+
+    An arm starts paused. Its hand's lower button engages and pauses it, the upper toggles its gripper, both together
+    are the headset's alignment chord: with ``linked`` it stops both arms, since the frame of both hands may change.
+
+    An engaged arm is paused by: no pose or no button data for ``gate.timeout`` of receipt time, a pose that is not
+    finite or not a rotation, a jump past the gate, a lost connection, a loop that stalled or a clock that went back by
+    more than ``gate.timeout``; with ``linked`` the other arm too. Only a new press engages again.
+
+    No input makes :meth:`update` raise: samples of unknown hands, old, doubled or in bursts, and any ``now``.
+    """
+
+    def __init__(self, settings: TeleopSettings, arms: Sequence[str]) -> None:
+        self._linked = settings.linked
+        self._stall = settings.gate.timeout
+        swapped = settings.stance is not Stance.SIDE_BY_SIDE
+        self._arms = {arm: ArmTeleop(arm, settings) for arm in arms}
+        self._arm_of_hand = {_other(arm) if swapped else arm: arm for arm in arms}
+        self._commanded: dict[str, pin.SE3] = {}
+        self._now: float | None = None
+        self.delay = settings.filter.interpolation_delay + settings.filter.smoothing_delay
+
+    @property
+    def states(self) -> dict[str, ArmState]:
+        """State of every arm."""
+        return {name: arm.state for name, arm in self._arms.items()}
+
+    @property
+    def engaged(self) -> dict[str, bool]:
+        """Whether each arm follows its hand now."""
+        return {name: arm.state is ArmState.ENGAGED for name, arm in self._arms.items()}
+
+    def hand_of(self, arm: str) -> str:
+        """The hand that drives ``arm``."""
+        return next(hand for hand, name in self._arm_of_hand.items() if name == arm)
+
+    def take_events(self) -> list[Event]:
+        """State changes and refused presses since the last call, in order of time."""
+        events = sorted((event for arm in self._arms.values() for event in arm.events), key=lambda event: event.t)
+        for arm in self._arms.values():
+            arm.events.clear()
+        return events
+
+    def update(
+        self,
+        samples: Sequence[HandSample],
+        tools: Mapping[str, pin.SE3],
+        now: float,
+        commanded: Mapping[str, pin.SE3] | None = None,
+    ) -> dict[str, ArmTarget]:
+        """One tick: take what arrived and say where every arm should go.
+
+        ``tools``: measured tool poses in the world frame. ``commanded``: tool poses of the controller's reference; when
+        engaging, the position anchors to the measured tool and the orientation to the commanded one, so that sag
+        does not add up over many pauses. Without ``commanded`` it is the last target's, at first the measured one.
+        ``now`` [s] is the clock of the samples' stamps.
+        """
+        clock_fault = self._clock(now)
+        now = self._now if self._now is not None else 0.0
+        faults: dict[str, str | None] = {}
+        for sample in samples:
+            name = self._arm_of_hand.get(sample.hand)
+            if name is not None:
+                faults[name] = self._arms[name].receive(sample, now) or faults.get(name)
+        for name, arm in self._arms.items():
+            faults[name] = faults.get(name) or arm.watchdog(now) or clock_fault
+        self._disengage(faults, now)
+        chord = any(arm.chord for arm in self._arms.values())
+        targets = {}
+        for name, arm in self._arms.items():
+            arm.act(self._tool(name, tools, commanded), now, chord if self._linked else arm.chord)
+            pose = arm.target(now)
+            if pose is not None:
+                self._commanded[name] = pose
+            targets[name] = ArmTarget(pose, arm.gripper)
+        return targets
+
+    def connection_lost(self, now: float) -> None:
+        """The input is gone: every arm pauses, and nothing received before counts any more."""
+        self._clock(now)
+        for arm in self._arms.values():
+            arm.disengage(self._now if self._now is not None else 0.0, "connection lost")
+            arm.forget()
+
+    def _clock(self, now: float) -> str | None:
+        """Advance the time; returns the fault of a clock that cannot be followed, if any."""
+        last = self._now
+        if not math.isfinite(now):
+            return "the clock is not finite"
+        if last is not None and last - self._stall <= now <= last:
+            return None
+        self._now = now
+        if last is None or 0.0 < now - last <= self._stall:
+            return None
+        if now > last:
+            return f"the control loop stalled for {now - last:.3f} s"
+        for arm in self._arms.values():
+            arm.forget()
+        return f"the clock went back by {last - now:.3f} s"
+
+    def _disengage(self, faults: Mapping[str, str | None], now: float) -> None:
+        """Pause the arms whose hand is at fault; a fault of a hand whose arm is paused already concerns nobody."""
+        active = {name: fault for name, fault in faults.items() if fault and self._is_active(name)}
+        for name, fault in active.items():
+            self._arms[name].disengage(now, fault)
+        if active and self._linked:
+            first, fault = next(iter(active.items()))
+            for name, arm in self._arms.items():
+                if name not in active:
+                    arm.disengage(now, f"linked to {first}: {fault}")
+
+    def _is_active(self, name: str) -> bool:
+        return self._arms[name].state is not ArmState.PAUSED
+
+    def _tool(self, name: str, tools: Mapping[str, pin.SE3], commanded: Mapping[str, pin.SE3] | None) -> pin.SE3 | None:
+        """What an anchor takes as the tool's pose: measured position, commanded orientation."""
+        measured = tools.get(name)
+        if measured is None:
+            return None
+        reference = (commanded or self._commanded).get(name, measured)
+        return pin.SE3(reference.rotation, measured.translation)
+
+
+def _other(side: str) -> str:
+    return "right" if side == "left" else "left"
