@@ -11,3 +11,11 @@ class ConfigError(Q2R2Error):
 
 class RobotError(Q2R2Error):
     """A robot description cannot be loaded or does not have what the controller needs."""
+
+
+class ProtocolError(Q2R2Error):
+    """A peer sent bytes that its protocol does not allow; the message says which and what is allowed."""
+
+
+class InputError(Q2R2Error):
+    """An input cannot be opened; the message says which and why."""

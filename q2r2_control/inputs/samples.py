@@ -1,0 +1,90 @@
+"""Between the thread that receives and the loop that polls: messages become samples, which wait in a bounded queue."""
+
+from __future__ import annotations
+
+import threading
+from itertools import pairwise
+
+from q2r2_control.inputs.messages import HandMessage, HandPose
+from q2r2_control.types import SIDES, HandInputs, HandSample
+
+SAMPLES_KEPT = 64  # of each hand between two polls: over 0.4 s of pose and inputs at 75 Hz each
+
+
+class HandTracker:
+    """Joins pose and inputs, which travel apart, into samples that carry the newest of both.
+
+    One tracker lives as long as one connection, so that no pose or button outlives the client that sent it.
+    """
+
+    def __init__(self) -> None:
+        self._poses: dict[str, tuple[HandPose, float]] = {}
+        self._inputs: dict[str, tuple[HandInputs, float]] = dict.fromkeys(SIDES, (HandInputs(), float("-inf")))
+
+    def update(self, hand: str, message: HandMessage, now: float) -> HandSample | None:
+        """The sample after ``message`` came in at ``now`` [s]; None for a twist, or before the hand's first pose."""
+        if isinstance(message, HandPose):
+            self._poses[hand] = (message, now)
+        elif isinstance(message, HandInputs):
+            self._inputs[hand] = (message, now)
+        else:
+            return None
+        if hand not in self._poses:
+            return None
+        pose, pose_stamp = self._poses[hand]
+        inputs, inputs_stamp = self._inputs[hand]
+        return HandSample(hand, pose.position, pose.quaternion, pose_stamp, inputs, inputs_stamp)
+
+
+class SampleQueue:
+    """Bounded queue between two threads that keeps the newest samples and every button edge, and shows a cut.
+
+    A full queue gives up the oldest sample of that hand whose buttons its successor repeats: poses between are lost,
+    no press or release is. Only a hand that pressed ``SAMPLES_KEPT`` times between two polls loses the oldest press.
+
+    After :meth:`cut` the next two takes are empty and :attr:`is_cut` stays true from the cut until the second: a loop
+    that looks once a tick, before or after it takes, cannot miss a connection that was lost and made anew in between,
+    and so never reads two clients' poses as one motion.
+    """
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._samples: list[HandSample] = []
+        self._takes_owed = 0
+
+    @property
+    def is_cut(self) -> bool:
+        return self._takes_owed > 0
+
+    def put(self, sample: HandSample) -> None:
+        """Append the newest sample."""
+        with self._lock:
+            self._samples.append(sample)
+            if sum(other.hand == sample.hand for other in self._samples) > SAMPLES_KEPT:
+                del self._samples[self._expendable(sample.hand)]
+
+    def take(self) -> list[HandSample]:
+        """All samples since the last take, oldest first."""
+        with self._lock:
+            if self._takes_owed:
+                self._takes_owed -= 1
+                return []
+            samples, self._samples = self._samples, []
+            return samples
+
+    def cut(self) -> None:
+        """The connection is lost: forget what waits, which the hand may long have left behind."""
+        with self._lock:
+            self._samples.clear()
+            self._takes_owed = 2
+
+    def _expendable(self, hand: str) -> int:
+        indices = [index for index, sample in enumerate(self._samples) if sample.hand == hand]
+        for index, successor in pairwise(indices):
+            if _buttons(self._samples[index]) == _buttons(self._samples[successor]):
+                return index
+        return indices[0]
+
+
+def _buttons(sample: HandSample) -> tuple[bool, bool]:
+    return sample.inputs.button_upper, sample.inputs.button_lower

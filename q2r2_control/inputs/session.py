@@ -1,0 +1,204 @@
+"""What one client says and is answered: the ROS-TCP-Connector 0.7 protocol without sockets, threads or clocks."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections import Counter
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+from q2r2_control.errors import ProtocolError
+from q2r2_control.inputs.framing import KEEPALIVE, Frame, encode_frame
+from q2r2_control.inputs.messages import Dialect, HandMessage, MessageType, decode, encode_haptic, fits
+from q2r2_control.types import SIDES, HapticFeedback
+
+MAX_OUTGOING_BYTES = 1 << 16  # answers a client may leave unread
+MAX_COMMAND_BYTES = 1 << 14  # JSON of a system command; the app's have under 200
+MAX_TOPICS = 64  # a client may name; the app names about ten
+
+
+@dataclass(frozen=True, slots=True)
+class HandTopic:
+    """A topic that the app publishes."""
+
+    hand: str
+    kind: MessageType
+
+
+HAND_TOPICS = {
+    f"q2r_{hand}_hand_{suffix}": HandTopic(hand, kind)
+    for hand in SIDES
+    for suffix, kind in (("pose", MessageType.POSE), ("twist", MessageType.TWIST), ("inputs", MessageType.INPUTS))
+}
+HAPTIC_TOPICS = {hand: f"q2r_{hand}_hand_haptic_feedback" for hand in SIDES}
+
+_TOPIC_TYPES: dict[str, str] = {
+    **{name: topic.kind.value for name, topic in HAND_TOPICS.items()},
+    **dict.fromkeys(HAPTIC_TOPICS.values(), MessageType.HAPTIC.value),
+}
+_TOPIC_NAME = re.compile(r"[A-Za-z~_][A-Za-z0-9_~/]{0,255}")
+
+
+class Reception(NamedTuple):
+    """One message of a hand."""
+
+    topic: str  # without leading slash
+    hand: str
+    message: HandMessage
+
+
+def log_frame(level: str, text: str) -> bytes:
+    """A line for the app's console; ``level`` is log, warn or error."""
+    return encode_frame(f"__{level}", json.dumps({"text": text}).encode())
+
+
+class HeadsetSession:
+    """Protocol state of one client: frames in through :meth:`receive`, bytes out through :attr:`outgoing`.
+
+    The server speaks first, before anything tells the client's dialect. It says ROS2, the one that Quest2ROS2's users
+    set; an app that is set to ROS1 logs an error on its own side and goes on.
+
+    The dialect is read from the NUL that only ROS2 clients put behind every destination, then each payload has to fit
+    it. Two pieces of evidence that contradict each other end the session: no message is ever read by guess.
+
+    Data on topics outside ``HAND_TOPICS`` is counted and ignored, because an app that publishes more than we know
+    still has hands to follow. An unknown system command, a name that no topic can have, or a payload that its topic
+    cannot have shows that the two sides do not speak the same protocol: :class:`ProtocolError`.
+    """
+
+    def __init__(self) -> None:
+        self.dialect: Dialect | None = None
+        self.published: dict[str, str] = {}  # topic without leading slash -> type, as registered
+        self.subscribed: dict[str, str] = {}  # topic without leading slash -> its spelling, which the client listens to
+        self.unknown_topics: Counter[str] = Counter()
+        self.outgoing = bytearray()
+        self._skip_body = False
+        handshake = {"version": "v0.7.0", "metadata": json.dumps({"protocol": Dialect.ROS2.value})}
+        self._answer("__handshake", handshake)
+
+    def receive(self, frame: Frame) -> Reception | None:
+        """Take one frame; the hand's message if it was one. Raises :class:`ProtocolError`: drop the client."""
+        if frame.is_keepalive:
+            return None
+        self._agree_on_dialect(frame)
+        if self._skip_body:
+            self._skip_body = False
+            return None
+        if frame.destination.startswith("__"):
+            self._command(frame)
+            return None
+        return self._data(frame)
+
+    def queue_keepalive(self) -> None:
+        """Tell the client that the server lives."""
+        self.outgoing += KEEPALIVE
+
+    def queue_haptic(self, feedback: HapticFeedback) -> None:
+        """Vibrate, if the client listens; otherwise nothing happens."""
+        destination = self.subscribed.get(HAPTIC_TOPICS[feedback.hand])
+        if destination is not None and self.dialect is not None:
+            self.outgoing += encode_frame(destination, encode_haptic(feedback, self.dialect))
+
+    def _agree_on_dialect(self, frame: Frame) -> None:
+        dialect = Dialect.ROS2 if frame.terminated else Dialect.ROS1
+        if self.dialect is None:
+            self.dialect = dialect
+        elif dialect is not self.dialect:
+            raise ProtocolError(
+                f"destination {frame.destination!r:.60} ends {'with' if frame.terminated else 'without'} NUL, which "
+                f"is the {dialect} dialect; earlier ones were {self.dialect}"
+            )
+
+    def _data(self, frame: Frame) -> Reception | None:
+        assert self.dialect is not None  # set by _agree_on_dialect
+        name = _topic_name(frame.destination)
+        topic = HAND_TOPICS.get(name)
+        if topic is None:
+            if name in self.unknown_topics or len(self.unknown_topics) < MAX_TOPICS:
+                self.unknown_topics[name] += 1
+            return None
+        if fits(topic.kind, frame.payload, self.dialect.other):
+            raise ProtocolError(
+                f"{name}: {len(frame.payload)} bytes are a message of the {self.dialect.other} dialect, "
+                f"but the destination is written as in {self.dialect}"
+            )
+        try:
+            return Reception(name, topic.hand, decode(topic.kind, frame.payload, self.dialect))
+        except ProtocolError as error:
+            raise ProtocolError(f"{name}: {error}") from error
+
+    def _command(self, frame: Frame) -> None:
+        command = frame.destination
+        parameters = _parameters(command, frame.payload)
+        match command:
+            case "__publish":
+                _register(self.published, *_topic_and_type(command, parameters))
+            case "__subscribe":
+                topic, _ = _topic_and_type(command, parameters)
+                _register(self.subscribed, topic, parameters["topic"])
+            case "__remove_publisher":
+                self.published.pop(_topic(command, parameters), None)
+            case "__remove_subscriber":
+                self.subscribed.pop(_topic(command, parameters), None)
+            case "__topic_list":
+                types = _TOPIC_TYPES | self.published
+                self._answer("__topic_list", {"topics": list(types), "types": list(types.values())})
+            case "__ros_service" | "__unity_service":
+                self._answer("__warn", {"text": f"{command} {_topic(command, parameters)}: q2r2 offers no services"})
+            case "__remove_ros_service" | "__remove_unity_service":
+                pass  # none was registered
+            case "__request":
+                self._skip_body = True
+                self._answer("__error", {"text": "__request: q2r2 offers no services"})
+            case "__response":
+                self._skip_body = True  # nobody asked
+            case _:
+                raise ProtocolError(f"unknown system command {command!r:.60}")
+
+    def _answer(self, command: str, parameters: dict[str, Any]) -> None:
+        self.outgoing += encode_frame(command, json.dumps(parameters).encode())
+        if len(self.outgoing) > MAX_OUTGOING_BYTES:
+            raise ProtocolError(f"over {MAX_OUTGOING_BYTES} bytes of answers left unread")
+
+
+def _parameters(command: str, payload: bytes) -> dict[str, Any]:
+    """The JSON object of a system command; what is no JSON may also be nested too deeply, or hold too long a number."""
+    if len(payload) > MAX_COMMAND_BYTES:
+        raise ProtocolError(f"{command!r:.60}: {len(payload)} bytes, at most {MAX_COMMAND_BYTES} are allowed")
+    try:
+        parameters = json.loads(payload.removesuffix(b"\0").decode() or "{}")
+    except (ValueError, RecursionError) as error:
+        raise ProtocolError(f"{command!r:.60}: {payload[:60]!r} is not JSON: {error}") from None
+    if not isinstance(parameters, dict):
+        raise ProtocolError(f"{command!r:.60}: {payload[:60]!r} is not a JSON object")
+    return parameters
+
+
+def _topic(command: str, parameters: dict[str, Any]) -> str:
+    topic = parameters.get("topic")
+    if not isinstance(topic, str):
+        raise ProtocolError(f"{command}: the topic is a string, got a {type(topic).__name__}")
+    return _topic_name(topic)
+
+
+def _topic_and_type(command: str, parameters: dict[str, Any]) -> tuple[str, str]:
+    kind = parameters.get("message_name")
+    if not isinstance(kind, str):
+        raise ProtocolError(f"{command}: the message_name is a string, got a {type(kind).__name__}")
+    return _topic(command, parameters), kind
+
+
+def _topic_name(name: str) -> str:
+    """The name without its leading slash, which clients may write or not."""
+    bare = name.removeprefix("/")
+    if not _TOPIC_NAME.fullmatch(bare):
+        raise ProtocolError(f"{name!r:.60} is not a topic name")
+    return bare
+
+
+def _register(registrations: dict[str, str], topic: str, value: str) -> None:
+    """Idempotent: the app registers anew whenever it likes."""
+    registrations[topic] = value
+    if len(registrations) > MAX_TOPICS:
+        raise ProtocolError(f"more than {MAX_TOPICS} topics registered")

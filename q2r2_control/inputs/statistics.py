@@ -1,0 +1,56 @@
+"""What a headset connection looks like from outside, for people: counts, rates, ages, last values, reasons."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+from q2r2_control.inputs.messages import Dialect, HandMessage
+
+RATE_WINDOW = 1.0  # [s]
+_STAMPS_KEPT = 1000  # above what any headset sends in RATE_WINDOW
+
+
+@dataclass(frozen=True, slots=True)
+class TopicStatistics:
+    """One topic of the app since it connected."""
+
+    count: int
+    rate: float  # messages in the last second [Hz]
+    age: float  # since the last message [s]
+    last: HandMessage
+
+
+@dataclass(frozen=True, slots=True)
+class HeadsetStatistics:
+    """A snapshot of the server. After a disconnect, dialect and topics are those of the last connection."""
+
+    address: tuple[str, int]  # bound host and port
+    peer: str | None  # host:port of the connected headset
+    dialect: Dialect | None
+    topics: dict[str, TopicStatistics]
+    unknown_topics: dict[str, int]  # data that nothing here reads, by topic
+    published: tuple[str, ...]  # topics that the app announced
+    subscribed: tuple[str, ...]  # topics that the app listens to
+    connections: int  # since the server was started
+    last_disconnect: str | None  # reason
+
+
+class TopicRecorder:
+    """Counts the messages of one topic."""
+
+    def __init__(self) -> None:
+        self._stamps: deque[float] = deque(maxlen=_STAMPS_KEPT)
+        self._count = 0
+        self._last: HandMessage | None = None
+
+    def record(self, message: HandMessage, now: float) -> None:
+        self._stamps.append(now)
+        self._count += 1
+        self._last = message
+
+    def snapshot(self, now: float) -> TopicStatistics:
+        """The figures at ``now`` [s]; only after the first :meth:`record`."""
+        assert self._last is not None
+        recent = sum(stamp > now - RATE_WINDOW for stamp in self._stamps)
+        return TopicStatistics(self._count, recent / RATE_WINDOW, now - self._stamps[-1], self._last)
