@@ -1,0 +1,232 @@
+"""A fake Quest2ROS headset: the app's bytes over TCP in both dialects, packed here and not by the code under test.
+
+As a process it plays an operator's session against a running server:
+
+    python -m tests.support.fake_headset --port 10000 --dialect ros2 --script acceptance --duration 20 --log sent.jsonl
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import socket
+import struct
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import asdict
+from pathlib import Path
+
+from tests.support.operator_script import HANDS, SCRIPTS, START, Quaternion, Reading, Script, Vector
+
+RATE_HZ = 75.0
+DIALECTS = ("ros1", "ros2")
+KEEPALIVE = b"\0\0\0\0\0\0\0\0"
+
+
+class FakeHeadset:
+    """One connection of a headset. ``slash`` writes topics with a leading slash."""
+
+    def __init__(
+        self, address: tuple[str, int], dialect: str = "ros2", slash: bool = False, connect_timeout: float = 5.0
+    ) -> None:
+        self.dialect = dialect
+        self._slash = "/" if slash else ""
+        self._received = bytearray()
+        self.socket = _connect(address, connect_timeout)
+        self.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+
+    def frame(self, destination: str, payload: bytes) -> bytes:
+        """A frame as this dialect's client writes it."""
+        name = destination.encode() + (b"\0" if self.dialect == "ros2" else b"")
+        return struct.pack(f"<I{len(name)}sI", len(name), name, len(payload)) + payload
+
+    def command(self, name: str, **parameters: object) -> bytes:
+        """A system command; JSON ends with NUL in the ROS2 dialect."""
+        text = json.dumps(parameters, separators=(",", ":")).encode()
+        return self.frame(name, text + (b"\0" if self.dialect == "ros2" else b""))
+
+    def topic(self, hand: str, suffix: str) -> str:
+        return f"{self._slash}q2r_{hand}_hand_{suffix}"
+
+    def registrations(self) -> bytes:
+        """What the app says right after connecting: a keepalive, its topics, and a question for the server's."""
+        parts = [KEEPALIVE]
+        for hand in HANDS:
+            for suffix, kind in (
+                ("pose", "geometry_msgs/PoseStamped"),
+                ("twist", "geometry_msgs/Twist"),
+                ("inputs", "quest2ros/OVR2ROSInputs"),
+            ):
+                topic = self.topic(hand, suffix)
+                parts.append(self.command("__publish", topic=topic, message_name=kind, queue_size=10, latch=False))
+            parts.append(
+                self.command(
+                    "__subscribe",
+                    topic=self.topic(hand, "haptic_feedback"),
+                    message_name="quest2ros/OVR2ROSHapticFeedback",
+                )
+            )
+        return b"".join([*parts, self.command("__topic_list")])
+
+    def pose(self, hand: str, position: Vector, quaternion: Quaternion, frame_id: str = "") -> bytes:
+        return self.frame(self.topic(hand, "pose"), pack_pose(self.dialect, position, quaternion, frame_id))
+
+    def twist(self, hand: str, linear: Vector, angular: Vector) -> bytes:
+        return self.frame(self.topic(hand, "twist"), pack_twist(self.dialect, linear, angular))
+
+    def inputs(
+        self, hand: str, upper: bool = False, lower: bool = False, analog: tuple[float, ...] = (0.0,) * 4
+    ) -> bytes:
+        return self.frame(self.topic(hand, "inputs"), pack_inputs(self.dialect, upper, lower, analog))
+
+    def send(self, data: bytes) -> None:
+        self.socket.sendall(data)
+
+    def read_frame(self, timeout: float = 5.0) -> tuple[str, bytes] | None:
+        """Next frame from the server that is no keepalive, None at the end. Raises TimeoutError."""
+        deadline = time.monotonic() + timeout
+        while True:
+            frame = self._cut_frame()
+            if frame == ("", b""):
+                continue
+            if frame is not None:
+                return frame
+            self.socket.settimeout(max(deadline - time.monotonic(), 0.001))
+            try:
+                data = self.socket.recv(1 << 16)
+            except ConnectionError:
+                return None
+            finally:
+                self.socket.settimeout(None)
+            if not data:
+                return None
+            self._received += data
+
+    def read_until(self, destination: str, timeout: float = 5.0) -> bytes:
+        """Payload of the next frame with ``destination``, skipping others. Raises TimeoutError or ConnectionError."""
+        deadline = time.monotonic() + timeout
+        while (frame := self.read_frame(max(deadline - time.monotonic(), 0.001))) is not None:
+            if frame[0] == destination:
+                return frame[1]
+        raise ConnectionError(f"the server closed before it sent {destination}")
+
+    def discard_received(self) -> None:
+        """Throw away what the server has sent so far."""
+        self._received.clear()
+        try:
+            while self.socket.recv(1 << 16, socket.MSG_DONTWAIT):
+                pass
+        except BlockingIOError:
+            pass
+
+    def reset(self) -> None:
+        """Vanish with a TCP reset instead of a farewell."""
+        self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+        self.socket.close()
+
+    def close(self) -> None:
+        self.socket.close()
+
+    def __enter__(self) -> FakeHeadset:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _cut_frame(self) -> tuple[str, bytes] | None:
+        buffer = self._received
+        if len(buffer) < 8:
+            return None
+        name_size = struct.unpack_from("<I", buffer)[0]
+        if len(buffer) < 8 + name_size:
+            return None
+        size = struct.unpack_from("<I", buffer, 4 + name_size)[0]
+        end = 8 + name_size + size
+        if len(buffer) < end:
+            return None
+        frame = (buffer[4 : 4 + name_size].decode(), bytes(buffer[8 + name_size : end]))
+        del buffer[:end]
+        return frame
+
+
+def pack_pose(dialect: str, position: Vector, quaternion: Quaternion, frame_id: str = "") -> bytes:
+    numbers = struct.pack("<7d", *position, *quaternion)
+    name = frame_id.encode()
+    if dialect == "ros1":
+        return struct.pack("<IIII", 7, 12, 500, len(name)) + name + numbers
+    text = struct.pack("<iII", 12, 500, len(name) + 1) + name + b"\0"
+    return b"\0\1\0\0" + text + b"\0" * (-len(text) % 8) + numbers
+
+
+def pack_twist(dialect: str, linear: Vector, angular: Vector) -> bytes:
+    return (b"\0\1\0\0" if dialect == "ros2" else b"") + struct.pack("<6d", *linear, *angular)
+
+
+def pack_inputs(dialect: str, upper: bool, lower: bool, analog: tuple[float, ...]) -> bytes:
+    if dialect == "ros1":
+        return struct.pack("<??4f", upper, lower, *analog)
+    return b"\0\1\0\0" + struct.pack("<??2x4f", upper, lower, *analog)
+
+
+def _connect(address: tuple[str, int], timeout: float) -> socket.socket:
+    """Connect, trying again while nobody listens, as the app does."""
+    deadline = time.monotonic() + timeout
+    while True:
+        try:
+            return socket.create_connection(address, timeout=None)
+        except ConnectionRefusedError:
+            if time.monotonic() > deadline:
+                raise
+            time.sleep(0.05)
+
+
+def play(headset: FakeHeadset, script: Script, duration: float) -> Iterator[tuple[float, Reading]]:
+    """Send the script at RATE_HZ in real time; yields what was sent with its time on ``time.monotonic``."""
+    start = time.monotonic()
+    for index in range(int(duration * RATE_HZ)):
+        due = start + index / RATE_HZ
+        time.sleep(max(due - time.monotonic(), 0.0))
+        readings = [script.reading(hand, index / RATE_HZ) for hand in HANDS]
+        headset.discard_received()
+        for reading in readings:
+            headset.send(headset.pose(reading.hand, reading.position, reading.quaternion))
+            headset.send(headset.inputs(reading.hand, reading.upper, reading.lower))
+            yield time.monotonic(), reading
+
+
+def main() -> int:
+    """Play a script against a server; 0 also when the server closes first, as it does at the end of its run."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--host", default="127.0.0.1")
+    parser.add_argument("--port", type=int, required=True)
+    parser.add_argument("--dialect", choices=DIALECTS, default="ros2")
+    parser.add_argument("--script", choices=sorted(SCRIPTS), default="acceptance")
+    parser.add_argument("--duration", type=float, default=20.0, help="[s]")
+    parser.add_argument("--end", choices=("close", "cut", "stall"), default="close", help="cut: inside a frame")
+    parser.add_argument("--connect-timeout", type=float, default=30.0, help="waits for the server this long [s]")
+    parser.add_argument("--log", type=Path, help="writes what was sent, a JSON line each")
+    arguments = parser.parse_args()
+    sent: list[tuple[float, Reading]] = []
+    address = (arguments.host, arguments.port)
+    headset = FakeHeadset(address, arguments.dialect, connect_timeout=arguments.connect_timeout)
+    try:
+        headset.send(headset.registrations())
+        for time_and_reading in play(headset, SCRIPTS[arguments.script](arguments.duration), arguments.duration):
+            sent.append(time_and_reading)
+        if arguments.end == "cut":
+            headset.send(headset.pose("left", START["left"], (0.0, 0.0, 0.0, -1.0))[:30])
+        elif arguments.end == "stall":
+            time.sleep(3.0)
+    except ConnectionError:
+        pass
+    finally:
+        headset.close()
+        if arguments.log is not None:
+            lines = [json.dumps({"t": t, **asdict(reading)}) + "\n" for t, reading in sent]
+            arguments.log.write_text("".join(lines), encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
