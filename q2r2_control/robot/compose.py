@@ -138,7 +138,7 @@ def _load(model: str, key: str) -> Description:
 
 
 def _last_link(tree: LinkTree) -> str:
-    """The link furthest down that comes before the movable joints branch: a flange, or a gripper without its fingers."""
+    """The link furthest down before the movable joints branch: a flange, or a gripper without its fingers."""
     links = [tree.root, *tree.joint_to]
     depth = 0
     while True:

@@ -225,7 +225,7 @@ def _mesh_file(name: str, where: str, folder: Path | None) -> str:
 
 def _package_file(url: str, folder: Path | None) -> Path:
     """A ``package://NAME/PATH``: in the ROS paths, around ``folder``, or in example-robot-data."""
-    package, _, path = url.removeprefix("package://").partition("/")
+    package, _, path = url.removeprefix("package://").lstrip("/").partition("/")
     places: list[Callable[[], list[Path]]] = [
         lambda: [Path(root) / "share" for root in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if root],
         lambda: [Path(root) for root in os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep) if root],

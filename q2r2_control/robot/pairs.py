@@ -1,0 +1,93 @@
+"""Which collision pairs are monitored."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from collections.abc import Callable, Iterable, Sequence
+from itertools import combinations
+
+import numpy as np
+import pinocchio as pin
+
+from q2r2_control.robot.description import LinkTree, joint_end
+from q2r2_control.types import Array
+
+
+def link_of(geometry_name: str) -> str:
+    """Link of a geometry object: Pinocchio names the objects of a link LINK_0, LINK_1, ..."""
+    return geometry_name.rsplit("_", 1)[0]
+
+
+def add_movable_pairs(model: pin.Model, geometry: pin.GeometryModel, tree: LinkTree) -> None:
+    """Add every pair whose bodies can move relative to each other and are not neighbours in the chain.
+
+    Neighbours: bodies with one joint between them, where fixed parts such as a tool belong to the body that carries
+    them. What stands fixed in the world is one body for Pinocchio, yet a table is no neighbour of an arm's first
+    link: there only the link that carries the joint is.
+    """
+    geometry.removeAllCollisionPairs()
+    for first, second in combinations(range(geometry.ngeoms), 2):
+        a, b = (geometry.geometryObjects[index] for index in (first, second))
+        if a.parentJoint == b.parentJoint:
+            continue
+        inner, outer = (a, b) if a.parentJoint < b.parentJoint else (b, a)
+        if model.parents[outer.parentJoint] == inner.parentJoint and (
+            inner.parentJoint != 0 or _carries(link_of(inner.name), model.names[outer.parentJoint], tree)
+        ):
+            continue
+        geometry.addCollisionPair(pin.CollisionPair(first, second))
+
+
+def remove_disabled_pairs(geometry: pin.GeometryModel, exclusions: Iterable[ET.Element]) -> None:
+    """Remove what an SRDF disables: ``disable_collisions`` of two links, ``disable_default_collisions`` of one."""
+    pairs: set[frozenset[str]] = set()
+    links: set[str] = set()
+    for element in exclusions:
+        if element.tag == "disable_collisions":
+            pairs.add(frozenset((element.get("link1", ""), element.get("link2", ""))))
+        elif element.tag == "disable_default_collisions":
+            links.add(element.get("link", ""))
+    _keep(
+        geometry,
+        lambda a, b: frozenset((link_of(a), link_of(b))) not in pairs and not links & {link_of(a), link_of(b)},
+    )
+
+
+def remove_overlapping_own_pairs(
+    model: pin.Model, geometry: pin.GeometryModel, own_links: Sequence[set[str]], postures: Sequence[Array]
+) -> tuple[tuple[str, str], ...]:
+    """Remove pairs of one arm's own links that touch at every one of ``postures``, and return their names.
+
+    For shapes that overlap by construction, such as capsules around neighbouring meshes. ``own_links`` has one set of
+    links an arm, from its base to its tool. A pair with the other arm or with an obstacle stays, however it lies.
+    """
+    data, geometry_data = model.createData(), geometry.createData()
+    names = pair_names(geometry)
+    touching = np.array([any({link_of(name) for name in pair} <= links for links in own_links) for pair in names])
+    for q in postures:
+        pin.computeDistances(model, data, geometry, geometry_data, q)
+        touching &= np.array([result.min_distance <= 0 for result in geometry_data.distanceResults], dtype=bool)
+    removed = tuple(pair for pair, touches in zip(names, touching, strict=True) if touches)
+    _keep(geometry, lambda a, b: (a, b) not in removed)
+    return removed
+
+
+def pair_names(geometry: pin.GeometryModel) -> tuple[tuple[str, str], ...]:
+    """Names of both objects of each pair, in Pinocchio's order."""
+    objects = geometry.geometryObjects
+    return tuple((objects[pair.first].name, objects[pair.second].name) for pair in geometry.collisionPairs)
+
+
+def _keep(geometry: pin.GeometryModel, wanted: Callable[[str, str], bool]) -> None:
+    pairs = list(geometry.collisionPairs)
+    names = pair_names(geometry)
+    geometry.removeAllCollisionPairs()
+    for pair, (a, b) in zip(pairs, names, strict=True):
+        if wanted(a, b):
+            geometry.addCollisionPair(pair)
+
+
+def _carries(link: str, joint: str, tree: LinkTree) -> bool:
+    return any(
+        element.get("name") == joint and joint_end(element, "parent") == link for element in tree.joint_to.values()
+    )

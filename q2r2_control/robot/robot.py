@@ -1,0 +1,216 @@
+"""The robot as the controller sees it: a Pinocchio model, monitored collision pairs, arms, limits."""
+
+from __future__ import annotations
+
+import os
+import xml.etree.ElementTree as ET
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+
+from q2r2_control.config import Config
+from q2r2_control.errors import RobotError
+from q2r2_control.robot.compose import compose
+from q2r2_control.robot.description import LinkTree, joint_limits, parse_srdf, parse_urdf
+from q2r2_control.robot.enclose import enclose_shapes
+from q2r2_control.robot.pairs import (
+    add_movable_pairs,
+    pair_names,
+    remove_disabled_pairs,
+    remove_overlapping_own_pairs,
+)
+from q2r2_control.types import Array
+
+
+@dataclass(frozen=True, slots=True)
+class Arm:
+    """One arm: the frame the operator moves and the joints that move it."""
+
+    name: str
+    tool_frame: str  # link name
+    frame_id: int  # of the tool frame in ``Robot.model``
+    joints: np.ndarray  # velocity indices from base to tool; a joint that several arms hang on is in each of them
+
+
+@dataclass(frozen=True, slots=True)
+class PairDistance:
+    """Distance of one monitored pair."""
+
+    name_a: str
+    name_b: str
+    distance: float  # [m]; negative: penetration depth
+
+
+class Robot:
+    """Kinematics, dynamics and collision model of a cell, reduced to the joints that move a tool.
+
+    All arrays are (nv,) in the order of ``model``'s velocity, which is that of ``joint_names``. Positions in rad (m for
+    prismatic joints), velocities per second, torques in Nm (N). Build one with :meth:`from_config` or :meth:`from_urdf`.
+
+    ``collision_model`` holds exactly the monitored pairs: each arm against the other with its base, against its own links
+    that can meet, and against what stands in the cell. Every monitored shape is a capsule, a sphere, or a box fixed in
+    the world. ``ignored_pairs`` names pairs of one arm's own shapes that overlap by construction and are not monitored.
+    """
+
+    def __init__(
+        self,
+        urdf: ET.Element,
+        exclusions: Iterable[ET.Element] | None,
+        tool_frames: Mapping[str, str],
+        home: Mapping[str, float],
+        where: str,
+    ) -> None:
+        tree = LinkTree(urdf, where)
+        chains = {name: _checked_chain(tree, name, frame, where) for name, frame in tool_frames.items()}
+        self.name: str = urdf.get("name", "robot")
+        self.urdf: str = ET.tostring(urdf, encoding="unicode")
+        self.model, self.collision_model = _reduced(self.urdf, chains, home, where)
+        self.joint_names: tuple[str, ...] = tuple(self.model.names)[1:]
+        self.arms: dict[str, Arm] = {
+            name: Arm(
+                name=name,
+                tool_frame=frame,
+                frame_id=int(self.model.getFrameId(frame, pin.FrameType.BODY)),
+                joints=np.array([self.model.joints[self.model.getJointId(joint)].idx_v for joint in chains[name]]),
+            )
+            for name, frame in tool_frames.items()
+        }
+        self.home: Array = np.array([home[joint] for joint in self.joint_names])
+        self.position_lower: Array = self.model.lowerPositionLimit.copy()
+        self.position_upper: Array = self.model.upperPositionLimit.copy()
+        self.velocity_limit: Array = self.model.velocityLimit.copy()
+        self.torque_limit: Array = self.model.effortLimit.copy()
+        _set_rotors(self.model, urdf)
+        self.ignored_pairs = self._monitor(tree, exclusions, tool_frames)
+        self._data: pin.Data = self.model.createData()
+        self._collision_data: pin.GeometryData = self.collision_model.createData()
+
+    @classmethod
+    def from_config(cls, config: Config) -> Robot:
+        """The robot of a cell. Raises :class:`ConfigError` or :class:`RobotError` with what is wrong and where."""
+        cell = compose(config)
+        urdf = parse_urdf(cell.urdf, cell.name)
+        return cls(urdf, parse_srdf(cell.srdf, cell.name), cell.tool_frames, cell.home, cell.name)
+
+    @classmethod
+    def from_urdf(
+        cls, path_or_xml: str | os.PathLike[str], arms: Mapping[str, str], srdf: str | os.PathLike[str] | None = None
+    ) -> Robot:
+        """A robot from any URDF, given as file or text.
+
+        ``arms`` maps an arm's name to its tool frame, a link of the URDF. Home is 0 for each joint, or the middle of its
+        range where 0 is outside. ``srdf`` (file or text) says which pairs need no watching; without one, links of
+        one arm that overlap at home are taken to overlap by construction. Raises :class:`RobotError`.
+        """
+        text, where, folder = _text_of(path_or_xml, "URDF text")
+        urdf = parse_urdf(text, where, folder)
+        exclusions = None if srdf is None else parse_srdf(*_text_of(srdf, "SRDF text")[:2])
+        if not arms:
+            raise RobotError(f"{where}: no arms given; expected a mapping such as {{'left': 'left_tool_frame'}}")
+        home = {joint.get("name", ""): _resting(*joint_limits(joint)) for joint in urdf.findall("joint")}
+        return cls(urdf, exclusions, dict(arms), home, where)
+
+    def tool_pose(self, q: Array, arm: str) -> pin.SE3:
+        """Pose of the arm's tool frame in the world at ``q`` (nv,)."""
+        pin.forwardKinematics(self.model, self._data, q)
+        return pin.updateFramePlacement(self.model, self._data, self.arms[arm].frame_id).copy()
+
+    def distances(self, q: Array) -> list[PairDistance]:
+        """Distance of every monitored pair at ``q`` (nv,), computed by Coal, in the order of the collision pairs."""
+        pin.computeDistances(self.model, self._data, self.collision_model, self._collision_data, q)
+        return [
+            PairDistance(a, b, float(result.min_distance))
+            for (a, b), result in zip(
+                pair_names(self.collision_model), self._collision_data.distanceResults, strict=True
+            )
+        ]
+
+    def _monitor(
+        self, tree: LinkTree, exclusions: Iterable[ET.Element] | None, tool_frames: Mapping[str, str]
+    ) -> tuple[tuple[str, str], ...]:
+        """Choose the pairs; returns those of one arm that overlap by construction and are left out."""
+        enclose_shapes(self.collision_model)
+        add_movable_pairs(self.model, self.collision_model, tree)
+        if exclusions is not None:
+            remove_disabled_pairs(self.collision_model, exclusions)
+        postures = [self.home]
+        if exclusions is not None:
+            # Who lists the pairs is believed: only what overlaps everywhere is dropped, since it can never be parted.
+            random = np.random.default_rng(0)
+            postures += [random.uniform(self.position_lower, self.position_upper) for _ in range(50)]
+        own_links = [set(tree.path(frame)) for frame in tool_frames.values()]
+        return remove_overlapping_own_pairs(self.model, self.collision_model, own_links, postures)
+
+
+def _text_of(path_or_text: str | os.PathLike[str], name_of_text: str) -> tuple[str, str, Path | None]:
+    """Text, what to call it in errors, and the folder it came from."""
+    if isinstance(path_or_text, str) and path_or_text.lstrip().startswith("<"):
+        return path_or_text, name_of_text, None
+    try:
+        file = Path(path_or_text)
+        return file.read_text(encoding="utf-8"), str(file), file.parent
+    except (OSError, ValueError) as error:
+        raise RobotError(f"{str(path_or_text)[:200]!r}: neither XML nor a file that can be read: {error}") from error
+
+
+def _resting(lower: float, upper: float) -> float:
+    return 0.0 if lower <= 0.0 <= upper else (lower + upper) / 2
+
+
+def _checked_chain(tree: LinkTree, arm: str, frame: str, where: str) -> list[str]:
+    """Names of the joints that move ``frame``, each of a kind and with limits that the controller can hold to."""
+    if frame != tree.root and frame not in tree.joint_to:
+        raise RobotError(f"{where}: arm {arm}: no link {frame!r:.60}; links: {', '.join([tree.root, *tree.joint_to])}")
+    chain = tree.chain(frame)
+    if not chain:
+        raise RobotError(f"{where}: arm {arm}: no movable joint carries {frame}")
+    for joint in chain:
+        name, kind = joint.get("name", ""), joint.get("type")
+        if kind not in ("revolute", "prismatic") or joint.find("mimic") is not None:
+            kind = kind if joint.find("mimic") is None else "mimic"
+            raise RobotError(f"{where}: joint {name} is {kind}; an arm's joints have to be revolute or prismatic")
+        lower, upper = joint_limits(joint)
+        if not lower < upper:
+            raise RobotError(
+                f"{where}: joint {name} has position limits {lower:g} .. {upper:g}; expected lower < upper"
+            )
+        limit = joint.find("limit")
+        for what in ("velocity", "effort"):
+            value = 0.0 if limit is None else float(limit.get(what, "0"))
+            if not value > 0:
+                raise RobotError(f"{where}: joint {name} has {what} limit {value:g}; expected more than 0")
+    return [joint.get("name", "") for joint in chain]
+
+
+def _reduced(
+    urdf: str, chains: Mapping[str, list[str]], home: Mapping[str, float], where: str
+) -> tuple[pin.Model, pin.GeometryModel]:
+    """Pinocchio's models with every joint outside ``chains`` locked at home."""
+    kept = {name for chain in chains.values() for name in chain}
+    try:
+        model = pin.buildModelFromXML(urdf)
+        geometry = pin.buildGeomFromUrdfString(model, urdf, pin.GeometryType.COLLISION)
+        posture = pin.neutral(model)
+        for joint, name in zip(model.joints[1:], list(model.names)[1:], strict=True):
+            if joint.nq == joint.nv == 1:
+                posture[joint.idx_q] = home[name]
+        locked = [index for index, name in enumerate(model.names) if index > 0 and name not in kept]
+        return pin.buildReducedModel(model, geometry, locked, posture)
+    except (ValueError, RuntimeError, IndexError) as error:
+        raise RobotError(f"{where}: Pinocchio cannot read it: {' '.join(str(error).split())}") from error
+
+
+def _set_rotors(model: pin.Model, urdf: ET.Element) -> None:
+    """Put each joint's rotor inertia into the model, reflected to the joint's side (inertia times gear squared) as well."""
+    for joint in urdf.findall("joint"):
+        rotor, name = joint.find("rotor"), joint.get("name", "")
+        if rotor is None or not model.existJointName(name):
+            continue
+        index = model.joints[model.getJointId(name)].idx_v
+        inertia, gear = float(rotor.get("inertia", "0")), float(rotor.get("gear", "1"))
+        model.rotorInertia[index] = inertia
+        model.rotorGearRatio[index] = gear
+        model.armature[index] = inertia * gear**2
