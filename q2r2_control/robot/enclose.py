@@ -1,7 +1,7 @@
 """Collision shapes as the distance kernels want them.
 
-Capsules, spheres and boxes fixed in the world stay; everything else is enclosed. A box that moves becomes a capsule too,
-so that a pair of two boxes, which has no short closed form, cannot occur.
+Capsules, spheres and boxes fixed in the world stay; everything else is enclosed. A box that moves becomes a capsule
+too, so that a pair of two boxes, which has no short closed form, cannot occur.
 
 A mesh or convex becomes a capsule around its vertices, hence around its triangles, since a capsule is convex. The
 capsule is close to the smallest; safety rests on its enclosing every vertex only, which its construction gives for any
@@ -21,7 +21,6 @@ from scipy.spatial import ConvexHull, QhullError
 
 from q2r2_control.errors import RobotError
 from q2r2_control.types import Array
-
 
 # What rounding may take away is given back: 1 micrometre on every enclosing radius.
 _ROUNDING = 1e-6
@@ -136,7 +135,7 @@ def _volume(radius: float, ends: Array) -> float:
 
 
 def _around_cylinder(radius: float, half_length: float, box_allowed: bool) -> coal.CollisionGeometry:
-    """The smaller of a box, if one is allowed, and the smallest coaxial capsule: a round table top is a poor capsule."""
+    """The smallest coaxial capsule, or the box where that is allowed and smaller, as for a round table top."""
 
     def half_segment(capsule_radius: float) -> float:
         return max(half_length - float(np.sqrt(max(capsule_radius**2 - radius**2, 0.0))), 0.0)

@@ -48,11 +48,12 @@ class Robot:
     """Kinematics, dynamics and collision model of a cell, reduced to the joints that move a tool.
 
     All arrays are (nv,) in the order of ``model``'s velocity, which is that of ``joint_names``. Positions in rad (m for
-    prismatic joints), velocities per second, torques in Nm (N). Build one with :meth:`from_config` or :meth:`from_urdf`.
+    prismatic joints), velocities per second, torques in Nm (N). Made by :meth:`from_config` or :meth:`from_urdf`.
 
-    ``collision_model`` holds exactly the monitored pairs: each arm against the other with its base, against its own links
-    that can meet, and against what stands in the cell. Every monitored shape is a capsule, a sphere, or a box fixed in
-    the world. ``ignored_pairs`` names pairs of one arm's own shapes that overlap by construction and are not monitored.
+    ``collision_model`` holds exactly the monitored pairs: each arm against the other with its base, against its own
+    links that can meet, and against what stands in the cell. Every monitored shape is a capsule, a sphere, or a box
+    fixed in the world. ``ignored_pairs`` names pairs of one arm's own shapes that overlap by construction and are not
+    monitored.
     """
 
     def __init__(
@@ -101,8 +102,8 @@ class Robot:
     ) -> Robot:
         """A robot from any URDF, given as file or text.
 
-        ``arms`` maps an arm's name to its tool frame, a link of the URDF. Home is 0 for each joint, or the middle of its
-        range where 0 is outside. ``srdf`` (file or text) says which pairs need no watching; without one, links of
+        ``arms`` maps an arm's name to its tool frame, a link of the URDF. Home is 0 for each joint, or the middle of
+        its range where 0 is outside. ``srdf`` (file or text) says which pairs need no watching; without one, links of
         one arm that overlap at home are taken to overlap by construction. Raises :class:`RobotError`.
         """
         text, where, folder = _text_of(path_or_xml, "URDF text")
@@ -204,7 +205,7 @@ def _reduced(
 
 
 def _set_rotors(model: pin.Model, urdf: ET.Element) -> None:
-    """Put each joint's rotor inertia into the model, reflected to the joint's side (inertia times gear squared) as well."""
+    """Put each joint's rotor into the model, its armature (rotor inertia times gear squared) included."""
     for joint in urdf.findall("joint"):
         rotor, name = joint.find("rotor"), joint.get("name", "")
         if rotor is None or not model.existJointName(name):
