@@ -1,0 +1,103 @@
+"""Frames are cut out of the stream however it arrives, and what cannot be a frame is refused with its reason."""
+
+from __future__ import annotations
+
+import struct
+
+import pytest
+
+from q2r2_control.errors import ProtocolError
+from q2r2_control.inputs.framing import KEEPALIVE, MAX_FRAME_BYTES, Frame, FrameDecoder, encode_frame
+
+# Written by hand from the protocol: length 4, "/abc", length 3, "xyz".
+ABC = b"\x04\x00\x00\x00/abc\x03\x00\x00\x00xyz"
+ABC_NUL = b"\x05\x00\x00\x00/abc\x00\x03\x00\x00\x00xyz"
+
+
+def frames(*chunks: bytes) -> list[Frame]:
+    decoder = FrameDecoder()
+    found = []
+    for chunk in chunks:
+        decoder.feed(chunk)
+        while (frame := decoder.next_frame()) is not None:
+            found.append(frame)
+    decoder.finish()
+    return found
+
+
+def test_a_frame_is_read_as_written_by_hand() -> None:
+    assert frames(ABC) == [Frame("/abc", b"xyz", terminated=False)]
+
+
+def test_the_nul_of_a_ros2_destination_is_told_and_taken_off() -> None:
+    assert frames(ABC_NUL) == [Frame("/abc", b"xyz", terminated=True)]
+
+
+def test_eight_zero_bytes_are_a_keepalive() -> None:
+    (frame,) = frames(KEEPALIVE)
+    assert frame.is_keepalive
+    assert not frames(ABC)[0].is_keepalive
+
+
+def test_the_server_writes_no_nul() -> None:
+    assert encode_frame("/abc", b"xyz") == ABC
+
+
+@pytest.mark.parametrize("split", range(1, 2 * len(ABC_NUL) + 8))
+def test_a_stream_split_at_any_byte_gives_the_same_frames(split: int) -> None:
+    stream = ABC_NUL + KEEPALIVE + ABC_NUL
+    assert frames(stream[:split], stream[split:]) == frames(stream)
+
+
+def test_a_stream_byte_by_byte_gives_the_same_frames() -> None:
+    stream = ABC + KEEPALIVE + ABC_NUL
+    assert frames(*(bytes([byte]) for byte in stream)) == frames(stream)
+
+
+def test_coalesced_frames_come_out_in_order() -> None:
+    stream = b"".join(encode_frame(f"topic_{index}", bytes([index])) for index in range(100))
+    assert [frame.destination for frame in frames(stream)] == [f"topic_{index}" for index in range(100)]
+
+
+@pytest.mark.parametrize("length", range(1, len(ABC)))
+def test_a_stream_that_ends_inside_a_frame_is_truncated(length: int) -> None:
+    with pytest.raises(ProtocolError, match=f"ended inside a frame, {length} bytes"):
+        frames(ABC[:length])
+
+
+def test_a_frame_of_exactly_one_mebibyte_is_allowed() -> None:
+    (frame,) = frames(encode_frame("big", bytes(MAX_FRAME_BYTES - 8 - 3)))
+    assert len(frame.payload) == MAX_FRAME_BYTES - 11
+
+
+@pytest.mark.parametrize(
+    "announcement",
+    [
+        pytest.param(struct.pack("<I", MAX_FRAME_BYTES - 7), id="destination that leaves no room for lengths"),
+        pytest.param(struct.pack("<I", 0xFFFFFFFF), id="destination of 4 GiB"),
+        pytest.param(struct.pack("<I3sI", 3, b"big", MAX_FRAME_BYTES - 10), id="payload one byte too long"),
+        pytest.param(struct.pack("<I3sI", 3, b"big", 0xFFFFFFFF), id="payload of 4 GiB"),
+        pytest.param(b"GET / HTTP/1.1\r\n\r\n", id="another protocol"),
+    ],
+)
+def test_an_oversized_frame_is_refused_when_it_is_announced(announcement: bytes) -> None:
+    with pytest.raises(ProtocolError, match=r"bytes announced, at most 1048576 are allowed"):
+        frames(announcement)
+
+
+def test_a_destination_that_is_not_utf8_is_refused() -> None:
+    with pytest.raises(ProtocolError, match="not UTF-8"):
+        frames(b"\x02\x00\x00\x00\xff\xfe\x00\x00\x00\x00")
+
+
+def test_payload_without_destination_is_refused() -> None:
+    with pytest.raises(ProtocolError, match="without a destination"):
+        frames(b"\x00\x00\x00\x00\x01\x00\x00\x00x")
+
+
+def test_frames_before_a_fault_are_not_lost() -> None:
+    decoder = FrameDecoder()
+    decoder.feed(ABC + b"\xff\xff\xff\xff")
+    assert decoder.next_frame() == Frame("/abc", b"xyz", terminated=False)
+    with pytest.raises(ProtocolError):
+        decoder.next_frame()

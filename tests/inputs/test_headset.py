@@ -1,0 +1,576 @@
+"""The headset server over real TCP: what the app gets, what a fault does, and that the loop never waits."""
+
+from __future__ import annotations
+
+import logging
+import math
+import random
+import socket
+import struct
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from q2r2_control.errors import InputError
+from q2r2_control.inputs.base import Input
+from q2r2_control.inputs.headset import MAX_FRAMES_PER_SECOND, HeadsetServer
+from q2r2_control.inputs.messages import Dialect, HandPose
+from q2r2_control.inputs.session import HeadsetSession
+from q2r2_control.types import HandSample, HapticFeedback
+from tests.support.fake_headset import DIALECTS, KEEPALIVE, FakeHeadset, pack_inputs, pack_pose
+
+IDENTITY = (0.0, 0.0, 0.0, -1.0)
+HAPTIC = "q2r_left_hand_haptic_feedback"
+
+every_dialect = pytest.mark.parametrize("dialect", DIALECTS)
+
+
+class HandClock:
+    """A clock that only the test moves."""
+
+    def __init__(self) -> None:
+        self.now = 100.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+@pytest.fixture
+def clock() -> HandClock:
+    return HandClock()
+
+
+@pytest.fixture
+def server() -> Iterator[HeadsetServer]:
+    running = HeadsetServer(port=0)
+    running.start()
+    yield running
+    running.close()
+
+
+@pytest.fixture
+def timed_server(clock: HandClock) -> Iterator[HeadsetServer]:
+    """A server whose time stands still unless the test moves it."""
+    running = HeadsetServer(port=0, clock=clock)
+    running.start()
+    yield running
+    running.close()
+
+
+def eventually(condition: Callable[[], object], what: str = "") -> None:
+    """Wait for the other thread, far longer than it needs."""
+    deadline = time.monotonic() + 10.0
+    while not condition():
+        assert time.monotonic() < deadline, f"never happened: {what or condition}"
+        time.sleep(0.001)
+
+
+def collect(server: HeadsetServer, count: int) -> list[HandSample]:
+    """Poll as the loop does until ``count`` samples have come."""
+    samples: list[HandSample] = []
+
+    def enough() -> bool:
+        samples.extend(server.poll(0.0))
+        return len(samples) >= count
+
+    eventually(enough, f"{count} samples")
+    return samples
+
+
+def assert_serves(server: HeadsetServer, dialect: str = "ros2") -> None:
+    """A new headset is accepted and its motion arrives."""
+    with connect(server, dialect) as headset:
+        headset.send(headset.registrations() + headset.pose("right", (7.0, 8.0, 9.0), IDENTITY))
+        headset.read_until("__topic_list")
+        (sample,) = collect(server, 1)
+        assert (sample.hand, sample.position.tolist()) == ("right", [7.0, 8.0, 9.0])
+    eventually(lambda: server.statistics.peer is None)
+
+
+def connect(server: HeadsetServer, dialect: str = "ros2", slash: bool = False) -> FakeHeadset:
+    """Connect and wait until the server has the connection, so that tests can go on in order."""
+    headset = FakeHeadset(server.address, dialect, slash)
+    headset.read_until("__handshake")
+    return headset
+
+
+def warnings(caplog: pytest.LogCaptureFixture) -> list[str]:
+    return [record.getMessage() for record in caplog.records if record.levelno >= logging.WARNING]
+
+
+def wait_until_dropped(server: HeadsetServer, headset: FakeHeadset) -> None:
+    eventually(lambda: server.statistics.peer is None, "the client is dropped")
+    while headset.read_frame() is not None:
+        pass
+
+
+# What the app relies on ----------------------------------------------------------------------------------------------
+
+
+def test_the_server_is_an_input() -> None:
+    assert isinstance(HeadsetServer(), Input)
+
+
+def test_it_listens_on_this_machine_only_unless_told_otherwise() -> None:
+    assert HeadsetServer().address == ("127.0.0.1", 10000)
+
+
+@every_dialect
+@pytest.mark.parametrize("slash", [False, True], ids=["bare names", "leading slash"])
+def test_a_headset_is_greeted_answered_and_its_hands_arrive(server: HeadsetServer, dialect: str, slash: bool) -> None:
+    with FakeHeadset(server.address, dialect, slash) as headset:
+        first = headset.read_frame()
+        assert first is not None
+        assert first[0] == "__handshake"
+        headset.send(headset.registrations())
+        headset.read_until("__topic_list")
+        headset.send(headset.inputs("left", lower=True, analog=(0.5, -0.5, 0.25, 1.0)))
+        headset.send(headset.pose("left", (0.1, 0.2, 0.3), IDENTITY))
+        headset.send(headset.twist("left", (1.0, 2.0, 3.0), (4.0, 5.0, 6.0)))
+        headset.send(headset.pose("right", (0.4, 0.5, 0.6), (0.0, 0.6, 0.8, 0.0), frame_id="room"))
+        left, right = collect(server, 2)
+        assert server.connected
+    assert (left.hand, left.position.tolist(), left.quaternion.tolist()) == ("left", [0.1, 0.2, 0.3], list(IDENTITY))
+    assert left.inputs.button_lower
+    assert not left.inputs.button_upper
+    assert (left.inputs.thumb_stick_vertical, left.inputs.press_middle) == (-0.5, 1.0)
+    assert (right.hand, right.position.tolist()) == ("right", [0.4, 0.5, 0.6])
+
+
+@every_dialect
+def test_frames_split_at_every_byte_arrive_whole(server: HeadsetServer, dialect: str) -> None:
+    with connect(server, dialect) as headset:
+        frame = headset.pose("left", (0.1, 0.2, 0.3), IDENTITY) + headset.inputs("left", lower=True)
+        for split in range(1, len(frame)):
+            headset.send(frame[:split])
+            headset.send(frame[split:])
+        samples = collect(server, 2)
+        eventually(lambda: server.statistics.topics["q2r_left_hand_inputs"].count == len(frame) - 1)
+        samples += server.poll(0.0)
+    assert all(sample.position.tolist() == [0.1, 0.2, 0.3] for sample in samples)
+
+
+@every_dialect
+def test_coalesced_frames_arrive_one_by_one(server: HeadsetServer, dialect: str) -> None:
+    with connect(server, dialect) as headset:
+        headset.send(b"".join(headset.pose("left", (float(x), 0.0, 0.0), IDENTITY) for x in range(50)))
+        samples = collect(server, 50)
+    assert [sample.position[0] for sample in samples] == list(range(50))
+
+
+def test_a_pose_is_stamped_at_receipt_with_the_loops_clock_and_keeps_its_own_stamp_and_frame(
+    timed_server: HeadsetServer, clock: HandClock
+) -> None:
+    with connect(timed_server) as headset:
+        headset.send(headset.pose("left", (0.0, 0.0, 0.0), IDENTITY, frame_id="headset"))
+        (first,) = collect(timed_server, 1)
+        clock.now += 0.25
+        headset.send(headset.inputs("left", lower=True))
+        (second,) = collect(timed_server, 1)
+        last = timed_server.statistics.topics["q2r_left_hand_pose"].last
+    assert (first.pose_stamp, second.pose_stamp, second.inputs_stamp) == (100.0, 100.0, 100.25)
+    assert isinstance(last, HandPose)
+    assert (last.stamp, last.frame_id) == (12.0000005, "headset")
+
+
+def test_small_messages_are_sent_without_delay(server: HeadsetServer) -> None:
+    with connect(server):
+        assert server._client is not None
+        assert server._client.socket.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
+
+
+def test_after_a_second_without_words_the_server_sends_a_keepalive(
+    timed_server: HeadsetServer, clock: HandClock
+) -> None:
+    with connect(timed_server) as headset:
+        clock.now += 1.1
+        assert headset.socket.recv(100) == KEEPALIVE
+
+
+def test_a_headset_that_only_keeps_alive_stays(timed_server: HeadsetServer, clock: HandClock) -> None:
+    with connect(timed_server) as headset:
+        for _ in range(5):
+            clock.now += 1.5
+            headset.send(KEEPALIVE)
+            headset.send(headset.pose("left", (0.0, 0.0, 0.0), IDENTITY))
+            collect(timed_server, 1)
+        assert timed_server.connected
+
+
+def test_one_hand_that_falls_silent_does_not_stop_the_other(server: HeadsetServer) -> None:
+    with connect(server) as headset:
+        headset.send(headset.pose("left", (0.0, 0.0, 0.0), IDENTITY))
+        collect(server, 1)
+        for x in range(20):
+            headset.send(headset.pose("right", (float(x), 0.0, 0.0), IDENTITY))
+        assert {sample.hand for sample in collect(server, 20)} == {"right"}
+
+
+# Haptics -------------------------------------------------------------------------------------------------------------
+
+
+@every_dialect
+def test_haptics_arrive_as_two_floats_clipped_to_their_range(server: HeadsetServer, dialect: str) -> None:
+    with connect(server, dialect) as headset:
+        headset.send(headset.registrations())
+        headset.read_until("__topic_list")
+        server.send_haptic(HapticFeedback("left", frequency=0.5, amplitude=7.0))
+        payload = headset.read_until(HAPTIC)
+        assert len(payload) == (8 if dialect == "ros1" else 12)
+        assert struct.unpack("<2f", payload[-8:]) == (0.5, 1.0)
+        server.send_haptic(HapticFeedback("left", frequency=-1.0, amplitude=0.25))
+        assert struct.unpack("<2f", headset.read_until(HAPTIC)[-8:]) == (0.0, 0.25)
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_haptics_that_are_not_finite_are_not_sent(server: HeadsetServer, value: float) -> None:
+    with connect(server) as headset:
+        headset.send(headset.registrations())
+        headset.read_until("__topic_list")
+        server.send_haptic(HapticFeedback("left", value, 1.0))
+        server.send_haptic(HapticFeedback("left", 1.0, value))
+        server.send_haptic(HapticFeedback("right", 1.0, 1.0))
+        frame = headset.read_frame()
+    assert frame is not None
+    assert frame[0] == "q2r_right_hand_haptic_feedback"
+
+
+def test_haptics_without_a_headset_or_a_subscription_do_nothing(server: HeadsetServer) -> None:
+    server.send_haptic(HapticFeedback("left", 1.0, 1.0))
+    with connect(server) as headset:
+        server.send_haptic(HapticFeedback("left", 1.0, 1.0))
+        headset.send(headset.command("__topic_list"))
+        frame = headset.read_frame()
+        assert frame is not None
+        assert frame[0] == "__topic_list"
+    server.close()
+    server.send_haptic(HapticFeedback("left", 1.0, 1.0))
+
+
+def test_a_headset_that_never_reads_blocks_nobody_and_is_owed_only_the_newest_vibration(server: HeadsetServer) -> None:
+    headset = FakeHeadset(server.address)
+    headset.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+    with headset:
+        headset.send(headset.registrations())
+        eventually(lambda: HAPTIC in server.statistics.subscribed)
+        client = server._client
+        assert client is not None
+
+        def blocked() -> bool:
+            for _ in range(100):
+                server.send_haptic(HapticFeedback("left", 0.5, 0.5))
+            return len(client.session.outgoing) > 0
+
+        client.socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 4096)
+        eventually(blocked, "the network is full")
+        for _ in range(10000):
+            server.send_haptic(HapticFeedback("left", 0.5, 0.5))
+        server.send_haptic(HapticFeedback("left", 0.125, 0.875))
+        headset.send(headset.pose("left", (1.0, 2.0, 3.0), IDENTITY))
+        assert collect(server, 1)[0].position.tolist() == [1.0, 2.0, 3.0]
+        assert len(client.session.outgoing) < 200
+        newest = b""
+        while struct.unpack("<2f", newest[-8:] or bytes(8)) != (0.125, 0.875):
+            newest = headset.read_until(HAPTIC)
+
+
+# One headset at a time -----------------------------------------------------------------------------------------------
+
+
+def test_a_second_headset_is_refused_with_a_reason_and_one_line_while_one_drives(
+    server: HeadsetServer, caplog: pytest.LogCaptureFixture
+) -> None:
+    with connect(server) as first:
+        for _ in range(3):
+            with FakeHeadset(server.address) as second:
+                second.send(second.registrations())
+                assert b"refused" in second.read_until("__error")
+                assert second.read_frame() is None
+        first.send(first.pose("left", (1.0, 2.0, 3.0), IDENTITY))
+        collect(server, 1)
+        assert server.connected
+    assert len(warnings(caplog)) == 1
+    assert "refused" in warnings(caplog)[0]
+
+
+def test_a_dead_headset_is_dropped_after_two_seconds_of_silence_and_locks_nobody_out(
+    timed_server: HeadsetServer, clock: HandClock, caplog: pytest.LogCaptureFixture
+) -> None:
+    with connect(timed_server) as dead:
+        clock.now += 2.1
+        wait_until_dropped(timed_server, dead)
+    assert len(warnings(caplog)) == 1
+    assert "no frame for 2 s" in warnings(caplog)[0]
+    assert_serves(timed_server)
+
+
+def test_bytes_that_never_become_a_frame_are_silence(timed_server: HeadsetServer, clock: HandClock) -> None:
+    with connect(timed_server) as headset:
+        headset.send(headset.pose("left", (0.0, 0.0, 0.0), IDENTITY))
+        collect(timed_server, 1)
+        for _ in range(3):
+            clock.now += 0.9
+            headset.send(b"\x01")
+        wait_until_dropped(timed_server, headset)
+
+
+def test_nothing_of_a_lost_connection_reaches_the_next(server: HeadsetServer) -> None:
+    with connect(server) as first:
+        first.send(first.inputs("left", lower=True) + first.pose("left", (1.0, 2.0, 3.0), IDENTITY))
+        collect(server, 1)
+        first.send(first.pose("left", (5.0, 2.0, 3.0), IDENTITY))
+        eventually(lambda: server.statistics.topics["q2r_left_hand_pose"].count == 2)
+    eventually(lambda: server.statistics.peer is None)
+    assert not server.connected
+    with connect(server) as second:
+        second.send(second.inputs("right") + second.pose("left", (0.0, 0.0, 0.0), IDENTITY))
+        (sample,) = collect(server, 1)
+        assert sample.position.tolist() == [0.0, 0.0, 0.0]
+        assert not sample.inputs.button_lower
+        assert sample.inputs_stamp == float("-inf")
+        assert server.statistics.subscribed == ()
+
+
+def test_a_connection_lost_and_made_anew_between_two_ticks_is_seen_as_lost(server: HeadsetServer) -> None:
+    with connect(server) as first:
+        first.send(first.pose("left", (1.0, 2.0, 3.0), IDENTITY))
+        collect(server, 1)
+        eventually(lambda: server.connected)
+    eventually(lambda: server.statistics.peer is None)
+    with connect(server) as second:
+        second.send(second.pose("left", (4.0, 5.0, 6.0), IDENTITY))
+        eventually(lambda: server.statistics.topics)
+        assert server.poll(0.0) == []
+        assert not server.connected
+        collect(server, 1)
+        assert server.connected
+
+
+# Faults --------------------------------------------------------------------------------------------------------------
+
+FAULTS: dict[str, tuple[Callable[[FakeHeadset], bytes], str]] = {
+    "oversized frame": (lambda _: struct.pack("<I1sI", 1, b"a", 1 << 20), "at most 1048576"),
+    "destination of 4 GiB": (lambda _: b"\xff\xff\xff\xff", "at most 1048576"),
+    "destination that is not UTF-8": (lambda _: b"\x02\0\0\0\xff\xfe\0\0\0\0", "not UTF-8"),
+    "unknown system command": (lambda headset: headset.command("__ping"), "unknown system command"),
+    "destination that is no topic": (lambda headset: headset.frame("no topic", b""), "not a topic name"),
+    "log forgery in a destination": (lambda headset: headset.frame("a\nINFO all is well", b""), "not a topic name"),
+    "registration that is not JSON": (lambda headset: headset.frame("__publish", b"{"), "not JSON"),
+    "payload without destination": (lambda _: b"\0\0\0\0\x01\0\0\0x", "without a destination"),
+    "short pose": (lambda headset: headset.frame("q2r_left_hand_pose", bytes(20)), "bytes"),
+    "pose with spare bytes": (
+        lambda headset: headset.frame("q2r_left_hand_pose", pack_pose(headset.dialect, (0, 0, 0), IDENTITY) + b"\0"),
+        "bytes",
+    ),
+    "inputs of the other dialect": (
+        lambda headset: headset.frame("q2r_left_hand_inputs", pack_inputs(other(headset), False, False, (0.0,) * 4)),
+        "dialect",
+    ),
+    "pose of the other dialect": (
+        lambda headset: headset.frame("q2r_left_hand_pose", pack_pose(other(headset), (0, 0, 0), IDENTITY)),
+        "dialect",
+    ),
+    "flood of frames": (lambda _: KEEPALIVE * (MAX_FRAMES_PER_SECOND + 100), "frames in a second"),
+}
+
+
+def other(headset: FakeHeadset) -> str:
+    return "ros1" if headset.dialect == "ros2" else "ros2"
+
+
+@every_dialect
+@pytest.mark.parametrize("fault", list(FAULTS))
+def test_a_fault_drops_that_client_with_one_line_and_the_next_is_served(
+    timed_server: HeadsetServer, dialect: str, fault: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    make_bytes, reason = FAULTS[fault]
+    with connect(timed_server, dialect) as headset:
+        headset.send(headset.registrations() + headset.pose("left", (1.0, 2.0, 3.0), IDENTITY))
+        collect(timed_server, 1)
+        headset.read_until("__topic_list")
+        headset.send(make_bytes(headset))
+        eventually(lambda: not timed_server.connected)
+        assert reason.encode() in headset.read_until("__error"), "the operator's app is told why"
+    eventually(lambda: warnings(caplog))
+    (line,) = warnings(caplog)
+    assert reason in line
+    assert "\n" not in line
+    assert reason in str(timed_server.statistics.last_disconnect)
+    assert_serves(timed_server, dialect)
+    assert len(warnings(caplog)) == 1
+
+
+@every_dialect
+def test_a_frame_cut_off_by_the_end_of_the_connection_is_one_line(
+    server: HeadsetServer, dialect: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    with connect(server, dialect) as headset:
+        headset.send(headset.pose("left", (1.0, 2.0, 3.0), IDENTITY)[:30])
+    eventually(lambda: server.statistics.last_disconnect)
+    (line,) = warnings(caplog)
+    assert "ended inside a frame" in line
+    assert_serves(server, dialect)
+
+
+def test_a_reset_connection_is_one_line(server: HeadsetServer, caplog: pytest.LogCaptureFixture) -> None:
+    headset = connect(server)
+    headset.send(headset.pose("left", (1.0, 2.0, 3.0), IDENTITY))
+    collect(server, 1)
+    headset.reset()
+    eventually(lambda: server.statistics.peer is None)
+    assert len(warnings(caplog)) == 1
+    assert_serves(server)
+
+
+def test_a_farewell_between_frames_is_no_fault(server: HeadsetServer, caplog: pytest.LogCaptureFixture) -> None:
+    assert_serves(server)
+    assert warnings(caplog) == []
+    assert server.statistics.last_disconnect == "closed by the headset"
+
+
+@every_dialect
+def test_a_pose_that_is_not_a_number_passes_and_the_thread_lives(server: HeadsetServer, dialect: str) -> None:
+    with connect(server, dialect) as headset:
+        headset.send(headset.pose("left", (math.nan,) * 3, (math.inf,) * 4))
+        headset.send(headset.pose("left", (1.0, 2.0, 3.0), IDENTITY))
+        bad, good = collect(server, 2)
+    assert np.isnan(bad.position).all()
+    assert np.isinf(bad.quaternion).all()
+    assert good.position.tolist() == [1.0, 2.0, 3.0]
+
+
+def test_an_unexpected_exception_is_logged_and_costs_that_client_only(
+    server: HeadsetServer, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def break_down(*_: object) -> None:
+        raise ZeroDivisionError("a bug")
+
+    with monkeypatch.context() as patch, connect(server) as headset:
+        patch.setattr(HeadsetSession, "receive", break_down)
+        headset.send(KEEPALIVE)
+        wait_until_dropped(server, headset)
+    assert any(record.exc_info and "a bug" in str(record.exc_info[1]) for record in caplog.records)
+    assert_serves(server)
+
+
+def test_a_loop_that_stalls_finds_every_press_and_the_newest_pose(server: HeadsetServer) -> None:
+    with connect(server) as headset:
+        for index in range(600):
+            headset.send(headset.pose("left", (float(index), 0.0, 0.0), IDENTITY))
+            headset.send(headset.inputs("left", lower=index % 100 < 10))
+        eventually(lambda: server.statistics.topics.get("q2r_left_hand_inputs", None) is not None)
+        eventually(lambda: server.statistics.topics["q2r_left_hand_inputs"].count == 600)
+        samples = server.poll(0.0)
+    buttons = [False, *(sample.inputs.button_lower for sample in samples)]
+    assert sum(now and not before for before, now in pairwise(buttons)) == 6
+    assert samples[-1].position[0] == 599.0
+    assert len(samples) < 100
+
+
+def test_poll_and_haptics_do_not_wait_for_a_snapshot_or_for_decoding(server: HeadsetServer) -> None:
+    with connect(server) as headset, server._statistics_lock:
+        headset.send(headset.pose("left", (1.0, 2.0, 3.0), IDENTITY))
+
+        def tick() -> None:
+            server.poll(0.0)
+            server.send_haptic(HapticFeedback("left", 1.0, 1.0))
+
+        asked = threading.Thread(target=tick)
+        asked.start()
+        asked.join(5.0)
+        assert not asked.is_alive()
+
+
+def test_random_and_mutated_streams_never_stop_the_server(server: HeadsetServer) -> None:
+    random_source = random.Random(11)
+    threads = threading.active_count()
+    for attempt in range(120):
+        dialect = random_source.choice(DIALECTS)
+        with connect(server, dialect) as headset:
+            stream = bytearray(headset.registrations())
+            for hand in ("left", "right"):
+                stream += headset.pose(hand, (1.0, 2.0, 3.0), IDENTITY) + headset.inputs(hand, lower=True)
+            if attempt % 3 == 0:
+                stream = bytearray(random_source.randbytes(random_source.randrange(3000)))
+            for _ in range(random_source.randrange(1, 6)):
+                if stream:
+                    stream[random_source.randrange(len(stream))] = random_source.randrange(256)
+            with suppress(ConnectionError):
+                headset.send(bytes(stream[: random_source.randrange(1, len(stream) + 2)]))
+            if attempt % 5 == 0:
+                headset.reset()
+        eventually(lambda: server.statistics.peer is None)
+    server.poll(0.0)
+    server.poll(0.0)
+    assert_serves(server)
+    assert threading.active_count() <= threads
+
+
+# Opening, closing, looking -------------------------------------------------------------------------------------------
+
+
+def test_a_port_in_use_is_said_in_one_line(server: HeadsetServer) -> None:
+    with pytest.raises(InputError, match=rf"cannot listen on 127.0.0.1:{server.address[1]}"):
+        HeadsetServer(port=server.address[1]).start()
+
+
+@pytest.mark.parametrize(
+    ("host", "port"), [("no such host", 0), ("a" * 70, 0), ("127.0.0.1", 70000), ("203.0.113.1", 0)]
+)
+def test_an_address_that_cannot_be_bound_is_said_in_one_line(host: str, port: int) -> None:
+    with pytest.raises(InputError, match="cannot listen on"):
+        HeadsetServer(host, port).start()
+
+
+def test_starting_twice_is_refused(server: HeadsetServer) -> None:
+    with pytest.raises(InputError, match="already"):
+        server.start()
+
+
+def test_closing_frees_port_and_thread_and_may_come_twice(server: HeadsetServer) -> None:
+    with connect(server) as headset:
+        server.close()
+        server.close()
+        assert not server.connected
+        assert server.poll(0.0) == []
+        while headset.read_frame() is not None:
+            pass
+    again = HeadsetServer(port=server.address[1])
+    again.start()
+    try:
+        assert_serves(again)
+    finally:
+        again.close()
+    assert "headset" not in {thread.name for thread in threading.enumerate()}
+
+
+def test_statistics_show_peer_dialect_counts_rates_ages_and_last_values(
+    timed_server: HeadsetServer, clock: HandClock
+) -> None:
+    assert timed_server.statistics.peer is None
+    assert timed_server.statistics.topics == {}
+    with connect(timed_server, "ros1") as headset:
+        headset.send(headset.registrations() + headset.frame("q2r_head_pose", b"?"))
+        for index in range(90):
+            clock.now += 1.0 / 75.0
+            headset.send(headset.pose("left", (float(index), 0.0, 0.0), IDENTITY))
+            collect(timed_server, 1)
+        clock.now += 0.2
+        statistics = timed_server.statistics
+        assert statistics.peer == "{}:{}".format(*headset.socket.getsockname())
+    pose = statistics.topics["q2r_left_hand_pose"]
+    assert statistics.dialect is Dialect.ROS1
+    assert pose.count == 90
+    assert pose.rate == pytest.approx(60.0, abs=1.0)  # nothing came in the last 0.2 s of the second
+    assert pose.age == pytest.approx(0.2)
+    assert isinstance(pose.last, HandPose)
+    assert pose.last.position[0] == 89.0
+    assert statistics.unknown_topics == {"q2r_head_pose": 1}
+    assert set(statistics.subscribed) == {HAPTIC, "q2r_right_hand_haptic_feedback"}
+    assert "q2r_left_hand_twist" in statistics.published
+    assert (statistics.connections, statistics.last_disconnect) == (1, None)

@@ -1,0 +1,269 @@
+"""What a client may say and what it is answered, byte for byte, without sockets."""
+
+from __future__ import annotations
+
+import json
+import re
+
+import pytest
+
+from q2r2_control.errors import ProtocolError
+from q2r2_control.inputs.framing import KEEPALIVE, Frame, FrameDecoder
+from q2r2_control.inputs.messages import Dialect
+from q2r2_control.inputs.session import MAX_COMMAND_BYTES, MAX_OUTGOING_BYTES, MAX_TOPICS, HeadsetSession, Reception
+from q2r2_control.types import HapticFeedback
+from tests.support.fake_headset import pack_inputs, pack_pose, pack_twist
+
+POSITION, IDENTITY = (0.1, 0.2, 0.3), (0.0, 0.0, 0.0, -1.0)
+HAPTIC = "q2r_left_hand_haptic_feedback"
+
+every_dialect = pytest.mark.parametrize("dialect", list(Dialect))
+
+
+def frame(dialect: Dialect, destination: str, payload: bytes = b"") -> Frame:
+    return Frame(destination, payload, terminated=dialect is Dialect.ROS2)
+
+
+def command(dialect: Dialect, name: str, **parameters: object) -> Frame:
+    return frame(dialect, name, json.dumps(parameters).encode() + (b"\0" if dialect is Dialect.ROS2 else b""))
+
+
+def pose(dialect: Dialect, topic: str = "q2r_left_hand_pose") -> Frame:
+    return frame(dialect, topic, pack_pose(dialect.lower(), POSITION, IDENTITY))
+
+
+def answers(session: HeadsetSession) -> list[tuple[str, bytes]]:
+    """Frames the session wants to send, which are taken away."""
+    decoder = FrameDecoder()
+    decoder.feed(bytes(session.outgoing))
+    session.outgoing.clear()
+    found = []
+    while (answer := decoder.next_frame()) is not None:
+        assert not answer.terminated, "the server writes no NUL"
+        found.append((answer.destination, answer.payload))
+    return found
+
+
+@pytest.fixture
+def session() -> HeadsetSession:
+    """A session whose handshake was sent."""
+    new = HeadsetSession()
+    new.outgoing.clear()
+    return new
+
+
+def test_the_first_message_is_the_handshake_with_a_version_that_the_app_accepts() -> None:
+    ((name, payload),) = answers(HeadsetSession())
+    handshake = json.loads(payload)
+    assert name == "__handshake"
+    assert handshake["version"].startswith("v0.7.")
+    assert json.loads(handshake["metadata"]) == {"protocol": "ROS2"}
+
+
+@every_dialect
+def test_the_dialect_is_told_by_the_first_system_command(session: HeadsetSession, dialect: Dialect) -> None:
+    session.receive(command(dialect, "__topic_list"))
+    assert session.dialect is dialect
+
+
+@every_dialect
+def test_a_keepalive_tells_no_dialect(session: HeadsetSession, dialect: Dialect) -> None:
+    session.receive(Frame("", b"", terminated=False))
+    assert session.dialect is None
+    session.receive(command(dialect, "__topic_list"))
+    assert session.dialect is dialect
+
+
+@every_dialect
+def test_data_before_any_registration_tells_the_dialect_too(session: HeadsetSession, dialect: Dialect) -> None:
+    assert isinstance(session.receive(pose(dialect)), Reception)
+    assert session.dialect is dialect
+
+
+@every_dialect
+@pytest.mark.parametrize("slash", ["", "/"])
+def test_topics_are_known_with_and_without_leading_slash(session: HeadsetSession, dialect: Dialect, slash: str) -> None:
+    reception = session.receive(pose(dialect, slash + "q2r_right_hand_pose"))
+    assert reception is not None
+    assert (reception.topic, reception.hand) == ("q2r_right_hand_pose", "right")
+
+
+@every_dialect
+def test_buttons_of_the_other_dialect_are_never_read_as_pressed(session: HeadsetSession, dialect: Dialect) -> None:
+    session.receive(command(dialect, "__topic_list"))
+    wrong = pack_inputs(dialect.other.lower(), False, False, (0.0,) * 4)
+    with pytest.raises(ProtocolError, match=f"message of the {dialect.other} dialect.*as in {dialect}"):
+        session.receive(frame(dialect, "q2r_left_hand_inputs", wrong))
+
+
+@every_dialect
+@pytest.mark.parametrize("suffix", ["pose", "twist", "inputs"])
+def test_a_payload_of_the_wrong_dialect_ends_the_session(
+    session: HeadsetSession, dialect: Dialect, suffix: str
+) -> None:
+    wrong = {
+        "pose": pack_pose(dialect.other.lower(), POSITION, IDENTITY),
+        "twist": pack_twist(dialect.other.lower(), POSITION, POSITION),
+        "inputs": pack_inputs(dialect.other.lower(), True, False, (0.0,) * 4),
+    }[suffix]
+    with pytest.raises(ProtocolError, match="dialect"):
+        session.receive(frame(dialect, f"q2r_left_hand_{suffix}", wrong))
+
+
+@every_dialect
+def test_a_change_of_dialect_ends_the_session(session: HeadsetSession, dialect: Dialect) -> None:
+    session.receive(command(dialect, "__topic_list"))
+    with pytest.raises(ProtocolError, match=f"earlier ones were {dialect}"):
+        session.receive(pose(dialect.other))
+
+
+def test_the_nul_after_json_is_no_fault(session: HeadsetSession) -> None:
+    session.receive(frame(Dialect.ROS2, "__subscribe", b'{"topic":"/%s","message_name":"x/Y"}\0' % HAPTIC.encode()))
+    assert session.subscribed == {HAPTIC: "/" + HAPTIC}
+
+
+@every_dialect
+def test_registering_twice_is_registering_once(session: HeadsetSession, dialect: Dialect) -> None:
+    for _ in range(2):
+        session.receive(
+            command(dialect, "__publish", topic="a", message_name="std_msgs/Empty", queue_size=1, latch=False)
+        )
+        session.receive(command(dialect, "__subscribe", topic="/b", message_name="std_msgs/Empty"))
+    assert session.published == {"a": "std_msgs/Empty"}
+    assert session.subscribed == {"b": "/b"}
+
+
+@every_dialect
+def test_removing_takes_a_registration_away_and_may_come_without_one(session: HeadsetSession, dialect: Dialect) -> None:
+    session.receive(command(dialect, "__publish", topic="a", message_name="std_msgs/Empty"))
+    session.receive(command(dialect, "__subscribe", topic="b", message_name="std_msgs/Empty"))
+    for _ in range(2):
+        session.receive(command(dialect, "__remove_publisher", topic="a"))
+        session.receive(command(dialect, "__remove_subscriber", topic="/b"))
+    assert (session.published, session.subscribed) == ({}, {})
+
+
+def test_the_topic_list_has_a_type_of_two_parts_for_each_topic(session: HeadsetSession) -> None:
+    session.receive(command(Dialect.ROS2, "__publish", topic="dice", message_name="geometry_msgs/Twist"))
+    session.receive(command(Dialect.ROS2, "__topic_list"))
+    ((name, payload),) = answers(session)
+    topics = json.loads(payload)
+    assert name == "__topic_list"
+    types = dict(zip(topics["topics"], topics["types"], strict=True))
+    assert types["q2r_left_hand_pose"] == "geometry_msgs/PoseStamped"
+    assert types["q2r_right_hand_inputs"] == "quest2ros/OVR2ROSInputs"
+    assert types[HAPTIC] == "quest2ros/OVR2ROSHapticFeedback"
+    assert types["dice"] == "geometry_msgs/Twist"
+    assert all(re.fullmatch(r"\w+/\w+", kind) for kind in types.values())
+
+
+@every_dialect
+@pytest.mark.parametrize("name", ["__request", "__response"])
+def test_a_service_call_and_its_body_are_survived(session: HeadsetSession, dialect: Dialect, name: str) -> None:
+    session.receive(command(dialect, name, srv_id=3))
+    assert session.receive(frame(dialect, "any_service", b"\x01\x02")) is None
+    assert session.unknown_topics == {}
+    assert session.receive(pose(dialect)) is not None
+
+
+def test_a_request_is_answered_with_an_error(session: HeadsetSession) -> None:
+    session.receive(command(Dialect.ROS2, "__request", srv_id=3))
+    ((name, payload),) = answers(session)
+    assert name == "__error"
+    assert "services" in json.loads(payload)["text"]
+
+
+@pytest.mark.parametrize("name", ["__ros_service", "__unity_service", "__remove_ros_service", "__remove_unity_service"])
+def test_registering_services_is_survived(session: HeadsetSession, name: str) -> None:
+    session.receive(command(Dialect.ROS2, name, topic="reset", message_name="std_srvs/Empty"))
+    assert all(answer == "__warn" for answer, _ in answers(session))
+
+
+@every_dialect
+@pytest.mark.parametrize("name", ["__ping", "__", "__handshake", "__PUBLISH", "__publish\0"])
+def test_an_unknown_system_command_ends_the_session(session: HeadsetSession, dialect: Dialect, name: str) -> None:
+    with pytest.raises(ProtocolError, match="unknown system command"):
+        session.receive(command(dialect, name))
+
+
+@pytest.mark.parametrize(
+    "payload",
+    [
+        pytest.param(b"{", id="half an object"),
+        pytest.param(b"[]", id="a list"),
+        pytest.param(b"null", id="null"),
+        pytest.param(b"{}", id="no topic"),
+        pytest.param(b'{"topic":3,"message_name":"a/B"}', id="a topic that is a number"),
+        pytest.param(b'{"topic":"a"}', id="no type"),
+        pytest.param(b'{"topic":"a b","message_name":"a/B"}', id="a topic with a space"),
+        pytest.param(b'{"topic":"","message_name":"a/B"}', id="an empty topic"),
+        pytest.param(b'{"topic":"\\ud800","message_name":"a/B"}', id="half a surrogate"),
+        pytest.param(b'{"topic":"a","message_name":"a/B"}\0\0', id="two NULs"),
+        pytest.param(b"\xff\xfe", id="not UTF-8"),
+        pytest.param(b"[" * MAX_COMMAND_BYTES, id="nested without end"),
+        pytest.param(b'{"topic":' + b"[" * 900 + b"]" * 900 + b"}", id="a nested topic"),
+        pytest.param(b"9" * 10000, id="a number of ten thousand digits"),
+        pytest.param(b" " * (MAX_COMMAND_BYTES + 1), id="too long"),
+    ],
+)
+def test_a_registration_that_cannot_be_read_ends_the_session(session: HeadsetSession, payload: bytes) -> None:
+    with pytest.raises(ProtocolError, match=r"__publish|topic name"):
+        session.receive(frame(Dialect.ROS1, "__publish", payload))
+
+
+def test_data_on_an_unknown_topic_is_counted_and_ignored(session: HeadsetSession) -> None:
+    for _ in range(3):
+        assert session.receive(frame(Dialect.ROS2, "/q2r_head_pose", b"whatever")) is None
+    assert session.unknown_topics == {"q2r_head_pose": 3}
+
+
+def test_unknown_topics_are_remembered_in_bounded_number(session: HeadsetSession) -> None:
+    for index in range(10 * MAX_TOPICS):
+        session.receive(frame(Dialect.ROS2, f"topic_{index}", b""))
+    assert len(session.unknown_topics) == MAX_TOPICS
+
+
+def test_registrations_are_bounded(session: HeadsetSession) -> None:
+    for index in range(MAX_TOPICS):
+        session.receive(command(Dialect.ROS2, "__subscribe", topic=f"topic_{index}", message_name="a/B"))
+    with pytest.raises(ProtocolError, match="topics registered"):
+        session.receive(command(Dialect.ROS2, "__subscribe", topic="one_more", message_name="a/B"))
+
+
+@pytest.mark.parametrize("name", ["GET / HTTP", "q2r left", "-", "//a", "a" * 300, "\n", "é"])
+def test_a_destination_that_no_topic_can_have_ends_the_session(session: HeadsetSession, name: str) -> None:
+    with pytest.raises(ProtocolError, match="not a topic name"):
+        session.receive(frame(Dialect.ROS1, name, b"x"))
+
+
+def test_answers_to_a_client_that_never_reads_are_bounded(session: HeadsetSession) -> None:
+    question = command(Dialect.ROS2, "__topic_list")
+    session.receive(question)
+    for _ in range(MAX_OUTGOING_BYTES // len(session.outgoing) - 1):
+        session.receive(question)
+    with pytest.raises(ProtocolError, match="unread"):
+        session.receive(question)
+
+
+@every_dialect
+def test_haptics_go_to_the_subscribed_spelling_in_the_clients_dialect(
+    session: HeadsetSession, dialect: Dialect
+) -> None:
+    session.receive(command(dialect, "__subscribe", topic="/" + HAPTIC, message_name="quest2ros/OVR2ROSHapticFeedback"))
+    session.queue_haptic(HapticFeedback("left", 0.5, 1.0))
+    header = b"\0\1\0\0" if dialect is Dialect.ROS2 else b""
+    assert answers(session) == [("/" + HAPTIC, header + bytes.fromhex("0000003f 0000803f"))]
+
+
+def test_no_haptics_go_to_a_client_that_did_not_subscribe_or_no_longer_listens(session: HeadsetSession) -> None:
+    session.queue_haptic(HapticFeedback("left", 0.5, 1.0))
+    session.receive(command(Dialect.ROS2, "__subscribe", topic=HAPTIC, message_name="a/B"))
+    session.queue_haptic(HapticFeedback("right", 0.5, 1.0))
+    session.receive(command(Dialect.ROS2, "__remove_subscriber", topic=HAPTIC))
+    session.queue_haptic(HapticFeedback("left", 0.5, 1.0))
+    assert answers(session) == []
+
+
+def test_a_keepalive_is_eight_zero_bytes(session: HeadsetSession) -> None:
+    session.queue_keepalive()
+    assert bytes(session.outgoing) == KEEPALIVE
