@@ -203,7 +203,7 @@ class HeadsetServer:
         except BlockingIOError:
             return
         except OSError as error:
-            self._drop(str(error))
+            self._drop(f"connection lost: {error.strerror}")
         except ProtocolError as error:
             self._drop(str(error))
         else:
@@ -244,7 +244,7 @@ class HeadsetServer:
         except BlockingIOError:
             pass
         except OSError as error:
-            self._drop(str(error))
+            self._drop(f"connection lost: {error.strerror}")
             return
         events = selectors.EVENT_READ | (selectors.EVENT_WRITE if outgoing else 0)
         key = self._selector.get_key(client.socket)
