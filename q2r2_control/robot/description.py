@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 import xml.etree.ElementTree as ET
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -22,12 +23,21 @@ EXAMPLE_ROBOT_DATA = "example-robot-data:"
 CONTINUOUS_RANGE = 4 * math.pi
 
 _JOINT_TYPES = ("fixed", "revolute", "prismatic", "continuous", "planar", "floating")
-_NUMBERS = ("xyz", "rpy", "radius", "length", "size", "scale", "ixx", "ixy", "ixz", "iyy", "iyz", "izz")
-_NUMBERS_OF = {
+_SHAPES = ("box", "cylinder", "sphere", "mesh")
+
+# What urdfdom and Python both read as the same number; urdfdom skips what it cannot read without saying so.
+_NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?", re.ASCII)
+_LARGEST = 1e20  # squares of it are still finite
+_SHORTEST_AXIS = 1e-6
+_VECTORS = ("xyz", "rpy", "size", "scale")
+_POSITIVE = ("radius", "length", "size")
+_SCALARS = {
+    "cylinder": ("radius", "length"),
+    "sphere": ("radius",),
     "mass": ("value",),
+    "inertia": ("ixx", "ixy", "ixz", "iyy", "iyz", "izz"),
     "limit": ("lower", "upper", "velocity", "effort"),
     "rotor": ("inertia", "gear"),
-    "mimic": ("multiplier", "offset"),
 }
 
 
@@ -70,16 +80,11 @@ def parse_urdf(text: str, where: str, folder: Path | None = None) -> ET.Element:
     """
     root = _parse(text, where)
     _check_numbers(root, where)
+    _check_shapes(root, where)
     links = _unique_names(root, "link", where)
     _unique_names(root, "joint", where)
     for joint in root.findall("joint"):
-        if joint.get("type") not in _JOINT_TYPES:
-            raise RobotError(
-                f"{where}: joint {joint.get('name')} has type {joint.get('type')!r}; allowed: {', '.join(_JOINT_TYPES)}"
-            )
-        for end in ("parent", "child"):
-            if joint_end(joint, end) not in links:
-                raise RobotError(f"{where}: joint {joint.get('name')} has no {end} link among the model's links")
+        _check_joint(joint, links, where)
         if joint.get("type") == "continuous":
             _bound(joint)
     LinkTree(root, where)
@@ -149,16 +154,35 @@ def _parse(text: str, where: str) -> ET.Element:
 
 def _check_numbers(root: ET.Element, where: str) -> None:
     for element in root.iter():
-        for attribute in (*_NUMBERS, *_NUMBERS_OF.get(element.tag, ())):
+        for attribute in (*_VECTORS, *_SCALARS.get(element.tag, ())):
             text = element.get(attribute)
             if text is None:
                 continue
-            try:
-                finite = all(math.isfinite(float(part)) for part in text.split())
-            except ValueError:
-                finite = False
-            if not finite:
-                raise RobotError(f"{where}: <{element.tag}> has {attribute} = {text!r:.40}; allowed: finite numbers")
+            count = 3 if attribute in _VECTORS else 1
+            parts = text.split()
+            if len(parts) != count or not all(
+                _NUMBER.fullmatch(part) and abs(float(part)) < _LARGEST for part in parts
+            ):
+                allowed = f"{count} finite number(s)"
+            elif attribute in _POSITIVE and min(map(float, parts)) <= 0:
+                allowed = "more than 0"
+            elif attribute == "value" and float(text) < 0:
+                allowed = "0 or more"
+            else:
+                continue
+            raise RobotError(f"{where}: <{element.tag}> has {attribute} = {text!r:.40}; allowed: {allowed}")
+
+
+def _check_shapes(root: ET.Element, where: str) -> None:
+    """Every collision has one known shape: one that a reader skips would be a body that nobody watches."""
+    for link in root.findall("link"):
+        for collision in link.findall("collision"):
+            shapes = [shape.tag for shape in collision.findall("geometry/*")]
+            if len(shapes) != 1 or shapes[0] not in _SHAPES:
+                raise RobotError(
+                    f"{where}: a collision of link {link.get('name')} has shapes {shapes}; allowed: one of "
+                    f"{', '.join(_SHAPES)}"
+                )
 
 
 def _unique_names(root: ET.Element, tag: str, where: str) -> set[str]:
@@ -169,6 +193,19 @@ def _unique_names(root: ET.Element, tag: str, where: str) -> set[str]:
             raise RobotError(f"{where}: {tag} name {name!r} is {'given twice' if name else 'missing'}")
         names.add(name)
     return names
+
+
+def _check_joint(joint: ET.Element, links: set[str], where: str) -> None:
+    name, kind = joint.get("name"), joint.get("type")
+    if kind not in _JOINT_TYPES:
+        raise RobotError(f"{where}: joint {name} has type {kind!r}; allowed: {', '.join(_JOINT_TYPES)}")
+    for end in ("parent", "child"):
+        if joint_end(joint, end) not in links:
+            raise RobotError(f"{where}: joint {name} has no {end} link among the model's links")
+    axis = joint.find("axis")
+    direction = [float(part) for part in ("" if axis is None else axis.get("xyz", "")).split()]
+    if kind != "fixed" and direction and math.hypot(*direction) < _SHORTEST_AXIS:
+        raise RobotError(f"{where}: joint {name} has axis {direction}; allowed: a direction")
 
 
 def _bound(joint: ET.Element) -> None:

@@ -68,7 +68,7 @@ class Robot:
         chains = {name: _checked_chain(tree, name, frame, where) for name, frame in tool_frames.items()}
         self.name: str = urdf.get("name", "robot")
         self.urdf: str = ET.tostring(urdf, encoding="unicode")
-        self.model, self.collision_model = _reduced(self.urdf, chains, home, where)
+        self.model, self.collision_model = _reduced(urdf, chains, home, where)
         self.joint_names: tuple[str, ...] = tuple(self.model.names)[1:]
         self.arms: dict[str, Arm] = {
             name: Arm(
@@ -187,13 +187,16 @@ def _checked_chain(tree: LinkTree, arm: str, frame: str, where: str) -> list[str
 
 
 def _reduced(
-    urdf: str, chains: Mapping[str, list[str]], home: Mapping[str, float], where: str
+    urdf: ET.Element, chains: Mapping[str, list[str]], home: Mapping[str, float], where: str
 ) -> tuple[pin.Model, pin.GeometryModel]:
     """Pinocchio's models with every joint outside ``chains`` locked at home."""
     kept = {name for chain in chains.values() for name in chain}
     try:
-        model = pin.buildModelFromXML(urdf)
-        geometry = pin.buildGeomFromUrdfString(model, urdf, pin.GeometryType.COLLISION)
+        text = ET.tostring(urdf, encoding="unicode")
+        model = pin.buildModelFromXML(text)
+        geometry = pin.buildGeomFromUrdfString(model, text, pin.GeometryType.COLLISION)
+        if geometry.ngeoms != (written := len(urdf.findall("link/collision"))):
+            raise RobotError(f"{where}: Pinocchio read {geometry.ngeoms} of {written} collision shapes")
         posture = pin.neutral(model)
         for joint, name in zip(model.joints[1:], list(model.names)[1:], strict=True):
             if joint.nq == joint.nv == 1:
