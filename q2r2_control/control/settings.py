@@ -11,7 +11,7 @@ class ControllerSettings(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     solver: str = Field("daqp", description="daqp, osqp, or the name of any solver that qpsolvers has installed")
-    nominal_dt: float = Field(0.001, gt=0, le=0.02, description="loop period that gains are made for [s]")
+    solve_time_limit: float = Field(0.002, gt=0, le=0.1, description="a later solution counts as failed [s]")
     max_substep: float = Field(0.002, gt=0, le=0.02, description="a longer dt is split into equal parts below this [s]")
 
     acceleration_limit: float = Field(10.0, gt=0, le=100, description="every joint [rad/s^2]")
@@ -21,10 +21,10 @@ class ControllerSettings(BaseModel):
 
     min_distance: float = Field(0.02, ge=0, le=0.2, description="every monitored pair stays this far apart [m]")
     distance_buffer: float = Field(0.002, gt=0, le=0.05, description="the QP aims to stop this much earlier [m]")
-    influence_distance: float = Field(0.15, gt=0, le=1, description="pairs closer than this get a row [m]")
     separation_gain: float = Field(4.0, gt=0, le=50, description="approach speed per metre of free distance [1/s]")
     separation_recovery_speed: float = Field(0.05, gt=0, le=0.5, description="when too close, moving apart [m/s]")
-    contact_speed: float = Field(0.05, gt=0, le=1, description="tool speed at min_distance [m/s]")
+    contact_speed: float = Field(0.05, gt=0, le=1, description="tool speed where another arm is closest [m/s]")
+    full_speed_distance: float = Field(0.1, gt=0, le=1, description="free distance with full tool speed [m]")
 
     position_gain: float = Field(8.0, gt=0, le=50, description="[1/s]")
     rotation_gain: float = Field(8.0, gt=0, le=50, description="[1/s]")
@@ -32,9 +32,9 @@ class ControllerSettings(BaseModel):
     max_angular_speed: float = Field(2.5, gt=0, le=10, description="tool speed [rad/s]")
     linear_deceleration: float = Field(2.0, gt=0, le=50, description="planned when approaching a target [m/s^2]")
     angular_deceleration: float = Field(5.0, gt=0, le=100, description="planned when approaching a target [rad/s^2]")
-    feed_forward: bool = Field(True, description="follow the target's own velocity")
+    feed_forward_time: float = Field(0.02, gt=0, le=1, description="smoothing of the target's velocity [s]")
 
     posture_gain: float = Field(1.0, ge=0, le=20, description="pull towards the home posture [1/s]")
-    posture_weight: float = Field(1e-3, ge=0, le=1, description="against the tool task's 1")
-    damping: float = Field(1e-4, gt=0, le=1, description="regularisation of joint velocities")
-    error_damping: float = Field(1.0, ge=0, le=100, description="extra damping per squared tool error [1/m^2]")
+    posture_speed: float = Field(0.5, gt=0, le=3, description="of that pull, at most [rad/s]")
+    posture_weight: float = Field(1e-3, gt=0, le=1, description="against the tool task's 1; also regularises")
+    stretch_damping: float = Field(0.02, ge=0, le=10, description="damping per wanted tool speed [s]")

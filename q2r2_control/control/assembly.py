@@ -1,0 +1,124 @@
+"""One tick's problem from the reference's state: observe the geometry, then write costs and box, compiled."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from q2r2_control.control.chain import place
+from q2r2_control.control.collision import pose_bodies
+from q2r2_control.control.geometry import clamp
+from q2r2_control.control.jit import Held, kernel
+from q2r2_control.control.limits import next_velocity_box
+from q2r2_control.control.separation import separation_rows, speed_near
+from q2r2_control.control.tasks import add_tool_task, project_to_nullspace, tool_jacobian, tool_pose, wanted_twist
+from q2r2_control.control.workspace import Cell, Goals, Workspace
+
+# A held arm is not pushed about by the other one's task, but may give way to recover separation.
+_HOLD_WEIGHT = 10.0
+_HOLD_GAIN = 4.0  # [1/s]
+
+
+@kernel
+def observe(cell: Cell, work: Workspace) -> int:
+    """Where everything is at the reference: tool poses, distances and separation rows. Returns the closest pair."""
+    place(cell.chain, work.q, work.placements)
+    pose_bodies(cell.bodies, work.placements, work.posed)
+    for i in range(cell.tools.joint.shape[0]):
+        tool_pose(work.placements, cell.tools, i, work.rotation[i], work.translation[i])
+    closest = separation_rows(
+        cell.chain,
+        work.placements,
+        cell.bodies,
+        work.posed,
+        cell.pairs,
+        work.v,
+        cell.acceleration,
+        cell.limits.longest_step,
+        cell.approach,
+        work.distance,
+        work.contact,
+        work.rows,
+    )
+    for i in range(work.rows.count[0]):
+        row = work.rows.matrix[i]
+        size = np.sqrt(np.sum(row * row))
+        row /= size
+        work.rows.lower[i] /= size
+    return closest
+
+
+@kernel
+def assemble(held_cell: Held, held_goals: Held, held_work: Held, h: float) -> bool:
+    """Costs and box for a step of ``h``; needs :func:`observe` first. False where a joint is outside its limits."""
+    cell, goals, work = held_cell.value, held_goals.value, held_work.value
+    q = work.q
+    nv = q.shape[0]
+    work.H[:] = 0.0
+    work.g[:] = 0.0
+    work.J[:] = 0.0
+    pull = cell.limits.posture_gain
+    fastest = cell.limits.posture_speed
+    for j in range(nv):
+        work.posture[j] = clamp(pull * (cell.home[j] - q[j]), -fastest, fastest)
+    for i in range(cell.tools.joint.shape[0]):
+        if goals.follows[i] == 1:
+            _follow(cell, goals, i, work)
+        else:
+            _hold(cell, goals, i, work)
+    project_to_nullspace(work.J, work.posture)
+    weight = cell.limits.posture_weight
+    for j in range(nv):
+        work.H[j, j] += weight
+        work.g[j] -= weight * work.posture[j]
+    return next_velocity_box(
+        q,
+        work.v,
+        cell.lower,
+        cell.upper,
+        cell.velocity,
+        cell.acceleration,
+        h,
+        cell.limits.longest_step,
+        cell.limits.return_speed,
+        work.box_lower,
+        work.box_upper,
+        work.binding,
+    )
+
+
+@kernel
+def _follow(cell: Cell, goals: Goals, i: int, work: Workspace) -> None:
+    nearest = np.inf
+    for p in range(work.distance.shape[0]):
+        if cell.pair_arm[p, i] == 1.0 and work.distance[p] < nearest:
+            nearest = work.distance[p]
+    speed = speed_near(
+        nearest,
+        cell.approach.stop_distance,
+        cell.limits.contact_speed,
+        cell.motion.full_speed[0],
+        cell.limits.full_at,
+    )
+    J = work.J[6 * i : 6 * i + 6]
+    tool_jacobian(cell.chain, work.placements, cell.tools, i, work.translation[i], J)
+    feedback = wanted_twist(
+        work.rotation[i],
+        work.translation[i],
+        goals.rotation[i],
+        goals.translation[i],
+        goals.feed_forward[i],
+        cell.motion,
+        speed,
+        work.twist[i],
+    )
+    add_tool_task(J, work.twist[i], cell.motion.damping * feedback, cell.tools.member[i], work.H, work.g)
+
+
+@kernel
+def _hold(cell: Cell, goals: Goals, i: int, work: Workspace) -> None:
+    """Joints of a held arm return to where they were latched; the posture pull does not move them."""
+    for j in range(work.q.shape[0]):
+        if cell.tools.member[i, j] == 1.0:
+            work.H[j, j] += _HOLD_WEIGHT
+            work.g[j] -= _HOLD_WEIGHT * _HOLD_GAIN * (goals.hold[j] - work.q[j])
+            work.posture[j] = 0.0

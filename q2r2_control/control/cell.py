@@ -1,0 +1,85 @@
+"""What the compiled kernels need to know of a robot and its settings, gathered once."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from q2r2_control.control.chain import chain_of
+from q2r2_control.control.collision import Pairs, bodies_of, pairs_of
+from q2r2_control.control.separation import Approach
+from q2r2_control.control.settings import ControllerSettings
+from q2r2_control.control.tasks import Motion, Tools
+from q2r2_control.control.workspace import Cell, Limits
+from q2r2_control.robot.robot import Robot
+from q2r2_control.types import Array
+
+
+def cell_of(robot: Robot, settings: ControllerSettings) -> Cell:
+    """Arrays of a robot's joints, tools, pairs and limits. Raises :class:`RobotError` for what no kernel handles."""
+    chain = chain_of(robot.model)
+    bodies = bodies_of(robot.collision_model)
+    lower = robot.position_lower + settings.position_margin
+    upper = robot.position_upper - settings.position_margin
+    pairs = pairs_of(
+        robot.collision_model, chain, bodies, np.maximum(np.abs(robot.position_lower), np.abs(robot.position_upper))
+    )
+    tools = _tools(robot)
+    return Cell(
+        chain=chain,
+        bodies=bodies,
+        pairs=pairs,
+        tools=tools,
+        motion=Motion(
+            gain=np.array([settings.position_gain, settings.rotation_gain]),
+            deceleration=np.array([settings.linear_deceleration, settings.angular_deceleration]),
+            full_speed=np.array([settings.max_linear_speed, settings.max_angular_speed]),
+            damping=settings.stretch_damping,
+        ),
+        approach=Approach(
+            stop_distance=settings.min_distance + settings.distance_buffer,
+            gain=settings.separation_gain,
+            recovery_speed=settings.separation_recovery_speed,
+            slow_below=settings.min_distance + settings.distance_buffer + settings.full_speed_distance,
+        ),
+        pair_arm=_arms_slowed(pairs, tools.member),
+        lower=lower,
+        upper=upper,
+        velocity=robot.velocity_limit * settings.velocity_scale,
+        acceleration=np.full(robot.model.nv, settings.acceleration_limit),
+        home=np.array(robot.home, dtype=np.float64),
+        limits=Limits(
+            longest_step=settings.max_substep,
+            min_distance=settings.min_distance,
+            return_speed=settings.recovery_velocity,
+            contact_speed=settings.contact_speed,
+            full_at=settings.full_speed_distance,
+            posture_gain=settings.posture_gain,
+            posture_speed=settings.posture_speed,
+            posture_weight=settings.posture_weight,
+        ),
+    )
+
+
+def _tools(robot: Robot) -> Tools:
+    n, nv = len(robot.arms), robot.model.nv
+    tools = Tools(np.zeros(n, dtype=np.int64), np.zeros((n, 3, 3)), np.zeros((n, 3)), np.zeros((n, nv)))
+    for i, arm in enumerate(robot.arms.values()):
+        frame = robot.model.frames[arm.frame_id]
+        tools.joint[i] = frame.parentJoint
+        tools.rotation[i] = frame.placement.rotation
+        tools.translation[i] = frame.placement.translation
+        tools.member[i, arm.joints] = 1.0
+    return tools
+
+
+def _arms_slowed(pairs: Pairs, member: Array) -> Array:
+    """Which pairs slow which arms: round bodies of two arms, or of an arm and a fixed round body."""
+    slowed = np.zeros((len(pairs.first), len(member)))
+    for p in range(len(pairs.first)):
+        moving = pairs.joint[p][pairs.joint[p] > 0] - 1
+        touched = member[:, moving].any(axis=1)
+        both_sides = len(set(pairs.sign[p][pairs.joint[p] > 0])) == 2
+        within_one_arm = both_sides and touched.sum() == 1
+        if pairs.round[p] and not within_one_arm:
+            slowed[p, touched] = 1.0
+    return slowed

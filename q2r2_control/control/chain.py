@@ -1,0 +1,107 @@
+"""Forward kinematics of a tree of one-axis joints, compiled; equal to Pinocchio's, without its call overhead.
+
+The stop roll-out needs the links' placements at many configurations per tick, so this part of Pinocchio is written
+out here; a test holds it to Pinocchio for every robot.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import pinocchio as pin
+
+from q2r2_control.control.jit import kernel
+from q2r2_control.errors import RobotError
+from q2r2_control.types import Array
+
+IntArray = npt.NDArray[np.int64]
+
+
+class Chain(NamedTuple):
+    """Joint tree as arrays; index 0 is the world, joint i moves with velocity index i - 1."""
+
+    parent: IntArray  # (n,)
+    rotation: Array  # (n, 3, 3) joint frame in the parent joint's frame at zero
+    translation: Array  # (n, 3) [m]
+    axis: Array  # (n, 3) unit axis in the joint frame
+    prismatic: IntArray  # (n,) 1 where the joint slides
+
+
+class Placements(NamedTuple):
+    """Joint frames in the world, written by :func:`place`."""
+
+    rotation: Array  # (n, 3, 3)
+    translation: Array  # (n, 3) [m]
+    axis: Array  # (n, 3)
+
+    @classmethod
+    def empty(cls, chain: Chain) -> Placements:
+        n = len(chain.parent)
+        return cls(np.tile(np.eye(3), (n, 1, 1)), np.zeros((n, 3)), np.zeros((n, 3)))
+
+
+def chain_of(model: pin.Model) -> Chain:
+    """Read a Pinocchio model whose joints each have one position and one velocity. Raises :class:`RobotError`."""
+    axis = np.zeros((model.njoints, 3))
+    prismatic = np.zeros(model.njoints, dtype=np.int64)
+    data = model.createData()
+    pin.computeJointJacobians(model, data, np.zeros(model.nq))
+    for i in range(1, model.njoints):
+        joint = model.joints[i]
+        if joint.nq != 1 or joint.nv != 1 or joint.idx_v != i - 1:
+            raise RobotError(f"joint {model.names[i]}: only one-axis revolute and prismatic joints are supported")
+        column = pin.getJointJacobian(model, data, i, pin.LOCAL)[:, joint.idx_v]
+        prismatic[i] = int(np.linalg.norm(column[:3]) > 0.5)
+        axis[i] = column[:3] if prismatic[i] else column[3:]
+    return Chain(
+        parent=np.array([model.parents[i] for i in range(model.njoints)], dtype=np.int64),
+        rotation=np.array([placement.rotation for placement in model.jointPlacements]),
+        translation=np.array([placement.translation for placement in model.jointPlacements]),
+        axis=axis,
+        prismatic=prismatic,
+    )
+
+
+@kernel
+def place(chain: Chain, q: Array, placements: Placements) -> None:
+    """World placement of every joint frame at ``q`` (nv,)."""
+    for i in range(1, chain.parent.shape[0]):
+        parent = chain.parent[i]
+        x = chain.axis[i, 0]
+        y = chain.axis[i, 1]
+        z = chain.axis[i, 2]
+        sine = 0.0
+        versine = 0.0
+        if chain.prismatic[i] == 0:
+            sine = np.sin(q[i - 1])
+            versine = 1.0 - np.cos(q[i - 1])
+        # Rodrigues: I + sin K + (1 - cos) K^2
+        t00 = 1.0 - versine * (y * y + z * z)
+        t01 = versine * x * y - sine * z
+        t02 = versine * x * z + sine * y
+        t10 = versine * x * y + sine * z
+        t11 = 1.0 - versine * (x * x + z * z)
+        t12 = versine * y * z - sine * x
+        t20 = versine * x * z - sine * y
+        t21 = versine * y * z + sine * x
+        t22 = 1.0 - versine * (x * x + y * y)
+        for row in range(3):
+            r0 = 0.0
+            r1 = 0.0
+            r2 = 0.0
+            moved = placements.translation[parent, row]
+            for k in range(3):
+                up = placements.rotation[parent, row, k]
+                r0 += up * chain.rotation[i, k, 0]
+                r1 += up * chain.rotation[i, k, 1]
+                r2 += up * chain.rotation[i, k, 2]
+                moved += up * chain.translation[i, k]
+            placements.rotation[i, row, 0] = r0 * t00 + r1 * t10 + r2 * t20
+            placements.rotation[i, row, 1] = r0 * t01 + r1 * t11 + r2 * t21
+            placements.rotation[i, row, 2] = r0 * t02 + r1 * t12 + r2 * t22
+            placements.axis[i, row] = r0 * x + r1 * y + r2 * z
+            if chain.prismatic[i] == 1:
+                moved += q[i - 1] * placements.axis[i, row]
+            placements.translation[i, row] = moved

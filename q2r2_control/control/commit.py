@@ -1,0 +1,133 @@
+"""Take the solver's velocities as far as they can be certified, and move the reference, compiled."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from q2r2_control.control.assembly import observe
+from q2r2_control.control.braking import brake, certify
+from q2r2_control.control.geometry import clamp
+from q2r2_control.control.jit import Held, kernel
+from q2r2_control.control.limits import NO_LIMIT
+from q2r2_control.control.workspace import Cell, Workspace
+from q2r2_control.types import Array
+
+FOLLOWED, REDUCED, STOPPED = 0, 1, 2
+_BISECTIONS = 4
+_ACTIVE = 1e-7  # [rad/s] from a bound
+
+
+@kernel
+def commit(held_cell: Held, held_work: Held, solution: Array, usable: bool, h: float) -> tuple[int, int, float]:
+    """One step of ``h`` with the solver's next velocities ``solution`` (nv,), or the stop if they are not ``usable``.
+
+    Returns what was done (FOLLOWED, REDUCED towards the stop, STOPPED), the closest pair at the new state, and the
+    largest violation of a row [rad/s].
+    """
+    cell, work = held_cell.value, held_work.value
+    q, v = work.q, work.v
+    outcome = STOPPED
+    if usable:
+        for j in range(q.shape[0]):
+            # A solver's tolerance is larger than the contract's. NaN passes through clamps: the sum shows it.
+            work.wanted[j] = clamp(solution[j], work.box_lower[j], work.box_upper[j])
+        if np.isfinite(np.sum(work.wanted)) and np.isfinite(np.sum(solution)):
+            outcome = _largest_certified(cell, work, h)
+    if outcome == STOPPED:
+        # The last certified stop; what is left of it stays certified: see braking.py.
+        brake(q, v, cell.acceleration, h, work.candidate[1], work.candidate[0])
+    for j in range(q.shape[0]):
+        q[j] = work.candidate[1, j]
+        v[j] = work.candidate[0, j]
+    slack = _note_active(work)
+    return outcome, observe(cell, work), slack
+
+
+@kernel
+def first_look(held_cell: Held, held_work: Held) -> tuple[int, bool]:
+    """Observe after a reset: the closest pair, and whether the stop from here is known to keep all apart."""
+    cell, work = held_cell.value, held_work.value
+    closest = observe(cell, work)
+    work.candidate[0] = work.v
+    work.candidate[1] = work.q
+    return closest, _certified(cell, work, 0.0)
+
+
+@kernel
+def _certified(cell: Cell, work: Workspace, h: float) -> bool:
+    return certify(
+        cell.chain,
+        cell.bodies,
+        cell.pairs,
+        work.distance,
+        work.v,
+        work.candidate[1],
+        work.candidate[0],
+        cell.acceleration,
+        h,
+        cell.limits.min_distance,
+        work.rollout,
+    )
+
+
+@kernel
+def _largest_certified(cell: Cell, work: Workspace, h: float) -> int:
+    """Write into ``work.candidate`` the wanted velocities if they can be certified, else the most of them that can.
+
+    Every mixture of the wanted velocities and full braking lies in the box, which is convex and contains both.
+    """
+    nv = work.q.shape[0]
+    for j in range(nv):
+        change = cell.acceleration[j] * h
+        work.candidate[2, j] = work.v[j] - clamp(work.v[j], -change, change)
+    low = 0.0
+    high = 1.0
+    share = 1.0
+    for attempt in range(1 + _BISECTIONS):
+        _mix(work, share, h)
+        if _certified(cell, work, h):
+            if attempt == 0:
+                return FOLLOWED
+            low = share
+        else:
+            high = share
+        share = 0.5 * (low + high)
+    if low == 0.0:
+        return STOPPED
+    _mix(work, low, h)
+    return REDUCED
+
+
+@kernel
+def _mix(work: Workspace, share: float, h: float) -> None:
+    for j in range(work.q.shape[0]):
+        braked = work.candidate[2, j]
+        work.candidate[0, j] = work.wanted[j] if share == 1.0 else braked + share * (work.wanted[j] - braked)
+        work.candidate[1, j] = work.q[j] + 0.5 * h * (work.v[j] + work.candidate[0, j])
+
+
+@kernel
+def _note_active(work: Workspace) -> float:
+    """List the limits and pairs that the new velocities meet; returns the largest violation of a row [rad/s]."""
+    v = work.v
+    count = 0
+    for j in range(v.shape[0]):
+        kind = NO_LIMIT
+        if v[j] >= work.box_upper[j] - _ACTIVE:
+            kind = work.binding[j, 1]
+        elif v[j] <= work.box_lower[j] + _ACTIVE:
+            kind = work.binding[j, 0]
+        if kind != NO_LIMIT:
+            work.active.code[count] = 4 * j + kind
+            count += 1
+    slack = 0.0
+    for i in range(work.rows.count[0]):
+        rate = 0.0
+        for j in range(v.shape[0]):
+            rate += work.rows.matrix[i, j] * v[j]
+        slack = max(slack, work.rows.lower[i] - rate)
+        if rate <= work.rows.lower[i] + _ACTIVE:
+            work.active.code[count] = -1 - work.rows.pair[i]
+            count += 1
+    work.active.count[0] = count
+    return slack

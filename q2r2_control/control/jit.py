@@ -1,0 +1,72 @@
+"""Compile the hot path with Numba and keep the machine code between runs.
+
+Numba's own cache looks only at the file of the compiled function, so a kernel that calls another module's kernel
+would go on running that module's old code after an edit. A controller must not run yesterday's mathematics: the
+cache folder is named by a hash of every source file of this package, so any edit compiles afresh.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numba
+from numba.core import types
+from numba.experimental import structref
+
+
+def _cache_folder() -> Path:
+    sources = sorted(Path(__file__).parent.glob("*.py"))
+    digest = hashlib.sha256(b"".join(source.read_bytes() for source in sources)).hexdigest()[:16]
+    root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "q2r2_control"
+    try:
+        root.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=root):
+            pass
+    except OSError:
+        root = Path(tempfile.gettempdir()) / f"q2r2_control-{os.getuid()}"
+    return root / digest
+
+
+_FOLDER = str(_cache_folder())
+
+
+@structref.register
+class _HeldType(types.StructRef):  # type: ignore[misc]
+    def preprocess_fields(self, fields: Any) -> Any:
+        return tuple((name, types.unliteral(kind)) for name, kind in fields)
+
+
+class Held(structref.StructRefProxy):  # type: ignore[misc]
+    """A named tuple of arrays behind one pointer: made by :func:`hold`, read in a kernel as ``held.value``.
+
+    Handing a kernel fifty arrays costs more than the work it does; a pointer costs the same for any number.
+    """
+
+    def __new__(cls, value: Any) -> Held:
+        held: Held = structref.StructRefProxy.__new__(cls, value)
+        return held
+
+
+structref.define_proxy(Held, _HeldType, ["value"])
+
+
+def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Compile ``function`` at its first call; strict IEEE arithmetic, no Python objects, division by 0 gives inf."""
+    previous = numba.config.CACHE_DIR
+    numba.config.CACHE_DIR = _FOLDER  # read once, while decorating
+    try:
+        compiled: Callable[..., Any] = numba.njit(function, cache=True, error_model="numpy", nogil=True)
+    finally:
+        numba.config.CACHE_DIR = previous
+    return compiled
+
+
+@kernel
+def hold(value: Any) -> Held:
+    """Put ``value`` behind a pointer."""
+    return Held(value)

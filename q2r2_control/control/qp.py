@@ -1,0 +1,192 @@
+"""The QP as data, and the solvers that take it. Building is pure and separate from solving.
+
+    minimise    1/2 v' H v + g' v + 1/(2 rho) sum_i s_i^2
+    subject to  lower <= v <= upper,    rows v + s >= rows_lower,    s >= 0
+
+The box is never empty (limits.py) and the rows are soft, so a solution always exists. Rows have unit norm, so that a
+slack is a joint speed and one rho fits all.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import daqp
+import numpy as np
+import osqp
+import qpsolvers
+from scipy import sparse
+
+from q2r2_control.errors import ConfigError
+from q2r2_control.types import Array
+
+SOFTNESS = 1e-5  # rho: a row gives way by rho times its multiplier
+_UNBOUNDED = 1e30
+
+
+@dataclass(frozen=True, slots=True)
+class QpProblem:
+    """One tick's problem; arrays are valid until the next tick."""
+
+    H: Array  # (nv, nv), symmetric positive definite
+    g: Array  # (nv,)
+    lower: Array  # (nv,) [rad/s]
+    upper: Array  # (nv,) [rad/s]
+    rows: Array  # (m, nv), unit rows
+    rows_lower: Array  # (m,) [rad/s]
+
+    def slack(self, v: Array) -> float:
+        """Largest violation of a row by ``v`` (nv,) [rad/s]."""
+        return float(max(0.0, np.max(self.rows_lower - self.rows @ v))) if len(self.rows_lower) else 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class QpSolution:
+    """What a solver found."""
+
+    v: Array | None  # (nv,) [rad/s]; None: no solution
+    solve_time: float  # the solver's own measure [s]
+
+
+class Solver(Protocol):
+    """Solves a :class:`QpProblem`; never raises for a numerical reason."""
+
+    def solve(self, problem: QpProblem) -> QpSolution: ...
+
+
+class DaqpSolver:
+    """DAQP (Arnstrom, Bemporad, Axehill, IEEE TAC 2022): dual active set, soft rows of its own."""
+
+    _OPTIMAL = (1, 2)  # 2: optimal with a soft row violated
+
+    def __init__(self, nv: int, time_limit: float) -> None:
+        self._nv = nv
+        self._time_limit = time_limit
+        self._upper = np.full(nv, _UNBOUNDED)
+        self._lower = np.full(nv, -_UNBOUNDED)
+        self._sense = np.zeros(nv, dtype=np.int32)
+
+    def solve(self, problem: QpProblem) -> QpSolution:
+        m = self._nv + len(problem.rows_lower)
+        if m > len(self._upper):
+            self._upper = np.full(m, _UNBOUNDED)
+            self._lower = np.empty(m)
+            self._sense = np.full(m, 8, dtype=np.int32)  # soft
+            self._sense[: self._nv] = 0
+        self._upper[: self._nv] = problem.upper
+        self._lower[: self._nv] = problem.lower
+        self._lower[self._nv : m] = problem.rows_lower
+        v, _, flag, info = daqp.solve(
+            problem.H,
+            problem.g,
+            problem.rows,
+            self._upper[:m],
+            self._lower[:m],
+            self._sense[:m],
+            rho_soft=SOFTNESS,
+            time_limit=self._time_limit,
+        )
+        return QpSolution(v if flag in self._OPTIMAL else None, info["setup_time"] + info["solve_time"])
+
+
+class OsqpSolver:
+    """OSQP (Stellato et al., Math. Prog. Comp. 2020), set up once and warm-started: the slack is a variable per row.
+
+    The problem's structure must not change between ticks, so rows are padded to a capacity that grows when needed.
+    """
+
+    def __init__(self, nv: int, time_limit: float) -> None:
+        self._nv = nv
+        self._time_limit = time_limit
+        self._capacity = 0
+        self._solver: Any = None
+
+    def solve(self, problem: QpProblem) -> QpSolution:
+        nv, m = self._nv, len(problem.rows_lower)
+        if self._solver is None or m > self._capacity:
+            self._set_up(max(16, 2 * m))
+        upper_triangle = problem.H.T[np.tril_indices(nv)]  # column by column of the upper triangle
+        self._matrix[:m], self._matrix[m:] = problem.rows, 0.0
+        self._lower[:nv], self._upper[:nv] = problem.lower, problem.upper
+        self._lower[nv : nv + m], self._lower[nv + m : nv + self._capacity] = problem.rows_lower, -_UNBOUNDED
+        self._cost[:nv] = problem.g
+        self._solver.update(
+            Px=np.concatenate([upper_triangle, np.full(self._capacity, 1.0 / SOFTNESS)]),
+            Ax=self._values(),
+            q=self._cost,
+            l=self._lower,
+            u=self._upper,
+        )
+        result = self._solver.solve(raise_error=False)
+        solved = result.info.status_val in (
+            osqp.SolverStatus.OSQP_SOLVED,
+            osqp.SolverStatus.OSQP_SOLVED_INACCURATE,
+        )
+        return QpSolution(np.asarray(result.x[:nv], dtype=np.float64) if solved else None, result.info.run_time)
+
+    def _values(self) -> Array:
+        """Non-zeros of the constraint matrix, column by column: identity over rows for v, one entry for s, one s >= 0."""
+        box = np.vstack([np.ones(self._nv), self._matrix]).T.ravel()
+        return np.concatenate([box, np.ones(2 * self._capacity)])
+
+    def _set_up(self, capacity: int) -> None:
+        nv = self._nv
+        self._capacity = capacity
+        self._matrix = np.ones((capacity, nv))
+        self._cost = np.zeros(nv + capacity)
+        self._lower = np.concatenate([np.full(nv + capacity, -_UNBOUNDED), np.zeros(capacity)])
+        self._upper = np.full(nv + 2 * capacity, _UNBOUNDED)
+        dense = np.triu(np.ones((nv, nv)))
+        P = sparse.block_diag([dense, sparse.eye(capacity) / SOFTNESS], format="csc")
+        A = sparse.bmat(
+            [[sparse.eye(nv), None], [self._matrix, sparse.eye(capacity)], [None, sparse.eye(capacity)]], format="csc"
+        )
+        A.sort_indices()
+        self._solver = osqp.OSQP()
+        settings = {"eps_abs": 1e-7, "eps_rel": 1e-7, "max_iter": 4000, "polishing": True, "verbose": False}
+        self._solver.setup(P, self._cost, A, self._lower, self._upper, time_limit=self._time_limit, **settings)
+
+
+class QpsolversSolver:
+    """Any other solver through qpsolvers, with the slack as extra variables."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+
+    def solve(self, problem: QpProblem) -> QpSolution:
+        nv, m = len(problem.g), len(problem.rows_lower)
+        P = np.eye(nv + m) / SOFTNESS
+        P[:nv, :nv] = problem.H
+        before = time.perf_counter()
+        try:
+            x = qpsolvers.solve_qp(
+                P,
+                np.concatenate([problem.g, np.zeros(m)]),
+                G=-np.hstack([problem.rows, np.eye(m)]) if m else None,
+                h=-problem.rows_lower if m else None,
+                lb=np.concatenate([problem.lower, np.zeros(m)]),
+                ub=np.concatenate([problem.upper, np.full(m, np.inf)]),
+                solver=self._name,
+            )
+        except (qpsolvers.QPError, ValueError, ArithmeticError):
+            x = None
+        v = None if x is None else np.asarray(x[:nv], dtype=np.float64)
+        # qpsolvers tells no time; this is the one place below the pipeline that reads a clock.
+        return QpSolution(v, time.perf_counter() - before)
+
+
+def make_solver(name: str, nv: int, time_limit: float) -> Solver:
+    """Solver by its name in the YAML; ``time_limit`` [s] is given to solvers that take one.
+
+    Raises :class:`ConfigError` for a solver that is not installed.
+    """
+    if name == "daqp":
+        return DaqpSolver(nv, time_limit)
+    if name == "osqp":
+        return OsqpSolver(nv, time_limit)
+    available = sorted({"daqp", "osqp", *qpsolvers.available_solvers})
+    if name not in available:
+        raise ConfigError(f"control.solver = {name!r}: not installed; allowed here: {', '.join(available)}")
+    return QpsolversSolver(name)

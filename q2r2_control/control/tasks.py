@@ -1,0 +1,215 @@
+"""Costs of the QP: tool twists, posture, hold, as H and g of  1/2 v' H v + g' v, compiled.
+
+For each following arm:  |J v - u|^2_W + mu |v|^2, u the wanted tool twist, W = diag(1, 1, 1, l^2, l^2, l^2) with the
+length l that makes a radian comparable to a metre. For all joints: w |v - v_p|^2 with the posture velocity v_p projected
+into the tools' nullspace, so that at rest it leaves no tool error.
+
+**Damping mu.** Stretched out towards an unreachable target, the gradient of the reach with respect to the elbow angle
+vanishes like L theta, so under a wanted speed s the closed loop near that posture has the gain L s / mu. It must stay
+well below 1/dt times what the acceleration limit leaves, or it limit-cycles: mu = c s keeps it at L / c whatever the
+error. The damping is in proportion to the wanted feedback speed and vanishes at the target.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from q2r2_control.control.chain import Chain, IntArray, Placements
+from q2r2_control.control.jit import kernel
+from q2r2_control.types import Array
+
+ROTATION_LENGTH = 0.3  # [m/rad]
+_PROJECTION_DAMPING = 1e-3
+
+
+class Tools(NamedTuple):
+    """The tool frame of each arm."""
+
+    joint: IntArray  # (n,) joint that carries it
+    rotation: Array  # (n, 3, 3) in the joint's frame
+    translation: Array  # (n, 3) [m]
+    member: Array  # (n, nv) 1 where a joint moves the tool
+
+
+class Motion(NamedTuple):
+    """How a tool approaches its target, linear then angular."""
+
+    gain: Array  # (2,) [1/s]
+    deceleration: Array  # (2,) [m/s^2, rad/s^2]
+    full_speed: Array  # (2,) [m/s, rad/s]
+    damping: float  # c in mu = c s [s]
+
+
+@kernel
+def tool_pose(placements: Placements, tools: Tools, i: int, rotation: Array, translation: Array) -> None:
+    """World pose of tool ``i`` into ``rotation`` (3, 3) and ``translation`` (3,)."""
+    joint = tools.joint[i]
+    for row in range(3):
+        translation[row] = placements.translation[joint, row]
+        for column in range(3):
+            total = 0.0
+            for k in range(3):
+                total += placements.rotation[joint, row, k] * tools.rotation[i, k, column]
+            rotation[row, column] = total
+            translation[row] += placements.rotation[joint, row, column] * tools.translation[i, column]
+
+
+@kernel
+def tool_jacobian(chain: Chain, placements: Placements, tools: Tools, i: int, translation: Array, J: Array) -> None:
+    """Jacobian (6, nv) of tool ``i``: linear, then angular velocity in world axes at the tool's origin."""
+    J[:] = 0.0
+    joint = tools.joint[i]
+    while joint != 0:
+        axis = placements.axis[joint]
+        j = joint - 1
+        if chain.prismatic[joint] == 1:
+            J[0:3, j] = axis
+        else:
+            x = translation[0] - placements.translation[joint, 0]
+            y = translation[1] - placements.translation[joint, 1]
+            z = translation[2] - placements.translation[joint, 2]
+            J[0, j] = axis[1] * z - axis[2] * y
+            J[1, j] = axis[2] * x - axis[0] * z
+            J[2, j] = axis[0] * y - axis[1] * x
+            J[3:6, j] = axis
+        joint = chain.parent[joint]
+
+
+@kernel
+def rotation_vector(R: Array, out: Array) -> None:
+    """Rotation vector [rad] of a rotation matrix (3, 3), angle in [0, pi], through its quaternion of largest part."""
+    q = np.empty(4)  # w x y z
+    trace = R[0, 0] + R[1, 1] + R[2, 2]
+    if trace > 0.0:
+        q[0] = 1.0 + trace
+        q[1] = R[2, 1] - R[1, 2]
+        q[2] = R[0, 2] - R[2, 0]
+        q[3] = R[1, 0] - R[0, 1]
+    else:
+        i = 0
+        if R[1, 1] > R[0, 0]:
+            i = 1
+        if R[2, 2] > R[i, i]:
+            i = 2
+        j = (i + 1) % 3
+        k = (i + 2) % 3
+        q[0] = R[k, j] - R[j, k]
+        q[1 + i] = 1.0 + R[i, i] - R[j, j] - R[k, k]
+        q[1 + j] = R[j, i] + R[i, j]
+        q[1 + k] = R[k, i] + R[i, k]
+        if q[0] < 0.0:
+            q = -q
+    imaginary = np.sqrt(q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
+    factor = 2.0 * np.arctan2(imaginary, q[0]) / imaginary if imaginary > 1e-12 else 2.0 / q[0]
+    for k in range(3):
+        out[k] = factor * q[1 + k]
+
+
+@kernel
+def approach_speed(error: float, gain: float, deceleration: float) -> float:
+    """Speed towards a target ``error`` away: proportional when near, that of constant deceleration when far.
+
+    v = gain e up to e0 = deceleration / gain^2, then v = sqrt(2 deceleration e - (deceleration / gain)^2), which
+    continues it smoothly. A purely proportional law asks for deceleration gain v, more than the joints have at speed.
+    """
+    if error * gain * gain <= deceleration:
+        return gain * error
+    return np.sqrt(2.0 * deceleration * error - (deceleration / gain) ** 2)
+
+
+@kernel
+def wanted_twist(
+    rotation: Array,
+    translation: Array,
+    goal_rotation: Array,
+    goal_translation: Array,
+    feed_forward: Array,
+    motion: Motion,
+    speed_limit: float,
+    twist: Array,
+) -> float:
+    """Tool twist towards the goal into ``twist`` (6,); returns the feedback speed that damping follows [m/s].
+
+    ``speed_limit`` [m/s] caps the linear part and, in proportion, the angular part.
+    """
+    relative = np.empty((3, 3))
+    for row in range(3):
+        for column in range(3):
+            total = 0.0
+            for k in range(3):
+                total += goal_rotation[row, k] * rotation[column, k]
+            relative[row, column] = total
+    for k in range(3):
+        twist[k] = goal_translation[k] - translation[k]
+    rotation_vector(relative, twist[3:6])
+    feedback = 0.0
+    for part in range(2):
+        piece = twist[3 * part : 3 * part + 3]
+        error = np.sqrt(piece[0] ** 2 + piece[1] ** 2 + piece[2] ** 2)
+        full = motion.full_speed[part]
+        cap = min(full, speed_limit * full / motion.full_speed[0])
+        speed = min(approach_speed(error, motion.gain[part], motion.deceleration[part]), cap)
+        if error > 1e-12:
+            piece *= speed / error
+        feedback += speed * (1.0 if part == 0 else ROTATION_LENGTH)
+        piece += feed_forward[3 * part : 3 * part + 3]
+        size = np.sqrt(piece[0] ** 2 + piece[1] ** 2 + piece[2] ** 2)
+        if size > cap:
+            piece *= cap / size
+    return feedback
+
+
+@kernel
+def add_tool_task(J: Array, twist: Array, mu: float, member: Array, H: Array, g: Array) -> None:
+    """Add |J v - twist|^2_W + mu |v|^2 of one arm to H (nv, nv) and g (nv,)."""
+    nv = g.shape[0]
+    square = ROTATION_LENGTH * ROTATION_LENGTH
+    for i in range(nv):
+        if member[i] == 0.0:
+            continue
+        H[i, i] += mu
+        for k in range(6):
+            weighted = J[k, i] if k < 3 else square * J[k, i]
+            if weighted == 0.0:
+                continue
+            g[i] -= weighted * twist[k]
+            for j in range(nv):
+                H[i, j] += weighted * J[k, j]
+
+
+@kernel
+def project_to_nullspace(J: Array, v: Array) -> None:
+    """Remove from ``v`` (nv,) what moves the tools: v -= J' (J J' + d I)^-1 J v, by Cholesky; J (6n, nv)."""
+    m = J.shape[0]
+    nv = J.shape[1]
+    A = np.empty((m, m))
+    y = np.empty(m)
+    for i in range(m):
+        for j in range(i + 1):
+            total = 0.0
+            for k in range(nv):
+                total += J[i, k] * J[j, k]
+            A[i, j] = total
+        A[i, i] += _PROJECTION_DAMPING * _PROJECTION_DAMPING
+        total = 0.0
+        for k in range(nv):
+            total += J[i, k] * v[k]
+        y[i] = total
+    for i in range(m):
+        for j in range(i + 1):
+            total = A[i, j]
+            for k in range(j):
+                total -= A[i, k] * A[j, k]
+            A[i, j] = np.sqrt(total) if i == j else total / A[j, j]
+        for k in range(i):
+            y[i] -= A[i, k] * y[k]
+        y[i] /= A[i, i]
+    for i in range(m - 1, -1, -1):
+        for k in range(i + 1, m):
+            y[i] -= A[k, i] * y[k]
+        y[i] /= A[i, i]
+    for j in range(nv):
+        for i in range(m):
+            v[j] -= J[i, j] * y[i]

@@ -1,0 +1,120 @@
+"""The arrays that the compiled kernels share: what a cell is, what its arms are asked to do, and scratch."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from q2r2_control.control.braking import Rollout
+from q2r2_control.control.chain import Chain, IntArray, Placements
+from q2r2_control.control.collision import Bodies, Contact, Pairs, Posed
+from q2r2_control.control.separation import Approach, Rows
+from q2r2_control.control.tasks import Motion, Tools
+from q2r2_control.types import Array
+
+
+class Limits(NamedTuple):
+    """Scalars of the settings that the kernels use."""
+
+    longest_step: float  # [s]
+    min_distance: float  # [m]
+    return_speed: float  # [rad/s]
+    contact_speed: float  # [m/s]
+    full_at: float  # [m]
+    posture_gain: float  # [1/s]
+    posture_speed: float  # [rad/s]
+    posture_weight: float
+
+
+class Cell(NamedTuple):
+    """What does not change between ticks."""
+
+    chain: Chain
+    bodies: Bodies
+    pairs: Pairs
+    tools: Tools
+    motion: Motion
+    approach: Approach
+    limits: Limits
+    pair_arm: Array  # (p, n) 1 where the pair slows arm n down when close
+    lower: Array  # (nv,) position limits less the margin [rad]
+    upper: Array
+    velocity: Array  # (nv,) [rad/s]
+    acceleration: Array  # (nv,) [rad/s^2]
+    home: Array  # (nv,) [rad]
+
+
+class Goals(NamedTuple):
+    """What the arms are asked to do."""
+
+    follows: IntArray  # (n,) 1: the tool follows its goal, 0: the arm's joints hold
+    rotation: Array  # (n, 3, 3)
+    translation: Array  # (n, 3) [m]
+    feed_forward: Array  # (n, 6) the goal's own twist [m/s, rad/s]
+    hold: Array  # (nv,) joint positions to hold [rad]
+
+    @classmethod
+    def empty(cls, cell: Cell) -> Goals:
+        n, nv = len(cell.tools.joint), len(cell.home)
+        return cls(np.zeros(n, dtype=np.int64), np.zeros((n, 3, 3)), np.zeros((n, 3)), np.zeros((n, 6)), np.zeros(nv))
+
+
+class Active(NamedTuple):
+    """Bounds that the last step met."""
+
+    code: IntArray  # (k,) 4 joint + kind of limit, or -1 - pair
+    count: IntArray  # (1,)
+
+
+class Workspace(NamedTuple):
+    """The reference's state and arrays written anew each tick."""
+
+    q: Array  # (nv,) [rad]
+    v: Array  # (nv,) [rad/s]
+    placements: Placements
+    posed: Posed
+    contact: Contact
+    rows: Rows
+    distance: Array  # (p,) [m]
+    rotation: Array  # (n, 3, 3) tool poses
+    translation: Array  # (n, 3)
+    J: Array  # (6 n, nv)
+    twist: Array  # (n, 6)
+    posture: Array  # (nv,)
+    H: Array  # (nv, nv)
+    g: Array  # (nv,)
+    box_lower: Array  # (nv,)
+    box_upper: Array  # (nv,)
+    binding: IntArray  # (nv, 2) which limit makes each side of the box
+    wanted: Array  # (nv,)
+    candidate: Array  # (3, nv) velocities, positions, full braking
+    active: Active
+    rollout: Rollout
+
+    @classmethod
+    def empty(cls, cell: Cell) -> Workspace:
+        n, nv = len(cell.tools.joint), len(cell.home)
+        return cls(
+            q=np.zeros(nv),
+            v=np.zeros(nv),
+            placements=Placements.empty(cell.chain),
+            posed=Posed.empty(cell.bodies),
+            contact=Contact.empty(),
+            rows=Rows.empty(len(cell.pairs.first), nv),
+            distance=np.zeros(len(cell.pairs.first)),
+            rotation=np.zeros((n, 3, 3)),
+            translation=np.zeros((n, 3)),
+            J=np.zeros((6 * n, nv)),
+            twist=np.zeros((n, 6)),
+            posture=np.zeros(nv),
+            H=np.zeros((nv, nv)),
+            g=np.zeros(nv),
+            box_lower=np.zeros(nv),
+            box_upper=np.zeros(nv),
+            binding=np.zeros((nv, 2), dtype=np.int64),
+            wanted=np.zeros(nv),
+            candidate=np.zeros((3, nv)),
+            active=Active(np.zeros(nv + 5 * len(cell.pairs.first), dtype=np.int64), np.zeros(1, dtype=np.int64)),
+            rollout=Rollout.empty(cell.chain, cell.bodies),
+        )
