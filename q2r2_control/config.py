@@ -26,6 +26,8 @@ Colour = tuple[
     Annotated[float, Field(ge=0, le=1)],
 ]
 
+Positive = Annotated[float, Field(gt=0)]
+
 
 class _Model(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
@@ -55,6 +57,12 @@ class GripperConfig(_Model):
     closed_position: float = Field(0.0, ge=-3.15, le=3.15, description="of each finger joint, closed [m or rad]")
     speed: float = Field(0.1, gt=0, le=5, description="of each finger joint [m/s or rad/s]")
     force: float = Field(60.0, gt=0, le=500, description="of each finger joint [N or Nm]")
+
+    @model_validator(mode="after")
+    def _opens(self) -> GripperConfig:
+        if self.joints and self.open_position == self.closed_position:
+            raise ValueError(f"open_position and closed_position have to differ, both are {self.open_position:g}")
+        return self
 
 
 class ArmConfig(_Model):
@@ -95,12 +103,22 @@ class HeadsetConfig(_Model):
     port: int = Field(10000, ge=0, le=65535, description="0 takes any free port")
 
 
+class ObjectConfig(_Model):
+    """A loose box in the simulated cell, to be grasped. The controller does not know of it."""
+
+    size: tuple[Positive, Positive, Positive] = Field(description="x y z [m]")
+    position: Metres3 = Field(description="of the centre at the start [m]")
+    mass: float = Field(0.2, gt=0, le=100, description="[kg]")
+    colour: Colour = (0.2, 0.45, 0.8, 1.0)
+
+
 class MujocoConfig(_Model):
     """The simulated cell."""
 
     timestep: float = Field(0.001, gt=0, le=0.001, description="physics step [s]")
     position_stiffness: float = Field(4000.0, gt=0, le=1e6, description="of the position servos [Nm/rad]")
     position_damping_ratio: float = Field(1.0, gt=0, le=5, description="of the position servos")
+    objects: dict[str, ObjectConfig] = Field(default_factory=dict, description="loose boxes by name")
 
 
 class Config(_Model):

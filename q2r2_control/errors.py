@@ -19,3 +19,7 @@ class ProtocolError(Q2R2Error):
 
 class InputError(Q2R2Error):
     """An input cannot be opened; the message says which and why."""
+
+
+class PlantError(Q2R2Error):
+    """A plant cannot be built or driven as asked; the message says what was wrong and what is allowed."""

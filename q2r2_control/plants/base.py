@@ -1,0 +1,113 @@
+"""What every plant offers, and the checks that keep a bad command from reaching one."""
+
+from __future__ import annotations
+
+import math
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+
+from q2r2_control.config import Config
+from q2r2_control.errors import PlantError
+from q2r2_control.robot.robot import Robot
+from q2r2_control.types import Array, Command, CommandMode, RobotState
+
+# Longest time one call may ask for. A loop that fell further behind has to notice and not to catch up in one leap.
+MAX_ADVANCE = 1.0
+
+
+@runtime_checkable
+class Plant(Protocol):
+    """What moves. Joint arrays are (nv,) in the order of ``Robot.joint_names``.
+
+    One tick: ``apply`` says where the plant has to be at the end of the tick, ``advance`` lets that time pass,
+    ``state`` says where it got. On hardware, where time passes by itself, ``advance`` is where a plant waits for the
+    next measurement. A new plant stands at home with open grippers, and stays there until a command comes.
+    """
+
+    def reset(self, q: Array | None = None) -> None:
+        """Start over at time 0, at rest at ``q`` (nv,) or else at home, grippers open. Raises :class:`PlantError`."""
+        ...
+
+    def apply(self, command: Command) -> None:
+        """Take ``command``: posture and velocity are due at the end of the next ``advance``, a torque acts at once.
+
+        Without a newer one, later advances hold its posture at rest, or its torque. Raises :class:`PlantError` on a
+        mode that the plant does not have and on numbers that are not finite; the previous command stays in force.
+        """
+        ...
+
+    def advance(self, dt: float) -> None:
+        """Let ``dt`` [s], 0 .. 1, pass. Raises :class:`PlantError` on any other time; nothing moves then."""
+        ...
+
+    def state(self) -> RobotState:
+        """The newest measurement; its stamp is on the plant's own clock, which starts at 0 on ``reset``."""
+        ...
+
+    def gripper_openings(self) -> dict[str, float]:
+        """Measured opening of each arm that has a gripper, 0 closed .. 1 fully open."""
+        ...
+
+    def close(self) -> None:
+        """Give back every resource; may be called twice."""
+        ...
+
+
+def check_command(command: Command, robot: Robot, modes: tuple[CommandMode, ...]) -> None:
+    """Raise :class:`PlantError` unless a plant with ``modes`` can follow ``command``."""
+    if command.mode not in modes:
+        allowed = ", ".join(modes)
+        raise PlantError(f"command mode {command.mode!s:.40}: this plant follows {allowed} commands only")
+    check_joints("command q", command.q, robot)
+    check_joints("command v", command.v, robot)
+    if command.mode is CommandMode.TORQUE:
+        check_joints("command tau", command.tau, robot)
+    for arm, opening in command.grippers.items():
+        if arm not in robot.arms:
+            raise PlantError(f"command grippers: no arm {arm!r:.40}; arms: {', '.join(robot.arms)}")
+        if not 0 <= opening <= 1:
+            raise PlantError(f"command gripper of arm {arm} = {opening!r:.40}: allowed: 0 (closed) .. 1 (fully open)")
+
+
+def check_joints(what: str, values: Array, robot: Robot) -> None:
+    """Raise :class:`PlantError` unless ``values`` has one finite number for each joint of the robot."""
+    shape, count = np.shape(values), len(robot.joint_names)
+    if shape != (count,):
+        raise PlantError(f"{what} has shape {shape}; expected ({count},), one value for each joint")
+    if not np.isfinite(values).all():
+        joint = int(np.flatnonzero(~np.isfinite(values))[0])
+        raise PlantError(f"{what}: {robot.joint_names[joint]} = {values[joint]}: allowed: finite numbers")
+
+
+def check_duration(dt: float) -> None:
+    """Raise :class:`PlantError` unless ``dt`` is a time that a plant may be advanced by."""
+    if not (math.isfinite(dt) and 0 <= dt <= MAX_ADVANCE):
+        raise PlantError(f"advance by dt = {dt!r:.40} s: allowed: 0 .. {MAX_ADVANCE:g} s")
+
+
+class GripperMotion:
+    """Openings that the grippers are asked for, moving towards the commanded ones at the configured speed."""
+
+    def __init__(self, config: Config) -> None:
+        grippers = {side: arm.gripper for side, arm in config.arms.items() if arm.gripper.joints}
+        self._rate: dict[str, float] = {
+            side: gripper.speed / abs(gripper.open_position - gripper.closed_position)
+            for side, gripper in grippers.items()
+        }
+        self.reset()
+
+    def reset(self) -> None:
+        """Fully open, and to stay so."""
+        self.openings = dict.fromkeys(self._rate, 1.0)
+        self._wanted = dict(self.openings)
+
+    def command(self, openings: dict[str, float]) -> None:
+        """Set where to go; arms without a gripper are passed over, grippers not named keep their goal."""
+        self._wanted.update({arm: float(openings[arm]) for arm in self._rate if arm in openings})
+
+    def advance(self, dt: float) -> None:
+        """Move for ``dt`` [s]."""
+        for arm, rate in self._rate.items():
+            gap, reach = self._wanted[arm] - self.openings[arm], rate * dt
+            self.openings[arm] += min(max(gap, -reach), reach)

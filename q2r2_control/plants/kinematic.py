@@ -1,0 +1,58 @@
+"""A plant that does exactly what it is told: for tests, replays and machines without a simulator."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from q2r2_control.config import Config
+from q2r2_control.plants.base import GripperMotion, check_command, check_duration, check_joints
+from q2r2_control.robot.robot import Robot
+from q2r2_control.types import Array, Command, CommandMode, RobotState
+
+
+class KinematicPlant:
+    """Perfect tracking of position commands; grippers move at their configured speed. Nothing has a mass here."""
+
+    def __init__(self, robot: Robot, config: Config) -> None:
+        self._robot = robot
+        self._grippers = GripperMotion(config)
+        self.reset()
+
+    def reset(self, q: Array | None = None) -> None:
+        """See :meth:`Plant.reset`."""
+        posture = self._robot.home if q is None else q
+        check_joints("reset q", posture, self._robot)
+        self._q = np.array(posture, dtype=np.float64)
+        self._v = np.zeros_like(self._q)
+        self._due_q, self._due_v = self._q, self._v
+        self._time = 0.0
+        self._grippers.reset()
+
+    def apply(self, command: Command) -> None:
+        """See :meth:`Plant.apply`. Raises :class:`PlantError` in torque mode."""
+        check_command(command, self._robot, (CommandMode.POSITION,))
+        self._due_q, self._due_v = command.q.copy(), command.v.copy()
+        self._grippers.command(command.grippers)
+
+    def advance(self, dt: float) -> None:
+        """See :meth:`Plant.advance`."""
+        check_duration(dt)
+        if dt == 0:
+            return
+        self._q, self._v = self._due_q, self._due_v
+        self._due_v = np.zeros_like(self._q)
+        self._time += dt
+        self._grippers.advance(dt)
+
+    def state(self) -> RobotState:
+        """See :meth:`Plant.state`. Torques are zero; external torque cannot be told."""
+        return RobotState(
+            q=self._q.copy(), v=self._v.copy(), tau=np.zeros_like(self._q), tau_external=None, stamp=self._time
+        )
+
+    def gripper_openings(self) -> dict[str, float]:
+        """See :meth:`Plant.gripper_openings`."""
+        return dict(self._grippers.openings)
+
+    def close(self) -> None:
+        """See :meth:`Plant.close`."""

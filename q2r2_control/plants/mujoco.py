@@ -1,0 +1,246 @@
+"""The cell in MuJoCo: position servos or direct torque, fingers that grasp, pushes for tests."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+import numpy.typing as npt
+
+from q2r2_control.config import Config
+from q2r2_control.errors import PlantError
+from q2r2_control.plants.base import GripperMotion, check_command, check_duration, check_joints
+from q2r2_control.plants.mujoco_model import build_model
+from q2r2_control.plants.mujoco_view import Camera, Window, take_picture
+from q2r2_control.plants.servo import ReferenceLine, ServoGains, servo_gains
+from q2r2_control.robot.robot import Robot
+from q2r2_control.types import Array, Command, CommandMode, RobotState
+
+# In steps: a step that is due but for the rounding of the ticks' sum is due.
+_STEP_ROUNDING = 1e-6
+
+
+@dataclass(frozen=True, slots=True)
+class _Push:
+    wrench: Array  # (6,) force [N], torque [Nm], world axes, at the tool frame's origin
+    last_step: int
+
+
+@dataclass(frozen=True, slots=True)
+class _Fingers:
+    """Where one gripper's joints are in MuJoCo's arrays, and what fully open and closed mean for them."""
+
+    positions: tuple[int, ...]
+    actuators: tuple[int, ...]
+    open_position: float
+    closed_position: float
+
+    def position(self, opening: float) -> float:
+        return self.closed_position + opening * (self.open_position - self.closed_position)
+
+    def opening(self, qpos: Array) -> float:
+        position = sum(float(qpos[index]) for index in self.positions) / len(self.positions)
+        opening = (position - self.closed_position) / (self.open_position - self.closed_position)
+        return min(max(opening, 0.0), 1.0)
+
+
+class MujocoPlant:
+    """The simulated cell, driven in one of two ways that each command chooses.
+
+    Position: a servo on each joint, tau = K (q_ref - q) + D (v_ref - v) + M a_ref + bias, with the simulator's own M
+    and bias (gravity, Coriolis), computed at each physics step about a reference that moves straight from the last
+    command to the newest, and clipped at the robot's torque limits. Torque: the command's, clipped; gravity is the
+    sender's to bear.
+
+    ``model`` and ``data`` are MuJoCo's own, to look at.
+    """
+
+    def __init__(self, robot: Robot, config: Config) -> None:
+        """Raises :class:`PlantError` where MuJoCo cannot make a model of the cell."""
+        self.model: mujoco.MjModel = build_model(robot, config)
+        self.data: mujoco.MjData = mujoco.MjData(self.model)
+        # Views of MuJoCo's arrays, kept since each access by name makes a new one.
+        self._qpos, self._qvel = self.data.qpos, self.data.qvel
+        self._bias, self._ctrl = self.data.qfrc_bias, self.data.ctrl
+        self._robot = robot
+        self._timestep = config.mujoco.timestep
+        self._window: Window | None = None
+        self._grippers = GripperMotion(config)
+        self._fingers: dict[str, _Fingers] = {
+            side: _Fingers(
+                tuple(self.model.joint(f"{side}_{name}").qposadr[0] for name in arm.gripper.joints),
+                tuple(self.model.actuator(f"{side}_{name}").id for name in arm.gripper.joints),
+                arm.gripper.open_position,
+                arm.gripper.closed_position,
+            )
+            for side, arm in config.arms.items()
+            if arm.gripper.joints
+        }
+        self._q_index = np.array([self.model.joint(name).qposadr[0] for name in robot.joint_names])
+        self._v_index = np.array([self.model.joint(name).dofadr[0] for name in robot.joint_names])
+        self._tools = {arm.name: self.model.body(arm.tool_frame).id for arm in robot.arms.values()}
+        self._acceleration = np.zeros(self.model.nv)
+        self._inertial_torque = np.zeros(self.model.nv)
+        self.reset()
+        self._gains: ServoGains = self._tuned(config)
+
+    def reset(self, q: Array | None = None) -> None:
+        """See :meth:`Plant.reset`. Loose objects go back to their places, pushes end."""
+        posture = self._robot.home if q is None else q
+        check_joints("reset q", posture, self._robot)
+        mujoco.mj_resetData(self.model, self.data)
+        self.data.qpos[self._q_index] = posture
+        self._grippers.reset()
+        for fingers in self._fingers.values():
+            self.data.qpos[list(fingers.positions)] = fingers.open_position
+        self._reference = ReferenceLine(self.data.qpos[self._q_index])
+        self._torque: Array | None = None  # commanded in torque mode
+        self._pushes: dict[str, _Push] = {}
+        self._steps = 0
+        self._clock = 0.0
+        mujoco.mj_forward(self.model, self.data)
+        self._drive_fingers()
+        self._drive_arms(self.data.qfrc_bias[self._v_index])
+        mujoco.mj_forward(self.model, self.data)
+
+    def apply(self, command: Command) -> None:
+        """See :meth:`Plant.apply`."""
+        check_command(command, self._robot, (CommandMode.POSITION, CommandMode.TORQUE))
+        if command.mode is CommandMode.TORQUE:
+            self._torque = command.tau.copy()
+        else:
+            if self._torque is not None:
+                # Back from torque mode there is no last command to start the line from.
+                self._reference = ReferenceLine(command.q)
+                self._torque = None
+            self._reference.command(command.q, command.v)
+        self._grippers.command(command.grippers)
+
+    def advance(self, dt: float) -> None:
+        """See :meth:`Plant.advance`. Takes the whole physics steps that are due and carries the rest over.
+
+        Raises :class:`PlantError` as well when the simulation has diverged; ``reset`` makes it usable again.
+        """
+        check_duration(dt)
+        if dt == 0:
+            return
+        start, self._clock = self._clock, self._clock + dt
+        self._reference.begin_tick()
+        self._grippers.advance(dt)
+        self._drive_fingers()
+        # A tick shorter than a step must not look like a jump of the velocity.
+        self._acceleration[self._v_index] = self._reference.acceleration(max(dt, self._timestep))
+        due = math.floor(self._clock / self._timestep + _STEP_ROUNDING)
+        while self._steps < due:
+            # A step may begin before the tick that it ends in.
+            self._step(max(self._steps * self._timestep - start, 0.0) / dt)
+        if not math.isfinite(np.dot(self._qvel, self._qvel)):
+            raise PlantError(f"the simulation diverged at {self._clock:.3f} s; reset it")
+
+    def state(self) -> RobotState:
+        """See :meth:`Plant.state`. External torque: contacts, pushes, and hard stops at the ends of a joint's range."""
+        data, index = self.data, self._v_index
+        # What MuJoCo adds up before contacts, less what is not external, leaves pushes from here and from its window.
+        pushed = data.qfrc_smooth - data.qfrc_passive + data.qfrc_bias - data.qfrc_actuator
+        return RobotState(
+            q=data.qpos[self._q_index],
+            v=data.qvel[index],
+            tau=data.qfrc_actuator[index],
+            tau_external=(data.qfrc_constraint + pushed)[index],
+            stamp=self._steps * self._timestep,
+        )
+
+    def gripper_openings(self) -> dict[str, float]:
+        """See :meth:`Plant.gripper_openings`."""
+        return {side: fingers.opening(self._qpos) for side, fingers in self._fingers.items()}
+
+    def push(self, arm: str, wrench: Array, duration: float) -> None:
+        """Push ``arm``'s tool for ``duration`` [s] from now on; replaces the arm's earlier push.
+
+        ``wrench`` (6,): force [N], then torque [Nm], in world axes at the tool frame's origin.
+        Raises :class:`PlantError`.
+        """
+        if arm not in self._tools:
+            raise PlantError(f"push: no arm {arm!r:.40}; arms: {', '.join(self._tools)}")
+        wrench = np.array(wrench, dtype=np.float64)
+        if wrench.shape != (6,) or not np.isfinite(wrench).all() or not 0 <= duration < math.inf:
+            raise PlantError(
+                f"push: wrench {wrench!s:.80} for {duration:g} s; expected six finite numbers and a time >= 0"
+            )
+        self._pushes[arm] = _Push(wrench, self._steps + round(duration / self._timestep))
+
+    def launch_viewer(self) -> None:
+        """Open MuJoCo's own window. Raises :class:`PlantError` where there is no display."""
+        if self._window is None:
+            self._window = Window(self.model, self.data)
+
+    def viewer_sync(self) -> bool:
+        """Show the state of now in the window, if there is one; False when there is none or the user has closed it."""
+        if self._window is None or not self._window.is_open:
+            return False
+        self._window.sync()
+        return True
+
+    def render(self, width: int, height: int, camera: Camera | None = None) -> npt.NDArray[np.uint8]:
+        """Picture (height, width, 3), r g b, of the cell now. Raises :class:`PlantError` where OpenGL is missing."""
+        return take_picture(self.model, self.data, width, height, camera or Camera())
+
+    def close(self) -> None:
+        """See :meth:`Plant.close`."""
+        if self._window is not None:
+            self._window.close()
+            self._window = None
+
+    def _tuned(self, config: Config) -> ServoGains:
+        """Gains for each joint's effective inertia at home, 1 / (M^-1)_ii: what it feels while the others give way."""
+        inertia = np.zeros((self.model.nv, self.model.nv))
+        mujoco.mj_fullM(self.model, self.data, inertia)
+        effective = 1 / np.diag(np.linalg.inv(inertia))[self._v_index]
+        settings = config.mujoco
+        return servo_gains(
+            settings.position_stiffness,
+            settings.position_damping_ratio,
+            effective,
+            self.model.dof_armature[self._v_index],
+            settings.timestep,
+        )
+
+    def _step(self, fraction: float) -> None:
+        """One physics step, which begins when ``fraction`` of the tick has passed."""
+        mujoco.mj_step1(self.model, self.data)
+        self._drive_arms(self._servo_torque(fraction) if self._torque is None else self._torque)
+        self._apply_pushes()
+        mujoco.mj_step2(self.model, self.data)
+        self._steps += 1
+
+    def _servo_torque(self, fraction: float) -> Array:
+        q, v = self._reference.at(fraction)
+        mujoco.mj_mulM(self.model, self.data, self._inertial_torque, self._acceleration)
+        torque = (self._inertial_torque + self._bias)[self._v_index]
+        torque += self._gains.stiffness * (q - self._qpos[self._q_index])
+        torque += self._gains.damping * (v - self._qvel[self._v_index])
+        return torque
+
+    def _drive_arms(self, torque: Array) -> None:
+        limit = self._robot.torque_limit
+        self._ctrl[: len(torque)] = np.minimum(np.maximum(torque, -limit), limit)
+
+    def _drive_fingers(self) -> None:
+        for side, fingers in self._fingers.items():
+            position = fingers.position(self._grippers.openings[side])
+            for actuator in fingers.actuators:
+                self._ctrl[actuator] = position
+
+    def _apply_pushes(self) -> None:
+        if not self._pushes:
+            return
+        self._pushes = {arm: push for arm, push in self._pushes.items() if self._steps < push.last_step}
+        data = self.data
+        data.qfrc_applied[:] = 0
+        for arm, push in self._pushes.items():
+            body = self._tools[arm]
+            mujoco.mj_applyFT(
+                self.model, data, push.wrench[:3], push.wrench[3:], data.xpos[body], body, data.qfrc_applied
+            )

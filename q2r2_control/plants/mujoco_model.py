@@ -1,0 +1,169 @@
+"""Builds the MuJoCo model of a cell from its URDF.
+
+MuJoCo's URDF reader knows neither capsules nor rotors, SRDF or servos: what it misses is put in here, from the same
+:class:`Robot` that the controller uses.
+"""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from itertools import combinations
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from q2r2_control.config import Config, MujocoConfig
+from q2r2_control.errors import PlantError
+from q2r2_control.plants.scene import COLLISION_GROUP, ENVELOPE_GROUP, VISUAL_GROUP, furnish
+from q2r2_control.robot.pairs import link_of, pair_names
+from q2r2_control.robot.robot import Robot
+
+# Collision shapes of this name ending stand for a hand at every finger opening: watched from afar, never touched.
+_ENVELOPE = "_envelope"
+
+# Least inertia that a geared drive's rotor adds to its joint [kg m^2], for robots whose URDF does not say, and least
+# viscous friction [Nm s/rad]. Both keep light wrist joints steady; the friction is far below what a controller feels.
+_MIN_ARMATURE, _MIN_DAMPING = 0.1, 0.2
+
+# Rubber on a box: sliding 1, and torsion [m] and rolling [m] of a pad of about a square centimetre.
+_PAD_FRICTION = (1.0, 0.02, 0.001)
+
+# A finger servo gives its full force at this part of the stroke.
+_FINGER_SERVO_BAND = 0.05
+
+_MESH_FORMATS = (".stl", ".obj", ".msh")
+
+
+def build_model(robot: Robot, config: Config) -> mujoco.MjModel:
+    """Compile the cell: actuators ``robot.joint_names`` first, in that order, then each gripper's finger joints.
+
+    Raises :class:`PlantError` where MuJoCo cannot make a model of it.
+    """
+    try:
+        spec = mujoco.MjSpec.from_string(_readable_urdf(robot.urdf))
+        spec.modelname = robot.name
+        _set_solver(spec, config.mujoco)
+        _set_shapes(spec, _capsules(robot.urdf))
+        _set_arm_joints(spec, robot)
+        _set_grippers(spec, config)
+        _exclude_contacts(spec, robot)
+        _add_objects(spec, config.mujoco)
+        furnish(spec)
+        return spec.compile()
+    except (ValueError, RuntimeError, mujoco.FatalError) as error:
+        raise PlantError(f"{robot.name}: MuJoCo cannot make a model of it: {' '.join(str(error).split())}") from error
+
+
+def _readable_urdf(urdf: str) -> str:
+    """The URDF with every link kept as a body, drawings kept, and without the mesh drawings that MuJoCo cannot read."""
+    root = ET.fromstring(urdf)
+    extension = ET.SubElement(root, "mujoco")
+    ET.SubElement(extension, "compiler", discardvisual="false", fusestatic="false", strippath="false")
+    for link in root.findall("link"):
+        for visual in link.findall("visual"):
+            mesh = visual.find("geometry/mesh")
+            if mesh is not None and Path(mesh.get("filename", "")).suffix.lower() not in _MESH_FORMATS:
+                link.remove(visual)
+    return ET.tostring(root, encoding="unicode")
+
+
+def _capsules(urdf: str) -> set[str]:
+    """Names of the cylinders that the URDF's ``collision_checking`` declares to be capsules."""
+    return {capsule.get("name", "") for capsule in ET.fromstring(urdf).iterfind("link/collision_checking/capsule")}
+
+
+def _set_solver(spec: mujoco.MjSpec, config: MujocoConfig) -> None:
+    spec.option.timestep = config.timestep
+    # A state that cannot be is an error here, and no reason to jump back to the start.
+    spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+    # What lies still costs nothing.
+    spec.option.enableflags |= mujoco.mjtEnableBit.mjENBL_SLEEP
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    # The elliptic cone with this ratio keeps what is grasped from creeping out of the fingers.
+    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    spec.option.impratio = 10
+
+
+def _set_shapes(spec: mujoco.MjSpec, capsules: set[str]) -> None:
+    """Sort shapes into groups, restore capsules, and keep envelopes out of contact."""
+    for body in spec.bodies:
+        drawn = any(not geom.contype for geom in body.geoms)
+        for geom in body.geoms:
+            if geom.name in capsules:
+                geom.type = mujoco.mjtGeom.mjGEOM_CAPSULE
+            if not geom.contype:
+                geom.group = VISUAL_GROUP
+            elif geom.name.endswith(_ENVELOPE):
+                geom.group, geom.contype, geom.conaffinity = ENVELOPE_GROUP, 0, 0
+            elif drawn:
+                geom.group = COLLISION_GROUP
+
+
+def _set_arm_joints(spec: mujoco.MjSpec, robot: Robot) -> None:
+    for name, armature, torque in zip(robot.joint_names, robot.model.armature, robot.torque_limit, strict=True):
+        joint = spec.joint(name)
+        joint.armature = armature if armature > 0 else _MIN_ARMATURE
+        joint.damping[0] = max(joint.damping[0], _MIN_DAMPING)
+        motor = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+        motor.set_to_motor()
+        motor.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE
+        motor.forcerange = (-torque, torque)
+
+
+def _set_grippers(spec: mujoco.MjSpec, config: Config) -> None:
+    """A servo for each finger joint, all of one gripper coupled as by its gear, with contacts that hold a box."""
+    for side, arm in config.arms.items():
+        gripper, names = arm.gripper, [f"{side}_{joint}" for joint in arm.gripper.joints]
+        if not names:
+            continue
+        stiffness = gripper.force / (_FINGER_SERVO_BAND * abs(gripper.open_position - gripper.closed_position))
+        for name in names:
+            servo = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+            servo.set_to_position(kp=stiffness, dampratio=1.0)
+            servo.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE
+            servo.forcerange = (-gripper.force, gripper.force)
+            for geom in spec.joint(name).parent.geoms:
+                geom.condim, geom.friction = 4, _PAD_FRICTION
+        for name in names[1:]:
+            coupling = spec.add_equality(name=f"{name}_coupling", name1=name, name2=names[0])
+            coupling.type, coupling.objtype = mujoco.mjtEq.mjEQ_JOINT, mujoco.mjtObj.mjOBJ_JOINT
+            coupling.data[:5] = (0, 1, 0, 0, 0)
+        # The joint limits keep the fingers apart already.
+        for first, second in combinations(names, 2):
+            _exclude(spec, spec.joint(first).parent.name, spec.joint(second).parent.name)
+
+
+def _exclude_contacts(spec: mujoco.MjSpec, robot: Robot) -> None:
+    """Let pairs that the robot does not watch pass through each other: neighbours, what always or never meets."""
+    watched = {frozenset((link_of(a), link_of(b))) for a, b in pair_names(robot.collision_model)}
+    for first, second in combinations(sorted(frozenset().union(*watched)), 2):
+        if frozenset((first, second)) not in watched:
+            _exclude(spec, first, second)
+    for name in robot.joint_names:
+        # MuJoCo leaves out contacts with a parent only where that parent can move.
+        link = spec.joint(name).parent
+        if frozenset((link.parent.name, link.name)) not in watched:
+            _exclude(spec, link.parent.name, link.name)
+
+
+def _exclude(spec: mujoco.MjSpec, first: str, second: str) -> None:
+    name = f"{first}|{second}"
+    if spec.exclude(name) is None:
+        spec.add_exclude(name=name, bodyname1=first, bodyname2=second)
+
+
+def _add_objects(spec: mujoco.MjSpec, config: MujocoConfig) -> None:
+    for name, thing in config.objects.items():
+        body = spec.worldbody.add_body(name=name, pos=thing.position)
+        body.add_freejoint(name=f"{name}_free")
+        body.add_geom(
+            name=name,
+            type=mujoco.mjtGeom.mjGEOM_BOX,
+            size=np.array(thing.size) / 2,
+            mass=thing.mass,
+            rgba=thing.colour,
+            group=VISUAL_GROUP,
+            condim=4,
+            friction=_PAD_FRICTION,
+        )

@@ -1,0 +1,75 @@
+"""What makes the simulated cell pleasant to look at: floor, sky and light. Only the floor can be touched."""
+
+from __future__ import annotations
+
+import mujoco
+
+# Geom groups: MuJoCo's viewers draw 0 to 2 and leave out the others until asked.
+VISUAL_GROUP, COLLISION_GROUP, ENVELOPE_GROUP = 2, 3, 4
+
+
+def furnish(spec: mujoco.MjSpec) -> None:
+    """Add floor , sky and lights, and set the view that a window opens with."""
+    _add_sky(spec)
+    _add_floor(spec)
+    _add_lights(spec)
+    spec.visual.headlight.ambient = (0.25, 0.25, 0.25)
+    spec.visual.headlight.diffuse = (0.25, 0.25, 0.25)
+    spec.visual.headlight.specular = (0.0, 0.0, 0.0)
+    spec.visual.quality.shadowsize = 4096
+    spec.visual.quality.offsamples = 8
+    # Large enough for any picture that is asked for.
+    spec.visual.global_.offwidth, spec.visual.global_.offheight = 3840, 2160
+    spec.visual.global_.azimuth, spec.visual.global_.elevation = 145, -22
+    spec.stat.center, spec.stat.extent = (0.35, 0.0, 0.45), 1.6
+
+
+def _add_sky(spec: mujoco.MjSpec) -> None:
+    spec.add_texture(
+        name="sky",
+        type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
+        rgb1=(0.90, 0.94, 0.98),
+        rgb2=(0.55, 0.66, 0.78),
+        width=256,
+        height=256 * 6,
+    )
+
+
+def _add_floor(spec: mujoco.MjSpec) -> None:
+    spec.add_texture(
+        name="tiles",
+        type=mujoco.mjtTexture.mjTEXTURE_2D,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
+        rgb1=(0.72, 0.74, 0.76),
+        rgb2=(0.66, 0.68, 0.71),
+        mark=mujoco.mjtMark.mjMARK_EDGE,
+        markrgb=(0.60, 0.62, 0.65),
+        width=512,
+        height=512,
+    )
+    material = spec.add_material(name="floor", texrepeat=(1, 1), texuniform=True, reflectance=0.08)
+    material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "tiles"
+    spec.worldbody.add_geom(
+        name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=(0, 0, 0.5), material="floor", group=VISUAL_GROUP
+    )
+
+
+def _add_lights(spec: mujoco.MjSpec) -> None:
+    directional = mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
+    spec.worldbody.add_light(
+        name="key",
+        type=directional,
+        pos=(1.5, 1.5, 3),
+        dir=(-0.4, -0.45, -1),
+        diffuse=(0.55, 0.55, 0.53),
+        castshadow=True,
+    )
+    spec.worldbody.add_light(
+        name="fill",
+        type=directional,
+        pos=(1, -2, 2.5),
+        dir=(-0.3, 0.8, -0.7),
+        diffuse=(0.2, 0.21, 0.24),
+        castshadow=False,
+    )
