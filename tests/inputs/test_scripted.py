@@ -1,0 +1,191 @@
+"""Scripted hands: what the demo and the tracking tests rely on."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from q2r2_control.errors import ConfigError
+from q2r2_control.inputs.base import Input
+from q2r2_control.inputs.scripted import ScriptedInput
+from q2r2_control.inputs.trajectories import TRAJECTORIES
+from q2r2_control.types import SIDES, HandSample, HapticFeedback
+
+EVERY = pytest.mark.parametrize("trajectory", list(TRAJECTORIES))
+
+
+def play(script: ScriptedInput, duration: float, dt: float = 0.01, start: float = 0.0) -> list[HandSample]:
+    script.start()
+    return [sample for tick in range(round(duration / dt)) for sample in script.poll(start + tick * dt)]
+
+
+def of(hand: str, samples: list[HandSample]) -> list[HandSample]:
+    return [sample for sample in samples if sample.hand == hand]
+
+
+def flat(samples: list[HandSample]) -> list[tuple[object, ...]]:
+    return [(s.hand, s.pose_stamp, s.inputs, *s.position.tolist(), *s.quaternion.tolist()) for s in samples]
+
+
+def test_it_is_an_input() -> None:
+    assert isinstance(ScriptedInput("circle"), Input)
+
+
+@EVERY
+@pytest.mark.parametrize("human", [False, True], ids=["clean", "human"])
+def test_the_same_seed_gives_the_same_samples_however_they_are_polled(trajectory: str, human: bool) -> None:
+    def script() -> ScriptedInput:
+        return ScriptedInput(trajectory, human=human, seed=3)
+
+    often, seldom = play(script(), 6.0, dt=0.001), play(script(), 6.0, dt=0.1)
+    assert len(seldom) > 500
+    assert flat(often)[: len(seldom)] == flat(seldom)
+
+
+def test_another_seed_and_the_other_hand_shake_differently() -> None:
+    first, second = (play(ScriptedInput("circle", human=True, seed=seed), 1.0) for seed in (0, 1))
+    assert flat(first) != flat(second)
+    left, right = of("left", first), of("right", first)
+    assert [s.pose_stamp for s in left] != [s.pose_stamp for s in right]
+
+
+def test_stamps_are_on_the_callers_clock_and_never_in_its_future() -> None:
+    script = ScriptedInput("circle", human=True)
+    script.start()
+    last = dict.fromkeys(SIDES, -math.inf)
+    for tick in range(1000):
+        now = 5000.0 + tick * 0.01
+        for sample in script.poll(now):
+            assert last[sample.hand] < sample.pose_stamp <= now
+            assert sample.inputs_stamp == sample.pose_stamp
+            last[sample.hand] = sample.pose_stamp
+
+
+def test_clean_samples_lie_on_the_ideal_path_at_the_rate_asked_for() -> None:
+    script = ScriptedInput("circle", rate_hz=50.0)
+    samples = of("left", play(script, 4.0, start=100.0))
+    np.testing.assert_allclose(np.diff([s.pose_stamp for s in samples]), 0.02, atol=1e-9)
+    for sample in samples:
+        np.testing.assert_allclose(sample.position, script.hand_pose("left", sample.pose_stamp).translation, atol=1e-9)
+
+
+def test_human_samples_come_at_72_to_76_hz_with_jitter_and_dropouts_shorter_than_the_watchdog() -> None:
+    gaps = np.diff([s.pose_stamp for s in of("left", play(ScriptedInput("circle", human=True), 60.0))])
+    assert 1.0 / 76.0 < np.median(gaps) < 1.0 / 72.0
+    assert np.std(gaps) > 0.001
+    assert 0.025 < gaps.max() < 0.12
+
+
+def test_a_human_hand_trembles_by_a_millimetre_and_some_tenths_of_a_degree_between_8_and_12_hz() -> None:
+    script = ScriptedInput("line", hands=("left",), human=True, seed=1)
+    samples = [s for s in play(script, 1.0) if s.pose_stamp < 1.0]
+    home = script.hand_pose("left", 0.0)
+    t = np.array([s.pose_stamp for s in samples])
+    shift = np.array([s.position for s in samples]) - home.translation
+    turn = np.array([pin.log3(pin.Quaternion(s.quaternion).toRotationMatrix() @ home.rotation.T) for s in samples])
+    assert 0.4e-3 < np.abs(shift).max() < 2e-3
+    assert 0.1 < np.degrees(np.abs(turn).max()) < 0.6
+    frequencies = np.arange(2.0, 30.0, 0.5)
+    power = np.abs(np.exp(-2j * np.pi * frequencies[:, None] * t) @ shift).sum(axis=1)
+    assert 7.5 <= frequencies[power.argmax()] <= 12.5
+
+
+@EVERY
+@pytest.mark.parametrize("hand", SIDES)
+def test_hands_move_smoothly_within_reach_and_never_below_the_start(trajectory: str, hand: str) -> None:
+    script = ScriptedInput(trajectory)
+    dt = 0.005
+    poses = [script.hand_pose(hand, tick * dt) for tick in range(4200)]
+    positions = np.array([pose.translation for pose in poses])
+    way = positions - positions[0]
+    assert way[:, 2].min() > -1e-9
+    assert np.abs(way).max() <= 0.35
+    velocity = np.diff(positions, axis=0) / dt
+    assert np.linalg.norm(velocity, axis=1).max() < 0.5
+    assert np.abs(np.diff(velocity, axis=0) / dt).max() < 1.5
+    turns = [pin.log3(b.rotation @ a.rotation.T) / dt for a, b in itertools.pairwise(poses)]
+    assert np.abs(turns).max() < 1.5
+    assert np.abs(np.diff(turns, axis=0) / dt).max() < 5.0
+
+
+@EVERY
+def test_the_hands_are_still_from_the_first_press_until_the_arm_is_engaged(trajectory: str) -> None:
+    script = ScriptedInput(trajectory)
+    samples = [s for s in play(script, 2.0) if s.pose_stamp < 1.1]
+    assert any(s.inputs.button_lower for s in samples)
+    assert not samples[0].inputs.button_lower
+    assert not samples[-1].inputs.button_lower
+    assert np.ptp([s.position for s in of("left", samples)], axis=0).max() < 1e-12
+
+
+def test_the_handover_brings_the_hands_together_and_each_grips_and_releases_once() -> None:
+    script = ScriptedInput("reach_grasp_handover")
+    samples = play(script, 20.0)
+    for hand in SIDES:
+        upper = np.diff([int(s.inputs.button_upper) for s in of(hand, samples)])
+        lower = np.diff([int(s.inputs.button_lower) for s in of(hand, samples)])
+        assert [(upper == 1).sum(), (lower == 1).sum()] == [2, 2]
+        inwards = -1.0 if hand == "left" else 1.0
+        moved = script.hand_pose(hand, 11.0).translation - script.hand_pose(hand, 0.0).translation
+        assert moved[1] == pytest.approx(inwards * 0.34)
+        assert of(hand, samples)[-1].inputs.press_index == 0.0
+
+
+def test_the_right_hand_mirrors_the_left() -> None:
+    script = ScriptedInput("rotate")
+    reflection = np.diag([1.0, -1.0, 1.0])
+    for t in (0.0, 2.0, 5.0, 9.0, 13.0):
+        left = script.hand_pose("left", 0.0).rotation.T @ script.hand_pose("left", t).rotation
+        right = script.hand_pose("right", 0.0).rotation.T @ script.hand_pose("right", t).rotation
+        np.testing.assert_allclose(reflection @ left @ reflection, right, atol=1e-12)
+
+
+def test_nothing_comes_before_start_nor_after_close_and_haptics_are_harmless() -> None:
+    script = ScriptedInput("circle")
+    assert (script.connected, script.poll(0.0)) == (False, [])
+    script.start()
+    assert script.connected
+    assert script.poll(0.0)
+    script.send_haptic(HapticFeedback("left", 0.5, 0.5))
+    script.close()
+    script.close()
+    assert (script.connected, script.poll(1.0)) == (False, [])
+
+
+@pytest.mark.parametrize("now", [math.nan, math.inf, -math.inf], ids=["nan", "infinite", "minus infinite"])
+def test_a_clock_that_is_not_finite_gives_nothing(now: float) -> None:
+    script = ScriptedInput("circle")
+    script.start()
+    script.poll(0.0)
+    assert script.poll(now) == []
+
+
+def test_the_script_waits_while_nobody_polls() -> None:
+    script = ScriptedInput("circle", hands=("left",))
+    script.start()
+    script.poll(0.0)
+    late = script.poll(1e9)
+    assert 70 < len(late) < 80
+    assert late[-1].pose_stamp == pytest.approx(1e9, abs=0.02)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"trajectory": "spiral"}, "allowed are circle"),
+        ({"trajectory": "circle", "hands": ("middle",)}, "allowed are left, right"),
+        ({"trajectory": "circle", "rate_hz": 0.0}, "rate_hz = 0"),
+        ({"trajectory": "circle", "frequency_hz": math.nan}, "frequency_hz = nan"),
+    ],
+    ids=["unknown trajectory", "unknown hand", "no rate", "frequency not a number"],
+)
+def test_a_wrong_setting_is_refused_in_one_line_that_says_what_is_allowed(
+    arguments: dict[str, object], message: str
+) -> None:
+    with pytest.raises(ConfigError, match=message) as caught:
+        ScriptedInput(**arguments)  # type: ignore[arg-type]
+    assert "\n" not in str(caught.value)
