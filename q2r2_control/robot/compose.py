@@ -7,14 +7,14 @@ The one text feeds Pinocchio, MuJoCo, viewers and ``robot_description``. Names o
 from __future__ import annotations
 
 import copy
-import math
 import re
 import xml.etree.ElementTree as ET
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from q2r2_control.config import ArmConfig, Config, ObstacleConfig, PoseConfig
 from q2r2_control.errors import ConfigError, Q2R2Error
-from q2r2_control.resources import find_resource
 from q2r2_control.robot.description import Description, LinkTree, joint_limits, load_description, parse_srdf
 from q2r2_control.types import SIDES
 
@@ -83,51 +83,55 @@ def compose(config: Config) -> ComposedCell:
 
 
 def _compose_arm(side: str, config: ArmConfig) -> _Arm:
-    key = f"arms.{side}"
-    arm = _load(config.model, f"{key}.model")
-    parts = [*arm.urdf]
-    srdf = [*(arm.srdf if arm.srdf is not None else ())]
-    tree = LinkTree(arm.urdf, config.model)
-    carrier = config.tool.link or _last_link(tree)
-    _check_link(carrier, tree, config.model, f"{key}.tool.link")
-    frame = carrier
-    if config.tool.model is not None:
-        tool = _load(config.tool.model, f"{key}.tool.model")
-        _check_clash(arm, tool, f"{key}.tool.model")
-        tool_tree = LinkTree(tool.urdf, config.tool.model)
-        parts += [*tool.urdf, _fixed_joint("tool_mount", carrier, tool_tree.root, config.tool.mount)]
-        srdf += [*(tool.srdf if tool.srdf is not None else ())]
-        if carrier == _last_link(tree) and config.tool.mount == PoseConfig():
-            srdf += _exclusions_of_the_two(arm, tool)
-        frame = config.tool.frame or _last_link(tool_tree)
-        _check_link(frame, tool_tree, config.tool.model, f"{key}.tool.frame")
-    elif config.tool.frame is not None:
-        frame = config.tool.frame
-        _check_link(frame, tree, config.model, f"{key}.tool.frame")
-
-    joined = ET.Element("robot")
-    joined.extend(part for part in parts if part.tag in ("link", "joint", "material"))
-    whole = LinkTree(joined, key)
-    chain = whole.chain(frame)
+    key, prefix = f"arms.{side}", f"{side}_"
+    robot, srdf, frame = _arm_with_tool(config, key)
+    tree = LinkTree(robot, key)
+    chain = tree.chain(frame)
     if not chain:
         raise ConfigError(
             f"{key}.tool.frame = {frame!r:.60}: no movable joint carries it; name a link that the arm moves"
         )
-    home = _posture(joined, chain, config, key)
-    prefix = f"{side}_"
-    root = _fixed_joint("mount", "", whole.root, config.mount)
-    elements = [_prefixed(part, prefix) for part in (root, *joined)]
-    parent = elements[0].find("parent")
-    assert parent is not None
-    parent.set("link", WORLD)
+    home = _posture(robot, chain, config, key)
+    parts = [_prefixed(part, prefix) for part in robot]
+    _name_shapes(parts)
+    mount = _fixed_joint(f"{prefix}mount", WORLD, prefix + tree.root, config.mount)
     return _Arm(
-        urdf=elements,
+        urdf=[mount, *parts],
         srdf=[exclusion for part in srdf for exclusion in _prefixed_exclusion(part, prefix)],
         tool_frame=prefix + frame,
         joints=tuple(prefix + joint.get("name", "") for joint in chain),
         fingers=tuple(prefix + joint for joint in config.gripper.joints),
         home={prefix + joint: position for joint, position in home.items()},
     )
+
+
+def _arm_with_tool(config: ArmConfig, key: str) -> tuple[ET.Element, list[ET.Element], str]:
+    """URDF of an arm with its tool, the exclusions of both, and the link that the operator moves; nothing prefixed."""
+    arm = _load(config.model, f"{key}.model")
+    tree = LinkTree(arm.urdf, config.model)
+    carrier = config.tool.link or _last_link(tree)
+    _check_link(carrier, tree, config.model, f"{key}.tool.link")
+    parts, srdf = [*arm.urdf], _children(arm.srdf)
+    if config.tool.model is None:
+        frame = config.tool.frame or carrier
+        _check_link(frame, tree, config.model, f"{key}.tool.frame")
+    else:
+        tool = _load(config.tool.model, f"{key}.tool.model")
+        _check_clash(arm, tool, f"{key}.tool.model")
+        tool_tree = LinkTree(tool.urdf, config.tool.model)
+        parts += [*tool.urdf, _fixed_joint("tool_mount", carrier, tool_tree.root, config.tool.mount)]
+        srdf += _children(tool.srdf)
+        if carrier == _last_link(tree) and config.tool.mount == PoseConfig():
+            srdf += _exclusions_of_the_two(arm, tool)
+        frame = config.tool.frame or _last_link(tool_tree)
+        _check_link(frame, tool_tree, config.tool.model, f"{key}.tool.frame")
+    robot = ET.Element("robot")
+    robot.extend(part for part in parts if part.tag in ("link", "joint", "material"))
+    return robot, srdf, frame
+
+
+def _children(element: ET.Element | None) -> list[ET.Element]:
+    return [] if element is None else [*element]
 
 
 def _load(model: str, key: str) -> Description:
@@ -166,12 +170,9 @@ def _check_clash(arm: Description, tool: Description, key: str) -> None:
 
 
 def _exclusions_of_the_two(arm: Description, tool: Description) -> list[ET.Element]:
-    """Pairs that are known of just this tool flat on just this arm's last link: ``TOOL_on_ARM.srdf`` in robots/."""
-    try:
-        file = find_resource(f"robots/{tool.file.stem}_on_{arm.file.stem}.srdf")
-    except ConfigError:
-        return []
-    return [*parse_srdf(file.read_text(encoding="utf-8"), str(file))]
+    """Pairs known of just this tool flat on just this arm's last link: ``TOOL_on_ARM.srdf`` beside the tool."""
+    file = tool.file.with_name(f"{tool.file.stem}_on_{arm.file.stem}.srdf")
+    return [*parse_srdf(file.read_text(encoding="utf-8"), str(file))] if file.is_file() else []
 
 
 def _posture(robot: ET.Element, chain: list[ET.Element], config: ArmConfig, key: str) -> dict[str, float]:
@@ -204,7 +205,7 @@ def _check_position(joint: ET.Element, position: float, key: str) -> None:
 
 
 def _prefixed(part: ET.Element, prefix: str) -> ET.Element:
-    """A copy of a link, joint or material with every name in it prefixed and every shape named."""
+    """A copy of a link, joint or material with every name in it prefixed."""
     part = copy.deepcopy(part)
     for element in part.iter():
         if element.tag in _NAMING:
@@ -212,11 +213,17 @@ def _prefixed(part: ET.Element, prefix: str) -> ET.Element:
             element.set(attribute, prefix + element.get(attribute, ""))
         elif element.get("name"):
             element.set("name", prefix + element.get("name", ""))
-    for tag in ("collision", "visual"):
-        for index, shape in enumerate(part.findall(tag)):
-            if not shape.get("name"):
-                shape.set("name", f"{part.get('name')}_{tag}_{index}")
     return part
+
+
+def _name_shapes(links: Sequence[ET.Element]) -> None:
+    """Give every shape a name of its own, which MuJoCo needs; shapes that share one or have none get their link's."""
+    for tag in ("collision", "visual"):
+        used = Counter(shape.get("name") for link in links for shape in link.findall(tag))
+        for link in links:
+            for index, shape in enumerate(link.findall(tag)):
+                if not shape.get("name") or used[shape.get("name")] > 1:
+                    shape.set("name", f"{link.get('name')}_{tag}_{index}")
 
 
 def _prefixed_exclusion(part: ET.Element, prefix: str) -> list[ET.Element]:
@@ -272,5 +279,5 @@ def _fixed_joint(name: str, parent: str, child: str, pose: PoseConfig) -> ET.Ele
     return joint
 
 
-def _numbers(values: tuple[float, ...] | list[float]) -> str:
-    return " ".join(repr(float(value)) for value in values if math.isfinite(value))
+def _numbers(values: Sequence[float]) -> str:
+    return " ".join(repr(float(value)) for value in values)

@@ -1,0 +1,43 @@
+"""Cells that several tests look at; loading one takes a tenth of a second, so each is loaded once."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from q2r2_control.config import Config, load_config
+from q2r2_control.robot.compose import ComposedCell, compose
+from q2r2_control.robot.robot import Robot
+
+PANDA_HOME = [0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785]
+
+
+def one_arm(**arm: Any) -> Config:
+    """A cell of one arm, by default a bare iiwa 7 with all joints at zero."""
+    return Config.model_validate({"name": "cell", "arms": {"left": {"model": "iiwa7", "home": [0.0] * 7} | arm}})
+
+
+@pytest.fixture(scope="session", params=["dual_iiwa7", "dual_iiwa14"])
+def dual_iiwa(request: pytest.FixtureRequest) -> Robot:
+    return Robot.from_config(load_config(f"config/{request.param}.yaml"))
+
+
+@pytest.fixture(scope="session")
+def dual_iiwa7() -> Robot:
+    return Robot.from_config(load_config("config/dual_iiwa7.yaml"))
+
+
+@pytest.fixture(scope="session")
+def dual_iiwa7_cell() -> ComposedCell:
+    return compose(load_config("config/dual_iiwa7.yaml"))
+
+
+@pytest.fixture(scope="session")
+def dual_panda() -> Robot:
+    arms = {
+        side: {"model": "example-robot-data:panda", "mount": {"position": [0.0, y, 0.0]}, "home": PANDA_HOME}
+        for side, y in (("left", 0.4), ("right", -0.4))
+    }
+    table = {"shape": "box", "size": [0.8, 1.6, 0.04], "position": [0.75, 0.0, 0.0]}
+    return Robot.from_config(Config.model_validate({"name": "pandas", "arms": arms, "obstacles": {"table": table}}))

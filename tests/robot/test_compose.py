@@ -1,0 +1,176 @@
+from __future__ import annotations
+
+import math
+import re
+import xml.etree.ElementTree as ET
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from q2r2_control.config import Config, load_config
+from q2r2_control.errors import ConfigError
+from q2r2_control.resources import find_resource
+from q2r2_control.robot.compose import ComposedCell, compose
+from tests.robot.conftest import one_arm
+
+HAND = {"model": "hand_e", "frame": "tool_frame"}
+FINGERS = {"joints": ["finger_joint_1", "finger_joint_2"], "open_position": 0.025}
+
+
+def test_the_cell_names_its_parts_by_side(dual_iiwa7_cell: ComposedCell) -> None:
+    cell = dual_iiwa7_cell
+    assert cell.tool_frames == {"left": "left_tool_frame", "right": "right_tool_frame"}
+    for side in ("left", "right"):
+        assert cell.arm_joints[side] == tuple(f"{side}_A{number}" for number in range(1, 8))
+        assert cell.finger_joints[side] == (f"{side}_finger_joint_1", f"{side}_finger_joint_2")
+        assert cell.home[f"{side}_finger_joint_1"] == 0.025
+    assert cell.obstacles == ("table",)
+
+
+def test_every_name_in_the_urdf_is_unique_of_its_kind(dual_iiwa7_cell: ComposedCell) -> None:
+    root = ET.fromstring(dual_iiwa7_cell.urdf)
+    for path in ("link", "joint", "link/visual", "link/collision", "material"):
+        names = [element.get("name") for element in root.findall(path)]
+        assert None not in names
+        assert len(names) == len(set(names)) > 0, path
+
+
+def test_shapes_that_share_a_name_are_told_apart(tmp_path: Path) -> None:
+    text = find_resource("robots/iiwa7.urdf").read_text()
+    file = tmp_path / "arm.urdf"
+    file.write_text(re.sub(r'<(visual|collision) name="[^"]*"', r'<\1 name="shape"', text))
+    root = ET.fromstring(compose(one_arm(model=str(file))).urdf)
+    for path in ("link/visual", "link/collision"):
+        names = [element.get("name") for element in root.findall(path)]
+        assert len(names) == len(set(names)) > 0
+
+
+def test_mounts_and_obstacles_stand_where_the_config_puts_them() -> None:
+    cell = compose(
+        Config.model_validate(
+            {
+                "name": "cell",
+                "arms": {
+                    "left": {
+                        "model": "iiwa7",
+                        "mount": {"position": [1, 2, 3], "rpy": [0, math.pi, 0]},
+                        "tool": HAND | {"mount": {"position": [0, 0, 0.1]}},
+                        "home": [0] * 7,
+                    }
+                },
+                "obstacles": {"post": {"shape": "cylinder", "size": [0.1, 2], "position": [4, 5, 6]}},
+            }
+        )
+    )
+    model = pin.buildModelFromXML(cell.urdf)
+    data = model.createData()
+    pin.framesForwardKinematics(model, data, pin.neutral(model))
+    tool = data.oMf[model.getFrameId("left_tool_frame", pin.FrameType.BODY)]
+    np.testing.assert_allclose(tool.translation, [1, 2, 3 - 1.266 - 0.1 - 0.1435], atol=1e-9)
+    np.testing.assert_allclose(data.oMf[model.getFrameId("post", pin.FrameType.BODY)].translation, [4, 5, 6])
+
+
+def test_one_text_loads_in_pinocchio_and_in_mujoco_alike(dual_iiwa7_cell: ComposedCell) -> None:
+    ours = pin.buildModelFromXML(dual_iiwa7_cell.urdf)
+    theirs = mujoco.MjModel.from_xml_string(dual_iiwa7_cell.urdf)
+    names = list(ours.names)[1:]
+    assert sorted(theirs.joint(index).name for index in range(theirs.njnt)) == sorted(names)
+    data, mj_data = ours.createData(), mujoco.MjData(theirs)
+    q = np.random.default_rng(0).uniform(ours.lowerPositionLimit, ours.upperPositionLimit)
+    for index, name in enumerate(names):
+        mj_data.joint(name).qpos = q[index]
+    mujoco.mj_forward(theirs, mj_data)
+    pin.framesForwardKinematics(ours, data, q)
+    for link in ("left_link_7", "right_link_7"):
+        frame = data.oMf[ours.getFrameId(link, pin.FrameType.BODY)]
+        np.testing.assert_allclose(mj_data.body(link).xpos, frame.translation, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["dual_iiwa7", "dual_iiwa14"])
+def test_shipped_cells_compose(name: str) -> None:
+    assert compose(load_config(f"config/{name}.yaml")).name == name
+
+
+@pytest.mark.parametrize(
+    ("arm", "frame"),
+    [
+        pytest.param({"model": "iiwa7"}, "left_link_ee", id="of a bare arm its last link"),
+        pytest.param({"model": "example-robot-data:panda", "home": [0, 0, 0, -1, 0, 1, 0]}, "left_panda_hand_tcp",
+                     id="of an arm with fingers the link before they branch"),
+    ],
+)  # fmt: skip
+def test_the_tool_frame_is_by_default(arm: dict[str, Any], frame: str) -> None:
+    assert compose(one_arm(**arm)).tool_frames == {"left": frame}
+
+
+def test_joints_that_nobody_drives_rest_as_near_zero_as_they_can() -> None:
+    cell = compose(one_arm(model="example-robot-data:panda", home=[0, 0, 0, -1, 0, 1, 0]))
+    assert cell.home["left_panda_finger_joint1"] == 0.0
+    assert cell.finger_joints == {"left": ()}
+
+
+def test_pairs_of_tool_and_arm_are_excluded_only_where_the_tool_sits_flat_on_the_flange() -> None:
+    flat = compose(one_arm(tool=HAND)).srdf
+    moved = compose(one_arm(tool=HAND | {"mount": {"position": [0, 0, 0.2]}})).srdf
+    assert '"left_hand_e_envelope" link2="left_link_4"' in flat
+    assert '"left_hand_e_envelope" link2="left_link_4"' not in moved
+
+
+@pytest.mark.parametrize(
+    ("arm", "line"),
+    [
+        pytest.param({"model": "iiwa9"}, "arms.left.model = 'iiwa9': robots/iiwa9.urdf: no such file", id="no model"),
+        pytest.param({"tool": {"model": "claw"}}, "arms.left.tool.model = 'claw'", id="no tool"),
+        pytest.param({"tool": HAND | {"link": "link_9"}}, "arms.left.tool.link = 'link_9'", id="no such carrier"),
+        pytest.param({"tool": HAND | {"frame": "tcp"}}, "arms.left.tool.frame = 'tcp'", id="no such tool frame"),
+        pytest.param({"tool": {"frame": "tcp"}}, "arms.left.tool.frame = 'tcp'", id="no such frame of a bare arm"),
+        pytest.param({"tool": {"frame": "link_0"}}, "no movable joint", id="a tool frame that nothing moves"),
+        pytest.param({"tool": {"model": "iiwa7"}}, "occur in the arm as well", id="a tool with the arm's names"),
+        pytest.param({"home": [0] * 6}, "6 value(s), expected 7: A1, A2, A3", id="too few home values"),
+        pytest.param({"home": [0] * 8}, "8 value(s), expected 7", id="too many home values"),
+        pytest.param({"home": []}, "0 value(s), expected 7", id="no home values"),
+        pytest.param({"home": [0, 2.5, *[0] * 5]}, "home[1] = 2.5: joint A2 allows -2.0944 .. 2", id="home outside"),
+        pytest.param({"gripper": FINGERS}, "no such finger joint; allowed: none", id="fingers without a hand"),
+        pytest.param(
+            {"tool": HAND, "gripper": FINGERS | {"joints": ["A7"]}}, "allowed: finger_joint_1", id="arm joint as finger"
+        ),
+        pytest.param(
+            {"tool": HAND, "gripper": FINGERS | {"open_position": 0.05}},
+            "arms.left.gripper.open_position = 0.05: joint finger_joint_1 allows 0 .. 0.025",
+            id="opened too far",
+        ),
+    ],
+)  # fmt: skip
+def test_a_bad_arm_ends_in_one_line_that_names_key_value_and_what_is_allowed(arm: dict[str, Any], line: str) -> None:
+    with pytest.raises(ConfigError) as error:
+        compose(one_arm(**arm))
+    assert line in str(error.value)
+    assert "arms.left" in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    "name", ["world", "universe", "left_post", "right_", "", "two words", 'a"><link name="b', "ä", "1st", "a\n"]
+)
+def test_obstacle_names_that_clash_or_break_out_are_refused(name: str) -> None:
+    config = Config.model_validate(
+        {
+            "name": "cell",
+            "arms": {"left": {"model": "iiwa7", "home": [0] * 7}},
+            "obstacles": {name: {"shape": "sphere", "size": [0.1]}},
+        }
+    )
+    with pytest.raises(ConfigError, match=r"obstacles\..*allowed: letters") as error:
+        compose(config)
+    assert "\n" not in str(error.value)
+
+
+def test_a_cell_name_cannot_break_out_of_the_text() -> None:
+    quoted = one_arm().model_copy(update={"name": 'a"><link name="b'})
+    assert ET.fromstring(compose(quoted).urdf).get("name") == 'a"><link name="b'
+    with pytest.raises(ConfigError, match="printable"):
+        compose(one_arm().model_copy(update={"name": "a\x00b"}))

@@ -1,0 +1,159 @@
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import coal
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from q2r2_control.config import Config
+from q2r2_control.errors import RobotError
+from q2r2_control.robot.description import load_description
+from q2r2_control.robot.enclose import enclose_shapes, enclosing_capsule
+from q2r2_control.robot.robot import Robot
+from q2r2_control.types import Array
+
+
+def _reach(points: Array, start: Array, end: Array) -> Array:
+    """Distance of each point from the segment."""
+    along = end - start
+    share = np.clip((points - start) @ along / max(float(along @ along), 1e-300), 0, 1)
+    return np.asarray(np.linalg.norm(points - start - np.outer(share, along), axis=1))
+
+
+def _cloud(kind: str) -> Array:
+    random = np.random.default_rng(7)
+    ball = random.normal(size=(400, 3))
+    ball /= np.linalg.norm(ball, axis=1, keepdims=True)
+    turn = np.array(pin.rpy.rpyToMatrix(0.3, -1.1, 2.0))
+    clouds = {
+        "a rod": ball * [0.01, 0.01, 0.5],
+        "a ball": 0.1 * ball,
+        "a disc": ball * [0.3, 0.3, 0.01],
+        "a brick": np.array([[x, y, z] for x in (0, 0.1) for y in (0, 0.2) for z in (0, 0.4)]),
+        "an L": np.vstack([random.random((200, 3)) * [0.5, 0.05, 0.05], random.random((200, 3)) * [0.05, 0.05, 0.5]]),
+        "a flat plate": random.random((50, 3)) * [1, 1, 0],
+        "points on a line": np.outer(np.linspace(0, 1, 9), [1, 2, 3]),
+        "two points": np.array([[0.0, 0, 0], [0, 0, 1]]),
+        "one point": np.array([[1.0, 2, 3]]),
+        "equal points": np.ones((5, 3)),
+        "millimetres": 1e3 * ball * [1, 2, 3],
+        "far from the origin": ball * [0.1, 0.1, 0.3] + [1e3, -1e3, 1e3],
+    }
+    return np.asarray(clouds[kind] @ turn.T)
+
+
+CLOUDS = [
+    "a rod", "a ball", "a disc", "a brick", "an L", "a flat plate", "points on a line", "two points", "one point",
+    "equal points", "millimetres", "far from the origin",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", CLOUDS)
+def test_every_vertex_is_inside_its_capsule(kind: str) -> None:
+    points = _cloud(kind)
+    radius, start, end = enclosing_capsule(points)
+    assert np.isfinite([radius, *start, *end]).all()
+    assert _reach(points, start, end).max() <= radius
+
+
+@pytest.mark.parametrize(
+    ("kind", "smallest"),
+    [("a rod", 0.0102), ("a ball", 0.101), ("a brick", 0.118)],
+    ids=["a rod's own radius", "a ball's own radius", "half a brick's end diagonal"],
+)
+def test_the_capsule_fits_closely(kind: str, smallest: float) -> None:
+    radius, _, _ = enclosing_capsule(_cloud(kind))
+    assert radius < smallest
+
+
+def _geometry(model: str) -> pin.GeometryModel:
+    text = ET.tostring(load_description(model).urdf, encoding="unicode")
+    return pin.buildGeomFromUrdfString(pin.buildModelFromXML(text), text, pin.GeometryType.COLLISION)
+
+
+@pytest.mark.parametrize("model", ["panda", "ur5", "xarm7"])
+def test_the_capsules_of_a_real_arm_hold_every_vertex_of_its_meshes(model: str) -> None:
+    meshes, enclosed = _geometry(f"example-robot-data:{model}"), _geometry(f"example-robot-data:{model}")
+    replaced = enclose_shapes(enclosed)
+    checked = 0
+    for before, after in zip(meshes.geometryObjects, enclosed.geometryObjects, strict=True):
+        assert before.name == after.name
+        if not isinstance(before.geometry, coal.BVHModelBase):
+            continue
+        assert before.name in replaced
+        points = np.array([before.placement.act(vertex) for vertex in before.geometry.vertices()])
+        half = np.array([0.0, 0.0, after.geometry.halfLength])
+        ends = after.placement.act(-half), after.placement.act(half)
+        assert _reach(points, *ends).max() <= after.geometry.radius
+        checked += 1
+    assert checked >= 6
+
+
+def _one(shape: coal.CollisionGeometry, parent_joint: int) -> pin.GeometryModel:
+    geometry = pin.GeometryModel()
+    geometry.addGeometryObject(pin.GeometryObject("thing_0", parent_joint, pin.SE3.Random(), shape))
+    return geometry
+
+
+@pytest.mark.parametrize("parent_joint", [0, 1], ids=["fixed in the world", "on a moving link"])
+@pytest.mark.parametrize(
+    "shape",
+    [
+        coal.Cylinder(0.1, 1.0), coal.Cylinder(0.5, 0.02), coal.Cylinder(0.1, 0.2), coal.Ellipsoid(0.1, 0.3, 0.2),
+        coal.Ellipsoid(0.2, 0.2, 0.2), coal.Ellipsoid(0.5, 0.01, 0.4), coal.Box(0.1, 0.2, 0.3),
+    ],
+    ids=["post", "round table top", "tin", "ellipsoid", "ball-like ellipsoid", "flat ellipsoid", "box"],
+)  # fmt: skip
+def test_a_primitive_lies_inside_what_replaces_it(shape: coal.CollisionGeometry, parent_joint: int) -> None:
+    geometry = _one(shape, parent_joint)
+    before = geometry.geometryObjects[0].copy()
+    enclose_shapes(geometry)
+    after = geometry.geometryObjects[0]
+    assert isinstance(after.geometry, coal.Capsule | coal.Box)
+    assert parent_joint == 0 or not isinstance(after.geometry, coal.Box)
+    points = np.array([after.placement.actInv(before.placement.act(point)) for point in _surface(shape)])
+    if isinstance(after.geometry, coal.Box):
+        assert (np.abs(points) <= after.geometry.halfSide + 1e-12).all()
+    else:
+        half = np.array([0.0, 0.0, after.geometry.halfLength])
+        assert _reach(points, -half, half).max() <= after.geometry.radius
+
+
+def _surface(shape: coal.CollisionGeometry) -> Array:
+    random = np.random.default_rng(3)
+    ball = random.normal(size=(2000, 3))
+    ball /= np.linalg.norm(ball, axis=1, keepdims=True)
+    if isinstance(shape, coal.Ellipsoid):
+        return np.asarray(ball * shape.radii)
+    if isinstance(shape, coal.Box):
+        return np.asarray(np.sign(ball) * shape.halfSide)
+    angle = random.uniform(0, 2 * np.pi, 2000)
+    side = np.where(random.random(2000) < 0.5, -1.0, 1.0)
+    return np.column_stack([shape.radius * np.cos(angle), shape.radius * np.sin(angle), side * shape.halfLength])
+
+
+def test_capsules_spheres_and_fixed_boxes_are_left_alone() -> None:
+    for shape in (coal.Capsule(0.1, 0.4), coal.Sphere(0.1), coal.Box(1.0, 1.0, 1.0)):
+        geometry = _one(shape, 0)
+        assert enclose_shapes(geometry) == ()
+        assert geometry.geometryObjects[0].geometry == shape
+
+
+def test_an_unbounded_shape_is_refused_by_name() -> None:
+    with pytest.raises(RobotError, match="thing_0 is a Halfspace"):
+        enclose_shapes(_one(coal.Halfspace(np.array([0.0, 0, 1]), 0.0), 0))
+
+
+def test_a_mesh_without_triangles_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "tip.stl").write_text("solid nothing\nendsolid nothing\n")
+    (tmp_path / "arm.urdf").write_text(
+        '<robot name="a"><link name="base"/><link name="tip"><collision><geometry><mesh filename="tip.stl"/>'
+        '</geometry></collision></link><joint name="j" type="revolute"><parent link="base"/><child link="tip"/>'
+        '<axis xyz="0 0 1"/><limit lower="-1" upper="1" velocity="1" effort="1"/></joint></robot>'
+    )
+    arms = {"left": {"model": str(tmp_path / "arm.urdf"), "home": [0.0]}}
+    with pytest.raises(RobotError):
+        Robot.from_config(Config.model_validate({"name": "a", "arms": arms}))

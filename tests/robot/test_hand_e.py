@@ -1,0 +1,93 @@
+"""robots/hand_e.urdf: fingers, tool frame, and the envelope that stands for the hand in every distance."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+
+import coal
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from q2r2_control.robot.description import load_description
+from q2r2_control.types import Array
+
+FLANGE_TO_TIPS = 0.1565
+
+
+@pytest.fixture(scope="module")
+def hand() -> tuple[pin.Model, pin.GeometryModel]:
+    text = ET.tostring(load_description("hand_e").urdf, encoding="unicode")
+    model = pin.buildModelFromXML(text)
+    return model, pin.buildGeomFromUrdfString(model, text, pin.GeometryType.COLLISION)
+
+
+def _points_of(shape: coal.CollisionGeometry) -> Array:
+    """Points on and in a box or a cylinder, close enough to leave no gap a millimetre wide near an edge."""
+    if isinstance(shape, coal.Box):
+        axes = [np.linspace(-half, half, 13) for half in shape.halfSide]
+        return np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 3)
+    angles = np.linspace(0, 2 * np.pi, 48)
+    heights = np.linspace(-shape.halfLength, shape.halfLength, 60)
+    return np.array([(shape.radius * np.cos(a), shape.radius * np.sin(a), z) for a in angles for z in heights])
+
+
+def _outside(point: Array, capsule: pin.GeometryObject, placement: pin.SE3) -> float:
+    local = placement.actInv(point)
+    half = capsule.geometry.halfLength
+    return float(np.linalg.norm(local - [0, 0, np.clip(local[2], -half, half)])) - float(capsule.geometry.radius)
+
+
+@pytest.mark.parametrize("opening", [0.0, 0.005, 0.0125, 0.02, 0.025])
+def test_the_envelope_holds_body_and_fingers_at_every_opening(
+    hand: tuple[pin.Model, pin.GeometryModel], opening: float
+) -> None:
+    model, geometry = hand
+    data, geometry_data = model.createData(), geometry.createData()
+    pin.updateGeometryPlacements(model, data, geometry, geometry_data, np.full(2, opening))
+    items = list(zip(geometry.geometryObjects, geometry_data.oMg, strict=True))
+    envelope = [(item, placement) for item, placement in items if "envelope" in item.name]
+    contact = [(item, placement) for item, placement in items if "envelope" not in item.name]
+    assert [type(item.geometry) for item, _ in envelope] == [coal.Capsule, coal.Capsule]
+    assert len(contact) == 3
+    for item, placement in contact:
+        for point in _points_of(item.geometry):
+            outside = min(_outside(placement.act(point), capsule, where) for capsule, where in envelope)
+            assert outside <= 0, (item.name, placement.act(point))
+
+
+def test_the_envelope_is_tight_at_the_tips(hand: tuple[pin.Model, pin.GeometryModel]) -> None:
+    _, geometry = hand
+    reach = max(
+        item.placement.translation[2]
+        + item.geometry.radius
+        + abs(item.placement.rotation[2, 2]) * item.geometry.halfLength
+        for item in geometry.geometryObjects
+        if "envelope" in item.name
+    )
+    assert FLANGE_TO_TIPS < reach < FLANGE_TO_TIPS + 0.004
+
+
+def test_fingers_open_from_closed_to_fifty_millimetres(hand: tuple[pin.Model, pin.GeometryModel]) -> None:
+    model, geometry = hand
+    data = model.createData()
+    fingers = [geometry.getGeometryId(f"hand_e_finger_{number}_0") for number in (1, 2)]
+    geometry.removeAllCollisionPairs()
+    geometry.addCollisionPair(pin.CollisionPair(*fingers))
+    for per_finger in (0.0, 0.01, 0.025):
+        pin.computeDistances(model, data, geometry, (geometry_data := geometry.createData()), np.full(2, per_finger))
+        assert geometry_data.distanceResults[0].min_distance == pytest.approx(2 * per_finger, abs=1e-6)
+    np.testing.assert_allclose(model.lowerPositionLimit, 0.0)
+    np.testing.assert_allclose(model.upperPositionLimit, 0.025)
+
+
+def test_the_tool_frame_lies_between_the_pads_just_behind_the_tips(hand: tuple[pin.Model, pin.GeometryModel]) -> None:
+    model, _ = hand
+    place = model.frames[model.getFrameId("tool_frame")].placement
+    np.testing.assert_allclose(place.rotation, np.eye(3))
+    np.testing.assert_allclose(place.translation, [0, 0, FLANGE_TO_TIPS - 0.013])
+
+
+def test_the_hand_weighs_what_the_data_sheet_says(hand: tuple[pin.Model, pin.GeometryModel]) -> None:
+    masses = [float(mass.get("value", "nan")) for mass in load_description("hand_e").urdf.iter("mass")]
+    assert sum(masses) == pytest.approx(0.864 + 0.119 + 2 * 0.038)

@@ -1,0 +1,189 @@
+"""robots/iiwa7 and robots/iiwa14: numbers against their sources, exclusions against sampling."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import coal
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from q2r2_control.robot.compose import compose
+from q2r2_control.robot.description import load_description
+from q2r2_control.robot.pairs import link_of, pair_names
+from q2r2_control.robot.robot import Robot
+from q2r2_control.types import Array
+from tests.robot.conftest import one_arm
+
+
+@dataclass(frozen=True)
+class DataSheet:
+    """What KUKA and the public lbr_description say of one robot."""
+
+    lengths: tuple[float, ...]  # base-shoulder, shoulder-elbow, elbow-wrist, wrist-flange [m]
+    masses: tuple[float, ...]  # of link 0..7 [kg]
+    velocity: tuple[float, ...]  # [deg/s]
+    torque: tuple[float, ...]  # [Nm]
+    rotor: tuple[float, ...]  # inertia about the rotor's own axis [kg m^2]
+    gear: tuple[float, ...]
+
+
+SHEETS = {
+    "iiwa7": DataSheet(
+        (0.34, 0.4, 0.4, 0.126),
+        (4.855658, 3.394011, 4.031991, 3.394011, 4.031989, 1.529239, 2.403626, 0.259474),
+        (98, 98, 100, 130, 140, 180, 180),
+        (176, 176, 110, 110, 110, 40, 40),
+        (7.17e-5, 1.737e-4, 1.266e-4, 7.10e-5, 5.44e-5, 5.48e-5, 5.44e-5),
+        (160,) * 7,
+    ),
+    "iiwa14": DataSheet(
+        (0.36, 0.42, 0.4, 0.126),
+        (7.050378, 5.289529, 5.688888, 3.461245, 4.122995, 1.563756, 2.457878, 0.265331),
+        (85, 85, 100, 75, 130, 135, 135),
+        (320, 320, 176, 176, 110, 40, 40),
+        (1.321e-4,) * 5 + (4.54e-5,) * 2,
+        (160, 160, 160, 160, 100, 160, 160),
+    ),
+}
+
+
+@pytest.fixture(scope="module", params=list(SHEETS))
+def name(request: pytest.FixtureRequest) -> str:
+    return str(request.param)
+
+
+@pytest.fixture(scope="module")
+def robot(name: str) -> Robot:
+    return Robot.from_config(one_arm(model=name))
+
+
+def _posture(*degrees: float) -> Array:
+    return np.radians(np.array(degrees, dtype=float))
+
+
+@pytest.mark.parametrize(
+    ("degrees", "expected"),
+    [
+        pytest.param((0, 0, 0, 0, 0, 0, 0), lambda d: (0, 0, sum(d)), id="stretched upwards"),
+        pytest.param((0, 90, 0, 0, 0, 0, 0), lambda d: (sum(d[1:]), 0, d[0]), id="A2 tips the whole arm forwards"),
+        pytest.param((0, 0, 0, -90, 0, 0, 0), lambda d: (d[2] + d[3], 0, d[0] + d[1]), id="negative A4 bends forwards"),
+        pytest.param((0, 0, 0, 0, 0, 90, 0), lambda d: (d[3], 0, sum(d[:3])), id="A6 bends the hand forwards"),
+        pytest.param((90, 90, 0, 0, 0, 0, 0), lambda d: (0, sum(d[1:]), d[0]), id="A1 turns to the left"),
+        pytest.param((0, 0, 90, -90, 0, 0, 0), lambda d: (0, d[2] + d[3], d[0] + d[1]), id="A3 turns the forearm"),
+        pytest.param((0, 0, 0, -90, 90, 90, 0), lambda d: (d[2], d[3], d[0] + d[1]), id="A5 turns the hand"),
+    ],
+)
+def test_flange_lies_where_the_four_lengths_put_it(
+    robot: Robot, name: str, degrees: tuple[float, ...], expected: Callable[[tuple[float, ...]], tuple[float, ...]]
+) -> None:
+    np.testing.assert_allclose(
+        robot.tool_pose(_posture(*degrees), "left").translation, expected(SHEETS[name].lengths), atol=1e-9
+    )
+
+
+def test_a7_turns_the_flange_about_its_own_axis(robot: Robot) -> None:
+    pose = robot.tool_pose(_posture(0, 0, 0, 0, 0, 0, 30), "left")
+    np.testing.assert_allclose(pose.rotation, pin.utils.rotate("z", math.pi / 6), atol=1e-9)
+
+
+def test_masses_are_those_of_the_table(name: str) -> None:
+    urdf = load_description(name).urdf
+    written = [float(mass.get("value", "nan")) for mass in urdf.findall("link/inertial/mass")]
+    assert written == list(SHEETS[name].masses)
+    model = pin.buildModelFromXML(compose(one_arm(model=name)).urdf)
+    np.testing.assert_allclose([inertia.mass for inertia in model.inertias][1:], written[1:])
+
+
+def test_inertias_belong_to_real_bodies(robot: Robot) -> None:
+    for inertia in list(robot.model.inertias)[1:]:
+        principal = np.linalg.eigvalsh(inertia.inertia)
+        assert principal[0] > 0
+        assert principal[0] + principal[1] > principal[2]
+
+
+def test_limits_are_those_of_the_data_sheet_and_never_above(robot: Robot, name: str) -> None:
+    position = np.radians([170, 120, 170, 120, 170, 120, 175])
+    for actual, sheet in (
+        (robot.position_upper, position),
+        (-robot.position_lower, position),
+        (robot.velocity_limit, np.radians(SHEETS[name].velocity)),
+        (robot.torque_limit, np.array(SHEETS[name].torque, dtype=float)),
+    ):
+        np.testing.assert_allclose(actual, sheet, atol=2e-6)
+        assert (actual <= sheet).all()
+
+
+def test_rotors_reach_the_model_with_their_gear(robot: Robot, name: str) -> None:
+    sheet = SHEETS[name]
+    np.testing.assert_allclose(robot.model.rotorInertia, sheet.rotor)
+    np.testing.assert_allclose(robot.model.rotorGearRatio, sheet.gear)
+    np.testing.assert_allclose(robot.model.armature, np.array(sheet.rotor) * np.square(sheet.gear))
+
+
+def test_every_link_is_a_capsule_for_coal_and_the_last_a_sphere(robot: Robot) -> None:
+    shapes = {item.name: item.geometry for item in robot.collision_model.geometryObjects}
+    assert {name: type(shape) for name, shape in shapes.items()} == {
+        **{f"left_link_{index}_0": coal.Capsule for index in range(7)},
+        "left_link_7_0": coal.Sphere,
+    }
+
+
+@pytest.mark.parametrize(
+    ("model", "link", "start", "end", "radius"),
+    [
+        ("iiwa7", 0, (0, 0, 0.059), (-0.033, 0, 0.067), 0.1198),
+        ("iiwa7", 1, (0, 0, 0.0505), (0, -0.042, 0.1945), 0.0794),
+        ("iiwa7", 2, (0, 0.0515, -0.001), (0, 0.0105, 0.144), 0.0799),
+        ("iiwa7", 5, (0, 0, -0.0005), (0, -0.048, 0.1775), 0.0715),
+        ("iiwa14", 0, (0, 0, 0.055), (-0.037, 0, 0.067), 0.1335),
+        ("iiwa14", 1, (0, 0, 0.0395), (0, -0.031, 0.2135), 0.0910),
+        ("iiwa14", 6, (0, 0.0697, -0.017), (0, 0.0707, 0.021), 0.0793),
+    ],
+)
+def test_capsule_runs_between_the_ends_that_enclose_the_mesh(
+    model: str, link: int, start: tuple[float, ...], end: tuple[float, ...], radius: float
+) -> None:
+    full = pin.buildModelFromXML(urdf := compose(one_arm(model=model)).urdf)
+    geometry = pin.buildGeomFromUrdfString(full, urdf, pin.GeometryType.COLLISION)
+    item = geometry.geometryObjects[geometry.getGeometryId(f"left_link_{link}_0")]
+    half = np.array([0.0, 0.0, item.geometry.halfLength])
+    in_link = full.frames[item.parentFrame].placement.inverse() * item.placement
+    np.testing.assert_allclose(in_link.act(-half), start, atol=1e-6)
+    np.testing.assert_allclose(in_link.act(half), end, atol=1e-6)
+    assert radius < item.geometry.radius < radius + 0.0015
+
+
+def test_links_that_no_pair_watches_never_meet(name: str) -> None:
+    """Every pair that the SRDF calls Never stays apart in random and in extreme postures, with a Hand-E in the hand."""
+    robot = Robot.from_config(one_arm(model=name, tool={"model": "hand_e", "frame": "tool_frame"}))
+    geometry = robot.collision_model
+    watched = {frozenset(map(link_of, names)) for names in pair_names(geometry)}
+    geometry = geometry.copy()
+    geometry.removeAllCollisionPairs()
+    items = [
+        (index, item)
+        for index, item in enumerate(geometry.geometryObjects)
+        if "hand_e" not in item.name or "envelope" in item.name
+    ]
+    for number, (first, a) in enumerate(items):
+        for second, b in items[:number]:
+            apart = abs(a.parentJoint - b.parentJoint) > 1  # neighbours and one body touch by construction
+            if apart and frozenset((link_of(a.name), link_of(b.name))) not in watched:
+                geometry.addCollisionPair(pin.CollisionPair(second, first))
+    overlapping = {("left_link_5_0", "left_link_7_0")}
+    assert len(pair_names(geometry)) > 15
+
+    data, geometry_data = robot.model.createData(), geometry.createData()
+    random = np.random.default_rng(0)
+    for tick in range(1500):
+        q = random.uniform(robot.position_lower, robot.position_upper)
+        if tick % 2:
+            extreme = np.where(random.random(7) < 0.5, robot.position_lower, robot.position_upper)
+            q = np.where(random.random(7) < 0.6, extreme, q)
+        pin.computeDistances(robot.model, data, geometry, geometry_data, q)
+        for names, result in zip(pair_names(geometry), geometry_data.distanceResults, strict=True):
+            assert names in overlapping or result.min_distance > 0.005, (names, q)

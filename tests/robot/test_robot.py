@@ -1,0 +1,198 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from q2r2_control.errors import RobotError
+from q2r2_control.robot.compose import ComposedCell
+from q2r2_control.robot.pairs import link_of, pair_names
+from q2r2_control.robot.robot import Robot
+
+TOOLS = {"left": "left_tool_frame", "right": "right_tool_frame"}
+
+
+def _urdf(links: int = 3, limit: str = 'lower="-1" upper="1" velocity="1" effort="1"', kind: str = "revolute") -> str:
+    """A chain of links 0.3 m apart; each carries a sphere of 0.1 m."""
+    ball = '<collision><geometry><sphere radius="0.1"/></geometry></collision>'
+    return '<robot name="chain"><link name="l0"/>' + "".join(
+        f'<link name="l{n}">{ball}</link><joint name="j{n}" type="{kind}"><parent link="l{n - 1}"/>'
+        f'<child link="l{n}"/><origin xyz="0 0 0.3"/><axis xyz="0 1 0"/><limit {limit}/></joint>'
+        for n in range(1, links + 1)
+    ) + "</robot>"  # fmt: skip
+
+
+def test_arrays_follow_the_order_of_the_joint_names(dual_iiwa7: Robot) -> None:
+    robot = dual_iiwa7
+    assert robot.joint_names == tuple(f"{side}_A{number}" for side in ("left", "right") for number in range(1, 8))
+    assert robot.model.nq == robot.model.nv == 14
+    for values in (robot.home, robot.position_lower, robot.position_upper, robot.velocity_limit, robot.torque_limit):
+        assert values.shape == (14,)
+    assert robot.arms["left"].joints.tolist() == list(range(7))
+    assert robot.arms["right"].joints.tolist() == list(range(7, 14))
+    assert (robot.position_lower < robot.home).all()
+    assert (robot.home < robot.position_upper).all()
+
+
+def test_fingers_are_locked_open(dual_iiwa7: Robot) -> None:
+    assert not [name for name in dual_iiwa7.joint_names if "finger" in name]
+    finger = dual_iiwa7.model.frames[dual_iiwa7.model.getFrameId("left_hand_e_finger_1", pin.FrameType.BODY)]
+    tool = dual_iiwa7.model.frames[dual_iiwa7.arms["left"].frame_id]
+    assert (tool.placement.inverse() * finger.placement).translation[1] == pytest.approx(0.025)
+
+
+@pytest.mark.parametrize(("side", "sign"), [("left", 1), ("right", -1)])
+def test_at_home_the_tools_point_straight_down_mirrored_and_clear(dual_iiwa: Robot, side: str, sign: int) -> None:
+    pose = dual_iiwa.tool_pose(dual_iiwa.home, side)
+    np.testing.assert_allclose(pose.translation, [0.5, 0.25 * sign, 0.38], atol=2e-4)
+    np.testing.assert_allclose(pose.rotation, np.diag([-1.0, 1.0, -1.0]), atol=2e-4)
+    assert min(pair.distance for pair in dual_iiwa.distances(dual_iiwa.home)) > 0.1
+
+
+def test_a_pose_that_was_returned_does_not_change_with_the_next_one(dual_iiwa7: Robot) -> None:
+    first = dual_iiwa7.tool_pose(dual_iiwa7.home, "left")
+    kept = first.homogeneous.copy()
+    dual_iiwa7.tool_pose(np.zeros(14), "left")
+    np.testing.assert_array_equal(first.homogeneous, kept)
+
+
+def test_distances_name_the_pairs_in_their_order_and_turn_negative_in_penetration(dual_iiwa7: Robot) -> None:
+    pairs = dual_iiwa7.distances(dual_iiwa7.home)
+    assert tuple((pair.name_a, pair.name_b) for pair in pairs) == pair_names(dual_iiwa7.collision_model)
+    into_the_table = np.where(np.arange(14) % 7 == 1, 2.0, 0.0)
+    worst = min(dual_iiwa7.distances(into_the_table), key=lambda pair: pair.distance)
+    assert worst.distance < -0.01
+    assert "table_0" in (worst.name_a, worst.name_b)
+
+
+def test_the_urdf_it_carries_loads_to_the_same_robot(dual_iiwa7: Robot, dual_iiwa7_cell: ComposedCell) -> None:
+    again = Robot.from_urdf(dual_iiwa7.urdf, TOOLS, srdf=dual_iiwa7_cell.srdf)
+    assert again.name == "dual_iiwa7"
+    assert again.joint_names == dual_iiwa7.joint_names
+    assert pair_names(again.collision_model) == pair_names(dual_iiwa7.collision_model)
+    np.testing.assert_array_equal(again.model.armature, dual_iiwa7.model.armature)
+    np.testing.assert_allclose(
+        again.tool_pose(dual_iiwa7.home, "left").homogeneous,
+        dual_iiwa7.tool_pose(dual_iiwa7.home, "left").homogeneous,
+    )
+
+
+def test_files_load_like_their_text(tmp_path: Path) -> None:
+    (tmp_path / "chain.urdf").write_text(_urdf())
+    from_file = Robot.from_urdf(tmp_path / "chain.urdf", {"left": "l3"})
+    from_text = Robot.from_urdf("\n " + _urdf(), {"left": "l3"})
+    assert from_file.urdf == from_text.urdf
+
+
+def test_one_arm_of_two_may_be_left_out(dual_iiwa7_cell: ComposedCell) -> None:
+    robot = Robot.from_urdf(dual_iiwa7_cell.urdf, {"left": "left_tool_frame"}, srdf=dual_iiwa7_cell.srdf)
+    assert robot.joint_names == tuple(f"left_A{number}" for number in range(1, 8))
+    watched = {frozenset(map(link_of, names)) for names in pair_names(robot.collision_model)}
+    assert frozenset(("left_link_5", "right_link_5")) in watched
+
+
+def test_without_an_srdf_neighbours_and_what_touches_at_home_is_not_watched() -> None:
+    far = Robot.from_urdf(_urdf(4), {"left": "l4"})
+    assert pair_names(far.collision_model) == (("l1_0", "l3_0"), ("l1_0", "l4_0"), ("l2_0", "l4_0"))
+    fat = Robot.from_urdf(_urdf(4).replace('radius="0.1"', 'radius="0.31"'), {"left": "l4"})
+    assert pair_names(fat.collision_model) == (("l1_0", "l4_0"),)
+    assert fat.ignored_pairs == (("l1_0", "l3_0"), ("l2_0", "l4_0"))
+
+
+def test_without_an_srdf_an_arm_in_the_other_one_or_in_an_obstacle_at_home_is_still_watched() -> None:
+    arms = _urdf(3).replace("</robot>", "").replace('"l', '"a_l').replace('"j', '"a_j') + _urdf(3).replace(
+        '<robot name="chain">', ""
+    ).replace("</robot>", "")
+    post = '<link name="post"><collision><geometry><box size="0.1 0.1 2"/></geometry></collision></link>'
+    joints = "".join(
+        f'<joint name="to_{link}" type="fixed"><parent link="w"/><child link="{link}"/></joint>'
+        for link in ("l0", "a_l0", "post")
+    )
+    robot = Robot.from_urdf(f'{arms}<link name="w"/>{post}{joints}</robot>', {"left": "l3", "right": "a_l3"})
+    watched = set(map(frozenset, pair_names(robot.collision_model)))
+    assert {frozenset(("l3_0", "a_l3_0")), frozenset(("l3_0", "post_0")), frozenset(("l1_0", "post_0"))} <= watched
+
+
+def test_with_an_srdf_only_what_overlaps_everywhere_is_left_out() -> None:
+    """Links 1 and 3 are at most 0.6 m apart, and less at home, where the chain is bent."""
+    bent = _urdf(3).replace('xyz="0 0 0.3"', 'xyz="0 0 0.3" rpy="0 1 0"')
+    touching_at_home, touching_always = bent.replace("0.1", "0.28"), bent.replace("0.1", "0.301")
+    assert Robot.from_urdf(touching_at_home, {"left": "l3"}, srdf="<robot/>").ignored_pairs == ()
+    assert Robot.from_urdf(touching_at_home, {"left": "l3"}).ignored_pairs == (("l1_0", "l3_0"),)
+    assert Robot.from_urdf(touching_always, {"left": "l3"}, srdf="<robot/>").ignored_pairs == (("l1_0", "l3_0"),)
+
+
+@pytest.mark.parametrize(
+    ("urdf", "complaint"),
+    [
+        pytest.param(
+            _urdf(limit='lower="-1" upper="1" velocity="0" effort="1"'), "j1 has velocity limit 0", id="velocity zero"
+        ),
+        pytest.param(_urdf(limit='lower="-1" upper="1" effort="1"'), "joint j1 has velocity limit 0", id="no velocity"),
+        pytest.param(_urdf(limit='lower="-1" upper="1" velocity="inf" effort="1"'), "'inf'", id="velocity infinite"),
+        pytest.param(_urdf(limit='lower="-1" upper="1" velocity="1"'), "joint j1 has effort limit 0", id="no torque"),
+        pytest.param(_urdf(limit='lower="1" upper="-1" velocity="1" effort="1"'), "1 .. -1", id="limits swapped"),
+        pytest.param(_urdf(limit='velocity="1" effort="1"'), "expected lower < upper", id="no position limits"),
+        pytest.param(_urdf(kind="floating"), "joint j1 is floating", id="a floating joint in the arm"),
+        pytest.param(_urdf(kind="planar"), "joint j1 is planar", id="a planar joint in the arm"),
+        pytest.param(
+            _urdf().replace("<axis", '<mimic joint="j1"/><axis', 1), "joint j1 is mimic", id="a mimic joint in the arm"
+        ),
+        pytest.param("arm.urdf", "neither XML nor a file", id="a file that is not there"),
+        pytest.param("a\x00b", "neither XML nor a file", id="a name that cannot be a file"),
+        pytest.param("", "neither XML nor a file", id="nothing"),
+    ],
+)  # fmt: skip
+def test_a_robot_that_cannot_be_controlled_is_refused_in_one_line(urdf: str, complaint: str) -> None:
+    with pytest.raises(RobotError) as error:
+        Robot.from_urdf(urdf, {"left": "l3"})
+    assert complaint in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("arms", "complaint"),
+    [
+        ({}, "no arms"),
+        ({"left": "l9"}, "no link 'l9'; links: l0, l1"),
+        ({"left": "l0"}, "no movable joint carries l0"),
+    ],
+)
+def test_arms_that_the_urdf_does_not_have_are_refused(arms: dict[str, str], complaint: str) -> None:
+    with pytest.raises(RobotError, match=complaint):
+        Robot.from_urdf(_urdf(), arms)
+
+
+def test_an_endless_joint_is_bounded() -> None:
+    robot = Robot.from_urdf(_urdf(kind="continuous"), {"left": "l3"})
+    assert robot.model.nq == 3
+    np.testing.assert_allclose(robot.position_upper, 4 * np.pi)
+
+
+def test_two_pandas_load_with_seven_joints_each(dual_panda: Robot) -> None:
+    assert dual_panda.joint_names == tuple(
+        f"{side}_panda_joint{number}" for side in ("left", "right") for number in range(1, 8)
+    )
+    assert dual_panda.arms["right"].tool_frame == "right_panda_hand_tcp"
+    np.testing.assert_allclose(dual_panda.tool_pose(dual_panda.home, "left").translation[1], 0.4, atol=1e-3)
+
+
+def test_random_damage_to_the_text_never_ends_in_anything_but_a_robot_or_a_clear_refusal(
+    dual_iiwa7_cell: ComposedCell,
+) -> None:
+    random = np.random.default_rng(5)
+    urdf = dual_iiwa7_cell.urdf
+    places = [index for index, character in enumerate(urdf) if character == '"']
+    values = ["", "nan", "-1", "1e300", "1 2", "world", "left_link_3", "0x10"]
+    for _ in range(40):
+        begin = places[2 * int(random.integers(len(places) // 2))]
+        end = urdf.index('"', begin + 1)
+        damaged = urdf[: begin + 1] + str(random.choice(values)) + urdf[end:]
+        try:
+            robot = Robot.from_urdf(damaged, TOOLS, srdf=dual_iiwa7_cell.srdf)
+        except RobotError:
+            continue
+        assert np.isfinite(robot.tool_pose(robot.home, "left").homogeneous).all()
+        assert np.isfinite([pair.distance for pair in robot.distances(robot.home)]).all()
