@@ -29,6 +29,10 @@ _MIN_ARMATURE, _MIN_DAMPING = 0.1, 0.2
 # Rubber on a box: sliding 1, and torsion [m] and rolling [m] of a pad of about a square centimetre.
 _PAD_FRICTION = (1.0, 0.02, 0.001)
 
+# Time constant [s] and damping ratio of a finger's contacts: MuJoCo scales their stiffness with the inertia behind
+# them, which is small in a finger, and with its usual 0.02 s the grip would sink millimetres into what it holds.
+_PAD_STIFFNESS = (0.004, 1.0)
+
 # A finger servo gives its full force at this part of the stroke.
 _FINGER_SERVO_BAND = 0.05
 
@@ -90,6 +94,8 @@ def _set_shapes(spec: mujoco.MjSpec, capsules: set[str]) -> None:
     for body in spec.bodies:
         drawn = any(not geom.contype for geom in body.geoms)
         for geom in body.geoms:
+            # In a URDF shapes weigh nothing; without this, links that name no mass would get one from their shapes.
+            geom.mass = 0.0
             if geom.name in capsules:
                 geom.type = mujoco.mjtGeom.mjGEOM_CAPSULE
             if not geom.contype:
@@ -124,7 +130,8 @@ def _set_grippers(spec: mujoco.MjSpec, config: Config) -> None:
             servo.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE
             servo.forcerange = (-gripper.force, gripper.force)
             for geom in spec.joint(name).parent.geoms:
-                geom.condim, geom.friction = 4, _PAD_FRICTION
+                geom.condim, geom.friction, geom.solref = 4, _PAD_FRICTION, _PAD_STIFFNESS
+                geom.priority = 1
         for name in names[1:]:
             coupling = spec.add_equality(name=f"{name}_coupling", name1=name, name2=names[0])
             coupling.type, coupling.objtype = mujoco.mjtEq.mjEQ_JOINT, mujoco.mjtObj.mjOBJ_JOINT

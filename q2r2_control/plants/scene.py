@@ -16,12 +16,13 @@ def furnish(spec: mujoco.MjSpec) -> None:
     spec.visual.headlight.ambient = (0.25, 0.25, 0.25)
     spec.visual.headlight.diffuse = (0.25, 0.25, 0.25)
     spec.visual.headlight.specular = (0.0, 0.0, 0.0)
-    spec.visual.quality.shadowsize = 4096
+    spec.visual.quality.shadowsize = 8192
+    spec.visual.map.shadowclip = 2.0
     spec.visual.quality.offsamples = 8
     # Large enough for any picture that is asked for.
     spec.visual.global_.offwidth, spec.visual.global_.offheight = 3840, 2160
     spec.visual.global_.azimuth, spec.visual.global_.elevation = 145, -22
-    spec.stat.center, spec.stat.extent = (0.35, 0.0, 0.45), 1.6
+    spec.stat.center, spec.stat.extent = (0.4, 0.0, 0.4), 1.6
 
 
 def _add_sky(spec: mujoco.MjSpec) -> None:
@@ -41,14 +42,14 @@ def _add_floor(spec: mujoco.MjSpec) -> None:
         name="tiles",
         type=mujoco.mjtTexture.mjTEXTURE_2D,
         builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
-        rgb1=(0.72, 0.74, 0.76),
-        rgb2=(0.66, 0.68, 0.71),
+        rgb1=(0.80, 0.81, 0.82),
+        rgb2=(0.77, 0.78, 0.80),
         mark=mujoco.mjtMark.mjMARK_EDGE,
-        markrgb=(0.60, 0.62, 0.65),
+        markrgb=(0.70, 0.71, 0.73),
         width=512,
         height=512,
     )
-    material = spec.add_material(name="floor", texrepeat=(1, 1), texuniform=True, reflectance=0.08)
+    material = spec.add_material(name="floor", texrepeat=(1, 1), texuniform=True)
     material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "tiles"
     spec.worldbody.add_geom(
         name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=(0, 0, 0.5), material="floor", group=VISUAL_GROUP

@@ -1,0 +1,96 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from q2r2_control.config import Config
+from q2r2_control.errors import PlantError
+from q2r2_control.plants.base import Plant
+from q2r2_control.plants.kinematic import KinematicPlant
+from q2r2_control.robot.robot import Robot
+from q2r2_control.types import CommandMode
+from tests.plants.conftest import hold
+
+
+@pytest.fixture
+def plant(robot: Robot, config: Config) -> KinematicPlant:
+    return KinematicPlant(robot, config)
+
+
+def test_it_is_a_plant(plant: KinematicPlant) -> None:
+    assert isinstance(plant, Plant)
+
+
+def test_it_stands_at_home_with_open_grippers_until_told_otherwise(plant: KinematicPlant, robot: Robot) -> None:
+    plant.advance(0.5)
+    state = plant.state()
+    np.testing.assert_array_equal(state.q, robot.home)
+    np.testing.assert_array_equal(state.v, 0)
+    assert plant.gripper_openings() == {"left": 1.0, "right": 1.0}
+
+
+def test_it_is_exactly_where_the_command_says_at_the_end_of_the_tick(plant: KinematicPlant, robot: Robot) -> None:
+    command = replace(hold(robot.home + 0.1), v=np.full(14, 0.3))
+    plant.apply(command)
+    np.testing.assert_array_equal(plant.state().q, robot.home)
+    plant.advance(0.001)
+    np.testing.assert_array_equal(plant.state().q, command.q)
+    np.testing.assert_array_equal(plant.state().v, command.v)
+
+
+def test_without_a_newer_command_it_rests_where_it_is(plant: KinematicPlant, robot: Robot) -> None:
+    plant.apply(replace(hold(robot.home + 0.1), v=np.full(14, 0.3)))
+    plant.advance(0.001)
+    plant.advance(0.001)
+    np.testing.assert_array_equal(plant.state().q, robot.home + 0.1)
+    np.testing.assert_array_equal(plant.state().v, 0)
+
+
+def test_changing_the_array_of_a_command_afterwards_changes_nothing(plant: KinematicPlant, robot: Robot) -> None:
+    q = robot.home + 0.1
+    plant.apply(hold(q))
+    q[:] = 99
+    plant.advance(0.001)
+    np.testing.assert_array_equal(plant.state().q, robot.home + 0.1)
+
+
+@pytest.mark.parametrize("dt", [0.001, 0.0037, 0.02])
+def test_a_gripper_closes_at_its_speed_whatever_the_tick(plant: KinematicPlant, robot: Robot, dt: float) -> None:
+    plant.apply(hold(robot.home, left=0.0))
+    while plant.state().stamp < 0.1:
+        plant.advance(dt)
+    # 0.1 m/s over a stroke of 0.025 m.
+    assert plant.gripper_openings()["left"] == pytest.approx(1 - 4 * plant.state().stamp, abs=1e-9)
+    for _ in range(100):
+        plant.advance(dt)
+    while plant.state().stamp < 0.3:
+        plant.advance(dt)
+    assert plant.gripper_openings() == {"left": 0.0, "right": 1.0}
+
+
+def test_reset_forgets_command_time_and_grippers(plant: KinematicPlant, robot: Robot) -> None:
+    plant.apply(hold(robot.home + 0.1, left=0.0))
+    plant.advance(0.1)
+    plant.apply(hold(robot.home + 0.2))
+    plant.reset(robot.home - 0.1)
+    plant.advance(0.0)
+    assert plant.state().stamp == 0
+    plant.advance(0.25)
+    np.testing.assert_array_equal(plant.state().q, robot.home - 0.1)
+    assert plant.gripper_openings() == {"left": 1.0, "right": 1.0}
+
+
+def test_torque_mode_is_refused_with_what_is_allowed(plant: KinematicPlant, robot: Robot) -> None:
+    with pytest.raises(PlantError, match=r"torque.*follows position commands only"):
+        plant.apply(replace(hold(robot.home), mode=CommandMode.TORQUE))
+
+
+@pytest.mark.parametrize("dt", [float("nan"), float("inf"), -0.001, 1.5])
+def test_an_impossible_time_is_refused_and_nothing_moves(plant: KinematicPlant, robot: Robot, dt: float) -> None:
+    plant.apply(hold(robot.home + 0.1))
+    with pytest.raises(PlantError, match=r"allowed: 0 \.\. 1 s"):
+        plant.advance(dt)
+    np.testing.assert_array_equal(plant.state().q, robot.home)
+    assert plant.state().stamp == 0

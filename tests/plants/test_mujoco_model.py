@@ -1,0 +1,131 @@
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+
+import mujoco
+import numpy as np
+import pytest
+
+from q2r2_control.config import Config, MujocoConfig, ObjectConfig
+from q2r2_control.errors import PlantError
+from q2r2_control.plants.mujoco import MujocoPlant
+from q2r2_control.plants.mujoco_model import build_model
+from q2r2_control.robot.robot import Robot
+
+
+@pytest.fixture(scope="module")
+def urdf(robot: Robot) -> ET.Element:
+    return ET.fromstring(robot.urdf)
+
+
+def _pairs_in_contact(plant: MujocoPlant) -> set[frozenset[str]]:
+    return {
+        frozenset(plant.model.geom(geom).name for geom in (contact.geom1, contact.geom2))
+        for contact in plant.data.contact
+    }
+
+
+def test_every_link_weighs_what_the_urdf_says(plant: MujocoPlant, urdf: ET.Element) -> None:
+    for link in urdf.findall("link"):
+        if link.get("name") != "world":
+            mass = link.find("inertial/mass")
+            expected = 0.0 if mass is None else float(mass.get("value", "0"))
+            assert plant.model.body(link.get("name")).mass[0] == pytest.approx(expected)
+
+
+def test_joint_space_inertia_and_gravity_equal_the_controllers_model(plant: MujocoPlant, robot: Robot) -> None:
+    import pinocchio as pin
+
+    inertia = np.zeros((plant.model.nv, plant.model.nv))
+    mujoco.mj_fullM(plant.model, plant.data, inertia)
+    index = [plant.model.joint(name).dofadr[0] for name in robot.joint_names]
+    data = robot.model.createData()
+    expected = pin.crba(robot.model, data, robot.home)
+    expected = np.triu(expected) + np.triu(expected, 1).T
+    np.testing.assert_allclose(inertia[np.ix_(index, index)], expected, atol=1e-6)
+    gravity = pin.computeGeneralizedGravity(robot.model, data, robot.home)
+    np.testing.assert_allclose(plant.data.qfrc_bias[index], gravity, atol=1e-5)
+
+
+def test_armature_is_rotor_inertia_times_gear_squared(plant: MujocoPlant, urdf: ET.Element, robot: Robot) -> None:
+    for name in robot.joint_names:
+        rotor = urdf.find(f"joint[@name='{name}']/rotor")
+        assert rotor is not None
+        expected = float(rotor.get("inertia", "0")) * float(rotor.get("gear", "0")) ** 2
+        assert plant.model.joint(name).armature[0] == pytest.approx(expected)
+
+
+def test_joint_and_torque_limits_are_the_robots(plant: MujocoPlant, robot: Robot) -> None:
+    for index, name in enumerate(robot.joint_names):
+        np.testing.assert_allclose(
+            plant.model.joint(name).range, (robot.position_lower[index], robot.position_upper[index])
+        )
+        np.testing.assert_allclose(
+            plant.model.actuator(name).forcerange, (-robot.torque_limit[index], robot.torque_limit[index])
+        )
+
+
+def test_capsules_are_capsules_of_the_urdfs_size(plant: MujocoPlant, urdf: ET.Element) -> None:
+    declared = {capsule.get("name") for capsule in urdf.iterfind("link/collision_checking/capsule")}
+    assert len(declared) == 2 * 9
+    for collision in urdf.iterfind("link/collision"):
+        if collision.get("name") not in declared:
+            continue
+        cylinder = collision.find("geometry/cylinder")
+        assert cylinder is not None
+        geom = plant.model.geom(collision.get("name"))
+        assert geom.type[0] == mujoco.mjtGeom.mjGEOM_CAPSULE
+        np.testing.assert_allclose(
+            geom.size[:2], (float(cylinder.get("radius", "0")), float(cylinder.get("length", "0")) / 2)
+        )
+
+
+def test_drawings_and_envelopes_touch_nothing_and_fingers_do(plant: MujocoPlant) -> None:
+    names = {plant.model.geom(index).name for index in range(plant.model.ngeom)}
+    assert {"left_link_3_ring", "left_hand_e_fingers_envelope", "right_hand_e_finger_2_contact"} <= names
+    for name in names:
+        geom = plant.model.geom(name)
+        if name.endswith("_envelope") or ("_link_" in name and not name.endswith(("_capsule", "_sphere"))):
+            assert (geom.contype[0], geom.conaffinity[0]) == (0, 0), name
+    finger = plant.model.geom("left_hand_e_finger_1_contact")
+    assert finger.contype[0] == 1
+    assert finger.condim[0] >= 4
+    assert finger.friction[0] >= 0.8
+
+
+def test_only_the_blocks_on_the_table_are_in_contact_at_home(plant: MujocoPlant, config: Config) -> None:
+    plant.advance(0.5)
+    assert _pairs_in_contact(plant) <= {frozenset((name, "table_collision")) for name in config.mujoco.objects}
+
+
+@pytest.mark.parametrize(
+    ("q", "prefixes"),
+    [
+        pytest.param([0.0, 1.9, 0.0, -0.3, 0.0, 0.5, 0.0] * 2, {"left", "table"}, id="an arm and the table"),
+        pytest.param(
+            [-1.57, 0.9, 0, -0.5, 0, 0.5, 0, 1.57, 0.9, 0, -0.5, 0, 0.5, 0], {"left", "right"}, id="both arms"
+        ),
+        pytest.param([0, -1.2, 0, 2.0, 0, -1.5, 0] + [0] * 7, {"left"}, id="an arm and itself"),
+    ],
+)
+def test_what_really_can_meet_collides(plant: MujocoPlant, q: list[float], prefixes: set[str]) -> None:
+    plant.reset(np.array(q, dtype=float))
+    assert prefixes in [{name.split("_")[0] for name in pair} for pair in _pairs_in_contact(plant)]
+
+
+def test_neighbours_never_touch_anywhere_in_the_joint_range(plant: MujocoPlant, robot: Robot) -> None:
+    rng = np.random.default_rng(7)
+    for _ in range(200):
+        plant.reset(rng.uniform(robot.position_lower, robot.position_upper))
+        for pair in _pairs_in_contact(plant):
+            links = [name.split("_link_") for name in pair if "_link_" in name]
+            if len(links) == 2 and links[0][0] == links[1][0]:
+                first, second = (int(link[1][0]) for link in links)
+                assert abs(first - second) > 1, pair
+
+
+def test_an_object_named_like_a_part_of_the_robot_is_refused(robot: Robot, config: Config) -> None:
+    thing = ObjectConfig(size=(0.04, 0.04, 0.04), position=(0.5, 0.0, 0.3))
+    clashing = config.model_copy(update={"mujoco": MujocoConfig(objects={"table": thing})})
+    with pytest.raises(PlantError, match=r"dual_iiwa7: MuJoCo cannot make a model of it: .*table"):
+        build_model(robot, clashing)
