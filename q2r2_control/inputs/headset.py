@@ -12,20 +12,19 @@ from collections.abc import Callable
 from contextlib import suppress
 
 from q2r2_control.errors import InputError, ProtocolError
-from q2r2_control.inputs.farewell import Farewells
 from q2r2_control.inputs.framing import FrameDecoder
 from q2r2_control.inputs.messages import warm_up
 from q2r2_control.inputs.samples import HandTracker, SampleQueue
-from q2r2_control.inputs.session import HeadsetSession, Reception
+from q2r2_control.inputs.session import HeadsetSession, Reception, log_frame
 from q2r2_control.inputs.statistics import HeadsetStatistics, TopicRecorder
 from q2r2_control.types import SIDES, HandSample, HapticFeedback
 
 KEEPALIVE_AFTER = 1.0  # of own silence [s]
 SILENCE_ALLOWED = 2.0  # without a whole frame [s]; the app sends a keepalive after 1 s
-MAX_FRAMES_PER_SECOND = 5000  # the app sends about 450; more would take processor time from the control loop
+MAX_FRAMES_PER_SECOND = 2000  # the app sends about 450; more would take processor time from the control loop
 MAX_HOSTS_NAMED = 8  # in the log as refused while one headset drives
 _TURN = 0.05  # longest wait for the network; timeouts are looked at this often [s]
-_RECEIVE_BYTES = 1 << 16
+_RECEIVE_BYTES = 1 << 12  # some 40 messages: the control loop gets the interpreter between two such portions
 
 _LOG = logging.getLogger(__name__)
 
@@ -70,7 +69,6 @@ class HeadsetServer:
         self._selector = selectors.DefaultSelector()
         self._selector.register(self._listener, selectors.EVENT_READ, self._accept)
         self._selector.register(self._waiter, selectors.EVENT_READ, self._drain_waiter)
-        self._farewells = Farewells(self._selector)
         self._stop.clear()
         self._thread = threading.Thread(target=self._run, name="headset", daemon=True)
         self._thread.start()
@@ -146,7 +144,6 @@ class HeadsetServer:
                     self._disconnect("unexpected fault of the server")
                 time.sleep(_TURN)
         self._disconnect("server closed")
-        self._farewells.close()
         for open_socket in (self._listener, self._waker, self._waiter):
             open_socket.close()
         self._selector.close()
@@ -158,7 +155,6 @@ class HeadsetServer:
         now = self._clock()
         if self._client is not None:
             self._attend(self._client, now)
-        self._farewells.expire(now)
 
     def _drain_waiter(self) -> None:
         self._waiter.recv(_RECEIVE_BYTES)
@@ -179,7 +175,7 @@ class HeadsetServer:
             if address[0] not in driving.refused_hosts and len(driving.refused_hosts) < MAX_HOSTS_NAMED:
                 driving.refused_hosts.add(address[0])
                 _LOG.warning("headset %s refused: %s drives", peer, driving.peer)
-            self._farewells.dismiss(connection, f"refused: {driving.peer} drives", self._clock())
+            _dismiss(connection, f"refused: {driving.peer} drives")
             return
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         client = _Client(connection, peer, self._clock())
@@ -268,8 +264,14 @@ class HeadsetServer:
             self._last_disconnect = reason
         self._selector.unregister(client.socket)
         # Behind half a frame the text could not be read.
-        text = None if client.session.outgoing else f"dropped: {reason}"
-        self._farewells.dismiss(client.socket, text, self._clock())
+        _dismiss(client.socket, None if client.session.outgoing else f"dropped: {reason}")
+
+
+def _dismiss(connection: socket.socket, text: str | None) -> None:
+    """Close, with a last word for the app's console where the network takes it at once."""
+    with connection, suppress(OSError):
+        if text is not None:
+            connection.send(log_frame("error", text))
 
 
 class _Client:
