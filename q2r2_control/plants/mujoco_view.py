@@ -18,10 +18,10 @@ from q2r2_control.plants.scene import COLLISION_GROUP
 class Camera:
     """Where a picture is taken from: ``distance`` [m] away from ``target`` (world, [m]), angles in degrees."""
 
-    target: tuple[float, float, float] = (0.4, 0.0, 0.38)
-    distance: float = 2.2
-    azimuth: float = 150.0  # direction of sight in the x-y plane, counted from x
-    elevation: float = -18.0  # negative looks down
+    target: tuple[float, float, float] = (0.42, 0.0, 0.34)
+    distance: float = 2.3
+    azimuth: float = 145.0  # direction of sight in the x-y plane, counted from x
+    elevation: float = -20.0  # negative looks down
 
 
 class Window:

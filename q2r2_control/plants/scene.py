@@ -17,11 +17,10 @@ def furnish(spec: mujoco.MjSpec) -> None:
     spec.visual.headlight.diffuse = (0.25, 0.25, 0.25)
     spec.visual.headlight.specular = (0.0, 0.0, 0.0)
     spec.visual.quality.shadowsize = 8192
-    spec.visual.map.shadowclip = 2.0
     spec.visual.quality.offsamples = 8
     # Large enough for any picture that is asked for.
     spec.visual.global_.offwidth, spec.visual.global_.offheight = 3840, 2160
-    spec.visual.global_.azimuth, spec.visual.global_.elevation = 145, -22
+    spec.visual.global_.azimuth, spec.visual.global_.elevation = 145, -20
     spec.stat.center, spec.stat.extent = (0.4, 0.0, 0.4), 1.6
 
 
@@ -57,18 +56,21 @@ def _add_floor(spec: mujoco.MjSpec) -> None:
 
 
 def _add_lights(spec: mujoco.MjSpec) -> None:
-    directional = mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
+    """A lamp overhead that casts shadows, and a weak light from all over the other side that does not."""
     spec.worldbody.add_light(
-        name="key",
-        type=directional,
-        pos=(1.5, 1.5, 3),
-        dir=(-0.4, -0.45, -1),
-        diffuse=(0.55, 0.55, 0.53),
+        name="lamp",
+        type=mujoco.mjtLightType.mjLIGHT_SPOT,
+        pos=(1.6, 1.4, 3.6),
+        dir=(-1.2, -1.4, -3.4),
+        cutoff=60,
+        exponent=2,
+        diffuse=(0.65, 0.65, 0.63),
+        specular=(0.2, 0.2, 0.2),
         castshadow=True,
     )
     spec.worldbody.add_light(
         name="fill",
-        type=directional,
+        type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
         pos=(1, -2, 2.5),
         dir=(-0.3, 0.8, -0.7),
         diffuse=(0.2, 0.21, 0.24),

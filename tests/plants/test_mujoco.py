@@ -325,3 +325,13 @@ def test_a_window_without_a_display_is_refused_with_the_reason(
     with pytest.raises(PlantError, match="needs a display"):
         plant.launch_viewer()
     assert plant.viewer_sync() is False
+
+
+def test_a_block_that_lies_still_moves_when_an_arm_runs_into_it(robot: Robot, grasping_config: Config) -> None:
+    plant = MujocoPlant(robot, grasping_config)
+    plant.advance(1.0)
+    before = plant.data.body("block").xpos.copy()
+    for command in tool_motion(robot, "left", np.array([0.0, 0.1, 0.0]), 0.6, DT, robot.home):
+        plant.apply(command)
+        plant.advance(DT)
+    assert plant.data.body("block").xpos[1] - before[1] > 0.02
