@@ -39,29 +39,31 @@ class Interpolator:
 
     def add(self, pose: pin.SE3, stamp: float, now: float) -> None:
         """Append a sample received at ``stamp`` <= ``now`` [s]; ``reset`` has to come first."""
-        playhead = now - self.delay
-        here = self.at(now)
-        if len(self._knots) > 1 and stamp - self._knots[-1][0] < _MIN_SPACING:
+        while len(self._knots) > 1 and stamp - self._knots[-1][0] < _MIN_SPACING:
             self._knots.pop()
-        while self._knots and self._knots[0][0] <= playhead:
-            self._knots.popleft()
-        # Lines already begun start anew from where the output is, so a merged or late sample cannot make it step.
-        self._knots.appendleft((playhead, here))
-        self._knots.append((max(stamp, self._knots[-1][0] + _MIN_SPACING), pose))
+        # In time there is the whole delay to get there; a late sample is not raced to.
+        earliest = self._knots[0][0] + max(self.delay / 2.0, _MIN_SPACING)
+        self._knots.append((max(stamp, earliest), pose))
 
     def at(self, now: float) -> pin.SE3:
-        """The pose played back at ``now`` [s]."""
+        """The pose played back at ``now`` [s], which never goes back."""
         playhead = now - self.delay
         while len(self._knots) > 1 and self._knots[1][0] <= playhead:
             self._knots.popleft()
         start, first = self._knots[0]
-        if len(self._knots) == 1 or playhead <= start:
-            return first
-        end, second = self._knots[1]
-        fraction = (playhead - start) / (end - start)
-        position = first.translation + fraction * (second.translation - first.translation)
-        turn = pin.log3(second.rotation @ first.rotation.T)
-        return pin.SE3(pin.exp3(fraction * turn) @ first.rotation, position)
+        if len(self._knots) > 1:
+            end, second = self._knots[1]
+            first = _between(first, second, (playhead - start) / (end - start))
+        # What was played is where the next line starts, so a sample that replaces another cannot make the output step.
+        self._knots[0] = (playhead, first)
+        return first
+
+
+def _between(first: pin.SE3, second: pin.SE3, fraction: float) -> pin.SE3:
+    """Straight in position, by one rotation about a fixed axis in orientation."""
+    position = first.translation + fraction * (second.translation - first.translation)
+    turn = pin.log3(second.rotation @ first.rotation.T)
+    return pin.SE3(pin.exp3(fraction * turn) @ first.rotation, position)
 
 
 class OneEuro:

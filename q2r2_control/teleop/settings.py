@@ -32,7 +32,7 @@ class FilterSettings(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
-    interpolation_delay: float = Field(0.02, ge=0, le=0.2, description="1.5 periods of a 75 Hz headset [s]")
+    interpolation_delay: float = Field(0.02, ge=0.005, le=0.2, description="1.5 periods of a 75 Hz headset [s]")
     smoothing_delay: float = Field(0.025, ge=0, le=0.2, description="of a motion at constant speed [s]")
     min_cutoff: float = Field(1.5, gt=0, le=100, description="cutoff frequency at rest; tremor is 8-12 Hz [Hz]")
     beta: float = Field(10.0, ge=0, le=1000, description="cutoff added per speed [Hz s/m]")

@@ -1,0 +1,108 @@
+"""An operator for the teleop tests: two hands, a loop, and arms that stay where they are."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import pinocchio as pin
+
+from q2r2_control.teleop.settings import TeleopSettings
+from q2r2_control.teleop.teleop import Teleop
+from q2r2_control.types import SIDES, ArmTarget, Event, HandInputs, HandSample
+
+TICK = 0.001
+PERIOD = 0.013  # of the hands' samples [s]
+
+
+def pose(x: float = 0.0, y: float = 0.0, z: float = 0.0, turn: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> pin.SE3:
+    return pin.SE3(pin.exp3(np.array(turn)), np.array([x, y, z]))
+
+
+def sample(
+    hand: str, hand_pose: pin.SE3, stamp: float, *, lower: bool = False, upper: bool = False, sign: float = 1.0
+) -> HandSample:
+    quaternion = sign * pin.Quaternion(hand_pose.rotation).coeffs()
+    inputs = HandInputs(button_upper=upper, button_lower=lower)
+    return HandSample(hand, hand_pose.translation.copy(), quaternion, stamp, inputs, stamp)
+
+
+@dataclass
+class Operator:
+    """Feeds a :class:`Teleop` at 1 kHz with both hands' samples at about 77 Hz; records every target."""
+
+    settings: TeleopSettings = field(default_factory=TeleopSettings)
+    arms: tuple[str, ...] = SIDES
+    now: float = 10.0
+    hands: dict[str, pin.SE3] = field(
+        default_factory=lambda: {"left": pose(0.3, 0.2, 1.0), "right": pose(0.3, -0.2, 1.0)}
+    )
+    tools: dict[str, pin.SE3] = field(
+        default_factory=lambda: {
+            "left": pose(0.5, 0.4, 0.4, (np.pi, 0.0, 0.0)),
+            "right": pose(0.5, -0.4, 0.4, (0.0, 3.0, 0.3)),
+        }
+    )
+    commanded: dict[str, pin.SE3] | None = None
+    lower: set[str] = field(default_factory=set)  # hands that hold the button
+    upper: set[str] = field(default_factory=set)
+    silent: set[str] = field(default_factory=set)  # hands that send nothing
+    alter: Callable[[HandSample], HandSample] = lambda received: received
+    events: list[Event] = field(default_factory=list)
+    targets: dict[str, ArmTarget] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.teleop = Teleop(self.settings, self.arms)
+        self._next_sample = self.now
+
+    def samples(self) -> list[HandSample]:
+        """What both hands send now."""
+        return [
+            self.alter(sample(hand, self.hands[hand], self.now, lower=hand in self.lower, upper=hand in self.upper))
+            for hand in SIDES
+            if hand not in self.silent
+        ]
+
+    def tick(self, samples: list[HandSample] | None = None, dt: float = TICK) -> dict[str, ArmTarget]:
+        self.now += dt
+        if samples is None:
+            samples = []
+            if self.now >= self._next_sample - 1e-9:
+                samples = self.samples()
+                self._next_sample = self.now + PERIOD
+        self.targets = self.teleop.update(samples, self.tools, self.now, self.commanded)
+        self.events += self.teleop.take_events()
+        return self.targets
+
+    def run(
+        self, duration: float, move: Callable[[float], dict[str, pin.SE3]] | None = None
+    ) -> list[dict[str, ArmTarget]]:
+        """Ticks for ``duration``; ``move`` gives the hands' poses over the time since the call."""
+        start, history = self.now, []
+        while self.now < start + duration - TICK / 2:
+            if move is not None:
+                self.hands = {**self.hands, **move(self.now + TICK - start)}
+            history.append(self.tick())
+        return history
+
+    def press(self, *hands: str, button: str = "lower") -> None:
+        """A press of 0.15 s, after which the button rests for 0.1 s."""
+        held = self.lower if button == "lower" else self.upper
+        held.update(hands)
+        self.run(0.15)
+        held.difference_update(hands)
+        self.run(0.1)
+
+    def engage(self, *hands: str) -> None:
+        self.run(0.05)
+        self.press(*(hands or SIDES))
+
+    @property
+    def states(self) -> dict[str, str]:
+        return {arm: str(state) for arm, state in self.teleop.states.items()}
+
+
+def spoilt(received: HandSample, **changes: object) -> HandSample:
+    """The sample with some of its fields replaced by what they should never hold."""
+    return replace(received, **changes)  # type: ignore[arg-type]

@@ -1,0 +1,165 @@
+"""Filters: the stated delay, the tremor, and what a hostile stream may not do."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import numpy.typing as npt
+import pinocchio as pin
+import pytest
+
+from q2r2_control.teleop.filters import PoseFilter
+from q2r2_control.teleop.settings import FilterSettings
+from tests.teleop.hands import pose
+
+Path = Callable[[float], pin.SE3]
+STILL = pose(0.1, 0.2, 0.3, (0.4, 0.5, 0.6))
+
+
+def follow(path: Path, duration: float = 3.0, dt: float = 0.002, period: float = 1 / 75) -> tuple[float, list[pin.SE3]]:
+    """The filter's delay and its output at every tick."""
+    pose_filter = PoseFilter(FilterSettings())
+    pose_filter.reset(path(0.0), 0.0)
+    due, outputs = period, []
+    for tick in range(round(duration / dt)):
+        now = tick * dt
+        while due <= now:
+            pose_filter.add(path(due), due, now)
+            due += period
+        outputs.append(pose_filter.at(now))
+    return pose_filter.delay, outputs
+
+
+def errors(path: Path, since: float, dt: float = 0.002, **options: float) -> tuple[float, float]:
+    """RMS distance [m] and angle [rad] from the path shifted by the stated delay, at every tick from ``since`` on."""
+    delay, outputs = follow(path, dt=dt, **options)
+    distances, angles = [], []
+    for tick, output in enumerate(outputs):
+        if tick * dt >= since:
+            ideal = path(tick * dt - delay)
+            distances.append(np.linalg.norm(output.translation - ideal.translation))
+            angles.append(np.linalg.norm(pin.log3(ideal.rotation.T @ output.rotation)))
+    return math.sqrt(np.mean(np.square(distances))), math.sqrt(np.mean(np.square(angles)))
+
+
+@pytest.mark.parametrize("dt", [0.001, 0.005, 0.02], ids="loop of {} s".format)
+@pytest.mark.parametrize("speed", [0.02, 0.1, 0.5, 2.0], ids="{} per second".format)
+def test_a_steady_motion_comes_out_late_by_exactly_the_stated_delay_at_any_speed(speed: float, dt: float) -> None:
+    def path(t: float) -> pin.SE3:
+        return pose(speed * t, 0.0, 0.0, (0.0, 0.0, speed * t))
+
+    distance, angle = errors(path, since=2.0, dt=dt)
+    tolerance = 1e-3  # [s]
+    assert distance < speed * tolerance
+    assert angle < speed * tolerance
+
+
+def test_the_default_delay_is_below_50_milliseconds() -> None:
+    assert 0.0 < PoseFilter(FilterSettings()).delay <= 0.05
+
+
+@pytest.mark.parametrize("frequency", [0.25, 0.5], ids="{} Hz".format)
+def test_a_circle_keeps_its_shape_to_a_millimetre(frequency: float) -> None:
+    def path(t: float) -> pin.SE3:
+        phase = 2 * math.pi * frequency * t
+        return pose(0.0, 0.1 * math.sin(phase), 0.1 * (1 - math.cos(phase)))
+
+    assert errors(path, since=0.7)[0] < 1e-3
+
+
+@pytest.mark.parametrize("frequency", [0.25, 0.5], ids="{} Hz".format)
+def test_a_rotation_of_30_degrees_keeps_its_shape_to_half_a_degree(frequency: float) -> None:
+    def path(t: float) -> pin.SE3:
+        return pose(turn=(0.0, math.radians(30) * math.sin(2 * math.pi * frequency * t), 0.0))
+
+    assert math.degrees(errors(path, since=0.5)[1]) < 0.5
+
+
+@pytest.mark.parametrize("frequency", [8.0, 10.0, 12.0], ids="{} Hz".format)
+def test_tremor_of_a_resting_hand_is_reduced_to_less_than_two_fifths(frequency: float) -> None:
+    def path(t: float) -> pin.SE3:
+        wave = math.sin(2 * math.pi * frequency * t)
+        return pose(0.001 * wave, 0.0, 0.0, (0.0, math.radians(0.3) * wave, 0.0))
+
+    _, outputs = follow(path)
+    rest = outputs[500:]
+    assert max(abs(output.translation[0]) for output in rest) < 0.4e-3
+    assert max(abs(pin.log3(output.rotation)[1]) for output in rest) < math.radians(0.4 * 0.3)
+
+
+def test_a_hand_that_stops_dead_is_overshot_by_less_than_the_lead_can_be() -> None:
+    def path(t: float) -> pin.SE3:
+        return pose(0.3 * min(t, 1.0))
+
+    _, outputs = follow(path)
+    assert max(output.translation[0] for output in outputs) - 0.3 < 1 / (2 * math.pi * FilterSettings().beta)
+    assert outputs[-1].translation[0] == pytest.approx(0.3, abs=1e-5)
+
+
+def test_the_output_moves_in_every_tick_although_samples_come_every_thirteenth() -> None:
+    """The controller follows the target's velocity, so steps at the sampling rate would be felt."""
+
+    def path(t: float) -> pin.SE3:
+        return pose(0.2 * t)
+
+    _, outputs = follow(path, dt=0.001)
+    speeds = np.diff([output.translation[0] for output in outputs[2000:]]) / 0.001
+    np.testing.assert_allclose(speeds, 0.2, rtol=0.02)
+
+
+def test_a_reset_filter_rests_at_its_pose_whatever_went_before() -> None:
+    pose_filter = PoseFilter(FilterSettings())
+    pose_filter.reset(pose(), 0.0)
+    for tick in range(100):
+        pose_filter.add(pose(0.01 * tick, turn=(0.02 * tick, 0, 0)), tick * 0.013, tick * 0.013)
+        pose_filter.at(tick * 0.013)
+    pose_filter.reset(STILL, 1.3)
+    for tick in range(200):
+        np.testing.assert_allclose(pose_filter.at(1.3 + 0.001 * tick).homogeneous, STILL.homogeneous, atol=1e-12)
+
+
+def largest_step(arrivals: list[tuple[float, list[tuple[float, float]]]]) -> float:
+    """Largest step of the output in 1 ms, for samples (stamp, x) that arrive at given times."""
+    pose_filter = PoseFilter(FilterSettings())
+    pose_filter.reset(pose(), 0.0)
+    outputs: list[float] = []
+    queue = list(arrivals)
+    for tick in range(2000):
+        now = tick * 0.001
+        while queue and queue[0][0] <= now:
+            for stamp, x in queue.pop(0)[1]:
+                pose_filter.add(pose(x), stamp, now)
+        outputs.append(float(pose_filter.at(now).translation[0]))
+    return float(np.abs(np.diff(outputs)).max())
+
+
+@pytest.mark.parametrize(
+    "arrivals",
+    [
+        [(0.5, [(0.5, 0.1)])],
+        [(0.5, [(0.5 - 0.001 * back, 0.1 - 0.002 * back) for back in range(50, -1, -1)])],
+        [(0.5, [(0.5, 0.05), (0.5, 0.1), (0.5, 0.1)])],
+        [(0.5, [(0.2, 0.1)])],
+        [(0.5, [(0.5, 0.1)]), (0.501, [(0.501, 0.0)]), (0.502, [(0.502, 0.1)])],
+        [(0.1 * n, [(0.1 * n, 0.05 * n)]) for n in range(1, 15)],
+    ],
+    ids=["a step", "a burst of 51", "doubled stamps", "a late stamp", "samples a millisecond apart", "long gaps"],
+)
+def test_the_output_is_continuous_when_the_stream_has(arrivals: list[tuple[float, list[tuple[float, float]]]]) -> None:
+    assert largest_step(arrivals) < 0.006
+
+
+def test_a_clock_that_stands_still_or_goes_back_returns_the_same_pose() -> None:
+    pose_filter = PoseFilter(FilterSettings())
+    pose_filter.reset(pose(), 1.0)
+    pose_filter.add(pose(0.1), 1.01, 1.01)
+    here: npt.NDArray[np.float64] = pose_filter.at(1.02).homogeneous
+    for now in (1.02, 1.0, -5.0):
+        np.testing.assert_array_equal(pose_filter.at(now).homogeneous, here)
+
+
+def test_the_delay_stated_follows_the_settings() -> None:
+    settings = FilterSettings(interpolation_delay=0.05, smoothing_delay=0.1)
+    assert PoseFilter(settings).delay == pytest.approx(0.15)

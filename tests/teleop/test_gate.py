@@ -1,0 +1,106 @@
+"""The gate: which poses may move an arm."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from q2r2_control.teleop.gate import PoseGate
+from q2r2_control.teleop.settings import GateSettings
+from tests.teleop.hands import pose, sample
+
+GOOD = sample("left", pose(0.1, 0.2, 0.3, (0.1, 0.2, 0.3)), 1.0)
+
+
+def gate() -> PoseGate:
+    fresh = PoseGate(GateSettings())
+    assert fresh.receive(GOOD, 1.0) == (True, None)
+    return fresh
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"position": np.array([np.nan, 0, 0])},
+        {"position": np.array([0, np.inf, 0])},
+        {"position": np.array([0, 0, 1e300])},
+        {"position": np.zeros(2)},
+        {"position": np.zeros((3, 1))},
+        {"position": None},
+        {"position": "here"},
+        {"quaternion": np.zeros(4)},
+        {"quaternion": np.array([0, 0, 0, np.nan])},
+        {"quaternion": np.array([0, 0, 0, 1e200])},
+        {"quaternion": np.array([0, 0, 0, 1e-200])},
+        {"quaternion": np.array([0, 0, 1.0])},
+        {"quaternion": object()},
+    ],
+    ids=str,
+)
+def test_a_pose_that_is_not_finite_or_not_a_rotation_is_refused_and_leaves_no_pose(changes: dict[str, object]) -> None:
+    spoilt = replace(GOOD, pose_stamp=1.01, **changes)  # type: ignore[arg-type]
+    passed = gate()
+    usable, fault = passed.receive(spoilt, 1.01)
+    assert not usable
+    assert fault is not None
+    assert passed.pose is None
+
+
+@pytest.mark.parametrize("factor", [1.0, -1.0, 0.5, 7.0, -1e-3])
+def test_a_quaternion_of_either_sign_and_any_length_is_the_same_rotation(factor: float) -> None:
+    passed = gate()
+    assert passed.receive(replace(GOOD, quaternion=factor * GOOD.quaternion, pose_stamp=1.01), 1.01) == (True, None)
+    assert passed.pose is not None
+    np.testing.assert_allclose(passed.pose.homogeneous, pose(0.1, 0.2, 0.3, (0.1, 0.2, 0.3)).homogeneous, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("moved", "fault"),
+    [
+        (pose(0.24, 0.2, 0.3, (0.1, 0.2, 0.3)), None),
+        (pose(0.26, 0.2, 0.3, (0.1, 0.2, 0.3)), "jumped 0.160 m"),
+        (pose(0.1, 0.2, 0.3, (0.1, 0.2, 1.2)), None),
+        (pose(0.1, 0.2, 0.3, (0.1, 0.2, 1.6)), "rotation jumped"),
+    ],
+    ids=["a fast move passes", "a jump is a fault", "a fast turn passes", "a jump of the rotation is a fault"],
+)
+def test_between_two_samples(moved: object, fault: str | None) -> None:
+    usable, found = gate().receive(sample("left", moved, 1.013), 1.013)
+    assert usable
+    assert (found is None) if fault is None else (fault in str(found))
+
+
+def test_the_watchdog_counts_receipt_time_and_only_new_poses() -> None:
+    passed = gate()
+    assert not passed.stale(1.15)
+    passed.receive(GOOD, 1.14)
+    assert passed.stale(1.1501)
+
+
+def test_a_stamp_in_the_future_does_not_hold_the_watchdog_off() -> None:
+    passed = gate()
+    passed.receive(replace(GOOD, pose_stamp=1e6), 1.01)
+    assert passed.stale(1.17)
+    assert passed.receive(replace(GOOD, pose_stamp=1.02), 1.02) == (True, None)
+
+
+def test_an_overtaken_pose_is_passed_over() -> None:
+    passed = gate()
+    assert passed.receive(sample("left", pose(9.0), 0.99), 1.01) == (False, None)
+    assert passed.pose is not None
+    assert passed.pose.translation[0] == 0.1
+
+
+def test_poses_too_far_apart_in_time_are_a_fault_even_when_they_arrive_together() -> None:
+    assert "no pose for" in str(gate().receive(replace(GOOD, pose_stamp=1.2), 1.2)[1])
+
+
+def test_before_any_pose_inputs_alone_are_no_fault_and_a_stamp_that_is_no_number_is() -> None:
+    fresh = PoseGate(GateSettings())
+    assert fresh.receive(replace(GOOD, pose_stamp=-math.inf, quaternion=np.zeros(4)), 1.0) == (False, None)
+    assert fresh.receive(replace(GOOD, pose_stamp=math.nan), 1.0)[1] is not None
+    assert fresh.pose is None
+    assert fresh.stale(1.0)

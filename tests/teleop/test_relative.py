@@ -1,0 +1,205 @@
+"""Relative motion: what the tool does when the hand moves."""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise, permutations, product
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from q2r2_control.errors import ConfigError, Q2R2Error
+from q2r2_control.teleop.relative import RelativeMotion
+from tests.teleop.hands import pose
+
+STANCES = ("side_by_side", "mirror", "mirror_reflected")
+FRAMES = ("base", "tool")
+REFLECTION = np.diag([1.0, -1.0, 1.0])
+
+numbers = st.floats(-3.0, 3.0)
+poses = st.builds(lambda x, y, z, a, b, c: pose(x, y, z, (a, b, c)), *[numbers] * 6)
+quick = settings(derandomize=True, max_examples=60, deadline=None)
+
+
+def assert_same(a: pin.SE3, b: pin.SE3, tolerance: float = 1e-9) -> None:
+    np.testing.assert_allclose(a.homogeneous, b.homogeneous, atol=tolerance)
+
+
+def anchored(hand: pin.SE3, tool: pin.SE3, **settings: object) -> RelativeMotion:
+    motion = RelativeMotion(**settings)  # type: ignore[arg-type]
+    motion.anchor(hand, tool)
+    return motion
+
+
+@quick
+@given(hand=poses, tool=poses, stance=st.sampled_from(STANCES), frame=st.sampled_from(FRAMES), scale=numbers.map(abs))
+def test_the_first_target_is_the_tool_wherever_hand_and_tool_are(
+    hand: pin.SE3, tool: pin.SE3, stance: str, frame: str, scale: float
+) -> None:
+    motion = anchored(hand, tool, stance=stance, rotation_frame=frame, scale=scale + 0.1, rotation_scale=scale)
+    assert_same(motion.target(hand), tool)
+
+
+@quick
+@given(hand=poses, tool=poses, moved=poses)
+def test_in_the_base_frame_the_tool_translates_and_turns_as_the_hand_does(
+    hand: pin.SE3, tool: pin.SE3, moved: pin.SE3
+) -> None:
+    target = anchored(hand, tool).target(moved)
+    np.testing.assert_allclose(target.translation - tool.translation, moved.translation - hand.translation, atol=1e-9)
+    np.testing.assert_allclose(target.rotation @ tool.rotation.T, moved.rotation @ hand.rotation.T, atol=1e-9)
+
+
+@quick
+@given(hand=poses, tool=poses, moved=poses)
+def test_in_the_tool_frame_the_tool_turns_about_its_own_axes_as_the_hand_does_about_its_own(
+    hand: pin.SE3, tool: pin.SE3, moved: pin.SE3
+) -> None:
+    target = anchored(hand, tool, rotation_frame="tool").target(moved)
+    np.testing.assert_allclose(tool.rotation.T @ target.rotation, hand.rotation.T @ moved.rotation, atol=1e-9)
+    np.testing.assert_allclose(target.translation - tool.translation, moved.translation - hand.translation, atol=1e-9)
+
+
+@quick
+@given(hand=poses, tool=poses, moved=poses, frame=st.sampled_from(FRAMES))
+def test_the_mirror_keeps_the_rooms_axes(hand: pin.SE3, tool: pin.SE3, moved: pin.SE3, frame: str) -> None:
+    beside, mirror = (anchored(hand, tool, stance=stance, rotation_frame=frame) for stance in STANCES[:2])
+    assert_same(beside.target(moved), mirror.target(moved))
+
+
+@quick
+@given(hand=poses, tool=poses, moved=poses)
+def test_the_reflected_mirror_reflects_translation_and_rotation(hand: pin.SE3, tool: pin.SE3, moved: pin.SE3) -> None:
+    target = anchored(hand, tool, stance="mirror_reflected").target(moved)
+    way = target.translation - tool.translation
+    np.testing.assert_allclose(way, REFLECTION @ (moved.translation - hand.translation), atol=1e-9)
+    turn = moved.rotation @ hand.rotation.T
+    np.testing.assert_allclose(target.rotation @ tool.rotation.T, REFLECTION @ turn @ REFLECTION, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("turn", "expected"),
+    [((0.4, 0, 0), (-0.4, 0, 0)), ((0, 0.4, 0), (0, 0.4, 0)), ((0, 0, 0.4), (0, 0, -0.4))],
+    ids=["roll changes sign", "pitch stays", "yaw changes sign"],
+)
+def test_in_the_reflected_mirror(turn: tuple[float, float, float], expected: tuple[float, float, float]) -> None:
+    target = anchored(pose(), pose(), stance="mirror_reflected").target(pose(turn=turn))
+    np.testing.assert_allclose(pin.log3(target.rotation), expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("frame", FRAMES)
+def test_scales_multiply_the_way_and_the_rotation_vector(frame: str) -> None:
+    motion = anchored(pose(), pose(), scale=0.5, rotation_scale=2.0, rotation_frame=frame)
+    target = motion.target(pose(0.2, -0.4, 0.6, (0.1, 0.2, -0.3)))
+    np.testing.assert_allclose(target.translation, [0.1, -0.2, 0.3], atol=1e-12)
+    np.testing.assert_allclose(pin.log3(target.rotation), [0.2, 0.4, -0.6], atol=1e-12)
+
+
+def test_a_rotation_scale_of_zero_keeps_the_orientation() -> None:
+    tool = pose(turn=(1.0, 2.0, 0.5))
+    target = anchored(pose(), tool, rotation_scale=0.0).target(pose(0.1, 0, 0, (2.0, -1.0, 0.5)))
+    np.testing.assert_allclose(target.rotation, tool.rotation, atol=1e-12)
+
+
+@pytest.mark.parametrize("frame", FRAMES)
+@pytest.mark.parametrize("wobble", [0.0, 0.2], ids=["about one axis", "with a wobble"])
+@pytest.mark.parametrize("scale", [0.3, 0.5, 1.0, 1.5, 2.0])
+def test_the_tool_turns_steadily_while_the_hand_makes_three_turns(scale: float, wobble: float, frame: str) -> None:
+    motion = anchored(pose(), pose(), rotation_scale=scale, rotation_frame=frame)
+    step = 0.02
+
+    def hand(angle: float) -> pin.SE3:
+        tilt = pin.exp3(wobble * np.array([math.sin(angle), 0.0, 0.0]))
+        return pin.SE3(pin.exp3(np.array([0.0, 0.0, angle])) @ tilt, np.zeros(3))
+
+    targets = [motion.target(hand(angle)) for angle in np.arange(0.0, 6.0 * math.pi, step)]
+    turns = [float(np.linalg.norm(pin.log3(a.rotation.T @ b.rotation))) for a, b in pairwise(targets)]
+    assert max(turns) < 4.0 * scale * step
+
+
+@pytest.mark.parametrize("frame", FRAMES)
+def test_a_half_scaled_rotation_past_half_a_turn_goes_on_instead_of_flipping(frame: str) -> None:
+    motion = anchored(pose(), pose(), rotation_scale=0.5, rotation_frame=frame)
+    for angle in np.arange(0.0, 4.0, 0.05):
+        target = motion.target(pose(turn=(0.0, 0.0, angle)))
+        assert pin.log3(target.rotation)[2] == pytest.approx(0.5 * angle)
+
+
+@pytest.mark.parametrize("frame", FRAMES)
+def test_a_thousand_anchors_with_the_hand_turning_in_between_do_not_drift(frame: str) -> None:
+    random = np.random.default_rng(0)
+    tool = pose(0.5, 0.1, 0.4, (3.0, 0.2, 0.1))
+    motion, carried = RelativeMotion(rotation_frame=frame), tool
+    for _ in range(1000):
+        hand = pin.SE3(pin.exp3(random.uniform(-3, 3, 3)), random.uniform(-1, 1, 3))
+        motion.anchor(hand, carried)
+        carried = motion.target(hand)
+    assert_same(carried, tool)
+    np.testing.assert_allclose(carried.rotation @ carried.rotation.T, np.eye(3), atol=1e-14)
+
+
+AXES = [
+    tuple(sign + axis for sign, axis in zip(signs, order, strict=True))
+    for order in permutations("xyz")
+    for signs in product("+-", repeat=3)
+]
+
+
+@pytest.mark.parametrize("axes", AXES, ids=" ".join)
+def test_every_axis_convention_gives_the_world_what_the_hand_did_in_the_world(axes: tuple[str, str, str]) -> None:
+    """The same physical motion, written down in the input's frame, moves the tool as it does written in the world's."""
+    to_world = np.array([[float(axis[0] + "1") * (name == axis[1]) for name in "xyz"] for axis in axes])
+
+    def as_sent(physical: pin.SE3) -> pin.SE3:
+        return pin.SE3(to_world.T @ physical.rotation @ to_world, to_world.T @ physical.translation)
+
+    hand, moved, tool = pose(1, 2, 3, (0.3, 0.1, 2.0)), pose(1.1, 1.8, 3.3, (1.0, -1.0, 0.5)), pose(0, 0, 1, (3, 0, 0))
+    for frame in FRAMES:
+        physical = anchored(hand, tool, rotation_frame=frame).target(moved)
+        assert_same(anchored(as_sent(hand), tool, axes=axes, rotation_frame=frame).target(as_sent(moved)), physical)
+
+
+def test_raw_unity_arrives_as_the_connectors_own_conversion_would_send_it() -> None:
+    """Unity (x right, y up, z forwards, left-handed) to the robot's axes: (z, -x, y) and (z, -x, y, -w)."""
+    motion = anchored(pose(), pose(), axes=("+z", "-x", "+y"))
+    x, y, z, w = np.array([0.1, 0.5, -0.3, 0.8]) / np.linalg.norm([0.1, 0.5, -0.3, 0.8])
+    target = motion.target(pin.SE3(pin.Quaternion(w, x, y, z).toRotationMatrix(), np.array([1.0, 2.0, 3.0])))
+    np.testing.assert_allclose(target.translation, [3.0, -1.0, 2.0])
+    np.testing.assert_allclose(target.rotation, pin.Quaternion(-w, z, -x, y).toRotationMatrix(), atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"axes": ("+x", "+x", "+z")}, "axes .* use x, y and z once each"),
+        ({"axes": ("x", "y", "z")}, "axes .* use x, y and z once each"),
+        ({"axes": ("+x", "+y")}, "axes"),
+        ({"axes": ("+x", "+y", "+w")}, "axes"),
+        ({"stance": "behind"}, "stance = 'behind'.*side_by_side"),
+        ({"rotation_frame": "hand"}, "rotation_frame = 'hand'.*base"),
+        ({"scale": 0.0}, "position_scale = 0.0.*greater than 0"),
+        ({"scale": math.nan}, "position_scale = nan"),
+        ({"rotation_scale": -1.0}, "rotation_scale = -1.0"),
+    ],
+    ids=lambda value: str(value) if isinstance(value, dict) else "",
+)
+def test_a_setting_that_is_not_allowed_is_named_with_what_is(arguments: dict[str, object], message: str) -> None:
+    with pytest.raises(ConfigError, match=message) as caught:
+        RelativeMotion(**arguments)  # type: ignore[arg-type]
+    assert "\n" not in str(caught.value)
+
+
+def test_a_target_without_an_anchor_is_refused() -> None:
+    with pytest.raises(Q2R2Error, match="anchor"):
+        RelativeMotion().target(pose())
+
+
+def test_anchoring_copies_what_it_is_given() -> None:
+    hand, tool = pose(), pose(1.0)
+    motion = anchored(hand, tool)
+    hand.translation[:] = 5.0
+    tool.translation[:] = 7.0
+    np.testing.assert_allclose(motion.target(pose(0.1)).translation, [1.1, 0.0, 0.0])
