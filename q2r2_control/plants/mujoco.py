@@ -58,7 +58,7 @@ class MujocoPlant:
     """
 
     def __init__(self, robot: Robot, config: Config) -> None:
-        """Raises :class:`PlantError` where MuJoCo cannot make a model of the cell."""
+        """``robot`` has to be the one of ``config``. Raises :class:`PlantError` where MuJoCo cannot model it."""
         self.model: mujoco.MjModel = build_model(robot, config)
         self.data: mujoco.MjData = mujoco.MjData(self.model)
         # Views of MuJoCo's arrays, kept since each access by name makes a new one.

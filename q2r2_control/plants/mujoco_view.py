@@ -57,33 +57,24 @@ def take_picture(
     model: mujoco.MjModel, data: mujoco.MjData, width: int, height: int, camera: Camera
 ) -> npt.NDArray[np.uint8]:
     """Picture (height, width, 3) of the cell. Raises :class:`PlantError` where OpenGL or the size does not allow it."""
-    if sys.platform == "linux" and not _has_display():
-        # Read when the renderer is first imported; without it MuJoCo looks for a window system.
-        os.environ.setdefault("MUJOCO_GL", "egl")
     view = mujoco.MjvCamera()
     view.lookat, view.distance = camera.target, camera.distance
     view.azimuth, view.elevation = camera.azimuth, camera.elevation
     try:
-        from mujoco.renderer import Renderer
-
-        with Renderer(model, height=height, width=width) as renderer:
+        with mujoco.Renderer(model, height=height, width=width) as renderer:
             renderer.update_scene(data, view)
             return renderer.render()
-    except (ImportError, AttributeError, ValueError, RuntimeError, mujoco.FatalError) as error:
+    except (ImportError, ValueError, RuntimeError, mujoco.FatalError) as error:
         reason = " ".join(str(error).split())
         raise PlantError(
-            f"no picture of {width} x {height}: {reason}; without a display this takes EGL "
-            "(on Debian: libegl1 and libgl1-mesa-dri)"
+            f"no picture of {width} x {height}: {reason}; without a display, start with MUJOCO_GL=egl in the environment "
+            "(on Debian that takes libegl1 and libgl1-mesa-dri)"
         ) from error
-
-
-def _has_display() -> bool:
-    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
 def _check_display() -> None:
     """MuJoCo waits for ever for a window that its thread cannot open, so try first."""
-    if sys.platform == "linux" and not _has_display():
+    if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         raise PlantError("MuJoCo's window needs a display: neither DISPLAY nor WAYLAND_DISPLAY is set; run headless")
     import glfw
 

@@ -50,6 +50,16 @@ def grasping_config(config: Config, robot: Robot) -> Config:
     )
 
 
+@pytest.fixture(scope="session")
+def grasping_robot(grasping_config: Config) -> Robot:
+    return Robot.from_config(grasping_config)
+
+
+@pytest.fixture
+def grasping_plant(grasping_robot: Robot, grasping_config: Config) -> MujocoPlant:
+    return MujocoPlant(grasping_robot, grasping_config)
+
+
 def hold(q: Array, **grippers: float) -> Command:
     """A command to rest at ``q``."""
     return Command(CommandMode.POSITION, q, np.zeros_like(q), np.zeros_like(q), grippers)

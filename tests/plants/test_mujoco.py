@@ -201,8 +201,8 @@ class TestGripper:
         assert plant.gripper_openings()["left"] == pytest.approx(0, abs=0.01)
         assert plant.gripper_openings()["right"] == pytest.approx(1, abs=0.01)
 
-    def test_it_grasps_lifts_and_drops_a_block(self, robot: Robot, grasping_config: Config) -> None:
-        plant = MujocoPlant(robot, grasping_config)
+    def test_it_grasps_lifts_and_drops_a_block(self, grasping_plant: MujocoPlant, robot: Robot) -> None:
+        plant = grasping_plant
         plant.apply(hold(robot.home, left=0.0))
         plant.advance(0.5)
         # A block of 40 mm leaves a part of the stroke of 50 mm.
@@ -220,8 +220,8 @@ class TestGripper:
         plant.advance(0.8)
         assert _block_height(plant) < resting + 0.01
 
-    def test_the_squeeze_is_no_stronger_than_configured(self, robot: Robot, grasping_config: Config) -> None:
-        plant = MujocoPlant(robot, grasping_config)
+    def test_the_squeeze_is_no_stronger_than_configured(self, grasping_plant: MujocoPlant, robot: Robot) -> None:
+        plant = grasping_plant
         plant.apply(hold(robot.home, left=0.0))
         for _ in range(500):
             plant.advance(DT)
@@ -327,11 +327,32 @@ def test_a_window_without_a_display_is_refused_with_the_reason(
     assert plant.viewer_sync() is False
 
 
-def test_a_block_that_lies_still_moves_when_an_arm_runs_into_it(robot: Robot, grasping_config: Config) -> None:
-    plant = MujocoPlant(robot, grasping_config)
+def test_a_block_that_has_lain_still_for_long_moves_when_an_arm_runs_into_it(
+    grasping_plant: MujocoPlant, robot: Robot
+) -> None:
+    plant = grasping_plant
     plant.advance(1.0)
-    before = plant.data.body("block").xpos.copy()
+    before = float(plant.data.body("block").xpos[1])
     for command in tool_motion(robot, "left", np.array([0.0, 0.1, 0.0]), 0.6, DT, robot.home):
         plant.apply(command)
         plant.advance(DT)
-    assert plant.data.body("block").xpos[1] - before[1] > 0.02
+    assert float(plant.data.body("block").xpos[1]) > before + 0.02
+
+
+def test_an_arm_that_has_rested_for_long_answers_to_a_push(plant: MujocoPlant, robot: Robot) -> None:
+    for _ in range(3):
+        plant.advance(1.0)
+    plant.push("left", np.array([0, 0, -50.0, 0, 0, 0]), 0.3)
+    plant.advance(0.3)
+    assert np.abs(plant.state().q - robot.home).max() > 1e-3
+
+
+def test_a_diverged_simulation_is_an_error_until_reset_and_never_a_silent_jump(
+    plant: MujocoPlant, robot: Robot
+) -> None:
+    plant.data.qvel[3] = np.nan
+    with pytest.raises(PlantError, match="diverged"):
+        plant.advance(DT)
+    plant.reset()
+    plant.advance(DT)
+    np.testing.assert_allclose(plant.state().q, robot.home, atol=1e-9)
