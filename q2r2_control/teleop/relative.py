@@ -69,13 +69,21 @@ class RelativeMotion:
         if settings.stance is Stance.MIRROR_REFLECTED:
             self._map = _REFLECTION @ self._map
         self._hand: pin.SE3 | None = None
-        self._tool = pin.SE3.Identity()
+        self._tool_position = np.zeros(3)
+        # The tool's rotation is before * (the hand's own rotation since the anchor) * after.
+        self._before = self._after = np.eye(3)
         self._vector = np.zeros(3)
 
     def anchor(self, hand: pin.SE3, tool: pin.SE3) -> None:
         """Make ``hand`` (finite, input's frame) and ``tool`` (world frame) correspond from now on."""
-        self._hand = self._in_world(hand)
-        self._tool = pin.SE3(_orthonormal(tool.rotation), tool.translation)
+        self._hand = pin.SE3(hand)
+        self._tool_position = np.array(tool.translation)
+        rotation = _orthonormal(tool.rotation)
+        # M exp(s w) M' = exp(s M w), up to the sign that a reflection gives an axis: scaling and mapping commute.
+        if self._in_tool_frame:
+            self._before, self._after = rotation @ self._map, self._map.T
+        else:
+            self._before, self._after = self._map, self._map.T @ rotation
         self._vector = np.zeros(3)
 
     def target(self, hand: pin.SE3) -> pin.SE3:
@@ -85,19 +93,13 @@ class RelativeMotion:
         """
         if self._hand is None:
             raise Q2R2Error("RelativeMotion.target: call anchor(hand, tool) first")
-        now = self._in_world(hand)
-        position = self._tool.translation + self._scale * (now.translation - self._hand.translation)
-        if self._in_tool_frame:
-            rotation = self._tool.rotation @ self._scaled(self._hand.rotation.T @ now.rotation)
-        else:
-            rotation = self._scaled(now.rotation @ self._hand.rotation.T) @ self._tool.rotation
-        target = pin.SE3(rotation, position)
+        way = self._scale * (self._map @ (hand.translation - self._hand.translation))
+        before, now = self._hand.rotation.T, hand.rotation
+        turn = before @ now if self._in_tool_frame else now @ before
+        target = pin.SE3(self._before @ self._scaled(turn) @ self._after, self._tool_position + way)
         if np.linalg.norm(self._vector) > _REANCHOR_ANGLE:
             self.anchor(hand, target)
         return target
-
-    def _in_world(self, hand: pin.SE3) -> pin.SE3:
-        return pin.SE3(self._map @ hand.rotation @ self._map.T, self._map @ hand.translation)
 
     def _scaled(self, rotation: Array) -> Array:
         if self._rotation_scale == 1.0:

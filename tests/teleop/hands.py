@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 
 import numpy as np
 import pinocchio as pin
 
 from q2r2_control.teleop.settings import TeleopSettings
 from q2r2_control.teleop.teleop import Teleop
-from q2r2_control.types import SIDES, ArmTarget, Event, HandInputs, HandSample
+from q2r2_control.types import SIDES, ArmTarget, Array, Event, HandInputs, HandSample
 
 TICK = 0.001
 PERIOD = 0.013  # of the hands' samples [s]
@@ -106,3 +107,53 @@ class Operator:
 def spoilt(received: HandSample, **changes: object) -> HandSample:
     """The sample with some of its fields replaced by what they should never hold."""
     return replace(received, **changes)  # type: ignore[arg-type]
+
+
+History = list[dict[str, ArmTarget]]
+PAUSED = {"left": "paused", "right": "paused"}
+ENGAGED = {"left": "engaged", "right": "engaged"}
+
+
+def operator(**changes: object) -> Operator:
+    return Operator(TeleopSettings.model_validate(changes))
+
+
+def engaged(**changes: object) -> Operator:
+    driver = operator(**changes)
+    driver.engage()
+    assert driver.states == ENGAGED
+    return driver
+
+
+def waving(driver: Operator, speed: float = 0.2) -> Callable[[float], dict[str, pin.SE3]]:
+    """Both hands going sidewards and turning from where they are."""
+    start = dict(driver.hands)
+    return lambda t: {
+        hand: pin.SE3(pin.exp3(np.array([0.0, 0.0, speed * t])) @ at.rotation, at.translation + sidewards(speed * t))
+        for hand, at in start.items()
+    }
+
+
+def sidewards(way: float) -> Array:
+    return np.array([0.0, way, 0.0])
+
+
+def first_targets(history: History, arm: str) -> pin.SE3:
+    return next(targets[arm].pose for targets in history if targets[arm].pose is not None)
+
+
+def assert_smooth(history: History, largest: float = 0.002) -> None:
+    """Between two ticks of one engagement a target moves by less than ``largest`` metres and 3 ``largest`` radians."""
+    for before, after in pairwise(history):
+        for arm in SIDES:
+            a, b = before[arm].pose, after[arm].pose
+            if a is not None and b is not None:
+                assert np.linalg.norm(b.translation - a.translation) < largest
+                assert np.linalg.norm(pin.log3(a.rotation.T @ b.rotation)) < 3 * largest
+
+
+def assert_holds(driver: Operator, duration: float = 0.4) -> None:
+    """Both arms hold at every tick, although the hands go on waving."""
+    for targets in driver.run(duration, waving(driver)):
+        assert targets["left"].pose is None
+        assert targets["right"].pose is None

@@ -1,0 +1,236 @@
+"""Faults and hostile input: every arm stops, stays, and engages anew only by a new press."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from q2r2_control.types import SIDES, HandSample
+from tests.teleop.hands import (
+    ENGAGED,
+    PAUSED,
+    assert_holds,
+    assert_smooth,
+    engaged,
+    first_targets,
+    operator,
+    pose,
+    sample,
+    sidewards,
+    spoilt,
+    waving,
+)
+
+FAULTS: dict[str, Callable[[HandSample], HandSample]] = {
+    "pose for 0.15 s": lambda s: spoilt(s, pose_stamp=10.29),
+    "button data for 0.15 s": lambda s: spoilt(s, inputs_stamp=10.29),
+    "not finite or not a rotation": lambda s: spoilt(s, position=np.array([np.nan, 0.0, 0.0])),
+    "not a rotation": lambda s: spoilt(s, quaternion=np.zeros(4)),
+    "jumped 1": lambda s: spoilt(s, position=s.position + 1.0),
+    "rotation jumped": lambda s: spoilt(s, quaternion=np.array([1.0, 0.0, 0.0, 0.0])),
+    "without a receipt time": lambda s: spoilt(s, pose_stamp=math.nan),
+}
+
+
+@pytest.mark.parametrize("linked", [True, False], ids=["linked", "each for itself"])
+@pytest.mark.parametrize("reason", list(FAULTS))
+def test_a_fault_of_the_left_hand_disengages(reason: str, linked: bool) -> None:
+    driver = engaged(linked=linked)
+    driver.alter = lambda s: FAULTS[reason](s) if s.hand == "left" else s
+    history = driver.run(0.3, waving(driver))
+    assert_smooth(history)
+    assert driver.states == (PAUSED if linked else {"left": "paused", "right": "engaged"})
+    last = [event for event in driver.events if event.destination == "paused"]
+    assert reason in last[0].reason
+    assert [event.arm for event in last] == (["left", "right"] if linked else ["left"])
+    driver.alter = lambda s: s
+    if linked:
+        assert_holds(driver)
+    driver.press("left")
+    assert driver.states["left"] == "engaged"
+
+
+def test_silence_disengages_within_the_timeout_and_a_tick() -> None:
+    driver = engaged()
+    driver.tick(driver.samples())
+    driver.silent = set(SIDES)
+    history = driver.run(0.3)
+    following = sum(targets["left"].pose is not None for targets in history)
+    assert 148 <= following <= 151
+
+
+def test_after_silence_the_hand_may_come_back_anywhere_and_the_arm_stays() -> None:
+    driver = engaged()
+    driver.silent = {"left"}
+    driver.run(0.3)
+    driver.hands["left"] = pose(2.0, 2.0, 2.0, (1.0, 1.0, 1.0))
+    driver.silent = set()
+    assert_holds(driver)
+    driver.lower = {"left"}
+    first = first_targets(driver.run(0.2), "left")
+    np.testing.assert_allclose(first.translation, driver.tools["left"].translation, atol=1e-9)
+
+
+def test_a_button_held_through_a_fault_does_not_engage_again_until_released_and_pressed() -> None:
+    driver = operator()
+    driver.run(0.1)
+    driver.lower = set(SIDES)
+    driver.run(0.3)
+    assert driver.states == ENGAGED
+    driver.silent = set(SIDES)
+    driver.run(0.3)
+    driver.silent = set()
+    assert_holds(driver)
+    driver.lower = set()
+    assert_holds(driver)
+    driver.press(*SIDES)
+    assert driver.states == ENGAGED
+
+
+def test_a_press_that_a_fault_interrupts_does_not_engage() -> None:
+    driver = engaged()
+    driver.press("left")
+    driver.lower = {"left"}
+    driver.run(0.03)
+    driver.alter = lambda s: spoilt(s, quaternion=np.zeros(4)) if s.hand == "right" else s
+    driver.run(0.03)
+    driver.alter = lambda s: s
+    assert_holds(driver)
+
+
+def test_a_lost_connection_pauses_every_arm_and_wants_fresh_poses_and_a_new_press() -> None:
+    driver = engaged()
+    driver.run(0.2, waving(driver))
+    driver.teleop.connection_lost(driver.now)
+    assert driver.states == PAUSED
+    assert {event.reason for event in driver.teleop.take_events()} == {"connection lost"}
+    driver.lower = set(SIDES)
+    assert_holds(driver)
+    driver.lower = set()
+    driver.run(0.1)
+    driver.press(*SIDES)
+    assert driver.states == ENGAGED
+
+
+@pytest.mark.parametrize(
+    ("alter", "reason"),
+    [
+        (lambda s: spoilt(s, pose_stamp=9.0), "no pose for 0.15 s"),
+        (lambda s: spoilt(s, pose_stamp=-math.inf), "no pose for 0.15 s"),
+        (lambda s: spoilt(s, quaternion=np.zeros(4)), "the newest pose is not usable"),
+    ],
+    ids=["stale", "never received", "not usable"],
+)
+def test_engaging_is_refused_when_poses_are(alter: Callable[[HandSample], HandSample], reason: str) -> None:
+    driver = operator()
+    driver.alter = alter
+    driver.run(0.3)
+    driver.press(*SIDES)
+    assert driver.states == PAUSED
+    assert [event.reason for event in driver.events] == [f"not engaged: {reason}"] * 2
+
+
+@pytest.mark.parametrize("tools", [{}, dict.fromkeys(SIDES, pose(math.nan))], ids=["missing", "not finite"])
+def test_engaging_is_refused_when_the_tools_pose_is(tools: dict[str, pin.SE3]) -> None:
+    driver = operator()
+    driver.tools = tools
+    driver.engage()
+    assert driver.states == PAUSED
+    assert {event.reason for event in driver.events} == {"not engaged: the tool's pose is not known"}
+
+
+def test_silence_during_a_chord_disengages_for_good() -> None:
+    driver = engaged()
+    driver.lower = driver.upper = {"left"}
+    driver.run(0.1)
+    driver.silent = {"left"}
+    driver.run(0.3)
+    driver.silent, driver.lower, driver.upper = set(), set(), set()
+    assert_holds(driver)
+
+
+def test_a_stalled_loop_disengages_instead_of_catching_up() -> None:
+    driver = engaged()
+    driver.run(0.1, waving(driver))
+    driver.hands = {hand: pose(*(at.translation + sidewards(0.1))) for hand, at in driver.hands.items()}
+    driver.now += 1.0
+    assert driver.tick(driver.samples())["left"].pose is None
+    assert_holds(driver)
+
+
+@pytest.mark.parametrize("back", [0.001, 0.1], ids=["a millisecond", "a tenth of a second"])
+def test_a_clock_that_goes_back_a_little_holds_the_target_still(back: float) -> None:
+    driver = engaged()
+    driver.run(0.2, waving(driver))
+    before = driver.targets
+    after = driver.teleop.update(driver.samples(), driver.tools, driver.now - back)
+    assert_smooth([before, after], 1e-12)
+    assert driver.states == ENGAGED
+
+
+@pytest.mark.parametrize("now", [math.nan, math.inf, -math.inf, -1e9, 0.0, 1e12], ids=str)
+def test_a_clock_that_cannot_be_followed_disengages_and_a_press_on_the_new_one_engages(now: float) -> None:
+    driver = engaged()
+    driver.run(0.2, waving(driver))
+    targets = driver.teleop.update(driver.samples(), driver.tools, now)
+    assert targets["left"].pose is targets["right"].pose is None
+    if math.isfinite(now):
+        driver.now = driver._next_sample = now
+    assert_holds(driver)
+    driver.press(*SIDES)
+    assert driver.states == ENGAGED
+
+
+def test_bursts_doubled_overtaken_and_unknown_samples_make_no_jump() -> None:
+    driver = engaged()
+    history = [driver.targets]
+    hand = driver.hands["left"].translation
+    for burst in range(20):
+        samples = [
+            sample("left", pose(*(hand + sidewards(0.002 * (burst + k / 50)))), driver.now - 0.0002 * (50 - k))
+            for k in range(50)
+        ]
+        samples += [samples[-1], samples[3], samples[-1]]
+        samples += [replace(samples[0], hand=name) for name in ("middle", "")]
+        history.append(driver.tick([*samples, sample("right", driver.hands["right"], driver.now)]))
+        history += driver.run(0.02, lambda t: {}) if burst % 3 == 0 else [driver.tick([]) for _ in range(20)]
+        driver.silent = {"left"}
+    assert driver.states == ENGAGED
+    assert_smooth(history)
+
+
+values = st.one_of(st.floats(allow_nan=True), st.sampled_from([0.0, 1.0, math.nan, math.inf, 1e308]))
+hostile = st.builds(
+    lambda hand, position, quaternion, stamps, buttons: spoilt(
+        sample("left", pose(), stamps[0], lower=buttons[0], upper=buttons[1]),
+        hand=hand,
+        position=np.array(position),
+        quaternion=np.array(quaternion),
+        inputs_stamp=stamps[1],
+    ),
+    st.sampled_from(["left", "right", "head"]),
+    st.lists(values, min_size=3, max_size=3),
+    st.lists(values, min_size=4, max_size=4),
+    st.tuples(values, values),
+    st.tuples(st.booleans(), st.booleans()),
+)
+
+
+@settings(derandomize=True, max_examples=60, deadline=None)
+@given(st.lists(st.tuples(st.lists(hostile, max_size=3), values), max_size=20), st.booleans())
+def test_no_input_raises_and_every_target_is_finite(
+    ticks: list[tuple[list[HandSample], float]], start_engaged: bool
+) -> None:
+    driver = engaged() if start_engaged else operator()
+    for samples, now in ticks:
+        targets = driver.teleop.update(samples, driver.tools, now)
+        targets |= driver.tick([*driver.samples(), *samples])
+        for target in targets.values():
+            assert target.pose is None or np.isfinite(target.pose.homogeneous).all()
