@@ -11,7 +11,6 @@ import numpy as np
 import numpy.typing as npt
 
 from q2r2_control.errors import PlantError
-from q2r2_control.plants.scene import COLLISION_GROUP
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +35,6 @@ class Window:
             self._handle = viewer.launch_passive(model, data, show_left_ui=False, show_right_ui=False)
         except (RuntimeError, mujoco.FatalError) as error:
             raise PlantError(f"MuJoCo's window cannot be opened: {error}") from error
-        self._handle.opt.geomgroup[COLLISION_GROUP] = 0
 
     @property
     def is_open(self) -> bool:
@@ -57,6 +55,9 @@ def take_picture(
     model: mujoco.MjModel, data: mujoco.MjData, width: int, height: int, camera: Camera
 ) -> npt.NDArray[np.uint8]:
     """Picture (height, width, 3) of the cell. Raises :class:`PlantError` where OpenGL or the size does not allow it."""
+    largest = model.vis.global_.offwidth, model.vis.global_.offheight
+    if not (0 < width <= largest[0] and 0 < height <= largest[1]):
+        raise PlantError(f"picture of {width} x {height}: allowed: 1 x 1 .. {largest[0]} x {largest[1]} pixels")
     view = mujoco.MjvCamera()
     view.lookat, view.distance = camera.target, camera.distance
     view.azimuth, view.elevation = camera.azimuth, camera.elevation
@@ -64,10 +65,10 @@ def take_picture(
         with mujoco.Renderer(model, height=height, width=width) as renderer:
             renderer.update_scene(data, view)
             return renderer.render()
-    except (ImportError, ValueError, RuntimeError, mujoco.FatalError) as error:
+    except (ImportError, RuntimeError, mujoco.FatalError) as error:
         reason = " ".join(str(error).split())
         raise PlantError(
-            f"no picture of {width} x {height}: {reason}; without a display, start with MUJOCO_GL=egl in the environment "
+            f"no picture: {reason}; without a display, set MUJOCO_GL=egl in the environment "
             "(on Debian that takes libegl1 and libgl1-mesa-dri)"
         ) from error
 

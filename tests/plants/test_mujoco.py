@@ -316,17 +316,6 @@ def test_a_state_that_was_handed_out_does_not_change_later(plant: MujocoPlant, r
     np.testing.assert_array_equal(state.q, robot.home)
 
 
-def test_a_window_without_a_display_is_refused_with_the_reason(
-    plant: MujocoPlant, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.delenv("DISPLAY", raising=False)
-    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
-    monkeypatch.setattr("sys.platform", "linux")
-    with pytest.raises(PlantError, match="needs a display"):
-        plant.launch_viewer()
-    assert plant.viewer_sync() is False
-
-
 def test_a_block_that_has_lain_still_for_long_moves_when_an_arm_runs_into_it(
     grasping_plant: MujocoPlant, robot: Robot
 ) -> None:
