@@ -39,7 +39,7 @@ def observe(cell: Cell, work: Workspace) -> int:
         work.contact,
         work.rows,
     )
-    for i in range(work.rows.count[0]):
+    for i in range(work.rows.used[0]):
         row = work.rows.matrix[i]
         size = np.sqrt(np.sum(row * row))
         row /= size

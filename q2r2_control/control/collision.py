@@ -111,7 +111,7 @@ def pairs_of(model: pin.GeometryModel, chain: Chain, bodies: Bodies, travel: Arr
         if bodies.box[first]:
             names = [model.geometryObjects[i].name for i in (first, second)]
             raise RobotError(f"pair {names[0]}, {names[1]}: two boxes; allowed: at most one box in a pair")
-        moving = {}
+        moving: dict[int, tuple[float, float]] = {}
         for body, sign in ((first, -1.0), (second, 1.0)):
             farthest = np.linalg.norm(bodies.half[body]) + max(
                 np.linalg.norm(bodies.start[body]), np.linalg.norm(bodies.end[body])

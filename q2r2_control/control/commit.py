@@ -121,7 +121,7 @@ def _note_active(work: Workspace) -> float:
             work.active.code[count] = 4 * j + kind
             count += 1
     slack = 0.0
-    for i in range(work.rows.count[0]):
+    for i in range(work.rows.used[0]):
         rate = 0.0
         for j in range(v.shape[0]):
             rate += work.rows.matrix[i, j] * v[j]
@@ -129,5 +129,5 @@ def _note_active(work: Workspace) -> float:
         if rate <= work.rows.lower[i] + _ACTIVE:
             work.active.code[count] = -1 - work.rows.pair[i]
             count += 1
-    work.active.count[0] = count
+    work.active.used[0] = count
     return slack

@@ -114,7 +114,7 @@ class CartesianController:
         """One substep: build, solve, certify and move."""
         work = self._work
         summary.inside &= assemble(self._held_cell, self._goals.held, self._held_work, h)
-        count = int(work.rows.count[0])
+        count = int(work.rows.used[0])
         problem = QpProblem(
             H=work.H,
             g=work.g,
@@ -124,7 +124,8 @@ class CartesianController:
             rows_lower=work.rows.lower[:count],
         )
         solution = self._solver.solve(problem)
-        usable = solution.v is not None and solution.solve_time <= self.settings.solve_time_limit
+        limit = self.settings.solve_time_limit
+        usable = solution.v is not None and (limit is None or solution.solve_time <= limit)
         wanted = solution.v if usable else work.wanted
         outcome, self._closest, slack = commit(self._held_cell, self._held_work, wanted, usable, h)
         summary.fallback |= outcome != FOLLOWED
@@ -149,7 +150,7 @@ class CartesianController:
     def _binding(self) -> tuple[str, ...]:
         """Names of limits and pairs that held the last step back."""
         active = self._work.active
-        found = int(active.count[0])
+        found = int(active.used[0])
         if not found:
             return ()
         return tuple(dict.fromkeys(self._limit_name(code) for code in active.code[:found].tolist()))

@@ -133,7 +133,7 @@ def _checked_pose(pose: Array, rotation: Array, translation: Array) -> bool:
     if largest > _FARTHEST:
         for i in range(3):
             translation[i] *= _FARTHEST / largest
-    # One Newton step towards the nearest rotation (Higham, Functions of Matrices, 2008, eq. 8.20): R - (R R' - I) R / 2.
+    # A Newton step towards the nearest rotation, R - (R R' - I) R / 2 (Higham, Functions of Matrices, 2008, eq. 8.20).
     correction = np.zeros((3, 3))
     for i in range(3):
         for j in range(3):

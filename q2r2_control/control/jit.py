@@ -35,17 +35,23 @@ def _cache_folder() -> Path:
 _FOLDER = str(_cache_folder())
 
 
+# Set by Numba at run time, so no type checker knows its members.
+config: Any = numba.config
+
+
 @structref.register
-class _HeldType(types.StructRef):  # type: ignore[misc]
+class _HeldType(types.StructRef):
     def preprocess_fields(self, fields: Any) -> Any:
         return tuple((name, types.unliteral(kind)) for name, kind in fields)
 
 
-class Held(structref.StructRefProxy):  # type: ignore[misc]
+class Held(structref.StructRefProxy):
     """A named tuple of arrays behind one pointer: made by :func:`hold`, read in a kernel as ``held.value``.
 
     Handing a kernel fifty arrays costs more than the work it does; a pointer costs the same for any number.
     """
+
+    value: Any
 
     def __new__(cls, value: Any) -> Held:
         held: Held = structref.StructRefProxy.__new__(cls, value)
@@ -57,12 +63,12 @@ structref.define_proxy(Held, _HeldType, ["value"])
 
 def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
     """Compile ``function`` at its first call; strict IEEE arithmetic, no Python objects, division by 0 gives inf."""
-    previous = numba.config.CACHE_DIR
-    numba.config.CACHE_DIR = _FOLDER  # read once, while decorating
+    previous = config.CACHE_DIR
+    config.CACHE_DIR = _FOLDER  # read once, while decorating
     try:
         compiled: Callable[..., Any] = numba.njit(function, cache=True, error_model="numpy", nogil=True)
     finally:
-        numba.config.CACHE_DIR = previous
+        config.CACHE_DIR = previous
     return compiled
 
 

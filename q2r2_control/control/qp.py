@@ -61,9 +61,9 @@ class DaqpSolver:
 
     _OPTIMAL = (1, 2)  # 2: optimal with a soft row violated
 
-    def __init__(self, nv: int, time_limit: float) -> None:
+    def __init__(self, nv: int, time_limit: float | None) -> None:
         self._nv = nv
-        self._time_limit = time_limit
+        self._time_limit = time_limit or 0.0  # 0: none
         self._upper = np.full(nv, _UNBOUNDED)
         self._lower = np.full(nv, -_UNBOUNDED)
         self._sense = np.zeros(nv, dtype=np.int32)
@@ -97,9 +97,10 @@ class OsqpSolver:
     The problem's structure must not change between ticks, so rows are padded to a capacity that grows when needed.
     """
 
-    def __init__(self, nv: int, time_limit: float) -> None:
+    def __init__(self, nv: int, time_limit: float | None) -> None:
         self._nv = nv
-        self._time_limit = time_limit
+        # 0 would stop OSQP at once.
+        self._time_limit = time_limit or _UNBOUNDED
         self._capacity = 0
         self._solver: Any = None
 
@@ -127,7 +128,7 @@ class OsqpSolver:
         return QpSolution(np.asarray(result.x[:nv], dtype=np.float64) if solved else None, result.info.run_time)
 
     def _values(self) -> Array:
-        """Non-zeros of the constraint matrix, column by column: identity over rows for v, one entry for s, one s >= 0."""
+        """Non-zeros of the constraint matrix by columns: identity over rows for v, then row and s >= 0 for each s."""
         box = np.vstack([np.ones(self._nv), self._matrix]).T.ravel()
         return np.concatenate([box, np.ones(2 * self._capacity)])
 
@@ -177,7 +178,7 @@ class QpsolversSolver:
         return QpSolution(v, time.perf_counter() - before)
 
 
-def make_solver(name: str, nv: int, time_limit: float) -> Solver:
+def make_solver(name: str, nv: int, time_limit: float | None) -> Solver:
     """Solver by its name in the YAML; ``time_limit`` [s] is given to solvers that take one.
 
     Raises :class:`ConfigError` for a solver that is not installed.

@@ -36,12 +36,12 @@ class Approach(NamedTuple):
 
 
 class Rows(NamedTuple):
-    """Rows ``matrix v >= lower`` written by :func:`separation_rows`; the first ``count[0]`` are valid."""
+    """Rows ``matrix v >= lower`` written by :func:`separation_rows`; the first ``used[0]`` are valid."""
 
     matrix: Array  # (m, nv)
     lower: Array  # (m,) [m/s]
     pair: IntArray  # (m,)
-    count: IntArray  # (1,)
+    used: IntArray  # (1,) number of valid rows
 
     @classmethod
     def empty(cls, pairs: int, nv: int) -> Rows:
@@ -175,13 +175,13 @@ def separation_rows(
                     count = _append_row(
                         chain, placements, pairs, p, contact, reached, v, step, h, approach, rows, count
                     )
-    rows.count[0] = count
+    rows.used[0] = count
     return closest
 
 
 @kernel
 def speed_near(nearest: float, stop_distance: float, contact_speed: float, full_speed: float, full_at: float) -> float:
-    """Tool speed allowed at ``nearest`` [m] of two round bodies: full at ``full_at`` beyond, contact speed when closest.
+    """Tool speed allowed with two round bodies ``nearest`` apart [m]: contact speed if closest, full from ``full_at``.
 
     Round bodies that slide past each other turn the normal; the acceleration this takes grows with the square of the
     sliding speed, so it has to fall before the joints, shared between rows, run out of it.

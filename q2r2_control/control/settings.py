@@ -11,7 +11,9 @@ class ControllerSettings(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     solver: str = Field("daqp", description="daqp, osqp, or the name of any solver that qpsolvers has installed")
-    solve_time_limit: float = Field(0.002, gt=0, le=0.1, description="a later solution counts as failed [s]")
+    solve_time_limit: float | None = Field(
+        None, gt=0, le=0.1, description="a later solution counts as failed [s]; none: runs do not depend on the clock"
+    )
     max_substep: float = Field(0.002, gt=0, le=0.02, description="a longer dt is split into equal parts below this [s]")
 
     acceleration_limit: float = Field(10.0, gt=0, le=100, description="every joint [rad/s^2]")

@@ -1,8 +1,8 @@
 """Costs of the QP: tool twists, posture, hold, as H and g of  1/2 v' H v + g' v, compiled.
 
 For each following arm:  |J v - u|^2_W + mu |v|^2, u the wanted tool twist, W = diag(1, 1, 1, l^2, l^2, l^2) with the
-length l that makes a radian comparable to a metre. For all joints: w |v - v_p|^2 with the posture velocity v_p projected
-into the tools' nullspace, so that at rest it leaves no tool error.
+length l that makes a radian comparable to a metre. For all joints: w |v - v_p|^2 with the posture velocity v_p
+projected into the tools' nullspace, so that at rest it leaves no tool error.
 
 **Damping mu.** Stretched out towards an unreachable target, the gradient of the reach with respect to the elbow angle
 vanishes like L theta, so under a wanted speed s the closed loop near that posture has the gain L s / mu. It must stay

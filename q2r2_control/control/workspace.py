@@ -64,7 +64,7 @@ class Active(NamedTuple):
     """Bounds that the last step met."""
 
     code: IntArray  # (k,) 4 joint + kind of limit, or -1 - pair
-    count: IntArray  # (1,)
+    used: IntArray  # (1,) number of valid codes
 
 
 class Workspace(NamedTuple):
