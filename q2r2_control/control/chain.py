@@ -18,6 +18,8 @@ from q2r2_control.types import Array
 
 IntArray = npt.NDArray[np.int64]
 
+_ANY_MOTION = 1e-9  # of a unit axis: more than rounding
+
 
 class Chain(NamedTuple):
     """Joint tree as arrays; index 0 is the world, joint i moves with velocity index i - 1."""
@@ -52,8 +54,12 @@ def chain_of(model: pin.Model) -> Chain:
         joint = model.joints[i]
         if joint.nq != 1 or joint.nv != 1 or joint.idx_v != i - 1:
             raise RobotError(f"joint {model.names[i]}: only one-axis revolute and prismatic joints are supported")
-        column = pin.getJointJacobian(model, data, i, pin.LOCAL)[:, joint.idx_v]
-        prismatic[i] = int(np.linalg.norm(column[:3]) > 0.5)
+        # Pinocchio's binding drops the column dimension of a model with one joint.
+        column = np.reshape(pin.getJointJacobian(model, data, i, pin.LOCAL), (6, model.nv))[:, joint.idx_v]
+        slides, turns = np.linalg.norm(column[:3]) > _ANY_MOTION, np.linalg.norm(column[3:]) > _ANY_MOTION
+        if slides and turns:
+            raise RobotError(f"joint {model.names[i]} is a screw; only revolute and prismatic joints are supported")
+        prismatic[i] = int(slides)
         axis[i] = column[:3] if prismatic[i] else column[3:]
     return Chain(
         parent=np.array([model.parents[i] for i in range(model.njoints)], dtype=np.int64),

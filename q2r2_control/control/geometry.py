@@ -58,8 +58,9 @@ def segment_segment(a0: Array, a1: Array, b0: Array, b1: Array, on_a: Array, on_
         s = clamp(-ar / aa, 0.0, 1.0)
     else:
         determinant = aa * bb - ab * ab
-        # Parallel segments have many closest pairs; the middle of the overlap turns least when they tilt.
-        if determinant > 1e-9 * aa * bb:
+        # Parallel segments have many closest pairs; the middle of the overlap turns least when they tilt. It is too
+        # far by at most half the overlap times the angle, so only an angle below 1e-7 counts as parallel.
+        if determinant > 1e-14 * aa * bb:
             s = clamp((ab * br - ar * bb) / determinant, 0.0, 1.0)
         else:
             s = _middle_of_overlap(aa, ab, ar, bb)
