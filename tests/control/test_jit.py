@@ -1,0 +1,100 @@
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from q2r2_control.control import jit
+from q2r2_control.control.jit import hold, kernel
+from q2r2_control.types import Array
+
+
+@pytest.fixture
+def sources(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A copy of the package's sources that the cache folder is named after."""
+    copy = tmp_path / "control"
+    copy.mkdir()
+    for source in Path(jit.__file__).parent.glob("*.py"):
+        shutil.copy(source, copy)
+    monkeypatch.setattr(jit, "__file__", str(copy / "jit.py"))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    return copy
+
+
+def test_the_same_sources_share_a_cache_folder(sources: Path) -> None:
+    folder = jit._cache_folder()
+    assert folder == jit._cache_folder()
+    assert folder.parent == sources.parent / "cache" / "q2r2_control"
+
+
+@pytest.mark.parametrize("name", ["geometry.py", "braking.py", "settings.py"])
+def test_an_edit_of_any_source_leaves_yesterdays_machine_code_behind(sources: Path, name: str) -> None:
+    before = jit._cache_folder()
+    (sources / name).write_text((sources / name).read_text() + "# edited\n")
+    edited = jit._cache_folder()
+    (sources / "new_module.py").write_text("")
+    (sources / "another.py").write_text("value = 1\n")
+    assert len({before, edited, jit._cache_folder()}) == 3
+
+
+def test_a_cache_that_cannot_be_written_is_put_elsewhere(sources: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    occupied = sources.parent / "a_file"
+    occupied.write_text("")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(occupied))
+    folder = jit._cache_folder()
+    assert occupied not in folder.parents
+    folder.mkdir(parents=True, exist_ok=True)
+    folder.rmdir()
+
+
+def test_kernels_run_where_no_cache_can_be_written(tmp_path: Path) -> None:
+    occupied = tmp_path / "a_file"
+    occupied.write_text("")
+    program = (
+        "import numpy as np\nfrom q2r2_control.control.geometry import dot\nprint(dot(np.ones(3), np.full(3, 2.0)))\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program],
+        env={"XDG_CACHE_HOME": str(occupied), "TMPDIR": str(tmp_path), "HOME": str(tmp_path)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.stdout.split() == ["6.0"], done.stderr
+
+
+@kernel
+def _double(values: Array) -> None:
+    values *= 2.0
+
+
+@kernel
+def _one_over(value: float) -> float:
+    return 1.0 / value
+
+
+def test_a_kernel_changes_the_callers_array() -> None:
+    values = np.arange(3.0)
+    _double(values)
+    np.testing.assert_array_equal(values, [0.0, 2.0, 4.0])
+
+
+def test_division_by_zero_gives_infinity_instead_of_an_exception() -> None:
+    assert _one_over(0.0) == np.inf
+
+
+def test_what_is_held_stays_the_callers_own_array() -> None:
+    values = np.arange(3.0)
+    held = hold((values,))
+    values[0] = 7.0
+    _double_held(held)
+    np.testing.assert_array_equal(values, [14.0, 2.0, 4.0])
+
+
+@kernel
+def _double_held(held: jit.Held) -> None:
+    held.value[0][:] *= 2.0
