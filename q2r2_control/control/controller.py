@@ -53,7 +53,13 @@ class CartesianController:
         names = [geometry.name for geometry in robot.collision_model.geometryObjects]
         pairs = zip(cell.pairs.first.tolist(), cell.pairs.second.tolist(), strict=True)
         self._pair_names = [(names[first], names[second]) for first, second in pairs]
+        self._compile()
         self.reset(robot.home)
+
+    def _compile(self) -> None:
+        """Run every kernel once, so that none is compiled in mid-motion."""
+        self.reset(self.robot.home)
+        self.step({arm: self.tool_pose(arm) for arm in self._arms}, self.settings.max_substep)
 
     def reset(self, q: Array, v: Array | None = None) -> None:
         """Start anew at joint positions ``q`` [rad] and velocities ``v`` [rad/s], (nv,) each; goals are forgotten.

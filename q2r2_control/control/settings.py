@@ -25,7 +25,7 @@ class ControllerSettings(BaseModel):
     distance_buffer: float = Field(0.002, gt=0, le=0.05, description="the QP aims to stop this much earlier [m]")
     separation_gain: float = Field(4.0, gt=0, le=50, description="approach speed per metre of free distance [1/s]")
     separation_recovery_speed: float = Field(0.05, gt=0, le=0.5, description="when too close, moving apart [m/s]")
-    contact_speed: float = Field(0.05, gt=0, le=1, description="tool speed where another arm is closest [m/s]")
+    contact_speed: float = Field(0.03, gt=0, le=1, description="tool speed where another arm is closest [m/s]")
     full_speed_distance: float = Field(0.1, gt=0, le=1, description="free distance with full tool speed [m]")
 
     position_gain: float = Field(8.0, gt=0, le=50, description="[1/s]")
