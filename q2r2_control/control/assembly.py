@@ -7,7 +7,7 @@ import numpy as np
 from q2r2_control.control.chain import place
 from q2r2_control.control.collision import pose_bodies
 from q2r2_control.control.geometry import clamp
-from q2r2_control.control.jit import Held, kernel
+from q2r2_control.control.jit import Held, kernel, lean_kernel
 from q2r2_control.control.limits import next_velocity_box
 from q2r2_control.control.separation import separation_rows, speed_near
 from q2r2_control.control.tasks import add_tool_task, project_to_nullspace, tool_jacobian, tool_pose, wanted_twist
@@ -18,7 +18,7 @@ _HOLD_WEIGHT = 10.0
 _HOLD_GAIN = 4.0  # [1/s]
 
 
-@kernel
+@lean_kernel
 def observe(cell: Cell, work: Workspace) -> int:
     """Where everything is at the reference: tool poses, distances and separation rows. Returns the closest pair."""
     place(cell.chain, work.q, work.placements)
@@ -40,9 +40,12 @@ def observe(cell: Cell, work: Workspace) -> int:
         work.rows,
     )
     for i in range(work.rows.used[0]):
-        row = work.rows.matrix[i]
-        size = np.sqrt(np.sum(row * row))
-        row /= size
+        square = 0.0
+        for j in range(work.q.shape[0]):
+            square += work.rows.matrix[i, j] ** 2
+        size = np.sqrt(square)
+        for j in range(work.q.shape[0]):
+            work.rows.matrix[i, j] /= size
         work.rows.lower[i] /= size
     return closest
 
@@ -114,7 +117,7 @@ def _follow(cell: Cell, goals: Goals, i: int, work: Workspace) -> None:
     add_tool_task(J, work.twist[i], cell.motion.damping * feedback, cell.tools.member[i], work.H, work.g)
 
 
-@kernel
+@lean_kernel
 def _hold(cell: Cell, goals: Goals, i: int, work: Workspace) -> None:
     """Joints of a held arm return to where they were latched; the posture pull does not move them."""
     for j in range(work.q.shape[0]):

@@ -22,7 +22,7 @@ import numpy as np
 
 from q2r2_control.control.chain import Chain, Placements, place
 from q2r2_control.control.collision import Bodies, Contact, Pairs, Posed, measure, pose_bodies
-from q2r2_control.control.jit import kernel
+from q2r2_control.control.jit import lean_kernel
 from q2r2_control.types import Array
 
 _DEEPEST = 5  # halvings of the stop: 32 intervals
@@ -34,6 +34,7 @@ class Rollout(NamedTuple):
     """Scratch of :func:`certify`: samples of the stop at up to 2^deepest + 1 instants."""
 
     q: Array  # (s, nv)
+    v: Array  # (nv,)
     start: Array  # (s, g, 3)
     end: Array  # (s, g, 3)
     rotation: Array  # (s, g, 3, 3)
@@ -47,6 +48,7 @@ class Rollout(NamedTuple):
         samples, nv, g = 2**_DEEPEST + 1, len(chain.parent) - 1, len(bodies.joint)
         return cls(
             np.zeros((samples, nv)),
+            np.zeros(nv),
             np.zeros((samples, g, 3)),
             np.zeros((samples, g, 3)),
             np.zeros((samples, g, 3, 3)),
@@ -57,7 +59,7 @@ class Rollout(NamedTuple):
         )
 
 
-@kernel
+@lean_kernel
 def brake(q: Array, v: Array, a: Array, t: float, q_out: Array, v_out: Array) -> None:
     """State of the stop after ``t`` seconds, from (q, v) with decelerations a, (nv,) each."""
     for j in range(q.shape[0]):
@@ -71,7 +73,7 @@ def brake(q: Array, v: Array, a: Array, t: float, q_out: Array, v_out: Array) ->
             v_out[j] = v[j] - sign * a[j] * t
 
 
-@kernel
+@lean_kernel
 def step_way(v: float, v_next: float, h: float) -> float:
     """Way a joint travels in a step of constant acceleration, there and back counted."""
     if v * v_next >= 0.0:
@@ -79,21 +81,20 @@ def step_way(v: float, v_next: float, h: float) -> float:
     return 0.5 * (v * v + v_next * v_next) / (abs(v) + abs(v_next)) * h
 
 
-@kernel
+@lean_kernel
 def _sample(
     chain: Chain, bodies: Bodies, q: Array, v: Array, a: Array, duration: float, i: int, rollout: Rollout
 ) -> None:
     """Pose all bodies at sample ``i`` of the stop, once."""
     if rollout.known[i] == 1.0:
         return
-    unused = np.empty(q.shape[0])
-    brake(q, v, a, duration * i / (rollout.q.shape[0] - 1), rollout.q[i], unused)
+    brake(q, v, a, duration * i / (rollout.q.shape[0] - 1), rollout.q[i], rollout.v)
     place(chain, rollout.q[i], rollout.placements)
     pose_bodies(bodies, rollout.placements, Posed(rollout.start[i], rollout.end[i], rollout.rotation[i]))
     rollout.known[i] = 1.0
 
 
-@kernel
+@lean_kernel
 def _stop_keeps_apart(
     chain: Chain,
     bodies: Bodies,
@@ -140,7 +141,7 @@ def _stop_keeps_apart(
     return False
 
 
-@kernel
+@lean_kernel
 def certify(
     chain: Chain,
     bodies: Bodies,
@@ -192,7 +193,7 @@ def certify(
     return True
 
 
-@kernel
+@lean_kernel
 def _comes_no_closer(
     chain: Chain,
     bodies: Bodies,

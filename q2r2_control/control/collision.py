@@ -15,7 +15,7 @@ import pinocchio as pin
 
 from q2r2_control.control.chain import Chain, IntArray, Placements
 from q2r2_control.control.geometry import dot, segment_box, segment_segment
-from q2r2_control.control.jit import kernel
+from q2r2_control.control.jit import lean_kernel
 from q2r2_control.errors import RobotError
 from q2r2_control.types import Array
 
@@ -63,10 +63,12 @@ class Contact(NamedTuple):
     first: Array
     second: Array
     normal: Array
+    local: Array  # (3, 3)
+    witness: Array  # (3,)
 
     @classmethod
     def empty(cls) -> Contact:
-        return cls(np.zeros(3), np.zeros(3), np.zeros(3))
+        return cls(np.zeros(3), np.zeros(3), np.zeros(3), np.zeros((3, 3)), np.zeros(3))
 
 
 def bodies_of(model: pin.GeometryModel) -> Bodies:
@@ -143,7 +145,7 @@ def pairs_of(model: pin.GeometryModel, chain: Chain, bodies: Bodies, travel: Arr
     return pairs
 
 
-@kernel
+@lean_kernel
 def pose_bodies(bodies: Bodies, placements: Placements, posed: Posed) -> None:
     """Move every geometry to the world."""
     for g in range(bodies.joint.shape[0]):
@@ -164,7 +166,7 @@ def pose_bodies(bodies: Bodies, placements: Placements, posed: Posed) -> None:
                     posed.rotation[g, row, column] = turned
 
 
-@kernel
+@lean_kernel
 def at_least(bodies: Bodies, posed: Posed, first: int, second: int) -> float:
     """Cheap lower bound on the distance of two geometries, from the balls around them [m]."""
     square = 0.0
@@ -174,7 +176,7 @@ def at_least(bodies: Bodies, posed: Posed, first: int, second: int) -> float:
     return 0.5 * np.sqrt(square) - bodies.size[first] - bodies.size[second]
 
 
-@kernel
+@lean_kernel
 def measure(bodies: Bodies, posed: Posed, first: int, second: int, start: Array, end: Array, contact: Contact) -> float:
     """Signed distance [m] of the part ``start``-``end`` of geometry ``first`` from ``second``; fills ``contact``.
 
@@ -182,7 +184,7 @@ def measure(bodies: Bodies, posed: Posed, first: int, second: int, start: Array,
     changes no rate of distance.
     """
     if bodies.box[second] == 1:
-        local = np.empty((3, 3))
+        local = contact.local
         axes = posed.rotation[second]
         for k in range(3):
             along_start = 0.0
@@ -210,26 +212,25 @@ def measure(bodies: Bodies, posed: Posed, first: int, second: int, start: Array,
     return distance - bodies.radius[first] - bodies.radius[second]
 
 
-@kernel
+@lean_kernel
 def _any_normal(a0: Array, a1: Array, b0: Array, b1: Array, normal: Array) -> None:
-    """A unit normal for segments that touch: across both, away from the first's middle if they are parallel."""
-    u = a1 - a0
-    w = b1 - b0
-    across = np.array([u[1] * w[2] - u[2] * w[1], u[2] * w[0] - u[0] * w[2], u[0] * w[1] - u[1] * w[0]])
-    size = np.sqrt(dot(across, across))
-    if size < 1e-9:
-        across = 0.5 * (b0 + b1) - 0.5 * (a0 + a1)
-        size = np.sqrt(dot(across, across))
-        if size < 1e-9:
-            across = np.array([0.0, 0.0, 1.0])
-            size = 1.0
-    elif dot(across, 0.5 * (b0 + b1) - 0.5 * (a0 + a1)) < 0.0:
-        across = -across
+    """A unit normal for segments that touch: across both, or between their middles if they are parallel."""
+    between = 0.0
     for k in range(3):
-        normal[k] = across[k] / size
+        i, j = (k + 1) % 3, (k + 2) % 3
+        normal[k] = (a1[i] - a0[i]) * (b1[j] - b0[j]) - (a1[j] - a0[j]) * (b1[i] - b0[i])
+        between += normal[k] * (b0[k] + b1[k] - a0[k] - a1[k])
+    if dot(normal, normal) < 1e-18:
+        for k in range(3):
+            normal[k] = b0[k] + b1[k] - a0[k] - a1[k]
+    if dot(normal, normal) < 1e-18:
+        normal[2] = 1.0
+    size = np.sqrt(dot(normal, normal)) if between >= 0.0 else -np.sqrt(dot(normal, normal))
+    for k in range(3):
+        normal[k] /= size
 
 
-@kernel
+@lean_kernel
 def distance_row(chain: Chain, placements: Placements, pairs: Pairs, p: int, contact: Contact, row: Array) -> None:
     """Gradient of pair ``p``'s distance with respect to q into ``row`` (nv,) [m/rad]."""
     row[:] = 0.0

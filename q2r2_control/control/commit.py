@@ -7,7 +7,7 @@ import numpy as np
 from q2r2_control.control.assembly import observe
 from q2r2_control.control.braking import brake, certify
 from q2r2_control.control.geometry import clamp
-from q2r2_control.control.jit import Held, kernel
+from q2r2_control.control.jit import Held, kernel, lean_kernel
 from q2r2_control.control.limits import NO_LIMIT
 from q2r2_control.control.workspace import Cell, Workspace
 from q2r2_control.types import Array
@@ -53,7 +53,7 @@ def first_look(held_cell: Held, held_work: Held) -> tuple[int, bool]:
     return closest, _certified(cell, work, 0.0)
 
 
-@kernel
+@lean_kernel
 def _certified(cell: Cell, work: Workspace, h: float) -> bool:
     return certify(
         cell.chain,
@@ -70,7 +70,7 @@ def _certified(cell: Cell, work: Workspace, h: float) -> bool:
     )
 
 
-@kernel
+@lean_kernel
 def _largest_certified(cell: Cell, work: Workspace, h: float) -> int:
     """Write into ``work.candidate`` the wanted velocities if they can be certified, else the most of them that can.
 
@@ -98,7 +98,7 @@ def _largest_certified(cell: Cell, work: Workspace, h: float) -> int:
     return REDUCED
 
 
-@kernel
+@lean_kernel
 def _mix(work: Workspace, share: float, h: float) -> None:
     for j in range(work.q.shape[0]):
         braked = work.candidate[2, j]
@@ -106,7 +106,7 @@ def _mix(work: Workspace, share: float, h: float) -> None:
         work.candidate[1, j] = work.q[j] + 0.5 * h * (work.v[j] + work.candidate[0, j])
 
 
-@kernel
+@lean_kernel
 def _note_active(work: Workspace) -> float:
     """List the limits and pairs that the new velocities meet; returns the largest violation of a row [rad/s]."""
     v = work.v

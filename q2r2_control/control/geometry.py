@@ -9,25 +9,25 @@ from __future__ import annotations
 
 import numpy as np
 
-from q2r2_control.control.jit import kernel
+from q2r2_control.control.jit import lean_kernel
 from q2r2_control.types import Array
 
 _TINY = 1e-12
 
 
-@kernel
+@lean_kernel
 def dot(a: Array, b: Array) -> float:
     """Scalar product of two 3-vectors."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-@kernel
+@lean_kernel
 def clamp(value: float, lower: float, upper: float) -> float:
     """``value`` moved into ``[lower, upper]``."""
     return min(max(value, lower), upper)
 
 
-@kernel
+@lean_kernel
 def segment_segment(a0: Array, a1: Array, b0: Array, b1: Array, on_a: Array, on_b: Array) -> float:
     """Distance [m] of segments a0-a1 and b0-b1, each (3,); writes the closest points into ``on_a`` and ``on_b``.
 
@@ -79,7 +79,7 @@ def segment_segment(a0: Array, a1: Array, b0: Array, b1: Array, on_a: Array, on_
     return np.sqrt(square)
 
 
-@kernel
+@lean_kernel
 def _middle_of_overlap(aa: float, ab: float, ar: float, bb: float) -> float:
     """Parameter on a of the middle of what b covers of it, for parallel segments."""
     first = -ar / aa  # of b0 on a
@@ -89,7 +89,7 @@ def _middle_of_overlap(aa: float, ab: float, ar: float, bb: float) -> float:
     return 0.5 * (low + high)
 
 
-@kernel
+@lean_kernel
 def segment_box(a0: Array, a1: Array, half: Array, on_a: Array, on_box: Array, normal: Array) -> float:
     """Signed distance [m] of a segment and a box of half sides ``half``, all in the box frame, (3,).
 
@@ -98,20 +98,7 @@ def segment_box(a0: Array, a1: Array, half: Array, on_a: Array, on_box: Array, n
     between two of the at most six parameters where the segment crosses a face plane. A segment that enters the box
     is pushed out through the face that takes the least way (negative distance).
     """
-    breaks = np.empty(8)
-    breaks[0] = 0.0
-    breaks[1] = 1.0
-    count = 2
-    for k in range(3):
-        direction = a1[k] - a0[k]
-        if abs(direction) > _TINY:
-            for face in (-half[k], half[k]):
-                s = (face - a0[k]) / direction
-                if 0.0 < s < 1.0:
-                    breaks[count] = s
-                    count += 1
-    breaks[:count].sort()
-    s = _minimum_along(a0, a1, half, breaks, count)
+    s = _minimum_along(a0, a1, half)
     square = 0.0
     for k in range(3):
         on_a[k] = a0[k] + s * (a1[k] - a0[k])
@@ -125,7 +112,7 @@ def segment_box(a0: Array, a1: Array, half: Array, on_a: Array, on_box: Array, n
     return _push_out(a0, a1, half, on_a, on_box, normal)
 
 
-@kernel
+@lean_kernel
 def _slope_along(a0: Array, a1: Array, half: Array, s: float) -> float:
     """Half the derivative of the squared distance at parameter s."""
     slope = 0.0
@@ -136,31 +123,49 @@ def _slope_along(a0: Array, a1: Array, half: Array, s: float) -> float:
     return slope
 
 
-@kernel
-def _minimum_along(a0: Array, a1: Array, half: Array, breaks: Array, count: int) -> float:
-    """Parameter of the minimum; where many share it (a segment along a face) the middle of them."""
-    low = 0.0
-    low_found = False
-    previous = _slope_along(a0, a1, half, breaks[0])
-    if previous > _TINY:
+@lean_kernel
+def _minimum_along(a0: Array, a1: Array, half: Array) -> float:
+    """Parameter of the minimum; where many share it (a segment along a face) the middle of them.
+
+    The slope never falls, so the largest break with a negative and the smallest with a positive slope enclose all
+    minima; no break lies between them but those where the slope is zero.
+    """
+    low, low_slope = 0.0, _slope_along(a0, a1, half, 0.0)
+    high, high_slope = 1.0, _slope_along(a0, a1, half, 1.0)
+    if low_slope > _TINY:
         return 0.0
-    if previous >= -_TINY:
-        low_found = True
-    for i in range(1, count):
-        slope = _slope_along(a0, a1, half, breaks[i])
-        if not low_found and slope >= -_TINY:
-            rise = slope - previous
-            low = breaks[i - 1] - previous * (breaks[i] - breaks[i - 1]) / rise if rise > _TINY else breaks[i]
-            low_found = True
-        if slope > _TINY:
-            if previous >= -_TINY:
-                return 0.5 * (low + breaks[i - 1])
-            return low
-        previous = slope
-    return 0.5 * (low + 1.0) if low_found else 1.0
+    if high_slope < -_TINY:
+        return 1.0
+    first_flat = 0.0 if low_slope >= -_TINY else np.inf
+    last_flat = 1.0 if high_slope <= _TINY else -np.inf
+    for k in range(3):
+        direction = a1[k] - a0[k]
+        if abs(direction) <= _TINY:
+            continue
+        for face in (-half[k], half[k]):
+            s = (face - a0[k]) / direction
+            if not 0.0 < s < 1.0:
+                continue
+            slope = _slope_along(a0, a1, half, s)
+            if slope < -_TINY:
+                if s > low:
+                    low, low_slope = s, slope
+            elif slope > _TINY:
+                if s < high:
+                    high, high_slope = s, slope
+            else:
+                first_flat = min(first_flat, s)
+                last_flat = max(last_flat, s)
+    if first_flat <= last_flat:
+        return 0.5 * (first_flat + last_flat)
+    if first_flat < np.inf:
+        return first_flat
+    if last_flat > -np.inf:
+        return last_flat
+    return low - low_slope * (high - low) / (high_slope - low_slope)
 
 
-@kernel
+@lean_kernel
 def _push_out(a0: Array, a1: Array, half: Array, on_a: Array, on_box: Array, normal: Array) -> float:
     """Least way out of the box for a segment that enters it."""
     best = np.inf

@@ -26,7 +26,7 @@ from __future__ import annotations
 import numpy as np
 
 from q2r2_control.control.geometry import clamp
-from q2r2_control.control.jit import kernel
+from q2r2_control.control.jit import lean_kernel
 from q2r2_control.types import Array
 
 # Inward speed per radian outside, and how far inside the return aims so that it ends after finite time.
@@ -36,7 +36,7 @@ _RETURN_DEPTH = 1e-3  # [rad]
 NO_LIMIT, POSITION, VELOCITY, ACCELERATION = 0, 1, 2, 3
 
 
-@kernel
+@lean_kernel
 def fastest_towards(room: float, v: float, a: float, h: float, longest: float, return_speed: float) -> float:
     """Largest next velocity towards a limit [rad/s] that keeps P, given the ``room`` to it [rad]; see the proof above.
 
@@ -52,7 +52,7 @@ def fastest_towards(room: float, v: float, a: float, h: float, longest: float, r
     return 2.0 * remaining / (c + np.sqrt(c * c + 2.0 * remaining / a))
 
 
-@kernel
+@lean_kernel
 def next_velocity_box(
     q: Array,
     v: Array,

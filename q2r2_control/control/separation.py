@@ -18,7 +18,7 @@ import numpy as np
 from q2r2_control.control.chain import Chain, IntArray, Placements
 from q2r2_control.control.collision import Bodies, Contact, Pairs, Posed, at_least, distance_row, measure
 from q2r2_control.control.geometry import clamp, segment_segment
-from q2r2_control.control.jit import kernel
+from q2r2_control.control.jit import lean_kernel
 from q2r2_control.types import Array
 
 _SHARE = 0.25
@@ -54,7 +54,7 @@ class Rows(NamedTuple):
         )
 
 
-@kernel
+@lean_kernel
 def slowest_rate(free: float, alpha: float, approach: Approach) -> float:
     """Least rate of distance [m/s] allowed at the free distance ``free`` [m]."""
     if free < 0.0:
@@ -62,7 +62,7 @@ def slowest_rate(free: float, alpha: float, approach: Approach) -> float:
     return -min(approach.gain * free, np.sqrt(2.0 * alpha * free))
 
 
-@kernel
+@lean_kernel
 def _append_row(
     chain: Chain,
     placements: Placements,
@@ -71,20 +71,20 @@ def _append_row(
     contact: Contact,
     distance: float,
     v: Array,
-    step: Array,
+    a: Array,
     h: float,
     approach: Approach,
     rows: Rows,
     count: int,
 ) -> int:
-    """Keep the row if some velocity that the acceleration allows (v +- step) breaks it; any other cannot bind."""
+    """Keep the row if some velocity that the acceleration allows (v +- a h) breaks it; any other cannot bind."""
     row = rows.matrix[count]
     distance_row(chain, placements, pairs, p, contact, row)
     rate = 0.0
     change = 0.0
     for j in range(row.shape[0]):
         rate += row[j] * v[j]
-        change += abs(row[j]) * step[j]
+        change += abs(row[j]) * a[j] * h
     lower = slowest_rate(distance - approach.stop_distance, _SHARE * change / h, approach)
     if rate - change >= lower or change <= 0.0:
         return count
@@ -93,7 +93,7 @@ def _append_row(
     return count + 1
 
 
-@kernel
+@lean_kernel
 def _near(point: Array, other: Array) -> bool:
     return (
         abs(point[0] - other[0]) < _SAME_POINT
@@ -102,7 +102,13 @@ def _near(point: Array, other: Array) -> bool:
     )
 
 
-@kernel
+@lean_kernel
+def _copy(point: Array, to: Array) -> None:
+    for k in range(3):
+        to[k] = point[k]
+
+
+@lean_kernel
 def separation_rows(
     chain: Chain,
     placements: Placements,
@@ -122,11 +128,10 @@ def separation_rows(
     ``distance`` (p,) receives the exact distance where it matters (a row could bind, the arms could have to slow down,
     the closest pair) and a lower bound elsewhere. Returns the closest pair.
     """
-    step = a * h
     count = 0
     closest = 0
     least = np.inf
-    witness = np.empty(3)
+    witness = contact.witness
     for p in range(pairs.first.shape[0]):
         first = pairs.first[p]
         second = pairs.second[p]
@@ -137,7 +142,7 @@ def separation_rows(
             joint = pairs.joint[p, k]
             if joint == 0:
                 break
-            closing += pairs.reach[p, k] * (abs(v[joint - 1]) + step[joint - 1])
+            closing += pairs.reach[p, k] * (abs(v[joint - 1]) + a[joint - 1] * h)
         relevant = approach.stop_distance + 2.0 * closing / approach.gain
         if pairs.round[p] == 1:
             relevant = max(relevant, approach.slow_below)
@@ -152,19 +157,19 @@ def separation_rows(
         if distance[p] > relevant:
             continue
         before = count
-        count = _append_row(chain, placements, pairs, p, contact, distance[p], v, step, h, approach, rows, count)
+        count = _append_row(chain, placements, pairs, p, contact, distance[p], v, a, h, approach, rows, count)
         if count == before:
             continue
         # The closest points of near-parallel bodies jump from end to end; rows at all ends leave nothing to jump.
-        witness[:] = contact.first
+        _copy(contact.first, witness)
         for point in (start, end):
             if not _near(point, witness):
                 reached = measure(bodies, posed, first, second, point, point, contact)
-                count = _append_row(chain, placements, pairs, p, contact, reached, v, step, h, approach, rows, count)
+                count = _append_row(chain, placements, pairs, p, contact, reached, v, a, h, approach, rows, count)
         if bodies.box[second] == 1:
             continue
         measure(bodies, posed, first, second, start, end, contact)
-        witness[:] = contact.second
+        _copy(contact.second, witness)
         for point in (posed.start[second], posed.end[second]):
             if not _near(point, witness):
                 reached = segment_segment(start, end, point, point, contact.first, contact.second)
@@ -172,14 +177,12 @@ def separation_rows(
                     for k in range(3):
                         contact.normal[k] = (contact.second[k] - contact.first[k]) / reached
                     reached -= bodies.radius[first] + bodies.radius[second]
-                    count = _append_row(
-                        chain, placements, pairs, p, contact, reached, v, step, h, approach, rows, count
-                    )
+                    count = _append_row(chain, placements, pairs, p, contact, reached, v, a, h, approach, rows, count)
     rows.used[0] = count
     return closest
 
 
-@kernel
+@lean_kernel
 def speed_near(nearest: float, stop_distance: float, contact_speed: float, full_speed: float, full_at: float) -> float:
     """Tool speed allowed with two round bodies ``nearest`` apart [m]: contact speed if closest, full from ``full_at``.
 

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from q2r2_control.control.chain import Chain, IntArray, Placements
-from q2r2_control.control.jit import kernel
+from q2r2_control.control.jit import kernel, lean_kernel
 from q2r2_control.types import Array
 
 ROTATION_LENGTH = 0.3  # [m/rad]
@@ -42,7 +42,7 @@ class Motion(NamedTuple):
     damping: float  # c in mu = c s [s]
 
 
-@kernel
+@lean_kernel
 def tool_pose(placements: Placements, tools: Tools, i: int, rotation: Array, translation: Array) -> None:
     """World pose of tool ``i`` into ``rotation`` (3, 3) and ``translation`` (3,)."""
     joint = tools.joint[i]
@@ -56,7 +56,7 @@ def tool_pose(placements: Placements, tools: Tools, i: int, rotation: Array, tra
             translation[row] += placements.rotation[joint, row, column] * tools.translation[i, column]
 
 
-@kernel
+@lean_kernel
 def tool_jacobian(chain: Chain, placements: Placements, tools: Tools, i: int, translation: Array, J: Array) -> None:
     """Jacobian (6, nv) of tool ``i``: linear, then angular velocity in world axes at the tool's origin."""
     J[:] = 0.0
@@ -65,7 +65,8 @@ def tool_jacobian(chain: Chain, placements: Placements, tools: Tools, i: int, tr
         axis = placements.axis[joint]
         j = joint - 1
         if chain.prismatic[joint] == 1:
-            J[0:3, j] = axis
+            for k in range(3):
+                J[k, j] = axis[k]
         else:
             x = translation[0] - placements.translation[joint, 0]
             y = translation[1] - placements.translation[joint, 1]
@@ -73,7 +74,8 @@ def tool_jacobian(chain: Chain, placements: Placements, tools: Tools, i: int, tr
             J[0, j] = axis[1] * z - axis[2] * y
             J[1, j] = axis[2] * x - axis[0] * z
             J[2, j] = axis[0] * y - axis[1] * x
-            J[3:6, j] = axis
+            for k in range(3):
+                J[3 + k, j] = axis[k]
         joint = chain.parent[joint]
 
 
@@ -107,7 +109,7 @@ def rotation_vector(R: Array, out: Array) -> None:
         out[k] = factor * q[1 + k]
 
 
-@kernel
+@lean_kernel
 def approach_speed(error: float, gain: float, deceleration: float) -> float:
     """Speed towards a target ``error`` away: proportional when near, that of constant deceleration when far.
 
@@ -161,7 +163,7 @@ def wanted_twist(
     return feedback
 
 
-@kernel
+@lean_kernel
 def add_tool_task(J: Array, twist: Array, mu: float, member: Array, H: Array, g: Array) -> None:
     """Add |J v - twist|^2_W + mu |v|^2 of one arm to H (nv, nv) and g (nv,)."""
     nv = g.shape[0]
