@@ -5,7 +5,9 @@ Every key has a unit and a range here; ``config/dual_iiwa7.yaml`` shows them all
 
 from __future__ import annotations
 
+import json
 import os
+import re
 from typing import Annotated, Any, Literal
 
 import yaml
@@ -17,16 +19,14 @@ from q2r2_control.resources import find_resource
 from q2r2_control.teleop.settings import TeleopSettings
 
 Side = Literal["left", "right"]
-Metres3 = Annotated[tuple[float, float, float], Field(description="x, y, z [m]")]
-Radians3 = Annotated[tuple[float, float, float], Field(description="roll, pitch, yaw [rad]")]
-Colour = tuple[
-    Annotated[float, Field(ge=0, le=1)],
-    Annotated[float, Field(ge=0, le=1)],
-    Annotated[float, Field(ge=0, le=1)],
-    Annotated[float, Field(ge=0, le=1)],
-]
-
-Positive = Annotated[float, Field(gt=0)]
+# The ranges are there to catch millimetres and degrees.
+Coordinate = Annotated[float, Field(ge=-20, le=20)]  # [m]
+Extent = Annotated[float, Field(gt=0, le=20)]  # [m]
+Angle = Annotated[float, Field(ge=-6.2832, le=6.2832)]  # [rad]
+Share = Annotated[float, Field(ge=0, le=1)]
+Metres3 = Annotated[tuple[Coordinate, Coordinate, Coordinate], Field(description="x, y, z [m]")]
+Radians3 = Annotated[tuple[Angle, Angle, Angle], Field(description="roll, pitch, yaw [rad]")]
+Colour = tuple[Share, Share, Share, Share]
 
 
 class _Model(BaseModel):
@@ -79,7 +79,7 @@ class ObstacleConfig(_Model):
     """A fixed body of the cell. Cylinders and capsules stand along z; a capsule's length is its segment's."""
 
     shape: Literal["box", "cylinder", "sphere", "capsule"]
-    size: tuple[float, ...] = Field(
+    size: tuple[Extent, ...] = Field(
         description="box: x y z; cylinder, capsule: radius length; sphere: radius [m]",
         min_length=1,
         max_length=3,
@@ -91,8 +91,8 @@ class ObstacleConfig(_Model):
     @model_validator(mode="after")
     def _size_fits_shape(self) -> ObstacleConfig:
         count = {"box": 3, "cylinder": 2, "sphere": 1, "capsule": 2}[self.shape]
-        if len(self.size) != count or min(self.size) <= 0:
-            raise ValueError(f"a {self.shape} takes {count} positive size value(s), got {list(self.size)}")
+        if len(self.size) != count:
+            raise ValueError(f"a {self.shape} takes {count} size value(s), got {list(self.size)}")
         return self
 
 
@@ -106,7 +106,7 @@ class HeadsetConfig(_Model):
 class ObjectConfig(_Model):
     """A loose box in the simulated cell, to be grasped. The controller does not know of it."""
 
-    size: tuple[Positive, Positive, Positive] = Field(description="x y z [m]")
+    size: tuple[Extent, Extent, Extent] = Field(description="x y z [m]")
     position: Metres3 = Field(description="of the centre at the start [m]")
     mass: float = Field(0.2, gt=0, le=100, description="[kg]")
     colour: Colour = (0.2, 0.45, 0.8, 1.0)
@@ -142,25 +142,31 @@ def load_config(path: str | os.PathLike[str]) -> Config:
     """
     file = find_resource(path)
     try:
-        data = yaml.load(file.read_text(encoding="utf-8"), Loader=_UniqueKeyLoader)
+        data = yaml.load(file.read_text(encoding="utf-8"), Loader=_Loader)
     except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: cannot be read: {error}") from error
-    except yaml.YAMLError as error:
-        raise ConfigError(f"{path}: not YAML: {' '.join(str(error).split())}") from error
+        raise ConfigError(f"{path}: cannot be read: {_line(error)}") from error
+    # Values such as dates and huge integers, and nesting without end, raise Python's own exceptions.
+    except (yaml.YAMLError, ValueError, TypeError, RecursionError) as error:
+        raise ConfigError(f"{path}: not YAML: {_line(error)}") from error
     if not isinstance(data, dict):
         raise ConfigError(f"{path}: expected a mapping of keys such as name, arms, obstacles; got {data!r:.60}")
     try:
-        return Config.model_validate(data)
+        # Strict, or `off` would pass for 0.0; by way of JSON, where sequences are tuples and names are enums.
+        return Config.model_validate_json(json.dumps(data, default=str), strict=True)
     except ValidationError as error:
         raise ConfigError(f"{path}: {_first_fault(error)}") from error
+    except (ValueError, TypeError, RecursionError) as error:
+        raise ConfigError(f"{path}: expected plain keys and values: {_line(error)}") from error
 
 
-class _UniqueKeyLoader(yaml.SafeLoader):
-    """Plain YAML lets a later key silently replace an earlier one; in a safety setting that is a fault."""
+class _Loader(yaml.SafeLoader):
+    """Stricter than plain YAML 1.1, where a later key silently replaces an earlier one and 1e-3 is a text."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         seen: set[Any] = set()
         for key_node, _ in node.value:
+            if key_node.tag == "tag:yaml.org,2002:merge":
+                continue  # `<<: *other`: keys of the mapping itself may replace the merged ones
             key = self.construct_object(key_node, deep=True)
             if key in seen:
                 raise yaml.constructor.ConstructorError(None, None, f"key {key!r} is given twice", key_node.start_mark)
@@ -168,21 +174,29 @@ class _UniqueKeyLoader(yaml.SafeLoader):
         return super().construct_mapping(node, deep)
 
 
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float", re.compile(r"[-+]?[0-9]+(\.[0-9]*)?[eE][-+]?[0-9]+"), list("-+0123456789")
+)
+
+
 def _first_fault(error: ValidationError) -> str:
     """One line about the first fault: key, value, what is allowed, and how many more there are."""
-    faults = error.errors()
+    # A key that is misspelt is missing as well; the misspelling says more.
+    faults = sorted(error.errors(), key=lambda fault: fault["type"] == "missing")
     fault = faults[0]
-    key = ".".join(str(part) for part in fault["loc"] if part != "[key]") or "(top level)"
+    key = _line(".".join(str(part) for part in fault["loc"] if part != "[key]")) or "(top level)"
+    more = f" (and {len(faults) - 1} more)" if len(faults) > 1 else ""
+    if fault["type"] == "missing":
+        return f"{key}: missing, and has no default{more}"
     allowed = fault["msg"].removeprefix("Value error, ")
     if fault["type"] == "extra_forbidden":
         allowed = f"unknown key; allowed here: {', '.join(_keys_at(fault['loc'][:-1]))}"
-    elif fault["type"] == "missing":
-        return f"{key}: missing, and has no default" + _count(faults)
-    return f"{key} = {fault['input']!r:.60}: {allowed}" + _count(faults)
+    return f"{key} = {fault['input']!r:.60}: {allowed}{more}"
 
 
-def _count(faults: list[Any]) -> str:
-    return f" (and {len(faults) - 1} more)" if len(faults) > 1 else ""
+def _line(text: object) -> str:
+    """``text`` as one line of bounded length."""
+    return " ".join(str(text).split())[:300]
 
 
 def _keys_at(location: tuple[int | str, ...]) -> list[str]:

@@ -8,7 +8,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -25,14 +25,16 @@ from q2r2_control.plants.kinematic import KinematicPlant
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.robot.robot import Robot
 from q2r2_control.summary import RunStatistics, RunSummary
+from q2r2_control.teleop.arm import OPEN
 from q2r2_control.teleop.teleop import Teleop
 from q2r2_control.types import ArmTarget, Command, CommandMode, Event, HandSample, Reference, RobotState
 
 INPUTS = ("scripted", "headset")
 PLANTS = ("mujoco", "kinematic")
 DEFAULT_TRAJECTORY = "reach_grasp_handover"
-# Braking from the fastest joint takes well under a second; nobody waits longer for a stop.
-_LONGEST_STOP = 2.0  # [s]
+STOPPING = "stopping"  # state of every arm while the run ends
+# Added to the time that full braking takes; an arm that still recovers into its limits is not waited for longer.
+_STOP_ALLOWANCE = 1.0  # [s]
 _REST = 1e-6  # [rad/s]
 
 
@@ -45,7 +47,7 @@ class Tick:
     samples: list[HandSample]
     targets: dict[str, ArmTarget]
     engaged: dict[str, bool]
-    states: dict[str, str]
+    states: dict[str, str]  # of the teleop layer, or STOPPING
     reference: Reference
     state: RobotState  # measured before the tick's command
     tools: dict[str, pin.SE3]  # measured tool poses, world frame
@@ -55,6 +57,9 @@ class Tick:
 
 class Pipeline:
     """Runs a cell. ``listeners`` are called with every :class:`Tick`; they must not take long.
+
+    Whatever ends a run, the arms are brought to rest before input and plant are closed. A listener that raises is not
+    called again; it ends the run like :meth:`stop`, and then its exception goes to the caller.
 
     ``realtime``: the loop follows the clock, and a tick's dt is the time that really passed, so that a late loop moves
     the robot no faster. Otherwise time is simulated, as fast as the machine can, and the run is repeatable.
@@ -68,7 +73,8 @@ class Pipeline:
         self.controller = CartesianController(robot, config.control)
         self.teleop = Teleop(config.teleop, tuple(robot.arms))
         self.listeners: list[Callable[[Tick], None]] = []
-        self._stop = threading.Event()
+        # A plain flag: unlike the locks of threading.Event, a signal handler can set it in the middle of anything.
+        self._stopping = False
 
     @classmethod
     def from_config(cls, config: Config, *, input: Input | str = "scripted", plant: Plant | str = "mujoco") -> Pipeline:
@@ -80,8 +86,8 @@ class Pipeline:
         return cls(config, robot, _input_of(input, config), _plant_of(plant, robot, config))
 
     def stop(self) -> None:
-        """Bring the arms to rest and end the run; may be called from any thread or a signal handler."""
-        self._stop.set()
+        """Bring the arms to rest and end the run, or the next one if none runs; from any thread or signal handler."""
+        self._stopping = True
 
     def run(self, duration: float | None = None, realtime: bool = True) -> RunSummary:
         """Run for ``duration`` [s], or until :meth:`stop`, Ctrl-C or SIGTERM; the arms are brought to rest first.
@@ -90,23 +96,32 @@ class Pipeline:
         """
         if duration is not None and not (math.isfinite(duration) and duration > 0.0):
             raise ConfigError(f"duration = {duration!r}: allowed: a positive number of seconds")
-        if not realtime:
-            # Whether a solution is late depends on the machine; a repeatable run must not.
-            settings = self.config.control.model_copy(update={"solve_time_limit": None})
-            self.controller = CartesianController(self.robot, settings)
-        self._stop.clear()
-        self.input.start()
+        self._prepare(realtime)
         try:
-            with _stop_on_signals(self.stop), _no_garbage_collection():
+            self.input.start()
+            with _stop_on_signals(self.stop), _few_garbage_collections():
                 return _Run(self, realtime).until(duration)
         finally:
-            self.input.close()
-            self.plant.close()
+            self._stopping = False
+            try:
+                self.input.close()
+            finally:
+                self.plant.close()
+
+    def _prepare(self, realtime: bool) -> None:
+        """Nothing of an earlier run may move an arm: every run starts paused and with open grippers, as the plant."""
+        self.teleop = Teleop(self.config.teleop, tuple(self.robot.arms))
+        settings = self.config.control
+        if not realtime:
+            # Whether a solution is late depends on the machine; a repeatable run must not.
+            settings = settings.model_copy(update={"solve_time_limit": None})
+        if settings != self.controller.settings:
+            self.controller = CartesianController(self.robot, settings)
 
     @property
     def stopping(self) -> bool:
-        """Whether :meth:`stop` was called."""
-        return self._stop.is_set()
+        """Whether :meth:`stop` was called, until the run has ended."""
+        return self._stopping
 
 
 class _Run:
@@ -116,39 +131,58 @@ class _Run:
         self._pipeline = pipeline
         self._period = 1.0 / pipeline.config.loop_rate_hz
         self._realtime = realtime
-        control = pipeline.config.control
-        self._statistics = RunStatistics(pipeline.robot, control.acceleration_limit, control.position_margin)
+        self._statistics = RunStatistics(pipeline.robot, pipeline.config.control)
         self._data = pipeline.robot.model.createData()
+        self._listeners = list(pipeline.listeners)
+        self._failure: Exception | None = None  # of a listener
+        self._targets = {arm: ArmTarget(None, OPEN) for arm in pipeline.robot.arms}
+        self._following = True
         self._connected = False
-        self._start = self._now = time.monotonic() if realtime else 0.0
-        self._wall_start = time.perf_counter()
         pipeline.plant.reset()
         pipeline.controller.reset(pipeline.plant.state().q)
+        self._ticks = 0
+        self._start = self._now = self._due = time.monotonic() if realtime else 0.0
+        self._wall_start = time.perf_counter()
 
     def until(self, duration: float | None) -> RunSummary:
         """Tick until ``duration`` is over or a stop is asked for, then until the arms are at rest."""
         ends = math.inf if duration is None else duration
-        # Half a period of tolerance: counting periods must not add or lose one by rounding.
-        while self._now - self._start < ends - 0.5 * self._period and not self._pipeline.stopping:
-            self._tick(stopping=False)
-        deadline = self._now + _LONGEST_STOP
-        moving = True
-        while moving and self._now < deadline:
-            moving = bool(np.abs(self._tick(stopping=True).v).max() > _REST)
+        try:
+            # Half a period of tolerance: counting periods must not add or lose one by rounding.
+            while self._now - self._start < ends - 0.5 * self._period and not self._pipeline.stopping:
+                self._tick()
+        except BaseException:
+            # The arms come first, whatever failed. What failed may fail again; the first fault tells more.
+            with suppress(Exception):
+                self._bring_to_rest()
+            raise
+        self._bring_to_rest()
+        if self._failure is not None:
+            raise self._failure
         return self._statistics.summary(time.perf_counter() - self._wall_start)
 
-    def _tick(self, stopping: bool) -> Reference:
+    def _bring_to_rest(self) -> None:
+        """Tick without input and targets until the reference stands still; no fault of an input can prevent it."""
+        self._following = False
+        self._targets = {arm: ArmTarget(None, target.gripper) for arm, target in self._targets.items()}
+        speed = float(np.abs(self._tick().v).max())
+        deadline = self._now + speed / self._pipeline.config.control.acceleration_limit + _STOP_ALLOWANCE
+        while speed > _REST and self._now < deadline:
+            speed = float(np.abs(self._tick().v).max())
+
+    def _tick(self) -> Reference:
         """One line of the way of the data: sample -> target -> reference -> command -> state."""
         pipeline = self._pipeline
         dt = self._wait()
         began = time.perf_counter()
-        samples = self._poll()
+        samples = self._poll() if self._following else []
         state = pipeline.plant.state()
         tools = self._tools(state)
-        commanded = {arm: pipeline.controller.tool_pose(arm) for arm in pipeline.robot.arms}
-        targets = pipeline.teleop.update(samples, tools, self._now, commanded)
-        poses = {arm: None if stopping else target.pose for arm, target in targets.items()}
-        reference = pipeline.controller.step(poses, dt)
+        if self._following:
+            commanded = {arm: pipeline.controller.tool_pose(arm) for arm in pipeline.robot.arms}
+            self._targets = pipeline.teleop.update(samples, tools, self._now, commanded)
+        targets = self._targets
+        reference = pipeline.controller.step({arm: target.pose for arm, target in targets.items()}, dt)
         grippers = {arm: target.gripper for arm, target in targets.items()}
         pipeline.plant.apply(
             Command(CommandMode.POSITION, reference.q, reference.v, np.zeros_like(reference.q), grippers)
@@ -163,13 +197,17 @@ class _Run:
 
     def _wait(self) -> float:
         """Let the next tick come; returns the time since the last one [s]."""
+        self._ticks += 1
         if not self._realtime:
-            self._now += self._period
+            self._now = self._ticks * self._period
             return self._period
-        rest = self._now + self._period - time.monotonic()
+        self._due += self._period
+        rest = self._due - time.monotonic()
         if rest > 0.0:
             time.sleep(rest)
         before, self._now = self._now, time.monotonic()
+        # Late wake-ups do not add up, since ticks are due on a grid; ticks that were missed are not made up for.
+        self._due = max(self._due, self._now - self._period)
         return min(max(self._now - before, 1e-6), LONGEST_DT)
 
     def _poll(self) -> list[HandSample]:
@@ -199,12 +237,12 @@ class _Run:
         compute_time: float,
     ) -> None:
         teleop, statistics = self._pipeline.teleop, self._statistics
-        engaged = teleop.engaged
+        engaged = {arm: self._following and value for arm, value in teleop.engaged.items()}
         statistics.tick.add(compute_time)
         statistics.add(dt, reference, targets, tools, engaged)
         for event in teleop.take_events():
             statistics.events.append(_since(event, self._start))
-        if not self._pipeline.listeners:
+        if not self._listeners:
             return
         tick = Tick(
             t=self._now - self._start,
@@ -212,15 +250,24 @@ class _Run:
             samples=samples,
             targets=targets,
             engaged=engaged,
-            states={arm: str(value) for arm, value in teleop.states.items()},
+            states={arm: str(value) if self._following else STOPPING for arm, value in teleop.states.items()},
             reference=reference,
             state=state,
             tools=tools,
             grippers=self._pipeline.plant.gripper_openings(),
             compute_time=compute_time,
         )
-        for listener in self._pipeline.listeners:
-            listener(tick)
+        self._tell(tick)
+
+    def _tell(self, tick: Tick) -> None:
+        """Call every listener; the first exception is kept until the arms are at rest."""
+        for listener in list(self._listeners):
+            try:
+                listener(tick)
+            except Exception as error:
+                self._listeners.remove(listener)
+                self._failure = self._failure or error
+                self._pipeline.stop()
 
 
 def _since(event: Event, start: float) -> Event:
@@ -263,15 +310,11 @@ def _stop_on_signals(stop: Callable[[], None]) -> Iterator[None]:
 
 
 @contextmanager
-def _no_garbage_collection() -> Iterator[None]:
-    """The loop makes no cycles; a collection in mid-motion would cost it several ticks."""
-    enabled = gc.isenabled()
+def _few_garbage_collections() -> Iterator[None]:
+    """Take all that exists out of garbage collection, which would otherwise cost the loop several ticks each time."""
     gc.collect()
     gc.freeze()
-    gc.disable()
     try:
         yield
     finally:
-        if enabled:
-            gc.enable()
         gc.unfreeze()

@@ -21,11 +21,16 @@ def resource_roots() -> list[Path]:
 
 def find_resource(path: str | os.PathLike[str]) -> Path:
     """Resolve ``path`` from the working directory, then among the shipped files. Raises :class:`ConfigError`."""
-    wanted = Path(path).expanduser()
-    candidates = [wanted] if wanted.is_absolute() else [wanted, *(root / wanted for root in resource_roots())]
-    for candidate in candidates:
-        if candidate.is_file():
-            return candidate
+    wanted = Path(path)
+    try:
+        wanted = wanted.expanduser()
+        candidates = [wanted] if wanted.is_absolute() else [wanted, *(root / wanted for root in resource_roots())]
+        for candidate in candidates:
+            if candidate.is_file():
+                return candidate
+    except (OSError, ValueError, RuntimeError) as error:
+        # A name that is too long, a folder that may not be entered, the home of an unknown user.
+        raise ConfigError(f"{path!s:.120}: cannot be looked up: {error!s:.120}") from error
     raise ConfigError(f"{path}: no such file here, nor among the shipped ones ({_shipped(wanted)})")
 
 

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import math
+from collections import deque
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
 import pinocchio as pin
 
+from q2r2_control.control.settings import ControllerSettings
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import ArmTarget, Array, Event, Reference
 
+EVENTS_KEPT = 10_000  # the newest; no operator makes that many, but a broken button can
 _REST = 1e-3  # [rad/s]
 
 
@@ -74,7 +78,9 @@ class Histogram:
         self._largest = 0.0
 
     def add(self, duration: float) -> None:
-        """Count one duration [s]."""
+        """Count one duration [s]; one below zero counts as zero, one that is not finite does not count."""
+        if not math.isfinite(duration):
+            return
         self._counts[min(max(int(duration / self._bin), 0), len(self._counts) - 1)] += 1
         self._largest = max(self._largest, duration)
 
@@ -85,9 +91,8 @@ class Histogram:
             return Percentiles(None, None, None)
         cumulative = np.cumsum(self._counts)
         largest = self._largest / self._unit
-        middle, high = (
-            min((int(np.searchsorted(cumulative, share * total)) + 1) * 1e-3, largest) for share in (0.5, 0.99)
-        )
+        bins = (int(np.searchsorted(cumulative, share * total)) for share in (0.5, 0.99))
+        middle, high = (largest if i == len(cumulative) - 1 else min((i + 1) * 1e-3, largest) for i in bins)
         return Percentiles(middle, high, largest)
 
 
@@ -106,12 +111,12 @@ class RunStatistics:
     """Gathers a :class:`RunSummary`."""
 
     robot: Robot
-    acceleration_limit: float  # [rad/s^2]
-    position_margin: float  # [rad]
+    control: ControllerSettings
     tick: Histogram = field(default_factory=lambda: Histogram(1e-3))
     latency: Histogram = field(default_factory=lambda: Histogram(1e-3))
-    events: list[Event] = field(default_factory=list)
+    events: deque[Event] = field(default_factory=lambda: deque(maxlen=EVENTS_KEPT))
     _arms: dict[str, _ArmFigures] = field(init=False)
+    _velocity_limit: Array = field(init=False)
     _ticks: int = 0
     _duration: float = 0.0
     _distance: float = float("inf")
@@ -126,6 +131,7 @@ class RunStatistics:
 
     def __post_init__(self) -> None:
         self._arms = {name: _ArmFigures() for name in self.robot.arms}
+        self._velocity_limit = self.control.velocity_scale * self.robot.velocity_limit
 
     def add(
         self,
@@ -136,13 +142,13 @@ class RunStatistics:
         engaged: dict[str, bool],
     ) -> None:
         """Count one tick; ``tools`` are the poses that the targets of the tick before led to."""
-        robot, report = self.robot, reference.report
+        robot, control, report = self.robot, self.control, reference.report
         self._ticks += 1
         self._duration += dt
-        self._velocity = max(self._velocity, float((np.abs(reference.v) / robot.velocity_limit).max()))
-        self._acceleration = max(self._acceleration, float(np.abs(reference.a).max()) / self.acceleration_limit)
+        self._velocity = max(self._velocity, float(np.max(np.abs(reference.v) / self._velocity_limit)))
+        self._acceleration = max(self._acceleration, float(np.abs(reference.a).max()) / control.acceleration_limit)
         room: Array = np.minimum(reference.q - robot.position_lower, robot.position_upper - reference.q)
-        self._margin = min(self._margin, float(room.min()) - self.position_margin)
+        self._margin = min(self._margin, float(room.min()) - control.position_margin)
         if report.closest_distance < self._distance:
             self._distance, self._pair = report.closest_distance, report.closest_pair
         self._fallback += report.fallback
