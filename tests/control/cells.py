@@ -9,7 +9,17 @@ import numpy as np
 
 from q2r2_control.config import Config, load_config
 from q2r2_control.control.chain import Chain, Placements, chain_of, place
-from q2r2_control.control.collision import Bodies, Contact, Pairs, Posed, bodies_of, measure, pairs_of, pose_bodies
+from q2r2_control.control.collision import (
+    Bodies,
+    Contact,
+    Pairs,
+    Posed,
+    at_least,
+    bodies_of,
+    measure,
+    pairs_of,
+    pose_bodies,
+)
 from q2r2_control.control.jit import kernel
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
@@ -65,11 +75,14 @@ def placed(cell: CellArrays, q: Array) -> tuple[Placements, Posed]:
     return placements, posed
 
 
-def distances(cell: CellArrays, motion: Array) -> Array:
-    """Distance of every pair (s, p) [m] at every posture of ``motion`` (s, nv)."""
+def distances(cell: CellArrays, motion: Array, exact_below: float = np.inf) -> Array:
+    """Distance of every pair (s, p) [m] at every posture of ``motion`` (s, nv).
+
+    Pairs that are clearly farther apart than ``exact_below`` get a lower bound instead, which saves most of the time.
+    """
     out = np.zeros((len(motion), len(cell.pairs.first)))
     placements, posed = Placements.empty(cell.chain), Posed.empty(cell.bodies)
-    _measure_all(cell.chain, cell.bodies, cell.pairs, motion, placements, posed, Contact.empty(), out)
+    _measure_all(cell.chain, cell.bodies, cell.pairs, motion, exact_below, placements, posed, Contact.empty(), out)
     return out
 
 
@@ -79,6 +92,7 @@ def _measure_all(
     bodies: Bodies,
     pairs: Pairs,
     motion: Array,
+    exact_below: float,
     placements: Placements,
     posed: Posed,
     contact: Contact,
@@ -88,5 +102,7 @@ def _measure_all(
         place(chain, motion[i], placements)
         pose_bodies(bodies, placements, posed)
         for p in range(pairs.first.shape[0]):
-            first = pairs.first[p]
-            out[i, p] = measure(bodies, posed, first, pairs.second[p], posed.start[first], posed.end[first], contact)
+            first, second = pairs.first[p], pairs.second[p]
+            out[i, p] = at_least(bodies, posed, first, second)
+            if out[i, p] < exact_below:
+                out[i, p] = measure(bodies, posed, first, second, posed.start[first], posed.end[first], contact)
