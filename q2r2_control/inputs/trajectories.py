@@ -77,20 +77,20 @@ def _rotate(t: float, frequency: float) -> tuple[Array, Array]:
     return np.array([0.0, 0.0, lift]), turn
 
 
-# t [s], displacement [m], tilt about x [rad]: the finger tips turn towards the other arm's.
+# t [s], displacement [m], tilt about x [rad]: wrists outwards, so that the finger tips are what comes nearest.
 _HANDOVER = np.array(
     [
-        (1.2, 0.00, 0.00, 0.00, 0.00),
-        (2.8, 0.00, 0.00, 0.10, 0.00),  # rise
-        (4.8, 0.08, 0.05, 0.00, 0.00),  # reach, down to the thing
-        (5.8, 0.08, 0.05, 0.00, 0.00),  # the left hand grasps
-        (7.2, 0.04, 0.00, 0.10, 0.00),  # lift
-        (10.2, -0.08, -0.34, 0.04, -0.40),  # to the middle, where the two grippers nearly touch
-        (12.4, -0.08, -0.34, 0.04, -0.40),  # the right hand grasps, the left lets go
-        (15.2, 0.04, 0.00, 0.10, 0.00),  # back
-        (16.6, 0.06, 0.03, 0.00, 0.00),  # down
-        (17.4, 0.06, 0.03, 0.00, 0.00),  # the right hand lets go
-        (18.6, 0.00, 0.00, 0.08, 0.00),  # away
+        (1.2, 0.00, 0.00, 0.000, 0.00),
+        (2.6, 0.05, 0.00, -0.030, 0.00),  # over the block
+        (4.4, 0.05, 0.00, -0.137, 0.00),  # down around it
+        (5.4, 0.05, 0.00, -0.137, 0.00),  # grasp
+        (7.0, 0.05, 0.00, 0.020, 0.00),  # lift
+        (10.2, 0.05, -0.19, 0.020, -0.25),  # to the middle, where the two grippers nearly touch
+        (11.2, 0.05, -0.19, 0.020, -0.25),
+        (14.0, 0.05, 0.00, 0.020, 0.00),  # back
+        (15.8, 0.05, 0.00, -0.137, 0.00),  # put down
+        (16.8, 0.05, 0.00, -0.137, 0.00),  # let go
+        (18.6, 0.00, 0.00, 0.000, 0.00),  # away
     ]
 )
 
@@ -115,7 +115,7 @@ TRAJECTORIES: Mapping[str, Trajectory] = {
     "rotate": Trajectory(_rotate),
     "reach_grasp_handover": Trajectory(
         _reach_grasp_handover,
-        upper_presses={"left": (5.1, 11.8), "right": (11.0, 16.9)},
+        upper_presses={"left": (4.7, 16.1), "right": (4.9, 16.3)},
         lower_presses=(_FIRST_PRESS, 19.0),
     ),
 }

@@ -1,0 +1,113 @@
+"""What a cell consists of, and what is wrong with it before anything moves."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from q2r2_control.config import Config, ObstacleConfig
+from q2r2_control.robot.robot import PairDistance, Robot
+from q2r2_control.types import Array
+
+_NEAREST = 8
+
+
+@dataclass(frozen=True, slots=True)
+class JointCheck:
+    """One joint. Positions in rad (m for a sliding joint), velocity per second, torque in Nm (N)."""
+
+    name: str
+    lower: float
+    home: float
+    upper: float
+    velocity: float
+    torque: float
+
+
+@dataclass(frozen=True, slots=True)
+class ArmCheck:
+    """One arm; ``tool_position`` [m] is in the world, at home."""
+
+    name: str
+    model: str
+    tool_model: str | None
+    tool_frame: str
+    tool_position: tuple[float, ...]
+    joints: tuple[JointCheck, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class CellCheck:
+    """A cell as the controller sees it. Distances in metres, at home; ``faults`` are empty for a good cell."""
+
+    name: str
+    arms: tuple[ArmCheck, ...]
+    obstacles: dict[str, ObstacleConfig]
+    monitored_pairs: int
+    ignored_pairs: tuple[tuple[str, str], ...]  # overlap by construction
+    min_distance: float
+    nearest: tuple[PairDistance, ...]  # nearest first
+    faults: tuple[str, ...]
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain data and dataclasses for the JSON writer."""
+        data = {name: getattr(self, name) for name in self.__slots__}
+        data["obstacles"] = {name: obstacle.model_dump(mode="json") for name, obstacle in self.obstacles.items()}
+        return data
+
+
+def check_cell(config: Config) -> CellCheck:
+    """Build the cell and look at it at home. Raises :class:`Q2R2Error` where it cannot be built."""
+    robot = Robot.from_config(config)
+    distances = sorted(robot.distances(robot.home), key=lambda pair: pair.distance)
+    settings = config.control
+    return CellCheck(
+        name=config.name,
+        arms=tuple(_arm_check(config, robot, name) for name in robot.arms),
+        obstacles=dict(config.obstacles),
+        monitored_pairs=len(distances),
+        ignored_pairs=robot.ignored_pairs,
+        min_distance=settings.min_distance,
+        nearest=tuple(distances[:_NEAREST]),
+        faults=(
+            *_home_outside_limits(robot, robot.home, settings.position_margin),
+            *(
+                f"home: {pair.name_a} and {pair.name_b} are {1e3 * pair.distance:.1f} mm apart; "
+                f"allowed: at least min_distance, {1e3 * settings.min_distance:.1f} mm"
+                for pair in distances
+                if pair.distance < settings.min_distance
+            ),
+        ),
+    )
+
+
+def _arm_check(config: Config, robot: Robot, name: str) -> ArmCheck:
+    arm = robot.arms[name]
+    settings = next(settings for side, settings in config.arms.items() if side == name)
+    return ArmCheck(
+        name=name,
+        model=settings.model,
+        tool_model=settings.tool.model,
+        tool_frame=arm.tool_frame,
+        tool_position=tuple(robot.tool_pose(robot.home, name).translation.tolist()),
+        joints=tuple(
+            JointCheck(
+                name=robot.joint_names[index],
+                lower=float(robot.position_lower[index]),
+                home=float(robot.home[index]),
+                upper=float(robot.position_upper[index]),
+                velocity=float(robot.velocity_limit[index]),
+                torque=float(robot.torque_limit[index]),
+            )
+            for index in arm.joints
+        ),
+    )
+
+
+def _home_outside_limits(robot: Robot, home: Array, margin: float) -> list[str]:
+    lower, upper = robot.position_lower + margin, robot.position_upper - margin
+    return [
+        f"home: {name} = {home[index]:g}; allowed: {lower[index]:g} .. {upper[index]:g} rad, position_margin included"
+        for index, name in enumerate(robot.joint_names)
+        if not lower[index] <= home[index] <= upper[index]
+    ]

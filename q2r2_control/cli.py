@@ -1,0 +1,185 @@
+"""The ``q2r2`` command."""
+
+from __future__ import annotations
+
+import logging
+import math
+import sys
+from enum import StrEnum
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from q2r2_control.cell_check import check_cell
+from q2r2_control.config import Config, HeadsetConfig, load_config
+from q2r2_control.errors import ConfigError
+from q2r2_control.inputs.trajectories import TRAJECTORIES
+from q2r2_control.one_line import OneLineErrors
+from q2r2_control.pipeline import DEFAULT_TRAJECTORY
+from q2r2_control.plain import as_json_text
+from q2r2_control.running import RunOptions
+from q2r2_control.running import run as run_cell
+from q2r2_control.summary import RunSummary
+from q2r2_control.viewer.tables import arm_table, obstacle_table, pair_table, summary_table
+
+DEMO_CONFIG = "config/dual_iiwa7.yaml"
+
+app = typer.Typer(
+    cls=OneLineErrors,
+    add_completion=False,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+    help="Bimanual VR teleoperation: a headset's hands move two robot arms, safely.",
+)
+
+
+class InputName(StrEnum):
+    """Where hand samples come from."""
+
+    SCRIPTED = "scripted"
+    HEADSET = "headset"
+
+
+class PlantName(StrEnum):
+    """What moves."""
+
+    MUJOCO = "mujoco"
+    KINEMATIC = "kinematic"
+
+
+ConfigFile = Annotated[str, typer.Argument(metavar="CONFIG", help="The cell's YAML, such as config/dual_iiwa7.yaml.")]
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout, and all else on stderr.")]
+Headless = Annotated[bool, typer.Option("--headless", help="No live table, no window.")]
+Viewer = Annotated[bool, typer.Option("--viewer", help="Open MuJoCo's window; closing it ends the run.")]
+Human = Annotated[bool, typer.Option("--human", help="Scripted hands tremble, and samples get lost and late.")]
+Host = Annotated[str | None, typer.Option(help="Address to bind, instead of the config's; 0.0.0.0: every network.")]
+Port = Annotated[int | None, typer.Option(min=0, max=65535, help="Port, instead of the config's; 0: any free one.")]
+
+
+@app.callback()
+def main() -> None:
+    """Set up what all commands share."""
+    logging.basicConfig(stream=sys.stderr, level=logging.INFO, format="%(message)s", force=True)
+
+
+@app.command(epilog="Example: q2r2 demo --viewer")
+def demo(
+    duration: Annotated[float, typer.Option(help="[s]")] = 20.0,
+    viewer: Viewer = False,
+    headless: Headless = False,
+    human: Human = False,
+    json: Json = False,
+) -> None:
+    """Two simulated arms follow scripted hands: both pick up a block, meet in the middle, put it back.
+
+    Writes plots and a summary to a folder under runs/.
+    """
+    options = RunOptions(
+        name="demo",
+        input="scripted",
+        plant="mujoco",
+        duration=_positive("--duration", duration),
+        fast=False,
+        trajectory=DEFAULT_TRAJECTORY,
+        human=human,
+        seed=0,
+        table=_table(headless, viewer),
+        window=viewer,
+        report=True,
+    )
+    _show(run_cell(load_config(DEMO_CONFIG), options, _stderr()), json)
+
+
+@app.command(epilog="Example: q2r2 run config/dual_iiwa7.yaml --input headset --host 0.0.0.0")
+def run(
+    config: ConfigFile,
+    input: Annotated[InputName, typer.Option(help="Where hand samples come from.")] = InputName.SCRIPTED,
+    plant: Annotated[PlantName, typer.Option(help="What moves.")] = PlantName.MUJOCO,
+    duration: Annotated[float | None, typer.Option(help="[s]; without it, until Ctrl-C.")] = None,
+    fast: Annotated[bool, typer.Option("--fast", help="Simulated time, as fast as it can, repeatable.")] = False,
+    trajectory: Annotated[str | None, typer.Option(help=f"Scripted: {', '.join(TRAJECTORIES)}.")] = None,
+    human: Human = False,
+    seed: Annotated[int, typer.Option(min=0, help="Of what --human adds.")] = 0,
+    host: Host = None,
+    port: Port = None,
+    viewer: Viewer = False,
+    headless: Headless = False,
+    report: Annotated[bool, typer.Option(help="Write plots and a summary to a folder under runs/.")] = False,
+    json: Json = False,
+) -> None:
+    """Run a cell until the duration is over or Ctrl-C; both bring the arms to rest first.
+
+    With the headset, one line on stderr says which address was bound: "headset: listening on HOST:PORT".
+    """
+    scripted_only = {"--trajectory": trajectory is not None, "--human": human, "--fast": fast, "--seed": seed != 0}
+    headset_only = {"--host": host is not None, "--port": port is not None}
+    unfit = headset_only if input is InputName.SCRIPTED else scripted_only
+    for option, given in unfit.items():
+        if given:
+            raise ConfigError(f"{option} cannot be used with --input {input.value}")
+    if fast and duration is None:
+        raise ConfigError("--fast needs --duration, since simulated time has no end of its own")
+    cell = _with_address(load_config(config), host, port)
+    options = RunOptions(
+        name=cell.name,
+        input=input.value,
+        plant=plant.value,
+        duration=None if duration is None else _positive("--duration", duration),
+        fast=fast,
+        trajectory=trajectory or DEFAULT_TRAJECTORY,
+        human=human,
+        seed=seed,
+        table=_table(headless, viewer),
+        window=viewer,
+        report=report,
+    )
+    _show(run_cell(cell, options, _stderr()), json)
+
+
+@app.command(epilog="Example: q2r2 check config/dual_iiwa7.yaml")
+def check(config: ConfigFile, json: Json = False) -> None:
+    """Validate a cell and print its arms, limits, obstacles and distances at home; exit 1 where home is unsafe."""
+    result = check_cell(load_config(config))
+    if json:
+        print(as_json_text(result.as_json()))
+    else:
+        console = Console()
+        console.print(f"cell {result.name}", highlight=False)
+        for table in (*map(arm_table, result.arms), obstacle_table(result), pair_table(result)):
+            console.print(table)
+        for fault in result.faults:
+            console.print(f"FAULT {fault}", style="red", highlight=False, soft_wrap=True)
+    raise typer.Exit(1 if result.faults else 0)
+
+
+def _with_address(config: Config, host: str | None, port: int | None) -> Config:
+    """The config with another address for the headset to connect to."""
+    address = HeadsetConfig(
+        host=config.headset.host if host is None else host, port=config.headset.port if port is None else port
+    )
+    return config.model_copy(update={"headset": address})
+
+
+def _positive(option: str, value: float) -> float:
+    if not (math.isfinite(value) and value > 0.0):
+        raise ConfigError(f"{option} {value:g}: allowed: a positive number of seconds")
+    return value
+
+
+def _table(headless: bool, viewer: bool) -> bool:
+    """Whether to show the live table."""
+    if headless and viewer:
+        raise ConfigError("--headless and --viewer exclude each other")
+    return not headless and sys.stderr.isatty()
+
+
+def _stderr() -> Console:
+    return Console(stderr=True)
+
+
+def _show(summary: RunSummary, json: bool) -> None:
+    if json:
+        print(as_json_text(summary.as_json()))
+    else:
+        Console().print(summary_table(summary))

@@ -1,0 +1,104 @@
+"""A table that shows a run while it goes on."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+from rich.console import Console
+from rich.live import Live
+from rich.table import Table
+
+from q2r2_control.pipeline import Tick
+from q2r2_control.viewer.history import tracking_error
+
+_REFRESH_RATE = 6.0  # [Hz]
+# The drawing thread gives the interpreter back to the control loop after this long [s].
+_SWITCH_INTERVAL = 2e-4
+_LIMITS_SHOWN = 4
+
+
+class LiveTable:
+    """Listens to a run and shows its newest tick, drawn by a thread of its own: a tick only leaves a reference."""
+
+    def __init__(self, title: str, min_distance: float) -> None:
+        self._title = title
+        self._min_distance = min_distance
+        self._newest: Tick | None = None
+        self._count = 0
+        self._binding: dict[str, None] = {}
+        self._drawn = (time.monotonic(), 0)
+
+    def __call__(self, tick: Tick) -> None:
+        """Listen to one tick."""
+        self._newest = tick
+        self._count += 1
+        if tick.reference.report.binding:
+            self._binding.update(dict.fromkeys(tick.reference.report.binding))
+
+    @contextmanager
+    def shown(self, console: Console) -> Iterator[None]:
+        """Show the table on ``console`` for as long as the context lasts."""
+        interval = sys.getswitchinterval()
+        sys.setswitchinterval(_SWITCH_INTERVAL)
+        try:
+            with Live(get_renderable=self.render, console=console, refresh_per_second=_REFRESH_RATE, transient=True):
+                yield
+        finally:
+            sys.setswitchinterval(interval)
+
+    def render(self) -> Table:
+        """The table of now."""
+        tick, rate = self._newest, self._rate()
+        table = Table(title=self._title, title_justify="left", min_width=76)
+        table.add_column("", style="dim")
+        if tick is None:
+            table.add_row("starting")
+            return table
+        arms = list(tick.tools)
+        for arm in arms:
+            table.add_column(arm, justify="right", min_width=18)
+        for name, values in _arm_rows(tick, arms):
+            table.add_row(name, *values)
+        table.add_section()
+        report = tick.reference.report
+        distance = 1e3 * report.closest_distance
+        colour = "yellow" if report.closest_distance < self._min_distance + 0.01 else "default"
+        binding, self._binding = list(self._binding), {}
+        rows = {
+            "time, loop": (f"{tick.t:.1f} s", f"{rate:.0f} Hz, {1e6 * tick.compute_time:.0f} us a tick"),
+            "nearest pair": (f"[{colour}]{distance:.1f} mm[/]", " | ".join(report.closest_pair)),
+            "status": (str(report.status), "a stop is certified" if report.certified else "[red]no certified stop[/]"),
+            "limits at work": (str(len(binding)), _some(binding)),
+        }
+        for name, (first, second) in rows.items():
+            table.add_row(name, first, second)
+        return table
+
+    def _rate(self) -> float:
+        (then, counted), now = self._drawn, time.monotonic()
+        self._drawn = now, self._count
+        return (self._drawn[1] - counted) / max(now - then, 1e-9)
+
+
+def _arm_rows(tick: Tick, arms: list[str]) -> list[tuple[str, list[str]]]:
+    errors = {arm: tracking_error(tick, arm) for arm in arms}
+    return [
+        ("teleop", [f"[green]{tick.states[arm]}[/]" if tick.engaged[arm] else tick.states[arm] for arm in arms]),
+        ("position error", [_figure(1e3 * errors[arm][0], "mm", 1) for arm in arms]),
+        ("rotation error", [_figure(np.degrees(errors[arm][1]), "deg", 2) for arm in arms]),
+        ("tool x y z [m]", ["{:.3f} {:.3f} {:.3f}".format(*tick.tools[arm].translation) for arm in arms]),
+        ("gripper opening", [_figure(100.0 * tick.grippers.get(arm, np.nan), "%", 0) for arm in arms]),
+    ]
+
+
+def _figure(value: float, unit: str, digits: int) -> str:
+    return f"{value:.{digits}f} {unit}" if np.isfinite(value) else "-"
+
+
+def _some(names: list[str]) -> str:
+    more = f" and {len(names) - _LIMITS_SHOWN} more" if len(names) > _LIMITS_SHOWN else ""
+    return ", ".join(names[:_LIMITS_SHOWN]) + more if names else "-"

@@ -1,0 +1,133 @@
+"""The PNG of a run: tracking, distances and limits over time."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from q2r2_control.summary import RunSummary
+from q2r2_control.types import Array
+from q2r2_control.viewer.history import History
+
+_COLOURS = {"left": "#1f6fb2", "right": "#d9722b"}
+_LIMIT = "#b3202c"
+_AXES_STYLE = (("x", 1.0), ("y", 0.7), ("z", 0.45))  # name, opacity
+
+
+def draw_report(history: History, summary: RunSummary, min_distance: float, title: str, file: Path) -> None:
+    """Write the plots of ``history`` to ``file``; ``min_distance`` [m] is drawn as the limit it is."""
+    figure = Figure(figsize=(14.0, 15.0), layout="constrained")
+    canvas = FigureCanvasAgg(figure)
+    figure.suptitle(f"{title}\n{_headline(summary)}", fontsize=13)
+    arms = list(history.robot.arms)
+    grid = figure.subplots(4, 2, sharex=True, squeeze=False)
+    for column, arm in enumerate(arms):
+        _draw_path(grid[0, column], history, arm)
+        _draw_joints(grid[3, column], history, arm)
+    _draw_errors(grid[1, 0], history, arms, "position")
+    _draw_errors(grid[1, 1], history, arms, "rotation")
+    _draw_distance(grid[2, 0], history, min_distance)
+    _draw_ratios(grid[2, 1], history)
+    for axes in grid.flat:
+        axes.grid(alpha=0.3)
+        axes.margins(x=0.01)
+    for axes in grid[3]:
+        axes.set_xlabel("time [s]")
+    for unused in range(len(arms), 2):
+        for row in (0, 3):
+            grid[row, unused].set_axis_off()
+    canvas.print_png(file)
+
+
+def _headline(summary: RunSummary) -> str:
+    parts = [f"{summary.duration_s:.1f} s at {summary.loop_rate_hz:.0f} Hz"]
+    for name, arm in summary.arms.items():
+        if arm.position_error_mm_rms is not None and arm.rotation_error_deg_rms is not None:
+            parts.append(f"{name} {arm.position_error_mm_rms:.2f} mm, {arm.rotation_error_deg_rms:.2f} deg RMS")
+    if summary.min_distance_mm is not None:
+        parts.append(f"never nearer than {summary.min_distance_mm:.1f} mm")
+    return "   |   ".join(parts)
+
+
+def _draw_path(axes: Axes, history: History, arm: str) -> None:
+    """Displacement from where the tool started: three coordinates on one scale."""
+    colour, start = _COLOURS[arm], history.tool(arm)[:1]
+    measured, target = 1e3 * (history.tool(arm) - start), 1e3 * (history.target(arm) - start)
+    for index, (name, opacity) in enumerate(_AXES_STYLE):
+        axes.plot(history.t, measured[:, index], color=colour, alpha=opacity, label=f"{name} measured")
+        axes.plot(history.t, target[:, index], color="black", linestyle=(0, (2, 4)), linewidth=1.0)
+        axes.annotate(name, (1.005, measured[-1, index]), xycoords=("axes fraction", "data"), color=colour)
+    axes.plot([], [], color="black", linestyle=(0, (2, 4)), linewidth=1.0, label="target")
+    axes.set_title(f"{arm} tool: way from its start")
+    axes.set_ylabel("displacement [mm]")
+    closed = history.gripper(arm) < 0.95
+    if closed.any():
+        axes.fill_between(
+            history.t,
+            0,
+            1,
+            where=closed,
+            transform=axes.get_xaxis_transform(),
+            color="grey",
+            alpha=0.12,
+            linewidth=0,
+            label="gripper closed",
+        )
+    axes.legend(loc="best", fontsize=8, ncols=2)
+
+
+def _draw_errors(axes: Axes, history: History, arms: list[str], kind: str) -> None:
+    """Measured tool against the target, where engaged."""
+    for arm in arms:
+        error = 1e3 * history.position_error(arm) if kind == "position" else np.degrees(history.rotation_error(arm))
+        axes.plot(history.t, error, color=_COLOURS[arm], label=arm, alpha=0.8)
+    axes.set_title(f"{kind} error of the measured tool, while engaged")
+    axes.set_ylabel("error [mm]" if kind == "position" else "error [deg]")
+    axes.set_ylim(bottom=0.0)
+    axes.legend(loc="best", fontsize=8)
+
+
+def _draw_distance(axes: Axes, history: History, min_distance: float) -> None:
+    distance = np.where(np.isfinite(history.distance), 1e3 * history.distance, np.nan)
+    axes.plot(history.t, distance, color="#3b7d3b", label="nearest monitored pair")
+    _draw_limit(axes, 1e3 * min_distance, f"min_distance {1e3 * min_distance:g} mm")
+    axes.set_title("distance of the nearest monitored pair")
+    axes.set_ylabel("distance [mm]")
+    axes.set_ylim(bottom=min(0.0, float(np.nanmin(distance, initial=0.0))))
+    axes.legend(loc="best", fontsize=8)
+
+
+def _draw_ratios(axes: Axes, history: History) -> None:
+    axes.plot(history.t, history.velocity_ratio, color="#6a4c93", label="velocity, worst joint")
+    axes.plot(history.t, history.acceleration_ratio, color="#8d8d8d", linewidth=1.0, label="acceleration, worst joint")
+    _draw_limit(axes, 1.0, "limit")
+    axes.set_title("reference velocity and acceleration, as part of their limits")
+    axes.set_ylabel("ratio [1]")
+    axes.set_ylim(0.0, 1.1)
+    axes.legend(loc="best", fontsize=8)
+
+
+def _draw_joints(axes: Axes, history: History, arm: str) -> None:
+    robot = history.robot
+    joints = robot.arms[arm].joints
+    lower, upper = robot.position_lower[joints], robot.position_upper[joints]
+    place: Array = (2.0 * history.q[:, joints] - lower - upper) / (upper - lower)
+    for number, index in enumerate(joints):
+        opacity = 1.0 - 0.75 * number / max(len(joints) - 1, 1)
+        axes.plot(history.t, place[:, number], color=_COLOURS[arm], alpha=opacity, label=robot.joint_names[index])
+        axes.annotate(
+            str(number + 1), (1.005, place[-1, number]), xycoords=("axes fraction", "data"), color=_COLOURS[arm]
+        )
+    _draw_limit(axes, 1.0, "limits")
+    _draw_limit(axes, -1.0, None)
+    axes.set_title(f"{arm} joints between their limits")
+    axes.set_ylabel("position: -1 lower, +1 upper limit")
+    axes.set_ylim(-1.1, 1.1)
+
+
+def _draw_limit(axes: Axes, value: float, label: str | None) -> None:
+    axes.axhline(value, color=_LIMIT, linestyle="--", linewidth=1.2, label=label)

@@ -1,0 +1,81 @@
+"""Tables of what a command found out."""
+
+from __future__ import annotations
+
+from rich.table import Table
+
+from q2r2_control.cell_check import ArmCheck, CellCheck
+from q2r2_control.summary import Percentiles, RunSummary
+
+
+def summary_table(summary: RunSummary) -> Table:
+    """What a run amounted to."""
+    table = Table(title="summary", title_justify="left", show_header=False)
+    table.add_row("duration", f"{summary.duration_s:.2f} s, {summary.ticks} ticks, {summary.loop_rate_hz:.0f} Hz")
+    table.add_row("tick", _percentiles(summary.tick_us, "us", 0))
+    table.add_row("input to command", _percentiles(summary.input_to_command_ms, "ms", 2))
+    for name, arm in summary.arms.items():
+        figures = f"engaged {arm.engaged_s:.2f} s"
+        if arm.position_error_mm_rms is not None and arm.rotation_error_deg_rms is not None:
+            figures += f", error {arm.position_error_mm_rms:.2f} mm, {arm.rotation_error_deg_rms:.2f} deg RMS"
+        table.add_row(f"{name} arm", f"{figures}, gripper changes {arm.gripper_changes}")
+    if summary.min_distance_mm is not None and summary.closest_pair is not None:
+        table.add_row("nearest pair", f"{summary.min_distance_mm:.1f} mm, {' | '.join(summary.closest_pair)}")
+    table.add_row(
+        "velocity, acceleration",
+        f"{_share(summary.max_velocity_ratio)} of the limits at most, {_share(summary.max_acceleration_ratio)}",
+    )
+    table.add_row("room to position limits", f"{summary.min_position_margin_rad:.3f} rad at least")
+    table.add_row("certified stops executed", f"{summary.fallback_ticks} ticks, {summary.uncertified_ticks} without")
+    table.add_row("targets rejected", str(summary.rejected_targets))
+    table.add_row("arms at the end", "at rest" if summary.at_rest else "[red]moving[/]")
+    return table
+
+
+def arm_table(arm: ArmCheck) -> Table:
+    """One arm's joints and limits."""
+    position = " ".join(f"{value:.3f}" for value in arm.tool_position)
+    title = f"{arm.name} arm: {arm.model}, tool {arm.tool_model or 'none'}; {arm.tool_frame} at home at {position} m"
+    table = Table(title=title, title_justify="left")
+    table.add_column("joint")
+    for column in ("min [rad]", "home [rad]", "max [rad]", "speed [rad/s]", "torque [Nm]"):
+        table.add_column(column, justify="right")
+    for joint in arm.joints:
+        figures = (joint.lower, joint.home, joint.upper, joint.velocity, joint.torque)
+        table.add_row(joint.name, *(f"{value:.3f}" for value in figures))
+    return table
+
+
+def obstacle_table(check: CellCheck) -> Table:
+    """What stands in the cell."""
+    table = Table(title="obstacles" if check.obstacles else "no obstacles", title_justify="left")
+    for column in ("name", "shape", "size [m]", "centre [m]"):
+        table.add_column(column)
+    for name, obstacle in check.obstacles.items():
+        table.add_row(name, obstacle.shape, _numbers(obstacle.size), _numbers(obstacle.position))
+    return table
+
+
+def pair_table(check: CellCheck) -> Table:
+    """The nearest pairs at home."""
+    title = f"nearest of {check.monitored_pairs} monitored pairs at home, min_distance {1e3 * check.min_distance:g} mm"
+    table = Table(title=title, title_justify="left")
+    table.add_column("pair")
+    table.add_column("distance [mm]", justify="right")
+    for pair in check.nearest:
+        table.add_row(f"{pair.name_a} | {pair.name_b}", f"{1e3 * pair.distance:.1f}")
+    return table
+
+
+def _numbers(values: tuple[float, ...]) -> str:
+    return " ".join(f"{value:g}" for value in values)
+
+
+def _percentiles(values: Percentiles, unit: str, digits: int) -> str:
+    if values.p50 is None or values.p99 is None or values.max is None:
+        return "-"
+    return f"median {values.p50:.{digits}f} {unit}, p99 {values.p99:.{digits}f}, max {values.max:.{digits}f}"
+
+
+def _share(ratio: float) -> str:
+    return f"{100.0 * ratio:.0f} %"
