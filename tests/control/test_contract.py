@@ -1,0 +1,398 @@
+"""The contract of the controller at every tick, in named scenarios, on two robots, at several tick lengths."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from q2r2_control.config import Config, load_config
+from q2r2_control.control.controller import CartesianController
+from q2r2_control.control.qp import QpProblem, QpSolution, Solver, make_solver
+from q2r2_control.control.settings import ControllerSettings
+from q2r2_control.robot.robot import Robot
+from q2r2_control.types import Array, StepStatus
+from tests.control.contract import Contract
+from tests.control.scenarios import SCENARIOS, circle, crossing
+
+PANDA_HOME = [0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785]
+
+
+@cache
+def robot_of(name: str) -> Robot:
+    if name == "iiwa7":
+        return Robot.from_config(load_config("config/dual_iiwa7.yaml"))
+    arms = {
+        side: {"model": "example-robot-data:panda", "mount": {"position": [0.0, y, 0.0]}, "home": PANDA_HOME}
+        for side, y in (("left", 0.4), ("right", -0.4))
+    }
+    table = {"shape": "box", "size": [0.8, 1.6, 0.04], "position": [0.75, 0.0, 0.0]}
+    return Robot.from_config(Config.model_validate({"name": "pandas", "arms": arms, "obstacles": {"table": table}}))
+
+
+@cache
+def controller_of(name: str) -> CartesianController:
+    """Made once: reset starts it anew, which a test of its own proves."""
+    return CartesianController(robot_of(name))
+
+
+def run(
+    controller: CartesianController,
+    scenario: Any,
+    duration: float,
+    dt: float,
+    q: Array | None = None,
+    v: Array | None = None,
+) -> Contract:
+    """Run a scenario and assert the contract at every tick."""
+    q = controller.robot.home if q is None else q
+    controller.reset(q, v)
+    contract = Contract(controller, q, v)
+    start = {arm: controller.tool_pose(arm) for arm in controller.robot.arms}
+    for tick in range(round(duration / dt)):
+        contract.check(controller.step(scenario(tick * dt, start), dt), dt)
+    return contract
+
+
+@pytest.mark.parametrize("dt", [0.001, 0.002, 0.005, 0.01], ids=lambda dt: f"{1e3 * dt:g} ms")
+@pytest.mark.parametrize("robot", ["iiwa7", "panda"])
+@pytest.mark.parametrize("scenario", SCENARIOS.values(), ids=SCENARIOS.keys())
+def test_keeps_every_limit_and_all_pairs_apart_at_every_tick(scenario: Any, robot: str, dt: float) -> None:
+    contract = run(controller_of(robot), scenario, 2.0, dt)
+    assert contract.fallback_share < 0.01
+
+
+@pytest.mark.parametrize(
+    ("name", "duration"),
+    [
+        pytest.param("crossing", 10.0, id="two arms that block each other"),
+        pytest.param("same point", 6.0, id="both at one place"),
+        pytest.param("unreachable", 6.0, id="out of reach"),
+        pytest.param("overhead", 12.0, id="stretched out"),
+        pytest.param("into the table", 4.0, id="pressing on the table"),
+        pytest.param("one arm frozen", 6.0, id="against an arm that holds"),
+    ],
+)
+def test_a_constant_target_ends_in_rest_reachable_or_not(name: str, duration: float) -> None:
+    contract = run(controller_of("iiwa7"), SCENARIOS[name], duration, 0.005)
+    assert contract.tail_acceleration() < 0.1
+
+
+def test_a_reachable_target_is_reached_and_held() -> None:
+    controller = controller_of("iiwa7")
+    goal: dict[str, pin.SE3 | None] = {}
+
+    def turned(t: float, start: Any) -> dict[str, pin.SE3 | None]:
+        for side, pose in start.items():
+            turn = pin.exp3(np.array([0.2, -0.3, 0.4]))
+            goal[side] = pin.SE3(turn @ pose.rotation, pose.translation + np.array([0.05, 0.05, 0.15]))
+        return goal
+
+    contract = run(controller, turned, 4.0, 0.002)
+    assert contract.tail_acceleration() < 0.1
+    for side, pose in goal.items():
+        error = controller.tool_pose(side).actInv(pose)
+        assert np.linalg.norm(error.translation) < 1e-4
+        assert np.linalg.norm(pin.log3(error.rotation)) < 1e-3
+
+
+def test_jittering_ticks_keep_the_contract() -> None:
+    controller = controller_of("iiwa7")
+    controller.reset(controller.robot.home)
+    contract = Contract(controller, controller.robot.home)
+    start = {arm: controller.tool_pose(arm) for arm in controller.robot.arms}
+    random, t = np.random.default_rng(3), 0.0
+    for _ in range(600):
+        dt = float(random.choice([1e-6, 1e-4, 0.001, 0.0015, 0.005, 0.02, 0.1]))
+        t += dt
+        contract.check(controller.step(crossing(t, start), dt), dt)
+    assert contract.fallback_share < 0.01
+
+
+def test_ten_thousand_hostile_ticks_neither_raise_nor_break_a_limit() -> None:
+    controller = controller_of("iiwa7")
+    controller.reset(controller.robot.home)
+    contract = Contract(controller, controller.robot.home)
+    random = np.random.default_rng(11)
+    for _ in range(10_000):
+        dt = float(10.0 ** random.uniform(-9.0, -2.0))
+        contract.check(controller.step({side: _hostile(random) for side in ("left", "right", "nobody")}, dt), dt)
+
+
+def _hostile(random: np.random.Generator) -> Any:
+    kind = random.integers(10)
+    pose = pin.SE3(pin.exp3(random.normal(size=3) * 2.0), random.uniform([-0.5, -1.0, -0.2], [1.2, 1.0, 1.4]))
+    if kind == 0:
+        pose.translation = np.array([np.nan, 0.0, 0.0])
+    elif kind == 1:
+        pose.translation = random.normal(size=3) * 10.0 ** random.uniform(0.0, 300.0)
+    elif kind == 2:
+        pose.rotation = pose.rotation * random.choice([0.0, 0.5, -1.0, np.inf])
+    elif kind == 3:
+        return random.choice(np.array([None, "here", 3.0, float("nan")], dtype=object))
+    return pose
+
+
+@settings(max_examples=40, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
+@given(
+    moves=st.lists(
+        st.tuples(
+            st.floats(1e-6, 0.1),
+            st.lists(st.floats(-2.0, 2.0), min_size=6, max_size=6),
+            st.lists(st.floats(-3.0, 3.0), min_size=6, max_size=6),
+        ),
+        min_size=1,
+        max_size=30,
+    )
+)
+def test_any_sequence_of_targets_and_ticks_keeps_the_contract(
+    moves: list[tuple[float, list[float], list[float]]],
+) -> None:
+    controller = controller_of("iiwa7")
+    controller.reset(controller.robot.home)
+    contract = Contract(controller, controller.robot.home)
+    for dt, places, turns in moves:
+        targets = {
+            side: pin.SE3(pin.exp3(np.array(turns[3 * i : 3 * i + 3])), np.array(places[3 * i : 3 * i + 3]))
+            for i, side in enumerate(("left", "right"))
+        }
+        contract.check(controller.step(targets, dt), dt)
+
+
+@pytest.mark.parametrize("dt", [0.0, -0.001, float("nan"), float("inf"), "soon", None], ids=str)
+def test_a_dt_that_is_no_time_moves_nothing_and_says_so(dt: Any) -> None:
+    controller = controller_of("iiwa7")
+    controller.reset(controller.robot.home)
+    start = {arm: controller.tool_pose(arm) for arm in controller.robot.arms}
+    reference = controller.step(crossing(0.0, start), dt)
+    if dt == float("inf"):
+        assert reference.report.status is StepStatus.DT_REJECTED
+    np.testing.assert_array_equal(reference.q, controller.robot.home)
+    assert reference.report.status is StepStatus.DT_REJECTED
+
+
+def test_a_dt_above_a_tenth_of_a_second_moves_no_further_than_that() -> None:
+    controller = controller_of("iiwa7")
+    results = []
+    for dt in (0.1, 5.0):
+        controller.reset(controller.robot.home)
+        start = {arm: controller.tool_pose(arm) for arm in controller.robot.arms}
+        results.append(controller.step(crossing(0.0, start), dt))
+    np.testing.assert_array_equal(results[0].q, results[1].q)
+    assert [result.report.status for result in results] == [StepStatus.OK, StepStatus.DT_REJECTED]
+
+
+@pytest.mark.parametrize("joint", range(14))
+@pytest.mark.parametrize("side", [-1.0, 1.0], ids=["lower", "upper"])
+def test_started_outside_a_position_limit_it_returns_without_a_jump(joint: int, side: float) -> None:
+    controller = controller_of("iiwa7")
+    robot = controller.robot
+    q = robot.home.copy()
+    limit = robot.position_upper[joint] if side > 0 else robot.position_lower[joint]
+    q[joint] = limit + side * 0.05
+    start_distance = min(pair.distance for pair in robot.distances(q))
+    if start_distance < controller.settings.min_distance:
+        pytest.skip(f"{robot.joint_names[joint]} there is in penetration too, which another test starts from")
+    controller.reset(q)
+    contract = Contract(controller, q)
+    statuses = set()
+    for _ in range(1500):
+        reference = controller.step({}, 0.002)
+        statuses.add(reference.report.status)
+        contract.check(reference, 0.002)
+    assert StepStatus.RECOVERING in statuses
+    margin = controller.settings.position_margin
+    assert robot.position_lower[joint] + margin <= reference.q[joint] <= robot.position_upper[joint] - margin
+
+
+def test_started_in_penetration_it_separates_and_never_comes_closer() -> None:
+    controller = controller_of("iiwa7")
+    q = in_penetration(controller.robot, -0.039)
+    contract = run(controller, crossing, 4.0, 0.002, q=q)
+    assert contract.ticks == 2000
+    assert min(pair.distance for pair in controller.robot.distances(controller.step({}, 0.001).q)) >= 0.02 - 1e-4
+
+
+def in_penetration(robot: Robot, depth: float) -> Array:
+    """A posture in which the two hands overlap by ``depth`` [m], found by turning the first joints inwards."""
+    low, high = 0.0, 1.2
+    for _ in range(60):
+        turn = 0.5 * (low + high)
+        q = robot.home.copy()
+        q[0] -= turn
+        q[7] += turn
+        closest = min(pair.distance for pair in robot.distances(q))
+        low, high = (turn, high) if closest > depth else (low, turn)
+    return q
+
+
+@pytest.mark.parametrize("share", [0.5, 1.0, 1.5], ids=["half the limit", "at the limit", "above the limit"])
+def test_started_with_a_velocity_it_brakes_within_the_limits(share: float) -> None:
+    controller = controller_of("iiwa7")
+    for seed in range(5):
+        signs = np.random.default_rng(seed).choice([-1.0, 1.0], size=14)
+        v = share * signs * controller.robot.velocity_limit
+        q = 0.2 * controller.robot.home + np.array([0.0, -0.5, 0.0, -0.8, 0.0, 0.4, 0.0] * 2)
+        run(controller, lambda t, start: {}, 1.0, 0.002, q=q, v=0.3 * v if share < 1.5 else v)
+
+
+def test_both_arms_can_leave_after_having_blocked_each_other() -> None:
+    controller = controller_of("iiwa7")
+    run(controller, crossing, 4.0, 0.005)
+    home = {arm: controller.robot.tool_pose(controller.robot.home, arm) for arm in controller.robot.arms}
+    q, v = controller.step({}, 0.001).q, controller.step({}, 0.001).v
+    contract = Contract(controller, *_state(controller))
+    for _ in range(1200):
+        contract.check(controller.step(home, 0.005), 0.005)
+    assert q.shape == v.shape
+    for arm, pose in home.items():
+        assert np.linalg.norm(controller.tool_pose(arm).translation - pose.translation) < 1e-3
+
+
+def _state(controller: CartesianController) -> tuple[Array, Array]:
+    reference = controller.step({}, 1e-9)
+    return reference.q, reference.v
+
+
+def test_an_arm_that_holds_is_not_pushed_about_by_the_other() -> None:
+    controller = controller_of("iiwa7")
+    run(controller, SCENARIOS["one arm frozen"], 5.0, 0.005)
+    moved = (
+        controller.robot.tool_pose(controller.robot.home, "left").translation - controller.tool_pose("left").translation
+    )
+    assert np.linalg.norm(moved) < 0.02
+
+
+def test_it_leaves_a_stretched_posture_as_fast_as_it_leaves_a_bent_one() -> None:
+    controller = controller_of("iiwa7")
+    robot = controller.robot
+    stretched = robot.home.copy()
+    for arm in robot.arms.values():
+        stretched[arm.joints] = [0.0, 0.9, 0.0, 0.0, 0.0, 0.0, 0.0]
+    times = {}
+    for name, q in (("stretched", stretched), ("bent", robot.home)):
+        controller.reset(q)
+        contract = Contract(controller, q)
+        start = {arm: controller.tool_pose(arm) for arm in robot.arms}
+        inward = {
+            arm: pin.SE3(pose.rotation, pose.translation + 0.15 * _towards(robot, arm, pose))
+            for arm, pose in start.items()
+        }
+        times[name] = 0.0
+        while times[name] < 4.0:
+            contract.check(controller.step(inward, 0.001), 0.001)
+            times[name] += 0.001
+            errors = [np.linalg.norm(controller.tool_pose(arm).translation - inward[arm].translation) for arm in inward]
+            if max(errors) < 0.01:
+                break
+    assert times["stretched"] < 2.0 * times["bent"] + 0.3, times
+
+
+def _towards(robot: Robot, arm: str, pose: pin.SE3) -> Array:
+    """Unit vector from the tool towards its arm's shoulder."""
+    base = np.array([0.0, 0.4 if arm == "left" else -0.4, 0.34])
+    away: Array = base - pose.translation
+    return away / np.linalg.norm(away)
+
+
+class _Faulty:
+    """A real solver that fails as told every few ticks."""
+
+    def __init__(self, inner: Solver, fault: str) -> None:
+        self._inner, self._fault, self._count = inner, fault, 0
+
+    def solve(self, problem: QpProblem) -> QpSolution:
+        self._count += 1
+        solution = self._inner.solve(problem)
+        if (self._count // 20) % 3 != 1:
+            return solution
+        nv = len(problem.g)
+        return {
+            "none": QpSolution(None, 0.0),
+            "nan": QpSolution(np.full(nv, np.nan), 0.0),
+            "infinite": QpSolution(np.full(nv, np.inf), 0.0),
+            "late": QpSolution(solution.v, 1.0),
+            "absurd": QpSolution(np.full(nv, 1e12), 0.0),
+        }[self._fault]
+
+
+@pytest.mark.parametrize("fault", ["none", "nan", "infinite", "late", "absurd"])
+def test_a_solver_that_fails_gets_the_certified_stop_executed(fault: str) -> None:
+    robot = robot_of("iiwa7")
+    limits = ControllerSettings(solve_time_limit=0.05)
+    controller = CartesianController(robot, limits, solver=_Faulty(make_solver("daqp", 14, None), fault))
+    contract = run(controller, crossing, 2.0, 0.002)
+    if fault != "absurd":
+        assert 0.2 < contract.fallback_share < 0.5
+
+
+def test_a_solver_that_never_answers_brings_the_arms_to_rest_along_the_certified_stop() -> None:
+    robot = robot_of("iiwa7")
+    faulty = _Faulty(make_solver("daqp", 14, None), "none")
+    controller = CartesianController(robot, solver=faulty)
+    controller.reset(robot.home)
+    start = {arm: controller.tool_pose(arm) for arm in robot.arms}
+    contract = Contract(controller, robot.home)
+    for tick in range(300):
+        faulty._count = 0 if tick < 200 else 20
+        reference = controller.step(crossing(0.0, start), 0.002)
+        contract.check(reference, 0.002)
+        assert reference.report.certified
+    assert not reference.v.any()
+
+
+@pytest.mark.parametrize("solver", ["daqp", "osqp"])
+def test_every_solver_keeps_the_contract_and_tracks(solver: str) -> None:
+    controller = CartesianController(robot_of("iiwa7"), ControllerSettings(solver=solver))
+    contract = run(controller, crossing, 1.5, 0.005)
+    assert contract.fallback_share < 0.01
+    run(controller, circle, 2.0, 0.005)
+    goal = circle(
+        2.0 - 0.005, {arm: controller.robot.tool_pose(controller.robot.home, arm) for arm in ("left", "right")}
+    )
+    for arm, pose in goal.items():
+        assert pose is not None
+        assert np.linalg.norm(controller.tool_pose(arm).translation - pose.translation) < 0.005
+
+
+def test_the_same_start_and_targets_give_the_same_motion_to_the_bit() -> None:
+    controller = controller_of("iiwa7")
+    runs = []
+    for _ in range(2):
+        controller.reset(controller.robot.home)
+        start = {arm: controller.tool_pose(arm) for arm in controller.robot.arms}
+        runs.append([controller.step(crossing(0.0, start), 0.005).q for _ in range(100)])
+    np.testing.assert_array_equal(runs[0], runs[1])
+
+
+def test_the_report_names_what_holds_the_arms_back() -> None:
+    controller = controller_of("iiwa7")
+    controller.reset(controller.robot.home)
+    start = {arm: controller.tool_pose(arm) for arm in controller.robot.arms}
+    for _ in range(800):
+        report = controller.step(SCENARIOS["into the table"](0.0, start), 0.005).report
+    assert "left_hand_e_fingers_envelope|table_0" in report.binding or any("table" in name for name in report.binding)
+    assert "table" in "|".join(report.closest_pair)
+    assert report.certified
+    assert not report.fallback
+
+
+def test_separation_between_ticks_holds_too() -> None:
+    """The reference moves along parabolas between ticks; Coal measures them densely."""
+    controller = controller_of("iiwa7")
+    robot, dt = controller.robot, 0.01
+    controller.reset(robot.home)
+    start = {arm: controller.tool_pose(arm) for arm in robot.arms}
+    for tick in range(150):
+        before_q, before_v = _state(controller)
+        reference = controller.step(crossing(0.0, start), dt)
+        if tick % 10:
+            continue
+        for share in np.linspace(0.0, 1.0, 8):
+            q = before_q + share * dt * before_v + 0.5 * share**2 * dt * (reference.v - before_v)
+            assert min(pair.distance for pair in robot.distances(q)) >= 0.02 - 1e-4
