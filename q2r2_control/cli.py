@@ -14,14 +14,16 @@ from rich.console import Console
 from q2r2_control.cell_check import check_cell
 from q2r2_control.config import Config, HeadsetConfig, load_config
 from q2r2_control.errors import ConfigError
+from q2r2_control.headset_check import watch_headset
 from q2r2_control.inputs.trajectories import TRAJECTORIES
 from q2r2_control.one_line import OneLineErrors
 from q2r2_control.pipeline import DEFAULT_TRAJECTORY
 from q2r2_control.plain import as_json_text
-from q2r2_control.running import RunOptions
+from q2r2_control.running import AnnouncedHeadset, RunOptions
 from q2r2_control.running import run as run_cell
 from q2r2_control.summary import RunSummary
-from q2r2_control.viewer.tables import arm_table, obstacle_table, pair_table, summary_table
+from q2r2_control.viewer.live import HeadsetDisplay
+from q2r2_control.viewer.tables import arm_table, headset_table, obstacle_table, pair_table, summary_table
 
 DEMO_CONFIG = "config/dual_iiwa7.yaml"
 
@@ -151,6 +153,39 @@ def check(config: ConfigFile, json: Json = False) -> None:
         for fault in result.faults:
             console.print(f"FAULT {fault}", style="red", highlight=False, soft_wrap=True)
     raise typer.Exit(1 if result.faults else 0)
+
+
+@app.command("headset-check", epilog="Example: q2r2 headset-check --host 0.0.0.0")
+def headset_check(
+    config: Annotated[str, typer.Argument(metavar="[CONFIG]", help="Whose address and teleop.axes to use.")] = (
+        DEMO_CONFIG
+    ),
+    host: Host = None,
+    port: Port = None,
+    duration: Annotated[float | None, typer.Option(help="[s]; without it, until Ctrl-C.")] = None,
+    json: Json = False,
+) -> None:
+    """Show what a headset sends: connection, rates, ages, last values, and which way each hand moves.
+
+    Move a hand forwards, to the left, up: where the words do not agree, change teleop.axes in the config.
+    Exit 1 when no hand data came at all.
+    """
+    cell = _with_address(load_config(config), host, port)
+    if duration is not None:
+        _positive("--duration", duration)
+    console = _stderr()
+    server = AnnouncedHeadset(cell, console)
+    server.start()
+    try:
+        with HeadsetDisplay(console) as display:
+            check = watch_headset(server, cell, duration, display.show)
+    finally:
+        server.close()
+    if json:
+        print(as_json_text(check.as_json()))
+    else:
+        Console().print(headset_table(check))
+    raise typer.Exit(0 if check.heard else 1)
 
 
 def _with_address(config: Config, host: str | None, port: int | None) -> Config:

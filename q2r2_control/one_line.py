@@ -17,12 +17,11 @@ _BadUsage: type[Exception] = typer.BadParameter.__mro__[2]
 class OneLineErrors(TyperGroup):
     """Commands whose bad usage and :class:`Q2R2Error` end in one line on stderr and exit code 2, Ctrl-C in 130."""
 
-    def main(self, *args: Any, standalone_mode: bool = True, **extra: Any) -> Any:
-        """Run the command line; leaves by :class:`SystemExit` unless ``standalone_mode`` is off."""
-        if not standalone_mode:
-            return super().main(*args, standalone_mode=False, **extra)
+    def main(self, *args: Any, **extra: Any) -> Any:
+        """Run the command line; leaves by :class:`SystemExit`."""
+        extra["standalone_mode"] = False
         try:
-            code = super().main(*args, standalone_mode=False, **extra)
+            code = super().main(*args, **extra)
         except Q2R2Error as error:
             _fail(str(error))
         except (KeyboardInterrupt, typer.Abort):
@@ -30,7 +29,8 @@ class OneLineErrors(TyperGroup):
         except _BadUsage as error:
             context = getattr(error, "ctx", None)
             command = context.command_path if context else "q2r2"
-            _fail(f"{error.format_message()} See {command} --help")  # type: ignore[attr-defined]
+            message = error.format_message()  # type: ignore[attr-defined]
+            _fail(f"{message.rstrip('.')}; see {command} --help")
         sys.exit(code if isinstance(code, int) else 0)
 
 

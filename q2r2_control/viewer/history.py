@@ -28,6 +28,9 @@ class History:
         self._used = 0
         self._interval = _FIRST_INTERVAL
         self._due = 0.0
+        self._distance: float
+        self._velocity: float
+        self._acceleration: float
         self._forget_extremes()
 
     def __call__(self, tick: Tick) -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -16,6 +18,10 @@ from q2r2_control.viewer.history import History
 _COLOURS = {"left": "#1f6fb2", "right": "#d9722b"}
 _LIMIT = "#b3202c"
 _AXES_STYLE = (("x", 1.0), ("y", 0.7), ("z", 0.45))  # name, opacity
+_LINE_STYLES = {"left": "-", "right": (0, (4, 3))}  # where both share a plot, the right lies on top
+_TARGET_STYLE: dict[str, Any] = {"color": "black", "linestyle": (0, (2, 4)), "linewidth": 1.0}
+_CLOSED = 0.95  # a gripper's opening below which it is drawn as closed
+_LABEL_ROOM = 0.09  # between two labels beside the joints' plot, in its units
 
 
 def draw_report(history: History, summary: RunSummary, min_distance: float, title: str, file: Path) -> None:
@@ -28,6 +34,8 @@ def draw_report(history: History, summary: RunSummary, min_distance: float, titl
     for column, arm in enumerate(arms):
         _draw_path(grid[0, column], history, arm)
         _draw_joints(grid[3, column], history, arm)
+    if len(arms) == 2:
+        grid[0, 1].sharey(grid[0, 0])
     _draw_errors(grid[1, 0], history, arms, "position")
     _draw_errors(grid[1, 1], history, arms, "rotation")
     _draw_distance(grid[2, 0], history, min_distance)
@@ -54,28 +62,33 @@ def _headline(summary: RunSummary) -> str:
 
 
 def _draw_path(axes: Axes, history: History, arm: str) -> None:
-    """Displacement from where the tool started: three coordinates on one scale."""
+    """Displacement from where the tool started, and while the gripper is closed."""
     colour, start = _COLOURS[arm], history.tool(arm)[:1]
     measured, target = 1e3 * (history.tool(arm) - start), 1e3 * (history.target(arm) - start)
     for index, (name, opacity) in enumerate(_AXES_STYLE):
-        axes.plot(history.t, measured[:, index], color=colour, alpha=opacity, label=f"{name} measured")
-        axes.plot(history.t, target[:, index], color="black", linestyle=(0, (2, 4)), linewidth=1.0)
-        axes.annotate(name, (1.005, measured[-1, index]), xycoords=("axes fraction", "data"), color=colour)
-    axes.plot([], [], color="black", linestyle=(0, (2, 4)), linewidth=1.0, label="target")
+        axes.plot(history.t, measured[:, index], color=colour, alpha=opacity, linewidth=2.0, label=f"{name} measured")
+        axes.plot(history.t, target[:, index], **_TARGET_STYLE)
+    for index, (name, _) in enumerate(_AXES_STYLE):
+        farthest = int(np.abs(measured[:, index]).argmax())
+        axes.annotate(
+            name,
+            (history.t[farthest], measured[farthest, index]),
+            xytext=(0, 4),
+            textcoords="offset points",
+            ha="center",
+            fontsize=11,
+            fontweight="bold",
+            color=colour,
+        )
+    axes.plot([], [], **_TARGET_STYLE, label="target")
     axes.set_title(f"{arm} tool: way from its start")
     axes.set_ylabel("displacement [mm]")
-    closed = history.gripper(arm) < 0.95
+    axes.margins(y=0.12)
+    closed = history.gripper(arm) < _CLOSED
     if closed.any():
+        band = axes.get_xaxis_transform()
         axes.fill_between(
-            history.t,
-            0,
-            1,
-            where=closed,
-            transform=axes.get_xaxis_transform(),
-            color="grey",
-            alpha=0.12,
-            linewidth=0,
-            label="gripper closed",
+            history.t, 0, 1, where=closed, transform=band, color="grey", alpha=0.12, lw=0, label="gripper closed"
         )
     axes.legend(loc="best", fontsize=8, ncols=2)
 
@@ -84,7 +97,7 @@ def _draw_errors(axes: Axes, history: History, arms: list[str], kind: str) -> No
     """Measured tool against the target, where engaged."""
     for arm in arms:
         error = 1e3 * history.position_error(arm) if kind == "position" else np.degrees(history.rotation_error(arm))
-        axes.plot(history.t, error, color=_COLOURS[arm], label=arm, alpha=0.8)
+        axes.plot(history.t, error, color=_COLOURS[arm], linestyle=_LINE_STYLES[arm], label=arm)
     axes.set_title(f"{kind} error of the measured tool, while engaged")
     axes.set_ylabel("error [mm]" if kind == "position" else "error [deg]")
     axes.set_ylim(bottom=0.0)
@@ -93,11 +106,13 @@ def _draw_errors(axes: Axes, history: History, arms: list[str], kind: str) -> No
 
 def _draw_distance(axes: Axes, history: History, min_distance: float) -> None:
     distance = np.where(np.isfinite(history.distance), 1e3 * history.distance, np.nan)
+    lowest = float(np.nanmin(distance, initial=0.0))
     axes.plot(history.t, distance, color="#3b7d3b", label="nearest monitored pair")
+    axes.axhspan(min(0.0, lowest), 1e3 * min_distance, color=_LIMIT, alpha=0.08, linewidth=0)
     _draw_limit(axes, 1e3 * min_distance, f"min_distance {1e3 * min_distance:g} mm")
     axes.set_title("distance of the nearest monitored pair")
     axes.set_ylabel("distance [mm]")
-    axes.set_ylim(bottom=min(0.0, float(np.nanmin(distance, initial=0.0))))
+    axes.set_ylim(bottom=min(0.0, lowest))
     axes.legend(loc="best", fontsize=8)
 
 
@@ -116,17 +131,28 @@ def _draw_joints(axes: Axes, history: History, arm: str) -> None:
     joints = robot.arms[arm].joints
     lower, upper = robot.position_lower[joints], robot.position_upper[joints]
     place: Array = (2.0 * history.q[:, joints] - lower - upper) / (upper - lower)
-    for number, index in enumerate(joints):
+    for number in range(len(joints)):
         opacity = 1.0 - 0.75 * number / max(len(joints) - 1, 1)
-        axes.plot(history.t, place[:, number], color=_COLOURS[arm], alpha=opacity, label=robot.joint_names[index])
+        axes.plot(history.t, place[:, number], color=_COLOURS[arm], alpha=opacity)
+    for number, height in enumerate(_spread(place[-1])):
+        name = robot.joint_names[joints[number]].removeprefix(f"{arm}_")
         axes.annotate(
-            str(number + 1), (1.005, place[-1, number]), xycoords=("axes fraction", "data"), color=_COLOURS[arm]
+            name, (1.01, height), xycoords=("axes fraction", "data"), va="center", fontsize=8, color=_COLOURS[arm]
         )
     _draw_limit(axes, 1.0, "limits")
     _draw_limit(axes, -1.0, None)
     axes.set_title(f"{arm} joints between their limits")
     axes.set_ylabel("position: -1 lower, +1 upper limit")
     axes.set_ylim(-1.1, 1.1)
+
+
+def _spread(heights: Array) -> Array:
+    """Heights of labels, moved up where one would cover the one below."""
+    spread = np.array(heights)
+    order = np.argsort(heights)
+    for below, above in itertools.pairwise(order):
+        spread[above] = max(spread[above], spread[below] + _LABEL_ROOM)
+    return spread
 
 
 def _draw_limit(axes: Axes, value: float, label: str | None) -> None:
