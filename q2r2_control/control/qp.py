@@ -1,10 +1,11 @@
 """The QP as data, and the solvers that take it. Building is pure and separate from solving.
 
-    minimise    1/2 v' H v + g' v + 1/(2 rho) sum_i s_i^2
+    minimise    1/2 v' H v + g' v + 1/2 sum_i s_i^2 / rho_i,    rho_i = SOFTNESS a_i' H^-1 a_i,  a_i the i-th row
     subject to  lower <= v <= upper,    rows v + s >= rows_lower,    s >= 0
 
 The box is never empty (limits.py) and the rows are soft, so a solution always exists. Rows have unit norm, so that a
-slack is a joint speed and one rho fits all.
+slack is a joint speed. H^-1 along a row is what the cost yields to it: a row alone gives way by the part SOFTNESS of
+what it corrects, however strong the cost. This is DAQP's own notion of softness; the other solvers are given the same.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from scipy import sparse
 from q2r2_control.errors import ConfigError
 from q2r2_control.types import Array
 
-SOFTNESS = 1e-5  # rho: a row gives way by rho times its multiplier
+SOFTNESS = 1e-5  # part of its correction by which a row gives way
 _UNBOUNDED = 1e30
 
 
@@ -36,6 +37,10 @@ class QpProblem:
     upper: Array  # (nv,) [rad/s]
     rows: Array  # (m, nv), unit rows
     rows_lower: Array  # (m,) [rad/s]
+
+    def softness(self) -> Array:
+        """rho (m,): how far each row gives way per unit of its multiplier."""
+        return np.asarray(SOFTNESS * np.sum(self.rows * np.linalg.solve(self.H, self.rows.T).T, axis=1))
 
     def slack(self, v: Array) -> float:
         """Largest violation of a row by ``v`` (nv,) [rad/s]."""
@@ -113,19 +118,32 @@ class OsqpSolver:
         self._lower[:nv], self._upper[:nv] = problem.lower, problem.upper
         self._lower[nv : nv + m], self._lower[nv + m : nv + self._capacity] = problem.rows_lower, -_UNBOUNDED
         self._cost[:nv] = problem.g
-        self._solver.update(
-            Px=np.concatenate([upper_triangle, np.full(self._capacity, 1.0 / SOFTNESS)]),
-            Ax=self._values(),
-            q=self._cost,
-            l=self._lower,
-            u=self._upper,
-        )
-        result = self._solver.solve(raise_error=False)
+        self._slack_cost[:m] = 1.0 / problem.softness()
+        try:
+            self._solver.update(
+                Px=np.concatenate([upper_triangle, self._slack_cost]),
+                Ax=self._values(),
+                q=self._cost,
+                l=self._lower,
+                u=self._upper,
+            )
+            result = self._solver.solve(raise_error=False)
+        except osqp.OSQPException:
+            return self._failed(0.0)
+        # Rows that contradict each other take many iterations; the last one is good, and still has to be certified.
         solved = result.info.status_val in (
             osqp.SolverStatus.OSQP_SOLVED,
             osqp.SolverStatus.OSQP_SOLVED_INACCURATE,
+            osqp.SolverStatus.OSQP_MAX_ITER_REACHED,
         )
-        return QpSolution(np.asarray(result.x[:nv], dtype=np.float64) if solved else None, result.info.run_time)
+        if not (solved and np.isfinite(result.x).all()):
+            return self._failed(result.info.run_time)
+        return QpSolution(np.asarray(result.x[:nv], dtype=np.float64), result.info.run_time)
+
+    def _failed(self, run_time: float) -> QpSolution:
+        """What is kept between ticks may be spoilt: start anew at the next."""
+        self._solver = None
+        return QpSolution(None, run_time)
 
     def _values(self) -> Array:
         """Non-zeros of the constraint matrix by columns: identity over rows for v, then row and s >= 0 for each s."""
@@ -137,6 +155,7 @@ class OsqpSolver:
         self._capacity = capacity
         self._matrix = np.ones((capacity, nv))
         self._cost = np.zeros(nv + capacity)
+        self._slack_cost = np.full(capacity, 1.0 / SOFTNESS)
         self._lower = np.concatenate([np.full(nv + capacity, -_UNBOUNDED), np.zeros(capacity)])
         self._upper = np.full(nv + 2 * capacity, _UNBOUNDED)
         dense = np.triu(np.ones((nv, nv)))
@@ -158,7 +177,7 @@ class QpsolversSolver:
 
     def solve(self, problem: QpProblem) -> QpSolution:
         nv, m = len(problem.g), len(problem.rows_lower)
-        P = np.eye(nv + m) / SOFTNESS
+        P = np.diag(np.concatenate([np.zeros(nv), 1.0 / problem.softness()]))
         P[:nv, :nv] = problem.H
         before = time.perf_counter()
         try:
@@ -171,7 +190,7 @@ class QpsolversSolver:
                 ub=np.concatenate([problem.upper, np.full(m, np.inf)]),
                 solver=self._name,
             )
-        except (qpsolvers.QPError, ValueError, ArithmeticError):
+        except Exception:  # each solver behind qpsolvers has exceptions of its own
             x = None
         v = None if x is None else np.asarray(x[:nv], dtype=np.float64)
         # qpsolvers tells no time; this is the one place below the pipeline that reads a clock.
