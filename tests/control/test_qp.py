@@ -16,6 +16,8 @@ from q2r2_control.control.qp import (
 )
 from q2r2_control.errors import ConfigError
 
+# qpsolvers tells of sparse conversions and of OSQP's coarse tolerance; neither is what these tests are about.
+pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")
 NV = 14
 ROUTES: dict[str, Callable[[], Solver]] = {
     "daqp": lambda: DaqpSolver(NV, None),
