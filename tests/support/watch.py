@@ -1,0 +1,51 @@
+"""Watching a whole run: the controller's contract at every tick, and every tick kept to be looked at later."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+
+from q2r2_control.config import Config, load_config
+from q2r2_control.pipeline import Pipeline, Tick
+from q2r2_control.types import Event
+from tests.control.contract import Contract
+
+CELL = "config/dual_iiwa7.yaml"
+
+
+@cache
+def cell() -> Config:
+    """The shipped cell of two iiwa 7."""
+    return load_config(CELL)
+
+
+class Watch:
+    """A listener that fails the run at the first tick that breaks a limit."""
+
+    def __init__(self, pipeline: Pipeline) -> None:
+        self.ticks: list[Tick] = []
+        self._pipeline = pipeline
+        self._contract: Contract | None = None
+        pipeline.listeners.append(self)
+
+    def __call__(self, tick: Tick) -> None:
+        if self._contract is None:
+            self._contract = Contract(self._pipeline.controller, self._pipeline.robot.home)
+        self._contract.check(tick.reference, tick.dt)
+        self.ticks.append(tick)
+
+    def engagements(self, arm: str) -> list[int]:
+        """Indices of the ticks in which ``arm`` became engaged."""
+        engaged = [tick.engaged[arm] for tick in self.ticks]
+        return [i for i, now in enumerate(engaged) if now and not (i and engaged[i - 1])]
+
+
+def speed(tick: Tick) -> float:
+    """Of the fastest joint's reference [rad/s]."""
+    return float(np.abs(tick.reference.v).max())
+
+
+def changes(events: list[Event], arm: str) -> list[tuple[str, str, str]]:
+    """What happened to ``arm``: from, to, reason."""
+    return [(str(event.source), str(event.destination), event.reason) for event in events if event.arm == arm]

@@ -1,0 +1,299 @@
+"""An operator over TCP, in real time: tracking, re-anchoring, grippers, and connections that end in mid-motion.
+
+What is asserted about time allows for the machine's own delays, as measured; what is asserted about safety does not.
+"""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from q2r2_control.inputs.headset import HeadsetServer
+from q2r2_control.pipeline import Pipeline, Tick
+from q2r2_control.summary import RunSummary
+from q2r2_control.types import SIDES, Array, HandSample
+from tests.support.watch import Watch, cell, changes, speed
+
+CHECKOUT = Path(__file__).resolve().parents[1]
+SESSION = 15.0  # [s]
+# Reasons of events that a starved machine causes, not the stack.
+STARVED = ("stalled", "no pose for", "no button data for", "jumped", "connection lost")
+ATTEMPTS = 3
+
+
+class ClockedServer(HeadsetServer):
+    """Remembers the loop's clock at every poll, which a tick does not tell."""
+
+    def __init__(self) -> None:
+        super().__init__(port=0)
+        self.times: list[float] = []
+
+    def poll(self, now: float) -> list[HandSample]:
+        self.times.append(now)
+        return super().poll(now)
+
+
+@dataclass
+class Live:
+    """A run in another thread."""
+
+    server: ClockedServer
+    loop: Pipeline
+    watch: Watch
+    summary: RunSummary | None = None
+    failure: BaseException | None = None
+    delay: float = 0.0  # of teleoperation [s]
+    sent: list[dict] = field(default_factory=list)  # the fake headset's log
+
+    def run(self) -> None:
+        try:
+            self.summary = self.loop.run()
+        except BaseException as failure:
+            self.failure = failure
+
+    @property
+    def ticks(self) -> list[Tick]:
+        """Those in which the input was polled, as many as there are ``times``."""
+        return self.watch.ticks[: len(self.server.times)]
+
+    def wait_for(self, what: str, condition: Callable[[], bool], timeout: float = 30.0) -> None:
+        deadline = time.monotonic() + timeout
+        while not condition():
+            if self.failure is not None:
+                raise self.failure
+            assert time.monotonic() < deadline, f"waited in vain for {what}"
+            time.sleep(0.005)
+
+    def headset(self, *arguments: str) -> subprocess.Popen[bytes]:
+        command = [sys.executable, "-m", "tests.support.fake_headset", "--port", str(self.server.address[1])]
+        return subprocess.Popen([*command, *arguments], cwd=CHECKOUT)
+
+
+@contextmanager
+def live(plant: str) -> Iterator[Live]:
+    """A pipeline that listens, until the end of the block; then it is stopped, and a failure of the run raised."""
+    server = ClockedServer()
+    loop = Pipeline.from_config(cell(), input=server, plant=plant)
+    run = Live(server, loop, Watch(loop), delay=loop.teleop.delay)
+    thread = threading.Thread(target=run.run)
+    thread.start()
+    try:
+        run.wait_for("the first tick", lambda: bool(run.watch.ticks))
+        yield run
+    finally:
+        loop.stop()
+        thread.join(10.0)
+    assert not thread.is_alive()
+    if run.failure is not None:
+        raise run.failure
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory: pytest.TempPathFactory) -> Live:
+    """The whole session: both hands move, pause, the left one turns by 120 degrees, resume, close the grippers."""
+    for attempt in range(ATTEMPTS):
+        log = tmp_path_factory.mktemp("session") / "sent.jsonl"
+        with live("mujoco") as run:
+            headset = run.headset("--dialect", "ros2", "--duration", str(SESSION), "--log", str(log))
+            assert headset.wait(SESSION + 60.0) == 0
+        run.sent = [json.loads(line) for line in log.read_text(encoding="utf-8").splitlines()]
+        assert run.summary is not None
+        end = run.sent[-1]["t"] - run.server.times[0]
+        reasons = [event.reason for event in run.summary.events if event.t < end]
+        starved = [reason for reason in reasons if any(fault in reason for fault in STARVED)]
+        if not starved or attempt == ATTEMPTS - 1:
+            break
+    return run
+
+
+def hand_path(session: Live, hand: str) -> tuple[Array, Array, list[pin.SE3]]:
+    """Times (n,) [s], positions (n, 3) [m] and poses that ``hand`` sent."""
+    sent = [line for line in session.sent if line["hand"] == hand]
+    poses = [
+        pin.SE3(pin.Quaternion(np.array(line["quaternion"])).matrix(), np.array(line["position"])) for line in sent
+    ]
+    return np.array([line["t"] for line in sent]), np.array([pose.translation for pose in poses]), poses
+
+
+@pytest.mark.parametrize("arm", SIDES)
+class TestSession:
+    def test_the_buttons_engage_pause_and_resume_and_nothing_else_does(self, session: Live, arm: str) -> None:
+        assert session.summary is not None
+        assert changes(session.summary.events, arm)[:4] == [
+            ("paused", "engaged", "lower button"),
+            ("engaged", "pausing", "lower button"),
+            ("pausing", "paused", "lower button"),
+            ("paused", "engaged", "lower button"),
+        ]
+
+    def test_the_first_target_after_engaging_and_resuming_is_where_the_tool_was_measured(
+        self, session: Live, arm: str
+    ) -> None:
+        starts = session.watch.engagements(arm)
+        assert len(starts) == 2
+        for index in starts:
+            tick = session.watch.ticks[index]
+            target = tick.targets[arm].pose
+            assert target is not None
+            assert np.linalg.norm(target.translation - tick.tools[arm].translation) < 1e-6
+            # Nor does anything jump afterwards: the hands still rest.
+            before, after = tick.tools[arm], session.watch.ticks[index + 100].tools[arm]
+            assert np.linalg.norm(after.translation - before.translation) < 1e-3
+            assert np.linalg.norm(pin.log3(before.rotation.T @ after.rotation)) < np.radians(0.5)
+
+    def test_the_tool_follows_the_hand_that_was_within_5_mm_and_1_degree(self, session: Live, arm: str) -> None:
+        times, positions, poses = hand_path(session, arm)
+        clock, ticks = session.server.times, session.ticks
+        shifts, turns, travelled = [], [], []
+        starts = session.watch.engagements(arm)
+        for start in starts:
+            anchor, index = poses[np.searchsorted(times, clock[start]) - 1], start
+            tool = ticks[start].tools[arm]
+            while index < len(ticks) and ticks[index].engaged[arm] and clock[index] < times[-1]:
+                due = clock[index] - session.delay
+                if due > times[0]:
+                    wanted = np.array([np.interp(due, times, column) for column in positions.T]) - anchor.translation
+                    nearest = poses[int(np.argmin(np.abs(times - due)))]
+                    turn = nearest.rotation @ anchor.rotation.T
+                    got = ticks[index].tools[arm]
+                    shifts.append(np.linalg.norm(got.translation - tool.translation - wanted))
+                    turns.append(np.linalg.norm(pin.log3(got.rotation @ (turn @ tool.rotation).T)))
+                    travelled.append(np.linalg.norm(wanted))
+                index += 1
+        assert max(travelled) > 0.19, "circles of 0.1 m radius"
+        assert root_mean_square(shifts) < 5e-3
+        assert np.degrees(root_mean_square(turns)) < 1.0
+
+    def test_the_tool_stands_still_while_the_hand_turns_in_the_pause(self, session: Live, arm: str) -> None:
+        _, resumed = session.watch.engagements(arm)
+        middle = [tick for tick in session.ticks if -1.5 < tick.t - session.watch.ticks[resumed].t < -0.1]
+        assert len(middle) > 100
+        assert max(map(speed, middle)) < 1e-3
+        assert np.ptp([tick.tools[arm].translation for tick in middle], axis=0).max() < 1e-4
+
+    def test_the_gripper_closes(self, session: Live, arm: str) -> None:
+        _, second = session.watch.engagements(arm)
+        assert session.watch.ticks[second].grippers[arm] > 0.95
+        assert session.watch.ticks[-1].grippers[arm] < 0.05
+        assert session.summary is not None
+        assert session.summary.arms[arm].gripper_changes == 1
+
+
+def test_the_session_hardly_ever_needs_the_fallback_and_ends_at_rest(session: Live) -> None:
+    summary = session.summary
+    assert summary is not None
+    # A machine that is busy elsewhere makes a solver late now and then; the certified stop bridges it.
+    assert summary.fallback_ticks < 0.02 * summary.ticks
+    assert summary.uncertified_ticks == 0
+    assert summary.rejected_targets == 0
+    assert summary.at_rest
+    assert summary.max_velocity_ratio <= 1.0 + 1e-9
+    assert summary.max_acceleration_ratio <= 1.0 + 1e-9
+    assert summary.min_position_margin_rad >= -1e-9
+
+
+def root_mean_square(values: Sequence[float | np.floating]) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+@dataclass
+class Cut:
+    """A connection that ended in mid-motion."""
+
+    last: int  # tick of its last sample
+    until: int  # first tick of the next client's engagement, or the end
+
+
+@pytest.fixture(scope="module")
+def cuts() -> tuple[Live, dict[str, Cut]]:
+    """One run, three clients that end in mid-motion; each next one sends before it presses, and engages anew."""
+    found: dict[str, Cut] = {}
+    with live("kinematic") as run:
+        first, second, third = (
+            ("--script", "circle", "--dialect", dialect, "--duration", duration, *end)
+            for dialect, duration, end in (
+                ("ros2", "30", ()),
+                ("ros1", "30", ()),
+                ("ros2", "2.2", ("--end", "cut")),
+            )
+        )
+        marks = []
+        for arguments, end in ((first, signal.SIGKILL), (second, signal.SIGSTOP), (third, None)):
+            headset = run.headset(*arguments)
+            try:
+                run.wait_for(
+                    "motion", lambda: all(run.watch.ticks[-1].engaged.values()) and speed(run.watch.ticks[-1]) > 0.1
+                )
+                if end is not None:
+                    headset.send_signal(end)
+                run.wait_for("a pause", lambda: not any(run.watch.ticks[-1].engaged.values()))
+                marks.append(len(run.watch.ticks) - 1)
+                time.sleep(0.5)
+                if end is signal.SIGSTOP:
+                    # The operator's hands moved on meanwhile, and go on moving.
+                    headset.send_signal(signal.SIGCONT)
+                    time.sleep(0.7)
+            finally:
+                headset.kill()
+                headset.wait()
+    ticks = run.watch.ticks
+    for name, mark in zip(("killed", "silent", "cut"), marks, strict=True):
+        last = max(index for index in range(mark + 1) if ticks[index].samples)
+        until = next((i for i in range(mark, len(ticks)) if any(ticks[i].engaged.values())), len(ticks))
+        found[name] = Cut(last, until)
+    return run, found
+
+
+@pytest.mark.parametrize("name", ["killed", "silent", "cut"])
+class TestConnectionEndsInMidMotion:
+    def test_both_arms_are_at_rest_within_150_ms_and_the_braking_time(
+        self, cuts: tuple[Live, dict[str, Cut]], name: str
+    ) -> None:
+        run, found = cuts
+        cut, ticks = found[name], run.watch.ticks
+        received = max(sample.pose_stamp for sample in ticks[cut.last].samples)
+        after = range(cut.last, cut.until)
+        rest = next(index for index in after if speed(ticks[index]) < 1e-3)
+        moving = range(cut.last, rest + 1)
+        assert speed(ticks[cut.last]) > 0.05, "in mid-motion"
+        braking = max(speed(ticks[index]) for index in moving) / run.loop.config.control.acceleration_limit
+        # A tick that comes late sees the timeout late, and what is left of the braking one tick later.
+        late = 3.0 * max(ticks[index].dt for index in moving)
+        assert run.server.times[rest] - received <= 0.15 + braking + late + 0.005
+
+    def test_they_stay_at_rest_until_engaged_anew_whatever_the_hands_do(
+        self, cuts: tuple[Live, dict[str, Cut]], name: str
+    ) -> None:
+        run, found = cuts
+        cut, ticks = found[name], run.watch.ticks
+        rest = next(index for index in range(cut.last, cut.until) if speed(ticks[index]) < 1e-3)
+        still = ticks[rest : cut.until]
+        assert still[-1].t - still[0].t > 0.4
+        assert max(map(speed, still)) < 1e-3
+        assert np.ptp([tick.reference.q for tick in still], axis=0).max() < 1e-4
+        received = [sample for tick in still for sample in tick.samples]
+        assert received or name == "cut", "hands went on sending"
+
+    def test_both_arms_are_told_why(self, cuts: tuple[Live, dict[str, Cut]], name: str) -> None:
+        run, found = cuts
+        assert run.summary is not None
+        begin = run.watch.ticks[found[name].last].t - 0.01
+        expected = (
+            ("no pose for", "no button data for", "jumped", "linked to") if name == "silent" else ("connection lost",)
+        )
+        for arm in SIDES:
+            event = next(event for event in run.summary.events if event.arm == arm and event.t >= begin)
+            assert (str(event.source), str(event.destination)) == ("engaged", "paused")
+            assert any(reason in event.reason for reason in expected), event.reason

@@ -1,0 +1,437 @@
+"""The whole loop in simulated time: limits at every tick, repeatability, and a stop whatever ends the run."""
+
+from __future__ import annotations
+
+import gc
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from q2r2_control.errors import ConfigError, InputError
+from q2r2_control.inputs.headset import HeadsetServer
+from q2r2_control.inputs.scripted import ScriptedInput
+from q2r2_control.pipeline import STOPPING, Pipeline, Tick
+from q2r2_control.plants.kinematic import KinematicPlant
+from q2r2_control.robot.robot import Robot
+from q2r2_control.summary import RunSummary
+from q2r2_control.types import SIDES, Command, HandSample
+from tests.support.watch import Watch, cell, changes, speed
+
+CHECKOUT = Path(__file__).resolve().parents[1]
+
+
+class WitnessedPlant(KinematicPlant):
+    """Counts what is called, and fails when asked to."""
+
+    def __init__(self) -> None:
+        super().__init__(Robot.from_config(cell()), cell())
+        self.closed = 0
+        self.fails_at: int | None = None
+        self.commands: list[Command] = []
+
+    def apply(self, command: Command) -> None:
+        self.commands.append(command)
+        if self.fails_at is not None and len(self.commands) >= self.fails_at:
+            raise RuntimeError("the plant failed")
+        super().apply(command)
+
+    def close(self) -> None:
+        self.closed += 1
+
+
+def pipeline(trajectory: str = "circle", plant: str = "kinematic", **changes: object) -> Pipeline:
+    config = cell().model_copy(update=changes)
+    return Pipeline.from_config(config, input=ScriptedInput(trajectory, frequency_hz=0.5), plant=plant)
+
+
+def when_moving(action: Callable[[], object]) -> Callable[[Tick], None]:
+    """A listener that acts once, in mid-motion."""
+    acted: list[Tick] = []
+
+    def listener(tick: Tick) -> None:
+        if not acted and speed(tick) > 0.1:
+            acted.append(tick)
+            action()
+
+    return listener
+
+
+@pytest.mark.parametrize(
+    ("trajectory", "human", "plant", "millimetres", "degrees"),
+    [
+        ("circle", False, "mujoco", 2.0, 0.3),
+        ("line", False, "kinematic", 2.0, 0.3),
+        ("rotate", False, "mujoco", 2.0, 0.5),
+        ("reach_grasp_handover", False, "kinematic", 2.0, 0.3),
+        ("circle", True, "mujoco", 2.0, 0.5),
+    ],
+    ids=["circle", "line", "rotate", "reach", "a human's circle"],
+)
+def test_both_arms_follow_within_every_limit(
+    trajectory: str, human: bool, plant: str, millimetres: float, degrees: float
+) -> None:
+    source = ScriptedInput(trajectory, human=human, seed=3)
+    loop = Pipeline.from_config(cell(), input=source, plant=plant)
+    watch = Watch(loop)
+    summary = loop.run(2.4, realtime=False)
+    assert summary.ticks == len(watch.ticks) >= 2400
+    assert summary.fallback_ticks == summary.uncertified_ticks == summary.rejected_targets == 0
+    assert summary.at_rest
+    for arm in SIDES:
+        assert changes(summary.events, arm) == [("paused", "engaged", "lower button")]
+        figures = summary.arms[arm]
+        assert figures.engaged_s == pytest.approx(2.4 - 0.68, abs=0.05)
+        assert figures.position_error_mm_rms is not None
+        assert figures.rotation_error_deg_rms is not None
+        assert figures.position_error_mm_rms < millimetres
+        assert figures.rotation_error_deg_rms < degrees
+        (start,) = watch.engagements(arm)
+        first = watch.ticks[start]
+        pose = first.targets[arm].pose
+        assert pose is not None
+        assert np.linalg.norm(pose.translation - first.tools[arm].translation) < 1e-6
+        travelled = [tick.tools[arm].translation for tick in watch.ticks]
+        assert np.ptp(travelled, axis=0).max() > 0.01 or trajectory == "rotate"
+    assert max(map(speed, watch.ticks)) > 0.05
+
+
+class LeftUpperPresses(ScriptedInput):
+    """The left hand presses its upper button at 1.0 and at 1.6 s, and moves in between."""
+
+    def poll(self, now: float) -> list[HandSample]:
+        held = 1.0 <= now < 1.1 or 1.6 <= now < 1.7
+        return [
+            replace(sample, inputs=replace(sample.inputs, button_upper=held)) if sample.hand == "left" else sample
+            for sample in super().poll(now)
+        ]
+
+
+def test_a_gripper_closes_and_opens_with_the_upper_button_of_its_hand() -> None:
+    loop = Pipeline.from_config(cell(), input=LeftUpperPresses("line"), plant="mujoco")
+    watch = Watch(loop)
+    summary = loop.run(2.2, realtime=False)
+    assert {arm: figures.gripper_changes for arm, figures in summary.arms.items()} == {"left": 2, "right": 0}
+    openings = {t: watch.ticks[round(t * 1000)].grippers for t in (0.95, 1.55, 2.15)}
+    assert openings[0.95]["left"] > 0.95
+    assert openings[1.55]["left"] < 0.05
+    assert openings[2.15]["left"] > 0.95
+    assert all(opening["right"] > 0.95 for opening in openings.values())
+
+
+def test_two_simulated_runs_are_equal_bit_for_bit_also_on_the_same_pipeline() -> None:
+    def run(loop: Pipeline) -> tuple[list[bytes], RunSummary]:
+        watch = Watch(loop)
+        loop.input = ScriptedInput("circle", human=True, seed=1)
+        summary = loop.run(1.5, realtime=False)
+        loop.listeners.clear()
+        bits = [b"".join((x.reference.q.tobytes(), x.reference.v.tobytes(), x.state.q.tobytes())) for x in watch.ticks]
+        return bits, summary
+
+    loop = pipeline(plant="mujoco")
+    (first, one), (again, two), (anew, _) = run(loop), run(loop), run(pipeline(plant="mujoco"))
+    assert first == again == anew
+    assert one.events == two.events
+    assert [tick_free(one), tick_free(two)] == [tick_free(one)] * 2
+
+
+def tick_free(summary: RunSummary) -> str:
+    """All of a summary that does not depend on the machine's speed."""
+    data = summary.as_json()
+    del data["tick_us"], data["loop_rate_hz"]
+    return json.dumps(data)
+
+
+def test_a_run_starts_paused_even_when_the_one_before_ended_engaged() -> None:
+    loop = pipeline()
+    assert loop.run(2.0, realtime=False).arms["left"].engaged_s > 1.0
+    for realtime in (False, True):
+        loop.input = ScriptedInput("circle")
+        watch = Watch(loop)
+        summary = loop.run(0.3, realtime=realtime)
+        assert not summary.events
+        assert max(map(speed, watch.ticks)) < 1e-6
+        loop.listeners.clear()
+
+
+def test_runs_by_the_clock_keep_the_solver_s_time_limit_and_simulated_ones_have_none() -> None:
+    loop = pipeline()
+    assert loop.config.control.solve_time_limit is not None
+    for realtime, expected in ((False, None), (True, loop.config.control.solve_time_limit), (False, None)):
+        loop.run(0.05, realtime=realtime)
+        assert loop.controller.settings.solve_time_limit == expected
+
+
+@pytest.mark.parametrize("rate", [50.0, 333.0, 1000.0])
+def test_a_run_takes_as_many_ticks_as_its_duration_has_periods(rate: float) -> None:
+    summary = pipeline(loop_rate_hz=rate).run(0.4, realtime=False)
+    assert summary.ticks == round(0.4 * rate) + 1, "and one to come to rest"
+    assert summary.duration_s == pytest.approx(summary.ticks / rate)
+
+
+@pytest.mark.parametrize("rate", [50.0, 200.0])
+def test_a_slow_loop_keeps_the_limits_too(rate: float) -> None:
+    loop = pipeline(plant="mujoco", loop_rate_hz=rate)
+    watch = Watch(loop)
+    summary = loop.run(3.0, realtime=False)
+    error = summary.arms["left"].position_error_mm_rms
+    assert error is not None
+    assert error < 15.0
+    assert len(watch.ticks) == summary.ticks
+
+
+def test_by_the_clock_ticks_lie_on_a_grid() -> None:
+    loop = pipeline(loop_rate_hz=100.0)
+    watch = Watch(loop)
+    summary = loop.run(0.5)
+    times = np.array([tick.t for tick in watch.ticks])
+    # However late single ticks are on a busy machine, the delays do not add up.
+    assert np.median(times - 0.01 * np.arange(1, len(times) + 1)) < 0.02
+    assert summary.duration_s == pytest.approx(times[-1])
+    assert summary.input_to_command_ms.p50 is not None
+
+
+@pytest.mark.parametrize("duration", [0.0, -1.0, float("nan"), float("inf")])
+def test_a_duration_that_is_no_time_is_refused(duration: float) -> None:
+    with pytest.raises(ConfigError, match="allowed: a positive number of seconds"):
+        pipeline().run(duration, realtime=False)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"input": "mouse"}, "input 'mouse': allowed are scripted, headset"),
+        ({"plant": "gazebo"}, "plant 'gazebo': allowed are mujoco, kinematic"),
+    ],
+)
+def test_an_unknown_input_or_plant_is_refused(arguments: dict[str, str], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        Pipeline.from_config(cell(), **arguments)
+
+
+def test_one_arm_alone_is_a_cell() -> None:
+    config = cell().model_copy(update={"arms": {"left": cell().arms["left"]}, "obstacles": {}})
+    loop = Pipeline.from_config(config, input=ScriptedInput("circle"), plant="kinematic")
+    Watch(loop)
+    summary = loop.run(2.0, realtime=False)
+    assert list(summary.arms) == ["left"]
+    assert summary.arms["left"].engaged_s > 1.0
+
+
+class TestStop:
+    @pytest.mark.parametrize("how", ["stop", "SIGINT", "SIGTERM"])
+    def test_in_mid_motion_brakes_first(self, how: str) -> None:
+        loop = pipeline()
+        handlers = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
+        watch = Watch(loop)
+        action = loop.stop if how == "stop" else lambda: os.kill(os.getpid(), getattr(signal, how))
+        loop.listeners.append(when_moving(action))
+        summary = loop.run(60.0, realtime=False)
+        assert summary.duration_s < 5.0
+        assert_braked(loop, watch, summary)
+        assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == handlers
+
+    def test_from_another_thread_in_mid_motion_brakes_first(self) -> None:
+        loop = pipeline()
+        watch = Watch(loop)
+        moving = threading.Event()
+        loop.listeners.append(when_moving(moving.set))
+        summaries: list[RunSummary] = []
+        thread = threading.Thread(target=lambda: summaries.append(loop.run()))
+        thread.start()
+        assert moving.wait(30.0)
+        loop.stop()
+        thread.join(10.0)
+        assert not thread.is_alive()
+        assert_braked(loop, watch, summaries[0])
+
+    def test_at_the_end_of_the_duration_brakes_first(self) -> None:
+        loop = pipeline()
+        watch = Watch(loop)
+        assert_braked(loop, watch, loop.run(2.5, realtime=False))
+
+    def test_waits_for_slow_braking(self) -> None:
+        # Braking takes longer than anything that is allowed for beside it.
+        control = cell().control.model_copy(update={"acceleration_limit": 0.05})
+        loop = pipeline(control=control)
+        watch = Watch(loop)
+        summary = loop.run(4.0, realtime=False)
+        before = next(tick for tick in watch.ticks if STOPPING in tick.states.values())
+        assert speed(before) > 0.05, "a stop of more than a second"
+        assert speed(watch.ticks[-1]) < 1e-3
+        assert summary.at_rest
+
+    def test_asked_for_before_the_run_ends_it_at_once_and_the_next_one_runs(self) -> None:
+        loop = pipeline()
+        loop.stop()
+        assert loop.run(10.0, realtime=False).ticks == 1
+        assert loop.run(0.1, realtime=False).ticks > 100
+
+    @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
+    def test_of_a_process_by_a_signal_returns_its_summary(self, name: str) -> None:
+        script = (
+            "import json\n"
+            "from tests.test_pipeline import Watch, pipeline, when_moving\n"
+            "loop = pipeline(plant='mujoco')\n"
+            "watch = Watch(loop)\n"
+            "loop.listeners.append(when_moving(lambda: print('moving', flush=True)))\n"
+            "print(json.dumps(loop.run().as_json()), flush=True)\n"
+        )
+        with subprocess.Popen([sys.executable, "-c", script], cwd=CHECKOUT, stdout=subprocess.PIPE, text=True) as run:
+            assert run.stdout is not None
+            assert run.stdout.readline() == "moving\n"
+            run.send_signal(getattr(signal, name))
+            summary = json.loads(run.stdout.readline())
+            assert run.wait(10.0) == 0
+        assert summary["at_rest"]
+        assert summary["max_velocity_ratio"] > 0.0
+        assert summary["max_acceleration_ratio"] <= 1.0 + 1e-9
+
+
+def assert_braked(loop: Pipeline, watch: Watch, summary: RunSummary) -> None:
+    """At the end all stands still, reached without input; the contract was checked on the way."""
+    stopping = [tick for tick in watch.ticks if STOPPING in tick.states.values()]
+    assert stopping[0] is watch.ticks[-len(stopping)]
+    assert all(not tick.samples and not any(tick.engaged.values()) for tick in stopping)
+    assert speed(watch.ticks[-len(stopping) - 1]) > 0.05, "it was moving"
+    assert speed(watch.ticks[-1]) <= 1e-6
+    assert summary.at_rest
+    braking = speed(watch.ticks[-len(stopping) - 1]) / loop.config.control.acceleration_limit
+    assert stopping[-1].t - stopping[0].t <= 1.5 * braking + 0.05
+    assert not loop.stopping
+
+
+class TestFailure:
+    def test_of_a_listener_brakes_first_and_calls_it_no_more(self) -> None:
+        loop, calls = pipeline(), []
+
+        def fail() -> None:
+            calls.append(1)
+            raise RuntimeError("the listener failed")
+
+        loop.listeners.append(when_moving(fail))
+        watch = Watch(loop)
+        with pytest.raises(RuntimeError, match="the listener failed"):
+            loop.run(60.0, realtime=False)
+        assert len(calls) == 1
+        assert speed(watch.ticks[-1]) <= 1e-6 < max(map(speed, watch.ticks))
+
+    @pytest.mark.parametrize("call", ["poll", "connected"])
+    def test_of_the_input_brakes_first(self, call: str, monkeypatch: pytest.MonkeyPatch) -> None:
+        loop = pipeline()
+        watch = Watch(loop)
+
+        def fail(*_: object) -> None:
+            raise RuntimeError("the input failed")
+
+        broken = property(fail) if call == "connected" else fail
+        loop.listeners.append(when_moving(lambda: monkeypatch.setattr(ScriptedInput, call, broken)))
+        with pytest.raises(RuntimeError, match="the input failed"):
+            loop.run(60.0, realtime=False)
+        assert speed(watch.ticks[-1]) <= 1e-6 < max(map(speed, watch.ticks))
+
+    @pytest.mark.parametrize("who", ["plant", "listener", "reset", "nobody"])
+    def test_leaves_no_thread_no_port_and_no_plant_behind(self, who: str, monkeypatch: pytest.MonkeyPatch) -> None:
+        plant, server = WitnessedPlant(), HeadsetServer(port=0)
+        loop = Pipeline.from_config(cell(), input=server, plant=plant)
+
+        def fail(*_: object) -> None:
+            raise RuntimeError(f"the {who} failed")
+
+        if who == "plant":
+            plant.fails_at = 20
+        elif who == "listener":
+            loop.listeners.append(fail)
+        elif who == "reset":
+            monkeypatch.setattr(plant, "reset", fail)
+        if who == "nobody":
+            loop.run(0.1, realtime=False)
+        else:
+            with pytest.raises(RuntimeError, match=f"the {who} failed"):
+                loop.run(1.0, realtime=False)
+        assert plant.closed == 1
+        assert "headset" not in {thread.name for thread in threading.enumerate()}
+        with socket.create_server(server.address):
+            pass
+        assert gc.isenabled()
+        assert gc.get_freeze_count() == 0
+
+    def test_to_open_the_input_closes_the_plant_and_names_the_port(self) -> None:
+        plant = WitnessedPlant()
+        with socket.create_server(("127.0.0.1", 0)) as taken:
+            loop = Pipeline.from_config(cell(), input=HeadsetServer(port=taken.getsockname()[1]), plant=plant)
+            with pytest.raises(InputError, match=str(taken.getsockname()[1])):
+                loop.run(1.0, realtime=False)
+        assert plant.closed == 1
+        assert not plant.commands
+
+
+class HostileInput:
+    """A hand that moves as it should and presses buttons, with samples among it that nothing should ever send."""
+
+    def __init__(self, seed: int) -> None:
+        self._random = np.random.default_rng(seed)
+        self._source = ScriptedInput("circle", human=True, seed=seed, frequency_hz=1.0)
+        self.connected = True
+        self.start, self.close, self.send_haptic = self._source.start, self._source.close, self._source.send_haptic
+
+    def poll(self, now: float) -> list[HandSample]:
+        random = self._random
+        self.connected = bool(random.random() > 1e-3)
+        pressed = now % 0.6 < 0.2
+        samples = [
+            replace(sample, inputs=replace(sample.inputs, button_lower=pressed)) for sample in self._source.poll(now)
+        ]
+        if samples and random.random() < 0.05:
+            samples.append(self._spoilt(samples[-1]))
+        if samples and random.random() < 0.002:
+            samples += [self._spoilt(samples[0]) for _ in range(1000)]
+        return samples
+
+    def _spoilt(self, sample: HandSample) -> HandSample:
+        random, bad = self._random, (np.nan, np.inf, -np.inf, 1e308, -1e-308, 0.0)
+        changes: list[dict[str, object]] = [
+            {"position": np.array(random.choice(bad, 3))},
+            {"position": sample.position + random.normal(0.0, 10.0 ** random.uniform(-4, 3), 3)},
+            {"position": np.zeros(random.integers(0, 5))},
+            {"quaternion": np.zeros(4)},
+            {"quaternion": np.array(random.choice(bad, 4))},
+            {"quaternion": random.normal(0.0, 1.0, 4)},
+            {"hand": str(random.choice(["middle", "", "LEFT", "right"]))},
+            {"pose_stamp": float(random.choice([np.nan, np.inf, -np.inf, 1e300]))},
+            {"pose_stamp": sample.pose_stamp - random.exponential(1.0)},
+            {"pose_stamp": sample.pose_stamp + random.exponential(1.0)},
+            {"inputs_stamp": float(random.choice([np.nan, np.inf, -np.inf, -1e300]))},
+            {"inputs": replace(sample.inputs, button_lower=bool(random.random() < 0.5), press_index=np.nan)},
+            {"inputs": replace(sample.inputs, button_lower=True, button_upper=True)},
+        ]
+        return replace(sample, **changes[random.integers(len(changes))])  # type: ignore[arg-type]
+
+
+def test_ten_thousand_ticks_of_hostile_samples_break_no_limit_and_raise_nothing() -> None:
+    loop = Pipeline.from_config(cell(), input=HostileInput(7), plant="kinematic")
+    watch = Watch(loop)
+    summary = loop.run(10.0, realtime=False)
+    assert summary.ticks == len(watch.ticks) >= 10_000
+    json.dumps(summary.as_json(), allow_nan=False)
+    assert summary.at_rest
+    assert len(watch.engagements("left")) >= 5, "it was not just ignored"
+    assert max(map(speed, watch.ticks)) > 0.3
+    reasons = " ".join(event.reason for event in summary.events)
+    for fault in ("not finite", "jumped", "connection lost", "alignment chord"):
+        assert fault in reasons
+    for arm in SIDES:
+        for index in watch.engagements(arm):
+            tick = watch.ticks[index]
+            pose = tick.targets[arm].pose
+            assert pose is not None
+            assert np.linalg.norm(pose.translation - tick.tools[arm].translation) < 1e-6
