@@ -10,7 +10,14 @@ from q2r2_control.control.geometry import clamp
 from q2r2_control.control.jit import Held, kernel, lean_kernel
 from q2r2_control.control.limits import next_velocity_box
 from q2r2_control.control.separation import separation_rows, speed_near
-from q2r2_control.control.tasks import add_tool_task, project_to_nullspace, tool_jacobian, tool_pose, wanted_twist
+from q2r2_control.control.tasks import (
+    add_stretch_damping,
+    add_tool_task,
+    project_to_nullspace,
+    tool_jacobian,
+    tool_pose,
+    wanted_twist,
+)
 from q2r2_control.control.workspace import Cell, Goals, Workspace
 
 # A held arm is not pushed about by the other one's task, but may give way to recover separation.
@@ -104,7 +111,7 @@ def _follow(cell: Cell, goals: Goals, i: int, work: Workspace) -> None:
     )
     J = work.J[6 * i : 6 * i + 6]
     tool_jacobian(cell.chain, work.placements, cell.tools, i, work.translation[i], J)
-    feedback = wanted_twist(
+    wanted_twist(
         work.rotation[i],
         work.translation[i],
         goals.rotation[i],
@@ -113,8 +120,12 @@ def _follow(cell: Cell, goals: Goals, i: int, work: Workspace) -> None:
         cell.motion,
         speed,
         work.twist[i],
+        work.feedback,
     )
-    add_tool_task(J, work.twist[i], cell.motion.damping * feedback, cell.tools.member[i], work.H, work.g)
+    add_tool_task(J, work.twist[i], work.H, work.g)
+    add_stretch_damping(
+        cell.chain, work.placements, cell.tools.joint[i], J, work.feedback, cell.motion.stretch_gain, work.H
+    )
 
 
 @lean_kernel

@@ -33,7 +33,7 @@ def cell_of(robot: Robot, settings: ControllerSettings) -> Cell:
             gain=np.array([settings.position_gain, settings.rotation_gain]),
             deceleration=np.array([settings.linear_deceleration, settings.angular_deceleration]),
             full_speed=np.array([settings.max_linear_speed, settings.max_angular_speed]),
-            damping=settings.stretch_damping,
+            stretch_gain=settings.stretch_gain,
         ),
         approach=Approach(
             stop_distance=settings.min_distance + settings.distance_buffer,

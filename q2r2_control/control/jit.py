@@ -22,13 +22,14 @@ from numba.experimental import structref
 def _cache_folder() -> Path:
     sources = sorted(Path(__file__).parent.glob("*.py"))
     digest = hashlib.sha256(b"".join(source.read_bytes() for source in sources)).hexdigest()[:16]
-    root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "q2r2_control"
     try:
+        root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "q2r2_control"
         root.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=root):
             pass
-    except OSError:
-        root = Path(tempfile.gettempdir()) / f"q2r2_control-{os.getuid()}"
+    except (OSError, RuntimeError):
+        # Numba loads what it finds there as code, so a folder that others could have made will not do.
+        root = Path(tempfile.mkdtemp(prefix="q2r2_control-"))
     return root / digest
 
 

@@ -1,13 +1,16 @@
 """Costs of the QP: tool twists, posture, hold, as H and g of  1/2 v' H v + g' v, compiled.
 
-For each following arm:  |J v - u|^2_W + mu |v|^2, u the wanted tool twist, W = diag(1, 1, 1, l^2, l^2, l^2) with the
+For each following arm:  |J v - u|^2_W + v' M v, u the wanted tool twist, W = diag(1, 1, 1, l^2, l^2, l^2) with the
 length l that makes a radian comparable to a metre. For all joints: w |v - v_p|^2 with the posture velocity v_p
 projected into the tools' nullspace, so that at rest it leaves no tool error.
 
-**Damping mu.** Stretched out towards an unreachable target, the gradient of the reach with respect to the elbow angle
-vanishes like L theta, so under a wanted speed s the closed loop near that posture has the gain L s / mu. It must stay
-well below 1/dt times what the acceleration limit leaves, or it limit-cycles: mu = c s keeps it at L / c whatever the
-error. The damping is in proportion to the wanted feedback speed and vanishes at the target.
+**Damping M.** Stretched out towards an unreachable target, the gradient of the reach with respect to the elbow angle
+vanishes like L theta. Under a wanted speed s the loop near that posture therefore has the gain L s / mu, which without
+damping mu is unbounded, and with bounded accelerations ends in a limit cycle. In general the wanted velocity s adds the
+geometric stiffness E_ij = s' d2x / dq_i dq_j, and only its negative part, the pull outwards, needs damping: the pull
+inwards drives the arm away from the singular posture, as it should. Joint i gets mu_i = d_i + sum_j min(|E_ij|, d_i)
+over k, with d_i = max(0, -E_ii); where an arm is pulled straight, |E_ij| <= d_i, so that by Gershgorin's theorem the
+gain is at most k. M vanishes at the target.
 """
 
 from __future__ import annotations
@@ -39,7 +42,7 @@ class Motion(NamedTuple):
     gain: Array  # (2,) [1/s]
     deceleration: Array  # (2,) [m/s^2, rad/s^2]
     full_speed: Array  # (2,) [m/s, rad/s]
-    damping: float  # c in mu = c s [s]
+    stretch_gain: float  # k [1/s]
 
 
 @lean_kernel
@@ -131,10 +134,12 @@ def wanted_twist(
     motion: Motion,
     speed_limit: float,
     twist: Array,
-) -> float:
-    """Tool twist towards the goal into ``twist`` (6,); returns the feedback speed that damping follows [m/s].
+    feedback: Array,
+) -> None:
+    """Tool twist towards the goal into ``twist`` (6,).
 
-    ``speed_limit`` [m/s] caps the linear part and, in proportion, the angular part.
+    ``feedback`` (6,) receives the part that the error makes. ``speed_limit`` [m/s] caps the linear part and, in
+    proportion, the angular part.
     """
     relative = np.empty((3, 3))
     for row in range(3):
@@ -146,7 +151,6 @@ def wanted_twist(
     for k in range(3):
         twist[k] = goal_translation[k] - translation[k]
     rotation_vector(relative, twist[3:6])
-    feedback = 0.0
     for part in range(2):
         piece = twist[3 * part : 3 * part + 3]
         error = np.sqrt(piece[0] ** 2 + piece[1] ** 2 + piece[2] ** 2)
@@ -155,23 +159,20 @@ def wanted_twist(
         speed = min(approach_speed(error, motion.gain[part], motion.deceleration[part]), cap)
         if error > 1e-12:
             piece *= speed / error
-        feedback += speed * (1.0 if part == 0 else ROTATION_LENGTH)
+        for k in range(3):
+            feedback[3 * part + k] = piece[k]
         piece += feed_forward[3 * part : 3 * part + 3]
         size = np.sqrt(piece[0] ** 2 + piece[1] ** 2 + piece[2] ** 2)
         if size > cap:
             piece *= cap / size
-    return feedback
 
 
 @lean_kernel
-def add_tool_task(J: Array, twist: Array, mu: float, member: Array, H: Array, g: Array) -> None:
-    """Add |J v - twist|^2_W + mu |v|^2 of one arm to H (nv, nv) and g (nv,)."""
+def add_tool_task(J: Array, twist: Array, H: Array, g: Array) -> None:
+    """Add |J v - twist|^2_W of one arm to H (nv, nv) and g (nv,)."""
     nv = g.shape[0]
     square = ROTATION_LENGTH * ROTATION_LENGTH
     for i in range(nv):
-        if member[i] == 0.0:
-            continue
-        H[i, i] += mu
         for k in range(6):
             weighted = J[k, i] if k < 3 else square * J[k, i]
             if weighted == 0.0:
@@ -179,6 +180,45 @@ def add_tool_task(J: Array, twist: Array, mu: float, member: Array, H: Array, g:
             g[i] -= weighted * twist[k]
             for j in range(nv):
                 H[i, j] += weighted * J[k, j]
+
+
+@lean_kernel
+def add_stretch_damping(
+    chain: Chain, placements: Placements, joint: int, J: Array, feedback: Array, gain: float, H: Array
+) -> None:
+    """Add the damping M of the tool that ``joint`` carries to H (nv, nv); ``J`` (6, nv) is the tool's Jacobian.
+
+    For joint i between the base and joint j, d2x / dq_i dq_j = z_i x J_j (linear part). For the angular part, whose
+    second derivative is no Hessian, the same bound in magnitude stands in: J_j turns with joint i by at most |z_i|.
+    """
+    turning = 0.0
+    for k in range(3):
+        turning += feedback[3 + k] * feedback[3 + k]
+    turning = ROTATION_LENGTH * ROTATION_LENGTH * np.sqrt(turning)
+    far = joint
+    while far != 0:
+        j = far - 1
+        pull_j = max(0.0, -_stiffness(chain, placements, far, far, J, feedback))
+        H[j, j] += (turning + pull_j) / gain
+        near = chain.parent[far]
+        while near != 0:
+            i = near - 1
+            pull_i = max(0.0, -_stiffness(chain, placements, near, near, J, feedback))
+            coupling = abs(_stiffness(chain, placements, near, far, J, feedback))
+            H[j, j] += min(coupling, pull_j) / gain
+            H[i, i] += min(coupling, pull_i) / gain
+            near = chain.parent[near]
+        far = chain.parent[far]
+
+
+@lean_kernel
+def _stiffness(chain: Chain, placements: Placements, near: int, far: int, J: Array, s: Array) -> float:
+    """s' d2x / dq_near dq_far for the linear part of the tool's motion: z_near x J_far, none for a sliding joint."""
+    if chain.prismatic[near] == 1:
+        return 0.0
+    x, y, z = placements.axis[near, 0], placements.axis[near, 1], placements.axis[near, 2]
+    j = far - 1
+    return s[0] * (y * J[2, j] - z * J[1, j]) + s[1] * (z * J[0, j] - x * J[2, j]) + s[2] * (x * J[1, j] - y * J[0, j])
 
 
 @kernel

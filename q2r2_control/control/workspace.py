@@ -81,6 +81,7 @@ class Workspace(NamedTuple):
     translation: Array  # (n, 3)
     J: Array  # (6 n, nv)
     twist: Array  # (n, 6)
+    feedback: Array  # (6,)
     posture: Array  # (nv,)
     H: Array  # (nv, nv)
     g: Array  # (nv,)
@@ -107,6 +108,7 @@ class Workspace(NamedTuple):
             translation=np.zeros((n, 3)),
             J=np.zeros((6 * n, nv)),
             twist=np.zeros((n, 6)),
+            feedback=np.zeros(6),
             posture=np.zeros(nv),
             H=np.zeros((nv, nv)),
             g=np.zeros(nv),

@@ -111,7 +111,15 @@ def test_following_the_approach_speed_asks_for_no_more_than_the_planned_decelera
 def _twist(tool: pin.SE3, goal: pin.SE3, feed_forward: Array, speed_limit: float = 1.0) -> Array:
     twist = np.zeros(6)
     wanted_twist(
-        tool.rotation, tool.translation, goal.rotation, goal.translation, feed_forward, MOTION, speed_limit, twist
+        tool.rotation,
+        tool.translation,
+        goal.rotation,
+        goal.translation,
+        feed_forward,
+        MOTION,
+        speed_limit,
+        twist,
+        np.zeros(6),
     )
     return twist
 
@@ -151,12 +159,12 @@ def test_at_the_goal_only_the_goals_own_motion_is_wanted() -> None:
 
 def test_a_tool_task_is_the_weighted_square_of_its_twist_error() -> None:
     random = np.random.default_rng(26)
-    J, twist, member, mu = random.normal(size=(6, 14)), random.normal(size=6), np.repeat([1.0, 0.0], 7), 0.3
+    J, twist = random.normal(size=(6, 14)), random.normal(size=6)
     J[:, 7:] = 0.0
     H, g = np.zeros((14, 14)), np.zeros(14)
-    add_tool_task(J, twist, mu, member, H, g)
+    add_tool_task(J, twist, H, g)
     W = np.diag([1.0] * 3 + [ROTATION_LENGTH**2] * 3)
-    np.testing.assert_allclose(H, J.T @ W @ J + mu * np.diag(member), atol=1e-12)
+    np.testing.assert_allclose(H, J.T @ W @ J, atol=1e-12)
     np.testing.assert_allclose(g, -J.T @ W @ twist, atol=1e-12)
 
 
