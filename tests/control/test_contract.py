@@ -277,8 +277,8 @@ def test_it_leaves_a_stretched_posture_in_little_more_than_the_time_the_accelera
     controller.reset(q)
     contract = Contract(controller, q)
     goals = {arm: controller.tool_pose(arm) for arm in robot.arms}
-    for arm, pose in goals.items():
-        pose.translation = pose.translation + 0.15 * _towards(robot, arm, pose)
+    for side, pose in goals.items():
+        pose.translation = pose.translation + 0.15 * _towards(robot, side, pose)
     time, error = 0.0, 1.0
     while error > 0.01 and time < 4.0:
         reference = controller.step(goals, 0.001)
