@@ -181,8 +181,8 @@ _Loader.add_implicit_resolver(
 
 def _first_fault(error: ValidationError) -> str:
     """One line about the first fault: key, value, what is allowed, and how many more there are."""
-    # A key that is misspelt is missing as well; the misspelling says more.
-    faults = sorted(error.errors(), key=lambda fault: fault["type"] == "missing")
+    # A misspelt key leaves others missing or empty; the misspelling says more.
+    faults = sorted(error.errors(), key=lambda fault: fault["type"] != "extra_forbidden")
     fault = faults[0]
     key = _line(".".join(str(part) for part in fault["loc"] if part != "[key]")) or "(top level)"
     more = f" (and {len(faults) - 1} more)" if len(faults) > 1 else ""

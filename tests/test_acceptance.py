@@ -168,9 +168,9 @@ class TestSession:
                     nearest = poses[int(np.argmin(np.abs(times - due)))]
                     turn = nearest.rotation @ anchor.rotation.T
                     got = ticks[index].tools[arm]
-                    shifts.append(np.linalg.norm(got.translation - tool.translation - wanted))
-                    turns.append(np.linalg.norm(pin.log3(got.rotation @ (turn @ tool.rotation).T)))
-                    travelled.append(np.linalg.norm(wanted))
+                    shifts.append(_norm(got.translation - tool.translation - wanted))
+                    turns.append(_norm(pin.log3(got.rotation @ (turn @ tool.rotation).T)))
+                    travelled.append(_norm(wanted))
                 index += 1
         assert max(travelled) > 0.19, "circles of 0.1 m radius"
         assert root_mean_square(shifts) < 5e-3
@@ -204,7 +204,11 @@ def test_the_session_hardly_ever_needs_the_fallback_and_ends_at_rest(session: Li
     assert summary.min_position_margin_rad >= -1e-9
 
 
-def root_mean_square(values: Sequence[float | np.floating]) -> float:
+def _norm(vector: Array) -> float:
+    return float(np.linalg.norm(vector))
+
+
+def root_mean_square(values: Sequence[float]) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
