@@ -11,6 +11,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
+from q2r2_control.bench import run_bench
 from q2r2_control.cell_check import check_cell
 from q2r2_control.config import Config, HeadsetConfig, load_config
 from q2r2_control.errors import ConfigError
@@ -19,11 +20,11 @@ from q2r2_control.inputs.trajectories import TRAJECTORIES
 from q2r2_control.one_line import OneLineErrors
 from q2r2_control.pipeline import DEFAULT_TRAJECTORY
 from q2r2_control.plain import as_json_text
-from q2r2_control.running import AnnouncedHeadset, RunOptions
+from q2r2_control.running import AnnouncedHeadset, RunOptions, notice_of_compiling
 from q2r2_control.running import run as run_cell
 from q2r2_control.summary import RunSummary
 from q2r2_control.viewer.live import HeadsetDisplay
-from q2r2_control.viewer.tables import arm_table, headset_table, obstacle_table, pair_table, summary_table
+from q2r2_control.viewer.tables import arm_table, bench_table, headset_table, obstacle_table, pair_table, summary_table
 
 DEMO_CONFIG = "config/dual_iiwa7.yaml"
 
@@ -59,10 +60,20 @@ Host = Annotated[str | None, typer.Option(help="Address to bind, instead of the 
 Port = Annotated[int | None, typer.Option(min=0, max=65535, help="Port, instead of the config's; 0: any free one.")]
 
 
+class _StderrHandler(logging.Handler):
+    """Writes to what stderr is at the time, so that lines appear above a live table and not across it."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        print(self.format(record), file=sys.stderr)
+
+
 @app.callback()
 def main() -> None:
     """Set up what all commands share."""
-    logging.basicConfig(stream=sys.stderr, level=logging.INFO, format="%(message)s", force=True)
+    logger = logging.getLogger("q2r2_control")
+    if not logger.handlers:
+        logger.addHandler(_StderrHandler())
+        logger.setLevel(logging.INFO)
 
 
 @app.command(epilog="Example: q2r2 demo --viewer")
@@ -186,6 +197,18 @@ def headset_check(
     else:
         Console().print(headset_table(check))
     raise typer.Exit(0 if check.heard else 1)
+
+
+@app.command(epilog="Example: q2r2 bench --ticks 20000")
+def bench(ticks: Annotated[int, typer.Option(min=100, help="Of each scenario.")] = 5000, json: Json = False) -> None:
+    """Time one tick of the controller with both arms, every pair and the certificate."""
+    config = load_config(DEMO_CONFIG)
+    with notice_of_compiling(_stderr()):
+        report = run_bench(config, ticks)
+    if json:
+        print(as_json_text(report.as_json()))
+    else:
+        Console().print(bench_table(report))
 
 
 def _with_address(config: Config, host: str | None, port: int | None) -> Config:

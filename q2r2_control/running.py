@@ -47,14 +47,17 @@ class RunOptions:
 
 def run(config: Config, options: RunOptions, console: Console) -> RunSummary:
     """Run a cell and tell ``console`` about it. Raises :class:`Q2R2Error` where that is not possible as asked."""
-    with _notice(console):
+    if options.window and options.plant != "mujoco":
+        raise ConfigError(f"--viewer: the {options.plant} plant has no window; allowed: --plant mujoco")
+    with notice_of_compiling(console):
         pipeline = Pipeline.from_config(config, input=_input_of(config, options, console), plant=options.plant)
     history = History(pipeline.robot, config.control.acceleration_limit)
     if options.report:
         pipeline.listeners.append(history)
     with ExitStack() as stack:
-        if options.window:
-            pipeline.listeners.append(_window_listener(pipeline))
+        if options.window and isinstance(pipeline.plant, MujocoPlant):
+            pipeline.plant.launch_viewer()
+            pipeline.listeners.append(_WindowListener(pipeline, pipeline.plant))
         if options.table:
             table = LiveTable(f"{options.name}: Ctrl-C brings the arms to rest and ends", config.control.min_distance)
             pipeline.listeners.append(table)
@@ -99,16 +102,9 @@ class _WindowListener:
                 self._pipeline.stop()
 
 
-def _window_listener(pipeline: Pipeline) -> _WindowListener:
-    if not isinstance(pipeline.plant, MujocoPlant):
-        raise ConfigError("--viewer: only the mujoco plant has a window; allowed: --plant mujoco")
-    pipeline.plant.launch_viewer()
-    return _WindowListener(pipeline, pipeline.plant)
-
-
 @contextmanager
-def _notice(console: Console) -> Iterator[None]:
-    """Say what takes so long, if it does."""
+def notice_of_compiling(console: Console) -> Iterator[None]:
+    """Say what takes so long, where building the controller does."""
     text = "compiling the controller for this machine: once for each version of the code, 1-2 minutes"
     timer = threading.Timer(_NOTICE_AFTER, lambda: console.print(text, soft_wrap=True, highlight=False))
     timer.daemon = True

@@ -1,7 +1,8 @@
 """Ideal hand motions with their button presses, to see the robot's answer to an input without an operator.
 
 All are written for the left hand, as displacements from wherever the hand starts; the right hand mirrors them left to
-right. Axes: x forwards, y to the left, z up. Nothing goes below the start, which is often just above a table.
+right. Axes: x forwards, y to the left, z up. Only the handover goes below
+the start, to what lies on the table of config/dual_iiwa7.yaml.
 """
 
 from __future__ import annotations
@@ -96,7 +97,10 @@ _HANDOVER = np.array(
 
 
 def _reach_grasp_handover(t: float, frequency: float) -> tuple[Array, Array]:
-    """Between rests by minimum-jerk motions (Flash and Hogan, 1985), as people reach; ``frequency`` means nothing."""
+    """Each hand picks a block up, both meet in the middle, each puts its block back; ``frequency`` means nothing.
+
+    Between rests by minimum-jerk motions (Flash and Hogan, 1985), as people reach.
+    """
     times = _HANDOVER[:, 0]
     index = int(np.clip(np.searchsorted(times, t, side="right") - 1, 0, len(times) - 2))
     fraction = _minimum_jerk((t - times[index]) / (times[index + 1] - times[index]))

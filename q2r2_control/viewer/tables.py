@@ -5,6 +5,7 @@ from __future__ import annotations
 from rich.table import Table
 from rich.text import Text
 
+from q2r2_control.bench import BenchReport
 from q2r2_control.cell_check import ArmCheck, CellCheck
 from q2r2_control.headset_check import HeadsetCheck
 from q2r2_control.inputs.messages import HandMessage, HandPose, HandTwist
@@ -39,7 +40,7 @@ def arm_table(arm: ArmCheck) -> Table:
     """One arm's joints and limits."""
     position = " ".join(f"{value:.3f}" for value in arm.tool_position)
     title = f"{arm.name} arm: {arm.model}, tool {arm.tool_model or 'none'}; {arm.tool_frame} at home at {position} m"
-    table = Table(title=title, title_justify="left")
+    table = Table(title=title, title_justify="left", min_width=len(title))
     table.add_column("joint")
     for column in ("min [rad]", "home [rad]", "max [rad]", "speed [rad/s]", "torque [Nm]"):
         table.add_column(column, justify="right")
@@ -62,11 +63,25 @@ def obstacle_table(check: CellCheck) -> Table:
 def pair_table(check: CellCheck) -> Table:
     """The nearest pairs at home."""
     title = f"nearest of {check.monitored_pairs} monitored pairs at home, min_distance {1e3 * check.min_distance:g} mm"
-    table = Table(title=title, title_justify="left")
+    table = Table(title=title, title_justify="left", min_width=len(title))
     table.add_column("pair")
     table.add_column("distance [mm]", justify="right")
     for pair in check.nearest:
         table.add_row(f"{pair.name_a} | {pair.name_b}", f"{1e3 * pair.distance:.1f}")
+    return table
+
+
+def bench_table(report: BenchReport) -> Table:
+    """How long a tick takes."""
+    title = f"{report.cell}: one tick of the controller, {report.pairs} pairs"
+    table = Table(title=title, title_justify="left", min_width=len(title))
+    table.add_column("scenario")
+    for column in ("median [us]", "p99 [us]", "max [us]", "nearest [mm]", "acceleration / limit", "certified stops"):
+        table.add_column(column, justify="right")
+    for row in report.rows:
+        times = (f"{value:.0f}" for value in (row.median_us, row.p99_us, row.max_us))
+        figures = (f"{row.min_distance_mm:.2f}", f"{row.max_acceleration_ratio:.3f}", str(row.fallback_ticks))
+        table.add_row(row.name, *times, *figures)
     return table
 
 

@@ -1,0 +1,83 @@
+"""What the plots are drawn from: no peak lost, and never more than a bounded number of rows."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from q2r2_control.config import load_config
+from q2r2_control.pipeline import Tick
+from q2r2_control.robot.robot import Robot
+from q2r2_control.types import ArmTarget, Reference, RobotState, StepReport, StepStatus
+from q2r2_control.viewer.history import History, tracking_error
+
+
+@pytest.fixture(scope="module")
+def robot() -> Robot:
+    return Robot.from_config(load_config("config/dual_iiwa7.yaml"))
+
+
+def tick_at(robot: Robot, t: float, acceleration: float = 0.0, distance: float = 0.1, engaged: bool = True) -> Tick:
+    """A tick whose tools are 3 mm and 0.1 rad from their targets."""
+    zero = np.zeros(len(robot.joint_names))
+    report = StepReport(StepStatus.OK, (), (), ("left_link_5_0", "table_0"), distance, True, False, 0.0, 0.0)
+    tools = {arm: robot.tool_pose(robot.home, arm) for arm in robot.arms}
+    offset = pin.SE3(pin.exp3(np.array([0.0, 0.1, 0.0])), np.array([0.003, 0.0, 0.0]))
+    return Tick(
+        t=t,
+        dt=0.001,
+        samples=[],
+        targets={arm: ArmTarget(pose * offset if engaged else None, 1.0) for arm, pose in tools.items()},
+        engaged=dict.fromkeys(robot.arms, engaged),
+        states=dict.fromkeys(robot.arms, "engaged" if engaged else "paused"),
+        reference=Reference(robot.home, zero, zero + acceleration, report),
+        state=RobotState(robot.home, zero, zero, None, t),
+        tools=tools,
+        grippers=dict.fromkeys(robot.arms, 0.5),
+        compute_time=1e-4,
+    )
+
+
+def test_peaks_between_rows_are_kept_however_long_the_run_and_rows_stay_bounded(robot: Robot) -> None:
+    history = History(robot, acceleration_limit=10.0, max_rows=50)
+    calm, peak = tick_at(robot, 0.0), tick_at(robot, 0.0, acceleration=-7.0, distance=0.021)
+    for index in range(20_000):
+        history(replace(peak if index in (1234, 15_001) else calm, t=1e-3 * index))
+    assert 25 <= len(history.t) <= 50
+    assert np.all(np.diff(history.t) > 0.0)
+    assert history.t[-1] > 19.0
+    for index in (1234, 15_001):
+        row = int(np.searchsorted(history.t, 1e-3 * index))
+        assert history.acceleration_ratio[row] == pytest.approx(0.7)
+        assert history.distance[row] == pytest.approx(0.021)
+    assert (history.acceleration_ratio > 0.0).sum() == 2
+
+
+def test_a_row_has_the_tools_their_targets_and_errors(robot: Robot) -> None:
+    history = History(robot, 10.0)
+    history(tick_at(robot, 0.0))
+    np.testing.assert_allclose(history.tool("right")[0], robot.tool_pose(robot.home, "right").translation)
+    np.testing.assert_allclose(history.position_error("left"), 0.003)
+    np.testing.assert_allclose(history.rotation_error("left"), 0.1)
+    np.testing.assert_allclose(history.q[0], robot.home)
+    assert history.gripper("left")[0] == 0.5
+    assert history.engaged("right")[0] == 1.0
+
+
+def test_an_arm_that_is_not_engaged_has_no_error(robot: Robot) -> None:
+    history = History(robot, 10.0)
+    history(tick_at(robot, 0.0, engaged=False))
+    assert np.isnan(history.position_error("left")).all()
+    assert np.isnan(history.target("left")).all()
+    assert np.isnan(tracking_error(tick_at(robot, 0.0, engaged=False), "left")).all()
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-7, 0.5, 3.0, np.pi], ids="{:g} rad".format)
+def test_the_angle_of_a_rotation_error_is_exact_from_none_to_half_a_turn(robot: Robot, angle: float) -> None:
+    tick = tick_at(robot, 0.0)
+    turned = tick.tools["left"] * pin.SE3(pin.exp3(np.array([0.0, 0.0, angle])), np.zeros(3))
+    error = tracking_error(replace(tick, targets={"left": ArmTarget(turned, 1.0)}), "left")
+    assert error[1] == pytest.approx(angle, abs=1e-9)

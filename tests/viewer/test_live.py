@@ -1,0 +1,62 @@
+"""The live table: what it shows, without a terminal."""
+
+from __future__ import annotations
+
+import io
+import sys
+from dataclasses import replace
+
+import pytest
+from rich.console import Console
+
+from q2r2_control.robot.robot import Robot
+from q2r2_control.viewer.live import LiveTable
+from tests.viewer.test_history import robot, tick_at
+
+__all__ = ["robot"]
+
+
+def drawn(table: LiveTable) -> str:
+    console = Console(file=io.StringIO(), width=120)
+    console.print(table.render())
+    assert isinstance(console.file, io.StringIO)
+    return console.file.getvalue()
+
+
+def test_it_shows_states_errors_distances_and_grippers_of_the_newest_tick(robot: Robot) -> None:
+    table = LiveTable("demo", min_distance=0.02)
+    table(tick_at(robot, 1.0, engaged=False))
+    table(tick_at(robot, 2.0, distance=0.0234))
+    text = drawn(table)
+    for expected in ("demo", "engaged", "3.0 mm", "5.73 deg", "50 %", "23.4 mm", "left_link_5_0 | table_0", "2.0 s"):
+        assert expected in text
+    assert "paused" not in text
+
+
+def test_it_shows_every_limit_that_was_at_work_since_it_was_drawn_last(robot: Robot) -> None:
+    table = LiveTable("demo", min_distance=0.02)
+    tick = tick_at(robot, 0.0)
+    report = replace(tick.reference.report, binding=("left_A2 velocity",))
+    table(replace(tick, reference=replace(tick.reference, report=report)))
+    table(tick)
+    assert "left_A2 velocity" in drawn(table)
+    assert "left_A2 velocity" not in drawn(table)
+
+
+def test_before_the_first_tick_it_says_that_the_run_is_starting() -> None:
+    assert "starting" in drawn(LiveTable("demo", min_distance=0.02))
+
+
+def test_the_interpreters_switch_interval_is_as_before_after_a_fault() -> None:
+    interval = sys.getswitchinterval()
+    during = []
+
+    def fail() -> None:
+        with LiveTable("demo", 0.02).shown(Console(file=io.StringIO())):
+            during.append(sys.getswitchinterval())
+            raise RuntimeError
+
+    with pytest.raises(RuntimeError):
+        fail()
+    assert during[0] < interval
+    assert sys.getswitchinterval() == interval
