@@ -34,8 +34,10 @@ def draw_report(history: History, summary: RunSummary, min_distance: float, titl
     for column, arm in enumerate(arms):
         _draw_path(grid[0, column], history, arm)
         _draw_joints(grid[3, column], history, arm)
-    if len(arms) == 2:
-        grid[0, 1].sharey(grid[0, 0])
+    # One scale for both arms; sharing the axis would keep the first one's limits.
+    limits = [axes.get_ylim() for axes in grid[0, : len(arms)]]
+    for axes in grid[0, : len(arms)]:
+        axes.set_ylim(min(low for low, _ in limits), max(high for _, high in limits))
     _draw_errors(grid[1, 0], history, arms, "position")
     _draw_errors(grid[1, 1], history, arms, "rotation")
     _draw_distance(grid[2, 0], history, min_distance)
