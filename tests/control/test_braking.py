@@ -157,7 +157,7 @@ def test_nothing_comes_too_close_in_a_certified_motion_and_most_safe_motions_are
             assert least >= MIN_DISTANCE
         elif least >= MIN_DISTANCE + 0.02:
             refused += 1
-        clearly_safe += least >= MIN_DISTANCE + 0.02
+        clearly_safe += bool(least >= MIN_DISTANCE + 0.02)
     assert certified > 5
     assert refused <= 0.2 * clearly_safe, "safe by 20 mm"
 

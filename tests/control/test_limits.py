@@ -85,7 +85,7 @@ def _fastest_in_p(room: Array, bounds: Bounds) -> Array:
 
 def _start_on_the_edge_of_p(random: np.random.Generator, bounds: Bounds) -> tuple[Array, Array]:
     q = random.uniform(bounds.lower, bounds.upper)
-    share = random.choice([0.0, 0.5, 1.0], len(q))
+    share: Array = random.choice(np.array([0.0, 0.5, 1.0]), len(q))
     upward = random.random(len(q)) < 0.5
     return q, share * np.where(
         upward, _fastest_in_p(bounds.upper - q, bounds), -_fastest_in_p(q - bounds.lower, bounds)
