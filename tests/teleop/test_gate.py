@@ -36,7 +36,7 @@ def gate() -> PoseGate:
         {"quaternion": np.array([0, 0, 0, 1e200])},
         {"quaternion": np.array([0, 0, 0, 1e-200])},
         {"quaternion": np.array([0, 0, 1.0])},
-        {"quaternion": object()},
+        {"quaternion": {"x": 1.0}},
     ],
     ids=str,
 )
