@@ -10,6 +10,7 @@ from contextlib import contextmanager
 import numpy as np
 from rich.console import Console
 from rich.live import Live
+from rich.markup import escape
 from rich.table import Table
 
 from q2r2_control.headset_check import HeadsetCheck
@@ -92,7 +93,7 @@ def _arm_rows(tick: Tick, arms: list[str]) -> list[tuple[str, list[str]]]:
         ("teleop", [f"[green]{tick.states[arm]}[/]" if tick.engaged[arm] else tick.states[arm] for arm in arms]),
         ("position error", [_figure(1e3 * errors[arm][0], "mm", 1) for arm in arms]),
         ("rotation error", [_figure(np.degrees(errors[arm][1]), "deg", 2) for arm in arms]),
-        ("tool x y z [m]", ["{:.3f} {:.3f} {:.3f}".format(*tick.tools[arm].translation) for arm in arms]),
+        (escape("tool x y z [m]"), ["{:.3f} {:.3f} {:.3f}".format(*tick.tools[arm].translation) for arm in arms]),
         ("gripper opening", [_figure(100.0 * tick.grippers.get(arm, np.nan), "%", 0) for arm in arms]),
     ]
 

@@ -40,10 +40,10 @@ def arm_table(arm: ArmCheck) -> Table:
     """One arm's joints and limits."""
     position = " ".join(f"{value:.3f}" for value in arm.tool_position)
     title = f"{arm.name} arm: {arm.model}, tool {arm.tool_model or 'none'}; {arm.tool_frame} at home at {position} m"
-    table = Table(title=title, title_justify="left", min_width=len(title))
+    table = Table(title=Text(title), title_justify="left", min_width=len(title))
     table.add_column("joint")
     for column in ("min [rad]", "home [rad]", "max [rad]", "speed [rad/s]", "torque [Nm]"):
-        table.add_column(column, justify="right")
+        table.add_column(Text(column), justify="right")
     for joint in arm.joints:
         figures = (joint.lower, joint.home, joint.upper, joint.velocity, joint.torque)
         table.add_row(joint.name, *(f"{value:.3f}" for value in figures))
@@ -54,18 +54,18 @@ def obstacle_table(check: CellCheck) -> Table:
     """What stands in the cell."""
     table = Table(title="obstacles" if check.obstacles else "no obstacles", title_justify="left")
     for column in ("name", "shape", "size [m]", "centre [m]"):
-        table.add_column(column)
+        table.add_column(Text(column))
     for name, obstacle in check.obstacles.items():
-        table.add_row(name, obstacle.shape, _numbers(obstacle.size), _numbers(obstacle.position))
+        table.add_row(Text(name), obstacle.shape, _numbers(obstacle.size), _numbers(obstacle.position))
     return table
 
 
 def pair_table(check: CellCheck) -> Table:
     """The nearest pairs at home."""
     title = f"nearest of {check.monitored_pairs} monitored pairs at home, min_distance {1e3 * check.min_distance:g} mm"
-    table = Table(title=title, title_justify="left", min_width=len(title))
+    table = Table(title=Text(title), title_justify="left", min_width=len(title))
     table.add_column("pair")
-    table.add_column("distance [mm]", justify="right")
+    table.add_column(Text("distance [mm]"), justify="right")
     for pair in check.nearest:
         table.add_row(f"{pair.name_a} | {pair.name_b}", f"{1e3 * pair.distance:.1f}")
     return table
@@ -74,10 +74,10 @@ def pair_table(check: CellCheck) -> Table:
 def bench_table(report: BenchReport) -> Table:
     """How long a tick takes."""
     title = f"{report.cell}: one tick of the controller, {report.pairs} pairs"
-    table = Table(title=title, title_justify="left", min_width=len(title))
+    table = Table(title=Text(title), title_justify="left", min_width=len(title))
     table.add_column("scenario")
-    for column in ("median [us]", "p99 [us]", "max [us]", "nearest [mm]", "acceleration / limit", "certified stops"):
-        table.add_column(column, justify="right")
+    for column in ("median [us]", "p99 [us]", "max [us]", "nearest [mm]", "a / limit", "stops"):
+        table.add_column(Text(column), justify="right")
     for row in report.rows:
         times = (f"{value:.0f}" for value in (row.median_us, row.p99_us, row.max_us))
         figures = (f"{row.min_distance_mm:.2f}", f"{row.max_acceleration_ratio:.3f}", str(row.fallback_ticks))
@@ -94,7 +94,7 @@ def headset_table(check: HeadsetCheck) -> Table:
     table = Table(title=f"headset on {address}: {state}{dialect}", title_justify="left", min_width=76)
     table.add_column("topic")
     for column in ("messages", "rate [Hz]", "age [s]"):
-        table.add_column(column, justify="right")
+        table.add_column(Text(column), justify="right")
     table.add_column("last value")
     for name, topic in sorted(statistics.topics.items()):
         table.add_row(name, str(topic.count), f"{topic.rate:.0f}", f"{topic.age:.2f}", _in_short(topic.last))
