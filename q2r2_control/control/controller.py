@@ -97,7 +97,8 @@ class CartesianController:
             self._advance(time / max(substeps, 1), summary)
         a = np.zeros(self._nv)
         if time > 0.0:
-            a = np.clip((work.v - before) / time, -self._acceleration, self._acceleration)
+            # Rounding of a difference over a tiny dt may exceed the limit that the velocities keep.
+            a = np.minimum(np.maximum((work.v - before) / time, -self._acceleration), self._acceleration)
         report = StepReport(
             status=self._status(usable and dt <= LONGEST_DT, rejected, summary),
             rejected=rejected,
