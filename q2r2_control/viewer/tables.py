@@ -75,7 +75,7 @@ def bench_table(report: BenchReport) -> Table:
     """How long a tick takes."""
     title = f"{report.cell}: one tick of the controller, {report.pairs} pairs"
     table = Table(title=Text(title), title_justify="left", min_width=len(title))
-    table.add_column("scenario")
+    table.add_column("scenario", no_wrap=True)
     for column in ("median [us]", "p99 [us]", "max [us]", "nearest [mm]", "a / limit", "stops"):
         table.add_column(Text(column), justify="right")
     for row in report.rows:
