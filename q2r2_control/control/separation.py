@@ -136,7 +136,8 @@ def separation_rows(
         first = pairs.first[p]
         second = pairs.second[p]
         distance[p] = at_least(bodies, posed, first, second)
-        # The fastest that the pair can close in after this step; twice what the gain needs for that covers the root.
+        # The fastest that the pair can close in after this step. Farther than twice what the gain needs for that, a row
+        # could bind only through its root, at very low leverage: it would add comfort, and the certificate needs none.
         closing = 0.0
         for k in range(pairs.joint.shape[1]):
             joint = pairs.joint[p, k]

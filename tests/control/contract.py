@@ -33,6 +33,7 @@ class Contract:
         self._least_distance: float | None = None
         self._accelerations: list[tuple[float, Array]] = []
         self.fallbacks = 0
+        self.uncertified = 0
         self.ticks = 0
 
     def check(self, reference: Reference, dt: float) -> None:
@@ -51,6 +52,7 @@ class Contract:
         self._q, self._v = q, v
         self._accelerations.append((dt, a))
         self.fallbacks += report.fallback
+        self.uncertified += not report.certified
         self.ticks += 1
 
     def _check_velocity(self, v: Array) -> None:

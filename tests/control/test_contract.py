@@ -65,6 +65,7 @@ def run(
 def test_keeps_every_limit_and_all_pairs_apart_at_every_tick(scenario: Any, robot: str, dt: float) -> None:
     contract = run(controller_of(robot), scenario, 2.0, dt)
     assert contract.fallback_share < 0.01
+    assert contract.uncertified == 0
 
 
 @pytest.mark.parametrize(
@@ -122,6 +123,7 @@ def test_ten_thousand_hostile_ticks_neither_raise_nor_break_a_limit() -> None:
     for _ in range(10_000):
         dt = float(10.0 ** random.uniform(-9.0, -2.0))
         contract.check(controller.step({side: _hostile(random) for side in ("left", "right", "nobody")}, dt), dt)
+    assert contract.uncertified == 0
 
 
 def _hostile(random: np.random.Generator) -> Any:
@@ -170,8 +172,6 @@ def test_a_dt_that_is_no_time_moves_nothing_and_says_so(dt: Any) -> None:
     controller.reset(controller.robot.home)
     start = {arm: controller.tool_pose(arm) for arm in controller.robot.arms}
     reference = controller.step(crossing(0.0, start), dt)
-    if dt == float("inf"):
-        assert reference.report.status is StepStatus.DT_REJECTED
     np.testing.assert_array_equal(reference.q, controller.robot.home)
     assert reference.report.status is StepStatus.DT_REJECTED
 
@@ -245,11 +245,9 @@ def test_both_arms_can_leave_after_having_blocked_each_other() -> None:
     controller = controller_of("iiwa7")
     run(controller, crossing, 4.0, 0.005)
     home = {arm: controller.robot.tool_pose(controller.robot.home, arm) for arm in controller.robot.arms}
-    q, v = controller.step({}, 0.001).q, controller.step({}, 0.001).v
     contract = Contract(controller, *_state(controller))
     for _ in range(1200):
         contract.check(controller.step(home, 0.005), 0.005)
-    assert q.shape == v.shape
     for arm, pose in home.items():
         assert np.linalg.norm(controller.tool_pose(arm).translation - pose.translation) < 1e-3
 
@@ -376,7 +374,7 @@ def test_the_report_names_what_holds_the_arms_back() -> None:
     start = {arm: controller.tool_pose(arm) for arm in controller.robot.arms}
     for _ in range(800):
         report = controller.step(SCENARIOS["into the table"](0.0, start), 0.005).report
-    assert "left_hand_e_fingers_envelope|table_0" in report.binding or any("table" in name for name in report.binding)
+    assert any("envelope" in name and "table" in name for name in report.binding)
     assert "table" in "|".join(report.closest_pair)
     assert report.certified
     assert not report.fallback
