@@ -2,13 +2,15 @@
 
 Numba's own cache looks only at the file of the compiled function, so a kernel that calls another module's kernel
 would go on running that module's old code after an edit. A controller must not run yesterday's mathematics: the
-cache folder is named by a hash of every source file of this package, so any edit compiles afresh.
+cache folder is named by a hash of every source file of this package that machine code is made from, so any edit of
+one compiles afresh.
 """
 
 from __future__ import annotations
 
 import hashlib
 import os
+import re
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
@@ -19,9 +21,17 @@ from numba.core import types
 from numba.experimental import structref
 
 
-def _cache_folder() -> Path:
+_COMPILED = re.compile(r"^@(lean_)?kernel|\bNamedTuple\b|\bstructref\b", re.MULTILINE)
+
+
+def compiled_sources() -> list[Path]:
+    """Files that hold kernels or the types of their arguments; they take constants from no other file."""
     sources = sorted(Path(__file__).parent.glob("*.py"))
-    digest = hashlib.sha256(b"".join(source.read_bytes() for source in sources)).hexdigest()[:16]
+    return [source for source in sources if _COMPILED.search(source.read_text(encoding="utf-8"))]
+
+
+def _cache_folder() -> Path:
+    digest = hashlib.sha256(b"".join(source.read_bytes() for source in compiled_sources())).hexdigest()[:16]
     try:
         root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "q2r2_control"
         root.mkdir(parents=True, exist_ok=True)

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import ast
 import shutil
 import subprocess
 import sys
@@ -31,14 +32,32 @@ def test_the_same_sources_share_a_cache_folder(sources: Path) -> None:
     assert folder.parent == sources.parent / "cache" / "q2r2_control"
 
 
-@pytest.mark.parametrize("name", ["geometry.py", "braking.py", "settings.py"])
-def test_an_edit_of_any_source_leaves_yesterdays_machine_code_behind(sources: Path, name: str) -> None:
+@pytest.mark.parametrize("name", ["geometry.py", "braking.py", "workspace.py", "jit.py"])
+def test_an_edit_of_a_compiled_source_leaves_yesterdays_machine_code_behind(sources: Path, name: str) -> None:
     before = jit._cache_folder()
     (sources / name).write_text((sources / name).read_text() + "# edited\n")
     edited = jit._cache_folder()
-    (sources / "new_module.py").write_text("")
-    (sources / "another.py").write_text("value = 1\n")
+    (sources / "new_module.py").write_text("@kernel\ndef one() -> float:\n    return 1.0\n")
     assert len({before, edited, jit._cache_folder()}) == 3
+
+
+def test_an_edit_of_a_source_without_kernels_compiles_nothing(sources: Path) -> None:
+    before = jit._cache_folder()
+    (sources / "controller.py").write_text("value = 1\n")
+    assert jit._cache_folder() == before
+
+
+@pytest.mark.parametrize("source", jit.compiled_sources(), ids=lambda source: source.stem)
+def test_what_a_kernel_uses_is_covered_by_the_name_of_the_cache(source: Path) -> None:
+    covered = {f"q2r2_control.control.{path.stem}" for path in jit.compiled_sources()}
+    # Types only: no constant of theirs enters a kernel.
+    harmless = {"q2r2_control.types", "q2r2_control.errors", "q2r2_control.control.settings"}
+    imported = {
+        node.module
+        for node in ast.walk(ast.parse(source.read_text(encoding="utf-8")))
+        if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("q2r2_control.")
+    }
+    assert imported <= covered | harmless
 
 
 def test_a_cache_that_cannot_be_written_is_put_elsewhere(sources: Path, monkeypatch: pytest.MonkeyPatch) -> None:
