@@ -40,6 +40,7 @@ class Rollout(NamedTuple):
     rotation: Array  # (s, g, 3, 3)
     distance: Array  # (s,)
     known: Array  # (s,) 1 where the sample's bodies are posed
+    way: Array  # (2, nv) of each joint during the step, then during the stop [rad]
     placements: Placements
     contact: Contact
 
@@ -54,6 +55,7 @@ class Rollout(NamedTuple):
             np.zeros((samples, g, 3, 3)),
             np.zeros(samples),
             np.zeros(samples),
+            np.zeros((2, nv)),
             Placements.empty(chain),
             Contact.empty(),
         )
@@ -109,7 +111,6 @@ def _stop_keeps_apart(
 ) -> bool:
     """Prove pair ``p`` apart along the whole stop, with as few samples as it takes."""
     last = rollout.q.shape[0] - 1
-    first = pairs.first[p]
     stride = last
     measured = 0
     while stride >= 1:
@@ -119,9 +120,7 @@ def _stop_keeps_apart(
             if measured == 0 or (i // stride) % 2 == 1:
                 _sample(chain, bodies, q, v, a, duration, i, rollout)
                 posed = Posed(rollout.start[i], rollout.end[i], rollout.rotation[i])
-                rollout.distance[i] = measure(
-                    bodies, posed, first, pairs.second[p], posed.start[first], posed.end[first], rollout.contact
-                )
+                rollout.distance[i] = _distance(bodies, pairs, p, posed, rollout)
                 if rollout.distance[i] < threshold:
                     return False
             if previous >= 0:
@@ -147,6 +146,7 @@ def certify(
     bodies: Bodies,
     pairs: Pairs,
     distance: Array,
+    posed: Posed,
     v: Array,
     q_next: Array,
     v_next: Array,
@@ -157,13 +157,16 @@ def certify(
 ) -> bool:
     """Whether the step to (q_next, v_next) in ``h`` and the full stop from there keep every pair apart.
 
-    ``distance`` (p,) holds distances, or lower bounds of them, before the step. A pair that is closer than
-    ``min_distance`` already must not come closer at the step's end and during the stop.
+    ``distance`` (p,) holds distances, or lower bounds of them, before the step, where bodies are ``posed``; a bound
+    that does not suffice is replaced by the distance. A pair that is closer than ``min_distance`` already must not come
+    closer at the step's end and during the stop.
     """
     rollout.known[:] = 0.0
     duration = 0.0
     for j in range(v.shape[0]):
         duration = max(duration, abs(v_next[j]) / a[j])
+        rollout.way[0, j] = step_way(v[j], v_next[j], h)
+        rollout.way[1, j] = v_next[j] * v_next[j] / (2.0 * a[j])
     for p in range(pairs.first.shape[0]):
         step = 0.0
         stop = 0.0
@@ -171,9 +174,8 @@ def certify(
             joint = pairs.joint[p, k]
             if joint == 0:
                 break
-            j = joint - 1
-            step += pairs.reach[p, k] * step_way(v[j], v_next[j], h)
-            stop += pairs.reach[p, k] * v_next[j] * v_next[j] / (2.0 * a[j])
+            step += pairs.reach[p, k] * rollout.way[0, joint - 1]
+            stop += pairs.reach[p, k] * rollout.way[1, joint - 1]
         if distance[p] - step - stop >= min_distance:
             continue
         if distance[p] < min_distance:
@@ -181,11 +183,13 @@ def certify(
                 return False
             continue
         _sample(chain, bodies, q_next, v_next, a, duration, 0, rollout)
-        posed = Posed(rollout.start[0], rollout.end[0], rollout.rotation[0])
-        first = pairs.first[p]
-        after = measure(bodies, posed, first, pairs.second[p], posed.start[first], posed.end[first], rollout.contact)
-        if after < min_distance or 0.5 * (distance[p] + after - step) < min_distance:
+        after = _distance(bodies, pairs, p, Posed(rollout.start[0], rollout.end[0], rollout.rotation[0]), rollout)
+        if after < min_distance:
             return False
+        if 0.5 * (distance[p] + after - step) < min_distance:
+            distance[p] = _distance(bodies, pairs, p, posed, rollout)
+            if 0.5 * (distance[p] + after - step) < min_distance:
+                return False
         if after - stop >= min_distance:
             continue
         if not _stop_keeps_apart(chain, bodies, pairs, p, q_next, v_next, a, duration, min_distance, rollout):
@@ -207,12 +211,15 @@ def _comes_no_closer(
     rollout: Rollout,
 ) -> bool:
     """For a pair that is too close already: no sample of the stop is closer than ``distance``."""
-    last = rollout.q.shape[0] - 1
-    first = pairs.first[p]
-    for i in range(0, last + 1, max(last // 4, 1)):
+    for i in range(rollout.q.shape[0]):
         _sample(chain, bodies, q, v, a, duration, i, rollout)
-        posed = Posed(rollout.start[i], rollout.end[i], rollout.rotation[i])
-        now = measure(bodies, posed, first, pairs.second[p], posed.start[first], posed.end[first], rollout.contact)
+        now = _distance(bodies, pairs, p, Posed(rollout.start[i], rollout.end[i], rollout.rotation[i]), rollout)
         if now < distance - _ROUNDING:
             return False
     return True
+
+
+@lean_kernel
+def _distance(bodies: Bodies, pairs: Pairs, p: int, posed: Posed, rollout: Rollout) -> float:
+    first = pairs.first[p]
+    return measure(bodies, posed, first, pairs.second[p], posed.start[first], posed.end[first], rollout.contact)

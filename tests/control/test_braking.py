@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from q2r2_control.control.braking import Rollout, brake, certify, step_way
 from q2r2_control.types import Array
 
-from .cells import NAMES, CellArrays, cell, distances, random_posture
+from .cells import NAMES, CellArrays, cell, distances, placed, random_posture
 
 MIN_DISTANCE = 0.02
 ACCELERATION = 10.0
@@ -108,6 +108,7 @@ def _certified(name: str, motion: Motion, known: Array | None = None) -> bool:
             arrays.bodies,
             arrays.pairs,
             before,
+            placed(arrays, motion.q)[1],
             motion.v,
             motion.q_next,
             motion.v_next,
