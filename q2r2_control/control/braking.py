@@ -11,7 +11,8 @@ stop can be executed now, and what is left of it needs no new check.
 **Between samples.** A point of a body is never farther than reach_j from joint j's axis, so while the joints travel
 ways w_j (total variation) a pair's distance changes by at most S = sum_j reach_j w_j over the joints that move one body
 relative to the other. Between two samples with distances d1 and d2 it is therefore at least (d1 + d2 - S) / 2: going
-down from d1 and up to d2 uses up S. One sample already proves d1 - S, enough for most pairs.
+down from d1 and up to d2 uses up S. One sample already proves d1 - S, enough for most pairs. For a step that S leaves
+no room for, plane.py has a proof that knows directions.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ import numpy as np
 from q2r2_control.control.chain import Chain, Placements, place
 from q2r2_control.control.collision import Bodies, Contact, Pairs, Posed, measure, pose_bodies
 from q2r2_control.control.jit import lean_kernel
+from q2r2_control.control.plane import step_keeps_beyond
 from q2r2_control.types import Array
 
 _DEEPEST = 5  # halvings of the stop: 32 intervals
@@ -143,6 +145,7 @@ def _stop_keeps_apart(
 @lean_kernel
 def certify(
     chain: Chain,
+    placements: Placements,
     bodies: Bodies,
     pairs: Pairs,
     distance: Array,
@@ -157,9 +160,9 @@ def certify(
 ) -> bool:
     """Whether the step to (q_next, v_next) in ``h`` and the full stop from there keep every pair apart.
 
-    ``distance`` (p,) holds distances, or lower bounds of them, before the step, where bodies are ``posed``; a bound
-    that does not suffice is replaced by the distance. A pair that is closer than ``min_distance`` already must not come
-    closer at the step's end and during the stop.
+    ``distance`` (p,) holds distances, or lower bounds of them, before the step, where joint frames have ``placements``
+    and bodies are ``posed``; a bound that does not suffice is replaced by the distance. A pair that is closer than
+    ``min_distance`` already must not come closer at the step's end and during the stop.
     """
     rollout.known[:] = 0.0
     duration = 0.0
@@ -188,7 +191,9 @@ def certify(
             return False
         if 0.5 * (distance[p] + after - step) < min_distance:
             distance[p] = _distance(bodies, pairs, p, posed, rollout)
-            if 0.5 * (distance[p] + after - step) < min_distance:
+            if 0.5 * (distance[p] + after - step) < min_distance and not step_keeps_beyond(
+                chain, placements, bodies, posed, pairs, p, rollout.contact, v, v_next, h, rollout.way[0], min_distance
+            ):
                 return False
         if after - stop >= min_distance:
             continue

@@ -69,6 +69,7 @@ def _distance_of(work: Workspace, pair: int) -> float:
 def _certified(cell: Cell, work: Workspace, h: float) -> bool:
     return certify(
         cell.chain,
+        work.placements,
         cell.bodies,
         cell.pairs,
         work.distance,

@@ -102,13 +102,15 @@ def _rollout(name: str) -> Rollout:
 def _certified(name: str, motion: Motion, known: Array | None = None) -> bool:
     arrays = cell(name)
     before = distances(arrays, motion.q[None])[0] if known is None else known
+    placements, posed = placed(arrays, motion.q)
     return bool(
         certify(
             arrays.chain,
+            placements,
             arrays.bodies,
             arrays.pairs,
             before,
-            placed(arrays, motion.q)[1],
+            posed,
             motion.v,
             motion.q_next,
             motion.v_next,
