@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from q2r2_control.config import Config, ObstacleConfig
+from q2r2_control.errors import ConfigError
+from q2r2_control.robot.reachability import PairReach, nearest_approaches, srdf_of
 from q2r2_control.robot.robot import PairDistance, Robot
 from q2r2_control.types import Array
 
@@ -78,6 +81,42 @@ def check_cell(config: Config) -> CellCheck:
                 if pair.distance < settings.min_distance
             ),
         ),
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class PairsWritten:
+    """What sampling says of the monitored pairs of links; distances in metres."""
+
+    file: str
+    samples: int
+    clearance: float
+    never: tuple[PairReach, ...]  # farther apart than the clearance, farthest last
+    watched: tuple[PairReach, ...]  # the others, nearest first
+
+
+def write_pairs(config: Config, file: Path, samples: int, clearance: float, seed: int = 0) -> PairsWritten:
+    """Sample which pairs of a cell can meet and write those that cannot as an SRDF to ``file``, which is not replaced.
+
+    Raises :class:`ConfigError` for a clearance that is not above ``control.min_distance``, and for a file that exists.
+    """
+    least = config.control.min_distance
+    if not least < clearance <= 1.0:
+        raise ConfigError(f"clearance = {clearance:g} m: allowed: above control.min_distance, {least:g}, up to 1")
+    if file.exists():
+        raise ConfigError(f"{file}: exists; give the name of a new file")
+    robot = Robot.from_config(config)
+    approaches = nearest_approaches(robot, samples, seed)
+    try:
+        file.write_text(srdf_of(robot, approaches, clearance, samples), encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(f"{file}: cannot be written: {error}") from error
+    return PairsWritten(
+        file=str(file),
+        samples=samples,
+        clearance=clearance,
+        never=tuple(pair for pair in approaches if pair.nearest > clearance),
+        watched=tuple(pair for pair in approaches if pair.nearest <= clearance),
     )
 
 

@@ -5,14 +5,16 @@ from __future__ import annotations
 import logging
 import math
 import sys
+from dataclasses import asdict
 from enum import StrEnum
+from pathlib import Path
 from typing import Annotated
 
 import typer
 from rich.console import Console
 
 from q2r2_control.bench import run_bench
-from q2r2_control.cell_check import check_cell
+from q2r2_control.cell_check import check_cell, write_pairs
 from q2r2_control.config import Config, HeadsetConfig, load_config
 from q2r2_control.errors import ConfigError
 from q2r2_control.headset_check import watch_headset
@@ -24,7 +26,15 @@ from q2r2_control.running import AnnouncedHeadset, RunOptions, notice_of_compili
 from q2r2_control.running import run as run_cell
 from q2r2_control.summary import RunSummary
 from q2r2_control.viewer.live import HeadsetDisplay
-from q2r2_control.viewer.tables import arm_table, bench_table, headset_table, obstacle_table, pair_table, summary_table
+from q2r2_control.viewer.tables import (
+    arm_table,
+    bench_table,
+    headset_table,
+    obstacle_table,
+    pair_reach_table,
+    pair_table,
+    summary_table,
+)
 
 DEMO_CONFIG = "config/dual_iiwa7.yaml"
 
@@ -150,9 +160,25 @@ def run(
     _show(run_cell(cell, options, _stderr()), json)
 
 
-@app.command(epilog="Example: q2r2 check config/dual_iiwa7.yaml")
-def check(config: ConfigFile, json: Json = False) -> None:
+@app.command(epilog="Example: q2r2 check config/dual_iiwa7.yaml --pairs dual_iiwa7.srdf")
+def check(
+    config: ConfigFile,
+    pairs: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Find pairs that can never meet and write them as an SRDF for the key srdf."),
+    ] = None,
+    samples: Annotated[int, typer.Option(help="Random postures that --pairs looks at.")] = 20_000,
+    clearance: Annotated[float, typer.Option(help="Pairs that stay farther apart need no watching [m].")] = 0.05,
+    json: Json = False,
+) -> None:
     """Validate a cell and print its arms, limits, obstacles and distances at home; exit 1 where home is unsafe."""
+    if pairs is not None:
+        found = write_pairs(load_config(config), pairs, samples, clearance)
+        if json:
+            print(as_json_text(asdict(found)))
+        else:
+            Console().print(pair_reach_table(found))
+        return
     result = check_cell(load_config(config))
     if json:
         print(as_json_text(result.as_json()))

@@ -127,6 +127,7 @@ class Config(_Model):
     name: str = Field(min_length=1)
     arms: dict[Side, ArmConfig] = Field(min_length=1)
     obstacles: dict[str, ObstacleConfig] = Field(default_factory=dict)
+    srdf: str | None = Field(None, description="a file of pairs that need no watching, as q2r2 check --pairs writes it")
     loop_rate_hz: float = Field(1000.0, ge=50, le=2000, description="control loop [Hz]")
     control: ControllerSettings = ControllerSettings()
     teleop: TeleopSettings = TeleopSettings()

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from q2r2_control.config import ArmConfig, Config, ObstacleConfig, PoseConfig
 from q2r2_control.errors import ConfigError, Q2R2Error
 from q2r2_control.robot.description import Description, LinkTree, joint_limits, load_description, parse_srdf
+from q2r2_control.robot.pairs import exclusions_of_file
 from q2r2_control.types import SIDES
 
 WORLD = "world"
@@ -68,6 +69,8 @@ def compose(config: Config) -> ComposedCell:
     for name, obstacle in config.obstacles.items():
         _check_obstacle_name(name)
         urdf.extend(_obstacle(name, obstacle))
+    if config.srdf is not None:
+        srdf.extend(exclusions_of_file(config.srdf, {link.get("name", "") for link in urdf.findall("link")}))
     for tree in (urdf, srdf):
         ET.indent(tree)
     return ComposedCell(

@@ -9,7 +9,9 @@ from itertools import combinations
 import numpy as np
 import pinocchio as pin
 
-from q2r2_control.robot.description import LinkTree, joint_end
+from q2r2_control.errors import ConfigError, RobotError
+from q2r2_control.resources import find_resource
+from q2r2_control.robot.description import LinkTree, joint_end, parse_srdf
 from q2r2_control.types import Array
 
 
@@ -51,6 +53,22 @@ def remove_disabled_pairs(geometry: pin.GeometryModel, exclusions: Iterable[ET.E
         geometry,
         lambda a, b: frozenset((link_of(a), link_of(b))) not in pairs and not links & {link_of(a), link_of(b)},
     )
+
+
+def exclusions_of_file(path: str, links: set[str]) -> list[ET.Element]:
+    """Pairs that an SRDF of a whole cell disables; all of them have to be among the cell's ``links``.
+
+    Raises :class:`ConfigError`: a link that is not there was meant for another cell.
+    """
+    file = find_resource(path)
+    try:
+        found = parse_srdf(file.read_text(encoding="utf-8"), str(file)).findall("disable_collisions")
+    except (OSError, UnicodeDecodeError, RobotError) as error:
+        raise ConfigError(f"srdf = {path!r:.80}: cannot be read: {error!s:.200}") from error
+    for link in (element.get(end, "") for element in found for end in ("link1", "link2")):
+        if link not in links:
+            raise ConfigError(f"srdf = {path!r:.80}: no link {link!r:.60} in this cell; q2r2 check --pairs writes one")
+    return found
 
 
 def remove_overlapping_own_pairs(

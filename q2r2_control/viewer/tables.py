@@ -6,7 +6,7 @@ from rich.table import Table
 from rich.text import Text
 
 from q2r2_control.bench import BenchReport
-from q2r2_control.cell_check import ArmCheck, CellCheck
+from q2r2_control.cell_check import ArmCheck, CellCheck, PairsWritten
 from q2r2_control.headset_check import HeadsetCheck
 from q2r2_control.inputs.messages import HandMessage, HandPose, HandTwist
 from q2r2_control.summary import Percentiles, RunSummary
@@ -68,6 +68,20 @@ def pair_table(check: CellCheck) -> Table:
     table.add_column(Text("distance [mm]"), justify="right")
     for pair in check.nearest:
         table.add_row(f"{pair.name_a} | {pair.name_b}", f"{1e3 * pair.distance:.1f}")
+    return table
+
+
+def pair_reach_table(pairs: PairsWritten) -> Table:
+    """Which pairs of links cannot meet."""
+    title = (
+        f"{pairs.file}: {len(pairs.never)} of {len(pairs.never) + len(pairs.watched)} pairs of links stay more than "
+        f"{1e3 * pairs.clearance:g} mm apart"
+    )
+    table = Table(title=Text(title), title_justify="left", min_width=len(title))
+    table.add_column("pair")
+    table.add_column(Text("nearest found [mm]"), justify="right")
+    for pair in pairs.never:
+        table.add_row(f"{pair.link_a} | {pair.link_b}", f"{1e3 * pair.nearest:.0f}")
     return table
 
 

@@ -1,0 +1,88 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from q2r2_control.cell_check import PairsWritten, write_pairs
+from q2r2_control.config import Config, load_config
+from q2r2_control.errors import ConfigError, RobotError
+from q2r2_control.robot.pairs import link_of
+from q2r2_control.robot.reachability import nearest_approaches
+from q2r2_control.robot.robot import Robot
+
+CONFIG = load_config("config/dual_iiwa7.yaml")
+
+
+def _with(config: Config, **changes: object) -> Config:
+    return Config.model_validate(config.model_dump() | changes)
+
+
+@pytest.fixture(scope="module")
+def found(tmp_path_factory: pytest.TempPathFactory) -> PairsWritten:
+    return write_pairs(CONFIG, tmp_path_factory.mktemp("pairs") / "cell.srdf", 2000, 0.05)
+
+
+def test_what_is_written_leaves_only_pairs_unwatched_that_no_posture_brings_near(found: PairsWritten) -> None:
+    assert found.never
+    assert min(pair.nearest for pair in found.never) > 0.05
+    robot, pruned = Robot.from_config(CONFIG), Robot.from_config(_with(CONFIG, srdf=found.file))
+    never = {frozenset((pair.link_a, pair.link_b)) for pair in found.never}
+    monitored = {frozenset((link_of(pair.name_a), link_of(pair.name_b))) for pair in pruned.distances(pruned.home)}
+    assert not never & monitored
+    random = np.random.default_rng(99)
+    for _ in range(500):
+        q = random.uniform(robot.position_lower, robot.position_upper)
+        for pair in robot.distances(q):
+            if frozenset((link_of(pair.name_a), link_of(pair.name_b))) in never:
+                assert pair.distance > 0.05
+
+
+def test_the_elbow_of_one_arm_stays_watched_against_the_other_arm(found: PairsWritten) -> None:
+    watched = {frozenset((pair.link_a, pair.link_b)) for pair in found.watched}
+    for other in ("link_3", "link_4", "link_5", "link_6", "link_7", "hand_e_envelope"):
+        assert frozenset(("left_link_4", f"right_{other}")) in watched
+
+
+def test_more_samples_do_not_change_the_nearest_approach(found: PairsWritten) -> None:
+    thorough = {(p.link_a, p.link_b): p.nearest for p in nearest_approaches(Robot.from_config(CONFIG), 4000, 2)}
+    for pair in (*found.never, *found.watched):
+        if thorough[pair.link_a, pair.link_b] > 0.0:
+            assert pair.nearest == pytest.approx(thorough[pair.link_a, pair.link_b], abs=0.003)
+
+
+def test_a_file_that_exists_is_not_replaced(tmp_path: Path) -> None:
+    file = tmp_path / "cell.srdf"
+    file.write_text("mine")
+    with pytest.raises(ConfigError, match="exists; give the name of a new file"):
+        write_pairs(CONFIG, file, 200, 0.05)
+    assert file.read_text() == "mine"
+
+
+@pytest.mark.parametrize("clearance", [0.0, 0.02, -1.0, 2.0, float("nan")])
+def test_a_clearance_that_is_no_more_than_what_is_kept_is_refused(tmp_path: Path, clearance: float) -> None:
+    with pytest.raises(ConfigError, match=r"clearance = .* allowed: above control.min_distance, 0.02, up to 1"):
+        write_pairs(CONFIG, tmp_path / "cell.srdf", 200, clearance)
+
+
+def test_too_few_samples_are_refused() -> None:
+    with pytest.raises(RobotError, match="samples = 10: allowed: 100 or more"):
+        nearest_approaches(Robot.from_config(CONFIG), 10, 0)
+
+
+@pytest.mark.parametrize(
+    ("text", "fault"),
+    [
+        pytest.param(
+            '<robot><disable_collisions link1="left_link_1" link2="elbow"/></robot>', "no link 'elbow'", id="link"
+        ),
+        pytest.param("<robot>", "cannot be read", id="no XML"),
+    ],
+    ids=["a link of another cell", "no XML"],
+)
+def test_a_cells_srdf_that_does_not_fit_it_is_refused(tmp_path: Path, text: str, fault: str) -> None:
+    file = tmp_path / "cell.srdf"
+    file.write_text(text)
+    with pytest.raises(ConfigError, match=fault):
+        Robot.from_config(_with(CONFIG, srdf=str(file)))
