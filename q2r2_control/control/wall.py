@@ -23,6 +23,7 @@ from q2r2_control.control.collision import bodies_of, pairs_of
 from q2r2_control.control.jit import hold
 from q2r2_control.control.settings import ControllerSettings
 from q2r2_control.control.wall_force import Scratch, Wall, find_near, wall_torque
+from q2r2_control.errors import RobotError
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 
@@ -58,8 +59,12 @@ class MeasuredSeparation:
     """Keeps the measured links apart in torque mode. Holds nothing between ticks but scratch."""
 
     def __init__(self, robot: Robot, settings: ControllerSettings, wall_settings: WallSettings | None = None) -> None:
-        """Uses ``min_distance`` of ``settings``. Raises :class:`RobotError` for a shape that no kernel measures."""
+        """Uses ``min_distance`` of ``settings``.
+
+        Raises :class:`RobotError` for a shape that no kernel measures and for joints that carry no inertia.
+        """
         law, self._model, self._data = wall_settings or WallSettings(), robot.model, robot.model.createData()
+        _check_inertia(robot)
         chain, bodies = chain_of(robot.model), bodies_of(robot.collision_model)
         travel = np.maximum(np.abs(robot.position_lower), np.abs(robot.position_upper))
         pairs = pairs_of(robot.collision_model, chain, bodies, travel)
@@ -109,3 +114,11 @@ class MeasuredSeparation:
     def _press(self, count: int) -> float:
         self._scratch.M[:] = pin.crba(self._model, self._data, self._scratch.q)
         return float(wall_torque(self._held_wall, self._held_scratch, count))
+
+
+def _check_inertia(robot: Robot) -> None:
+    """Every joint has to have some, or no damping could be stable."""
+    own = pin.crba(robot.model, robot.model.createData(), robot.home).diagonal()
+    if not (own > 0.0).all():
+        joint = robot.joint_names[int(np.argmin(own))]
+        raise RobotError(f"joint {joint}: moves no inertia; the wall needs links with masses, or rotors")
