@@ -6,7 +6,8 @@ sake. Only the QP sees the displaced target: recordings and the teleop layer go 
 
 The law and its reasons stand in compliance.py. What the tool shows is the admittance in series with the servos below
 it: a tool held by soft servos moves by their own give besides. Against a stiff body the loop closes through QP and
-servos with their delay; a larger virtual mass or damping ratio makes it calmer.
+servos with their delay: with the defaults a simulated arm leans quietly on 10 kN/m, and on 30 kN/m with twice the
+damping ratio or four times the mass. What the tool carries without its model knowing counts as a push downwards.
 """
 
 from __future__ import annotations
