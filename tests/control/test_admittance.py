@@ -168,6 +168,15 @@ def test_from_its_limit_it_sets_off_at_once_when_the_force_falls() -> None:
     assert back[150] < DEFAULT.max_displacement - 0.02
 
 
+def test_the_limit_takes_the_speed_with_which_it_is_met() -> None:
+    admittance = Admittance(ROBOT, AdmittanceSettings(damping_ratio=0.1, filter_time=0.0))
+    push, x = _touch(_wrench(0, 95.0)), 0.0
+    while x < DEFAULT.max_displacement - 1e-9:
+        x = _displaced(admittance, push, 1)[0][0]
+    back = np.array(_displaced(admittance, UNTOUCHED, 50))[:, 0]
+    assert (np.diff([x, *back]) < 0.0).all()
+
+
 def test_an_arm_yields_to_its_own_push_only() -> None:
     admittance = Admittance(ROBOT)
     for _ in range(500):
