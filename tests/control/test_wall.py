@@ -260,3 +260,22 @@ def test_released_from_the_wall_the_arm_comes_out_once_and_stays_out() -> None:
     assert distances.argmax() > 300
     assert distances[-1] > SHELL
     assert (np.diff(distances)[:300] > -1e-6).all(), "opens steadily"
+
+
+def test_pressed_towards_the_table_the_arm_rests_where_the_spring_bears_the_force_and_the_torque_is_quiet() -> None:
+    plant, data = MujocoPlant(ROBOT, load_config("config/dual_iiwa7.yaml")), ROBOT.model.createData()
+    plant.push("left", np.array([0.0, 0.0, -40.0, 0.0, 0.0, 0.0]), 10.0)
+    depths, torques = [], []
+    for _ in range(2000):
+        state = plant.state()
+        report = wall().update(state.q, state.v)
+        assert report.closest_distance > 0.005
+        depths.append(SHELL - report.closest_distance)
+        torques.append(report.tau)
+        tau = pin.computeGeneralizedGravity(ROBOT.model, data, state.q) + report.tau - 10.0 * state.v
+        plant.apply(Command(CommandMode.TORQUE, state.q, state.v, tau, {}))
+        plant.advance(0.002)
+    assert report.pressing
+    assert all(map(_with_the_table, report.pressing))
+    assert sum(depths[-100:]) / 100 == pytest.approx(40.0 / WallSettings().stiffness, abs=5e-4)
+    assert np.abs(np.diff(torques[-500:], axis=0)).max() < 0.02
