@@ -9,6 +9,7 @@ from q2r2_control.control.collision import pose_bodies
 from q2r2_control.control.geometry import clamp
 from q2r2_control.control.jit import Held, kernel, lean_kernel
 from q2r2_control.control.limits import next_velocity_box
+from q2r2_control.control.pace import find_pace
 from q2r2_control.control.separation import separation_rows, speed_near
 from q2r2_control.control.tasks import (
     add_stretch_damping,
@@ -30,6 +31,7 @@ def observe(cell: Cell, work: Workspace) -> int:
     """Where everything is at the reference: tool poses, distances and separation rows. Returns the closest pair."""
     place(cell.chain, work.q, work.placements)
     pose_bodies(cell.bodies, work.placements, work.posed)
+    find_pace(cell.chain, work.placements, cell.bodies, work.posed, work.v, work.pace)
     for i in range(cell.tools.joint.shape[0]):
         tool_pose(work.placements, cell.tools, i, work.rotation[i], work.translation[i])
     closest = separation_rows(
@@ -38,6 +40,7 @@ def observe(cell: Cell, work: Workspace) -> int:
         cell.bodies,
         work.posed,
         cell.pairs,
+        work.pace,
         work.v,
         cell.acceleration,
         cell.limits.longest_step,

@@ -11,7 +11,8 @@ stop can be executed now, and what is left of it needs no new check.
 **Between samples.** A point of a body is never farther than reach_j from joint j's axis, so while the joints travel
 ways w_j (total variation) a pair's distance changes by at most S = sum_j reach_j w_j over the joints that move one body
 relative to the other. Between two samples with distances d1 and d2 it is therefore at least (d1 + d2 - S) / 2: going
-down from d1 and up to d2 uses up S. One sample already proves d1 - S, enough for most pairs.
+down from d1 and up to d2 uses up S. One sample already proves d1 - S, enough for most pairs. For a step that S leaves
+no room for, plane.py has a proof that knows directions.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ import numpy as np
 from q2r2_control.control.chain import Chain, Placements, place
 from q2r2_control.control.collision import Bodies, Contact, Pairs, Posed, measure, pose_bodies
 from q2r2_control.control.jit import lean_kernel
+from q2r2_control.control.plane import step_keeps_beyond
 from q2r2_control.types import Array
 
 _DEEPEST = 5  # halvings of the stop: 32 intervals
@@ -40,6 +42,7 @@ class Rollout(NamedTuple):
     rotation: Array  # (s, g, 3, 3)
     distance: Array  # (s,)
     known: Array  # (s,) 1 where the sample's bodies are posed
+    way: Array  # (2, nv) of each joint during the step, then during the stop [rad]
     placements: Placements
     contact: Contact
 
@@ -54,6 +57,7 @@ class Rollout(NamedTuple):
             np.zeros((samples, g, 3, 3)),
             np.zeros(samples),
             np.zeros(samples),
+            np.zeros((2, nv)),
             Placements.empty(chain),
             Contact.empty(),
         )
@@ -109,7 +113,6 @@ def _stop_keeps_apart(
 ) -> bool:
     """Prove pair ``p`` apart along the whole stop, with as few samples as it takes."""
     last = rollout.q.shape[0] - 1
-    first = pairs.first[p]
     stride = last
     measured = 0
     while stride >= 1:
@@ -119,9 +122,7 @@ def _stop_keeps_apart(
             if measured == 0 or (i // stride) % 2 == 1:
                 _sample(chain, bodies, q, v, a, duration, i, rollout)
                 posed = Posed(rollout.start[i], rollout.end[i], rollout.rotation[i])
-                rollout.distance[i] = measure(
-                    bodies, posed, first, pairs.second[p], posed.start[first], posed.end[first], rollout.contact
-                )
+                rollout.distance[i] = _distance(bodies, pairs, p, posed, rollout)
                 if rollout.distance[i] < threshold:
                     return False
             if previous >= 0:
@@ -144,9 +145,11 @@ def _stop_keeps_apart(
 @lean_kernel
 def certify(
     chain: Chain,
+    placements: Placements,
     bodies: Bodies,
     pairs: Pairs,
     distance: Array,
+    posed: Posed,
     v: Array,
     q_next: Array,
     v_next: Array,
@@ -157,13 +160,16 @@ def certify(
 ) -> bool:
     """Whether the step to (q_next, v_next) in ``h`` and the full stop from there keep every pair apart.
 
-    ``distance`` (p,) holds distances, or lower bounds of them, before the step. A pair that is closer than
+    ``distance`` (p,) holds distances, or lower bounds of them, before the step, where joint frames have ``placements``
+    and bodies are ``posed``; a bound that does not suffice is replaced by the distance. A pair that is closer than
     ``min_distance`` already must not come closer at the step's end and during the stop.
     """
     rollout.known[:] = 0.0
     duration = 0.0
     for j in range(v.shape[0]):
         duration = max(duration, abs(v_next[j]) / a[j])
+        rollout.way[0, j] = step_way(v[j], v_next[j], h)
+        rollout.way[1, j] = v_next[j] * v_next[j] / (2.0 * a[j])
     for p in range(pairs.first.shape[0]):
         step = 0.0
         stop = 0.0
@@ -171,9 +177,8 @@ def certify(
             joint = pairs.joint[p, k]
             if joint == 0:
                 break
-            j = joint - 1
-            step += pairs.reach[p, k] * step_way(v[j], v_next[j], h)
-            stop += pairs.reach[p, k] * v_next[j] * v_next[j] / (2.0 * a[j])
+            step += pairs.reach[p, k] * rollout.way[0, joint - 1]
+            stop += pairs.reach[p, k] * rollout.way[1, joint - 1]
         if distance[p] - step - stop >= min_distance:
             continue
         if distance[p] < min_distance:
@@ -181,11 +186,15 @@ def certify(
                 return False
             continue
         _sample(chain, bodies, q_next, v_next, a, duration, 0, rollout)
-        posed = Posed(rollout.start[0], rollout.end[0], rollout.rotation[0])
-        first = pairs.first[p]
-        after = measure(bodies, posed, first, pairs.second[p], posed.start[first], posed.end[first], rollout.contact)
-        if after < min_distance or 0.5 * (distance[p] + after - step) < min_distance:
+        after = _distance(bodies, pairs, p, Posed(rollout.start[0], rollout.end[0], rollout.rotation[0]), rollout)
+        if after < min_distance:
             return False
+        if 0.5 * (distance[p] + after - step) < min_distance:
+            distance[p] = _distance(bodies, pairs, p, posed, rollout)
+            if 0.5 * (distance[p] + after - step) < min_distance and not step_keeps_beyond(
+                chain, placements, bodies, posed, pairs, p, rollout.contact, v, v_next, h, rollout.way[0], min_distance
+            ):
+                return False
         if after - stop >= min_distance:
             continue
         if not _stop_keeps_apart(chain, bodies, pairs, p, q_next, v_next, a, duration, min_distance, rollout):
@@ -207,12 +216,15 @@ def _comes_no_closer(
     rollout: Rollout,
 ) -> bool:
     """For a pair that is too close already: no sample of the stop is closer than ``distance``."""
-    last = rollout.q.shape[0] - 1
-    first = pairs.first[p]
-    for i in range(0, last + 1, max(last // 4, 1)):
+    for i in range(rollout.q.shape[0]):
         _sample(chain, bodies, q, v, a, duration, i, rollout)
-        posed = Posed(rollout.start[i], rollout.end[i], rollout.rotation[i])
-        now = measure(bodies, posed, first, pairs.second[p], posed.start[first], posed.end[first], rollout.contact)
+        now = _distance(bodies, pairs, p, Posed(rollout.start[i], rollout.end[i], rollout.rotation[i]), rollout)
         if now < distance - _ROUNDING:
             return False
     return True
+
+
+@lean_kernel
+def _distance(bodies: Bodies, pairs: Pairs, p: int, posed: Posed, rollout: Rollout) -> float:
+    first = pairs.first[p]
+    return measure(bodies, posed, first, pairs.second[p], posed.start[first], posed.end[first], rollout.contact)

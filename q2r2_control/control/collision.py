@@ -41,6 +41,7 @@ class Pairs(NamedTuple):
     joint: IntArray  # (p, k) joint indices, padded with 0
     sign: Array  # (p, k) +1: the joint moves the second geometry, -1: the first
     reach: Array  # (p, k) bound on how far the geometry's points are from the joint's axis [m]; 1 for a sliding joint
+    leverage: Array  # (p,) sum of reach
     round: IntArray  # (p,) 1 where both are capsules, whose normal turns as they slide past each other
 
 
@@ -137,11 +138,13 @@ def pairs_of(model: pin.GeometryModel, chain: Chain, bodies: Bodies, travel: Arr
         joint=np.zeros((len(rows), width), dtype=np.int64),
         sign=np.zeros((len(rows), width)),
         reach=np.zeros((len(rows), width)),
+        leverage=np.zeros(len(rows)),
         round=np.array([1 - bodies.box[row[1]] for row in rows], dtype=np.int64),
     )
     for p, (_, _, moving) in enumerate(rows):
         for k, (joint, (sign, reach)) in enumerate(sorted(moving.items())):
             pairs.joint[p, k], pairs.sign[p, k], pairs.reach[p, k] = joint, sign, reach
+            pairs.leverage[p] += reach
     return pairs
 
 
@@ -168,8 +171,19 @@ def pose_bodies(bodies: Bodies, placements: Placements, posed: Posed) -> None:
 
 @lean_kernel
 def at_least(bodies: Bodies, posed: Posed, first: int, second: int) -> float:
-    """Cheap lower bound on the distance of two geometries, from the balls around them [m]."""
+    """Cheap lower bound on the distance of two geometries, from the balls around them, or ball and box [m]."""
     square = 0.0
+    if bodies.box[second] == 1:
+        x = 0.5 * (posed.start[first, 0] + posed.end[first, 0]) - posed.start[second, 0]
+        y = 0.5 * (posed.start[first, 1] + posed.end[first, 1]) - posed.start[second, 1]
+        z = 0.5 * (posed.start[first, 2] + posed.end[first, 2]) - posed.start[second, 2]
+        axes = posed.rotation[second]
+        inside = np.inf
+        for k in range(3):
+            depth = bodies.half[second, k] - abs(axes[0, k] * x + axes[1, k] * y + axes[2, k] * z)
+            inside = min(inside, depth)
+            square += min(depth, 0.0) ** 2
+        return (-inside if inside > 0.0 else np.sqrt(square)) - bodies.size[first]
     for k in range(3):
         between = posed.start[first, k] + posed.end[first, k] - posed.start[second, k] - posed.end[second, k]
         square += between * between

@@ -18,11 +18,14 @@ _ACTIVE = 1e-7  # [rad/s] from a bound
 
 
 @kernel
-def commit(held_cell: Held, held_work: Held, solution: Array, usable: bool, h: float) -> tuple[int, int, float]:
+def commit(
+    held_cell: Held, held_work: Held, solution: Array, usable: bool, h: float, share: float
+) -> tuple[int, int, float, float]:
     """One step of ``h`` with the solver's next velocities ``solution`` (nv,), or the stop if they are not ``usable``.
 
-    Returns what was done (FOLLOWED, REDUCED towards the stop, STOPPED), the closest pair at the new state, and the
-    largest violation of a row [rad/s].
+    ``share`` is the step's part of the tick, whose mean acceleration it adds to. Returns what was done (FOLLOWED,
+    REDUCED towards the stop, STOPPED), the closest pair at the new state, its distance [m] (infinite if there is no
+    pair), and the largest violation of a row [rad/s].
     """
     cell, work = held_cell.value, held_work.value
     q, v = work.q, work.v
@@ -37,29 +40,40 @@ def commit(held_cell: Held, held_work: Held, solution: Array, usable: bool, h: f
         # The last certified stop; what is left of it stays certified: see braking.py.
         brake(q, v, cell.acceleration, h, work.candidate[1], work.candidate[0])
     for j in range(q.shape[0]):
+        # Rounding of a difference over a tiny h may exceed the limit that the velocities keep.
+        rate = clamp((work.candidate[0, j] - v[j]) / h, -cell.acceleration[j], cell.acceleration[j])
+        work.a[j] += share * rate
         q[j] = work.candidate[1, j]
         v[j] = work.candidate[0, j]
     slack = _note_active(work)
-    return outcome, observe(cell, work), slack
+    closest = observe(cell, work)
+    return outcome, closest, _distance_of(work, closest), slack
 
 
 @kernel
-def first_look(held_cell: Held, held_work: Held) -> tuple[int, bool]:
-    """Observe after a reset: the closest pair, and whether the stop from here is known to keep all apart."""
+def first_look(held_cell: Held, held_work: Held) -> tuple[int, float, bool]:
+    """Observe after a reset: the closest pair, its distance, and whether the stop is known to keep all apart."""
     cell, work = held_cell.value, held_work.value
     closest = observe(cell, work)
     work.candidate[0] = work.v
     work.candidate[1] = work.q
-    return closest, _certified(cell, work, 0.0)
+    return closest, _distance_of(work, closest), _certified(cell, work, 0.0)
+
+
+@lean_kernel
+def _distance_of(work: Workspace, pair: int) -> float:
+    return work.distance[pair] if work.distance.shape[0] > 0 else np.inf
 
 
 @lean_kernel
 def _certified(cell: Cell, work: Workspace, h: float) -> bool:
     return certify(
         cell.chain,
+        work.placements,
         cell.bodies,
         cell.pairs,
         work.distance,
+        work.posed,
         work.v,
         work.candidate[1],
         work.candidate[0],

@@ -46,7 +46,6 @@ class CartesianController:
         self._arms = tuple(robot.arms)
         self._solver = solver or make_solver(self.settings.solver, self._nv, self.settings.solve_time_limit)
         cell = cell_of(robot, self.settings)
-        self._acceleration = cell.acceleration
         self._work = Workspace.empty(cell)
         self._goals = GoalTracker(cell, self._arms, self.settings)
         self._held_cell, self._held_work = hold(cell), hold(self._work)
@@ -70,8 +69,8 @@ class CartesianController:
         self._work.q[:] = self._checked("q", q)
         self._work.v[:] = 0.0 if v is None else self._checked("v", v)
         self._goals.reset(self._work.q)
-        self._closest, proven = first_look(self._held_cell, self._held_work)
-        self._apart = self._is_apart()
+        self._closest, self._distance, proven = first_look(self._held_cell, self._held_work)
+        self._apart = self._distance >= self.settings.min_distance
         self._certified = proven and self._apart
 
     def _checked(self, name: str, values: Array) -> Array:
@@ -90,35 +89,32 @@ class CartesianController:
         time = min(float(dt), LONGEST_DT) if usable else 0.0
         work = self._work
         rejected = self._goals.update(targets, time, work.q, work.v)
-        before = work.v.copy()
+        work.a[:] = 0.0
         summary = _Summary()
-        substeps = math.ceil(time / self.settings.max_substep - 1e-9) if time > 0.0 else 0
-        for _ in range(max(substeps, int(time > 0.0))):
-            self._advance(time / max(substeps, 1), summary)
-        a = np.zeros(self._nv)
         if time > 0.0:
-            # Rounding of a difference over a tiny dt may exceed the limit that the velocities keep.
-            a = np.minimum(np.maximum((work.v - before) / time, -self._acceleration), self._acceleration)
+            substeps = max(math.ceil(time / self.settings.max_substep - 1e-9), 1)
+            for _ in range(substeps):
+                self._advance(time / substeps, 1.0 / substeps, summary)
         report = StepReport(
             status=self._status(usable and dt <= LONGEST_DT, rejected, summary),
             rejected=rejected,
             binding=self._binding(),
             closest_pair=self._pair_names[self._closest] if self._pair_names else ("", ""),
-            closest_distance=float(work.distance[self._closest]) if self._pair_names else math.inf,
+            closest_distance=self._distance,
             certified=self._certified,
             fallback=summary.fallback,
             slack=summary.slack,
             solve_time=summary.solve_time,
         )
-        return Reference(work.q.copy(), work.v.copy(), a, report)
+        return Reference(work.q.copy(), work.v.copy(), work.a.copy(), report)
 
     def tool_pose(self, arm: str) -> pin.SE3:
         """World pose of an arm's tool at the reference."""
         i = self._arms.index(arm)
         return pin.SE3(self._work.rotation[i].copy(), self._work.translation[i].copy())
 
-    def _advance(self, h: float, summary: _Summary) -> None:
-        """One substep: build, solve, certify and move."""
+    def _advance(self, h: float, share: float, summary: _Summary) -> None:
+        """One substep, which is a ``share`` of the tick: build, solve, certify and move."""
         work = self._work
         summary.inside &= assemble(self._held_cell, self._goals.held, self._held_work, h)
         count = int(work.rows.used[0])
@@ -134,16 +130,15 @@ class CartesianController:
         limit = self.settings.solve_time_limit
         usable = solution.v is not None and (limit is None or solution.solve_time <= limit)
         wanted = solution.v if usable else work.wanted
-        outcome, self._closest, slack = commit(self._held_cell, self._held_work, wanted, usable, h)
+        outcome, self._closest, self._distance, slack = commit(
+            self._held_cell, self._held_work, wanted, usable, h, share
+        )
         summary.fallback |= outcome != FOLLOWED
         summary.slack = max(summary.slack, slack)
         summary.solve_time += solution.solve_time
-        was_apart, self._apart = self._apart, self._is_apart()
+        was_apart, self._apart = self._apart, self._distance >= self.settings.min_distance
         # A certified stop stays certified. Anything else was proven just now, and if all was apart before, in full.
         self._certified = self._apart and (self._certified if outcome == STOPPED else was_apart)
-
-    def _is_apart(self) -> bool:
-        return not self._pair_names or bool(self._work.distance[self._closest] >= self.settings.min_distance)
 
     def _status(self, dt_usable: bool, rejected: tuple[str, ...], summary: _Summary) -> StepStatus:
         if summary.fallback:

@@ -21,64 +21,88 @@ _TELEPORT = 3.0
 _AT_REST = 1e-2  # [rad/s]
 
 
+_NONE, _POSE, _NO_POSE = 0, 1, 2  # what was offered to an arm
+
+
 class GoalTracker:
     """Keeps the last usable target of each arm and the smoothed twist with which it moves (feed-forward)."""
 
     def __init__(self, cell: Cell, arms: tuple[str, ...], settings: ControllerSettings) -> None:
         self._arms = arms
-        self._members = [np.flatnonzero(member) for member in cell.tools.member]
-        self._time = settings.feed_forward_time
-        self._fastest = _TELEPORT * np.array([settings.max_linear_speed, settings.max_angular_speed])
-        self._latched = [False] * len(arms)
-        self._goals = Goals.empty(cell)
+        teleport = (_TELEPORT * settings.max_linear_speed, _TELEPORT * settings.max_angular_speed)
+        self._goals = Goals.empty(cell, np.array([settings.feed_forward_time, *teleport]))
+        self._pose, self._offered = self._goals.pose, self._goals.offered
         self.held = hold(self._goals)
 
     def reset(self, q: Array) -> None:
         """Forget all targets; every arm holds where it is, ``q`` (nv,) [rad]."""
-        self._latched = [False] * len(self._arms)
+        self._goals.latched[:] = 0
         self._goals.follows[:] = 0
         self._goals.hold[:] = q
 
     def update(self, targets: Mapping[str, pin.SE3 | None], dt: float, q: Array, v: Array) -> tuple[str, ...]:
         """Take the targets of one tick; returns the names whose target is not usable, unknown names among them."""
-        rejected = []
+        known = 0
         for i, arm in enumerate(self._arms):
             target = targets.get(arm)
-            if target is None:
-                self._hold(i, q, v)
-            elif not isinstance(target, pin.SE3) or not take_target(
-                self.held, i, target.homogeneous, dt, self._time, self._fastest
-            ):
-                rejected.append(arm)
-                if self._goals.follows[i] == 0:
-                    self._hold(i, q, v)
-        if len(targets) > len(self._arms) or any(name not in self._arms for name in targets):
-            rejected.extend(str(name) for name in targets if name not in self._arms)
-        return tuple(rejected)
-
-    def _hold(self, i: int, q: Array, v: Array) -> None:
-        """A moving arm is braked first and holds where it comes to rest, so that it need not come back."""
-        if self._goals.follows[i] == 1:
-            self._goals.follows[i] = 0
-            self._latched[i] = False
-        if not self._latched[i]:
-            joints = self._members[i]
-            self._goals.hold[joints] = q[joints]
-            self._latched[i] = bool(np.abs(v[joints]).max() < _AT_REST)
+            if isinstance(target, pin.SE3):
+                self._pose[i] = target.homogeneous
+                self._offered[i] = _POSE
+            else:
+                self._offered[i] = _NONE if target is None else _NO_POSE
+            known += arm in targets
+        usable = take_targets(self.held, q, v, dt)
+        if usable and known == len(targets):
+            return ()
+        rejected = [arm for arm, offered in zip(self._arms, self._offered, strict=True) if offered == _NO_POSE]
+        return (*rejected, *(str(name) for name in targets if name not in self._arms))
 
 
 @kernel
-def take_target(held_goals: Held, i: int, pose: Array, dt: float, time: float, fastest: Array) -> bool:
-    """Make the homogeneous ``pose`` (4, 4) the goal of arm ``i``; False, and no change, if it is not a finite pose.
+def take_targets(held_goals: Held, q: Array, v: Array, dt: float) -> bool:
+    """Make what was offered each arm's goal, or hold it where there is nothing usable; False if something was not.
 
-    A goal that moves has its twist smoothed over ``time`` [s]; one that was put elsewhere, faster than ``fastest``
-    (2,) [m/s, rad/s], has none.
+    What is no pose is marked so in ``goals.offered``.
     """
     goals = held_goals.value
+    all_usable = True
+    for i in range(goals.offered.shape[0]):
+        if goals.offered[i] == _POSE and _take_pose(goals, i, dt):
+            continue
+        if goals.offered[i] == _NONE:
+            if goals.follows[i] == 1:
+                goals.follows[i] = 0
+                goals.latched[i] = 0
+        else:
+            goals.offered[i] = _NO_POSE
+            goals.feed_forward[i] = 0.0
+            all_usable = False
+        if goals.follows[i] == 0 and goals.latched[i] == 0:
+            _hold(goals, i, q, v)
+    return all_usable
+
+
+@kernel
+def _hold(goals: Goals, i: int, q: Array, v: Array) -> None:
+    """A moving arm is braked first and holds where it comes to rest, so that it need not come back."""
+    speed = 0.0
+    for j in range(q.shape[0]):
+        if goals.member[i, j] == 1.0:
+            goals.hold[j] = q[j]
+            speed = max(speed, abs(v[j]))
+    if speed < _AT_REST:
+        goals.latched[i] = 1
+
+
+@kernel
+def _take_pose(goals: Goals, i: int, dt: float) -> bool:
+    """Make the offered homogeneous pose the goal of arm ``i``; False, and no change, if it is not a finite pose.
+
+    A goal that moves has its twist smoothed over a time; one that was put elsewhere, faster than any tool, has none.
+    """
     rotation = np.empty((3, 3))
     translation = np.empty(3)
-    if not _checked_pose(pose, rotation, translation):
-        goals.feed_forward[i] = 0.0
+    if not _checked_pose(goals.pose[i], rotation, translation):
         return False
     moved = np.zeros(6)
     if goals.follows[i] == 1 and dt > 0.0:
@@ -86,9 +110,12 @@ def take_target(held_goals: Held, i: int, pose: Array, dt: float, time: float, f
             moved[k] = (translation[k] - goals.translation[i, k]) / dt
         rotation_vector(_times_transposed(rotation, goals.rotation[i]), moved[3:6])
         moved[3:6] /= dt
-        if np.sqrt(np.sum(moved[0:3] ** 2)) > fastest[0] or np.sqrt(np.sum(moved[3:6] ** 2)) > fastest[1]:
+        if (
+            np.sqrt(np.sum(moved[0:3] ** 2)) > goals.smoothing[1]
+            or np.sqrt(np.sum(moved[3:6] ** 2)) > goals.smoothing[2]
+        ):
             moved[:] = 0.0
-        share = 1.0 - np.exp(-dt / time)
+        share = 1.0 - np.exp(-dt / goals.smoothing[0])
         for k in range(6):
             goals.feed_forward[i, k] += share * (moved[k] - goals.feed_forward[i, k])
     else:

@@ -20,7 +20,6 @@ import numba
 from numba.core import types
 from numba.experimental import structref
 
-
 _COMPILED = re.compile(r"^@(lean_)?kernel|\bNamedTuple\b|\bstructref\b", re.MULTILINE)
 
 

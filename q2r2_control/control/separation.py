@@ -19,6 +19,7 @@ from q2r2_control.control.chain import Chain, IntArray, Placements
 from q2r2_control.control.collision import Bodies, Contact, Pairs, Posed, at_least, distance_row, measure
 from q2r2_control.control.geometry import clamp, segment_segment
 from q2r2_control.control.jit import lean_kernel
+from q2r2_control.control.pace import Pace, fastest_approach
 from q2r2_control.types import Array
 
 _SHARE = 0.25
@@ -115,6 +116,7 @@ def separation_rows(
     bodies: Bodies,
     posed: Posed,
     pairs: Pairs,
+    pace: Pace,
     v: Array,
     a: Array,
     h: float,
@@ -132,18 +134,16 @@ def separation_rows(
     closest = 0
     least = np.inf
     witness = contact.witness
+    surge = 0.0
+    for j in range(a.shape[0]):
+        surge = max(surge, a[j] * h)
     for p in range(pairs.first.shape[0]):
         first = pairs.first[p]
         second = pairs.second[p]
         distance[p] = at_least(bodies, posed, first, second)
         # The fastest that the pair can close in after this step. Farther than twice what the gain needs for that, a row
         # could bind only through its root, at very low leverage: it would add comfort, and the certificate needs none.
-        closing = 0.0
-        for k in range(pairs.joint.shape[1]):
-            joint = pairs.joint[p, k]
-            if joint == 0:
-                break
-            closing += pairs.reach[p, k] * (abs(v[joint - 1]) + a[joint - 1] * h)
+        closing = fastest_approach(pace, first, second) + pairs.leverage[p] * surge
         relevant = approach.stop_distance + 2.0 * closing / approach.gain
         if pairs.round[p] == 1:
             relevant = max(relevant, approach.slow_below)

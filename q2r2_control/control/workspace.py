@@ -9,6 +9,7 @@ import numpy as np
 from q2r2_control.control.braking import Rollout
 from q2r2_control.control.chain import Chain, IntArray, Placements
 from q2r2_control.control.collision import Bodies, Contact, Pairs, Posed
+from q2r2_control.control.pace import Pace
 from q2r2_control.control.separation import Approach, Rows
 from q2r2_control.control.tasks import Motion, Tools
 from q2r2_control.types import Array
@@ -48,16 +49,32 @@ class Cell(NamedTuple):
 class Goals(NamedTuple):
     """What the arms are asked to do."""
 
+    member: Array  # (n, nv) 1 where a joint is the arm's
+    smoothing: Array  # (3,) time of the feed-forward [s], and the tool speeds [m/s, rad/s] above which there is none
     follows: IntArray  # (n,) 1: the tool follows its goal, 0: the arm's joints hold
     rotation: Array  # (n, 3, 3)
     translation: Array  # (n, 3) [m]
     feed_forward: Array  # (n, 6) the goal's own twist [m/s, rad/s]
     hold: Array  # (nv,) joint positions to hold [rad]
+    latched: IntArray  # (n,) 1: the arm has come to rest where it holds
+    offered: IntArray  # (n,) what this tick brought: nothing, a pose, something else
+    pose: Array  # (n, 4, 4) homogeneous, as offered
 
     @classmethod
-    def empty(cls, cell: Cell) -> Goals:
+    def empty(cls, cell: Cell, smoothing: Array) -> Goals:
         n, nv = len(cell.tools.joint), len(cell.home)
-        return cls(np.zeros(n, dtype=np.int64), np.zeros((n, 3, 3)), np.zeros((n, 3)), np.zeros((n, 6)), np.zeros(nv))
+        return cls(
+            member=cell.tools.member,
+            smoothing=smoothing,
+            follows=np.zeros(n, dtype=np.int64),
+            rotation=np.zeros((n, 3, 3)),
+            translation=np.zeros((n, 3)),
+            feed_forward=np.zeros((n, 6)),
+            hold=np.zeros(nv),
+            latched=np.zeros(n, dtype=np.int64),
+            offered=np.zeros(n, dtype=np.int64),
+            pose=np.zeros((n, 4, 4)),
+        )
 
 
 class Active(NamedTuple):
@@ -72,8 +89,10 @@ class Workspace(NamedTuple):
 
     q: Array  # (nv,) [rad]
     v: Array  # (nv,) [rad/s]
+    a: Array  # (nv,) mean of this tick [rad/s^2]
     placements: Placements
     posed: Posed
+    pace: Pace
     contact: Contact
     rows: Rows
     distance: Array  # (p,) [m]
@@ -99,8 +118,10 @@ class Workspace(NamedTuple):
         return cls(
             q=np.zeros(nv),
             v=np.zeros(nv),
+            a=np.zeros(nv),
             placements=Placements.empty(cell.chain),
             posed=Posed.empty(cell.bodies),
+            pace=Pace.empty(cell.chain, cell.bodies),
             contact=Contact.empty(),
             rows=Rows.empty(len(cell.pairs.first), nv),
             distance=np.zeros(len(cell.pairs.first)),

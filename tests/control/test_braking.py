@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from q2r2_control.control.braking import Rollout, brake, certify, step_way
 from q2r2_control.types import Array
 
-from .cells import NAMES, CellArrays, cell, distances, random_posture
+from .cells import NAMES, CellArrays, cell, distances, placed, random_posture
 
 MIN_DISTANCE = 0.02
 ACCELERATION = 10.0
@@ -102,12 +102,15 @@ def _rollout(name: str) -> Rollout:
 def _certified(name: str, motion: Motion, known: Array | None = None) -> bool:
     arrays = cell(name)
     before = distances(arrays, motion.q[None])[0] if known is None else known
+    placements, posed = placed(arrays, motion.q)
     return bool(
         certify(
             arrays.chain,
+            placements,
             arrays.bodies,
             arrays.pairs,
             before,
+            posed,
             motion.v,
             motion.q_next,
             motion.v_next,

@@ -6,6 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from q2r2_control.control.collision import Contact
+from q2r2_control.control.pace import Pace, find_pace
 from q2r2_control.control.separation import Approach, Rows, separation_rows, slowest_rate, speed_near
 from q2r2_control.types import Array
 
@@ -22,6 +23,8 @@ class Seen:
     def __init__(self, name: str, q: Array, v: Array) -> None:
         arrays = cell(name)
         placements, posed = placed(arrays, q)
+        pace = Pace.empty(arrays.chain, arrays.bodies)
+        find_pace(arrays.chain, placements, arrays.bodies, posed, v, pace)
         rows = Rows.empty(len(arrays.pairs.first), len(q))
         self.distance = np.zeros(len(arrays.pairs.first))
         self.closest = separation_rows(
@@ -30,6 +33,7 @@ class Seen:
             arrays.bodies,
             posed,
             arrays.pairs,
+            pace,
             v,
             A,
             H,

@@ -1,0 +1,193 @@
+"""The suite to trust a robot by: named ways to hurt it, each at several tick lengths, the contract at every tick.
+
+Another robot joins by a line in ``ROBOTS``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+import pytest
+
+from q2r2_control.config import Config, load_config
+from q2r2_control.control.controller import CartesianController
+from q2r2_control.control.qp import QpProblem, QpSolution, Solver, make_solver
+from q2r2_control.control.settings import ControllerSettings
+from q2r2_control.robot.robot import Robot
+from q2r2_control.types import Array, StepStatus
+from tests.control.contract import Contract
+from tests.control.scenarios import SCENARIOS, Scenario, back_inwards, circle, crossing
+
+DURATION = 2.0  # [s]
+PANDA_HOME = [0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785]
+Start = Callable[[Robot], tuple[Array, Array]]
+
+
+def _pandas() -> Config:
+    arms = {
+        side: {"model": "example-robot-data:panda", "mount": {"position": [0.0, y, 0.0]}, "home": PANDA_HOME}
+        for side, y in (("left", 0.4), ("right", -0.4))
+    }
+    table = {"shape": "box", "size": [0.8, 1.6, 0.04], "position": [0.75, 0.0, 0.0]}
+    return Config.model_validate({"name": "pandas", "arms": arms, "obstacles": {"table": table}})
+
+
+ROBOTS: dict[str, Callable[[], Config]] = {
+    "iiwa7": lambda: load_config("config/dual_iiwa7.yaml"),
+    "panda": _pandas,
+}
+
+
+class FaultySolver:
+    """A real solver that fails as told for some of every 200 calls in a row."""
+
+    def __init__(self, inner: Solver) -> None:
+        self._inner, self._calls = inner, 0
+        self.fault = ""
+        self.share = 0.2
+
+    def solve(self, problem: QpProblem) -> QpSolution:
+        self._calls += 1
+        solution = self._inner.solve(problem)
+        if not self.fault or self._calls % 200 < 200 * (1.0 - self.share):
+            return solution
+        return {
+            "no solution": QpSolution(None, 0.0),
+            "not finite": QpSolution(np.full(len(problem.g), np.nan), 0.0),
+            "late": QpSolution(solution.v, 1.0),
+            "absurd": QpSolution(np.full(len(problem.g), 1e12), 0.0),
+        }[self.fault]
+
+
+@cache
+def robot_of(name: str) -> Robot:
+    return Robot.from_config(ROBOTS[name]())
+
+
+@cache
+def controller_of(name: str) -> tuple[CartesianController, FaultySolver]:
+    """Made once: reset starts it anew."""
+    settings = ControllerSettings(solve_time_limit=0.05)
+    solver = FaultySolver(make_solver("daqp", robot_of(name).model.nv, None))
+    return CartesianController(robot_of(name), settings, solver=solver), solver
+
+
+def at_home(robot: Robot) -> tuple[Array, Array]:
+    return robot.home.copy(), np.zeros(robot.model.nv)
+
+
+def outside_its_limits(robot: Robot) -> tuple[Array, Array]:
+    """The last joint of every arm 0.05 rad beyond its upper limit."""
+    q, v = at_home(robot)
+    for arm in robot.arms.values():
+        q[arm.joints[-1]] = robot.position_upper[arm.joints[-1]] + 0.05
+    return q, v
+
+
+def in_penetration(robot: Robot) -> tuple[Array, Array]:
+    """The arms overlap by 39 mm: turned inwards and leant forwards until they do."""
+    first = [arm.joints[0] for arm in robot.arms.values()]
+
+    def turned(turn: float) -> Array:
+        q = robot.home.copy()
+        q[first] += np.array([-turn, turn])
+        q[np.add(first, 1)] += 0.25 * turn
+        return q
+
+    def deep(turn: float) -> bool:
+        return min(pair.distance for pair in robot.distances(turned(turn))) <= -0.039
+
+    high = next(turn for turn in np.arange(0.0, 1.5, 0.01) if deep(turn))
+    low = high - 0.01
+    for _ in range(30):
+        middle = 0.5 * (low + high)
+        low, high = (low, middle) if deep(middle) else (middle, high)
+    return turned(high), np.zeros(robot.model.nv)
+
+
+def too_fast(robot: Robot) -> tuple[Array, Array]:
+    """Every joint 1.2 times as fast as it may be, upwards and apart, far from its position limits."""
+    q, v = at_home(robot)
+    for arm, sign in zip(robot.arms.values(), (1.0, -1.0), strict=True):
+        v[arm.joints[0]] = 1.2 * sign * robot.velocity_limit[arm.joints[0]]
+        v[arm.joints[-1]] = 1.2 * sign * robot.velocity_limit[arm.joints[-1]]
+    return q, v
+
+
+def stretched_out(robot: Robot) -> tuple[Array, Array]:
+    """Elbows as straight as the limits allow, leaning forwards."""
+    q, v = at_home(robot)
+    for arm in robot.arms.values():
+        q[arm.joints[:4]] = [0.0, 0.9, 0.0, 0.0]
+    margin = 0.01
+    return np.clip(q, robot.position_lower + margin, robot.position_upper - margin), v
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """Targets over time, where the robot starts, whether ticks jitter, and how the solver fails."""
+
+    scenario: Scenario
+    start: Start = at_home
+    jitter: bool = False
+    fault: str = ""
+
+    @property
+    def starts_well(self) -> bool:
+        return self.start in (at_home, stretched_out)
+
+
+CASES = {
+    **{name: Case(scenario) for name, scenario in SCENARIOS.items()},
+    "start outside": Case(circle, start=outside_its_limits),
+    "start in penetration": Case(crossing, start=in_penetration),
+    "velocity start": Case(crossing, start=too_fast),
+    "singular leave": Case(back_inwards, start=stretched_out),
+    "jittering dt": Case(crossing, jitter=True),
+    "solver failure": Case(crossing, fault="no solution"),
+    "solver not finite": Case(crossing, fault="not finite"),
+    "solver late": Case(crossing, fault="late"),
+    "solver absurd": Case(crossing, fault="absurd"),
+}
+
+
+def ticks_of(dt: float, jitter: bool) -> Iterator[float]:
+    """Lengths of the ticks of one run; jittering ones are between a fifth and five times as long."""
+    random, t = np.random.default_rng(5), 0.0
+    while t < DURATION:
+        length = dt * 5.0 ** random.uniform(-1.0, 1.0) if jitter else dt
+        t += length
+        yield length
+
+
+@pytest.mark.parametrize("dt", [0.001, 0.002, 0.005, 0.01], ids=lambda dt: f"{1e3 * dt:g} ms")
+@pytest.mark.parametrize("robot", ROBOTS)
+@pytest.mark.parametrize("name", CASES)
+def test_the_contract_holds_at_every_tick(name: str, robot: str, dt: float) -> None:
+    case = CASES[name]
+    controller, solver = controller_of(robot)
+    q, v = case.start(controller.robot)
+    controller.reset(q, v)
+    solver.fault = case.fault
+    contract = Contract(controller, q, v)
+    start = {arm: controller.tool_pose(arm) for arm in controller.robot.arms}
+    t, statuses = 0.0, set()
+    for length in ticks_of(dt, case.jitter):
+        reference = controller.step(case.scenario(t, start), length)
+        contract.check(reference, length)
+        statuses.add(reference.report.status)
+        t += length
+    if case.starts_well:
+        assert contract.uncertified == 0
+    if case.fault == "absurd":
+        return  # a number too large is a wish like any other, and may be certified as far as the box allows
+    if case.fault:
+        assert 0.1 < contract.fallback_share < 0.6
+    else:
+        assert contract.fallback_share < (0.01 if case.starts_well else 0.1)
+    if case.start in (outside_its_limits, in_penetration, too_fast):
+        assert StepStatus.RECOVERING in statuses
+        assert reference.report.status is not StepStatus.RECOVERING
