@@ -188,6 +188,14 @@ def test_a_robot_without_masses_is_refused_by_the_name_of_the_joint() -> None:
         MeasuredSeparation(Robot.from_urdf(WEIGHTLESS, {"left": "rod"}), ControllerSettings())
 
 
+def test_a_robot_without_pairs_meets_no_wall() -> None:
+    weight = '<link name="rod"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/>'
+    robot = Robot.from_urdf(WEIGHTLESS.replace('<link name="rod"/>', weight + "</inertial></link>"), {"left": "rod"})
+    report = MeasuredSeparation(robot, ControllerSettings()).update(np.zeros(1), np.ones(1))
+    assert not report.tau.any()
+    assert report.closest_distance == np.inf
+
+
 @dataclass(frozen=True)
 class _Seen:
     """One tick of a simulated push."""
