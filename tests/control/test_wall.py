@@ -127,14 +127,14 @@ def test_the_damping_takes_energy_at_every_velocity() -> None:
 
 def test_the_torque_grows_gradually_into_the_shell_while_closing() -> None:
     crossed = 0
-    for q, report in _postures()[:20]:
+    for q, report in _postures()[:12]:
         # From outside along the torque, at a speed of its own, in steps of a few micrometres.
         direction = report.tau / np.linalg.norm(report.tau)
         way = np.linspace(0.1, 0.0, 8001)
         torques = np.array([wall().update(q + s * direction, -0.3 * direction).tau for s in way])
         assert np.linalg.norm(np.diff(torques, axis=0), axis=1).max() < 1.5
         crossed += bool(not torques[0].any() and np.linalg.norm(torques[-1]) > 10.0)
-    assert crossed >= 5
+    assert crossed >= 3
 
 
 def test_default_stiffness_is_never_scaled_down_and_stacked_pairs_of_a_hard_wall_are() -> None:
