@@ -81,7 +81,8 @@ def remove_overlapping_own_pairs(
     """
     data, geometry_data = model.createData(), geometry.createData()
     names = pair_names(geometry)
-    touching = np.array([any({link_of(name) for name in pair} <= links for links in own_links) for pair in names])
+    within_one_arm = [any({link_of(name) for name in pair} <= links for links in own_links) for pair in names]
+    touching = np.array(within_one_arm, dtype=bool)  # of no pair too
     for q in postures:
         pin.computeDistances(model, data, geometry, geometry_data, q)
         touching &= np.array([result.min_distance <= 0 for result in geometry_data.distanceResults], dtype=bool)

@@ -171,6 +171,16 @@ def test_an_endless_joint_is_bounded() -> None:
     np.testing.assert_allclose(robot.position_upper, 4 * np.pi)
 
 
+BARE = """<robot name="rod"><link name="base"/><link name="rod"/><joint name="hinge" type="revolute">
+<parent link="base"/><child link="rod"/><limit lower="-1" upper="1" velocity="1" effort="1"/></joint></robot>"""
+
+
+def test_a_robot_without_collision_shapes_loads_and_watches_no_pair() -> None:
+    robot = Robot.from_urdf(BARE, {"left": "rod"})
+    assert robot.distances(robot.home) == []
+    assert robot.ignored_pairs == ()
+
+
 def test_two_pandas_load_with_seven_joints_each(dual_panda: Robot) -> None:
     assert dual_panda.joint_names == tuple(
         f"{side}_panda_joint{number}" for side in ("left", "right") for number in range(1, 8)
