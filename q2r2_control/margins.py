@@ -37,29 +37,29 @@ class Margin:
 
 def contract_margins() -> dict[str, Margin]:
     """What :class:`ContractWatch` checks, by short names."""
-    rounding, coal = 1e-9, 1e-8  # [relative; rad], [m]: Coal's own accuracy
+    rounding, coal = 1e-9, 2e-6  # [relative; rad]; [m], as exactly as Coal measures a capsule from a box
     rows = {
         "exceptions": ("exceptions raised by step", "", "<=", 0.0),
-        "not_finite": ("references with numbers that are not finite", "", "<=", 0.0),
+        "not_finite": ("references that are not finite", "", "<=", 0.0),
         "unreported": ("unusable targets not reported", "", "<=", 0.0),
-        "refused": ("usable targets reported as rejected", "", "<=", 0.0),
+        "refused": ("usable targets rejected", "", "<=", 0.0),
         "idle": ("motion in a dt that is no time", "rad", "<=", 0.0),
         "acceleration": ("acceleration / limit", "", "<=", 1.0 + rounding),
         "velocity": ("velocity / limit", "", "<=", 1.0 + rounding),
-        "too_fast": ("started above the velocity limit: faster still", "rad/s", "<=", rounding),
-        "position": ("room to position limits less margin", "rad", ">=", -rounding),
-        "outward": ("started outside position limits: outward, not braking", "rad", "<=", rounding),
-        "jump": ("way of a tick / way that the velocities allow", "", "<=", 1.0 + rounding),
-        "parabola": ("reference off constant acceleration or stop", "rad", "<=", 1e-11),
-        "distance": ("least distance less min_distance, at ticks", "m", ">=", 0.0),
-        "between": ("least distance less min_distance, between ticks", "m", ">=", -coal),
-        "stop": ("least distance less min_distance, during full stops", "m", ">=", -coal),
-        "stop_position": ("room to position limits where a full stop ends", "rad", ">=", -rounding),
-        "truth": ("reported least distance off Coal's", "m", "<=", coal),
-        "bystanders": ("pairs apart less min_distance, others recovering", "m", ">=", -coal),
-        "uncertified": ("ticks without a certificate that was known before", "", "<=", 0.0),
-        "approach": ("started in penetration: coming closer in a tick", "m", "<=", rounding),
-        "not_stopped": ("solver failed: off the certified stop", "rad, rad/s", "<=", 1e-11),
+        "too_fast": ("started too fast: faster still", "rad/s", "<=", rounding),
+        "position": ("room to position limits", "rad", ">=", -rounding),
+        "outward": ("started outside limits: further out", "rad", "<=", rounding),
+        "jump": ("way of a tick / way that v allows", "", "<=", 1.0 + rounding),
+        "parabola": ("off constant acceleration or the stop", "rad", "<=", 1e-11),
+        "distance": ("distance - min_distance, at ticks", "m", ">=", 0.0),
+        "between": ("distance - min_distance, between ticks", "m", ">=", -coal),
+        "stop": ("distance - min_distance, full stops", "m", ">=", -coal),
+        "stop_position": ("room to position limits, full stops", "rad", ">=", -rounding),
+        "truth": ("reported distance off Coal's", "m", "<=", coal),
+        "bystanders": ("pairs apart while others recover", "m", ">=", -coal),
+        "uncertified": ("certificates lost", "", "<=", 0.0),
+        "approach": ("recovery: closer by, in a tick", "m", "<=", rounding),
+        "not_stopped": ("solver failed: off the stop", "rad, rad/s", "<=", 1e-11),
         "unsaid": ("solver failed: stop not reported", "", "<=", 0.0),
     }
     return {key: Margin(*row) for key, row in rows.items()}

@@ -83,7 +83,7 @@ class SoakReport:
         return asdict(self) | {"passed": self.passed}
 
 
-def run_soak(config: Config, ticks: int, seed: int, progress: Callable[[int], None] = lambda tick: None) -> SoakReport:
+def run_soak(config: Config, ticks: int, seed: int, progress: Callable[[str], None] = lambda what: None) -> SoakReport:
     """Soak the controller of a cell. Raises :class:`ConfigError` for fewer than 100 ticks or a negative seed."""
     if ticks < FEWEST_TICKS:
         raise ConfigError(f"soak: ticks = {ticks}: allowed: {FEWEST_TICKS} or more")
@@ -106,7 +106,7 @@ class Soak:
         controller: Steppable,
         solver: FaultySolver,
         seed: int,
-        progress: Callable[[int], None] = lambda tick: None,
+        progress: Callable[[str], None] = lambda what: None,
     ) -> None:
         self._cell, self._controller, self._solver, self._seed = cell, controller, solver, seed
         self._progress = progress
@@ -122,7 +122,7 @@ class Soak:
             if tick == settled:
                 before = _memory_mb()
             if tick % max(ticks // 20, 1) == 0:
-                self._progress(tick)
+                self._progress(f"tick {tick} of {ticks}")
             self._tick(tick, segment, since)
         after = _memory_mb()
         return SoakReport(

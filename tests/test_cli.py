@@ -122,6 +122,7 @@ def test_the_help_lists_every_command(command: str) -> None:
         pytest.param(("headset-check", "--duration", "inf"), "--duration inf", id="a check without end"),
         pytest.param(("check", "pyproject.toml"), "pyproject.toml", id="a file that is no cell"),
         pytest.param(("bench", "--ticks", "0"), "--ticks", id="a benchmark of nothing"),
+        pytest.param(("bench", "--seed", "3"), "--seed", id="a seed of what draws nothing"),
     ],
 )
 def test_bad_usage_ends_in_exit_code_2_and_one_line_that_names_it(arguments: tuple[str, ...], named: str) -> None:
@@ -277,8 +278,20 @@ def test_ctrl_c_brings_the_arms_to_rest_and_ends_a_headset_run_with_its_summary(
 
 
 def test_bench_times_every_scenario() -> None:
-    report = one_object(q2r2("bench", "--ticks", "100", "--json").stdout)
+    report = one_object(q2r2("bench", "--no-peers", "--ticks", "100", "--json").stdout)
     assert {row["ticks"] for row in report["rows"]} == {100}
     assert all(0.0 < row["median_us"] <= row["p99_us"] <= row["max_us"] for row in report["rows"])
-    table = q2r2("bench", "--ticks", "100").stdout
+    assert all(row["min_distance_mm"] >= 20.0 for row in report["rows"])
+    table = q2r2("bench", "--no-peers", "--ticks", "100").stdout
     assert all(row["name"] in table for row in report["rows"])
+
+
+def test_a_soak_prints_every_promise_and_ends_in_0_when_all_were_kept() -> None:
+    result = q2r2("bench", "--soak", "--ticks", "400", "--seed", "1", "--json")
+    report = one_object(result.stdout)
+    assert report["passed"]
+    assert result.exit_code == 0
+    assert report["ticks"] == 400
+    assert {margin["violations"] for margin in report["margins"]} == {0}
+    table = q2r2("bench", "--soak", "--ticks", "100").stdout
+    assert "acceleration / limit" in table
