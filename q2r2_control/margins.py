@@ -59,7 +59,7 @@ def contract_margins() -> dict[str, Margin]:
         "bystanders": ("pairs apart while others recover", "m", ">=", -coal),
         "uncertified": ("certificates lost", "", "<=", 0.0),
         "approach": ("recovery: closer by, in a tick", "m", "<=", rounding),
-        "not_stopped": ("solver failed: off the stop", "rad, rad/s", "<=", 1e-11),
+        "not_stopped": ("solver failed: off the stop", "rad", "<=", 1e-11),
         "unsaid": ("solver failed: stop not reported", "", "<=", 0.0),
     }
     return {key: Margin(*row) for key, row in rows.items()}

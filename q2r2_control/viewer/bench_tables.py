@@ -32,7 +32,7 @@ def deeds_table(report: BenchReport) -> Table:
     table = _table(
         "what they did",
         "controller",
-        ("a / limit", "v / limit", "room [rad]", "nearest [mm]", "failed", "stops", "tail [rad/s^2]"),
+        ("a / limit", "v / limit", "room [rad]", "nearest [mm]", "held", "tail [rad/s^2]"),
     )
     for row in _by_scenario(report, table):
         deeds = row.deeds
@@ -42,11 +42,11 @@ def deeds_table(report: BenchReport) -> Table:
             f"{deeds.max_velocity_ratio:.2f}",
             f"{deeds.min_position_margin_rad:.3f}",
             f"{deeds.min_distance_mm:.2f}",
-            str(deeds.failures),
-            "" if row.fallback_ticks is None else str(row.fallback_ticks),
+            str(deeds.failures if row.fallback_ticks is None else row.fallback_ticks),
             f"{deeds.tail_acceleration:.3f}",
         )
-    table.caption = Text("\n".join(report.notes)) if report.notes else None
+    held = "held: ticks without a solution, in which a peer's arms stand still and ours execute the certified stop"
+    table.caption = Text("\n".join([held, *report.notes]))
     table.caption_justify = "left"
     return table
 
@@ -70,14 +70,13 @@ def soak_table(report: SoakReport) -> Table:
     )
     for margin in report.margins:
         unit = f" {margin.unit}" if margin.unit else ""
-        worst = "" if math.isinf(margin.worst) and not margin.violations else f"{margin.worst:.4g}{unit}"
-        allowed = f"{margin.sense} {margin.allowed:.10g}"
-        tick = "" if margin.tick is None else str(margin.tick)
+        worst = "" if math.isinf(margin.worst) and not margin.violations else f"{margin.worst:.2g}{unit}"
+        allowed = f"{margin.sense} {margin.allowed:.2g}"
         style = "red" if margin.violations else None
-        table.add_row(Text(margin.name), worst, allowed, str(margin.checked), str(margin.violations), tick, style=style)
+        table.add_row(Text(margin.name), worst, allowed, str(margin.checked), str(margin.violations), style=style)
     if report.memory_growth_mb is not None:
         grown, broken = f"{report.memory_growth_mb:.2f} MB", str(int(report.memory_growth_mb > MEMORY_ALLOWED))
-        table.add_row("memory growth after a tenth of the ticks", grown, f"<= {MEMORY_ALLOWED:g}", "1", broken)
+        table.add_row("memory growth after a tenth of it", grown, f"<= {MEMORY_ALLOWED:g}", "1", broken)
     table.caption = Text(_circumstances(report))
     table.caption_justify = "left"
     return table
