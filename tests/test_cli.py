@@ -16,6 +16,7 @@ from typer.testing import CliRunner, Result
 
 from q2r2_control.cli import app
 from q2r2_control.resources import find_resource
+from q2r2_control.soak import SoakReport, run_soak
 
 CELL = "config/dual_iiwa7.yaml"
 COMMANDS = ("demo", "run", "check", "headset-check", "bench")
@@ -295,3 +296,15 @@ def test_a_soak_prints_every_promise_and_ends_in_0_when_all_were_kept() -> None:
     assert {margin["violations"] for margin in report["margins"]} == {0}
     table = q2r2("bench", "--soak", "--ticks", "100").stdout
     assert "acceleration / limit" in table
+
+
+def test_a_soak_that_finds_something_ends_in_1(monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*arguments: Any) -> SoakReport:
+        report = run_soak(*arguments)
+        report.margins[0].note(1.0, 7)
+        return report
+
+    monkeypatch.setattr("q2r2_control.cli.run_soak", broken)
+    result = q2r2("bench", "--soak", "--ticks", "100", "--json")
+    assert result.exit_code == 1
+    assert not one_object(result.stdout)["passed"]

@@ -93,6 +93,10 @@ def _circumstances(report: SoakReport) -> str:
             f"first broken at tick {found.tick}: {found.promise}{error}"
             f" [tick {found.since_segment} of: {found.segment}; dt {found.dt}]"
         )
+    if report.broken:
+        lines.append(
+            f"to see the first again: q2r2 bench --soak --seed {report.seed} --ticks {report.broken[0].tick + 1}"
+        )
     return "\n".join(lines)
 
 

@@ -50,3 +50,4 @@ def test_a_broken_promise_stands_in_the_table_with_its_tick_and_its_segment() ->
     assert "-0.25 m" in text
     assert "first broken at tick 7: least distance" in " ".join(text.split())
     assert "teleport, dt 1 ms" in " ".join(text.split())
+    assert "q2r2 bench --soak --seed 5 --ticks 8" in " ".join(text.split())
