@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV   := .venv
 BIN    := $(VENV)/bin
 
-.PHONY: setup demo test lint bench clean
+.PHONY: setup demo test lint bench soak clean
 .DEFAULT_GOAL := setup
 
 setup: $(VENV)/.installed
@@ -27,8 +27,15 @@ lint: setup
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-bench: setup
+bench: $(VENV)/.installed-bench
 	$(BIN)/q2r2 bench
+
+# The peers to compare with. Where they cannot be had, the bench says so and does without.
+$(VENV)/.installed-bench: $(VENV)/.installed
+	$(BIN)/python -m pip install --quiet --editable '.[bench]' && touch $@ || true
+
+soak: setup
+	$(BIN)/q2r2 bench --soak
 
 clean:
 	rm -rf $(VENV) build *.egg-info .mypy_cache .ruff_cache .pytest_cache

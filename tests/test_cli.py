@@ -16,6 +16,7 @@ from typer.testing import CliRunner, Result
 
 from q2r2_control.cli import app
 from q2r2_control.resources import find_resource
+from q2r2_control.soak import SoakReport, run_soak
 
 CELL = "config/dual_iiwa7.yaml"
 COMMANDS = ("demo", "run", "check", "headset-check", "bench")
@@ -122,6 +123,7 @@ def test_the_help_lists_every_command(command: str) -> None:
         pytest.param(("headset-check", "--duration", "inf"), "--duration inf", id="a check without end"),
         pytest.param(("check", "pyproject.toml"), "pyproject.toml", id="a file that is no cell"),
         pytest.param(("bench", "--ticks", "0"), "--ticks", id="a benchmark of nothing"),
+        pytest.param(("bench", "--seed", "3"), "--seed", id="a seed of what draws nothing"),
     ],
 )
 def test_bad_usage_ends_in_exit_code_2_and_one_line_that_names_it(arguments: tuple[str, ...], named: str) -> None:
@@ -277,8 +279,32 @@ def test_ctrl_c_brings_the_arms_to_rest_and_ends_a_headset_run_with_its_summary(
 
 
 def test_bench_times_every_scenario() -> None:
-    report = one_object(q2r2("bench", "--ticks", "100", "--json").stdout)
+    report = one_object(q2r2("bench", "--no-peers", "--ticks", "100", "--json").stdout)
     assert {row["ticks"] for row in report["rows"]} == {100}
     assert all(0.0 < row["median_us"] <= row["p99_us"] <= row["max_us"] for row in report["rows"])
-    table = q2r2("bench", "--ticks", "100").stdout
+    assert all(row["min_distance_mm"] >= 20.0 for row in report["rows"])
+    table = q2r2("bench", "--no-peers", "--ticks", "100").stdout
     assert all(row["name"] in table for row in report["rows"])
+
+
+def test_a_soak_prints_every_promise_and_ends_in_0_when_all_were_kept() -> None:
+    result = q2r2("bench", "--soak", "--ticks", "400", "--seed", "1", "--json")
+    report = one_object(result.stdout)
+    assert report["passed"]
+    assert result.exit_code == 0
+    assert report["ticks"] == 400
+    assert {margin["violations"] for margin in report["margins"]} == {0}
+    table = q2r2("bench", "--soak", "--ticks", "100").stdout
+    assert "acceleration / limit" in table
+
+
+def test_a_soak_that_finds_something_ends_in_1(monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*arguments: Any) -> SoakReport:
+        report = run_soak(*arguments)
+        report.margins[0].note(1.0, 7)
+        return report
+
+    monkeypatch.setattr("q2r2_control.cli.run_soak", broken)
+    result = q2r2("bench", "--soak", "--ticks", "100", "--json")
+    assert result.exit_code == 1
+    assert not one_object(result.stdout)["passed"]

@@ -13,7 +13,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 # Distributions whose import has another name.
-IMPORTS = {"pin": "pinocchio", "example-robot-data-loaders": "example_robot_data", "PyYAML": "yaml"}
+IMPORTS = {"pin": "pinocchio", "example-robot-data-loaders": "example_robot_data", "PyYAML": "yaml", "pin-pink": "pink"}
 
 
 def dependencies() -> list[str]:
@@ -21,14 +21,22 @@ def dependencies() -> list[str]:
     return [re.split(r"[<>=]", entry)[0] for entry in project["dependencies"]]
 
 
+def dependencies_to_compare() -> list[str]:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    return list(project["optional-dependencies"]["bench"])
+
+
 def imported() -> set[str]:
+    return set().union(*(imported_by(file) for file in (ROOT / "q2r2_control").rglob("*.py")))
+
+
+def imported_by(file: Path) -> set[str]:
     names = set()
-    for file in (ROOT / "q2r2_control").rglob("*.py"):
-        for node in ast.walk(ast.parse(file.read_text())):
-            if isinstance(node, ast.Import):
-                names |= {alias.name.split(".")[0] for alias in node.names}
-            elif isinstance(node, ast.ImportFrom) and node.module:
-                names.add(node.module.split(".")[0])
+    for node in ast.walk(ast.parse(file.read_text())):
+        if isinstance(node, ast.Import):
+            names |= {alias.name.split(".")[0] for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            names.add(node.module.split(".")[0])
     return names
 
 
@@ -39,8 +47,16 @@ def test_every_dependency_is_imported_by_the_package(dependency: str) -> None:
 
 def test_everything_that_is_imported_is_a_dependency() -> None:
     # coal comes with pin, glfw with mujoco.
-    known = {IMPORTS.get(name, name) for name in dependencies()} | {"coal", "glfw"}
+    known = {IMPORTS.get(name, name) for name in dependencies() + dependencies_to_compare()} | {"coal", "glfw"}
     assert imported() - known - set(sys.stdlib_module_names) == {"q2r2_control"}
+
+
+def test_peers_are_imported_by_their_own_modules_only() -> None:
+    peers = {IMPORTS.get(name, name) for name in dependencies_to_compare()}
+    for file in (ROOT / "q2r2_control").rglob("*.py"):
+        if peers & imported_by(file):
+            assert file.parent.name == "peers"
+            assert peers & imported_by(file) == {file.stem}
 
 
 def test_the_code_in_the_readme_runs() -> None:

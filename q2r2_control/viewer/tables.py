@@ -5,7 +5,6 @@ from __future__ import annotations
 from rich.table import Table
 from rich.text import Text
 
-from q2r2_control.bench import BenchReport
 from q2r2_control.cell_check import ArmCheck, CellCheck, PairsWritten
 from q2r2_control.headset_check import HeadsetCheck
 from q2r2_control.inputs.messages import HandMessage, HandPose, HandTwist
@@ -82,20 +81,6 @@ def pair_reach_table(pairs: PairsWritten) -> Table:
     table.add_column(Text("nearest found [mm]"), justify="right")
     for pair in pairs.never:
         table.add_row(f"{pair.link_a} | {pair.link_b}", f"{1e3 * pair.nearest:.0f}")
-    return table
-
-
-def bench_table(report: BenchReport) -> Table:
-    """How long a tick takes."""
-    title = f"{report.cell}: one tick of the controller, {report.pairs} pairs"
-    table = Table(title=Text(title), title_justify="left", min_width=len(title))
-    table.add_column("scenario", no_wrap=True)
-    for column in ("median [us]", "p99 [us]", "max [us]", "nearest [mm]", "a / limit", "stops"):
-        table.add_column(Text(column), justify="right")
-    for row in report.rows:
-        times = (f"{value:.0f}" for value in (row.median_us, row.p99_us, row.max_us))
-        figures = (f"{row.min_distance_mm:.2f}", f"{row.max_acceleration_ratio:.3f}", str(row.fallback_ticks))
-        table.add_row(row.name, *times, *figures)
     return table
 
 

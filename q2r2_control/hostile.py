@@ -1,0 +1,209 @@
+"""Streams of targets that a controller has to survive: hostile ones, drawn at random from a seed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+import pinocchio as pin
+
+from q2r2_control.robot.robot import Robot
+from q2r2_control.types import Array
+
+
+class Asked(NamedTuple):
+    """What one tick asks of the controller."""
+
+    targets: dict[str, Any]
+    unusable: frozenset[str]  # arms whose target has to be reported as rejected
+
+
+# From the tick within the segment and the last reference's joint positions (nv,) to what is asked.
+Stream = Callable[[int, Array], Asked]
+_NONE: frozenset[str] = frozenset()
+_WORKSPACE = np.array([[-0.6, -1.1, -0.1], [1.1, 1.1, 1.4]])  # [m]
+
+
+class Adversary:
+    """Draws streams for the arms of one robot. Every name in :attr:`names` is a method that makes one."""
+
+    names = (
+        "hold",
+        "stay_home",
+        "teleport",
+        "crossing",
+        "same_point",
+        "unreachable",
+        "into_the_table",
+        "random_walk",
+        "garbage",
+        "missing_arms",
+        "elbow",
+        "chatter",
+        "shaking",
+        "postures",
+    )
+
+    def __init__(self, robot: Robot, random: np.random.Generator) -> None:
+        self._robot, self._random = robot, random
+        self._arms = tuple(robot.arms)
+        self._others = {arm: self._arms[i - 1] for i, arm in enumerate(self._arms)}
+        self._home = {arm: robot.tool_pose(robot.home, arm) for arm in self._arms}
+        self._data = robot.model.createData()
+
+    def stream(self, name: str) -> Stream:
+        """A new stream of the kind ``name``."""
+        made: Stream = getattr(self, f"_{name}")()
+        return made
+
+    def pose(self) -> pin.SE3:
+        """A tool pose anywhere around the cell."""
+        return pin.SE3(pin.exp3(self._random.normal(size=3) * 1.5), self._random.uniform(*_WORKSPACE))
+
+    def _constant(self, targets: dict[str, Any]) -> Stream:
+        asked = Asked(targets, _NONE)
+        return lambda tick, q: asked
+
+    def _poses(self) -> dict[str, Any]:
+        return {arm: self.pose() for arm in self._arms}
+
+    def _moved(self, by: Callable[[], Array]) -> dict[str, Any]:
+        return {arm: pin.SE3(pose.rotation, pose.translation + by()) for arm, pose in self._home.items()}
+
+    def _hold(self) -> Stream:
+        return self._constant({})
+
+    def _stay_home(self) -> Stream:
+        return self._constant(dict(self._home))
+
+    def _teleport(self) -> Stream:
+        """Somewhere else every now and then, each time for as long."""
+        return self._renewed(int(self._random.integers(5, 800)), self._poses)
+
+    def _postures(self) -> Stream:
+        """Where the tools are in random postures, many of them at joint limits."""
+
+        def poses() -> dict[str, Any]:
+            q = self._random.uniform(self._robot.position_lower, self._robot.position_upper)
+            at_limit = self._random.random(len(q)) < 0.3
+            q[at_limit] = np.where(q > 0.0, self._robot.position_upper, self._robot.position_lower)[at_limit]
+            return {arm: self._robot.tool_pose(q, arm) for arm in self._arms}
+
+        return self._renewed(int(self._random.integers(100, 1500)), poses)
+
+    def _renewed(self, period: int, poses: Callable[[], dict[str, Any]]) -> Stream:
+        asked = Asked({}, _NONE)
+
+        def stream(tick: int, q: Array) -> Asked:
+            nonlocal asked
+            if tick % period == 0:
+                asked = Asked(poses(), _NONE)
+            return asked
+
+        return stream
+
+    def _crossing(self) -> Stream:
+        """Each tool is asked to be where another one started."""
+        return self._constant({arm: self._home[self._others[arm]] for arm in self._arms})
+
+    def _same_point(self) -> Stream:
+        place = self._random.uniform([0.2, -0.5, 0.3], [0.8, 0.5, 1.0])
+        return self._constant({arm: pin.SE3(pose.rotation, place) for arm, pose in self._home.items()})
+
+    def _unreachable(self) -> Stream:
+        """Metres away, or farther than any cell is large."""
+        size = 10.0 ** self._random.uniform(0.3, 200.0 if self._random.random() < 0.2 else 2.0)
+        return self._constant(self._moved(lambda: self._random.normal(size=3) * size))
+
+    def _into_the_table(self) -> Stream:
+        depth = self._random.uniform(0.1, 1.0)
+        return self._constant(self._moved(lambda: np.array([*self._random.uniform(-0.3, 0.3, size=2), -depth])))
+
+    def _random_walk(self) -> Stream:
+        """Speeds far above what an arm can do; the walk is drawn back to home."""
+        speed, turn = self._random.uniform(0.001, 0.05), self._random.uniform(0.0, 0.1)
+        poses = {arm: pose.copy() for arm, pose in self._home.items()}
+
+        def stream(tick: int, q: Array) -> Asked:
+            for arm, pose in poses.items():
+                back = 0.002 * (self._home[arm].translation - pose.translation)
+                rotation = pin.exp3(turn * self._random.normal(size=3)) @ pose.rotation
+                poses[arm] = pin.SE3(rotation, pose.translation + back + speed * self._random.normal(size=3))
+            return Asked(dict(poses), _NONE)
+
+        return stream
+
+    def _garbage(self) -> Stream:
+        """Something useless for some arms, and for arms that there are not."""
+
+        def stream(tick: int, q: Array) -> Asked:
+            targets: dict[str, Any] = self._poses()
+            unusable = set()
+            for arm in (*self._arms, "nobody"):
+                if self._random.random() < 0.5:
+                    targets[arm] = self._useless()
+                    unusable.add(arm)
+            return Asked(targets, frozenset(unusable))
+
+        return stream
+
+    def _useless(self) -> Any:
+        kind = int(self._random.integers(7))
+        pose = self.pose()
+        if kind == 0:
+            pose.translation = np.full(3, np.nan)
+        elif kind == 1:
+            pose.translation = np.array([np.inf, 0.0, -np.inf])
+        elif kind == 2:
+            pose.rotation = pose.rotation * float(self._random.choice([0.0, 0.5, -1.0, 1e150, np.inf, np.nan]))
+        elif kind == 3:
+            pose.rotation = np.diag([1.0, 1.0, -1.0])
+        elif kind == 4:
+            pose.rotation = self._random.normal(size=(3, 3)) + 3.0 * np.eye(3)
+        else:
+            return ("here", np.eye(4))[kind - 5]
+        return pose
+
+    def _missing_arms(self) -> Stream:
+        """An arm is asked something in one tick and nothing in the next."""
+        poses = self._poses()
+
+        def stream(tick: int, q: Array) -> Asked:
+            present = {arm: pose for arm, pose in poses.items() if self._random.random() < 0.7}
+            return Asked(present | {arm: None for arm in self._arms if self._random.random() < 0.2}, _NONE)
+
+        return stream
+
+    def _elbow(self) -> Stream:
+        """One tool reaches for the middle of another arm, which reaches elsewhere."""
+        chaser = str(self._random.choice(self._arms))
+        joint = int(self._robot.arms[self._others[chaser]].joints[3 if self._random.random() < 0.5 else 5]) + 1
+        asked = Asked({}, _NONE)
+        elsewhere = self._poses()
+
+        def stream(tick: int, q: Array) -> Asked:
+            nonlocal asked
+            if tick % 10 == 0:
+                pin.forwardKinematics(self._robot.model, self._data, q)
+                there = pin.SE3(self._home[chaser].rotation, self._data.oMi[joint].translation.copy())
+                asked = Asked(elsewhere | {chaser: there}, _NONE)
+            return asked
+
+        return stream
+
+    def _chatter(self) -> Stream:
+        """Back and forth at every tick."""
+        pair = [Asked(self._poses(), _NONE), Asked(self._poses(), _NONE)]
+        return lambda tick, q: pair[tick % 2]
+
+    def _shaking(self) -> Stream:
+        """As fast as the tool can go or faster, sideways towards the other arm."""
+        size, rate = self._random.uniform(0.05, 0.6), self._random.uniform(0.005, 0.1)
+        along = self._random.normal(size=3) * [0.3, 1.0, 0.3]
+
+        def stream(tick: int, q: Array) -> Asked:
+            by = size * np.sin(rate * tick) * along
+            return Asked(self._moved(lambda: by), _NONE)
+
+        return stream
