@@ -1,0 +1,118 @@
+"""Pure pieces of Cartesian impedance control: pose error, task inertia, damping design, nullspaces, torque bounds.
+
+Task vectors (6,) are linear, then angular, in world axes at the tool's origin; J (6, n) is that Jacobian of an arm's n
+joints. Stiffness [N/m, Nm/rad], damping [Ns/m, Nms/rad], task inertia [kg, kg m^2].
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+
+from q2r2_control.types import Array
+
+# A length that makes a radian comparable to a metre [m/rad], as in the QP's tool task.
+_METRES = np.array([1.0, 1.0, 1.0, 0.3, 0.3, 0.3])
+# No direction of a tool counts for more than this [kg], a rotation for this times 0.3^2 [kg m^2]. An arm whose
+# rotors weigh most of it stays below a fifth of it in every posture that it works in.
+_HEAVIEST = 1000.0
+# A direction in which the scaled Jacobian is smaller is taken for one in which the arm cannot move its tool.
+_LEAST_MOTION = 0.05  # [m/rad]
+
+
+def pose_error(goal: pin.SE3, pose: pin.SE3) -> Array:
+    """Way from ``pose`` to ``goal`` (6,): difference of positions [m], rotation vector [rad], in world axes."""
+    return np.concatenate([goal.translation - pose.translation, pin.log3(goal.rotation @ pose.rotation.T)])
+
+
+def clip_error(error: Array, position: float, rotation: float) -> tuple[Array, bool]:
+    """``error`` (6,) with each part no longer than ``position`` [m], ``rotation`` [rad]; and whether it was longer."""
+    lengths = np.array([np.linalg.norm(error[:3]), np.linalg.norm(error[3:])])
+    longest = np.array([position, rotation])
+    factor = longest / np.maximum(lengths, longest)
+    return error * np.repeat(factor, 3), bool((factor < 1.0).any())
+
+
+def task_inertia(J: Array, M_inverse: Array) -> Array:
+    """Inertia Lambda = (J M^-1 J')^-1 (6, 6) that a hand at the tool feels (Khatib 1987, eq. 18).
+
+    Near a singular posture the mobility J M^-1 J' vanishes along some direction and Lambda, and with it the damping
+    force, would grow without bound. There the mobility's eigenvalues, after a radian was made comparable to a metre,
+    are raised to that of 1000 kg. All others stay exact, other than with a damping term on the diagonal, which would
+    make the projector that is built with Lambda leak everywhere.
+    """
+    return _floored_inverse(J @ M_inverse @ J.T, 1.0 / _HEAVIEST)
+
+
+def _floored_inverse(A: Array, least: float) -> Array:
+    """Inverse of a symmetric positive semidefinite A (6, 6) whose scaled eigenvalues are raised to ``least``."""
+    values, vectors = np.linalg.eigh(A * np.outer(_METRES, _METRES))
+    vectors *= _METRES[:, None]
+    inverse: Array = (vectors / np.maximum(values, least)) @ vectors.T
+    return inverse
+
+
+def double_diagonalised_damping(stiffness: Array, inertia: Array, damping_ratio: float) -> Array:
+    """Damping D (n, n) that gives every mode of  inertia x'' + D x' + stiffness x = 0  the damping ratio xi.
+
+    Both matrices symmetric positive definite (n, n). Albu-Schaeffer, Ott, Frese, Hirzinger: "Cartesian impedance
+    control of redundant robots: recent results with the DLR-light-weight-arms", ICRA 2003: K v = lambda Lambda v with
+    V' Lambda V = I, Q = V^-1, D = 2 Q' diag(xi sqrt(lambda)) Q. With Lambda = L L' and the eigenvectors U of the
+    symmetric L^-1 K L^-T, V = L^-T U and Q = U' L', so that nothing but a triangle has to be inverted.
+    """
+    L = np.linalg.cholesky(inertia)
+    half = np.linalg.solve(L, stiffness)
+    eigenvalues, U = np.linalg.eigh(np.linalg.solve(L, half.T))
+    Q = (L @ U).T
+    D: Array = Q.T @ (2.0 * damping_ratio * np.sqrt(np.maximum(eigenvalues, 0.0))[:, None] * Q)
+    return D
+
+
+def consistent_projector(J: Array, M_inverse: Array, inertia: Array) -> Array:
+    """N (n, n): torque N tau accelerates no tool, J M^-1 N = 0: I - J' Lambda J M^-1 (Khatib 1987, eq. 51)."""
+    return np.eye(J.shape[1]) - J.T @ inertia @ J @ M_inverse
+
+
+def kinematic_projector(J: Array) -> Array:
+    """N (n, n): torque N tau balances no static force at the tool, J N = 0: I - J' J'^+; needs no inertia."""
+    return np.eye(J.shape[1]) - J.T @ _floored_inverse(J @ J.T, _LEAST_MOTION**2) @ J
+
+
+def limit_repulsion(
+    q: Array, v: Array, wanted: Array, lower: Array, upper: Array, stiffness: float, damping: float, reach: float
+) -> Array:
+    """Torque (n,) [Nm] away from position limits, a spring [Nm/rad] that begins ``reach`` [rad] before each.
+
+    Where ``wanted`` (n,), the reference, lies nearer to the limit, the spring begins there: the reference keeps the
+    limits by itself, and what holds a joint off its reference would hold the tool off its target. The damping
+    [Nms/rad] grows from 0 over the reach, so that the torque does not jump, and it only brakes, it never pulls.
+    """
+    below = np.maximum(np.minimum(lower + reach, wanted) - q, 0.0)
+    above = np.maximum(q - np.maximum(upper - reach, wanted), 0.0)
+    share = damping / reach
+    towards_upper: Array = np.maximum(stiffness * below - share * np.minimum(below, reach) * v, 0.0)
+    towards_lower: Array = np.maximum(stiffness * above + share * np.minimum(above, reach) * v, 0.0)
+    return towards_upper - towards_lower
+
+
+@dataclass(frozen=True, slots=True)
+class BoundedTorque:
+    """A torque within its bounds, and which bounds held it back."""
+
+    tau: Array  # (n,) [Nm]
+    saturated: Array  # (n,) bool
+    rate_limited: Array  # (n,) bool
+
+
+def bound_torque(tau: Array, last: Array, limit: Array, change: float) -> BoundedTorque:
+    """``tau`` (n,) within +-``limit`` (n,) and no further than ``change`` from ``last`` (n,), all [Nm].
+
+    First the torque is saturated, then it approaches what remains by at most ``change``. Both bounds hold afterwards
+    whenever ``last`` is within the limit: the result lies between ``last`` and the saturated torque, hence within the
+    limit too.
+    """
+    saturated = np.minimum(np.maximum(tau, -limit), limit)
+    bounded = np.minimum(np.maximum(saturated, last - change), last + change)
+    return BoundedTorque(bounded, saturated != tau, bounded != saturated)
