@@ -6,6 +6,7 @@ joints. Stiffness [N/m, Nm/rad], damping [Ns/m, Nms/rad], task inertia [kg, kg m
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +16,7 @@ from q2r2_control.types import Array
 
 # A length that makes a radian comparable to a metre [m/rad], as in the QP's tool task.
 _METRES = np.array([1.0, 1.0, 1.0, 0.3, 0.3, 0.3])
+_SCALE = np.outer(_METRES, _METRES)
 # No direction of a tool counts for more than this [kg], a rotation for this times 0.3^2 [kg m^2]. An arm whose
 # rotors weigh most of it stays below a fifth of it in every posture that it works in.
 _HEAVIEST = 1000.0
@@ -29,10 +31,8 @@ def pose_error(goal: pin.SE3, pose: pin.SE3) -> Array:
 
 def clip_error(error: Array, position: float, rotation: float) -> tuple[Array, bool]:
     """``error`` (6,) with each part no longer than ``position`` [m], ``rotation`` [rad]; and whether it was longer."""
-    lengths = np.array([np.linalg.norm(error[:3]), np.linalg.norm(error[3:])])
-    longest = np.array([position, rotation])
-    factor = longest / np.maximum(lengths, longest)
-    return error * np.repeat(factor, 3), bool((factor < 1.0).any())
+    shares = (position / max(math.hypot(*error[:3]), position), rotation / max(math.hypot(*error[3:]), rotation))
+    return error * np.repeat(shares, 3), min(shares) < 1.0
 
 
 def task_inertia(J: Array, M_inverse: Array) -> Array:
@@ -48,25 +48,25 @@ def task_inertia(J: Array, M_inverse: Array) -> Array:
 
 def _floored_inverse(A: Array, least: float) -> Array:
     """Inverse of a symmetric positive semidefinite A (6, 6) whose scaled eigenvalues are raised to ``least``."""
-    values, vectors = np.linalg.eigh(A * np.outer(_METRES, _METRES))
+    values, vectors = np.linalg.eigh(A * _SCALE)
     vectors *= _METRES[:, None]
     inverse: Array = (vectors / np.maximum(values, least)) @ vectors.T
     return inverse
 
 
 def double_diagonalised_damping(stiffness: Array, inertia: Array, damping_ratio: float) -> Array:
-    """Damping D (n, n) that gives every mode of  inertia x'' + D x' + stiffness x = 0  the damping ratio xi.
+    """Damping D (n, n) that gives every mode of  inertia x'' + D x' + diag(stiffness) x = 0  the damping ratio xi.
 
-    Both matrices symmetric positive definite (n, n). Albu-Schaeffer, Ott, Frese, Hirzinger: "Cartesian impedance
-    control of redundant robots: recent results with the DLR-light-weight-arms", ICRA 2003: K v = lambda Lambda v with
-    V' Lambda V = I, Q = V^-1, D = 2 Q' diag(xi sqrt(lambda)) Q. With Lambda = L L' and the eigenvectors U of the
-    symmetric L^-1 K L^-T, V = L^-T U and Q = U' L', so that nothing but a triangle has to be inverted.
+    ``stiffness`` (n,) along the axes, positive; ``inertia`` (n, n) symmetric positive definite. Albu-Schaeffer, Ott,
+    Frese, Hirzinger: "Cartesian impedance control of redundant robots: recent results with the
+    DLR-light-weight-arms", ICRA 2003: K v = lambda Lambda v with V' Lambda V = I, Q = V^-1,
+    D = 2 Q' diag(xi sqrt(lambda)) Q. K being diagonal, W and U of  K^-1/2 Lambda K^-1/2 = U W U'  give
+    lambda = 1 / W, Q = W^1/2 U' K^1/2, and D = 2 xi K^1/2 U W^1/2 U' K^1/2, without any matrix to invert.
     """
-    L = np.linalg.cholesky(inertia)
-    half = np.linalg.solve(L, stiffness)
-    eigenvalues, U = np.linalg.eigh(np.linalg.solve(L, half.T))
-    Q = (L @ U).T
-    D: Array = Q.T @ (2.0 * damping_ratio * np.sqrt(np.maximum(eigenvalues, 0.0))[:, None] * Q)
+    root = np.sqrt(stiffness)
+    W, U = np.linalg.eigh(inertia / np.outer(root, root))
+    U *= root[:, None]
+    D: Array = (U * (2.0 * damping_ratio * np.sqrt(np.maximum(W, 0.0)))) @ U.T
     return D
 
 

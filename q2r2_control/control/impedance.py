@@ -213,11 +213,10 @@ class ImpedanceController:
         M_inverse = np.linalg.inv(M)
         tool_inertia = task_inertia(J, M_inverse)
         stiffness = np.repeat(self._stiffness[arm.name], 3)
-        damping = double_diagonalised_damping(np.diag(stiffness), tool_inertia, settings.damping_ratio)
-        posture_damping = double_diagonalised_damping(
-            settings.nullspace_stiffness * np.eye(len(joints)), M, settings.nullspace_damping_ratio
-        )
-        posture: Array = settings.nullspace_stiffness * (self._wanted_q - state.q)[joints]
+        damping = double_diagonalised_damping(stiffness, tool_inertia, settings.damping_ratio)
+        posture_stiffness = np.full(len(joints), settings.nullspace_stiffness)
+        posture_damping = double_diagonalised_damping(posture_stiffness, M, settings.nullspace_damping_ratio)
+        posture: Array = posture_stiffness * (self._wanted_q - state.q)[joints]
         posture += posture_damping @ (self._wanted_v - state.v)[joints]
         if settings.nullspace_projector == "consistent":
             N = consistent_projector(J, M_inverse, tool_inertia)
