@@ -37,7 +37,7 @@ STOPPING = "stopping"  # state of every arm while the run ends
 # Added to the time that full braking takes; an arm that still recovers into its limits is not waited for longer.
 _STOP_ALLOWANCE = 1.0  # [s]
 _REST = 1e-6  # of the reference [rad/s]
-_STILL = 1e-3  # of an arm on its spring [rad/s]
+_STILL = 1e-2  # of an arm on its spring [rad/s]
 
 
 @dataclass(frozen=True, slots=True)

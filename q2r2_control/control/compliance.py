@@ -10,9 +10,12 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 import pinocchio as pin
 
 from q2r2_control.types import Array
+
+BoolArray = npt.NDArray[np.bool_]
 
 # A length that makes a radian comparable to a metre [m/rad], as in the QP's tool task.
 _METRES = np.array([1.0, 1.0, 1.0, 0.3, 0.3, 0.3])
@@ -102,8 +105,8 @@ class BoundedTorque:
     """A torque within its bounds, and which bounds held it back."""
 
     tau: Array  # (n,) [Nm]
-    saturated: Array  # (n,) bool
-    rate_limited: Array  # (n,) bool
+    saturated: BoolArray  # (n,)
+    rate_limited: BoolArray  # (n,)
 
 
 def bound_torque(tau: Array, last: Array, limit: Array, change: float) -> BoundedTorque:

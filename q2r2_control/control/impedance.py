@@ -10,6 +10,9 @@ of :func:`double_diagonalised_damping`, N a nullspace projector. Hogan 1985, Alb
 it, 30 mm at 1 m/s^2; with it the spring bears only what the model does not know, and may be soft. It vanishes with the
 reference's acceleration, so that it does nothing to the stiffness that a push at rest feels.
 
+**Torque rate.** A full stop at 10 rad/s^2 takes 70 Nm more in a joint that moves the whole arm. As long as the torque
+rises to that the tool leaves the reference, and with it the distances that the reference keeps.
+
 **Time.** A reference is due at the end of its tick, the state is measured at its start. So the spring is about the
 reference of the tick before, which is due now, while the acceleration is the one that leads to the newest.
 """
@@ -24,6 +27,7 @@ import pinocchio as pin
 from pydantic import ValidationError
 
 from q2r2_control.control.compliance import (
+    BoolArray,
     bound_torque,
     clip_error,
     consistent_projector,
@@ -225,7 +229,7 @@ class ImpedanceController:
         torque: Array = J.T @ (stiffness * error + damping @ error_rate) + N @ posture
         return torque, error, clipped
 
-    def _names(self, which: Array) -> tuple[str, ...]:
+    def _names(self, which: BoolArray) -> tuple[str, ...]:
         if not which.any():
             return ()
         return tuple(self.robot.joint_names[index] for index in np.flatnonzero(which))

@@ -64,5 +64,5 @@ class ImpedanceSettings(BaseModel):
     limit_stiffness: float = Field(300.0, gt=0, le=5000, description="of that repulsion [Nm/rad]")
     limit_damping: float = Field(20.0, gt=0, le=200, description="of that repulsion [Nms/rad]")
     torque_scale: float = Field(1.0, gt=0, le=1, description="fraction of the robot's torque limits")
-    torque_rate_limit: float = Field(1000.0, gt=0, le=1e5, description="of every joint [Nm/s]")
+    torque_rate_limit: float = Field(5000.0, gt=0, le=1e5, description="of every joint [Nm/s]")
     ramp_time: float = Field(0.5, ge=0.01, le=10, description="a change of stiffness at run time takes [s]")

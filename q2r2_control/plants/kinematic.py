@@ -13,7 +13,7 @@ from q2r2_control.types import Array, Command, CommandMode, RobotState
 class KinematicPlant:
     """Perfect tracking of position commands; grippers move at their configured speed. Nothing has a mass here."""
 
-    modes = (CommandMode.POSITION,)
+    modes: tuple[CommandMode, ...] = (CommandMode.POSITION,)
 
     def __init__(self, robot: Robot, config: Config) -> None:
         self._robot = robot

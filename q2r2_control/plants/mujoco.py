@@ -57,7 +57,7 @@ class MujocoPlant:
     ``model`` and ``data`` are MuJoCo's own, to look at.
     """
 
-    modes = (CommandMode.POSITION, CommandMode.TORQUE)
+    modes: tuple[CommandMode, ...] = (CommandMode.POSITION, CommandMode.TORQUE)
 
     def __init__(self, robot: Robot, config: Config) -> None:
         """``robot`` has to be the one of ``config``. Raises :class:`PlantError` where MuJoCo cannot model it."""
