@@ -189,11 +189,13 @@ class _Run:
         """Tick without input and targets until all stands still; no fault of an input can prevent it."""
         self._following = False
         self._targets = {arm: ArmTarget(None, target.gripper) for arm, target in self._targets.items()}
-        speed = float(np.abs(self._tick().v).max())
-        deadline = self._now + speed / self._pipeline.config.control.acceleration_limit + _STOP_ALLOWANCE
-        while (speed > _REST or self._swings()) and self._now < deadline:
+        try:
             speed = float(np.abs(self._tick().v).max())
-        self._let_go()
+            deadline = self._now + speed / self._pipeline.config.control.acceleration_limit + _STOP_ALLOWANCE
+            while (speed > _REST or self._swings()) and self._now < deadline:
+                speed = float(np.abs(self._tick().v).max())
+        finally:
+            self._let_go()
 
     def _swings(self) -> bool:
         """Whether an arm still moves on its spring, in torque mode."""

@@ -68,8 +68,8 @@ class ImpedanceController:
     """Turns each tick's reference and measured state into joint torques, for all arms of a cell.
 
     At every tick, whatever comes in: finite torques, within ``torque_scale`` of the robot's limits, and no further from
-    the tick before than ``torque_rate_limit`` allows. Each arm is treated by itself, with its own block of the inertia
-    matrix; joints that several arms hang on get the sum.
+    the tick before than ``torque_rate_limit`` allows. Each arm is treated by itself, with its own blocks of the inertia
+    matrix and its inverse; joints that several arms hang on get the sum.
     """
 
     def __init__(self, robot: Robot, settings: ImpedanceSettings | None = None) -> None:
@@ -190,12 +190,13 @@ class ImpedanceController:
         )
         tau = repulsion + pin.rnea(model, data, state.q, state.v, acceleration)
         inertia = np.array(pin.crba(model, data, state.q))
+        inverse = np.array(pin.computeMinverse(model, data, state.q))
         pin.computeJointJacobians(model, data, state.q)
         pin.computeJointJacobians(model, self._wanted_data, self._wanted_q)
         errors, clipped = {}, []
         try:
             for name, arm in self.robot.arms.items():
-                torque, errors[name], was_clipped = self._arm_torque(arm, state, inertia)
+                torque, errors[name], was_clipped = self._arm_torque(arm, state, inertia, inverse)
                 tau[arm.joints] += torque
                 if was_clipped:
                     clipped.append(name)
@@ -203,7 +204,7 @@ class ImpedanceController:
             return None
         return _Law(tau, gravity, repulsion, errors, tuple(clipped))
 
-    def _arm_torque(self, arm: Arm, state: RobotState, inertia: Array) -> tuple[Array, Array, bool]:
+    def _arm_torque(self, arm: Arm, state: RobotState, inertia: Array, inverse: Array) -> tuple[Array, Array, bool]:
         """Torque (n,) of one arm's spring and posture, its clipped error (6,), and whether that was clipped."""
         model, settings, joints = self.robot.model, self.settings, arm.joints
         frame = arm.frame_id
@@ -213,8 +214,8 @@ class ImpedanceController:
         J_goal = pin.getFrameJacobian(model, self._wanted_data, frame, pin.LOCAL_WORLD_ALIGNED)[:, joints]
         error, clipped = clip_error(pose_error(goal, pose), settings.max_position_error, settings.max_rotation_error)
         error_rate = J_goal @ self._wanted_v[joints] - J @ state.v[joints]
-        M = inertia[np.ix_(joints, joints)]
-        M_inverse = np.linalg.inv(M)
+        block = np.ix_(joints, joints)
+        M, M_inverse = inertia[block], inverse[block]
         tool_inertia = task_inertia(J, M_inverse)
         stiffness = np.repeat(self._stiffness[arm.name], 3)
         damping = double_diagonalised_damping(stiffness, tool_inertia, settings.damping_ratio)
