@@ -28,6 +28,7 @@ from q2r2_control.running import AnnouncedHeadset, RunOptions, notice_of_compili
 from q2r2_control.running import run as run_cell
 from q2r2_control.soak import SoakReport, run_soak
 from q2r2_control.summary import RunSummary
+from q2r2_control.types import CommandMode
 from q2r2_control.viewer.bench_tables import deeds_table, soak_table, times_table
 from q2r2_control.viewer.live import HeadsetDisplay
 from q2r2_control.viewer.tables import (
@@ -100,12 +101,13 @@ def demo(
 ) -> None:
     """Two simulated arms follow scripted hands: both pick up a block, meet in the middle, put it back.
 
-    Writes plots and a summary to a folder under runs/.
+    The arms are driven in torque mode, by Cartesian impedance. Writes plots and a summary to a folder under runs/.
     """
     options = RunOptions(
         name="demo",
         input="scripted",
         plant="mujoco",
+        mode="torque",
         duration=_positive("--duration", duration),
         fast=False,
         trajectory=DEFAULT_TRAJECTORY,
@@ -123,6 +125,9 @@ def run(
     config: ConfigFile,
     input: Annotated[InputName, typer.Option(help="Where hand samples come from.")] = InputName.SCRIPTED,
     plant: Annotated[PlantName, typer.Option(help="What moves.")] = PlantName.MUJOCO,
+    mode: Annotated[CommandMode, typer.Option(help="What the plant gets; torque: arms that yield.")] = (
+        CommandMode.POSITION
+    ),
     duration: Annotated[float | None, typer.Option(help="[s]; without it, until Ctrl-C.")] = None,
     fast: Annotated[bool, typer.Option("--fast", help="Simulated time, as fast as it can, repeatable.")] = False,
     trajectory: Annotated[str | None, typer.Option(help=f"Scripted: {', '.join(TRAJECTORIES)}.")] = None,
@@ -152,6 +157,7 @@ def run(
         name=cell.name,
         input=input.value,
         plant=plant.value,
+        mode=mode.value,
         duration=None if duration is None else _positive("--duration", duration),
         fast=fast,
         trajectory=trajectory or DEFAULT_TRAJECTORY,

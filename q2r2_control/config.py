@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from q2r2_control.control.settings import ControllerSettings
+from q2r2_control.control.settings import ControllerSettings, ImpedanceSettings
 from q2r2_control.errors import ConfigError
 from q2r2_control.resources import find_resource
 from q2r2_control.teleop.settings import TeleopSettings
@@ -130,6 +130,7 @@ class Config(_Model):
     srdf: str | None = Field(None, description="a file of pairs that need no watching, as q2r2 check --pairs writes it")
     loop_rate_hz: float = Field(1000.0, ge=50, le=2000, description="control loop [Hz]")
     control: ControllerSettings = ControllerSettings()
+    impedance: ImpedanceSettings = ImpedanceSettings()
     teleop: TeleopSettings = TeleopSettings()
     headset: HeadsetConfig = HeadsetConfig()
     mujoco: MujocoConfig = MujocoConfig()

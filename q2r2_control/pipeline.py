@@ -16,6 +16,7 @@ import pinocchio as pin
 
 from q2r2_control.config import Config
 from q2r2_control.control.controller import LONGEST_DT, CartesianController
+from q2r2_control.control.impedance import ImpedanceController, ImpedanceReport
 from q2r2_control.errors import ConfigError
 from q2r2_control.inputs.base import Input
 from q2r2_control.inputs.headset import HeadsetServer
@@ -27,7 +28,7 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.summary import RunStatistics, RunSummary
 from q2r2_control.teleop.arm import OPEN
 from q2r2_control.teleop.teleop import Teleop
-from q2r2_control.types import ArmTarget, Command, CommandMode, Event, HandSample, Reference, RobotState
+from q2r2_control.types import ArmTarget, Array, Command, CommandMode, Event, HandSample, Reference, RobotState
 
 INPUTS = ("scripted", "headset")
 PLANTS = ("mujoco", "kinematic")
@@ -35,7 +36,8 @@ DEFAULT_TRAJECTORY = "reach_grasp_handover"
 STOPPING = "stopping"  # state of every arm while the run ends
 # Added to the time that full braking takes; an arm that still recovers into its limits is not waited for longer.
 _STOP_ALLOWANCE = 1.0  # [s]
-_REST = 1e-6  # [rad/s]
+_REST = 1e-6  # of the reference [rad/s]
+_STILL = 1e-2  # of an arm on its spring [rad/s]
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,6 +55,7 @@ class Tick:
     tools: dict[str, pin.SE3]  # measured tool poses, world frame
     grippers: dict[str, float]  # measured openings
     compute_time: float  # [s]
+    impedance: ImpedanceReport | None = None  # of torque mode
 
 
 class Pipeline:
@@ -65,25 +68,43 @@ class Pipeline:
     the robot no faster. Otherwise time is simulated, as fast as the machine can, and the run is repeatable.
     """
 
-    def __init__(self, config: Config, robot: Robot, input: Input, plant: Plant) -> None:
+    def __init__(
+        self,
+        config: Config,
+        robot: Robot,
+        input: Input,
+        plant: Plant,
+        mode: CommandMode | str = CommandMode.POSITION,
+    ) -> None:
         self.config = config
         self.robot = robot
         self.input = input
         self.plant = plant
+        self.mode = _mode_of(mode, plant)
         self.controller = CartesianController(robot, config.control)
+        self.impedance = ImpedanceController(robot, config.impedance) if self.mode is CommandMode.TORQUE else None
         self.teleop = Teleop(config.teleop, tuple(robot.arms))
         self.listeners: list[Callable[[Tick], None]] = []
         # A plain flag: unlike the locks of threading.Event, a signal handler can set it in the middle of anything.
         self._stopping = False
 
     @classmethod
-    def from_config(cls, config: Config, *, input: Input | str = "scripted", plant: Plant | str = "mujoco") -> Pipeline:
+    def from_config(
+        cls,
+        config: Config,
+        *,
+        input: Input | str = "scripted",
+        plant: Plant | str = "mujoco",
+        mode: CommandMode | str = CommandMode.POSITION,
+    ) -> Pipeline:
         """Build a pipeline with an input (``scripted``, ``headset``) and a plant (``mujoco``, ``kinematic``).
 
-        Either may also be an object of one's own. Raises :class:`ConfigError` for an unknown name.
+        Either may also be an object of one's own. ``mode``: the plant gets joint positions (``position``), or joint
+        torques of a Cartesian impedance (``torque``). Raises :class:`ConfigError` for an unknown name, and for a mode
+        that the plant does not have.
         """
         robot = Robot.from_config(config)
-        return cls(config, robot, _input_of(input, config), _plant_of(plant, robot, config))
+        return cls(config, robot, _input_of(input, config), _plant_of(plant, robot, config), mode)
 
     def stop(self) -> None:
         """Bring the arms to rest and end the run, or the next one if none runs; from any thread or signal handler."""
@@ -139,7 +160,10 @@ class _Run:
         self._following = True
         self._connected = False
         pipeline.plant.reset()
-        pipeline.controller.reset(pipeline.plant.state().q)
+        state = pipeline.plant.state()
+        pipeline.controller.reset(state.q)
+        if pipeline.impedance is not None:
+            pipeline.impedance.reset(state)
         self._ticks = 0
         self._start = self._now = self._due = time.monotonic() if realtime else 0.0
         self._wall_start = time.perf_counter()
@@ -162,16 +186,34 @@ class _Run:
         return self._statistics.summary(time.perf_counter() - self._wall_start)
 
     def _bring_to_rest(self) -> None:
-        """Tick without input and targets until the reference stands still; no fault of an input can prevent it."""
+        """Tick without input and targets until all stands still; no fault of an input can prevent it."""
         self._following = False
         self._targets = {arm: ArmTarget(None, target.gripper) for arm, target in self._targets.items()}
-        speed = float(np.abs(self._tick().v).max())
-        deadline = self._now + speed / self._pipeline.config.control.acceleration_limit + _STOP_ALLOWANCE
-        while speed > _REST and self._now < deadline:
+        try:
             speed = float(np.abs(self._tick().v).max())
+            deadline = self._now + speed / self._pipeline.config.control.acceleration_limit + _STOP_ALLOWANCE
+            while (speed > _REST or self._swings()) and self._now < deadline:
+                speed = float(np.abs(self._tick().v).max())
+        finally:
+            self._let_go()
+
+    def _swings(self) -> bool:
+        """Whether an arm still moves on its spring, in torque mode."""
+        pipeline = self._pipeline
+        return pipeline.impedance is not None and float(np.abs(pipeline.plant.state().v).max()) > _STILL
+
+    def _let_go(self) -> None:
+        """Leave the arms to the plant's position servos where they are: a torque that nobody renews holds nothing."""
+        pipeline = self._pipeline
+        if pipeline.impedance is None:
+            return
+        q = pipeline.plant.state().q
+        zero = np.zeros_like(q)
+        grippers = {arm: target.gripper for arm, target in self._targets.items()}
+        pipeline.plant.apply(Command(CommandMode.POSITION, q, zero, zero, grippers))
 
     def _tick(self) -> Reference:
-        """One line of the way of the data: sample -> target -> reference -> command -> state."""
+        """One line of the way of the data: sample -> target -> reference -> (torque) -> command -> state."""
         pipeline = self._pipeline
         dt = self._wait()
         began = time.perf_counter()
@@ -183,17 +225,23 @@ class _Run:
             self._targets = pipeline.teleop.update(samples, tools, self._now, commanded)
         targets = self._targets
         reference = pipeline.controller.step({arm: target.pose for arm, target in targets.items()}, dt)
+        tau, impedance = self._torque(reference, state, dt)
         grippers = {arm: target.gripper for arm, target in targets.items()}
-        pipeline.plant.apply(
-            Command(CommandMode.POSITION, reference.q, reference.v, np.zeros_like(reference.q), grippers)
-        )
+        pipeline.plant.apply(Command(pipeline.mode, reference.q, reference.v, tau, grippers))
         compute_time = time.perf_counter() - began
         if samples:
             newest = max(max(sample.pose_stamp, sample.inputs_stamp) for sample in samples)
             self._statistics.latency.add((time.monotonic() if self._realtime else self._now) - newest)
         pipeline.plant.advance(dt)
-        self._record(dt, samples, targets, reference, state, tools, compute_time)
+        self._record(dt, samples, targets, reference, state, tools, compute_time, impedance)
         return reference
+
+    def _torque(self, reference: Reference, state: RobotState, dt: float) -> tuple[Array, ImpedanceReport | None]:
+        """Torque of this tick (nv,) [Nm] in torque mode, else zeros."""
+        if self._pipeline.impedance is None:
+            return np.zeros_like(reference.q), None
+        command = self._pipeline.impedance.step(reference, state, dt)
+        return command.tau, command.report
 
     def _wait(self) -> float:
         """Let the next tick come; returns the time since the last one [s]."""
@@ -235,6 +283,7 @@ class _Run:
         state: RobotState,
         tools: dict[str, pin.SE3],
         compute_time: float,
+        impedance: ImpedanceReport | None,
     ) -> None:
         teleop, statistics = self._pipeline.teleop, self._statistics
         engaged = {arm: self._following and value for arm, value in teleop.engaged.items()}
@@ -256,6 +305,7 @@ class _Run:
             tools=tools,
             grippers=self._pipeline.plant.gripper_openings(),
             compute_time=compute_time,
+            impedance=impedance,
         )
         self._tell(tick)
 
@@ -292,6 +342,13 @@ def _plant_of(plant: Plant | str, robot: Robot, config: Config) -> Plant:
     if isinstance(plant, str):
         raise ConfigError(f"plant {plant!r}: allowed are {', '.join(PLANTS)}")
     return plant
+
+
+def _mode_of(mode: CommandMode | str, plant: Plant) -> CommandMode:
+    if mode not in plant.modes:
+        allowed = ", ".join(plant.modes)
+        raise ConfigError(f"mode {mode!s:.40}: {type(plant).__name__} follows {allowed} commands only")
+    return CommandMode(mode)
 
 
 @contextmanager

@@ -35,6 +35,7 @@ class RunOptions:
     name: str  # of the run, for its report's folder and title
     input: str  # scripted or headset
     plant: str  # mujoco or kinematic
+    mode: str  # position or torque
     duration: float | None  # [s]; None: until Ctrl-C
     fast: bool  # simulated time
     trajectory: str  # of the scripted input
@@ -50,7 +51,8 @@ def run(config: Config, options: RunOptions, console: Console) -> RunSummary:
     if options.window and options.plant != "mujoco":
         raise ConfigError(f"--viewer: the {options.plant} plant has no window; allowed: --plant mujoco")
     with notice_of_compiling(console):
-        pipeline = Pipeline.from_config(config, input=_input_of(config, options, console), plant=options.plant)
+        source = _input_of(config, options, console)
+        pipeline = Pipeline.from_config(config, input=source, plant=options.plant, mode=options.mode)
     history = History(pipeline.robot, config.control.acceleration_limit)
     if options.report:
         pipeline.listeners.append(history)

@@ -99,6 +99,12 @@ def test_the_help_lists_every_command(command: str) -> None:
         pytest.param(("run", "nowhere.yaml"), "nowhere.yaml: no such file", id="a file that does not exist"),
         pytest.param(("run", CELL, "--input", "mind"), "'mind'", id="an unknown input"),
         pytest.param(("run", CELL, "--plant", "granite"), "'granite'", id="an unknown plant"),
+        pytest.param(("run", CELL, "--mode", "speed"), "'speed'", id="an unknown mode"),
+        pytest.param(
+            ("run", CELL, "--plant", "kinematic", "--mode", "torque", "--duration", "1"),
+            "mode torque: KinematicPlant follows position commands only",
+            id="torque of a plant that has none",
+        ),
         pytest.param(("run", CELL, "--duration", "soon"), "--duration", id="a duration that is no number"),
         pytest.param(("run", CELL, "--duration", "nan"), "--duration nan: allowed", id="a duration that is not finite"),
         pytest.param(("run", CELL, "--duration", "-1"), "--duration -1: allowed", id="a negative duration"),
@@ -210,6 +216,14 @@ def test_a_fast_run_prints_one_json_object_with_every_figure_and_nothing_else_an
         for timing in ("tick_us", "loop_rate_hz"):
             del summary[timing]
     assert summaries[0] == summaries[1]
+
+
+def test_a_run_by_torque_repeats_itself_too_and_differs_from_one_by_position() -> None:
+    arguments = ("run", CELL, "--fast", "--json", "--headless", "--trajectory", "circle", "--duration", "1.8")
+    runs = [q2r2(*arguments, "--mode", mode) for mode in ("torque", "torque", "position")]
+    errors = [one_object(run.stdout)["arms"]["left"]["position_error_mm_rms"] for run in runs]
+    assert errors[0] == errors[1] != errors[2]
+    assert 0.0 < errors[0] < 2.0
 
 
 def test_another_seed_makes_another_run() -> None:

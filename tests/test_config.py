@@ -23,7 +23,7 @@ from q2r2_control.config import (
     ToolConfig,
     load_config,
 )
-from q2r2_control.control.settings import ControllerSettings
+from q2r2_control.control.settings import ControllerSettings, ImpedanceSettings
 from q2r2_control.errors import ConfigError, Q2R2Error
 from q2r2_control.robot.robot import Robot
 from q2r2_control.teleop.settings import FilterSettings, GateSettings, TeleopSettings
@@ -83,6 +83,7 @@ class TestTheShippedCellShowsAllThereIsToTune:
         ("obstacles.table", ObstacleConfig),
         ("headset", HeadsetConfig),
         ("control", ControllerSettings),
+        ("impedance", ImpedanceSettings),
         ("teleop", TeleopSettings),
         ("teleop.filter", FilterSettings),
         ("teleop.gate", GateSettings),
@@ -130,6 +131,7 @@ class TestTheShippedCellShowsAllThereIsToTune:
         [
             ("headset", HeadsetConfig),
             ("control", ControllerSettings),
+            ("impedance", ImpedanceSettings),
             ("teleop", TeleopSettings),
             ("mujoco", MujocoConfig),
         ],
@@ -154,6 +156,7 @@ class TestTheShippedCellShowsAllThereIsToTune:
         "obstacles.table.sizes",
         "headset.ports",
         "control.gain",
+        "impedance.stiffness",
         "teleop.scale",
         "teleop.filter.cutoff",
         "teleop.gate.jump",
@@ -196,6 +199,11 @@ def test_a_misspelt_key_is_named_before_the_one_that_is_missing_for_it(tmp_path:
         ("control.acceleration_limit", -10, "greater than 0"),
         ("control.velocity_scale", 100, "less than or equal to 1"),
         ("control.min_distance", 20, "less than or equal to 0.2"),
+        ("impedance.translational_stiffness", -1, "greater than 0"),
+        ("impedance.rotational_stiffness", 0, "greater than 0"),
+        ("impedance.damping_ratio", 0, "greater than or equal to 0.1"),
+        ("impedance.nullspace_projector", "none", "'consistent' or 'kinematic'"),
+        ("impedance.torque_rate_limit", math.inf, "finite number"),
         ("mujoco.timestep", 0.01, "less than or equal to 0.001"),
         ("loop_rate_hz", 1, "greater than or equal to 50"),
         ("loop_rate_hz", 1e300, "less than or equal to 2000"),

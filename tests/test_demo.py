@@ -9,7 +9,8 @@ from q2r2_control.inputs.scripted import ScriptedInput
 from q2r2_control.pipeline import DEFAULT_TRAJECTORY, Pipeline, Tick
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.robot.robot import Robot
-from q2r2_control.types import Array
+from q2r2_control.types import Array, CommandMode
+from tests.support.watch import assert_torque_bounds
 
 BLOCKS = {"left": "blue_block", "right": "yellow_block"}
 
@@ -40,7 +41,7 @@ def test_both_arms_pick_up_their_block_meet_in_the_middle_and_put_it_back() -> N
     config = coarse()
     robot = Robot.from_config(config)
     plant = MujocoPlant(robot, config)
-    pipeline = Pipeline(config, robot, ScriptedInput(DEFAULT_TRAJECTORY), plant)
+    pipeline = Pipeline(config, robot, ScriptedInput(DEFAULT_TRAJECTORY), plant, CommandMode.TORQUE)
     watch = BlockWatch(plant)
     pipeline.listeners.append(watch)
     summary = pipeline.run(20.0, realtime=False)
@@ -57,6 +58,7 @@ def test_both_arms_pick_up_their_block_meet_in_the_middle_and_put_it_back() -> N
         assert error is not None
         assert error < 1.0
         assert summary.arms[arm].gripper_changes == 2
+    assert_torque_bounds(pipeline, watch.ticks)
     distances = np.array([tick.reference.report.closest_distance for tick in watch.ticks])
     meeting = (t > 10.0) & (t < 11.3)
     limit = config.control.min_distance + config.control.distance_buffer

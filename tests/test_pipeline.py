@@ -12,6 +12,7 @@ import sys
 import threading
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +26,7 @@ from q2r2_control.plants.kinematic import KinematicPlant
 from q2r2_control.robot.robot import Robot
 from q2r2_control.summary import RunSummary
 from q2r2_control.types import SIDES, Command, HandSample
-from tests.support.watch import Watch, cell, changes, speed
+from tests.support.watch import Watch, assert_torque_bounds, cell, changes, speed
 
 CHECKOUT = Path(__file__).resolve().parents[1]
 
@@ -49,10 +50,12 @@ class WitnessedPlant(KinematicPlant):
         self.closed += 1
 
 
-def pipeline(trajectory: str = "circle", plant: str = "kinematic", **changes: object) -> Pipeline:
+def pipeline(
+    trajectory: str = "circle", plant: str = "kinematic", mode: str = "position", **changes: object
+) -> Pipeline:
     """At 500 Hz, the lowest rate with one substep a tick, since most of a test's time goes by ticks."""
     config = cell().model_copy(update={"loop_rate_hz": 500.0, **changes})
-    return Pipeline.from_config(config, input=ScriptedInput(trajectory, frequency_hz=0.5), plant=plant)
+    return Pipeline.from_config(config, input=ScriptedInput(trajectory, frequency_hz=0.5), plant=plant, mode=mode)
 
 
 def when_moving(action: Callable[[], object]) -> Callable[[Tick], None]:
@@ -68,21 +71,23 @@ def when_moving(action: Callable[[], object]) -> Callable[[Tick], None]:
 
 
 @pytest.mark.parametrize(
-    ("trajectory", "human", "plant", "millimetres", "degrees"),
+    ("trajectory", "human", "plant", "mode", "millimetres", "degrees"),
     [
-        ("circle", False, "mujoco", 2.0, 0.3),
-        ("line", False, "kinematic", 2.0, 0.3),
-        ("rotate", False, "mujoco", 2.0, 0.5),
-        ("reach_grasp_handover", False, "kinematic", 2.0, 0.3),
-        ("circle", True, "mujoco", 2.0, 0.5),
+        ("circle", False, "mujoco", "position", 2.0, 0.3),
+        ("line", False, "kinematic", "position", 2.0, 0.3),
+        ("rotate", False, "mujoco", "position", 2.0, 0.5),
+        ("reach_grasp_handover", False, "kinematic", "position", 2.0, 0.3),
+        ("circle", True, "mujoco", "position", 2.0, 0.5),
+        ("circle", True, "mujoco", "torque", 2.0, 0.5),
+        ("rotate", False, "mujoco", "torque", 2.0, 0.5),
     ],
-    ids=["circle", "line", "rotate", "reach", "a human's circle"],
+    ids=["circle", "line", "rotate", "reach", "a human's circle", "a human's circle by torque", "rotate by torque"],
 )
 def test_both_arms_follow_within_every_limit(
-    trajectory: str, human: bool, plant: str, millimetres: float, degrees: float
+    trajectory: str, human: bool, plant: str, mode: str, millimetres: float, degrees: float
 ) -> None:
     source = ScriptedInput(trajectory, human=human, seed=3)
-    loop = Pipeline.from_config(cell(), input=source, plant=plant)
+    loop = Pipeline.from_config(cell(), input=source, plant=plant, mode=mode)
     watch = Watch(loop)
     summary = loop.run(2.4, realtime=False)
     assert summary.ticks == len(watch.ticks) >= 2400
@@ -104,6 +109,8 @@ def test_both_arms_follow_within_every_limit(
         travelled = [tick.tools[arm].translation for tick in watch.ticks]
         assert np.ptp(travelled, axis=0).max() > 0.01 or trajectory == "rotate"
     assert max(map(speed, watch.ticks)) > 0.05
+    if mode == "torque":
+        assert_torque_bounds(loop, watch.ticks)
 
 
 class LeftUpperPresses(ScriptedInput):
@@ -129,7 +136,8 @@ def test_a_gripper_closes_and_opens_with_the_upper_button_of_its_hand() -> None:
     assert all(opening["right"] > 0.95 for opening in openings.values())
 
 
-def test_two_simulated_runs_are_equal_bit_for_bit_also_on_the_same_pipeline() -> None:
+@pytest.mark.parametrize("mode", ["position", "torque"])
+def test_two_simulated_runs_are_equal_bit_for_bit_also_on_the_same_pipeline(mode: str) -> None:
     def run(loop: Pipeline) -> tuple[list[bytes], RunSummary]:
         watch = Watch(loop)
         loop.input = ScriptedInput("circle", human=True, seed=1)
@@ -138,8 +146,8 @@ def test_two_simulated_runs_are_equal_bit_for_bit_also_on_the_same_pipeline() ->
         bits = [b"".join((x.reference.q.tobytes(), x.reference.v.tobytes(), x.state.q.tobytes())) for x in watch.ticks]
         return bits, summary
 
-    loop = pipeline(plant="mujoco")
-    (first, one), (again, two), (anew, _) = run(loop), run(loop), run(pipeline(plant="mujoco"))
+    loop = pipeline(plant="mujoco", mode=mode)
+    (first, one), (again, two), (anew, _) = run(loop), run(loop), run(pipeline(plant="mujoco", mode=mode))
     assert first == again == anew
     assert one.events == two.events
     assert [tick_free(one), tick_free(two)] == [tick_free(one)] * 2
@@ -212,9 +220,13 @@ def test_a_duration_that_is_no_time_is_refused(duration: float) -> None:
     [
         ({"input": "mouse"}, "input 'mouse': allowed are scripted, headset"),
         ({"plant": "gazebo"}, "plant 'gazebo': allowed are mujoco, kinematic"),
+        ({"mode": "velocity"}, "mode velocity: MujocoPlant follows position, torque commands only"),
+        ({"plant": "kinematic", "mode": "torque"}, "mode torque: KinematicPlant follows position commands only"),
     ],
 )
-def test_an_unknown_input_or_plant_is_refused(arguments: dict[str, str], message: str) -> None:
+def test_an_unknown_input_or_plant_and_a_mode_that_the_plant_does_not_have_are_refused(
+    arguments: dict[str, str], message: str
+) -> None:
     with pytest.raises(ConfigError, match=message):
         Pipeline.from_config(cell(), **arguments)
 
@@ -259,6 +271,24 @@ class TestStop:
         loop = pipeline()
         watch = Watch(loop)
         assert_braked(loop, watch, loop.run(2.5, realtime=False))
+
+    def test_in_torque_mode_the_arms_come_to_rest_on_their_springs_and_nothing_drops_afterwards(self) -> None:
+        loop = pipeline(plant="mujoco", mode="torque")
+        watch = Watch(loop)
+        loop.listeners.append(when_moving(loop.stop))
+        summary = loop.run(60.0, realtime=False)
+        assert_braked(loop, watch, summary)
+        assert_torque_bounds(loop, watch.ticks)
+        rest = loop.plant.state()
+        assert np.abs(rest.v).max() < 1e-2
+        np.testing.assert_allclose(rest.q, watch.ticks[-1].reference.q, atol=5e-3)
+        for tick, after in pairwise(watch.ticks):
+            for arm in SIDES:
+                due = loop.robot.tool_pose(tick.reference.q, arm).translation
+                assert np.linalg.norm(after.tools[arm].translation - due) < 3e-3
+        for _ in range(20):
+            loop.plant.advance(0.1)
+            np.testing.assert_allclose(loop.plant.state().q, rest.q, atol=1e-3)
 
     def test_waits_for_slow_braking(self) -> None:
         # Braking takes longer than anything that is allowed for beside it.

@@ -20,8 +20,8 @@ import numpy as np
 import pinocchio as pin
 from pydantic import BaseModel, ConfigDict, Field
 
-from q2r2_control.control.compliance import NOT_MEASURED, TOUCHED, UNUSABLE, Law, Yielding, comply
 from q2r2_control.control.jit import hold
+from q2r2_control.control.yielding import NOT_MEASURED, TOUCHED, UNUSABLE, Law, Yielding, comply
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, RobotState
 

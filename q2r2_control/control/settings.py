@@ -1,6 +1,8 @@
-"""Everything a user tunes about the Cartesian controller, with units and ranges."""
+"""Everything a user tunes about motion control, with units and ranges."""
 
 from __future__ import annotations
+
+from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -40,3 +42,27 @@ class ControllerSettings(BaseModel):
     posture_speed: float = Field(0.5, gt=0, le=3, description="of that pull, at most [rad/s]")
     posture_weight: float = Field(1e-3, gt=0, le=1, description="against the tool task's 1; also regularises")
     stretch_gain: float = Field(10.0, gt=0, le=200, description="highest gain of a stretched-out arm [1/s]")
+
+
+class ImpedanceSettings(BaseModel):
+    """Settings of :class:`ImpedanceController`. Nothing here may be zero or negative: a stiffness or a damping of -1,
+    meant as "automatic", would drive an arm instead of holding it."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    translational_stiffness: float = Field(2000.0, gt=0, le=5000, description="of the tool, all directions [N/m]")
+    rotational_stiffness: float = Field(200.0, gt=0, le=300, description="of the tool, all axes [Nm/rad]")
+    damping_ratio: float = Field(1.0, ge=0.1, le=2, description="of every mode of the tool; 1: no overshoot")
+    nullspace_stiffness: float = Field(50.0, gt=0, le=500, description="towards the reference's posture [Nm/rad]")
+    nullspace_damping_ratio: float = Field(1.0, ge=0.1, le=2, description="of the posture's motion")
+    nullspace_projector: Literal["consistent", "kinematic"] = Field(
+        "consistent", description="consistent: exact where the model is; kinematic: needs no masses"
+    )
+    max_position_error: float = Field(0.1, gt=0, le=1, description="a longer way from the reference is clipped [m]")
+    max_rotation_error: float = Field(0.5, gt=0, le=3, description="a wider turn from the reference is clipped [rad]")
+    limit_distance: float = Field(0.1, gt=0, le=0.5, description="joints are repelled nearer to a limit [rad]")
+    limit_stiffness: float = Field(300.0, gt=0, le=5000, description="of that repulsion [Nm/rad]")
+    limit_damping: float = Field(20.0, gt=0, le=200, description="of that repulsion [Nms/rad]")
+    torque_scale: float = Field(1.0, gt=0, le=1, description="fraction of the robot's torque limits")
+    torque_rate_limit: float = Field(5000.0, gt=0, le=1e5, description="of every joint [Nm/s]")
+    ramp_time: float = Field(0.5, ge=0.01, le=10, description="a change of stiffness at run time takes [s]")

@@ -25,6 +25,8 @@ class Plant(Protocol):
     next measurement. A new plant stands at home with open grippers, and stays there until a command comes.
     """
 
+    modes: tuple[CommandMode, ...]  # of the commands that this plant follows
+
     def reset(self, q: Array | None = None) -> None:
         """Start over at time 0, at rest at ``q`` (nv,) or else at home, grippers open. Raises :class:`PlantError`."""
         ...

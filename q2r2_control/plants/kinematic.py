@@ -13,6 +13,8 @@ from q2r2_control.types import Array, Command, CommandMode, RobotState
 class KinematicPlant:
     """Perfect tracking of position commands; grippers move at their configured speed. Nothing has a mass here."""
 
+    modes: tuple[CommandMode, ...] = (CommandMode.POSITION,)
+
     def __init__(self, robot: Robot, config: Config) -> None:
         self._robot = robot
         self._grippers = GripperMotion(config)
@@ -30,7 +32,7 @@ class KinematicPlant:
 
     def apply(self, command: Command) -> None:
         """See :meth:`Plant.apply`. Raises :class:`PlantError` in torque mode."""
-        check_command(command, self._robot, (CommandMode.POSITION,))
+        check_command(command, self._robot, self.modes)
         self._due_q, self._due_v = command.q.copy(), command.v.copy()
         self._grippers.command(command.grippers)
 

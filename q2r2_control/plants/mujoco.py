@@ -57,6 +57,8 @@ class MujocoPlant:
     ``model`` and ``data`` are MuJoCo's own, to look at.
     """
 
+    modes: tuple[CommandMode, ...] = (CommandMode.POSITION, CommandMode.TORQUE)
+
     def __init__(self, robot: Robot, config: Config) -> None:
         """``robot`` has to be the one of ``config``. Raises :class:`PlantError` where MuJoCo cannot model it."""
         self.model: mujoco.MjModel = build_model(robot, config)
@@ -107,7 +109,7 @@ class MujocoPlant:
 
     def apply(self, command: Command) -> None:
         """See :meth:`Plant.apply`."""
-        check_command(command, self._robot, (CommandMode.POSITION, CommandMode.TORQUE))
+        check_command(command, self._robot, self.modes)
         if command.mode is CommandMode.TORQUE:
             self._torque = command.tau.copy()
         else:

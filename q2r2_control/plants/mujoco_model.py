@@ -22,9 +22,8 @@ from q2r2_control.robot.robot import Robot
 # Collision shapes of this name ending stand for a hand at every finger opening: watched from afar, never touched.
 _ENVELOPE = "_envelope"
 
-# Least inertia that a geared drive's rotor adds to its joint [kg m^2], for robots whose URDF does not say, and least
-# viscous friction [Nm s/rad]. Both keep light wrist joints steady; the friction is far below what a controller feels.
-_MIN_ARMATURE, _MIN_DAMPING = 0.1, 0.2
+# Least viscous friction [Nm s/rad]: it keeps light wrist joints steady and is far below what a controller feels.
+_MIN_DAMPING = 0.2
 
 # Rubber on a box: sliding 1, and torsion [m] and rolling [m] of a pad of about a square centimetre.
 _PAD_FRICTION = (1.0, 0.02, 0.001)
@@ -109,7 +108,7 @@ def _set_shapes(spec: mujoco.MjSpec, capsules: set[str]) -> None:
 def _set_arm_joints(spec: mujoco.MjSpec, robot: Robot) -> None:
     for name, armature, torque in zip(robot.joint_names, robot.model.armature, robot.torque_limit, strict=True):
         joint = spec.joint(name)
-        joint.armature = armature if armature > 0 else _MIN_ARMATURE
+        joint.armature = armature
         joint.damping[0] = max(joint.damping[0], _MIN_DAMPING)
         motor = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
         motor.set_to_motor()

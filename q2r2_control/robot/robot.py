@@ -24,6 +24,10 @@ from q2r2_control.robot.pairs import (
 )
 from q2r2_control.types import Array
 
+# Inertia that the rotor of a geared drive adds to its joint where the URDF does not say [kg m^2]. Without any, light
+# wrist joints would need torques faster than a control loop gives them.
+_USUAL_ARMATURE = 0.1
+
 
 @dataclass(frozen=True, slots=True)
 class Arm:
@@ -211,6 +215,7 @@ def _reduced(
 
 def _set_rotors(model: pin.Model, urdf: ET.Element) -> None:
     """Put each joint's rotor into the model, its armature (rotor inertia times gear squared) included."""
+    model.armature[:] = _USUAL_ARMATURE
     for joint in urdf.findall("joint"):
         rotor, name = joint.find("rotor"), joint.get("name", "")
         if rotor is None or not model.existJointName(name):
@@ -219,4 +224,4 @@ def _set_rotors(model: pin.Model, urdf: ET.Element) -> None:
         inertia, gear = float(rotor.get("inertia", "0")), float(rotor.get("gear", "1"))
         model.rotorInertia[index] = inertia
         model.rotorGearRatio[index] = gear
-        model.armature[index] = inertia * gear**2
+        model.armature[index] = inertia * gear**2 or _USUAL_ARMATURE

@@ -41,6 +41,16 @@ class Watch:
         return [i for i, now in enumerate(engaged) if now and not (i and engaged[i - 1])]
 
 
+def assert_torque_bounds(pipeline: Pipeline, ticks: list[Tick]) -> None:
+    """Every torque that the plant gave from one tick to the next is within the limits, and so is its change."""
+    settings = pipeline.config.impedance
+    tau = np.array([tick.state.tau for tick in ticks])
+    dt = np.array([tick.dt for tick in ticks])
+    assert (np.abs(tau) <= settings.torque_scale * pipeline.robot.torque_limit).all()
+    assert (np.abs(np.diff(tau, axis=0)) <= settings.torque_rate_limit * dt[:-1, None] + 1e-6).all()
+    assert not any(tick.impedance is None or tick.impedance.held for tick in ticks)
+
+
 def speed(tick: Tick) -> float:
     """Of the fastest joint's reference [rad/s]."""
     return float(np.abs(tick.reference.v).max())

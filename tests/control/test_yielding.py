@@ -4,8 +4,8 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from q2r2_control.control.compliance import estimate_wrench, oscillate
 from q2r2_control.control.tasks import ROTATION_LENGTH
+from q2r2_control.control.yielding import estimate_wrench, oscillate
 from q2r2_control.types import Array
 
 from .cells import cell, random_posture

@@ -1,0 +1,337 @@
+"""The impedance controller closed over MuJoCo: stiffness, damping, contact, wrong masses; every bound at every step."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import pinocchio as pin
+import pytest
+import scipy.linalg
+from scipy.integrate import cumulative_trapezoid
+
+from q2r2_control.config import Config
+from q2r2_control.control.compliance import pose_error
+from q2r2_control.control.settings import ImpedanceSettings
+from q2r2_control.plants.mujoco import MujocoPlant
+from q2r2_control.robot.robot import Robot
+from q2r2_control.types import Array
+from tests.plants.conftest import tool_motion
+from tests.support.torque_loop import DT, TorqueLoop, reference
+
+POSTURES = {
+    "home": None,
+    "reaching far": [0.2, 0.9, -0.3, -0.75, 0.1, 1.3, 0.3],
+    "drawn in": [0.3, -0.2, -0.5, -1.8, 0.3, 1.2, 0.5],
+    "high": [0.4, 0.3, -0.3, -1.0, 0.5, -0.6, 0.2],
+    "elbow out": [0.6, 0.5, -1.2, -1.5, 0.9, 1.2, -0.3],
+}
+# Links 0..7 of an iiwa 7 as Drake's description has them [kg]; those of the other public description are in the URDF.
+OTHER_MASSES = (3.863, 2.7025, 2.7258, 3.175, 2.73, 1.69, 1.8, 0.4)
+SETTINGS = ImpedanceSettings()
+FORCE = 20.0  # [N]
+SLOW = 0.002  # a tick for what takes long and is no matter of milliseconds [s]
+PROJECTORS = ("consistent", "kinematic")
+
+
+@pytest.fixture(scope="module")
+def bare_config(config: Config) -> Config:
+    """The cell without blocks: the tool may go down to the table."""
+    return config.model_copy(update={"mujoco": config.mujoco.model_copy(update={"objects": {}})})
+
+
+@pytest.fixture(scope="module")
+def bare(robot: Robot, bare_config: Config) -> MujocoPlant:
+    return MujocoPlant(robot, bare_config)
+
+
+@pytest.fixture(scope="module")
+def reweighed(robot: Robot, bare_config: Config) -> MujocoPlant:
+    """Arms whose links weigh something else than the controller thinks."""
+    plant = MujocoPlant(robot, bare_config)
+    for arm in robot.arms:
+        for link, mass in enumerate(OTHER_MASSES):
+            body = plant.model.body(f"{arm}_link_{link}")
+            body.inertia *= mass / body.mass[0]
+            body.mass[0] = mass
+    mujoco.mj_setConst(plant.model, plant.data)
+    return plant
+
+
+def posture(robot: Robot, name: str) -> Array:
+    q = robot.home.copy()
+    left = POSTURES[name]
+    if left is not None:
+        q[robot.arms["left"].joints] = left
+    return q
+
+
+def along(axis: int, force: float = FORCE) -> Array:
+    return force * np.eye(6)[axis]
+
+
+def left_arm(robot: Robot, q: Array) -> tuple[Array, Array]:
+    """Jacobian (6, 7) and inertia (7, 7) of the left arm."""
+    data, arm = robot.model.createData(), robot.arms["left"]
+    pin.computeJointJacobians(robot.model, data, q)
+    J = pin.getFrameJacobian(robot.model, data, arm.frame_id, pin.LOCAL_WORLD_ALIGNED)[:, arm.joints]
+    return J, pin.crba(robot.model, data, q)[np.ix_(arm.joints, arm.joints)]
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2], ids=["x", "y", "z"])
+@pytest.mark.parametrize("name", POSTURES)
+def test_a_push_moves_the_tool_by_force_over_stiffness_and_turns_nothing(
+    bare: MujocoPlant, robot: Robot, name: str, axis: int
+) -> None:
+    loop = TorqueLoop(bare, robot, SETTINGS, posture(robot, name), SLOW)
+    bare.push("left", along(axis), 60.0)
+    loop.settle()
+    expected = FORCE / SETTINGS.translational_stiffness
+    displacement = loop.displacement()
+    np.testing.assert_allclose(displacement[:3], expected * np.eye(3)[axis], atol=0.05 * expected)
+    assert np.linalg.norm(displacement[3:]) < np.radians(0.05)
+    assert np.linalg.norm(loop.displacement("right")) < 1e-4
+
+
+def test_a_torque_turns_the_tool_by_torque_over_stiffness_and_moves_nothing(bare: MujocoPlant, robot: Robot) -> None:
+    loop = TorqueLoop(bare, robot, SETTINGS, robot.home, SLOW)
+    bare.push("left", np.array([0, 0, 0, 5.0, -4.0, 3.0]), 60.0)
+    loop.settle()
+    np.testing.assert_allclose(loop.displacement()[3:], np.array([5.0, -4.0, 3.0]) / 200.0, atol=0.05 * 3.0 / 200.0)
+    assert np.linalg.norm(loop.displacement()[:3]) < 5e-4
+
+
+def modes(robot: Robot, settings: ImpedanceSettings) -> tuple[Array, Array]:
+    """Frequencies (6,) [rad/s] and shapes V (6, 6) of the left tool on its spring at home, V' Lambda V = 1."""
+    J, M = left_arm(robot, robot.home)
+    inertia = np.linalg.inv(J @ np.linalg.solve(M, J.T))
+    stiffness = np.diag([settings.translational_stiffness] * 3 + [settings.rotational_stiffness] * 3)
+    squares, V = scipy.linalg.eigh(stiffness, inertia)
+    return np.sqrt(squares), V
+
+
+def fitted_ratio(z: Array) -> float:
+    """Damping ratio of z'' + 2 xi w z' + w^2 z = 0 that fits a release from rest best, for any xi.
+
+    Integrated twice, z - z_0 = -2 xi w S(z - z_0) - w^2 SS z, which is linear in 2 xi w and w^2 and takes no derivative
+    of a measurement. Nothing is assumed about xi, other than by a logarithmic decrement, which needs oscillation.
+    """
+    first = cumulative_trapezoid(z - z[0], dx=DT, initial=0)
+    second = cumulative_trapezoid(cumulative_trapezoid(z, dx=DT, initial=0), dx=DT, initial=0)
+    (damping, square), *_ = np.linalg.lstsq(np.column_stack([-first, -second]), z - z[0], rcond=None)
+    return float(damping / (2 * np.sqrt(square)))
+
+
+@pytest.mark.parametrize(("ratio", "projector"), [(0.7, "consistent"), (1.0, "kinematic")])
+def test_released_every_mode_returns_with_the_damping_ratio_asked_for(
+    bare: MujocoPlant, robot: Robot, ratio: float, projector: str
+) -> None:
+    settings = SETTINGS.model_copy(update={"damping_ratio": ratio, "nullspace_projector": projector})
+    frequencies, V = modes(robot, settings)
+    stiffness = np.repeat([settings.translational_stiffness, settings.rotational_stiffness], 3)
+    for frequency, shape in zip(frequencies, V.T, strict=True):
+        # Each mode by itself, since a fast one would drown in what is left of a slow one.
+        wrench = stiffness * shape
+        wrench *= min(15.0 / np.linalg.norm(wrench[:3]), 4.0 / np.linalg.norm(wrench[3:]))
+        loop = TorqueLoop(bare, robot, settings, robot.home)
+        bare.push("left", wrench, 8.0 / frequency)
+        loop.run(8.0 / frequency)
+        way = [loop.displacement()]
+        way += [loop.displacement() for _ in loop.ticks(6.0 / frequency)]
+        z = np.array(way) @ np.linalg.inv(V).T @ (V.T @ wrench / np.linalg.norm(V.T @ wrench))
+        assert fitted_ratio(z) == pytest.approx(ratio, abs=0.1), f"mode of {frequency:.1f} rad/s"
+        overshoot = max(0.0, float(-(z / z[0]).min()))
+        if ratio == 1.0:
+            assert overshoot < 1e-3
+        else:
+            logarithm = np.log(overshoot)
+            assert -logarithm / np.hypot(np.pi, logarithm) == pytest.approx(ratio, abs=0.1)
+
+
+def energy(loop: TorqueLoop) -> float:
+    """Kinetic energy, and what the tool's and the posture's virtual springs hold [J]; gravity is compensated."""
+    state, settings = loop.state, loop.settings
+    M = pin.crba(loop.robot.model, loop.robot.model.createData(), state.q)
+    total = 0.5 * float(state.v @ M @ state.v)
+    total += 0.5 * settings.nullspace_stiffness * float(np.sum((state.q - loop.reference.q) ** 2))
+    for arm in loop.robot.arms:
+        e = loop.displacement(arm)
+        total += 0.5 * settings.translational_stiffness * float(e[:3] @ e[:3])
+        total += 0.5 * settings.rotational_stiffness * float(e[3:] @ e[3:])
+    return total
+
+
+@pytest.mark.parametrize(("name", "projector"), [("home", "consistent"), ("reaching far", "kinematic")])
+def test_after_release_energy_never_grows(bare: MujocoPlant, robot: Robot, name: str, projector: str) -> None:
+    settings = SETTINGS.model_copy(update={"damping_ratio": 0.7, "nullspace_projector": projector})
+    loop = TorqueLoop(bare, robot, settings, posture(robot, name))
+    bare.push("left", np.array([15.0, -10.0, 20.0, 2.0, 3.0, -1.0]), 2.0)
+    loop.run(2.0)
+    start = least = energy(loop)
+    assert start > 0.2
+    for _ in loop.ticks(2.0):
+        now = energy(loop)
+        # Of the posture's spring only a projection acts, which does no work at the tool: its energy is no state's
+        # function, by a part in a thousand of the whole at these displacements.
+        assert now < least + 1e-3 * start
+        least = min(least, now)
+    assert now < 0.01 * start
+
+
+@pytest.mark.parametrize("name", POSTURES)
+def test_arms_that_weigh_something_else_stay_stable_and_within_2_cm(
+    reweighed: MujocoPlant, robot: Robot, name: str
+) -> None:
+    loop = TorqueLoop(reweighed, robot, SETTINGS, posture(robot, name), SLOW)
+    largest = 0.0
+    for _ in loop.ticks(2.5):
+        largest = max(largest, *(float(np.linalg.norm(loop.displacement(arm)[:3])) for arm in robot.arms))
+    static = 1e3 * np.linalg.norm(loop.displacement()[:3])
+    message = f"largest tool error {1e3 * largest:.1f} mm, static {static:.1f} mm from gravity that is not compensated"
+    assert largest < 0.02, message
+    assert static > 1.0, "the masses are others"
+    assert np.abs(loop.state.v).max() < 2e-3, message
+
+
+def test_arms_that_weigh_something_else_yield_alike_and_come_back_to_rest(reweighed: MujocoPlant, robot: Robot) -> None:
+    loop = TorqueLoop(reweighed, robot, SETTINGS, robot.home, SLOW)
+    loop.settle()
+    before = loop.displacement()
+    reweighed.push("left", along(2), 3.0)
+    loop.run(3.0)
+    np.testing.assert_allclose((loop.displacement() - before)[:3], [0, 0, FORCE / 2000.0], atol=0.05 * FORCE / 2000.0)
+    loop.settle()
+    np.testing.assert_allclose(loop.displacement()[:3], before[:3], atol=3e-4)
+
+
+@pytest.mark.parametrize("ratio", [0.7, 1.0])
+def test_it_meets_the_table_at_a_tenth_of_a_metre_a_second_without_bouncing_more_than_twice(
+    bare: MujocoPlant, robot: Robot, ratio: float
+) -> None:
+    loop = TorqueLoop(bare, robot, SETTINGS.model_copy(update={"damping_ratio": ratio}), robot.home)
+    way = list(tool_motion(robot, "left", np.array([0.0, 0.0, -0.1]), 2.5, DT, robot.home))
+    touching = []
+    v = np.zeros(14)
+    for command in way:
+        loop.reference = reference(command.q, command.v, (command.v - v) / DT)
+        v = command.v
+        loop.tick()
+        touching.append(touches_table(bare))
+    loop.reference = reference(way[-1].q)
+    for _ in loop.ticks(1.0):
+        touching.append(touches_table(bare))
+    lost = int(np.sum(np.diff(np.array(touching, dtype=int)) == -1))
+    assert lost <= 2
+    assert not touching[0]
+    assert all(touching[-1000:])
+    assert np.abs(loop.state.v).max() < 2e-3
+    # What the table bears is what the spring is pressed together by.
+    depth = robot.tool_pose(loop.state.q, "left").translation - robot.tool_pose(way[-1].q, "left").translation
+    assert 0.03 < depth[2] < 0.1
+    external = loop.state.tau_external
+    assert external is not None
+    J, _ = left_arm(robot, loop.state.q)
+    force, *_ = np.linalg.lstsq(J.T, external[:7], rcond=None)
+    assert force[2] == pytest.approx(SETTINGS.translational_stiffness * depth[2], rel=0.05)
+
+
+def touches_table(plant: MujocoPlant) -> bool:
+    table = plant.model.geom("table_collision").id
+    return any(table in (contact.geom1, contact.geom2) for contact in plant.data.contact)
+
+
+def test_a_change_of_stiffness_under_load_is_a_ramp_and_no_jump(bare: MujocoPlant, robot: Robot) -> None:
+    loop = TorqueLoop(bare, robot, SETTINGS, robot.home)
+    bare.push("left", along(2), 60.0)
+    loop.settle()
+    for stiffness in (500.0, 4000.0):
+        loop.controller.set_stiffness(translational=stiffness)
+        for _ in range(round(SETTINGS.ramp_time / DT)):
+            before = loop.controller.stiffness("left")[0]
+            # The rate limit, which would hide a jump, is never touched.
+            assert not loop.tick().report.rate_limited
+            change = abs(loop.controller.stiffness("left")[0] - before)
+            assert change <= 3500.0 * DT / SETTINGS.ramp_time * (1 + 1e-9)
+        assert loop.controller.stiffness("left")[0] == stiffness
+        loop.run(2.0)
+        assert loop.displacement()[2] == pytest.approx(FORCE / stiffness, rel=0.05)
+
+
+@pytest.mark.parametrize("projector", PROJECTORS)
+def test_a_nullspace_push_moves_the_elbow_and_leaves_the_tool_within_two_millimetres(
+    bare: MujocoPlant, robot: Robot, projector: str
+) -> None:
+    loop = TorqueLoop(bare, robot, SETTINGS.model_copy(update={"nullspace_projector": projector}), robot.home)
+    elbow = bare.model.body("left_link_4").id
+    start, joints = bare.data.xpos[elbow].copy(), robot.arms["left"].joints
+    index = [bare.model.joint(robot.joint_names[joint]).dofadr[0] for joint in joints]
+    previous = np.linalg.svd(left_arm(robot, robot.home)[0])[2][6]
+    moved = 0.0
+    for tick in range(2500):
+        J, M = left_arm(robot, loop.state.q)
+        self_motion = np.linalg.svd(J)[2][6]
+        self_motion *= np.sign(self_motion @ previous)
+        previous = self_motion
+        # Torque that accelerates no tool, or torque that nothing has to balance at the tool; let go in the end.
+        push = M @ self_motion if projector == "consistent" else self_motion
+        bare.data.qfrc_applied[index] = (30.0 if tick < 1800 else 0.0) * push / np.linalg.norm(push)
+        loop.tick()
+        displacement = loop.displacement()
+        assert np.linalg.norm(displacement[:3]) < 2e-3
+        assert np.linalg.norm(displacement[3:]) < np.radians(0.5)
+        if tick == 1799:
+            assert np.linalg.norm(displacement[:3]) < 1e-4, "at rest the push is none of the tool's business"
+        moved = max(moved, float(np.linalg.norm(bare.data.xpos[elbow] - start)))
+    assert moved > 0.03
+
+
+def follow(loop: TorqueLoop, feed_forward: bool) -> float:
+    """Largest way [m] of the left tool from a reference that reaches far, least jerk, up to 0.3 m/s."""
+    start, end, duration = posture(loop.robot, "home"), posture(loop.robot, "reaching far"), 2.0
+    q, v, way, speeds = start, np.zeros(14), [], []
+    for s in np.linspace(0, 1, round(duration / DT) + 1)[1:]:
+        before, speed = q, v
+        q = start + s**3 * (10 - 15 * s + 6 * s**2) * (end - start)
+        v = (q - before) / DT
+        loop.reference = reference(q, v, (v - speed) / DT if feed_forward else None)
+        loop.tick()
+        was, due, reached = (loop.robot.tool_pose(x, "left").translation for x in (before, q, loop.state.q))
+        way.append(float(np.linalg.norm(reached - due)))
+        speeds.append(np.linalg.norm(due - was) / DT)
+    assert max(speeds) > 0.28
+    return max(way)
+
+
+def test_the_tool_follows_within_half_a_millimetre_and_without_feed_forward_would_lag_by_ten_times_as_much(
+    bare: MujocoPlant, robot: Robot
+) -> None:
+    loop = TorqueLoop(bare, robot, SETTINGS, robot.home)
+    largest = follow(loop, feed_forward=True)
+    assert largest < 5e-4
+    loop.settle()
+    at_rest = pose_error(robot.tool_pose(loop.state.q, "left"), robot.tool_pose(loop.reference.q, "left"))
+    assert np.linalg.norm(at_rest[:3]) < 1e-4
+    assert follow(TorqueLoop(bare, robot, SETTINGS, robot.home), feed_forward=False) > 10 * largest
+
+
+@pytest.mark.parametrize("wrench", [along(0), along(1), along(2, -FORCE)], ids=["sideways", "across", "down"])
+def test_stretched_out_it_stays_stable(bare: MujocoPlant, robot: Robot, wrench: Array) -> None:
+    loop = TorqueLoop(bare, robot, SETTINGS, np.zeros(14), SLOW)
+    bare.push("left", wrench, 0.5)
+    for _ in loop.ticks(0.5):
+        assert np.linalg.norm(loop.displacement()[:3]) < 0.012
+    loop.settle()
+    assert np.linalg.norm(loop.displacement()[:3]) < 1e-3
+
+
+def test_thrown_by_a_blow_it_keeps_every_bound_and_comes_back(bare: MujocoPlant, robot: Robot) -> None:
+    settings = SETTINGS.model_copy(update={"torque_rate_limit": 1000.0})
+    loop = TorqueLoop(bare, robot, settings, robot.home, SLOW)
+    bare.push("left", np.array([0.0, 300.0, 300.0, 0, 0, 0]), 0.15)
+    limited, clipped = set(), set()
+    for command in loop.ticks(0.5):
+        limited |= set(command.report.rate_limited)
+        clipped |= set(command.report.clipped)
+    assert limited
+    assert clipped == {"left"}
+    loop.settle()
+    assert np.linalg.norm(loop.displacement()[:3]) < 2e-3

@@ -1,0 +1,77 @@
+"""An impedance controller that drives a plant by torque, with the bounds of every single step asserted."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import pinocchio as pin
+
+from q2r2_control.control.compliance import pose_error
+from q2r2_control.control.impedance import ImpedanceController, TorqueCommand
+from q2r2_control.control.settings import ImpedanceSettings
+from q2r2_control.plants.mujoco import MujocoPlant
+from q2r2_control.robot.robot import Robot
+from q2r2_control.types import Array, Command, CommandMode, Reference, StepReport, StepStatus
+
+DT = 0.001
+_ROUNDING = 1e-9  # [Nm]
+_NO_REPORT = StepReport(StepStatus.OK, (), (), ("", ""), np.inf, True, False, 0.0, 0.0)
+
+
+def reference(q: Array, v: Array | None = None, a: Array | None = None) -> Reference:
+    """A reference that no QP made; at rest where ``v`` and ``a`` are left out."""
+    zero = np.zeros_like(q)
+    return Reference(q, zero if v is None else v, zero if a is None else a, _NO_REPORT)
+
+
+class TorqueLoop:
+    """One run with a tick of ``dt`` [s], which starts at rest at the posture ``q`` (nv,) that the reference holds."""
+
+    def __init__(self, plant: MujocoPlant, robot: Robot, settings: ImpedanceSettings, q: Array, dt: float = DT) -> None:
+        self.dt = dt
+        self.plant, self.robot, self.settings = plant, robot, settings
+        self.controller = ImpedanceController(robot, settings)
+        self.reference = reference(q)
+        self.start = {arm: robot.tool_pose(q, arm) for arm in robot.arms}
+        self._limit = settings.torque_scale * robot.torque_limit
+        self._change = settings.torque_rate_limit * dt
+        plant.reset(q)
+        self.state = plant.state()
+        self.controller.reset(self.state)
+        self._last: Array = pin.computeGeneralizedGravity(robot.model, robot.model.createData(), q)
+
+    def tick(self) -> TorqueCommand:
+        """One tick, with every bound asserted."""
+        command = self.controller.step(self.reference, self.state, self.dt)
+        # A number that is not finite fails these as well.
+        assert (np.abs(command.tau) <= self._limit).all()
+        assert np.abs(command.tau - self._last).max() <= self._change + _ROUNDING
+        assert not command.report.held
+        self._last = command.tau
+        self.plant.apply(Command(CommandMode.TORQUE, self.reference.q, self.reference.v, command.tau, {}))
+        self.plant.advance(self.dt)
+        self.state = self.plant.state()
+        assert (self.state.tau == command.tau).all(), "the plant has nothing to clip"
+        return command
+
+    def ticks(self, duration: float) -> Iterator[TorqueCommand]:
+        """Ticks for ``duration`` [s]."""
+        for _ in range(round(duration / self.dt)):
+            yield self.tick()
+
+    def run(self, duration: float) -> None:
+        """Tick for ``duration`` [s]."""
+        for _ in self.ticks(duration):
+            pass
+
+    def settle(self, timeout: float = 8.0) -> None:
+        """Tick until all joints rest, which they have to do in time."""
+        for _ in self.ticks(timeout):
+            if np.abs(self.state.v).max() < 3e-4 and self.state.stamp > 0.3:
+                return
+        raise AssertionError(f"still {np.abs(self.state.v).max():.2e} rad/s after {timeout:g} s")
+
+    def displacement(self, arm: str = "left") -> Array:
+        """Way (6,) [m, rad] that the tool is away from where the run started, world axes."""
+        return pose_error(self.robot.tool_pose(self.state.q, arm), self.start[arm])
