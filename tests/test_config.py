@@ -26,7 +26,7 @@ from q2r2_control.config import (
 from q2r2_control.control.settings import ControllerSettings
 from q2r2_control.errors import ConfigError, Q2R2Error
 from q2r2_control.robot.robot import Robot
-from q2r2_control.teleop.settings import FilterSettings, GateSettings, TeleopSettings
+from q2r2_control.teleop.settings import FilterSettings, GateSettings, LeashSettings, TeleopSettings
 
 SHIPPED = Path(__file__).resolve().parents[1] / "config"
 CELL = SHIPPED / "dual_iiwa7.yaml"
@@ -85,6 +85,7 @@ class TestTheShippedCellShowsAllThereIsToTune:
         ("control", ControllerSettings),
         ("teleop", TeleopSettings),
         ("teleop.filter", FilterSettings),
+        ("teleop.leash", LeashSettings),
         ("teleop.gate", GateSettings),
         ("mujoco", MujocoConfig),
         ("mujoco.objects.blue_block", ObjectConfig),
@@ -157,6 +158,7 @@ class TestTheShippedCellShowsAllThereIsToTune:
         "teleop.scale",
         "teleop.filter.cutoff",
         "teleop.gate.jump",
+        "teleop.leash.length",
         "mujoco.step",
         "mujoco.objects.blue_block.weight",
     ],
@@ -212,6 +214,7 @@ def test_a_misspelt_key_is_named_before_the_one_that_is_missing_for_it(tmp_path:
         ("control.position_margin", "0.01 rad", "valid number"),
         ("control.position_margin", None, "valid number"),
         ("control.solver", 3, "valid string"),
+        ("teleop.leash.distance", 100, "less than or equal to 2"),
         ("teleop.linked", "perhaps", "valid boolean"),
         ("arms.left.home", 0.0, "valid array"),
         ("arms.left.mount.position", [0, 0], "missing"),
