@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from q2r2_control.control.settings import ControllerSettings
+from q2r2_control.control.settings import ControllerSettings, check_priority
 from q2r2_control.errors import ConfigError
 from q2r2_control.resources import find_resource
 from q2r2_control.teleop.settings import TeleopSettings
@@ -153,7 +153,11 @@ def load_config(path: str | os.PathLike[str]) -> Config:
         raise ConfigError(f"{path}: expected a mapping of keys such as name, arms, obstacles; got {data!r:.60}")
     try:
         # Strict, or `off` would pass for 0.0; by way of JSON, where sequences are tuples and names are enums.
-        return Config.model_validate_json(json.dumps(data, default=str), strict=True)
+        config = Config.model_validate_json(json.dumps(data, default=str), strict=True)
+        check_priority(config.control.priority, config.arms)
+        return config
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from error
     except ValidationError as error:
         raise ConfigError(f"{path}: {_first_fault(error)}") from error
     except (ValueError, TypeError, RecursionError) as error:

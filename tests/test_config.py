@@ -214,6 +214,7 @@ def test_a_misspelt_key_is_named_before_the_one_that_is_missing_for_it(tmp_path:
         ("control.position_margin", "0.01 rad", "valid number"),
         ("control.position_margin", None, "valid number"),
         ("control.solver", 3, "valid string"),
+        ("control.priority", "middle", "allowed here: equal, left, right"),
         ("teleop.leash.distance", 100, "less than or equal to 2"),
         ("teleop.linked", "perhaps", "valid boolean"),
         ("arms.left.home", 0.0, "valid array"),

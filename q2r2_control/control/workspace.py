@@ -10,6 +10,7 @@ from q2r2_control.control.braking import Rollout
 from q2r2_control.control.chain import Chain, IntArray, Placements
 from q2r2_control.control.collision import Bodies, Contact, Pairs, Posed
 from q2r2_control.control.pace import Pace
+from q2r2_control.control.priority import Priority
 from q2r2_control.control.separation import Approach, Rows
 from q2r2_control.control.tasks import Motion, Tools
 from q2r2_control.types import Array
@@ -25,7 +26,6 @@ class Limits(NamedTuple):
     full_at: float  # [m]
     posture_gain: float  # [1/s]
     posture_speed: float  # [rad/s]
-    posture_weight: float
 
 
 class Cell(NamedTuple):
@@ -38,6 +38,7 @@ class Cell(NamedTuple):
     motion: Motion
     approach: Approach
     limits: Limits
+    priority: Priority
     pair_arm: Array  # (p, n) 1 where the pair slows arm n down when close
     lower: Array  # (nv,) position limits less the margin [rad]
     upper: Array
