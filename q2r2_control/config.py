@@ -65,6 +65,16 @@ class GripperConfig(_Model):
         return self
 
 
+class SwivelConfig(_Model):
+    """Where an arm's elbow is, about the line from shoulder to wrist. Names are joints of the arm's model."""
+
+    shoulder: str = Field("A2", description="joint in the shoulder")
+    elbow: str = Field("A4", description="joint in the elbow")
+    wrist: str = Field("A6", description="joint in the wrist")
+    angle: Angle | None = Field(None, description="0: elbow up, turning about that line [rad]; none: as at home")
+    gain: float = Field(0.0, ge=0, le=20, description="swivel speed per radian from the angle [1/s]; 0: off")
+
+
 class ArmConfig(_Model):
     """One arm: model, mount, tool, home posture."""
 
@@ -73,6 +83,7 @@ class ArmConfig(_Model):
     tool: ToolConfig = ToolConfig()
     gripper: GripperConfig = GripperConfig()
     home: tuple[float, ...] = Field(description="joint positions [rad]")
+    swivel: SwivelConfig = SwivelConfig()
 
 
 class ObstacleConfig(_Model):

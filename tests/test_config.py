@@ -20,6 +20,7 @@ from q2r2_control.config import (
     ObjectConfig,
     ObstacleConfig,
     PoseConfig,
+    SwivelConfig,
     ToolConfig,
     load_config,
 )
@@ -80,6 +81,7 @@ class TestTheShippedCellShowsAllThereIsToTune:
         ("arms.left.mount", PoseConfig),
         ("arms.left.tool", ToolConfig),
         ("arms.left.gripper", GripperConfig),
+        ("arms.left.swivel", SwivelConfig),
         ("obstacles.table", ObstacleConfig),
         ("headset", HeadsetConfig),
         ("control", ControllerSettings),
@@ -159,6 +161,7 @@ class TestTheShippedCellShowsAllThereIsToTune:
         "teleop.filter.cutoff",
         "teleop.gate.jump",
         "teleop.leash.length",
+        "arms.left.swivel.shoulders",
         "mujoco.step",
         "mujoco.objects.blue_block.weight",
     ],

@@ -49,6 +49,9 @@ class ControllerSettings(BaseModel):
     posture_gain: float = Field(1.0, ge=0, le=20, description="pull towards the home posture [1/s]")
     posture_speed: float = Field(0.5, gt=0, le=3, description="of that pull, at most [rad/s]")
     posture_weight: float = Field(1e-3, gt=0, le=1, description="against the tool task's 1; also regularises")
+    manipulability_gain: float = Field(
+        0.0, ge=0, le=10, description="posture speed per relative rise of manipulability; 0: off [rad/s]"
+    )
     stretch_gain: float = Field(10.0, gt=0, le=200, description="highest gain of a stretched-out arm [1/s]")
 
 
