@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from q2r2_control.control.settings import ControllerSettings, ImpedanceSettings
+from q2r2_control.control.settings import ControllerSettings, ImpedanceSettings, check_priority
 from q2r2_control.errors import ConfigError
 from q2r2_control.resources import find_resource
 from q2r2_control.teleop.settings import TeleopSettings
@@ -65,6 +65,16 @@ class GripperConfig(_Model):
         return self
 
 
+class SwivelConfig(_Model):
+    """Where an arm's elbow is, about the line from shoulder to wrist. Names are joints of the arm's model."""
+
+    shoulder: str = Field("A2", description="joint in the shoulder")
+    elbow: str = Field("A4", description="joint in the elbow")
+    wrist: str = Field("A6", description="joint in the wrist")
+    angle: Angle | None = Field(None, description="0: elbow up, turning about that line [rad]; none: as at home")
+    gain: float = Field(0.0, ge=0, le=20, description="swivel speed per radian from the angle [1/s]; 0: off")
+
+
 class ArmConfig(_Model):
     """One arm: model, mount, tool, home posture."""
 
@@ -73,6 +83,7 @@ class ArmConfig(_Model):
     tool: ToolConfig = ToolConfig()
     gripper: GripperConfig = GripperConfig()
     home: tuple[float, ...] = Field(description="joint positions [rad]")
+    swivel: SwivelConfig = SwivelConfig()
 
 
 class ObstacleConfig(_Model):
@@ -154,7 +165,11 @@ def load_config(path: str | os.PathLike[str]) -> Config:
         raise ConfigError(f"{path}: expected a mapping of keys such as name, arms, obstacles; got {data!r:.60}")
     try:
         # Strict, or `off` would pass for 0.0; by way of JSON, where sequences are tuples and names are enums.
-        return Config.model_validate_json(json.dumps(data, default=str), strict=True)
+        config = Config.model_validate_json(json.dumps(data, default=str), strict=True)
+        check_priority(config.control.priority, config.arms)
+        return config
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from error
     except ValidationError as error:
         raise ConfigError(f"{path}: {_first_fault(error)}") from error
     except (ValueError, TypeError, RecursionError) as error:

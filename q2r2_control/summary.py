@@ -35,6 +35,8 @@ class ArmSummary:
     position_error_mm_rms: float | None  # None: never engaged
     rotation_error_deg_rms: float | None
     gripper_changes: int
+    slip_mm_max: float  # largest slip of one engagement: how far the target went along with a tool held up
+    slip_deg_max: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,6 +106,8 @@ class _ArmFigures:
     rotation: float = 0.0  # [rad^2]
     gripper: float | None = None
     gripper_changes: int = 0
+    slip: float = 0.0  # largest [m]
+    slip_angle: float = 0.0  # largest [rad]
 
 
 @dataclass(slots=True)
@@ -160,6 +164,8 @@ class RunStatistics:
             if figures.gripper is not None and figures.gripper != target.gripper:
                 figures.gripper_changes += 1
             figures.gripper = target.gripper
+            figures.slip = max(figures.slip, target.slip)
+            figures.slip_angle = max(figures.slip_angle, target.slip_angle)
             if engaged[name] and target.pose is not None:
                 error = tools[name].actInv(target.pose)
                 figures.engaged += dt
@@ -199,4 +205,6 @@ def _arm_summary(figures: _ArmFigures) -> ArmSummary:
         position_error_mm_rms=None if rms[0] is None else 1e3 * rms[0],
         rotation_error_deg_rms=None if rms[1] is None else float(np.degrees(rms[1])),
         gripper_changes=figures.gripper_changes,
+        slip_mm_max=1e3 * figures.slip,
+        slip_deg_max=math.degrees(figures.slip_angle),
     )

@@ -128,6 +128,8 @@ class ArmTarget:
 
     pose: pin.SE3 | None  # tool pose in the world frame; None: hold
     gripper: float  # opening, 0 closed .. 1 fully open
+    slip: float = 0.0  # how far the target has slipped along with a tool held up, since engaging [m]
+    slip_angle: float = 0.0  # the same of the rotation [rad]
 
 
 @dataclass(frozen=True, slots=True)

@@ -37,7 +37,14 @@ SUMMARY_KEYS = {
     "rejected_targets",
     "events",
 }
-ARM_KEYS = {"engaged_s", "position_error_mm_rms", "rotation_error_deg_rms", "gripper_changes"}
+ARM_KEYS = {
+    "engaged_s",
+    "position_error_mm_rms",
+    "rotation_error_deg_rms",
+    "gripper_changes",
+    "slip_mm_max",
+    "slip_deg_max",
+}
 
 
 def q2r2(*arguments: str) -> Result:

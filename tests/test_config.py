@@ -20,13 +20,14 @@ from q2r2_control.config import (
     ObjectConfig,
     ObstacleConfig,
     PoseConfig,
+    SwivelConfig,
     ToolConfig,
     load_config,
 )
 from q2r2_control.control.settings import ControllerSettings, ImpedanceSettings
 from q2r2_control.errors import ConfigError, Q2R2Error
 from q2r2_control.robot.robot import Robot
-from q2r2_control.teleop.settings import FilterSettings, GateSettings, TeleopSettings
+from q2r2_control.teleop.settings import FilterSettings, GateSettings, LeashSettings, TeleopSettings
 
 SHIPPED = Path(__file__).resolve().parents[1] / "config"
 CELL = SHIPPED / "dual_iiwa7.yaml"
@@ -80,12 +81,14 @@ class TestTheShippedCellShowsAllThereIsToTune:
         ("arms.left.mount", PoseConfig),
         ("arms.left.tool", ToolConfig),
         ("arms.left.gripper", GripperConfig),
+        ("arms.left.swivel", SwivelConfig),
         ("obstacles.table", ObstacleConfig),
         ("headset", HeadsetConfig),
         ("control", ControllerSettings),
         ("impedance", ImpedanceSettings),
         ("teleop", TeleopSettings),
         ("teleop.filter", FilterSettings),
+        ("teleop.leash", LeashSettings),
         ("teleop.gate", GateSettings),
         ("mujoco", MujocoConfig),
         ("mujoco.objects.blue_block", ObjectConfig),
@@ -160,6 +163,8 @@ class TestTheShippedCellShowsAllThereIsToTune:
         "teleop.scale",
         "teleop.filter.cutoff",
         "teleop.gate.jump",
+        "teleop.leash.length",
+        "arms.left.swivel.shoulders",
         "mujoco.step",
         "mujoco.objects.blue_block.weight",
     ],
@@ -220,6 +225,8 @@ def test_a_misspelt_key_is_named_before_the_one_that_is_missing_for_it(tmp_path:
         ("control.position_margin", "0.01 rad", "valid number"),
         ("control.position_margin", None, "valid number"),
         ("control.solver", 3, "valid string"),
+        ("control.priority", "middle", "allowed here: equal, left, right"),
+        ("teleop.leash.distance", 100, "less than or equal to 2"),
         ("teleop.linked", "perhaps", "valid boolean"),
         ("arms.left.home", 0.0, "valid array"),
         ("arms.left.mount.position", [0, 0], "missing"),

@@ -37,7 +37,14 @@ KEYS: dict[str, type | set[str]] = {
     "at_rest": bool,
     "events": list,
 }
-ARM_KEYS = {"engaged_s", "position_error_mm_rms", "rotation_error_deg_rms", "gripper_changes"}
+ARM_KEYS = {
+    "engaged_s",
+    "position_error_mm_rms",
+    "rotation_error_deg_rms",
+    "gripper_changes",
+    "slip_mm_max",
+    "slip_deg_max",
+}
 
 REPORT = StepReport(StepStatus.OK, (), (), ("left_a", "right_b"), 0.2, True, False, 0.0, 1e-5)
 
@@ -59,6 +66,18 @@ def add(statistics: RunStatistics, *, error: pin.SE3 | None = None, gripper: flo
         tools,
         dict.fromkeys(tools, error is not None),
     )
+
+
+def test_the_largest_slip_of_an_engagement_is_told(statistics: RunStatistics) -> None:
+    reference = Reference(statistics.robot.home, np.zeros(14), np.zeros(14), REPORT)
+    tools = {arm: pin.SE3.Identity() for arm in statistics.robot.arms}
+    for slip, angle in ((0.0, 0.0), (0.2, np.pi / 6), (0.05, np.pi / 3), (0.0, 0.0)):
+        targets = {"left": ArmTarget(pin.SE3.Identity(), 1.0, slip, angle), "right": ArmTarget(None, 1.0)}
+        statistics.add(0.001, reference, targets, tools, {"left": True, "right": False})
+    figures = statistics.summary(1.0).arms
+    assert figures["left"].slip_mm_max == pytest.approx(200.0)
+    assert figures["left"].slip_deg_max == pytest.approx(60.0)
+    assert figures["right"].slip_mm_max == figures["right"].slip_deg_max == 0.0
 
 
 def test_a_run_s_json_has_every_key_that_others_read() -> None:

@@ -9,8 +9,11 @@ from q2r2_control.control.collision import pose_bodies
 from q2r2_control.control.geometry import clamp
 from q2r2_control.control.jit import Held, kernel, lean_kernel
 from q2r2_control.control.limits import next_velocity_box
+from q2r2_control.control.manipulability import add_manipulability
 from q2r2_control.control.pace import find_pace
-from q2r2_control.control.separation import separation_rows, speed_near
+from q2r2_control.control.priority import tool_speed
+from q2r2_control.control.separation import separation_rows
+from q2r2_control.control.swivel import turn_elbows, write_rows
 from q2r2_control.control.tasks import (
     add_stretch_damping,
     add_tool_task,
@@ -79,8 +82,12 @@ def assemble(held_cell: Held, held_goals: Held, held_work: Held, h: float) -> bo
         else:
             _hold(cell, goals, i, work)
     project_to_nullspace(work.J, work.posture)
-    weight = cell.limits.posture_weight
+    if cell.limits.swivels == 1:
+        write_rows(cell.chain, work.placements, cell.swivels, goals.follows, fastest, work.swivel)
+        project_to_nullspace(work.J, work.swivel.free)
+        turn_elbows(cell.tools.member, fastest, work.swivel, work.posture)
     for j in range(nv):
+        weight = cell.priority.posture_weight[j]
         work.H[j, j] += weight
         work.g[j] -= weight * work.posture[j]
     return next_velocity_box(
@@ -101,12 +108,13 @@ def assemble(held_cell: Held, held_goals: Held, held_work: Held, h: float) -> bo
 
 @kernel
 def _follow(cell: Cell, goals: Goals, i: int, work: Workspace) -> None:
-    nearest = np.inf
-    for p in range(work.distance.shape[0]):
-        if cell.pair_arm[p, i] == 1.0 and work.distance[p] < nearest:
-            nearest = work.distance[p]
-    speed = speed_near(
-        nearest,
+    weight = cell.priority.weight[i]
+    speed = tool_speed(
+        i,
+        work.distance,
+        cell.pair_arm,
+        goals.follows,
+        cell.priority,
         cell.approach.stop_distance,
         cell.limits.contact_speed,
         cell.motion.full_speed[0],
@@ -125,10 +133,21 @@ def _follow(cell: Cell, goals: Goals, i: int, work: Workspace) -> None:
         work.twist[i],
         work.feedback,
     )
-    add_tool_task(J, work.twist[i], work.H, work.g)
+    add_tool_task(J, work.twist[i], weight, work.H, work.g)
     add_stretch_damping(
-        cell.chain, work.placements, cell.tools.joint[i], J, work.feedback, cell.motion.stretch_gain, work.H
+        cell.chain, work.placements, cell.tools.joint[i], J, work.feedback, cell.motion.stretch_gain, weight, work.H
     )
+    if cell.limits.manipulability_gain > 0.0:
+        add_manipulability(
+            cell.chain,
+            work.placements,
+            cell.tools.joint[i],
+            J,
+            cell.limits.manipulability_gain,
+            cell.limits.posture_speed,
+            work.manipulability,
+            work.posture,
+        )
 
 
 @lean_kernel

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from q2r2_control.control.chain import chain_of
+from q2r2_control.control.chain import Chain, Placements, chain_of, place
 from q2r2_control.control.collision import Pairs, bodies_of, pairs_of
+from q2r2_control.control.priority import Priority
 from q2r2_control.control.separation import Approach
-from q2r2_control.control.settings import ControllerSettings
+from q2r2_control.control.settings import EQUAL, ControllerSettings, check_priority
+from q2r2_control.control.swivel import Swivels, SwivelScratch, nearest_along, swivel_angle
 from q2r2_control.control.tasks import Motion, Tools
 from q2r2_control.control.workspace import Cell, Limits
 from q2r2_control.robot.robot import Robot
@@ -15,7 +17,11 @@ from q2r2_control.types import Array
 
 
 def cell_of(robot: Robot, settings: ControllerSettings) -> Cell:
-    """Arrays of a robot's joints, tools, pairs and limits. Raises :class:`RobotError` for what no kernel handles."""
+    """Arrays of a robot's joints, tools, pairs and limits.
+
+    Raises :class:`RobotError` for what no kernel handles, :class:`ConfigError` for a priority that is no arm's name.
+    """
+    check_priority(settings.priority, tuple(robot.arms))
     chain = chain_of(robot.model)
     bodies = bodies_of(robot.collision_model)
     lower = robot.position_lower + settings.position_margin
@@ -24,6 +30,7 @@ def cell_of(robot: Robot, settings: ControllerSettings) -> Cell:
         robot.collision_model, chain, bodies, np.maximum(np.abs(robot.position_lower), np.abs(robot.position_upper))
     )
     tools = _tools(robot)
+    swivels = _swivels(robot, chain)
     return Cell(
         chain=chain,
         bodies=bodies,
@@ -41,6 +48,8 @@ def cell_of(robot: Robot, settings: ControllerSettings) -> Cell:
             recovery_speed=settings.separation_recovery_speed,
             slow_below=settings.min_distance + settings.distance_buffer + settings.full_speed_distance,
         ),
+        priority=_priority(robot, settings),
+        swivels=swivels,
         pair_arm=_arms_slowed(pairs, tools.member),
         lower=lower,
         upper=upper,
@@ -55,7 +64,8 @@ def cell_of(robot: Robot, settings: ControllerSettings) -> Cell:
             full_at=settings.full_speed_distance,
             posture_gain=settings.posture_gain,
             posture_speed=settings.posture_speed,
-            posture_weight=settings.posture_weight,
+            manipulability_gain=settings.manipulability_gain,
+            swivels=int(swivels.gain.any()),
         ),
     )
 
@@ -70,6 +80,41 @@ def _tools(robot: Robot) -> Tools:
         tools.translation[i] = frame.placement.translation
         tools.member[i, arm.joints] = 1.0
     return tools
+
+
+def _priority(robot: Robot, settings: ControllerSettings) -> Priority:
+    n, nv = len(robot.arms), robot.model.nv
+    priority = Priority(
+        np.ones(n), np.full(nv, settings.posture_weight), np.zeros(n, dtype=np.int64), settings.yield_speed
+    )
+    if settings.priority == EQUAL:
+        return priority
+    first = robot.arms[settings.priority].joints
+    for i, (name, arm) in enumerate(robot.arms.items()):
+        if name == settings.priority:
+            priority.pushes[i] = 1
+            continue
+        priority.weight[i] = settings.yield_weight
+        # A joint that also moves the arm with priority keeps its full cost.
+        priority.posture_weight[np.setdiff1d(arm.joints, first)] = settings.yield_weight * settings.posture_weight
+    return priority
+
+
+def _swivels(robot: Robot, chain: Chain) -> Swivels:
+    """The arms' swivel tasks; without an angle of its own, a task keeps that of the home posture."""
+    n, nv = len(robot.arms), robot.model.nv
+    swivels, placements, scratch = Swivels.none(n), Placements.empty(chain), SwivelScratch.empty(n, nv)
+    place(chain, np.array(robot.home, dtype=np.float64), placements)
+    for i, arm in enumerate(robot.arms.values()):
+        if arm.swivel is None:
+            continue
+        swivels.gain[i] = arm.swivel.gain
+        for k, name in enumerate((arm.swivel.shoulder, arm.swivel.elbow, arm.swivel.wrist)):
+            swivels.joint[i, k] = robot.model.getJointId(name)
+            swivels.along[i, k] = nearest_along(chain, int(swivels.joint[i, k]))
+        at_home, _ = swivel_angle(placements, swivels, i, scratch)
+        swivels.angle[i] = at_home if arm.swivel.angle is None else arm.swivel.angle
+    return swivels
 
 
 def _arms_slowed(pairs: Pairs, member: Array) -> Array:

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
+
+from q2r2_control.errors import ConfigError
+
+EQUAL = "equal"
 
 
 class ControllerSettings(BaseModel):
@@ -30,6 +35,10 @@ class ControllerSettings(BaseModel):
     contact_speed: float = Field(0.03, gt=0, le=1, description="tool speed where another arm is closest [m/s]")
     full_speed_distance: float = Field(0.1, gt=0, le=1, description="free distance with full tool speed [m]")
 
+    priority: str = Field(EQUAL, description="equal, or the arm that the other one gives way to")
+    yield_weight: float = Field(0.01, gt=0, le=1, description="of the costs of the arm that gives way")
+    yield_speed: float = Field(0.1, gt=0, le=1, description="tool speed with which the arm with priority pushes [m/s]")
+
     position_gain: float = Field(8.0, gt=0, le=50, description="[1/s]")
     rotation_gain: float = Field(8.0, gt=0, le=50, description="[1/s]")
     max_linear_speed: float = Field(1.0, gt=0, le=3, description="tool speed [m/s]")
@@ -41,7 +50,16 @@ class ControllerSettings(BaseModel):
     posture_gain: float = Field(1.0, ge=0, le=20, description="pull towards the home posture [1/s]")
     posture_speed: float = Field(0.5, gt=0, le=3, description="of that pull, at most [rad/s]")
     posture_weight: float = Field(1e-3, gt=0, le=1, description="against the tool task's 1; also regularises")
+    manipulability_gain: float = Field(
+        0.0, ge=0, le=10, description="posture speed per relative rise of manipulability; 0: off [rad/s]"
+    )
     stretch_gain: float = Field(10.0, gt=0, le=200, description="highest gain of a stretched-out arm [1/s]")
+
+
+def check_priority(priority: str, arms: Collection[str]) -> None:
+    """Raises :class:`ConfigError` unless ``priority`` is ``equal`` or one of ``arms``."""
+    if priority != EQUAL and priority not in arms:
+        raise ConfigError(f"control.priority = {priority!r:.60}: allowed here: {', '.join((EQUAL, *arms))}")
 
 
 class ImpedanceSettings(BaseModel):

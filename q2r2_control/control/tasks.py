@@ -168,13 +168,13 @@ def wanted_twist(
 
 
 @lean_kernel
-def add_tool_task(J: Array, twist: Array, H: Array, g: Array) -> None:
-    """Add |J v - twist|^2_W of one arm to H (nv, nv) and g (nv,)."""
+def add_tool_task(J: Array, twist: Array, weight: float, H: Array, g: Array) -> None:
+    """Add ``weight`` |J v - twist|^2_W of one arm to H (nv, nv) and g (nv,)."""
     nv = g.shape[0]
-    square = ROTATION_LENGTH * ROTATION_LENGTH
+    square = weight * ROTATION_LENGTH * ROTATION_LENGTH
     for i in range(nv):
         for k in range(6):
-            weighted = J[k, i] if k < 3 else square * J[k, i]
+            weighted = weight * J[k, i] if k < 3 else square * J[k, i]
             if weighted == 0.0:
                 continue
             g[i] -= weighted * twist[k]
@@ -184,9 +184,9 @@ def add_tool_task(J: Array, twist: Array, H: Array, g: Array) -> None:
 
 @lean_kernel
 def add_stretch_damping(
-    chain: Chain, placements: Placements, joint: int, J: Array, feedback: Array, gain: float, H: Array
+    chain: Chain, placements: Placements, joint: int, J: Array, feedback: Array, gain: float, weight: float, H: Array
 ) -> None:
-    """Add the damping M of the tool that ``joint`` carries to H (nv, nv); ``J`` (6, nv) is the tool's Jacobian.
+    """Add ``weight`` times the damping M of the tool that ``joint`` carries to H (nv, nv), ``J`` (6, nv) its Jacobian.
 
     For joint i between the base and joint j, d2x / dq_i dq_j = z_i x J_j (linear part). For the angular part, whose
     second derivative is no Hessian, the same bound in magnitude stands in: J_j turns with joint i by at most |z_i|.
@@ -195,18 +195,19 @@ def add_stretch_damping(
     for k in range(3):
         turning += feedback[3 + k] * feedback[3 + k]
     turning = ROTATION_LENGTH * ROTATION_LENGTH * np.sqrt(turning)
+    scale = weight / gain
     far = joint
     while far != 0:
         j = far - 1
         pull_j = max(0.0, -_stiffness(chain, placements, far, far, J, feedback))
-        H[j, j] += (turning + pull_j) / gain
+        H[j, j] += scale * (turning + pull_j)
         near = chain.parent[far]
         while near != 0:
             i = near - 1
             pull_i = max(0.0, -_stiffness(chain, placements, near, near, J, feedback))
             coupling = abs(_stiffness(chain, placements, near, far, J, feedback))
-            H[j, j] += min(coupling, pull_j) / gain
-            H[i, i] += min(coupling, pull_i) / gain
+            H[j, j] += scale * min(coupling, pull_j)
+            H[i, i] += scale * min(coupling, pull_i)
             near = chain.parent[near]
         far = chain.parent[far]
 

@@ -9,8 +9,11 @@ import numpy as np
 from q2r2_control.control.braking import Rollout
 from q2r2_control.control.chain import Chain, IntArray, Placements
 from q2r2_control.control.collision import Bodies, Contact, Pairs, Posed
+from q2r2_control.control.manipulability import ManipulabilityScratch
 from q2r2_control.control.pace import Pace
+from q2r2_control.control.priority import Priority
 from q2r2_control.control.separation import Approach, Rows
+from q2r2_control.control.swivel import Swivels, SwivelScratch
 from q2r2_control.control.tasks import Motion, Tools
 from q2r2_control.types import Array
 
@@ -25,7 +28,8 @@ class Limits(NamedTuple):
     full_at: float  # [m]
     posture_gain: float  # [1/s]
     posture_speed: float  # [rad/s]
-    posture_weight: float
+    manipulability_gain: float  # [rad/s]; 0: off
+    swivels: int  # 1: some arm has a swivel task
 
 
 class Cell(NamedTuple):
@@ -38,6 +42,8 @@ class Cell(NamedTuple):
     motion: Motion
     approach: Approach
     limits: Limits
+    priority: Priority
+    swivels: Swivels
     pair_arm: Array  # (p, n) 1 where the pair slows arm n down when close
     lower: Array  # (nv,) position limits less the margin [rad]
     upper: Array
@@ -102,6 +108,8 @@ class Workspace(NamedTuple):
     twist: Array  # (n, 6)
     feedback: Array  # (6,)
     posture: Array  # (nv,)
+    manipulability: ManipulabilityScratch
+    swivel: SwivelScratch
     H: Array  # (nv, nv)
     g: Array  # (nv,)
     box_lower: Array  # (nv,)
@@ -131,6 +139,8 @@ class Workspace(NamedTuple):
             twist=np.zeros((n, 6)),
             feedback=np.zeros(6),
             posture=np.zeros(nv),
+            manipulability=ManipulabilityScratch.empty(nv),
+            swivel=SwivelScratch.empty(n, nv),
             H=np.zeros((nv, nv)),
             g=np.zeros(nv),
             box_lower=np.zeros(nv),

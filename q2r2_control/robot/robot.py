@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import os
 import xml.etree.ElementTree as ET
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
 
 from q2r2_control.config import Config
-from q2r2_control.errors import RobotError
+from q2r2_control.errors import ConfigError, RobotError
 from q2r2_control.robot.compose import compose
 from q2r2_control.robot.description import LinkTree, joint_limits, parse_srdf, parse_urdf
 from q2r2_control.robot.enclose import enclose_shapes
@@ -30,6 +30,17 @@ _USUAL_ARMATURE = 0.1
 
 
 @dataclass(frozen=True, slots=True)
+class Swivel:
+    """Where the elbow should be, about the line from shoulder to wrist."""
+
+    shoulder: str  # joint names
+    elbow: str
+    wrist: str
+    angle: float | None  # [rad]; None: as at home
+    gain: float  # [1/s]
+
+
+@dataclass(frozen=True, slots=True)
 class Arm:
     """One arm: the frame the operator moves and the joints that move it."""
 
@@ -37,6 +48,7 @@ class Arm:
     tool_frame: str  # link name
     frame_id: int  # of the tool frame in ``Robot.model``
     joints: np.ndarray  # velocity indices from base to tool; a joint that several arms hang on is in each of them
+    swivel: Swivel | None = None  # None: the elbow is free
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,7 +110,10 @@ class Robot:
         """The robot of a cell. Raises :class:`ConfigError` or :class:`RobotError` with what is wrong and where."""
         cell = compose(config)
         urdf = parse_urdf(cell.urdf, cell.name)
-        return cls(urdf, parse_srdf(cell.srdf, cell.name), cell.tool_frames, cell.home, cell.name)
+        robot = cls(urdf, parse_srdf(cell.srdf, cell.name), cell.tool_frames, cell.home, cell.name)
+        for name, arm in robot.arms.items():
+            robot.arms[name] = replace(arm, swivel=_swivel(config, name, cell.arm_joints[name]))
+        return robot
 
     @classmethod
     def from_urdf(
@@ -150,6 +165,24 @@ class Robot:
             postures += [random.uniform(self.position_lower, self.position_upper) for _ in range(50)]
         own_links = [set(tree.path(frame)) for frame in tool_frames.values()]
         return remove_overlapping_own_pairs(self.model, self.collision_model, own_links, postures)
+
+
+def _swivel(config: Config, arm: str, joints: Sequence[str]) -> Swivel | None:
+    """An arm's swivel task with the names that its joints have in the cell; raises :class:`ConfigError`."""
+    wanted, prefix = next(made.swivel for side, made in config.arms.items() if side == arm), f"{arm}_"
+    if wanted.gain == 0.0:
+        return None
+    places = []
+    for key in ("shoulder", "elbow", "wrist"):
+        name = getattr(wanted, key)
+        if prefix + name not in joints:
+            allowed = ", ".join(joint.removeprefix(prefix) for joint in joints)
+            raise ConfigError(f"arms.{arm}.swivel.{key} = {name!r:.60}: no joint of the arm; allowed: {allowed}")
+        places.append(joints.index(prefix + name))
+    if not places[0] < places[1] < places[2]:
+        raise ConfigError(f"arms.{arm}.swivel: expected shoulder, elbow, wrist in the order of the arm's joints")
+    shoulder, elbow, wrist = (joints[place] for place in places)
+    return Swivel(shoulder, elbow, wrist, wanted.angle, wanted.gain)
 
 
 def _text_of(path_or_text: str | os.PathLike[str], name_of_text: str) -> tuple[str, str, Path | None]:

@@ -10,6 +10,7 @@ import pinocchio as pin
 from q2r2_control.teleop.buttons import ButtonArbiter, Press
 from q2r2_control.teleop.filters import PoseFilter
 from q2r2_control.teleop.gate import PoseGate
+from q2r2_control.teleop.leash import Leash
 from q2r2_control.teleop.relative import RelativeMotion
 from q2r2_control.teleop.settings import TeleopSettings
 from q2r2_control.types import Event, HandSample
@@ -43,13 +44,18 @@ class ArmTeleop:
         self._gate = PoseGate(settings.gate)
         self._buttons = ButtonArbiter(settings.chord_window)
         self._filter = PoseFilter(settings.filter)
-        self._motion = RelativeMotion(
-            settings.stance,
-            settings.position_scale,
-            settings.rotation_frame,
-            settings.rotation_scale,
-            settings.axes,
+        self._motion, self._unslipped = (
+            RelativeMotion(
+                settings.stance,
+                settings.position_scale,
+                settings.rotation_frame,
+                settings.rotation_scale,
+                settings.axes,
+            )
+            for _ in range(2)
         )
+        self._newest: tuple[pin.SE3, pin.SE3] | None = None  # the newest hand pose and where it would have the tool
+        self._leash = Leash(settings.leash)
         self._presses: list[Press] = []
         self._aligned_at = 0.0
 
@@ -101,11 +107,24 @@ class ArmTeleop:
             self._press(press, tool, now)
         self._presses.clear()
 
-    def target(self, now: float) -> pin.SE3 | None:
-        """Where the tool should be at ``now`` in the world frame; None: hold."""
+    def target(self, now: float, commanded: pin.SE3 | None = None) -> pin.SE3 | None:
+        """Where the tool should be at ``now`` in the world frame; None: hold.
+
+        ``commanded``: the tool's pose at the controller's reference, from which no target is farther than the leash.
+        """
         if self.state is not ArmState.ENGAGED:
             return None
-        return self._motion.target(self._filter.at(now))
+        hand = self._filter.at(now)
+        if commanded is None or self._gate.pose is None:
+            return self._motion.target(hand)
+        if self._newest is None or self._newest[0] is not self._gate.pose:
+            self._newest = self._gate.pose, self._unslipped.target(self._gate.pose)
+        return self._leash.target(self._motion, hand, self._newest[1], commanded, now)
+
+    @property
+    def slip(self) -> tuple[float, float]:
+        """How far the target has slipped along with the tool since engaging [m, rad]."""
+        return self._leash.slip, self._leash.slip_angle
 
     def _align(self, now: float) -> None:
         self._aligned_at = now
@@ -140,6 +159,9 @@ class ArmTeleop:
     def _anchor(self, hand: pin.SE3, tool: pin.SE3, now: float) -> None:
         self._filter.reset(hand, now)
         self._motion.anchor(hand, tool)
+        self._unslipped.anchor(hand, tool)
+        self._newest = None
+        self._leash.reset()
 
     def _go(self, state: ArmState, now: float, reason: str) -> None:
         if state is not self.state:

@@ -68,7 +68,8 @@ class RelativeMotion:
         self._map = axes_matrix(settings.axes)
         if settings.stance is Stance.MIRROR_REFLECTED:
             self._map = _REFLECTION @ self._map
-        self._hand: pin.SE3 | None = None
+        self._hand_position: Array | None = None
+        self._hand_rotation = np.eye(3)
         self._tool_position = np.zeros(3)
         # The tool's rotation is before * (the hand's own rotation since the anchor) * after.
         self._before = self._after = np.eye(3)
@@ -76,8 +77,17 @@ class RelativeMotion:
 
     def anchor(self, hand: pin.SE3, tool: pin.SE3) -> None:
         """Make ``hand`` (finite, input's frame) and ``tool`` (world frame) correspond from now on."""
-        self._hand = pin.SE3(hand)
+        self.anchor_position(hand, tool)
+        self.anchor_rotation(hand, tool)
+
+    def anchor_position(self, hand: pin.SE3, tool: pin.SE3) -> None:
+        """Make only the positions of ``hand`` and ``tool`` correspond from now on; rotations go on as they were."""
+        self._hand_position = np.array(hand.translation)
         self._tool_position = np.array(tool.translation)
+
+    def anchor_rotation(self, hand: pin.SE3, tool: pin.SE3) -> None:
+        """Make only the rotations of ``hand`` and ``tool`` correspond from now on; positions go on as they were."""
+        self._hand_rotation = np.array(hand.rotation)
         rotation = _orthonormal(tool.rotation)
         # M exp(s w) M' = exp(s M w), up to the sign that a reflection gives an axis: scaling and mapping commute.
         if self._in_tool_frame:
@@ -91,14 +101,14 @@ class RelativeMotion:
 
         Raises :class:`Q2R2Error` when nothing has been anchored.
         """
-        if self._hand is None:
+        if self._hand_position is None:
             raise Q2R2Error("RelativeMotion.target: call anchor(hand, tool) first")
-        way = self._scale * (self._map @ (hand.translation - self._hand.translation))
-        before, now = self._hand.rotation.T, hand.rotation
+        way = self._scale * (self._map @ (hand.translation - self._hand_position))
+        before, now = self._hand_rotation.T, hand.rotation
         turn = before @ now if self._in_tool_frame else now @ before
         target = pin.SE3(self._before @ self._scaled(turn) @ self._after, self._tool_position + way)
         if np.linalg.norm(self._vector) > _REANCHOR_ANGLE:
-            self.anchor(hand, target)
+            self.anchor_rotation(hand, target)
         return target
 
     def _scaled(self, rotation: Array) -> Array:

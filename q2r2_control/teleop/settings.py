@@ -50,6 +50,15 @@ class GateSettings(BaseModel):
     max_rotation_jump: float = Field(1.0, gt=0, le=3.14, description="rotation between two samples [rad]")
 
 
+class LeashSettings(BaseModel):
+    """How far a target may be from its tool; beyond that it slips along. None: as far as the hand goes."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    distance: float | None = Field(0.1, ge=0.02, le=2, description="of positions [m]; none: no leash")
+    angle: float | None = Field(0.5, ge=0.1, le=2, description="of rotations [rad]; none: no leash")
+
+
 class TeleopSettings(BaseModel):
     """Settings of the teleop layer; every range is checked when the object is made."""
 
@@ -68,6 +77,7 @@ class TeleopSettings(BaseModel):
     )
     linked: bool = Field(True, description="a fault of one hand disengages both arms")
     filter: FilterSettings = Field(default_factory=FilterSettings)
+    leash: LeashSettings = Field(default_factory=LeashSettings)
     gate: GateSettings = Field(default_factory=GateSettings)
 
     @field_validator("axes")

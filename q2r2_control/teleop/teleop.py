@@ -68,6 +68,7 @@ class Teleop:
         ``tools``: measured tool poses in the world frame. ``commanded``: tool poses of the controller's reference; when
         engaging, the position anchors to the measured tool and the orientation to the commanded one, so that sag
         does not add up over many pauses. Without ``commanded`` it is the last target's, at first the measured one.
+        ``commanded`` is also what the leash is tied to; without it there is none.
         ``now`` [s] is the clock of the samples' stamps.
         """
         clock_fault = self._clock(now)
@@ -84,10 +85,10 @@ class Teleop:
         targets = {}
         for name, arm in self._arms.items():
             arm.act(self._tool(name, tools, commanded), now, chord if self._linked else arm.chord)
-            pose = arm.target(now)
+            pose = arm.target(now, (commanded or {}).get(name))
             if pose is not None:
                 self._commanded[name] = pose
-            targets[name] = ArmTarget(pose, arm.gripper)
+            targets[name] = ArmTarget(pose, arm.gripper, *arm.slip)
         return targets
 
     def connection_lost(self, now: float) -> None:

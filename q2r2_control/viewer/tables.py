@@ -21,6 +21,8 @@ def summary_table(summary: RunSummary) -> Table:
         figures = f"engaged {arm.engaged_s:.2f} s"
         if arm.position_error_mm_rms is not None and arm.rotation_error_deg_rms is not None:
             figures += f", error {arm.position_error_mm_rms:.2f} mm, {arm.rotation_error_deg_rms:.2f} deg RMS"
+        if arm.slip_mm_max > 0.0 or arm.slip_deg_max > 0.0:
+            figures += f", target slipped {arm.slip_mm_max:.0f} mm, {arm.slip_deg_max:.0f} deg"
         table.add_row(f"{name} arm", f"{figures}, gripper changes {arm.gripper_changes}")
     if summary.min_distance_mm is not None and summary.closest_pair is not None:
         table.add_row("nearest pair", f"{summary.min_distance_mm:.1f} mm, {' | '.join(summary.closest_pair)}")

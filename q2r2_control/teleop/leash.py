@@ -1,0 +1,161 @@
+"""The leash between a tool and its target: a target that cannot be reached slips along, and comes back at once.
+
+An arm that is stretched out, or blocked by the table or the other arm, cannot follow its hand. Without a leash the hand
+would have to come all the way back before the arm moves again. The leash is the farthest that a target gets from the
+tool: beyond it, the anchor of the relative motion shifts, so that the target stays where the leash ends and the hand
+moves it from there. Position and rotation have a leash each.
+
+**Slack.** When a leash is taut, the tool held up in its direction, and the hand comes back by more than tremor, the
+target is put at the tool, which follows the hand from there. Whether the hand comes back is read from its unfiltered
+poses: when a hand stops, the filtered ones swing back by millimetres. Position and rotation are put there together: a
+tool that is held up rests where the pulls of both balance, and would follow the one that is left. Stretched out to
+0.1 m from its target, a tool was pulled back 50 mm by its rotation alone.
+
+**Why that makes no lurch.** A tool at rest under a pull has nothing to give back when the pull ends: the controller
+keeps no state but the reference, which stands still, and that is what it is asked for. The controller also follows its
+target's own velocity. A step that is faster than three times the tool's limit, 9 m/s or 30 rad/s at most, it takes for
+no motion; dropped slack is made to be such a step, by waiting for a tick that is short enough.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import pinocchio as pin
+
+from q2r2_control.teleop.relative import RelativeMotion
+from q2r2_control.teleop.settings import LeashSettings
+from q2r2_control.types import Array
+
+# The way back that drops the slack: more than tremor of 0.2 mm and 0.2 degrees to either side, and noise.
+_WAY_BACK = 0.9e-3, 12e-3  # [m, rad]
+# Slower than this a tool counts as held up. Stopping from there takes a fraction of a millimetre.
+_HELD_UP = 0.05, 0.2  # [m/s, rad/s]
+# A step faster than this is no motion of a target, whatever the controller's settings.
+_NO_MOTION = 10.0, 35.0  # [m/s, rad/s]
+
+
+class Strand:
+    """The leash of a position or of a rotation; ways are vectors (3,) in the world frame [m or rad]."""
+
+    def __init__(self, length: float | None, way_back: float, held_up: float, no_motion: float) -> None:
+        self._length = math.inf if length is None else length
+        self._way_back, self._held_up, self._no_motion = way_back, held_up, no_motion
+        self.reset()
+
+    def reset(self) -> None:
+        """Slack, nothing slipped."""
+        self.slip = 0.0
+        self.taut = False
+        self._back = 0.0  # of the hand, since it was farthest
+
+    def lets_go(self, way: Array, by_hand: Array, by_tool: Array, dt: float) -> bool:
+        """Whether the slack is to be dropped.
+
+        ``way`` is from the tool to the target; ``by_hand`` and ``by_tool`` are what the unfiltered hand and the tool
+        moved since the last call, ``dt`` [s] ago.
+        """
+        distance = math.hypot(*way)
+        if distance >= self._length:
+            self.taut = True
+        if distance < 0.5 * self._length:
+            self.taut = False  # the tool has come after by itself
+        if not self.taut:
+            self._back = 0.0
+            return False
+        self._back = max(0.0, self._back - float(way @ by_hand) / distance)
+        held_up = abs(float(way @ by_tool)) < self._held_up * distance * dt
+        return self._back > self._way_back and held_up and distance > self._no_motion * dt
+
+    def drop(self, way: Array) -> Array:
+        """The way to a target that is put at the tool."""
+        self.taut, self._back = False, 0.0
+        self.slip += math.hypot(*way)
+        return np.zeros(3)
+
+    def hold(self, way: Array) -> Array | None:
+        """The way to a target that the leash holds; None: the leash is not taut."""
+        distance = math.hypot(*way)
+        if distance <= self._length:
+            return None
+        self.slip += distance - self._length
+        return way * (self._length / distance)
+
+
+class Leash:
+    """Keeps one arm's target near its tool; see the module's text. Starts slack at every :meth:`reset`."""
+
+    def __init__(self, settings: LeashSettings) -> None:
+        limits = list(zip(_WAY_BACK, _HELD_UP, _NO_MOTION, strict=True))
+        self._strands = Strand(settings.distance, *limits[0]), Strand(settings.angle, *limits[1])
+        self._distance = math.inf if settings.distance is None else settings.distance
+        # Of a trace, 1 + 2 cos(angle); a little more than the leash's, so that it is looked at in time.
+        self._trace = -math.inf if settings.angle is None else 1.0 + 2.0 * math.cos(settings.angle) + 1e-9
+        self._last: _Tick | None = None
+
+    @property
+    def slip(self) -> float:
+        """How far the target's position has slipped since the reset, to and fro counted [m]."""
+        return self._strands[0].slip
+
+    @property
+    def slip_angle(self) -> float:
+        """How far the target's rotation has slipped since the reset, to and fro counted [rad]."""
+        return self._strands[1].slip
+
+    def reset(self) -> None:
+        """Slack, nothing slipped: for a new anchor."""
+        for strand in self._strands:
+            strand.reset()
+        self._last = None
+
+    def target(self, motion: RelativeMotion, hand: pin.SE3, newest: pin.SE3, tool: pin.SE3, now: float) -> pin.SE3:
+        """The target of ``hand`` at ``now`` [s], no farther from ``tool`` (world frame) than the leash reaches.
+
+        ``newest`` is where the unfiltered hand would have the tool if nothing had ever slipped. Where the leash pulls,
+        ``motion`` is anchored anew, so that the hand moves the target from there.
+        """
+        target, last = motion.target(hand), self._last
+        self._last = _Tick(tool, newest, now)
+        # The first target is the anchor, which must not move the arm wherever the plant says the tool is.
+        if last is None or not (any(strand.taut for strand in self._strands) or self._ends(tool, target)):
+            return target
+        position, rotation = self._pull(_ways(tool, target), last, self._last)
+        if position is not None:
+            target = pin.SE3(target.rotation, tool.translation + position)
+            motion.anchor_position(hand, target)
+        if rotation is not None:
+            target = pin.SE3(pin.exp3(rotation) @ tool.rotation, target.translation)
+            motion.anchor_rotation(hand, target)
+        return target
+
+    def _ends(self, tool: pin.SE3, target: pin.SE3) -> bool:
+        """Whether the target is as far as a leash reaches, told with little work: at most ticks it is not."""
+        return (
+            math.dist(target.translation, tool.translation) >= self._distance
+            or np.vdot(target.rotation, tool.rotation) <= self._trace
+        )
+
+    def _pull(self, ways: tuple[Array, Array], last: _Tick, this: _Tick) -> list[Array | None]:
+        """Ways from the tool to the target's new position and rotation, None for what the leash leaves alone."""
+        moves = zip(self._strands, ways, _ways(last.newest, this.newest), _ways(last.tool, this.tool), strict=True)
+        # Both are asked, since each has to see every tick.
+        let_go = [strand.lets_go(way, by_hand, by_tool, this.now - last.now) for strand, way, by_hand, by_tool in moves]
+        if any(let_go):
+            return [strand.drop(way) for strand, way in zip(self._strands, ways, strict=True)]
+        return [strand.hold(way) for strand, way in zip(self._strands, ways, strict=True)]
+
+
+class _Tick(NamedTuple):
+    """What the next tick compares itself with."""
+
+    tool: pin.SE3
+    newest: pin.SE3
+    now: float  # [s]
+
+
+def _ways(start: pin.SE3, end: pin.SE3) -> tuple[Array, Array]:
+    """Position and rotation vector from one pose to another."""
+    return end.translation - start.translation, pin.log3(end.rotation @ start.rotation.T)

@@ -1,0 +1,48 @@
+"""An input whose hands follow given paths: engaged by a press early on, 75 samples a second."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from q2r2_control.types import SIDES, Array, HandInputs, HandSample, HapticFeedback
+
+PERIOD = 1.0 / 75.0  # [s]
+PRESSED, RELEASED = 0.1, 0.2  # [s]
+ENGAGED = 0.3  # both arms follow their hands from here on [s]
+
+Path = Callable[[float], Array]  # time [s] -> (6,) position [m] and rotation vector [rad] of a hand
+
+
+class HandsInput:
+    """Both hands along paths of position and rotation vector; a hand without one stays where it is."""
+
+    connected = True
+
+    def __init__(self, **paths: Path) -> None:
+        self._paths = paths
+        self._next = 0.0
+
+    def start(self) -> None:
+        self._next = 0.0
+
+    def poll(self, now: float) -> list[HandSample]:
+        if now < self._next - 1e-9:
+            return []
+        self._next += PERIOD
+        inputs = HandInputs(button_lower=PRESSED <= now < RELEASED)
+        return [self._sample(hand, inputs, now) for hand in SIDES]
+
+    def _sample(self, hand: str, inputs: HandInputs, now: float) -> HandSample:
+        path = self._paths[hand](now) if hand in self._paths else np.zeros(6)
+        angle = float(np.linalg.norm(path[3:]))
+        axis = path[3:] / angle if angle > 0.0 else np.zeros(3)
+        quaternion = np.append(np.sin(0.5 * angle) * axis, np.cos(0.5 * angle))
+        return HandSample(hand, path[:3].copy(), quaternion, now, inputs, now)
+
+    def send_haptic(self, feedback: HapticFeedback) -> None:
+        pass
+
+    def close(self) -> None:
+        pass

@@ -1,0 +1,326 @@
+"""The leash: alone on an arm that does not move, then in the closed loop with one that is stretched out or blocked."""
+
+from __future__ import annotations
+
+import copy
+import math
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from q2r2_control.config import Config, load_config
+from q2r2_control.pipeline import Pipeline, Tick
+from q2r2_control.summary import RunSummary
+from q2r2_control.teleop.leash import Leash
+from q2r2_control.teleop.relative import RelativeMotion
+from q2r2_control.teleop.settings import LeashSettings
+from q2r2_control.types import Array
+from tests.support.hands_input import HandsInput
+from tests.teleop.hands import History, Operator, assert_smooth, engaged, pose, waving
+
+DT = 0.001
+TOOL = pose(0.5, 0.2, 0.4, (3.0, 0.2, -0.1))
+HAND = pose(0.1, -0.3, 1.1, (0.3, -0.5, 0.8))
+MOTIONS = {
+    "as it is": RelativeMotion(),
+    "enlarged": RelativeMotion(scale=2.0, rotation_scale=1.5),
+    "reduced": RelativeMotion(scale=0.4, rotation_scale=0.5),
+    "in the tool's frame": RelativeMotion(rotation_frame="tool"),
+    "in the tool's frame, reduced": RelativeMotion(rotation_frame="tool", scale=0.5, rotation_scale=0.5),
+    "reflected": RelativeMotion(stance="mirror_reflected", rotation_scale=1.2),
+    "with axes changed": RelativeMotion(axes=("+z", "-x", "+y")),
+}
+
+
+class Tied:
+    """A hand, a motion and a leash to a tool; every tick is 1 ms."""
+
+    def __init__(self, motion: RelativeMotion, **settings: float | None) -> None:
+        self.motion, self.leash = motion, Leash(LeashSettings.model_validate(settings))
+        self.hand, self.tool, self.now = HAND, TOOL, 0.0
+        self.newest = copy.deepcopy(motion)
+        self.newest.anchor(HAND, TOOL)
+        motion.anchor(HAND, TOOL)
+        self.target = self.tick(HAND)
+
+    def tick(self, hand: pin.SE3, dt: float = DT) -> pin.SE3:
+        self.hand, self.now = hand, self.now + dt
+        self.target = self.leash.target(self.motion, hand, self.newest.target(hand), self.tool, self.now)
+        return self.target
+
+    def go(self, twist: Array, ticks: int) -> list[pin.SE3]:
+        """Move the hand by ``twist`` (6,) each tick."""
+        return [self.tick(moved(self.hand, twist)) for _ in range(ticks)]
+
+    @property
+    def distance(self) -> float:
+        return float(np.linalg.norm(self.target.translation - self.tool.translation))
+
+    @property
+    def angle(self) -> float:
+        return float(np.linalg.norm(pin.log3(self.target.rotation @ self.tool.rotation.T)))
+
+
+def moved(at: pin.SE3, twist: Array) -> pin.SE3:
+    return pin.SE3(pin.exp3(twist[3:]) @ at.rotation, at.translation + twist[:3])
+
+
+def along(*values: float) -> Array:
+    return np.array([*values, *[0.0] * (6 - len(values))])
+
+
+@pytest.mark.parametrize("motion", MOTIONS.values(), ids=MOTIONS.keys())
+def test_a_target_within_the_leash_is_the_relative_motion_bit_for_bit(motion: RelativeMotion) -> None:
+    random = np.random.default_rng(51)
+    tied, untied = Tied(motion, distance=0.1, angle=0.5), []
+    targets = []
+    for _ in range(200):
+        hand = moved(HAND, np.append(random.uniform(-0.02, 0.02, 3), random.uniform(-0.1, 0.1, 3)))
+        targets.append(tied.tick(hand).homogeneous)
+        untied.append(hand)
+    motion.anchor(HAND, TOOL)
+    np.testing.assert_array_equal(targets, [motion.target(hand).homogeneous for hand in [HAND, *untied]][1:])
+    assert tied.leash.slip == tied.leash.slip_angle == 0.0
+
+
+@pytest.mark.parametrize("motion", MOTIONS.values(), ids=MOTIONS.keys())
+def test_a_taut_leash_holds_the_target_at_its_length_and_counts_what_slipped(motion: RelativeMotion) -> None:
+    tied = Tied(motion, distance=0.1, angle=0.5)
+    way, turn = 0.6, 0.9
+    for target in tied.go(along(way / 600, 0, 0, 0, 0, turn / 600), 600):
+        assert tied.distance <= 0.1 + 1e-12
+        assert np.isfinite(target.homogeneous).all()
+    motion.anchor(HAND, TOOL)
+    free = motion.target(tied.hand)
+    whole = np.linalg.norm(free.translation - TOOL.translation)
+    angle = np.linalg.norm(pin.log3(free.rotation @ TOOL.rotation.T))
+    assert tied.distance == pytest.approx(min(whole, 0.1))
+    assert tied.angle == pytest.approx(min(angle, 0.5))
+    assert tied.leash.slip == pytest.approx(whole - 0.1)
+    assert tied.leash.slip_angle == pytest.approx(max(angle - 0.5, 0.0), abs=1e-9)
+
+
+@pytest.mark.parametrize("motion", MOTIONS.values(), ids=MOTIONS.keys())
+def test_what_slipped_is_a_new_anchor(motion: RelativeMotion) -> None:
+    tied = Tied(motion, distance=0.1, angle=0.5)
+    tied.go(along(0.001, 0.0005, 0, 0, 0.002, 0.002), 900)
+    held, hand = tied.target, tied.hand
+    assert tied.leash.slip > 0.0
+    assert tied.leash.slip_angle > 0.0
+    # Across both leashes, by less than what drops the slack.
+    across = along(0.0002, -0.0004, 0.0002, 0.004, 0.002, -0.002)
+    motion.anchor(hand, held)
+    expected = motion.target(moved(hand, across))
+    assert np.linalg.norm(expected.translation - held.translation) > 1e-4
+    np.testing.assert_allclose(tied.tick(moved(hand, across)).homogeneous, expected.homogeneous, atol=1e-4)
+
+
+def test_position_and_rotation_have_a_leash_each() -> None:
+    tied = Tied(RelativeMotion(), distance=0.1, angle=0.5)
+    tied.go(along(0.001), 300)
+    assert tied.leash.slip == pytest.approx(0.2)
+    assert tied.leash.slip_angle == 0.0
+    np.testing.assert_array_equal(tied.target.rotation, Tied(RelativeMotion()).target.rotation)
+    tied = Tied(RelativeMotion(), distance=0.1, angle=0.5)
+    tied.go(along(0, 0, 0, 0.002, 0, 0), 450)
+    assert tied.leash.slip == 0.0
+    assert tied.leash.slip_angle == pytest.approx(0.4)
+    np.testing.assert_array_equal(tied.target.translation, TOOL.translation)
+
+
+@pytest.mark.parametrize("settings", [{"distance": None}, {"angle": None}, {"distance": None, "angle": None}], ids=str)
+def test_a_leash_that_is_none_lets_the_target_go_anywhere(settings: dict[str, None]) -> None:
+    tied = Tied(RelativeMotion(), **settings)
+    tied.go(along(0.001, 0, 0, 0.002, 0, 0), 1000)
+    assert tied.distance == pytest.approx(1.0 if "distance" in settings else 0.1)
+    assert tied.angle == pytest.approx(2.0 if "angle" in settings else 0.5)
+
+
+def test_a_taut_target_goes_along_with_its_tool_without_a_step() -> None:
+    tied = Tied(RelativeMotion(), distance=0.1, angle=0.5)
+    tied.go(along(0.001), 300)
+    before = tied.target
+    for _ in range(300):
+        tied.tool = moved(tied.tool, along(-0.0005, 0.0001))  # pushed back by something
+        target = tied.tick(tied.hand)
+        assert np.linalg.norm(target.translation - before.translation) < 0.0006
+        assert tied.distance <= 0.1 + 1e-12
+        before = target
+    assert tied.leash.slip == pytest.approx(0.35, abs=0.01)
+
+
+@pytest.mark.parametrize("motion", MOTIONS.values(), ids=MOTIONS.keys())
+@pytest.mark.parametrize("turning", [False, True], ids=["position", "rotation"])
+def test_a_hand_that_comes_back_takes_the_target_from_the_tool_at_once(motion: RelativeMotion, turning: bool) -> None:
+    tied = Tied(motion, distance=0.1, angle=0.5)
+    out = along(0, 0, 0, 0, 0, 0.002) if turning else along(0.001)
+    tied.go(out, 900)
+    farthest, held = tied.hand, tied.target
+    tied.go(-0.1 * out, 200)
+    # As if the hand had been at the tool when it was farthest, but for the part that could have been tremor.
+    motion.anchor(farthest, TOOL)
+    expected = motion.target(tied.hand)
+    missing = expected.actInv(tied.target)
+    assert np.linalg.norm(missing.translation) < 1.2e-3
+    assert np.linalg.norm(pin.log3(missing.rotation)) < 13e-3
+    way = held.actInv(tied.target)
+    assert np.linalg.norm(pin.log3(way.rotation) if turning else way.translation) > 0.1
+    assert (tied.leash.slip_angle if turning else tied.leash.slip) > 0.1
+
+
+def test_tremor_drops_no_slack() -> None:
+    tied = Tied(RelativeMotion(), distance=0.1, angle=0.5)
+    tied.go(along(0.001), 300)
+    start = tied.hand
+    for tick in range(2000):
+        shake = math.sin(2.0 * math.pi * 9.0 * tick * DT)
+        tied.tick(moved(start, along(2e-4 * shake, 1e-4 * shake, 0, 3e-3 * shake, 0, 0)))
+        assert tied.distance > 0.099
+
+
+def test_a_tool_that_comes_after_is_not_held_up() -> None:
+    tied = Tied(RelativeMotion(), distance=0.1, angle=0.5)
+    tied.go(along(0.001), 300)
+    for _ in range(150):
+        tied.tool = moved(tied.tool, along(0.0004))  # 0.4 m/s
+        target = tied.go(along(-0.0001), 1)[0]
+        assert target.translation[0] - tied.tool.translation[0] > 0.02  # never put at the tool
+
+
+def test_slack_is_dropped_only_in_a_tick_so_short_that_no_controller_takes_it_for_motion() -> None:
+    tied = Tied(RelativeMotion(), distance=0.1, angle=0.5)
+    tied.go(along(0.001), 300)
+    for _ in range(4):
+        tied.tick(moved(tied.hand, along(-0.001)), dt=0.012)
+        assert tied.distance > 0.095
+    tied.tick(moved(tied.hand, along(-0.001)), dt=0.002)
+    assert tied.distance < 1e-12
+
+
+def test_a_new_engagement_starts_slack_at_the_tool() -> None:
+    driver = engaged()
+    driver.commanded = dict(driver.tools)
+    start = dict(driver.hands)
+    away = lambda t: {hand: moved(at, along(0.3 * t)) for hand, at in start.items()}  # noqa: E731
+    assert_smooth(driver.run(1.0, away))
+    assert all(target.slip == pytest.approx(0.2, abs=0.03) for target in driver.targets.values())
+    driver.press("left", "right")
+    assert all(target.pose is None for target in driver.targets.values())
+    history = driver.run(0.05) + _pressed(driver)
+    for arm, tool in driver.tools.items():
+        first = next(targets[arm] for targets in history if targets[arm].pose is not None)
+        assert first.pose is not None
+        np.testing.assert_allclose(first.pose.translation, tool.translation, atol=1e-9)
+        assert first.slip == first.slip_angle == 0.0
+
+
+def _pressed(driver: Operator) -> History:
+    driver.lower = {"left", "right"}
+    return driver.run(0.2)
+
+
+def test_without_the_controllers_tool_pose_there_is_no_leash() -> None:
+    driver = engaged()
+    driver.run(2.0, waving(driver, 0.3))
+    for arm, target in driver.targets.items():
+        assert target.pose is not None
+        assert np.linalg.norm(target.pose.translation - driver.tools[arm].translation) > 0.4
+        assert target.slip == 0.0
+
+
+class Out(NamedTuple):
+    """A hand's way out, held, and back by ``back`` [m] after ``HELD``; directions in the world."""
+
+    direction: tuple[float, float, float]
+    way: float  # [m]; the arm can follow a part of it
+
+
+OUT = {
+    "stretched out forwards": Out((1.0, 0.0, 0.0), 1.0),
+    "stretched out upwards": Out((-0.3, 0.0, 1.0), 1.2),
+    "blocked by the table": Out((0.0, 0.0, -1.0), 0.65),
+    "blocked by the other arm": Out((0.0, -1.0, 0.0), 0.9),
+}
+HELD, BACK = 4.0, 0.002  # [s, m]
+RATE = 500.0
+
+
+class Run(NamedTuple):
+    t: Array  # (n,) [s]
+    way: Array  # (n,) of the tool, along the hand's direction [m]
+    speed: Array  # (n,) of the tool [m/s]
+    acceleration: Array  # (n,) norm over the joints [rad/s^2]
+    summary: RunSummary
+
+    def moved(self, start: float, end: float) -> float:
+        """How far the tool went along the hand's direction from one time to another [m]."""
+        first, last = np.searchsorted(self.t, [start - 1e-9, end - 1e-9])
+        return float(self.way[last] - self.way[first])
+
+
+@cache
+def loop(name: str, leash: bool, tremor: float = 0.0) -> Run:
+    """The left hand goes out smoothly within 2.5 s, rests, comes back at ``HELD``; 0.2 mm of tremor come on top."""
+    data = load_config("config/dual_iiwa7.yaml").model_dump()
+    data["loop_rate_hz"] = RATE
+    if not leash:
+        data["teleop"]["leash"] = {"distance": None, "angle": None}
+    direction = np.array(OUT[name].direction) / np.linalg.norm(OUT[name].direction)
+
+    def hand(t: float) -> Array:
+        share = 0.5 - 0.5 * math.cos(math.pi * min(max((t - 0.4) / 2.5, 0.0), 1.0))
+        back = min(max((t - HELD) / 0.05, 0.0), 1.0)
+        way = OUT[name].way * share - BACK * back + tremor * math.sin(2.0 * math.pi * 9.0 * t)
+        return np.append(way * direction, np.zeros(3))
+
+    pipeline = Pipeline.from_config(Config.model_validate(data), input=HandsInput(left=hand), plant="kinematic")
+    ticks: list[Tick] = []
+    pipeline.listeners.append(ticks.append)
+    summary = pipeline.run(HELD + 0.5, realtime=False)
+    places = np.array([tick.tools["left"].translation for tick in ticks])
+    speed = np.linalg.norm(np.diff(places, axis=0, prepend=places[:1]), axis=1) * RATE
+    return Run(
+        t=np.array([tick.t for tick in ticks]),
+        way=places @ direction,
+        speed=speed,
+        acceleration=np.array([np.linalg.norm(tick.reference.a) for tick in ticks]),
+        summary=summary,
+    )
+
+
+@pytest.mark.parametrize("name", OUT)
+def test_an_arm_held_up_follows_the_first_millimetres_back_within_a_quarter_of_a_second(name: str) -> None:
+    run = loop(name, leash=True)
+    assert run.moved(0.4, HELD) < OUT[name].way - 0.45  # the arm was held up for half a metre
+    # Almost straight, an arm takes a while for the second one; and an arm that was pushed aside comes back as well.
+    assert -2.0 * BACK < run.moved(HELD, HELD + 0.25) < -0.5 * BACK
+    assert run.summary.arms["left"].slip_mm_max > 350.0
+    assert run.summary.fallback_ticks == run.summary.uncertified_ticks == 0
+
+
+@pytest.mark.parametrize("name", OUT)
+def test_without_a_leash_it_does_not_move_back(name: str) -> None:
+    run = loop(name, leash=False)
+    assert run.moved(HELD, HELD + 0.45) > -0.6e-3
+    assert run.summary.arms["left"].slip_mm_max == 0.0
+
+
+@pytest.mark.parametrize("name", OUT)
+def test_dropping_the_slack_makes_no_lurch(name: str) -> None:
+    run = loop(name, leash=True)
+    after = run.t >= HELD
+    # The hand comes back at 0.04 m/s.
+    assert run.speed[after].max() < 0.05
+    assert run.moved(HELD, HELD + 0.45) > -2.0 * BACK
+
+
+@pytest.mark.parametrize("name", OUT)
+def test_tremor_does_not_make_an_arm_held_up_chatter(name: str) -> None:
+    run = loop(name, leash=True, tremor=0.2e-3)
+    resting = (run.t > HELD - 0.5) & (run.t < HELD)
+    # An arm that is free has 0.39.
+    assert np.sqrt(np.mean(run.acceleration[resting] ** 2)) < 0.2
+    assert run.speed[resting].max() < 0.01
