@@ -117,6 +117,7 @@ class Workspace(NamedTuple):
     binding: IntArray  # (nv, 2) which limit makes each side of the box
     wanted: Array  # (nv,)
     candidate: Array  # (3, nv) velocities, positions, full braking
+    deceleration: Array  # (2, nv) of the certified stop, and of the candidate's [rad/s^2]
     active: Active
     rollout: Rollout
 
@@ -148,6 +149,7 @@ class Workspace(NamedTuple):
             binding=np.zeros((nv, 2), dtype=np.int64),
             wanted=np.zeros(nv),
             candidate=np.zeros((3, nv)),
+            deceleration=np.zeros((2, nv)),
             active=Active(np.zeros(nv + 5 * len(cell.pairs.first), dtype=np.int64), np.zeros(1, dtype=np.int64)),
             rollout=Rollout.empty(cell.chain, cell.bodies),
         )
