@@ -82,17 +82,20 @@ def brake(q: Array, v: Array, a: Array, t: float, q_out: Array, v_out: Array) ->
 
 
 @lean_kernel
-def stop_together(q: Array, v: Array, lower: Array, upper: Array, a: Array, deceleration: Array) -> bool:
+def stop_together(
+    q: Array, v: Array, lower: Array, upper: Array, a: Array, longest: float, deceleration: Array
+) -> bool:
     """Decelerations (nv,) with which all joints stop at the same time, the first of them at its limit ``a``.
 
-    Returns False where that leaves no room to a position limit.
+    Returns False where that leaves no room to a position limit. The room includes a step of the ``longest`` time, as
+    in limits.py, and what is left of it during the stop does too: then every state of the stop keeps P.
     """
     duration = 0.0
     for j in range(q.shape[0]):
         duration = max(duration, abs(v[j]) / a[j])
     for j in range(q.shape[0]):
         deceleration[j] = abs(v[j]) / duration if v[j] != 0.0 else a[j]
-        end = q[j] + 0.5 * v[j] * duration
+        end = q[j] + v[j] * (0.5 * duration + longest)
         if (v[j] > 0.0 and end > upper[j]) or (v[j] < 0.0 and end < lower[j]):
             return False
     return True

@@ -124,7 +124,13 @@ def _mix(cell: Cell, work: Workspace, share: float, h: float, together: bool) ->
         work.candidate[1, j] = work.q[j] + 0.5 * h * (work.v[j] + work.candidate[0, j])
     if together:
         return stop_together(
-            work.candidate[1], work.candidate[0], cell.lower, cell.upper, cell.acceleration, work.deceleration[1]
+            work.candidate[1],
+            work.candidate[0],
+            cell.lower,
+            cell.upper,
+            cell.acceleration,
+            cell.limits.longest_step,
+            work.deceleration[1],
         )
     for j in range(work.q.shape[0]):
         work.deceleration[1, j] = cell.acceleration[j]
