@@ -51,7 +51,12 @@ class Interfaces:
             probe = f"{kind}.Goal()" if module.endswith(".action") else f"{kind}()"
             lines += [f"from {module} import {kind}", f"serialize_message({probe})"]
         lines += [f"import {self.name}", f"print({self.name}.__path__[0])"]
-        run = subprocess.run([sys.executable, "-c", "\n".join(lines)], capture_output=True, text=True)
+        # Where a ROS is sourced, this environment's libraries are found once its own setup file is sourced too; the
+        # user is told so, and here the path does the same.
+        libraries = os.pathsep.join(filter(None, [str(Path(sys.prefix, "lib")), os.environ.get("LD_LIBRARY_PATH")]))
+        environment = os.environ | {"LD_LIBRARY_PATH": libraries}
+        command = [sys.executable, "-c", "\n".join(lines)]
+        run = subprocess.run(command, env=environment, capture_output=True, text=True)
         return Path(run.stdout.splitlines()[-1]) if run.returncode == 0 else None
 
 
@@ -70,15 +75,11 @@ def build_interfaces(report: Callable[[str], None], force: bool = False) -> None
     packages = interface_packages()
     with ThreadPoolExecutor(_workers()) as pool:
         found = dict(zip(packages, pool.map(Interfaces.found_in, packages), strict=True))
-        wanted = []
+        wanted = [package for package, folder in found.items() if folder is None or (force and _is_in(folder, prefix))]
         for package, folder in found.items():
-            if folder is None or (force and folder.resolve().is_relative_to(prefix.resolve())):
-                wanted.append(package)
-            else:
+            if package not in wanted:
                 report(f"{package.name}: already there ({folder})")
-        if not wanted:
-            return
-        if missing := missing_tools(prefix):
+        if wanted and (missing := missing_tools(prefix)):
             names = ", ".join(package.name for package in wanted)
             raise BuildError(f"{names} not built: missing {'; '.join(missing)}")
         builds = [pool.submit(_build_and_check, package, prefix) for package in wanted]
@@ -88,6 +89,9 @@ def build_interfaces(report: Callable[[str], None], force: bool = False) -> None
                 report(build.result())
     if errors:
         raise BuildError("; ".join(map(str, errors)))
+    held = [*wanted, *(package for package, folder in found.items() if folder and _is_in(folder, prefix))]
+    if held and _is_overlay(prefix):
+        report(f"before use: source {prefix}/share/{held[0].name}/local_setup.bash")
 
 
 def missing_tools(prefix: Path) -> list[str]:
@@ -146,8 +150,7 @@ def _build_and_check(package: Interfaces, prefix: Path) -> str:
     log = prefix / "share" / "q2r2_control" / "log" / f"{package.name}.log"
     seconds = build(package, prefix, log)
     if package.found_in() is None:
-        hint = f"add {prefix / 'lib'} to LD_LIBRARY_PATH" if _is_sourced() else f"see {log}"
-        raise BuildError(f"{package.name} was built into {prefix} but cannot be imported: {hint}")
+        raise BuildError(f"{package.name} was built into {prefix} but cannot be imported, see {log}")
     return f"{package.name}: built in {seconds:.0f} s (log: {log})"
 
 
@@ -167,11 +170,20 @@ def _python_looks_into(prefix: Path) -> bool:
     return Path(sysconfig.get_path("purelib")) == packages and os.access(packages, os.W_OK)
 
 
+def _is_in(folder: Path, prefix: Path) -> bool:
+    return folder.resolve().is_relative_to(prefix.resolve())
+
+
+def _sourced() -> list[Path]:
+    """The ROS installs that are sourced; none where ROS is part of the environment."""
+    return [Path(root) for root in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if root]
+
+
 def _prefix_path(prefix: Path) -> list[Path]:
-    """``prefix``, the running environment and every ROS install that is sourced."""
-    sourced = os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)
-    return list(dict.fromkeys([prefix, Path(sys.prefix), *(Path(root) for root in sourced if root)]))
+    """Where CMake finds packages: in ``prefix``, the running environment and every ROS that is sourced."""
+    return list(dict.fromkeys([prefix, Path(sys.prefix), *_sourced()]))
 
 
-def _is_sourced() -> bool:
-    return bool(os.environ.get("AMENT_PREFIX_PATH"))
+def _is_overlay(prefix: Path) -> bool:
+    """Whether the sourced ROS does not know of ``prefix`` yet, and so does not find its libraries."""
+    return bool(_sourced()) and prefix not in _sourced()
