@@ -82,11 +82,11 @@ def build_interfaces(report: Callable[[str], None], force: bool = False) -> None
         if wanted and (missing := missing_tools(prefix)):
             names = ", ".join(package.name for package in wanted)
             raise BuildError(f"{names} not built: missing {'; '.join(missing)}")
-        builds = [pool.submit(_build_and_check, package, prefix) for package in wanted]
-        errors = [error for build in builds if (error := build.exception())]
-        for build in builds:
-            if not build.exception():
-                report(build.result())
+        futures = [pool.submit(_build_and_check, package, prefix) for package in wanted]
+        errors = [error for future in futures if (error := future.exception())]
+        for future in futures:
+            if not future.exception():
+                report(future.result())
     if errors:
         raise BuildError("; ".join(map(str, errors)))
     held = [*wanted, *(package for package, folder in found.items() if folder and _is_in(folder, prefix))]

@@ -73,7 +73,7 @@ def test_what_a_sourced_install_has_is_left_alone_even_when_forced(
     assert not (bare_environment / "share").exists()
 
 
-def test_a_package_is_built_into_an_environment_of_its_own(
+def test_a_package_built_beside_a_sourced_install_is_used_after_sourcing_it_too(
     bare_environment: Path, sourced: dict[str, str], tmp_path: Path
 ) -> None:
     pytest.importorskip("rclpy", reason=NEEDS_ROS)
@@ -82,6 +82,15 @@ def test_a_package_is_built_into_an_environment_of_its_own(
     log = tmp_path / "quest2ros.log"
     build(Interfaces(INTERFACES / "quest2ros"), bare_environment, log)
     assert "Installing: " in log.read_text()
+
+    python = bare_environment / "bin" / "python"
+    packages = bare_environment / SITE_PACKAGES
+    path = os.pathsep.join([str(packages), sourced["PYTHONPATH"]])
+    told = build_interfaces(python=python, **(sourced | {"PYTHONPATH": path})).stdout.splitlines()
+    assert f"quest2ros: already there ({packages / 'quest2ros'})" in told
+    setup_file = bare_environment / "share" / "quest2ros" / "local_setup.bash"
+    assert told[-1] == f"before use: source {setup_file}"
+
     script = (
         "from rclpy.serialization import deserialize_message, serialize_message\n"
         "import quest2ros\n"
@@ -89,12 +98,8 @@ def test_a_package_is_built_into_an_environment_of_its_own(
         "print(quest2ros.__path__[0])\n"
         "print(deserialize_message(serialize_message(Haptic(frequency=0.5, amplitude=0.25)), Haptic))\n"
     )
-    packages = bare_environment / SITE_PACKAGES
-    environment = os.environ | {
-        "PYTHONPATH": os.pathsep.join([str(packages), sourced["PYTHONPATH"]]),
-        "LD_LIBRARY_PATH": os.pathsep.join([str(bare_environment / "lib"), sourced["LD_LIBRARY_PATH"]]),
-    }
-    run = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True, timeout=60)
+    command = ["bash", "-c", 'source "$0" && "$1" -c "$2"', str(setup_file), str(python), script]
+    run = subprocess.run(command, env=os.environ | sourced, capture_output=True, text=True, timeout=60)
     assert run.stdout.splitlines() == [
         str(packages / "quest2ros"),
         "quest2ros.msg.OVR2ROSHapticFeedback(frequency=0.5, amplitude=0.25)",
