@@ -102,7 +102,7 @@ def missing_tools(prefix: Path) -> list[str]:
     compilers = [os.environ["CXX"].split()[0]] if os.environ.get("CXX", "").strip() else _COMPILERS
     if not _found(compilers):
         missing.append(f"a C++ compiler ({' or '.join(compilers)}; Debian, Ubuntu: g++)")
-    if not _found(["make", "ninja"]):
+    if not _found(["make"]):
         missing.append("make")
     if not _found(["cmake"]):
         missing.append("cmake (pip install cmake)")
