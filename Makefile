@@ -9,11 +9,15 @@ BIN    := $(VENV)/bin
 setup: $(VENV)/.installed
 
 # Reinstalled when the dependencies change; the package itself is editable, so code changes need nothing.
-$(VENV)/.installed: pyproject.toml
+# ROS 2 is worth a line when it cannot be had, and no more: all but the nodes works without it.
+$(VENV)/.installed: pyproject.toml setup.py
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "q2r2_control needs Python 3.11 or newer: make PYTHON=python3.12 ...")'
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip
-	$(BIN)/python -m pip install --quiet --editable '.[dev]'
+	$(BIN)/python -m pip install --quiet --editable '.[dev,ros]' \
+		|| { echo 'No ROS 2 packages for this machine: going on without.'; \
+		     $(BIN)/python -m pip install --quiet --editable '.[dev]'; }
+	$(BIN)/q2r2 ros build-interfaces || true
 	touch $@
 
 demo: setup
@@ -38,4 +42,4 @@ soak: setup
 	$(BIN)/q2r2 bench --soak
 
 clean:
-	rm -rf $(VENV) build *.egg-info .mypy_cache .ruff_cache .pytest_cache
+	rm -rf $(VENV) build install log *.egg-info .mypy_cache .ruff_cache .pytest_cache

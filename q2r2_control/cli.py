@@ -24,6 +24,7 @@ from q2r2_control.one_line import OneLineErrors
 from q2r2_control.peers.base import PEERS
 from q2r2_control.pipeline import DEFAULT_TRAJECTORY
 from q2r2_control.plain import as_json_text
+from q2r2_control.ros.cli import app as ros_app
 from q2r2_control.running import AnnouncedHeadset, RunOptions, notice_of_compiling
 from q2r2_control.running import run as run_cell
 from q2r2_control.soak import SoakReport, run_soak
@@ -50,6 +51,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     help="Bimanual VR teleoperation: a headset's hands move two robot arms, safely.",
 )
+app.add_typer(ros_app, name="ros")
 
 
 class InputName(StrEnum):

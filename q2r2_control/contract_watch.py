@@ -94,18 +94,26 @@ class ContractWatch:
         self._note("jump", float(np.max(way / ((np.maximum(speed, np.abs(self._v)) + self._a * h) * h))))
         if h <= self._substep:
             self._parabola = bool(np.abs(self._q + 0.5 * h * (self._v + v) - q).max() <= 1e-11)
-            off = 0.0 if self._parabola else float(np.abs(self._braked(self._q, self._v, h)[0] - q).max())
-            self._note("parabola", off)
+            self._note("parabola", 0.0 if self._parabola else self._off_the_stop(q, v, h))
 
     def _check_stopped(self, q: Array, v: Array, h: float, fallback: bool) -> None:
-        stop_q, stop_v = self._braked(self._q, self._v, h)
-        self._note("not_stopped", max(float(np.abs(stop_q - q).max()), float(np.abs(stop_v - v).max())))
+        self._note("not_stopped", self._off_the_stop(q, v, h))
         self._note("unsaid", float(not fallback))
 
-    def _braked(self, q: Array, v: Array, t: float | Array) -> tuple[Array, Array]:
-        """Position and velocity after full braking for ``t`` [s], a number or (s, 1)."""
-        time = np.minimum(t, np.abs(v) / self._a)
-        brake = np.sign(v) * self._a
+    def _off_the_stop(self, q: Array, v: Array, h: float) -> float:
+        """How far a tick of ``h`` [s] was from full braking, or, in recovery, from stopping all joints together."""
+        stops = [self._braked(self._q, self._v, h)]
+        if not self._certain:
+            stops.append(self._braked(self._q, self._v, h, together=True))
+        return min(max(float(np.abs(stop_q - q).max()), float(np.abs(stop_v - v).max())) for stop_q, stop_v in stops)
+
+    def _braked(self, q: Array, v: Array, t: float | Array, together: bool = False) -> tuple[Array, Array]:
+        """Position and velocity after full braking for ``t`` [s], a number or (s, 1); or all joints ``together``."""
+        duration = np.abs(v) / self._a
+        if together:
+            duration = np.full_like(v, duration.max())
+        time = np.minimum(t, duration)
+        brake = np.divide(v, duration, out=np.zeros_like(v), where=duration > 0.0)
         return q + v * time - 0.5 * brake * time * time, v - brake * time
 
     def _check_limits(self, q: Array, v: Array) -> None:

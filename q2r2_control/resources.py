@@ -14,8 +14,8 @@ _CHECKOUT = Path(__file__).resolve().parent.parent
 def resource_roots() -> list[Path]:
     """Folders that can hold config/ and robots/, nearest first."""
     installed = [Path(sysconfig.get_path("data", scheme)) for scheme in ("venv", "posix_user", "posix_prefix")]
-    # pip --target puts share/ beside the package.
-    installed.append(_CHECKOUT)
+    # pip --target puts share/ beside the package, colcon beside the lib/ of lib/python3.x/site-packages.
+    installed += [_CHECKOUT, *_CHECKOUT.parents[2:3]]
     return [_CHECKOUT, *(root / "share" / "q2r2_control" for root in installed)]
 
 

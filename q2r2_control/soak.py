@@ -26,7 +26,7 @@ from q2r2_control.types import Array, Reference
 
 FEWEST_TICKS = 100
 _SETTLED = 0.1  # share of the ticks after which memory should have stopped growing
-MEMORY_ALLOWED = 8.0  # [MB]
+MEMORY_ALLOWED = 5.0  # [MB]
 
 
 class Steppable(Protocol):

@@ -7,56 +7,86 @@ import re
 import subprocess
 import sys
 import tomllib
+from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
 
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
+ROS = ROOT / "q2r2_control" / "ros"
 # Distributions whose import has another name.
 IMPORTS = {"pin": "pinocchio", "example-robot-data-loaders": "example_robot_data", "PyYAML": "yaml", "pin-pink": "pink"}
 
 
+def project() -> dict[str, Any]:
+    table: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    return table
+
+
 def dependencies() -> list[str]:
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    return [re.split(r"[<>=]", entry)[0] for entry in project["dependencies"]]
+    return [re.split(r"[<>=]", entry)[0] for entry in project()["dependencies"]]
 
 
-def dependencies_to_compare() -> list[str]:
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    return list(project["optional-dependencies"]["bench"])
+def dependencies_to_compare() -> set[str]:
+    """Modules of the public controllers that the bench knows."""
+    return {IMPORTS.get(name, name) for name in project()["optional-dependencies"]["bench"]}
 
 
-def imported() -> set[str]:
-    return set().union(*(imported_by(file) for file in (ROOT / "q2r2_control").rglob("*.py")))
+def modules_of_dependencies() -> set[str]:
+    # coal comes with pin, glfw with mujoco.
+    return {IMPORTS.get(name, name) for name in dependencies()} | {"coal", "glfw"}
 
 
-def imported_by(file: Path) -> set[str]:
+def modules_of_ros() -> set[str]:
+    """What the extra ros brings, and the interface packages that ship as source."""
+    registry = {
+        entry.removeprefix("ros-jazzy-").replace("-", "_") for entry in project()["optional-dependencies"]["ros"]
+    }
+    return registry | {file.parent.name for file in (ROS / "interfaces").glob("*/package.xml")}
+
+
+def imported(files: Iterable[Path]) -> set[str]:
     names = set()
-    for node in ast.walk(ast.parse(file.read_text())):
-        if isinstance(node, ast.Import):
-            names |= {alias.name.split(".")[0] for alias in node.names}
-        elif isinstance(node, ast.ImportFrom) and node.module:
-            names.add(node.module.split(".")[0])
-    return names
+    for file in files:
+        for node in ast.walk(ast.parse(file.read_text())):
+            if isinstance(node, ast.Import):
+                names |= {alias.name.split(".")[0] for alias in node.names}
+            elif isinstance(node, ast.ImportFrom) and node.module:
+                names.add(node.module.split(".")[0])
+    return names - set(sys.stdlib_module_names) - {"q2r2_control"}
+
+
+def modules_outside_ros() -> set[Path]:
+    return set((ROOT / "q2r2_control").rglob("*.py")) - set(ROS.rglob("*.py"))
 
 
 @pytest.mark.parametrize("dependency", dependencies())
 def test_every_dependency_is_imported_by_the_package(dependency: str) -> None:
-    assert IMPORTS.get(dependency, dependency) in imported()
+    assert IMPORTS.get(dependency, dependency) in imported(modules_outside_ros())
 
 
-def test_everything_that_is_imported_is_a_dependency() -> None:
-    # coal comes with pin, glfw with mujoco.
-    known = {IMPORTS.get(name, name) for name in dependencies() + dependencies_to_compare()} | {"coal", "glfw"}
-    assert imported() - known - set(sys.stdlib_module_names) == {"q2r2_control"}
+def test_everything_that_is_imported_outside_ros_is_a_dependency() -> None:
+    assert imported(modules_outside_ros()) - modules_of_dependencies() - dependencies_to_compare() == set()
+
+
+def test_everything_that_the_nodes_import_is_a_dependency_or_in_the_extra_ros() -> None:
+    assert imported(ROS.rglob("*.py")) - modules_of_dependencies() - modules_of_ros() == set()
+
+
+def test_the_ros_manifest_has_the_name_and_version_of_the_python_package() -> None:
+    manifest = ElementTree.parse(ROOT / "package.xml").getroot()
+    assert manifest.findtext("name") == project()["name"]
+    assert manifest.findtext("version") == project()["version"]
 
 
 def test_peers_are_imported_by_their_own_modules_only() -> None:
-    peers = {IMPORTS.get(name, name) for name in dependencies_to_compare()}
+    peers = dependencies_to_compare()
     for file in (ROOT / "q2r2_control").rglob("*.py"):
-        if peers & imported_by(file):
+        if peers & imported([file]):
             assert file.parent.name == "peers"
-            assert peers & imported_by(file) == {file.stem}
+            assert peers & imported([file]) == {file.stem}
 
 
 def test_the_code_in_the_readme_runs() -> None:

@@ -1,8 +1,12 @@
 """The stopping motion and the certificate that it keeps every pair apart, compiled.
 
-**Stop.** Each joint brakes at its full deceleration to rest: q_j(t) = q_j + v_j t - sign(v_j) a_j t^2 / 2 until
+**Stop.** Each joint brakes at its full deceleration a to rest: q_j(t) = q_j + v_j t - sign(v_j) a_j t^2 / 2 until
 t_j = |v_j| / a_j. It keeps every joint limit (limits.py) and, being a function of time, is the same motion whatever
 the length of the ticks it is executed in.
+
+Out of a position that is too close the joints stop together instead, each at the deceleration that takes as long as the
+slowest one's: then the stop runs straight on in joint space, and a pair that was opening goes on opening, while joints
+that stop one after the other turn the motion, and may close it. Its room to position limits is checked, not proven.
 
 **Certificate.** A tick moves the reference along a parabola to (q+, v+) and must know that the parabola and the stop
 from (q+, v+) keep every pair at min_distance. Then by induction the robot is always safe: the last tick's certified
@@ -27,7 +31,7 @@ from q2r2_control.control.jit import lean_kernel
 from q2r2_control.control.plane import step_keeps_beyond
 from q2r2_control.types import Array
 
-_DEEPEST = 5  # halvings of the stop: 32 intervals
+_DEEPEST = 6  # halvings of the stop: 64 intervals
 # A pair that starts closer than min_distance may not come closer; this is rounding only.
 _ROUNDING = 1e-9  # [m]
 
@@ -65,7 +69,7 @@ class Rollout(NamedTuple):
 
 @lean_kernel
 def brake(q: Array, v: Array, a: Array, t: float, q_out: Array, v_out: Array) -> None:
-    """State of the stop after ``t`` seconds, from (q, v) with decelerations a, (nv,) each."""
+    """State of the stop after ``t`` seconds, from (q, v) with decelerations a > 0, (nv,) each."""
     for j in range(q.shape[0]):
         speed = abs(v[j])
         sign = 1.0 if v[j] >= 0.0 else -1.0
@@ -75,6 +79,26 @@ def brake(q: Array, v: Array, a: Array, t: float, q_out: Array, v_out: Array) ->
         else:
             q_out[j] = q[j] + v[j] * t - sign * 0.5 * a[j] * t * t
             v_out[j] = v[j] - sign * a[j] * t
+
+
+@lean_kernel
+def stop_together(
+    q: Array, v: Array, lower: Array, upper: Array, a: Array, longest: float, deceleration: Array
+) -> bool:
+    """Decelerations (nv,) with which all joints stop at the same time, the first of them at its limit ``a``.
+
+    Returns False where that leaves no room to a position limit. The room includes a step of the ``longest`` time, as
+    in limits.py, and what is left of it during the stop does too: then every state of the stop keeps P.
+    """
+    duration = 0.0
+    for j in range(q.shape[0]):
+        duration = max(duration, abs(v[j]) / a[j])
+    for j in range(q.shape[0]):
+        deceleration[j] = abs(v[j]) / duration if v[j] != 0.0 else a[j]
+        end = q[j] + v[j] * (0.5 * duration + longest)
+        if (v[j] > 0.0 and end > upper[j]) or (v[j] < 0.0 and end < lower[j]):
+            return False
+    return True
 
 
 @lean_kernel
@@ -215,12 +239,14 @@ def _comes_no_closer(
     duration: float,
     rollout: Rollout,
 ) -> bool:
-    """For a pair that is too close already: no sample of the stop is closer than ``distance``."""
+    """For a pair that is too close already: no sample of the stop is closer than the one before."""
+    before = distance
     for i in range(rollout.q.shape[0]):
         _sample(chain, bodies, q, v, a, duration, i, rollout)
         now = _distance(bodies, pairs, p, Posed(rollout.start[i], rollout.end[i], rollout.rotation[i]), rollout)
-        if now < distance - _ROUNDING:
+        if now < before - _ROUNDING:
             return False
+        before = now
     return True
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from q2r2_control.control.assembly import observe
-from q2r2_control.control.braking import brake, certify
+from q2r2_control.control.braking import brake, certify, stop_together
 from q2r2_control.control.geometry import clamp
 from q2r2_control.control.jit import Held, kernel, lean_kernel
 from q2r2_control.control.limits import NO_LIMIT
@@ -38,7 +38,7 @@ def commit(
             outcome = _largest_certified(cell, work, h)
     if outcome == STOPPED:
         # The last certified stop; what is left of it stays certified: see braking.py.
-        brake(q, v, cell.acceleration, h, work.candidate[1], work.candidate[0])
+        brake(q, v, work.deceleration[0], h, work.candidate[1], work.candidate[0])
     for j in range(q.shape[0]):
         # Rounding of a difference over a tiny h may exceed the limit that the velocities keep.
         rate = clamp((work.candidate[0, j] - v[j]) / h, -cell.acceleration[j], cell.acceleration[j])
@@ -57,6 +57,8 @@ def first_look(held_cell: Held, held_work: Held) -> tuple[int, float, bool]:
     closest = observe(cell, work)
     work.candidate[0] = work.v
     work.candidate[1] = work.q
+    work.deceleration[0] = cell.acceleration
+    work.deceleration[1] = cell.acceleration
     return closest, _distance_of(work, closest), _certified(cell, work, 0.0)
 
 
@@ -77,7 +79,7 @@ def _certified(cell: Cell, work: Workspace, h: float) -> bool:
         work.v,
         work.candidate[1],
         work.candidate[0],
-        cell.acceleration,
+        work.deceleration[1],
         h,
         cell.limits.min_distance,
         work.rollout,
@@ -88,36 +90,51 @@ def _certified(cell: Cell, work: Workspace, h: float) -> bool:
 def _largest_certified(cell: Cell, work: Workspace, h: float) -> int:
     """Write into ``work.candidate`` the wanted velocities if they can be certified, else the most of them that can.
 
-    Every mixture of the wanted velocities and full braking lies in the box, which is convex and contains both.
+    The certified stop lies in the box as the wanted velocities do, and the box is convex, so every mixture lies in it.
     """
-    nv = work.q.shape[0]
-    for j in range(nv):
-        change = cell.acceleration[j] * h
-        work.candidate[2, j] = work.v[j] - clamp(work.v[j], -change, change)
+    too_close = False
+    for p in range(work.distance.shape[0]):
+        too_close |= work.distance[p] < cell.limits.min_distance
+    brake(work.q, work.v, work.deceleration[0], h, work.candidate[1], work.candidate[2])
     low = 0.0
     high = 1.0
     share = 1.0
     for attempt in range(1 + _BISECTIONS):
-        _mix(work, share, h)
-        if _certified(cell, work, h):
-            if attempt == 0:
-                return FOLLOWED
+        if _mix(cell, work, share, h, too_close) and _certified(cell, work, h):
             low = share
+            if attempt == 0:
+                break
         else:
             high = share
         share = 0.5 * (low + high)
     if low == 0.0:
         return STOPPED
-    _mix(work, low, h)
-    return REDUCED
+    _mix(cell, work, low, h, too_close)
+    for j in range(work.q.shape[0]):
+        work.deceleration[0, j] = work.deceleration[1, j]
+    return FOLLOWED if low == 1.0 else REDUCED
 
 
 @lean_kernel
-def _mix(work: Workspace, share: float, h: float) -> None:
+def _mix(cell: Cell, work: Workspace, share: float, h: float, together: bool) -> bool:
+    """Candidate between the certified stop and the wanted velocities, and its own stop; False if that has no room."""
     for j in range(work.q.shape[0]):
         braked = work.candidate[2, j]
         work.candidate[0, j] = work.wanted[j] if share == 1.0 else braked + share * (work.wanted[j] - braked)
         work.candidate[1, j] = work.q[j] + 0.5 * h * (work.v[j] + work.candidate[0, j])
+    if together:
+        return stop_together(
+            work.candidate[1],
+            work.candidate[0],
+            cell.lower,
+            cell.upper,
+            cell.acceleration,
+            cell.limits.longest_step,
+            work.deceleration[1],
+        )
+    for j in range(work.q.shape[0]):
+        work.deceleration[1, j] = cell.acceleration[j]
+    return True
 
 
 @lean_kernel

@@ -167,7 +167,12 @@ def _minimum_along(a0: Array, a1: Array, half: Array) -> float:
 
 @lean_kernel
 def _push_out(a0: Array, a1: Array, half: Array, on_a: Array, on_box: Array, normal: Array) -> float:
-    """Least way out of the box for a segment that enters it."""
+    """Least way out of the box for a segment that enters it.
+
+    The penetration depth of two convex polytopes is the distance from the origin to the nearest face of their Minkowski
+    difference (Cameron, ICRA 1997). For box and segment the faces belong to the box's faces, and to each of its edges
+    with the segment; leaving out the latter, the depth would jump where a segment begins to cut an edge.
+    """
     best = np.inf
     axis = 0
     sign = 1.0
@@ -182,6 +187,17 @@ def _push_out(a0: Array, a1: Array, half: Array, on_a: Array, on_box: Array, nor
             best = downward
             axis = k
             sign = -1.0
+    edge = -1
+    length = np.sqrt((a1[0] - a0[0]) ** 2 + (a1[1] - a0[1]) ** 2 + (a1[2] - a0[2]) ** 2)
+    for k in range(3):
+        depth = _depth_across(a0, a1, half, k, 1e-6 * length, normal)
+        if depth < best:
+            best = depth
+            edge = k
+    if edge >= 0:
+        _depth_across(a0, a1, half, edge, 1e-6 * length, normal)
+        _across_edge(a0, a1, half, edge, on_a, on_box, normal)
+        return -best
     deeper_is_a0 = sign * a0[axis] < sign * a1[axis]
     for k in range(3):
         on_a[k] = a0[k] if deeper_is_a0 else a1[k]
@@ -190,3 +206,37 @@ def _push_out(a0: Array, a1: Array, half: Array, on_a: Array, on_box: Array, nor
     on_box[axis] = sign * half[axis]
     normal[axis] = -sign  # from the segment into the box: against the way out
     return -best
+
+
+@lean_kernel
+def _depth_across(a0: Array, a1: Array, half: Array, k: int, least: float, normal: Array) -> float:
+    """Way out of the box across its edges along axis ``k``; ``normal`` leads from the segment into the box."""
+    i, j = (k + 1) % 3, (k + 2) % 3
+    # e_k x (a1 - a0)
+    x = -(a1[j] - a0[j])
+    y = a1[i] - a0[i]
+    size = np.sqrt(x * x + y * y)
+    if size <= least:
+        return np.inf
+    x /= size
+    y /= size
+    along = x * a0[i] + y * a0[j]
+    out = 1.0 if along >= 0.0 else -1.0
+    normal[k] = 0.0
+    normal[i] = -out * x
+    normal[j] = -out * y
+    return half[i] * abs(x) + half[j] * abs(y) - abs(along)
+
+
+@lean_kernel
+def _across_edge(a0: Array, a1: Array, half: Array, k: int, on_a: Array, on_box: Array, normal: Array) -> None:
+    """Where the segment passes the edge along axis ``k`` that it leaves the box across, against ``normal``."""
+    i, j = (k + 1) % 3, (k + 2) % 3
+    for axis in (i, j):
+        on_box[axis] = -half[axis] if normal[axis] > 0.0 else half[axis]
+    # Seen along the edge the segment is a line; its foot is where the edge is nearest.
+    x, y = a1[i] - a0[i], a1[j] - a0[j]
+    s = clamp(((on_box[i] - a0[i]) * x + (on_box[j] - a0[j]) * y) / (x * x + y * y), 0.0, 1.0)
+    for axis in range(3):
+        on_a[axis] = a0[axis] + s * (a1[axis] - a0[axis])
+    on_box[k] = clamp(on_a[k], -half[k], half[k])

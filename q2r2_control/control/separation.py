@@ -87,6 +87,10 @@ def _append_row(
         rate += row[j] * v[j]
         change += abs(row[j]) * a[j] * h
     lower = slowest_rate(distance - approach.stop_distance, _SHARE * change / h, approach)
+    if lower > 0.0:
+        # Asked for more than the joints can do in this step, rows of several pairs would be weighed against each other,
+        # and the deeper pair would be opened at the cost of closing another one.
+        lower = min(lower, max(rate, 0.0) + _SHARE * change)
     if rate - change >= lower or change <= 0.0:
         return count
     rows.lower[count] = lower

@@ -214,8 +214,10 @@ def test_a_segment_along_a_face_meets_it_in_the_middle() -> None:
     np.testing.assert_allclose(answer.on_a, np.array([0.0, 0.0, 0.5]), atol=1e-9)
 
 
-def test_a_segment_that_enters_a_box_leaves_it_by_the_shortest_of_the_six_ways() -> None:
-    entered = 0
+def test_a_segment_that_enters_a_box_leaves_it_by_the_shortest_way_of_all_directions() -> None:
+    directions = np.random.default_rng(8).normal(size=(400, 3))
+    directions = np.vstack([directions / np.linalg.norm(directions, axis=1, keepdims=True), np.eye(3), -np.eye(3)])
+    entered = across = 0
     for a0, a1, half in _boxes_and_segments(1000, spread=0.4):
         if _nearest_along(a0, a1, half) > 1e-9:
             continue
@@ -224,12 +226,23 @@ def test_a_segment_that_enters_a_box_leaves_it_by_the_shortest_of_the_six_ways()
         assert answer.distance <= 0.0
         assert _to_segment(answer.on_a, a0, a1) < 1e-9
         np.testing.assert_allclose(answer.on_box - answer.on_a, answer.distance * answer.normal, atol=1e-9)
-        assert np.abs(np.abs(answer.on_box) - half).min() < 1e-9, "the way out ends in the plane of a face"
-        ways = [half[k] - min(a0[k], a1[k]) for k in range(3)] + [half[k] + max(a0[k], a1[k]) for k in range(3)]
-        assert -answer.distance == pytest.approx(min(ways), abs=1e-9)
+        assert np.abs(np.abs(answer.on_box) - half).min() < 1e-9, "the way out ends on the box"
+        across += np.abs(answer.normal).max() < 1.0 - 1e-9
+        # Moved by t n the segment is out once its nearest end has passed the box's farthest corner.
+        ways = np.abs(directions) @ half - np.minimum(directions @ a0, directions @ a1)
+        assert -answer.distance <= ways.min() + 1e-9
         out = answer.distance * answer.normal
         assert _to_box(a0 + 1.0001 * out, a1 + 1.0001 * out, half).distance >= 0.0
     assert entered > 200
+    assert across > 20
+
+
+def test_the_depth_grows_from_nothing_where_a_segment_begins_to_cut_an_edge() -> None:
+    half = np.array([0.4, 0.2, 0.3])
+    for depth in (-1e-3, -1e-6, 1e-6, 1e-3):
+        corner = np.array([0.4, 0.0, 0.3]) - depth * np.array([1.0, 0.0, 1.0]) / np.sqrt(2.0)
+        along = np.array([1.0, 0.0, -1.0])
+        assert _to_box(corner - along, corner + along, half).distance == pytest.approx(-depth, abs=1e-9)
 
 
 @pytest.mark.parametrize("side", [1.0, -1.0], ids=["from above", "from below"])

@@ -13,7 +13,6 @@ from pydantic import ValidationError
 from q2r2_control.config import load_config
 from q2r2_control.control.settings import ControllerSettings, WallSettings
 from q2r2_control.control.wall import MeasuredSeparation, WallReport
-from q2r2_control.errors import RobotError
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, Command, CommandMode
@@ -181,11 +180,6 @@ def test_settings_that_would_not_push_apart_or_would_add_energy_are_refused(key:
 
 WEIGHTLESS = """<robot name="rod"><link name="base"/><link name="rod"/><joint name="hinge" type="revolute">
 <parent link="base"/><child link="rod"/><limit lower="-1" upper="1" velocity="1" effort="1"/></joint></robot>"""
-
-
-def test_a_robot_without_masses_is_refused_by_the_name_of_the_joint() -> None:
-    with pytest.raises(RobotError, match=r"hinge.*masses"):
-        MeasuredSeparation(Robot.from_urdf(WEIGHTLESS, {"left": "rod"}), ControllerSettings())
 
 
 def test_a_robot_without_pairs_meets_no_wall() -> None:

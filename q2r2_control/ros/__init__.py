@@ -1,0 +1,1 @@
+"""ROS 2: needs rclpy, which the rest of the package does not."""

@@ -1,0 +1,138 @@
+"""Between ROS messages and the dataclasses of ``types.py``; nothing here decides anything.
+
+Joints are matched by name, never by order. Stamps of messages are the sender's clock and stay with the message; times
+inside are receipt times on the node's own clock, given in seconds.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import pinocchio as pin
+from builtin_interfaces.msg import Time
+from geometry_msgs.msg import Pose, PoseStamped, Transform
+from quest2ros.msg import OVR2ROSInputs
+from sensor_msgs.msg import JointState
+
+from q2r2_control.types import Array, HandInputs, HandSample, RobotState
+
+_UNIT = 1e-3  # a quaternion's norm may be off by this
+
+
+def seconds(stamp: Time) -> float:
+    """A message's stamp in seconds of its sender's clock."""
+    return float(stamp.sec) + 1e-9 * float(stamp.nanosec)
+
+
+def time_message(t: float) -> Time:
+    """``t`` [s] as a stamp; not negative."""
+    whole = math.floor(max(t, 0.0))
+    return Time(sec=int(whole), nanosec=min(round((max(t, 0.0) - whole) * 1e9), 999_999_999))
+
+
+def pose_message(pose: pin.SE3) -> Pose:
+    """A pose with a unit quaternion, x y z w."""
+    message = Pose()
+    _write(pose, message.position, message.orientation)
+    return message
+
+
+def transform_message(pose: pin.SE3) -> Transform:
+    """The same as a transform."""
+    message = Transform()
+    _write(pose, message.translation, message.rotation)
+    return message
+
+
+def stamped_pose(pose: pin.SE3, frame: str, t: float) -> PoseStamped:
+    """A pose in ``frame`` at ``t`` [s]."""
+    message = PoseStamped()
+    message.header.frame_id = frame
+    message.header.stamp = time_message(t)
+    message.pose = pose_message(pose)
+    return message
+
+
+def pose_of(message: Pose) -> pin.SE3 | None:
+    """The pose of a message, its quaternion normalised; None for numbers that are not finite or no rotation."""
+    position = np.array([message.position.x, message.position.y, message.position.z])
+    quaternion = _quaternion(message)
+    norm = float(np.linalg.norm(quaternion))
+    if not (np.isfinite(position).all() and abs(norm - 1.0) <= _UNIT):
+        return None
+    return pin.SE3(pin.Quaternion(quaternion / norm).toRotationMatrix(), position)
+
+
+def hand_sample(
+    hand: str, pose: PoseStamped, pose_stamp: float, inputs: OVR2ROSInputs | None, inputs_stamp: float
+) -> HandSample:
+    """One reading of a hand, unchecked, from its newest messages and their receipt times [s]."""
+    position = pose.pose.position
+    return HandSample(
+        hand=hand,
+        position=np.array([position.x, position.y, position.z]),
+        quaternion=_quaternion(pose.pose),
+        pose_stamp=pose_stamp,
+        inputs=HandInputs() if inputs is None else hand_inputs(inputs),
+        inputs_stamp=inputs_stamp,
+    )
+
+
+def hand_inputs(message: OVR2ROSInputs) -> HandInputs:
+    """Buttons, triggers and stick of one hand."""
+    return HandInputs(**{name: getattr(message, name) for name in HandInputs.__slots__})
+
+
+def inputs_message(inputs: HandInputs) -> OVR2ROSInputs:
+    """The same as a message."""
+    return OVR2ROSInputs(**{name: getattr(inputs, name) for name in HandInputs.__slots__})
+
+
+def joint_state_message(names: Sequence[str], q: Array, v: Array, tau: Array, t: float, frame: str = "") -> JointState:
+    """Joint positions [rad], velocities [rad/s] and torques [Nm] at ``t`` [s]."""
+    message = JointState(name=list(names), position=q.tolist(), velocity=v.tolist(), effort=tau.tolist())
+    message.header.stamp = time_message(t)
+    message.header.frame_id = frame
+    return message
+
+
+def robot_state(message: JointState, names: Sequence[str], t: float) -> RobotState | str:
+    """State in the order of ``names``, received at ``t`` [s]; or what is wrong with the message, in one line.
+
+    Joints of others may be in it. Velocities and torques may be missing as a whole and are then zero.
+    """
+    columns: Mapping[str, int] = {name: index for index, name in enumerate(message.name)}
+    if len(columns) != len(message.name):
+        return "a joint is named twice"
+    missing = [name for name in names if name not in columns]
+    if missing:
+        return f"no joint {missing[0]}" + (f" and {len(missing) - 1} more" if len(missing) > 1 else "")
+    order = [columns[name] for name in names]
+    values = []
+    for field, required in (("position", True), ("velocity", False), ("effort", False)):
+        numbers = np.array(getattr(message, field), dtype=np.float64)
+        if len(numbers) == 0 and not required:
+            values.append(np.zeros(len(names)))
+            continue
+        if len(numbers) != len(message.name):
+            return f"{len(numbers)} {field} values for {len(message.name)} joints"
+        numbers = numbers[order]
+        if not np.isfinite(numbers).all():
+            return f"{field} of {names[int(np.flatnonzero(~np.isfinite(numbers))[0])]} is not finite"
+        values.append(numbers)
+    return RobotState(q=values[0], v=values[1], tau=values[2], tau_external=None, stamp=t)
+
+
+def _quaternion(message: Pose) -> Array:
+    orientation = message.orientation
+    return np.array([orientation.x, orientation.y, orientation.z, orientation.w])
+
+
+def _write(pose: pin.SE3, position: object, orientation: object) -> None:
+    quaternion = pin.Quaternion(pose.rotation).normalized().coeffs()
+    for name, value in zip("xyz", pose.translation.tolist(), strict=True):
+        setattr(position, name, value)
+    for name, value in zip("xyzw", quaternion.tolist(), strict=True):
+        setattr(orientation, name, value)

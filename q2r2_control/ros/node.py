@@ -1,0 +1,124 @@
+"""What every node has in common: parameters with ranges, QoS, its own state, diagnostics, an orderly end."""
+
+from __future__ import annotations
+
+import json
+import signal
+import sys
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from std_msgs.msg import String
+
+from q2r2_control.errors import Q2R2Error
+
+# Commands: only the newest counts, and it has to arrive.
+COMMAND_QOS = QoSProfile(
+    history=HistoryPolicy.KEEP_LAST,
+    depth=1,
+    reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.VOLATILE,
+)
+# Streams of a headset or of joint states: a late one is worth less than the next.
+STREAM_QOS = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
+# What late comers have to get too, such as robot_description.
+LATCHED_QOS = QoSProfile(
+    history=HistoryPolicy.KEEP_LAST,
+    depth=1,
+    reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.TRANSIENT_LOCAL,
+)
+_DIAGNOSTICS_PERIOD = 0.5  # [s]
+
+OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
+
+
+class BaseNode(Node):
+    """A node with described parameters, ``/diagnostics`` and ``~/state`` (one JSON object in a String).
+
+    Subclasses override :meth:`health`.
+    """
+
+    def __init__(self, name: str, **kwargs: Any) -> None:
+        super().__init__(name, **kwargs)
+        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        self._state = self.create_publisher(String, "~/state", 10)
+        self.create_timer(_DIAGNOSTICS_PERIOD, self.report_health)
+
+    def parameter(
+        self,
+        name: str,
+        default: Any,
+        description: str,
+        *,
+        at_least: float | None = None,
+        at_most: float | None = None,
+        read_only: bool = True,
+    ) -> Any:
+        """Declare a parameter and return its value. A value outside the range is refused by rclpy itself."""
+        descriptor = ParameterDescriptor(description=description, read_only=read_only)
+        if at_least is not None and at_most is not None:
+            if isinstance(default, int) and not isinstance(default, bool):
+                descriptor.integer_range = [IntegerRange(from_value=int(at_least), to_value=int(at_most), step=0)]
+            else:
+                descriptor.floating_point_range = [
+                    FloatingPointRange(from_value=float(at_least), to_value=float(at_most), step=0.0)
+                ]
+        return self.declare_parameter(name, default, descriptor).value
+
+    @property
+    def now(self) -> float:
+        """The node's clock [s]: ROS time, so that use_sim_time counts."""
+        return float(self.get_clock().now().nanoseconds) * 1e-9
+
+    def health(self) -> tuple[bytes, str, Mapping[str, Any]]:
+        """Level (OK, WARN, ERROR), one line, and figures."""
+        return OK, "running", {}
+
+    def report_health(self) -> None:
+        """Publish :meth:`health` now; a timer does it twice a second, a change that matters need not wait."""
+        level, line, values = self.health()
+        status = DiagnosticStatus(level=level, name=self.get_fully_qualified_name(), message=line)
+        status.values = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
+        array = DiagnosticArray(status=[status])
+        array.header.stamp = self.get_clock().now().to_msg()
+        self._diagnostics.publish(array)
+        state = {"level": {OK: "ok", WARN: "warn", ERROR: "error"}[level], "message": line, **values}
+        self._state.publish(String(data=json.dumps(state, default=str)))
+
+
+def run_node(make: Callable[[], Node], args: Sequence[str] | None = None) -> int:
+    """Main function of an executable: make the node, spin until Ctrl-C or SIGTERM, close it; the exit code.
+
+    A fault of its configuration is one line on stderr and exit code 2. ``node.close()`` is called if there is one.
+    """
+    rclpy.init(args=list(sys.argv if args is None else args), signal_handler_options=rclpy.SignalHandlerOptions.NO)
+    stop = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    node: Any = None
+    try:
+        node = make()
+        executor = SingleThreadedExecutor()
+        executor.add_node(node)
+        while rclpy.ok() and not stop.is_set():
+            executor.spin_once(timeout_sec=0.1)
+    except Q2R2Error as error:
+        print(f"{sys.argv[0].rsplit('/', 1)[-1]}: {error}", file=sys.stderr)
+        return 2
+    except ExternalShutdownException:
+        pass
+    finally:
+        if node is not None:
+            if hasattr(node, "close"):
+                node.close()
+            node.destroy_node()
+        rclpy.try_shutdown()
+    return 0

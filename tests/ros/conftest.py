@@ -1,0 +1,82 @@
+"""ROS 2 in tests: a private domain for each worker, processes and nodes in it, and the interfaces that they need.
+
+Modules that need ROS say ``pytest.importorskip("rclpy", reason=...)`` on top or use one of these fixtures, which skip.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Generator, Iterator
+from pathlib import Path
+from threading import Thread
+from typing import Any
+
+import pytest
+
+from q2r2_control.ros.build import interface_packages, missing_tools
+from tests.ros.processes import Processes, environment_of
+
+NEEDS_ROS = "needs ROS 2 Jazzy: pip install 'q2r2_control[ros]', or source an install"
+_PROCESSES = pytest.StashKey[Processes]()
+
+
+@pytest.fixture(scope="session")
+def domain(tmp_path_factory: pytest.TempPathFactory) -> Iterator[int]:
+    """A ROS_DOMAIN_ID that no other test session or worker on this machine has; set for this process too."""
+    pytest.importorskip("rclpy", reason=NEEDS_ROS)
+    coordinator = pytest.importorskip("domain_coordinator", reason=NEEDS_ROS)
+    with coordinator.domain_id() as number, pytest.MonkeyPatch.context() as patch:
+        for key, value in environment_of(number, tmp_path_factory.mktemp("ros")).items():
+            patch.setenv(key, value)
+        yield number
+
+
+@pytest.fixture(scope="session")
+def interfaces() -> None:
+    """The interface packages can be imported; where they are not built the test fails, or skips for lack of tools."""
+    pytest.importorskip("rclpy", reason=NEEDS_ROS)
+    absent = [package.name for package in interface_packages() if package.found_in() is None]
+    if absent:
+        if missing := missing_tools(Path(sys.prefix)):
+            pytest.skip(f"{', '.join(absent)} cannot be built here: missing {'; '.join(missing)}")
+        pytest.fail(f"{', '.join(absent)} not built: run q2r2 ros build-interfaces")
+
+
+@pytest.fixture
+def processes(domain: int, tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Processes]:
+    """Starts processes in the private domain; what they printed is part of a failed test's report."""
+    started = Processes(tmp_path, os.environ)
+    request.node.stash[_PROCESSES] = started
+    yield started
+    started.end_all()
+
+
+@pytest.fixture
+def node(domain: int) -> Iterator[Any]:
+    """An ``rclpy`` node in the private domain, spun by a thread of its own."""
+    import rclpy
+    from rclpy.executors import SingleThreadedExecutor
+
+    context = rclpy.Context()
+    rclpy.init(context=context, domain_id=domain)
+    made = rclpy.create_node("test", context=context)
+    executor = SingleThreadedExecutor(context=context)
+    executor.add_node(made)
+    thread = Thread(target=executor.spin, daemon=True)
+    thread.start()
+    yield made
+    executor.shutdown()
+    thread.join()
+    made.destroy_node()
+    context.try_shutdown()
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(
+    item: pytest.Item, call: pytest.CallInfo[None]
+) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    report = yield
+    if report.failed and (started := item.stash.get(_PROCESSES, None)):
+        report.sections += [(f"output of {process.name}", process.output) for process in started.started]
+    return report

@@ -1,0 +1,110 @@
+"""Processes of a test: ended by their own id, their output kept for the message of a failure."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+PATIENCE = 30.0  # [s], for starting Python and finding each other on a busy machine
+
+
+class RosProcess:
+    """One running program, with stdout and stderr in one file."""
+
+    def __init__(self, name: str, command: Sequence[str], log: Path, environment: Mapping[str, str]) -> None:
+        self.name = name
+        self.log = log
+        with log.open("w") as output:
+            self._process = subprocess.Popen(
+                command, cwd=ROOT, env=environment, stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT
+            )
+
+    @property
+    def pid(self) -> int:
+        return self._process.pid
+
+    @property
+    def output(self) -> str:
+        """All it has printed so far."""
+        return self.log.read_text(errors="replace")
+
+    @property
+    def running(self) -> bool:
+        return self._process.poll() is None
+
+    def wait_for(self, text: str, timeout: float = PATIENCE) -> str:
+        """The first whole line of output that contains ``text``; fails when the process ends or time runs out."""
+        deadline = time.monotonic() + timeout
+        while True:
+            ended = not self.running  # asked before reading, so that its last words are read
+            for line in self.output.splitlines(keepends=True):
+                if text in line and line.endswith("\n"):
+                    return line.rstrip("\n")
+            assert not ended, f"{self.name} ended with {self._process.returncode} before it said {text!r}"
+            assert time.monotonic() < deadline, f"{self.name} did not say {text!r} within {timeout:g} s"
+            time.sleep(0.02)
+
+    def wait(self, timeout: float = PATIENCE) -> int:
+        """Its exit code; fails when time runs out."""
+        try:
+            return self._process.wait(timeout)
+        except subprocess.TimeoutExpired:
+            raise AssertionError(f"{self.name} did not end within {timeout:g} s") from None
+
+    def interrupt(self, timeout: float = 10.0) -> int:
+        """Ctrl-C; the exit code, or a failure when it does not end by that."""
+        self._process.send_signal(signal.SIGINT)
+        return self.wait(timeout)
+
+    def end(self) -> None:
+        """End it however it takes: politely, then not."""
+        for means in (self._process.terminate, self._process.kill):
+            if self.running:
+                means()
+                try:
+                    self._process.wait(5.0)
+                except subprocess.TimeoutExpired:
+                    continue
+
+
+class Processes:
+    """Starts processes in one environment, and ends those that are left."""
+
+    def __init__(self, folder: Path, environment: Mapping[str, str]) -> None:
+        self._folder = folder
+        self._environment = dict(environment)
+        self.started: list[RosProcess] = []
+
+    def start(self, *command: str, name: str = "", **environment: str) -> RosProcess:
+        """Start a program; ``environment`` is added to the private domain's."""
+        name = name or Path(command[0]).name
+        log = self._folder / f"{len(self.started)}-{name}.log"
+        process = RosProcess(name, command, log, self._environment | environment)
+        self.started.append(process)
+        return process
+
+    def start_module(self, module: str, *arguments: str, **environment: str) -> RosProcess:
+        """Start ``python -m module``, unbuffered."""
+        return self.start(sys.executable, "-u", "-m", module, *arguments, name=module.split(".")[-1], **environment)
+
+    def end_all(self) -> None:
+        """Last started, first ended."""
+        for process in reversed(self.started):
+            process.end()
+
+
+def environment_of(domain: int, folder: Path) -> dict[str, str]:
+    """This process's environment with ROS confined to ``domain`` on this machine, and its logs to ``folder``."""
+    paths = [str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]
+    return dict(os.environ) | {
+        "ROS_DOMAIN_ID": str(domain),
+        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+        "ROS_LOG_DIR": str(folder),
+        "PYTHONPATH": os.pathsep.join(paths),
+    }

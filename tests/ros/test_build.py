@@ -1,0 +1,135 @@
+"""``q2r2 ros build-interfaces``: what it builds, what it leaves alone, and what it says when something is missing."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import venv
+from pathlib import Path
+
+import pytest
+
+from q2r2_control.ros.build import INTERFACES, BuildError, Interfaces, build, interface_packages, missing_tools
+from tests.ros.conftest import NEEDS_ROS
+from tests.ros.processes import ROOT
+
+SITE_PACKAGES = Path("lib", f"python{sys.version_info.major}.{sys.version_info.minor}", "site-packages")
+NAMES = ["control_msgs", "quest2ros", "tf2_msgs"]
+
+
+def build_interfaces(
+    *options: str, python: str | Path = sys.executable, **environment: str
+) -> subprocess.CompletedProcess[str]:
+    command = [python, "-m", "q2r2_control", "ros", "build-interfaces", *options]
+    return subprocess.run(command, cwd=ROOT, env=os.environ | environment, capture_output=True, text=True, timeout=120)
+
+
+@pytest.fixture
+def bare_environment(tmp_path: Path) -> Path:
+    """A virtual environment that holds nothing; returns its folder."""
+    folder = tmp_path / "bare"
+    venv.create(folder, symlinks=True, with_pip=False)
+    return folder
+
+
+@pytest.fixture
+def sourced(bare_environment: Path) -> dict[str, str]:
+    """Variables that let another environment see the packages of this one, as sourcing a ROS install does."""
+    prefix = Path(sys.prefix)
+    libraries = [prefix / "lib", *(prefix / SITE_PACKAGES).glob("ros_*.libs")]
+    return {
+        "AMENT_PREFIX_PATH": str(prefix),
+        "PYTHONPATH": os.pathsep.join(map(str, [ROOT, *filter(None, sys.path)])),
+        "LD_LIBRARY_PATH": os.pathsep.join(map(str, libraries)),
+    }
+
+
+def test_the_shipped_packages_define_what_the_app_and_grippers_use() -> None:
+    assert [package.name for package in interface_packages()] == NAMES
+    assert Interfaces(INTERFACES / "quest2ros").types == [
+        ("quest2ros.msg", "OVR2ROSHapticFeedback"),
+        ("quest2ros.msg", "OVR2ROSInputs"),
+    ]
+    assert ("control_msgs.action", "ParallelGripperCommand") in Interfaces(INTERFACES / "control_msgs").types
+
+
+@pytest.mark.usefixtures("interfaces")
+def test_what_can_be_imported_is_not_built_again() -> None:
+    run = build_interfaces()
+    assert (run.returncode, run.stderr) == (0, "")
+    folders = [Path(sys.prefix) / SITE_PACKAGES / name for name in NAMES]
+    assert run.stdout.splitlines() == [f"{folder.name}: already there ({folder})" for folder in folders]
+
+
+@pytest.mark.usefixtures("interfaces")
+def test_what_a_sourced_install_has_is_left_alone_even_when_forced(
+    bare_environment: Path, sourced: dict[str, str]
+) -> None:
+    run = build_interfaces("--force", python=bare_environment / "bin" / "python", **sourced)
+    assert (run.returncode, run.stderr) == (0, "")
+    assert [line.split(" (")[0] for line in run.stdout.splitlines()] == [f"{name}: already there" for name in NAMES]
+    assert not (bare_environment / "share").exists()
+
+
+def test_a_package_built_beside_a_sourced_install_is_used_after_sourcing_it_too(
+    bare_environment: Path, sourced: dict[str, str], tmp_path: Path
+) -> None:
+    pytest.importorskip("rclpy", reason=NEEDS_ROS)
+    if missing := missing_tools(Path(sys.prefix)):
+        pytest.skip(f"nothing can be built here: missing {'; '.join(missing)}")
+    log = tmp_path / "quest2ros.log"
+    build(Interfaces(INTERFACES / "quest2ros"), bare_environment, log)
+    assert "Installing: " in log.read_text()
+
+    python = bare_environment / "bin" / "python"
+    packages = bare_environment / SITE_PACKAGES
+    path = os.pathsep.join([str(packages), sourced["PYTHONPATH"]])
+    told = build_interfaces(python=python, **(sourced | {"PYTHONPATH": path})).stdout.splitlines()
+    assert f"quest2ros: already there ({packages / 'quest2ros'})" in told
+    setup_file = bare_environment / "share" / "quest2ros" / "local_setup.bash"
+    assert told[-1] == f"before use: source {setup_file}"
+
+    script = (
+        "from rclpy.serialization import deserialize_message, serialize_message\n"
+        "import quest2ros\n"
+        "from quest2ros.msg import OVR2ROSHapticFeedback as Haptic\n"
+        "print(quest2ros.__path__[0])\n"
+        "print(deserialize_message(serialize_message(Haptic(frequency=0.5, amplitude=0.25)), Haptic))\n"
+    )
+    command = ["bash", "-c", 'source "$0" && "$1" -c "$2"', str(setup_file), str(python), script]
+    run = subprocess.run(command, env=os.environ | sourced, capture_output=True, text=True, timeout=60)
+    assert run.stdout.splitlines() == [
+        str(packages / "quest2ros"),
+        "quest2ros.msg.OVR2ROSHapticFeedback(frequency=0.5, amplitude=0.25)",
+    ], run.stderr
+
+
+def test_without_a_compiler_one_line_says_so(tmp_path: Path) -> None:
+    """With a PATH that has make and nothing else; CMake comes with the environment."""
+    pytest.importorskip("rclpy", reason=NEEDS_ROS)
+    if (make := shutil.which("make")) is None:
+        pytest.skip("needs make")
+    (tmp_path / "make").symlink_to(make)
+    run = build_interfaces("--force", PATH=str(tmp_path), CXX="")
+    assert run.returncode == 1
+    (line,) = run.stderr.splitlines()
+    assert line.startswith("q2r2: ")
+    assert "quest2ros" in line
+    assert line.endswith(" not built: missing a C++ compiler (c++ or g++ or clang++; Debian, Ubuntu: g++)")
+
+
+def test_a_folder_that_no_python_looks_into_is_refused(tmp_path: Path) -> None:
+    assert f"a virtual environment that can be written to, since {tmp_path} is none" in missing_tools(tmp_path)
+
+
+def test_a_build_that_fails_names_its_log(tmp_path: Path) -> None:
+    pytest.importorskip("catkin_pkg")
+    source = tmp_path / "broken"
+    source.mkdir()
+    (source / "CMakeLists.txt").write_text("cmake_minimum_required(VERSION 3.16)\nmessage(FATAL_ERROR broken)\n")
+    log = tmp_path / "log" / "broken.log"
+    with pytest.raises(BuildError, match=f"^broken not built: cmake failed, see {log}$"):
+        build(Interfaces(source), tmp_path / "prefix", log)
+    assert "broken" in log.read_text()
