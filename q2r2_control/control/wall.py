@@ -16,12 +16,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import pinocchio as pin
-from pydantic import BaseModel, ConfigDict, Field
 
 from q2r2_control.control.chain import chain_of
 from q2r2_control.control.collision import bodies_of, pairs_of
 from q2r2_control.control.jit import hold
-from q2r2_control.control.settings import ControllerSettings
+from q2r2_control.control.settings import ControllerSettings, WallSettings
 from q2r2_control.control.wall_force import Scratch, Wall, find_near, wall_torque
 from q2r2_control.errors import RobotError
 from q2r2_control.robot.robot import Robot
@@ -31,16 +30,6 @@ from q2r2_control.types import Array
 _SMOOTHING = 0.07
 # Cores closer than this part of the radii are measured as they are: so deep, the smoothing would weaken the force.
 _DEEP = 0.25
-
-
-class WallSettings(BaseModel):
-    """The wall between measured links; its depth is the controller's ``min_distance``."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-    stiffness: float = Field(10000.0, gt=0, le=100000, description="force per depth below min_distance [N/m]")
-    damping_ratio: float = Field(1.0, ge=0.2, le=2, description="at each pair's effective mass")
-    maximum_force: float = Field(400.0, gt=0, le=2000, description="of each pair of links [N]")
 
 
 @dataclass(frozen=True, slots=True)
