@@ -10,13 +10,14 @@ from typing import Any
 import pytest
 
 from tests.ros.conftest import NEEDS_ROS
-from tests.ros.processes import Processes
+from tests.ros.processes import PATIENCE, Processes
 from tests.ros.waiting import States, eventually
 
 pytest.importorskip("rclpy", reason=NEEDS_ROS)
 pytestmark = pytest.mark.usefixtures("interfaces")
 
 MODULE = "q2r2_control.ros.check_tcp_connection"
+LONG = 3.0 * PATIENCE  # two start at once, and then run for a time of their own
 
 
 @contextmanager
@@ -60,8 +61,8 @@ def test_it_shows_values_rate_and_age_and_tells_a_timeout(node: Any, processes: 
 
 
 def test_after_its_duration_the_exit_code_says_whether_anything_arrives(node: Any, processes: Processes) -> None:
-    arguments = ("--ros-args", "-p", "duration:=4.0")
+    arguments = ("--ros-args", "-p", "duration:=3.0")
     with left_hand_publishing(node):
         hears = processes.start_module(MODULE, *arguments)
         alone = processes.start_module(MODULE, *arguments, "-r", "__ns:=/elsewhere")
-        assert (hears.wait(), alone.wait()) == (0, 1)
+        assert (hears.wait(LONG), alone.wait(LONG)) == (0, 1)

@@ -113,6 +113,6 @@ def test_a_bad_parameter_is_one_line(processes: Processes) -> None:
     }
     started = [processes.start_module(MODULE, "--ros-args", "-p", parameter) for parameter in complaints]
     for process, complaint in zip(started, complaints.values(), strict=True):
-        assert process.wait() == 2
+        assert process.wait(3.0 * PATIENCE) == 2
         (line,) = process.output.splitlines()
         assert complaint in line

@@ -261,7 +261,7 @@ def test_an_address_that_cannot_be_bound_and_a_port_out_of_range_are_one_line(pr
             "port:=65536": "allowed is 0 .. 65535",
         }
         started = [processes.start_module(MODULE, "--ros-args", "-p", parameter) for parameter in complaints]
-        assert [process.wait() for process in started] == [2, 2]
+        assert [process.wait(2.0 * PATIENCE) for process in started] == [2, 2]
     for process, complaint in zip(started, complaints.values(), strict=True):
         (line,) = process.output.splitlines()
         assert complaint in line
