@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from q2r2_control.control.settings import ControllerSettings, ImpedanceSettings, check_priority
+from q2r2_control.control.settings import AdmittanceSettings, ControllerSettings, ImpedanceSettings, check_priority
 from q2r2_control.errors import ConfigError
 from q2r2_control.resources import find_resource
 from q2r2_control.teleop.settings import TeleopSettings
@@ -142,6 +142,7 @@ class Config(_Model):
     loop_rate_hz: float = Field(1000.0, ge=50, le=2000, description="control loop [Hz]")
     control: ControllerSettings = ControllerSettings()
     impedance: ImpedanceSettings = ImpedanceSettings()
+    admittance: AdmittanceSettings = AdmittanceSettings()
     teleop: TeleopSettings = TeleopSettings()
     headset: HeadsetConfig = HeadsetConfig()
     mujoco: MujocoConfig = MujocoConfig()

@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-import gc
 import math
-import signal
-import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
 import pinocchio as pin
 
+from q2r2_control.clock import LoopClock
 from q2r2_control.config import Config
-from q2r2_control.control.controller import LONGEST_DT, CartesianController
-from q2r2_control.control.impedance import ImpedanceController, ImpedanceReport
+from q2r2_control.control.admittance import AdmittanceReport
+from q2r2_control.control.controller import CartesianController
+from q2r2_control.control.impedance import ImpedanceReport
+from q2r2_control.control.wall import WallReport
+from q2r2_control.drive import drive_of
 from q2r2_control.errors import ConfigError
 from q2r2_control.inputs.base import Input
 from q2r2_control.inputs.headset import HeadsetServer
@@ -24,11 +25,12 @@ from q2r2_control.inputs.scripted import ScriptedInput
 from q2r2_control.plants.base import Plant
 from q2r2_control.plants.kinematic import KinematicPlant
 from q2r2_control.plants.mujoco import MujocoPlant
+from q2r2_control.process import few_garbage_collections, stop_on_signals
 from q2r2_control.robot.robot import Robot
 from q2r2_control.summary import RunStatistics, RunSummary
 from q2r2_control.teleop.arm import OPEN
 from q2r2_control.teleop.teleop import Teleop
-from q2r2_control.types import ArmTarget, Array, Command, CommandMode, Event, HandSample, Reference, RobotState
+from q2r2_control.types import ArmTarget, CommandMode, HandSample, Reference, RobotState
 
 INPUTS = ("scripted", "headset")
 PLANTS = ("mujoco", "kinematic")
@@ -37,7 +39,6 @@ STOPPING = "stopping"  # state of every arm while the run ends
 # Added to the time that full braking takes; an arm that still recovers into its limits is not waited for longer.
 _STOP_ALLOWANCE = 1.0  # [s]
 _REST = 1e-6  # of the reference [rad/s]
-_STILL = 1e-2  # of an arm on its spring [rad/s]
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +48,7 @@ class Tick:
     t: float  # since the start of the run [s]
     dt: float  # [s]
     samples: list[HandSample]
-    targets: dict[str, ArmTarget]
+    targets: dict[str, ArmTarget]  # as the operator asks for them, whatever an admittance makes of them
     engaged: dict[str, bool]
     states: dict[str, str]  # of the teleop layer, or STOPPING
     reference: Reference
@@ -56,6 +57,8 @@ class Tick:
     grippers: dict[str, float]  # measured openings
     compute_time: float  # [s]
     impedance: ImpedanceReport | None = None  # of torque mode
+    wall: WallReport | None = None  # of torque mode
+    admittance: AdmittanceReport | None = None  # of position mode, where it is enabled
 
 
 class Pipeline:
@@ -80,9 +83,8 @@ class Pipeline:
         self.robot = robot
         self.input = input
         self.plant = plant
-        self.mode = _mode_of(mode, plant)
+        self.drive = drive_of(mode, plant, robot, config)
         self.controller = CartesianController(robot, config.control)
-        self.impedance = ImpedanceController(robot, config.impedance) if self.mode is CommandMode.TORQUE else None
         self.teleop = Teleop(config.teleop, tuple(robot.arms))
         self.listeners: list[Callable[[Tick], None]] = []
         # A plain flag: unlike the locks of threading.Event, a signal handler can set it in the middle of anything.
@@ -120,7 +122,7 @@ class Pipeline:
         self._prepare(realtime)
         try:
             self.input.start()
-            with _stop_on_signals(self.stop), _few_garbage_collections():
+            with stop_on_signals(self.stop), few_garbage_collections():
                 return _Run(self, realtime).until(duration)
         finally:
             self._stopping = False
@@ -132,10 +134,9 @@ class Pipeline:
     def _prepare(self, realtime: bool) -> None:
         """Nothing of an earlier run may move an arm: every run starts paused and with open grippers, as the plant."""
         self.teleop = Teleop(self.config.teleop, tuple(self.robot.arms))
-        settings = self.config.control
-        if not realtime:
-            # Whether a solution is late depends on the machine; a repeatable run must not.
-            settings = settings.model_copy(update={"solve_time_limit": None})
+        # Whether a solution is late depends on the machine; a repeatable run must not.
+        changes = {} if realtime else {"solve_time_limit": None}
+        settings = self.config.control.model_copy(update=changes)
         if settings != self.controller.settings:
             self.controller = CartesianController(self.robot, settings)
 
@@ -150,8 +151,6 @@ class _Run:
 
     def __init__(self, pipeline: Pipeline, realtime: bool) -> None:
         self._pipeline = pipeline
-        self._period = 1.0 / pipeline.config.loop_rate_hz
-        self._realtime = realtime
         self._statistics = RunStatistics(pipeline.robot, pipeline.config.control)
         self._data = pipeline.robot.model.createData()
         self._listeners = list(pipeline.listeners)
@@ -162,108 +161,69 @@ class _Run:
         pipeline.plant.reset()
         state = pipeline.plant.state()
         pipeline.controller.reset(state.q)
-        if pipeline.impedance is not None:
-            pipeline.impedance.reset(state)
-        self._ticks = 0
-        self._start = self._now = self._due = time.monotonic() if realtime else 0.0
-        self._wall_start = time.perf_counter()
+        pipeline.drive.reset(state)
+        self._clock = LoopClock(1.0 / pipeline.config.loop_rate_hz, realtime)
 
     def until(self, duration: float | None) -> RunSummary:
         """Tick until ``duration`` is over or a stop is asked for, then until the arms are at rest."""
         ends = math.inf if duration is None else duration
         try:
-            # Half a period of tolerance: counting periods must not add or lose one by rounding.
-            while self._now - self._start < ends - 0.5 * self._period and not self._pipeline.stopping:
+            while not (self._clock.after(ends) or self._pipeline.stopping):
                 self._tick()
+                self._pipeline.drive.check()
         except BaseException:
             # The arms come first, whatever failed. What failed may fail again; the first fault tells more.
             with suppress(Exception):
                 self._bring_to_rest()
             raise
         self._bring_to_rest()
+        self._pipeline.drive.check()
         if self._failure is not None:
             raise self._failure
-        return self._statistics.summary(time.perf_counter() - self._wall_start)
+        return self._statistics.summary(self._clock.wall_time())
 
     def _bring_to_rest(self) -> None:
         """Tick without input and targets until all stands still; no fault of an input can prevent it."""
         self._following = False
         self._targets = {arm: ArmTarget(None, target.gripper) for arm, target in self._targets.items()}
+        drive, plant = self._pipeline.drive, self._pipeline.plant
         try:
             speed = float(np.abs(self._tick().v).max())
-            deadline = self._now + speed / self._pipeline.config.control.acceleration_limit + _STOP_ALLOWANCE
-            while (speed > _REST or self._swings()) and self._now < deadline:
+            deadline = self._clock.now + speed / self._pipeline.config.control.acceleration_limit + _STOP_ALLOWANCE
+            while (speed > _REST or not drive.at_rest(plant.state())) and self._clock.now < deadline:
                 speed = float(np.abs(self._tick().v).max())
         finally:
-            self._let_go()
-
-    def _swings(self) -> bool:
-        """Whether an arm still moves on its spring, in torque mode."""
-        pipeline = self._pipeline
-        return pipeline.impedance is not None and float(np.abs(pipeline.plant.state().v).max()) > _STILL
-
-    def _let_go(self) -> None:
-        """Leave the arms to the plant's position servos where they are: a torque that nobody renews holds nothing."""
-        pipeline = self._pipeline
-        if pipeline.impedance is None:
-            return
-        q = pipeline.plant.state().q
-        zero = np.zeros_like(q)
-        grippers = {arm: target.gripper for arm, target in self._targets.items()}
-        pipeline.plant.apply(Command(CommandMode.POSITION, q, zero, zero, grippers))
+            drive.let_go(plant, self._grippers())
 
     def _tick(self) -> Reference:
-        """One line of the way of the data: sample -> target -> reference -> (torque) -> command -> state."""
-        pipeline = self._pipeline
-        dt = self._wait()
+        """One line of the way of the data: sample -> target -> reference -> command -> state."""
+        pipeline, drive = self._pipeline, self._pipeline.drive
+        dt = self._clock.wait()
         began = time.perf_counter()
         samples = self._poll() if self._following else []
         state = pipeline.plant.state()
         tools = self._tools(state)
         if self._following:
             commanded = {arm: pipeline.controller.tool_pose(arm) for arm in pipeline.robot.arms}
-            self._targets = pipeline.teleop.update(samples, tools, self._now, commanded)
-        targets = self._targets
-        reference = pipeline.controller.step({arm: target.pose for arm, target in targets.items()}, dt)
-        tau, impedance = self._torque(reference, state, dt)
-        grippers = {arm: target.gripper for arm, target in targets.items()}
-        pipeline.plant.apply(Command(pipeline.mode, reference.q, reference.v, tau, grippers))
+            self._targets = pipeline.teleop.update(samples, tools, self._clock.now, commanded)
+        asked = {arm: target.pose for arm, target in self._targets.items()}
+        reference = pipeline.controller.step(drive.displaced(asked, state, dt), dt)
+        pipeline.plant.apply(drive.command(reference, state, self._grippers(), dt))
         compute_time = time.perf_counter() - began
-        if samples:
-            newest = max(max(sample.pose_stamp, sample.inputs_stamp) for sample in samples)
-            self._statistics.latency.add((time.monotonic() if self._realtime else self._now) - newest)
+        self._statistics.add_latency(samples, self._clock.read())
         pipeline.plant.advance(dt)
-        self._record(dt, samples, targets, reference, state, tools, compute_time, impedance)
+        self._record(dt, samples, reference, state, tools, compute_time)
         return reference
 
-    def _torque(self, reference: Reference, state: RobotState, dt: float) -> tuple[Array, ImpedanceReport | None]:
-        """Torque of this tick (nv,) [Nm] in torque mode, else zeros."""
-        if self._pipeline.impedance is None:
-            return np.zeros_like(reference.q), None
-        command = self._pipeline.impedance.step(reference, state, dt)
-        return command.tau, command.report
-
-    def _wait(self) -> float:
-        """Let the next tick come; returns the time since the last one [s]."""
-        self._ticks += 1
-        if not self._realtime:
-            self._now = self._ticks * self._period
-            return self._period
-        self._due += self._period
-        rest = self._due - time.monotonic()
-        if rest > 0.0:
-            time.sleep(rest)
-        before, self._now = self._now, time.monotonic()
-        # Late wake-ups do not add up, since ticks are due on a grid; ticks that were missed are not made up for.
-        self._due = max(self._due, self._now - self._period)
-        return min(max(self._now - before, 1e-6), LONGEST_DT)
+    def _grippers(self) -> dict[str, float]:
+        return {arm: target.gripper for arm, target in self._targets.items()}
 
     def _poll(self) -> list[HandSample]:
         source, was_connected = self._pipeline.input, self._connected
-        samples = source.poll(self._now)
+        samples = source.poll(self._clock.now)
         self._connected = source.connected
         if was_connected and not self._connected:
-            self._pipeline.teleop.connection_lost(self._now)
+            self._pipeline.teleop.connection_lost(self._clock.now)
         return samples
 
     def _tools(self, state: RobotState) -> dict[str, pin.SE3]:
@@ -278,26 +238,23 @@ class _Run:
         self,
         dt: float,
         samples: list[HandSample],
-        targets: dict[str, ArmTarget],
         reference: Reference,
         state: RobotState,
         tools: dict[str, pin.SE3],
         compute_time: float,
-        impedance: ImpedanceReport | None,
     ) -> None:
-        teleop, statistics = self._pipeline.teleop, self._statistics
+        teleop, statistics, report = self._pipeline.teleop, self._statistics, self._pipeline.drive.report
         engaged = {arm: self._following and value for arm, value in teleop.engaged.items()}
         statistics.tick.add(compute_time)
-        statistics.add(dt, reference, targets, tools, engaged)
+        statistics.add(dt, reference, self._targets, tools, engaged)
+        statistics.add_drive(dt, report)
         for event in teleop.take_events():
-            statistics.events.append(_since(event, self._start))
-        if not self._listeners:
-            return
+            statistics.events.append(replace(event, t=event.t - self._clock.start))
         tick = Tick(
-            t=self._now - self._start,
+            t=self._clock.now - self._clock.start,
             dt=dt,
             samples=samples,
-            targets=targets,
+            targets=self._targets,
             engaged=engaged,
             states={arm: str(value) if self._following else STOPPING for arm, value in teleop.states.items()},
             reference=reference,
@@ -305,7 +262,9 @@ class _Run:
             tools=tools,
             grippers=self._pipeline.plant.gripper_openings(),
             compute_time=compute_time,
-            impedance=impedance,
+            impedance=report.impedance,
+            wall=report.wall,
+            admittance=report.admittance,
         )
         self._tell(tick)
 
@@ -318,10 +277,6 @@ class _Run:
                 self._listeners.remove(listener)
                 self._failure = self._failure or error
                 self._pipeline.stop()
-
-
-def _since(event: Event, start: float) -> Event:
-    return replace(event, t=event.t - start)
 
 
 def _input_of(source: Input | str, config: Config) -> Input:
@@ -342,36 +297,3 @@ def _plant_of(plant: Plant | str, robot: Robot, config: Config) -> Plant:
     if isinstance(plant, str):
         raise ConfigError(f"plant {plant!r}: allowed are {', '.join(PLANTS)}")
     return plant
-
-
-def _mode_of(mode: CommandMode | str, plant: Plant) -> CommandMode:
-    if mode not in plant.modes:
-        allowed = ", ".join(plant.modes)
-        raise ConfigError(f"mode {mode!s:.40}: {type(plant).__name__} follows {allowed} commands only")
-    return CommandMode(mode)
-
-
-@contextmanager
-def _stop_on_signals(stop: Callable[[], None]) -> Iterator[None]:
-    """Ctrl-C and SIGTERM ask for a stop instead of tearing the loop apart in mid-motion; only the main thread may."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    signals = (signal.SIGINT, signal.SIGTERM)
-    previous = [signal.signal(number, lambda *_: stop()) for number in signals]
-    try:
-        yield
-    finally:
-        for number, handler in zip(signals, previous, strict=True):
-            signal.signal(number, handler)
-
-
-@contextmanager
-def _few_garbage_collections() -> Iterator[None]:
-    """Take all that exists out of garbage collection, which would otherwise cost the loop several ticks each time."""
-    gc.collect()
-    gc.freeze()
-    try:
-        yield
-    finally:
-        gc.unfreeze()

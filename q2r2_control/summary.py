@@ -11,8 +11,10 @@ import numpy as np
 import pinocchio as pin
 
 from q2r2_control.control.settings import ControllerSettings
+from q2r2_control.drive import DriveReport
 from q2r2_control.robot.robot import Robot
-from q2r2_control.types import ArmTarget, Array, Event, Reference
+from q2r2_control.torque_summary import TorqueStatistics, TorqueSummary
+from q2r2_control.types import ArmTarget, Array, Event, HandSample, Reference
 
 EVENTS_KEPT = 10_000  # the newest; no operator makes that many, but a broken button can
 _REST = 1e-3  # [rad/s]
@@ -29,7 +31,11 @@ class Percentiles:
 
 @dataclass(frozen=True, slots=True)
 class ArmSummary:
-    """One arm, over the ticks in which it was engaged. Errors: measured tool against the teleop layer's target."""
+    """One arm, over the ticks in which it was engaged.
+
+    Errors: measured tool against the target that the operator asked for, whatever lies between them: lag, limits, the
+    other arm, and what the tool yields to a push, on its spring or by an admittance.
+    """
 
     engaged_s: float
     position_error_mm_rms: float | None  # None: never engaged
@@ -37,6 +43,8 @@ class ArmSummary:
     gripper_changes: int
     slip_mm_max: float  # largest slip of one engagement: how far the target went along with a tool held up
     slip_deg_max: float
+    yielded_mm_max: float  # largest displacement of its target by the admittance, in position mode
+    yielded_deg_max: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,6 +66,7 @@ class RunSummary:
     uncertified_ticks: int
     rejected_targets: int
     at_rest: bool  # the reference stood still when the run ended
+    torque: TorqueSummary | None  # None: position mode
     events: list[Event]
 
     def as_json(self) -> dict[str, Any]:
@@ -108,6 +117,8 @@ class _ArmFigures:
     gripper_changes: int = 0
     slip: float = 0.0  # largest [m]
     slip_angle: float = 0.0  # largest [rad]
+    yielded: float = 0.0  # largest [m]
+    yielded_angle: float = 0.0  # largest [rad]
 
 
 @dataclass(slots=True)
@@ -120,6 +131,7 @@ class RunStatistics:
     latency: Histogram = field(default_factory=lambda: Histogram(1e-3))
     events: deque[Event] = field(default_factory=lambda: deque(maxlen=EVENTS_KEPT))
     _arms: dict[str, _ArmFigures] = field(init=False)
+    _torque: TorqueStatistics = field(init=False)
     _velocity_limit: Array = field(init=False)
     _ticks: int = 0
     _duration: float = 0.0
@@ -135,6 +147,7 @@ class RunStatistics:
 
     def __post_init__(self) -> None:
         self._arms = {name: _ArmFigures() for name in self.robot.arms}
+        self._torque = TorqueStatistics.of(tuple(self.robot.arms))
         self._velocity_limit = self.control.velocity_scale * self.robot.velocity_limit
 
     def add(
@@ -169,9 +182,26 @@ class RunStatistics:
             if engaged[name] and target.pose is not None:
                 error = tools[name].actInv(target.pose)
                 figures.engaged += dt
+                if not math.isfinite(float(error.translation.sum())):
+                    continue  # nothing was measured
                 figures.ticks += 1
                 figures.position += float(error.translation @ error.translation)
                 figures.rotation += float(np.sum(pin.log3(error.rotation) ** 2))
+
+    def add_latency(self, samples: list[HandSample], now: float) -> None:
+        """Count the time from the newest of the ``samples`` that a tick took in to its command, sent at ``now`` [s]."""
+        if samples:
+            self.latency.add(now - max(max(sample.pose_stamp, sample.inputs_stamp) for sample in samples))
+
+    def add_drive(self, dt: float, report: DriveReport) -> None:
+        """Count what the mode's own laws did in one tick."""
+        if report.impedance is not None and report.wall is not None:
+            self._torque.add(dt, report.impedance, report.wall)
+        if report.admittance is not None:
+            for name, arm in report.admittance.arms.items():
+                figures = self._arms[name]
+                figures.yielded = max(figures.yielded, math.hypot(*arm.displacement[:3]))
+                figures.yielded_angle = max(figures.yielded_angle, math.hypot(*arm.displacement[3:]))
 
     def summary(self, wall_time: float) -> RunSummary:
         """The run so far; ``wall_time`` [s] is what it took."""
@@ -192,6 +222,7 @@ class RunStatistics:
             uncertified_ticks=self._uncertified,
             rejected_targets=self._rejected,
             at_rest=self._rest,
+            torque=self._torque.summary(),
             events=list(self.events),
         )
 
@@ -207,4 +238,6 @@ def _arm_summary(figures: _ArmFigures) -> ArmSummary:
         gripper_changes=figures.gripper_changes,
         slip_mm_max=1e3 * figures.slip,
         slip_deg_max=math.degrees(figures.slip_angle),
+        yielded_mm_max=1e3 * figures.yielded,
+        yielded_deg_max=math.degrees(figures.yielded_angle),
     )

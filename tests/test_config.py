@@ -24,7 +24,7 @@ from q2r2_control.config import (
     ToolConfig,
     load_config,
 )
-from q2r2_control.control.settings import ControllerSettings, ImpedanceSettings
+from q2r2_control.control.settings import AdmittanceSettings, ControllerSettings, ImpedanceSettings, WallSettings
 from q2r2_control.errors import ConfigError, Q2R2Error
 from q2r2_control.robot.robot import Robot
 from q2r2_control.teleop.settings import FilterSettings, GateSettings, LeashSettings, TeleopSettings
@@ -86,6 +86,8 @@ class TestTheShippedCellShowsAllThereIsToTune:
         ("headset", HeadsetConfig),
         ("control", ControllerSettings),
         ("impedance", ImpedanceSettings),
+        ("impedance.wall", WallSettings),
+        ("admittance", AdmittanceSettings),
         ("teleop", TeleopSettings),
         ("teleop.filter", FilterSettings),
         ("teleop.leash", LeashSettings),
@@ -135,6 +137,7 @@ class TestTheShippedCellShowsAllThereIsToTune:
             ("headset", HeadsetConfig),
             ("control", ControllerSettings),
             ("impedance", ImpedanceSettings),
+            ("admittance", AdmittanceSettings),
             ("teleop", TeleopSettings),
             ("mujoco", MujocoConfig),
         ],
@@ -160,6 +163,8 @@ class TestTheShippedCellShowsAllThereIsToTune:
         "headset.ports",
         "control.gain",
         "impedance.stiffness",
+        "impedance.wall.depth",
+        "admittance.damping",
         "teleop.scale",
         "teleop.filter.cutoff",
         "teleop.gate.jump",
@@ -209,6 +214,10 @@ def test_a_misspelt_key_is_named_before_the_one_that_is_missing_for_it(tmp_path:
         ("impedance.damping_ratio", 0, "greater than or equal to 0.1"),
         ("impedance.nullspace_projector", "none", "'consistent' or 'kinematic'"),
         ("impedance.torque_rate_limit", math.inf, "finite number"),
+        ("impedance.wall.stiffness", 0, "greater than 0"),
+        ("impedance.wall.maximum_force", -400, "greater than 0"),
+        ("admittance.enabled", 1, "valid boolean"),
+        ("admittance.mass", 0, "greater than or equal to 0.5"),
         ("mujoco.timestep", 0.01, "less than or equal to 0.001"),
         ("loop_rate_hz", 1, "greater than or equal to 50"),
         ("loop_rate_hz", 1e300, "less than or equal to 2000"),

@@ -35,6 +35,7 @@ KEYS: dict[str, type | set[str]] = {
     "uncertified_ticks": int,
     "rejected_targets": int,
     "at_rest": bool,
+    "torque": type(None),
     "events": list,
 }
 ARM_KEYS = {
@@ -44,6 +45,8 @@ ARM_KEYS = {
     "gripper_changes",
     "slip_mm_max",
     "slip_deg_max",
+    "yielded_mm_max",
+    "yielded_deg_max",
 }
 
 REPORT = StepReport(StepStatus.OK, (), (), ("left_a", "right_b"), 0.2, True, False, 0.0, 1e-5)

@@ -18,30 +18,12 @@ from dataclasses import dataclass
 
 import numpy as np
 import pinocchio as pin
-from pydantic import BaseModel, ConfigDict, Field
 
 from q2r2_control.control.jit import hold
+from q2r2_control.control.settings import AdmittanceSettings
 from q2r2_control.control.yielding import NOT_MEASURED, TOUCHED, UNUSABLE, Law, Yielding, comply
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, RobotState
-
-
-class AdmittanceSettings(BaseModel):
-    """The impedance that a tool shows in position mode, on plants that report external torque."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-    stiffness: float = Field(1000.0, ge=10, le=20000, description="[N/m]")
-    rotation_stiffness: float = Field(30.0, ge=0.5, le=1000, description="[Nm/rad]")
-    damping_ratio: float = Field(1.0, ge=0.1, le=5, description="1 returns fastest without overshoot")
-    mass: float = Field(10.0, ge=0.5, le=200, description="virtual mass of the tool [kg]")
-    inertia: float = Field(0.3, ge=0.01, le=20, description="virtual inertia of the tool [kg m^2]")
-    # The weight of 0.2 kg, which the tool's model may be off by, and that weight 0.15 m from the tool frame.
-    force_dead_band: float = Field(2.0, ge=0, le=50, description="a smaller force moves nothing [N]")
-    torque_dead_band: float = Field(0.3, ge=0, le=10, description="a smaller torque moves nothing [Nm]")
-    filter_time: float = Field(0.01, ge=0, le=0.5, description="time constant of the wrench's low-pass [s]")
-    max_displacement: float = Field(0.1, gt=0, le=0.5, description="[m]")
-    max_rotation: float = Field(0.5, gt=0, le=1.5, description="[rad]")
 
 
 @dataclass(frozen=True, slots=True)

@@ -132,6 +132,7 @@ def _follow(cell: Cell, goals: Goals, i: int, work: Workspace) -> None:
         speed,
         work.twist[i],
         work.feedback,
+        work.contact.local,
     )
     add_tool_task(J, work.twist[i], weight, work.H, work.g)
     add_stretch_damping(

@@ -33,7 +33,7 @@ from q2r2_control.types import Array
 
 _DEEPEST = 6  # halvings of the stop: 64 intervals
 # A pair that starts closer than min_distance may not come closer; this is rounding only.
-_ROUNDING = 1e-9  # [m]
+_ROUNDING = 1e-12  # [m]
 
 
 class Rollout(NamedTuple):

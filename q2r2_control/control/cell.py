@@ -29,7 +29,7 @@ def cell_of(robot: Robot, settings: ControllerSettings) -> Cell:
     pairs = pairs_of(
         robot.collision_model, chain, bodies, np.maximum(np.abs(robot.position_lower), np.abs(robot.position_upper))
     )
-    tools = _tools(robot)
+    tools = tools_of(robot)
     swivels = _swivels(robot, chain)
     return Cell(
         chain=chain,
@@ -70,7 +70,7 @@ def cell_of(robot: Robot, settings: ControllerSettings) -> Cell:
     )
 
 
-def _tools(robot: Robot) -> Tools:
+def tools_of(robot: Robot) -> Tools:
     n, nv = len(robot.arms), robot.model.nv
     tools = Tools(np.zeros(n, dtype=np.int64), np.zeros((n, 3, 3)), np.zeros((n, 3)), np.zeros((n, nv)))
     for i, arm in enumerate(robot.arms.values()):

@@ -2,17 +2,20 @@
 
 Task vectors (6,) are linear, then angular, in world axes at the tool's origin; J (6, n) is that Jacobian of an arm's n
 joints. Stiffness [N/m, Nm/rad], damping [Ns/m, Nms/rad], task inertia [kg, kg m^2].
+
+Compiled, but for what takes a pose; spring.py puts them together. Matrices that are not finite raise
+:class:`numpy.linalg.LinAlgError`.
 """
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 import pinocchio as pin
 
+from q2r2_control.control.jit import kernel
 from q2r2_control.types import Array
 
 BoolArray = npt.NDArray[np.bool_]
@@ -20,6 +23,7 @@ BoolArray = npt.NDArray[np.bool_]
 # A length that makes a radian comparable to a metre [m/rad], as in the QP's tool task.
 _METRES = np.array([1.0, 1.0, 1.0, 0.3, 0.3, 0.3])
 _SCALE = np.outer(_METRES, _METRES)
+_ROWS = _METRES.reshape(6, 1)
 # No direction of a tool counts for more than this [kg], a rotation for this times 0.3^2 [kg m^2]. An arm whose
 # rotors weigh most of it stays below a fifth of it in every posture that it works in.
 _HEAVIEST = 1000.0
@@ -32,12 +36,18 @@ def pose_error(goal: pin.SE3, pose: pin.SE3) -> Array:
     return np.concatenate([goal.translation - pose.translation, pin.log3(goal.rotation @ pose.rotation.T)])
 
 
+@kernel
 def clip_error(error: Array, position: float, rotation: float) -> tuple[Array, bool]:
     """``error`` (6,) with each part no longer than ``position`` [m], ``rotation`` [rad]; and whether it was longer."""
-    shares = (position / max(math.hypot(*error[:3]), position), rotation / max(math.hypot(*error[3:]), rotation))
-    return error * np.repeat(shares, 3), min(shares) < 1.0
+    nearer = position / max(np.sqrt(np.sum(error[:3] ** 2)), position)
+    less = rotation / max(np.sqrt(np.sum(error[3:] ** 2)), rotation)
+    clipped = error.copy()
+    clipped[:3] *= nearer
+    clipped[3:] *= less
+    return clipped, min(nearer, less) < 1.0
 
 
+@kernel
 def task_inertia(J: Array, M_inverse: Array) -> Array:
     """Inertia Lambda = (J M^-1 J')^-1 (6, 6) that a hand at the tool feels (Khatib 1987, eq. 18).
 
@@ -49,14 +59,15 @@ def task_inertia(J: Array, M_inverse: Array) -> Array:
     return _floored_inverse(J @ M_inverse @ J.T, 1.0 / _HEAVIEST)
 
 
+@kernel
 def _floored_inverse(A: Array, least: float) -> Array:
     """Inverse of a symmetric positive semidefinite A (6, 6) whose scaled eigenvalues are raised to ``least``."""
     values, vectors = np.linalg.eigh(A * _SCALE)
-    vectors *= _METRES[:, None]
-    inverse: Array = (vectors / np.maximum(values, least)) @ vectors.T
-    return inverse
+    vectors *= _ROWS
+    return (vectors / np.maximum(values, least)) @ vectors.T
 
 
+@kernel
 def double_diagonalised_damping(stiffness: Array, inertia: Array, damping_ratio: float) -> Array:
     """Damping D (n, n) that gives every mode of  inertia x'' + D x' + diag(stiffness) x = 0  the damping ratio xi.
 
@@ -68,21 +79,23 @@ def double_diagonalised_damping(stiffness: Array, inertia: Array, damping_ratio:
     """
     root = np.sqrt(stiffness)
     W, U = np.linalg.eigh(inertia / np.outer(root, root))
-    U *= root[:, None]
-    D: Array = (U * (2.0 * damping_ratio * np.sqrt(np.maximum(W, 0.0)))) @ U.T
-    return D
+    U *= root.reshape((-1, 1))
+    return (U * (2.0 * damping_ratio * np.sqrt(np.maximum(W, 0.0)))) @ U.T
 
 
+@kernel
 def consistent_projector(J: Array, M_inverse: Array, inertia: Array) -> Array:
     """N (n, n): torque N tau accelerates no tool, J M^-1 N = 0: I - J' Lambda J M^-1 (Khatib 1987, eq. 51)."""
     return np.eye(J.shape[1]) - J.T @ inertia @ J @ M_inverse
 
 
+@kernel
 def kinematic_projector(J: Array) -> Array:
     """N (n, n): torque N tau balances no static force at the tool, J N = 0: I - J' J'^+; needs no inertia."""
     return np.eye(J.shape[1]) - J.T @ _floored_inverse(J @ J.T, _LEAST_MOTION**2) @ J
 
 
+@kernel
 def limit_repulsion(
     q: Array, v: Array, wanted: Array, lower: Array, upper: Array, stiffness: float, damping: float, reach: float
 ) -> Array:
@@ -95,13 +108,12 @@ def limit_repulsion(
     below = np.maximum(np.minimum(lower + reach, wanted) - q, 0.0)
     above = np.maximum(q - np.maximum(upper - reach, wanted), 0.0)
     share = damping / reach
-    towards_upper: Array = np.maximum(stiffness * below - share * np.minimum(below, reach) * v, 0.0)
-    towards_lower: Array = np.maximum(stiffness * above + share * np.minimum(above, reach) * v, 0.0)
+    towards_upper = np.maximum(stiffness * below - share * np.minimum(below, reach) * v, 0.0)
+    towards_lower = np.maximum(stiffness * above + share * np.minimum(above, reach) * v, 0.0)
     return towards_upper - towards_lower
 
 
-@dataclass(frozen=True, slots=True)
-class BoundedTorque:
+class BoundedTorque(NamedTuple):
     """A torque within its bounds, and which bounds held it back."""
 
     tau: Array  # (n,) [Nm]
@@ -109,6 +121,7 @@ class BoundedTorque:
     rate_limited: BoolArray  # (n,)
 
 
+@kernel
 def bound_torque(tau: Array, last: Array, limit: Array, change: float) -> BoundedTorque:
     """``tau`` (n,) within +-``limit`` (n,) and no further than ``change`` from ``last`` (n,), all [Nm].
 

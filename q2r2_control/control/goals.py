@@ -7,10 +7,10 @@ from collections.abc import Mapping
 import numpy as np
 import pinocchio as pin
 
-from q2r2_control.control.jit import Held, hold, kernel
+from q2r2_control.control.jit import Held, hold, kernel, lean_kernel
 from q2r2_control.control.settings import ControllerSettings
 from q2r2_control.control.tasks import rotation_vector
-from q2r2_control.control.workspace import Cell, Goals
+from q2r2_control.control.workspace import Cell, Goals, Trial
 from q2r2_control.types import Array
 
 # Farther than any cell; keeps squares of what is merely far away finite.
@@ -82,7 +82,7 @@ def take_targets(held_goals: Held, q: Array, v: Array, dt: float) -> bool:
     return all_usable
 
 
-@kernel
+@lean_kernel
 def _hold(goals: Goals, i: int, q: Array, v: Array) -> None:
     """A moving arm is braked first and holds where it comes to rest, so that it need not come back."""
     speed = 0.0
@@ -94,79 +94,89 @@ def _hold(goals: Goals, i: int, q: Array, v: Array) -> None:
         goals.latched[i] = 1
 
 
-@kernel
+@lean_kernel
 def _take_pose(goals: Goals, i: int, dt: float) -> bool:
     """Make the offered homogeneous pose the goal of arm ``i``; False, and no change, if it is not a finite pose.
 
     A goal that moves has its twist smoothed over a time; one that was put elsewhere, faster than any tool, has none.
     """
-    rotation = np.empty((3, 3))
-    translation = np.empty(3)
-    if not _checked_pose(goals.pose[i], rotation, translation):
+    trial = goals.trial
+    if not _checked_pose(goals.pose[i], trial):
         return False
-    moved = np.zeros(6)
+    moved = trial.moved
     if goals.follows[i] == 1 and dt > 0.0:
         for k in range(3):
-            moved[k] = (translation[k] - goals.translation[i, k]) / dt
-        rotation_vector(_times_transposed(rotation, goals.rotation[i]), moved[3:6])
-        moved[3:6] /= dt
-        if (
-            np.sqrt(np.sum(moved[0:3] ** 2)) > goals.smoothing[1]
-            or np.sqrt(np.sum(moved[3:6] ** 2)) > goals.smoothing[2]
-        ):
-            moved[:] = 0.0
+            moved[k] = (trial.translation[k] - goals.translation[i, k]) / dt
+        _times_transposed(trial.rotation, goals.rotation[i], trial.gram)
+        turned = moved[3:6]
+        rotation_vector(trial.gram, turned)
+        for k in range(3):
+            turned[k] /= dt
+        put_elsewhere = _size(moved[0:3]) > goals.smoothing[1] or _size(turned) > goals.smoothing[2]
         share = 1.0 - np.exp(-dt / goals.smoothing[0])
         for k in range(6):
-            goals.feed_forward[i, k] += share * (moved[k] - goals.feed_forward[i, k])
+            velocity = 0.0 if put_elsewhere else moved[k]
+            goals.feed_forward[i, k] += share * (velocity - goals.feed_forward[i, k])
     else:
         goals.feed_forward[i] = 0.0
     goals.follows[i] = 1
-    goals.rotation[i] = rotation
-    goals.translation[i] = translation
+    for row in range(3):
+        goals.translation[i, row] = trial.translation[row]
+        for column in range(3):
+            goals.rotation[i, row, column] = trial.rotation[row, column]
     return True
 
 
-@kernel
-def _times_transposed(A: Array, B: Array) -> Array:
+@lean_kernel
+def _size(vector: Array) -> float:
+    return np.sqrt(vector[0] * vector[0] + vector[1] * vector[1] + vector[2] * vector[2])
+
+
+@lean_kernel
+def _times_transposed(A: Array, B: Array, product: Array) -> None:
     """A B' of two 3 by 3 matrices."""
-    product = np.zeros((3, 3))
     for i in range(3):
         for j in range(3):
-            for k in range(3):
-                product[i, j] += A[i, k] * B[j, k]
-    return product
+            product[i, j] = A[i, 0] * B[j, 0] + A[i, 1] * B[j, 1] + A[i, 2] * B[j, 2]
 
 
-@kernel
-def _checked_pose(pose: Array, rotation: Array, translation: Array) -> bool:
-    """Split a pose (4, 4), the rotation made orthonormal; False for what is not finite or no rotation."""
+@lean_kernel
+def _checked_pose(pose: Array, trial: Trial) -> bool:
+    """Split a pose (4, 4) into ``trial``, its rotation made orthonormal; False if not finite or no rotation."""
+    rotation, translation, gram = trial.rotation, trial.translation, trial.gram
+    largest = 0.0
+    total = 0.0
     for i in range(3):
         for j in range(3):
             rotation[i, j] = pose[i, j]
         translation[i] = pose[i, 3]
-    largest = np.max(np.abs(translation))
-    gram = _times_transposed(rotation, rotation)
+        largest = max(largest, abs(translation[i]))
+        total += translation[i]
+    _times_transposed(rotation, rotation, gram)
+    error = 0.0
     for i in range(3):
         gram[i, i] -= 1.0
+        for j in range(3):
+            total += gram[i, j]
+            error = max(error, abs(gram[i, j]))
     determinant = (
         rotation[0, 0] * (rotation[1, 1] * rotation[2, 2] - rotation[1, 2] * rotation[2, 1])
         - rotation[0, 1] * (rotation[1, 0] * rotation[2, 2] - rotation[1, 2] * rotation[2, 0])
         + rotation[0, 2] * (rotation[1, 0] * rotation[2, 1] - rotation[1, 1] * rotation[2, 0])
     )
-    # Written so that NaN, which fails every comparison, is refused.
-    usable = np.isfinite(np.sum(translation)) and np.max(np.abs(gram)) < _ORTHONORMAL and determinant > 0.0
-    if not (usable and np.isfinite(np.sum(gram))):
+    # A maximum may pass over NaN and infinities may cancel; what is not finite shows in the sum.
+    if not (np.isfinite(total) and error < _ORTHONORMAL and determinant > 0.0):
         return False
     if largest > _FARTHEST:
         for i in range(3):
             translation[i] *= _FARTHEST / largest
     # A Newton step towards the nearest rotation, R - (R R' - I) R / 2 (Higham, Functions of Matrices, 2008, eq. 8.20).
-    correction = np.zeros((3, 3))
     for i in range(3):
         for j in range(3):
-            for k in range(3):
-                correction[i, j] += 0.5 * gram[i, k] * rotation[k, j]
+            trial.correction[i, j] = 0.5 * (
+                gram[i, 0] * rotation[0, j] + gram[i, 1] * rotation[1, j] + gram[i, 2] * rotation[2, j]
+            )
     for i in range(3):
         for j in range(3):
-            rotation[i, j] -= correction[i, j]
+            rotation[i, j] -= trial.correction[i, j]
     return True

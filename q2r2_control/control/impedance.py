@@ -26,21 +26,15 @@ import numpy as np
 import pinocchio as pin
 from pydantic import ValidationError
 
-from q2r2_control.control.compliance import (
-    BoolArray,
-    bound_torque,
-    clip_error,
-    consistent_projector,
-    double_diagonalised_damping,
-    kinematic_projector,
-    limit_repulsion,
-    pose_error,
-    task_inertia,
-)
+from q2r2_control.control.cell import tools_of
+from q2r2_control.control.chain import chain_of
+from q2r2_control.control.compliance import BoolArray, bound_torque
 from q2r2_control.control.controller import LONGEST_DT
+from q2r2_control.control.jit import hold
 from q2r2_control.control.settings import ImpedanceSettings
+from q2r2_control.control.spring import Pull, Springs, pull_arms
 from q2r2_control.errors import ConfigError, RobotError
-from q2r2_control.robot.robot import Arm, Robot
+from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, Reference, RobotState
 
 
@@ -76,12 +70,18 @@ class ImpedanceController:
         self.robot = robot
         self.settings = settings or ImpedanceSettings()
         self._limit = self.settings.torque_scale * robot.torque_limit
-        self._data, self._wanted_data = robot.model.createData(), robot.model.createData()
-        stiffness = np.array([self.settings.translational_stiffness, self.settings.rotational_stiffness])
-        self._stiffness = {arm: stiffness.copy() for arm in robot.arms}  # [N/m, Nm/rad], on its way to the goal
-        self._goal = {arm: stiffness.copy() for arm in robot.arms}
-        self._ramp_rate = {arm: np.zeros(2) for arm in robot.arms}
+        self._data = robot.model.createData()
+        springs = _springs_of(robot, self.settings)
+        self._pull = Pull.empty(springs)
+        self._held_springs, self._held_pull = hold(springs), hold(self._pull)
+        self._pull.stiffness[:] = self.settings.translational_stiffness, self.settings.rotational_stiffness
+        self._goal = self._pull.stiffness.copy()  # of a ramp (k, 2) [N/m, Nm/rad]
+        self._ramp_rate = np.zeros_like(self._goal)
+        self._ramping = False
         self._begin(robot.home, np.zeros(robot.model.nv))
+        # Every kernel runs once here, so that none is compiled in mid-motion.
+        pull_arms(self._held_springs, self._held_pull)
+        bound_torque(self._last, self._last, self._limit, 0.0)
 
     def reset(self, state: RobotState) -> None:
         """Start anew at rest at the measured posture: the first torque is that of gravity there, without a bump.
@@ -92,8 +92,8 @@ class ImpedanceController:
         q = np.array(state.q, dtype=np.float64)
         if q.shape != self._limit.shape or not np.isfinite(q).all():
             raise RobotError(f"impedance reset: q = {q!s:.80}: expected {len(self._limit)} finite numbers")
-        for arm, goal in self._goal.items():
-            self._stiffness[arm] = goal.copy()
+        self._pull.stiffness[:] = self._goal
+        self._ramping = False
         self._begin(q, np.zeros_like(q))
 
     def _begin(self, q: Array, v: Array) -> None:
@@ -110,8 +110,9 @@ class ImpedanceController:
         The damping follows, so that the damping ratio stays. A ramp and no jump: stiffness is energy in a spring that
         is stretched. Raises :class:`ConfigError` for a value out of range or an arm that does not exist.
         """
-        if arm is not None and arm not in self._goal:
-            raise ConfigError(f"stiffness: no arm {arm!r:.40}; arms: {', '.join(self._goal)}")
+        arms = list(self.robot.arms)
+        if arm is not None and arm not in arms:
+            raise ConfigError(f"stiffness: no arm {arm!r:.40}; arms: {', '.join(arms)}")
         given = {"translational_stiffness": translational, "rotational_stiffness": rotational}
         changes = {key: value for key, value in given.items() if value is not None}
         try:
@@ -119,14 +120,15 @@ class ImpedanceController:
         except ValidationError as error:
             fault = error.errors()[0]
             raise ConfigError(f"{fault['loc'][0]} = {fault['input']!r:.40}: {fault['msg']}") from error
-        for name in self._goal if arm is None else (arm,):
-            wanted = (translational, rotational)
-            self._goal[name] = np.array([g if w is None else w for g, w in zip(self._goal[name], wanted, strict=True)])
-            self._ramp_rate[name] = np.abs(self._goal[name] - self._stiffness[name]) / self.settings.ramp_time
+        for i in range(len(arms)) if arm is None else (arms.index(arm),):
+            for k, wanted in enumerate((translational, rotational)):
+                self._goal[i, k] = self._goal[i, k] if wanted is None else wanted
+            self._ramp_rate[i] = np.abs(self._goal[i] - self._pull.stiffness[i]) / self.settings.ramp_time
+        self._ramping = True
 
     def stiffness(self, arm: str) -> tuple[float, float]:
         """Stiffness of an arm's tool in force now: translational [N/m], rotational [Nm/rad]."""
-        translational, rotational = self._stiffness[arm]
+        translational, rotational = self._pull.stiffness[list(self.robot.arms).index(arm)]
         return float(translational), float(rotational)
 
     def step(self, reference: Reference, state: RobotState, dt: float, extra: Array | None = None) -> TorqueCommand:
@@ -138,32 +140,41 @@ class ImpedanceController:
         """
         usable = isinstance(dt, int | float | np.floating) and math.isfinite(dt) and dt > 0.0
         time = min(float(dt), LONGEST_DT) if usable else 0.0
-        self._ramp(time)
+        if self._ramping:
+            self._ramp(time)
         acceleration = self._exchange(reference)
-        law = self._law(state, acceleration) if _finite(state.q, state.v) else None
+        gravity = self._law(state, acceleration) if _finite(state.q, state.v) else None
         wanted = self._gravity
-        if law is not None:
-            wanted = law.tau if extra is None else law.tau + extra
+        if gravity is not None:
+            wanted = self._pull.tau if extra is None else self._pull.tau + extra
             if _finite(wanted):
-                self._gravity = law.gravity
+                self._gravity = gravity
             else:
-                law, wanted = None, self._gravity
+                gravity, wanted = None, self._gravity
         bounded = bound_torque(wanted, self._last, self._limit, self.settings.torque_rate_limit * time)
         self._last = bounded.tau
+        held = gravity is None
+        errors, clipped = self._errors()
         report = ImpedanceReport(
-            errors={} if law is None else law.errors,
-            clipped=() if law is None else law.clipped,
+            errors={} if held else errors,
+            clipped=() if held else clipped,
             saturated=self._names(bounded.saturated),
             rate_limited=self._names(bounded.rate_limited),
-            repelled=() if law is None else self._names(law.repulsion != 0.0),
-            held=law is None,
+            repelled=() if held else self._names(self._pull.repulsion != 0.0),
+            held=held,
         )
         return TorqueCommand(bounded.tau.copy(), report)
 
+    def _errors(self) -> tuple[dict[str, Array], tuple[str, ...]]:
+        """Of the last law: each arm's clipped error, and the arms whose error was longer."""
+        pull, arms = self._pull, self.robot.arms
+        clipped = tuple(name for name, was in zip(arms, pull.clipped.tolist(), strict=True) if was)
+        return dict(zip(arms, pull.errors.copy(), strict=True)), clipped
+
     def _ramp(self, time: float) -> None:
-        for arm, goal in self._goal.items():
-            reach = self._ramp_rate[arm] * time
-            self._stiffness[arm] += np.minimum(np.maximum(goal - self._stiffness[arm], -reach), reach)
+        reach = self._ramp_rate * time
+        self._pull.stiffness[:] += np.minimum(np.maximum(self._goal - self._pull.stiffness, -reach), reach)
+        self._ramping = bool((self._pull.stiffness != self._goal).any())
 
     def _exchange(self, reference: Reference) -> Array:
         """Take the newest reference in for the next tick; returns the acceleration (nv,) that leads to it."""
@@ -174,61 +185,22 @@ class ImpedanceController:
         self._due_v = np.zeros_like(self._due_v)
         return self._due_v
 
-    def _law(self, state: RobotState, acceleration: Array) -> _Law | None:
-        """The control law, without bounds; None where the numbers are too large to be computed with."""
-        model, data, settings = self.robot.model, self._data, self.settings
-        gravity = np.array(pin.computeGeneralizedGravity(model, data, state.q))
-        repulsion = limit_repulsion(
-            state.q,
-            state.v,
-            self._wanted_q,
-            self.robot.position_lower,
-            self.robot.position_upper,
-            settings.limit_stiffness,
-            settings.limit_damping,
-            settings.limit_distance,
-        )
-        tau = repulsion + pin.rnea(model, data, state.q, state.v, acceleration)
-        inertia = np.array(pin.crba(model, data, state.q))
-        inverse = np.array(pin.computeMinverse(model, data, state.q))
-        pin.computeJointJacobians(model, data, state.q)
-        pin.computeJointJacobians(model, self._wanted_data, self._wanted_q)
-        errors, clipped = {}, []
+    def _law(self, state: RobotState, acceleration: Array) -> Array | None:
+        """Pull at all arms, without bounds, and return gravity's torque.
+
+        None where the numbers are too large to be computed with.
+        """
+        model, data, pull = self.robot.model, self._data, self._pull
+        pull.q[:], pull.v[:], pull.wanted_q[:], pull.wanted_v[:] = state.q, state.v, self._wanted_q, self._wanted_v
+        gravity = np.array(pin.computeGeneralizedGravity(model, data, pull.q))
+        pull.tau[:] = pin.rnea(model, data, pull.q, pull.v, acceleration)
+        pull.M[:] = pin.crba(model, data, pull.q)
+        pull.M_inverse[:] = pin.computeMinverse(model, data, pull.q)
         try:
-            for name, arm in self.robot.arms.items():
-                torque, errors[name], was_clipped = self._arm_torque(arm, state, inertia, inverse)
-                tau[arm.joints] += torque
-                if was_clipped:
-                    clipped.append(name)
+            pull_arms(self._held_springs, self._held_pull)
         except np.linalg.LinAlgError:
             return None
-        return _Law(tau, gravity, repulsion, errors, tuple(clipped))
-
-    def _arm_torque(self, arm: Arm, state: RobotState, inertia: Array, inverse: Array) -> tuple[Array, Array, bool]:
-        """Torque (n,) of one arm's spring and posture, its clipped error (6,), and whether that was clipped."""
-        model, settings, joints = self.robot.model, self.settings, arm.joints
-        frame = arm.frame_id
-        pose = pin.updateFramePlacement(model, self._data, frame)
-        goal = pin.updateFramePlacement(model, self._wanted_data, frame)
-        J = pin.getFrameJacobian(model, self._data, frame, pin.LOCAL_WORLD_ALIGNED)[:, joints]
-        J_goal = pin.getFrameJacobian(model, self._wanted_data, frame, pin.LOCAL_WORLD_ALIGNED)[:, joints]
-        error, clipped = clip_error(pose_error(goal, pose), settings.max_position_error, settings.max_rotation_error)
-        error_rate = J_goal @ self._wanted_v[joints] - J @ state.v[joints]
-        block = np.ix_(joints, joints)
-        M, M_inverse = inertia[block], inverse[block]
-        tool_inertia = task_inertia(J, M_inverse)
-        stiffness = np.repeat(self._stiffness[arm.name], 3)
-        damping = double_diagonalised_damping(stiffness, tool_inertia, settings.damping_ratio)
-        posture_stiffness = np.full(len(joints), settings.nullspace_stiffness)
-        posture_damping = double_diagonalised_damping(posture_stiffness, M, settings.nullspace_damping_ratio)
-        posture: Array = posture_stiffness * (self._wanted_q - state.q)[joints]
-        posture += posture_damping @ (self._wanted_v - state.v)[joints]
-        if settings.nullspace_projector == "consistent":
-            N = consistent_projector(J, M_inverse, tool_inertia)
-        else:
-            N = kinematic_projector(J)
-        torque: Array = J.T @ (stiffness * error + damping @ error_rate) + N @ posture
-        return torque, error, clipped
+        return gravity
 
     def _names(self, which: BoolArray) -> tuple[str, ...]:
         if not which.any():
@@ -236,14 +208,30 @@ class ImpedanceController:
         return tuple(self.robot.joint_names[index] for index in np.flatnonzero(which))
 
 
-@dataclass(frozen=True, slots=True)
-class _Law:
-    tau: Array  # (nv,) [Nm]
-    gravity: Array  # (nv,) [Nm]
-    repulsion: Array  # (nv,) [Nm]
-    errors: dict[str, Array]
-    clipped: tuple[str, ...]
+def _springs_of(robot: Robot, settings: ImpedanceSettings) -> Springs:
+    arms = list(robot.arms.values())
+    joints = np.zeros((len(arms), max(len(arm.joints) for arm in arms)), dtype=np.int64)
+    for row, arm in zip(joints, arms, strict=True):
+        row[: len(arm.joints)] = arm.joints
+    return Springs(
+        chain=chain_of(robot.model),
+        tools=tools_of(robot),
+        joints=joints,
+        dofs=np.array([len(arm.joints) for arm in arms]),
+        lower=robot.position_lower,
+        upper=robot.position_upper,
+        limit_stiffness=settings.limit_stiffness,
+        limit_damping=settings.limit_damping,
+        limit_distance=settings.limit_distance,
+        damping_ratio=settings.damping_ratio,
+        posture_stiffness=settings.nullspace_stiffness,
+        posture_damping_ratio=settings.nullspace_damping_ratio,
+        max_position_error=settings.max_position_error,
+        max_rotation_error=settings.max_rotation_error,
+        consistent=settings.nullspace_projector == "consistent",
+    )
 
 
 def _finite(*arrays: Array) -> bool:
-    return all(np.isfinite(array).all() for array in arrays)
+    """Sums of squares are finite where all numbers are, and none is so large that it means nothing."""
+    return all(math.isfinite(np.vdot(array, array)) for array in arrays)

@@ -27,7 +27,7 @@ SOFTNESS = 1e-5  # part of its correction by which a row gives way
 _UNBOUNDED = 1e30
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)  # not frozen: that would cost a microsecond a tick
 class QpProblem:
     """One tick's problem; arrays are valid until the next tick."""
 
@@ -47,7 +47,7 @@ class QpProblem:
         return float(max(0.0, np.max(self.rows_lower - self.rows @ v))) if len(self.rows_lower) else 0.0
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class QpSolution:
     """What a solver found."""
 

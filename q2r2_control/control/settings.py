@@ -62,6 +62,16 @@ def check_priority(priority: str, arms: Collection[str]) -> None:
         raise ConfigError(f"control.priority = {priority!r:.60}: allowed here: {', '.join((EQUAL, *arms))}")
 
 
+class WallSettings(BaseModel):
+    """The wall between measured links; its depth is the controller's ``min_distance``."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    stiffness: float = Field(10000.0, gt=0, le=100000, description="force per depth below min_distance [N/m]")
+    damping_ratio: float = Field(1.0, ge=0.2, le=2, description="at each pair's effective mass")
+    maximum_force: float = Field(400.0, gt=0, le=2000, description="of each pair of links [N]")
+
+
 class ImpedanceSettings(BaseModel):
     """Settings of :class:`ImpedanceController`. Nothing here may be zero or negative: a stiffness or a damping of -1,
     meant as "automatic", would drive an arm instead of holding it."""
@@ -84,3 +94,23 @@ class ImpedanceSettings(BaseModel):
     torque_scale: float = Field(1.0, gt=0, le=1, description="fraction of the robot's torque limits")
     torque_rate_limit: float = Field(5000.0, gt=0, le=1e5, description="of every joint [Nm/s]")
     ramp_time: float = Field(0.5, ge=0.01, le=10, description="a change of stiffness at run time takes [s]")
+    wall: WallSettings = WallSettings()
+
+
+class AdmittanceSettings(BaseModel):
+    """The impedance that a tool shows in position mode, on plants that report external torque."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    enabled: bool = Field(False, description="needs a plant that measures external torque")
+    stiffness: float = Field(1000.0, ge=10, le=20000, description="[N/m]")
+    rotation_stiffness: float = Field(30.0, ge=0.5, le=1000, description="[Nm/rad]")
+    damping_ratio: float = Field(1.0, ge=0.1, le=5, description="1 returns fastest without overshoot")
+    mass: float = Field(10.0, ge=0.5, le=200, description="virtual mass of the tool [kg]")
+    inertia: float = Field(0.3, ge=0.01, le=20, description="virtual inertia of the tool [kg m^2]")
+    # The weight of 0.2 kg, which the tool's model may be off by, and that weight 0.15 m from the tool frame.
+    force_dead_band: float = Field(2.0, ge=0, le=50, description="a smaller force moves nothing [N]")
+    torque_dead_band: float = Field(0.3, ge=0, le=10, description="a smaller torque moves nothing [Nm]")
+    filter_time: float = Field(0.01, ge=0, le=0.5, description="time constant of the wrench's low-pass [s]")
+    max_displacement: float = Field(0.1, gt=0, le=0.5, description="[m]")
+    max_rotation: float = Field(0.5, gt=0, le=1.5, description="[rad]")

@@ -82,16 +82,15 @@ def tool_jacobian(chain: Chain, placements: Placements, tools: Tools, i: int, tr
         joint = chain.parent[joint]
 
 
-@kernel
+@lean_kernel
 def rotation_vector(R: Array, out: Array) -> None:
     """Rotation vector [rad] of a rotation matrix (3, 3), angle in [0, pi], through its quaternion of largest part."""
-    q = np.empty(4)  # w x y z
     trace = R[0, 0] + R[1, 1] + R[2, 2]
     if trace > 0.0:
-        q[0] = 1.0 + trace
-        q[1] = R[2, 1] - R[1, 2]
-        q[2] = R[0, 2] - R[2, 0]
-        q[3] = R[1, 0] - R[0, 1]
+        w = 1.0 + trace
+        out[0] = R[2, 1] - R[1, 2]
+        out[1] = R[0, 2] - R[2, 0]
+        out[2] = R[1, 0] - R[0, 1]
     else:
         i = 0
         if R[1, 1] > R[0, 0]:
@@ -100,16 +99,16 @@ def rotation_vector(R: Array, out: Array) -> None:
             i = 2
         j = (i + 1) % 3
         k = (i + 2) % 3
-        q[0] = R[k, j] - R[j, k]
-        q[1 + i] = 1.0 + R[i, i] - R[j, j] - R[k, k]
-        q[1 + j] = R[j, i] + R[i, j]
-        q[1 + k] = R[k, i] + R[i, k]
-        if q[0] < 0.0:
-            q = -q
-    imaginary = np.sqrt(q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
-    factor = 2.0 * np.arctan2(imaginary, q[0]) / imaginary if imaginary > 1e-12 else 2.0 / q[0]
+        w = R[k, j] - R[j, k]
+        sign = 1.0 if w >= 0.0 else -1.0
+        w *= sign
+        out[i] = sign * (1.0 + R[i, i] - R[j, j] - R[k, k])
+        out[j] = sign * (R[j, i] + R[i, j])
+        out[k] = sign * (R[k, i] + R[i, k])
+    imaginary = np.sqrt(out[0] * out[0] + out[1] * out[1] + out[2] * out[2])
+    factor = 2.0 * np.arctan2(imaginary, w) / imaginary if imaginary > 1e-12 else 2.0 / w
     for k in range(3):
-        out[k] = factor * q[1 + k]
+        out[k] *= factor
 
 
 @lean_kernel
@@ -124,7 +123,7 @@ def approach_speed(error: float, gain: float, deceleration: float) -> float:
     return np.sqrt(2.0 * deceleration * error - (deceleration / gain) ** 2)
 
 
-@kernel
+@lean_kernel
 def wanted_twist(
     rotation: Array,
     translation: Array,
@@ -135,13 +134,13 @@ def wanted_twist(
     speed_limit: float,
     twist: Array,
     feedback: Array,
+    relative: Array,
 ) -> None:
     """Tool twist towards the goal into ``twist`` (6,).
 
     ``feedback`` (6,) receives the part that the error makes. ``speed_limit`` [m/s] caps the linear part and, in
-    proportion, the angular part.
+    proportion, the angular part. ``relative`` (3, 3) is scratch.
     """
-    relative = np.empty((3, 3))
     for row in range(3):
         for column in range(3):
             total = 0.0
@@ -157,14 +156,14 @@ def wanted_twist(
         full = motion.full_speed[part]
         cap = min(full, speed_limit * full / motion.full_speed[0])
         speed = min(approach_speed(error, motion.gain[part], motion.deceleration[part]), cap)
-        if error > 1e-12:
-            piece *= speed / error
+        scale = speed / error if error > 1e-12 else 1.0
         for k in range(3):
-            feedback[3 * part + k] = piece[k]
-        piece += feed_forward[3 * part : 3 * part + 3]
+            feedback[3 * part + k] = scale * piece[k]
+            piece[k] = feedback[3 * part + k] + feed_forward[3 * part + k]
         size = np.sqrt(piece[0] ** 2 + piece[1] ** 2 + piece[2] ** 2)
         if size > cap:
-            piece *= cap / size
+            for k in range(3):
+                piece[k] *= cap / size
 
 
 @lean_kernel
@@ -173,13 +172,18 @@ def add_tool_task(J: Array, twist: Array, weight: float, H: Array, g: Array) -> 
     nv = g.shape[0]
     square = weight * ROTATION_LENGTH * ROTATION_LENGTH
     for i in range(nv):
+        # Other arms' joints do not move this tool; a revolute one that does turns it, a sliding one shifts it.
+        if J[0, i] == J[1, i] == J[2, i] == J[3, i] == J[4, i] == J[5, i] == 0.0:
+            continue
         for k in range(6):
-            weighted = weight * J[k, i] if k < 3 else square * J[k, i]
-            if weighted == 0.0:
-                continue
-            g[i] -= weighted * twist[k]
-            for j in range(nv):
-                H[i, j] += weighted * J[k, j]
+            g[i] -= (weight if k < 3 else square) * J[k, i] * twist[k]
+        for j in range(i + 1):
+            linear = J[0, i] * J[0, j] + J[1, i] * J[1, j] + J[2, i] * J[2, j]
+            angular = J[3, i] * J[3, j] + J[4, i] * J[4, j] + J[5, i] * J[5, j]
+            both = weight * linear + square * angular
+            H[i, j] += both
+            if i != j:
+                H[j, i] += both
 
 
 @lean_kernel

@@ -16,14 +16,12 @@ from dataclasses import dataclass
 
 import numpy as np
 import pinocchio as pin
-from pydantic import BaseModel, ConfigDict, Field
 
 from q2r2_control.control.chain import chain_of
 from q2r2_control.control.collision import bodies_of, pairs_of
 from q2r2_control.control.jit import hold
-from q2r2_control.control.settings import ControllerSettings
+from q2r2_control.control.settings import ControllerSettings, WallSettings
 from q2r2_control.control.wall_force import Scratch, Wall, find_near, wall_torque
-from q2r2_control.errors import RobotError
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 
@@ -31,16 +29,6 @@ from q2r2_control.types import Array
 _SMOOTHING = 0.07
 # Cores closer than this part of the radii are measured as they are: so deep, the smoothing would weaken the force.
 _DEEP = 0.25
-
-
-class WallSettings(BaseModel):
-    """The wall between measured links; its depth is the controller's ``min_distance``."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-    stiffness: float = Field(10000.0, gt=0, le=100000, description="force per depth below min_distance [N/m]")
-    damping_ratio: float = Field(1.0, ge=0.2, le=2, description="at each pair's effective mass")
-    maximum_force: float = Field(400.0, gt=0, le=2000, description="of each pair of links [N]")
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,10 +49,9 @@ class MeasuredSeparation:
     def __init__(self, robot: Robot, settings: ControllerSettings, wall_settings: WallSettings | None = None) -> None:
         """Uses ``min_distance`` of ``settings``.
 
-        Raises :class:`RobotError` for a shape that no kernel measures and for joints that carry no inertia.
+        Raises :class:`RobotError` for a shape that no kernel measures.
         """
         law, self._model, self._data = wall_settings or WallSettings(), robot.model, robot.model.createData()
-        _check_inertia(robot)
         chain, bodies = chain_of(robot.model), bodies_of(robot.collision_model)
         travel = np.maximum(np.abs(robot.position_lower), np.abs(robot.position_upper))
         pairs = pairs_of(robot.collision_model, chain, bodies, travel)
@@ -114,11 +101,3 @@ class MeasuredSeparation:
     def _press(self, count: int) -> float:
         self._scratch.M[:] = pin.crba(self._model, self._data, self._scratch.q)
         return float(wall_torque(self._held_wall, self._held_scratch, count))
-
-
-def _check_inertia(robot: Robot) -> None:
-    """Every joint has to have some, or no damping could be stable."""
-    own = pin.crba(robot.model, robot.model.createData(), robot.home).diagonal()
-    if not (own > 0.0).all():
-        joint = robot.joint_names[int(np.argmin(own))]
-        raise RobotError(f"joint {joint}: moves no inertia; the wall needs links with masses, or rotors")

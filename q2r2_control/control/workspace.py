@@ -52,6 +52,16 @@ class Cell(NamedTuple):
     home: Array  # (nv,) [rad]
 
 
+class Trial(NamedTuple):
+    """Scratch of a pose that is being looked at."""
+
+    rotation: Array  # (3, 3)
+    translation: Array  # (3,)
+    gram: Array  # (3, 3)
+    correction: Array  # (3, 3)
+    moved: Array  # (6,)
+
+
 class Goals(NamedTuple):
     """What the arms are asked to do."""
 
@@ -65,6 +75,7 @@ class Goals(NamedTuple):
     latched: IntArray  # (n,) 1: the arm has come to rest where it holds
     offered: IntArray  # (n,) what this tick brought: nothing, a pose, something else
     pose: Array  # (n, 4, 4) homogeneous, as offered
+    trial: Trial
 
     @classmethod
     def empty(cls, cell: Cell, smoothing: Array) -> Goals:
@@ -80,6 +91,7 @@ class Goals(NamedTuple):
             latched=np.zeros(n, dtype=np.int64),
             offered=np.zeros(n, dtype=np.int64),
             pose=np.zeros((n, 4, 4)),
+            trial=Trial(np.zeros((3, 3)), np.zeros(3), np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(6)),
         )
 
 

@@ -10,8 +10,9 @@ import pytest
 from pydantic import ValidationError
 
 from q2r2_control.config import Config, load_config
-from q2r2_control.control.admittance import Admittance, AdmittanceSettings
+from q2r2_control.control.admittance import Admittance
 from q2r2_control.control.controller import CartesianController
+from q2r2_control.control.settings import AdmittanceSettings
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.types import Array, Command, CommandMode, RobotState
 

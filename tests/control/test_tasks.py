@@ -120,6 +120,7 @@ def _twist(tool: pin.SE3, goal: pin.SE3, feed_forward: Array, speed_limit: float
         speed_limit,
         twist,
         np.zeros(6),
+        np.zeros((3, 3)),
     )
     return twist
 

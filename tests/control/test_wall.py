@@ -11,8 +11,8 @@ import pytest
 from pydantic import ValidationError
 
 from q2r2_control.config import load_config
-from q2r2_control.control.settings import ControllerSettings
-from q2r2_control.control.wall import MeasuredSeparation, WallReport, WallSettings
+from q2r2_control.control.settings import ControllerSettings, WallSettings
+from q2r2_control.control.wall import MeasuredSeparation, WallReport
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, Command, CommandMode

@@ -1,0 +1,46 @@
+"""When a tick is due: by the computer's clock, or in simulated time."""
+
+from __future__ import annotations
+
+import time
+
+from q2r2_control.control.controller import LONGEST_DT
+
+_SHORTEST_DT = 1e-6  # [s]
+
+
+class LoopClock:
+    """Ticks on a grid of ``period`` [s], in real time or as fast as they come."""
+
+    def __init__(self, period: float, realtime: bool) -> None:
+        self._period, self._realtime = period, realtime
+        self._ticks = 0
+        self.start = self.now = self._due = time.monotonic() if realtime else 0.0  # [s]
+        self._wall_start = time.perf_counter()
+
+    def wait(self) -> float:
+        """Let the next tick come; returns the time since the last one [s]."""
+        self._ticks += 1
+        if not self._realtime:
+            self.now = self._ticks * self._period
+            return self._period
+        self._due += self._period
+        rest = self._due - time.monotonic()
+        if rest > 0.0:
+            time.sleep(rest)
+        before, self.now = self.now, time.monotonic()
+        # Late wake-ups do not add up, since ticks are due on a grid; ticks that were missed are not made up for.
+        self._due = max(self._due, self.now - self._period)
+        return min(max(self.now - before, _SHORTEST_DT), LONGEST_DT)
+
+    def after(self, duration: float) -> bool:
+        """Whether ``duration`` [s] is over; half a period early, so that rounding adds or loses no tick."""
+        return self.now - self.start >= duration - 0.5 * self._period
+
+    def read(self) -> float:
+        """Time of this very moment; in simulated time that of the tick [s]."""
+        return time.monotonic() if self._realtime else self.now
+
+    def wall_time(self) -> float:
+        """What the run has taken so far, whatever time it simulated [s]."""
+        return time.perf_counter() - self._wall_start
