@@ -11,17 +11,18 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 
+import numpy as np
+
 from q2r2_control.errors import InputError, ProtocolError
-from q2r2_control.inputs.framing import FrameDecoder
-from q2r2_control.inputs.messages import warm_up
-from q2r2_control.inputs.samples import HandTracker, SampleQueue
-from q2r2_control.inputs.session import HeadsetSession, Reception, log_frame
-from q2r2_control.inputs.statistics import HeadsetStatistics, TopicRecorder
+from q2r2_control.inputs.client import Client
+from q2r2_control.inputs.messages import PROP_TOPICS, AppMessage, PropTwist, warm_up
+from q2r2_control.inputs.samples import SampleQueue
+from q2r2_control.inputs.session import Reception, log_frame, topic_of
+from q2r2_control.inputs.statistics import HeadsetStatistics
 from q2r2_control.types import SIDES, HandSample, HapticFeedback
 
 KEEPALIVE_AFTER = 1.0  # of own silence [s]
 SILENCE_ALLOWED = 2.0  # without a whole frame [s]; the app sends a keepalive after 1 s
-MAX_FRAMES_PER_SECOND = 2000  # the app sends about 450; more would take processor time from the control loop
 MAX_HOSTS_NAMED = 8  # in the log as refused while one headset drives
 _TURN = 0.05  # longest wait for the network; timeouts are looked at this often [s]
 _RECEIVE_BYTES = 1 << 12  # some 40 messages: the control loop gets the interpreter between two such portions
@@ -35,19 +36,29 @@ class HeadsetServer:
     Samples are stamped with ``clock`` when their bytes are received. The loop's thread never waits for the network
     or for decoding. A client that breaks the protocol, floods, or is silent for ``SILENCE_ALLOWED`` is dropped with one
     logged line, and the next one is welcome; while one drives, others are refused.
+
+    Where a ``listener`` is given, each message goes to it alone, in the receiving thread and at once, and
+    :meth:`poll` returns nothing: this is for passing on what the headset said, message by message.
     """
 
-    def __init__(self, host: str = "127.0.0.1", port: int = 10000, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self,
+        host: str = "127.0.0.1",
+        port: int = 10000,
+        clock: Callable[[], float] = time.monotonic,
+        listener: Callable[[Reception], None] | None = None,
+    ) -> None:
         self._address = (host, port)
         self._clock = clock
+        self._tell = listener
         self._thread: threading.Thread | None = None
         self._stop = threading.Event()
         self._samples = SampleQueue()
-        self._haptics: dict[str, HapticFeedback] = {}  # newest of each hand
-        self._haptics_lock = threading.Lock()
-        self._statistics_lock = threading.Lock()  # never taken by poll or send_haptic
-        self._client: _Client | None = None
-        self._last_client: _Client | None = None
+        self._owed: dict[str, AppMessage] = {}  # newest of each topic
+        self._owed_lock = threading.Lock()
+        self._statistics_lock = threading.Lock()  # never taken by poll or what sends
+        self._client: Client | None = None
+        self._last_client: Client | None = None
         self._connections = 0
         self._last_disconnect: str | None = None
 
@@ -90,12 +101,14 @@ class HeadsetServer:
     def send_haptic(self, feedback: HapticFeedback) -> None:
         """Vibrate, values clipped to 0..1; nothing happens unless a headset listens, or when a value is not finite."""
         values = (feedback.frequency, feedback.amplitude)
-        if self._client is None or feedback.hand not in SIDES or not all(map(math.isfinite, values)):
-            return
-        frequency, amplitude = (min(max(float(value), 0.0), 1.0) for value in values)
-        with self._haptics_lock:
-            self._haptics[feedback.hand] = HapticFeedback(feedback.hand, frequency, amplitude)
-        self._wake()
+        if feedback.hand in SIDES and all(map(math.isfinite, values)):
+            frequency, amplitude = (min(max(float(value), 0.0), 1.0) for value in values)
+            self._owe(HapticFeedback(feedback.hand, frequency, amplitude))
+
+    def send_twist(self, twist: PropTwist) -> None:
+        """Move a thing in the app; nothing happens unless a headset listens, or when a value is not finite."""
+        if twist.topic in PROP_TOPICS and np.isfinite([twist.linear, twist.angular]).all():
+            self._owe(twist)
 
     @property
     def statistics(self) -> HeadsetStatistics:
@@ -124,6 +137,12 @@ class HeadsetServer:
         self._wake()
         self._thread.join()
         self._thread = None
+
+    def _owe(self, message: AppMessage) -> None:
+        if self._client is not None:
+            with self._owed_lock:
+                self._owed[topic_of(message)] = message
+            self._wake()
 
     def _wake(self) -> None:
         # A full pipe wakes just as well, a closed one has nobody to wake.
@@ -178,16 +197,16 @@ class HeadsetServer:
             _dismiss(connection, f"refused: {driving.peer} drives")
             return
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        client = _Client(connection, peer, self._clock())
+        client = Client(connection, peer, self._clock())
         self._selector.register(connection, selectors.EVENT_READ, lambda: self._receive(client))
-        with self._haptics_lock:
-            self._haptics.clear()
+        with self._owed_lock:
+            self._owed.clear()
         with self._statistics_lock:
             self._client = self._last_client = client
             self._connections += 1
         _LOG.info("headset %s connected", peer)
 
-    def _receive(self, client: _Client) -> None:
+    def _receive(self, client: Client) -> None:
         if client is not self._client:
             return
         try:
@@ -206,7 +225,7 @@ class HeadsetServer:
             _LOG.info("headset %s closed the connection", client.peer)
             self._disconnect("closed by the headset")
 
-    def _handle(self, client: _Client, data: bytes, now: float) -> None:
+    def _handle(self, client: Client, data: bytes, now: float) -> None:
         client.decoder.feed(data)
         while (frame := client.decoder.next_frame()) is not None:
             client.count_frame(now)
@@ -215,11 +234,14 @@ class HeadsetServer:
                 reception = client.session.receive(frame)
                 if reception is not None:
                     client.record(reception, now)
-            sample = client.tracker.update(reception.hand, reception.message, now) if reception else None
-            if sample is not None:
+            if reception is None:
+                continue
+            if self._tell is not None:
+                self._tell(reception)
+            elif (sample := client.tracker.update(reception.hand, reception.message, now)) is not None:
                 self._samples.put(sample)
 
-    def _attend(self, client: _Client, now: float) -> None:
+    def _attend(self, client: Client, now: float) -> None:
         """Send what is owed, and drop a client that is silent: its half-open connection would keep others out."""
         if now - client.last_frame > SILENCE_ALLOWED:
             self._drop(f"no frame for {SILENCE_ALLOWED:g} s")
@@ -227,10 +249,10 @@ class HeadsetServer:
         outgoing = client.session.outgoing
         if not outgoing:
             # Only now, so that a client that does not read is owed the newest vibration and not all of them.
-            with self._haptics_lock:
-                haptics, self._haptics = self._haptics, {}
-            for feedback in haptics.values():
-                client.session.queue_haptic(feedback)
+            with self._owed_lock:
+                owed, self._owed = self._owed, {}
+            for message in owed.values():
+                client.session.queue_message(message)
             if not outgoing and now - client.last_sent > KEEPALIVE_AFTER:
                 client.session.queue_keepalive()
         try:
@@ -272,32 +294,3 @@ def _dismiss(connection: socket.socket, text: str | None) -> None:
     with connection, suppress(OSError):
         if text is not None:
             connection.send(log_frame("error", text))
-
-
-class _Client:
-    """The connected headset."""
-
-    def __init__(self, connection: socket.socket, peer: str, now: float) -> None:
-        self.socket = connection
-        self.peer = peer
-        self.session = HeadsetSession()
-        self.decoder = FrameDecoder()
-        self.tracker = HandTracker()
-        self.recorders: dict[str, TopicRecorder] = {}
-        self.refused_hosts: set[str] = set()
-        self.last_frame = now
-        self.last_sent = now
-        self._window_start = now
-        self._window_frames = 0
-
-    def count_frame(self, now: float) -> None:
-        """Raises :class:`ProtocolError` when the client floods."""
-        self.last_frame = now
-        if now - self._window_start >= 1.0:
-            self._window_start, self._window_frames = now, 0
-        self._window_frames += 1
-        if self._window_frames > MAX_FRAMES_PER_SECOND:
-            raise ProtocolError(f"more than {MAX_FRAMES_PER_SECOND} frames in a second")
-
-    def record(self, reception: Reception, now: float) -> None:
-        self.recorders.setdefault(reception.topic, TopicRecorder()).record(reception.message, now)

@@ -63,7 +63,19 @@ class HandTwist:
     angular: Array  # (3,) [rad/s]
 
 
+@dataclass(frozen=True, slots=True)
+class PropTwist:
+    """A velocity for one of the things that the app shows."""
+
+    topic: str  # of PROP_TOPICS
+    linear: Array  # (3,) [m/s]
+    angular: Array  # (3,) [rad/s]
+
+
 HandMessage = HandPose | HandTwist | HandInputs
+AppMessage = HapticFeedback | PropTwist
+
+PROP_TOPICS = ("dice_twist", "q2r_twist")
 
 # quest2ros/msg/OVR2ROSInputs and OVR2ROSHapticFeedback of the public Quest2ROS repository.
 _INPUTS_FIELDS = """
@@ -126,12 +138,19 @@ def fits(kind: MessageType, payload: bytes, dialect: Dialect) -> bool:
     return True
 
 
-def encode_haptic(feedback: HapticFeedback, dialect: Dialect) -> bytes:
-    """Serialise a vibration as two float32, frequency and amplitude."""
+def encode(message: AppMessage, dialect: Dialect) -> bytes:
+    """Serialise a vibration as two float32, frequency and amplitude, or a twist as six float64, linear first."""
     store = _store(dialect)
+    if isinstance(message, HapticFeedback):
+        kind = MessageType.HAPTIC
+        content: Any = store.types[kind.full_name](frequency=message.frequency, amplitude=message.amplitude)
+    else:
+        kind = MessageType.TWIST
+        vector = store.types["geometry_msgs/msg/Vector3"]
+        linear, angular = (vector(*values.tolist()) for values in (message.linear, message.angular))
+        content = store.types[kind.full_name](linear=linear, angular=angular)
     write = store.serialize_ros1 if dialect is Dialect.ROS1 else store.serialize_cdr
-    message = store.types[MessageType.HAPTIC.full_name](frequency=feedback.frequency, amplitude=feedback.amplitude)
-    return bytes(write(message, MessageType.HAPTIC.full_name))
+    return bytes(write(content, kind.full_name))
 
 
 def warm_up() -> None:

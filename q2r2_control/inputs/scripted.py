@@ -24,6 +24,8 @@ _DROPOUT_PROBABILITY = 0.005
 _LONGEST_DROPOUT = 5  # samples
 _RECEIPT_JITTER = 0.0015  # [s], scale of an exponential distribution
 _POSITION_NOISE, _ROTATION_NOISE = 1e-4, math.radians(0.03)
+# Half a central difference of the ideal pose [s].
+_DIFFERENCE = 1e-4
 # While nobody polls for longer than this, the script waits [s].
 _LONGEST_BACKLOG = 1.0
 
@@ -81,6 +83,13 @@ class ScriptedInput:
     def hand_pose(self, hand: str, t: float) -> pin.SE3:
         """Where ``hand`` ideally is at ``t`` [s], on the clock of the samples' stamps; script time before any poll."""
         return self._pose(hand, t - (self._origin or 0.0))
+
+    def hand_twist(self, hand: str, t: float) -> pin.Motion:
+        """How ``hand`` ideally moves at ``t`` [s], in the axes that its poses have [m/s, rad/s]."""
+        t -= self._origin or 0.0  # before the difference, which on a clock that counts since 1970 would be coarse
+        before, after = self._pose(hand, t - _DIFFERENCE), self._pose(hand, t + _DIFFERENCE)
+        linear = (after.translation - before.translation) / (2.0 * _DIFFERENCE)
+        return pin.Motion(linear, pin.log3(after.rotation @ before.rotation.T) / (2.0 * _DIFFERENCE))
 
     def poll(self, now: float) -> list[HandSample]:
         """Samples that came due since the last poll, with the time they were due as receipt time; oldest first."""

@@ -10,7 +10,16 @@ from typing import Any, NamedTuple
 
 from q2r2_control.errors import ProtocolError
 from q2r2_control.inputs.framing import KEEPALIVE, Frame, encode_frame
-from q2r2_control.inputs.messages import Dialect, HandMessage, MessageType, decode, encode_haptic, fits
+from q2r2_control.inputs.messages import (
+    PROP_TOPICS,
+    AppMessage,
+    Dialect,
+    HandMessage,
+    MessageType,
+    decode,
+    encode,
+    fits,
+)
 from q2r2_control.types import SIDES, HapticFeedback
 
 MAX_OUTGOING_BYTES = 1 << 16  # answers a client may leave unread
@@ -36,6 +45,7 @@ HAPTIC_TOPICS = {hand: f"q2r_{hand}_hand_haptic_feedback" for hand in SIDES}
 _TOPIC_TYPES: dict[str, str] = {
     **{name: topic.kind.value for name, topic in HAND_TOPICS.items()},
     **dict.fromkeys(HAPTIC_TOPICS.values(), MessageType.HAPTIC.value),
+    **dict.fromkeys(PROP_TOPICS, MessageType.TWIST.value),
 }
 _TOPIC_NAME = re.compile(r"[A-Za-z~_][A-Za-z0-9_~/]{0,255}")
 
@@ -46,6 +56,11 @@ class Reception(NamedTuple):
     topic: str  # without leading slash
     hand: str
     message: HandMessage
+
+
+def topic_of(message: AppMessage) -> str:
+    """The topic that carries ``message`` to the app."""
+    return HAPTIC_TOPICS[message.hand] if isinstance(message, HapticFeedback) else message.topic
 
 
 def log_frame(level: str, text: str) -> bytes:
@@ -94,11 +109,11 @@ class HeadsetSession:
         """Tell the client that the server lives."""
         self.outgoing += KEEPALIVE
 
-    def queue_haptic(self, feedback: HapticFeedback) -> None:
-        """Vibrate, if the client listens; otherwise nothing happens."""
-        destination = self.subscribed.get(HAPTIC_TOPICS[feedback.hand])
+    def queue_message(self, message: AppMessage) -> None:
+        """Send a vibration or a twist, if the client listens; otherwise nothing happens."""
+        destination = self.subscribed.get(topic_of(message))
         if destination is not None and self.dialect is not None:
-            self.outgoing += encode_frame(destination, encode_haptic(feedback, self.dialect))
+            self.outgoing += encode_frame(destination, encode(message, self.dialect))
 
     def _agree_on_dialect(self, frame: Frame) -> None:
         dialect = Dialect.ROS2 if frame.terminated else Dialect.ROS1

@@ -12,10 +12,11 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import pinocchio as pin
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import Pose, PoseStamped, Transform
+from geometry_msgs.msg import Pose, PoseStamped, Transform, Twist, Vector3
 from quest2ros.msg import OVR2ROSInputs
 from sensor_msgs.msg import JointState
 
+from q2r2_control.inputs.messages import HandPose, HandTwist
 from q2r2_control.types import Array, HandInputs, HandSample, RobotState
 
 _UNIT = 1e-3  # a quaternion's norm may be off by this
@@ -78,6 +79,41 @@ def hand_sample(
         inputs=HandInputs() if inputs is None else hand_inputs(inputs),
         inputs_stamp=inputs_stamp,
     )
+
+
+def hand_pose(message: PoseStamped) -> HandPose:
+    """A hand's pose, unchecked."""
+    position = message.pose.position
+    return HandPose(
+        position=np.array([position.x, position.y, position.z]),
+        quaternion=_quaternion(message.pose),
+        stamp=seconds(message.header.stamp),
+        frame_id=message.header.frame_id,
+    )
+
+
+def hand_pose_message(pose: HandPose, frame: str, t: float) -> PoseStamped:
+    """The same as a message in ``frame`` at ``t`` [s], all numbers as they are: the quaternion may be no unit one."""
+    message = PoseStamped()
+    message.header.frame_id = frame
+    message.header.stamp = time_message(t)
+    position, orientation = message.pose.position, message.pose.orientation
+    position.x, position.y, position.z = pose.position.tolist()
+    orientation.x, orientation.y, orientation.z, orientation.w = pose.quaternion.tolist()
+    return message
+
+
+def hand_twist(message: Twist) -> HandTwist:
+    """A hand's velocity, unchecked."""
+    return HandTwist(*(np.array([vector.x, vector.y, vector.z]) for vector in (message.linear, message.angular)))
+
+
+def hand_twist_message(twist: HandTwist) -> Twist:
+    """The same as a message."""
+    linear, angular = (
+        Vector3(**dict(zip("xyz", vector.tolist(), strict=True))) for vector in (twist.linear, twist.angular)
+    )
+    return Twist(linear=linear, angular=angular)
 
 
 def hand_inputs(message: OVR2ROSInputs) -> HandInputs:

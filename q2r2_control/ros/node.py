@@ -12,12 +12,13 @@ from typing import Any
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import String
 
-from q2r2_control.errors import Q2R2Error
+from q2r2_control.errors import ConfigError, Q2R2Error
 
 # Commands: only the newest counts, and it has to arrive.
 COMMAND_QOS = QoSProfile(
@@ -43,8 +44,10 @@ OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.E
 class BaseNode(Node):
     """A node with described parameters, ``/diagnostics`` and ``~/state`` (one JSON object in a String).
 
-    Subclasses override :meth:`health`.
+    Subclasses override :meth:`health`. Setting ``exit_code`` ends the executable with it.
     """
+
+    exit_code: int | None = None
 
     def __init__(self, name: str, **kwargs: Any) -> None:
         super().__init__(name, **kwargs)
@@ -60,10 +63,17 @@ class BaseNode(Node):
         *,
         at_least: float | None = None,
         at_most: float | None = None,
+        one_of: Sequence[str] = (),
         read_only: bool = True,
     ) -> Any:
-        """Declare a parameter and return its value. A value outside the range is refused by rclpy itself."""
+        """Declare a parameter and return its value.
+
+        A range is kept by rclpy itself, ``one_of`` only at the start. Raises :class:`ConfigError` for a value of
+        another type, outside the range or not in ``one_of``.
+        """
         descriptor = ParameterDescriptor(description=description, read_only=read_only)
+        if one_of:
+            descriptor.additional_constraints = f"one of {', '.join(one_of)}"
         if at_least is not None and at_most is not None:
             if isinstance(default, int) and not isinstance(default, bool):
                 descriptor.integer_range = [IntegerRange(from_value=int(at_least), to_value=int(at_most), step=0)]
@@ -71,7 +81,16 @@ class BaseNode(Node):
                 descriptor.floating_point_range = [
                     FloatingPointRange(from_value=float(at_least), to_value=float(at_most), step=0.0)
                 ]
-        return self.declare_parameter(name, default, descriptor).value
+        try:
+            value = self.declare_parameter(name, default, descriptor).value
+        except ParameterException as error:
+            allowed = (
+                f"; allowed is {at_least:g} .. {at_most:g}" if at_least is not None and at_most is not None else ""
+            )
+            raise ConfigError(f"parameter {name}: {' '.join(str(error).split())}{allowed}") from None
+        if one_of and value not in one_of:
+            raise ConfigError(f"parameter {name}: {value!r}: allowed are {', '.join(one_of)}")
+        return value
 
     @property
     def now(self) -> float:
@@ -108,7 +127,7 @@ def run_node(make: Callable[[], Node], args: Sequence[str] | None = None) -> int
         node = make()
         executor = SingleThreadedExecutor()
         executor.add_node(node)
-        while rclpy.ok() and not stop.is_set():
+        while rclpy.ok() and not stop.is_set() and getattr(node, "exit_code", None) is None:
             executor.spin_once(timeout_sec=0.1)
     except Q2R2Error as error:
         print(f"{sys.argv[0].rsplit('/', 1)[-1]}: {error}", file=sys.stderr)
@@ -121,4 +140,4 @@ def run_node(make: Callable[[], Node], args: Sequence[str] | None = None) -> int
                 node.close()
             node.destroy_node()
         rclpy.try_shutdown()
-    return 0
+    return getattr(node, "exit_code", None) or 0

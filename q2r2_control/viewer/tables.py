@@ -7,9 +7,9 @@ from rich.text import Text
 
 from q2r2_control.cell_check import ArmCheck, CellCheck, PairsWritten
 from q2r2_control.headset_check import HeadsetCheck
-from q2r2_control.inputs.messages import HandMessage, HandPose, HandTwist
 from q2r2_control.summary import Percentiles, RunSummary
 from q2r2_control.torque_summary import TorqueSummary
+from q2r2_control.viewer.topics import topic_table
 
 
 def summary_table(summary: RunSummary) -> Table:
@@ -111,13 +111,7 @@ def headset_table(check: HeadsetCheck) -> Table:
     state = f"{statistics.peer} connected" if statistics.peer else "nobody is connected"
     dialect = f", dialect {statistics.dialect}" if statistics.dialect else ""
     address = "{}:{}".format(*statistics.address)
-    table = Table(title=f"headset on {address}: {state}{dialect}", title_justify="left", min_width=76)
-    table.add_column("topic")
-    for column in ("messages", "rate [Hz]", "age [s]"):
-        table.add_column(Text(column), justify="right")
-    table.add_column("last value")
-    for name, topic in sorted(statistics.topics.items()):
-        table.add_row(name, str(topic.count), f"{topic.rate:.0f}", f"{topic.age:.2f}", _in_short(topic.last))
+    table = topic_table(f"headset on {address}: {state}{dialect}", dict(sorted(statistics.topics.items())))
     for name, count in statistics.unknown_topics.items():
         table.add_row(Text(name), str(count), "", "", "not read")
     table.add_section()
@@ -129,18 +123,6 @@ def headset_table(check: HeadsetCheck) -> Table:
     table.caption = Text("\n".join(check.advice)) if check.advice else None
     table.caption_justify = "left"
     return table
-
-
-def _in_short(message: HandMessage) -> str:
-    if isinstance(message, HandPose):
-        position, quaternion = (
-            " ".join(f"{x:.2f}" for x in values) for values in (message.position, message.quaternion)
-        )
-        return f"{position} m, quaternion {quaternion}"
-    if isinstance(message, HandTwist):
-        return "{:.2f} {:.2f} {:.2f} m/s".format(*message.linear)
-    held = [name for name in ("upper", "lower") if getattr(message, f"button_{name}")]
-    return f"held: {' '.join(held) or 'none'}, triggers {message.press_index:.1f} {message.press_middle:.1f}"
 
 
 def _numbers(values: tuple[float, ...]) -> str:

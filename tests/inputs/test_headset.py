@@ -19,11 +19,12 @@ import pytest
 
 from q2r2_control.errors import InputError
 from q2r2_control.inputs.base import Input
-from q2r2_control.inputs.headset import MAX_FRAMES_PER_SECOND, HeadsetServer
-from q2r2_control.inputs.messages import Dialect, HandPose
-from q2r2_control.inputs.session import HeadsetSession
+from q2r2_control.inputs.client import MAX_FRAMES_PER_SECOND
+from q2r2_control.inputs.headset import HeadsetServer
+from q2r2_control.inputs.messages import Dialect, HandPose, PropTwist
+from q2r2_control.inputs.session import HeadsetSession, Reception
 from q2r2_control.types import HandSample, HapticFeedback
-from tests.support.fake_headset import DIALECTS, KEEPALIVE, FakeHeadset, pack_inputs, pack_pose
+from tests.support.fake_headset import DIALECTS, KEEPALIVE, FakeHeadset, pack_inputs, pack_pose, pack_twist
 
 IDENTITY = (0.0, 0.0, 0.0, -1.0)
 HAPTIC = "q2r_left_hand_haptic_feedback"
@@ -325,6 +326,49 @@ def test_a_vibration_that_one_headset_did_not_take_is_not_given_to_the_next(serv
         frame = second.read_frame()
     assert frame is not None
     assert frame[0] == "q2r_right_hand_haptic_feedback"
+
+
+# Twists for what the app shows ---------------------------------------------------------------------------------------
+
+
+@every_dialect
+def test_twists_arrive_at_a_headset_that_listens_and_only_whole_ones(server: HeadsetServer, dialect: str) -> None:
+    linear, angular = np.array([1.0, 2.0, 3.0]), np.array([4.0, 5.0, 6.0])
+    server.send_twist(PropTwist("dice_twist", linear, angular))
+    with connect(server, dialect) as headset:
+        headset.send(headset.command("__subscribe", topic="dice_twist", message_name="geometry_msgs/Twist"))
+        headset.send(headset.command("__topic_list"))
+        headset.read_until("__topic_list")
+        server.send_twist(PropTwist("q2r_twist", linear, angular))  # nobody listens
+        server.send_twist(PropTwist("dice_twist", linear, np.array([math.nan, 0.0, 0.0])))
+        server.send_twist(PropTwist("dice", linear, angular))  # no such thing
+        server.send_twist(PropTwist("dice_twist", -linear, angular))
+        frame = headset.read_frame()
+    assert frame == ("dice_twist", pack_twist(dialect, (-1.0, -2.0, -3.0), (4.0, 5.0, 6.0)))
+
+
+# A listener ----------------------------------------------------------------------------------------------------------
+
+
+@every_dialect
+def test_a_listener_gets_every_message_in_order_and_poll_none(clock: HandClock, dialect: str) -> None:
+    heard: list[Reception] = []
+    server = HeadsetServer(port=0, clock=clock, listener=heard.append)
+    server.start()
+    try:
+        with connect(server, dialect) as headset:
+            for index in range(100):
+                headset.send(headset.pose("left", (float(index), 0.0, 0.0), IDENTITY))
+                headset.send(headset.twist("left", (float(index), 0.0, 0.0), (0.0, 0.0, 0.0)))
+                headset.send(headset.inputs("right", lower=index % 2 == 0))
+            eventually(lambda: len(heard) == 300)
+            topics = ("q2r_left_hand_pose", "q2r_left_hand_twist", "q2r_right_hand_inputs")
+            assert [reception.topic for reception in heard] == [*topics] * 100
+            poses = [reception.message for reception in heard[::3]]
+            assert [pose.position[0] for pose in poses if isinstance(pose, HandPose)] == list(range(100))
+            assert server.poll(0.0) == []
+    finally:
+        server.close()
 
 
 # One headset at a time -----------------------------------------------------------------------------------------------

@@ -16,8 +16,9 @@ from q2r2_control.inputs.messages import (
     HandPose,
     HandTwist,
     MessageType,
+    PropTwist,
     decode,
-    encode_haptic,
+    encode,
     fits,
     warm_up,
 )
@@ -112,7 +113,13 @@ def test_inputs_are_read_in_the_order_of_their_fields(dialect: Dialect) -> None:
     ],
 )
 def test_haptics_are_packed_as_two_floats_and_not_as_doubles(dialect: Dialect, expected: bytes) -> None:
-    assert encode_haptic(HapticFeedback("left", frequency=0.5, amplitude=1.0), dialect) == expected
+    assert encode(HapticFeedback("left", frequency=0.5, amplitude=1.0), dialect) == expected
+
+
+@every_dialect
+def test_a_twist_for_the_app_has_the_bytes_of_one_that_the_app_sends(dialect: Dialect) -> None:
+    twist = PropTwist("dice_twist", np.array([1.0, 2.0, 0.5]), np.array([0.0, 0.0, -1.0]))
+    assert encode(twist, dialect) == TWISTS[dialect]
 
 
 @every_dialect

@@ -156,6 +156,19 @@ def test_the_right_hand_mirrors_the_left() -> None:
         np.testing.assert_allclose(reflection @ left @ reflection, right, atol=1e-12)
 
 
+@pytest.mark.parametrize("trajectory", TRAJECTORIES)
+@pytest.mark.parametrize("hand", SIDES)
+def test_the_twist_leads_from_each_pose_to_the_next(trajectory: str, hand: str) -> None:
+    script = ScriptedInput(trajectory)
+    dt = 0.01
+    for t in np.arange(0.0, 12.0, 0.05).tolist():
+        before, after = script.hand_pose(hand, t), script.hand_pose(hand, t + dt)
+        twist = script.hand_twist(hand, t + dt / 2.0)
+        np.testing.assert_allclose(before.translation + dt * twist.linear, after.translation, atol=2e-6)
+        turned = pin.exp3(dt * twist.angular) @ before.rotation
+        np.testing.assert_allclose(turned, after.rotation, atol=2e-5)
+
+
 def test_nothing_comes_before_start_nor_after_close_and_haptics_are_harmless() -> None:
     script = ScriptedInput("circle")
     assert (script.connected, script.poll(0.0)) == (False, [])

@@ -5,11 +5,12 @@ from __future__ import annotations
 import json
 import re
 
+import numpy as np
 import pytest
 
 from q2r2_control.errors import ProtocolError
 from q2r2_control.inputs.framing import KEEPALIVE, Frame, FrameDecoder
-from q2r2_control.inputs.messages import Dialect
+from q2r2_control.inputs.messages import PROP_TOPICS, Dialect, PropTwist
 from q2r2_control.inputs.session import MAX_COMMAND_BYTES, MAX_OUTGOING_BYTES, MAX_TOPICS, HeadsetSession, Reception
 from q2r2_control.types import HapticFeedback
 from tests.support.fake_headset import pack_inputs, pack_pose, pack_twist
@@ -153,7 +154,7 @@ def test_the_topic_list_has_a_type_of_two_parts_for_each_topic(session: HeadsetS
     assert types["q2r_left_hand_pose"] == "geometry_msgs/PoseStamped"
     assert types["q2r_right_hand_inputs"] == "quest2ros/OVR2ROSInputs"
     assert types[HAPTIC] == "quest2ros/OVR2ROSHapticFeedback"
-    assert types["dice"] == "geometry_msgs/Twist"
+    assert types["dice"] == types["dice_twist"] == types["q2r_twist"] == "geometry_msgs/Twist"
     assert all(re.fullmatch(r"\w+/\w+", kind) for kind in types.values())
 
 
@@ -250,18 +251,32 @@ def test_haptics_go_to_the_subscribed_spelling_in_the_clients_dialect(
     session: HeadsetSession, dialect: Dialect
 ) -> None:
     session.receive(command(dialect, "__subscribe", topic="/" + HAPTIC, message_name="quest2ros/OVR2ROSHapticFeedback"))
-    session.queue_haptic(HapticFeedback("left", 0.5, 1.0))
+    session.queue_message(HapticFeedback("left", 0.5, 1.0))
     header = b"\0\1\0\0" if dialect is Dialect.ROS2 else b""
     assert answers(session) == [("/" + HAPTIC, header + bytes.fromhex("0000003f 0000803f"))]
 
 
 def test_no_haptics_go_to_a_client_that_did_not_subscribe_or_no_longer_listens(session: HeadsetSession) -> None:
-    session.queue_haptic(HapticFeedback("left", 0.5, 1.0))
+    session.queue_message(HapticFeedback("left", 0.5, 1.0))
     session.receive(command(Dialect.ROS2, "__subscribe", topic=HAPTIC, message_name="a/B"))
-    session.queue_haptic(HapticFeedback("right", 0.5, 1.0))
+    session.queue_message(HapticFeedback("right", 0.5, 1.0))
     session.receive(command(Dialect.ROS2, "__remove_subscriber", topic=HAPTIC))
-    session.queue_haptic(HapticFeedback("left", 0.5, 1.0))
+    session.queue_message(HapticFeedback("left", 0.5, 1.0))
     assert answers(session) == []
+
+
+@every_dialect
+@pytest.mark.parametrize("topic", PROP_TOPICS)
+@pytest.mark.parametrize("slash", ["", "/"])
+def test_a_twist_goes_to_the_subscribed_spelling_in_the_clients_dialect(
+    session: HeadsetSession, dialect: Dialect, topic: str, slash: str
+) -> None:
+    twist = PropTwist(topic, np.array(POSITION), -np.array(POSITION))
+    session.queue_message(twist)
+    session.receive(command(dialect, "__subscribe", topic=slash + topic, message_name="geometry_msgs/Twist"))
+    session.queue_message(twist)
+    payload = pack_twist(dialect.lower(), POSITION, (-0.1, -0.2, -0.3))
+    assert answers(session) == [(slash + topic, payload)]
 
 
 def test_a_keepalive_is_eight_zero_bytes(session: HeadsetSession) -> None:

@@ -1,0 +1,68 @@
+"""The live view of both hands, as a process that prints."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import pytest
+
+from tests.ros.conftest import NEEDS_ROS
+from tests.ros.processes import PATIENCE, Processes
+from tests.ros.waiting import States, eventually
+
+pytest.importorskip("rclpy", reason=NEEDS_ROS)
+pytestmark = pytest.mark.usefixtures("interfaces")
+
+MODULE = "q2r2_control.ros.check_tcp_connection"
+LONG = 3.0 * PATIENCE  # two start at once, and then run for a time of their own
+
+
+@contextmanager
+def left_hand_publishing(node: Any) -> Iterator[None]:
+    """Pose, inputs and twist of the left hand with numbers of their own, for as long as the context lasts."""
+    from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion, Twist, Vector3
+    from quest2ros.msg import OVR2ROSInputs
+
+    pose = PoseStamped(pose=Pose(position=Point(x=1.0, y=2.0, z=-3.0), orientation=Quaternion(w=-1.0)))
+    twist = Twist(linear=Vector3(x=0.5), angular=Vector3(z=-0.25))
+    inputs = OVR2ROSInputs(button_lower=True, press_index=0.75)
+    messages = {"pose": pose, "twist": twist, "inputs": inputs}
+    publishers = {name: node.create_publisher(type(m), f"q2r_left_hand_{name}", 10) for name, m in messages.items()}
+    timer = node.create_timer(0.02, lambda: [publishers[name].publish(m) for name, m in messages.items()])
+    try:
+        yield
+    finally:
+        node.destroy_timer(timer)
+
+
+def test_it_shows_values_rate_and_age_and_tells_a_timeout(node: Any, processes: Processes) -> None:
+    states = States(node, "check_tcp_connection")
+    check = processes.start_module(MODULE)
+    terminal = {"FORCE_COLOR": "1", "TERM": "xterm", "COLUMNS": "140"}
+    table = processes.start_module(MODULE, "--ros-args", "-r", "__node:=table", **terminal)
+    with left_hand_publishing(node):
+        pose = check.wait_for("s old: 1.00 2.00 -3.00 m, quaternion 0.00 0.00 0.00 -1.00")
+        assert re.fullmatch(r"q2r_left_hand_pose: \d+ messages, \d+ Hz, \d\.\d\d s old: .*", pose)
+        assert check.wait_for("s old: 0.50 0.00 0.00 m/s").startswith("q2r_left_hand_twist: ")
+        assert check.wait_for("held: lower, triggers 0.8 0.0").startswith("q2r_left_hand_inputs: ")
+        check.wait_for("q2r_right_hand_pose: timeout, nothing yet")
+        state = states.wait_for("timeout, nothing for 2 s: q2r_right_hand_pose")
+        assert state["level"] == "warn"
+        assert state["rate_hz"]["q2r_left_hand_pose"] > 0.0
+        assert "q2r_left_hand_pose" in table.wait_for("1.00 2.00 -3.00 m")
+        assert "q2r_right_hand_" in table.wait_for("timeout  nothing yet")
+    eventually(lambda: re.search(r"q2r_left_hand_pose: timeout, \d+ messages", check.output), "a timeout of the pose")
+    assert "q2r_left_hand_pose" in table.wait_for("timeout  1.00 2.00 -3.00 m")
+    assert states.wait_for("q2r_left_hand_pose")["level"] == "error"
+    assert (check.interrupt(), table.interrupt()) == (0, 0)
+
+
+def test_after_its_duration_the_exit_code_says_whether_anything_arrives(node: Any, processes: Processes) -> None:
+    arguments = ("--ros-args", "-p", "duration:=3.0")
+    with left_hand_publishing(node):
+        hears = processes.start_module(MODULE, *arguments)
+        alone = processes.start_module(MODULE, *arguments, "-r", "__ns:=/elsewhere")
+        assert (hears.wait(LONG), alone.wait(LONG)) == (0, 1)

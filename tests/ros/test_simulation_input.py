@@ -1,0 +1,118 @@
+"""The scripted hands as other processes hear them, compared with the script itself."""
+
+from __future__ import annotations
+
+import time
+from queue import Queue
+from typing import Any
+
+import numpy as np
+import pytest
+
+from q2r2_control.inputs.scripted import ScriptedInput
+from q2r2_control.types import Array
+from tests.ros.conftest import NEEDS_ROS
+from tests.ros.processes import PATIENCE, Processes
+from tests.ros.waiting import States, drained, eventually
+
+pytest.importorskip("rclpy", reason=NEEDS_ROS)
+pytestmark = pytest.mark.usefixtures("interfaces")
+
+MODULE = "q2r2_control.ros.simulation_input"
+RATE = 50.0  # [Hz]
+
+
+def start(processes: Processes, **parameters: object) -> Any:
+    arguments = [argument for name, value in parameters.items() for argument in ("-p", f"{name}:={value}")]
+    return processes.start_module(MODULE, "--ros-args", *arguments)
+
+
+def subscribe(node: Any, hand: str) -> dict[str, Queue[Any]]:
+    from geometry_msgs.msg import PoseStamped, Twist
+    from quest2ros.msg import OVR2ROSInputs
+
+    queues: dict[str, Queue[Any]] = {}
+    for suffix, kind in (("pose", PoseStamped), ("twist", Twist), ("inputs", OVR2ROSInputs)):
+        queues[suffix] = Queue()
+        node.create_subscription(kind, f"q2r_{hand}_hand_{suffix}", queues[suffix].put, 100)
+    return queues
+
+
+def assert_a_part_of(received: Array, script: Array, tolerance: float = 0.0) -> None:
+    """``received`` is a run of rows of ``script``; the first few may be lost, until both sides know each other."""
+    starts = range(len(script) - len(received) + 1)
+    worst = [float(np.abs(script[start : start + len(received)] - received).max()) for start in starts]
+    assert min(worst) <= tolerance
+
+
+def test_poses_inputs_and_twists_are_the_scripts_own(node: Any, processes: Processes) -> None:
+    queues = subscribe(node, "right")
+    start(processes, side="right", trajectory="rotate", rate=RATE)
+    eventually(lambda: queues["pose"].qsize() >= 150, "three seconds of poses")
+    eventually(lambda: queues["inputs"].qsize() >= 150, "three seconds of inputs")
+    eventually(lambda: queues["twist"].qsize() >= 150, "three seconds of twists")
+    poses, inputs, twists = (drained(queues[suffix])[:150] for suffix in ("pose", "inputs", "twist"))
+
+    script = ScriptedInput("rotate", ["right"], rate_hz=RATE)
+    script.start()
+    expected = [sample for k in range(6) for sample in script.poll(float(k))]
+    positions = [[m.pose.position.x, m.pose.position.y, m.pose.position.z] for m in poses]
+    orientations = [[q.x, q.y, q.z, q.w] for q in (m.pose.orientation for m in poses)]
+    reference = np.array([[*sample.position, *sample.quaternion] for sample in expected])
+    assert_a_part_of(np.hstack([positions, orientations]), reference)
+    stamps = np.array([m.header.stamp.sec + 1e-9 * m.header.stamp.nanosec for m in poses])
+    np.testing.assert_allclose(np.diff(stamps), 1.0 / RATE, atol=1e-6)
+
+    pressed = np.array([[float(m.button_lower), float(m.button_upper)] for m in inputs])
+    assert 0.0 < pressed[:, 0].sum() * (1.0 / RATE) < 0.3, "the lower button is pressed to engage, and let go"
+    assert pressed[0, 0] == pressed[-1, 0] == 0.0
+    assert_a_part_of(pressed, np.array([[s.inputs.button_lower, s.inputs.button_upper] for s in expected], dtype=float))
+
+    linear = np.array([[m.linear.x, m.linear.y, m.linear.z] for m in twists])
+    angular = np.array([[m.angular.x, m.angular.y, m.angular.z] for m in twists])
+    assert np.linalg.norm(linear, axis=1).max() > 0.05
+    assert np.linalg.norm(angular, axis=1).max() > 0.1
+    motions = [script.hand_twist("right", s.pose_stamp) for s in expected]
+    assert_a_part_of(np.hstack([linear, angular]), np.array([[*m.linear, *m.angular] for m in motions]), 1e-6)
+
+
+def test_a_mode_publishes_its_topics_alone(node: Any, processes: Processes) -> None:
+    left, right = subscribe(node, "left"), subscribe(node, "right")
+    start(processes, side="left", mode="teleop")
+    start(processes, side="right", mode="velocity")
+    for queue in (left["pose"], left["inputs"], right["twist"]):
+        queue.get(timeout=PATIENCE)
+    published = {
+        f"{hand} {suffix}": len(node.get_publishers_info_by_topic(f"/q2r_{hand}_hand_{suffix}"))
+        for hand in ("left", "right")
+        for suffix in left
+    }
+    assert {name for name, count in published.items() if count} == {"left pose", "left inputs", "right twist"}
+
+
+def test_the_script_waits_until_both_hands_are_listened_to(node: Any, processes: Processes) -> None:
+    states = States(node, "simulation_input")
+    left = subscribe(node, "left")
+    process = start(processes, side="both", frame_id="room")
+    assert states.wait_for("waits for a subscriber of the right hand")["samples"] == 0
+    time.sleep(0.2)
+    assert left["pose"].empty()
+    right = subscribe(node, "right")
+    assert right["pose"].get(timeout=PATIENCE).header.frame_id == "room"
+    assert left["pose"].get(timeout=PATIENCE).header.frame_id == "room"
+    state = states.wait_for("circle of left and right")
+    assert state["level"] == "ok"
+    assert process.interrupt() == 0
+
+
+def test_a_bad_parameter_is_one_line(processes: Processes) -> None:
+    complaints = {
+        "side:=up": "parameter side: 'up': allowed are left, right, both",
+        "trajectory:=spiral": "parameter trajectory: 'spiral': allowed are circle, line",
+        "rate:=0.0": "allowed is 1 .. 250",
+    }
+    started = [processes.start_module(MODULE, "--ros-args", "-p", parameter) for parameter in complaints]
+    for process, complaint in zip(started, complaints.values(), strict=True):
+        assert process.wait(3.0 * PATIENCE) == 2
+        (line,) = process.output.splitlines()
+        assert complaint in line

@@ -1,0 +1,267 @@
+"""The endpoint between a headset on a real TCP connection and this process on real topics."""
+
+from __future__ import annotations
+
+import math
+import socket
+import struct
+import time
+from contextlib import suppress
+from queue import Empty, Queue
+from threading import Event, Lock, Thread
+from typing import Any
+
+import numpy as np
+import pytest
+
+from q2r2_control.inputs.messages import PROP_TOPICS
+from tests.ros.conftest import NEEDS_ROS
+from tests.ros.processes import PATIENCE, Processes, RosProcess
+from tests.ros.waiting import States, drained
+from tests.support.fake_headset import DIALECTS, KEEPALIVE, FakeHeadset, pack_twist
+
+pytest.importorskip("rclpy", reason=NEEDS_ROS)
+pytestmark = pytest.mark.usefixtures("interfaces")
+
+MODULE = "q2r2_control.ros.tcp_endpoint"
+IDENTITY = (0.0, 0.0, 0.0, -1.0)
+CDR = b"\0\1\0\0"
+
+every_dialect = pytest.mark.parametrize("dialect", DIALECTS)
+
+
+def start_endpoint(processes: Processes, *parameters: str) -> tuple[RosProcess, tuple[str, int]]:
+    """The running node, and where it listens."""
+    arguments = [argument for parameter in ("port:=0", *parameters) for argument in ("-p", parameter)]
+    process = processes.start_module(MODULE, "--ros-args", *arguments)
+    host, port = process.wait_for("listening on ").rsplit(" ", 1)[-1].split(":")
+    return process, (host, int(port))
+
+
+class LivingHeadset(FakeHeadset):
+    """Sends a keepalive now and then, as the app does, so that no slow machine makes it look dead."""
+
+    def __init__(self, address: tuple[str, int], dialect: str = "ros2") -> None:
+        super().__init__(address, dialect)
+        self._sending = Lock()
+        self._closed = Event()
+        self._thread = Thread(target=self._live, daemon=True)
+        self._thread.start()
+
+    def send(self, data: bytes) -> None:
+        with self._sending:
+            super().send(data)
+
+    def close(self) -> None:
+        self._closed.set()
+        self._thread.join()
+        super().close()
+
+    def _live(self) -> None:
+        with suppress(ConnectionError):
+            while not self._closed.wait(0.5):
+                self.send(KEEPALIVE)
+
+
+class Hand:
+    """Receives all topics of one hand, reliably."""
+
+    def __init__(self, node: Any, name: str) -> None:
+        from geometry_msgs.msg import PoseStamped, Twist
+        from quest2ros.msg import OVR2ROSInputs
+
+        self.name = name
+        self.queues: dict[str, Queue[Any]] = {}
+        for suffix, kind in (("pose", PoseStamped), ("twist", Twist), ("inputs", OVR2ROSInputs)):
+            self.queues[suffix] = Queue()
+            node.create_subscription(kind, f"q2r_{name}_hand_{suffix}", self.queues[suffix].put, 100)
+
+    def meet(self, headset: FakeHeadset) -> None:
+        """Until publisher and subscriber know each other a message may be lost: send until each topic has come."""
+        for suffix, queue in self.queues.items():
+            probe = {
+                "pose": headset.pose(self.name, (0.0, 0.0, 0.0), IDENTITY),
+                "twist": headset.twist(self.name, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)),
+                "inputs": headset.inputs(self.name),
+            }[suffix]
+            deadline = time.monotonic() + PATIENCE
+            while True:
+                headset.send(probe)
+                try:
+                    queue.get(timeout=0.1)
+                    break
+                except Empty:
+                    assert time.monotonic() < deadline, f"no {suffix} of the {self.name} hand"
+
+    def next(self, suffix: str, count: int) -> list[Any]:
+        """The next ``count`` messages that are no probes, some of which may still be on their way."""
+        messages: list[Any] = []
+        while len(messages) < count:
+            message = self.queues[suffix].get(timeout=PATIENCE)
+            if any(numbers(message)):
+                messages.append(message)
+        return messages
+
+
+def numbers(message: Any) -> list[float]:
+    """Position or linear velocity or buttons: what is all zero in a probe."""
+    if hasattr(message, "button_upper"):
+        return [message.button_upper, message.button_lower, message.press_index]
+    vector = message.linear if hasattr(message, "linear") else message.pose.position
+    return [vector.x, vector.y, vector.z]
+
+
+@every_dialect
+def test_what_a_headset_says_is_published_number_by_number(node: Any, processes: Processes, dialect: str) -> None:
+    _, address = start_endpoint(processes)
+    hands = [Hand(node, name) for name in ("left", "right")]
+    random = np.random.default_rng(3)
+    with LivingHeadset(address, dialect) as headset:
+        headset.send(headset.registrations())
+        for hand in hands:
+            hand.meet(headset)
+        for hand in hands:
+            poses = random.normal(size=(8, 7)).tolist()  # not normalised: that is not the endpoint's to decide
+            twists = random.normal(size=(8, 6)).tolist()
+            asked = node.get_clock().now().nanoseconds
+            for pose, twist in zip(poses, twists, strict=True):
+                headset.send(headset.pose(hand.name, tuple(pose[:3]), tuple(pose[3:]), frame_id="room"))
+                headset.send(headset.twist(hand.name, tuple(twist[:3]), tuple(twist[3:])))
+            headset.send(headset.inputs(hand.name, True, False, (0.5, -0.5, 0.25, 1.0)))
+            headset.send(headset.pose(hand.name, (math.nan, 1.0, math.inf), IDENTITY))
+            *published, odd = hand.next("pose", 9)
+            answered = node.get_clock().now().nanoseconds
+
+            orientations = [message.pose.orientation for message in published]
+            assert [numbers(message) for message in published] == [pose[:3] for pose in poses]
+            assert [[q.x, q.y, q.z, q.w] for q in orientations] == [pose[3:] for pose in poses]
+            assert {message.header.frame_id for message in published} == {"room"}
+            stamps = [message.header.stamp.sec * 10**9 + message.header.stamp.nanosec for message in published]
+            assert [asked, *stamps, answered] == sorted([asked, *stamps, answered])
+            np.testing.assert_equal(numbers(odd), [math.nan, 1.0, math.inf])
+            assert odd.header.frame_id == ""
+
+            velocities = hand.next("twist", 8)
+            assert [numbers(message) for message in velocities] == [twist[:3] for twist in twists]
+            assert [[m.angular.x, m.angular.y, m.angular.z] for m in velocities] == [twist[3:] for twist in twists]
+            (inputs,) = hand.next("inputs", 1)
+            assert (inputs.button_upper, inputs.button_lower) == (True, False)
+            sticks = (inputs.thumb_stick_horizontal, inputs.thumb_stick_vertical)
+            assert (*sticks, inputs.press_index, inputs.press_middle) == (0.5, -0.5, 0.25, 1.0)
+
+
+def test_best_effort_subscribers_hear_too_and_a_configured_frame_replaces_the_headsets(
+    node: Any, processes: Processes
+) -> None:
+    from geometry_msgs.msg import PoseStamped
+
+    from q2r2_control.ros.node import STREAM_QOS
+
+    _, address = start_endpoint(processes, "left_frame_id:=base")
+    received: dict[str, Queue[Any]] = {}
+    for hand in ("left", "right"):
+        received[hand] = Queue()
+        node.create_subscription(PoseStamped, f"q2r_{hand}_hand_pose", received[hand].put, STREAM_QOS)
+    frames: dict[str, str] = {}
+    with LivingHeadset(address) as headset:
+        deadline = time.monotonic() + PATIENCE
+        while len(frames) < 2:
+            assert time.monotonic() < deadline
+            for hand in ("left", "right"):
+                headset.send(headset.pose(hand, (1.0, 2.0, 3.0), IDENTITY, frame_id="room"))
+            time.sleep(0.05)
+            for hand, queue in received.items():
+                for message in drained(queue):
+                    frames[hand] = message.header.frame_id
+    assert frames == {"left": "base", "right": "room"}
+
+
+def send_until_received(publisher: Any, message: Any, headset: FakeHeadset) -> bytes:
+    """Publish until the headset gets it: both sides may not know each other yet. Fails when it gets anything else."""
+    deadline = time.monotonic() + PATIENCE
+    while time.monotonic() < deadline:
+        publisher.publish(message)
+        try:
+            frame = headset.read_frame(0.2)
+        except TimeoutError:
+            continue
+        assert frame is not None
+        assert frame[0] == publisher.topic_name.removeprefix("/")
+        return frame[1]
+    raise AssertionError(f"nothing arrived from {publisher.topic_name}")
+
+
+@every_dialect
+def test_vibrations_and_twists_reach_a_headset_that_subscribed_byte_by_byte(
+    node: Any, processes: Processes, dialect: str
+) -> None:
+    from geometry_msgs.msg import Twist, Vector3
+    from quest2ros.msg import OVR2ROSHapticFeedback
+
+    _, address = start_endpoint(processes)
+    header = CDR if dialect == "ros2" else b""
+    haptic = node.create_publisher(OVR2ROSHapticFeedback, "q2r_right_hand_haptic_feedback", 10)
+    dice, q2r = (node.create_publisher(Twist, topic, 10) for topic in PROP_TOPICS)
+    twist = Twist(linear=Vector3(x=1.0, y=2.0, z=3.0), angular=Vector3(x=4.0, y=5.0, z=6.0))
+    with LivingHeadset(address, dialect) as headset:
+        headset.send(headset.registrations())
+        headset.send(headset.command("__subscribe", topic="dice_twist", message_name="geometry_msgs/Twist"))
+        headset.read_until("__topic_list")
+        payload = send_until_received(haptic, OVR2ROSHapticFeedback(frequency=0.25, amplitude=7.0), headset)
+        assert payload == header + struct.pack("<2f", 0.25, 1.0)
+    with LivingHeadset(address, dialect) as headset:
+        headset.send(headset.command("__subscribe", topic="dice_twist", message_name="geometry_msgs/Twist"))
+        headset.send(headset.command("__topic_list"))
+        headset.read_until("__topic_list")
+        for _ in range(20):
+            q2r.publish(twist)  # it did not subscribe to this one
+        assert send_until_received(dice, twist, headset) == pack_twist(dialect, (1.0, 2.0, 3.0), (4.0, 5.0, 6.0))
+    with LivingHeadset(address, dialect) as headset:
+        headset.send(headset.command("__subscribe", topic="q2r_twist", message_name="geometry_msgs/Twist"))
+        headset.send(headset.command("__topic_list"))
+        headset.read_until("__topic_list")
+        assert send_until_received(q2r, twist, headset) == pack_twist(dialect, (1.0, 2.0, 3.0), (4.0, 5.0, 6.0))
+
+
+def test_topics_are_silent_without_a_headset_and_a_headset_of_the_other_dialect_may_follow(
+    node: Any, processes: Processes
+) -> None:
+    process, address = start_endpoint(processes)
+    states = States(node, "tcp_endpoint")
+    assert states.wait_for("no headset is connected")["level"] == "warn"
+    hand = Hand(node, "left")
+    with LivingHeadset(address, "ros2") as headset:
+        headset.send(headset.registrations())
+        hand.meet(headset)
+        headset.send(headset.pose("left", (1.0, 0.0, 0.0), IDENTITY) + headset.inputs("left", lower=True))
+        hand.next("pose", 1)
+        hand.next("inputs", 1)
+        state = states.wait_for("is connected")
+        assert (state["level"], state["dialect"], state["connections"]) == ("ok", "ROS2", 1)
+    state = states.wait_for("no headset is connected")
+    assert state["last_disconnect"]
+    time.sleep(0.5)
+    assert all(not drained(queue) for queue in hand.queues.values()), "something was published that nobody sent"
+    assert len(node.get_publishers_info_by_topic("/q2r_left_hand_pose")) == 1
+    with LivingHeadset(address, "ros1") as headset:
+        headset.send(headset.registrations() + headset.pose("left", (2.0, 0.0, 0.0), IDENTITY))
+        assert numbers(hand.next("pose", 1)[0]) == [2.0, 0.0, 0.0]
+        state = states.wait_for("is connected")
+        assert (state["dialect"], state["connections"]) == ("ROS1", 2)
+        headset.send(b"\xff" * 64)  # no protocol at all
+        process.wait_for("dropped: frame of")
+    assert process.interrupt() == 0
+
+
+def test_an_address_that_cannot_be_bound_and_a_port_out_of_range_are_one_line(processes: Processes) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        taken = other.getsockname()[1]
+        complaints = {
+            f"port:={taken}": f"cannot listen on 127.0.0.1:{taken}",
+            "port:=65536": "allowed is 0 .. 65535",
+        }
+        started = [processes.start_module(MODULE, "--ros-args", "-p", parameter) for parameter in complaints]
+        assert [process.wait(2.0 * PATIENCE) for process in started] == [2, 2]
+    for process, complaint in zip(started, complaints.values(), strict=True):
+        (line,) = process.output.splitlines()
+        assert complaint in line
