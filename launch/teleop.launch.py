@@ -1,9 +1,9 @@
-"""The nodes of q2r2 ros up for ``ros2 launch``: ``ros2 launch q2r2_control teleop.launch.py config:=... input:=...``."""
+"""What q2r2 ros up starts, for ROS: ``ros2 launch q2r2_control teleop.launch.py config:=... input:=...``."""
 
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument, Shutdown
-from launch.conditions import LaunchConfigurationEquals
-from launch.substitutions import LaunchConfiguration
+from launch.conditions import IfCondition
+from launch.substitutions import EqualsSubstitution, LaunchConfiguration
 from launch_ros.actions import Node
 
 # Executable, and the input that it is for; None: any.
@@ -29,7 +29,7 @@ def generate_launch_description() -> LaunchDescription:
             executable=executable,
             output="screen",
             parameters=[{"config": LaunchConfiguration("config")}],
-            condition=None if source is None else LaunchConfigurationEquals("input", source),
+            condition=None if source is None else IfCondition(EqualsSubstitution(LaunchConfiguration("input"), source)),
             on_exit=Shutdown(reason=f"{executable} ended"),
         )
         for executable, source in NODES

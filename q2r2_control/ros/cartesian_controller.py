@@ -33,6 +33,8 @@ from q2r2_control.ros.supervisor import Phase, Supervisor
 from q2r2_control.ros.target_stream import StreamSettings
 from q2r2_control.types import Reference, RobotState
 
+_RECENT = 1.0  # refused targets are a warning for this long [s]
+
 # Parameters that may change while the node runs: name, unit or meaning, least and greatest value.
 _STREAM_PARAMETERS = (
     ("timeout", "target_timeout", "an arm without targets for this long holds [s]", 0.02, 2.0),
@@ -68,8 +70,6 @@ class CartesianControllerNode(BaseNode):
         for target, table in ((self._streams, _STREAM_PARAMETERS), (self._watch, _WATCH_PARAMETERS)):
             self._declare(target, table)
         self.add_post_set_parameters_callback(self._on_parameters)
-        self._controller = CartesianController(self._robot, config.control)
-        self._supervisor = Supervisor(self._robot, self._controller, self._streams, self._watch)
         self._output = make_output(
             self.parameter("output", "trajectory", "trajectory, float64, joint_state, lbr_position, lbr_torque"),
             self.parameter("output_topic", "", "joint commands; empty: the output's usual one"),
@@ -79,9 +79,12 @@ class CartesianControllerNode(BaseNode):
             1.0 / rate,
             self._topics("lbr_topic", "/{arm}/command/lbr_joint_position_command", "LBR commands"),
         )
+        self._target_topics = self._topics("target_topic", "/q2r2/{arm}/target_frame", "targets")
+        self._controller = CartesianController(self._robot, config.control)
+        self._supervisor = Supervisor(self._robot, self._controller, self._streams, self._watch)
         self._measured: RobotState | None = None
         self._reference: Reference | None = None
-        self._refused: dict[str, str] = {}
+        self._refused: dict[str, _Refusal] = {}
         self._rejected = dict.fromkeys(self._robot.arms, 0)
         self._ticks, self._reported_at, self._last_tick = 0, time.monotonic(), self.now
         self._connect()
@@ -125,11 +128,8 @@ class CartesianControllerNode(BaseNode):
         return {arm: pattern.replace("{arm}", arm) for arm in self._robot.arms}
 
     def _connect(self) -> None:
-        self._target_topics = self._topics("target_topic", "/q2r2/{arm}/target_frame", "targets")
         for arm, topic in self._target_topics.items():
-            self.create_subscription(
-                PoseStamped, topic, lambda message, arm=arm: self._on_target(arm, message), COMMAND_QOS
-            )
+            self.create_subscription(PoseStamped, topic, partial(self._on_target, arm), COMMAND_QOS)
         self.create_subscription(JointState, "joint_states", self._on_joint_state, STREAM_QOS)
         self._safe_targets = {
             arm: self.create_publisher(PoseStamped, f"~/safe_target/{arm}", COMMAND_QOS) for arm in self._robot.arms
@@ -156,25 +156,26 @@ class CartesianControllerNode(BaseNode):
     def _on_target(self, arm: str, message: PoseStamped) -> None:
         frame = self._frames[arm]
         if message.header.frame_id != frame.name:
-            self._note(arm, f"frame_id {message.header.frame_id!r:.40}; allowed: {frame.name!r}")
+            self._refuse(arm, "frame", f"frame_id {message.header.frame_id!r:.40}; allowed: {frame.name!r}")
             return
         pose = pose_of(message.pose)
         if pose is None:
-            self._note(arm, "not a finite pose with a unit quaternion")
+            self._refuse(arm, "pose", "not a finite pose with a unit quaternion")
             return
-        self._note(arm, self._supervisor.take_target(arm, frame.pose * pose, self.now))
-
-    def _note(self, arm: str, fault: str | None) -> None:
-        """Say why targets are not used: once, until one is used again."""
-        if fault is None:
+        refusal = self._supervisor.take_target(arm, frame.pose * pose, self.now)
+        if refusal is None:
             self._refused.pop(arm, None)
-            return
+        else:
+            self._refuse(arm, "stream", refusal)
+
+    def _refuse(self, arm: str, kind: str, fault: str) -> None:
+        """Say why targets are not used: once for each kind of fault, until one is used again or none come any more."""
         self._rejected[arm] += 1
-        if arm not in self._refused:
+        before = self._refused.get(arm)
+        self._refused[arm] = _Refusal(kind, fault, self.now)
+        if before is None or before.kind != kind:
             self.get_logger().warning(f"target of {arm} not used: {fault}")
-            self._refused[arm] = fault
             self.report_health()
-        self._refused[arm] = fault
 
     def _tick(self) -> None:
         now = self.now
@@ -242,7 +243,9 @@ class CartesianControllerNode(BaseNode):
         if self._supervisor.fault is not None:
             return ERROR, self._supervisor.fault
         crowded = [arm for arm, topic in self._target_topics.items() if self.count_publishers(topic) > 1]
-        lines = [f"target of {arm} not used: {fault}" for arm, fault in self._refused.items()]
+        recent = {arm: refusal for arm, refusal in self._refused.items() if self.now - refusal.stamp <= _RECENT}
+        self._refused = recent
+        lines = [f"target of {arm} not used: {refusal.fault}" for arm, refusal in recent.items()]
         lines += [f"{self._target_topics[arm]} has more than one publisher" for arm in crowded]
         return (WARN, "; ".join(lines)) if lines else (OK, "paused" if self._supervisor.paused else "active")
 
@@ -252,6 +255,15 @@ class CartesianControllerNode(BaseNode):
         while self._supervisor.phase is Phase.BRAKING:
             time.sleep(self._period)
             self._tick()
+
+
+@dataclass(frozen=True, slots=True)
+class _Refusal:
+    """Why an arm's last target was not used."""
+
+    kind: str
+    fault: str
+    stamp: float  # [s]
 
 
 @dataclass(frozen=True, slots=True)

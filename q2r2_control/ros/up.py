@@ -127,15 +127,15 @@ def _watch(
 def _end(
     running: Mapping[str, subprocess.Popen[str]], lines: queue.SimpleQueue[str], say: Callable[[str], None]
 ) -> None:
-    """Last started, first asked: hands, then arms, then the robot, each by its own process id."""
-    for number, patience in _PATIENCE.items():
-        for process in reversed(running.values()):
+    """Last started, first ended, one after the other: the robot is there until the controller has braked it."""
+    for process in reversed(list(running.values())):
+        for number, patience in _PATIENCE.items():
             if process.poll() is None:
                 process.send_signal(number)
-        deadline = time.monotonic() + patience
-        while time.monotonic() < deadline and any(process.poll() is None for process in running.values()):
-            _drain(lines, say)
-            time.sleep(0.02)
+            deadline = time.monotonic() + patience
+            while process.poll() is None and time.monotonic() < deadline:
+                _drain(lines, say)
+                time.sleep(0.02)
     for name, process in running.items():
         if process.poll() is None:
             say(f"[up] {name} (process {process.pid}) did not end and is killed")
