@@ -1,8 +1,9 @@
 """``cartesian_controller``: the built-in controller for all arms of a cell, between target poses and joint commands.
 
-Targets come in on ``target_topic`` of each arm, ``/q2r2/{arm}/target_frame`` unless told otherwise: ``{arm}`` stands
-for the arm's name, so that a controller an arm in one namespace (``/robot/{arm}_arm_clik_controller/target_frame``) and
-a namespace an arm (``/{arm}/target_pose``) are both one parameter. What is done with them: :mod:`supervisor`.
+Targets come in on a topic an arm, ``/q2r2/left/target_frame`` for the left one. The parameters ``left.target_topic``
+and ``left.target_frame_id`` make it any other, be it a controller an arm in one namespace
+(``/robot/left_arm_clik_controller/target_frame``) or a namespace an arm (``/left/target_pose``). What is done with
+targets: :mod:`supervisor`.
 """
 
 from __future__ import annotations
@@ -33,6 +34,7 @@ from q2r2_control.ros.supervisor import Phase, Supervisor
 from q2r2_control.ros.target_stream import StreamSettings
 from q2r2_control.types import Reference, RobotState
 
+_LONGEST_STOP = 3.0  # [s]
 _RECENT = 1.0  # refused targets are a warning for this long [s]
 
 # Parameters that may change while the node runs: name, unit or meaning, least and greatest value.
@@ -57,14 +59,7 @@ class CartesianControllerNode(BaseNode):
         config = load_config(self.parameter("config", "config/dual_iiwa7.yaml", "YAML of the cell"))
         rate = self.parameter("rate", 250.0, "of the control loop [Hz]", at_least=20, at_most=1000)
         self._robot = Robot.from_config(config)
-        self._frames = self._frames_of(
-            self.parameter(
-                "target_frame_id",
-                WORLD,
-                "frame_id that targets have to have: a link that does not move ({arm} stands for the arm's name), or "
-                "any other name, which then means the cell's world",
-            )
-        )
+        self._frames = {arm: self._frame_of(arm) for arm in self._robot.arms}
         self._streams, self._watch = StreamSettings(), WatchSettings()
         self._settings: dict[str, tuple[Any, str]] = {}
         for target, table in ((self._streams, _STREAM_PARAMETERS), (self._watch, _WATCH_PARAMETERS)):
@@ -106,26 +101,30 @@ class CartesianControllerNode(BaseNode):
                 target, field = self._settings[parameter.name]
                 setattr(target, field, parameter.value)
 
-    def _frames_of(self, pattern: str) -> dict[str, _Frame]:
-        """Each arm's frame of targets."""
-        frames, model, data = {}, self._robot.model, self._robot.model.createData()
-        pin.framesForwardKinematics(model, data, self._robot.home)
-        for arm in self._robot.arms:
-            name, pose = pattern.replace("{arm}", arm), pin.SE3.Identity()
-            if name != WORLD and model.existFrame(name, pin.FrameType.BODY):
-                index = model.getFrameId(name, pin.FrameType.BODY)
-                if model.frames[index].parentJoint != 0:
-                    raise ConfigError(f"target_frame_id = {name!r:.60}: that link moves; allowed: one that does not")
-                pose = data.oMf[index].copy()
-            frames[arm] = _Frame(name, pose)
-        return frames
+    def _frame_of(self, arm: str) -> _Frame:
+        """An arm's frame of targets."""
+        name = self.parameter(
+            f"{arm}.target_frame_id",
+            WORLD,
+            "frame_id that targets have to have: a link that does not move, or any other name for the cell's world",
+        )
+        model = self._robot.model
+        if name == WORLD or not model.existFrame(name, pin.FrameType.BODY):
+            return _Frame(name, pin.SE3.Identity())
+        frame = model.frames[model.getFrameId(name, pin.FrameType.BODY)]
+        if frame.parentJoint != 0:
+            raise ConfigError(f"{arm}.target_frame_id = {name!r:.60}: that link moves; allowed: one that does not")
+        return _Frame(name, frame.placement.copy())
 
     def _topics(self, name: str, default: str, what: str) -> dict[str, str]:
-        """A topic for each arm, from a pattern that has to tell them apart."""
-        pattern = self.parameter(name, default, f"topic of {what}; {{arm}} stands for the arm's name")
-        if "{arm}" not in pattern and len(self._robot.arms) > 1:
-            raise ConfigError(f"{name} = {pattern!r:.80}: expected {{arm}} in it, which stands for the arm's name")
-        return {arm: pattern.replace("{arm}", arm) for arm in self._robot.arms}
+        """A topic for each arm; ``default`` has {arm} where the arm's name goes."""
+        topics: dict[str, str] = {}
+        for arm in self._robot.arms:
+            topic = self.parameter(f"{arm}.{name}", default.format(arm=arm), f"topic of {what} of this arm")
+            if topic in topics.values():
+                raise ConfigError(f"{arm}.{name} = {topic!r:.80}: another arm has it; allowed: a topic of its own")
+            topics[arm] = topic
+        return topics
 
     def _connect(self) -> None:
         for arm, topic in self._target_topics.items():
@@ -183,8 +182,10 @@ class CartesianControllerNode(BaseNode):
         dt = min(now - self._last_tick, LONGEST_DT)
         self._last_tick = now
         self._ticks += 1
-        if dt <= 0.0:
-            return
+        if dt > 0.0:
+            self._advance(now, dt)
+
+    def _advance(self, now: float, dt: float) -> None:
         was_active = self._supervisor.phase is Phase.ACTIVE
         reference = self._supervisor.tick(now, dt)
         if not was_active and self._supervisor.phase is Phase.ACTIVE and self._measured is not None:
@@ -252,9 +253,10 @@ class CartesianControllerNode(BaseNode):
     def close(self) -> None:
         """Bring the arms to rest along the certified stop before the commands end."""
         self._supervisor.stop("ending")
-        while self._supervisor.phase is Phase.BRAKING:
+        deadline = time.monotonic() + _LONGEST_STOP
+        while self._supervisor.phase is Phase.BRAKING and time.monotonic() < deadline:
             time.sleep(self._period)
-            self._tick()
+            self._advance(self.now, self._period)  # simulated time may have ended already
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -49,7 +50,7 @@ class Cell:
         node.create_subscription(JointState, "/joint_states", self._on_joint_state, 100)
         node.create_subscription(TFMessage, "/tf", self._on_transforms, 100)
         for name in ("mujoco_robot", "cartesian_controller"):
-            node.create_subscription(String, f"/{name}/state", lambda m, name=name: self._on_state(name, m), 10)
+            node.create_subscription(String, f"/{name}/state", partial(self._on_state, name), 10)
 
     def _on_joint_state(self, message: JointState) -> None:
         place = {name: index for index, name in enumerate(message.name)}
@@ -110,8 +111,7 @@ class Cell:
     def engage(self, *arms: str) -> Stream:
         """Begin streams of targets at the tools."""
         stream = Stream(self, {arm: self.tool(arm) for arm in arms})
-        for arm in arms:
-            wait(lambda arm=arm: self.state(f"{arm}_state") == "following", f"{arm} follows")
+        wait(lambda: all(self.state(f"{arm}_state") == "following" for arm in arms), f"{arms} follow")
         return stream
 
 

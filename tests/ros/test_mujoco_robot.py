@@ -71,6 +71,12 @@ def publish_steadily(publisher: Any, messages: list[Any], period: float = 0.01) 
         time.sleep(period)
 
 
+def send_until_refused(cell: Cell, publisher: Any, message: Any) -> None:
+    before = cell.state("refused_commands", "mujoco_robot")
+    publish_steadily(publisher, [message] * 10)
+    wait(lambda: cell.state("refused_commands", "mujoco_robot") > before, "it is refused")
+
+
 def ramp(robot: Robot, joint: int, way: float, count: int) -> list[np.ndarray]:
     """Postures from home on, one joint moving steadily."""
     postures = [robot.home.copy() for _ in range(count)]
@@ -139,9 +145,7 @@ def test_commands_that_cannot_be_followed_move_nothing_and_are_reported_once(cel
         JointTrajectory(joint_names=list(robot.joint_names)),
     ]
     for message in bad:
-        before = cell.state("refused_commands", "mujoco_robot")
-        publish_steadily(publisher, [message] * 10)
-        wait(lambda before=before: cell.state("refused_commands", "mujoco_robot") > before, "it is refused")
+        send_until_refused(cell, publisher, message)
         assert np.abs(cell.q - robot.home).max() < 5e-3
         assert cell.state("level", "mujoco_robot") == "warn"
     assert cell.processes[0].output.count("joint_trajectory: refused") == 1
