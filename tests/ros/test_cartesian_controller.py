@@ -37,6 +37,8 @@ from tests.ros.cell import CONFIG, Cell, Stream, wait
 # How far the simulated arms lag behind their reference at the speeds of these tests, between two arms.
 TRACKING = 0.01  # [m]
 STILL = 2e-3  # [rad]
+# Longer than by default, so that a machine that is busy elsewhere does not look like a fault.
+PATIENT = ("-p", "joint_state_timeout:=0.5", "-p", "target_timeout:=0.5")
 
 
 @pytest.fixture(scope="module")
@@ -59,7 +61,7 @@ def start(processes: Processes, name: str, *arguments: str) -> RosProcess:
 @pytest.fixture(scope="module")
 def started(domain: int, running: Processes, robot: Robot) -> Iterator[Cell]:
     with spun_node(domain) as node:
-        yield Cell(node, robot, start(running, "mujoco_robot"), start(running, "cartesian_controller"))
+        yield Cell(node, robot, start(running, "mujoco_robot"), start(running, "cartesian_controller", *PATIENT))
 
 
 @pytest.fixture
@@ -222,15 +224,16 @@ def test_a_controller_that_is_killed_leaves_the_arms_to_stop_and_its_return_does
     started: Cell, cell: Cell, running: Processes, streams: list[Stream]
 ) -> None:
     stream = engage(cell, streams, "left", "right")
-    stream.poses["left"] = shifted(stream.poses["left"], 0.25, 0.0, 0.1)
-    wait(lambda: moved(cell, 5) > 2e-3, "the arms are in mid-motion")
+    begin = stream.poses["left"]
+    stream.poses["left"] = shifted(begin, 0.25, 0.0, 0.1)
+    wait(lambda: np.linalg.norm(cell.tool("left").translation - begin.translation) > 0.05, "the arm is in mid-motion")
     os.kill(cell.processes[1].pid, signal.SIGKILL)
     killed = time.monotonic()
     rest = at_rest(cell)
     # Braking takes |v| / a, at most 1.75 / 10 s here; the rest is for a machine that delivers late.
     moving = [measured.t for measured in cell.measured if np.abs(measured.q - rest).max() > 5e-3]
-    assert max(moving) - killed < 0.15 + 0.175 + 0.2
-    back = start(running, "cartesian_controller")
+    assert 0.0 < max(moving) - killed < 0.15 + 0.175 + 0.2
+    back = start(running, "cartesian_controller", *PATIENT)
     started.processes = (started.processes[0], back)
     started.states.pop("cartesian_controller", None)
     cell.wait_until_active()
@@ -250,16 +253,24 @@ def faulty_joint_state(kind: str, robot: Robot, q: np.ndarray) -> JointState:
     return JointState(name=names, position=position)
 
 
-@pytest.mark.parametrize("kind", ["a joint is missing", "not a number", "a jump", "a stall"])
+@pytest.mark.parametrize(
+    ("kind", "said"),
+    [
+        ("a joint is missing", "no joint left_A1"),
+        ("not a number", "position of left_A4 is not finite"),
+        ("a jump", "jumped by 0."),
+        ("a stall", "no joint states for"),
+    ],
+)
 def test_joint_states_that_cannot_be_believed_stop_the_arms_with_one_diagnostic(
-    cell: Cell, robot: Robot, streams: list[Stream], kind: str
+    cell: Cell, robot: Robot, streams: list[Stream], kind: str, said: str
 ) -> None:
     output = cell.processes[1].output
     stream = engage(cell, streams, "left")
     stream.move("left", (0.0, 0.0, 0.03))
     if kind == "a stall":
         os.kill(cell.processes[0].pid, signal.SIGSTOP)
-        time.sleep(0.4)
+        time.sleep(1.0)
         os.kill(cell.processes[0].pid, signal.SIGCONT)
     else:
         publisher = cell.node.create_publisher(JointState, "/joint_states", 10)
@@ -267,10 +278,10 @@ def test_joint_states_that_cannot_be_believed_stop_the_arms_with_one_diagnostic(
         wait(lambda: publisher.get_subscription_count() >= 2, "the controller listens")
         publisher.publish(faulty_joint_state(kind, robot, cell.q))
         cell.node.destroy_publisher(publisher)
-    wait(lambda: "joint states: " in cell.processes[1].output[len(output) :], "it is reported")
+    wait(lambda: f"joint states: {said}" in cell.processes[1].output[len(output) :], "it is reported")
     wait(lambda: "active: " in cell.processes[1].output[len(output) :], "the controller is active again")
     stream.move("left", (0.05, 0.0, 0.0))
-    assert cell.processes[1].output[len(output) :].count("joint states: ") == 1
+    assert cell.processes[1].output[len(output) :].count(f"joint states: {said}") == 1
     wait(lambda: cell.state("left_state") == "holding", "the arm holds")
     rest = at_rest(cell)
     time.sleep(0.3)
@@ -302,7 +313,7 @@ def test_parameters_change_together_or_not_at_all(cell: Cell) -> None:
     assert not sent.result().result.successful
     read = client.get_parameters(["target_timeout", "engage_distance"])
     wait(read.done, "the parameters are read")
-    assert [value.double_value for value in read.result().values] == [0.15, 0.03]
+    assert [value.double_value for value in read.result().values] == [0.5, 0.03]
 
 
 def test_it_follows_in_another_layout_and_frame_with_another_output_and_on_simulated_time(
