@@ -274,9 +274,9 @@ def test_joint_states_that_cannot_be_believed_stop_the_arms_with_one_diagnostic(
         os.kill(cell.processes[0].pid, signal.SIGCONT)
     else:
         publisher = cell.node.create_publisher(JointState, "/joint_states", 10)
-        wait(publisher.get_subscription_count, "joint states are listened to")
-        wait(lambda: publisher.get_subscription_count() >= 2, "the controller listens")
-        publisher.publish(faulty_joint_state(kind, robot, cell.q))
+        message = faulty_joint_state(kind, robot, cell.q)
+        # Whoever was killed before counts as a listener for a while: only the report says that it has arrived.
+        wait(lambda: publisher.publish(message) or said in cell.processes[1].output[len(output) :], "it is reported")
         cell.node.destroy_publisher(publisher)
     wait(lambda: f"joint states: {said}" in cell.processes[1].output[len(output) :], "it is reported")
     wait(lambda: "active: " in cell.processes[1].output[len(output) :], "the controller is active again")
