@@ -258,7 +258,7 @@ def faulty_joint_state(kind: str, robot: Robot, q: np.ndarray) -> JointState:
     [
         ("a joint is missing", "no joint left_A1"),
         ("not a number", "position of left_A4 is not finite"),
-        ("a jump", "jumped by 0."),
+        ("a jump", "left_A4 jumped by 0."),
         ("a stall", "no joint states for"),
     ],
 )
