@@ -3,13 +3,24 @@
 from __future__ import annotations
 
 import sys
+from enum import StrEnum
 from typing import Annotated
 
 import typer
 
+from q2r2_control.config import load_config
 from q2r2_control.ros.build import BuildError, build_interfaces
+from q2r2_control.ros.up import nodes_of, run_together
 
 app = typer.Typer(rich_markup_mode=None, help="ROS 2 Jazzy, from apt or from the Python registry.")
+
+
+class HandSource(StrEnum):
+    """Where the hands' topics come from."""
+
+    SCRIPTED = "scripted"
+    HEADSET = "headset"
+    NONE = "none"
 
 
 @app.command("build-interfaces", epilog="Example: q2r2 ros build-interfaces")
@@ -25,3 +36,18 @@ def build_interfaces_command(
     except BuildError as error:
         print(f"q2r2: {error}", file=sys.stderr)
         raise typer.Exit(1) from None
+
+
+@app.command(epilog="Example: q2r2 ros up config/dual_iiwa7.yaml --input headset")
+def up(
+    config: Annotated[str, typer.Argument(metavar="CONFIG", help="YAML of the cell.")],
+    input: Annotated[
+        HandSource, typer.Option(help="SimulationInput, tcp_endpoint, or neither: another node sends the hands.")
+    ] = HandSource.SCRIPTED,
+) -> None:
+    """Start the simulated robot, the controller, both arms' teleop and an input as ROS nodes, until Ctrl-C.
+
+    A node that ends by itself is reported, and all others are stopped: exit 1.
+    """
+    load_config(config)
+    raise typer.Exit(run_together(nodes_of(config, input.value), lambda line: print(line, flush=True)))

@@ -14,6 +14,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import String
@@ -118,7 +119,12 @@ def run_node(make: Callable[[], Node], args: Sequence[str] | None = None) -> int
 
     A fault of its configuration is one line on stderr and exit code 2. ``node.close()`` is called if there is one.
     """
-    rclpy.init(args=list(sys.argv if args is None else args), signal_handler_options=rclpy.SignalHandlerOptions.NO)
+    name = sys.argv[0].rsplit("/", 1)[-1]
+    try:
+        rclpy.init(args=list(sys.argv if args is None else args), signal_handler_options=rclpy.SignalHandlerOptions.NO)
+    except rclpy_implementation.RCLError as error:  # such as arguments that cannot be parsed
+        print(f"{name}: {error}", file=sys.stderr)
+        return 2
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
@@ -129,8 +135,8 @@ def run_node(make: Callable[[], Node], args: Sequence[str] | None = None) -> int
         executor.add_node(node)
         while rclpy.ok() and not stop.is_set() and getattr(node, "exit_code", None) is None:
             executor.spin_once(timeout_sec=0.1)
-    except Q2R2Error as error:
-        print(f"{sys.argv[0].rsplit('/', 1)[-1]}: {error}", file=sys.stderr)
+    except (Q2R2Error, ParameterException) as error:
+        print(f"{name}: {error}", file=sys.stderr)
         return 2
     except ExternalShutdownException:
         pass

@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Generator, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from threading import Thread
 from typing import Any
@@ -55,6 +56,13 @@ def processes(domain: int, tmp_path: Path, request: pytest.FixtureRequest) -> It
 @pytest.fixture
 def node(domain: int) -> Iterator[Any]:
     """An ``rclpy`` node in the private domain, spun by a thread of its own."""
+    with spun_node(domain) as made:
+        yield made
+
+
+@contextmanager
+def spun_node(domain: int) -> Iterator[Any]:
+    """The same for fixtures that outlive one test."""
     import rclpy
     from rclpy.executors import SingleThreadedExecutor
 

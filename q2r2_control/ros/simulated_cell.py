@@ -1,0 +1,169 @@
+"""The simulated cell behind ``mujoco_robot``: commands that come when they come, a plant that runs in fixed steps."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from q2r2_control.config import Config
+from q2r2_control.plants.follower import JointFollower
+from q2r2_control.plants.mujoco import MujocoPlant
+from q2r2_control.robot.robot import Robot
+from q2r2_control.types import Array, Command, CommandMode, RobotState
+
+# A loop that fell further behind drops the time instead of catching up in one leap [s].
+_LONGEST_CATCH_UP = 0.05
+
+
+@dataclass(frozen=True, slots=True)
+class JointSetpoint:
+    """A command for the joints that it names; velocities may be unknown."""
+
+    names: Sequence[str]
+    q: Array  # [rad]
+    v: Array | None  # [rad/s]
+    delay: float = 0.0  # from receipt until it is due [s]
+
+
+class SimulatedCell:
+    """Plant, follower of commands, and what happens without commands: a stop and position servos, in either mode.
+
+    Every refusal is a line of text that is returned; nothing is commanded then.
+    """
+
+    def __init__(self, robot: Robot, config: Config, hold_after: float, max_jump: float) -> None:
+        self.robot = robot
+        self.plant = MujocoPlant(robot, config)
+        self.loose_objects = frozenset(config.mujoco.objects)
+        self.dropped = 0.0  # time that the simulation fell behind in all [s]
+        self._hold_after, self._max_jump = hold_after, max_jump
+        self._columns = {name: index for index, name in enumerate(robot.joint_names)}
+        self._timestep = config.mujoco.timestep
+        self._follower = JointFollower(robot.home, config.control.acceleration_limit, robot.velocity_limit)
+        self.fingers = tuple(f"{side}_{joint}" for side, arm in config.arms.items() for joint in arm.gripper.joints)
+        self._finger_q = [self.plant.model.joint(name).qposadr[0] for name in self.fingers]
+        self._finger_v = [self.plant.model.joint(name).dofadr[0] for name in self.fingers]
+        self._finger_force: dict[str, list[int]] = {
+            side: [self.plant.model.actuator(f"{side}_{joint}").id for joint in arm.gripper.joints]
+            for side, arm in config.arms.items()
+        }
+        self._time: float | None = None
+        self.reset()
+
+    def reset(self) -> None:
+        """Home, at rest, grippers open, no command."""
+        self.plant.reset()
+        self._follower.stop(self.robot.home, np.zeros_like(self.robot.home))
+        self._tau: Array | None = None
+        self._last_command = -math.inf
+        self._openings = dict.fromkeys(self.plant.gripper_openings(), 1.0)
+
+    def mode(self, now: float) -> str:
+        """What drives the arms: position or torque commands, or nobody."""
+        if now - self._last_command > self._hold_after:
+            return "holding"
+        return "position" if self._tau is None else "torque"
+
+    def command_positions(self, setpoint: JointSetpoint, now: float) -> str | None:
+        """Follow joint positions that came at ``now`` [s]; joints of others may be among them."""
+        fault, columns = self._columns_of(setpoint)
+        if fault is not None:
+            return fault
+        names = list(setpoint.names)
+        ours = np.array([names.index(self.robot.joint_names[column]) for column in columns])
+        q = setpoint.q[ours]
+        reference = self._follower.q if self._tau is None else self.plant.state().q
+        jump = np.abs(q - reference[columns])
+        if jump.max() > self._max_jump:
+            worst = int(jump.argmax())
+            return (
+                f"{self.robot.joint_names[columns[worst]]} is asked to jump by {jump[worst]:.3f} rad; "
+                f"allowed: {self._max_jump:g}"
+            )
+        if self._tau is not None:
+            self._back_to_servos()
+        self._follower.command(columns, q, None if setpoint.v is None else setpoint.v[ours], now + setpoint.delay)
+        self._last_command = now
+        return None
+
+    def command_torques(self, tau: Array, now: float) -> str | None:
+        """Apply joint torques (nv,) [Nm] that came at ``now`` [s]; gravity is the sender's to bear."""
+        if len(tau) != len(self._columns):
+            return f"{len(tau)} torques for {len(self._columns)} joints"
+        if not np.isfinite(tau).all():
+            return "a torque is not finite"
+        self._tau = tau.copy()
+        self._last_command = now
+        return None
+
+    def command_gripper(self, arm: str, opening: float) -> None:
+        """Open (1) or close (0) an arm's gripper."""
+        self._openings[arm] = opening
+
+    def gripper_force(self, arm: str) -> float:
+        """What an arm's gripper presses with [N]."""
+        forces = self.plant.data.actuator_force[self._finger_force[arm]]
+        return float(np.abs(forces).max()) if len(forces) else 0.0
+
+    def finger_positions(self) -> Array:
+        """Of ``fingers`` [m or rad]."""
+        return np.array(self.plant.data.qpos[self._finger_q])
+
+    def finger_velocities(self) -> Array:
+        """Of ``fingers`` [m/s or rad/s]."""
+        return np.array(self.plant.data.qvel[self._finger_v])
+
+    def advance(self, now: float) -> RobotState:
+        """Let the whole physics steps pass that are due at ``now`` [s], and measure."""
+        if self._time is None:
+            self._time = now
+        behind = now - self._time
+        if behind > _LONGEST_CATCH_UP:
+            self.dropped += behind - _LONGEST_CATCH_UP
+            self._time = now - _LONGEST_CATCH_UP
+        steps = math.floor((now - self._time) / self._timestep + 1e-6)
+        if steps > 0:
+            dt = steps * self._timestep
+            self._time += dt
+            self._drive(dt)
+        return self.plant.state()
+
+    def _drive(self, dt: float) -> None:
+        assert self._time is not None
+        # A torque that nobody renews is a push without end.
+        if self._tau is not None and self._time - self._last_command > self._hold_after:
+            self._back_to_servos()
+        zero = np.zeros_like(self.robot.home)
+        if self._tau is not None:
+            state = self.plant.state()
+            command = Command(CommandMode.TORQUE, state.q, state.v, self._tau, self._openings)
+        else:
+            self._follower.advance(self._time, dt)
+            command = Command(CommandMode.POSITION, self._follower.q, self._follower.v, zero, self._openings)
+        self.plant.apply(command)
+        self.plant.advance(dt)
+
+    def _back_to_servos(self) -> None:
+        state = self.plant.state()
+        self._follower.stop(state.q, state.v)
+        self._tau = None
+
+    def _columns_of(self, setpoint: JointSetpoint) -> tuple[str | None, np.ndarray]:
+        none = np.empty(0, dtype=np.intp)
+        names, count = setpoint.names, len(setpoint.names)
+        if len(setpoint.q) != count or (setpoint.v is not None and len(setpoint.v) != count):
+            return f"{len(setpoint.q)} positions for {count} joints", none
+        if len(set(names)) != count:
+            return "a joint is named twice", none
+        columns = [self._columns[name] for name in names if name in self._columns]
+        if not columns:
+            return f"none of its joints is one of {', '.join(self._columns)}"[:200], none
+        values = setpoint.q if setpoint.v is None else np.concatenate((setpoint.q, setpoint.v))
+        if not np.isfinite(values).all():
+            return "a number is not finite", none
+        if not 0.0 <= setpoint.delay <= 1.0:
+            return f"due in {setpoint.delay:g} s; allowed: 0 .. 1", none
+        return None, np.array(columns)

@@ -1,0 +1,89 @@
+"""Which targets an arm may follow: only those of a stream that began where the arm was.
+
+An arm follows a stream of targets from the first one on, if that lies within ``engage_distance`` and ``engage_angle``
+of the reference's tool pose: whoever engages begins at the tool. What begins elsewhere is somebody who does not know
+that the arm was stopped meanwhile, and is refused as a whole, even where it later comes by. A new stream begins with
+the first target ever, after a silence of ``timeout``, after a reset, and where targets that were refused jump to the
+tool, as those of an operator do who engages anew while the targets never cease.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import pinocchio as pin
+
+# A jump that no hand makes between two messages, and so the beginning of something new [m], [rad].
+_JUMP, _TURN = 0.05, 0.25
+
+
+@dataclass(slots=True)
+class StreamSettings:
+    """What a stream of targets is; may be changed at run time."""
+
+    timeout: float = 0.15  # [s]
+    engage_distance: float = 0.03  # [m]
+    engage_angle: float = 0.3  # [rad]
+
+
+class TargetStream:
+    """The targets of one arm. Times are receipt times [s]."""
+
+    def __init__(self, settings: StreamSettings) -> None:
+        self._settings = settings
+        self.pose: pin.SE3 | None = None  # followed; None: the arm holds
+        self.stamp = -math.inf  # of the last target that was a pose
+        self._last: pin.SE3 | None = None  # of the stream, followed or not; None: the next one begins a stream
+
+    @property
+    def following(self) -> bool:
+        return self.pose is not None
+
+    def reset(self) -> None:
+        """Hold; the next target begins a stream."""
+        self.pose = self._last = None
+
+    def drop(self) -> None:
+        """Hold; the stream that goes on now will not be followed any more."""
+        self.pose = None
+
+    def expire(self, now: float) -> bool:
+        """Whether the stream that was followed has just run dry."""
+        if self._last is None or now - self.stamp <= self._settings.timeout:
+            return False
+        was_following = self.following
+        self.reset()
+        return was_following
+
+    def offer(self, pose: pin.SE3, tool: pin.SE3, now: float) -> str | None:
+        """Take a target; ``tool`` is the reference's tool pose. Returns why it is not followed, or None."""
+        self.expire(now)
+        begins, self.stamp = self._begins(pose), now
+        self._last = pose
+        if self.following:
+            self.pose = pose
+            return None
+        distance, angle = _apart(pose, tool)
+        near = distance <= self._settings.engage_distance and angle <= self._settings.engage_angle
+        if begins and near:
+            self.pose = pose
+            return None
+        began = "begins" if begins else "goes on"
+        return (
+            f"the stream {began} {distance:.3f} m and {angle:.2f} rad from the tool; to be followed it has to begin "
+            f"anew within {self._settings.engage_distance:g} m and {self._settings.engage_angle:g} rad"
+        )
+
+    def _begins(self, pose: pin.SE3) -> bool:
+        if self._last is None:
+            return True
+        distance, angle = _apart(pose, self._last)
+        return distance >= _JUMP or angle >= _TURN
+
+
+def _apart(a: pin.SE3, b: pin.SE3) -> tuple[float, float]:
+    difference = a.translation - b.translation
+    way = float(math.sqrt(difference @ difference))
+    cosine = 0.5 * (float((a.rotation * b.rotation).sum()) - 1.0)
+    return way, math.acos(min(max(cosine, -1.0), 1.0))

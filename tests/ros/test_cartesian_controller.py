@@ -1,0 +1,353 @@
+"""The controller as a process that moves the simulated robot: targets followed, faults survived, nothing jumps."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import signal
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+
+from q2r2_control import Robot, load_config
+from tests.ros.conftest import NEEDS_ROS, spun_node
+from tests.ros.processes import PATIENCE, Processes, RosProcess
+
+pytest.importorskip("rclpy", reason=NEEDS_ROS)
+pytest.importorskip("control_msgs", reason="needs control_msgs: q2r2 ros build-interfaces")
+pytest.importorskip("tf2_msgs", reason="needs tf2_msgs: q2r2 ros build-interfaces")
+
+import pinocchio as pin
+from geometry_msgs.msg import PoseStamped
+from rclpy.parameter import Parameter
+from rclpy.parameter_client import AsyncParameterClient
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import JointState
+from std_msgs.msg import String
+from std_srvs.srv import SetBool
+
+from q2r2_control.ros.messages import pose_message, stamped_pose, time_message
+from q2r2_control.ros.node import COMMAND_QOS
+from tests.ros.cell import CONFIG, Cell, Stream, wait
+
+# How far the simulated arms lag behind their reference at the speeds of these tests, between two arms.
+TRACKING = 0.01  # [m]
+STILL = 2e-3  # [rad]
+# Longer than by default, so that a machine that is busy elsewhere does not look like a fault.
+PATIENT = ("-p", "joint_state_timeout:=0.5", "-p", "target_timeout:=0.5")
+
+
+@pytest.fixture(scope="module")
+def robot() -> Robot:
+    return Robot.from_config(load_config(CONFIG))
+
+
+@pytest.fixture(scope="module")
+def running(domain: int, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Processes]:
+    """Processes that outlive one test, since each takes seconds to start."""
+    processes = Processes(tmp_path_factory.mktemp("cell"), os.environ)
+    yield processes
+    processes.end_all()
+
+
+def start(processes: Processes, name: str, *arguments: str) -> RosProcess:
+    return processes.start_module(f"q2r2_control.ros.{name}", "--ros-args", "-p", f"config:={CONFIG}", *arguments)
+
+
+@pytest.fixture(scope="module")
+def started(domain: int, running: Processes, robot: Robot) -> Iterator[Cell]:
+    with spun_node(domain) as node:
+        yield Cell(node, robot, start(running, "mujoco_robot"), start(running, "cartesian_controller", *PATIENT))
+
+
+@pytest.fixture
+def cell(started: Cell, running: Processes) -> Cell:
+    """At home, active, without targets."""
+    started.call("/cartesian_controller/stop")
+    wait(lambda: started.state("phase") == "stopped", "the controller is stopped")
+    started.call("/mujoco_robot/reset")
+    started.call("/cartesian_controller/reset")
+    started.wait_until_active()
+    time.sleep(0.1)  # transforms of before the reset are past
+    started.measured.clear()
+    wait(lambda: started.measured, "joint states come")
+    return started
+
+
+@pytest.fixture
+def streams() -> Iterator[list[Stream]]:
+    """Streams that a test began; they end with it."""
+    begun: list[Stream] = []
+    yield begun
+    for stream in begun:
+        stream.end()
+
+
+def engage(cell: Cell, streams: list[Stream], *arms: str) -> Stream:
+    streams.append(cell.engage(*arms))
+    return streams[-1]
+
+
+def shifted(pose: pin.SE3, x: float, y: float, z: float) -> pin.SE3:
+    return pin.SE3(pose.rotation, pose.translation + np.array([x, y, z]))
+
+
+def at_rest(cell: Cell) -> np.ndarray:
+    """Joint positions once they no longer change."""
+    wait(lambda: len(cell.measured) > 60 and moved(cell, 50) < 5e-4, "the arms are at rest")
+    return cell.q
+
+
+def moved(cell: Cell, count: int) -> float:
+    """How far any joint has moved in the last so many joint states [rad]."""
+    return float(np.ptp([measured.q for measured in cell.measured[-count:]], axis=0).max())
+
+
+def test_an_arm_follows_its_target_and_the_other_one_holds(cell: Cell, robot: Robot, streams: list[Stream]) -> None:
+    stream = engage(cell, streams, "left")
+    start_q, begin = cell.q, stream.poses["left"]
+    stream.move("left", (0.05, 0.0, 0.0))
+    goal = stream.poses["left"]
+    assert np.linalg.norm(goal.translation - begin.translation) == pytest.approx(0.05)
+    wait(lambda: np.linalg.norm(cell.tool("left").translation - goal.translation) < 2e-3, "the arm is there")
+    wait(lambda: np.linalg.norm(pin.log3(cell.tool("left").rotation.T @ goal.rotation)) < 5e-3, "it is turned so")
+    right = robot.arms["right"].joints
+    assert all(np.abs((measured.q - start_q)[right]).max() < STILL for measured in cell.measured)
+
+
+def test_crossing_targets_never_bring_the_arms_nearer_than_the_least_distance(
+    cell: Cell, robot: Robot, streams: list[Stream]
+) -> None:
+    stream = engage(cell, streams, "left", "right")
+    least = load_config(CONFIG).control.min_distance
+    for _ in range(25):
+        for arm, sign in (("left", -1.0), ("right", 1.0)):
+            stream.poses[arm] = shifted(stream.poses[arm], 0.0, 0.02 * sign, 0.0)
+        time.sleep(0.04)
+    time.sleep(1.0)
+    nearest = min(float(robot.distance_values(measured.q).min()) for measured in cell.measured)
+    assert nearest < least + 0.02  # they did meet
+    assert nearest >= least - TRACKING
+
+
+def test_safe_targets_are_the_tool_poses_that_the_arms_are_led_to(cell: Cell, streams: list[Stream]) -> None:
+    poses: list[PoseStamped] = []
+    subscription = cell.node.create_subscription(
+        PoseStamped, "/cartesian_controller/safe_target/left", poses.append, 10
+    )
+    engage(cell, streams, "left").move("left", (0.0, 0.0, 0.05))
+    wait(lambda: poses, "safe targets come")
+    at_rest(cell)
+    position = poses[-1].pose.position
+    assert poses[-1].header.frame_id == "world"
+    assert np.allclose([position.x, position.y, position.z], cell.tool("left").translation, atol=3e-3)
+    cell.node.destroy_subscription(subscription)
+
+
+def bad_target(kind: str, pose: pin.SE3) -> PoseStamped:
+    message = PoseStamped(pose=pose_message(pose))
+    message.header.frame_id = "elsewhere" if kind == "wrong frame" else "world"
+    if kind == "not a number":
+        message.pose.position.x = math.nan
+    elif kind == "zero quaternion":
+        for axis in "xyzw":
+            setattr(message.pose.orientation, axis, 0.0)
+    return message
+
+
+@pytest.mark.parametrize(
+    ("kind", "said"),
+    [
+        ("wrong frame", "frame_id 'elsewhere'"),
+        ("not a number", "not a finite pose"),
+        ("zero quaternion", "not a finite pose"),
+        ("far from the tool", "the stream begins 0.1"),
+    ],
+)
+def test_a_bad_target_moves_nothing_and_is_reported_once(cell: Cell, kind: str, said: str) -> None:
+    wait(lambda: cell.state("level") == "ok", "nothing is wrong")
+    before, output = cell.q, cell.processes[1].output
+    pose = shifted(cell.tool("left"), 0.1, 0.0, 0.0) if kind == "far from the tool" else cell.tool("left")
+    for _ in range(30):
+        cell.send_message("left", bad_target(kind, pose))
+        time.sleep(0.01)
+    wait(lambda: cell.state("level") == "warn", "it is in the diagnostics")
+    assert "target of left not used" in cell.state("message")
+    assert all(np.abs(measured.q - before).max() < STILL for measured in cell.measured)
+    added = cell.processes[1].output[len(output) :]
+    assert added.count("target of left not used") == added.count(said) == 1
+    assert cell.processes[1].running
+
+
+def test_an_arm_holds_without_targets_and_follows_only_a_stream_that_begins_at_its_tool(
+    cell: Cell, streams: list[Stream]
+) -> None:
+    stream = engage(cell, streams, "left")
+    stream.move("left", (0.05, 0.0, 0.0))
+    stream.end()
+    wait(lambda: cell.state("left_state") == "holding", "the arm holds")
+    rest = at_rest(cell)
+    far = shifted(stream.poses["left"], 0.0, 0.0, 0.1)
+    streams.append(again := Stream(cell, {"left": far}))
+    again.move("left", (0.0, 0.0, -0.1))  # comes by where the arm is
+    time.sleep(0.3)
+    assert np.abs(cell.q - rest).max() < STILL
+    assert cell.state("left_state") == "holding"
+    again.poses["left"] = far
+    time.sleep(0.1)
+    again.poses["left"] = cell.tool("left")  # engaged anew, while the targets never cease
+    wait(lambda: cell.state("left_state") == "following", "the arm follows")
+
+
+def test_pause_stop_and_home(cell: Cell, robot: Robot, streams: list[Stream]) -> None:
+    stream = engage(cell, streams, "left")
+    stream.move("left", (0.0, 0.0, 0.06))
+    assert cell.call("/cartesian_controller/pause", SetBool.Request(data=True)).success
+    rest = at_rest(cell)
+    stream.move("left", (0.05, 0.0, 0.0))
+    assert np.abs(cell.q - rest).max() < STILL
+    assert not cell.call("/cartesian_controller/home").success
+    assert cell.call("/cartesian_controller/pause", SetBool.Request(data=False)).success
+    assert cell.call("/cartesian_controller/home").success
+    home = robot.tool_pose(robot.home, "left")
+    wait(lambda: np.linalg.norm(cell.tool("left").translation - home.translation) < 4e-3, "the tool is at home")
+    assert cell.call("/cartesian_controller/stop").success
+    wait(lambda: cell.state("phase") == "stopped", "the controller is stopped")
+    wait(lambda: cell.state("mode", "mujoco_robot") == "holding", "nothing is commanded")
+
+
+def test_a_controller_that_is_killed_leaves_the_arms_to_stop_and_its_return_does_not_move_them(
+    started: Cell, cell: Cell, running: Processes, streams: list[Stream]
+) -> None:
+    stream = engage(cell, streams, "left", "right")
+    begin = stream.poses["left"]
+    stream.poses["left"] = shifted(begin, 0.25, 0.0, 0.1)
+    wait(lambda: np.linalg.norm(cell.tool("left").translation - begin.translation) > 0.05, "the arm is in mid-motion")
+    os.kill(cell.processes[1].pid, signal.SIGKILL)
+    killed = time.monotonic()
+    rest = at_rest(cell)
+    # Braking takes |v| / a, at most 1.75 / 10 s here; the rest is for a machine that delivers late.
+    moving = [measured.t for measured in cell.measured if np.abs(measured.q - rest).max() > 5e-3]
+    assert 0.0 < max(moving) - killed < 0.15 + 0.175 + 0.2
+    back = start(running, "cartesian_controller", *PATIENT)
+    started.processes = (started.processes[0], back)
+    started.states.pop("cartesian_controller", None)
+    cell.wait_until_active()
+    time.sleep(0.5)  # targets still come, from where nobody engaged anew
+    assert np.abs(cell.q - rest).max() < STILL
+    assert cell.state("left_state") == "holding"
+
+
+def faulty_joint_state(kind: str, robot: Robot, q: np.ndarray) -> JointState:
+    names, position = list(robot.joint_names), q.tolist()
+    if kind == "a joint is missing":
+        names, position = names[1:], position[1:]
+    elif kind == "not a number":
+        position[3] = math.nan
+    elif kind == "a jump":
+        position[3] += 0.5
+    return JointState(name=names, position=position)
+
+
+@pytest.mark.parametrize(
+    ("kind", "said"),
+    [
+        ("a joint is missing", "no joint left_A1"),
+        ("not a number", "position of left_A4 is not finite"),
+        ("a jump", "left_A4 jumped by 0."),
+        ("a stall", "no joint states for"),
+    ],
+)
+def test_joint_states_that_cannot_be_believed_stop_the_arms_with_one_diagnostic(
+    cell: Cell, robot: Robot, streams: list[Stream], kind: str, said: str
+) -> None:
+    output = cell.processes[1].output
+    stream = engage(cell, streams, "left")
+    stream.move("left", (0.0, 0.0, 0.03))
+    if kind == "a stall":
+        os.kill(cell.processes[0].pid, signal.SIGSTOP)
+        time.sleep(1.0)
+        os.kill(cell.processes[0].pid, signal.SIGCONT)
+    else:
+        publisher = cell.node.create_publisher(JointState, "/joint_states", 10)
+        message = faulty_joint_state(kind, robot, cell.q)
+        # Whoever was killed before counts as a listener for a while: only the report says that it has arrived.
+        wait(lambda: publisher.publish(message) or said in cell.processes[1].output[len(output) :], "it is reported")
+        cell.node.destroy_publisher(publisher)
+    wait(lambda: f"joint states: {said}" in cell.processes[1].output[len(output) :], "it is reported")
+    wait(lambda: "active: " in cell.processes[1].output[len(output) :], "the controller is active again")
+    stream.move("left", (0.05, 0.0, 0.0))
+    assert cell.processes[1].output[len(output) :].count(f"joint states: {said}") == 1
+    wait(lambda: cell.state("left_state") == "holding", "the arm holds")
+    rest = at_rest(cell)
+    time.sleep(0.3)
+    assert np.abs(cell.q - rest).max() < STILL
+
+
+def test_joint_states_are_matched_by_name_whatever_their_order(cell: Cell, robot: Robot, streams: list[Stream]) -> None:
+    engage(cell, streams, "left")
+    order = np.random.default_rng(2).permutation(len(robot.joint_names))
+    names, output = [robot.joint_names[index] for index in order], cell.processes[1].output
+    publisher = cell.node.create_publisher(JointState, "/joint_states", 10)
+    wait(lambda: publisher.get_subscription_count() >= 2, "the controller listens")
+    for _ in range(50):
+        publisher.publish(JointState(name=names, position=cell.q[order].tolist()))
+        time.sleep(0.005)
+    publisher.publish(JointState(name=["of_somebody_else"], position=[math.nan]))
+    time.sleep(0.2)
+    cell.node.destroy_publisher(publisher)
+    assert cell.state("left_state") == "following"
+    assert cell.processes[1].output == output
+
+
+def test_parameters_change_together_or_not_at_all(cell: Cell) -> None:
+    client = AsyncParameterClient(cell.node, "/cartesian_controller")
+    assert client.wait_for_services(PATIENCE)
+    good, bad = Parameter("target_timeout", value=0.2), Parameter("engage_distance", value=9.0)
+    sent = client.set_parameters_atomically([good, bad])
+    wait(sent.done, "the parameters are answered")
+    assert not sent.result().result.successful
+    read = client.get_parameters(["target_timeout", "engage_distance"])
+    wait(read.done, "the parameters are read")
+    assert [value.double_value for value in read.result().values] == [0.5, 0.03]
+
+
+def test_it_follows_in_another_layout_and_frame_with_another_output_and_on_simulated_time(
+    cell: Cell, robot: Robot, processes: Processes
+) -> None:
+    cell.call("/cartesian_controller/stop")
+    parameters = ("left.target_topic:=/left/target_pose", "left.target_frame_id:=left_link_0", "output:=joint_state")
+    arguments = [part for parameter in parameters for part in ("-p", parameter)]
+    start(processes, "cartesian_controller", *arguments, "-p", "use_sim_time:=true", "-r", "__node:=second")
+    states: list[dict[str, Any]] = []
+    node = cell.node
+    subscription = node.create_subscription(String, "/second/state", lambda m: states.append(json.loads(m.data)), 10)
+    clock = node.create_publisher(Clock, "/clock", 10)
+    targets = node.create_publisher(PoseStamped, "/left/target_pose", COMMAND_QOS)
+    began = time.monotonic()
+    timer = node.create_timer(0.005, lambda: clock.publish(Clock(clock=time_message(100 + time.monotonic() - began))))
+    wait(lambda: states and states[-1]["phase"] == "active", "the second controller is active")
+    base = robot.model.frames[robot.model.getFrameId("left_link_0")].placement
+    tool = cell.tool("left")
+    for step in range(51):
+        goal = base.actInv(shifted(tool, 0.0, 0.001 * step, 0.0))
+        targets.publish(stamped_pose(goal, "left_link_0", 0.0))
+        time.sleep(0.02)
+    wait(lambda: abs(cell.tool("left").translation[1] - tool.translation[1] - 0.05) < 4e-3, "the arm is there")
+    node.destroy_timer(timer)
+    for publisher in (clock, targets):
+        node.destroy_publisher(publisher)
+    node.destroy_subscription(subscription)
+
+
+def test_what_cannot_be_had_ends_in_one_line(processes: Processes) -> None:
+    faults = {"output:=lbr_torque": "lbr_fri_idl", "rate:=5000.0": "rate"}
+    begun = {said: start(processes, "cartesian_controller", "-p", fault) for fault, said in faults.items()}
+    for said, process in begun.items():
+        assert process.wait() == 2
+        (line,) = (line for line in process.output.splitlines() if line)
+        assert said in line

@@ -1,0 +1,194 @@
+"""The simulated robot as a ROS process: what it publishes, what it follows, and what it does when commands end."""
+
+from __future__ import annotations
+
+import math
+import os
+import time
+from collections.abc import Iterator
+from queue import Queue
+from typing import Any
+
+import numpy as np
+import pytest
+
+from q2r2_control import Robot, load_config
+from tests.ros.conftest import NEEDS_ROS, spun_node
+from tests.ros.processes import PATIENCE, Processes
+
+pytest.importorskip("rclpy", reason=NEEDS_ROS)
+pytest.importorskip("control_msgs", reason="needs control_msgs: q2r2 ros build-interfaces")
+pytest.importorskip("tf2_msgs", reason="needs tf2_msgs: q2r2 ros build-interfaces")
+
+from control_msgs.action import GripperCommand
+from rclpy.action import ActionClient
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray, String
+from tf2_msgs.msg import TFMessage
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+
+from q2r2_control.ros.node import COMMAND_QOS, LATCHED_QOS
+from tests.ros.cell import CONFIG, Cell, wait
+
+FINGERS = tuple(f"{side}_finger_joint_{number}" for side in ("left", "right") for number in (1, 2))
+
+
+@pytest.fixture(scope="module")
+def robot() -> Robot:
+    return Robot.from_config(load_config(CONFIG))
+
+
+@pytest.fixture(scope="module")
+def started(domain: int, robot: Robot, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cell]:
+    """One robot process for all tests, which takes a second to start."""
+    processes = Processes(tmp_path_factory.mktemp("robot"), os.environ)
+    with spun_node(domain) as node:
+        cell = Cell(
+            node,
+            robot,
+            processes.start_module("q2r2_control.ros.mujoco_robot", "--ros-args", "-p", f"config:={CONFIG}"),
+        )
+        try:
+            wait(lambda: cell.measured, "joint states come")
+            yield cell
+        finally:
+            processes.end_all()
+
+
+@pytest.fixture
+def cell(started: Cell, robot: Robot) -> Cell:
+    """At home, at rest, commanded by nobody."""
+    wait(lambda: started.state("mode", "mujoco_robot") == "holding", "the robot holds")
+    started.call("/mujoco_robot/reset")
+    wait(lambda: np.abs(started.q - robot.home).max() < 1e-3, "the arms are at home")
+    return started
+
+
+def publish_steadily(publisher: Any, messages: list[Any], period: float = 0.01) -> None:
+    wait(publisher.get_subscription_count, "commands are listened to")
+    for message in messages:
+        publisher.publish(message)
+        time.sleep(period)
+
+
+def send_until_refused(cell: Cell, publisher: Any, message: Any) -> None:
+    before = cell.state("refused_commands", "mujoco_robot")
+    publish_steadily(publisher, [message] * 10)
+    wait(lambda: cell.state("refused_commands", "mujoco_robot") > before, "it is refused")
+
+
+def ramp(robot: Robot, joint: int, way: float, count: int) -> list[np.ndarray]:
+    """Postures from home on, one joint moving steadily."""
+    postures = [robot.home.copy() for _ in range(count)]
+    for step, q in enumerate(postures, 1):
+        q[joint] += way * step / count
+    return postures
+
+
+def trajectory(robot: Robot, q: np.ndarray, names: tuple[str, ...] | None = None) -> JointTrajectory:
+    return JointTrajectory(
+        joint_names=list(names or robot.joint_names), points=[JointTrajectoryPoint(positions=q.tolist())]
+    )
+
+
+def test_it_publishes_joints_by_name_all_links_and_the_description(cell: Cell, robot: Robot) -> None:
+    names: Queue[list[str]] = Queue()
+    fixed: Queue[list[str]] = Queue()
+    description: Queue[str] = Queue()
+    node = cell.node
+    node.create_subscription(JointState, "/joint_states", lambda m: names.put(list(m.name)), 10)
+    node.create_subscription(
+        TFMessage, "/tf_static", lambda m: fixed.put([t.child_frame_id for t in m.transforms]), LATCHED_QOS
+    )
+    node.create_subscription(String, "/robot_description", lambda m: description.put(m.data), LATCHED_QOS)
+    assert names.get(timeout=PATIENCE) == [*robot.joint_names, *FINGERS]
+    urdf = description.get(timeout=PATIENCE)
+    assert urdf == robot.urdf
+    wait(lambda: cell.tools, "transforms come")
+    links = {line.split('"')[1] for line in urdf.splitlines() if line.strip().startswith("<link ")}
+    assert set(fixed.get(timeout=PATIENCE)) | set(cell.tools) == links - {"world"}
+    for arm in robot.arms:
+        assert np.allclose(cell.tool(arm).homogeneous, robot.tool_pose(robot.home, arm).homogeneous, atol=2e-3)
+
+
+@pytest.mark.parametrize("kind", ["joint_trajectory", "joint_commands", "position_commands"])
+def test_it_follows_positions_in_any_order_of_names_and_stays_where_they_end(
+    cell: Cell, robot: Robot, kind: str
+) -> None:
+    postures = ramp(robot, 0, 0.2, 50)
+    postures += postures[-1:] * 30
+    order = np.random.default_rng(1).permutation(len(robot.joint_names))
+    names = [robot.joint_names[index] for index in order]
+    if kind == "joint_trajectory":
+        messages: list[Any] = [trajectory(robot, q[order], tuple(names)) for q in postures]
+    elif kind == "joint_commands":
+        messages = [JointState(name=names, position=q[order].tolist()) for q in postures]
+    else:
+        messages = [Float64MultiArray(data=q.tolist()) for q in postures]
+    publish_steadily(cell.node.create_publisher(type(messages[0]), kind, COMMAND_QOS), messages)
+    wait(lambda: cell.state("mode", "mujoco_robot") == "holding", "the robot holds")
+    assert np.abs(np.delete(cell.q - robot.home, 0)).max() < 0.01
+    assert cell.q[0] - robot.home[0] == pytest.approx(0.2, abs=0.01)
+    before = cell.q
+    time.sleep(0.3)
+    assert np.abs(cell.q - before).max() < 1e-3
+
+
+def test_commands_that_cannot_be_followed_move_nothing_and_are_reported_once(cell: Cell, robot: Robot) -> None:
+    publisher = cell.node.create_publisher(JointTrajectory, "joint_trajectory", COMMAND_QOS)
+    far, unknown = robot.home + 0.5, tuple(f"no_{name}" for name in robot.joint_names)
+    bad = [
+        trajectory(robot, np.full_like(robot.home, math.nan)),
+        trajectory(robot, far),
+        trajectory(robot, robot.home[:3]),
+        trajectory(robot, robot.home, unknown),
+        JointTrajectory(joint_names=list(robot.joint_names)),
+    ]
+    for message in bad:
+        send_until_refused(cell, publisher, message)
+        assert np.abs(cell.q - robot.home).max() < 5e-3
+        assert cell.state("level", "mujoco_robot") == "warn"
+    assert cell.processes[0].output.count("joint_trajectory: refused") == 1
+
+
+def test_a_torque_that_nobody_renews_gives_way_to_position_servos(cell: Cell, robot: Robot) -> None:
+    publisher = cell.node.create_publisher(Float64MultiArray, "torque_commands", COMMAND_QOS)
+    tau = np.zeros(len(robot.joint_names))  # without gravity's torque the arms begin to fall
+    publish_steadily(publisher, [Float64MultiArray(data=tau.tolist())] * 15)
+    assert cell.state("mode", "mujoco_robot") is not None
+    wait(lambda: cell.state("mode", "mujoco_robot") == "holding", "the robot holds")
+    assert np.abs(cell.q - robot.home).max() > 0.01
+    wait(lambda: np.ptp([m.q for m in cell.measured[-50:]], axis=0).max() < 5e-4, "the arms stand")
+    assert np.abs(cell.q - robot.home).max() < 0.6
+
+
+def test_reset_brings_the_arms_home(cell: Cell, robot: Robot) -> None:
+    messages = [trajectory(robot, q) for q in ramp(robot, 0, 0.2, 50)]
+    publish_steadily(cell.node.create_publisher(JointTrajectory, "joint_trajectory", COMMAND_QOS), messages)
+    wait(lambda: abs(cell.q[0] - robot.home[0]) > 0.1, "the joint moves")
+    assert cell.call("/mujoco_robot/reset").success
+    wait(lambda: np.abs(cell.q - robot.home).max() < 1e-3, "the arms are at home")
+
+
+def test_a_gripper_closes_on_nothing_opens_and_refuses_what_it_cannot_reach(cell: Cell) -> None:
+    client = ActionClient(cell.node, GripperCommand, "/q2r2/left_gripper/gripper_cmd")
+    assert client.wait_for_server(PATIENCE)
+    for position in (0.05, 0.0):
+        result = result_of(client, position)
+        assert result.reached_goal
+        assert not result.stalled
+        assert result.position == pytest.approx(position, abs=2e-3)
+    assert result_of(client, 0.2) is None
+
+
+def result_of(client: ActionClient, position: float) -> Any:
+    """The result of a goal, or None where it is refused."""
+    goal = GripperCommand.Goal()
+    goal.command.position, goal.command.max_effort = position, 5.0
+    sent = client.send_goal_async(goal)
+    wait(sent.done, "the goal is answered")
+    if not sent.result().accepted:
+        return None
+    ended = sent.result().get_result_async()
+    wait(ended.done, "the goal has ended")
+    return ended.result().result
