@@ -39,8 +39,10 @@ class ArmLink:
     @property
     def disagreement(self) -> str | None:
         """What the two arms do not agree on, in one line."""
+        if self._node.count_publishers(self._stance_of_other) == 0:
+            self._other_stance = None  # what is gone has no say, and whoever comes next speaks for itself
         theirs = self._other_stance
-        if theirs in (None, self._stance) or self._node.count_publishers(self._stance_of_other) == 0:
+        if theirs in (None, self._stance):
             return None
         return f"this arm is set to {self._stance}, the {self.other} one to {theirs}: set mirror alike in both"
 

@@ -71,9 +71,13 @@ class BaseArmController(BaseNode):
             gripper_action_topic=gripper_action_topic or f"/{robot_name}/{arm_name}_gripper/gripper_cmd",
             filter_window_size=filter_window_size,
         )
-        self.parameters = self.setup_parameters()
-        self.setup_state()
-        self.setup_interfaces()
+        try:
+            self.parameters = self.setup_parameters()
+            self.setup_state()
+            self.setup_interfaces()
+        except BaseException:
+            self.destroy_node()  # a node that nobody gets to hold may keep the process from ending
+            raise
 
     def setup_parameters(self) -> ArmParameters:
         """Declare the parameters; returns what they say."""
