@@ -14,6 +14,7 @@ from q2r2_control.ros.presets import Hold, Preset
 from q2r2_control.teleop.guard import GuardSettings, TargetGuard
 
 _GRAPH_PERIOD = 0.1  # between two looks at who else is there [s]
+_ALERT = 1.0  # after somebody came every tick looks, since names are known later than endpoints [s]
 # A tool farther from a held target than this was moved by something else, and the target is not asked for again.
 _HELD = 0.15, 0.6  # [m, rad]
 
@@ -41,7 +42,7 @@ class TargetOutput:
         self._restarted = False
         self._endpoints: set[bytes] = set()  # of the controller
         self._listeners = 0
-        self._looked = -math.inf
+        self._looked = self._came = -math.inf
         self.sent = 0
 
     @property
@@ -69,8 +70,13 @@ class TargetOutput:
     def take_fault(self, now: float) -> str | None:
         """Look who is there; says once that the controller was started anew while it was driven."""
         listeners = self._publisher.get_subscription_count()
-        if listeners != self._listeners or now - self._looked > _GRAPH_PERIOD or now < self._looked:
-            self._listeners, self._looked = listeners, now
+        if listeners > self._listeners or listeners == 0:
+            self._came = now
+            if not self._following:
+                self.forget(now)  # whoever it is, it is not to be greeted with a target of the past
+        self._listeners = listeners
+        if now - self._came < _ALERT or not 0.0 <= now - self._looked <= _GRAPH_PERIOD:
+            self._looked = now
             self._look(now)
         restarted, self._restarted = self._restarted, False
         return f"{self._controller} was started anew" if restarted else None
@@ -101,9 +107,9 @@ class TargetOutput:
 
     def _holds(self, tool: pin.SE3 | None, now: float) -> bool:
         """Whether the last target is repeated."""
-        if tool is None or self.guard.pose is None:
+        if self.guard.pose is None:
             return False
-        if not near(self.guard.pose, tool, *_HELD):
+        if tool is None or not near(self.guard.pose, tool, *_HELD):
             self.forget(now)
             return False
         return self.preset.hold is Hold.REPEAT
@@ -117,8 +123,6 @@ class TargetOutput:
         }
         if endpoints - self._endpoints:
             self._restarted = self._following
-            if not self._following:
-                self.forget(now)
             self._send_zero_wrench(now)
         self._endpoints = endpoints
 
