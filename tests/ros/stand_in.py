@@ -21,6 +21,7 @@ STIFFNESS, DAMPING = 900.0, 60.0  # of a unit mass [N/m, Ns/m]
 DT = 0.005  # [s]
 FASTEST = 0.55  # that a target may move [m/s]
 FASTEST_TURN = 2.2  # [rad/s]
+LONGEST_GAP = 0.3  # that a busy machine may leave between two targets [s]
 SETTLED = 0.004  # from a tool or a target that rests [m]
 SETTLED_TURN = 0.02  # [rad]
 WRENCH_PATIENCE = 0.5  # [s]
@@ -59,7 +60,9 @@ class StandIn(Node):
         rotation = np.array([turned.x, turned.y, turned.z, turned.w])
         for fault in self._faults(message.header.frame_id, stamp, position, rotation):
             print(f"violation: {fault}")
-        self._began = min(self._began, self._now)
+        if self._target is None:
+            self._began = self._now
+            print("first target")
         self._target = position, rotation, stamp
 
     def _faults(self, frame: str, stamp: float, position: Any, rotation: Any) -> list[str]:
@@ -77,7 +80,7 @@ class StandIn(Node):
             way, allowed = math.dist(position, self._position), SETTLED
             turn, allowed_turn = angle(rotation, self._rotation), SETTLED_TURN
         else:
-            period = min(max(stamp - self._target[2], 0.0), 0.1)
+            period = min(max(stamp - self._target[2], 0.0), LONGEST_GAP)
             way, allowed = math.dist(position, self._target[0]), FASTEST * period + SETTLED
             turn, allowed_turn = angle(rotation, self._target[1]), FASTEST_TURN * period + SETTLED_TURN
         if way > allowed or turn > allowed_turn:

@@ -82,7 +82,7 @@ def _quaternion(target: Any) -> list[float]:
 
 
 def test_a_silent_hand_pauses_the_arm_and_its_return_moves_nothing(rig: ArmRig, processes: Processes) -> None:
-    rig.start(processes, **{"teleop.gate.timeout": 0.15})
+    rig.start(processes, {"teleop.gate.timeout": 0.15})
     rig.engage()
     rig.move((0.1, 0.0, 0.0), 0.2)
     rig.sends_hand = False
@@ -208,7 +208,7 @@ def test_a_subclass_with_other_names_works_in_its_robots_frame(node: Any, proces
     topic = "/bh_robot/right_arm_clik_controller/target_frame"
     rig = ArmRig(node, "right", hand="left", topic=topic, tool_frame="right_arm_link_ee", robot="bh_robot")
     rig.follows = False
-    rig.start(processes, "tests.ros.third_arm", world_frame_id="world", **{"teleop.leash.distance": 0.0})
+    rig.start(processes, {"world_frame_id": "world", "teleop.leash.distance": 0.0}, "tests.ros.third_arm")
     rig.engage()
     rig.wait(lambda: rig.targets, "targets come")
     assert rig.targets[0].header.frame_id == "bh_robot_base"
@@ -273,7 +273,7 @@ def test_a_gripper_is_closed_when_its_result_says_so_even_stalled(kind: str, rig
     with spinning("gripper") as other:
         server = ActionServer(other, action, "/q2r2/left_gripper/gripper_cmd", execute)
         joint = {"gripper.joint_name": "finger"} if kind == "ParallelGripperCommand" else {}
-        rig.start(processes, **{"gripper.action_type": kind, "gripper.open_position": 0.04}, **joint)
+        rig.start(processes, {"gripper.action_type": kind, "gripper.open_position": 0.04, **joint})
         rig.press("upper")
         command = goals.get(timeout=PATIENCE)
         position = command.position if kind == "GripperCommand" else command.position[0]

@@ -14,10 +14,10 @@ pytest.importorskip("rclpy", reason=NEEDS_ROS)
 pytest.importorskip("tf2_msgs", reason="needs q2r2 ros build-interfaces")
 pytest.importorskip("quest2ros", reason="needs q2r2 ros build-interfaces")
 
-from geometry_msgs.msg import TransformStamped  # noqa: E402
+from geometry_msgs.msg import TransformStamped
 
-from q2r2_control.ros.frames import FrameTree  # noqa: E402
-from q2r2_control.ros.messages import transform_message  # noqa: E402
+from q2r2_control.ros.frames import FrameTree
+from q2r2_control.ros.messages import transform_message
 
 A = pin.SE3(pin.exp3(np.array([0.3, -1.0, 0.2])), np.array([1.0, 2.0, -0.5]))
 B = pin.SE3(pin.exp3(np.array([-0.7, 0.1, 2.0])), np.array([0.2, -0.4, 0.9]))
