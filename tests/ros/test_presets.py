@@ -152,8 +152,8 @@ def test_the_stand_in_notices_what_it_is_there_to_notice(node: Any, processes: P
     send_until("frame 'world'")
     message.header.frame_id = "robot_base"
     send_until("s old", age=1.0)
-    message.pose.position.x = 0.6
-    send_until("jump of 0.1")
+    message.pose.position.x = 0.9
+    send_until("jump of 0.4")
     message.pose.orientation.y = 0.9
     send_until("not a unit quaternion")
     other = node.create_publisher(PoseStamped, topic, 1)
