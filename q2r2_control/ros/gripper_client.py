@@ -5,10 +5,10 @@ from __future__ import annotations
 from enum import StrEnum
 from typing import Any
 
-from action_msgs.msg import GoalStatus
 from control_msgs.action import GripperCommand, ParallelGripperCommand
 from pydantic import BaseModel, ConfigDict, Field
 from rclpy.action import ActionClient
+from rclpy.action.client import GoalStatus
 from rclpy.node import Node
 from std_msgs.msg import Float64MultiArray
 
