@@ -58,6 +58,7 @@ class ArmTeleop:
         self._leash = Leash(settings.leash)
         self._presses: list[Press] = []
         self._aligned_at = 0.0
+        self._obstacle: str | None = None
 
     @property
     def chord(self) -> bool:
@@ -94,11 +95,13 @@ class ArmTeleop:
         self._buttons.forget()
         self._presses.clear()
 
-    def act(self, tool: pin.SE3 | None, now: float, chord: bool) -> None:
+    def act(self, tool: pin.SE3 | None, now: float, chord: bool, obstacle: str | None = None) -> None:
         """Let buttons and chords change the state.
 
-        ``tool``: pose to anchor to, None if not known; ``chord``: whether an alignment chord stops this arm.
+        ``tool``: pose to anchor to, None if not known; ``chord``: whether an alignment chord stops this arm;
+        ``obstacle``: why it may not be engaged now, if it may not.
         """
+        self._obstacle = obstacle
         if chord:
             self._align(now)
         elif self.state is ArmState.ALIGNING and self._gate.pose is not None and self._gate.stamp >= self._aligned_at:
@@ -143,7 +146,7 @@ class ArmTeleop:
             self._engage(tool, now, "lower button")
 
     def _engage(self, tool: pin.SE3 | None, now: float, reason: str) -> None:
-        obstacle = self.watchdog(now)
+        obstacle = self._obstacle or self.watchdog(now)
         if self._gate.pose is None:
             obstacle = obstacle or "the newest pose is not usable"
         elif tool is None or not np.isfinite(tool.homogeneous).all():

@@ -62,6 +62,7 @@ class Teleop:
         tools: Mapping[str, pin.SE3],
         now: float,
         commanded: Mapping[str, pin.SE3] | None = None,
+        obstacles: Mapping[str, str] | None = None,
     ) -> dict[str, ArmTarget]:
         """One tick: take what arrived and say where every arm should go.
 
@@ -69,6 +70,7 @@ class Teleop:
         engaging, the position anchors to the measured tool and the orientation to the commanded one, so that sag
         does not add up over many pauses. Without ``commanded`` it is the last target's, at first the measured one.
         ``commanded`` is also what the leash is tied to; without it there is none.
+        ``obstacles``: why an arm may not be engaged now, for reasons outside of this layer.
         ``now`` [s] is the clock of the samples' stamps.
         """
         clock_fault = self._clock(now)
@@ -84,7 +86,12 @@ class Teleop:
         chord = any(arm.chord for arm in self._arms.values())
         targets = {}
         for name, arm in self._arms.items():
-            arm.act(self._tool(name, tools, commanded), now, chord if self._linked else arm.chord)
+            arm.act(
+                self._tool(name, tools, commanded),
+                now,
+                chord if self._linked else arm.chord,
+                (obstacles or {}).get(name),
+            )
             pose = arm.target(now, (commanded or {}).get(name))
             if pose is not None:
                 self._commanded[name] = pose
@@ -97,6 +104,12 @@ class Teleop:
         for arm in self._arms.values():
             arm.disengage(self._now if self._now is not None else 0.0, "connection lost")
             arm.forget()
+
+    def pause(self, now: float, reason: str) -> None:
+        """Every arm holds until a new press, for a reason outside of this layer."""
+        self._clock(now)
+        for arm in self._arms.values():
+            arm.disengage(self._now if self._now is not None else 0.0, reason)
 
     def _clock(self, now: float) -> str | None:
         """Advance the time; returns the fault of a clock that cannot be followed, if any."""

@@ -1,0 +1,304 @@
+"""Teleoperation of one arm as a node. A robot is ported by a subclass that gives its names, see left_arm_controller."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import pinocchio as pin
+from geometry_msgs.msg import PoseStamped
+from quest2ros.msg import OVR2ROSHapticFeedback, OVR2ROSInputs
+from std_srvs.srv import Trigger
+from visualization_msgs.msg import Marker
+
+from q2r2_control.errors import ConfigError
+from q2r2_control.inputs.samples import SampleQueue
+from q2r2_control.inputs.session import HAPTIC_TOPICS
+from q2r2_control.ros.arm_link import ArmLink
+from q2r2_control.ros.arm_parameters import ArmDefaults, ArmParameters, arm_parameters
+from q2r2_control.ros.frames import FrameListener
+from q2r2_control.ros.gripper_client import GripperClient
+from q2r2_control.ros.markers import TargetMarkers
+from q2r2_control.ros.messages import hand_sample
+from q2r2_control.ros.node import COMMAND_QOS, ERROR, OK, STREAM_QOS, WARN, BaseNode
+from q2r2_control.ros.pose_source import PoseTopic, ToolFrame
+from q2r2_control.ros.presets import BUILTIN, Mode
+from q2r2_control.ros.target_output import TargetOutput, near
+from q2r2_control.teleop.arm import OPEN, ArmState
+from q2r2_control.teleop.haptics import HapticPulses
+from q2r2_control.teleop.teleop import Teleop
+from q2r2_control.types import SIDES, ArmTarget
+
+_MARKER_PERIOD = 0.05  # [s]
+# Farther from the measured pose than sag explains, a commanded one is not what the tool is anchored to.
+_SAG = 0.05, 0.1  # [m, rad]
+_SAFE_TIMEOUT = 0.15  # of the built-in controller's targets [s]
+
+
+class BaseArmController(BaseNode):
+    """One arm follows one hand: hand topics in, target pose, gripper goals, markers and vibrations out.
+
+    The node is ``<arm_name>_<robot_name>_arm_controller``; the other arguments are defaults of parameters so named.
+    ``filter_window_size``, in samples of a 75 Hz headset, sets ``teleop.filter.smoothing_delay``.
+
+    Steps to override: :meth:`setup_parameters`, :meth:`setup_state`, :meth:`setup_interfaces`, :meth:`current_pose`,
+    :meth:`pose_callback`, :meth:`inputs_callback`, :meth:`toggle_gripper`.
+    """
+
+    def __init__(
+        self,
+        arm_name: str,
+        robot_name: str = "q2r2",
+        mirror: bool = False,
+        base_frame_id: str = "world",
+        filter_window_size: int | None = None,
+        end_effector_link_name: str = "",
+        ctrl_prefix: str = "",
+        gripper_action_topic: str = "",
+        **kwargs: Any,
+    ) -> None:
+        if arm_name not in SIDES:
+            raise ConfigError(f"arm_name = {arm_name!r:.60}: allowed are {', '.join(SIDES)}")
+        super().__init__(f"{arm_name}_{robot_name}_arm_controller", **kwargs)
+        self.arm_name, self.robot_name = arm_name, robot_name
+        self.defaults = ArmDefaults(
+            arm_name=arm_name,
+            robot_name=robot_name,
+            mirror=mirror,
+            base_frame_id=base_frame_id,
+            end_effector_link_name=end_effector_link_name or f"{arm_name}_tool_frame",
+            ctrl_prefix=ctrl_prefix or f"/{robot_name}/{arm_name}",
+            gripper_action_topic=gripper_action_topic or f"/{robot_name}/{arm_name}_gripper/gripper_cmd",
+            filter_window_size=filter_window_size,
+        )
+        try:
+            self.parameters = self.setup_parameters()
+            self.setup_state()
+            self.setup_interfaces()
+        except BaseException:
+            self.destroy_node()  # a node that nobody gets to hold may keep the process from ending
+            raise
+
+    def setup_parameters(self) -> ArmParameters:
+        """Declare the parameters; returns what they say."""
+        return arm_parameters(self, self.defaults)
+
+    def setup_state(self) -> None:
+        """Make what the node remembers."""
+        self.teleop = Teleop(self.parameters.teleop, (self.arm_name,))
+        self.hand = self.teleop.hand_of(self.arm_name)
+        self.haptics = HapticPulses(self.hand)
+        self.markers = TargetMarkers(self.arm_name, self.parameters.tool_frame, self.parameters.world_frame)
+        self._samples = SampleQueue()
+        self._pose: tuple[PoseStamped, float] | None = None
+        self._inputs: tuple[OVR2ROSInputs | None, float] = (None, float("-inf"))
+        self._target = ArmTarget(None, OPEN)
+        self._last_event = "paused: not engaged yet"
+        self._refusal: tuple[bytes, str] | None = None
+        self._relaying = False
+        self._shown = 0.0
+
+    def setup_interfaces(self) -> None:
+        """Make publishers, subscriptions, services, the action client and the timer."""
+        values, hand = self.parameters, self.hand
+        self._frames = FrameListener(self)
+        tree, world = self._frames.tree, values.world_frame
+        self._tool: ToolFrame | PoseTopic = ToolFrame(tree, values.tool_frame, world, values.tool_timeout)
+        if values.current_pose_topic:
+            self._tool = PoseTopic(self, values.current_pose_topic, tree, world, values.tool_timeout)
+        self._safe_target = PoseTopic(self, values.safe_target_topic, tree, world, _SAFE_TIMEOUT)
+        self._link = ArmLink(self, self.robot_name, self.arm_name, values.teleop.stance, values.link_timeout)
+        self._make_outputs()
+        self.gripper = GripperClient(self, values.gripper_topic, values.gripper)
+        self._markers = self.create_publisher(Marker, "/visualization_marker", 10)
+        self._haptics = self.create_publisher(OVR2ROSHapticFeedback, HAPTIC_TOPICS[hand], COMMAND_QOS)
+        self.create_subscription(PoseStamped, f"q2r_{hand}_hand_pose", self.pose_callback, STREAM_QOS)
+        self.create_subscription(OVR2ROSInputs, f"q2r_{hand}_hand_inputs", self.inputs_callback, STREAM_QOS)
+        self.create_service(Trigger, "~/pause", self._on_pause)
+        self.create_service(Trigger, "~/reset", self._on_reset)
+        self.create_timer(1.0 / values.rate, self.tick)
+
+    def current_pose(self) -> pin.SE3 | None:
+        """The tool's pose in the world frame; None where it is not known."""
+        return self._tool.at(self.now)
+
+    def pose_callback(self, message: PoseStamped) -> None:
+        """Take a pose of the hand."""
+        self._pose = message, self.now
+        self._put_sample()
+
+    def inputs_callback(self, message: OVR2ROSInputs) -> None:
+        """Take buttons, triggers and stick of the hand."""
+        self._inputs = message, self.now
+        self._put_sample()
+
+    def toggle_gripper(self) -> None:
+        """The upper button was pressed."""
+        self.gripper.toggle(self.now)
+
+    def tick(self) -> None:
+        """Take what arrived, and say where the tool should go."""
+        now, tool = self.now, self.current_pose()
+        base = self._base()
+        self._refusal = self._refuse(tool, base)
+        obstacle = None if self._refusal is None else self._refusal[1]
+        fault = self._faults(now) or obstacle
+        if fault is not None and self.state is not ArmState.PAUSED:
+            self.teleop.pause(now, fault)
+        samples, arm = self._samples.take(), self.arm_name
+        tools = {} if tool is None else {arm: tool}
+        commanded = {} if tool is None else {arm: self._commanded(tool, now)}
+        obstacles = {} if obstacle is None else {arm: obstacle}
+        target = self.teleop.update(samples, tools, now, commanded or None, obstacles)[arm]
+        toggled = target.gripper != self._target.gripper
+        self._target = target
+        sent = self._output.step(target.pose, tool, base, now)
+        self._relay(tool, base, now)
+        if toggled:
+            self.toggle_gripper()
+        self.gripper.check(now)
+        self._tell_events(now)
+        self._tell_operator(sent, tool, now)
+
+    @property
+    def state(self) -> ArmState:
+        """State of the teleop layer."""
+        return self.teleop.states[self.arm_name]
+
+    def health(self) -> tuple[bytes, str, Mapping[str, Any]]:
+        """State, what keeps the arm from being engaged, and figures."""
+        guard = self._output.guard
+        values = {
+            "arm": self.arm_name,
+            "state": str(self.state),
+            "engaged": self.state is ArmState.ENGAGED,
+            "hand": self.hand,
+            "hand_age": round(self.now - self._pose[1], 3) if self._pose else None,
+            "inputs_age": round(self.now - self._inputs[1], 3) if self._inputs[0] else None,
+            "stance": str(self.parameters.teleop.stance),
+            "preset": self.parameters.preset.name,
+            "mode": str(self.parameters.mode),
+            "target_topic": self._output.topic,
+            "targets_sent": self._output.sent,
+            "targets_clipped": guard.clipped,
+            "slip": round(self._target.slip, 4),
+            "slip_angle": round(self._target.slip_angle, 4),
+            "gripper": self.gripper.state,
+            "last_event": self._last_event,
+        }
+        if self._refusal is not None:
+            return *self._refusal, values
+        if self.gripper.problem is not None:
+            return WARN, self.gripper.problem, values
+        return OK, self._last_event, values
+
+    def close(self) -> None:
+        """Say good-bye to the other arm."""
+        self._link.close()
+
+    def _make_outputs(self) -> None:
+        values = self.parameters
+        if values.mode is Mode.RAW:
+            self._output = TargetOutput(
+                self, values.preset, values.controller, values.target_topic, values.base_frame, values.guard
+            )
+            self._external: TargetOutput | None = None
+            return
+        topic = BUILTIN.topic.format(ctrl=values.builtin_prefix)
+        self._output = TargetOutput(self, BUILTIN, "/cartesian_controller", topic, values.world_frame, BUILTIN.guard)
+        self._external = None
+        if values.preset.takes_poses and values.preset is not BUILTIN:
+            self._external = TargetOutput(
+                self, values.preset, values.controller, values.target_topic, values.base_frame, values.guard
+            )
+
+    def _base(self) -> pin.SE3 | None:
+        """The frame that targets are published in, in the world frame."""
+        if self.parameters.base_frame == self.parameters.world_frame:
+            return pin.SE3.Identity()
+        placement = self._frames.tree.find(self.parameters.base_frame, self.parameters.world_frame)
+        return None if placement is None else placement.pose
+
+    def _refuse(self, tool: pin.SE3 | None, base: pin.SE3 | None) -> tuple[bytes, str] | None:
+        """Why the arm may not be engaged now, and how bad that is."""
+        outputs = [self._output] if self._external is None else [self._output, self._external]
+        for line in (self._link.disagreement, *(output.conflict for output in outputs)):
+            if line is not None:
+                return ERROR, line
+        if tool is None:
+            return WARN, f"the tool's pose is not known: {self._tool.problem or 'current_pose() gives none'}"
+        if base is None:
+            values = self.parameters
+            return WARN, f"no transform from {values.base_frame} to {values.world_frame} on /tf"
+        unheard = next((output.unheard for output in outputs if output.unheard), None)
+        return None if unheard is None else (WARN, unheard)
+
+    def _faults(self, now: float) -> str | None:
+        """What happened elsewhere that pauses this arm."""
+        linked = self._link.take_fault(now) if self.parameters.teleop.linked else None
+        own = self._output.take_fault(now)
+        external = None
+        if self._external is not None and (external := self._external.take_fault(now)):
+            self._relaying = False
+        return external or own or linked
+
+    def _commanded(self, tool: pin.SE3, now: float) -> pin.SE3:
+        """What the leash is tied to, and whose orientation an anchor takes."""
+        reference = self._safe_target.at(now)
+        if self.state is ArmState.ENGAGED:
+            return tool if reference is None else reference
+        reference = reference or self._output.guard.pose
+        return reference if reference is not None and near(reference, tool, *_SAG) else tool
+
+    def _relay(self, tool: pin.SE3 | None, base: pin.SE3 | None, now: float) -> None:
+        """Mode filtered: pass what the built-in controller allows on to the external one, from engaging on."""
+        if self._external is None:
+            return
+        safe = self._safe_target.at(now)
+        if not self._relaying and self.state is ArmState.ENGAGED:
+            self._relaying = safe is not None and tool is not None and near(safe, tool, *_SAG)
+            if not self._relaying:
+                reason = self._safe_target.problem or f"{self.parameters.safe_target_topic} is not where the tool is"
+                self.teleop.pause(now, reason)
+        self._relaying = self._relaying and safe is not None
+        self._external.step(safe if self._relaying else None, tool, base, now)
+
+    def _tell_events(self, now: float) -> None:
+        """Pass changes of the state on to the log, the hand and the other arm."""
+        for event in self.teleop.take_events():
+            self._last_event = f"{event.destination}: {event.reason}"
+            self.get_logger().info(self._last_event)
+            self.haptics.tell(event)
+            stopped = event.source != ArmState.PAUSED and event.destination in (ArmState.PAUSED, ArmState.ALIGNING)
+            if stopped and event.reason != "lower button" and not event.reason.startswith("linked to"):
+                self._link.report(event.reason)
+            self.report_health()
+
+    def _tell_operator(self, sent: pin.SE3 | None, tool: pin.SE3 | None, now: float) -> None:
+        """Markers and vibrations."""
+        self.haptics.slip(self._target.slip, self._target.slip_angle)
+        if (pulse := self.haptics.at(now)) is not None:
+            self._haptics.publish(OVR2ROSHapticFeedback(frequency=pulse.frequency, amplitude=pulse.amplitude))
+        if not 0.0 <= now - self._shown < _MARKER_PERIOD:
+            self._shown = now
+            for marker in self.markers.at(sent, tool, self.state is ArmState.ENGAGED, now):
+                self._markers.publish(marker)
+
+    def _put_sample(self) -> None:
+        if self._pose is not None:
+            self._samples.put(hand_sample(self.hand, *self._pose, *self._inputs))
+
+    def _on_pause(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        self.teleop.pause(self.now, "the pause service")
+        response.success, response.message = True, f"{self.arm_name} is paused"
+        return response
+
+    def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        """Trust nothing received so far and hold nothing; a press engages anew."""
+        now = self.now
+        self.teleop.connection_lost(now)
+        for output in filter(None, (self._output, self._external)):
+            output.forget(now)
+        self._relaying = False
+        response.success, response.message = True, f"{self.arm_name} starts anew"
+        return response

@@ -1,0 +1,140 @@
+"""The last step before a controller that is not ours: it gets targets on its own terms, or none."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pinocchio as pin
+from geometry_msgs.msg import PoseStamped, WrenchStamped
+
+from q2r2_control.ros.messages import stamped_pose, time_message
+from q2r2_control.ros.node import COMMAND_QOS, LATCHED_QOS, BaseNode
+from q2r2_control.ros.presets import Hold, Preset
+from q2r2_control.teleop.guard import GuardSettings, TargetGuard
+
+_GRAPH_PERIOD = 0.1  # between two looks at who else is there [s]
+_ALERT = 1.0  # after somebody came every tick looks, since names are known later than endpoints [s]
+# A tool farther from a held target than this was moved by something else, and the target is not asked for again.
+_HELD = 0.15, 0.6  # [m, rad]
+
+
+class TargetOutput:
+    """Publishes one arm's target to one controller.
+
+    While there is a target it is followed by a :class:`TargetGuard`, which starts at the first one: that is where the
+    tool is, so engaging moves nothing. When there is none any more the guard brakes, and then the last pose is repeated
+    or not, as the preset says. It is never repeated to a tool that has gone elsewhere, nor to a controller that was
+    started anew: both would be a jump.
+    """
+
+    def __init__(
+        self, node: BaseNode, preset: Preset, controller: str, topic: str, frame: str, guard: GuardSettings
+    ) -> None:
+        self.preset = preset
+        self.guard = TargetGuard(guard)
+        self._node, self._controller, self._frame = node, controller, frame
+        self._publisher = node.create_publisher(PoseStamped, topic, COMMAND_QOS)
+        self._wrench = None
+        if preset.zero_wrench is not None:
+            self._wrench = node.create_publisher(WrenchStamped, preset.zero_wrench.format(ctrl=controller), LATCHED_QOS)
+        self._following = False
+        self._restarted = False
+        self._endpoints: set[bytes] = set()  # of the controller
+        self._listeners = 0
+        self._looked = self._came = -math.inf
+        self.sent = 0
+
+    @property
+    def topic(self) -> str:
+        """Where the targets go."""
+        return str(self._publisher.topic_name)
+
+    @property
+    def others(self) -> int:
+        """Publishers of the same topic besides this one."""
+        return max(0, self._node.count_publishers(self.topic) - 1)
+
+    @property
+    def conflict(self) -> str | None:
+        """One line on publishers that should not be there."""
+        if self.others == 0:
+            return None
+        return f"{self.others + 1} publishers of {self.topic}, allowed is one (one that was killed counts for 20 s)"
+
+    @property
+    def unheard(self) -> str | None:
+        """One line where nobody takes the targets."""
+        return f"nobody listens to {self.topic}" if self._publisher.get_subscription_count() == 0 else None
+
+    def take_fault(self, now: float) -> str | None:
+        """Look who is there; says once that the controller was started anew while it was driven."""
+        listeners = self._publisher.get_subscription_count()
+        if listeners > self._listeners or listeners == 0:
+            self._came = now
+            if not self._following:
+                self.forget(now)  # whoever it is, it is not to be greeted with a target of the past
+        self._listeners = listeners
+        if now - self._came < _ALERT or not 0.0 <= now - self._looked <= _GRAPH_PERIOD:
+            self._looked = now
+            self._look(now)
+        restarted, self._restarted = self._restarted, False
+        return f"{self._controller} was started anew" if restarted else None
+
+    def step(self, target: pin.SE3 | None, tool: pin.SE3 | None, base: pin.SE3 | None, now: float) -> pin.SE3 | None:
+        """Publish for ``now`` [s]; returns what was published, in the world frame.
+
+        ``target``: where the tool should be, None: nowhere new; ``tool``: where it is; both in the world frame, as is
+        ``base``, the frame that the controller reads its targets in. None of the latter two: not known.
+        """
+        idle = not self._following and self.guard.at_rest
+        self._following = target is not None
+        if target is not None and idle:
+            self.guard.reset(target, now)
+            self._send_zero_wrench(now)
+        pose = self.guard.step(target, now)
+        if pose is None or base is None or not (self._following or not self.guard.at_rest or self._holds(tool, now)):
+            return None
+        message = stamped_pose(base.actInv(pose), self._frame, now)
+        self._publisher.publish(message)
+        self.sent += 1
+        return pose
+
+    def forget(self, now: float) -> None:
+        """Hold nothing any more; the next target starts anew."""
+        self._following = False
+        self.guard.reset(None, now)
+
+    def _holds(self, tool: pin.SE3 | None, now: float) -> bool:
+        """Whether the last target is repeated."""
+        if self.guard.pose is None:
+            return False
+        if tool is None or not near(self.guard.pose, tool, *_HELD):
+            self.forget(now)
+            return False
+        return self.preset.hold is Hold.REPEAT
+
+    def _look(self, now: float) -> None:
+        """Notice a controller that has come."""
+        endpoints = {
+            bytes(info.endpoint_gid)
+            for info in self._node.get_subscriptions_info_by_topic(self.topic)
+            if f"{info.node_namespace.rstrip('/')}/{info.node_name}" == self._controller
+        }
+        if endpoints - self._endpoints:
+            self._restarted = self._following
+            self._send_zero_wrench(now)
+        self._endpoints = endpoints
+
+    def _send_zero_wrench(self, now: float) -> None:
+        if self._wrench is not None:
+            message = WrenchStamped()
+            message.header.frame_id = self._frame
+            message.header.stamp = time_message(now)
+            self._wrench.publish(message)
+
+
+def near(pose: pin.SE3, other: pin.SE3, distance: float, angle: float) -> bool:
+    """Whether two poses are within ``distance`` [m] and ``angle`` [rad] of each other."""
+    turn = float(np.linalg.norm(pin.log3(pose.rotation.T @ other.rotation)))
+    return math.dist(pose.translation, other.translation) <= distance and turn <= angle

@@ -1,0 +1,137 @@
+"""What a target keeps to on its way to a controller that has no limits of its own."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pinocchio as pin
+from pydantic import BaseModel, ConfigDict, Field
+
+from q2r2_control.types import Array
+
+# A step that is longer moves the target no farther: a loop that stalled has nothing to make up for [s].
+_LONGEST_DT = 0.1
+_REST = 1e-9  # slower than this is at rest [m/s, rad/s]
+
+
+class GuardSettings(BaseModel):
+    """How fast a target may move, whatever the hand does."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    max_velocity: float = Field(0.5, gt=0, le=5, description="of the target's position [m/s]")
+    max_acceleration: float = Field(5.0, gt=0, le=100, description="of the target's position [m/s^2]")
+    max_angular_velocity: float = Field(2.0, gt=0, le=20, description="of the target's rotation [rad/s]")
+    max_angular_acceleration: float = Field(20.0, gt=0, le=400, description="of the target's rotation [rad/s^2]")
+
+
+class TargetGuard:
+    """Follows a target within limits of velocity and acceleration, and comes to rest where there is none.
+
+    Within the limits a target that moves steadily is followed without lag: what is limited is the speed relative to
+    it, v = u + e/|e| s(|e|), with u the target's own velocity, e the lag and s the largest speed from which full
+    braking in steps of dt still stops at it,
+
+        s(d) = min(d / dt, a (-dt/2 + sqrt(dt^2/4 + 2 d/a))).
+
+    A step of the target faster than the limit is no motion of it; then u = 0. Rotations are limited the same way by
+    the rotation vector from pose to target. Poses are in one frame, whichever; quaternions stay of unit length over any
+    number of steps. Nothing but :meth:`reset` makes the pose jump.
+    """
+
+    def __init__(self, settings: GuardSettings) -> None:
+        self.settings = settings
+        self.pose: pin.SE3 | None = None
+        self.clipped = 0  # steps in which a limit held the pose back, since the start
+        self._linear = _Limited(settings.max_velocity, settings.max_acceleration)
+        self._angular = _Limited(settings.max_angular_velocity, settings.max_angular_acceleration)
+        self._target: pin.SE3 | None = None
+        self._now = -math.inf
+
+    @property
+    def at_rest(self) -> bool:
+        """Whether the pose stands still, which it also does when there is none."""
+        return self.pose is None or (self._linear.speed < _REST and self._angular.speed < _REST)
+
+    def reset(self, pose: pin.SE3 | None, now: float) -> None:
+        """Rest at ``pose``, or at none, from ``now`` [s] on."""
+        self.pose = None if pose is None else _unit(pose)
+        self._target, self._now = self.pose, now
+        self._linear.stop()
+        self._angular.stop()
+
+    def step(self, target: pin.SE3 | None, now: float) -> pin.SE3 | None:
+        """The pose at ``now`` [s], nearer to ``target``; None or a target that is not finite: brake and hold.
+
+        None before the first :meth:`reset`. A time that does not advance returns the same pose again.
+        """
+        dt = min(now - self._now, _LONGEST_DT)
+        if self.pose is None or not dt > 0.0:
+            return self.pose
+        self._now = now
+        if target is None or not np.isfinite(target.homogeneous).all():
+            limited = False
+            self._target = None
+            shift, turn = self._linear.brake(dt), self._angular.brake(dt)
+        else:
+            last, self._target = self._target or self.pose, target
+            lag = last.translation - self.pose.translation, pin.log3(last.rotation @ self.pose.rotation.T)
+            way = target.translation - last.translation, pin.log3(target.rotation @ last.rotation.T)
+            shift, slow = self._linear.follow(lag[0], way[0], dt)
+            turn, slow_turn = self._angular.follow(lag[1], way[1], dt)
+            limited = slow or slow_turn
+        self.clipped += limited
+        self.pose = _unit(pin.SE3(pin.exp3(turn) @ self.pose.rotation, self.pose.translation + shift))
+        return self.pose
+
+
+class _Limited:
+    """Velocity of a position or a rotation, (3,), that is bounded together with its change."""
+
+    def __init__(self, velocity: float, acceleration: float) -> None:
+        self._max, self._acceleration = velocity, acceleration
+        self.stop()
+
+    @property
+    def speed(self) -> float:
+        return math.hypot(*self._velocity)
+
+    def stop(self) -> None:
+        self._velocity = np.zeros(3)
+
+    def brake(self, dt: float) -> Array:
+        """What to move in ``dt`` [s] while coming to rest."""
+        return self._towards(np.zeros(3), dt)[0]
+
+    def follow(self, lag: Array, way: Array, dt: float) -> tuple[Array, bool]:
+        """What to move in ``dt`` [s], and whether that is less than asked for.
+
+        ``lag`` is from the pose to the last target, ``way`` from that to this one.
+        """
+        own = way / dt
+        if math.hypot(*own) > self._max:
+            lag, own = lag + way, np.zeros(3)
+        distance = math.hypot(*lag)
+        wanted = own
+        if distance > 0.0:
+            a = self._acceleration
+            speed = min(distance / dt, a * (-0.5 * dt + math.sqrt(0.25 * dt * dt + 2.0 * distance / a)))
+            wanted = own + lag * (speed / distance)
+        shift, limited = self._towards(wanted, dt)
+        return shift, limited or distance > self._max * dt
+
+    def _towards(self, wanted: Array, dt: float) -> tuple[Array, bool]:
+        fast = _at_most(wanted, self._max)
+        self._velocity = self._velocity + _at_most(fast - self._velocity, self._acceleration * dt)
+        return self._velocity * dt, math.dist(self._velocity, wanted) > _REST
+
+
+def _at_most(vector: Array, length: float) -> Array:
+    norm = math.hypot(*vector)
+    return vector if norm <= length else vector * (length / norm)
+
+
+def _unit(pose: pin.SE3) -> pin.SE3:
+    """Keeps rounding from adding up."""
+    return pin.SE3(pin.Quaternion(pose.rotation).normalized().toRotationMatrix(), np.array(pose.translation))

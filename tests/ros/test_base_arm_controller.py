@@ -1,0 +1,322 @@
+"""An arm's teleop node as the rest of a ROS system meets it: topics, actions, services, state; real processes."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from queue import Queue
+from threading import Thread
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from tests.ros.conftest import NEEDS_ROS
+from tests.ros.processes import PATIENCE, Processes, RosProcess
+
+pytest.importorskip("rclpy", reason=NEEDS_ROS)
+pytest.importorskip("quest2ros", reason="needs q2r2 ros build-interfaces")
+pytestmark = pytest.mark.usefixtures("interfaces")
+
+from q2r2_control.errors import ConfigError  # noqa: E402
+from q2r2_control.ros.messages import pose_of, transform_message  # noqa: E402
+from tests.ros.arm_rig import TOOL, ArmRig, steps  # noqa: E402
+
+
+@pytest.fixture
+def rig(node: Any) -> ArmRig:
+    return ArmRig(node)
+
+
+def offset(pose: pin.SE3, by: tuple[float, float, float], turn: float = 0.0) -> pin.SE3:
+    return pin.SE3(pin.exp3(np.array([0.0, 0.0, turn])) @ pose.rotation, pose.translation + np.array(by))
+
+
+def assert_same(pose: pin.SE3 | None, other: pin.SE3, tolerance: float) -> None:
+    assert pose is not None
+    np.testing.assert_allclose(pose.homogeneous, other.homogeneous, atol=tolerance)
+
+
+def first(rig: ArmRig) -> pin.SE3:
+    pose = pose_of(rig.targets[0].pose)
+    assert pose is not None
+    return pose
+
+
+def test_an_arm_engages_where_it_is_follows_pauses_and_resumes_without_a_jump(
+    rig: ArmRig, processes: Processes
+) -> None:
+    process = rig.start(processes)
+    rig.move((0.2, 0.0, 0.0), 0.1)
+    time.sleep(0.3)
+    assert rig.targets == []
+    rig.engage()
+    rig.wait(lambda: rig.targets, "the first target comes")
+    assert_same(first(rig), TOOL, 1e-9)
+    assert rig.targets[0].header.frame_id == "world"
+
+    rig.move((0.05, -0.1, 0.08), turn=0.3)
+    assert_same(rig.wait_for_rest(), offset(TOOL, (0.05, -0.1, 0.08), 0.3), 1e-3)
+    rig.pause()
+    held = rig.wait_for_rest()
+    rig.move((-0.3, 0.3, -0.2), turn=-0.8)
+    assert_same(rig.newest(), held, 1e-12)
+    rig.engage()
+    before = len(rig.targets)
+    rig.wait(lambda: len(rig.targets) > before + 5, "targets come again")
+    rig.move((0.0, 0.05, 0.0))
+    assert_same(rig.wait_for_rest(), offset(held, (0.0, 0.05, 0.0)), 1e-3)
+
+    assert max(steps(rig.targets)) < 0.02
+    assert all(abs(np.linalg.norm(_quaternion(target)) - 1.0) < 1e-12 for target in rig.targets)
+    assert (0.0, 0.0) in rig.pulses
+    assert len(rig.pulses) >= 6  # two engagements and a pause, each with its end
+    assert process.interrupt() == 0
+
+
+def _quaternion(target: Any) -> list[float]:
+    orientation = target.pose.orientation
+    return [orientation.x, orientation.y, orientation.z, orientation.w]
+
+
+def test_a_silent_hand_pauses_the_arm_and_its_return_moves_nothing(rig: ArmRig, processes: Processes) -> None:
+    rig.start(processes, {"teleop.gate.timeout": 0.15})
+    rig.engage()
+    rig.move((0.1, 0.0, 0.0), 0.2)
+    rig.sends_hand = False
+    rig.wait(lambda: rig.state["state"] == "paused", "the watchdog pauses the arm")
+    assert "data for 0.15 s" in rig.state["last_event"] or "pose for 0.15 s" in rig.state["last_event"]
+    held = rig.wait_for_rest()
+    rig.hand = offset(rig.hand, (0.3, 0.3, 0.0))
+    rig.sends_hand = True
+    time.sleep(0.5)
+    assert rig.state["state"] == "paused"
+    assert_same(rig.newest(), held, 1e-12)
+    rig.engage()
+    rig.wait_for_rest()
+    assert_same(rig.newest(), held, 1e-6)
+
+
+def test_without_its_tools_pose_an_arm_is_not_engaged_nor_a_gripper_closed_without_server(
+    rig: ArmRig, processes: Processes
+) -> None:
+    rig.tells_tool = False
+    rig.start(processes)
+    rig.press()
+    rig.wait(lambda: "the tool's pose is not known" in rig.state["last_event"], "the press is refused")
+    assert rig.state["level"] == "warn"
+    assert "no transform from left_tool_frame to world" in rig.state["message"]
+    rig.tells_tool = True
+    rig.engage()
+    rig.wait(lambda: rig.targets, "targets come")
+    rig.tells_tool = False
+    rig.wait(lambda: rig.state["state"] == "paused", "an arm whose tool is not seen any more is paused")
+
+    rig.tells_tool = True
+    rig.press("upper")
+    rig.wait(lambda: "no gripper server at /q2r2/left_gripper/gripper_cmd" in rig.state["message"], "it is told")
+    assert rig.state["gripper"] == "open"
+
+
+def call(node: Any, service: str) -> bool:
+    from std_srvs.srv import Trigger
+
+    client = node.create_client(Trigger, f"/left_q2r2_arm_controller/{service}")
+    assert client.wait_for_service(PATIENCE)
+    answers: Queue[Any] = Queue()
+    client.call_async(Trigger.Request()).add_done_callback(lambda future: answers.put(future.result()))
+    return bool(answers.get(timeout=PATIENCE).success)
+
+
+def test_services_and_a_second_publisher_of_targets_pause_the_arm(rig: ArmRig, node: Any, processes: Processes) -> None:
+    from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+    from geometry_msgs.msg import PoseStamped
+
+    errors: Queue[str] = Queue()
+
+    def on_diagnostics(message: Any) -> None:
+        for status in message.status:
+            if status.level == DiagnosticStatus.ERROR:
+                errors.put(f"{status.name}: {status.message}")
+
+    node.create_subscription(DiagnosticArray, "/diagnostics", on_diagnostics, 10)
+    rig.start(processes)
+    for service in ("pause", "reset"):
+        rig.engage()
+        assert call(node, service)
+        rig.wait(lambda: rig.state["state"] == "paused", "the service pauses the arm")
+
+    rig.engage()
+    second = node.create_publisher(PoseStamped, "/q2r2/left/target_frame", 1)
+    rig.wait(lambda: rig.state["level"] == "error", "the second publisher is reported")
+    assert "2 publishers of /q2r2/left/target_frame" in rig.state["message"]
+    assert rig.state["state"] == "paused"
+    assert "/left_q2r2_arm_controller: 2 publishers" in errors.get(timeout=PATIENCE)
+    rig.press()
+    assert rig.state["state"] == "paused"
+    node.destroy_publisher(second)
+    rig.engage()
+
+
+def test_arms_with_different_mirror_settings_refuse_to_engage_and_a_fault_of_one_pauses_both(
+    node: Any, processes: Processes
+) -> None:
+    left, right = ArmRig(node, "left"), ArmRig(node, "right")
+    left.start(processes)
+    wrong = start_mirrored(right, processes)
+    left.wait(lambda: left.state.get("level") == "error", "the disagreement is reported")
+    assert left.state["message"] == (
+        "this arm is set to side_by_side, the right one to mirror: set mirror alike in both"
+    )
+    left.press()
+    left.wait(lambda: "not engaged: this arm is set to" in left.state["last_event"], "the press is refused")
+    assert wrong.interrupt() == 0
+
+    right.start(processes)
+    left.engage()
+    right.engage()
+    left.hand = offset(left.hand, (1.0, 0.0, 0.0))  # a jump, which is a fault of the left hand
+    left.wait(lambda: left.state["state"] == "paused", "the fault pauses its own arm")
+    right.wait(lambda: right.state["state"] == "paused", "and the other")
+    assert right.state["last_event"].startswith("paused: linked to left: the hand jumped")
+
+
+def start_mirrored(rig: ArmRig, processes: Processes) -> RosProcess:
+    process = processes.start_module(f"q2r2_control.ros.{rig.arm}_arm_controller", "--ros-args", "-p", "mirror:=true")
+    rig.wait(lambda: rig.state.get("stance") == "mirror", "the mirrored arm is there")
+    rig.state = {}
+    return process
+
+
+def test_a_subclass_with_other_names_works_in_its_robots_frame(node: Any, processes: Processes) -> None:
+    from geometry_msgs.msg import TransformStamped
+    from tf2_msgs.msg import TFMessage
+    from visualization_msgs.msg import Marker
+
+    from q2r2_control.ros.node import LATCHED_QOS
+
+    base = pin.SE3(pin.exp3(np.array([0.0, 0.0, 1.2])), np.array([0.1, -0.4, 0.3]))
+    transform = TransformStamped(child_frame_id="bh_robot_base", transform=transform_message(base))
+    transform.header.frame_id = "world"
+    static = node.create_publisher(TFMessage, "/tf_static", LATCHED_QOS)
+    static.publish(TFMessage(transforms=[transform]))
+    shown: dict[str, Any] = {}
+    node.create_subscription(Marker, "/visualization_marker", lambda marker: shown.update({marker.ns: marker}), 10)
+
+    topic = "/bh_robot/right_arm_clik_controller/target_frame"
+    rig = ArmRig(node, "right", hand="left", topic=topic, tool_frame="right_arm_link_ee", robot="bh_robot")
+    rig.follows = False
+    rig.start(processes, {"world_frame_id": "world", "teleop.leash.distance": 0.0}, "tests.ros.third_arm")
+    rig.engage()
+    rig.wait(lambda: rig.targets, "targets come")
+    assert rig.targets[0].header.frame_id == "bh_robot_base"
+    assert_same(base * first(rig), TOOL, 1e-9)
+    rig.move((0.0, 0.1, 0.0))
+    assert_same(base * rig.wait_for_rest(), offset(TOOL, (0.0, 0.1, 0.0)), 1e-3)
+
+    rig.wait(lambda: {"right_engaged", "right_axes", "right_path"} <= shown.keys(), "markers come")
+    assert shown["right_axes"].header.frame_id == "right_arm_link_ee"
+    assert_same(TOOL * (pose_of(shown["right_axes"].pose) or pin.SE3.Identity()), offset(TOOL, (0.0, 0.1, 0.0)), 2e-3)
+    rig.pause()
+    rig.wait(lambda: shown["right_engaged"].color.a < 1.0, "the marker fades")
+    assert_same(pose_of(shown["right_engaged"].pose), pin.SE3.Identity(), 1e-9)
+
+
+@pytest.fixture
+def context(domain: int) -> Iterator[Any]:
+    """Where nodes are made that never spin."""
+    import rclpy
+
+    made = rclpy.Context()
+    rclpy.init(context=made, domain_id=domain)
+    yield made
+    made.try_shutdown()
+
+
+@contextmanager
+def spinning(name: str) -> Iterator[Any]:
+    """A node whose callbacks may wait, since a thread of their own runs them."""
+    import rclpy
+    from rclpy.executors import SingleThreadedExecutor
+
+    context = rclpy.Context()
+    rclpy.init(context=context)
+    made = rclpy.create_node(name, context=context)
+    executor = SingleThreadedExecutor(context=context)
+    executor.add_node(made)
+    thread = Thread(target=executor.spin, daemon=True)
+    thread.start()
+    yield made
+    executor.shutdown()
+    thread.join()
+    made.destroy_node()
+    context.try_shutdown()
+
+
+@pytest.mark.parametrize("kind", ["GripperCommand", "ParallelGripperCommand"])
+def test_a_gripper_is_closed_when_its_result_says_so_even_stalled(kind: str, rig: ArmRig, processes: Processes) -> None:
+    import control_msgs.action
+    from rclpy.action import ActionServer
+
+    action = getattr(control_msgs.action, kind)
+    goals: Queue[Any] = Queue()
+    answers: Queue[dict[str, bool]] = Queue()
+
+    def execute(goal: Any) -> Any:
+        goals.put(goal.request.command)
+        answer = answers.get(timeout=PATIENCE)
+        goal.abort()  # as grippers do that are held up
+        return action.Result(**answer)
+
+    with spinning("gripper") as other:
+        server = ActionServer(other, action, "/q2r2/left_gripper/gripper_cmd", execute)
+        joint = {"gripper.joint_name": "finger"} if kind == "ParallelGripperCommand" else {}
+        rig.start(processes, {"gripper.action_type": kind, "gripper.open_position": 0.04, **joint})
+        rig.press("upper")
+        command = goals.get(timeout=PATIENCE)
+        position = command.position if kind == "GripperCommand" else command.position[0]
+        assert position == 0.0
+        if joint:
+            assert list(command.name) == ["finger"]
+        rig.wait(lambda: rig.state["gripper"] == "closing", "the gripper is not taken for closed before its result")
+        answers.put({"stalled": True})
+        rig.wait(lambda: rig.state["gripper"] == "closed", "stalled is closed")
+
+        rig.press("upper")
+        command = goals.get(timeout=PATIENCE)
+        assert (command.position if kind == "GripperCommand" else command.position[0]) == 0.04
+        answers.put({"stalled": False})
+        rig.wait(lambda: "neither stalled nor at its goal" in rig.state["message"], "the failure is told")
+        assert rig.state["gripper"] == "closed"
+        server.destroy()
+
+
+BAD_PARAMETERS = {
+    "preset:=kuka": "preset = 'kuka': allowed are builtin, kuka_lbr_clik",
+    "mode:=direct": "mode = 'direct': allowed are raw, filtered",
+    "preset:=jtc": "preset = 'jtc' with mode = 'raw': it takes joint positions",
+    "mirror_reflected:=true": "allowed with mirror = True only",
+    "rate:=5.0": "parameter rate = 5: preset builtin needs at least 20",
+    "rate:=fast": "parameter rate: ",
+    "teleop.gate.timeout:=9.0": "parameter teleop.gate.timeout: ",
+    "teleop.axes:=[+x,+x,+z]": "parameter teleop.axes = ",
+    "guard.max_velocity:=0.0": "parameter guard.max_velocity = 0.0",
+}
+
+
+@pytest.mark.parametrize("given", BAD_PARAMETERS)
+def test_a_bad_parameter_is_refused_with_one_line(given: str, context: Any) -> None:
+    from q2r2_control.ros.left_arm_controller import LeftArmController
+
+    with pytest.raises(ConfigError) as error:
+        LeftArmController(context=context, cli_args=["--ros-args", "-p", given])
+    assert BAD_PARAMETERS[given] in str(error.value)
+    assert len(str(error.value).splitlines()) == 1
+
+
+def test_a_node_with_a_bad_parameter_ends_with_that_line(processes: Processes) -> None:
+    process = processes.start_module("q2r2_control.ros.left_arm_controller", "--ros-args", "-p", "mode:=direct")
+    assert process.wait() == 2
+    assert process.output == "left_arm_controller.py: mode = 'direct': allowed are raw, filtered\n"

@@ -1,0 +1,175 @@
+"""The guard's promises at every tick: speed, acceleration, unit quaternions, rest; and no lag where it need not lag."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from q2r2_control.teleop.guard import GuardSettings, TargetGuard
+from q2r2_control.types import Array
+from tests.teleop.hands import pose
+
+DT = 0.01
+LIMITS = GuardSettings(max_velocity=0.5, max_acceleration=5.0, max_angular_velocity=2.0, max_angular_acceleration=20.0)
+
+
+class Watched:
+    """A guard whose every step is checked against its limits."""
+
+    def __init__(self, start: pin.SE3 | None = None) -> None:
+        self.guard = TargetGuard(LIMITS)
+        self.now = 5.0
+        self.guard.reset(start or pose(), self.now)
+        self.velocity = np.zeros(3), np.zeros(3)
+
+    @property
+    def pose(self) -> pin.SE3:
+        assert self.guard.pose is not None
+        return self.guard.pose
+
+    def step(self, target: pin.SE3 | None, dt: float = DT) -> pin.SE3:
+        before, last = self.pose, self.velocity
+        self.now += dt
+        after = self.guard.step(target, self.now)
+        assert after is not None
+        dt = min(dt, 0.1)
+        self.velocity = (
+            (after.translation - before.translation) / dt,
+            pin.log3(after.rotation @ before.rotation.T) / dt,
+        )
+        bounds = (
+            (LIMITS.max_velocity, LIMITS.max_acceleration),
+            (
+                LIMITS.max_angular_velocity,
+                LIMITS.max_angular_acceleration,
+            ),
+        )
+        for velocity, previous, (fastest, acceleration) in zip(self.velocity, last, bounds, strict=True):
+            assert math.hypot(*velocity) <= fastest * (1 + 1e-6) + 1e-9
+            assert math.dist(velocity, previous) <= acceleration * dt * (1 + 1e-6) + 1e-6
+        assert np.abs(after.rotation.T @ after.rotation - np.eye(3)).max() < 1e-12
+        return after
+
+
+def circle(t: float, radius: float, period: float) -> pin.SE3:
+    """A circle through the origin that sets off within half a second, turning on its way."""
+    phase = 2 * math.pi / period * (t * t if t < 0.5 else t - 0.25)
+    return pose(radius * (math.cos(phase) - 1), radius * math.sin(phase), 0.0, (0.0, 0.0, 0.5 * math.sin(phase)))
+
+
+def test_without_a_reset_there_is_no_pose() -> None:
+    guard = TargetGuard(LIMITS)
+    assert guard.step(pose(1.0), 1.0) is None
+    assert guard.at_rest
+
+
+def test_the_first_pose_is_that_of_the_reset_exactly() -> None:
+    start = pose(0.3, -0.2, 0.7, (0.1, 2.0, -0.4))
+    guard = TargetGuard(LIMITS)
+    guard.reset(start, 5.0)
+    first = guard.step(start, 5.0 + DT)
+    assert first is not None
+    np.testing.assert_allclose(first.homogeneous, start.homogeneous, atol=1e-12)
+
+
+def test_a_motion_within_the_limits_is_followed_without_lag() -> None:
+    watched = Watched()
+    for tick in range(1, 800):
+        target = circle(tick * DT, 0.1, 3.0)
+        after = watched.step(target)
+        np.testing.assert_allclose(after.homogeneous, target.homogeneous, atol=1e-9)
+    assert watched.guard.clipped == 0
+
+
+@pytest.mark.parametrize("dt", [0.002, 0.005, 0.01, 0.02])
+def test_a_step_is_reached_without_overshoot_in_the_time_that_the_limits_take(dt: float) -> None:
+    watched, goal = Watched(), pose(0.4, 0.0, 0.0, (0.0, 0.0, 1.0))
+    fastest = 0.4 / LIMITS.max_velocity + LIMITS.max_velocity / LIMITS.max_acceleration
+    for _ in range(math.ceil(fastest / dt) + 4):
+        after = watched.step(goal, dt)
+        assert after.translation[0] <= 0.4 + 1e-9
+        assert pin.log3(after.rotation)[2] <= 1.0 + 1e-9
+    np.testing.assert_allclose(after.homogeneous, goal.homogeneous, atol=1e-6)
+    assert watched.guard.clipped > 0
+
+
+def test_without_a_target_it_brakes_and_rests() -> None:
+    watched = Watched()
+    for tick in range(1, 100):
+        watched.step(pose(0.004 * tick))
+    assert math.hypot(*watched.velocity[0]) > 0.3
+    for _ in range(math.ceil(0.4 / LIMITS.max_acceleration / DT) + 1):
+        watched.step(None)
+    assert watched.guard.at_rest
+    rest = watched.pose
+    for _ in range(20):
+        np.testing.assert_array_equal(watched.step(None).homogeneous, rest.homogeneous)
+
+
+def test_a_target_that_returns_elsewhere_is_approached_and_not_jumped_to() -> None:
+    watched = Watched()
+    watched.step(None)
+    for _ in range(300):
+        after = watched.step(pose(0.0, 0.6, 0.0))
+    np.testing.assert_allclose(after.translation, [0.0, 0.6, 0.0], atol=1e-6)
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+def test_a_target_that_is_not_finite_is_held_off(bad: float) -> None:
+    watched = Watched()
+    for tick in range(1, 50):
+        watched.step(pose(0.004 * tick))
+    for _ in range(50):
+        watched.step(pose(bad))
+    assert watched.guard.at_rest
+
+
+def test_a_loop_that_stalled_makes_up_for_nothing() -> None:
+    watched = Watched()
+    for tick in range(1, 50):
+        watched.step(pose(0.004 * tick))
+    before = watched.pose
+    watched.step(pose(3.0), dt=5.0)
+    assert np.linalg.norm(watched.pose.translation - before.translation) <= LIMITS.max_velocity * 0.1 + 1e-9
+
+
+def test_a_clock_that_does_not_advance_returns_the_same_pose() -> None:
+    watched = Watched()
+    watched.step(pose(0.1))
+    before = watched.pose
+    for now in (watched.now, watched.now - 1.0, math.nan):
+        assert watched.guard.step(pose(0.2), now) is before
+
+
+Coordinate = st.floats(-2.0, 2.0)
+Target = st.one_of(st.none(), st.tuples(Coordinate, Coordinate, Coordinate, Coordinate, Coordinate, Coordinate))
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.tuples(Target, st.integers(1, 30), st.sampled_from([0.001, 0.01, 0.013, 0.1, 1.0])), max_size=8))
+def test_no_sequence_of_targets_breaks_a_limit(
+    sequence: list[tuple[tuple[float, ...] | None, int, float]],
+) -> None:
+    watched = Watched()
+    for numbers, ticks, dt in sequence:
+        target = None if numbers is None else pin.SE3(pin.exp3(np.array(numbers[3:])), np.array(numbers[:3]))
+        for _ in range(ticks):
+            watched.step(target, dt)
+    for _ in range(60):
+        watched.step(None)
+    assert watched.guard.at_rest
+
+
+def test_a_target_that_stays_is_where_it_ends() -> None:
+    watched, goal = Watched(), pose(0.3, -0.5, 0.2, (1.0, -2.0, 0.5))
+    velocities: list[Array] = []
+    for _ in range(400):
+        watched.step(goal)
+        velocities.append(watched.velocity[0])
+    np.testing.assert_allclose(watched.pose.homogeneous, goal.homogeneous, atol=1e-6)
+    assert np.abs(velocities[-50:]).max() < 1e-6
