@@ -24,7 +24,7 @@ demo: setup
 	$(BIN)/q2r2 demo
 
 test: setup
-	$(BIN)/python -m pytest -n auto
+	$(BIN)/python -m pytest -n auto --dist loadgroup
 
 lint: setup
 	$(BIN)/ruff check .

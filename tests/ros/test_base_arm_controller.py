@@ -82,12 +82,12 @@ def _quaternion(target: Any) -> list[float]:
 
 
 def test_a_silent_hand_pauses_the_arm_and_its_return_moves_nothing(rig: ArmRig, processes: Processes) -> None:
-    rig.start(processes, {"teleop.gate.timeout": 0.15})
+    rig.start(processes, {"teleop.gate.timeout": 0.5})
     rig.engage()
     rig.move((0.1, 0.0, 0.0), 0.2)
     rig.sends_hand = False
     rig.wait(lambda: rig.state["state"] == "paused", "the watchdog pauses the arm")
-    assert "data for 0.15 s" in rig.state["last_event"] or "pose for 0.15 s" in rig.state["last_event"]
+    assert "data for 0.5 s" in rig.state["last_event"] or "pose for 0.5 s" in rig.state["last_event"]
     held = rig.wait_for_rest()
     rig.hand = offset(rig.hand, (0.3, 0.3, 0.0))
     rig.sends_hand = True
