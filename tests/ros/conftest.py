@@ -22,13 +22,6 @@ NEEDS_ROS = "needs ROS 2 Jazzy: pip install 'q2r2_control[ros]', or source an in
 _PROCESSES = pytest.StashKey[Processes]()
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """One worker runs all of these: nodes of two tests at once would starve each other on two cores."""
-    for item in items:
-        if Path(__file__).parent in item.path.parents:
-            item.add_marker(pytest.mark.xdist_group("ros"))
-
-
 @pytest.fixture(scope="session")
 def domain(tmp_path_factory: pytest.TempPathFactory) -> Iterator[int]:
     """A ROS_DOMAIN_ID that no other test session or worker on this machine has; set for this process too."""
