@@ -61,14 +61,14 @@ def node(domain: int) -> Iterator[Any]:
 
 
 @contextmanager
-def spun_node(domain: int) -> Iterator[Any]:
+def spun_node(domain: int, name: str = "test") -> Iterator[Any]:
     """The same for fixtures that outlive one test."""
     import rclpy
     from rclpy.executors import SingleThreadedExecutor
 
     context = rclpy.Context()
     rclpy.init(context=context, domain_id=domain)
-    made = rclpy.create_node("test", context=context)
+    made = rclpy.create_node(name, context=context)
     executor = SingleThreadedExecutor(context=context)
     executor.add_node(made)
     thread = Thread(target=executor.spin, daemon=True)

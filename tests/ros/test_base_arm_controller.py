@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
 from queue import Queue
-from threading import Thread
 from typing import Any
 
 import numpy as np
 import pinocchio as pin
 import pytest
 
-from tests.ros.conftest import NEEDS_ROS
+from tests.ros.conftest import NEEDS_ROS, spun_node
 from tests.ros.processes import PATIENCE, Processes, RosProcess
 
 pytest.importorskip("rclpy", reason=NEEDS_ROS)
@@ -175,8 +173,9 @@ def test_arms_with_different_mirror_settings_refuse_to_engage_and_a_fault_of_one
     assert wrong.interrupt() == 0
 
     right.start(processes)
-    left.engage()
     right.engage()
+    left.engage()
+    assert right.state["engaged"]
     left.hand = offset(left.hand, (1.0, 0.0, 0.0))  # a jump, which is a fault of the left hand
     left.wait(lambda: left.state["state"] == "paused", "the fault pauses its own arm")
     right.wait(lambda: right.state["state"] == "paused", "and the other")
@@ -235,28 +234,10 @@ def context(domain: int) -> Iterator[Any]:
     made.try_shutdown()
 
 
-@contextmanager
-def spinning(name: str) -> Iterator[Any]:
-    """A node whose callbacks may wait, since a thread of their own runs them."""
-    import rclpy
-    from rclpy.executors import SingleThreadedExecutor
-
-    context = rclpy.Context()
-    rclpy.init(context=context)
-    made = rclpy.create_node(name, context=context)
-    executor = SingleThreadedExecutor(context=context)
-    executor.add_node(made)
-    thread = Thread(target=executor.spin, daemon=True)
-    thread.start()
-    yield made
-    executor.shutdown()
-    thread.join()
-    made.destroy_node()
-    context.try_shutdown()
-
-
 @pytest.mark.parametrize("kind", ["GripperCommand", "ParallelGripperCommand"])
-def test_a_gripper_is_closed_when_its_result_says_so_even_stalled(kind: str, rig: ArmRig, processes: Processes) -> None:
+def test_a_gripper_is_closed_when_its_result_says_so_even_stalled(
+    kind: str, rig: ArmRig, processes: Processes, domain: int
+) -> None:
     import control_msgs.action
     from rclpy.action import ActionServer
 
@@ -270,12 +251,14 @@ def test_a_gripper_is_closed_when_its_result_says_so_even_stalled(kind: str, rig
         goal.abort()  # as grippers do that are held up
         return action.Result(**answer)
 
-    with spinning("gripper") as other:
+    with spun_node(domain, "gripper") as other:
         server = ActionServer(other, action, "/q2r2/left_gripper/gripper_cmd", execute)
         joint = {"gripper.joint_name": "finger"} if kind == "ParallelGripperCommand" else {}
         rig.start(processes, {"gripper.action_type": kind, "gripper.open_position": 0.04, **joint})
-        rig.press("upper")
-        command = goals.get(timeout=PATIENCE)
+        while goals.empty():  # a press before the server was found asks nobody
+            rig.press("upper")
+            rig.wait(lambda: not goals.empty() or "no gripper server" in rig.state["message"], "an answer to the press")
+        command = goals.get()
         position = command.position if kind == "GripperCommand" else command.position[0]
         assert position == 0.0
         if joint:

@@ -69,9 +69,6 @@ def test_a_process_that_dies_is_reported_and_ends_the_others(pair: RosProcess) -
 
 def test_the_command_starts_and_stops_the_whole_set(processes: Processes) -> None:
     nodes = nodes_of(CONFIG, "scripted")
-    missing = [node.module for node in nodes if importlib.util.find_spec(node.module) is None]
-    if missing:
-        pytest.skip(f"no such modules: {', '.join(missing)}")
     process = processes.start(sys.executable, "-m", "q2r2_control", "ros", "up", CONFIG, name="up")
     for name in ("mujoco_robot", "cartesian_controller"):
         process.wait_for(f"[{name}] ")
