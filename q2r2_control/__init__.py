@@ -1,16 +1,23 @@
 """Bimanual VR teleoperation and Cartesian control with a safe QP controller.
 
-The fixed API; everything else may move between versions.
+The fixed API; everything else may move between versions. A name is imported when it is first asked for: a ROS node that
+passes messages on need not wait for the solver and its compiled kernels.
 """
 
-from q2r2_control.config import load_config
-from q2r2_control.control.controller import CartesianController
-from q2r2_control.control.settings import ControllerSettings
-from q2r2_control.errors import ConfigError, Q2R2Error
-from q2r2_control.pipeline import Pipeline
-from q2r2_control.robot.robot import Robot
-from q2r2_control.summary import RunSummary
-from q2r2_control.teleop.relative import RelativeMotion
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from q2r2_control.config import load_config
+    from q2r2_control.control.controller import CartesianController
+    from q2r2_control.control.settings import ControllerSettings
+    from q2r2_control.errors import ConfigError, Q2R2Error
+    from q2r2_control.pipeline import Pipeline
+    from q2r2_control.robot.robot import Robot
+    from q2r2_control.summary import RunSummary
+    from q2r2_control.teleop.relative import RelativeMotion
 
 __all__ = [
     "CartesianController",
@@ -23,3 +30,25 @@ __all__ = [
     "RunSummary",
     "load_config",
 ]
+
+_MODULES = {
+    "CartesianController": "control.controller",
+    "ConfigError": "errors",
+    "ControllerSettings": "control.settings",
+    "Pipeline": "pipeline",
+    "Q2R2Error": "errors",
+    "RelativeMotion": "teleop.relative",
+    "Robot": "robot.robot",
+    "RunSummary": "summary",
+    "load_config": "config",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *__all__])

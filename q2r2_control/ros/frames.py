@@ -15,10 +15,23 @@ from tf2_msgs.msg import TFMessage
 _UNIT = 1e-3  # a quaternion's norm may be off by this
 
 
-class _Edge(NamedTuple):
-    parent: str
-    pose: pin.SE3  # of the child in the parent
-    received: float  # [s]; inf: static
+class _Edge:
+    """Where a child is in its parent; put together when it is asked for, since most frames of a robot never are."""
+
+    __slots__ = ("_pose", "_transform", "parent", "received")
+
+    def __init__(self, transform: TransformStamped, received: float) -> None:
+        self.parent, self.received = _name(transform.header.frame_id), received  # [s]; inf: static
+        self._transform = transform.transform
+        self._pose: pin.SE3 | None = None
+
+    @property
+    def pose(self) -> pin.SE3:
+        if self._pose is None:
+            position, rotation = self._transform.translation, self._transform.rotation
+            quaternion = pin.Quaternion(rotation.w, rotation.x, rotation.y, rotation.z).normalized()
+            self._pose = pin.SE3(quaternion.toRotationMatrix(), np.array([position.x, position.y, position.z]))
+        return self._pose
 
 
 class Placement(NamedTuple):
@@ -36,10 +49,8 @@ class FrameTree:
 
     def set(self, transform: TransformStamped, received: float) -> None:
         """Take one transform; numbers that are not finite or no rotation are passed over."""
-        pose = _pose(transform)
-        if pose is not None:
-            child, parent = _name(transform.child_frame_id), _name(transform.header.frame_id)
-            self._edges[child] = _Edge(parent, pose, received)
+        if _is_pose(transform):
+            self._edges[_name(transform.child_frame_id)] = _Edge(transform, received)
 
     def find(self, frame: str, within: str) -> Placement | None:
         """Pose of ``frame`` in ``within``; None where no chain of transforms joins them."""
@@ -81,11 +92,7 @@ def _name(frame: str) -> str:
     return frame.lstrip("/")
 
 
-def _pose(message: TransformStamped) -> pin.SE3 | None:
-    position, rotation = message.transform.translation, message.transform.rotation
-    translation = np.array([position.x, position.y, position.z])
-    quaternion = np.array([rotation.x, rotation.y, rotation.z, rotation.w])
-    norm = float(np.linalg.norm(quaternion))
-    if not (np.isfinite(translation).all() and abs(norm - 1.0) <= _UNIT):
-        return None
-    return pin.SE3(pin.Quaternion(quaternion / norm).toRotationMatrix(), translation)
+def _is_pose(message: TransformStamped) -> bool:
+    p, r = message.transform.translation, message.transform.rotation
+    # A sum or a norm with NaN or infinity in it is not finite.
+    return math.isfinite(p.x + p.y + p.z) and abs(math.hypot(r.x, r.y, r.z, r.w) - 1.0) <= _UNIT
