@@ -235,7 +235,7 @@ class BaseArmController(BaseNode):
 
     def _faults(self, now: float) -> str | None:
         """What happened elsewhere that pauses this arm."""
-        linked = self._link.take_fault(now) if self.parameters.teleop.linked else None
+        linked = self._link.take_fault() if self.parameters.teleop.linked else None
         own = self._output.take_fault(now)
         external = None
         if self._external is not None and (external := self._external.take_fault(now)):
@@ -269,6 +269,8 @@ class BaseArmController(BaseNode):
             self._last_event = f"{event.destination}: {event.reason}"
             self.get_logger().info(self._last_event)
             self.haptics.tell(event)
+            if event.destination is ArmState.ENGAGED:
+                self._link.engaged()
             stopped = event.source != ArmState.PAUSED and event.destination in (ArmState.PAUSED, ArmState.ALIGNING)
             if stopped and event.reason != "lower button" and not event.reason.startswith("linked to"):
                 self._link.report(event.reason)
