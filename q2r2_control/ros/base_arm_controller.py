@@ -18,6 +18,7 @@ from q2r2_control.ros.arm_link import ArmLink
 from q2r2_control.ros.arm_parameters import ArmDefaults, ArmParameters, arm_parameters
 from q2r2_control.ros.frames import FrameListener
 from q2r2_control.ros.gripper_client import GripperClient
+from q2r2_control.ros.hand_topics import HandWatch
 from q2r2_control.ros.markers import TargetMarkers
 from q2r2_control.ros.messages import hand_sample
 from q2r2_control.ros.node import COMMAND_QOS, ERROR, OK, STREAM_QOS, WARN, BaseNode
@@ -103,11 +104,12 @@ class BaseArmController(BaseNode):
         values, hand = self.parameters, self.hand
         self._frames = FrameListener(self)
         tree, world = self._frames.tree, values.world_frame
-        self._tool: ToolFrame | PoseTopic = ToolFrame(tree, values.tool_frame, world, values.tool_timeout)
+        self._tool: ToolFrame | PoseTopic = ToolFrame(self, tree, values.tool_frame, world, values.tool_timeout)
         if values.current_pose_topic:
             self._tool = PoseTopic(self, values.current_pose_topic, tree, world, values.tool_timeout)
         self._safe_target = PoseTopic(self, values.safe_target_topic, tree, world, _SAFE_TIMEOUT)
         self._link = ArmLink(self, self.robot_name, self.arm_name, values.teleop.stance, values.link_timeout)
+        self._hand_watch = HandWatch(self, hand, values.teleop.gate.timeout)
         self._make_outputs()
         self.gripper = GripperClient(self, values.gripper_topic, values.gripper)
         self._markers = self.create_publisher(Marker, "/visualization_marker", 10)
@@ -140,7 +142,7 @@ class BaseArmController(BaseNode):
         """Take what arrived, and say where the tool should go."""
         now, tool = self.now, self.current_pose()
         base = self._base()
-        self._refusal = self._refuse(tool, base)
+        self._refusal = self._refuse(tool, base, now)
         obstacle = None if self._refusal is None else self._refusal[1]
         fault = self._faults(now) or obstacle
         if fault is not None and self.state is not ArmState.PAUSED:
@@ -219,7 +221,7 @@ class BaseArmController(BaseNode):
         placement = self._frames.tree.find(self.parameters.base_frame, self.parameters.world_frame)
         return None if placement is None else placement.pose
 
-    def _refuse(self, tool: pin.SE3 | None, base: pin.SE3 | None) -> tuple[bytes, str] | None:
+    def _refuse(self, tool: pin.SE3 | None, base: pin.SE3 | None, now: float) -> tuple[bytes, str] | None:
         """Why the arm may not be engaged now, and how bad that is."""
         outputs = [self._output] if self._external is None else [self._output, self._external]
         for line in (self._link.disagreement, *(output.conflict for output in outputs)):
@@ -230,8 +232,9 @@ class BaseArmController(BaseNode):
         if base is None:
             values = self.parameters
             return WARN, f"no transform from {values.base_frame} to {values.world_frame} on /tf"
-        unheard = next((output.unheard for output in outputs if output.unheard), None)
-        return None if unheard is None else (WARN, unheard)
+        silence = self._hand_watch.silence(now, self._pose[1] if self._pose else float("-inf"), self._inputs[1])
+        problem = silence or next((output.unheard for output in outputs if output.unheard), None)
+        return None if problem is None else (WARN, problem)
 
     def _faults(self, now: float) -> str | None:
         """What happened elsewhere that pauses this arm."""
@@ -240,7 +243,8 @@ class BaseArmController(BaseNode):
         external = None
         if self._external is not None and (external := self._external.take_fault(now)):
             self._relaying = False
-        return external or own or linked
+        safe = self._safe_target.take_silence(now) if self._output.preset is BUILTIN else None
+        return external or own or safe or linked
 
     def _commanded(self, tool: pin.SE3, now: float) -> pin.SE3:
         """What the leash is tied to, and whose orientation an anchor takes."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable
 from typing import Any
 
@@ -21,6 +22,7 @@ from q2r2_control.ros.messages import (
     inputs_message,
 )
 from q2r2_control.ros.node import STREAM_QOS
+from q2r2_control.ros.publishers import Publishers
 
 # Reliable, so that every subscriber can have it: a best-effort publisher has no reliable subscribers.
 PUBLISHED_QOS = QoSProfile(
@@ -59,6 +61,25 @@ class HandPublishers:
         """How many subscribers the topics of ``hand`` have."""
         publishers = (publisher for topic, publisher in self._publishers.items() if HAND_TOPICS[topic].hand == hand)
         return sum(publisher.get_subscription_count() for publisher in publishers)
+
+
+class HandWatch:
+    """Says which node's data of a hand have ceased. Poses and buttons are needed both: one guides, the other stops."""
+
+    def __init__(self, node: Node, hand: str, timeout: float) -> None:
+        self._hand, self._timeout = hand, timeout
+        self._publishers = Publishers(node, f"q2r_{hand}_hand_pose", f"q2r_{hand}_hand_inputs")
+
+    def silence(self, now: float, pose_stamp: float, inputs_stamp: float) -> str | None:
+        """One line, or None; the stamps are receipt times of the newest, -inf before the first [s]."""
+        ages = {"pose": now - pose_stamp, "button data": now - inputs_stamp}
+        missing = [what for what, age in ages.items() if age > self._timeout]
+        if not missing:
+            return None
+        what = "data" if len(missing) == len(ages) else missing[0]
+        age = min(ages[what] for what in missing)
+        since = f"for {age:.2f} s" if age < math.inf else "yet"
+        return f"no {what} of the {self._hand} hand from {self._publishers} {since}"
 
 
 def subscribe_to_hands(node: Node, listener: Callable[[str, HandMessage], None]) -> None:

@@ -6,12 +6,15 @@ import json
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
 from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
@@ -38,6 +41,7 @@ LATCHED_QOS = QoSProfile(
     durability=DurabilityPolicy.TRANSIENT_LOCAL,
 )
 _DIAGNOSTICS_PERIOD = 0.5  # [s]
+_CLOCK_TIMEOUT = 1.0  # simulated time that stands still for this long is told [s]
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 
@@ -54,7 +58,9 @@ class BaseNode(Node):
         super().__init__(name, **kwargs)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._state = self.create_publisher(String, "~/state", 10)
-        self.create_timer(_DIAGNOSTICS_PERIOD, self.report_health)
+        self._clock_moved = 0.0, time.monotonic()  # the newest ROS time, and when it was first seen [s]
+        # Whoever asks why nothing moves has to get an answer, above all where ROS time stands still.
+        self.create_timer(_DIAGNOSTICS_PERIOD, self.report_health, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def parameter(
         self,
@@ -105,6 +111,8 @@ class BaseNode(Node):
     def report_health(self) -> None:
         """Publish :meth:`health` now; a timer does it twice a second, a change that matters need not wait."""
         level, line, values = self.health()
+        if (problem := self._clock_problem()) is not None:
+            level, line = max(level, WARN), f"{problem}; {line}"
         status = DiagnosticStatus(level=level, name=self.get_fully_qualified_name(), message=line)
         status.values = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
         array = DiagnosticArray(status=[status])
@@ -112,6 +120,18 @@ class BaseNode(Node):
         self._diagnostics.publish(array)
         state = {"level": {OK: "ok", WARN: "warn", ERROR: "error"}[level], "message": line, **values}
         self._state.publish(String(data=json.dumps(state, default=str)))
+
+    def _clock_problem(self) -> str | None:
+        """What keeps ROS time from moving, if it is a simulation's and does not."""
+        clock: Any = self.get_clock()
+        now, wall = self.now, time.monotonic()
+        if now != self._clock_moved[0]:
+            self._clock_moved = now, wall
+        if not clock.ros_time_is_active or wall - self._clock_moved[1] < _CLOCK_TIMEOUT:
+            return None
+        if now == 0.0:
+            return "use_sim_time is set and nothing comes on /clock"
+        return "use_sim_time is set and the time on /clock stands still"
 
 
 def _executor() -> Any:

@@ -10,13 +10,15 @@ from geometry_msgs.msg import PoseStamped
 from q2r2_control.ros.frames import FrameTree, Placement
 from q2r2_control.ros.messages import pose_of
 from q2r2_control.ros.node import STREAM_QOS, BaseNode
+from q2r2_control.ros.publishers import Publishers
 
 
 class ToolFrame:
     """The pose of a frame of /tf in the world."""
 
-    def __init__(self, tree: FrameTree, frame: str, world: str, timeout: float) -> None:
+    def __init__(self, node: BaseNode, tree: FrameTree, frame: str, world: str, timeout: float) -> None:
         self._tree, self._frame, self._world, self._timeout = tree, frame, world, timeout
+        self._publishers = Publishers(node, "/tf")
         self.problem: str | None = None
 
     def at(self, now: float) -> pin.SE3 | None:
@@ -26,7 +28,8 @@ class ToolFrame:
         if placement is None:
             self.problem = f"no transform from {self._frame} to {self._world} on /tf"
         elif now - placement.received > self._timeout:
-            self.problem = f"{self._frame} on /tf is {now - placement.received:.2f} s old"
+            age = now - placement.received
+            self.problem = f"{self._frame} on /tf from {self._publishers} is {age:.2f} s old"
         return None if placement is None or self.problem else placement.pose
 
 
@@ -36,7 +39,7 @@ class PoseTopic:
     def __init__(self, node: BaseNode, topic: str, tree: FrameTree, world: str, timeout: float) -> None:
         self._tree, self._world, self._timeout = tree, world, timeout
         self._newest: tuple[PoseStamped, float] | None = None
-        self._topic = topic
+        self._topic, self._publishers = topic, Publishers(node, topic)
         self.problem: str | None = None
         node.create_subscription(PoseStamped, topic, lambda message: self._take(message, node.now), STREAM_QOS)
 
@@ -47,7 +50,7 @@ class PoseTopic:
             return None
         message, received = self._newest
         if now - received > self._timeout:
-            self.problem = f"{self._topic} is silent for {now - received:.2f} s"
+            self.problem = f"{self._topic} from {self._publishers} is silent for {now - received:.2f} s"
             return None
         frame = message.header.frame_id
         placement = self._tree.find(frame, self._world) if frame else Placement(pin.SE3.Identity(), math.inf)
@@ -60,6 +63,14 @@ class PoseTopic:
             self.problem = None
             return placement.pose * pose
         return None
+
+    def take_silence(self, now: float) -> str | None:
+        """Says once that what had come comes no more."""
+        if self._newest is None or now - self._newest[1] <= self._timeout:
+            return None
+        self.at(now)
+        self._newest = None
+        return self.problem
 
     def _take(self, message: PoseStamped, now: float) -> None:
         self._newest = message, now

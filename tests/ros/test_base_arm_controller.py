@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import time
 from collections.abc import Iterator
 from queue import Queue
@@ -85,7 +86,9 @@ def test_a_silent_hand_pauses_the_arm_and_its_return_moves_nothing(rig: ArmRig, 
     rig.move((0.1, 0.0, 0.0), 0.2)
     rig.sends_hand = False
     rig.wait(lambda: rig.state["state"] == "paused", "the watchdog pauses the arm")
-    assert "data for 0.5 s" in rig.state["last_event"] or "pose for 0.5 s" in rig.state["last_event"]
+    assert re.match(r"paused: no (data|pose) of the left hand from /test for 0\.5", rig.state["last_event"])
+    rig.wait(lambda: "of the left hand from /test for" in rig.state["message"], "diagnostics name whose data ceased")
+    assert rig.state["level"] == "warn"
     held = rig.wait_for_rest()
     rig.hand = offset(rig.hand, (0.3, 0.3, 0.0))
     rig.sends_hand = True
@@ -111,6 +114,7 @@ def test_without_its_tools_pose_an_arm_is_not_engaged_nor_a_gripper_closed_witho
     rig.wait(lambda: rig.targets, "targets come")
     rig.tells_tool = False
     rig.wait(lambda: rig.state["state"] == "paused", "an arm whose tool is not seen any more is paused")
+    assert "left_tool_frame on /tf from /test is 1.0" in rig.state["last_event"]
 
     rig.tells_tool = True
     rig.press("upper")
