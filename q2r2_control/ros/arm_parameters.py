@@ -84,7 +84,7 @@ def arm_parameters(node: BaseNode, given: ArmDefaults) -> ArmParameters:
             node, "tool_timeout", 0.15, "a tool's pose older than this is not known [s]", at_least=0.01, at_most=2.0
         ),
         link_timeout=declared(
-            node, "link_timeout", 0.25, "the other arm's node may be silent [s]", at_least=0.1, at_most=10.0
+            node, "link_timeout", 0.15, "the other arm's node may be silent [s]", at_least=0.1, at_most=10.0
         ),
         rate=rate,
         preset=preset,

@@ -1,0 +1,82 @@
+"""An operator with a headset: both hands circle steadily, on a TCP connection that is made anew when it is lost."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections import deque
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+
+from tests.support.fake_headset import RATE_HZ, FakeHeadset
+from tests.support.operator_script import HANDS, START, Vector
+
+RADIUS, SPEED = 0.08, 0.3  # of the hands' circles [m], [m/s]
+RAMP = 0.3  # from rest to that speed [s]
+PRESS = 0.2  # longer than what tells a press from a chord [s]
+
+
+class Operator:
+    """Streams both hands while :meth:`wearing` and ``online``; ``moves`` is the test's to set as well."""
+
+    def __init__(self, address: tuple[str, int]) -> None:
+        self.online = True
+        self.moves = False
+        self._lower: frozenset[str] = frozenset()
+        self._address = address
+        self._angle = self._rate = 0.0
+        self._was: deque[tuple[float, float]] = deque(maxlen=int(60.0 * RATE_HZ))  # when [s], and the angle
+        self._ended = threading.Event()
+
+    @contextmanager
+    def wearing(self) -> Iterator[Operator]:
+        """The headset is on, and tries to connect as often as it has to."""
+        thread = threading.Thread(target=self._run, daemon=True)
+        thread.start()
+        try:
+            yield self
+        finally:
+            self._ended.set()
+            thread.join()
+
+    def press(self, *hands: str) -> None:
+        """The lower buttons of these hands, which engage and pause."""
+        self._lower = frozenset(hands)
+        time.sleep(PRESS)
+        self._lower = frozenset()
+        time.sleep(0.1)
+
+    def rest(self, where_they_were: float | None = None) -> None:
+        """Put both hands at rest where they were at that time [s], or at the start; a jump while no arm follows."""
+        self.moves = False
+        self._rate = 0.0
+        self._angle = next((angle for t, angle in reversed(self._was) if t <= (where_they_were or -1.0)), 0.0)
+
+    def _run(self) -> None:
+        while not self._ended.wait(0.1):
+            if not self.online:
+                continue
+            # Nobody may listen yet, or not any more.
+            with suppress(OSError), FakeHeadset(self._address, connect_timeout=0.0) as headset:
+                headset.send(headset.registrations())
+                self._stream(headset)
+
+    def _stream(self, headset: FakeHeadset) -> None:
+        while self.online and not self._ended.wait(1.0 / RATE_HZ):
+            self._move(1.0 / RATE_HZ)
+            headset.discard_received()
+            for hand in HANDS:
+                headset.send(headset.pose(hand, self._position(hand), (0.0, 0.0, 0.0, 1.0)))
+                headset.send(headset.inputs(hand, lower=hand in self._lower))
+
+    def _move(self, dt: float) -> None:
+        full = SPEED / RADIUS
+        change = dt / RAMP * full
+        self._rate = min(self._rate + change, full) if self.moves else max(self._rate - change, 0.0)
+        self._angle += self._rate * dt
+        self._was.append((time.monotonic(), self._angle))
+
+    def _position(self, hand: str) -> Vector:
+        x, y, z = START[hand]
+        return x, y + RADIUS * math.sin(self._angle), z + RADIUS * (1.0 - math.cos(self._angle))

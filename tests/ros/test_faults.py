@@ -1,0 +1,181 @@
+"""Every node of a running set is killed or frozen while both arms move: they stop, and nothing but a press moves them.
+
+Times are those of joint states received here, on the machine's steady clock.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import pytest
+
+from q2r2_control import Robot, load_config
+from tests.ros.cell import CONFIG
+from tests.ros.conftest import NEEDS_ROS, spun_node
+from tests.ros.processes import PATIENCE, Processes
+from tests.ros.waiting import eventually
+
+pytest.importorskip("rclpy", reason=NEEDS_ROS)
+pytest.importorskip("quest2ros", reason="needs q2r2 ros build-interfaces")
+pytestmark = pytest.mark.usefixtures("interfaces")
+
+from tests.ros.headset_operator import Operator  # noqa: E402
+from tests.ros.joint_log import Stop  # noqa: E402
+from tests.ros.teleop_cell import ARMS, TeleopCell, address_of  # noqa: E402
+
+TIMEOUT = 0.15  # after which whatever is silent counts as lost [s]
+BRAKING = 10.0  # acceleration_limit of the cell [rad/s^2]
+DELIVERY = 0.1  # allowance for messages, and for processes to get their turn [s]
+STILL = 0.005  # a joint that stands moves no farther [rad]
+ANCHORED = 0.005  # a tool whose hand rests moves no farther [m]
+FAST = 1.5  # no joint is faster when hands move at 0.3 m/s [rad/s]
+AWHILE = 0.5  # in which something would have moved if anything did [s]
+
+NODES = ("mujoco_robot", "cartesian_controller", "left_arm_controller", "right_arm_controller", "tcp_endpoint")
+# The node that is killed, and what /diagnostics say then.
+KILLED = {
+    "tcp_endpoint": "of the left hand from /tcp_endpoint for 0.",
+    "left_arm_controller": "linked to left: /left_q2r2_arm_controller is silent for 0.",
+    "right_arm_controller": "linked to right: /right_q2r2_arm_controller is silent for 0.",
+    "cartesian_controller": "/cartesian_controller/safe_target/left from /cartesian_controller is silent for 0.",
+}
+# The node that is frozen for a while, and what it says itself when it goes on.
+FROZEN = {"left_arm_controller": "the control loop stalled for 1.", "cartesian_controller": "stalled for 1."}
+
+Record = Callable[[str, object], None]
+
+
+class Scene:
+    """The set of nodes and its operator."""
+
+    def __init__(self, cell: TeleopCell, operator: Operator, port: int) -> None:
+        self.cell, self.operator, self._port = cell, operator, port
+
+    def mend(self, name: str) -> None:
+        """Start what was killed, wake what was frozen."""
+        self.cell.mend(name, *([f"port:={self._port}"] if name == "tcp_endpoint" else []))
+
+    def press(self) -> None:
+        """Engage both arms, each by its own hand; again, where a busy machine has looked like a fault."""
+        self.cell.wait_until_ready()
+        deadline = time.monotonic() + PATIENCE
+        while paused := [arm for arm in ARMS if not self.cell.engaged(arm)]:
+            assert time.monotonic() < deadline, f"{paused} cannot be engaged: {self.cell.diagnoses[-5:]}"
+            self.operator.press(*paused)
+            time.sleep(0.1)
+
+    def move(self) -> None:
+        """Let both arms follow their hands at 0.3 m/s."""
+        deadline = time.monotonic() + PATIENCE
+        since: float | None = None
+        while since is None or time.monotonic() - since < 0.3:
+            assert time.monotonic() < deadline, f"the arms do not follow: {self.cell.diagnoses[-5:]}"
+            if not all(map(self.cell.engaged, ARMS)):
+                self.press()
+            self.operator.moves = True
+            since = (since or time.monotonic()) if self.cell.moving else None
+            time.sleep(0.01)
+
+    def measure_stop(self, what: str, fault: float, record: Record) -> Stop:
+        """How both arms come to rest after a fault, which may take them no longer than it has to."""
+        stop = self.cell.joints.stop_after(fault)
+        allowed = TIMEOUT + stop.speed / BRAKING + DELIVERY
+        line = (
+            f"from {stop.speed:.2f} rad/s slow within {1e3 * stop.slow:.0f} ms, allowed {1e3 * allowed:.0f}, "
+            f"at rest within {1e3 * stop.rest:.0f} ms, allowed {1e3 * (allowed + TIMEOUT):.0f}"
+        )
+        record(what, line)
+        print(f"\n{what}: {line}")
+        assert stop.speed > 0.2
+        assert stop.slow <= allowed
+        assert stop.rest <= allowed + TIMEOUT  # of the targets, which end when the hand's data have been missed
+        return stop
+
+    def assert_only_a_press_moves(self, stop: Stop) -> None:
+        """Nothing has moved since the stop; a press moves nothing either, but from then on the arms follow."""
+        joints = self.cell.joints
+        self.cell.wait_until_ready()
+        time.sleep(AWHILE)
+        assert joints.farthest_from(stop.posture, stop.t) < STILL
+        self.operator.rest(stop.t)
+        began = time.monotonic()
+        self.press()
+        time.sleep(AWHILE)
+        assert self.cell.tools_moved(stop.posture, began) < ANCHORED  # elbows may, towards their usual posture
+        self.move()
+        assert max(np.abs(state.v).max() for state in joints.since(began)) < FAST
+
+
+@pytest.fixture(scope="module")
+def scene(domain: int, interfaces: None, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Scene]:
+    """All nodes and a headset that is on."""
+    folder = tmp_path_factory.mktemp("faults")
+    processes = Processes(folder, os.environ)
+    with spun_node(domain) as node:
+        cell = TeleopCell(node, Robot.from_config(load_config(CONFIG)), processes, folder)
+        try:
+            for name in NODES[:-1]:
+                cell.start(name)
+            address = address_of(cell.start(NODES[-1], "port:=0"))
+            with Operator(address).wearing() as operator:
+                yield Scene(cell, operator, address[1])
+        finally:
+            processes.end_all()
+
+
+@pytest.fixture
+def moving(scene: Scene) -> Scene:
+    """Both arms follow their hands, whatever a test before has left behind."""
+    for name in NODES:
+        scene.mend(name)
+    scene.move()
+    return scene
+
+
+@pytest.mark.parametrize("name", KILLED)
+def test_a_killed_node_stops_both_arms_and_its_return_moves_none(
+    name: str, moving: Scene, record_property: Record
+) -> None:
+    fault = moving.cell.kill(name)
+    stop = moving.measure_stop(f"{name} killed", fault, record_property)
+    moving.cell.wait_for_diagnosis(fault, KILLED[name])
+    moving.mend(name)
+    moving.assert_only_a_press_moves(stop)
+
+
+def test_a_killed_robot_is_missed_and_greeted_with_no_command_of_the_past(moving: Scene) -> None:
+    cell = moving.cell
+    fault = cell.kill("mujoco_robot")
+    cell.wait_for_diagnosis(fault, "left_tool_frame on /tf from /mujoco_robot is 0.")
+    cell.wait_for_diagnosis(fault, "no joint states for 0.1")
+    time.sleep(AWHILE)
+    silence = time.monotonic()
+    moving.mend("mujoco_robot")
+    eventually(lambda: cell.joints.since(silence), "the robot is back")
+    back = cell.joints.since(silence)[0]
+    assert not [t for t, _ in cell.commands if silence < t < back.t]
+    cell.wait_until_ready()
+    time.sleep(AWHILE)
+    commands = [np.abs(q - back.q).max() for t, q in cell.commands if t > silence]
+    assert commands, "the controller holds the arms where they are"
+    assert max(commands) < STILL
+    assert cell.joints.farthest_from(back.q, back.t) < STILL
+    moving.operator.rest()
+    moving.press()
+    moving.move()
+
+
+@pytest.mark.parametrize("name", FROZEN)
+def test_a_frozen_node_stops_both_arms_and_when_it_wakes_it_moves_none(
+    name: str, moving: Scene, record_property: Record
+) -> None:
+    fault = moving.cell.signal(name, signal.SIGSTOP)
+    stop = moving.measure_stop(f"{name} frozen", fault, record_property)
+    time.sleep(max(fault + 1.0 - time.monotonic(), 0.0))
+    woken = moving.cell.signal(name, signal.SIGCONT)
+    moving.cell.wait_for_diagnosis(woken, FROZEN[name])
+    moving.assert_only_a_press_moves(stop)
