@@ -259,7 +259,7 @@ def faulty_joint_state(kind: str, robot: Robot, q: np.ndarray) -> JointState:
         ("a joint is missing", "no joint left_A1"),
         ("not a number", "position of left_A4 is not finite"),
         ("a jump", "left_A4 jumped by 0."),
-        ("a stall", "no joint states for"),
+        ("a stall", "no joint states from /mujoco_robot for"),
     ],
 )
 def test_joint_states_that_cannot_be_believed_stop_the_arms_with_one_diagnostic(
