@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any
 
@@ -14,18 +15,20 @@ import pytest
 
 from q2r2_control import Robot, load_config
 from tests.ros.conftest import NEEDS_ROS, spun_node
-from tests.ros.processes import Processes
+from tests.ros.processes import Processes, RosProcess
 
 pytest.importorskip("rclpy", reason=NEEDS_ROS)
 pytest.importorskip("control_msgs", reason="needs control_msgs: q2r2 ros build-interfaces")
 pytest.importorskip("tf2_msgs", reason="needs tf2_msgs: q2r2 ros build-interfaces")
 
+import pinocchio as pin
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory
 
 from q2r2_control.ros.node import COMMAND_QOS
-from tests.ros.cell import CONFIG, PATIENT, STILL, Cell, at_rest, parameters, start, wait
+from tests.ros.cell import CONFIG, PATIENT, STILL, Cell, Measured, Stream, at_rest, parameters, start, wait
 
+Engage = Callable[..., Stream]
 TARGETS = "/{arm}/target_pose"
 TARGET_TOPICS = [f"{arm}.target_topic:=/{arm}/target_pose" for arm in ("left", "right")]
 
@@ -53,6 +56,20 @@ def cell(started: Cell) -> Cell:
     started.measured.clear()
     wait(lambda: started.measured, "joint states come")
     return started
+
+
+@pytest.fixture
+def engage(cell: Cell) -> Iterator[Engage]:
+    """Begins streams of targets at tools, which end with the test."""
+    begun: list[Stream] = []
+
+    def begin(*arms: str) -> Stream:
+        begun.append(cell.engage(*arms))
+        return begun[-1]
+
+    yield begin
+    for stream in begun:
+        stream.end()
 
 
 class Relay:
@@ -99,7 +116,7 @@ def relay(cell: Cell, robot: Robot) -> Iterator[Relay]:
 
 
 def test_a_namespace_an_arm_is_merged_by_name_and_commanded_apart(
-    cell: Cell, robot: Robot, relay: Relay, processes: Processes
+    cell: Cell, robot: Robot, relay: Relay, processes: Processes, engage: Engage
 ) -> None:
     layout = [f"{arm}.joint_states_topic:=/{arm}/joint_states" for arm in robot.arms]
     # Its right arm is named by the pattern for all, its left one by itself.
@@ -107,7 +124,7 @@ def test_a_namespace_an_arm_is_merged_by_name_and_commanded_apart(
     layout += ["left.output_topic:=/left/arm_controller/joint_trajectory"]
     start(processes, "cartesian_controller", *parameters(*TARGET_TOPICS, *layout), *PATIENT)
     cell.wait_until_active()
-    stream = cell.engage("left", "right")
+    stream = engage("left", "right")
     begin = cell.q
     stream.move("left", (0.0, 0.0, 0.05))
     stream.move("right", (0.05, 0.0, 0.0))
@@ -123,16 +140,15 @@ def test_a_namespace_an_arm_is_merged_by_name_and_commanded_apart(
     assert "no joint states from /test on /right/joint_states for 0." in cell.state("message")
     relay.silent = ""
     wait(lambda: cell.state("phase") == "active", "the controller is active again")
-    stream.end()
 
 
 def test_torques_move_an_arm_and_leave_it_on_its_servos_when_the_controller_is_killed(
-    cell: Cell, processes: Processes
+    cell: Cell, processes: Processes, engage: Engage
 ) -> None:
     controller = start(processes, "cartesian_controller", *parameters(*TARGET_TOPICS, "output:=torque"), *PATIENT)
     cell.wait_until_active()
     wait(lambda: cell.state("mode", "mujoco_robot") == "torque", "the robot is driven by torques")
-    stream = cell.engage("left")
+    stream = engage("left")
     stream.move("left", (0.0, 0.0, 0.05), speed=0.1)
     goal = stream.poses["left"].translation
     wait(lambda: np.linalg.norm(cell.tool("left").translation - goal) < 3e-3, "the arm is there")
@@ -145,3 +161,64 @@ def test_torques_move_an_arm_and_leave_it_on_its_servos_when_the_controller_is_k
     wait(lambda: cell.state("mode", "mujoco_robot") == "holding", "the robot holds")
     time.sleep(0.5)
     assert max(np.abs(measured.q - before).max() for measured in cell.measured) < STILL
+
+
+def lbr_commands(listener: RosProcess, arm: str, field: str) -> np.ndarray:
+    """All that an arm's driver was sent so far, (n, 7), or (n,) for its times."""
+    lines = [json.loads(line) for line in listener.output.splitlines()[1:-1]]
+    return np.array([line[field] for line in lines if line["arm"] == arm], float)
+
+
+def start_lbr(
+    cell: Cell, processes: Processes, environment: dict[str, str], output: str, message: str
+) -> tuple[RosProcess, Measured]:
+    """Start drivers and a controller; the listener, and what was measured before."""
+    listener = processes.start_module("tests.ros.lbr_listener", message, "left", "right", **environment)
+    listener.wait_for("listens")
+    before = cell.measured[-1]
+    arguments = parameters(*TARGET_TOPICS, f"output:={output}", "max_deviation:=3.0")
+    start(processes, "cartesian_controller", *arguments, *PATIENT, **environment)
+    cell.wait_until_active()
+    wait(lambda: all(len(lbr_commands(listener, arm, "q")) for arm in ("left", "right")), "commands come")
+    return listener, before
+
+
+def test_an_lbr_is_led_by_positions_that_begin_where_it_is_and_step_no_further_than_its_joints_may(
+    cell: Cell, robot: Robot, processes: Processes, engage: Engage, lbr_environment: dict[str, str]
+) -> None:
+    listener, before = start_lbr(cell, processes, lbr_environment, "lbr_position", "LBRJointPositionCommand")
+    stream = engage("left")
+    stream.move("left", (0.0, 0.0, 0.05))
+    goal = stream.poses["left"].translation
+    wait(lambda: np.linalg.norm(cell.tool("left").translation - goal) < 3e-3, "the arm is there")
+    for arm in ("left", "right"):
+        joints = robot.arms[arm].joints
+        q, t = lbr_commands(listener, arm, "q"), lbr_commands(listener, arm, "t") * 1e-9
+        assert np.abs(q[0] - before.q[joints]).max() < 1e-5
+        # The tick's own length is what the step may use; it shows in the times up to what the messages are late.
+        longest = robot.velocity_limit[joints] * (np.diff(t)[:, None] + 0.02)
+        assert (np.abs(np.diff(q, axis=0)) <= longest).all()
+
+
+def test_an_lbr_is_given_torques_without_gravity_beside_its_measured_positions(
+    cell: Cell, robot: Robot, processes: Processes, engage: Engage, lbr_environment: dict[str, str]
+) -> None:
+    listener, before = start_lbr(cell, processes, lbr_environment, "lbr_torque", "LBRTorqueCommand")
+    gravity = pin.computeGeneralizedGravity(robot.model, robot.model.createData(), before.q)
+    for arm in ("left", "right"):
+        joints = robot.arms[arm].joints
+        assert np.abs(gravity[joints]).max() > 20.0
+        assert np.abs(lbr_commands(listener, arm, "tau")[0]).max() < 0.5
+        assert np.abs(lbr_commands(listener, arm, "q")[0] - before.q[joints]).max() < 1e-5
+    stream = engage("left")
+    stream.move("left", (0.0, 0.0, 0.02))
+    stiffness = load_config(CONFIG).impedance.translational_stiffness
+    time.sleep(0.5)
+    tau = lbr_commands(listener, "left", "tau")
+    assert np.isfinite(tau).all()
+    # The simulated arm stays where it is, so the torque is that of a spring stretched by 20 mm: F = J^-T tau.
+    data = robot.model.createData()
+    J = pin.computeFrameJacobian(robot.model, data, before.q, robot.arms["left"].frame_id, pin.LOCAL_WORLD_ALIGNED)
+    force = np.linalg.pinv(J[:, robot.arms["left"].joints].T) @ tau[-1]
+    assert force[2] == pytest.approx(stiffness * 0.02, rel=0.05)
+    assert np.abs(lbr_commands(listener, "right", "tau")).max() < 0.5
