@@ -125,7 +125,7 @@ class Supervisor:
         refusal = None if pose is None else stream.offer(pose, self._controller.tool_pose(arm), now)
         if crowd is not None:
             stream.drop()
-            return Refusal("publishers", crowd)
+            return crowd
         if pose is None:
             return None
         if why := self._no_targets():
@@ -136,14 +136,15 @@ class Supervisor:
             return None
         return Refusal("stream", refusal)
 
-    def _crowd(self, arm: str, number: int, now: float) -> str | None:
+    def _crowd(self, arm: str, number: int, now: float) -> Refusal | None:
         """Says so where not one publisher alone has sent an arm's targets lately."""
         breaks = self._sequences[arm].take(number, now, self._stream_settings.timeout)
         if breaks == 0:
             return None
         if breaks == 1:
-            return f"another publisher took over{self._origins.targets(arm)}; the targets have to begin anew"
-        return f"two publishers at a time{self._origins.targets(arm)}; allowed: one"
+            line = f"another publisher took over{self._origins.targets(arm)}; the targets have to begin anew"
+            return Refusal("took over", line)
+        return Refusal("publishers", f"two publishers at a time{self._origins.targets(arm)}; allowed: one")
 
     def _no_targets(self) -> str | None:
         if self.phase is not Phase.ACTIVE:
