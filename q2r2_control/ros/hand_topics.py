@@ -68,7 +68,9 @@ class HandWatch:
 
     def __init__(self, node: Node, hand: str, timeout: float) -> None:
         self._hand, self._timeout = hand, timeout
-        self._publishers = Publishers(node, f"q2r_{hand}_hand_pose", f"q2r_{hand}_hand_inputs")
+        self._topics = {"pose": f"q2r_{hand}_hand_pose", "button data": f"q2r_{hand}_hand_inputs"}
+        self._publishers = Publishers(node, self._topics.values())
+        self._publishers.look_steadily()
 
     def silence(self, now: float, pose_stamp: float, inputs_stamp: float) -> str | None:
         """One line, or None; the stamps are receipt times of the newest, -inf before the first [s]."""
@@ -77,9 +79,10 @@ class HandWatch:
         if not missing:
             return None
         what = "data" if len(missing) == len(ages) else missing[0]
+        source = self._publishers.source(self._topics[missing[0]])
         age = min(ages[what] for what in missing)
         since = f"for {age:.2f} s" if age < math.inf else "yet"
-        return f"no {what} of the {self._hand} hand from {self._publishers} {since}"
+        return f"no {what} of the {self._hand} hand{source} {since}"
 
 
 def subscribe_to_hands(node: Node, listener: Callable[[str, HandMessage], None]) -> None:

@@ -58,7 +58,7 @@ class BaseNode(Node):
         super().__init__(name, **kwargs)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._state = self.create_publisher(String, "~/state", 10)
-        self._clock_moved = 0.0, time.monotonic()  # the newest ROS time, and when it was first seen [s]
+        self._ros_time = 0.0, time.monotonic()  # the newest ROS time, and when it was first seen [s]
         # Whoever asks why nothing moves has to get an answer, above all where ROS time stands still.
         self.create_timer(_DIAGNOSTICS_PERIOD, self.report_health, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
@@ -125,9 +125,9 @@ class BaseNode(Node):
         """What keeps ROS time from moving, if it is a simulation's and does not."""
         clock: Any = self.get_clock()
         now, wall = self.now, time.monotonic()
-        if now != self._clock_moved[0]:
-            self._clock_moved = now, wall
-        if not clock.ros_time_is_active or wall - self._clock_moved[1] < _CLOCK_TIMEOUT:
+        if now != self._ros_time[0]:
+            self._ros_time = now, wall
+        if not clock.ros_time_is_active or wall - self._ros_time[1] < _CLOCK_TIMEOUT:
             return None
         if now == 0.0:
             return "use_sim_time is set and nothing comes on /clock"

@@ -18,7 +18,8 @@ class ToolFrame:
 
     def __init__(self, node: BaseNode, tree: FrameTree, frame: str, world: str, timeout: float) -> None:
         self._tree, self._frame, self._world, self._timeout = tree, frame, world, timeout
-        self._publishers = Publishers(node, "/tf")
+        self._publishers = Publishers(node, ["/tf"])
+        self._publishers.look_steadily()
         self.problem: str | None = None
 
     def at(self, now: float) -> pin.SE3 | None:
@@ -29,7 +30,7 @@ class ToolFrame:
             self.problem = f"no transform from {self._frame} to {self._world} on /tf"
         elif now - placement.received > self._timeout:
             age = now - placement.received
-            self.problem = f"{self._frame} on /tf from {self._publishers} is {age:.2f} s old"
+            self.problem = f"{self._frame} on /tf{self._publishers.source('/tf')} is {age:.2f} s old"
         return None if placement is None or self.problem else placement.pose
 
 
@@ -39,7 +40,8 @@ class PoseTopic:
     def __init__(self, node: BaseNode, topic: str, tree: FrameTree, world: str, timeout: float) -> None:
         self._tree, self._world, self._timeout = tree, world, timeout
         self._newest: tuple[PoseStamped, float] | None = None
-        self._topic, self._publishers = topic, Publishers(node, topic)
+        self._topic, self._publishers = topic, Publishers(node, [topic])
+        self._publishers.look_steadily()
         self.problem: str | None = None
         node.create_subscription(PoseStamped, topic, lambda message: self._take(message, node.now), STREAM_QOS)
 
@@ -50,7 +52,8 @@ class PoseTopic:
             return None
         message, received = self._newest
         if now - received > self._timeout:
-            self.problem = f"{self._topic} from {self._publishers} is silent for {now - received:.2f} s"
+            source = self._publishers.source(self._topic)
+            self.problem = f"{self._topic}{source} is silent for {now - received:.2f} s"
             return None
         frame = message.header.frame_id
         placement = self._tree.find(frame, self._world) if frame else Placement(pin.SE3.Identity(), math.inf)

@@ -1,34 +1,56 @@
-"""Which nodes a topic's data come from: asked of the graph now and then, and remembered for when they cease."""
+"""Which nodes publish on a topic, so that a message about missing data can name who should have sent it."""
 
 from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterable
 
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.node import Node
 
-_PERIOD = 1.0  # between two looks; a node that dies stays in the graph for longer than that [s]
-_UNKNOWN = "_NODE_NAME_UNKNOWN_"  # until discovery has come that far
+_FRESH = 0.1  # the graph's answer is good for so long [s]
+_PERIOD = 1.0  # of the looks of a node that has no other reason to look [s]
 
 
 class Publishers:
-    """Names of the nodes that publish any of ``topics``, or did until nobody was left."""
+    """Remembers the publishers' nodes, since those that have ended leave the graph at once or after a while.
 
-    def __init__(self, node: Node, *topics: str) -> None:
-        self._node, self._topics = node, topics
-        self._names: list[str] = []
-        node.create_timer(_PERIOD, self._look, clock=Clock(clock_type=ClockType.STEADY_TIME))
+    The graph is asked now and then and never for each message. Two publishers of one topic may also be one that was
+    killed, which the graph does not tell, and the one that was started in its place.
+    """
 
-    def __str__(self) -> str:
-        """Their full names, "nobody" where there never was one."""
-        if not self._names:
-            self._look()
-        return " and ".join(self._names) or "nobody"
+    def __init__(self, node: Node, topics: Iterable[str]) -> None:
+        self._node = node
+        self._names: dict[str, str] = dict.fromkeys(topics, "")
+        self._asked_at = dict.fromkeys(self._names, -math.inf)
 
-    def _look(self) -> None:
-        names = {
-            f"{info.node_namespace.rstrip('/')}/{info.node_name}"
-            for topic in self._topics
-            for info in self._node.get_publishers_info_by_topic(topic)
-            if info.node_name != _UNKNOWN
-        }
-        self._names = sorted(names) or self._names
+    def look_steadily(self) -> None:
+        """Let the node look now and then by itself."""
+        self._node.create_timer(_PERIOD, self.look, clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+    def look(self) -> None:
+        """Ask the graph about all topics."""
+        for topic in self._names:
+            self._ask(topic)
+
+    def of(self, topic: str) -> str:
+        """Full names of the nodes that publish on ``topic``, or did when there last were any; "" for none ever."""
+        if time.monotonic() - self._asked_at[topic] > _FRESH:
+            self._ask(topic)
+        return self._names[topic]
+
+    def source(self, topic: str) -> str:
+        """The same for the middle of a sentence: " from /node", or nothing."""
+        names = self.of(topic)
+        return f" from {names}" if names else ""
+
+    def _ask(self, topic: str) -> None:
+        self._asked_at[topic] = time.monotonic()
+        infos = self._node.get_publishers_info_by_topic(topic)
+        # A publisher may be known before its node is.
+        known = [info for info in infos if not info.node_name.startswith("_NODE_NAME_")]
+        if known:
+            names = {f"{info.node_namespace.rstrip('/')}/{info.node_name}" for info in known}
+            self._names[topic] = " and ".join(sorted(names))
