@@ -98,6 +98,7 @@ class BaseArmController(BaseNode):
         self._refusal: tuple[bytes, str] | None = None
         self._relaying = False
         self._shown = 0.0
+        self._ticked = self.now
 
     def setup_interfaces(self) -> None:
         """Make publishers, subscriptions, services, the action client and the timer."""
@@ -154,6 +155,8 @@ class BaseArmController(BaseNode):
         target = self.teleop.update(samples, tools, now, commanded or None, obstacles)[arm]
         toggled = target.gripper != self._target.gripper
         self._target = target
+        if self.now - now > self.parameters.teleop.gate.timeout:
+            return  # frozen in between: what was to be sent is of the past, and the next tick finds out
         sent = self._output.step(target.pose, tool, base, now)
         self._relay(tool, base, now)
         if toggled:
@@ -237,14 +240,16 @@ class BaseArmController(BaseNode):
         return None if problem is None else (WARN, problem)
 
     def _faults(self, now: float) -> str | None:
-        """What happened elsewhere that pauses this arm."""
+        """What pauses this arm, besides its hand: its own standing still first, which makes all others look silent."""
+        stood, self._ticked = now - self._ticked, now
+        stalled = f"this node stood still for {stood:.2f} s" if stood > self.parameters.teleop.gate.timeout else None
         linked = self._link.take_fault() if self.parameters.teleop.linked else None
         own = self._output.take_fault(now)
         external = None
         if self._external is not None and (external := self._external.take_fault(now)):
             self._relaying = False
         safe = self._safe_target.take_silence(now) if self._output.preset is BUILTIN else None
-        return external or own or safe or linked
+        return stalled or external or own or safe or linked
 
     def _commanded(self, tool: pin.SE3, now: float) -> pin.SE3:
         """What the leash is tied to, and whose orientation an anchor takes."""

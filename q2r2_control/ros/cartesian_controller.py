@@ -127,16 +127,21 @@ class CartesianControllerNode(BaseNode):
         now = self.now
         # A late tick moves the arms no faster; a clock that was set back moves nothing.
         dt = min(now - self._last_tick, LONGEST_DT)
+        if now - self._last_tick > LONGEST_DT:
+            self._supervisor.stalled(now - self._last_tick, now)
         self._last_tick = now
         self._ticks += 1
         if dt > 0.0:
             self._advance(now, dt)
 
     def _advance(self, now: float, dt: float) -> None:
+        began = time.monotonic()
         was_active = self._supervisor.phase is Phase.ACTIVE
         reference, state = self._supervisor.tick(now, dt), self._joints.state
         if not was_active and self._supervisor.phase is Phase.ACTIVE and state is not None:
             self._output.activate(state)
+        if time.monotonic() - began > LONGEST_DT:
+            return  # frozen in between: what was to be sent is of the past, and the next tick finds out
         if reference is not None and state is not None:
             self._output.send(reference, state, dt, now, self._supervisor.trusted)
             self._reference = reference

@@ -187,6 +187,19 @@ class Supervisor:
         self.paused = paused
         self._forget_targets()
 
+    def stalled(self, duration: float, now: float) -> None:
+        """The loop stood still for ``duration`` [s]: what it was about to command is of the past.
+
+        The arms have come to rest by themselves meanwhile, so there is nothing to brake, and going on from the
+        reference would be a jump. They are activated anew where they rest; targets that waited are no new stream.
+        """
+        if self.phase not in (Phase.ACTIVE, Phase.BRAKING):
+            return
+        fault = f"the control loop stood still for {duration:.2f} s"
+        self._watch.take(fault, now)
+        self._brake(fault)
+        self.phase = Phase.INACTIVE if self._stopped is None else Phase.STOPPED
+
     def stop(self, why: str) -> None:
         """Brake, and command nothing until :meth:`reset`."""
         self._stopped = why

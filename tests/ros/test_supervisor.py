@@ -77,6 +77,27 @@ def test_nothing_is_commanded_before_joint_states_are_good_and_at_rest(world: Wo
     assert np.allclose(first, world.q, atol=1e-9)
 
 
+def test_a_loop_that_stood_still_commands_nothing_of_the_past_and_follows_no_target_that_waited(
+    world: World, controller: CartesianController
+) -> None:
+    world.run(0.2)
+    tool = controller.tool_pose("left")
+    world.run(0.02, tool)
+    world.run(0.3, raised(tool, 0.1))
+    assert world.supervisor.arm_state("left") == "following"
+    rest, before = world.q, len(world.commanded)  # where the robot has come to rest by itself, as far as it is known
+    waited = controller.tool_pose("left")
+    world.now += 1.0
+    world.supervisor.stalled(1.0, world.now)
+    assert world.supervisor.fault == "the control loop stood still for 1.00 s"
+    world.run(0.05, raised(waited, 0.01))
+    assert world.commanded[before:] == [None] * (len(world.commanded) - before)
+    world.run(1.0, raised(waited, 0.01))
+    assert world.is_in(Phase.ACTIVE)
+    assert world.supervisor.arm_state("left") == "holding"
+    assert np.allclose(world.q, rest, atol=1e-9)
+
+
 def test_lost_joint_states_brake_the_arms_and_their_return_moves_nothing(
     world: World, controller: CartesianController
 ) -> None:
