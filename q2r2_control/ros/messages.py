@@ -36,14 +36,14 @@ def time_message(t: float) -> Time:
 def pose_message(pose: pin.SE3) -> Pose:
     """A pose with a unit quaternion, x y z w."""
     message = Pose()
-    _write(pose, message.position, message.orientation)
+    _write(pose.translation, pin.Quaternion(pose.rotation).normalized().coeffs(), message.position, message.orientation)
     return message
 
 
-def transform_message(pose: pin.SE3) -> Transform:
-    """The same as a transform."""
+def transform_message(position: Array, quaternion: Array) -> Transform:
+    """A position (3,) and a unit quaternion x y z w as a transform."""
     message = Transform()
-    _write(pose, message.translation, message.rotation)
+    _write(position, quaternion, message.translation, message.rotation)
     return message
 
 
@@ -166,9 +166,8 @@ def _quaternion(message: Pose) -> Array:
     return np.array([orientation.x, orientation.y, orientation.z, orientation.w])
 
 
-def _write(pose: pin.SE3, position: object, orientation: object) -> None:
-    quaternion = pin.Quaternion(pose.rotation).normalized().coeffs()
-    for name, value in zip("xyz", pose.translation.tolist(), strict=True):
-        setattr(position, name, value)
+def _write(position: Array, quaternion: Array, to_position: object, to_quaternion: object) -> None:
+    for name, value in zip("xyz", position.tolist(), strict=True):
+        setattr(to_position, name, value)
     for name, value in zip("xyzw", quaternion.tolist(), strict=True):
-        setattr(orientation, name, value)
+        setattr(to_quaternion, name, value)

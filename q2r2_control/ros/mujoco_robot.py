@@ -14,7 +14,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from geometry_msgs.msg import Quaternion, TransformStamped, Vector3
+from geometry_msgs.msg import TransformStamped
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from sensor_msgs.msg import JointState
@@ -28,7 +28,7 @@ from q2r2_control.errors import ConfigError
 from q2r2_control.robot.compose import WORLD
 from q2r2_control.robot.robot import Robot
 from q2r2_control.ros.gripper_server import GripperServer, Stroke
-from q2r2_control.ros.messages import joint_state_message, seconds
+from q2r2_control.ros.messages import joint_state_message, seconds, transform_message
 from q2r2_control.ros.node import COMMAND_QOS, LATCHED_QOS, OK, WARN, BaseNode, run_node
 from q2r2_control.ros.simulated_cell import JointSetpoint, SimulatedCell
 from q2r2_control.types import RobotState
@@ -159,10 +159,7 @@ class MujocoRobot(BaseNode):
         data, stamp = self._cell.plant.data, self.get_clock().now().to_msg()
         for index, message in transforms.items():
             message.header.stamp = stamp
-            x, y, z = data.xpos[index].tolist()
-            message.transform.translation = Vector3(x=x, y=y, z=z)
-            w, x, y, z = data.xquat[index].tolist()
-            message.transform.rotation = Quaternion(x=x, y=y, z=z, w=w)
+            message.transform = transform_message(data.xpos[index], data.xquat[index][[1, 2, 3, 0]])  # from w first
         return TFMessage(transforms=list(transforms.values()))
 
     def _reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:

@@ -137,9 +137,7 @@ class ArmRig:
             pose.publish(stamped_pose(self.hand, "", now))
             inputs.publish(OVR2ROSInputs(button_upper=self.upper, button_lower=self.lower))
         if self.tells_tool:
-            transform = TransformStamped(child_frame_id=self._frame, transform=transform_message(self.tool))
-            transform.header.frame_id = "world"
-            tf.publish(TFMessage(transforms=[transform]))
+            tf.publish(TFMessage(transforms=[stamped_transform("world", self._frame, self.tool)]))
 
     def _on_target(self, message: PoseStamped) -> None:
         self.targets.append(message)
@@ -149,6 +147,14 @@ class ArmRig:
     def _on_state(self, message: String) -> None:
         self.state = json.loads(message.data)
         self.levels[self.state["level"]] += 1
+
+
+def stamped_transform(parent: str, child: str, pose: pin.SE3) -> TransformStamped:
+    """Where a frame is in another, as /tf tells it; its stamp means nothing."""
+    transform = transform_message(pose.translation, pin.Quaternion(pose.rotation).coeffs())
+    message = TransformStamped(child_frame_id=child, transform=transform)
+    message.header.frame_id = parent
+    return message
 
 
 def steps(targets: list[PoseStamped]) -> list[float]:

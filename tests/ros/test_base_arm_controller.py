@@ -20,8 +20,8 @@ pytest.importorskip("quest2ros", reason="needs q2r2 ros build-interfaces")
 pytestmark = pytest.mark.usefixtures("interfaces")
 
 from q2r2_control.errors import ConfigError  # noqa: E402
-from q2r2_control.ros.messages import pose_of, transform_message  # noqa: E402
-from tests.ros.arm_rig import TOOL, ArmRig, steps  # noqa: E402
+from q2r2_control.ros.messages import pose_of  # noqa: E402
+from tests.ros.arm_rig import TOOL, ArmRig, stamped_transform, steps  # noqa: E402
 
 
 @pytest.fixture
@@ -194,17 +194,14 @@ def start_mirrored(rig: ArmRig, processes: Processes) -> RosProcess:
 
 
 def test_a_subclass_with_other_names_works_in_its_robots_frame(node: Any, processes: Processes) -> None:
-    from geometry_msgs.msg import TransformStamped
     from tf2_msgs.msg import TFMessage
     from visualization_msgs.msg import Marker
 
     from q2r2_control.ros.node import LATCHED_QOS
 
     base = pin.SE3(pin.exp3(np.array([0.0, 0.0, 1.2])), np.array([0.1, -0.4, 0.3]))
-    transform = TransformStamped(child_frame_id="bh_robot_base", transform=transform_message(base))
-    transform.header.frame_id = "world"
     static = node.create_publisher(TFMessage, "/tf_static", LATCHED_QOS)
-    static.publish(TFMessage(transforms=[transform]))
+    static.publish(TFMessage(transforms=[stamped_transform("world", "bh_robot_base", base)]))
     shown: dict[str, Any] = {}
     node.create_subscription(Marker, "/visualization_marker", lambda marker: shown.update({marker.ns: marker}), 10)
 

@@ -14,29 +14,22 @@ pytest.importorskip("rclpy", reason=NEEDS_ROS)
 pytest.importorskip("tf2_msgs", reason="needs q2r2 ros build-interfaces")
 pytest.importorskip("quest2ros", reason="needs q2r2 ros build-interfaces")
 
-from geometry_msgs.msg import TransformStamped
 
 from q2r2_control.ros.frames import FrameTree
-from q2r2_control.ros.messages import transform_message
+from tests.ros.arm_rig import stamped_transform
 
 A = pin.SE3(pin.exp3(np.array([0.3, -1.0, 0.2])), np.array([1.0, 2.0, -0.5]))
 B = pin.SE3(pin.exp3(np.array([-0.7, 0.1, 2.0])), np.array([0.2, -0.4, 0.9]))
 C = pin.SE3(pin.exp3(np.array([1.1, 0.4, -0.3])), np.array([-0.6, 0.1, 0.3]))
 
 
-def transform(parent: str, child: str, pose: pin.SE3) -> TransformStamped:
-    message = TransformStamped(child_frame_id=child, transform=transform_message(pose))
-    message.header.frame_id = parent
-    return message
-
-
 @pytest.fixture
 def tree() -> FrameTree:
     """World with a mount, which carries an arm, and a table beside."""
     made = FrameTree()
-    made.set(transform("world", "mount", A), math.inf)
-    made.set(transform("mount", "/tool", B), 3.0)
-    made.set(transform("world", "table", C), 2.0)
+    made.set(stamped_transform("world", "mount", A), math.inf)
+    made.set(stamped_transform("mount", "/tool", B), 3.0)
+    made.set(stamped_transform("world", "table", C), 2.0)
     return made
 
 
@@ -59,13 +52,13 @@ def test_a_frame_is_found(frame: str, within: str, pose: pin.SE3, received: floa
 
 def test_frames_that_nothing_joins_are_not_found_even_in_a_ring(tree: FrameTree) -> None:
     assert tree.find("tool", "elsewhere") is None
-    tree.set(transform("tool", "world", A), 4.0)
+    tree.set(stamped_transform("tool", "world", A), 4.0)
     assert tree.find("tool", "elsewhere") is None
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, 0.0])
 def test_a_transform_that_is_none_is_passed_over(bad: float, tree: FrameTree) -> None:
-    message = transform("mount", "tool", C)
+    message = stamped_transform("mount", "tool", C)
     rotation = message.transform.rotation
     rotation.x = rotation.y = rotation.z = rotation.w = bad
     tree.set(message, 9.0)
