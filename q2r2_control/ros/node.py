@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 import sys
 import threading
@@ -15,6 +16,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
+from rclpy.duration import Duration
 from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
@@ -30,6 +32,15 @@ COMMAND_QOS = QoSProfile(
     depth=1,
     reliability=ReliabilityPolicy.RELIABLE,
     durability=DurabilityPolicy.VOLATILE,
+)
+# The same for those who send them: a reliable sender repeats what has not arrived, also when a link has been down for a
+# while, and a target of then is a jump now. Judged by the sender's clock alone; a receiver's may be another.
+SENT_COMMAND_QOS = QoSProfile(
+    history=HistoryPolicy.KEEP_LAST,
+    depth=1,
+    reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.VOLATILE,
+    lifespan=Duration(seconds=0.1),
 )
 # Streams of a headset or of joint states: a late one is worth less than the next.
 STREAM_QOS = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -140,6 +151,9 @@ def run_node(make: Callable[[], Node], args: Sequence[str] | None = None) -> int
     A fault of its configuration is one line on stderr and exit code 2. ``node.close()`` is called if there is one.
     """
     name = sys.argv[0].rsplit("/", 1)[-1]
+    # With shared memory a process that is killed or frozen while it writes holds up everybody who writes to it for a
+    # second, which is how long the middleware takes to find out. Whoever wants it all the same sets this.
+    os.environ.setdefault("FASTDDS_BUILTIN_TRANSPORTS", "UDPv4")
     try:
         rclpy.init(args=list(sys.argv if args is None else args), signal_handler_options=rclpy.SignalHandlerOptions.NO)
     except rclpy_implementation.RCLError as error:  # such as arguments that cannot be parsed

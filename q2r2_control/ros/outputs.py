@@ -15,7 +15,7 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from q2r2_control.robot.robot import Robot
 from q2r2_control.ros.messages import joint_state_message
-from q2r2_control.ros.node import COMMAND_QOS
+from q2r2_control.ros.node import SENT_COMMAND_QOS
 from q2r2_control.types import Array, Reference, RobotState
 
 # What makes a message of joint names, positions, velocities and the time [s] of the node's clock.
@@ -53,7 +53,7 @@ def channels(node: Node, kind: type, topics: Mapping[str, str], robot: Robot) ->
     for topic in dict.fromkeys(topics.values()):
         joints = joints_of(robot, (arm for arm, its in topics.items() if its == topic))
         names = [robot.joint_names[joint] for joint in joints]
-        made.append(Channel(names, joints, node.create_publisher(kind, topic, COMMAND_QOS)))
+        made.append(Channel(names, joints, node.create_publisher(kind, topic, SENT_COMMAND_QOS)))
     return made
 
 

@@ -9,7 +9,7 @@ import pinocchio as pin
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 
 from q2r2_control.ros.messages import stamped_pose, time_message
-from q2r2_control.ros.node import COMMAND_QOS, LATCHED_QOS, BaseNode
+from q2r2_control.ros.node import LATCHED_QOS, SENT_COMMAND_QOS, BaseNode
 from q2r2_control.ros.presets import Hold, Preset
 from q2r2_control.teleop.guard import GuardSettings, TargetGuard
 
@@ -34,7 +34,7 @@ class TargetOutput:
         self.preset = preset
         self.guard = TargetGuard(guard)
         self._node, self._controller, self._frame = node, controller, frame
-        self._publisher = node.create_publisher(PoseStamped, topic, COMMAND_QOS)
+        self._publisher = node.create_publisher(PoseStamped, topic, SENT_COMMAND_QOS)
         self._wrench = None
         if preset.zero_wrench is not None:
             self._wrench = node.create_publisher(WrenchStamped, preset.zero_wrench.format(ctrl=controller), LATCHED_QOS)

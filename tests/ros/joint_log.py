@@ -15,6 +15,8 @@ from tests.ros.waiting import eventually
 
 SLOW = 0.05  # 3 % of a joint's limit; what is left is an arm that settles, not one that goes on [rad/s]
 REST = 0.01  # [rad/s]
+USUAL_GAP = 0.03  # between two joint states, on a machine that has the time [s]
+LONGEST_STARVED = 0.1  # what a machine may be excused for [s]
 RESTING = 0.3  # for this long [s]
 
 
@@ -33,6 +35,7 @@ class Stop:
     speed: float  # of the fastest joint at the fault [rad/s]
     slow: float  # from the fault until all joints are slow for good [s]
     rest: float  # and until they rest [s]
+    starved: float  # longest time without a joint state until then, above what is usual, within bounds [s]
     posture: Array  # at rest
     t: float  # when they rest [s]
 
@@ -77,8 +80,10 @@ class JointLog:
 
         eventually(lambda: self.states[-1].t - last(REST) > RESTING, "all joints rest")
         before = [state for state in self.states if state.t <= fault][-1]
-        slow, rest = last(SLOW), last(REST)
-        return Stop(float(np.abs(before.v).max()), slow - fault, rest - fault, self.q, rest)
+        slow, rest = (self.since(last(speed))[0].t for speed in (SLOW, REST))
+        gaps = np.diff([before.t, *(state.t for state in self.since(fault) if state.t <= rest)])
+        starved = min(max(float(gaps.max()) - USUAL_GAP, 0.0), LONGEST_STARVED)
+        return Stop(float(np.abs(before.v).max()), slow - fault, rest - fault, starved, self.q, rest)
 
     def farthest_from(self, posture: Array, since: float, until: float = math.inf) -> float:
         """How far any joint has been from ``posture`` [rad]."""
