@@ -6,6 +6,8 @@ import sys
 from collections.abc import Mapping
 from typing import Any
 
+from std_srvs.srv import Trigger
+
 from q2r2_control.inputs.messages import HandMessage, HandPose, HandTwist, MessageType
 from q2r2_control.inputs.scripted import ScriptedInput
 from q2r2_control.inputs.session import HAND_TOPICS
@@ -26,6 +28,11 @@ class SimulationInput(BaseNode):
     """Plays a scripted trajectory: presses the lower buttons once to engage, as people do, and does not hold them.
 
     That press comes early, so the script starts only when every hand it plays has a subscriber, unless told otherwise.
+
+    It is the press of whoever started the node: who does that by hand asks for the motion, as an operator does by a
+    button. Whatever starts a node that has died again by itself, such as a launch file that respawns it, asks for
+    nothing, and arms that the death has stopped must not move then. There ``start_on_request`` belongs: nothing is
+    published until somebody calls ``~/start``, after every start of the node anew.
     """
 
     def __init__(self, **kwargs: Any) -> None:
@@ -38,6 +45,7 @@ class SimulationInput(BaseNode):
         rate = self.parameter("rate", 75.0, "Samples of each hand [Hz].", at_least=1.0, at_most=250.0)
         self._frame = self.parameter("frame_id", "", "Frame of the poses; a headset gives none.")
         self._waits = self.parameter("wait_for_subscribers", True, "Start when every hand has a subscriber.")
+        self._unasked = self.parameter("start_on_request", False, "Start when ~/start is called, and not before.")
         self._hands = SIDES if side == "both" else (side,)
         self._title = f"{trajectory} of {' and '.join(self._hands)}"
         self._topics = {
@@ -49,11 +57,14 @@ class SimulationInput(BaseNode):
         self._samples = 0
         self._script = ScriptedInput(trajectory, self._hands, rate_hz=rate)
         self._script.start()
+        self.create_service(Trigger, "~/start", self._on_start)
         self.create_timer(_PERIOD, self._play)
 
     def health(self) -> tuple[bytes, str, Mapping[str, Any]]:
         """What is played, or who is missing."""
         values = {"samples": self._samples}
+        if self._unasked:
+            return WARN, "waits for a call of ~/start", values
         if self._waits:
             return WARN, f"waits for a subscriber of {' and '.join(self._missing())}", values
         return OK, self._title, values
@@ -61,7 +72,14 @@ class SimulationInput(BaseNode):
     def _missing(self) -> list[str]:
         return [f"the {hand} hand" for hand in self._hands if not self._publishers_of_hands.subscribers(hand)]
 
+    def _on_start(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        response.success, response.message = self._unasked, "starts" if self._unasked else "has started before"
+        self._unasked = False
+        return response
+
     def _play(self) -> None:
+        if self._unasked:
+            return
         if self._waits:
             if self._missing():
                 return
