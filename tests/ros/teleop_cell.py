@@ -25,7 +25,7 @@ from tests.ros.processes import Processes, RosProcess
 from tests.ros.waiting import eventually
 
 ARMS = ("left", "right")
-RATE = 125.0  # of robot and controller: half of their own, since six processes share a test machine [Hz]
+RATE = 100.0  # of the nodes: half of their own or less, since six processes share a test machine [Hz]
 MOVING = 0.2  # an arm that moves has a joint this fast [rad/s]
 # A killed process stays in the graph until its lease ends; 20 s, as they are by default, are long for a test.
 SHORT_LEASE = """<?xml version="1.0" encoding="UTF-8"?>
@@ -67,7 +67,8 @@ class TeleopCell:
     def start(self, name: str, *parameters: str) -> RosProcess:
         """Start one of the package's nodes, or start it again."""
         module = f"q2r2_control.ros.{name}"
-        given = [f"config:={CONFIG}", f"rate:={RATE}"] if name in ("mujoco_robot", "cartesian_controller") else []
+        given = [] if name == "tcp_endpoint" else [f"rate:={RATE}"]
+        given += [f"config:={CONFIG}"] if name in ("mujoco_robot", "cartesian_controller") else []
         arguments = [part for parameter in (*given, *parameters) for part in ("-p", parameter)]
         process = self._processes.start_module(
             module, "--ros-args", *arguments, FASTRTPS_DEFAULT_PROFILES_FILE=str(self._lease)
@@ -107,10 +108,14 @@ class TeleopCell:
         """Whether an arm followed its hand when it last said so, which it does at every change."""
         return bool(self._state(f"{arm}_q2r2_arm_controller", 0.0).get("engaged"))
 
+    def controller_is(self, phase: str, since: float) -> bool:
+        """Whether the controller has said that after ``since`` [s]."""
+        return bool(self._state("cartesian_controller", since).get("phase") == phase)
+
     def ready(self, arm: str, since: float) -> bool:
         """Whether nothing keeps an arm from being engaged, as was said after ``since`` [s]."""
-        active = self._state("cartesian_controller", since).get("phase") == "active"
-        return active and self._state(f"{arm}_q2r2_arm_controller", since).get("level") == "ok"
+        level = self._state(f"{arm}_q2r2_arm_controller", since).get("level")
+        return level == "ok" and self.controller_is("active", since)
 
     def wait_until_ready(self) -> None:
         """Until nothing keeps either arm from being engaged, all of it said from now on."""

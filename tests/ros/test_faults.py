@@ -41,10 +41,13 @@ KILLED = {
     "tcp_endpoint": "of the left hand from /tcp_endpoint for 0.",
     "left_arm_controller": "linked to left: /left_q2r2_arm_controller is silent for 0.",
     "right_arm_controller": "linked to right: /right_q2r2_arm_controller is silent for 0.",
-    "cartesian_controller": "/cartesian_controller/safe_target/left from /cartesian_controller is silent for 0.",
+    "cartesian_controller": " from /cartesian_controller is silent for 0.",
 }
 # The node that is frozen for a while, and what it says itself when it goes on.
-FROZEN = {"left_arm_controller": "the control loop stalled for 1.", "cartesian_controller": "stalled for 1."}
+FROZEN = {
+    "left_arm_controller": "this node stood still for 1.",
+    "cartesian_controller": "the control loop stood still for 1.",
+}
 
 Record = Callable[[str, object], None]
 
@@ -80,17 +83,32 @@ class Scene:
             since = (since or time.monotonic()) if self.cell.moving else None
             time.sleep(0.01)
 
+    def play(self) -> None:
+        """Start the script, and with it press, until both arms follow: a busy machine may look like a fault."""
+        for _ in range(3):
+            self.cell.start("simulation_input")
+            deadline = time.monotonic() + PATIENCE / 3.0
+            while time.monotonic() < deadline:
+                if self.cell.moving:
+                    time.sleep(0.3)  # it gathers speed
+                    return
+                time.sleep(0.01)
+            self.cell.kill("simulation_input")
+        raise AssertionError(f"the arms do not follow the script: {self.cell.diagnoses[-5:]}")
+
     def measure_stop(self, what: str, fault: float, record: Record) -> Stop:
         """How both arms come to rest after a fault, which may take them no longer than it has to."""
         stop = self.cell.joints.stop_after(fault)
-        allowed = TIMEOUT + stop.speed / BRAKING + DELIVERY
+        # A machine that has no time for the robot or for this test has none for the node that has to act either.
+        allowed = TIMEOUT + stop.speed / BRAKING + DELIVERY + 2.0 * stop.starved
         line = (
             f"from {stop.speed:.2f} rad/s slow within {1e3 * stop.slow:.0f} ms, allowed {1e3 * allowed:.0f}, "
-            f"at rest within {1e3 * stop.rest:.0f} ms, allowed {1e3 * (allowed + TIMEOUT):.0f}"
+            f"at rest within {1e3 * stop.rest:.0f} ms, allowed {1e3 * (allowed + TIMEOUT):.0f}; "
+            f"of which for a starved machine {2e3 * stop.starved:.0f}"
         )
         record(what, line)
         print(f"\n{what}: {line}")
-        assert stop.speed > 0.2
+        assert stop.speed > 0.1
         assert stop.slow <= allowed
         assert stop.rest <= allowed + TIMEOUT  # of the targets, which end when the hand's data have been missed
         return stop
@@ -151,8 +169,9 @@ def test_a_killed_robot_is_missed_and_greeted_with_no_command_of_the_past(moving
     cell = moving.cell
     fault = cell.kill("mujoco_robot")
     cell.wait_for_diagnosis(fault, "left_tool_frame on /tf from /mujoco_robot is 0.")
-    cell.wait_for_diagnosis(fault, "no joint states for 0.1")
-    time.sleep(AWHILE)
+    cell.wait_for_diagnosis(fault, "no joint states from /mujoco_robot for 0.1")
+    eventually(lambda: cell.controller_is("inactive", fault), "the controller has braked")
+    time.sleep(0.1)
     silence = time.monotonic()
     moving.mend("mujoco_robot")
     eventually(lambda: cell.joints.since(silence), "the robot is back")
@@ -167,6 +186,34 @@ def test_a_killed_robot_is_missed_and_greeted_with_no_command_of_the_past(moving
     moving.operator.rest()
     moving.press()
     moving.move()
+
+
+def test_a_script_that_died_stops_both_arms_and_its_return_waits_to_be_asked(
+    scene: Scene, record_property: Record
+) -> None:
+    """Started by hand it plays at once, as it was asked to; started again by whatever does that, it does not."""
+    cell = scene.cell
+    for name in NODES:
+        scene.mend(name)
+    scene.operator.online = False
+    try:
+        eventually(lambda: not any(map(cell.engaged, ARMS)), "the headset is off")
+        scene.play()
+        fault = cell.kill("simulation_input")
+        stop = scene.measure_stop("simulation_input killed", fault, record_property)
+        cell.wait_for_diagnosis(fault, "of the left hand from /simulation_input")
+        cell.start("simulation_input", "start_on_request:=true")
+        back = time.monotonic()
+        cell.wait_for_diagnosis(back, "waits for a call of ~/start")
+        time.sleep(3.0 * AWHILE)  # longer than it takes the script to press and move
+        assert cell.joints.farthest_from(stop.posture, stop.t) < STILL
+        cell.call("/simulation_input/start")
+        eventually(lambda: cell.moving, "both arms follow again")
+        assert max(np.abs(state.v).max() for state in cell.joints.since(back)) < FAST
+    finally:
+        cell.kill("simulation_input")
+        scene.operator.rest()
+        scene.operator.online = True
 
 
 @pytest.mark.parametrize("name", FROZEN)
