@@ -53,11 +53,13 @@ def lbr_environment(domain: int, tmp_path_factory: pytest.TempPathFactory) -> di
     build(Interfaces(Path(__file__).parent / "interfaces" / "lbr_fri_idl"), prefix, prefix / "build.log")
     packages = prefix / "lib" / f"python{sys.version_info.major}.{sys.version_info.minor}" / "site-packages"
     added = {
-        "AMENT_PREFIX_PATH": [prefix, sys.prefix],
+        "AMENT_PREFIX_PATH": [prefix, Path(sys.prefix)],
         "PYTHONPATH": [packages],
         "LD_LIBRARY_PATH": [prefix / "lib"],
     }
-    return {name: os.pathsep.join([*map(str, paths), os.environ.get(name, "")]) for name, paths in added.items()}
+    return {
+        name: os.pathsep.join(filter(None, [*map(str, paths), os.environ.get(name)])) for name, paths in added.items()
+    }
 
 
 @pytest.fixture
