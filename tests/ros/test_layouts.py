@@ -167,10 +167,12 @@ def test_torques_move_an_arm_and_leave_it_on_its_servos_when_the_controller_is_k
     assert max(np.abs(measured.q - before).max() for measured in cell.measured) < STILL
 
 
-def lbr_commands(listener: RosProcess, arm: str, field: str) -> np.ndarray:
-    """All that an arm's driver was sent so far, (n, 7), or (n,) for its times."""
+def lbr_commands(listener: RosProcess, arm: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """All that an arm's driver was sent so far: positions (n, 7), torques (n, 7) and times (n,) [s]."""
     lines = [json.loads(line) for line in listener.output.splitlines()[1:-1]]
-    return np.array([line[field] for line in lines if line["arm"] == arm], float)
+    its = [line for line in lines if line["arm"] == arm]
+    q, tau, t = (np.array([line[field] for line in its], float) for field in ("q", "tau", "t"))
+    return q, tau, t * 1e-9
 
 
 def start_lbr(
@@ -183,7 +185,7 @@ def start_lbr(
     arguments = parameters(*TARGET_TOPICS, f"output:={output}", "max_deviation:=3.0")
     start(processes, "cartesian_controller", *arguments, *PATIENT, **environment)
     cell.wait_until_active()
-    wait(lambda: all(len(lbr_commands(listener, arm, "q")) for arm in ("left", "right")), "commands come")
+    wait(lambda: all(len(lbr_commands(listener, arm)[0]) for arm in ("left", "right")), "commands come")
     return listener, before
 
 
@@ -196,7 +198,7 @@ def test_an_lbr_is_led_by_positions_that_begin_where_it_is_and_step_no_further_t
     wait(lambda: away(cell, stream) < 3e-3, "the arm is there")
     for arm in ("left", "right"):
         joints = robot.arms[arm].joints
-        q, t = lbr_commands(listener, arm, "q"), lbr_commands(listener, arm, "t") * 1e-9
+        q, _, t = lbr_commands(listener, arm)
         assert np.abs(q[0] - before.q[joints]).max() < 1e-5
         # The tick's own length is what the step may use; it shows in the times up to what the messages are late.
         longest = robot.velocity_limit[joints] * (np.diff(t)[:, None] + 0.02)
@@ -211,17 +213,18 @@ def test_an_lbr_is_given_torques_without_gravity_beside_its_measured_positions(
     for arm in ("left", "right"):
         joints = robot.arms[arm].joints
         assert np.abs(gravity[joints]).max() > 20.0
-        assert np.abs(lbr_commands(listener, arm, "tau")[0]).max() < 0.5
-        assert np.abs(lbr_commands(listener, arm, "q")[0] - before.q[joints]).max() < 1e-5
+        q, tau, _ = lbr_commands(listener, arm)
+        assert np.abs(tau[0]).max() < 0.5
+        assert np.abs(q[0] - before.q[joints]).max() < 1e-5
     stream = engage("left")
     stream.move("left", (0.0, 0.0, 0.02))
     stiffness = load_config(CONFIG).impedance.translational_stiffness
     time.sleep(0.5)
-    tau = lbr_commands(listener, "left", "tau")
+    _, tau, _ = lbr_commands(listener, "left")
     assert np.isfinite(tau).all()
     # The simulated arm stays where it is, so the torque is that of a spring stretched by 20 mm: F = J^-T tau.
     data = robot.model.createData()
     J = pin.computeFrameJacobian(robot.model, data, before.q, robot.arms["left"].frame_id, pin.LOCAL_WORLD_ALIGNED)
     force = np.linalg.pinv(J[:, robot.arms["left"].joints].T) @ tau[-1]
     assert force[2] == pytest.approx(stiffness * 0.02, rel=0.05)
-    assert np.abs(lbr_commands(listener, "right", "tau")).max() < 0.5
+    assert np.abs(lbr_commands(listener, "right")[1]).max() < 0.5
