@@ -83,7 +83,7 @@ class Relay:
     """Between a robot that knows one topic of all arms, and a controller with a namespace an arm."""
 
     def __init__(self, node: Any, robot: Robot) -> None:
-        self._node, self.silent = node, ""  # the arm whose joint states it keeps back
+        self._node, self.silent, self.lost = node, "", ""  # the arm whose joint states it keeps back, and the joint
         self.commanded: dict[str, set[tuple[str, ...]]] = {arm: set() for arm in robot.arms}
         self._states = {arm: node.create_publisher(JointState, f"/{arm}/joint_states", 10) for arm in robot.arms}
         self._commands = node.create_publisher(JointTrajectory, "/joint_trajectory", COMMAND_QOS)
@@ -95,7 +95,8 @@ class Relay:
 
     def _split(self, message: JointState) -> None:
         for arm, publisher in self._states.items():
-            columns = [i for i, name in reversed(list(enumerate(message.name))) if name.startswith(arm)]
+            columns = [i for i, name in enumerate(message.name) if name.startswith(arm) and name != self.lost]
+            columns.reverse()
             if arm != self.silent:
                 part = JointState(
                     name=[message.name[i] for i in columns],
@@ -144,6 +145,10 @@ def test_a_namespace_an_arm_is_merged_by_name_and_commanded_apart(
     wait(lambda: cell.state("level") == "error", "the stall is reported")
     assert "no joint states from /test on /right/joint_states for 0." in cell.state("message")
     relay.silent = ""
+    wait(lambda: cell.state("phase") == "active", "the controller is active again")
+    relay.lost = "right_A3"
+    wait(lambda: "/right/joint_states: no joint right_A3" in cell.state("message"), "the missing joint is reported")
+    relay.lost = ""
     wait(lambda: cell.state("phase") == "active", "the controller is active again")
 
 
