@@ -8,9 +8,9 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Generator, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from threading import Thread
+from threading import Event, Thread
 from typing import Any
 
 import pytest
@@ -82,6 +82,7 @@ def node(domain: int) -> Iterator[Any]:
 def spun_node(domain: int, name: str = "test") -> Iterator[Any]:
     """The same for fixtures that outlive one test."""
     import rclpy
+    from rclpy.exceptions import InvalidHandle
     from rclpy.executors import SingleThreadedExecutor
 
     context = rclpy.Context()
@@ -89,9 +90,18 @@ def spun_node(domain: int, name: str = "test") -> Iterator[Any]:
     made = rclpy.create_node(name, context=context)
     executor = SingleThreadedExecutor(context=context)
     executor.add_node(made)
-    thread = Thread(target=executor.spin, daemon=True)
+    ended = Event()
+
+    def spin() -> None:
+        # A test may destroy an entity that the executor is just about to wait for; the others are still to be served.
+        while not ended.is_set():
+            with suppress(InvalidHandle):
+                executor.spin()
+
+    thread = Thread(target=spin, daemon=True)
     thread.start()
     yield made
+    ended.set()
     executor.shutdown()
     thread.join()
     made.destroy_node()
