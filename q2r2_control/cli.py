@@ -5,32 +5,28 @@ from __future__ import annotations
 import logging
 import math
 import sys
-from collections.abc import Callable
 from dataclasses import asdict
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, NoReturn
+from typing import Annotated
 
 import typer
 from rich.console import Console
 
-from q2r2_control.bench import run_bench
+from q2r2_control.bench_cli import bench
 from q2r2_control.cell_check import check_cell, write_pairs
 from q2r2_control.config import Config, HeadsetConfig, load_config
 from q2r2_control.errors import ConfigError
 from q2r2_control.headset_check import watch_headset
 from q2r2_control.inputs.trajectories import TRAJECTORIES
 from q2r2_control.one_line import OneLineErrors
-from q2r2_control.peers.base import PEERS
 from q2r2_control.pipeline import DEFAULT_TRAJECTORY
 from q2r2_control.plain import as_json_text
 from q2r2_control.ros.cli import app as ros_app
-from q2r2_control.running import AnnouncedHeadset, RunOptions, notice_of_compiling
+from q2r2_control.running import AnnouncedHeadset, RunOptions
 from q2r2_control.running import run as run_cell
-from q2r2_control.soak import SoakReport, run_soak
 from q2r2_control.summary import RunSummary
 from q2r2_control.types import CommandMode
-from q2r2_control.viewer.bench_tables import deeds_table, soak_table, times_table
 from q2r2_control.viewer.live import HeadsetDisplay
 from q2r2_control.viewer.tables import (
     arm_table,
@@ -42,7 +38,6 @@ from q2r2_control.viewer.tables import (
 )
 
 DEMO_CONFIG = "config/dual_iiwa7.yaml"
-BENCH_TICKS, SOAK_TICKS = 3000, 1_000_000
 
 app = typer.Typer(
     cls=OneLineErrors,
@@ -52,6 +47,7 @@ app = typer.Typer(
     help="Bimanual VR teleoperation: a headset's hands move two robot arms, safely.",
 )
 app.add_typer(ros_app, name="ros")
+app.command(epilog="Example: q2r2 bench --ticks 20000, q2r2 bench --soak --seed 3, or q2r2 bench --ros")(bench)
 
 
 class InputName(StrEnum):
@@ -235,55 +231,6 @@ def headset_check(
     else:
         Console().print(headset_table(check))
     raise typer.Exit(0 if check.heard else 1)
-
-
-@app.command(epilog="Example: q2r2 bench --ticks 20000, or q2r2 bench --soak --ticks 1000000 --seed 3")
-def bench(
-    ticks: Annotated[
-        int | None, typer.Option(min=100, help=f"Of each scenario, {BENCH_TICKS} by itself; soak: {SOAK_TICKS}.")
-    ] = None,
-    peers: Annotated[bool, typer.Option(help="Time roboplan, mink and pink too, where they are installed.")] = True,
-    soak: Annotated[
-        bool, typer.Option("--soak", help="Check every promise in hostile ticks instead of timing.")
-    ] = False,
-    seed: Annotated[int, typer.Option(min=0, help="Of the soak.")] = 0,
-    json: Json = False,
-) -> None:
-    """Time one tick of the controller with both arms, every pair and the certificate, and public peers beside it.
-
-    With --soak: random hostile targets, ticks, starts and solver failures; every promise of the controller is checked
-    at every tick, and the worst margin of each is printed. Exit 1 if one was broken.
-    """
-    if seed and not soak:
-        raise ConfigError("--seed needs --soak, since the bench draws nothing")
-    config = load_config(DEMO_CONFIG)
-    console = _stderr()
-    with notice_of_compiling(console):
-        if soak:
-            _show_soak(run_soak(config, SOAK_TICKS if ticks is None else ticks, seed, _progress(console)), json)
-        chosen = tuple(PEERS) if peers else ()
-        report = run_bench(config, BENCH_TICKS if ticks is None else ticks, chosen, _progress(console))
-    if json:
-        print(as_json_text(report.as_json()))
-    else:
-        out = Console()
-        out.print(times_table(report))
-        out.print(deeds_table(report))
-
-
-def _progress(console: Console) -> Callable[[str], None]:
-    """Prints lines, to people only: a live line would need a thread, which would be in the times."""
-    if not console.is_terminal:
-        return lambda what: None
-    return lambda what: console.print(what, highlight=False)
-
-
-def _show_soak(report: SoakReport, json: bool) -> NoReturn:
-    if json:
-        print(as_json_text(report.as_json()))
-    else:
-        Console().print(soak_table(report))
-    raise typer.Exit(0 if report.passed else 1)
 
 
 def _with_address(config: Config, host: str | None, port: int | None) -> Config:

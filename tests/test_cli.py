@@ -137,6 +137,10 @@ def test_the_help_lists_every_command(command: str) -> None:
         pytest.param(("check", "pyproject.toml"), "pyproject.toml", id="a file that is no cell"),
         pytest.param(("bench", "--ticks", "0"), "--ticks", id="a benchmark of nothing"),
         pytest.param(("bench", "--seed", "3"), "--seed", id="a seed of what draws nothing"),
+        pytest.param(("bench", "--soak", "--ros"), "exclude each other", id="two kinds of benchmark"),
+        pytest.param(("bench", "--ros", "--ticks", "200"), "--ticks", id="ticks of what is timed by messages"),
+        pytest.param(("bench", "--duration", "5"), "need --ros", id="a duration of what counts ticks"),
+        pytest.param(("bench", "--ros", "--rate", "5000"), "--rate", id="a rate that the node does not take"),
     ],
 )
 def test_bad_usage_ends_in_exit_code_2_and_one_line_that_names_it(arguments: tuple[str, ...], named: str) -> None:
@@ -325,7 +329,7 @@ def test_a_soak_that_finds_something_ends_in_1(monkeypatch: pytest.MonkeyPatch) 
         report.margins[0].note(1.0, 7)
         return report
 
-    monkeypatch.setattr("q2r2_control.cli.run_soak", broken)
+    monkeypatch.setattr("q2r2_control.bench_cli.run_soak", broken)
     result = q2r2("bench", "--soak", "--ticks", "100", "--json")
     assert result.exit_code == 1
     assert not one_object(result.stdout)["passed"]

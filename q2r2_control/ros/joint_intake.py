@@ -21,13 +21,15 @@ class JointIntake:
     """Makes one state of all arms; it is as old as the oldest of its parts."""
 
     def __init__(self, node: BaseNode, robot: Robot) -> None:
-        self._node, self._robot = node, robot
+        self._node = node
         self._topics: dict[str, list[str]] = {}  # to the arms whose joints they bring
         for arm in robot.arms:
             topic = node.parameter(f"{arm}.joint_states_topic", "joint_states", "brings all joints of this arm")
             self._topics.setdefault(topic, []).append(arm)
         self._joints = {topic: joints_of(robot, arms) for topic, arms in self._topics.items()}
         self._stamps = dict.fromkeys(self._topics, -math.inf)
+        self._names = {topic: [robot.joint_names[joint] for joint in joints] for topic, joints in self._joints.items()}
+        self._expected = {topic: set(names) for topic, names in self._names.items()}
         self._publishers = Publishers(node, self._topics)
         self._values = np.zeros((3, len(robot.joint_names)))
         self.state: RobotState | None = None  # the newest of all arms
@@ -48,9 +50,8 @@ class JointIntake:
         return self._publishers.source(topic) + where
 
     def _on_message(self, take: Callable[[RobotState | str, float], None], topic: str, message: JointState) -> None:
-        joints = self._joints[topic]
-        names = [self._robot.joint_names[joint] for joint in joints]
-        if not set(names) & set(message.name):
+        joints, names = self._joints[topic], self._names[topic]
+        if not self._expected[topic] & set(message.name):
             return  # of a gripper or another robot
         now = self._node.now
         part = robot_state(message, names, now)

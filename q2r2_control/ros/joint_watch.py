@@ -14,6 +14,7 @@ from q2r2_control.types import Array, RobotState
 _JUMP_ALLOWANCE, _JUMP_TIME = 0.05, 0.02  # [rad], [s]
 # What counts as rest during the time that states have to be good before they are believed [rad].
 _REST = 0.01
+NONE_YET = "no joint states yet"
 
 
 @dataclass(slots=True)
@@ -35,7 +36,7 @@ class JointWatch:
         self._names, self._velocity_limit, self._settings = names, velocity_limit, settings
         self._source = source  # where states come from, as " from /node", or ""
         self.state: RobotState | None = None  # the newest that was good
-        self.fault: str | None = "no joint states yet"
+        self.fault: str | None = NONE_YET
         self._still_since, self._still_at = math.inf, np.zeros_like(velocity_limit)
         self._near_at: float | None = None
 

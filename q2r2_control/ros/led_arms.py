@@ -32,7 +32,7 @@ class LedSettings:
 def settings_to_lead(config: Config) -> Config:
     """The cell's configuration with elbows that are free to follow."""
     arms = {
-        name: arm if arm.swivel is None else arm.model_copy(update={"swivel": None})
+        name: arm.model_copy(update={"swivel": arm.swivel.model_copy(update={"gain": 0.0})})
         for name, arm in config.arms.items()
     }
     return config.model_copy(update={"arms": arms, "control": config.control.model_copy(update=_FOLLOW)})

@@ -21,7 +21,7 @@ import pinocchio as pin
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.robot.robot import Robot
 from q2r2_control.ros.homing import Homing
-from q2r2_control.ros.joint_watch import JointWatch, WatchSettings
+from q2r2_control.ros.joint_watch import NONE_YET, JointWatch, WatchSettings
 from q2r2_control.ros.led_arms import LedArms
 from q2r2_control.ros.sequence_watch import SequenceWatch
 from q2r2_control.ros.target_stream import StreamSettings, TargetStream
@@ -85,6 +85,8 @@ class Supervisor:
     @property
     def fault(self) -> str | None:
         """Why nothing is commanded, or why the arms brake."""
+        if self._stopped is None and self._watch.fault == NONE_YET:
+            return NONE_YET + self._origins.joint_states()
         return self._stopped or self._watch.fault
 
     @property
@@ -212,6 +214,7 @@ class Supervisor:
         if self.phase is Phase.BRAKING:
             return "the arms are braking"
         self._stopped, self.paused = None, False
+        self.ceased.clear()
         for stream in self._streams.values():
             stream.reset()
         self._homing = None

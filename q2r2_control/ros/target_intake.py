@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import pinocchio as pin
 from geometry_msgs.msg import PoseStamped
@@ -51,8 +49,7 @@ class TargetIntake:
     def subscribe(self, take: Take) -> None:
         """Hand each target to ``take``."""
         for arm, topic in self.topics.items():
-            callback = _WithInfo(partial(self._on_target, take, arm))
-            self._node.create_subscription(PoseStamped, topic, callback, COMMAND_QOS)
+            self._node.create_subscription(PoseStamped, topic, partial(self._on_target, take, arm), COMMAND_QOS)
 
     def look(self) -> None:
         """Ask the graph who publishes."""
@@ -72,10 +69,10 @@ class TargetIntake:
         self._refused = {arm: entry for arm, entry in self._refused.items() if now - entry[1] <= _RECENT}
         return [f"target of {arm} not used: {refusal.line}" for arm, (refusal, _) in self._refused.items()]
 
-    def _on_target(self, take: Take, arm: str, message: PoseStamped, number: int | None) -> None:
+    def _on_target(self, take: Take, arm: str, message: PoseStamped, info: Mapping[str, int | None]) -> None:
         frame, now = self.frames[arm], self._node.now
         pose = pose_of(message.pose) if message.header.frame_id == frame.name else None
-        refusal = take(arm, None if pose is None else frame.pose * pose, now, number)
+        refusal = take(arm, None if pose is None else frame.pose * pose, now, info["publication_sequence_number"])
         if refusal is not None:
             self._refuse(arm, refusal)
         elif message.header.frame_id != frame.name:
@@ -94,20 +91,6 @@ class TargetIntake:
         if before is None or before[0].kind != refusal.kind:
             self._node.get_logger().warning(f"target of {arm} not used: {refusal.line}")
             self._changed()
-
-
-class _WithInfo:
-    """A callback for a message and its number, from executors that hand the two over as arguments or as one tuple."""
-
-    # What rclpy decides by that a callback takes both.
-    __signature__ = inspect.signature(lambda message, info: None)
-
-    def __init__(self, callback: Callable[[Any, int | None], None]) -> None:
-        self._callback = callback
-
-    def __call__(self, *received: Any) -> None:
-        message, info = received[0] if len(received) == 1 else received
-        self._callback(message, info["publication_sequence_number"])
 
 
 def _frame_of(node: BaseNode, robot: Robot, arm: str) -> Frame:

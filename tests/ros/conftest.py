@@ -8,9 +8,9 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Generator, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from threading import Thread
+from threading import Event, Thread
 from typing import Any
 
 import pytest
@@ -53,11 +53,13 @@ def lbr_environment(domain: int, tmp_path_factory: pytest.TempPathFactory) -> di
     build(Interfaces(Path(__file__).parent / "interfaces" / "lbr_fri_idl"), prefix, prefix / "build.log")
     packages = prefix / "lib" / f"python{sys.version_info.major}.{sys.version_info.minor}" / "site-packages"
     added = {
-        "AMENT_PREFIX_PATH": [prefix, sys.prefix],
+        "AMENT_PREFIX_PATH": [prefix, Path(sys.prefix)],
         "PYTHONPATH": [packages],
         "LD_LIBRARY_PATH": [prefix / "lib"],
     }
-    return {name: os.pathsep.join([*map(str, paths), os.environ.get(name, "")]) for name, paths in added.items()}
+    return {
+        name: os.pathsep.join(filter(None, [*map(str, paths), os.environ.get(name)])) for name, paths in added.items()
+    }
 
 
 @pytest.fixture
@@ -80,6 +82,7 @@ def node(domain: int) -> Iterator[Any]:
 def spun_node(domain: int, name: str = "test") -> Iterator[Any]:
     """The same for fixtures that outlive one test."""
     import rclpy
+    from rclpy.exceptions import InvalidHandle
     from rclpy.executors import SingleThreadedExecutor
 
     context = rclpy.Context()
@@ -87,9 +90,18 @@ def spun_node(domain: int, name: str = "test") -> Iterator[Any]:
     made = rclpy.create_node(name, context=context)
     executor = SingleThreadedExecutor(context=context)
     executor.add_node(made)
-    thread = Thread(target=executor.spin, daemon=True)
+    ended = Event()
+
+    def spin() -> None:
+        # A test may destroy an entity that the executor is just about to wait for; the others are still to be served.
+        while not ended.is_set():
+            with suppress(InvalidHandle):
+                executor.spin()
+
+    thread = Thread(target=spin, daemon=True)
     thread.start()
     yield made
+    ended.set()
     executor.shutdown()
     thread.join()
     made.destroy_node()

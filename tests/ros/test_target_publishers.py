@@ -45,6 +45,7 @@ def cell(domain: int, robot: Robot, tmp_path_factory: pytest.TempPathFactory) ->
 @pytest.fixture
 def stream(cell: Cell) -> Iterator[Stream]:
     """Targets of this process that the left arm follows."""
+    wait(lambda: cell.state("level") == "ok", "what the test before left is forgotten")
     begun = cell.engage("left")
     yield begun
     begun.end()
