@@ -36,7 +36,7 @@ from q2r2_control.ros.target_stream import StreamSettings
 from q2r2_control.types import Reference
 
 _LONGEST_STOP = 3.0  # [s]
-_LOOK_PERIOD = 0.5  # between two looks at the graph and at the clock [s]
+_LOOK_PERIOD = 0.5  # between two looks at the graph [s]
 
 # Parameters that may change while the node runs: name, unit or meaning, least and greatest value.
 _Table = tuple[tuple[str, str, str, float, float], ...]
@@ -87,7 +87,6 @@ class CartesianControllerNode(BaseNode):
         )
         self._reference: Reference | None = None
         self._ticks, self._reported_at, self._last_tick = 0, time.monotonic(), self.now
-        self._clock_at, self._clock_moved = self.now, time.monotonic()
         self._connect()
         self.get_logger().info(f"{config.name}: {', '.join(robot.arms)}; waits for joint states")
 
@@ -164,26 +163,9 @@ class CartesianControllerNode(BaseNode):
         self.report_health()
 
     def _look(self) -> None:
-        """Remember who publishes what, and see whether time passes."""
+        """Remember who publishes what."""
         self._targets.look()
         self._joints.look()
-        now, wall = self.now, time.monotonic()
-        stood = self._clock_fault() is not None
-        if now != self._clock_at:
-            self._clock_at, self._clock_moved = now, wall
-        fault = self._clock_fault()
-        if (fault is not None) != stood:
-            self.get_logger().warning(fault or "/clock goes on")
-        if fault is not None or stood:
-            self.report_health()
-
-    def _clock_fault(self) -> str | None:
-        """Says so where simulated time stands still, and with it the controller."""
-        stands = time.monotonic() - self._clock_moved
-        if stands < 2 * _LOOK_PERIOD:
-            return None
-        what = "no message has come on /clock" if self._clock_at == 0.0 else "/clock stands still"
-        return f"use_sim_time: {what} for {stands:.0f} s; nothing is commanded"
 
     def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         self._supervisor.pause(request.data)
@@ -215,8 +197,8 @@ class CartesianControllerNode(BaseNode):
         return level, line, values
 
     def _judge(self) -> tuple[bytes, str]:
-        if fault := self._clock_fault() or self._supervisor.fault:
-            return ERROR, fault
+        if self._supervisor.fault is not None:
+            return ERROR, self._supervisor.fault
         ceased = list(self._supervisor.ceased.values())
         if faults := self._targets.faults():
             return WARN, "; ".join(faults + ceased)

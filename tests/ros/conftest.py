@@ -15,6 +15,8 @@ from typing import Any
 
 import pytest
 
+from q2r2_control import CartesianController, Robot, load_config
+from q2r2_control.control.impedance import ImpedanceController
 from q2r2_control.ros.build import Interfaces, build, interface_packages, missing_tools
 from tests.ros.processes import Processes, environment_of
 
@@ -31,6 +33,15 @@ def domain(tmp_path_factory: pytest.TempPathFactory) -> Iterator[int]:
         for key, value in environment_of(number, tmp_path_factory.mktemp("ros")).items():
             patch.setenv(key, value)
         yield number
+
+
+@pytest.fixture(scope="session", autouse=True)
+def kernels() -> None:
+    """Compiled before any process is waited for: the first time that takes a minute or two."""
+    config = load_config("config/dual_iiwa7.yaml")
+    robot = Robot.from_config(config)
+    CartesianController(robot, config.control).step({}, 0.001)
+    ImpedanceController(robot, config.impedance)
 
 
 @pytest.fixture(scope="session")

@@ -306,7 +306,7 @@ def test_it_follows_in_another_layout_and_frame_with_another_output_and_on_simul
     subscription = node.create_subscription(String, "/second/state", lambda m: states.append(json.loads(m.data)), 10)
     clock = node.create_publisher(Clock, "/clock", 10)
     targets = node.create_publisher(PoseStamped, "/left/target_pose", COMMAND_QOS)
-    wait(lambda: states and "no message has come on /clock" in states[-1]["message"], "the missing clock is reported")
+    wait(lambda: states and "nothing comes on /clock" in states[-1]["message"], "the missing clock is reported")
     began = time.monotonic()
     timer = node.create_timer(0.005, lambda: clock.publish(Clock(clock=time_message(100 + time.monotonic() - began))))
     wait(lambda: states and states[-1]["phase"] == "active", "the second controller is active")
