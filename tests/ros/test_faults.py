@@ -178,9 +178,9 @@ def test_a_killed_robot_is_missed_and_greeted_with_no_command_of_the_past(moving
     moving.mend("mujoco_robot")
     eventually(lambda: cell.joints.since(silence), "the robot is back")
     back = cell.joints.since(silence)[0]
-    assert not [t for t, _ in cell.commands if silence < t < back.t]
     cell.wait_until_ready()
     time.sleep(AWHILE)
+    # The controller may have found the robot before this test did; whatever it commands, it is where the robot stands.
     commands = [np.abs(q - back.q).max() for t, q in cell.commands if t > silence]
     assert commands, "the controller holds the arms where they are"
     assert max(commands) < STILL
