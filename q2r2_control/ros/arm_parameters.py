@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from q2r2_control.errors import ConfigError
-from q2r2_control.ros.gripper_client import GripperSettings
+from q2r2_control.external import GripperSettings
 from q2r2_control.ros.node import BaseNode
 from q2r2_control.ros.parameters import declared, settings_from_parameters
-from q2r2_control.ros.presets import BUILTIN, Mode, Preset, preset_of
 from q2r2_control.teleop.guard import GuardSettings
+from q2r2_control.teleop.presets import BUILTIN, Mode, Preset, preset_of
 from q2r2_control.teleop.settings import Stance, TeleopSettings
 
 

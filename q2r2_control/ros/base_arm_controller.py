@@ -22,10 +22,10 @@ from q2r2_control.ros.markers import TargetMarkers
 from q2r2_control.ros.messages import hand_sample
 from q2r2_control.ros.node import COMMAND_QOS, ERROR, OK, STREAM_QOS, WARN, BaseNode
 from q2r2_control.ros.pose_source import PoseTopic, ToolFrame
-from q2r2_control.ros.presets import BUILTIN, Mode
 from q2r2_control.ros.target_output import TargetOutput, near
 from q2r2_control.teleop.arm import OPEN, ArmState
 from q2r2_control.teleop.haptics import HapticPulses
+from q2r2_control.teleop.presets import BUILTIN, Mode
 from q2r2_control.teleop.teleop import Teleop
 from q2r2_control.types import SIDES, ArmTarget
 

@@ -10,8 +10,8 @@ from geometry_msgs.msg import PoseStamped, WrenchStamped
 
 from q2r2_control.ros.messages import stamped_pose, time_message
 from q2r2_control.ros.node import COMMAND_QOS, LATCHED_QOS, BaseNode
-from q2r2_control.ros.presets import Hold, Preset
 from q2r2_control.teleop.guard import GuardSettings, TargetGuard
+from q2r2_control.teleop.presets import Hold, Preset
 
 _GRAPH_PERIOD = 0.1  # between two looks at who else is there [s]
 _ALERT = 1.0  # after somebody came every tick looks, since names are known later than endpoints [s]

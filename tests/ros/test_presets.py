@@ -20,7 +20,7 @@ pytest.importorskip("rclpy", reason=NEEDS_ROS)
 pytest.importorskip("quest2ros", reason="needs q2r2 ros build-interfaces")
 pytestmark = pytest.mark.usefixtures("interfaces")
 
-from q2r2_control.ros.presets import PRESETS, Mode, preset_of  # noqa: E402
+from q2r2_control.teleop.presets import PRESETS, Mode, preset_of  # noqa: E402
 from tests.ros.arm_rig import ArmRig  # noqa: E402
 
 CONTROLLER = "/robot/left_ctrl"
