@@ -75,6 +75,10 @@ class ExternalGripper(GripperSettings):
 
     topic: RosName | None = Field(None, description="its action or topic; none: /q2r2/left_gripper/gripper_cmd")
 
+    def settings(self) -> GripperSettings:
+        """How it is told to open and close, without where."""
+        return GripperSettings(**self.model_dump(exclude={"topic"}))
+
 
 class GuardLimits(_Model):
     """How fast a target may move; none: as the preset says."""
