@@ -29,7 +29,14 @@ class TargetOutput:
     """
 
     def __init__(
-        self, node: BaseNode, preset: Preset, controller: str, topic: str, frame: str, guard: GuardSettings
+        self,
+        node: BaseNode,
+        preset: Preset,
+        controller: str,
+        topic: str,
+        frame: str,
+        guard: GuardSettings,
+        prefix: str = "",
     ) -> None:
         self.preset = preset
         self.guard = TargetGuard(guard)
@@ -37,13 +44,14 @@ class TargetOutput:
         self._publisher = node.create_publisher(PoseStamped, topic, COMMAND_QOS)
         self._wrench = None
         if preset.zero_wrench is not None:
-            self._wrench = node.create_publisher(WrenchStamped, preset.zero_wrench.format(ctrl=controller), LATCHED_QOS)
+            self._wrench = node.create_publisher(WrenchStamped, preset.zero_wrench.format(ctrl=prefix), LATCHED_QOS)
         self._following = False
         self._restarted = False
         self._endpoints: set[bytes] = set()  # of the controller
         self._listeners = 0
         self._looked = self._came = -math.inf
         self.sent = 0
+        self.lives = 0  # how often the controller was seen to come
 
     @property
     def topic(self) -> str:
@@ -122,6 +130,7 @@ class TargetOutput:
             if f"{info.node_namespace.rstrip('/')}/{info.node_name}" == self._controller
         }
         if endpoints - self._endpoints:
+            self.lives += 1
             self._restarted = self._following
             self._send_zero_wrench(now)
         self._endpoints = endpoints

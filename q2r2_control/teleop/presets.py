@@ -44,6 +44,7 @@ class Preset:
     guard: GuardSettings
     activation: str  # what it takes for a target to count
     zero_wrench: str | None = None  # topic where a zero wrench is sent, without which it may push
+    command_type: str | None = None  # service that has to be told that targets are poses, at each of its starts
     longest_age: float | None = None  # of a target's stamp, older ones are dropped [s]
 
     @property
@@ -129,6 +130,7 @@ _ALL = (
         hold=Hold.SILENCE,
         guard=_CAREFUL,
         activation="{ctrl}/switch_command_type called with 2, which is pose",
+        command_type="{ctrl}/switch_command_type",
         longest_age=0.1,
     ),
     Preset(
