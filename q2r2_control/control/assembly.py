@@ -75,7 +75,7 @@ def assemble(held_cell: Held, held_goals: Held, held_work: Held, h: float) -> bo
     pull = cell.limits.posture_gain
     fastest = cell.limits.posture_speed
     for j in range(nv):
-        work.posture[j] = clamp(pull * (cell.home[j] - q[j]), -fastest, fastest)
+        work.posture[j] = clamp(pull * (goals.posture[j] - q[j]), -fastest, fastest)
     for i in range(cell.tools.joint.shape[0]):
         if goals.follows[i] == 1:
             _follow(cell, goals, i, work)

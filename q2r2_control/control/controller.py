@@ -79,15 +79,20 @@ class CartesianController:
             raise RobotError(f"reset: {name} = {values!r:.80}: expected {self._nv} finite numbers")
         return array
 
-    def step(self, targets: Mapping[str, pin.SE3 | None], dt: float) -> Reference:
+    def step(self, targets: Mapping[str, pin.SE3 | None], dt: float, posture: Array | None = None) -> Reference:
         """Move the reference by ``dt`` seconds towards the tool ``targets`` (world frame).
 
         An arm that is missing or None holds. A target that is not a finite pose is not used: the arm's last target
         stays, and the report names the arm. A dt that is not in (0, 0.1] s moves nothing, or no more than 0.1 s.
+
+        ``posture`` (nv,) [rad] is what arms that follow a target take as far as their tools leave them free to; without
+        it that is home. Where something else moves the arms it is what was measured, so that the reference's elbows
+        are where the arms' are. One that is not nv finite numbers is not used: the last one stays.
         """
         usable = isinstance(dt, int | float | np.floating) and math.isfinite(dt) and dt > 0.0
         time = min(float(dt), LONGEST_DT) if usable else 0.0
         work = self._work
+        self._goals.aim_posture(posture)
         rejected = self._goals.update(targets, time, work.q, work.v)
         work.a[:] = 0.0
         summary = _Summary()

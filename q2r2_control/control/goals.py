@@ -28,7 +28,7 @@ class GoalTracker:
     """Keeps the last usable target of each arm and the smoothed twist with which it moves (feed-forward)."""
 
     def __init__(self, cell: Cell, arms: tuple[str, ...], settings: ControllerSettings) -> None:
-        self._arms = arms
+        self._arms, self._home = arms, cell.home
         teleport = (_TELEPORT * settings.max_linear_speed, _TELEPORT * settings.max_angular_speed)
         self._goals = Goals.empty(cell, np.array([settings.feed_forward_time, *teleport]))
         self._pose, self._offered = self._goals.pose, self._goals.offered
@@ -39,6 +39,14 @@ class GoalTracker:
         self._goals.latched[:] = 0
         self._goals.follows[:] = 0
         self._goals.hold[:] = q
+        self._goals.posture[:] = self._home
+
+    def aim_posture(self, posture: Array | None) -> None:
+        """Let the free joints go to ``posture`` (nv,) [rad], home where there is none; a bad one changes nothing."""
+        if posture is None:
+            self._goals.posture[:] = self._home
+        elif posture.shape == self._home.shape and np.isfinite(posture).all():
+            self._goals.posture[:] = posture
 
     def update(self, targets: Mapping[str, pin.SE3 | None], dt: float, q: Array, v: Array) -> tuple[str, ...]:
         """Take the targets of one tick; returns the names whose target is not usable, unknown names among them."""

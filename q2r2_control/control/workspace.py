@@ -72,6 +72,7 @@ class Goals(NamedTuple):
     translation: Array  # (n, 3) [m]
     feed_forward: Array  # (n, 6) the goal's own twist [m/s, rad/s]
     hold: Array  # (nv,) joint positions to hold [rad]
+    posture: Array  # (nv,) joint positions that the arms take where the tools leave them free to [rad]
     latched: IntArray  # (n,) 1: the arm has come to rest where it holds
     offered: IntArray  # (n,) what this tick brought: nothing, a pose, something else
     pose: Array  # (n, 4, 4) homogeneous, as offered
@@ -88,6 +89,7 @@ class Goals(NamedTuple):
             translation=np.zeros((n, 3)),
             feed_forward=np.zeros((n, 6)),
             hold=np.zeros(nv),
+            posture=cell.home.copy(),
             latched=np.zeros(n, dtype=np.int64),
             offered=np.zeros(n, dtype=np.int64),
             pose=np.zeros((n, 4, 4)),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,8 +29,11 @@ class WatchSettings:
 class JointWatch:
     """Looks at every joint state. Times are receipt times [s]; arrays are (nv,)."""
 
-    def __init__(self, names: Sequence[str], velocity_limit: Array, settings: WatchSettings) -> None:
+    def __init__(
+        self, names: Sequence[str], velocity_limit: Array, settings: WatchSettings, source: Callable[[], str]
+    ) -> None:
         self._names, self._velocity_limit, self._settings = names, velocity_limit, settings
+        self._source = source  # where states come from, as " from /node", or ""
         self.state: RobotState | None = None  # the newest that was good
         self.fault: str | None = "no joint states yet"
         self._still_since, self._still_at = math.inf, np.zeros_like(velocity_limit)
@@ -64,7 +67,7 @@ class JointWatch:
             return self.fault
         assert self.state is not None
         if (age := now - self.state.stamp) > self._settings.timeout:
-            self._fail(f"no joint states for {age:.3f} s; allowed: {self._settings.timeout:g}")
+            self._fail(f"no joint states{self._source()} for {age:.3f} s; allowed: {self._settings.timeout:g}")
         return self.fault
 
     def deviates(self, reference: Array, now: float) -> str | None:

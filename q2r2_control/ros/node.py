@@ -114,15 +114,6 @@ class BaseNode(Node):
         self._state.publish(String(data=json.dumps(state, default=str)))
 
 
-def _executor() -> Any:
-    """The one that waits for events costs a third of the other's time; the first releases of Jazzy lack it."""
-    try:
-        from rclpy.experimental import EventsExecutor
-    except ImportError:
-        return SingleThreadedExecutor()
-    return EventsExecutor()
-
-
 def run_node(make: Callable[[], Node], args: Sequence[str] | None = None) -> int:
     """Main function of an executable: make the node, spin until Ctrl-C or SIGTERM, close it; the exit code.
 
@@ -140,7 +131,7 @@ def run_node(make: Callable[[], Node], args: Sequence[str] | None = None) -> int
     node: Any = None
     try:
         node = make()
-        executor = _executor()
+        executor = SingleThreadedExecutor()
         executor.add_node(node)
         while rclpy.ok() and not stop.is_set() and getattr(node, "exit_code", None) is None:
             executor.spin_once(timeout_sec=0.1)

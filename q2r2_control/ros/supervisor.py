@@ -10,7 +10,10 @@ tool, see :mod:`target_stream`. A fault brakes along the controller's certified 
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from enum import StrEnum
+from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -19,6 +22,8 @@ from q2r2_control.control.controller import CartesianController
 from q2r2_control.robot.robot import Robot
 from q2r2_control.ros.homing import Homing
 from q2r2_control.ros.joint_watch import JointWatch, WatchSettings
+from q2r2_control.ros.led_arms import LedArms
+from q2r2_control.ros.sequence_watch import SequenceWatch
 from q2r2_control.ros.target_stream import StreamSettings, TargetStream
 from q2r2_control.types import Reference, RobotState
 
@@ -34,20 +39,47 @@ class Phase(StrEnum):
     STOPPED = "stopped"  # until it is reset
 
 
+@dataclass(frozen=True, slots=True)
+class Origins:
+    """Who sends what, for lines that say what is missing: " from /node", or nothing where that is not known."""
+
+    joint_states: Callable[[], str] = lambda: ""
+    targets: Callable[[str], str] = lambda arm: ""
+
+
+class Refusal(NamedTuple):
+    """Why a target is not followed."""
+
+    kind: str
+    line: str
+
+
 class Supervisor:
-    """Decides at every tick what the controller is asked for, and whether its reference is commanded."""
+    """Decides at every tick what the controller is asked for, and whether its reference is commanded.
+
+    With ``led`` the reference only leads arms that another controller moves.
+    """
 
     def __init__(
-        self, robot: Robot, controller: CartesianController, streams: StreamSettings, watch: WatchSettings
+        self,
+        robot: Robot,
+        controller: CartesianController,
+        streams: StreamSettings,
+        watch: WatchSettings,
+        origins: Origins | None = None,
+        led: LedArms | None = None,
     ) -> None:
-        self._robot, self._controller = robot, controller
+        self._controller, self._stream_settings, self._led = controller, streams, led
+        self._origins = origins or Origins()
         self._home = {arm: robot.tool_pose(robot.home, arm) for arm in robot.arms}
         self._streams = {arm: TargetStream(streams) for arm in robot.arms}
-        self._watch = JointWatch(robot.joint_names, robot.velocity_limit, watch)
+        self._sequences = {arm: SequenceWatch() for arm in robot.arms}
+        self._watch = JointWatch(robot.joint_names, robot.velocity_limit, watch, self._origins.joint_states)
         self._homing: Homing | None = None
         self._stopped: str | None = None  # why it takes a reset
         self.phase = Phase.INACTIVE
         self.paused = False
+        self.ceased: dict[str, str] = {}  # arms that hold since their targets ceased, with a line that says so
         self.events: list[str] = []  # what happened, for the log; taken by whoever writes it
 
     @property
@@ -58,6 +90,11 @@ class Supervisor:
     @property
     def homing(self) -> bool:
         return self._homing is not None
+
+    @property
+    def trusted(self) -> bool:
+        """Whether the arms move, or hold, by joint states that are good."""
+        return self.phase in (Phase.ACTIVE, Phase.BRAKING) and self._watch.fault is None
 
     def arm_state(self, arm: str) -> str:
         """What one arm does: following, homing or holding; or why no arm does anything."""
@@ -78,15 +115,36 @@ class Supervisor:
         if self.phase is Phase.INACTIVE and self._watch.fault not in (None, before):
             self.events.append(f"joint states: {self._watch.fault}")
 
-    def take_target(self, arm: str, pose: pin.SE3, now: float) -> str | None:
-        """A target in the world frame; returns why it is not followed, or None."""
+    def take_target(self, arm: str, pose: pin.SE3 | None, now: float, number: int | None = None) -> Refusal | None:
+        """A target in the world frame, or None for one that was no pose; returns why it is not followed, or None.
+
+        ``number`` is the one among its publisher's messages, where the middleware tells.
+        """
         stream = self._streams[arm]
-        refusal = stream.offer(pose, self._controller.tool_pose(arm), now)
-        why = self._no_targets()
-        if why is not None:
+        crowd = None if number is None else self._crowd(arm, number, now)
+        refusal = None if pose is None else stream.offer(pose, self._controller.tool_pose(arm), now)
+        if crowd is not None:
             stream.drop()
-            return why
-        return refusal
+            return crowd
+        if pose is None:
+            return None
+        if why := self._no_targets():
+            stream.drop()
+            return Refusal("stream", why)
+        if refusal is None:
+            self.ceased.pop(arm, None)
+            return None
+        return Refusal("stream", refusal)
+
+    def _crowd(self, arm: str, number: int, now: float) -> Refusal | None:
+        """Says so where not one publisher alone has sent an arm's targets lately."""
+        breaks = self._sequences[arm].take(number, now, self._stream_settings.timeout)
+        if breaks == 0:
+            return None
+        if breaks == 1:
+            line = f"another publisher took over{self._origins.targets(arm)}; the targets have to begin anew"
+            return Refusal("took over", line)
+        return Refusal("publishers", f"two publishers at a time{self._origins.targets(arm)}; allowed: one")
 
     def _no_targets(self) -> str | None:
         if self.phase is not Phase.ACTIVE:
@@ -103,14 +161,26 @@ class Supervisor:
             return None
         if self.phase is Phase.ACTIVE:
             self._look(now)
-        reference = self._controller.step(self._targets(now, dt), dt)
+        reference = self._step(self._targets(now, dt), dt)
         if self.phase is Phase.ACTIVE:
-            if fault := self._watch.deviates(reference.q, now):
+            if fault := self._watch.deviates(reference.q, now) or self._too_close():
                 self.stop(fault)
             self._look_home()
         elif float(np.abs(reference.v).max()) <= _REST:
             self.phase = Phase.INACTIVE if self._stopped is None else Phase.STOPPED
         return reference
+
+    def _step(self, targets: dict[str, pin.SE3 | None], dt: float) -> Reference:
+        state = self._watch.state
+        if self._led is None or state is None or self.phase is not Phase.ACTIVE:
+            return self._controller.step(targets, dt)
+        reference = self._controller.step(self._led.targets(targets), dt, state.q)
+        self._led.note(reference)
+        return reference
+
+    def _too_close(self) -> str | None:
+        state = self._watch.state
+        return None if self._led is None or state is None else self._led.too_close(state)
 
     def pause(self, paused: bool) -> None:
         """Hold all arms where they come to rest, or allow new streams of targets."""
@@ -149,6 +219,8 @@ class Supervisor:
         assert state is not None
         self._controller.reset(state.q)
         self._forget_targets()
+        if self._led is not None:
+            self._led.begin()
         self._watch.accept()
         self.phase = Phase.ACTIVE
         self.events.append("active: the reference starts at the measured posture")
@@ -171,7 +243,8 @@ class Supervisor:
     def _targets(self, now: float, dt: float) -> dict[str, pin.SE3 | None]:
         for arm, stream in self._streams.items():
             if stream.expire(now):
-                self.events.append(f"{arm}: targets have ceased, the arm holds")
+                self.ceased[arm] = f"{arm}: targets{self._origins.targets(arm)} have ceased, the arm holds"
+                self.events.append(self.ceased[arm])
         if self._homing is not None:
             return self._homing.targets(dt)
         return {arm: stream.pose for arm, stream in self._streams.items()}

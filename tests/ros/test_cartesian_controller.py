@@ -15,7 +15,7 @@ import pytest
 
 from q2r2_control import Robot, load_config
 from tests.ros.conftest import NEEDS_ROS, spun_node
-from tests.ros.processes import PATIENCE, Processes, RosProcess
+from tests.ros.processes import PATIENCE, Processes
 
 pytest.importorskip("rclpy", reason=NEEDS_ROS)
 pytest.importorskip("control_msgs", reason="needs control_msgs: q2r2 ros build-interfaces")
@@ -32,13 +32,10 @@ from std_srvs.srv import SetBool
 
 from q2r2_control.ros.messages import pose_message, stamped_pose, time_message
 from q2r2_control.ros.node import COMMAND_QOS
-from tests.ros.cell import CONFIG, Cell, Stream, wait
+from tests.ros.cell import CONFIG, PATIENT, STILL, Cell, Stream, at_rest, parameters, shifted, start, wait
 
 # How far the simulated arms lag behind their reference at the speeds of these tests, between two arms.
 TRACKING = 0.01  # [m]
-STILL = 2e-3  # [rad]
-# Longer than by default, so that a machine that is busy elsewhere does not look like a fault.
-PATIENT = ("-p", "joint_state_timeout:=0.5", "-p", "target_timeout:=0.5")
 
 
 @pytest.fixture(scope="module")
@@ -52,10 +49,6 @@ def running(domain: int, tmp_path_factory: pytest.TempPathFactory) -> Iterator[P
     processes = Processes(tmp_path_factory.mktemp("cell"), os.environ)
     yield processes
     processes.end_all()
-
-
-def start(processes: Processes, name: str, *arguments: str) -> RosProcess:
-    return processes.start_module(f"q2r2_control.ros.{name}", "--ros-args", "-p", f"config:={CONFIG}", *arguments)
 
 
 @pytest.fixture(scope="module")
@@ -90,21 +83,6 @@ def streams() -> Iterator[list[Stream]]:
 def engage(cell: Cell, streams: list[Stream], *arms: str) -> Stream:
     streams.append(cell.engage(*arms))
     return streams[-1]
-
-
-def shifted(pose: pin.SE3, x: float, y: float, z: float) -> pin.SE3:
-    return pin.SE3(pose.rotation, pose.translation + np.array([x, y, z]))
-
-
-def at_rest(cell: Cell) -> np.ndarray:
-    """Joint positions once they no longer change."""
-    wait(lambda: len(cell.measured) > 60 and moved(cell, 50) < 5e-4, "the arms are at rest")
-    return cell.q
-
-
-def moved(cell: Cell, count: int) -> float:
-    """How far any joint has moved in the last so many joint states [rad]."""
-    return float(np.ptp([measured.q for measured in cell.measured[-count:]], axis=0).max())
 
 
 def test_an_arm_follows_its_target_and_the_other_one_holds(cell: Cell, robot: Robot, streams: list[Stream]) -> None:
@@ -259,7 +237,7 @@ def faulty_joint_state(kind: str, robot: Robot, q: np.ndarray) -> JointState:
         ("a joint is missing", "no joint left_A1"),
         ("not a number", "position of left_A4 is not finite"),
         ("a jump", "left_A4 jumped by 0."),
-        ("a stall", "no joint states for"),
+        ("a stall", "no joint states from /mujoco_robot for"),
     ],
 )
 def test_joint_states_that_cannot_be_believed_stop_the_arms_with_one_diagnostic(
@@ -320,14 +298,15 @@ def test_it_follows_in_another_layout_and_frame_with_another_output_and_on_simul
     cell: Cell, robot: Robot, processes: Processes
 ) -> None:
     cell.call("/cartesian_controller/stop")
-    parameters = ("left.target_topic:=/left/target_pose", "left.target_frame_id:=left_link_0", "output:=joint_state")
-    arguments = [part for parameter in parameters for part in ("-p", parameter)]
-    start(processes, "cartesian_controller", *arguments, "-p", "use_sim_time:=true", "-r", "__node:=second")
+    layout = ("left.target_topic:=/left/target_pose", "left.target_frame_id:=left_link_0", "output:=joint_state")
+    arguments = parameters(*layout, "use_sim_time:=true")
+    start(processes, "cartesian_controller", *arguments, "-r", "__node:=second")
     states: list[dict[str, Any]] = []
     node = cell.node
     subscription = node.create_subscription(String, "/second/state", lambda m: states.append(json.loads(m.data)), 10)
     clock = node.create_publisher(Clock, "/clock", 10)
     targets = node.create_publisher(PoseStamped, "/left/target_pose", COMMAND_QOS)
+    wait(lambda: states and "no message has come on /clock" in states[-1]["message"], "the missing clock is reported")
     began = time.monotonic()
     timer = node.create_timer(0.005, lambda: clock.publish(Clock(clock=time_message(100 + time.monotonic() - began))))
     wait(lambda: states and states[-1]["phase"] == "active", "the second controller is active")

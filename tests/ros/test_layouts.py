@@ -1,0 +1,224 @@
+"""Layouts and kinds of command: a namespace an arm, torques, an LBR's messages; each moves the simulated robot."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import time
+from collections.abc import Callable, Iterator
+from functools import partial
+from typing import Any
+
+import numpy as np
+import pytest
+
+from q2r2_control import Robot, load_config
+from tests.ros.conftest import NEEDS_ROS, spun_node
+from tests.ros.processes import Processes, RosProcess
+
+pytest.importorskip("rclpy", reason=NEEDS_ROS)
+pytest.importorskip("control_msgs", reason="needs control_msgs: q2r2 ros build-interfaces")
+pytest.importorskip("tf2_msgs", reason="needs tf2_msgs: q2r2 ros build-interfaces")
+
+import pinocchio as pin
+from sensor_msgs.msg import JointState
+from trajectory_msgs.msg import JointTrajectory
+
+from q2r2_control.ros.node import COMMAND_QOS
+from tests.ros.cell import CONFIG, PATIENT, STILL, Cell, Measured, Stream, at_rest, parameters, start, wait
+
+Engage = Callable[..., Stream]
+TARGETS = "/{arm}/target_pose"
+TARGET_TOPICS = [f"{arm}.target_topic:=/{arm}/target_pose" for arm in ("left", "right")]
+
+
+@pytest.fixture(scope="module")
+def robot() -> Robot:
+    return Robot.from_config(load_config(CONFIG))
+
+
+@pytest.fixture(scope="module")
+def started(domain: int, robot: Robot, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cell]:
+    """One simulated robot for all tests; each brings a controller of its own."""
+    processes = Processes(tmp_path_factory.mktemp("cell"), os.environ)
+    with spun_node(domain) as node:
+        yield Cell(node, robot, start(processes, "mujoco_robot"), targets=TARGETS)
+        processes.end_all()
+
+
+@pytest.fixture
+def cell(started: Cell) -> Cell:
+    """At home, commanded by nobody."""
+    wait(lambda: started.state("mode", "mujoco_robot") == "holding", "the robot holds")
+    started.call("/mujoco_robot/reset")
+    started.states.pop("cartesian_controller", None)
+    started.measured.clear()
+    wait(lambda: started.measured, "joint states come")
+    return started
+
+
+@pytest.fixture
+def engage(cell: Cell) -> Iterator[Engage]:
+    """Begins streams of targets at tools, which end with the test."""
+    begun: list[Stream] = []
+
+    def begin(*arms: str) -> Stream:
+        begun.append(cell.engage(*arms))
+        return begun[-1]
+
+    yield begin
+    for stream in begun:
+        stream.end()
+
+
+class Relay:
+    """Between a robot that knows one topic of all arms, and a controller with a namespace an arm."""
+
+    def __init__(self, node: Any, robot: Robot) -> None:
+        self._node, self.silent = node, ""  # the arm whose joint states it keeps back
+        self.commanded: dict[str, set[tuple[str, ...]]] = {arm: set() for arm in robot.arms}
+        self._states = {arm: node.create_publisher(JointState, f"/{arm}/joint_states", 10) for arm in robot.arms}
+        self._commands = node.create_publisher(JointTrajectory, "/joint_trajectory", COMMAND_QOS)
+        self._subscriptions = [node.create_subscription(JointState, "/joint_states", self._split, 10)]
+        for arm in robot.arms:
+            topic = f"/{arm}/arm_controller/joint_trajectory"
+            listener = node.create_subscription(JointTrajectory, topic, partial(self._join, arm), 10)
+            self._subscriptions.append(listener)
+
+    def _split(self, message: JointState) -> None:
+        for arm, publisher in self._states.items():
+            columns = [i for i, name in reversed(list(enumerate(message.name))) if name.startswith(arm)]
+            if arm != self.silent:
+                part = JointState(
+                    name=[message.name[i] for i in columns],
+                    position=[message.position[i] for i in columns],
+                    velocity=[message.velocity[i] for i in columns],
+                )
+                publisher.publish(part)
+
+    def _join(self, arm: str, message: JointTrajectory) -> None:
+        self.commanded[arm].add(tuple(message.joint_names))
+        self._commands.publish(message)
+
+    def end(self) -> None:
+        for subscription in self._subscriptions:
+            self._node.destroy_subscription(subscription)
+        for publisher in (*self._states.values(), self._commands):
+            self._node.destroy_publisher(publisher)
+
+
+@pytest.fixture
+def relay(cell: Cell, robot: Robot) -> Iterator[Relay]:
+    made = Relay(cell.node, robot)
+    yield made
+    made.end()
+
+
+def test_a_namespace_an_arm_is_merged_by_name_and_commanded_apart(
+    cell: Cell, robot: Robot, relay: Relay, processes: Processes, engage: Engage
+) -> None:
+    layout = [f"{arm}.joint_states_topic:=/{arm}/joint_states" for arm in robot.arms]
+    # Its right arm is named by the pattern for all, its left one by itself.
+    layout += ["output_topic:=/{arm}/arm_controller/joint_trajectory"]
+    layout += ["left.output_topic:=/left/arm_controller/joint_trajectory"]
+    start(processes, "cartesian_controller", *parameters(*TARGET_TOPICS, *layout), *PATIENT)
+    cell.wait_until_active()
+    stream = engage("left", "right")
+    begin = cell.q
+    stream.move("left", (0.0, 0.0, 0.05))
+    stream.move("right", (0.05, 0.0, 0.0))
+    for arm in robot.arms:
+        goal = stream.poses[arm].translation
+        wait(lambda arm=arm, goal=goal: np.linalg.norm(cell.tool(arm).translation - goal) < 3e-3, f"{arm} is there")
+    assert np.abs(cell.q - begin).max() > 0.05
+    joints = {arm: tuple(name for name in robot.joint_names if name.startswith(arm)) for arm in robot.arms}
+    assert relay.commanded == {arm: {names} for arm, names in joints.items()}
+
+    relay.silent = "right"
+    wait(lambda: cell.state("level") == "error", "the stall is reported")
+    assert "no joint states from /test on /right/joint_states for 0." in cell.state("message")
+    relay.silent = ""
+    wait(lambda: cell.state("phase") == "active", "the controller is active again")
+
+
+def test_torques_move_an_arm_and_leave_it_on_its_servos_when_the_controller_is_killed(
+    cell: Cell, processes: Processes, engage: Engage
+) -> None:
+    controller = start(processes, "cartesian_controller", *parameters(*TARGET_TOPICS, "output:=torque"), *PATIENT)
+    cell.wait_until_active()
+    wait(lambda: cell.state("mode", "mujoco_robot") == "torque", "the robot is driven by torques")
+    stream = engage("left")
+    stream.move("left", (0.0, 0.0, 0.05), speed=0.1)
+    goal = stream.poses["left"].translation
+    wait(lambda: np.linalg.norm(cell.tool("left").translation - goal) < 3e-3, "the arm is there")
+    before = at_rest(cell)
+    assert np.linalg.norm(cell.tool("left").translation - goal) < 3e-3
+    assert cell.state("mode", "mujoco_robot") == "torque"
+    cell.measured.clear()
+    os.kill(controller.pid, signal.SIGKILL)
+    stream.end()
+    wait(lambda: cell.state("mode", "mujoco_robot") == "holding", "the robot holds")
+    time.sleep(0.5)
+    assert max(np.abs(measured.q - before).max() for measured in cell.measured) < STILL
+
+
+def lbr_commands(listener: RosProcess, arm: str, field: str) -> np.ndarray:
+    """All that an arm's driver was sent so far, (n, 7), or (n,) for its times."""
+    lines = [json.loads(line) for line in listener.output.splitlines()[1:-1]]
+    return np.array([line[field] for line in lines if line["arm"] == arm], float)
+
+
+def start_lbr(
+    cell: Cell, processes: Processes, environment: dict[str, str], output: str, message: str
+) -> tuple[RosProcess, Measured]:
+    """Start drivers and a controller; the listener, and what was measured before."""
+    listener = processes.start_module("tests.ros.lbr_listener", message, "left", "right", **environment)
+    listener.wait_for("listens")
+    before = cell.measured[-1]
+    arguments = parameters(*TARGET_TOPICS, f"output:={output}", "max_deviation:=3.0")
+    start(processes, "cartesian_controller", *arguments, *PATIENT, **environment)
+    cell.wait_until_active()
+    wait(lambda: all(len(lbr_commands(listener, arm, "q")) for arm in ("left", "right")), "commands come")
+    return listener, before
+
+
+def test_an_lbr_is_led_by_positions_that_begin_where_it_is_and_step_no_further_than_its_joints_may(
+    cell: Cell, robot: Robot, processes: Processes, engage: Engage, lbr_environment: dict[str, str]
+) -> None:
+    listener, before = start_lbr(cell, processes, lbr_environment, "lbr_position", "LBRJointPositionCommand")
+    stream = engage("left")
+    stream.move("left", (0.0, 0.0, 0.05))
+    goal = stream.poses["left"].translation
+    wait(lambda: np.linalg.norm(cell.tool("left").translation - goal) < 3e-3, "the arm is there")
+    for arm in ("left", "right"):
+        joints = robot.arms[arm].joints
+        q, t = lbr_commands(listener, arm, "q"), lbr_commands(listener, arm, "t") * 1e-9
+        assert np.abs(q[0] - before.q[joints]).max() < 1e-5
+        # The tick's own length is what the step may use; it shows in the times up to what the messages are late.
+        longest = robot.velocity_limit[joints] * (np.diff(t)[:, None] + 0.02)
+        assert (np.abs(np.diff(q, axis=0)) <= longest).all()
+
+
+def test_an_lbr_is_given_torques_without_gravity_beside_its_measured_positions(
+    cell: Cell, robot: Robot, processes: Processes, engage: Engage, lbr_environment: dict[str, str]
+) -> None:
+    listener, before = start_lbr(cell, processes, lbr_environment, "lbr_torque", "LBRTorqueCommand")
+    gravity = pin.computeGeneralizedGravity(robot.model, robot.model.createData(), before.q)
+    for arm in ("left", "right"):
+        joints = robot.arms[arm].joints
+        assert np.abs(gravity[joints]).max() > 20.0
+        assert np.abs(lbr_commands(listener, arm, "tau")[0]).max() < 0.5
+        assert np.abs(lbr_commands(listener, arm, "q")[0] - before.q[joints]).max() < 1e-5
+    stream = engage("left")
+    stream.move("left", (0.0, 0.0, 0.02))
+    stiffness = load_config(CONFIG).impedance.translational_stiffness
+    time.sleep(0.5)
+    tau = lbr_commands(listener, "left", "tau")
+    assert np.isfinite(tau).all()
+    # The simulated arm stays where it is, so the torque is that of a spring stretched by 20 mm: F = J^-T tau.
+    data = robot.model.createData()
+    J = pin.computeFrameJacobian(robot.model, data, before.q, robot.arms["left"].frame_id, pin.LOCAL_WORLD_ALIGNED)
+    force = np.linalg.pinv(J[:, robot.arms["left"].joints].T) @ tau[-1]
+    assert force[2] == pytest.approx(stiffness * 0.02, rel=0.05)
+    assert np.abs(lbr_commands(listener, "right", "tau")).max() < 0.5
