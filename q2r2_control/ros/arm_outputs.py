@@ -42,6 +42,7 @@ class ArmOutputs:
         self._command_type: CommandType | None = None
         if preset.command_type is not None:
             self._command_type = CommandType(node, preset.command_type.format(ctrl=values.prefix))
+        self._allows = False  # the built-in controller says where the arm may go
         self._relaying = False
 
     @property
@@ -52,8 +53,11 @@ class ArmOutputs:
     @property
     def unready(self) -> str | None:
         """Why the arm may not be engaged yet."""
-        unheard = next((line for output in self._all if (line := output.unheard)), None)
-        return unheard or (None if self._command_type is None else self._command_type.unready)
+        if unheard := next((line for output in self._all if (line := output.unheard)), None):
+            return unheard
+        if self._last is not None and not self._allows:
+            return self._safe_target.problem
+        return None if self._command_type is None else self._command_type.unready
 
     @property
     def advice(self) -> str | None:
@@ -78,12 +82,14 @@ class ArmOutputs:
         if self._last is None:
             return None
         safe, fault = self._safe_target.at(now), None
+        self._allows = safe is not None
         if not self._relaying and engaged:
             self._relaying = safe is not None and tool is not None and near(safe, tool, *SAG)
             if not self._relaying:
                 fault = self._safe_target.problem or f"{self._safe_topic} is not where the tool is"
         self._relaying = self._relaying and safe is not None
-        self._last.step(safe if self._relaying else None, tool, base, now)
+        # The built-in controller's tool may be where the arm's is not, as far as the arm sags.
+        self._last.step(safe if self._relaying else None, tool, base, now, start=tool)
         return fault
 
     def forget(self, now: float) -> None:

@@ -102,7 +102,12 @@ def arm_parameters(node: BaseNode, subclass: ArmDefaults) -> ArmParameters:
         ),
         builtin_prefix=declared(node, "builtin_prefix", f"/q2r2/{arm}", "where mode filtered sends the hand's target"),
         tool_timeout=declared(
-            node, "tool_timeout", 0.15, "a tool's pose older than this is not known [s]", at_least=0.01, at_most=2.0
+            node,
+            "tool_timeout",
+            0.15,
+            "an older pose of the tool, or safe target, does not count [s]",
+            at_least=0.01,
+            at_most=2.0,
         ),
         link_timeout=declared(
             node, "link_timeout", 0.25, "the other arm's node may be silent [s]", at_least=0.1, at_most=10.0

@@ -30,7 +30,6 @@ from q2r2_control.teleop.teleop import Teleop
 from q2r2_control.types import SIDES, ArmTarget
 
 _MARKER_PERIOD = 0.05  # [s]
-_SAFE_TIMEOUT = 0.15  # of the built-in controller's targets [s]
 
 
 class BaseArmController(BaseNode):
@@ -103,7 +102,7 @@ class BaseArmController(BaseNode):
         self._tool: ToolFrame | PoseTopic = ToolFrame(tree, values.tool_frame, world, values.tool_timeout)
         if values.current_pose_topic:
             self._tool = PoseTopic(self, values.current_pose_topic, tree, world, values.tool_timeout)
-        self._safe_target = PoseTopic(self, values.safe_target_topic, tree, world, _SAFE_TIMEOUT)
+        self._safe_target = PoseTopic(self, values.safe_target_topic, tree, world, values.tool_timeout)
         self._link = ArmLink(self, self.robot_name, self.arm_name, values.teleop.stance, values.link_timeout)
         self._outputs = ArmOutputs(self, values, self._safe_target)
         self.gripper = GripperClient(self, values.gripper_topic, values.gripper)
