@@ -15,7 +15,8 @@ from typing import Any
 
 import pytest
 
-from q2r2_control.ros.build import Interfaces, build, interface_packages, missing_tools
+from q2r2_control.ros.build import interface_packages, missing_tools
+from tests.ros.built import built
 from tests.ros.processes import Processes, environment_of
 
 NEEDS_ROS = "needs ROS 2 Jazzy: pip install 'q2r2_control[ros]', or source an install"
@@ -45,19 +46,15 @@ def interfaces() -> None:
 
 
 @pytest.fixture(scope="session")
-def lbr_environment(domain: int, tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
-    """Variables for processes that import ``lbr_fri_idl``, which is built for the session beside the environment."""
-    if missing := missing_tools(Path(sys.prefix)):
-        pytest.skip(f"lbr_fri_idl cannot be built here: missing {'; '.join(missing)}")
-    prefix = tmp_path_factory.mktemp("lbr_fri_idl")
-    build(Interfaces(Path(__file__).parent / "interfaces" / "lbr_fri_idl"), prefix, prefix / "build.log")
-    packages = prefix / "lib" / f"python{sys.version_info.major}.{sys.version_info.minor}" / "site-packages"
-    added = {
-        "AMENT_PREFIX_PATH": [prefix, sys.prefix],
-        "PYTHONPATH": [packages],
-        "LD_LIBRARY_PATH": [prefix / "lib"],
-    }
-    return {name: os.pathsep.join([*map(str, paths), os.environ.get(name, "")]) for name, paths in added.items()}
+def others(domain: int, tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """Variables for processes that speak as MoveIt Servo and an LBR's driver do; built for the session."""
+    return built(tmp_path_factory.mktemp("others"), "moveit_msgs", "lbr_fri_idl")
+
+
+@pytest.fixture(scope="session")
+def lbr_environment(others: dict[str, str]) -> dict[str, str]:
+    """Variables for processes that import ``lbr_fri_idl``."""
+    return others
 
 
 @pytest.fixture
@@ -76,6 +73,17 @@ def node(domain: int) -> Iterator[Any]:
         yield made
 
 
+@pytest.fixture
+def context(domain: int) -> Iterator[Any]:
+    """Where nodes are made that never spin."""
+    import rclpy
+
+    made = rclpy.Context()
+    rclpy.init(context=made, domain_id=domain)
+    yield made
+    made.try_shutdown()
+
+
 @contextmanager
 def spun_node(domain: int, name: str = "test") -> Iterator[Any]:
     """The same for fixtures that outlive one test."""
@@ -89,11 +97,13 @@ def spun_node(domain: int, name: str = "test") -> Iterator[Any]:
     executor.add_node(made)
     thread = Thread(target=executor.spin, daemon=True)
     thread.start()
-    yield made
-    executor.shutdown()
-    thread.join()
-    made.destroy_node()
-    context.try_shutdown()
+    try:
+        yield made
+    finally:
+        executor.shutdown()
+        thread.join()
+        made.destroy_node()
+        context.try_shutdown()
 
 
 @pytest.hookimpl(wrapper=True)
