@@ -1,37 +1,38 @@
-"""What q2r2 ros up starts, for ROS: ``ros2 launch q2r2_control teleop.launch.py config:=... input:=...``."""
+"""What q2r2 ros up starts, for ROS: ``ros2 launch q2r2_control teleop.launch.py config:=... input:=... robot:=...``."""
 
 from launch import LaunchDescription
-from launch.actions import DeclareLaunchArgument, Shutdown
-from launch.conditions import IfCondition
-from launch.substitutions import EqualsSubstitution, LaunchConfiguration
+from launch.actions import DeclareLaunchArgument, OpaqueFunction, Shutdown
+from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
+from launch_ros.parameter_descriptions import ParameterValue
 
-# Executable, and the input that it is for; None: any.
-NODES = (
-    ("mujoco_robot", None),
-    ("cartesian_controller", None),
-    ("left_arm_controller", None),
-    ("right_arm_controller", None),
-    ("SimulationInput", "scripted"),
-    ("tcp_endpoint", "headset"),
-)
+from q2r2_control.ros.node_set import ROBOTS, SOURCES, nodes_of
 
 
-def generate_launch_description() -> LaunchDescription:
+def generate_launch_description():
     """All nodes; when one ends all end, and none is started again."""
-    arguments = [
-        DeclareLaunchArgument("config", default_value="config/dual_iiwa7.yaml", description="YAML of the cell"),
-        DeclareLaunchArgument("input", default_value="scripted", choices=["scripted", "headset", "none"]),
-    ]
-    nodes = [
+    return LaunchDescription(
+        [
+            DeclareLaunchArgument("config", default_value="config/dual_iiwa7.yaml", description="YAML of the cell"),
+            DeclareLaunchArgument("input", default_value="scripted", choices=list(SOURCES), description="of the hands"),
+            DeclareLaunchArgument(
+                "robot", default_value="auto", choices=list(ROBOTS), description="auto: mujoco for controller: builtin"
+            ),
+            OpaqueFunction(function=_nodes),
+        ]
+    )
+
+
+def _nodes(context):
+    given = [LaunchConfiguration(name).perform(context) for name in ("config", "input", "robot")]
+    return [
         Node(
             package="q2r2_control",
-            executable=executable,
+            executable=node.name,
             output="screen",
-            parameters=[{"config": LaunchConfiguration("config")}],
-            condition=None if source is None else IfCondition(EqualsSubstitution(LaunchConfiguration("input"), source)),
-            on_exit=Shutdown(reason=f"{executable} ended"),
+            # Typed, since launch would otherwise read a text that looks like a number as one.
+            parameters=[{key: ParameterValue(value, value_type=type(value)) for key, value in node.parameters.items()}],
+            on_exit=Shutdown(reason=f"{node.name} ended"),
         )
-        for executable, source in NODES
+        for node in nodes_of(*given)
     ]
-    return LaunchDescription([*arguments, *nodes])

@@ -8,6 +8,7 @@ from typing import Any
 
 from q2r2_control.config import Config, ObstacleConfig
 from q2r2_control.errors import ConfigError
+from q2r2_control.external import describe
 from q2r2_control.robot.reachability import PairReach, nearest_approaches, srdf_of
 from q2r2_control.robot.robot import PairDistance, Robot
 from q2r2_control.types import Array
@@ -51,6 +52,7 @@ class CellCheck:
     min_distance: float
     nearest: tuple[PairDistance, ...]  # nearest first
     faults: tuple[str, ...]
+    driven: dict[str, str]  # by arm: what controllers of others are sent, empty for the built-in one
 
     def as_json(self) -> dict[str, Any]:
         """Plain data and dataclasses for the JSON writer."""
@@ -81,6 +83,7 @@ def check_cell(config: Config) -> CellCheck:
                 if pair.distance < settings.min_distance
             ),
         ),
+        driven={} if config.external is None else describe(config.external),
     )
 
 

@@ -195,6 +195,8 @@ def check(
         console.print(f"cell {result.name}", highlight=False)
         for table in (*map(arm_table, result.arms), obstacle_table(result), pair_table(result)):
             console.print(table)
+        for arm, line in (result.driven or {"arms": "the built-in controller"}).items():
+            console.print(f"{arm} driven by {line}", highlight=False, markup=False, soft_wrap=True)
         for fault in result.faults:
             console.print(f"FAULT {fault}", style="red", highlight=False, soft_wrap=True)
     raise typer.Exit(1 if result.faults else 0)

@@ -15,6 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from q2r2_control.control.settings import AdmittanceSettings, ControllerSettings, ImpedanceSettings, check_priority
 from q2r2_control.errors import ConfigError
+from q2r2_control.external import ControllerKind, ExternalConfig, check_external
 from q2r2_control.resources import find_resource
 from q2r2_control.teleop.settings import TeleopSettings
 
@@ -140,6 +141,8 @@ class Config(_Model):
     obstacles: dict[str, ObstacleConfig] = Field(default_factory=dict)
     srdf: str | None = Field(None, description="a file of pairs that need no watching, as q2r2 check --pairs writes it")
     loop_rate_hz: float = Field(1000.0, ge=50, le=2000, description="control loop [Hz]")
+    controller: ControllerKind = Field(ControllerKind.BUILTIN, description="builtin, or external: for q2r2 ros up")
+    external: ExternalConfig | None = Field(None, description="controllers of others; with controller: external")
     control: ControllerSettings = ControllerSettings()
     impedance: ImpedanceSettings = ImpedanceSettings()
     admittance: AdmittanceSettings = AdmittanceSettings()
@@ -168,6 +171,7 @@ def load_config(path: str | os.PathLike[str]) -> Config:
         # Strict, or `off` would pass for 0.0; by way of JSON, where sequences are tuples and names are enums.
         config = Config.model_validate_json(json.dumps(data, default=str), strict=True)
         check_priority(config.control.priority, config.arms)
+        check_external(config.controller, config.external, config.arms)
         return config
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from error
@@ -224,6 +228,6 @@ def _keys_at(location: tuple[int | str, ...]) -> list[str]:
         annotation = model.model_fields[part].annotation if part in getattr(model, "model_fields", {}) else None
         if annotation is None:
             continue
-        arguments = getattr(annotation, "__args__", ())
+        arguments = [given for given in getattr(annotation, "__args__", ()) if given is not type(None)]
         model = arguments[-1] if arguments else annotation
     return sorted(getattr(model, "model_fields", {}))

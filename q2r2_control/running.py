@@ -13,6 +13,7 @@ from rich.console import Console
 
 from q2r2_control.config import Config
 from q2r2_control.errors import ConfigError
+from q2r2_control.external import ControllerKind
 from q2r2_control.inputs.base import Input
 from q2r2_control.inputs.headset import HeadsetServer
 from q2r2_control.inputs.scripted import ScriptedInput
@@ -48,6 +49,10 @@ class RunOptions:
 
 def run(config: Config, options: RunOptions, console: Console) -> RunSummary:
     """Run a cell and tell ``console`` about it. Raises :class:`Q2R2Error` where that is not possible as asked."""
+    if config.controller is ControllerKind.EXTERNAL:
+        raise ConfigError(
+            f"{config.name}: controller: external is driven by q2r2 ros up; this command runs controller: builtin only"
+        )
     if options.window and options.plant != "mujoco":
         raise ConfigError(f"--viewer: the {options.plant} plant has no window; allowed: --plant mujoco")
     with notice_of_compiling(console):

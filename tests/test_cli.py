@@ -17,6 +17,7 @@ from typer.testing import CliRunner, Result
 from q2r2_control.cli import app
 from q2r2_control.resources import find_resource
 from q2r2_control.soak import SoakReport, run_soak
+from tests.support.external_cell import external_text
 
 CELL = "config/dual_iiwa7.yaml"
 COMMANDS = ("demo", "run", "check", "headset-check", "bench")
@@ -172,6 +173,33 @@ def test_check_prints_arms_limits_obstacles_and_the_nearest_pairs_of_a_good_cell
     for expected in ("left_A1", "right_A7", "hand_e", "left_tool_frame", "table", "monitored pairs", "min_distance 20"):
         assert expected in result.stdout
     assert "FAULT" not in result.stdout
+
+
+def external_cell(folder: Path, old: str = "mode: raw", new: str = "mode: raw") -> str:
+    file = folder / "external.yaml"
+    file.write_text(external_text().replace(old, new, 1), encoding="utf-8")
+    return str(file)
+
+
+@pytest.mark.parametrize(
+    ("mode", "source"),
+    [("raw", "the hand's target"), ("filtered", "what the built-in controller makes of the hand's target")],
+)
+def test_check_says_what_drives_the_arms_and_how(tmp_path: Path, mode: str, source: str) -> None:
+    assert "arms driven by the built-in controller\n" in q2r2("check", CELL).stdout
+    file = external_cell(tmp_path, new=f"mode: {mode}")
+    topic = "/bh_robot/right_arm_clik_controller/target_frame"
+    line = f"kuka_lbr_clik: PoseStamped in bh_robot_base on {topic} at 100 Hz, {source}"
+    assert f"right driven by {line}\n" in q2r2("check", file).stdout
+    assert one_object(q2r2("check", file, "--json").stdout)["driven"]["right"] == line
+
+
+def test_a_cell_with_an_external_controller_is_not_run_without_ros(tmp_path: Path) -> None:
+    result = q2r2("run", external_cell(tmp_path), "--plant", "kinematic", "--fast", "--duration", "1", "--headless")
+    assert (result.exit_code, result.stdout) == (2, "")
+    assert result.stderr == (
+        "q2r2: dual_iiwa7: controller: external is driven by q2r2 ros up; this command runs controller: builtin only\n"
+    )
 
 
 def test_check_as_json_has_limits_and_distances_in_order() -> None:

@@ -15,6 +15,7 @@ from q2r2_control.errors import ConfigError
 from q2r2_control.inputs.samples import SampleQueue
 from q2r2_control.inputs.session import HAPTIC_TOPICS
 from q2r2_control.ros.arm_link import ArmLink
+from q2r2_control.ros.arm_outputs import SAG, ArmOutputs
 from q2r2_control.ros.arm_parameters import ArmDefaults, ArmParameters, arm_parameters
 from q2r2_control.ros.frames import FrameListener
 from q2r2_control.ros.gripper_client import GripperClient
@@ -23,17 +24,13 @@ from q2r2_control.ros.markers import TargetMarkers
 from q2r2_control.ros.messages import hand_sample
 from q2r2_control.ros.node import COMMAND_QOS, ERROR, OK, STREAM_QOS, WARN, BaseNode
 from q2r2_control.ros.pose_source import PoseTopic, ToolFrame
-from q2r2_control.ros.presets import BUILTIN, Mode
-from q2r2_control.ros.target_output import TargetOutput, near
+from q2r2_control.ros.target_output import near
 from q2r2_control.teleop.arm import OPEN, ArmState
 from q2r2_control.teleop.haptics import HapticPulses
 from q2r2_control.teleop.teleop import Teleop
 from q2r2_control.types import SIDES, ArmTarget
 
 _MARKER_PERIOD = 0.05  # [s]
-# Farther from the measured pose than sag explains, a commanded one is not what the tool is anchored to.
-_SAG = 0.05, 0.1  # [m, rad]
-_SAFE_TIMEOUT = 0.15  # of the built-in controller's targets [s]
 
 
 class BaseArmController(BaseNode):
@@ -96,7 +93,6 @@ class BaseArmController(BaseNode):
         self._target = ArmTarget(None, OPEN)
         self._last_event = "paused: not engaged yet"
         self._refusal: tuple[bytes, str] | None = None
-        self._relaying = False
         self._shown = 0.0
         self._ticked = self.now
 
@@ -108,10 +104,10 @@ class BaseArmController(BaseNode):
         self._tool: ToolFrame | PoseTopic = ToolFrame(self, tree, values.tool_frame, world, values.tool_timeout)
         if values.current_pose_topic:
             self._tool = PoseTopic(self, values.current_pose_topic, tree, world, values.tool_timeout)
-        self._safe_target = PoseTopic(self, values.safe_target_topic, tree, world, _SAFE_TIMEOUT)
+        self._safe_target = PoseTopic(self, values.safe_target_topic, tree, world, values.tool_timeout)
         self._link = ArmLink(self, self.robot_name, self.arm_name, values.teleop.stance, values.link_timeout)
         self._hand_watch = HandWatch(self, hand, values.teleop.gate.timeout)
-        self._make_outputs()
+        self._outputs = ArmOutputs(self, values, self._safe_target)
         self.gripper = GripperClient(self, values.gripper_topic, values.gripper)
         self._markers = self.create_publisher(Marker, "/visualization_marker", 10)
         self._haptics = self.create_publisher(OVR2ROSHapticFeedback, HAPTIC_TOPICS[hand], COMMAND_QOS)
@@ -157,8 +153,9 @@ class BaseArmController(BaseNode):
         self._target = target
         if self.now - now > self.parameters.teleop.gate.timeout:
             return  # frozen in between: what was to be sent is of the past, and the next tick finds out
-        sent = self._output.step(target.pose, tool, base, now)
-        self._relay(tool, base, now)
+        sent = self._outputs.step(target.pose, tool, base, now)
+        if (fault := self._outputs.relay(self.state is ArmState.ENGAGED, tool, base, now)) is not None:
+            self.teleop.pause(now, fault)
         if toggled:
             self.toggle_gripper()
         self.gripper.check(now)
@@ -172,7 +169,7 @@ class BaseArmController(BaseNode):
 
     def health(self) -> tuple[bytes, str, Mapping[str, Any]]:
         """State, what keeps the arm from being engaged, and figures."""
-        guard = self._output.guard
+        output = self._outputs.first
         values = {
             "arm": self.arm_name,
             "state": str(self.state),
@@ -183,9 +180,9 @@ class BaseArmController(BaseNode):
             "stance": str(self.parameters.teleop.stance),
             "preset": self.parameters.preset.name,
             "mode": str(self.parameters.mode),
-            "target_topic": self._output.topic,
-            "targets_sent": self._output.sent,
-            "targets_clipped": guard.clipped,
+            "target_topic": output.topic,
+            "targets_sent": output.sent,
+            "targets_clipped": output.guard.clipped,
             "slip": round(self._target.slip, 4),
             "slip_angle": round(self._target.slip_angle, 4),
             "gripper": self.gripper.state,
@@ -193,29 +190,14 @@ class BaseArmController(BaseNode):
         }
         if self._refusal is not None:
             return *self._refusal, values
-        if self.gripper.problem is not None:
-            return WARN, self.gripper.problem, values
+        for problem in (self.gripper.problem, self._outputs.advice):
+            if problem is not None:
+                return WARN, problem, values
         return OK, self._last_event, values
 
     def close(self) -> None:
         """Say good-bye to the other arm."""
         self._link.close()
-
-    def _make_outputs(self) -> None:
-        values = self.parameters
-        if values.mode is Mode.RAW:
-            self._output = TargetOutput(
-                self, values.preset, values.controller, values.target_topic, values.base_frame, values.guard
-            )
-            self._external: TargetOutput | None = None
-            return
-        topic = BUILTIN.topic.format(ctrl=values.builtin_prefix)
-        self._output = TargetOutput(self, BUILTIN, "/cartesian_controller", topic, values.world_frame, BUILTIN.guard)
-        self._external = None
-        if values.preset.takes_poses and values.preset is not BUILTIN:
-            self._external = TargetOutput(
-                self, values.preset, values.controller, values.target_topic, values.base_frame, values.guard
-            )
 
     def _base(self) -> pin.SE3 | None:
         """The frame that targets are published in, in the world frame."""
@@ -226,8 +208,7 @@ class BaseArmController(BaseNode):
 
     def _refuse(self, tool: pin.SE3 | None, base: pin.SE3 | None, now: float) -> tuple[bytes, str] | None:
         """Why the arm may not be engaged now, and how bad that is."""
-        outputs = [self._output] if self._external is None else [self._output, self._external]
-        for line in (self._link.disagreement, *(output.conflict for output in outputs)):
+        for line in (self._link.disagreement, self._outputs.conflict):
             if line is not None:
                 return ERROR, line
         if tool is None:
@@ -236,7 +217,7 @@ class BaseArmController(BaseNode):
             values = self.parameters
             return WARN, f"no transform from {values.base_frame} to {values.world_frame} on /tf"
         silence = self._hand_watch.silence(now, self._pose[1] if self._pose else float("-inf"), self._inputs[1])
-        problem = silence or next((output.unheard for output in outputs if output.unheard), None)
+        problem = silence or self._outputs.unready
         return None if problem is None else (WARN, problem)
 
     def _faults(self, now: float) -> str | None:
@@ -244,33 +225,15 @@ class BaseArmController(BaseNode):
         stood, self._ticked = now - self._ticked, now
         stalled = f"this node stood still for {stood:.2f} s" if stood > self.parameters.teleop.gate.timeout else None
         linked = self._link.take_fault() if self.parameters.teleop.linked else None
-        own = self._output.take_fault(now)
-        external = None
-        if self._external is not None and (external := self._external.take_fault(now)):
-            self._relaying = False
-        safe = self._safe_target.take_silence(now) if self._output.preset is BUILTIN else None
-        return stalled or external or own or safe or linked
+        return stalled or self._outputs.take_fault(now) or linked
 
     def _commanded(self, tool: pin.SE3, now: float) -> pin.SE3:
         """What the leash is tied to, and whose orientation an anchor takes."""
         reference = self._safe_target.at(now)
         if self.state is ArmState.ENGAGED:
             return tool if reference is None else reference
-        reference = reference or self._output.guard.pose
-        return reference if reference is not None and near(reference, tool, *_SAG) else tool
-
-    def _relay(self, tool: pin.SE3 | None, base: pin.SE3 | None, now: float) -> None:
-        """Mode filtered: pass what the built-in controller allows on to the external one, from engaging on."""
-        if self._external is None:
-            return
-        safe = self._safe_target.at(now)
-        if not self._relaying and self.state is ArmState.ENGAGED:
-            self._relaying = safe is not None and tool is not None and near(safe, tool, *_SAG)
-            if not self._relaying:
-                reason = self._safe_target.problem or f"{self.parameters.safe_target_topic} is not where the tool is"
-                self.teleop.pause(now, reason)
-        self._relaying = self._relaying and safe is not None
-        self._external.step(safe if self._relaying else None, tool, base, now)
+        reference = reference or self._outputs.first.guard.pose
+        return reference if reference is not None and near(reference, tool, *SAG) else tool
 
     def _tell_events(self, now: float) -> None:
         """Pass changes of the state on to the log, the hand and the other arm."""
@@ -308,8 +271,6 @@ class BaseArmController(BaseNode):
         """Trust nothing received so far and hold nothing; a press engages anew."""
         now = self.now
         self.teleop.connection_lost(now)
-        for output in filter(None, (self._output, self._external)):
-            output.forget(now)
-        self._relaying = False
+        self._outputs.forget(now)
         response.success, response.message = True, f"{self.arm_name} starts anew"
         return response

@@ -8,9 +8,9 @@ from typing import Annotated
 
 import typer
 
-from q2r2_control.config import load_config
 from q2r2_control.ros.build import BuildError, build_interfaces
-from q2r2_control.ros.up import nodes_of, run_together
+from q2r2_control.ros.node_set import nodes_of
+from q2r2_control.ros.up import run_together
 
 app = typer.Typer(rich_markup_mode=None, help="ROS 2 Jazzy, from apt or from the Python registry.")
 
@@ -20,6 +20,14 @@ class HandSource(StrEnum):
 
     SCRIPTED = "scripted"
     HEADSET = "headset"
+    NONE = "none"
+
+
+class RobotSource(StrEnum):
+    """What moves."""
+
+    AUTO = "auto"
+    MUJOCO = "mujoco"
     NONE = "none"
 
 
@@ -44,10 +52,16 @@ def up(
     input: Annotated[
         HandSource, typer.Option(help="SimulationInput, tcp_endpoint, or neither: another node sends the hands.")
     ] = HandSource.SCRIPTED,
+    robot: Annotated[
+        RobotSource,
+        typer.Option(help="Simulated, or one that is there; auto: mujoco for controller: builtin."),
+    ] = RobotSource.AUTO,
 ) -> None:
-    """Start the simulated robot, the controller, both arms' teleop and an input as ROS nodes, until Ctrl-C.
+    """Start what a cell needs as ROS nodes, until Ctrl-C: robot, controller, the arms' teleop and an input.
 
+    With controller: external the robot and its controllers are yours; what runs here are the arms' teleop and an input,
+    and in mode filtered the built-in controller between both.
     A node that ends by itself is reported, and all others are stopped: exit 1.
     """
-    load_config(config)
-    raise typer.Exit(run_together(nodes_of(config, input.value), lambda line: print(line, flush=True)))
+    nodes = nodes_of(config, input.value, robot.value)
+    raise typer.Exit(run_together(nodes, lambda line: print(line, flush=True)))

@@ -2,41 +2,18 @@
 
 from __future__ import annotations
 
-from enum import StrEnum
 from typing import Any
 
 from control_msgs.action import GripperCommand, ParallelGripperCommand
-from pydantic import BaseModel, ConfigDict, Field
 from rclpy.action import ActionClient
 from rclpy.action.client import GoalStatus
 from rclpy.node import Node
 from std_msgs.msg import Float64MultiArray
 
+from q2r2_control.external import GripperSettings, GripperType
 from q2r2_control.ros.node import COMMAND_QOS
 
 _PATIENCE = 10.0  # for a result; after that the gripper counts as silent [s]
-
-
-class GripperType(StrEnum):
-    """What a gripper is driven by."""
-
-    GRIPPER_COMMAND = "GripperCommand"
-    PARALLEL_GRIPPER_COMMAND = "ParallelGripperCommand"
-    FLOAT64_MULTI_ARRAY = "Float64MultiArray"
-
-
-class GripperSettings(BaseModel):
-    """How a gripper is told to open and close."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-    action_type: GripperType = Field(
-        GripperType.GRIPPER_COMMAND, description="GripperCommand, ParallelGripperCommand or Float64MultiArray"
-    )
-    open_position: float = Field(0.025, ge=-3.15, le=3.15, description="goal that opens [m or rad]")
-    closed_position: float = Field(0.0, ge=-3.15, le=3.15, description="goal that closes [m or rad]")
-    max_effort: float = Field(60.0, ge=0, le=500, description="of a goal [N or Nm]")
-    joint_name: str = Field("", description="joint of a ParallelGripperCommand")
 
 
 class GripperClient:

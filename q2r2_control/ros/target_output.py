@@ -10,11 +10,15 @@ from geometry_msgs.msg import PoseStamped, WrenchStamped
 
 from q2r2_control.ros.messages import stamped_pose, time_message
 from q2r2_control.ros.node import LATCHED_QOS, SENT_COMMAND_QOS, BaseNode
-from q2r2_control.ros.presets import Hold, Preset
 from q2r2_control.teleop.guard import GuardSettings, TargetGuard
+from q2r2_control.teleop.presets import Hold, Preset
 
 _GRAPH_PERIOD = 0.1  # between two looks at who else is there [s]
-_ALERT = 1.0  # after somebody came every tick looks, since names are known later than endpoints [s]
+# After somebody came every tick looks, since names are known later than endpoints. Until they are known nothing is
+# sent: it may be the controller, started anew, and what it is asked for first must not be a jump. After this long that
+# pauses an arm that is engaged [s].
+_ALERT = 3.0
+_NAMELESS = "_NODE_NAME_UNKNOWN_"  # as rcl says it
 # A tool farther from a held target than this was moved by something else, and the target is not asked for again.
 _HELD = 0.15, 0.6  # [m, rad]
 
@@ -22,14 +26,21 @@ _HELD = 0.15, 0.6  # [m, rad]
 class TargetOutput:
     """Publishes one arm's target to one controller.
 
-    While there is a target it is followed by a :class:`TargetGuard`, which starts at the first one: that is where the
-    tool is, so engaging moves nothing. When there is none any more the guard brakes, and then the last pose is repeated
+    While there is a target it is followed by a :class:`TargetGuard`, which starts where the tool is, so engaging moves
+    nothing. When there is none any more the guard brakes, and then the last pose is repeated
     or not, as the preset says. It is never repeated to a tool that has gone elsewhere, nor to a controller that was
     started anew: both would be a jump.
     """
 
     def __init__(
-        self, node: BaseNode, preset: Preset, controller: str, topic: str, frame: str, guard: GuardSettings
+        self,
+        node: BaseNode,
+        preset: Preset,
+        controller: str,
+        topic: str,
+        frame: str,
+        guard: GuardSettings,
+        prefix: str = "",
     ) -> None:
         self.preset = preset
         self.guard = TargetGuard(guard)
@@ -37,13 +48,15 @@ class TargetOutput:
         self._publisher = node.create_publisher(PoseStamped, topic, SENT_COMMAND_QOS)
         self._wrench = None
         if preset.zero_wrench is not None:
-            self._wrench = node.create_publisher(WrenchStamped, preset.zero_wrench.format(ctrl=controller), LATCHED_QOS)
+            self._wrench = node.create_publisher(WrenchStamped, preset.zero_wrench.format(ctrl=prefix), LATCHED_QOS)
         self._following = False
         self._restarted = False
         self._endpoints: set[bytes] = set()  # of the controller
         self._listeners = 0
+        self._strange = False  # somebody listens who is not known yet
         self._looked = self._came = -math.inf
         self.sent = 0
+        self.lives = 0  # how often the controller was seen to come
 
     @property
     def topic(self) -> str:
@@ -64,33 +77,49 @@ class TargetOutput:
 
     @property
     def unheard(self) -> str | None:
-        """One line where nobody takes the targets."""
-        return f"nobody listens to {self.topic}" if self._publisher.get_subscription_count() == 0 else None
+        """One line where nobody takes the targets, or it is not known yet who will."""
+        if self._publisher.get_subscription_count() == 0:
+            return f"nobody listens to {self.topic}"
+        strange = self._strange and not self._following
+        return f"it is not known who listens to {self.topic}" if strange else None
 
     def take_fault(self, now: float) -> str | None:
         """Look who is there; says once that the controller was started anew while it was driven."""
-        listeners = self._publisher.get_subscription_count()
+        listeners = self._present
         if listeners > self._listeners or listeners == 0:
             self._came = now
             if not self._following:
                 self.forget(now)  # whoever it is, it is not to be greeted with a target of the past
         self._listeners = listeners
-        if now - self._came < _ALERT or not 0.0 <= now - self._looked <= _GRAPH_PERIOD:
+        if self._strange or now - self._came < _ALERT or not 0.0 <= now - self._looked <= _GRAPH_PERIOD:
             self._looked = now
             self._look(now)
+        if self._strange and self._following and now - self._came > _ALERT:
+            self.forget(now)
+            return f"it is not known who listens to {self.topic}"
         restarted, self._restarted = self._restarted, False
         return f"{self._controller} was started anew" if restarted else None
 
-    def step(self, target: pin.SE3 | None, tool: pin.SE3 | None, base: pin.SE3 | None, now: float) -> pin.SE3 | None:
+    def step(
+        self,
+        target: pin.SE3 | None,
+        tool: pin.SE3 | None,
+        base: pin.SE3 | None,
+        now: float,
+        start: pin.SE3 | None = None,
+    ) -> pin.SE3 | None:
         """Publish for ``now`` [s]; returns what was published, in the world frame.
 
         ``target``: where the tool should be, None: nowhere new; ``tool``: where it is; both in the world frame, as is
         ``base``, the frame that the controller reads its targets in. None of the latter two: not known.
+        ``start``: where a stream begins that does not begin at its first target.
         """
+        if self._strange or self._present > self._listeners:
+            return None
         idle = not self._following and self.guard.at_rest
         self._following = target is not None
         if target is not None and idle:
-            self.guard.reset(target, now)
+            self.guard.reset(target if start is None else start, now)
             self._send_zero_wrench(now)
         pose = self.guard.step(target, now)
         if pose is None or base is None or not (self._following or not self.guard.at_rest or self._holds(tool, now)):
@@ -105,6 +134,11 @@ class TargetOutput:
         self._following = False
         self.guard.reset(None, now)
 
+    @property
+    def _present(self) -> int:
+        """How many listen; the graph knows of one before anything can be sent to it."""
+        return max(self._publisher.get_subscription_count(), self._node.count_subscribers(self.topic))
+
     def _holds(self, tool: pin.SE3 | None, now: float) -> bool:
         """Whether the last target is repeated."""
         if self.guard.pose is None:
@@ -116,13 +150,17 @@ class TargetOutput:
 
     def _look(self, now: float) -> None:
         """Notice a controller that has come."""
+        found = self._node.get_subscriptions_info_by_topic(self.topic)
+        self._strange = len(found) < self._listeners or any(info.node_name == _NAMELESS for info in found)
         endpoints = {
             bytes(info.endpoint_gid)
-            for info in self._node.get_subscriptions_info_by_topic(self.topic)
+            for info in found
             if f"{info.node_namespace.rstrip('/')}/{info.node_name}" == self._controller
         }
         if endpoints - self._endpoints:
+            self.lives += 1
             self._restarted = self._following
+            self.forget(now)
             self._send_zero_wrench(now)
         self._endpoints = endpoints
 

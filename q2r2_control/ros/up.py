@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import importlib.util
 import os
 import queue
@@ -12,41 +13,19 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 
 from q2r2_control.errors import Q2R2Error
+from q2r2_control.ros.node_set import NodeProcess
 
 # What a process gets to end itself, first by SIGINT, then by SIGTERM; the next means is SIGKILL [s].
 _PATIENCE = {signal.SIGINT: 5.0, signal.SIGTERM: 3.0}
+# Looked up here, since little is safe between fork and exec.
+_prctl = ctypes.CDLL(None).prctl if sys.platform == "linux" else None
+_PR_SET_PDEATHSIG = 1
 
 
 class UpError(Q2R2Error):
     """The set cannot be started; the message says what is missing."""
-
-
-@dataclass(frozen=True, slots=True)
-class NodeProcess:
-    """One node to start: its executable's name, its module, and its parameters."""
-
-    name: str
-    module: str
-    parameters: Mapping[str, str] = field(default_factory=dict)
-
-    def command(self) -> list[str]:
-        """What starts it with this Python."""
-        parameters = [part for key, value in self.parameters.items() for part in ("-p", f"{key}:={value}")]
-        return [sys.executable, "-u", "-m", self.module, "--ros-args", *parameters]
-
-
-def nodes_of(config: str, source: str) -> list[NodeProcess]:
-    """The set for a cell's YAML, with hands from ``source``: scripted, headset or none."""
-    names = ["mujoco_robot", "cartesian_controller", "left_arm_controller", "right_arm_controller"]
-    nodes = [NodeProcess(name, f"q2r2_control.ros.{name}", {"config": config}) for name in names]
-    if source == "scripted":
-        nodes.append(NodeProcess("SimulationInput", "q2r2_control.ros.simulation_input"))
-    elif source == "headset":
-        nodes.append(NodeProcess("tcp_endpoint", "q2r2_control.ros.tcp_endpoint", {"config": config}))
-    return nodes
 
 
 def run_together(nodes: Sequence[NodeProcess], say: Callable[[str], None]) -> int:
@@ -54,6 +33,7 @@ def run_together(nodes: Sequence[NodeProcess], say: Callable[[str], None]) -> in
 
     Ctrl-C or SIGTERM ends all of them: 0. One that ends by itself is reported at once and ends the others: 1. None is
     started again. Each is a session of its own, so that a terminal's Ctrl-C reaches it from here only, in order.
+    Where this process is killed, Linux interrupts them all: arms must not move for a teleoperation nobody can end.
     Raises :class:`UpError`.
     """
     _check(nodes)
@@ -63,8 +43,9 @@ def run_together(nodes: Sequence[NodeProcess], say: Callable[[str], None]) -> in
         readers: list[threading.Thread] = []
         try:
             for node in nodes:
-                running[node.name] = process = _start(node)
-                readers.append(threading.Thread(target=_read, args=(node.name, process, lines), daemon=True))
+                running[node.name] = _start(node)
+            for name, process in running.items():  # threads come last, since a process is forked from one thread best
+                readers.append(threading.Thread(target=_read, args=(name, process, lines), daemon=True))
                 readers[-1].start()
             dead = _watch(running, stop, lines, say)
         finally:
@@ -88,6 +69,7 @@ def _check(nodes: Sequence[NodeProcess]) -> None:
 
 
 def _start(node: NodeProcess) -> subprocess.Popen[str]:
+    parent = os.getpid()
     return subprocess.Popen(
         node.command(),
         stdin=subprocess.DEVNULL,
@@ -97,7 +79,16 @@ def _start(node: NodeProcess) -> subprocess.Popen[str]:
         errors="replace",
         env=os.environ | {"PYTHONUNBUFFERED": "1"},
         start_new_session=True,
+        preexec_fn=None if _prctl is None else lambda: _end_with(parent),
     )
+
+
+def _end_with(parent: int) -> None:
+    """In the new process: be interrupted when ``parent`` ends, which it may have done already."""
+    assert _prctl is not None
+    _prctl(_PR_SET_PDEATHSIG, signal.SIGINT)
+    if os.getppid() != parent:
+        os.kill(os.getpid(), signal.SIGINT)
 
 
 def _read(name: str, process: subprocess.Popen[str], lines: queue.SimpleQueue[str]) -> None:

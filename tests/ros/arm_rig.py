@@ -63,7 +63,7 @@ class ArmRig:
             node.create_subscription(
                 OVR2ROSHapticFeedback,
                 f"q2r_{hand}_hand_haptic_feedback",
-                lambda message: self.pulses.append((message.frequency, message.amplitude)),
+                lambda message: self.pulses.append((round(message.frequency, 3), round(message.amplitude, 3))),
                 COMMAND_QOS,
             ),
         ]
@@ -161,3 +161,21 @@ def steps(targets: list[PoseStamped]) -> list[float]:
     """Distances between one target and the next [m]."""
     positions = [np.array([t.pose.position.x, t.pose.position.y, t.pose.position.z]) for t in targets]
     return [float(np.linalg.norm(after - before)) for before, after in pairwise(positions)]
+
+
+def offset(pose: pin.SE3, by: tuple[float, float, float], turn: float = 0.0) -> pin.SE3:
+    """A pose moved by [m] and turned about z [rad], both of the world."""
+    return pin.SE3(pin.exp3(np.array([0.0, 0.0, turn])) @ pose.rotation, pose.translation + np.array(by))
+
+
+def assert_same(pose: pin.SE3 | None, other: pin.SE3, tolerance: float) -> None:
+    """Two poses are the same."""
+    assert pose is not None
+    np.testing.assert_allclose(pose.homogeneous, other.homogeneous, atol=tolerance)
+
+
+def first(rig: ArmRig) -> pin.SE3:
+    """The first target that came."""
+    pose = pose_of(rig.targets[0].pose)
+    assert pose is not None
+    return pose

@@ -98,14 +98,7 @@ class Cell:
 
     def call(self, service: str, request: Any = None) -> Any:
         """Call a Trigger service, or a SetBool one with its request; the response."""
-        client = self.node.create_client(Trigger if request is None else SetBool, service)
-        try:
-            assert client.wait_for_service(PATIENCE), service
-            future = client.call_async(Trigger.Request() if request is None else request)
-            wait(future.done, f"{service} answers")
-            return future.result()
-        finally:
-            self.node.destroy_client(client)
+        return call(self.node, service, request)
 
     def wait_until_active(self) -> None:
         """Until the arms can be moved."""
@@ -146,6 +139,18 @@ class Stream:
         while not self._ended.wait(1.0 / RATE):
             for arm, pose in self.poses.items():
                 self._cell.send(arm, pose)
+
+
+def call(node: Any, service: str, request: Any = None) -> Any:
+    """Call a Trigger service, or a SetBool one with its request; the response."""
+    client = node.create_client(Trigger if request is None else SetBool, service)
+    try:
+        assert client.wait_for_service(PATIENCE), service
+        future = client.call_async(Trigger.Request() if request is None else request)
+        wait(future.done, f"{service} answers")
+        return future.result()
+    finally:
+        node.destroy_client(client)
 
 
 def start(processes: Processes, name: str, *arguments: str, **environment: str) -> RosProcess:

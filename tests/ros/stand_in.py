@@ -1,130 +1,216 @@
-"""A controller as strict as the community's, on a point mass: ``python -m tests.ros.stand_in --topic NAME ...``.
+"""Two arms' controllers as strict as the community's, on the simulated robot: ``python -m tests.ros.stand_in TERMS``.
 
-It follows targets by a critically damped spring, tells its tool on /tf, and prints a line for every rule that a target
-breaks. It knows nothing of the package under test.
+TERMS is the JSON of :class:`Terms`. Each arm's controller is a node of its own, ``/robot/left_ctrl``, that prints a
+line for every rule that a target breaks. Both arms are driven as damped springs by torques for what ``joint_states``
+says; an arm without a target holds the posture it has. It knows nothing of the package under test.
 """
 
 from __future__ import annotations
 
-import argparse
+import json
 import math
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import import_module
 from typing import Any
 
 import numpy as np
+import pinocchio as pin
 import rclpy
-from geometry_msgs.msg import PoseStamped, TransformStamped, WrenchStamped
-from rclpy.executors import ExternalShutdownException
+from geometry_msgs.msg import PoseStamped, WrenchStamped
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
-from tf2_msgs.msg import TFMessage
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray, String
+from trajectory_msgs.msg import JointTrajectory
 
-STIFFNESS, DAMPING = 900.0, 60.0  # of a unit mass [N/m, Ns/m]
-DT = 0.005  # [s]
-FASTEST = 0.55  # that a target may move [m/s]
-FASTEST_TURN = 2.2  # [rad/s]
-LONGEST_GAP = 0.3  # that a busy machine may leave between two targets [s]
-SETTLED = 0.004  # from a tool or a target that rests [m]
-SETTLED_TURN = 0.02  # [rad]
+from tests.ros.springs import Springs
+
+ARMS = ("left", "right")
+FASTEST, FASTEST_TURN = 0.55, 2.2  # that a target may move [m/s], [rad/s]
+FASTEST_JOINT = 2.5  # that a joint's target may move [rad/s]
+LONGEST_GAP = 0.3  # that a busy machine may leave in a stream [s]
+SETTLED, SETTLED_TURN, SETTLED_JOINT = 0.004, 0.02, 0.02  # from a tool or a target that rests [m], [rad], [rad]
 WRENCH_PATIENCE = 0.5  # [s]
+LONGEST_SILENCE = 1.0  # in a stream of joint positions [s]
+OLD_AT_ONCE = 3  # stamps in a row that a sender alone is to blame for, and not a machine that took its turn away
+STALLED = 0.1  # a sender that stalled for longer makes up for no more [s]
 
 
-class StandIn(Node):
-    def __init__(self, options: argparse.Namespace) -> None:
-        super().__init__(options.node, namespace=options.namespace)
-        self._options = options
-        self._position = np.array(options.position)
-        self._velocity = np.zeros(3)
-        self._rotation = np.array([0.0, 1.0, 0.0, 0.0])
-        self._target: tuple[Any, Any, float] | None = None
-        self._began = math.inf
-        self._zero_wrench = False
-        self._tf = self.create_publisher(TFMessage, "/tf", 10)
-        self.create_subscription(PoseStamped, options.topic, self._on_target, 1)
-        if options.wrench:
-            self.create_subscription(WrenchStamped, options.wrench, self._on_wrench, 1)
-        self.create_timer(DT, self._move)
+@dataclass(frozen=True)
+class Terms:
+    """What a controller's own documentation asks for."""
+
+    topic: str  # below the controller's name
+    message: str = "pose"  # or array, trajectory, lbr
+    frame: str = "base"  # its own base link and no other; any: whichever; ignored: numbers are in the base link
+    lowest_rate: float = 50.0  # [Hz]
+    longest_age: float = 0.5  # of a stamp; longer than 0.1 it is no rule, but a bound on our own delay [s]
+    wrench: bool = False  # wants a zero one
+    command_type: bool = False  # targets count after a call of switch_command_type with 2
+
+
+class Controller(Node):
+    """One arm's."""
+
+    def __init__(self, arm: str, terms: Terms, springs: Springs) -> None:
+        super().__init__(f"{arm}_ctrl", namespace="/robot")
+        self.arm, self.terms, self.springs = arm, terms, springs
+        self._last: tuple[Any, float] | None = None  # target and stamp
+        self._began, self._zero_wrench = math.inf, False
+        self._old = 0  # stamps in a row
+        self._switched = not terms.command_type
+        kinds: dict[str, tuple[Callable[[], Any], Callable[..., None]]] = {
+            "pose": (lambda: PoseStamped, self._on_pose),
+            "array": (lambda: Float64MultiArray, lambda message: self._on_joints(message.data)),
+            "trajectory": (lambda: JointTrajectory, self._on_trajectory),
+            "lbr": (
+                lambda: import_module("lbr_fri_idl.msg").LBRJointPositionCommand,
+                lambda message: self._on_joints(message.joint_position),
+            ),
+        }
+        kind, callback = kinds[terms.message]
+        self._topic = f"/robot/{self.get_name()}/{terms.topic}"
+        if terms.command_type:
+            service = import_module("moveit_msgs.srv").ServoCommandType
+            self.create_service(service, "~/switch_command_type", self._on_command_type)
+        if terms.wrench:
+            self.create_subscription(WrenchStamped, "~/target_wrench", self._on_wrench, 1)
+        self.create_subscription(kind(), self._topic, callback, 1)
 
     @property
     def _now(self) -> float:
         return float(self.get_clock().now().nanoseconds) * 1e-9
 
+    def _say(self, fault: str) -> None:
+        print(f"violation: {self.arm}: {fault}", flush=True)
+
+    def _on_command_type(self, request: Any, response: Any) -> Any:
+        self._switched = response.success = request.command_type == 2
+        return response
+
     def _on_wrench(self, message: WrenchStamped) -> None:
         force, torque = message.wrench.force, message.wrench.torque
         self._zero_wrench = (force.x, force.y, force.z, torque.x, torque.y, torque.z) == (0.0,) * 6
-        if message.header.frame_id != self._options.frame:
-            print(f"violation: wrench in frame {message.header.frame_id!r}")
+        if message.header.frame_id != f"{self.arm}_link_0":
+            self._say(f"wrench in frame {message.header.frame_id!r}")
 
-    def _on_target(self, message: PoseStamped) -> None:
+    def _on_pose(self, message: PoseStamped, info: Any) -> None:
         stamp = message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
+        # As it was sent: how late it is taken here is the machine's matter.
+        age = 1e-9 * info["source_timestamp"] - stamp
+        self._old = self._old + 1 if age > self.terms.longest_age else 0
+        if self._old >= OLD_AT_ONCE:
+            self._say(f"stamp is {age:.3f} s old")
         at, turned = message.pose.position, message.pose.orientation
         position = np.array([at.x, at.y, at.z])
         rotation = np.array([turned.x, turned.y, turned.z, turned.w])
-        for fault in self._faults(message.header.frame_id, stamp, position, rotation):
-            print(f"violation: {fault}")
-        if self._target is None:
-            self._began = self._now
-            print("first target")
-        self._target = position, rotation, stamp
-
-    def _faults(self, frame: str, stamp: float, position: Any, rotation: Any) -> list[str]:
-        options, faults = self._options, []
-        if options.frame and frame != options.frame:
-            faults.append(f"frame {frame!r}")
-        if (publishers := self.count_publishers(options.topic)) != 1:
-            faults.append(f"{publishers} publishers")
-        if self._now - stamp > options.longest_age:
-            faults.append(f"stamp is {self._now - stamp:.3f} s old")
         if not (np.isfinite(position).all() and abs(np.linalg.norm(rotation) - 1.0) < 1e-6):
-            faults.append("not a unit quaternion, or not finite")
-            return faults
-        if self._target is None:
-            way, allowed = math.dist(position, self._position), SETTLED
-            turn, allowed_turn = angle(rotation, self._rotation), SETTLED_TURN
-        else:
-            period = min(max(stamp - self._target[2], 0.0), LONGEST_GAP)
-            way, allowed = math.dist(position, self._target[0]), FASTEST * period + SETTLED
-            turn, allowed_turn = angle(rotation, self._target[1]), FASTEST_TURN * period + SETTLED_TURN
-        if way > allowed or turn > allowed_turn:
-            faults.append(f"jump of {way:.4f} m, {turn:.3f} rad")
-        if options.wrench and not self._zero_wrench and self._now - self._began > WRENCH_PATIENCE:
-            faults.append("no zero wrench")
-        return faults
+            self._say("not a unit quaternion, or not finite")
+            return
+        own = f"{self.arm}_link_0"
+        frame = self.springs.frame(message.header.frame_id if self.terms.frame == "any" else own)
+        if frame is None or (self.terms.frame == "base" and message.header.frame_id != own):
+            self._say(f"frame {message.header.frame_id!r}")
+            return
+        if not self._switched:
+            self._say("a pose before the switch to poses")
+            return
+        self._step(frame * pin.SE3(pin.Quaternion(rotation).toRotationMatrix(), position), stamp)
 
-    def _move(self) -> None:
-        if self._target is not None:
-            acceleration = STIFFNESS * (self._target[0] - self._position) - DAMPING * self._velocity
-            self._velocity = self._velocity + DT * acceleration
-            self._position = self._position + DT * self._velocity
-            self._rotation = self._target[1]
-        transform = TransformStamped(child_frame_id=self._options.tool_frame)
-        transform.header.frame_id = self._options.base_frame
-        translation, rotation = transform.transform.translation, transform.transform.rotation
-        translation.x, translation.y, translation.z = self._position.tolist()
-        rotation.x, rotation.y, rotation.z, rotation.w = self._rotation.tolist()
-        self._tf.publish(TFMessage(transforms=[transform]))
+    def _step(self, target: pin.SE3, stamp: float) -> None:
+        tool, last = self.springs.tool(self.arm), self._last
+        gap = math.inf if last is None else max(stamp - last[1], 0.0)
+        faults = []
+        # A stream that begins, or begins again, does so at the tool.
+        for before, period in ((None if last is None else last[0], gap), (tool if gap > LONGEST_GAP else None, 0.0)):
+            if before is not None:
+                period = min(period, STALLED if gap > LONGEST_GAP else LONGEST_GAP)
+                way = math.dist(target.translation, before.translation)
+                turn = float(np.linalg.norm(pin.log3(before.rotation.T @ target.rotation)))
+                far = way > FASTEST * period + SETTLED or turn > FASTEST_TURN * period + SETTLED_TURN
+                faults.append(f"jump of {way:.4f} m, {turn:.3f} rad in {gap:.3f} s" if far else "")
+        if all(faults):
+            self._say(faults[0])
+        if self.terms.wrench and not self._zero_wrench and self._now - self._began > WRENCH_PATIENCE:
+            self._say("no zero wrench")
+        self._take(target, stamp)
+
+    def _on_trajectory(self, message: JointTrajectory) -> None:
+        names, count = list(message.joint_names), len(message.points)
+        if names != self.springs.joints(self.arm) or count != 1:
+            self._say(f"{count} points for {names}")
+            return
+        due = message.points[0].time_from_start.sec + 1e-9 * message.points[0].time_from_start.nanosec
+        if not 0.0 < due <= 0.1:
+            self._say(f"due in {due:.3f} s")
+        self._on_joints(message.points[0].positions)
+
+    def _on_joints(self, positions: Any) -> None:
+        target, now = np.array(positions, float), self._now
+        if target.shape != (7,) or not np.isfinite(target).all():
+            self._say(f"not 7 finite positions: {list(positions)}")
+            return
+        period = math.inf if self._last is None else now - self._last[1]
+        before = self.springs.positions(self.arm) if self._last is None else self._last[0]
+        allowed = SETTLED_JOINT + (0.0 if self._last is None else FASTEST_JOINT * period)
+        if np.abs(target - before).max() > allowed:
+            self._say(f"jump of {np.abs(target - before).max():.4f} rad, allowed {allowed:.4f}")
+        if LONGEST_SILENCE < period < math.inf:
+            self._say(f"nothing for {period:.3f} s")
+        self._take(target, now)
+
+    def _take(self, target: Any, stamp: float) -> None:
+        if (publishers := self.count_publishers(self._topic)) != 1:
+            self._say(f"{publishers} publishers")
+        if self._last is None:
+            self._began = self._now
+            print(f"first target of {self.arm}", flush=True)
+        self._last = target, stamp
+        self.springs.goals[self.arm] = target
 
 
-def angle(first: Any, second: Any) -> float:
-    """Between two unit quaternions [rad]."""
-    return 2.0 * math.acos(min(1.0, abs(float(first @ second))))
+class Driver(Node):
+    """Both arms' torques."""
+
+    def __init__(self) -> None:
+        super().__init__("springs", namespace="/robot")
+        self.springs: Springs | None = None
+        self.controllers: list[Controller] = []
+        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        newest = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+        self._torques = self.create_publisher(Float64MultiArray, "/torque_commands", 1)
+        self.create_subscription(String, "/robot_description", self._on_description, latched)
+        self.create_subscription(JointState, "/joint_states", self._on_joint_state, newest)
+        self.driving = False
+
+    def _on_description(self, message: String) -> None:
+        self.springs = Springs(message.data, {arm: f"{arm}_tool_frame" for arm in ARMS})
+
+    def _on_joint_state(self, message: JointState) -> None:
+        if self.springs is not None:
+            self.springs.measure(message.name, message.position, message.velocity)
+            self._torques.publish(Float64MultiArray(data=self.springs.torques()))
+            self.driving = self._torques.get_subscription_count() > 0
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser()
-    for name in ("topic", "frame", "wrench"):
-        parser.add_argument(f"--{name}", default="")
-    parser.add_argument("--node", default="left_ctrl")
-    parser.add_argument("--namespace", default="/robot")
-    parser.add_argument("--base-frame", default="robot_base")
-    parser.add_argument("--tool-frame", default="left_tool_frame")
-    parser.add_argument("--longest-age", type=float, default=0.5)
-    parser.add_argument("--position", type=float, nargs=3, default=[0.5, 0.25, 0.38])
+    terms = Terms(**json.loads(sys.argv[1]))
     rclpy.init()
-    node = StandIn(parser.parse_args())
-    print("ready")
+    executor, driver = SingleThreadedExecutor(), Driver()
+    executor.add_node(driver)
     try:
-        rclpy.spin(node)
+        while not driver.driving:
+            executor.spin_once()
+        assert driver.springs is not None
+        for arm in ARMS:
+            executor.add_node(Controller(arm, terms, driver.springs))
+        print("ready", flush=True)
+        executor.spin()
     except (KeyboardInterrupt, ExternalShutdownException):
-        node.destroy_node()
+        pass
 
 
 if __name__ == "__main__":

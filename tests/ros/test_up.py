@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
-import ast
-import importlib.util
 import os
-import re
+import runpy
 import signal
 import sys
+import time
 import tomllib
+import types
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 
-from q2r2_control.ros.up import nodes_of
+from q2r2_control.ros.node_set import SOURCES, NodeProcess, nodes_of
 from tests.ros.cell import CONFIG
 from tests.ros.conftest import NEEDS_ROS
 from tests.ros.processes import ROOT, Processes, RosProcess
+from tests.support.external_cell import external
 
 pytest.importorskip("rclpy", reason=NEEDS_ROS)
 pytestmark = pytest.mark.usefixtures("interfaces")
@@ -24,7 +28,8 @@ pytestmark = pytest.mark.usefixtures("interfaces")
 # The robot and the controller alone, through the same functions as the command.
 PAIR = f"""
 import sys
-from q2r2_control.ros.up import nodes_of, run_together
+from q2r2_control.ros.node_set import nodes_of
+from q2r2_control.ros.up import run_together
 sys.exit(run_together(nodes_of({CONFIG!r}, "none")[:2], lambda line: print(line, flush=True)))
 """
 
@@ -43,11 +48,12 @@ def children(pid: int) -> list[int]:
 
 
 def alive(pid: int) -> bool:
+    """Whether it runs; one that has ended may wait for whoever reaps orphans here."""
     try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
+        with open(f"/proc/{pid}/stat") as file:
+            return file.read().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
         return False
-    return True
 
 
 def test_ctrl_c_ends_every_process(pair: RosProcess) -> None:
@@ -65,6 +71,15 @@ def test_a_process_that_dies_is_reported_and_ends_the_others(pair: RosProcess) -
     assert f"mujoco_robot (process {robot}) ended by SIGKILL" in pair.wait_for("[up] ")
     assert pair.wait(30.0) == 1
     assert not alive(controller)
+
+
+def test_a_set_whose_command_is_killed_ends_by_itself(pair: RosProcess) -> None:
+    started = children(pair.pid)
+    os.kill(pair.pid, signal.SIGKILL)
+    deadline = time.monotonic() + 10.0
+    while any(map(alive, started)):
+        assert time.monotonic() < deadline, "a node has outlived the command"
+        time.sleep(0.05)
 
 
 def test_the_command_starts_and_stops_the_whole_set(processes: Processes) -> None:
@@ -86,20 +101,124 @@ def test_a_config_that_does_not_exist_ends_in_one_line(processes: Processes) -> 
     assert "nowhere.yaml" in line
 
 
-def test_the_launch_file_names_what_the_command_starts_and_what_is_installed() -> None:
-    tree = ast.parse((ROOT / "launch" / "teleop.launch.py").read_text())
-    compile(tree, "teleop.launch.py", "exec")
-    (nodes,) = (
-        ast.literal_eval(statement.value)
-        for statement in tree.body
-        if isinstance(statement, ast.Assign) and ast.unparse(statement.targets[0]) == "NODES"
-    )
-    by_input = {
-        source: {name for name, wanted in nodes if wanted in (None, source)}
-        for source in ("scripted", "headset", "none")
+def external_cell(folder: Path, preset: str, mode: str, **changes: Any) -> str:
+    cell = external()
+    cell["external"] |= {"preset": preset, "mode": mode} | changes
+    file = folder / "external.yaml"
+    file.write_text(yaml.safe_dump(cell))
+    return str(file)
+
+
+def names(nodes: Sequence[NodeProcess]) -> list[str]:
+    return [node.name for node in nodes]
+
+
+ARMS = ["left_arm_controller", "right_arm_controller"]
+
+
+def test_controllers_that_take_the_hands_target_need_no_other(tmp_path: Path) -> None:
+    file = external_cell(tmp_path, "fzi", "raw")
+    assert names(nodes_of(file, "headset")) == [*ARMS, "tcp_endpoint"]
+    assert names(nodes_of(file, "none", "mujoco")) == ["mujoco_robot", *ARMS]
+    assert all(node.parameters == {"config": file} for node in nodes_of(file, "none"))
+
+
+def test_controllers_that_take_what_the_built_in_one_allows_get_it_without_joint_commands(tmp_path: Path) -> None:
+    file = external_cell(tmp_path, "fzi", "filtered", world_frame="cell")
+    nodes = nodes_of(file)
+    assert names(nodes) == ["cartesian_controller", *ARMS, "SimulationInput"]
+    assert nodes[0].parameters == {
+        "config": file,
+        "output": "none",
+        "left.target_frame_id": "cell",
+        "left.joint_states_topic": "joint_states",
+        "right.target_frame_id": "cell",
+        "right.joint_states_topic": "joint_states",
     }
-    assert by_input == {source: {node.name for node in nodes_of(CONFIG, source)} for source in by_input}
+
+
+@pytest.mark.parametrize(
+    ("preset", "output", "topic", "rate"),
+    [
+        ("lbr_position", "lbr_position", "command/joint_position", 200.0),
+        ("forward_position", "float64", "commands", 200.0),
+        ("jtc", "trajectory", "joint_trajectory", 50.0),
+    ],
+)
+def test_controllers_of_joints_get_them_from_the_built_in_one_each_on_its_topic(
+    tmp_path: Path, preset: str, output: str, topic: str, rate: float
+) -> None:
+    file = external_cell(tmp_path, preset, "filtered")
+    parameters = nodes_of(file)[0].parameters
+    assert (parameters["output"], parameters["rate"]) == (output, rate)
+    for arm in ("left", "right"):
+        assert parameters[f"{arm}.output_topic"] == f"/bh_robot/{arm}_arm_clik_controller/{topic}"
+        assert parameters[f"{arm}.target_frame_id"] == "bh_robot_base"
+
+
+def test_a_cell_with_one_arm_has_one_arms_nodes(tmp_path: Path) -> None:
+    cell = external() | {"controller": "builtin"}
+    del cell["external"], cell["arms"]["right"]
+    file = tmp_path / "one.yaml"
+    file.write_text(yaml.safe_dump(cell))
+    assert names(nodes_of(str(file), "none")) == ["mujoco_robot", "cartesian_controller", "left_arm_controller"]
+
+
+def test_every_node_of_a_set_is_an_executable(tmp_path: Path) -> None:
     scripts: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
-    for node in (node for source in by_input for node in nodes_of(CONFIG, source)):
-        if importlib.util.find_spec(node.module) is not None:  # a node that is there is an executable
-            assert re.fullmatch(rf"{re.escape(node.module)}:main", scripts[node.name])
+    for source in SOURCES:
+        for node in nodes_of(CONFIG, source, "mujoco"):
+            assert scripts[node.name] == f"{node.module}:main"
+
+
+class Recorded:
+    """Stands for a class of launch: keeps what it was made with. Whether launch takes that, only launch can tell."""
+
+    def __init__(self, *given: Any, **named: Any) -> None:
+        self.given, self.named = given, named
+
+    def perform(self, context: dict[str, str]) -> str:
+        return context[self.given[0]]
+
+
+@pytest.fixture
+def launch_file(monkeypatch: pytest.MonkeyPatch) -> Any:
+    """The launch file with launch's classes recorded, since launch itself is not in the Python registry."""
+    for module, classes in {
+        "launch": ["LaunchDescription"],
+        "launch.actions": ["DeclareLaunchArgument", "OpaqueFunction", "Shutdown"],
+        "launch.substitutions": ["LaunchConfiguration"],
+        "launch_ros": [],
+        "launch_ros.actions": ["Node"],
+        "launch_ros.parameter_descriptions": ["ParameterValue"],
+    }.items():
+        made = types.ModuleType(module)
+        for name in classes:
+            setattr(made, name, type(name, (Recorded,), {}))
+        monkeypatch.setitem(sys.modules, module, made)
+    return runpy.run_path(str(ROOT / "launch" / "teleop.launch.py"))
+
+
+@pytest.mark.parametrize("source", SOURCES)
+@pytest.mark.parametrize("preset", ["builtin", "jtc"])
+def test_the_launch_file_starts_what_the_command_starts(
+    launch_file: Any, tmp_path: Path, preset: str, source: str
+) -> None:
+    config = CONFIG if preset == "builtin" else external_cell(tmp_path, preset, "filtered")
+    *arguments, nodes = launch_file["generate_launch_description"]().given[0]
+    assert {argument.given[0]: argument.named["default_value"] for argument in arguments} == {
+        "config": CONFIG,
+        "input": "scripted",
+        "robot": "auto",
+    }
+    actions = nodes.named["function"]({"config": config, "input": source, "robot": "auto"})
+    expected = nodes_of(config, source)
+    assert [(action.named["package"], action.named["executable"]) for action in actions] == [
+        ("q2r2_control", node.name) for node in expected
+    ]
+    for action, node in zip(actions, expected, strict=True):
+        (parameters,) = action.named["parameters"]
+        assert {key: value.given[0] for key, value in parameters.items()} == node.parameters
+        assert all(isinstance(value.given[0], value.named["value_type"]) for value in parameters.values())
+        assert action.named["on_exit"].named == {"reason": f"{node.name} ended"}
+        assert action.named["output"] == "screen"

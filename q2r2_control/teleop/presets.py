@@ -43,7 +43,9 @@ class Preset:
     hold: Hold
     guard: GuardSettings
     activation: str  # what it takes for a target to count
+    output: str = "none"  # of cartesian_controller in mode filtered: what joints it commands itself, if any
     zero_wrench: str | None = None  # topic where a zero wrench is sent, without which it may push
+    command_type: str | None = None  # service that has to be told that targets are poses, at each of its starts
     longest_age: float | None = None  # of a target's stamp, older ones are dropped [s]
 
     @property
@@ -129,6 +131,7 @@ _ALL = (
         hold=Hold.SILENCE,
         guard=_CAREFUL,
         activation="{ctrl}/switch_command_type called with 2, which is pose",
+        command_type="{ctrl}/switch_command_type",
         longest_age=0.1,
     ),
     Preset(
@@ -141,6 +144,7 @@ _ALL = (
         hold=Hold.REPEAT,
         guard=_WIDE,
         activation="the first command equals the measured positions",
+        output="lbr_position",
     ),
     Preset(
         name="forward_position",
@@ -152,6 +156,7 @@ _ALL = (
         hold=Hold.REPEAT,
         guard=_WIDE,
         activation="the first command equals the measured positions; one value a joint",
+        output="float64",
     ),
     Preset(
         name="jtc",
@@ -163,6 +168,7 @@ _ALL = (
         hold=Hold.SILENCE,
         guard=_WIDE,
         activation="active; points with a short horizon",
+        output="trajectory",
     ),
 )
 PRESETS = {preset.name: preset for preset in _ALL}

@@ -1,0 +1,186 @@
+"""The simulated robot with controllers of others that move it, and all that happens to who teleoperates it."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from std_msgs.msg import String
+
+from q2r2_control import Robot
+from q2r2_control.teleop.guard import GuardSettings
+from q2r2_control.teleop.presets import PRESETS
+from tests.ros.arm_rig import ArmRig
+from tests.ros.cell import call, parameters, start, wait
+from tests.ros.conftest import spun_node
+from tests.ros.hands import Hands
+from tests.ros.motion import Motion
+from tests.ros.processes import Processes, RosProcess
+from tests.ros.springs import STIFFNESS
+from tests.ros.stand_in import FASTEST, STALLED, Terms
+
+PATIENT = ("joint_state_timeout:=1.0", "target_timeout:=1.0", "deviation_time:=3.0")
+STILL = 2e-3  # how far a tool that stands still may move [m]
+NEAR = 5e-3  # where a tool has arrived [m]
+
+
+class Stage:
+    """The simulated robot and the built-in controller, which outlive a test."""
+
+    def __init__(self, domain: int, node: Any, robot: Robot, running: Processes, right_arm: Path) -> None:
+        self.domain, self.node, self.motion = domain, node, Motion(node, robot)
+        self.phase = ""
+        self._running, self._right_arm, self._made = running, right_arm, ""
+        self._controller: RosProcess | None = None
+        node.create_subscription(String, "/cartesian_controller/state", self._on_state, 10)
+        start(running, "mujoco_robot")
+
+    def set(self, *given: str, **environment: str) -> None:
+        """At home and active, with a built-in controller of these parameters for the right arm alone.
+
+        The left one is moved by others behind its back, which it would stop for.
+        """
+        if self._controller is None or " ".join(given) != self._made:
+            if self._controller is not None:
+                self._controller.interrupt()
+            call(self.node, "/mujoco_robot/reset")
+            self._made, self.phase = " ".join(given), ""
+            arguments = parameters(f"config:={self._right_arm}", *given, *PATIENT)
+            self._controller = self._running.start_module(
+                "q2r2_control.ros.cartesian_controller", "--ros-args", *arguments, **environment
+            )
+        else:
+            call(self.node, "/cartesian_controller/stop")
+            wait(lambda: self.phase == "stopped", "the built-in controller is stopped")
+            call(self.node, "/mujoco_robot/reset")
+            call(self.node, "/cartesian_controller/reset")
+        wait(lambda: self.phase == "active", "the built-in controller is active")
+        self.motion.moments.clear()
+        wait(lambda: self.motion.moments, "joint states come")
+
+    def _on_state(self, message: Any) -> None:
+        self.phase = json.loads(message.data)["phase"]
+
+
+class StandIn:
+    """The controllers of others, seen from outside."""
+
+    def __init__(self, processes: Processes, terms: Terms, environment: dict[str, str]) -> None:
+        self._processes, self._terms, self._environment = processes, terms, environment
+        self.lives: list[RosProcess] = []
+
+    def start(self) -> None:
+        terms = json.dumps(asdict(self._terms))
+        self.lives.append(self._processes.start_module("tests.ros.stand_in", terms, **self._environment))
+
+    def wait_until_ready(self) -> None:
+        self.lives[-1].wait_for("ready")
+
+    def wait_until_driven(self, hands: Hands) -> None:
+        """Return once the arms' first targets have arrived."""
+        for rig in hands.rigs:
+            self.lives[-1].wait_for(f"first target of {rig.arm}")
+
+    def kill(self) -> None:
+        os.kill(self.lives[-1].pid, signal.SIGKILL)
+        self.lives[-1].wait()
+
+    @property
+    def violations(self) -> list[str]:
+        return [line for life in self.lives for line in life.output.splitlines() if line.startswith("violation")]
+
+
+def act(stage: Stage, hands: Hands, stand_in: StandIn, guard: GuardSettings, pauses: bool = False) -> None:
+    """All that happens to an operator: a pause, a hand that is lost, a controller that is started anew.
+
+    A spring without overshoot moves the tool no faster than its target does, but for a fifth, nor more abruptly, but
+    for what the target makes up for when a busy machine has stalled. ``pauses``: the operator pauses before the
+    controller is started anew, which otherwise pauses the arm.
+    """
+    motion = stage.motion
+    made_up = STIFFNESS**2 * FASTEST * STALLED
+    limits = 1.2 * guard.max_velocity, 1.2 * guard.max_angular_velocity, guard.max_acceleration + made_up
+    stand_in.wait_until_ready()
+    hands.wait(lambda rig: rig.state.get("hand_age") is not None, "the arm's controller sees the hand")
+    began = len(motion.moments)
+    with motion.standing_still(STILL, "it is engaged"):
+        hands.engage()
+        stand_in.wait_until_driven(hands)
+    follows(stage, hands, (0.06, 0.0, 0.04), turn=0.2)
+
+    hands.pause()
+    motion.wait_for_rest()
+    with motion.standing_still(STILL, "it is paused and engaged again"):
+        hands.move((-0.5, 0.2, 0.0), 0.05, turn=1.0)
+        hands.engage()
+    follows(stage, hands, (0.0, 0.06, 0.0))
+
+    with motion.standing_still(STILL, "its hand is lost and comes back"):
+        hands.fall_silent()
+        hands.engage()
+    follows(stage, hands, (0.0, 0.0, 0.06))
+    motion.assert_smooth(began, *limits)
+
+    if pauses:
+        hands.pause()
+        motion.wait_for_rest()
+    stand_in.kill()
+    motion.wait_for_rest()
+    with motion.standing_still(STILL, "its controller is started anew"):
+        stand_in.start()
+        stand_in.wait_until_ready()
+        hands.wait_for_pause()
+        began = len(motion.moments)
+        hands.engage()
+        stand_in.wait_until_driven(hands)
+    follows(stage, hands, (-0.05, 0.0, 0.0))
+    motion.assert_smooth(began, *limits)
+    assert stand_in.violations == []
+
+
+def follows(stage: Stage, hands: Hands, by: tuple[float, float, float], turn: float = 0.0) -> None:
+    """The arms move with the hands."""
+    tools = {rig.arm: stage.motion.tool(rig.arm).translation for rig in hands.rigs}
+    hands.move(by, 0.3, turn)
+    for arm, tool in tools.items():
+        stage.motion.wait_for_tool(arm, tool + np.array(by), NEAR)
+    stage.motion.wait_for_rest()
+
+
+@contextmanager
+def arms(
+    stage: Stage, processes: Processes, preset: str, modes: dict[str, str], environment: dict[str, str]
+) -> Iterator[Hands]:
+    """Arm controllers by the mode of each, and the hands that drive them."""
+    with spun_node(stage.domain, "hands") as node:
+        yield Hands([start_arm(node, processes, preset, arm, mode, environment) for arm, mode in modes.items()])
+
+
+def start_arm(node: Any, processes: Processes, preset: str, arm: str, mode: str, environment: dict[str, str]) -> ArmRig:
+    prefix = f"/robot/{arm}_ctrl"
+    topic = PRESETS[preset].topic.format(ctrl=prefix) if mode == "raw" else "/nobody/target_frame"
+    rig = ArmRig(node, arm, topic=topic)
+    rig.tells_tool = rig.follows = False
+    given = {
+        "preset": preset,
+        "mode": mode,
+        "ctrl_prefix": prefix,
+        "controller_node": prefix,
+        "base_frame_id": f"{arm}_link_0",
+        "world_frame_id": "world",
+        "teleop.linked": False,
+        "teleop.gate.timeout": 1.0,
+        "teleop.leash.distance": 0.0,  # a simulation that a busy machine holds up is no obstacle
+        "tool_timeout": 1.0,
+        "link_timeout": 3.0,
+    }
+    arguments = parameters(*(f"{name}:={value}" for name, value in given.items()))
+    start(processes, f"{arm}_arm_controller", *arguments, **environment)
+    return rig

@@ -1,0 +1,134 @@
+"""What an arm controller can be told: by a cell's YAML, by topics in place of /tf and actions; real processes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from queue import Queue
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+from tests.ros.conftest import NEEDS_ROS
+from tests.ros.processes import PATIENCE, Processes
+from tests.support.external_cell import external
+
+pytest.importorskip("rclpy", reason=NEEDS_ROS)
+pytest.importorskip("quest2ros", reason="needs q2r2 ros build-interfaces")
+pytestmark = pytest.mark.usefixtures("interfaces")
+
+from q2r2_control.errors import ConfigError  # noqa: E402
+from q2r2_control.ros.messages import stamped_pose  # noqa: E402
+from tests.ros.arm_rig import TOOL, ArmRig, assert_same, first, offset  # noqa: E402
+
+
+@pytest.fixture
+def rig(node: Any) -> ArmRig:
+    return ArmRig(node)
+
+
+def test_a_cells_yaml_gives_stance_and_scale_and_parameters_change_them(
+    node: Any, processes: Processes, tmp_path: Path
+) -> None:
+    cell = external() | {"controller": "builtin"}
+    del cell["external"]
+    cell["teleop"] |= {"stance": "mirror_reflected", "position_scale": 0.5}
+    config = tmp_path / "cell.yaml"
+    config.write_text(yaml.safe_dump(cell))
+    rig = ArmRig(node, "left", hand="right")
+    mirrored = rig.start(processes, {"config": config})
+    rig.engage()
+    rig.move((0.08, 0.12, 0.0))
+    assert_same(rig.wait_for_rest(), offset(TOOL, (0.04, -0.06, 0.0)), 1e-3)
+    assert rig.state["stance"] == "mirror_reflected"
+    assert mirrored.interrupt() == 0
+    rig.sends_hand = rig.tells_tool = False
+
+    rig = ArmRig(node, "left")
+    rig.start(processes, {"config": config, "mirror": "false", "teleop.position_scale": 2.0})
+    rig.engage()
+    rig.move((0.0, 0.05, 0.0))
+    assert_same(rig.wait_for_rest(), offset(TOOL, (0.0, 0.1, 0.0)), 1e-3)
+
+
+def test_a_cells_yaml_names_the_external_controller_and_parameters_change_that(context: Any, tmp_path: Path) -> None:
+    from q2r2_control.ros.right_arm_controller import RightArmController
+
+    cell = external()
+    cell["external"] |= {"preset": "fzi", "rate": 60.0, "limits": {"max_velocity": 0.2}}
+    config = tmp_path / "cell.yaml"
+    config.write_text(yaml.safe_dump(cell))
+    arguments = ["--ros-args", "-p", f"config:={config}", "-p", "guard.max_acceleration:=1.0"]
+    made = RightArmController(context=context, cli_args=arguments)
+    values = made.parameters
+    assert (values.preset.name, values.mode, values.rate) == ("fzi", "raw", 60.0)
+    assert values.target_topic == "/bh_robot/right_arm_clik_controller/target_frame"
+    assert (values.base_frame, values.world_frame, values.tool_frame) == (
+        "bh_robot_base",
+        "bh_robot_base",
+        "right_arm_link_ee",
+    )
+    assert values.gripper_topic == "/bh_robot/right_arm_gripper_action_controller/gripper_cmd"
+    assert (values.guard.max_velocity, values.guard.max_acceleration) == (0.2, 1.0)
+    assert values.guard.max_angular_velocity == values.preset.guard.max_angular_velocity
+    made.destroy_node()
+
+    del cell["external"]["arms"]["right"], cell["arms"]["right"]
+    config.write_text(yaml.safe_dump(cell))
+    with pytest.raises(ConfigError, match=r"cell\.yaml has no arm right; allowed: left"):
+        RightArmController(context=context, cli_args=arguments)
+
+
+def test_a_tool_that_a_topic_tells_is_engaged_where_it_is_and_paused_when_the_topic_ends(
+    rig: ArmRig, node: Any, processes: Processes
+) -> None:
+    from geometry_msgs.msg import PoseStamped
+
+    rig.tells_tool = False
+    publisher = node.create_publisher(PoseStamped, "/left/current_pose", 10)
+    now = node.get_clock().now
+    timer = node.create_timer(
+        0.01, lambda: publisher.publish(stamped_pose(rig.tool, "world", 1e-9 * now().nanoseconds))
+    )
+    rig.start(processes, {"current_pose_topic": "/left/current_pose"})
+    rig.engage()
+    rig.wait(lambda: rig.targets, "targets come")
+    assert_same(first(rig), TOOL, 1e-9)
+    rig.move((0.05, 0.0, 0.0))
+    assert_same(rig.wait_for_rest(), offset(TOOL, (0.05, 0.0, 0.0)), 1e-3)
+    node.destroy_timer(timer)
+    rig.wait(lambda: rig.state["state"] == "paused", "an arm whose tool is not told any more is paused")
+    rig.wait(lambda: "/left/current_pose is silent" in rig.state["message"], "the reason is told")
+
+
+def test_a_gripper_behind_a_topic_is_told_its_positions(rig: ArmRig, node: Any, processes: Processes) -> None:
+    from std_msgs.msg import Float64MultiArray
+
+    commands: Queue[list[float]] = Queue()
+    node.create_subscription(Float64MultiArray, "/left/fingers", lambda message: commands.put(list(message.data)), 10)
+    given = {"action_type": "Float64MultiArray", "open_position": 0.1, "closed_position": 0.8}
+    names = {f"gripper.{key}": value for key, value in given.items()}
+    rig.start(processes, {"gripper_action_topic": "/left/fingers", **names})
+    rig.press("upper")
+    assert commands.get(timeout=PATIENCE) == [0.8]
+    rig.wait(lambda: rig.state["gripper"] == "closed", "the gripper counts as closed")
+    rig.press("upper")
+    assert commands.get(timeout=PATIENCE) == [0.1]
+    rig.wait(lambda: rig.state["gripper"] == "open", "the gripper counts as open")
+
+
+def test_a_target_that_slips_on_its_leash_is_felt(rig: ArmRig, processes: Processes) -> None:
+    rig.follows = False  # as if something were in the way
+    rig.start(processes, {"teleop.leash.distance": 0.05})
+    rig.engage()
+    rig.wait(lambda: (0.5, 0.4) in rig.pulses and rig.pulses[-1] == (0.0, 0.0), "engaging is felt")
+    rig.pulses.clear()
+    rig.move((0.04, 0.0, 0.0))
+    rig.wait_for_rest()
+    assert rig.pulses == []
+    rig.move((0.09, 0.0, 0.0), 0.6)
+    rig.wait(lambda: rig.pulses.count((0.2, 0.2)) >= 3, "every two centimetres of slip are felt")
+    rig.wait(lambda: rig.state["slip"] > 0.06, "the slip is told")
+    assert set(rig.pulses) == {(0.2, 0.2), (0.0, 0.0)}
+    assert np.linalg.norm(rig.wait_for_rest().translation - TOOL.translation) < 0.051
