@@ -29,10 +29,19 @@ class ArmOutputs:
         self._last: TargetOutput | None = None
         if self._filtered:
             topic = BUILTIN.topic.format(ctrl=values.builtin_prefix)
-            self.first = TargetOutput(node, BUILTIN, _BUILTIN_NODE, topic, values.world_frame, BUILTIN.guard)
+            self.first = TargetOutput(
+                node, BUILTIN, _BUILTIN_NODE, topic, values.world_frame, BUILTIN.guard, values.listener_timeout
+            )
         if not self._filtered or (preset.takes_poses and preset is not BUILTIN):
             theirs = TargetOutput(
-                node, preset, values.controller, values.target_topic, values.base_frame, values.guard, values.prefix
+                node,
+                preset,
+                values.controller,
+                values.target_topic,
+                values.base_frame,
+                values.guard,
+                values.listener_timeout,
+                values.prefix,
             )
             if self._filtered:
                 self._last = theirs

@@ -83,7 +83,7 @@ class CartesianControllerNode(BaseNode):
             streams,
             watch,
             Origins(self._joints.source, self._targets.source),
-            LedArms(robot, self._controller, led) if output == NONE else None,
+            LedArms(robot, self._controller, led, streams, watch) if output == NONE else None,
         )
         self._reference: Reference | None = None
         self._ticks, self._reported_at, self._last_tick = 0, time.monotonic(), self.now
@@ -135,6 +135,8 @@ class CartesianControllerNode(BaseNode):
 
     def _advance(self, now: float, dt: float) -> None:
         began = time.monotonic()
+        if (silence := self._output.silence(now)) is not None:
+            self._supervisor.start_over(silence, now)
         was_active = self._supervisor.phase is Phase.ACTIVE
         reference, state = self._supervisor.tick(now, dt), self._joints.state
         if not was_active and self._supervisor.phase is Phase.ACTIVE and state is not None:

@@ -7,6 +7,7 @@ than the reference may, less a tolerance for what an arm lags behind.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +16,8 @@ import pinocchio as pin
 from q2r2_control.config import Config
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.robot.robot import Robot
+from q2r2_control.ros.joint_watch import WatchSettings
+from q2r2_control.ros.target_stream import StreamSettings, apart
 from q2r2_control.types import Array, Reference, RobotState
 
 _REST = 0.01  # a held arm's joints are slower before its tool's pose is taken [rad/s]
@@ -41,14 +44,24 @@ def settings_to_lead(config: Config) -> Config:
 class LedArms:
     """What the controller is asked for, and what is looked at, where it only leads."""
 
-    def __init__(self, robot: Robot, controller: CartesianController, settings: LedSettings) -> None:
+    def __init__(
+        self,
+        robot: Robot,
+        controller: CartesianController,
+        settings: LedSettings,
+        streams: StreamSettings,
+        watch: WatchSettings,
+    ) -> None:
         self._robot, self._controller, self._settings = robot, controller, settings
+        self._streams, self._watch = streams, watch
+        self._near_at: dict[str, float] = {}  # when an arm's tool was last seen near [s]
         self._held: dict[str, pin.SE3] = {}
         self._v: Array = np.zeros_like(robot.home)
 
     def begin(self) -> None:
         """Start anew at rest."""
         self._held.clear()
+        self._near_at.clear()
         self._v = np.zeros_like(self._v)
 
     def note(self, reference: Reference) -> None:
@@ -63,6 +76,24 @@ class LedArms:
             elif arm not in self._held and np.abs(self._v[self._robot.arms[arm].joints]).max() < _REST:
                 self._held[arm] = self._controller.tool_pose(arm)
         return {arm: self._held.get(arm, pose) for arm, pose in wanted.items()}
+
+    def left_behind(self, state: RobotState, holding: Iterable[str], now: float) -> str | None:
+        """Says so where a tool of ``holding`` arms has been away from its reference's for too long.
+
+        Nobody moves that arm, nor could anybody engage it: a stream has to begin where tool and reference are both.
+        """
+        holding = set(holding)
+        for arm in self._robot.arms:
+            tool, led = self._robot.tool_pose(state.q, arm), self._controller.tool_pose(arm)
+            way, turn = apart(tool, led)
+            near = way <= self._streams.engage_distance and turn <= self._streams.engage_angle
+            if near or arm not in holding or arm not in self._near_at:
+                self._near_at[arm] = now
+            elif now - self._near_at[arm] > self._watch.deviation_time:
+                return (
+                    f"{arm}: the tool is {way:.3f} m and {turn:.2f} rad from where it was led; begins anew where it is"
+                )
+        return None
 
     def too_close(self, state: RobotState) -> str | None:
         """Says so where a measured pair is closer than allowed."""

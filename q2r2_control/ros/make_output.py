@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 from trajectory_msgs.msg import JointTrajectory
 
 from q2r2_control.config import Config
-from q2r2_control.control.settings import ImpedanceSettings
 from q2r2_control.robot.robot import Robot
 from q2r2_control.ros.node import BaseNode
 from q2r2_control.ros.outputs import (
+    Channel,
     NoOutput,
     Output,
     PositionOutput,
@@ -22,6 +22,7 @@ from q2r2_control.ros.outputs import (
     channels,
 )
 from q2r2_control.ros.torque_outputs import LbrOutput, TorqueOutput, Torques, lbr_message
+from q2r2_control.ros.watched_publisher import listener_timeout
 
 NONE = "none"
 _ARM = "{arm}"  # where an arm's name goes in a topic
@@ -49,15 +50,18 @@ def make_output(name: str, node: BaseNode, robot: Robot, config: Config, period:
     Raises :class:`ConfigError`.
     """
     topics = _topics(name, node, robot)
+    timeout = listener_timeout(node, "joint commands may not be acknowledged; then the arms brake [s]")
+
+    def on(kind: type) -> list[Channel]:
+        return channels(node, kind, topics, robot, timeout)
+
     makers: dict[str, Callable[[], Output]] = {
-        "trajectory": lambda: PositionOutput(channels(node, JointTrajectory, topics, robot), as_trajectory(period)),
-        "float64": lambda: PositionOutput(channels(node, Float64MultiArray, topics, robot), as_array),
-        "joint_state": lambda: PositionOutput(channels(node, JointState, topics, robot), as_joint_state),
-        "torque": lambda: TorqueOutput(
-            channels(node, Float64MultiArray, topics, robot), Torques(robot, config.impedance)
-        ),
-        "lbr_position": lambda: _lbr(node, topics, robot, None),
-        "lbr_torque": lambda: _lbr(node, topics, robot, config.impedance),
+        "trajectory": lambda: PositionOutput(on(JointTrajectory), as_trajectory(period)),
+        "float64": lambda: PositionOutput(on(Float64MultiArray), as_array),
+        "joint_state": lambda: PositionOutput(on(JointState), as_joint_state),
+        "torque": lambda: TorqueOutput(on(Float64MultiArray), Torques(robot, config.impedance)),
+        "lbr_position": lambda: _lbr(on, "LBRJointPositionCommand", None),
+        "lbr_torque": lambda: _lbr(on, "LBRTorqueCommand", Torques(robot, config.impedance)),
         NONE: NoOutput,
     }
     return makers[name]()
@@ -74,7 +78,6 @@ def _topics(name: str, node: BaseNode, robot: Robot) -> dict[str, str]:
     return topics
 
 
-def _lbr(node: BaseNode, topics: Mapping[str, str], robot: Robot, impedance: ImpedanceSettings | None) -> LbrOutput:
-    message = lbr_message("LBRJointPositionCommand" if impedance is None else "LBRTorqueCommand")
-    torques = None if impedance is None else Torques(robot, impedance)
-    return LbrOutput(channels(node, message, topics, robot), message, torques)
+def _lbr(on: Callable[[type], list[Channel]], name: str, torques: Torques | None) -> LbrOutput:
+    kind = lbr_message(name)
+    return LbrOutput(on(kind), kind, torques)

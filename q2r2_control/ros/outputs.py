@@ -15,7 +15,7 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from q2r2_control.robot.robot import Robot
 from q2r2_control.ros.messages import joint_state_message
-from q2r2_control.ros.node import SENT_COMMAND_QOS
+from q2r2_control.ros.watched_publisher import WatchedPublisher
 from q2r2_control.types import Array, Reference, RobotState
 
 # What makes a message of joint names, positions, velocities and the time [s] of the node's clock.
@@ -37,6 +37,10 @@ class Output(Protocol):
         """
         ...
 
+    def silence(self, now: float) -> str | None:
+        """One line where commands are not taken any more at ``now`` [s]."""
+        ...
+
 
 @dataclass(frozen=True, slots=True)
 class Channel:
@@ -44,16 +48,19 @@ class Channel:
 
     names: list[str]
     joints: np.ndarray  # velocity indices in the robot's order
-    publisher: Any
+    publisher: WatchedPublisher
 
 
-def channels(node: Node, kind: type, topics: Mapping[str, str], robot: Robot) -> list[Channel]:
-    """A publisher for every topic; ``topics`` says for each arm which one carries its joints."""
+def channels(node: Node, kind: type, topics: Mapping[str, str], robot: Robot, timeout: float) -> list[Channel]:
+    """A publisher for every topic; ``topics`` says for each arm which one carries its joints.
+
+    Commands that nobody acknowledges for ``timeout`` [s] are taken by nobody.
+    """
     made = []
     for topic in dict.fromkeys(topics.values()):
         joints = joints_of(robot, (arm for arm, its in topics.items() if its == topic))
         names = [robot.joint_names[joint] for joint in joints]
-        made.append(Channel(names, joints, node.create_publisher(kind, topic, SENT_COMMAND_QOS)))
+        made.append(Channel(names, joints, WatchedPublisher(node, kind, topic, timeout)))
     return made
 
 
@@ -71,15 +78,35 @@ class NoOutput:
     def send(self, reference: Reference, state: RobotState, dt: float, t: float, trusted: bool) -> None:
         """See :class:`Output`."""
 
+    def silence(self, now: float) -> str | None:
+        """See :class:`Output`."""
+        return None
 
-class PositionOutput:
+
+class ChannelOutput:
+    """What is sent on topics."""
+
+    def __init__(self, into: list[Channel]) -> None:
+        self._channels = into
+
+    def activate(self, state: RobotState) -> None:
+        """See :class:`Output`."""
+        for channel in self._channels:
+            channel.publisher.begin()
+
+    def silence(self, now: float) -> str | None:
+        """See :class:`Output`."""
+        # Each is asked, or those behind one that is silent would look so too.
+        lines = [channel.publisher.silence(now) for channel in self._channels]
+        return next((line for line in lines if line), None)
+
+
+class PositionOutput(ChannelOutput):
     """The reference's positions and velocities; what was measured does not matter."""
 
     def __init__(self, into: list[Channel], encode: Encode) -> None:
-        self._channels, self._encode = into, encode
-
-    def activate(self, state: RobotState) -> None:
-        """Nothing to begin."""
+        super().__init__(into)
+        self._encode = encode
 
     def send(self, reference: Reference, state: RobotState, dt: float, t: float, trusted: bool) -> None:
         """See :class:`Output`."""

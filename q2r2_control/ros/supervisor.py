@@ -165,8 +165,7 @@ class Supervisor:
             self._look(now)
         reference = self._step(self._targets(now, dt), dt)
         if self.phase is Phase.ACTIVE:
-            if fault := self._watch.deviates(reference.q, now) or self._too_close():
-                self.stop(fault)
+            self._compare(reference, now)
             self._look_home()
         elif float(np.abs(reference.v).max()) <= _REST:
             self.phase = Phase.INACTIVE if self._stopped is None else Phase.STOPPED
@@ -180,9 +179,18 @@ class Supervisor:
         self._led.note(reference)
         return reference
 
-    def _too_close(self) -> str | None:
-        state = self._watch.state
-        return None if self._led is None or state is None else self._led.too_close(state)
+    def _compare(self, reference: Reference, now: float) -> None:
+        """Whether the arms are where the reference is. Those that are only led may have nobody who moves them."""
+        away, state = self._watch.deviates(reference.q, now), self._watch.state
+        if self._led is None or state is None:
+            if away is not None:
+                self.stop(away)
+        elif too_close := self._led.too_close(state):
+            self.stop(too_close)
+        else:
+            holding = [arm for arm, stream in self._streams.items() if not stream.following]
+            if behind := away or self._led.left_behind(state, holding, now):
+                self.start_over(behind, now)
 
     def pause(self, paused: bool) -> None:
         """Hold all arms where they come to rest, or allow new streams of targets."""
@@ -201,6 +209,15 @@ class Supervisor:
         self._watch.take(fault, now)
         self._brake(fault)
         self.phase = Phase.INACTIVE if self._stopped is None else Phase.STOPPED
+
+    def start_over(self, fault: str, now: float) -> None:
+        """Nobody goes where the reference goes: brake, and be activated anew where the arms are then.
+
+        Whoever takes commands next is not to be asked for a reference that went on meanwhile.
+        """
+        if self.phase is Phase.ACTIVE:
+            self._watch.take(fault, now)
+            self._brake(fault)
 
     def stop(self, why: str) -> None:
         """Brake, and command nothing until :meth:`reset`."""

@@ -9,7 +9,8 @@ import pinocchio as pin
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 
 from q2r2_control.ros.messages import stamped_pose, time_message
-from q2r2_control.ros.node import LATCHED_QOS, SENT_COMMAND_QOS, BaseNode
+from q2r2_control.ros.node import LATCHED_QOS, BaseNode
+from q2r2_control.ros.watched_publisher import WatchedPublisher
 from q2r2_control.teleop.guard import GuardSettings, TargetGuard
 from q2r2_control.teleop.presets import Hold, Preset
 
@@ -40,12 +41,13 @@ class TargetOutput:
         topic: str,
         frame: str,
         guard: GuardSettings,
+        listener_timeout: float,
         prefix: str = "",
     ) -> None:
         self.preset = preset
         self.guard = TargetGuard(guard)
         self._node, self._controller, self._frame = node, controller, frame
-        self._publisher = node.create_publisher(PoseStamped, topic, SENT_COMMAND_QOS)
+        self._publisher = WatchedPublisher(node, PoseStamped, topic, listener_timeout)
         self._wrench = None
         if preset.zero_wrench is not None:
             self._wrench = node.create_publisher(WrenchStamped, preset.zero_wrench.format(ctrl=prefix), LATCHED_QOS)
@@ -61,7 +63,7 @@ class TargetOutput:
     @property
     def topic(self) -> str:
         """Where the targets go."""
-        return str(self._publisher.topic_name)
+        return self._publisher.topic_name
 
     @property
     def others(self) -> int:
@@ -78,13 +80,13 @@ class TargetOutput:
     @property
     def unheard(self) -> str | None:
         """One line where nobody takes the targets, or it is not known yet who will."""
-        if self._publisher.get_subscription_count() == 0:
+        if self._publisher.listeners == 0:
             return f"nobody listens to {self.topic}"
         strange = self._strange and not self._following
         return f"it is not known who listens to {self.topic}" if strange else None
 
     def take_fault(self, now: float) -> str | None:
-        """Look who is there; says once that the controller was started anew while it was driven."""
+        """Look who is there; says once that the controller was started anew, or is gone, while it was driven."""
         listeners = self._present
         if listeners > self._listeners or listeners == 0:
             self._came = now
@@ -98,7 +100,13 @@ class TargetOutput:
             self.forget(now)
             return f"it is not known who listens to {self.topic}"
         restarted, self._restarted = self._restarted, False
-        return f"{self._controller} was started anew" if restarted else None
+        if restarted:
+            return f"{self._controller} was started anew"
+        silence = self._publisher.silence(now) if self._following else None
+        if silence is not None:
+            self.forget(now)  # it is gone, and whoever comes is not to be asked for a target of the past
+            return f"{self._controller}: {silence}"
+        return None
 
     def step(
         self,
@@ -120,6 +128,7 @@ class TargetOutput:
         self._following = target is not None
         if target is not None and idle:
             self.guard.reset(target if start is None else start, now)
+            self._publisher.begin()
             self._send_zero_wrench(now)
         pose = self.guard.step(target, now)
         if pose is None or base is None or not (self._following or not self.guard.at_rest or self._holds(tool, now)):
@@ -137,7 +146,7 @@ class TargetOutput:
     @property
     def _present(self) -> int:
         """How many listen; the graph knows of one before anything can be sent to it."""
-        return max(self._publisher.get_subscription_count(), self._node.count_subscribers(self.topic))
+        return max(self._publisher.listeners, self._node.count_subscribers(self.topic))
 
     def _holds(self, tool: pin.SE3 | None, now: float) -> bool:
         """Whether the last target is repeated."""

@@ -64,7 +64,7 @@ class TargetStream:
         if self.following:
             self.pose = pose
             return None
-        distance, angle = _apart(pose, tool)
+        distance, angle = apart(pose, tool)
         near = distance <= self._settings.engage_distance and angle <= self._settings.engage_angle
         if begins and near:
             self.pose = pose
@@ -78,11 +78,12 @@ class TargetStream:
     def _begins(self, pose: pin.SE3) -> bool:
         if self._last is None:
             return True
-        distance, angle = _apart(pose, self._last)
+        distance, angle = apart(pose, self._last)
         return distance >= _JUMP or angle >= _TURN
 
 
-def _apart(a: pin.SE3, b: pin.SE3) -> tuple[float, float]:
+def apart(a: pin.SE3, b: pin.SE3) -> tuple[float, float]:
+    """Distance [m] and angle [rad] between two poses."""
     difference = a.translation - b.translation
     way = float(math.sqrt(difference @ difference))
     cosine = 0.5 * (float((a.rotation * b.rotation).sum()) - 1.0)

@@ -13,7 +13,7 @@ from q2r2_control.control.impedance import ImpedanceController
 from q2r2_control.control.settings import ImpedanceSettings
 from q2r2_control.errors import ConfigError
 from q2r2_control.robot.robot import Robot
-from q2r2_control.ros.outputs import Channel
+from q2r2_control.ros.outputs import Channel, ChannelOutput
 from q2r2_control.types import Array, Reference, RobotState
 
 LBR_JOINTS = 7
@@ -45,14 +45,16 @@ class Torques:
         return self.gravity(state)
 
 
-class TorqueOutput:
+class TorqueOutput(ChannelOutput):
     """Float64MultiArray of torques in the order of the joints; gravity and Coriolis are in them."""
 
     def __init__(self, into: list[Channel], torques: Torques) -> None:
-        self._channels, self._torques = into, torques
+        super().__init__(into)
+        self._torques = torques
 
     def activate(self, state: RobotState) -> None:
         """See :class:`Output`."""
+        super().activate(state)
         self._torques.reset(state)
 
     def send(self, reference: Reference, state: RobotState, dt: float, t: float, trusted: bool) -> None:
@@ -62,7 +64,7 @@ class TorqueOutput:
             channel.publisher.publish(Float64MultiArray(data=tau[channel.joints].tolist()))
 
 
-class LbrOutput:
+class LbrOutput(ChannelOutput):
     """lbr_fri_idl positions or torques, one topic an arm.
 
     Torques are without gravity, which the KUKA bears itself; each carries the measured position, since the driver
@@ -76,10 +78,12 @@ class LbrOutput:
                     f"output: {channel.publisher.topic_name} carries {len(channel.names)} joints; an LBR has "
                     f"{LBR_JOINTS}, and each needs a topic of its own"
                 )
-        self._channels, self._kind, self._torques = into, kind, torques
+        super().__init__(into)
+        self._kind, self._torques = kind, torques
 
     def activate(self, state: RobotState) -> None:
         """See :class:`Output`."""
+        super().activate(state)
         if self._torques is not None:
             self._torques.reset(state)
 

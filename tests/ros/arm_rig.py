@@ -24,7 +24,7 @@ PERIOD = 0.01  # of the hand's messages and of /tf [s]
 HAND = pin.SE3(pin.exp3(np.array([0.2, -0.4, 0.6])), np.array([0.3, 0.1, 1.0]))
 TOOL = pin.SE3(pin.exp3(np.array([3.0, 0.2, 0.1])), np.array([0.5, 0.25, 0.38]))
 # A busy machine must not look like a fault: only the tests of these timeouts leave them as they are.
-PATIENT = {"teleop.gate.timeout": 1.0, "tool_timeout": 1.0, "link_timeout": 3.0}
+PATIENT = {"teleop.gate.timeout": 1.0, "tool_timeout": 1.0, "link_timeout": 3.0, "listener_timeout": 1.0}
 
 
 class ArmRig:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import signal
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
@@ -22,11 +23,11 @@ from tests.ros.cell import call, parameters, start, wait
 from tests.ros.conftest import spun_node
 from tests.ros.hands import Hands
 from tests.ros.motion import Motion
-from tests.ros.processes import Processes, RosProcess
+from tests.ros.processes import PATIENCE, Processes, RosProcess
 from tests.ros.springs import STIFFNESS
 from tests.ros.stand_in import FASTEST, STALLED, Terms
 
-PATIENT = ("joint_state_timeout:=1.0", "target_timeout:=1.0", "deviation_time:=3.0")
+PATIENT_CONTROLLER = ("joint_state_timeout:=1.0", "target_timeout:=1.0", "deviation_time:=1.0", "listener_timeout:=0.5")
 STILL = 2e-3  # how far a tool that stands still may move [m]
 NEAR = 5e-3  # where a tool has arrived [m]
 
@@ -52,7 +53,7 @@ class Stage:
                 self._controller.interrupt()
             call(self.node, "/mujoco_robot/reset")
             self._made, self.phase = " ".join(given), ""
-            arguments = parameters(f"config:={self._right_arm}", *given, *PATIENT)
+            arguments = parameters(f"config:={self._right_arm}", *given, *PATIENT_CONTROLLER)
             self._controller = self._running.start_module(
                 "q2r2_control.ros.cartesian_controller", "--ros-args", *arguments, **environment
             )
@@ -83,10 +84,21 @@ class StandIn:
     def wait_until_ready(self) -> None:
         self.lives[-1].wait_for("ready")
 
-    def wait_until_driven(self, hands: Hands) -> None:
-        """Return once the arms' first targets have arrived."""
-        for rig in hands.rigs:
-            self.lives[-1].wait_for(f"first target of {rig.arm}")
+    def driven(self, hands: Hands) -> bool:
+        """Whether the arms' first targets have arrived."""
+        output = self.lives[-1].output
+        return all(f"first target of {rig.arm}" in output for rig in hands.rigs)
+
+    def engage(self, hands: Hands) -> None:
+        """Engage until targets arrive: who is found after the press was not there for the arm's controller."""
+        deadline = time.monotonic() + PATIENCE
+        while not self.driven(hands):
+            assert time.monotonic() < deadline, "no targets arrive"
+            hands.engage()
+            patience = time.monotonic() + 3.0
+            while not self.driven(hands) and time.monotonic() < patience:
+                time.sleep(0.01)
+        hands.engage()
 
     def kill(self) -> None:
         os.kill(self.lives[-1].pid, signal.SIGKILL)
@@ -97,12 +109,11 @@ class StandIn:
         return [line for life in self.lives for line in life.output.splitlines() if line.startswith("violation")]
 
 
-def act(stage: Stage, hands: Hands, stand_in: StandIn, guard: GuardSettings, pauses: bool = False) -> None:
+def act(stage: Stage, hands: Hands, stand_in: StandIn, guard: GuardSettings) -> None:
     """All that happens to an operator: a pause, a hand that is lost, a controller that is started anew.
 
     A spring without overshoot moves the tool no faster than its target does, but for a fifth, nor more abruptly, but
-    for what the target makes up for when a busy machine has stalled. ``pauses``: the operator pauses before the
-    controller is started anew, which otherwise pauses the arm.
+    for what the target makes up for when a busy machine has stalled.
     """
     motion = stage.motion
     made_up = STIFFNESS**2 * FASTEST * STALLED
@@ -111,8 +122,7 @@ def act(stage: Stage, hands: Hands, stand_in: StandIn, guard: GuardSettings, pau
     hands.wait(lambda rig: rig.state.get("hand_age") is not None, "the arm's controller sees the hand")
     began = len(motion.moments)
     with motion.standing_still(STILL, "it is engaged"):
-        hands.engage()
-        stand_in.wait_until_driven(hands)
+        stand_in.engage(hands)
     follows(stage, hands, (0.06, 0.0, 0.04), turn=0.2)
 
     hands.pause()
@@ -128,18 +138,14 @@ def act(stage: Stage, hands: Hands, stand_in: StandIn, guard: GuardSettings, pau
     follows(stage, hands, (0.0, 0.0, 0.06))
     motion.assert_smooth(began, *limits)
 
-    if pauses:
-        hands.pause()
-        motion.wait_for_rest()
     stand_in.kill()
+    hands.move((0.1, 0.0, 0.0), 0.3)  # who comes next is not to be asked to catch up with that
     motion.wait_for_rest()
     with motion.standing_still(STILL, "its controller is started anew"):
         stand_in.start()
         stand_in.wait_until_ready()
-        hands.wait_for_pause()
         began = len(motion.moments)
-        hands.engage()
-        stand_in.wait_until_driven(hands)
+        stand_in.engage(hands)
     follows(stage, hands, (-0.05, 0.0, 0.0))
     motion.assert_smooth(began, *limits)
     assert stand_in.violations == []
@@ -180,6 +186,7 @@ def start_arm(node: Any, processes: Processes, preset: str, arm: str, mode: str,
         "teleop.leash.distance": 0.0,  # a simulation that a busy machine holds up is no obstacle
         "tool_timeout": 1.0,
         "link_timeout": 3.0,
+        "listener_timeout": 0.5,
     }
     arguments = parameters(*(f"{name}:={value}" for name, value in given.items()))
     start(processes, f"{arm}_arm_controller", *arguments, **environment)
