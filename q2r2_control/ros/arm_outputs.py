@@ -6,6 +6,7 @@ import pinocchio as pin
 
 from q2r2_control.ros.arm_parameters import ArmParameters
 from q2r2_control.ros.command_type import CommandType
+from q2r2_control.ros.follow_watch import FollowWatch
 from q2r2_control.ros.node import BaseNode
 from q2r2_control.ros.pose_source import PoseTopic
 from q2r2_control.ros.target_output import TargetOutput, near
@@ -47,6 +48,10 @@ class ArmOutputs:
                 self._last = theirs
             else:
                 self.first = theirs
+        self._follows: FollowWatch | None = None
+        if self.first.preset is BUILTIN:
+            # Twice as long as anything else may be silent: the targets have to arrive, and the answer.
+            self._follows = FollowWatch(node, values.following_topic, 2.0 * values.listener_timeout)
         self._all = [self.first] if self._last is None else [self.first, self._last]
         self._command_type: CommandType | None = None
         if preset.command_type is not None:
@@ -80,8 +85,8 @@ class ArmOutputs:
             self._relaying = False
         if self._command_type is not None:
             self._command_type.step(self._all[-1].lives, now)
-        if self.first.preset is BUILTIN:
-            faults.append(self._safe_target.take_silence(now))
+        if self._follows is not None:
+            faults += [self._safe_target.take_silence(now), self._follows.refusal(self.first.following, now)]
         return next((fault for fault in faults if fault), None)
 
     def step(self, target: pin.SE3 | None, tool: pin.SE3 | None, base: pin.SE3 | None, now: float) -> pin.SE3 | None:

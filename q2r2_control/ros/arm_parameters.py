@@ -41,6 +41,7 @@ class ArmParameters:
     target_topic: str
     current_pose_topic: str  # "": from /tf
     safe_target_topic: str
+    following_topic: str
     builtin_prefix: str
     tool_timeout: float  # [s]
     link_timeout: float  # [s]
@@ -101,6 +102,9 @@ def arm_parameters(node: BaseNode, subclass: ArmDefaults) -> ArmParameters:
         current_pose_topic=declared(node, "current_pose_topic", "", 'PoseStamped of the tool; "": from /tf'),
         safe_target_topic=declared(
             node, "safe_target_topic", f"/cartesian_controller/safe_target/{arm}", "what the built-in controller allows"
+        ),
+        following_topic=declared(
+            node, "following_topic", f"/cartesian_controller/following/{arm}", "whether the built-in controller follows"
         ),
         builtin_prefix=declared(node, "builtin_prefix", f"/q2r2/{arm}", "where mode filtered sends the hand's target"),
         tool_timeout=declared(

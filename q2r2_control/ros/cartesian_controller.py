@@ -19,6 +19,7 @@ from geometry_msgs.msg import PoseStamped
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.parameter import Parameter
+from std_msgs.msg import Bool
 from std_srvs.srv import SetBool, Trigger
 
 from q2r2_control.config import load_config
@@ -29,7 +30,7 @@ from q2r2_control.ros.joint_watch import WatchSettings
 from q2r2_control.ros.led_arms import LedArms, LedSettings, settings_to_lead
 from q2r2_control.ros.make_output import NONE, make_output, output_name
 from q2r2_control.ros.messages import stamped_pose
-from q2r2_control.ros.node import COMMAND_QOS, ERROR, OK, WARN, BaseNode, run_node
+from q2r2_control.ros.node import COMMAND_QOS, ERROR, LATCHED_QOS, OK, WARN, BaseNode, run_node
 from q2r2_control.ros.supervisor import Origins, Phase, Supervisor
 from q2r2_control.ros.target_intake import TargetIntake
 from q2r2_control.ros.target_stream import StreamSettings
@@ -108,6 +109,8 @@ class CartesianControllerNode(BaseNode):
         self._safe_targets = {
             arm: self.create_publisher(PoseStamped, f"~/safe_target/{arm}", COMMAND_QOS) for arm in self._targets.topics
         }
+        self._follows: dict[str, bool | None] = dict.fromkeys(self._targets.topics)
+        self._following = {arm: self.create_publisher(Bool, f"~/following/{arm}", LATCHED_QOS) for arm in self._follows}
         self._targets.subscribe(self._supervisor.take_target)
         self._joints.subscribe(self._supervisor.take_joint_state)
         self.create_service(SetBool, "~/pause", self._on_pause)
@@ -132,6 +135,7 @@ class CartesianControllerNode(BaseNode):
         self._ticks += 1
         if dt > 0.0:
             self._advance(now, dt)
+        self._tell_followed()
 
     def _advance(self, now: float, dt: float) -> None:
         began = time.monotonic()
@@ -155,6 +159,14 @@ class CartesianControllerNode(BaseNode):
                 frame = self._targets.frames[arm]
                 tool = frame.pose.actInv(self._controller.tool_pose(arm))
                 publisher.publish(stamped_pose(tool, frame.name, now))
+
+    def _tell_followed(self) -> None:
+        """Say of each arm whether its targets are followed, when that changes."""
+        for arm, publisher in self._following.items():
+            follows = self._supervisor.follows(arm)
+            if follows != self._follows[arm]:
+                self._follows[arm] = follows
+                publisher.publish(Bool(data=follows))
 
     def _tell_events(self) -> None:
         if not self._supervisor.events:

@@ -104,7 +104,11 @@ class Supervisor:
             return str(self.phase)
         if self.homing:
             return "homing"
-        return "following" if self._streams[arm].following else "holding"
+        return "following" if self.follows(arm) else "holding"
+
+    def follows(self, arm: str) -> bool:
+        """Whether an arm follows its targets."""
+        return self.phase is Phase.ACTIVE and self._streams[arm].following
 
     def target_age(self, arm: str, now: float) -> float:
         """Since the last target of an arm that was a pose [s]."""

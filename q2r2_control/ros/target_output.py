@@ -51,7 +51,7 @@ class TargetOutput:
         self._wrench = None
         if preset.zero_wrench is not None:
             self._wrench = node.create_publisher(WrenchStamped, preset.zero_wrench.format(ctrl=prefix), LATCHED_QOS)
-        self._following = False
+        self.following = False  # a hand's target
         self._restarted = False
         self._endpoints: set[bytes] = set()  # of the controller
         self._listeners = 0
@@ -82,7 +82,7 @@ class TargetOutput:
         """One line where nobody takes the targets, or it is not known yet who will."""
         if self._publisher.listeners == 0:
             return f"nobody listens to {self.topic}"
-        strange = self._strange and not self._following
+        strange = self._strange and not self.following
         return f"it is not known who listens to {self.topic}" if strange else None
 
     def take_fault(self, now: float) -> str | None:
@@ -90,19 +90,19 @@ class TargetOutput:
         listeners = self._present
         if listeners > self._listeners or listeners == 0:
             self._came = now
-            if not self._following:
+            if not self.following:
                 self.forget(now)  # whoever it is, it is not to be greeted with a target of the past
         self._listeners = listeners
         if self._strange or now - self._came < _ALERT or not 0.0 <= now - self._looked <= _GRAPH_PERIOD:
             self._looked = now
             self._look(now)
-        if self._strange and self._following and now - self._came > _ALERT:
+        if self._strange and self.following and now - self._came > _ALERT:
             self.forget(now)
             return f"it is not known who listens to {self.topic}"
         restarted, self._restarted = self._restarted, False
         if restarted:
             return f"{self._controller} was started anew"
-        silence = self._publisher.silence(now) if self._following else None
+        silence = self._publisher.silence(now) if self.following else None
         if silence is not None:
             self.forget(now)  # it is gone, and whoever comes is not to be asked for a target of the past
             return f"{self._controller}: {silence}"
@@ -124,14 +124,14 @@ class TargetOutput:
         """
         if self._strange or self._present > self._listeners:
             return None
-        idle = not self._following and self.guard.at_rest
-        self._following = target is not None
+        idle = not self.following and self.guard.at_rest
+        self.following = target is not None
         if target is not None and idle:
             self.guard.reset(target if start is None else start, now)
             self._publisher.begin()
             self._send_zero_wrench(now)
         pose = self.guard.step(target, now)
-        if pose is None or base is None or not (self._following or not self.guard.at_rest or self._holds(tool, now)):
+        if pose is None or base is None or not (self.following or not self.guard.at_rest or self._holds(tool, now)):
             return None
         message = stamped_pose(base.actInv(pose), self._frame, now)
         self._publisher.publish(message)
@@ -140,7 +140,7 @@ class TargetOutput:
 
     def forget(self, now: float) -> None:
         """Hold nothing any more; the next target starts anew."""
-        self._following = False
+        self.following = False
         self.guard.reset(None, now)
 
     @property
@@ -168,7 +168,7 @@ class TargetOutput:
         }
         if endpoints - self._endpoints:
             self.lives += 1
-            self._restarted = self._following
+            self._restarted = self.following
             self.forget(now)
             self._send_zero_wrench(now)
         self._endpoints = endpoints

@@ -140,6 +140,7 @@ def act(stage: Stage, hands: Hands, stand_in: StandIn, guard: GuardSettings) -> 
 
     stand_in.kill()
     hands.move((0.1, 0.0, 0.0), 0.3)  # who comes next is not to be asked to catch up with that
+    hands.wait_for_pause()
     motion.wait_for_rest()
     with motion.standing_still(STILL, "its controller is started anew"):
         stand_in.start()
