@@ -16,7 +16,7 @@ from tests.ros.waiting import eventually
 SLOW = 0.05  # 3 % of a joint's limit; what is left is an arm that settles, not one that goes on [rad/s]
 REST = 0.01  # [rad/s]
 USUAL_GAP = 0.03  # between two joint states, on a machine that has the time [s]
-LONGEST_STARVED = 0.1  # what a machine may be excused for [s]
+LONGEST_STARVED = 0.1  # what a machine may be excused for; longer ones void the measurement [s]
 RESTING = 0.3  # for this long [s]
 
 
@@ -32,10 +32,11 @@ class Joints(NamedTuple):
 class Stop:
     """How all joints came to rest after a fault."""
 
+    fault: float  # when it was [s]
     speed: float  # of the fastest joint at the fault [rad/s]
     slow: float  # from the fault until all joints are slow for good [s]
     rest: float  # and until they rest [s]
-    starved: float  # longest time without a joint state until then, above what is usual, within bounds [s]
+    starved: float  # longest time without a joint state until then, above what is usual [s]
     posture: Array  # at rest
     t: float  # when they rest [s]
 
@@ -82,8 +83,8 @@ class JointLog:
         before = [state for state in self.states if state.t <= fault][-1]
         slow, rest = (self.since(last(speed))[0].t for speed in (SLOW, REST))
         gaps = np.diff([before.t, *(state.t for state in self.since(fault) if state.t <= rest)])
-        starved = min(max(float(gaps.max()) - USUAL_GAP, 0.0), LONGEST_STARVED)
-        return Stop(float(np.abs(before.v).max()), slow - fault, rest - fault, starved, self.q, rest)
+        starved = max(float(gaps.max()) - USUAL_GAP, 0.0)
+        return Stop(fault, float(np.abs(before.v).max()), slow - fault, rest - fault, starved, self.q, rest)
 
     def farthest_from(self, posture: Array, since: float, until: float = math.inf) -> float:
         """How far any joint has been from ``posture`` [rad]."""

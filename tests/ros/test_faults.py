@@ -24,7 +24,7 @@ pytest.importorskip("quest2ros", reason="needs q2r2 ros build-interfaces")
 pytestmark = pytest.mark.usefixtures("interfaces")
 
 from tests.ros.headset_operator import Operator  # noqa: E402
-from tests.ros.joint_log import Stop  # noqa: E402
+from tests.ros.joint_log import LONGEST_STARVED, Stop  # noqa: E402
 from tests.ros.teleop_cell import ARMS, TeleopCell, address_of  # noqa: E402
 
 TIMEOUT = 0.15  # after which whatever is silent counts as lost [s]
@@ -98,10 +98,21 @@ class Scene:
             self.cell.kill("simulation_input")
         raise AssertionError(f"the arms do not follow the script: {self.cell.diagnoses[-5:]}")
 
-    def measure_stop(self, what: str, fault: float, record: Record) -> Stop:
-        """How both arms come to rest after a fault, which may take them no longer than it has to."""
-        stop = self.cell.joints.stop_after(fault)
+    def measure_stop(self, what: str, hurt: Callable[[], float], again: Callable[[], None], record: Record) -> Stop:
+        """How both arms come to rest after a fault, which may take them no longer than it has to.
+
+        ``hurt`` does it and says when. Where the robot or this test stood still meanwhile, which says nothing of the
+        nodes, both arms move ``again`` and it is done once more.
+        """
+        stop = self.cell.joints.stop_after(hurt())
+        for _ in range(2):
+            if stop.starved <= LONGEST_STARVED:
+                break
+            print(f"\n{what}: no joint state came for {stop.starved:.2f} s; once more")
+            again()
+            stop = self.cell.joints.stop_after(hurt())
         # A machine that has no time for the robot or for this test has none for the node that has to act either.
+        assert stop.starved <= LONGEST_STARVED, "the robot or this test stood still"
         allowed = TIMEOUT + stop.speed / BRAKING + DELIVERY + 2.0 * stop.starved
         line = (
             f"from {stop.speed:.2f} rad/s slow within {1e3 * stop.slow:.0f} ms, allowed {1e3 * allowed:.0f}, "
@@ -160,9 +171,14 @@ def moving(scene: Scene) -> Scene:
 def test_a_killed_node_stops_both_arms_and_its_return_moves_none(
     name: str, moving: Scene, record_property: Record
 ) -> None:
-    fault = moving.cell.kill(name)
-    stop = moving.measure_stop(f"{name} killed", fault, record_property)
-    moving.cell.wait_for_diagnosis(fault, KILLED[name])
+
+    def move_again() -> None:
+        moving.mend(name)
+        moving.operator.rest()
+        moving.move()
+
+    stop = moving.measure_stop(f"{name} killed", lambda: moving.cell.kill(name), move_again, record_property)
+    moving.cell.wait_for_diagnosis(stop.fault, KILLED[name])
     moving.mend(name)
     moving.assert_only_a_press_moves(stop)
 
@@ -201,9 +217,9 @@ def test_a_script_that_died_stops_both_arms_and_its_return_waits_to_be_asked(
     try:
         eventually(lambda: not any(map(cell.engaged, ARMS)), "the headset is off")
         scene.play()
-        fault = cell.kill("simulation_input")
-        stop = scene.measure_stop("simulation_input killed", fault, record_property)
-        cell.wait_for_diagnosis(fault, "of the left hand from /simulation_input")
+        name = "simulation_input"
+        stop = scene.measure_stop(f"{name} killed", lambda: cell.kill(name), scene.play, record_property)
+        cell.wait_for_diagnosis(stop.fault, "of the left hand from /simulation_input")
         cell.start("simulation_input", "start_on_request:=true")
         back = time.monotonic()
         cell.wait_for_diagnosis(back, "waits for a call of ~/start")
@@ -222,9 +238,17 @@ def test_a_script_that_died_stops_both_arms_and_its_return_waits_to_be_asked(
 def test_a_frozen_node_stops_both_arms_and_when_it_wakes_it_moves_none(
     name: str, moving: Scene, record_property: Record
 ) -> None:
-    fault = moving.cell.signal(name, signal.SIGSTOP)
-    stop = moving.measure_stop(f"{name} frozen", fault, record_property)
-    time.sleep(max(fault + 1.0 - time.monotonic(), 0.0))
+
+    def move_again() -> None:
+        moving.mend(name)
+        moving.operator.rest()
+        moving.move()
+
+    def freeze() -> float:
+        return moving.cell.signal(name, signal.SIGSTOP)
+
+    stop = moving.measure_stop(f"{name} frozen", freeze, move_again, record_property)
+    time.sleep(max(stop.fault + 1.0 - time.monotonic(), 0.0))
     woken = moving.cell.signal(name, signal.SIGCONT)
     moving.cell.wait_for_diagnosis(woken, FROZEN[name])
     moving.assert_only_a_press_moves(stop)
