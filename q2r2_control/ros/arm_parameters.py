@@ -9,7 +9,6 @@ from q2r2_control.errors import ConfigError
 from q2r2_control.external import GripperSettings, GuardLimits
 from q2r2_control.ros.node import BaseNode
 from q2r2_control.ros.parameters import declared, settings_from_parameters
-from q2r2_control.ros.watched_publisher import listener_timeout
 from q2r2_control.teleop.guard import GuardSettings
 from q2r2_control.teleop.presets import BUILTIN, Mode, Preset, preset_of
 from q2r2_control.teleop.settings import Stance, TeleopSettings
@@ -115,7 +114,9 @@ def arm_parameters(node: BaseNode, subclass: ArmDefaults) -> ArmParameters:
             at_least=0.01,
             at_most=2.0,
         ),
-        listener_timeout=listener_timeout(node, "targets may not be acknowledged; then the arm is paused [s]"),
+        listener_timeout=declared(
+            node, "listener_timeout", 0.15, "targets may not be acknowledged [s]", at_least=0.1, at_most=10.0
+        ),
         link_timeout=declared(
             node, "link_timeout", 0.15, "the other arm's node may be silent [s]", at_least=0.1, at_most=10.0
         ),

@@ -31,9 +31,9 @@ from q2r2_control.ros.led_arms import LedArms, LedSettings, settings_to_lead
 from q2r2_control.ros.make_output import NONE, make_output, output_name
 from q2r2_control.ros.messages import stamped_pose
 from q2r2_control.ros.node import COMMAND_QOS, ERROR, LATCHED_QOS, OK, WARN, BaseNode, run_node
-from q2r2_control.ros.supervisor import Origins, Phase, Supervisor
+from q2r2_control.ros.supervisor import Phase, Supervisor
 from q2r2_control.ros.target_intake import TargetIntake
-from q2r2_control.ros.target_stream import StreamSettings
+from q2r2_control.ros.target_stream import Origins, StreamSettings
 from q2r2_control.types import Reference
 
 _LONGEST_STOP = 3.0  # [s]
@@ -87,6 +87,7 @@ class CartesianControllerNode(BaseNode):
             LedArms(robot, self._controller, led, streams, watch) if output == NONE else None,
         )
         self._reference: Reference | None = None
+        self._listeners = 0  # to the joint commands
         self._ticks, self._reported_at, self._last_tick = 0, time.monotonic(), self.now
         self._connect()
         self.get_logger().info(f"{config.name}: {', '.join(robot.arms)}; waits for joint states")
@@ -139,8 +140,9 @@ class CartesianControllerNode(BaseNode):
 
     def _advance(self, now: float, dt: float) -> None:
         began = time.monotonic()
-        if (silence := self._output.silence(now)) is not None:
-            self._supervisor.start_over(silence, now)
+        listeners, self._listeners = self._listeners, self._output.listeners
+        if self._listeners > listeners:
+            self._supervisor.greet(now)
         was_active = self._supervisor.phase is Phase.ACTIVE
         reference, state = self._supervisor.tick(now, dt), self._joints.state
         if not was_active and self._supervisor.phase is Phase.ACTIVE and state is not None:

@@ -22,7 +22,6 @@ from q2r2_control.ros.outputs import (
     channels,
 )
 from q2r2_control.ros.torque_outputs import LbrOutput, TorqueOutput, Torques, lbr_message
-from q2r2_control.ros.watched_publisher import listener_timeout
 
 NONE = "none"
 _ARM = "{arm}"  # where an arm's name goes in a topic
@@ -50,10 +49,9 @@ def make_output(name: str, node: BaseNode, robot: Robot, config: Config, period:
     Raises :class:`ConfigError`.
     """
     topics = _topics(name, node, robot)
-    timeout = listener_timeout(node, "joint commands may not be acknowledged; then the arms brake [s]")
 
     def on(kind: type) -> list[Channel]:
-        return channels(node, kind, topics, robot, timeout)
+        return channels(node, kind, topics, robot)
 
     makers: dict[str, Callable[[], Output]] = {
         "trajectory": lambda: PositionOutput(on(JointTrajectory), as_trajectory(period)),

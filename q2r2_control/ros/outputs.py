@@ -15,7 +15,7 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from q2r2_control.robot.robot import Robot
 from q2r2_control.ros.messages import joint_state_message
-from q2r2_control.ros.watched_publisher import WatchedPublisher
+from q2r2_control.ros.node import SENT_COMMAND_QOS
 from q2r2_control.types import Array, Reference, RobotState
 
 # What makes a message of joint names, positions, velocities and the time [s] of the node's clock.
@@ -37,8 +37,9 @@ class Output(Protocol):
         """
         ...
 
-    def silence(self, now: float) -> str | None:
-        """One line where commands are not taken any more at ``now`` [s]."""
+    @property
+    def listeners(self) -> int:
+        """How many take the commands, as far as is known."""
         ...
 
 
@@ -48,19 +49,16 @@ class Channel:
 
     names: list[str]
     joints: np.ndarray  # velocity indices in the robot's order
-    publisher: WatchedPublisher
+    publisher: Any
 
 
-def channels(node: Node, kind: type, topics: Mapping[str, str], robot: Robot, timeout: float) -> list[Channel]:
-    """A publisher for every topic; ``topics`` says for each arm which one carries its joints.
-
-    Commands that nobody acknowledges for ``timeout`` [s] are taken by nobody.
-    """
+def channels(node: Node, kind: type, topics: Mapping[str, str], robot: Robot) -> list[Channel]:
+    """A publisher for every topic; ``topics`` says for each arm which one carries its joints."""
     made = []
     for topic in dict.fromkeys(topics.values()):
         joints = joints_of(robot, (arm for arm, its in topics.items() if its == topic))
         names = [robot.joint_names[joint] for joint in joints]
-        made.append(Channel(names, joints, WatchedPublisher(node, kind, topic, timeout)))
+        made.append(Channel(names, joints, node.create_publisher(kind, topic, SENT_COMMAND_QOS)))
     return made
 
 
@@ -78,9 +76,10 @@ class NoOutput:
     def send(self, reference: Reference, state: RobotState, dt: float, t: float, trusted: bool) -> None:
         """See :class:`Output`."""
 
-    def silence(self, now: float) -> str | None:
+    @property
+    def listeners(self) -> int:
         """See :class:`Output`."""
-        return None
+        return 0
 
 
 class ChannelOutput:
@@ -90,15 +89,12 @@ class ChannelOutput:
         self._channels = into
 
     def activate(self, state: RobotState) -> None:
-        """See :class:`Output`."""
-        for channel in self._channels:
-            channel.publisher.begin()
+        """Nothing to begin."""
 
-    def silence(self, now: float) -> str | None:
+    @property
+    def listeners(self) -> int:
         """See :class:`Output`."""
-        # Each is asked, or those behind one that is silent would look so too.
-        lines = [channel.publisher.silence(now) for channel in self._channels]
-        return next((line for line in lines if line), None)
+        return sum(channel.publisher.get_subscription_count() for channel in self._channels)
 
 
 class PositionOutput(ChannelOutput):

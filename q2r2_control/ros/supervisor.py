@@ -10,10 +10,7 @@ tool, see :mod:`target_stream`. A fault brakes along the controller's certified 
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
 from enum import StrEnum
-from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -24,10 +21,11 @@ from q2r2_control.ros.homing import Homing
 from q2r2_control.ros.joint_watch import NONE_YET, JointWatch, WatchSettings
 from q2r2_control.ros.led_arms import LedArms
 from q2r2_control.ros.sequence_watch import SequenceWatch
-from q2r2_control.ros.target_stream import StreamSettings, TargetStream
-from q2r2_control.types import Reference, RobotState
+from q2r2_control.ros.target_stream import Origins, Refusal, StreamSettings, TargetStream
+from q2r2_control.types import Array, Reference, RobotState
 
 _REST = 1e-4  # of the reference [rad/s]
+_GREETING = 0.05  # more than arms lag behind the reference [rad]
 
 
 class Phase(StrEnum):
@@ -37,21 +35,6 @@ class Phase(StrEnum):
     ACTIVE = "active"
     BRAKING = "braking"
     STOPPED = "stopped"  # until it is reset
-
-
-@dataclass(frozen=True, slots=True)
-class Origins:
-    """Who sends what, for lines that say what is missing: " from /node", or nothing where that is not known."""
-
-    joint_states: Callable[[], str] = lambda: ""
-    targets: Callable[[str], str] = lambda arm: ""
-
-
-class Refusal(NamedTuple):
-    """Why a target is not followed."""
-
-    kind: str
-    line: str
 
 
 class Supervisor:
@@ -77,6 +60,7 @@ class Supervisor:
         self._watch = JointWatch(robot.joint_names, robot.velocity_limit, watch, self._origins.joint_states)
         self._homing: Homing | None = None
         self._stopped: str | None = None  # why it takes a reset
+        self._q: Array | None = None  # of the reference [rad]
         self.phase = Phase.INACTIVE
         self.paused = False
         self.ceased: dict[str, str] = {}  # arms that hold since their targets ceased, with a line that says so
@@ -168,6 +152,7 @@ class Supervisor:
         if self.phase is Phase.ACTIVE:
             self._look(now)
         reference = self._step(self._targets(now, dt), dt)
+        self._q = reference.q
         if self.phase is Phase.ACTIVE:
             self._compare(reference, now)
             self._look_home()
@@ -213,6 +198,14 @@ class Supervisor:
         self._watch.take(fault, now)
         self._brake(fault)
         self.phase = Phase.INACTIVE if self._stopped is None else Phase.STOPPED
+
+    def greet(self, now: float) -> None:
+        """Somebody new takes the commands: whoever moves the arms may have been gone, while the reference went on."""
+        state = self._watch.state
+        if self.phase is not Phase.ACTIVE or self._q is None or state is None:
+            return
+        if (away := float(np.abs(state.q - self._q).max())) > _GREETING:
+            self.start_over(f"somebody new takes the commands, and the arms are {away:.3f} rad from them", now)
 
     def start_over(self, fault: str, now: float) -> None:
         """Nobody goes where the reference goes: brake, and be activated anew where the arms are then.

@@ -15,7 +15,7 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.ros.messages import pose_of
 from q2r2_control.ros.node import COMMAND_QOS, BaseNode
 from q2r2_control.ros.publishers import Publishers
-from q2r2_control.ros.supervisor import Refusal
+from q2r2_control.ros.target_stream import Refusal
 
 _RECENT = 1.0  # refused targets are a warning for this long [s]
 # Takes an arm's target in the world frame, or None for one that is no pose, the time [s], and the message's number.

@@ -133,9 +133,9 @@ class TargetOutput:
         pose = self.guard.step(target, now)
         if pose is None or base is None or not (self.following or not self.guard.at_rest or self._holds(tool, now)):
             return None
-        message = stamped_pose(base.actInv(pose), self._frame, now)
-        self._publisher.publish(message)
-        self.sent += 1
+        if not (self.following and self._publisher.waits(now)):
+            self._publisher.publish(stamped_pose(base.actInv(pose), self._frame, now))
+            self.sent += 1
         return pose
 
     def forget(self, now: float) -> None:

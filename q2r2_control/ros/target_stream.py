@@ -10,7 +10,9 @@ tool, as those of an operator do who engages anew while the targets never cease.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import pinocchio as pin
 
@@ -25,6 +27,21 @@ class StreamSettings:
     timeout: float = 0.15  # [s]
     engage_distance: float = 0.03  # [m]
     engage_angle: float = 0.3  # [rad]
+
+
+@dataclass(frozen=True, slots=True)
+class Origins:
+    """Who sends what, for lines that say what is missing: " from /node", or nothing where that is not known."""
+
+    joint_states: Callable[[], str] = lambda: ""
+    targets: Callable[[str], str] = lambda arm: ""
+
+
+class Refusal(NamedTuple):
+    """Why a target is not followed."""
+
+    kind: str
+    line: str
 
 
 class TargetStream:

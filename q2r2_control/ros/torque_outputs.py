@@ -54,7 +54,6 @@ class TorqueOutput(ChannelOutput):
 
     def activate(self, state: RobotState) -> None:
         """See :class:`Output`."""
-        super().activate(state)
         self._torques.reset(state)
 
     def send(self, reference: Reference, state: RobotState, dt: float, t: float, trusted: bool) -> None:
@@ -83,7 +82,6 @@ class LbrOutput(ChannelOutput):
 
     def activate(self, state: RobotState) -> None:
         """See :class:`Output`."""
-        super().activate(state)
         if self._torques is not None:
             self._torques.reset(state)
 

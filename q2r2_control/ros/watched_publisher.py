@@ -1,20 +1,19 @@
-"""A publisher of commands that knows whether anybody still takes them."""
+"""A publisher of targets that knows whether anybody still takes them."""
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 from rclpy.duration import Duration
 from rclpy.node import Node
 
-from q2r2_control.ros.node import SENT_COMMAND_QOS, BaseNode
+from q2r2_control.ros.node import SENT_COMMAND_QOS
 
 _AT_ONCE = Duration(nanoseconds=0)
-
-
-def listener_timeout(node: BaseNode, description: str) -> float:
-    """Declare the parameter of this name and return its value [s]."""
-    return float(node.parameter("listener_timeout", 0.15, description, at_least=0.05, at_most=10.0))
+# A listener may take 5 ms to acknowledge, longer than the period of a fast stream. So now and then a message is left
+# out until the one before has been acknowledged, or for this long [s].
+_LOOK, _GAP = 0.05, 0.015
 
 
 class WatchedPublisher:
@@ -30,6 +29,7 @@ class WatchedPublisher:
         self._timeout = timeout
         self._streaming = False
         self._acknowledged: float | None = None  # when all was last; None: not yet in this stream [s]
+        self._gap_began = -math.inf  # [s]
 
     @property
     def topic_name(self) -> str:
@@ -42,22 +42,27 @@ class WatchedPublisher:
 
     def begin(self) -> None:
         """The next message begins a stream."""
-        self._streaming, self._acknowledged = False, None
+        self._streaming, self._acknowledged, self._gap_began = False, None, -math.inf
 
     def publish(self, message: Any) -> None:
         """Publish a message of the stream."""
         self._publisher.publish(message)
         self._streaming = True
 
-    def silence(self, now: float) -> str | None:
-        """One line where nothing was acknowledged for too long at ``now`` [s].
+    def waits(self, now: float) -> bool:
+        """Whether the next message is better left out at ``now`` [s], so that the last one can be acknowledged."""
+        if not self._streaming or (self._acknowledged is not None and now - self._acknowledged < _LOOK):
+            return False
+        if now - self._gap_began >= _LOOK:
+            self._gap_began = now
+        return now - self._gap_began < _GAP
 
-        To be asked before each message: the newest is as old as the stream's period then, and was acknowledged.
-        """
+    def silence(self, now: float) -> str | None:
+        """One line where nothing was acknowledged for too long at ``now`` [s]; to be asked before each message."""
         if not self._streaming:
             return None
         if self._publisher.wait_for_all_acked(_AT_ONCE):
             self._acknowledged = now
         if self._acknowledged is None or now - self._acknowledged <= self._timeout:
             return None
-        return f"commands on {self.topic_name} are not acknowledged for {now - self._acknowledged:.2f} s"
+        return f"targets on {self.topic_name} are not acknowledged for {now - self._acknowledged:.2f} s"

@@ -28,7 +28,7 @@ CONFIG = "config/dual_iiwa7.yaml"
 RATE = 100.0  # of targets [Hz]
 STILL = 2e-3  # how far joints at rest may move [rad]
 # Longer than by default, so that a machine that is busy elsewhere does not look like a fault.
-PATIENT = ("-p", "joint_state_timeout:=0.5", "-p", "target_timeout:=0.5", "-p", "listener_timeout:=0.5")
+PATIENT = ("-p", "joint_state_timeout:=0.5", "-p", "target_timeout:=0.5")
 
 
 @dataclass(frozen=True)

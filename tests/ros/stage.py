@@ -27,7 +27,7 @@ from tests.ros.processes import PATIENCE, Processes, RosProcess
 from tests.ros.springs import STIFFNESS
 from tests.ros.stand_in import FASTEST, STALLED, Terms
 
-PATIENT_CONTROLLER = ("joint_state_timeout:=1.0", "target_timeout:=1.0", "deviation_time:=1.0", "listener_timeout:=0.5")
+PATIENT_CONTROLLER = ("joint_state_timeout:=1.0", "target_timeout:=1.0", "deviation_time:=1.0")
 STILL = 2e-3  # how far a tool that stands still may move [m]
 NEAR = 5e-3  # where a tool has arrived [m]
 

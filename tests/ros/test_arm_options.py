@@ -99,7 +99,7 @@ def test_a_tool_that_a_topic_tells_is_engaged_where_it_is_and_paused_when_the_to
     assert_same(rig.wait_for_rest(), offset(TOOL, (0.05, 0.0, 0.0)), 1e-3)
     node.destroy_timer(timer)
     rig.wait(lambda: rig.state["state"] == "paused", "an arm whose tool is not told any more is paused")
-    rig.wait(lambda: "/left/current_pose is silent" in rig.state["message"], "the reason is told")
+    rig.wait(lambda: "/left/current_pose from /test is silent" in rig.state["message"], "the reason is told")
 
 
 def test_a_gripper_behind_a_topic_is_told_its_positions(rig: ArmRig, node: Any, processes: Processes) -> None:

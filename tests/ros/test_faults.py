@@ -21,7 +21,7 @@ from tests.ros.waiting import eventually
 
 pytest.importorskip("rclpy", reason=NEEDS_ROS)
 pytest.importorskip("quest2ros", reason="needs q2r2 ros build-interfaces")
-pytestmark = pytest.mark.usefixtures("interfaces")
+pytestmark = [pytest.mark.usefixtures("interfaces"), pytest.mark.alone]
 
 from tests.ros.headset_operator import Operator  # noqa: E402
 from tests.ros.joint_log import LONGEST_STARVED, Stop  # noqa: E402
