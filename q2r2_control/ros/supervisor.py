@@ -200,12 +200,16 @@ class Supervisor:
         self.phase = Phase.INACTIVE if self._stopped is None else Phase.STOPPED
 
     def greet(self, now: float) -> None:
-        """Somebody new takes the commands: whoever moves the arms may have been gone, while the reference went on."""
+        """Somebody new takes the commands: whoever moves the arms may have been gone, while the reference went on.
+
+        Then nothing more is commanded, not even the way to rest, which would be a jump too.
+        """
         state = self._watch.state
         if self.phase is not Phase.ACTIVE or self._q is None or state is None:
             return
         if (away := float(np.abs(state.q - self._q).max())) > _GREETING:
             self.start_over(f"somebody new takes the commands, and the arms are {away:.3f} rad from them", now)
+            self.phase = Phase.INACTIVE
 
     def start_over(self, fault: str, now: float) -> None:
         """Nobody goes where the reference goes: brake, and be activated anew where the arms are then.

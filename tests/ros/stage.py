@@ -109,11 +109,12 @@ class StandIn:
         return [line for life in self.lives for line in life.output.splitlines() if line.startswith("violation")]
 
 
-def act(stage: Stage, hands: Hands, stand_in: StandIn, guard: GuardSettings) -> None:
+def act(stage: Stage, hands: Hands, stand_in: StandIn, guard: GuardSettings, joints: bool = False) -> None:
     """All that happens to an operator: a pause, a hand that is lost, a controller that is started anew.
 
     A spring without overshoot moves the tool no faster than its target does, but for a fifth, nor more abruptly, but
-    for what the target makes up for when a busy machine has stalled.
+    for what the target makes up for when a busy machine has stalled. ``joints``: who listens to joint commands is not
+    missed before somebody comes in its place, so the operator pauses first.
     """
     motion = stage.motion
     made_up = STIFFNESS**2 * FASTEST * STALLED
@@ -138,9 +139,13 @@ def act(stage: Stage, hands: Hands, stand_in: StandIn, guard: GuardSettings) -> 
     follows(stage, hands, (0.0, 0.0, 0.06))
     motion.assert_smooth(began, *limits)
 
+    if joints:
+        hands.pause()
+        motion.wait_for_rest()
     stand_in.kill()
-    hands.move((0.1, 0.0, 0.0), 0.3)  # who comes next is not to be asked to catch up with that
-    hands.wait_for_pause()
+    if not joints:
+        hands.move((0.1, 0.0, 0.0), 0.3)  # who comes next is not to be asked to catch up with that
+        hands.wait_for_pause()
     motion.wait_for_rest()
     with motion.standing_still(STILL, "its controller is started anew"):
         stand_in.start()

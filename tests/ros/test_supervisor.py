@@ -186,3 +186,30 @@ def test_a_stream_that_was_dropped_is_not_taken_up_again_where_it_stands() -> No
     assert stream.offer(TOOL, TOOL, 0.01) is not None
     stream.reset()
     assert stream.offer(TOOL, TOOL, 0.02) is None
+
+
+def test_who_newly_takes_the_commands_is_asked_for_nothing_where_the_arms_are_not(world: World, robot: Robot) -> None:
+    world.run(0.3)
+    tool = robot.tool_pose(world.q, "left")
+    world.run(0.1, tool)
+    world.blocked = True  # whoever moved the arms is gone
+    world.run(0.3, raised(tool, 0.06))
+    last = world.commanded[-1]
+    assert last is not None
+    assert 0.05 < np.abs(last - world.q).max() < 0.15
+    world.supervisor.greet(world.now)
+    assert world.is_in(Phase.INACTIVE)
+    began = len(world.commanded)
+    world.run(0.5, raised(tool, 0.06))
+    assert world.is_in(Phase.ACTIVE)
+    assert all(np.abs(q - world.q).max() < 1e-6 for q in world.commanded[began:] if q is not None)
+    assert not world.supervisor.follows("left")
+
+
+def test_who_listens_besides_to_commands_that_the_arms_follow_changes_nothing(world: World, robot: Robot) -> None:
+    world.run(0.3)
+    tool = robot.tool_pose(world.q, "left")
+    world.run(0.1, tool)
+    world.run(0.3, raised(tool, 0.06))
+    world.supervisor.greet(world.now)
+    assert world.supervisor.follows("left")
