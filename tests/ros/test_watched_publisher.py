@@ -1,0 +1,91 @@
+"""A publisher that misses its listener, against a real one that is frozen and killed."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import time
+from typing import Any
+
+import pytest
+
+from tests.ros.conftest import NEEDS_ROS
+from tests.ros.processes import Processes, RosProcess
+from tests.ros.waiting import eventually
+
+pytest.importorskip("rclpy", reason=NEEDS_ROS)
+
+from geometry_msgs.msg import PoseStamped
+
+from q2r2_control.ros.watched_publisher import WatchedPublisher
+
+TIMEOUT = 0.5  # more than a busy machine takes to acknowledge [s]
+LISTENER = """
+import rclpy
+from geometry_msgs.msg import PoseStamped
+rclpy.init()
+node = rclpy.create_node("listener")
+node.create_subscription(PoseStamped, "watched", lambda message: None, 1)
+rclpy.spin(node)
+"""
+
+
+class Stream:
+    """Publishes as an arm controller does."""
+
+    def __init__(self, publisher: WatchedPublisher, rate: float) -> None:
+        self._publisher, self._period = publisher, 1.0 / rate
+        self.published = self.left_out = 0
+
+    def run(self, seconds: float) -> str | None:
+        """Publish for so long; what was said of the listener, if anything was."""
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            now = time.monotonic()
+            if (silence := self._publisher.silence(now)) is not None:
+                return silence
+            if self._publisher.waits(now):
+                self.left_out += 1
+            else:
+                self._publisher.publish(PoseStamped())
+                self.published += 1
+            time.sleep(self._period)
+        return None
+
+
+@pytest.fixture
+def listener(processes: Processes) -> RosProcess:
+    return processes.start(sys.executable, "-c", LISTENER, name="listener")
+
+
+@pytest.mark.parametrize("rate", [50.0, 200.0, 500.0])
+def test_a_listener_is_missed_when_it_hangs_and_never_while_it_lives(
+    rate: float, node: Any, listener: RosProcess
+) -> None:
+    publisher = WatchedPublisher(node, PoseStamped, "/watched", TIMEOUT)
+    eventually(lambda: publisher.listeners == 1, "the listener is found")
+    publisher.begin()
+    stream = Stream(publisher, rate)
+    assert stream.run(2.0) is None
+    assert stream.published > stream.left_out
+    os.kill(listener.pid, signal.SIGSTOP)
+    frozen = time.monotonic()
+    silence = stream.run(10.0 * TIMEOUT)
+    assert silence is not None
+    assert silence.startswith("targets on /watched are not acknowledged for 0.5")
+    assert time.monotonic() - frozen < 2.0 * TIMEOUT
+    os.kill(listener.pid, signal.SIGCONT)
+    eventually(lambda: publisher.silence(time.monotonic()) is None, "it is there again")
+
+
+def test_what_is_left_of_a_listener_that_ended_before_the_stream_is_not_missed(
+    node: Any, listener: RosProcess, processes: Processes
+) -> None:
+    publisher = WatchedPublisher(node, PoseStamped, "/watched", TIMEOUT)
+    eventually(lambda: publisher.listeners == 1, "the listener is found")
+    os.kill(listener.pid, signal.SIGKILL)
+    listener.wait()
+    publisher.begin()
+    assert Stream(publisher, 100.0).run(3.0 * TIMEOUT) is None
+    assert publisher.listeners == 1  # as the graph says
