@@ -43,7 +43,7 @@ KILLED = {
     "tcp_endpoint": "of the left hand from /tcp_endpoint for 0.",
     "left_arm_controller": "linked to left: /left_q2r2_arm_controller is silent for 0.",
     "right_arm_controller": "linked to right: /right_q2r2_arm_controller is silent for 0.",
-    "cartesian_controller": " from /cartesian_controller is silent for 0.",
+    "cartesian_controller": "/cartesian_controller",  # is silent, or acknowledges no targets
 }
 # The node that is frozen for a while, and what it says itself when it goes on.
 FROZEN = {
@@ -178,7 +178,7 @@ def test_a_killed_node_stops_both_arms_and_its_return_moves_none(
         moving.move()
 
     stop = moving.measure_stop(f"{name} killed", lambda: moving.cell.kill(name), move_again, record_property)
-    moving.cell.wait_for_diagnosis(stop.fault, KILLED[name])
+    moving.cell.wait_for_diagnosis(stop.fault, KILLED[name], " for 0.")
     moving.mend(name)
     moving.assert_only_a_press_moves(stop)
 
