@@ -30,7 +30,7 @@ from q2r2_control.ros.joint_watch import WatchSettings
 from q2r2_control.ros.led_arms import LedArms, LedSettings, settings_to_lead
 from q2r2_control.ros.make_output import NONE, make_output, output_name
 from q2r2_control.ros.messages import stamped_pose
-from q2r2_control.ros.node import COMMAND_QOS, ERROR, LATCHED_QOS, OK, WARN, BaseNode, run_node
+from q2r2_control.ros.node import ERROR, LATCHED_QOS, OK, SENT_COMMAND_QOS, WARN, BaseNode, run_node
 from q2r2_control.ros.supervisor import Phase, Supervisor
 from q2r2_control.ros.target_intake import TargetIntake
 from q2r2_control.ros.target_stream import Origins, StreamSettings
@@ -108,7 +108,8 @@ class CartesianControllerNode(BaseNode):
 
     def _connect(self) -> None:
         self._safe_targets = {
-            arm: self.create_publisher(PoseStamped, f"~/safe_target/{arm}", COMMAND_QOS) for arm in self._targets.topics
+            arm: self.create_publisher(PoseStamped, f"~/safe_target/{arm}", SENT_COMMAND_QOS)
+            for arm in self._targets.topics
         }
         self._follows: dict[str, bool | None] = dict.fromkeys(self._targets.topics)
         self._following = {arm: self.create_publisher(Bool, f"~/following/{arm}", LATCHED_QOS) for arm in self._follows}

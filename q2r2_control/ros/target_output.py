@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
 import pinocchio as pin
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 
 from q2r2_control.ros.messages import stamped_pose, time_message
 from q2r2_control.ros.node import LATCHED_QOS, BaseNode
+from q2r2_control.ros.target_stream import apart
 from q2r2_control.ros.watched_publisher import WatchedPublisher
 from q2r2_control.teleop.guard import GuardSettings, TargetGuard
 from q2r2_control.teleop.presets import Hold, Preset
@@ -183,5 +183,5 @@ class TargetOutput:
 
 def near(pose: pin.SE3, other: pin.SE3, distance: float, angle: float) -> bool:
     """Whether two poses are within ``distance`` [m] and ``angle`` [rad] of each other."""
-    turn = float(np.linalg.norm(pin.log3(pose.rotation.T @ other.rotation)))
-    return math.dist(pose.translation, other.translation) <= distance and turn <= angle
+    way, turn = apart(pose, other)
+    return way <= distance and turn <= angle

@@ -9,6 +9,7 @@ import os
 import signal
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 
 import numpy as np
 import pytest
@@ -84,6 +85,12 @@ class Scene:
             self.operator.moves = True
             since = (since or time.monotonic()) if self.cell.moving else None
             time.sleep(0.01)
+
+    def move_again(self, name: str) -> None:
+        """Mend a node, and let both arms follow anew."""
+        self.mend(name)
+        self.operator.rest()
+        self.move()
 
     def play(self) -> None:
         """Start the script, and with it press, until both arms follow: a busy machine may look like a fault."""
@@ -171,13 +178,8 @@ def moving(scene: Scene) -> Scene:
 def test_a_killed_node_stops_both_arms_and_its_return_moves_none(
     name: str, moving: Scene, record_property: Record
 ) -> None:
-
-    def move_again() -> None:
-        moving.mend(name)
-        moving.operator.rest()
-        moving.move()
-
-    stop = moving.measure_stop(f"{name} killed", lambda: moving.cell.kill(name), move_again, record_property)
+    again = partial(moving.move_again, name)
+    stop = moving.measure_stop(f"{name} killed", partial(moving.cell.kill, name), again, record_property)
     moving.cell.wait_for_diagnosis(stop.fault, KILLED[name], " for 0.")
     moving.mend(name)
     moving.assert_only_a_press_moves(stop)
@@ -238,16 +240,8 @@ def test_a_script_that_died_stops_both_arms_and_its_return_waits_to_be_asked(
 def test_a_frozen_node_stops_both_arms_and_when_it_wakes_it_moves_none(
     name: str, moving: Scene, record_property: Record
 ) -> None:
-
-    def move_again() -> None:
-        moving.mend(name)
-        moving.operator.rest()
-        moving.move()
-
-    def freeze() -> float:
-        return moving.cell.signal(name, signal.SIGSTOP)
-
-    stop = moving.measure_stop(f"{name} frozen", freeze, move_again, record_property)
+    freeze = partial(moving.cell.signal, name, signal.SIGSTOP)
+    stop = moving.measure_stop(f"{name} frozen", freeze, partial(moving.move_again, name), record_property)
     time.sleep(max(stop.fault + 1.0 - time.monotonic(), 0.0))
     woken = moving.cell.signal(name, signal.SIGCONT)
     moving.cell.wait_for_diagnosis(woken, FROZEN[name])

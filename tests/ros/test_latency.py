@@ -22,5 +22,5 @@ def test_the_bench_measures_both_ways_in_through_real_nodes(processes: Processes
     assert [row["way"] for row in report["rows"]] == ["target to joint command", "hand to joint command"]
     for row in report["rows"]:
         assert row["steps"] >= 10
-        assert row["missed"] < row["steps"]
+        assert row["missed"] <= row["steps"] / 2
         assert 0.0 < report["transport_p50_ms"] < row["p50_ms"] <= row["p99_ms"] <= row["max_ms"]
