@@ -24,6 +24,7 @@ from trajectory_msgs.msg import JointTrajectory
 
 from q2r2_control.config import load_config
 from q2r2_control.errors import Q2R2Error
+from q2r2_control.ros.middleware import set_up_middleware
 from q2r2_control.ros.node import COMMAND_QOS, STREAM_QOS
 from q2r2_control.ros.node_set import NodeProcess
 from q2r2_control.ros.responses import LatencyReport, Recording, latency_report
@@ -173,16 +174,14 @@ def _private_domain() -> Iterator[None]:
     """Nothing of this reaches a robot that is on the network, nor the other way round."""
     with domain_coordinator.domain_id() as number:
         own = {"ROS_DOMAIN_ID": str(number), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
-        before = {name: os.environ.get(name) for name in own}
+        before = dict(os.environ)
         os.environ.update(own)
+        set_up_middleware(os.environ)
         try:
             yield
         finally:
-            for name, value in before.items():
-                if value is None:
-                    del os.environ[name]
-                else:
-                    os.environ[name] = value
+            os.environ.clear()
+            os.environ.update(before)
 
 
 @contextmanager

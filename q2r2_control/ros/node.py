@@ -25,6 +25,7 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 from std_msgs.msg import String
 
 from q2r2_control.errors import ConfigError, Q2R2Error
+from q2r2_control.ros.middleware import set_up_middleware
 
 # Commands: only the newest counts, and it has to arrive.
 COMMAND_QOS = QoSProfile(
@@ -151,9 +152,7 @@ def run_node(make: Callable[[], Node], args: Sequence[str] | None = None) -> int
     A fault of its configuration is one line on stderr and exit code 2. ``node.close()`` is called if there is one.
     """
     name = sys.argv[0].rsplit("/", 1)[-1]
-    # With shared memory a process that is killed or frozen while it writes holds up everybody who writes to it for a
-    # second, which is how long the middleware takes to find out. Whoever wants it all the same sets this.
-    os.environ.setdefault("FASTDDS_BUILTIN_TRANSPORTS", "UDPv4")
+    set_up_middleware(os.environ)
     try:
         rclpy.init(args=list(sys.argv if args is None else args), signal_handler_options=rclpy.SignalHandlerOptions.NO)
     except rclpy_implementation.RCLError as error:  # such as arguments that cannot be parsed

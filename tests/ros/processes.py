@@ -10,6 +10,8 @@ import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from q2r2_control.ros.middleware import set_up_middleware
+
 ROOT = Path(__file__).resolve().parents[2]
 PATIENCE = 30.0  # [s], for starting Python and finding each other on a busy machine
 
@@ -100,11 +102,16 @@ class Processes:
 
 
 def environment_of(domain: int, folder: Path) -> dict[str, str]:
-    """This process's environment with ROS confined to ``domain`` on this machine, and its logs to ``folder``."""
+    """This process's environment with ROS confined to ``domain`` on this machine, and its logs to ``folder``.
+
+    Test processes use the middleware as nodes do: one that is killed is to hold up nobody.
+    """
     paths = [str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]
-    return dict(os.environ) | {
+    environment = dict(os.environ) | {
         "ROS_DOMAIN_ID": str(domain),
         "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
         "ROS_LOG_DIR": str(folder),
         "PYTHONPATH": os.pathsep.join(paths),
     }
+    set_up_middleware(environment)
+    return environment

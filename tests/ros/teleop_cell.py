@@ -6,7 +6,6 @@ import json
 import os
 import signal
 import time
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -27,14 +26,6 @@ from tests.ros.waiting import eventually
 ARMS = ("left", "right")
 RATE = 100.0  # of the nodes: half of their own or less, since six processes share a test machine [Hz]
 MOVING = 0.2  # an arm that moves has a joint this fast [rad/s]
-# A killed process stays in the graph until its lease ends; 20 s, as they are by default, are long for a test.
-SHORT_LEASE = """<?xml version="1.0" encoding="UTF-8"?>
-<profiles xmlns="http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles">
-  <participant profile_name="short_lease" is_default_profile="true"><rtps><builtin><discovery_config>
-    <leaseDuration><sec>3</sec></leaseDuration><leaseAnnouncement><sec>1</sec></leaseAnnouncement>
-  </discovery_config></builtin></rtps></participant>
-</profiles>
-"""
 
 
 class Diagnosis(NamedTuple):
@@ -48,7 +39,7 @@ class Diagnosis(NamedTuple):
 class TeleopCell:
     """The nodes as processes, seen from a node of the test that only listens."""
 
-    def __init__(self, node: Any, robot: Robot, processes: Processes, folder: Path) -> None:
+    def __init__(self, node: Any, robot: Robot, processes: Processes) -> None:
         self.node, self.robot = node, robot
         self.joints = JointLog(robot.joint_names)
         self.commands: list[tuple[float, Array]] = []  # receipt [s] and joint positions [rad] asked for
@@ -56,8 +47,6 @@ class TeleopCell:
         self._states: dict[str, tuple[float, dict[str, Any]]] = {}
         self._processes = processes
         self._running: dict[str, RosProcess] = {}
-        self._lease = folder / "short_lease.xml"
-        self._lease.write_text(SHORT_LEASE)
         node.create_subscription(JointState, "/joint_states", self._on_joint_state, STREAM_QOS)
         node.create_subscription(JointTrajectory, "/joint_trajectory", self._on_command, COMMAND_QOS)
         node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 100)
@@ -70,9 +59,7 @@ class TeleopCell:
         given = [] if name == "tcp_endpoint" else [f"rate:={RATE}"]
         given += [f"config:={CONFIG}"] if name in ("mujoco_robot", "cartesian_controller") else []
         arguments = [part for parameter in (*given, *parameters) for part in ("-p", parameter)]
-        process = self._processes.start_module(
-            module, "--ros-args", *arguments, FASTRTPS_DEFAULT_PROFILES_FILE=str(self._lease)
-        )
+        process = self._processes.start_module(module, "--ros-args", *arguments)
         self._running[name] = process
         return process
 

@@ -154,7 +154,7 @@ def scene(domain: int, interfaces: None, tmp_path_factory: pytest.TempPathFactor
     folder = tmp_path_factory.mktemp("faults")
     processes = Processes(folder, os.environ)
     with spun_node(domain) as node:
-        cell = TeleopCell(node, Robot.from_config(load_config(CONFIG)), processes, folder)
+        cell = TeleopCell(node, Robot.from_config(load_config(CONFIG)), processes)
         try:
             for name in NODES[:-1]:
                 cell.start(name)

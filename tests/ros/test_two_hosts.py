@@ -23,12 +23,14 @@ pytest.importorskip("rclpy", reason=NEEDS_ROS)
 pytest.importorskip("quest2ros", reason="needs q2r2 ros build-interfaces")
 pytestmark = [pytest.mark.usefixtures("interfaces"), pytest.mark.alone]
 
+from q2r2_control.ros.middleware import set_up_middleware  # noqa: E402
 from tests.ros.joint_log import JointLog  # noqa: E402
 
 ARMS = ("left_q2r2_arm_controller", "right_q2r2_arm_controller")
 RATE = 100.0  # of the nodes, fewer than usual for a machine that plays two [Hz]
 # Discovery reaches the other host as it does on a real network, and no shared memory bypasses the cable.
-NETWORK = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET", "FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"}
+NETWORK = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET"}
+set_up_middleware(NETWORK)
 TIMEOUT, BRAKING, DELIVERY = 0.15, 10.0, 0.1  # [s], [rad/s^2], [s]
 STILL, FAST = 0.005, 1.5  # [rad], [rad/s]
 
