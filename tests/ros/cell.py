@@ -26,6 +26,8 @@ from tests.ros.processes import PATIENCE, Processes, RosProcess
 
 CONFIG = "config/dual_iiwa7.yaml"
 RATE = 100.0  # of targets [Hz]
+NODE_RATE = 125.0  # of those below, half of their own, since many processes share a test machine [Hz]
+BUSY = ("mujoco_robot", "cartesian_controller")
 STILL = 2e-3  # how far joints at rest may move [rad]
 # Longer than by default, so that a machine that is busy elsewhere does not look like a fault.
 PATIENT = ("-p", "joint_state_timeout:=0.5", "-p", "target_timeout:=0.5")
@@ -155,8 +157,8 @@ def call(node: Any, service: str, request: Any = None) -> Any:
 
 def start(processes: Processes, name: str, *arguments: str, **environment: str) -> RosProcess:
     """Start a node of the cell."""
-    module, config = f"q2r2_control.ros.{name}", f"config:={CONFIG}"
-    return processes.start_module(module, "--ros-args", "-p", config, *arguments, **environment)
+    given = parameters(f"config:={CONFIG}", *([f"rate:={NODE_RATE}"] if name in BUSY else []))
+    return processes.start_module(f"q2r2_control.ros.{name}", "--ros-args", *given, *arguments, **environment)
 
 
 def parameters(*given: str) -> list[str]:

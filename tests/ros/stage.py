@@ -54,9 +54,7 @@ class Stage:
             call(self.node, "/mujoco_robot/reset")
             self._made, self.phase = " ".join(given), ""
             arguments = parameters(f"config:={self._right_arm}", *given, *PATIENT_CONTROLLER)
-            self._controller = self._running.start_module(
-                "q2r2_control.ros.cartesian_controller", "--ros-args", *arguments, **environment
-            )
+            self._controller = start(self._running, "cartesian_controller", *arguments, **environment)
         else:
             call(self.node, "/cartesian_controller/stop")
             wait(lambda: self.phase == "stopped", "the built-in controller is stopped")
