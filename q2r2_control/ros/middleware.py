@@ -23,8 +23,8 @@ def set_up_middleware(environment: MutableMapping[str, str]) -> None:
     if _PROFILES_FILE in environment or _TRANSPORTS in environment:
         return
     if environment.get(_RANGE) != "LOCALHOST":
-        environment |= {_TRANSPORTS: "UDPv4", _PROFILES_FILE: str(_PROFILES / "subnet.xml")}
+        environment.update({_TRANSPORTS: "UDPv4", _PROFILES_FILE: str(_PROFILES / "subnet.xml")})
     elif not environment.get(_PEERS):
         # For this range ROS 2 adds shared memory itself, whatever the profile says. For the system's default it adds
         # nothing to it; nor would it static peers, so who names some keeps shared memory.
-        environment |= {_RANGE: "SYSTEM_DEFAULT", _PROFILES_FILE: str(_PROFILES / "localhost.xml")}
+        environment.update({_RANGE: "SYSTEM_DEFAULT", _PROFILES_FILE: str(_PROFILES / "localhost.xml")})

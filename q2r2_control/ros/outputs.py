@@ -15,7 +15,7 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from q2r2_control.robot.robot import Robot
 from q2r2_control.ros.messages import joint_state_message
-from q2r2_control.ros.node import SENT_COMMAND_QOS
+from q2r2_control.ros.watched_publisher import WatchedPublisher
 from q2r2_control.types import Array, Reference, RobotState
 
 # What makes a message of joint names, positions, velocities and the time [s] of the node's clock.
@@ -37,6 +37,13 @@ class Output(Protocol):
         """
         ...
 
+    def silence(self, now: float, astray: bool) -> str | None:
+        """One line where nobody takes the commands any more at ``now`` [s]; to be asked before each is sent.
+
+        Only doubted where the arms have gone ``astray`` from the reference: looking costs a message now and then.
+        """
+        ...
+
     @property
     def listeners(self) -> int:
         """How many take the commands, as far as is known."""
@@ -49,16 +56,21 @@ class Channel:
 
     names: list[str]
     joints: np.ndarray  # velocity indices in the robot's order
-    publisher: Any
+    publisher: WatchedPublisher
+
+    def send(self, message: Any, now: float) -> None:
+        """Publish a message, or leave it out where the one before is looked after."""
+        if not self.publisher.waits(now):
+            self.publisher.publish(message)
 
 
-def channels(node: Node, kind: type, topics: Mapping[str, str], robot: Robot) -> list[Channel]:
+def channels(node: Node, kind: type, topics: Mapping[str, str], robot: Robot, listener_timeout: float) -> list[Channel]:
     """A publisher for every topic; ``topics`` says for each arm which one carries its joints."""
     made = []
     for topic in dict.fromkeys(topics.values()):
         joints = joints_of(robot, (arm for arm, its in topics.items() if its == topic))
         names = [robot.joint_names[joint] for joint in joints]
-        made.append(Channel(names, joints, node.create_publisher(kind, topic, SENT_COMMAND_QOS)))
+        made.append(Channel(names, joints, WatchedPublisher(node, kind, topic, listener_timeout)))
     return made
 
 
@@ -76,6 +88,10 @@ class NoOutput:
     def send(self, reference: Reference, state: RobotState, dt: float, t: float, trusted: bool) -> None:
         """See :class:`Output`."""
 
+    def silence(self, now: float, astray: bool) -> str | None:
+        """See :class:`Output`."""
+        return None
+
     @property
     def listeners(self) -> int:
         """See :class:`Output`."""
@@ -83,32 +99,41 @@ class NoOutput:
 
 
 class ChannelOutput:
-    """What is sent on topics."""
+    """What is sent on topics. With ``doubts`` it is found out whether anybody takes it."""
 
-    def __init__(self, into: list[Channel]) -> None:
-        self._channels = into
+    def __init__(self, into: list[Channel], doubts: bool) -> None:
+        self._channels, self._doubts = into, doubts
 
     def activate(self, state: RobotState) -> None:
         """Nothing to begin."""
 
+    def silence(self, now: float, astray: bool) -> str | None:
+        """See :class:`Output`."""
+        publishers = [channel.publisher for channel in self._channels]
+        if not (self._doubts and astray):
+            for publisher in publishers:
+                publisher.begin(now)
+            return None
+        return next((line for publisher in publishers if (line := publisher.silence(now))), None)
+
     @property
     def listeners(self) -> int:
         """See :class:`Output`."""
-        return sum(channel.publisher.get_subscription_count() for channel in self._channels)
+        return sum(channel.publisher.listeners for channel in self._channels)
 
 
 class PositionOutput(ChannelOutput):
     """The reference's positions and velocities; what was measured does not matter."""
 
     def __init__(self, into: list[Channel], encode: Encode) -> None:
-        super().__init__(into)
+        super().__init__(into, doubts=True)
         self._encode = encode
 
     def send(self, reference: Reference, state: RobotState, dt: float, t: float, trusted: bool) -> None:
         """See :class:`Output`."""
         for channel in self._channels:
             message = self._encode(channel.names, reference.q[channel.joints], reference.v[channel.joints], t)
-            channel.publisher.publish(message)
+            channel.send(message, t)
 
 
 def as_trajectory(horizon: float) -> Encode:

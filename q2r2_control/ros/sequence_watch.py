@@ -1,6 +1,6 @@
 """Whether one publisher alone sends a stream, told by the numbers that every publisher gives its messages.
 
-The graph cannot tell: it counts a publisher that was killed for another 20 s.
+The graph cannot tell: it counts a publisher that was killed for seconds more.
 """
 
 from __future__ import annotations

@@ -22,10 +22,10 @@ from q2r2_control.ros.joint_watch import NONE_YET, JointWatch, WatchSettings
 from q2r2_control.ros.led_arms import LedArms
 from q2r2_control.ros.sequence_watch import SequenceWatch
 from q2r2_control.ros.target_stream import Origins, Refusal, StreamSettings, TargetStream
-from q2r2_control.types import Array, Reference, RobotState
+from q2r2_control.types import Reference, RobotState
 
 _REST = 1e-4  # of the reference [rad/s]
-_GREETING = 0.05  # more than arms lag behind the reference [rad]
+_LAG = 0.02, 0.05  # arms lag behind the reference by no more than this [rad], and this times its speed [s]
 
 
 class Phase(StrEnum):
@@ -60,7 +60,7 @@ class Supervisor:
         self._watch = JointWatch(robot.joint_names, robot.velocity_limit, watch, self._origins.joint_states)
         self._homing: Homing | None = None
         self._stopped: str | None = None  # why it takes a reset
-        self._q: Array | None = None  # of the reference [rad]
+        self._last: Reference | None = None
         self.phase = Phase.INACTIVE
         self.paused = False
         self.ceased: dict[str, str] = {}  # arms that hold since their targets ceased, with a line that says so
@@ -152,7 +152,7 @@ class Supervisor:
         if self.phase is Phase.ACTIVE:
             self._look(now)
         reference = self._step(self._targets(now, dt), dt)
-        self._q = reference.q
+        self._last = reference
         if self.phase is Phase.ACTIVE:
             self._compare(reference, now)
             self._look_home()
@@ -199,16 +199,21 @@ class Supervisor:
         self._brake(fault)
         self.phase = Phase.INACTIVE if self._stopped is None else Phase.STOPPED
 
-    def greet(self, now: float) -> None:
-        """Somebody new takes the commands: whoever moves the arms may have been gone, while the reference went on.
+    @property
+    def astray(self) -> bool:
+        """Whether the arms are farther from the reference than they lag behind it: maybe nobody moves them."""
+        if self.phase is not Phase.ACTIVE or self._last is None or self._watch.state is None:
+            return False
+        away = np.abs(self._watch.state.q - self._last.q).max()
+        return bool(away > _LAG[0] + _LAG[1] * np.abs(self._last.v).max())
 
-        Then nothing more is commanded, not even the way to rest, which would be a jump too.
+    def abandon(self, fault: str, now: float) -> None:
+        """Nobody takes the commands, or somebody else than before: whoever it is, the reference may have gone on.
+
+        Then nothing more is commanded, not even the way to rest, which would be a jump to who comes.
         """
-        state = self._watch.state
-        if self.phase is not Phase.ACTIVE or self._q is None or state is None:
-            return
-        if (away := float(np.abs(state.q - self._q).max())) > _GREETING:
-            self.start_over(f"somebody new takes the commands, and the arms are {away:.3f} rad from them", now)
+        if self.phase is Phase.ACTIVE:
+            self.start_over(fault, now)
             self.phase = Phase.INACTIVE
 
     def start_over(self, fault: str, now: float) -> None:

@@ -46,10 +46,14 @@ class Torques:
 
 
 class TorqueOutput(ChannelOutput):
-    """Float64MultiArray of torques in the order of the joints; gravity and Coriolis are in them."""
+    """Float64MultiArray of torques in the order of the joints; gravity and Coriolis are in them.
+
+    Arms that are pushed go astray by design, and a torque for where they are is no jump to whoever takes it next: so
+    nobody is doubted.
+    """
 
     def __init__(self, into: list[Channel], torques: Torques) -> None:
-        super().__init__(into)
+        super().__init__(into, doubts=False)
         self._torques = torques
 
     def activate(self, state: RobotState) -> None:
@@ -60,7 +64,7 @@ class TorqueOutput(ChannelOutput):
         """See :class:`Output`."""
         tau = self._torques.step(reference, state, dt, trusted)
         for channel in self._channels:
-            channel.publisher.publish(Float64MultiArray(data=tau[channel.joints].tolist()))
+            channel.send(Float64MultiArray(data=tau[channel.joints].tolist()), t)
 
 
 class LbrOutput(ChannelOutput):
@@ -77,7 +81,7 @@ class LbrOutput(ChannelOutput):
                     f"output: {channel.publisher.topic_name} carries {len(channel.names)} joints; an LBR has "
                     f"{LBR_JOINTS}, and each needs a topic of its own"
                 )
-        super().__init__(into)
+        super().__init__(into, doubts=torques is None)
         self._kind, self._torques = kind, torques
 
     def activate(self, state: RobotState) -> None:
@@ -89,12 +93,12 @@ class LbrOutput(ChannelOutput):
         """See :class:`Output`."""
         if self._torques is None:
             for channel in self._channels:
-                channel.publisher.publish(self._kind(joint_position=reference.q[channel.joints].tolist()))
+                channel.send(self._kind(joint_position=reference.q[channel.joints].tolist()), t)
             return
         overlay = self._torques.step(reference, state, dt, trusted) - self._torques.gravity(state)
         for channel in self._channels:
             q, tau = state.q[channel.joints].tolist(), overlay[channel.joints].tolist()
-            channel.publisher.publish(self._kind(joint_position=q, torque=tau))
+            channel.send(self._kind(joint_position=q, torque=tau), t)
 
 
 def lbr_message(name: str) -> Any:

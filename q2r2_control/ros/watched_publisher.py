@@ -1,4 +1,4 @@
-"""A publisher of targets that knows whether anybody still takes them."""
+"""A publisher of targets or commands that knows whether anybody still takes them."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _LOOK, _GAP = 0.05, 0.015
 class WatchedPublisher:
     """Finds out about a listener that was killed or hangs: it acknowledges nothing any more.
 
-    The graph keeps such a listener for 20 s. Meanwhile a hand moves on, and whoever is started in the listener's place
+    The graph keeps such a listener for seconds. Meanwhile a hand moves on, and whoever is started in the listener's place
     would be asked to be where the hand is by then. A stream that never was acknowledged is not judged, since what is
     left of a listener that ended before does not acknowledge either. Best-effort listeners never do, nor need to.
     """
@@ -40,9 +40,9 @@ class WatchedPublisher:
         """How many are known; some may be no more."""
         return int(self._publisher.get_subscription_count())
 
-    def begin(self) -> None:
-        """The next message begins a stream."""
-        self._streaming, self._acknowledged, self._gap_began = False, None, -math.inf
+    def begin(self, acknowledged: float | None = None) -> None:
+        """The next message begins a stream; given a time [s], what was sent before that is taken as acknowledged."""
+        self._streaming, self._acknowledged, self._gap_began = False, acknowledged, -math.inf
 
     def publish(self, message: Any) -> None:
         """Publish a message of the stream."""
@@ -65,4 +65,4 @@ class WatchedPublisher:
             self._acknowledged = now
         if self._acknowledged is None or now - self._acknowledged <= self._timeout:
             return None
-        return f"targets on {self.topic_name} are not acknowledged for {now - self._acknowledged:.2f} s"
+        return f"messages on {self.topic_name} are not acknowledged for {now - self._acknowledged:.2f} s"

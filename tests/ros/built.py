@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import sys
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -14,14 +16,17 @@ from q2r2_control.ros.build import Interfaces, build, missing_tools
 INTERFACES = Path(__file__).parent / "interfaces"
 
 
-def built(prefix: Path, *names: str) -> dict[str, str]:
-    """Variables for processes that import the packages ``names``, which are built into ``prefix``."""
+def built(folder: Path, *names: str) -> dict[str, str]:
+    """Variables for processes that import the packages ``names``, built into ``folder`` by whoever asks first."""
+    prefix = folder / "others"
     if missing := missing_tools(Path(sys.prefix)):
         pytest.skip(f"{', '.join(names)} cannot be built here: missing {'; '.join(missing)}")
-    with ThreadPoolExecutor() as pool:
-        builds = [pool.submit(build, Interfaces(INTERFACES / name), prefix, prefix / f"{name}.log") for name in names]
-    for each in builds:
-        each.result()
+    done = folder / "others.done"
+    with (folder / "others.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not done.exists():
+            _build(prefix, names)
+            done.touch()
     packages = prefix / "lib" / f"python{sys.version_info.major}.{sys.version_info.minor}" / "site-packages"
     added: dict[str, list[Path | str]] = {
         "AMENT_PREFIX_PATH": [prefix, sys.prefix],
@@ -29,3 +34,11 @@ def built(prefix: Path, *names: str) -> dict[str, str]:
         "LD_LIBRARY_PATH": [prefix / "lib"],
     }
     return {name: os.pathsep.join([*map(str, paths), os.environ.get(name, "")]) for name, paths in added.items()}
+
+
+def _build(prefix: Path, names: Sequence[str]) -> None:
+    prefix.mkdir(exist_ok=True)
+    with ThreadPoolExecutor() as pool:
+        builds = [pool.submit(build, Interfaces(INTERFACES / name), prefix, prefix / f"{name}.log") for name in names]
+    for each in builds:
+        each.result()

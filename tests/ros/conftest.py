@@ -58,8 +58,9 @@ def interfaces() -> None:
 
 @pytest.fixture(scope="session")
 def others(domain: int, tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
-    """Variables for processes that speak as MoveIt Servo and an LBR's driver do; built for the session."""
-    return built(tmp_path_factory.mktemp("others"), "moveit_msgs", "lbr_fri_idl")
+    """Variables for processes that speak as MoveIt Servo and an LBR's driver do; built once for all workers."""
+    folder = tmp_path_factory.getbasetemp()
+    return built(folder.parent if "PYTEST_XDIST_WORKER" in os.environ else folder, "moveit_msgs", "lbr_fri_idl")
 
 
 @pytest.fixture(scope="session")

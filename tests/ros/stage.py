@@ -27,7 +27,12 @@ from tests.ros.processes import PATIENCE, Processes, RosProcess
 from tests.ros.springs import STIFFNESS
 from tests.ros.stand_in import FASTEST, STALLED, Terms
 
-PATIENT_CONTROLLER = ("joint_state_timeout:=1.0", "target_timeout:=1.0", "deviation_time:=1.0")
+PATIENT_CONTROLLER = (
+    "joint_state_timeout:=1.0",
+    "target_timeout:=1.0",
+    "deviation_time:=2.0",
+    "listener_timeout:=0.5",
+)
 STILL = 2e-3  # how far a tool that stands still may move [m]
 NEAR = 5e-3  # where a tool has arrived [m]
 
@@ -107,12 +112,11 @@ class StandIn:
         return [line for life in self.lives for line in life.output.splitlines() if line.startswith("violation")]
 
 
-def act(stage: Stage, hands: Hands, stand_in: StandIn, guard: GuardSettings, joints: bool = False) -> None:
+def act(stage: Stage, hands: Hands, stand_in: StandIn, guard: GuardSettings) -> None:
     """All that happens to an operator: a pause, a hand that is lost, a controller that is started anew.
 
     A spring without overshoot moves the tool no faster than its target does, but for a fifth, nor more abruptly, but
-    for what the target makes up for when a busy machine has stalled. ``joints``: who listens to joint commands is not
-    missed before somebody comes in its place, so the operator pauses first.
+    for what the target makes up for when a busy machine has stalled.
     """
     motion = stage.motion
     made_up = STIFFNESS**2 * FASTEST * STALLED
@@ -137,13 +141,9 @@ def act(stage: Stage, hands: Hands, stand_in: StandIn, guard: GuardSettings, joi
     follows(stage, hands, (0.0, 0.0, 0.06))
     motion.assert_smooth(began, *limits)
 
-    if joints:
-        hands.pause()
-        motion.wait_for_rest()
     stand_in.kill()
-    if not joints:
-        hands.move((0.1, 0.0, 0.0), 0.3)  # who comes next is not to be asked to catch up with that
-        hands.wait_for_pause()
+    hands.move((0.1, 0.0, 0.0), 0.3)  # who comes next is not to be asked to catch up with that
+    hands.wait_for_pause()
     motion.wait_for_rest()
     with motion.standing_still(STILL, "its controller is started anew"):
         stand_in.start()

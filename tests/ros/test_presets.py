@@ -92,7 +92,7 @@ def test_a_controller_of_joints_is_led_by_the_built_in_one_within_its_rules(
     stand_in = StandIn(processes, terms, others)
     stand_in.start()
     with arms(stage, processes, name, {"right": "filtered"}, others) as hands:
-        act(stage, hands, stand_in, BUILTIN.guard, joints=True)
+        act(stage, hands, stand_in, BUILTIN.guard)
 
 
 class Sender:

@@ -188,7 +188,9 @@ def test_a_stream_that_was_dropped_is_not_taken_up_again_where_it_stands() -> No
     assert stream.offer(TOOL, TOOL, 0.02) is None
 
 
-def test_who_newly_takes_the_commands_is_asked_for_nothing_where_the_arms_are_not(world: World, robot: Robot) -> None:
+def test_where_nobody_moves_the_arms_they_go_astray_and_whoever_comes_is_asked_for_nothing_elsewhere(
+    world: World, robot: Robot
+) -> None:
     world.run(0.3)
     tool = robot.tool_pose(world.q, "left")
     world.run(0.1, tool)
@@ -197,7 +199,8 @@ def test_who_newly_takes_the_commands_is_asked_for_nothing_where_the_arms_are_no
     last = world.commanded[-1]
     assert last is not None
     assert 0.05 < np.abs(last - world.q).max() < 0.15
-    world.supervisor.greet(world.now)
+    assert world.supervisor.astray
+    world.supervisor.abandon("somebody new takes the commands", world.now)
     assert world.is_in(Phase.INACTIVE)
     began = len(world.commanded)
     world.run(0.5, raised(tool, 0.06))
@@ -206,10 +209,11 @@ def test_who_newly_takes_the_commands_is_asked_for_nothing_where_the_arms_are_no
     assert not world.supervisor.follows("left")
 
 
-def test_who_listens_besides_to_commands_that_the_arms_follow_changes_nothing(world: World, robot: Robot) -> None:
+def test_arms_that_follow_the_commands_are_never_astray(world: World, robot: Robot) -> None:
     world.run(0.3)
     tool = robot.tool_pose(world.q, "left")
     world.run(0.1, tool)
-    world.run(0.3, raised(tool, 0.06))
-    world.supervisor.greet(world.now)
+    for _ in range(60):
+        world.run(DT, raised(tool, 0.06))
+        assert not world.supervisor.astray
     assert world.supervisor.follows("left")

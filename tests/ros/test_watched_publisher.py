@@ -73,7 +73,7 @@ def test_a_listener_is_missed_when_it_hangs_and_never_while_it_lives(
     frozen = time.monotonic()
     silence = stream.run(10.0 * TIMEOUT)
     assert silence is not None
-    assert silence.startswith("targets on /watched are not acknowledged for 0.5")
+    assert silence.startswith("messages on /watched are not acknowledged for 0.5")
     assert time.monotonic() - frozen < 2.0 * TIMEOUT
     os.kill(listener.pid, signal.SIGCONT)
     eventually(lambda: publisher.silence(time.monotonic()) is None, "it is there again")
