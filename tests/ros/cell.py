@@ -30,7 +30,7 @@ NODE_RATE = 125.0  # of those below, half of their own, since many processes sha
 BUSY = ("mujoco_robot", "cartesian_controller")
 STILL = 2e-3  # how far joints at rest may move [rad]
 # Longer than by default, so that a machine that is busy elsewhere does not look like a fault.
-PATIENT = ("-p", "joint_state_timeout:=0.5", "-p", "target_timeout:=0.5")
+PATIENT = ("-p", "joint_state_timeout:=0.5", "-p", "target_timeout:=0.5", "-p", "listener_timeout:=1.0")
 
 
 @dataclass(frozen=True)

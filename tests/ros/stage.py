@@ -186,12 +186,14 @@ def start_arm(node: Any, processes: Processes, preset: str, arm: str, mode: str,
         "base_frame_id": f"{arm}_link_0",
         "world_frame_id": "world",
         "teleop.linked": False,
-        "teleop.gate.timeout": 1.0,
+        "teleop.gate.timeout": 0.5,
         "teleop.leash.distance": 0.0,  # a simulation that a busy machine holds up is no obstacle
-        "tool_timeout": 1.0,
+        "tool_timeout": 0.5,
         "link_timeout": 3.0,
         "listener_timeout": 0.5,
     }
+    if mode == "raw":
+        given["following_topic"] = f"{prefix}/following"  # of the stand-in, which says nothing of it
     arguments = parameters(*(f"{name}:={value}" for name, value in given.items()))
     start(processes, f"{arm}_arm_controller", *arguments, **environment)
     return rig

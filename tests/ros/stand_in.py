@@ -29,7 +29,7 @@ from trajectory_msgs.msg import JointTrajectory
 from tests.ros.springs import Springs
 
 ARMS = ("left", "right")
-FASTEST, FASTEST_TURN = 0.55, 2.2  # that a target may move [m/s], [rad/s]
+FASTEST = 0.55  # that a target may move, where nothing else is said [m/s]
 FASTEST_JOINT = 2.5  # that a joint's target may move [rad/s]
 LONGEST_GAP = 0.3  # that a busy machine may leave in a stream [s]
 SETTLED, SETTLED_TURN, SETTLED_JOINT = 0.004, 0.02, 0.02  # from a tool or a target that rests [m], [rad], [rad]
@@ -50,6 +50,8 @@ class Terms:
     longest_age: float = 0.5  # of a stamp; longer than 0.1 it is no rule, but a bound on our own delay [s]
     wrench: bool = False  # wants a zero one
     command_type: bool = False  # targets count after a call of switch_command_type with 2
+    fastest: float = FASTEST  # that a target may move [m/s]
+    fastest_turn: float = 2.2  # [rad/s]
 
 
 class Controller(Node):
@@ -123,14 +125,14 @@ class Controller(Node):
     def _step(self, target: pin.SE3, stamp: float) -> None:
         tool, last = self.springs.tool(self.arm), self._last
         gap = math.inf if last is None else max(stamp - last[1], 0.0)
-        faults = []
+        fastest, turning, faults = self.terms.fastest, self.terms.fastest_turn, []
         # A stream that begins, or begins again, does so at the tool.
         for before, period in ((None if last is None else last[0], gap), (tool if gap > LONGEST_GAP else None, 0.0)):
             if before is not None:
                 period = min(period, STALLED if gap > LONGEST_GAP else LONGEST_GAP)
                 way = math.dist(target.translation, before.translation)
                 turn = float(np.linalg.norm(pin.log3(before.rotation.T @ target.rotation)))
-                far = way > FASTEST * period + SETTLED or turn > FASTEST_TURN * period + SETTLED_TURN
+                far = way > fastest * period + SETTLED or turn > turning * period + SETTLED_TURN
                 faults.append(f"jump of {way:.4f} m, {turn:.3f} rad in {gap:.3f} s" if far else "")
         if all(faults):
             self._say(faults[0])

@@ -35,7 +35,7 @@ from tests.ros.stage import Stage, StandIn, act, arms  # noqa: E402
 from tests.ros.stand_in import Terms  # noqa: E402
 
 POSES = {
-    "builtin": Terms("target_frame", lowest_rate=20.0),
+    "builtin": Terms("target_frame", lowest_rate=20.0, fastest=3.3, fastest_turn=13.0),  # it has limits of its own
     "kuka_lbr_clik": Terms("target_frame"),
     "kuka_lbr_impedance": Terms("target_frame", lowest_rate=100.0, wrench=True),
     "fzi": Terms("target_frame"),
