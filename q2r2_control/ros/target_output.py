@@ -75,7 +75,7 @@ class TargetOutput:
         """One line on publishers that should not be there."""
         if self.others == 0:
             return None
-        return f"{self.others + 1} publishers of {self.topic}, allowed is one (one that was killed counts for some seconds)"
+        return f"{self.others + 1} publishers of {self.topic}, allowed is one (a killed one counts for some seconds)"
 
     @property
     def unheard(self) -> str | None:

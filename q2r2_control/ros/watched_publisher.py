@@ -19,8 +19,8 @@ _LOOK, _GAP = 0.05, 0.015
 class WatchedPublisher:
     """Finds out about a listener that was killed or hangs: it acknowledges nothing any more.
 
-    The graph keeps such a listener for seconds. Meanwhile a hand moves on, and whoever is started in the listener's place
-    would be asked to be where the hand is by then. A stream that never was acknowledged is not judged, since what is
+    The graph keeps such a listener for seconds. Meanwhile a hand moves on, and whoever is started in its place would be
+    asked to be where the hand is by then. A stream that never was acknowledged is not judged, since what is
     left of a listener that ended before does not acknowledge either. Best-effort listeners never do, nor need to.
     """
 
