@@ -17,6 +17,7 @@ import numpy as np
 from geometry_msgs.msg import TransformStamped
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, String
 from std_srvs.srv import Trigger
@@ -29,7 +30,7 @@ from q2r2_control.robot.compose import WORLD
 from q2r2_control.robot.robot import Robot
 from q2r2_control.ros.gripper_server import GripperServer, Stroke
 from q2r2_control.ros.messages import joint_state_message, seconds, transform_message
-from q2r2_control.ros.node import COMMAND_QOS, LATCHED_QOS, OK, WARN, BaseNode, run_node
+from q2r2_control.ros.node import LATCHED_QOS, OK, WARN, BaseNode, run_node
 from q2r2_control.ros.simulated_cell import JointSetpoint, SimulatedCell
 from q2r2_control.types import RobotState
 
@@ -79,13 +80,15 @@ class MujocoRobot(BaseNode):
         self._tf_static.publish(self._placed(fixed))
 
     def _make_subscriptions(self) -> None:
+        # Each arm may have a sender of its own, and the one's message is not to take the place of the other's.
+        commands = QoSProfile(depth=2 * len(self._robot.arms), reliability=ReliabilityPolicy.RELIABLE)
         for kind, topic, callback in (
             (JointTrajectory, "joint_trajectory", self._on_trajectory),
             (JointState, "joint_commands", self._on_joint_state),
             (Float64MultiArray, "position_commands", self._on_positions),
             (Float64MultiArray, "torque_commands", self._on_torques),
         ):
-            self.create_subscription(kind, topic, callback, COMMAND_QOS)
+            self.create_subscription(kind, topic, callback, commands)
 
     def _gripper(self, arm: str, stroke: Stroke) -> GripperServer:
         return GripperServer(

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import math
 import os
+import signal
 import time
 from collections.abc import Iterator
+from functools import partial
 from queue import Queue
 from typing import Any
 
@@ -133,6 +135,25 @@ def test_it_follows_positions_in_any_order_of_names_and_stays_where_they_end(
     before = cell.q
     time.sleep(0.3)
     assert np.abs(cell.q - before).max() < 1e-3
+
+
+def test_each_arm_may_have_a_sender_of_its_own_on_one_topic(cell: Cell, robot: Robot) -> None:
+    joints = {arm: robot.arms[arm].joints for arm in robot.arms}
+    senders = {arm: cell.node.create_publisher(JointTrajectory, "joint_trajectory", COMMAND_QOS) for arm in joints}
+    for sender in senders.values():
+        wait(sender.get_subscription_count, "commands are listened to")
+    for way in (0.02, 0.04, 0.02, 0.0, 0.02, 0.04):
+        goal = robot.home + way
+        os.kill(cell.processes[0].pid, signal.SIGSTOP)
+        for arm, its in joints.items():
+            senders[arm].publish(trajectory(robot, goal[its], tuple(robot.joint_names[joint] for joint in its)))
+        time.sleep(0.05)
+        os.kill(cell.processes[0].pid, signal.SIGCONT)  # both have arrived before either is taken
+        wait(partial(is_at, cell, goal), "both arms are there", 5.0)
+
+
+def is_at(cell: Cell, q: np.ndarray) -> bool:
+    return bool(np.abs(cell.q - q).max() < 5e-3)
 
 
 def test_commands_that_cannot_be_followed_move_nothing_and_are_reported_once(cell: Cell, robot: Robot) -> None:
