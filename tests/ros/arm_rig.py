@@ -20,7 +20,7 @@ from q2r2_control.ros.messages import pose_of, stamped_pose, transform_message
 from q2r2_control.ros.node import COMMAND_QOS, STREAM_QOS
 from tests.ros.processes import PATIENCE, Processes, RosProcess
 
-PERIOD = 0.01  # of the hand's messages and of /tf [s]
+PERIOD = 1.0 / 72.0  # of the hand's messages, as a Quest sends them, and of /tf [s]
 HAND = pin.SE3(pin.exp3(np.array([0.2, -0.4, 0.6])), np.array([0.3, 0.1, 1.0]))
 TOOL = pin.SE3(pin.exp3(np.array([3.0, 0.2, 0.1])), np.array([0.5, 0.25, 0.38]))
 # A busy machine must not look like a fault: only the tests of these timeouts leave them as they are.
