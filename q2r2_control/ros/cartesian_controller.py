@@ -87,7 +87,6 @@ class CartesianControllerNode(BaseNode):
             LedArms(robot, self._controller, led, streams, watch) if output == NONE else None,
         )
         self._reference: Reference | None = None
-        self._listeners = 0  # to the joint commands
         self._ticks, self._reported_at, self._last_tick = 0, time.monotonic(), self.now
         self._connect()
         self.get_logger().info(f"{config.name}: {', '.join(robot.arms)}; waits for joint states")
@@ -141,7 +140,9 @@ class CartesianControllerNode(BaseNode):
 
     def _advance(self, now: float, dt: float) -> None:
         began = time.monotonic()
-        self._look_who_listens(now)
+        # What the arms do not follow is nothing to ask of somebody who was not there before.
+        if fault := self._output.doubt(self._supervisor.astray):
+            self._supervisor.abandon(fault, now)
         was_active = self._supervisor.phase is Phase.ACTIVE
         reference, state = self._supervisor.tick(now, dt), self._joints.state
         if not was_active and self._supervisor.phase is Phase.ACTIVE and state is not None:
@@ -153,17 +154,6 @@ class CartesianControllerNode(BaseNode):
             self._reference = reference
             self._publish_safe_targets(now)
         self._tell_events()
-
-    def _look_who_listens(self, now: float) -> None:
-        """What the arms do not follow is nothing to ask of somebody who was not there before."""
-        listeners, self._listeners = self._listeners, self._output.listeners
-        astray = self._supervisor.astray
-        if fault := self._output.silence(now, astray):
-            self._supervisor.abandon(fault, now)
-        elif astray and self._listeners > listeners:
-            self._supervisor.abandon(
-                "somebody new takes the commands, and the arms are not where they ask them to be", now
-            )
 
     def _publish_safe_targets(self, now: float) -> None:
         for arm, publisher in self._safe_targets.items():

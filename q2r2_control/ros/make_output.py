@@ -49,8 +49,8 @@ def make_output(name: str, node: BaseNode, robot: Robot, config: Config, period:
     Raises :class:`ConfigError`.
     """
     topics = _topics(name, node, robot)
-    what = "who takes the commands of arms that do not follow is missed after [s]"
-    listener_timeout = node.parameter("listener_timeout", 0.15, what, at_least=0.05, at_most=5.0)
+    what = "arms that do not follow and whose joint positions nobody acknowledges are given up after [s]"
+    listener_timeout = node.parameter("listener_timeout", 0.15, what, at_least=0.1, at_most=5.0)
 
     def on(kind: type) -> list[Channel]:
         return channels(node, kind, topics, robot, listener_timeout)

@@ -37,16 +37,11 @@ class Output(Protocol):
         """
         ...
 
-    def silence(self, now: float, astray: bool) -> str | None:
-        """One line where nobody takes the commands any more at ``now`` [s]; to be asked before each is sent.
+    def doubt(self, astray: bool) -> str | None:
+        """One line where who took the commands is gone, or is not alone any more; to be asked before each is sent.
 
-        Only doubted where the arms have gone ``astray`` from the reference: looking costs a message now and then.
+        Only doubted where the arms are ``astray`` from the reference: looking costs a message now and then.
         """
-        ...
-
-    @property
-    def listeners(self) -> int:
-        """How many take the commands, as far as is known."""
         ...
 
 
@@ -58,9 +53,9 @@ class Channel:
     joints: np.ndarray  # velocity indices in the robot's order
     publisher: WatchedPublisher
 
-    def send(self, message: Any, now: float) -> None:
-        """Publish a message, or leave it out where the one before is looked after."""
-        if not self.publisher.waits(now):
+    def send(self, message: Any) -> None:
+        """Publish a message, or leave it out while the last one's acknowledgement is waited for."""
+        if not self.publisher.waits():
             self.publisher.publish(message)
 
 
@@ -88,14 +83,9 @@ class NoOutput:
     def send(self, reference: Reference, state: RobotState, dt: float, t: float, trusted: bool) -> None:
         """See :class:`Output`."""
 
-    def silence(self, now: float, astray: bool) -> str | None:
+    def doubt(self, astray: bool) -> str | None:
         """See :class:`Output`."""
         return None
-
-    @property
-    def listeners(self) -> int:
-        """See :class:`Output`."""
-        return 0
 
 
 class ChannelOutput:
@@ -103,23 +93,22 @@ class ChannelOutput:
 
     def __init__(self, into: list[Channel], doubts: bool) -> None:
         self._channels, self._doubts = into, doubts
+        self._listeners = 0
 
     def activate(self, state: RobotState) -> None:
         """Nothing to begin."""
 
-    def silence(self, now: float, astray: bool) -> str | None:
+    def doubt(self, astray: bool) -> str | None:
         """See :class:`Output`."""
         publishers = [channel.publisher for channel in self._channels]
+        before, self._listeners = self._listeners, sum(publisher.listeners for publisher in publishers)
         if not (self._doubts and astray):
             for publisher in publishers:
-                publisher.begin(now)
+                publisher.begin(acknowledged=True)
             return None
-        return next((line for publisher in publishers if (line := publisher.silence(now))), None)
-
-    @property
-    def listeners(self) -> int:
-        """See :class:`Output`."""
-        return sum(channel.publisher.listeners for channel in self._channels)
+        if self._listeners > before:
+            return "somebody new takes the commands, and the arms are not where these are"
+        return next((line for publisher in publishers if (line := publisher.silence())), None)
 
 
 class PositionOutput(ChannelOutput):
@@ -133,7 +122,7 @@ class PositionOutput(ChannelOutput):
         """See :class:`Output`."""
         for channel in self._channels:
             message = self._encode(channel.names, reference.q[channel.joints], reference.v[channel.joints], t)
-            channel.send(message, t)
+            channel.send(message)
 
 
 def as_trajectory(horizon: float) -> Encode:

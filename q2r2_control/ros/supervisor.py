@@ -25,7 +25,7 @@ from q2r2_control.ros.target_stream import Origins, Refusal, StreamSettings, Tar
 from q2r2_control.types import Reference, RobotState
 
 _REST = 1e-4  # of the reference [rad/s]
-_LAG = 0.02, 0.05  # arms lag behind the reference by no more than this [rad], and this times its speed [s]
+_ASTRAY, _STILL = 0.02, 0.05  # a joint that stands still is not where the reference is [rad], [rad/s]
 
 
 class Phase(StrEnum):
@@ -201,11 +201,11 @@ class Supervisor:
 
     @property
     def astray(self) -> bool:
-        """Whether the arms are farther from the reference than they lag behind it: maybe nobody moves them."""
-        if self.phase is not Phase.ACTIVE or self._last is None or self._watch.state is None:
+        """Whether a joint stands still elsewhere than in the reference: maybe nobody moves it. One that lags moves."""
+        state = self._watch.state
+        if self.phase is not Phase.ACTIVE or self._last is None or state is None:
             return False
-        away = np.abs(self._watch.state.q - self._last.q).max()
-        return bool(away > _LAG[0] + _LAG[1] * np.abs(self._last.v).max())
+        return bool(((np.abs(state.q - self._last.q) > _ASTRAY) & (np.abs(state.v) < _STILL)).any())
 
     def abandon(self, fault: str, now: float) -> None:
         """Nobody takes the commands, or somebody else than before: whoever it is, the reference may have gone on.
@@ -261,6 +261,7 @@ class Supervisor:
         if self._led is not None:
             self._led.begin()
         self._watch.accept()
+        self._last = None
         self.phase = Phase.ACTIVE
         self.events.append("active: the reference starts at the measured posture")
 

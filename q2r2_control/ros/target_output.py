@@ -102,7 +102,7 @@ class TargetOutput:
         restarted, self._restarted = self._restarted, False
         if restarted:
             return f"{self._controller} was started anew"
-        silence = self._publisher.silence(now) if self.following else None
+        silence = self._publisher.silence() if self.following else None
         if silence is not None:
             self.forget(now)  # it is gone, and whoever comes is not to be asked for a target of the past
             return f"{self._controller}: {silence}"
@@ -133,7 +133,7 @@ class TargetOutput:
         pose = self.guard.step(target, now)
         if pose is None or base is None or not (self.following or not self.guard.at_rest or self._holds(tool, now)):
             return None
-        if not (self.following and self._publisher.waits(now)):
+        if not (self.following and self._publisher.waits()):
             self._publisher.publish(stamped_pose(base.actInv(pose), self._frame, now))
             self.sent += 1
         return pose

@@ -64,7 +64,7 @@ class TorqueOutput(ChannelOutput):
         """See :class:`Output`."""
         tau = self._torques.step(reference, state, dt, trusted)
         for channel in self._channels:
-            channel.send(Float64MultiArray(data=tau[channel.joints].tolist()), t)
+            channel.send(Float64MultiArray(data=tau[channel.joints].tolist()))
 
 
 class LbrOutput(ChannelOutput):
@@ -93,12 +93,12 @@ class LbrOutput(ChannelOutput):
         """See :class:`Output`."""
         if self._torques is None:
             for channel in self._channels:
-                channel.send(self._kind(joint_position=reference.q[channel.joints].tolist()), t)
+                channel.send(self._kind(joint_position=reference.q[channel.joints].tolist()))
             return
         overlay = self._torques.step(reference, state, dt, trusted) - self._torques.gravity(state)
         for channel in self._channels:
             q, tau = state.q[channel.joints].tolist(), overlay[channel.joints].tolist()
-            channel.send(self._kind(joint_position=q, torque=tau), t)
+            channel.send(self._kind(joint_position=q, torque=tau))
 
 
 def lbr_message(name: str) -> Any:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from typing import Any
 
 from rclpy.duration import Duration
@@ -22,6 +23,7 @@ class WatchedPublisher:
     The graph keeps such a listener for seconds. Meanwhile a hand moves on, and whoever is started in its place would be
     asked to be where the hand is by then. A stream that never was acknowledged is not judged, since what is
     left of a listener that ended before does not acknowledge either. Best-effort listeners never do, nor need to.
+    Acknowledging takes real time, whatever time a simulation has.
     """
 
     def __init__(self, node: Node, kind: type, topic: str, timeout: float) -> None:
@@ -40,27 +42,30 @@ class WatchedPublisher:
         """How many are known; some may be no more."""
         return int(self._publisher.get_subscription_count())
 
-    def begin(self, acknowledged: float | None = None) -> None:
-        """The next message begins a stream; given a time [s], what was sent before that is taken as acknowledged."""
-        self._streaming, self._acknowledged, self._gap_began = False, acknowledged, -math.inf
+    def begin(self, acknowledged: bool = False) -> None:
+        """The next message begins a stream; where what was sent before is taken as ``acknowledged`` it is judged."""
+        self._streaming, self._gap_began = False, -math.inf
+        self._acknowledged = time.monotonic() if acknowledged else None
 
     def publish(self, message: Any) -> None:
         """Publish a message of the stream."""
         self._publisher.publish(message)
         self._streaming = True
 
-    def waits(self, now: float) -> bool:
-        """Whether the next message is better left out at ``now`` [s], so that the last one can be acknowledged."""
+    def waits(self) -> bool:
+        """Whether the next message is better left out, so that the last one can be acknowledged."""
+        now = time.monotonic()
         if not self._streaming or (self._acknowledged is not None and now - self._acknowledged < _LOOK):
             return False
         if now - self._gap_began >= _LOOK:
             self._gap_began = now
         return now - self._gap_began < _GAP
 
-    def silence(self, now: float) -> str | None:
-        """One line where nothing was acknowledged for too long at ``now`` [s]; to be asked before each message."""
+    def silence(self) -> str | None:
+        """One line where nothing was acknowledged for too long; to be asked before each message."""
         if not self._streaming:
             return None
+        now = time.monotonic()
         if self._publisher.wait_for_all_acked(_AT_ONCE):
             self._acknowledged = now
         if self._acknowledged is None or now - self._acknowledged <= self._timeout:

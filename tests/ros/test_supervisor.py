@@ -32,6 +32,7 @@ class World:
     def __init__(self, robot: Robot, controller: CartesianController) -> None:
         self.supervisor = Supervisor(robot, controller, StreamSettings(), WatchSettings())
         self.q, self.now, self.blocked = robot.home.copy(), 0.0, False
+        self.v, self.lag = np.zeros_like(self.q), DT  # [s]
         self.commanded: list[Array | None] = []
 
     def is_in(self, phase: Phase) -> bool:
@@ -46,13 +47,13 @@ class World:
         for _ in range(round(seconds / DT)):
             self.now += DT
             if sees:
-                self.supervisor.take_joint_state(RobotState(self.q, zero, zero, None, self.now), self.now)
+                self.supervisor.take_joint_state(RobotState(self.q, self.v, zero, None, self.now), self.now)
             if target is not None:
                 self.supervisor.take_target("left", target, self.now)
             reference = self.supervisor.tick(self.now, DT)
             self.commanded.append(None if reference is None else reference.q)
-            if reference is not None and not self.blocked:
-                self.q = reference.q
+            self.v = zero if reference is None or self.blocked else (reference.q - self.q) / self.lag
+            self.q = self.q + self.v * DT
 
 
 @pytest.fixture
@@ -209,11 +210,16 @@ def test_where_nobody_moves_the_arms_they_go_astray_and_whoever_comes_is_asked_f
     assert not world.supervisor.follows("left")
 
 
-def test_arms_that_follow_the_commands_are_never_astray(world: World, robot: Robot) -> None:
+def test_arms_that_lag_behind_the_commands_are_not_astray(world: World, robot: Robot) -> None:
     world.run(0.3)
     tool = robot.tool_pose(world.q, "left")
     world.run(0.1, tool)
-    for _ in range(60):
-        world.run(DT, raised(tool, 0.06))
+    world.lag = 0.06
+    deviation = 0.0
+    for _ in range(100):
+        world.run(DT, raised(tool, 0.1))
+        assert world.commanded[-1] is not None
+        deviation = max(deviation, float(np.abs(world.commanded[-1] - world.q).max()))
         assert not world.supervisor.astray
+    assert deviation > 0.03
     assert world.supervisor.follows("left")
