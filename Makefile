@@ -9,6 +9,7 @@ BIN    := $(VENV)/bin
 setup: $(VENV)/.installed
 
 # Reinstalled when the dependencies change; the package itself is editable, so code changes need nothing.
+# The control kernels are compiled here, a minute or two, so that no demo and no test waits for them.
 # ROS 2 is worth a line when it cannot be had, and no more: all but the nodes works without it.
 $(VENV)/.installed: pyproject.toml setup.py
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "q2r2_control needs Python 3.11 or newer: make PYTHON=python3.12 ...")'
@@ -18,6 +19,7 @@ $(VENV)/.installed: pyproject.toml setup.py
 		|| { echo 'No ROS 2 packages for this machine: going on without.'; \
 		     $(BIN)/python -m pip install --quiet --editable '.[dev]'; }
 	$(BIN)/q2r2 ros build-interfaces || true
+	$(BIN)/q2r2 run config/dual_iiwa7.yaml --mode torque --fast --headless --duration 0.1 > /dev/null
 	touch $@
 
 demo: setup
