@@ -1,7 +1,7 @@
 """How Fast DDS, the middleware that ROS 2 Jazzy comes with, is set up where the user has not done it.
 
 Shared memory is left out: a process that is killed while it holds a lock there holds up whoever writes to the same
-memory, and all who listen to him, for a second or more. And a node that ended without a word is out of the graph after
+memory, and all who listen to him, for about a second. And a node that ended without a word is out of the graph after
 3 s instead of 20, so that the one in its place does not count as a second one for longer. Each process says that for
 itself: those of others stay as long as they say.
 """
