@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from q2r2_control.config import load_config
+    from q2r2_control.config.control import ControllerSettings
     from q2r2_control.control.controller import CartesianController
-    from q2r2_control.control.settings import ControllerSettings
     from q2r2_control.errors import ConfigError, Q2R2Error
     from q2r2_control.pipeline import Pipeline
     from q2r2_control.robot.robot import Robot
-    from q2r2_control.summary import RunSummary
+    from q2r2_control.runtime.run_summary import RunSummary
     from q2r2_control.teleop.relative import RelativeMotion
 
 __all__ = [
@@ -34,12 +34,12 @@ __all__ = [
 _MODULES = {
     "CartesianController": "control.controller",
     "ConfigError": "errors",
-    "ControllerSettings": "control.settings",
+    "ControllerSettings": "config.control",
     "Pipeline": "pipeline",
     "Q2R2Error": "errors",
     "RelativeMotion": "teleop.relative",
     "Robot": "robot.robot",
-    "RunSummary": "summary",
+    "RunSummary": "runtime.run_summary",
     "load_config": "config",
 }
 

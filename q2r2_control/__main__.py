@@ -1,5 +1,5 @@
 """``python -m q2r2_control`` is the ``q2r2`` command."""
 
-from q2r2_control.cli import app
+from q2r2_control.cli.app import app
 
 app()

@@ -11,13 +11,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pinocchio as pin
 
-from q2r2_control.clock import LoopClock
+from q2r2_control.compliance.admittance import AdmittanceReport
+from q2r2_control.compliance.impedance import ImpedanceReport
+from q2r2_control.compliance.repulsion import WallReport
 from q2r2_control.config import Config
-from q2r2_control.control.admittance import AdmittanceReport
 from q2r2_control.control.controller import CartesianController
-from q2r2_control.control.impedance import ImpedanceReport
-from q2r2_control.control.wall import WallReport
-from q2r2_control.drive import drive_of
+from q2r2_control.drives.drive import drive_of
 from q2r2_control.errors import ConfigError
 from q2r2_control.inputs.base import Input
 from q2r2_control.inputs.headset import HeadsetServer
@@ -25,9 +24,10 @@ from q2r2_control.inputs.scripted import ScriptedInput
 from q2r2_control.plants.base import Plant
 from q2r2_control.plants.kinematic import KinematicPlant
 from q2r2_control.plants.mujoco import MujocoPlant
-from q2r2_control.process import few_garbage_collections, stop_on_signals
 from q2r2_control.robot.robot import Robot
-from q2r2_control.summary import RunStatistics, RunSummary
+from q2r2_control.runtime.loop_clock import LoopClock
+from q2r2_control.runtime.process import few_garbage_collections, stop_on_signals
+from q2r2_control.runtime.run_summary import RunStatistics, RunSummary
 from q2r2_control.teleop.arm import OPEN
 from q2r2_control.teleop.teleop import Teleop
 from q2r2_control.types import ArmTarget, CommandMode, HandSample, Reference, RobotState

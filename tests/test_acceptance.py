@@ -22,7 +22,7 @@ import pytest
 
 from q2r2_control.inputs.headset import HeadsetServer
 from q2r2_control.pipeline import Pipeline, Tick
-from q2r2_control.summary import RunSummary
+from q2r2_control.runtime.run_summary import RunSummary
 from q2r2_control.types import SIDES, Array, HandSample
 from tests.support.watch import Watch, cell, changes, speed
 

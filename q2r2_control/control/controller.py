@@ -8,15 +8,15 @@ from collections.abc import Mapping
 import numpy as np
 import pinocchio as pin
 
-from q2r2_control.control.assembly import assemble
-from q2r2_control.control.cell import cell_of
-from q2r2_control.control.commit import FOLLOWED, STOPPED, commit, first_look
-from q2r2_control.control.goals import GoalTracker
+from q2r2_control.config.control import ControllerSettings
 from q2r2_control.control.jit import hold
-from q2r2_control.control.limits import ACCELERATION, POSITION, VELOCITY
+from q2r2_control.control.kernel_data import Workspace
+from q2r2_control.control.kernel_model import cell_of
 from q2r2_control.control.qp import QpProblem, Solver, make_solver
-from q2r2_control.control.settings import ControllerSettings
-from q2r2_control.control.workspace import Workspace
+from q2r2_control.control.qp_assembly import assemble
+from q2r2_control.control.safety.joint_limits import ACCELERATION, POSITION, VELOCITY
+from q2r2_control.control.safety.safety_filter import FOLLOWED, STOPPED, commit, first_look
+from q2r2_control.control.targets import GoalTracker
 from q2r2_control.errors import RobotError
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, Reference, StepReport, StepStatus

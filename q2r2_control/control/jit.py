@@ -20,12 +20,14 @@ import numba
 from numba.core import types
 from numba.experimental import structref
 
+_ROOMS = ("control", "compliance")
 _COMPILED = re.compile(r"^@(lean_)?kernel|\bNamedTuple\b|\bstructref\b", re.MULTILINE)
 
 
 def compiled_sources() -> list[Path]:
     """Files that hold kernels or the types of their arguments; they take constants from no other file."""
-    sources = sorted(Path(__file__).parent.glob("*.py"))
+    package = Path(__file__).parents[1]
+    sources = sorted(source for room in _ROOMS for source in (package / room).rglob("*.py"))
     return [source for source in sources if _COMPILED.search(source.read_text(encoding="utf-8"))]
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from q2r2_control.config import Config, MujocoConfig
+from q2r2_control.config.cell import Config, MujocoConfig
 from q2r2_control.errors import PlantError
 from q2r2_control.plants.scene import COLLISION_GROUP, ENVELOPE_GROUP, VISUAL_GROUP, furnish
 from q2r2_control.robot.pairs import link_of, pair_names

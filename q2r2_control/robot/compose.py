@@ -13,7 +13,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from q2r2_control.config import ArmConfig, Config, ObstacleConfig, PoseConfig
+from q2r2_control.config.cell import ArmConfig, Config, ObstacleConfig, PoseConfig
 from q2r2_control.errors import ConfigError, Q2R2Error
 from q2r2_control.robot.description import Description, LinkTree, joint_limits, load_description, parse_srdf
 from q2r2_control.robot.pairs import exclusions_of_file

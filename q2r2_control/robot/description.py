@@ -13,8 +13,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from q2r2_control.config.resources import find_resource
 from q2r2_control.errors import ConfigError, RobotError
-from q2r2_control.resources import find_resource
 
 EXAMPLE_ROBOT_DATA = "example-robot-data:"
 

@@ -9,8 +9,8 @@ from itertools import combinations
 import numpy as np
 import pinocchio as pin
 
+from q2r2_control.config.resources import find_resource
 from q2r2_control.errors import ConfigError, RobotError
-from q2r2_control.resources import find_resource
 from q2r2_control.robot.description import LinkTree, joint_end, parse_srdf
 from q2r2_control.types import Array
 

@@ -7,12 +7,12 @@ from enum import StrEnum
 import numpy as np
 import pinocchio as pin
 
+from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.teleop.buttons import ButtonArbiter, Press
 from q2r2_control.teleop.filters import PoseFilter
 from q2r2_control.teleop.gate import PoseGate
 from q2r2_control.teleop.leash import Leash
 from q2r2_control.teleop.relative import RelativeMotion
-from q2r2_control.teleop.settings import TeleopSettings
 from q2r2_control.types import Event, HandSample
 
 OPEN, CLOSED = 1.0, 0.0

@@ -15,7 +15,7 @@ from collections import deque
 import numpy as np
 import pinocchio as pin
 
-from q2r2_control.teleop.settings import FilterSettings
+from q2r2_control.config.teleop import FilterSettings
 from q2r2_control.types import Array
 
 # Closer samples are merged: over so short a time receipt jitter would look like speed [s].

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pinocchio as pin
 
-from q2r2_control.teleop.settings import GateSettings
+from q2r2_control.config.teleop import GateSettings
 from q2r2_control.types import Array, HandSample
 
 # Beyond this, doubles no longer resolve a tenth of a nanometre, and no tracking system reaches as far [m].

@@ -6,24 +6,13 @@ import math
 
 import numpy as np
 import pinocchio as pin
-from pydantic import BaseModel, ConfigDict, Field
 
+from q2r2_control.config.teleop import GuardSettings
 from q2r2_control.types import Array
 
 # A step that is longer moves the target no farther: a loop that stalled has nothing to make up for [s].
 _LONGEST_DT = 0.1
 _REST = 1e-9  # slower than this is at rest [m/s, rad/s]
-
-
-class GuardSettings(BaseModel):
-    """How fast a target may move, whatever the hand does."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-    max_velocity: float = Field(0.5, gt=0, le=5, description="of the target's position [m/s]")
-    max_acceleration: float = Field(5.0, gt=0, le=100, description="of the target's position [m/s^2]")
-    max_angular_velocity: float = Field(2.0, gt=0, le=20, description="of the target's rotation [rad/s]")
-    max_angular_acceleration: float = Field(20.0, gt=0, le=400, description="of the target's rotation [rad/s^2]")
 
 
 class TargetGuard:

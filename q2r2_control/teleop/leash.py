@@ -25,8 +25,8 @@ from typing import NamedTuple
 import numpy as np
 import pinocchio as pin
 
+from q2r2_control.config.teleop import LeashSettings
 from q2r2_control.teleop.relative import RelativeMotion
-from q2r2_control.teleop.settings import LeashSettings
 from q2r2_control.types import Array
 
 # The way back that drops the slack: more than tremor of 0.2 mm and 0.2 degrees to either side, and noise.

@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 
 import pinocchio as pin
 
+from q2r2_control.config.teleop import Stance, TeleopSettings
 from q2r2_control.teleop.arm import ArmState, ArmTeleop
-from q2r2_control.teleop.settings import Stance, TeleopSettings
 from q2r2_control.types import ArmTarget, Event, HandSample
 
 

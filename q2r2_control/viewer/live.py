@@ -13,10 +13,10 @@ from rich.live import Live
 from rich.markup import escape
 from rich.table import Table
 
-from q2r2_control.headset_check import HeadsetCheck
+from q2r2_control.cli.tables import headset_table
+from q2r2_control.inputs.headset_check import HeadsetCheck
 from q2r2_control.pipeline import Tick
 from q2r2_control.viewer.history import tracking_error
-from q2r2_control.viewer.tables import headset_table
 
 _REFRESH_RATE = 6.0  # [Hz]
 # The drawing thread gives the interpreter back to the control loop after this long [s].

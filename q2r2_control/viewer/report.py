@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from q2r2_control.summary import RunSummary
+from q2r2_control.runtime.run_summary import RunSummary
 from q2r2_control.types import Array
 from q2r2_control.viewer.history import History
 

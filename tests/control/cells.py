@@ -8,8 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from q2r2_control.config import Config, load_config
-from q2r2_control.control.chain import Chain, Placements, chain_of, place
-from q2r2_control.control.collision import (
+from q2r2_control.control.geometry.collision import (
     Bodies,
     Contact,
     Pairs,
@@ -20,6 +19,7 @@ from q2r2_control.control.collision import (
     pairs_of,
     pose_bodies,
 )
+from q2r2_control.control.geometry.kinematics import Chain, Placements, chain_of, place
 from q2r2_control.control.jit import kernel
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array

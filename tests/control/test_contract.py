@@ -10,9 +10,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from q2r2_control.config.control import ControllerSettings
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.control.qp import make_solver
-from q2r2_control.control.settings import ControllerSettings
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, StepStatus
 from tests.control.contract import Contract

@@ -17,11 +17,11 @@ from q2r2_control.types import Array
 @pytest.fixture
 def sources(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A copy of the package's sources that the cache folder is named after."""
-    copy = tmp_path / "control"
-    copy.mkdir()
-    for source in Path(jit.__file__).parent.glob("*.py"):
-        shutil.copy(source, copy)
-    monkeypatch.setattr(jit, "__file__", str(copy / "jit.py"))
+    package = Path(jit.__file__).parents[1]
+    copy = tmp_path / "package"
+    for room in ("control", "compliance"):
+        shutil.copytree(package / room, copy / room, ignore=shutil.ignore_patterns("__pycache__"))
+    monkeypatch.setattr(jit, "__file__", str(copy / "control" / "jit.py"))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     return copy
 
@@ -32,26 +32,41 @@ def test_the_same_sources_share_a_cache_folder(sources: Path) -> None:
     assert folder.parent == sources.parent / "cache" / "q2r2_control"
 
 
-@pytest.mark.parametrize("name", ["geometry.py", "braking.py", "workspace.py", "jit.py"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "control/geometry/closest_points.py",
+        "control/safety/stop_certificate.py",
+        "control/kernel_data.py",
+        "control/jit.py",
+        "compliance/impedance_kernels.py",
+    ],
+)
 def test_an_edit_of_a_compiled_source_leaves_yesterdays_machine_code_behind(sources: Path, name: str) -> None:
     before = jit._cache_folder()
     (sources / name).write_text((sources / name).read_text() + "# edited\n")
     edited = jit._cache_folder()
-    (sources / "new_module.py").write_text("@kernel\ndef one() -> float:\n    return 1.0\n")
+    (sources / "control" / "tasks" / "new_module.py").write_text("@kernel\ndef one() -> float:\n    return 1.0\n")
     assert len({before, edited, jit._cache_folder()}) == 3
 
 
 def test_an_edit_of_a_source_without_kernels_compiles_nothing(sources: Path) -> None:
     before = jit._cache_folder()
-    (sources / "controller.py").write_text("value = 1\n")
+    (sources / "control" / "controller.py").write_text("value = 1\n")
     assert jit._cache_folder() == before
 
 
-@pytest.mark.parametrize("source", jit.compiled_sources(), ids=lambda source: source.stem)
+def name_of(source: Path) -> str:
+    """Dotted name of a module of the package."""
+    parts = source.relative_to(Path(jit.__file__).parents[2]).with_suffix("").parts
+    return ".".join(parts)
+
+
+@pytest.mark.parametrize("source", jit.compiled_sources(), ids=name_of)
 def test_what_a_kernel_uses_is_covered_by_the_name_of_the_cache(source: Path) -> None:
-    covered = {f"q2r2_control.control.{path.stem}" for path in jit.compiled_sources()}
+    covered = {name_of(path) for path in jit.compiled_sources()}
     # Types only: no constant of theirs enters a kernel.
-    harmless = {"q2r2_control.types", "q2r2_control.errors", "q2r2_control.control.settings"}
+    harmless = {"q2r2_control.types", "q2r2_control.errors", "q2r2_control.config.control"}
     imported = {
         node.module
         for node in ast.walk(ast.parse(source.read_text(encoding="utf-8")))
@@ -74,7 +89,9 @@ def test_kernels_run_where_no_cache_can_be_written(tmp_path: Path) -> None:
     occupied = tmp_path / "a_file"
     occupied.write_text("")
     program = (
-        "import numpy as np\nfrom q2r2_control.control.geometry import dot\nprint(dot(np.ones(3), np.full(3, 2.0)))\n"
+        "import numpy as np\n"
+        "from q2r2_control.control.geometry.closest_points import dot\n"
+        "print(dot(np.ones(3), np.full(3, 2.0)))\n"
     )
     done = subprocess.run(
         [sys.executable, "-c", program],

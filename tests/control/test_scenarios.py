@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 from q2r2_control.config import Config, load_config
+from q2r2_control.config.control import ControllerSettings
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.control.qp import QpProblem, QpSolution, Solver, make_solver
-from q2r2_control.control.settings import ControllerSettings
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, StepStatus
 from tests.control.contract import Contract

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from q2r2_control.config import Config, MujocoConfig, ObjectConfig
+from q2r2_control.config.cell import Config, MujocoConfig, ObjectConfig
 from q2r2_control.errors import PlantError
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.plants.mujoco_model import build_model

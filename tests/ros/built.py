@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from q2r2_control.ros.build import Interfaces, build, missing_tools
+from q2r2_control.ros.launch.build import Interfaces, build, missing_tools
 
 INTERFACES = Path(__file__).parent / "interfaces"
 

@@ -16,8 +16,8 @@ from typing import Any
 import pytest
 
 from q2r2_control import CartesianController, Robot, load_config
-from q2r2_control.control.impedance import ImpedanceController
-from q2r2_control.ros.build import interface_packages, missing_tools
+from q2r2_control.compliance.impedance import ImpedanceController
+from q2r2_control.ros.launch.build import interface_packages, missing_tools
 from tests.ros.built import built
 from tests.ros.processes import Processes, environment_of
 

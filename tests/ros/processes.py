@@ -10,7 +10,7 @@ import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from q2r2_control.ros.middleware import set_up_middleware
+from q2r2_control.ros.launch.middleware import set_up_middleware
 
 ROOT = Path(__file__).resolve().parents[2]
 PATIENCE = 30.0  # [s], for starting Python and finding each other on a busy machine

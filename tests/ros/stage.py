@@ -16,8 +16,8 @@ import numpy as np
 from std_msgs.msg import String
 
 from q2r2_control import Robot
-from q2r2_control.teleop.guard import GuardSettings
-from q2r2_control.teleop.presets import PRESETS
+from q2r2_control.config.presets import PRESETS
+from q2r2_control.config.teleop import GuardSettings
 from tests.ros.arm_rig import ArmRig
 from tests.ros.cell import call, parameters, start, wait
 from tests.ros.conftest import spun_node

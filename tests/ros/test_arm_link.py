@@ -14,7 +14,7 @@ from tests.ros.waiting import eventually
 
 pytest.importorskip("rclpy", reason=NEEDS_ROS)
 
-from q2r2_control.ros.arm_link import ArmLink
+from q2r2_control.ros.monitoring.arm_link import ArmLink
 
 TIMEOUT = 1.0  # a busy machine must not look like silence [s]
 MEANWHILE = 0.3  # time for several signs of life [s]

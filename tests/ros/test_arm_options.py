@@ -19,7 +19,7 @@ pytest.importorskip("quest2ros", reason="needs q2r2 ros build-interfaces")
 pytestmark = pytest.mark.usefixtures("interfaces")
 
 from q2r2_control.errors import ConfigError  # noqa: E402
-from q2r2_control.ros.messages import stamped_pose  # noqa: E402
+from q2r2_control.ros.bridge.messages import stamped_pose  # noqa: E402
 from tests.ros.arm_rig import TOOL, ArmRig, assert_same, first, offset  # noqa: E402
 
 
@@ -53,7 +53,7 @@ def test_a_cells_yaml_gives_stance_and_scale_and_parameters_change_them(
 
 
 def test_a_cells_yaml_names_the_external_controller_and_parameters_change_that(context: Any, tmp_path: Path) -> None:
-    from q2r2_control.ros.right_arm_controller import RightArmController
+    from q2r2_control.ros.nodes.right_arm_controller import RightArmController
 
     cell = external()
     cell["external"] |= {"preset": "fzi", "rate": 60.0, "limits": {"max_velocity": 0.2}}

@@ -19,7 +19,7 @@ pytest.importorskip("quest2ros", reason="needs q2r2 ros build-interfaces")
 pytestmark = pytest.mark.usefixtures("interfaces")
 
 from q2r2_control.errors import ConfigError  # noqa: E402
-from q2r2_control.ros.messages import pose_of  # noqa: E402
+from q2r2_control.ros.bridge.messages import pose_of  # noqa: E402
 from tests.ros.arm_rig import TOOL, ArmRig, assert_same, first, offset, stamped_transform, steps  # noqa: E402
 
 
@@ -181,7 +181,7 @@ def test_a_subclass_with_other_names_works_in_its_robots_frame(node: Any, proces
     from tf2_msgs.msg import TFMessage
     from visualization_msgs.msg import Marker
 
-    from q2r2_control.ros.node import LATCHED_QOS
+    from q2r2_control.ros.bridge.base_node import LATCHED_QOS
 
     base = pin.SE3(pin.exp3(np.array([0.0, 0.0, 1.2])), np.array([0.1, -0.4, 0.3]))
     static = node.create_publisher(TFMessage, "/tf_static", LATCHED_QOS)
@@ -265,7 +265,7 @@ BAD_PARAMETERS = {
 
 @pytest.mark.parametrize("given", BAD_PARAMETERS)
 def test_a_bad_parameter_is_refused_with_one_line(given: str, context: Any) -> None:
-    from q2r2_control.ros.left_arm_controller import LeftArmController
+    from q2r2_control.ros.nodes.left_arm_controller import LeftArmController
 
     with pytest.raises(ConfigError) as error:
         LeftArmController(context=context, cli_args=["--ros-args", "-p", given])
@@ -274,6 +274,6 @@ def test_a_bad_parameter_is_refused_with_one_line(given: str, context: Any) -> N
 
 
 def test_a_node_with_a_bad_parameter_ends_with_that_line(processes: Processes) -> None:
-    process = processes.start_module("q2r2_control.ros.left_arm_controller", "--ros-args", "-p", "mode:=direct")
+    process = processes.start_module("q2r2_control.ros.nodes.left_arm_controller", "--ros-args", "-p", "mode:=direct")
     assert process.wait() == 2
     assert process.output == "left_arm_controller.py: mode = 'direct': allowed are raw, filtered\n"

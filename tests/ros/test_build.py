@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from q2r2_control.ros.build import INTERFACES, BuildError, Interfaces, build, interface_packages, missing_tools
+from q2r2_control.ros.launch.build import INTERFACES, BuildError, Interfaces, build, interface_packages, missing_tools
 from tests.ros.conftest import NEEDS_ROS
 from tests.ros.processes import ROOT
 

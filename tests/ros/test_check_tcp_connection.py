@@ -16,7 +16,7 @@ from tests.ros.waiting import States, eventually
 pytest.importorskip("rclpy", reason=NEEDS_ROS)
 pytestmark = pytest.mark.usefixtures("interfaces")
 
-MODULE = "q2r2_control.ros.check_tcp_connection"
+MODULE = "q2r2_control.ros.nodes.check_tcp_connection"
 # Two start at once and run for a time of their own, twice what it may take until all have found each other.
 LONG = 3.0 * PATIENCE
 

@@ -71,7 +71,7 @@ def test_the_command_starts_from_where_ros_looks_for_executables(workspace: Path
 
 
 def test_code_settings_and_robots_are_those_of_the_install_tree(workspace: Path) -> None:
-    script = "import q2r2_control.resources as r; print(r.__file__); print(r.find_resource('robots/iiwa7.urdf'))"
+    script = "import q2r2_control.config.resources as r; print(r.__file__); print(r.find_resource('robots/iiwa7.urdf'))"
     code, robot = in_workspace(workspace, f'"{sys.executable}" -c "{script}"').splitlines()
     assert Path(code).is_relative_to(installed(workspace) / "lib")
     assert Path(robot) == installed(workspace) / "share" / "q2r2_control" / "robots" / "iiwa7.urdf"

@@ -15,7 +15,7 @@ pytest.importorskip("tf2_msgs", reason="needs q2r2 ros build-interfaces")
 pytest.importorskip("quest2ros", reason="needs q2r2 ros build-interfaces")
 
 
-from q2r2_control.ros.frames import FrameTree
+from q2r2_control.ros.bridge.frames import FrameTree
 from tests.ros.arm_rig import stamped_transform
 
 A = pin.SE3(pin.exp3(np.array([0.3, -1.0, 0.2])), np.array([1.0, 2.0, -0.5]))

@@ -115,7 +115,7 @@ def test_elbows_may_swing_while_the_tools_stay_until_what_is_measured_comes_too_
     safe: list[PoseStamped] = []
     node.create_subscription(PoseStamped, "/cartesian_controller/safe_target/left", safe.append, 10)
     controller = processes.start_module(
-        "q2r2_control.ros.cartesian_controller",
+        "q2r2_control.ros.nodes.cartesian_controller",
         *("--ros-args", "-p", f"config:={config}", "-p", "output:=none"),
         *("-p", f"distance_tolerance:={TOLERANCE}", "-p", "joint_state_timeout:=0.5"),
     )

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from q2r2_control.ros.middleware import set_up_middleware
+from q2r2_control.ros.launch.middleware import set_up_middleware
 from tests.ros.conftest import NEEDS_ROS
 from tests.ros.processes import Processes
 from tests.ros.waiting import eventually

@@ -30,7 +30,7 @@ from std_msgs.msg import Float64MultiArray, String
 from tf2_msgs.msg import TFMessage
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from q2r2_control.ros.node import COMMAND_QOS, LATCHED_QOS
+from q2r2_control.ros.bridge.base_node import COMMAND_QOS, LATCHED_QOS
 from tests.ros.cell import CONFIG, Cell, wait
 
 FINGERS = tuple(f"{side}_finger_joint_{number}" for side in ("left", "right") for number in (1, 2))
@@ -49,7 +49,7 @@ def started(domain: int, robot: Robot, tmp_path_factory: pytest.TempPathFactory)
         cell = Cell(
             node,
             robot,
-            processes.start_module("q2r2_control.ros.mujoco_robot", "--ros-args", "-p", f"config:={CONFIG}"),
+            processes.start_module("q2r2_control.ros.nodes.mujoco_robot", "--ros-args", "-p", f"config:={CONFIG}"),
         )
         try:
             wait(lambda: cell.measured, "joint states come")

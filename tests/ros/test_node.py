@@ -26,7 +26,7 @@ def test_a_node_in_simulated_time_says_that_no_clock_comes_until_one_does_and_wh
     node.create_subscription(DiagnosticArray, "/diagnostics", lambda message: diagnostics.extend(message.status), 10)
     states = States(node, "simulation_input")
     processes.start_module(
-        "q2r2_control.ros.simulation_input", "--ros-args", "-p", "use_sim_time:=true", "-p", "side:=left"
+        "q2r2_control.ros.nodes.simulation_input", "--ros-args", "-p", "use_sim_time:=true", "-p", "side:=left"
     )
     state = states.wait_for("use_sim_time is set and nothing comes on /clock; waits for a subscriber of the left hand")
     assert state["level"] == "warn"

@@ -17,9 +17,9 @@ import pytest
 import yaml
 
 from q2r2_control import Robot, load_config
+from q2r2_control.config.presets import BUILTIN, PRESETS, Mode, preset_of
+from q2r2_control.config.resources import find_resource
 from q2r2_control.errors import ConfigError
-from q2r2_control.resources import find_resource
-from q2r2_control.teleop.presets import BUILTIN, PRESETS, Mode, preset_of
 from tests.ros.conftest import NEEDS_ROS, spun_node
 from tests.ros.processes import PATIENCE, Processes
 
@@ -29,7 +29,7 @@ pytestmark = pytest.mark.usefixtures("interfaces")
 
 from geometry_msgs.msg import PoseStamped  # noqa: E402
 
-from q2r2_control.ros.messages import stamped_pose  # noqa: E402
+from q2r2_control.ros.bridge.messages import stamped_pose  # noqa: E402
 from tests.ros.cell import CONFIG  # noqa: E402
 from tests.ros.stage import Stage, StandIn, act, arms  # noqa: E402
 from tests.ros.stand_in import Terms  # noqa: E402

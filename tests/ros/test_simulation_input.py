@@ -18,7 +18,7 @@ from tests.ros.waiting import States, drained, eventually
 pytest.importorskip("rclpy", reason=NEEDS_ROS)
 pytestmark = pytest.mark.usefixtures("interfaces")
 
-MODULE = "q2r2_control.ros.simulation_input"
+MODULE = "q2r2_control.ros.nodes.simulation_input"
 RATE = 50.0  # [Hz]
 
 

@@ -12,7 +12,7 @@ from tests.ros.conftest import NEEDS_ROS
 
 pytest.importorskip("rclpy", reason=NEEDS_ROS)
 
-from q2r2_control.ros.torque_outputs import Torques
+from q2r2_control.ros.bridge.torque_outputs import Torques
 
 DT = 0.004
 

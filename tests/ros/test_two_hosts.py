@@ -23,7 +23,7 @@ pytest.importorskip("rclpy", reason=NEEDS_ROS)
 pytest.importorskip("quest2ros", reason="needs q2r2 ros build-interfaces")
 pytestmark = [pytest.mark.usefixtures("interfaces"), pytest.mark.alone]
 
-from q2r2_control.ros.middleware import set_up_middleware  # noqa: E402
+from q2r2_control.ros.launch.middleware import set_up_middleware  # noqa: E402
 from tests.ros.joint_log import JointLog  # noqa: E402
 
 ARMS = ("left_q2r2_arm_controller", "right_q2r2_arm_controller")
@@ -70,7 +70,7 @@ class Hosts:
         """Start the script, and with it press, until both arms move: a busy machine may look like a fault."""
         arms = [arm.joints for arm in self.robot.arms.values()]
         for _ in range(5):
-            script = self.start("operator", "q2r2_control.ros.simulation_input")
+            script = self.start("operator", "q2r2_control.ros.nodes.simulation_input")
             deadline = time.monotonic() + 10.0
             while time.monotonic() < deadline:
                 if all(self.joints.speeds(0.05)[joints].max() > 0.15 for joints in arms):

@@ -7,9 +7,9 @@ from collections.abc import Iterator
 import numpy as np
 import pinocchio as pin
 
-from q2r2_control.control.compliance import pose_error
-from q2r2_control.control.impedance import ImpedanceController, TorqueCommand
-from q2r2_control.control.settings import ImpedanceSettings
+from q2r2_control.compliance.impedance import ImpedanceController, TorqueCommand
+from q2r2_control.compliance.impedance_terms import pose_error
+from q2r2_control.config.control import ImpedanceSettings
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, Command, CommandMode, Reference, StepReport, StepStatus

@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 import pinocchio as pin
 
-from q2r2_control.teleop.settings import TeleopSettings
+from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.teleop.teleop import Teleop
 from q2r2_control.types import SIDES, ArmTarget, Array, Event, HandInputs, HandSample
 

@@ -10,8 +10,8 @@ import numpy.typing as npt
 import pinocchio as pin
 import pytest
 
+from q2r2_control.config.teleop import FilterSettings
 from q2r2_control.teleop.filters import PoseFilter
-from q2r2_control.teleop.settings import FilterSettings
 from tests.teleop.hands import pose
 
 Path = Callable[[float], pin.SE3]

@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from q2r2_control.config.teleop import GateSettings
 from q2r2_control.teleop.gate import PoseGate
-from q2r2_control.teleop.settings import GateSettings
 from tests.teleop.hands import pose, sample
 
 GOOD = sample("left", pose(0.1, 0.2, 0.3, (0.1, 0.2, 0.3)), 1.0)

@@ -12,11 +12,11 @@ import pinocchio as pin
 import pytest
 
 from q2r2_control.config import Config, load_config
+from q2r2_control.config.teleop import LeashSettings
 from q2r2_control.pipeline import Pipeline, Tick
-from q2r2_control.summary import RunSummary
+from q2r2_control.runtime.run_summary import RunSummary
 from q2r2_control.teleop.leash import Leash
 from q2r2_control.teleop.relative import RelativeMotion
-from q2r2_control.teleop.settings import LeashSettings
 from q2r2_control.types import Array
 from tests.support.hands_input import HandsInput
 from tests.teleop.hands import History, Operator, assert_smooth, engaged, pose, waving

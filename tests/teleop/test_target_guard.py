@@ -10,7 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from q2r2_control.teleop.guard import GuardSettings, TargetGuard
+from q2r2_control.config.teleop import GuardSettings
+from q2r2_control.teleop.guard import TargetGuard
 from q2r2_control.types import Array
 from tests.teleop.hands import pose
 

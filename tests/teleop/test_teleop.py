@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from q2r2_control.teleop.settings import TeleopSettings
+from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.teleop.teleop import Teleop
 from q2r2_control.types import SIDES
 from tests.teleop.hands import (

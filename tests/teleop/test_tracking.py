@@ -8,8 +8,8 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
+from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.inputs.scripted import ScriptedInput
-from q2r2_control.teleop.settings import TeleopSettings
 from q2r2_control.teleop.teleop import Teleop
 from q2r2_control.types import SIDES
 from tests.teleop.hands import pose

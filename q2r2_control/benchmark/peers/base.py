@@ -1,0 +1,99 @@
+"""What the bench asks of a controller, its own or a peer, and what all peers are given alike."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Protocol
+
+import pinocchio as pin
+
+from q2r2_control.config import Config
+from q2r2_control.robot.compose import compose
+from q2r2_control.robot.robot import Robot
+from q2r2_control.types import Array
+
+# Peer -> the package that it needs, which is the name of its module here too.
+PEERS = {
+    "roboplan": "roboplan",
+    "roboplan, 10 nearest": "roboplan",
+    "mink": "mink",
+    "pink, 10 nearest": "pink",
+}
+INSTALL = "pip install 'q2r2_control[bench]'"
+NEAREST_ROWS = 10  # separation rows of a peer that is given the nearest pairs only
+DETECTION_DISTANCE = 0.25  # pairs farther apart than this need no exact distance [m]
+
+
+class Candidate(Protocol):
+    """Inverse kinematics that runs open loop, on a configuration of its own that it integrates."""
+
+    name: str
+    cannot: str  # what of the contract it has no means for, in a few words
+
+    def reset(self, q: Array) -> None:
+        """Start at rest at ``q`` (nv,) [rad], in the order of ``Robot.joint_names``."""
+
+    def step(self, targets: Mapping[str, pin.SE3], dt: float) -> tuple[Array, Array]:
+        """One tick: positions [rad] and velocities [rad/s] after it, (nv,) each. Raises where it has no solution."""
+
+    def hold(self) -> tuple[Array, Array]:
+        """The tick after a failure: the same positions, and no velocity."""
+
+
+@dataclass(frozen=True, slots=True)
+class Setup:
+    """Our settings in the units that peers take: gains per tick, limits with our margins."""
+
+    robot: Robot
+    config: Config
+    dt: float  # [s]
+
+    @property
+    def position_gain(self) -> float:
+        """Part of the tool's position error that a tick removes."""
+        return self.config.control.position_gain * self.dt
+
+    @property
+    def posture_gain(self) -> float:
+        """Part of the posture error that a tick removes."""
+        return self.config.control.posture_gain * self.dt
+
+    @property
+    def posture_cost(self) -> float:
+        """Square root of the posture's weight against the tool's 1."""
+        return float(self.config.control.posture_weight**0.5)
+
+    @property
+    def velocity(self) -> Array:
+        """(nv,) [rad/s]"""
+        return self.robot.velocity_limit * self.config.control.velocity_scale
+
+    @property
+    def lower(self) -> Array:
+        """(nv,) [rad]"""
+        return self.robot.position_lower + self.config.control.position_margin
+
+    @property
+    def upper(self) -> Array:
+        """(nv,) [rad]"""
+        return self.robot.position_upper - self.config.control.position_margin
+
+    def home_of_others(self) -> dict[str, float]:
+        """Where the joints stand that move no tool, such as fingers."""
+        home = compose(self.config).home
+        return {name: value for name, value in home.items() if name not in self.robot.joint_names}
+
+
+def make_peer(name: str, setup: Setup) -> Candidate:
+    """Build a peer of ``PEERS``. Raises what its package raises."""
+    module = importlib.import_module(f"q2r2_control.benchmark.peers.{PEERS[name]}")
+    peer: Candidate = module.make(setup, name)
+    return peer
+
+
+def is_installed(name: str) -> bool:
+    """Whether a peer's package can be found."""
+    return importlib.util.find_spec(PEERS[name]) is not None

@@ -1,0 +1,110 @@
+"""mink: differential inverse kinematics as one QP, on MuJoCo.
+
+Has position and velocity limits and collision avoidance for chosen pairs of geometries, but no acceleration limit. Its
+collision bound divides a distance by dt and is compared with a displacement of one tick: the gain that lets a pair
+close in at our rate is therefore our gain times dt squared. It drops pairs of a body and its parent. It is given the
+simulation's MuJoCo model, with every monitored capsule; the fingers, joints there, are frozen by equalities.
+"""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from collections.abc import Mapping
+
+import mink
+import numpy as np
+import pinocchio as pin
+
+from q2r2_control.benchmark.peers.base import DETECTION_DISTANCE, Setup
+from q2r2_control.plants.mujoco_model import build_model
+from q2r2_control.robot.pairs import pair_names
+from q2r2_control.types import Array
+
+
+class Mink:
+    """See the module."""
+
+    cannot = "no acceleration limit; no braking distance to pairs; no pairs of a body and its parent; no certificate"
+
+    def __init__(self, setup: Setup, name: str) -> None:
+        self.name = name
+        control, robot = setup.config.control, setup.robot
+        bare = setup.config.model_copy(update={"mujoco": setup.config.mujoco.model_copy(update={"objects": {}})})
+        self._model = build_model(robot, bare)
+        # What the simulation lets pass through each other is to be avoided all the same.
+        self._model.geom_contype[:] = self._model.geom_conaffinity[:] = 1
+        joints = [self._model.joint(name) for name in robot.joint_names]
+        self._q_index = np.array([joint.qposadr[0] for joint in joints])
+        self._v_index = np.array([joint.dofadr[0] for joint in joints])
+        for joint, lower, upper in zip(joints, setup.lower, setup.upper, strict=True):
+            self._model.jnt_range[joint.id] = lower, upper
+        self._rest = self._model.qpos0.copy()
+        for name, value in setup.home_of_others().items():
+            self._rest[self._model.joint(name).qposadr[0]] = value
+        self._configuration = mink.Configuration(self._model)
+        self._tasks = {
+            arm: mink.FrameTask(
+                description.tool_frame, "body", position_cost=1.0, orientation_cost=1.0, gain=setup.position_gain
+            )
+            for arm, description in robot.arms.items()
+        }
+        self._posture = mink.PostureTask(self._model, cost=setup.posture_cost, gain=setup.posture_gain)
+        self._posture.set_target(self._full(robot.home))
+        frozen = sorted(set(range(self._model.nv)) - set(self._v_index.tolist()))
+        self._frozen = [mink.DofFreezingTask(self._model, dof_indices=frozen)] if frozen else []
+        geometry_of = _mujoco_names(robot.urdf)
+        self._limits = [
+            mink.ConfigurationLimit(self._model),
+            mink.VelocityLimit(self._model, dict(zip(robot.joint_names, setup.velocity, strict=True))),
+            mink.CollisionAvoidanceLimit(
+                self._model,
+                [([geometry_of[a]], [geometry_of[b]]) for a, b in pair_names(robot.collision_model)],
+                gain=control.separation_gain * setup.dt**2,
+                minimum_distance_from_collisions=control.min_distance,
+                collision_detection_distance=DETECTION_DISTANCE,
+            ),
+        ]
+        self.pairs: int = self._limits[2].max_num_contacts
+        self.reset(robot.home)
+
+    def _full(self, q: Array) -> Array:
+        full = self._rest.copy()
+        full[self._q_index] = q
+        return full
+
+    def reset(self, q: Array) -> None:
+        """See :class:`Candidate`."""
+        self._configuration.update(self._full(q))
+
+    def step(self, targets: Mapping[str, pin.SE3], dt: float) -> tuple[Array, Array]:
+        """See :class:`Candidate`."""
+        for arm, task in self._tasks.items():
+            task.set_target(mink.SE3.from_matrix(targets[arm].homogeneous))
+        v = mink.solve_ik(
+            self._configuration,
+            (*self._tasks.values(), self._posture),
+            dt,
+            "daqp",
+            limits=self._limits,
+            constraints=self._frozen,
+        )
+        self._configuration.integrate_inplace(v, dt)
+        return self._configuration.q[self._q_index], v[self._v_index]
+
+    def hold(self) -> tuple[Array, Array]:
+        """See :class:`Candidate`."""
+        return self._configuration.q[self._q_index], np.zeros(len(self._v_index))
+
+
+def _mujoco_names(urdf: str) -> dict[str, str]:
+    """Pinocchio's name of each collision shape, LINK_0, LINK_1, ..., and the URDF's, which MuJoCo keeps."""
+    return {
+        f"{link.get('name')}_{index}": shape.get("name", "")
+        for link in ET.fromstring(urdf).iterfind("link")
+        for index, shape in enumerate(link.findall("collision"))
+    }
+
+
+def make(setup: Setup, name: str) -> Mink:
+    """Build it for a cell."""
+    return Mink(setup, name)

@@ -1,0 +1,97 @@
+"""pin-pink: differential inverse kinematics as one QP, on Pinocchio and Coal.
+
+Has position, velocity and acceleration limits and a barrier on the nearest pairs, all hard, so that they can contradict
+each other: it raises then. The barrier knows nothing of braking distances. It is given the same Pinocchio model, the
+same capsules and pairs as ours, and rows for the ten nearest: for all pairs it takes six times as long. Its damping
+towards a safe displacement, gain 1 by itself, is off, since it slows the tools down at ticks of 1 ms.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import pink
+import pinocchio as pin
+from pink.barriers import SelfCollisionBarrier
+from pink.limits import AccelerationLimit, ConfigurationLimit, VelocityLimit
+from pink.tasks import FrameTask, PostureTask
+
+from q2r2_control.benchmark.peers.base import NEAREST_ROWS, Setup
+from q2r2_control.types import Array
+
+
+class Pink:
+    """See the module."""
+
+    cannot = "hard limits that can contradict each other; no braking distance to pairs; no certificate"
+
+    def __init__(self, setup: Setup, name: str) -> None:
+        self.name = name
+        control = setup.config.control
+        self._collision_model = setup.robot.collision_model
+        self._model = setup.robot.model.copy()
+        self._model.lowerPositionLimit, self._model.upperPositionLimit = setup.lower, setup.upper
+        self._home = setup.robot.home
+        self._tasks = {
+            arm: FrameTask(description.tool_frame, position_cost=1.0, orientation_cost=1.0, gain=setup.position_gain)
+            for arm, description in setup.robot.arms.items()
+        }
+        self._posture = PostureTask(cost=setup.posture_cost, gain=setup.posture_gain)
+        self._posture.set_target(self._home)
+        nv = self._model.nv
+        self._acceleration = AccelerationLimit(self._model, np.full(nv, control.acceleration_limit))
+        self._limits = [
+            ConfigurationLimit(self._model),
+            VelocityLimit(self._model, setup.velocity),
+            self._acceleration,
+        ]
+        pairs = len(self._collision_model.collisionPairs)
+        self._barriers = [
+            SelfCollisionBarrier(
+                min(NEAREST_ROWS, pairs),
+                gain=control.separation_gain,
+                d_min=control.min_distance,
+                safe_displacement_gain=0.0,
+            )
+        ]
+        self._dt = setup.dt
+        self.reset(self._home)
+
+    def reset(self, q: Array) -> None:
+        """See :class:`Candidate`."""
+        self._configuration = pink.Configuration(
+            self._model,
+            self._model.createData(),
+            q,
+            collision_model=self._collision_model,
+            collision_data=self._collision_model.createData(),
+        )
+        self._acceleration.set_last_integration(np.zeros(self._model.nv), self._dt)
+
+    def step(self, targets: Mapping[str, pin.SE3], dt: float) -> tuple[Array, Array]:
+        """See :class:`Candidate`."""
+        for arm, task in self._tasks.items():
+            task.set_target(targets[arm])
+        v = pink.solve_ik(
+            self._configuration,
+            (*self._tasks.values(), self._posture),
+            dt,
+            solver="daqp",
+            limits=self._limits,
+            barriers=self._barriers,
+        )
+        self._configuration.integrate_inplace(v, dt)
+        self._acceleration.set_last_integration(v, dt)
+        return self._configuration.q.copy(), v
+
+    def hold(self) -> tuple[Array, Array]:
+        """See :class:`Candidate`."""
+        v = np.zeros(self._model.nv)
+        self._acceleration.set_last_integration(v, self._dt)
+        return self._configuration.q.copy(), v
+
+
+def make(setup: Setup, name: str) -> Pink:
+    """Build it for a cell."""
+    return Pink(setup, name)

@@ -1,0 +1,135 @@
+"""roboplan: OInK, differential inverse kinematics as one QP in C++, on Pinocchio, Coal and ProxQP.
+
+Has position, velocity and acceleration limits and a barrier on the nearest pairs. All are hard, so that they can
+contradict each other; its solver then looks for the nearest feasible problem, which can take it seconds. The barrier
+knows nothing of braking distances. It is given the same URDF with our margins in its position limits, the same capsules
+and pairs, and rows for every pair or for the ten nearest. Its solver's tolerance is left as it is (1e-6 rad a tick):
+tighter ones cost it up to two minutes in one tick. Its damping towards a safe displacement, gain 1 by itself, is
+off: with it the tools hardly follow at ticks of 1 ms.
+"""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from collections.abc import Mapping
+from itertools import combinations
+
+import numpy as np
+import pinocchio as pin
+from roboplan import core, optimal_ik
+
+from q2r2_control.benchmark.peers.base import DETECTION_DISTANCE, NEAREST_ROWS, Setup
+from q2r2_control.robot.pairs import link_of, pair_names
+from q2r2_control.robot.robot import Robot
+from q2r2_control.types import Array
+
+_GROUP = "arms"
+_REGULARISATION = 1e-6
+
+
+class Roboplan:
+    """See the module."""
+
+    cannot = "hard limits that can contradict each other; no braking distance to pairs; no certificate"
+
+    def __init__(self, setup: Setup, name: str) -> None:
+        self.name = name
+        robot, control, dt = setup.robot, setup.config.control, setup.dt
+        self._scene = core.Scene(robot.name, core.loadUrdfSceneDescriptionFromXml(_with_margins(setup)))
+        self._scene.addGroup(_GROUP, list(robot.joint_names))
+        _watch_pairs(self._scene, robot)
+        self._ik = optimal_ik.Oink(self._scene, _GROUP)
+        self._indices = np.array(self._ik.q_indices)
+        self._rest = np.array(self._scene.getCurrentJointPositions())
+        for joint, value in setup.home_of_others().items():
+            self._rest[self._scene.getJointPositionIndices([joint])] = value
+        nv = robot.model.nv
+        self._frame_tasks = {arm: self._frame_task(setup, arm) for arm in robot.arms}
+        posture = optimal_ik.ConfigurationTask(
+            self._ik,
+            robot.home,
+            np.full(nv, setup.posture_cost),
+            optimal_ik.ConfigurationTaskOptions(task_gain=setup.posture_gain),
+        )
+        self._tasks = [*self._frame_tasks.values(), posture]
+        self._acceleration = optimal_ik.AccelerationLimit(self._ik, dt, np.full(nv, control.acceleration_limit))
+        self._constraints = [
+            optimal_ik.PositionLimit(self._ik),
+            optimal_ik.VelocityLimit(self._ik, dt, setup.velocity),
+            self._acceleration,
+        ]
+        pairs = len(robot.collision_model.collisionPairs)
+        self._barriers = [
+            optimal_ik.SelfCollisionBarrier(
+                self._ik,
+                self._scene,
+                dt,
+                optimal_ik.SelfCollisionBarrierOptions(
+                    n_collision_pairs=max(1, NEAREST_ROWS if "nearest" in name else pairs),
+                    gain=control.separation_gain,
+                    d_min=control.min_distance,
+                    safe_displacement_gain=0.0,
+                    d_max=DETECTION_DISTANCE,
+                ),
+            )
+        ]
+        every = optimal_ik.SelfCollisionBarrierOptions(n_collision_pairs=10**6)
+        self.pairs: int = optimal_ik.SelfCollisionBarrier(self._ik, self._scene, dt, every).n_collision_pairs
+        self.reset(robot.home)
+
+    def _frame_task(self, setup: Setup, arm: str) -> optimal_ik.FrameTask:
+        control = setup.config.control
+        options = optimal_ik.FrameTaskOptions(
+            task_gain=setup.position_gain,
+            max_position_error=control.max_linear_speed / control.position_gain,
+            max_rotation_error=control.max_angular_speed / control.rotation_gain,
+        )
+        goal = core.CartesianConfiguration("", setup.robot.arms[arm].tool_frame, np.eye(4))
+        return optimal_ik.FrameTask(self._ik, self._scene, goal, options)
+
+    def reset(self, q: Array) -> None:
+        """See :class:`Candidate`."""
+        self._q = self._rest.copy()
+        self._q[self._indices] = q
+        self._acceleration.reset()
+
+    def step(self, targets: Mapping[str, pin.SE3], dt: float) -> tuple[Array, Array]:
+        """See :class:`Candidate`."""
+        for arm, task in self._frame_tasks.items():
+            task.setTargetFrameTransform(targets[arm].homogeneous)
+        way = np.zeros(len(self._indices))
+        self._ik.solveIk(self._q, self._tasks, self._constraints, self._barriers, way, _REGULARISATION)
+        self._q[self._indices] += way
+        v = way / dt
+        self._acceleration.setLastVelocity(v)
+        return self._q[self._indices], v
+
+    def hold(self) -> tuple[Array, Array]:
+        """See :class:`Candidate`."""
+        self._acceleration.reset()
+        return self._q[self._indices], np.zeros(len(self._indices))
+
+
+def _with_margins(setup: Setup) -> str:
+    """The cell's URDF, its position limits narrowed by our margin."""
+    root = ET.fromstring(setup.robot.urdf)
+    for name, lower, upper in zip(setup.robot.joint_names, setup.lower, setup.upper, strict=True):
+        limit = root.find(f"joint[@name='{name}']/limit")
+        if limit is not None:
+            limit.set("lower", repr(float(lower)))
+            limit.set("upper", repr(float(upper)))
+    return ET.tostring(root, encoding="unicode")
+
+
+def _watch_pairs(scene: core.Scene, robot: Robot) -> None:
+    """Have the scene watch the links of our pairs and no others."""
+    links = sorted({link_of(geometry.name) for geometry in robot.collision_model.geometryObjects})
+    watched = {frozenset((link_of(a), link_of(b))) for a, b in pair_names(robot.collision_model)}
+    pairs = list(combinations(links, 2))
+    scene.setCollisions([pair for pair in pairs if frozenset(pair) in watched], True)
+    scene.setCollisions([pair for pair in pairs if frozenset(pair) not in watched], False)
+
+
+def make(setup: Setup, name: str) -> Roboplan:
+    """Build it for a cell; ``name`` says which pairs get rows."""
+    return Roboplan(setup, name)

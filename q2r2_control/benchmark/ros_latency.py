@@ -1,0 +1,204 @@
+"""``q2r2 bench --ros``: how long it takes from a topic that comes in to the joint command that answers it.
+
+Real processes on this machine, in a domain of their own that nobody else hears: the simulated robot, the controller,
+and one arm's teleoperation. The input is stepped to and fro by millimetres at random moments; see :mod:`responses`.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import domain_coordinator
+import numpy as np
+import rclpy
+from geometry_msgs.msg import PoseStamped
+from quest2ros.msg import OVR2ROSInputs
+from rclpy.executors import SingleThreadedExecutor
+from trajectory_msgs.msg import JointTrajectory
+
+from q2r2_control.benchmark.command_responses import LatencyReport, Recording, latency_report
+from q2r2_control.config import load_config
+from q2r2_control.errors import Q2R2Error
+from q2r2_control.ros.bridge.base_node import COMMAND_QOS, STREAM_QOS
+from q2r2_control.ros.launch.middleware import set_up_middleware
+from q2r2_control.ros.launch.node_set import NodeProcess
+
+_PATIENCE = 300.0  # kernels may have to be compiled [s]
+_STEP = 0.002  # [m]
+_PAUSES = 0.07, 0.11  # between two steps; shorter than any timeout of a stream [s]
+_PRESS, _CHORD = 0.3, 0.3  # the lower button is held, and what follows its release [s]
+# The least that the hand's filters allow, so that what is left is the way through the nodes.
+_LEAST_FILTER = {"interpolation_delay": 0.005, "smoothing_delay": 0.0, "min_cutoff": 100.0, "beta": 1000.0}
+
+
+class LatencyError(Q2R2Error):
+    """The nodes did not come to life; the message says what was waited for."""
+
+
+def measure_latency(config: str, duration: float, rate: float, say: Callable[[str], None]) -> LatencyReport:
+    """Measure for ``duration`` [s] each way, with the controller at ``rate`` [Hz]. Raises :class:`LatencyError`."""
+    limit = load_config(config).control.acceleration_limit
+    least = {f"teleop.filter.{name}": str(value) for name, value in _LEAST_FILTER.items()}
+    nodes = [
+        NodeProcess("mujoco_robot", "q2r2_control.ros.nodes.mujoco_robot", {"config": config}),
+        NodeProcess(
+            "cartesian_controller",
+            "q2r2_control.ros.nodes.cartesian_controller",
+            {"config": config, "rate": f"{rate:.1f}"},
+        ),
+    ]
+    arm = NodeProcess("left_arm_controller", "q2r2_control.ros.nodes.left_arm_controller", least)
+    with _private_domain(), _running(nodes), _Probe() as probe:
+        say("waits for the controller")
+        probe.wait_for_tool()
+        say(f"target topic to joint command: {duration:g} s")
+        target = probe.step_targets(duration)
+        with _running([arm]):
+            say("waits for the arm's teleoperation")
+            probe.engage_hand()
+            say(f"hand topic to joint command: {duration:g} s")
+            hand = probe.step_hand(duration)
+    return latency_report(rate, limit, {"target to joint command": target, "hand to joint command": hand})
+
+
+class _Probe:
+    """Steps inputs and listens to commands, in turns: times are the middleware's, so a late turn does not count."""
+
+    def __init__(self) -> None:
+        self._context = rclpy.Context()
+        rclpy.init(context=self._context)
+        self._node = rclpy.create_node("latency_probe", context=self._context)
+        self._commands: list[tuple[float, float, list[float]]] = []
+        self._tool: PoseStamped | None = None
+        listen: Any = self._on_command  # rclpy's types know callbacks without the message's stamps only
+        self._node.create_subscription(JointTrajectory, "/joint_trajectory", listen, 1000)
+        self._node.create_subscription(PoseStamped, "/cartesian_controller/safe_target/left", self._on_tool, 1)
+        self._target = self._node.create_publisher(PoseStamped, "/q2r2/left/target_frame", COMMAND_QOS)
+        self._hand = self._node.create_publisher(PoseStamped, "/q2r_left_hand_pose", STREAM_QOS)
+        self._inputs = self._node.create_publisher(OVR2ROSInputs, "/q2r_left_hand_inputs", STREAM_QOS)
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self._node)
+
+    def __enter__(self) -> _Probe:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._executor.shutdown()
+        self._node.destroy_node()
+        self._context.try_shutdown()
+
+    def wait_for_tool(self) -> None:
+        """Until the controller is active, tells where the tool is, and listens."""
+        self._wait(lambda: self._tool is not None and self._commands, "cartesian_controller's commands")
+        self._wait(lambda: self._target.get_subscription_count() > 0, "cartesian_controller's subscription")
+
+    def step_targets(self, duration: float) -> Recording:
+        """Step the target about the tool."""
+        assert self._tool is not None
+        recording = self._step(self._target, self._tool, duration, lambda: None)
+        self._node.destroy_publisher(self._target)  # the next one is the arm controller's
+        return recording
+
+    def engage_hand(self) -> None:
+        """Press the lower button until targets come of it."""
+        targets: list[PoseStamped] = []
+        subscription = self._node.create_subscription(PoseStamped, "/q2r2/left/target_frame", targets.append, 1)
+        deadline = time.monotonic() + _PATIENCE
+        while not targets:
+            if time.monotonic() > deadline:
+                raise LatencyError(f"left_arm_controller was not engaged within {_PATIENCE:g} s")
+            for pressed, period in ((True, _PRESS), (False, _CHORD)):
+                self._send_hand(pressed, period)
+        self._node.destroy_subscription(subscription)
+
+    def step_hand(self, duration: float) -> Recording:
+        """Step the hand's pose."""
+        return self._step(self._hand, _pose(), duration, lambda: self._inputs.publish(OVR2ROSInputs()))
+
+    def _step(self, publisher: Any, begin: PoseStamped, duration: float, beside: Callable[[], None]) -> Recording:
+        random, message = np.random.default_rng(0), begin
+        height = message.pose.position.z
+        self._commands.clear()
+        steps: list[float] = []
+        end = time.monotonic() + duration
+        while time.monotonic() < end:
+            beside()
+            message.pose.position.z = height + _STEP * (len(steps) % 2)
+            steps.append(time.time())  # the clock of the middleware's stamps
+            publisher.publish(message)
+            self._spin(random.uniform(*_PAUSES))
+        if not self._commands:
+            raise LatencyError(f"no joint command came within {duration:g} s")
+        sent, received, v = (list(column) for column in zip(*self._commands, strict=True))
+        return Recording(steps, sent, received, np.array(v))
+
+    def _send_hand(self, pressed: bool, period: float) -> None:
+        end = time.monotonic() + period
+        while time.monotonic() < end:
+            self._hand.publish(_pose())
+            self._inputs.publish(OVR2ROSInputs(button_lower=pressed))
+            self._spin(0.02)
+
+    def _wait(self, condition: Callable[[], object], what: str) -> None:
+        deadline = time.monotonic() + _PATIENCE
+        while not condition():
+            if time.monotonic() > deadline:
+                raise LatencyError(f"waited {_PATIENCE:g} s for {what}")
+            self._spin(0.05)
+
+    def _spin(self, period: float) -> None:
+        end = time.monotonic() + period
+        while (left := end - time.monotonic()) > 0.0:
+            self._executor.spin_once(left)
+
+    def _on_command(self, message: JointTrajectory, info: dict[str, int]) -> None:
+        stamps = (1e-9 * info["source_timestamp"], 1e-9 * info["received_timestamp"])
+        self._commands.append((*stamps, list(message.points[0].velocities)))
+
+    def _on_tool(self, message: PoseStamped) -> None:
+        self._tool = message
+
+
+def _pose() -> PoseStamped:
+    message = PoseStamped()
+    message.pose.orientation.w = 1.0
+    return message
+
+
+@contextmanager
+def _private_domain() -> Iterator[None]:
+    """Nothing of this reaches a robot that is on the network, nor the other way round."""
+    with domain_coordinator.domain_id() as number:
+        own = {"ROS_DOMAIN_ID": str(number), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+        before = dict(os.environ)
+        os.environ.update(own)
+        set_up_middleware(os.environ)
+        try:
+            yield
+        finally:
+            os.environ.clear()
+            os.environ.update(before)
+
+
+@contextmanager
+def _running(nodes: list[NodeProcess]) -> Iterator[None]:
+    """The nodes as processes; they end in order with the context."""
+    processes = [
+        subprocess.Popen(node.command(), stdin=subprocess.DEVNULL, stderr=subprocess.DEVNULL) for node in nodes
+    ]
+    try:
+        yield
+    finally:
+        for process in reversed(processes):
+            process.send_signal(signal.SIGINT)
+        for process in reversed(processes):
+            try:
+                process.wait(10.0)
+            except subprocess.TimeoutExpired:
+                process.kill()

@@ -1,0 +1,125 @@
+"""One timed run of a controller, ours or a peer's, and what it did, measured alike for all."""
+
+from __future__ import annotations
+
+import gc
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+
+from q2r2_control.benchmark.peers.base import Candidate
+from q2r2_control.config.control import ControllerSettings
+from q2r2_control.control.controller import CartesianController
+from q2r2_control.robot.robot import Robot
+from q2r2_control.types import Array
+
+Poses = dict[str, pin.SE3]
+Targets = Callable[[float, Poses], Poses]
+
+WARM_UP = 0.1  # share of the ticks that is not counted in times
+_TAIL = 0.5  # [s]
+
+
+_MOMENT = 1e-9  # a tick that moves nothing [s]
+
+
+@dataclass(frozen=True, slots=True)
+class Deeds:
+    """What a controller did in a run, warm-up included."""
+
+    max_acceleration_ratio: float  # change of velocity in a tick over our limit
+    max_velocity_ratio: float
+    min_position_margin_rad: float  # to limits less the margin
+    min_distance_mm: float  # of the monitored pairs, by Coal
+    failures: int  # ticks: exception, no solution, not finite
+    tail_acceleration: float  # RMS over the last 0.5 s, norm over the joints [rad/s^2]
+    position_error_mm: float  # of the tools, at the end, the larger
+
+
+@dataclass(frozen=True, slots=True)
+class Timed:
+    """Times of the ticks after the warm-up, and the motion of all."""
+
+    times_us: Array  # (ticks,)
+    q: Array  # (n, nv) [rad]
+    v: Array  # (n, nv) [rad/s]
+    goal: Poses  # of the last tick
+    failures: int
+    dt: float  # [s]
+
+
+class Ours:
+    """:class:`CartesianController` as the bench sees a controller: the full tick, certificate and report included."""
+
+    name = "q2r2_control"
+    cannot = ""
+
+    def __init__(self, controller: CartesianController) -> None:
+        self._controller = controller
+        self.fallbacks = 0
+
+    def reset(self, q: Array) -> None:
+        """See :class:`Candidate`."""
+        self._controller.reset(q)
+        self.fallbacks = 0
+
+    def step(self, targets: Mapping[str, pin.SE3], dt: float) -> tuple[Array, Array]:
+        """See :class:`Candidate`."""
+        reference = self._controller.step(targets, dt)
+        self.fallbacks += reference.report.fallback
+        return reference.q, reference.v
+
+    def hold(self) -> tuple[Array, Array]:
+        """See :class:`Candidate`; a step that raised would be a broken promise, and is counted like a peer's."""
+        reference = self._controller.step({}, _MOMENT)
+        return reference.q, np.zeros_like(reference.v)
+
+
+def timed_run(candidate: Candidate, robot: Robot, targets: Targets, ticks: int, dt: float) -> Timed:
+    """Run from home for a warm-up and ``ticks`` ticks of ``dt`` [s]."""
+    start = {arm: robot.tool_pose(robot.home, arm) for arm in robot.arms}
+    goals = [targets(tick * dt, start) for tick in range(int(WARM_UP * ticks) + ticks)]
+    times = np.empty(len(goals))
+    q, v = np.empty((len(goals), robot.model.nv)), np.empty((len(goals), robot.model.nv))
+    failures = 0
+    candidate.reset(robot.home)
+    gc.collect()
+    gc.disable()
+    try:
+        for tick, goal in enumerate(goals):
+            began = time.perf_counter()
+            try:
+                q[tick], v[tick] = candidate.step(goal, dt)
+                solved = True
+            except Exception:  # each peer has exceptions of its own
+                solved = False
+            times[tick] = time.perf_counter() - began
+            if not (solved and np.isfinite(np.sum(q[tick]) + np.sum(v[tick]))):
+                failures += 1
+                q[tick], v[tick] = candidate.hold()
+    finally:
+        gc.enable()
+    return Timed(1e6 * times[len(goals) - ticks :], q, v, goals[-1], failures, dt)
+
+
+def deeds_of(run: Timed, robot: Robot, settings: ControllerSettings) -> Deeds:
+    """What was done in a run, by the same measures for everybody."""
+    q, v = run.q, run.v
+    a = np.diff(v, axis=0, prepend=0.0) / run.dt
+    tail = a[-round(_TAIL / run.dt) :]
+    room = np.minimum(q - robot.position_lower, robot.position_upper - q) - settings.position_margin
+    errors = [
+        np.linalg.norm(robot.tool_pose(q[-1], arm).translation - pose.translation) for arm, pose in run.goal.items()
+    ]
+    return Deeds(
+        max_acceleration_ratio=float(np.abs(a).max()) / settings.acceleration_limit,
+        max_velocity_ratio=float((np.abs(v) / (robot.velocity_limit * settings.velocity_scale)).max()),
+        min_position_margin_rad=float(room.min()),
+        min_distance_mm=1e3 * min(float(robot.distance_values(posture).min(initial=np.inf)) for posture in q),
+        failures=run.failures,
+        tail_acceleration=float(np.sqrt(np.mean(np.sum(tail**2, axis=1)))),
+        position_error_mm=1e3 * float(max(errors)),
+    )

@@ -1,0 +1,145 @@
+"""A run as the command line offers it: pipeline, live table, window, report."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+
+from rich.console import Console
+
+from q2r2_control.cli.json_output import as_json_text
+from q2r2_control.config import Config
+from q2r2_control.config.external import ControllerKind
+from q2r2_control.errors import ConfigError
+from q2r2_control.inputs.base import Input
+from q2r2_control.inputs.headset import HeadsetServer
+from q2r2_control.inputs.scripted import ScriptedInput
+from q2r2_control.pipeline import Pipeline, Tick
+from q2r2_control.plants.mujoco import MujocoPlant
+from q2r2_control.runtime.run_summary import RunSummary
+from q2r2_control.viewer.history import History
+from q2r2_control.viewer.live import LiveTable
+from q2r2_control.viewer.report import draw_report
+
+_NOTICE_AFTER = 3.0  # [s]
+_WINDOW_PERIOD = 1.0 / 30.0  # [s]
+
+
+@dataclass(frozen=True, slots=True)
+class RunOptions:
+    """What to run and what to show of it."""
+
+    name: str  # of the run, for its report's folder and title
+    input: str  # scripted or headset
+    plant: str  # mujoco or kinematic
+    mode: str  # position or torque
+    duration: float | None  # [s]; None: until Ctrl-C
+    fast: bool  # simulated time
+    trajectory: str  # of the scripted input
+    human: bool
+    seed: int
+    table: bool
+    window: bool
+    report: bool
+
+
+def run(config: Config, options: RunOptions, console: Console) -> RunSummary:
+    """Run a cell and tell ``console`` about it. Raises :class:`Q2R2Error` where that is not possible as asked."""
+    if config.controller is ControllerKind.EXTERNAL:
+        raise ConfigError(
+            f"{config.name}: controller: external is driven by q2r2 ros up; this command runs controller: builtin only"
+        )
+    if options.window and options.plant != "mujoco":
+        raise ConfigError(f"--viewer: the {options.plant} plant has no window; allowed: --plant mujoco")
+    with notice_of_compiling(console):
+        source = _input_of(config, options, console)
+        pipeline = Pipeline.from_config(config, input=source, plant=options.plant, mode=options.mode)
+    history = History(pipeline.robot, config.control.acceleration_limit)
+    if options.report:
+        pipeline.listeners.append(history)
+    with ExitStack() as stack:
+        if options.window and isinstance(pipeline.plant, MujocoPlant):
+            pipeline.plant.launch_viewer()
+            pipeline.listeners.append(_WindowListener(pipeline, pipeline.plant))
+        if options.table:
+            table = LiveTable(f"{options.name}: Ctrl-C brings the arms to rest and ends", config.control.min_distance)
+            pipeline.listeners.append(table)
+            stack.enter_context(table.shown(console))
+        summary = pipeline.run(options.duration, realtime=not options.fast)
+    if options.report:
+        folder = _write_report(config, options, history, summary)
+        console.print(f"report: {folder / 'report.png'}", soft_wrap=True, highlight=False)
+    return summary
+
+
+class AnnouncedHeadset(HeadsetServer):
+    """A headset server that says where it listens, for people and for scripts that asked for port 0."""
+
+    def __init__(self, config: Config, console: Console) -> None:
+        super().__init__(config.headset.host, config.headset.port)
+        self._console = console
+
+    def start(self) -> None:
+        """See :meth:`HeadsetServer.start`."""
+        super().start()
+        self._console.print(f"headset: listening on {self.address[0]}:{self.address[1]}", highlight=False)
+
+
+def _input_of(config: Config, options: RunOptions, console: Console) -> Input:
+    if options.input == "headset":
+        return AnnouncedHeadset(config, console)
+    return ScriptedInput(options.trajectory, human=options.human, seed=options.seed)
+
+
+class _WindowListener:
+    """Shows MuJoCo's window some thirty times a second; closing it ends the run."""
+
+    def __init__(self, pipeline: Pipeline, plant: MujocoPlant) -> None:
+        self._pipeline, self._plant = pipeline, plant
+        self._due = 0.0
+
+    def __call__(self, tick: Tick) -> None:
+        if tick.t >= self._due:
+            self._due = tick.t + _WINDOW_PERIOD
+            if not self._plant.viewer_sync():
+                self._pipeline.stop()
+
+
+@contextmanager
+def notice_of_compiling(console: Console) -> Iterator[None]:
+    """Say what takes so long, where building the controller does."""
+    text = "compiling the controller for this machine: once for each version of the code, 1-2 minutes"
+    timer = threading.Timer(_NOTICE_AFTER, lambda: console.print(text, soft_wrap=True, highlight=False))
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
+
+
+def _write_report(config: Config, options: RunOptions, history: History, summary: RunSummary) -> Path:
+    folder = _new_folder(Path("runs"), f"{datetime.now():%Y%m%d-%H%M%S}-{options.name}")
+    (folder / "summary.json").write_text(as_json_text(summary.as_json()) + "\n", encoding="utf-8")
+    what = options.trajectory if options.input == "scripted" else options.input
+    title = f"{config.name}: {what}, {options.plant} plant"
+    draw_report(history, summary, config.control.min_distance, title, folder / "report.png")
+    return folder
+
+
+def _new_folder(parent: Path, name: str) -> Path:
+    """A folder that did not exist before; runs may end within one second."""
+    for suffix in ("", *(f"-{number}" for number in range(2, 100))):
+        folder = parent / (name + suffix)
+        try:
+            folder.mkdir(parents=True)
+        except FileExistsError:
+            continue
+        except OSError as error:
+            raise ConfigError(f"report folder {folder}: {error}") from error
+        return folder
+    raise ConfigError(f"report folder {parent / name}: exists, and so do 98 numbered ones")

@@ -1,0 +1,237 @@
+"""Cartesian impedance control: the QP's reference in, joint torques out that make each tool a damped spring about it.
+
+    tau = J' (K e + D e') + N (K_n (q_r - q) + D_n (v_r - v)) + M(q) a_r + C(q, v) v + g(q) + joint-limit repulsion
+
+e is the way from the measured tool to that of the reference, e' the difference of their twists, D and D_n the damping
+of :func:`double_diagonalised_damping`, N a nullspace projector. Hogan 1985, Albu-Schaeffer et al. 2003.
+
+**Feed-forward M a_r.** Seen from the tool an arm weighs what its rotors weigh geared up, 20 to 140 kg for a robot of
+22 kg. Without feed-forward the spring would have to give the force for every acceleration and would have to yield for
+it, 30 mm at 1 m/s^2; with it the spring bears only what the model does not know, and may be soft. It vanishes with the
+reference's acceleration, so that it does nothing to the stiffness that a push at rest feels.
+
+**Torque rate.** A full stop at 10 rad/s^2 takes 70 Nm more in a joint that moves the whole arm. As long as the torque
+rises to that the tool leaves the reference, and with it the distances that the reference keeps.
+
+**Time.** A reference is due at the end of its tick, the state is measured at its start. So the spring is about the
+reference of the tick before, which is due now, while the acceleration is the one that leads to the newest.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+from pydantic import ValidationError
+
+from q2r2_control.compliance.impedance_kernels import Pull, Springs, pull_arms
+from q2r2_control.compliance.impedance_terms import BoolArray, bound_torque
+from q2r2_control.config.control import ImpedanceSettings
+from q2r2_control.control.controller import LONGEST_DT
+from q2r2_control.control.geometry.kinematics import chain_of
+from q2r2_control.control.jit import hold
+from q2r2_control.control.kernel_model import tools_of
+from q2r2_control.errors import ConfigError, RobotError
+from q2r2_control.robot.robot import Robot
+from q2r2_control.types import Array, Reference, RobotState
+
+
+@dataclass(frozen=True, slots=True)
+class ImpedanceReport:
+    """What one tick did and why. Joints and arms by name."""
+
+    errors: dict[str, Array]  # arm -> (6,) way to the reference after clipping [m, rad], world axes
+    clipped: tuple[str, ...]  # arms that are further from their reference than the clip allows
+    saturated: tuple[str, ...]  # joints that would need more than their torque limit
+    rate_limited: tuple[str, ...]  # joints whose torque could not change as fast as it should
+    repelled: tuple[str, ...]  # joints that are pushed away from a position limit
+    held: bool  # the measured state was of no use: the last gravity torque is held
+
+
+@dataclass(frozen=True, slots=True)
+class TorqueCommand:
+    """Joint torques of one tick."""
+
+    tau: Array  # (nv,) [Nm]
+    report: ImpedanceReport
+
+
+class ImpedanceController:
+    """Turns each tick's reference and measured state into joint torques, for all arms of a cell.
+
+    At every tick, whatever comes in: finite torques, within ``torque_scale`` of the robot's limits, and no further from
+    the tick before than ``torque_rate_limit`` allows. Each arm is treated by itself, with its own blocks of the inertia
+    matrix and its inverse; joints that several arms hang on get the sum.
+    """
+
+    def __init__(self, robot: Robot, settings: ImpedanceSettings | None = None) -> None:
+        self.robot = robot
+        self.settings = settings or ImpedanceSettings()
+        self._limit = self.settings.torque_scale * robot.torque_limit
+        self._data = robot.model.createData()
+        springs = _springs_of(robot, self.settings)
+        self._pull = Pull.empty(springs)
+        self._held_springs, self._held_pull = hold(springs), hold(self._pull)
+        self._pull.stiffness[:] = self.settings.translational_stiffness, self.settings.rotational_stiffness
+        self._goal = self._pull.stiffness.copy()  # of a ramp (k, 2) [N/m, Nm/rad]
+        self._ramp_rate = np.zeros_like(self._goal)
+        self._ramping = False
+        self._begin(robot.home, np.zeros(robot.model.nv))
+        # Every kernel runs once here, so that none is compiled in mid-motion.
+        pull_arms(self._held_springs, self._held_pull)
+        bound_torque(self._last, self._last, self._limit, 0.0)
+
+    def reset(self, state: RobotState) -> None:
+        """Start anew at rest at the measured posture: the first torque is that of gravity there, without a bump.
+
+        A stiffness that is being changed is reached at once. Raises :class:`RobotError` for a posture that is not nv
+        finite numbers.
+        """
+        q = np.array(state.q, dtype=np.float64)
+        if q.shape != self._limit.shape or not np.isfinite(q).all():
+            raise RobotError(f"impedance reset: q = {q!s:.80}: expected {len(self._limit)} finite numbers")
+        self._pull.stiffness[:] = self._goal
+        self._ramping = False
+        self._begin(q, np.zeros_like(q))
+
+    def _begin(self, q: Array, v: Array) -> None:
+        self._due_q, self._due_v = q.copy(), v  # of the newest reference, due at the end of its tick
+        self._wanted_q, self._wanted_v = self._due_q, self._due_v  # of the one before, due now
+        self._gravity = np.array(pin.computeGeneralizedGravity(self.robot.model, self._data, q))
+        self._last = np.minimum(np.maximum(self._gravity, -self._limit), self._limit)
+
+    def set_stiffness(
+        self, translational: float | None = None, rotational: float | None = None, arm: str | None = None
+    ) -> None:
+        """Change the stiffness [N/m], [Nm/rad] of one arm or of all, on a straight line over ``ramp_time``.
+
+        The damping follows, so that the damping ratio stays. A ramp and no jump: stiffness is energy in a spring that
+        is stretched. Raises :class:`ConfigError` for a value out of range or an arm that does not exist.
+        """
+        arms = list(self.robot.arms)
+        if arm is not None and arm not in arms:
+            raise ConfigError(f"stiffness: no arm {arm!r:.40}; arms: {', '.join(arms)}")
+        given = {"translational_stiffness": translational, "rotational_stiffness": rotational}
+        changes = {key: value for key, value in given.items() if value is not None}
+        try:
+            ImpedanceSettings.model_validate(changes, strict=True)
+        except ValidationError as error:
+            fault = error.errors()[0]
+            raise ConfigError(f"{fault['loc'][0]} = {fault['input']!r:.40}: {fault['msg']}") from error
+        for i in range(len(arms)) if arm is None else (arms.index(arm),):
+            for k, wanted in enumerate((translational, rotational)):
+                self._goal[i, k] = self._goal[i, k] if wanted is None else wanted
+            self._ramp_rate[i] = np.abs(self._goal[i] - self._pull.stiffness[i]) / self.settings.ramp_time
+        self._ramping = True
+
+    def stiffness(self, arm: str) -> tuple[float, float]:
+        """Stiffness of an arm's tool in force now: translational [N/m], rotational [Nm/rad]."""
+        translational, rotational = self._pull.stiffness[list(self.robot.arms).index(arm)]
+        return float(translational), float(rotational)
+
+    def step(self, reference: Reference, state: RobotState, dt: float, extra: Array | None = None) -> TorqueCommand:
+        """Torques for a tick of ``dt`` [s] that begins at ``state`` and ends when ``reference`` is due.
+
+        ``extra`` (nv,) [Nm] is added before saturation. A reference that is not finite is not used: the last one is
+        held. Where the state, or what comes of it, is not finite, the last gravity torque is held, since a spring
+        about an unknown posture could push anywhere. A dt that is not in (0, 0.1] s counts as 0 or as 0.1 s.
+        """
+        usable = isinstance(dt, int | float | np.floating) and math.isfinite(dt) and dt > 0.0
+        time = min(float(dt), LONGEST_DT) if usable else 0.0
+        if self._ramping:
+            self._ramp(time)
+        acceleration = self._exchange(reference)
+        gravity = self._law(state, acceleration) if _finite(state.q, state.v) else None
+        wanted = self._gravity
+        if gravity is not None:
+            wanted = self._pull.tau if extra is None else self._pull.tau + extra
+            if _finite(wanted):
+                self._gravity = gravity
+            else:
+                gravity, wanted = None, self._gravity
+        bounded = bound_torque(wanted, self._last, self._limit, self.settings.torque_rate_limit * time)
+        self._last = bounded.tau
+        held = gravity is None
+        errors, clipped = self._errors()
+        report = ImpedanceReport(
+            errors={} if held else errors,
+            clipped=() if held else clipped,
+            saturated=self._names(bounded.saturated),
+            rate_limited=self._names(bounded.rate_limited),
+            repelled=() if held else self._names(self._pull.repulsion != 0.0),
+            held=held,
+        )
+        return TorqueCommand(bounded.tau.copy(), report)
+
+    def _errors(self) -> tuple[dict[str, Array], tuple[str, ...]]:
+        """Of the last law: each arm's clipped error, and the arms whose error was longer."""
+        pull, arms = self._pull, self.robot.arms
+        clipped = tuple(name for name, was in zip(arms, pull.clipped.tolist(), strict=True) if was)
+        return dict(zip(arms, pull.errors.copy(), strict=True)), clipped
+
+    def _ramp(self, time: float) -> None:
+        reach = self._ramp_rate * time
+        self._pull.stiffness[:] += np.minimum(np.maximum(self._goal - self._pull.stiffness, -reach), reach)
+        self._ramping = bool((self._pull.stiffness != self._goal).any())
+
+    def _exchange(self, reference: Reference) -> Array:
+        """Take the newest reference in for the next tick; returns the acceleration (nv,) that leads to it."""
+        self._wanted_q, self._wanted_v = self._due_q, self._due_v
+        if _finite(reference.q, reference.v, reference.a):
+            self._due_q, self._due_v = reference.q.copy(), reference.v.copy()
+            return reference.a
+        self._due_v = np.zeros_like(self._due_v)
+        return self._due_v
+
+    def _law(self, state: RobotState, acceleration: Array) -> Array | None:
+        """Pull at all arms, without bounds, and return gravity's torque.
+
+        None where the numbers are too large to be computed with.
+        """
+        model, data, pull = self.robot.model, self._data, self._pull
+        pull.q[:], pull.v[:], pull.wanted_q[:], pull.wanted_v[:] = state.q, state.v, self._wanted_q, self._wanted_v
+        gravity = np.array(pin.computeGeneralizedGravity(model, data, pull.q))
+        pull.tau[:] = pin.rnea(model, data, pull.q, pull.v, acceleration)
+        pull.M[:] = pin.crba(model, data, pull.q)
+        pull.M_inverse[:] = pin.computeMinverse(model, data, pull.q)
+        try:
+            pull_arms(self._held_springs, self._held_pull)
+        except np.linalg.LinAlgError:
+            return None
+        return gravity
+
+    def _names(self, which: BoolArray) -> tuple[str, ...]:
+        if not which.any():
+            return ()
+        return tuple(self.robot.joint_names[index] for index in np.flatnonzero(which))
+
+
+def _springs_of(robot: Robot, settings: ImpedanceSettings) -> Springs:
+    arms = list(robot.arms.values())
+    joints = np.zeros((len(arms), max(len(arm.joints) for arm in arms)), dtype=np.int64)
+    for row, arm in zip(joints, arms, strict=True):
+        row[: len(arm.joints)] = arm.joints
+    return Springs(
+        chain=chain_of(robot.model),
+        tools=tools_of(robot),
+        joints=joints,
+        dofs=np.array([len(arm.joints) for arm in arms]),
+        lower=robot.position_lower,
+        upper=robot.position_upper,
+        limit_stiffness=settings.limit_stiffness,
+        limit_damping=settings.limit_damping,
+        limit_distance=settings.limit_distance,
+        damping_ratio=settings.damping_ratio,
+        posture_stiffness=settings.nullspace_stiffness,
+        posture_damping_ratio=settings.nullspace_damping_ratio,
+        max_position_error=settings.max_position_error,
+        max_rotation_error=settings.max_rotation_error,
+        consistent=settings.nullspace_projector == "consistent",
+    )
+
+
+def _finite(*arrays: Array) -> bool:
+    """Sums of squares are finite where all numbers are, and none is so large that it means nothing."""
+    return all(math.isfinite(np.vdot(array, array)) for array in arrays)

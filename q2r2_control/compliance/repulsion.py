@@ -1,0 +1,103 @@
+"""A repulsive, damped wall between the measured links, for torque mode, where they may leave the QP's reference.
+
+In the tick it comes after the QP, beside the impedance:  tau = impedance + gravity and Coriolis + wall,  from the
+measured q and v of the same tick and before torques are saturated. The reference keeps min_distance by itself; an arm
+that is pushed away from it meets this wall. The law, and why it is stable, stands in wall_force.py.
+
+**What it can take.** At rest a force of k min_distance or F_max, whichever is less. In motion it takes up at most the
+energy F_max min_distance for each pair, beside what the joints take; bodies that meet with more than that are slowed
+down, but touch.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+
+from q2r2_control.compliance.repulsion_kernels import Scratch, Wall, find_near, wall_torque
+from q2r2_control.config.control import ControllerSettings, WallSettings
+from q2r2_control.control.geometry.collision import bodies_of, pairs_of
+from q2r2_control.control.geometry.kinematics import chain_of
+from q2r2_control.control.jit import hold
+from q2r2_control.robot.robot import Robot
+from q2r2_control.types import Array
+
+# Of the sum of radii and min_distance: the smoothing length of distances, 0.3 mm of error at most.
+_SMOOTHING = 0.07
+# Cores closer than this part of the radii are measured as they are: so deep, the smoothing would weaken the force.
+_DEEP = 0.25
+
+
+@dataclass(frozen=True, slots=True)
+class WallReport:
+    """What the wall does in one tick."""
+
+    tau: Array  # (nv,) to be added to the commanded torque [Nm]
+    pressing: tuple[tuple[str, str], ...]  # geometry names of the pairs that the wall pushes apart
+    force: float  # the largest of them [N]
+    energy: float  # stored in the wall [J]
+    closest_pair: tuple[str, str]  # measured
+    closest_distance: float  # [m]; NaN if q or v is not finite
+
+
+class MeasuredSeparation:
+    """Keeps the measured links apart in torque mode. Holds nothing between ticks but scratch."""
+
+    def __init__(self, robot: Robot, settings: ControllerSettings, wall_settings: WallSettings | None = None) -> None:
+        """Uses ``min_distance`` of ``settings``.
+
+        Raises :class:`RobotError` for a shape that no kernel measures.
+        """
+        law, self._model, self._data = wall_settings or WallSettings(), robot.model, robot.model.createData()
+        chain, bodies = chain_of(robot.model), bodies_of(robot.collision_model)
+        travel = np.maximum(np.abs(robot.position_lower), np.abs(robot.position_upper))
+        pairs = pairs_of(robot.collision_model, chain, bodies, travel)
+        radii = bodies.radius[pairs.first] + bodies.radius[pairs.second]
+        wall = Wall(
+            chain=chain,
+            bodies=bodies,
+            pairs=pairs,
+            smoothing=(_SMOOTHING * (radii + settings.min_distance)) ** 2,
+            deep=(_DEEP - 1.0) * radii,
+            shell=settings.min_distance,
+            stiffness=law.stiffness,
+            damping_ratio=law.damping_ratio,
+            maximum_force=law.maximum_force,
+        )
+        self._scratch = Scratch.empty(wall)
+        self._held_wall, self._held_scratch = hold(wall), hold(self._scratch)
+        names = [geometry.name for geometry in robot.collision_model.geometryObjects]
+        indices = zip(pairs.first.tolist(), pairs.second.tolist(), strict=True)
+        self._pair_names = [(names[first], names[second]) for first, second in indices]
+        # Every kernel runs once here, so that none is compiled in mid-motion.
+        self._find(robot.home, np.zeros(robot.model.nv))
+        self._press(0)
+
+    def update(self, q: Array, v: Array) -> WallReport:
+        """Wall torque at the measured ``q`` [rad] and ``v`` [rad/s], (nv,) each.
+
+        Never raises because of a number: where one is not finite nothing can be known, and no torque is given.
+        """
+        if not (math.isfinite(q.sum()) and math.isfinite(v.sum())):
+            return WallReport(np.zeros(len(q)), (), 0.0, 0.0, ("", ""), math.nan)
+        count, closest, distance = self._find(q, v)
+        energy = self._press(count) if count else 0.0
+        pair = self._pair_names[closest] if self._pair_names else ("", "")
+        if not energy:
+            return WallReport(np.zeros(len(q)), (), 0.0, 0.0, pair, distance)
+        force = self._scratch.force[:count]
+        pressing = tuple(self._pair_names[self._scratch.near[i]] for i in np.flatnonzero(force > 0.0))
+        return WallReport(self._scratch.tau.copy(), pressing, float(force.max()), energy, pair, distance)
+
+    def _find(self, q: Array, v: Array) -> tuple[int, int, float]:
+        self._scratch.q[:] = q
+        self._scratch.v[:] = v
+        found: tuple[int, int, float] = find_near(self._held_wall, self._held_scratch)
+        return found
+
+    def _press(self, count: int) -> float:
+        self._scratch.M[:] = pin.crba(self._model, self._data, self._scratch.q)
+        return float(wall_torque(self._held_wall, self._held_scratch, count))

@@ -1,0 +1,198 @@
+"""The law of the wall between measured links, compiled: see :class:`MeasuredSeparation`.
+
+Each monitored pair closer than min_distance by the depth x presses itself apart with the force
+
+    F = min(k x, F_max) - c(x) d',    clipped to [0, F_max],    tau += (dd/dq)' F,
+
+d' the rate of distance, c the damping of ratio xi at the pair's effective mass m = 1 / (g' M^-1 g), g = dd/dq
+(Khatib, IJRR 1987), rising from 0 to its value in the first two millimetres. So the torque is continuous in q and v,
+never pulls two bodies together, and its elastic part is the gradient of  U = sum k x^2 / 2:  what the wall gives back
+is at most what was put in. Distances are those of smooth.py, so that bodies that lie along each other do not make the
+torque switch from end to end.
+
+**Why many pairs do not add up to an unstable stiffness.** Each wrist link presses against each link nearby, and all
+pairs act through the same joints. With K = sum k g g' and D = sum c g g' the fastest mode of M^-1 K is no faster than
+the trace, sum k / m, and that of M^-1 D no faster than sum c / m. Held over a period h, a mode with stiffness w^2 and
+damping 2 z is stable exactly when  h w^2 / 2 < 2 z < 2 / h  (Colgate and Schenkel, 1997, for the lower bound). With
+T = 2 ms, the longest period, the stiffness of all pairs is scaled down together where sum k / m would exceed
+0.25 / T^2, and the damping where sum c / m would exceed 0.5 / T, a quarter of what is stable: enough for one period
+of delay and for masses wrong by a factor of two. What is left satisfies c > h k / 2 for every pair while no more than
+16 are scaled down together, but for the first hundredths of a millimetre, where c is still rising. A pair's share in
+the sums fades in over two millimetres outside the shell, so that the scale does not jump; it only ever makes the wall
+softer, and where it acts (never for two iiwa 7 with the default stiffness) the torque is the gradient of U but for the
+scale's own slope.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from q2r2_control.control.geometry.closest_points import clamp
+from q2r2_control.control.geometry.collision import (
+    Bodies,
+    Contact,
+    Pairs,
+    Posed,
+    at_least,
+    distance_row,
+    measure,
+    pose_bodies,
+)
+from q2r2_control.control.geometry.kinematics import Chain, IntArray, Placements, place
+from q2r2_control.control.geometry.smooth_distance import smooth_distance
+from q2r2_control.control.jit import Held, kernel, lean_kernel
+from q2r2_control.types import Array
+
+_LONGEST_PERIOD = 0.002  # T [s]
+_STIFFEST = 0.25 / _LONGEST_PERIOD**2  # of sum k / m [1/s^2]
+_MOST_DAMPED = 0.5 / _LONGEST_PERIOD  # of sum c / m [1/s]
+_BAND = 0.002  # over which damping fades in inside the shell, and a pair's share in the sums outside it [m]
+_IMMOBILE = 1e-9  # [1/kg]
+
+
+class Wall(NamedTuple):
+    """What does not change between ticks."""
+
+    chain: Chain
+    bodies: Bodies
+    pairs: Pairs
+    smoothing: Array  # (p,) [m^2]
+    deep: Array  # (p,) distance from which it is measured as it is [m]
+    shell: float  # min_distance [m]
+    stiffness: float
+    damping_ratio: float
+    maximum_force: float
+
+
+class Scratch(NamedTuple):
+    """One tick's measurement and arrays written anew."""
+
+    q: Array  # (nv,)
+    v: Array  # (nv,)
+    M: Array  # (nv, nv) mass matrix, read from its upper triangle; overwritten
+    placements: Placements
+    posed: Posed
+    contact: Contact
+    near: IntArray  # (p,) pairs in the shell or just outside
+    depth: Array  # (p,) of them [m]
+    rows: Array  # (p, nv) gradients of their distances
+    mobility: Array  # (p,) 1 / m [1/kg]
+    force: Array  # (p,) [N]
+    row: Array  # (nv,)
+    tau: Array  # (nv,)
+
+    @classmethod
+    def empty(cls, wall: Wall) -> Scratch:
+        pairs, nv = len(wall.pairs.first), len(wall.chain.parent) - 1
+        return cls(
+            q=np.zeros(nv),
+            v=np.zeros(nv),
+            M=np.eye(nv),
+            placements=Placements.empty(wall.chain),
+            posed=Posed.empty(wall.bodies),
+            contact=Contact.empty(),
+            near=np.zeros(pairs, dtype=np.int64),
+            depth=np.zeros(pairs),
+            rows=np.zeros((pairs, nv)),
+            mobility=np.zeros(pairs),
+            force=np.zeros(pairs),
+            row=np.zeros(nv),
+            tau=np.zeros(nv),
+        )
+
+
+@kernel
+def find_near(held_wall: Held, held_scratch: Held) -> tuple[int, int, float]:
+    """Depths and gradients of the pairs in the shell or just outside.
+
+    Returns how many these are, the closest pair of all and its distance.
+    """
+    wall, scratch = held_wall.value, held_scratch.value
+    bodies, pairs, posed, contact = wall.bodies, wall.pairs, scratch.posed, scratch.contact
+    place(wall.chain, scratch.q, scratch.placements)
+    pose_bodies(bodies, scratch.placements, posed)
+    count, closest, least = 0, 0, np.inf
+    for p in range(pairs.first.shape[0]):
+        first, second = pairs.first[p], pairs.second[p]
+        if at_least(bodies, posed, first, second) >= max(least, wall.shell + _BAND):
+            continue
+        distance = measure(bodies, posed, first, second, posed.start[first], posed.end[first], contact)
+        if distance < least:
+            least, closest = distance, p
+        # The smooth distance is no smaller.
+        if distance >= wall.shell + _BAND:
+            continue
+        if distance > wall.deep[p]:
+            distance = smooth_distance(bodies, posed, first, second, wall.smoothing[p], contact)
+        scratch.near[count] = p
+        scratch.depth[count] = wall.shell - distance
+        distance_row(wall.chain, scratch.placements, pairs, p, contact, scratch.rows[count])
+        count += 1
+    return count, closest, least
+
+
+@kernel
+def wall_torque(held_wall: Held, held_scratch: Held, count: int) -> float:
+    """Add up the torques of the ``count`` pairs found near; returns the energy stored in the wall [J]."""
+    wall, scratch = held_wall.value, held_scratch.value
+    depth, mobility, force = scratch.depth, scratch.mobility, scratch.force
+    _factorise(scratch.M)
+    total = 0.0
+    for i in range(count):
+        mobility[i] = _mobility(scratch.M, scratch.rows[i], scratch.row)
+        total += wall.stiffness * mobility[i] * clamp(1.0 + depth[i] / _BAND, 0.0, 1.0)
+    stiffness = wall.stiffness * min(1.0, _STIFFEST / max(total, _IMMOBILE))
+    total = 0.0
+    for i in range(count):
+        # c = 2 xi sqrt(k m), thus c / m = 2 xi sqrt(k / m)
+        share = clamp(depth[i] / _BAND, 0.0, 1.0)
+        total += share * 2.0 * wall.damping_ratio * np.sqrt(stiffness * mobility[i])
+    damping = 2.0 * wall.damping_ratio * min(1.0, _MOST_DAMPED / max(total, _IMMOBILE))
+    scratch.tau[:] = 0.0
+    energy = 0.0
+    softest = wall.maximum_force / stiffness  # depth from which the force is constant
+    for i in range(count):
+        force[i] = 0.0
+        x = depth[i]
+        if x <= 0.0 or mobility[i] <= _IMMOBILE:
+            continue
+        rate = 0.0
+        for j in range(scratch.v.shape[0]):
+            rate += scratch.rows[i, j] * scratch.v[j]
+        elastic = stiffness * min(x, softest)
+        damped = damping * np.sqrt(stiffness / mobility[i]) * clamp(x / _BAND, 0.0, 1.0) * rate
+        force[i] = clamp(elastic - damped, 0.0, wall.maximum_force)
+        energy += elastic * (x - 0.5 * min(x, softest))
+        for j in range(scratch.v.shape[0]):
+            scratch.tau[j] += force[i] * scratch.rows[i, j]
+    return energy
+
+
+@lean_kernel
+def _factorise(M: Array) -> None:
+    """Cholesky factor of a symmetric M, read from its upper triangle, into the lower one and the diagonal."""
+    for j in range(M.shape[0]):
+        diagonal = M[j, j]
+        for k in range(j):
+            diagonal -= M[j, k] * M[j, k]
+        M[j, j] = np.sqrt(diagonal)
+        for i in range(j + 1, M.shape[0]):
+            value = M[j, i]
+            for k in range(j):
+                value -= M[i, k] * M[j, k]
+            M[i, j] = value / M[j, j]
+
+
+@lean_kernel
+def _mobility(factor: Array, row: Array, out: Array) -> float:
+    """Inverse of the effective mass along ``row``, g' M^-1 g = |L^-1 g|^2 [1/kg]."""
+    total = 0.0
+    for i in range(row.shape[0]):
+        value = row[i]
+        for k in range(i):
+            value -= factor[i, k] * out[k]
+        out[i] = value / factor[i, i]
+        total += out[i] * out[i]
+    return total

@@ -1,0 +1,233 @@
+"""The YAML of a cell: pydantic models and :func:`load_config`.
+
+Every key has a unit and a range here; ``config/dual_iiwa7.yaml`` shows them all with comments.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from typing import Annotated, Any, Literal
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from q2r2_control.config.control import AdmittanceSettings, ControllerSettings, ImpedanceSettings, check_priority
+from q2r2_control.config.external import ControllerKind, ExternalConfig, check_external
+from q2r2_control.config.resources import find_resource
+from q2r2_control.config.teleop import TeleopSettings
+from q2r2_control.errors import ConfigError
+
+Side = Literal["left", "right"]
+# The ranges are there to catch millimetres and degrees.
+Coordinate = Annotated[float, Field(ge=-20, le=20)]  # [m]
+Extent = Annotated[float, Field(gt=0, le=20)]  # [m]
+Angle = Annotated[float, Field(ge=-6.2832, le=6.2832)]  # [rad]
+Share = Annotated[float, Field(ge=0, le=1)]
+Metres3 = Annotated[tuple[Coordinate, Coordinate, Coordinate], Field(description="x, y, z [m]")]
+Radians3 = Annotated[tuple[Angle, Angle, Angle], Field(description="roll, pitch, yaw [rad]")]
+Colour = tuple[Share, Share, Share, Share]
+
+
+class _Model(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class PoseConfig(_Model):
+    """A fixed placement in the parent frame."""
+
+    position: Metres3 = (0.0, 0.0, 0.0)
+    rpy: Radians3 = (0.0, 0.0, 0.0)
+
+
+class ToolConfig(_Model):
+    """What is mounted on an arm's last link."""
+
+    model: str | None = Field(None, description="a file of robots/ without .urdf, or a path; none: bare flange")
+    link: str | None = Field(None, description="arm link that carries the tool; default: the arm's last link")
+    mount: PoseConfig = PoseConfig()
+    frame: str | None = Field(None, description="link of the tool that the operator moves; default: the last link")
+
+
+class GripperConfig(_Model):
+    """How an opening of 0..1 becomes finger joint positions."""
+
+    joints: tuple[str, ...] = Field((), description="finger joints of the tool, all driven alike")
+    open_position: float = Field(0.0, ge=-3.15, le=3.15, description="of each finger joint, open [m or rad]")
+    closed_position: float = Field(0.0, ge=-3.15, le=3.15, description="of each finger joint, closed [m or rad]")
+    speed: float = Field(0.1, gt=0, le=5, description="of each finger joint [m/s or rad/s]")
+    force: float = Field(60.0, gt=0, le=500, description="of each finger joint [N or Nm]")
+
+    @model_validator(mode="after")
+    def _opens(self) -> GripperConfig:
+        if self.joints and self.open_position == self.closed_position:
+            raise ValueError(f"open_position and closed_position have to differ, both are {self.open_position:g}")
+        return self
+
+
+class SwivelConfig(_Model):
+    """Where an arm's elbow is, about the line from shoulder to wrist. Names are joints of the arm's model."""
+
+    shoulder: str = Field("A2", description="joint in the shoulder")
+    elbow: str = Field("A4", description="joint in the elbow")
+    wrist: str = Field("A6", description="joint in the wrist")
+    angle: Angle | None = Field(None, description="0: elbow up, turning about that line [rad]; none: as at home")
+    gain: float = Field(0.0, ge=0, le=20, description="swivel speed per radian from the angle [1/s]; 0: off")
+
+
+class ArmConfig(_Model):
+    """One arm: model, mount, tool, home posture."""
+
+    model: str = Field(description="a file of robots/ without .urdf, example-robot-data:NAME, or a path")
+    mount: PoseConfig = PoseConfig()
+    tool: ToolConfig = ToolConfig()
+    gripper: GripperConfig = GripperConfig()
+    home: tuple[float, ...] = Field(description="joint positions [rad]")
+    swivel: SwivelConfig = SwivelConfig()
+
+
+class ObstacleConfig(_Model):
+    """A fixed body of the cell. Cylinders and capsules stand along z; a capsule's length is its segment's."""
+
+    shape: Literal["box", "cylinder", "sphere", "capsule"]
+    size: tuple[Extent, ...] = Field(
+        description="box: x y z; cylinder, capsule: radius length; sphere: radius [m]",
+        min_length=1,
+        max_length=3,
+    )
+    position: Metres3 = (0.0, 0.0, 0.0)
+    rpy: Radians3 = (0.0, 0.0, 0.0)
+    colour: Colour = (0.55, 0.45, 0.35, 1.0)
+
+    @model_validator(mode="after")
+    def _size_fits_shape(self) -> ObstacleConfig:
+        count = {"box": 3, "cylinder": 2, "sphere": 1, "capsule": 2}[self.shape]
+        if len(self.size) != count:
+            raise ValueError(f"a {self.shape} takes {count} size value(s), got {list(self.size)}")
+        return self
+
+
+class HeadsetConfig(_Model):
+    """The TCP server that the Quest2ROS app connects to."""
+
+    host: str = Field("127.0.0.1", description="address to bind; 0.0.0.0 admits the network")
+    port: int = Field(10000, ge=0, le=65535, description="0 takes any free port")
+
+
+class ObjectConfig(_Model):
+    """A loose box in the simulated cell, to be grasped. The controller does not know of it."""
+
+    size: tuple[Extent, Extent, Extent] = Field(description="x y z [m]")
+    position: Metres3 = Field(description="of the centre at the start [m]")
+    mass: float = Field(0.2, gt=0, le=100, description="[kg]")
+    colour: Colour = (0.2, 0.45, 0.8, 1.0)
+
+
+class MujocoConfig(_Model):
+    """The simulated cell."""
+
+    timestep: float = Field(0.001, gt=0, le=0.001, description="physics step [s]")
+    position_stiffness: float = Field(4000.0, gt=0, le=1e6, description="of the position servos [Nm/rad]")
+    position_damping_ratio: float = Field(1.0, gt=0, le=5, description="of the position servos")
+    objects: dict[str, ObjectConfig] = Field(default_factory=dict, description="loose boxes by name")
+
+
+class Config(_Model):
+    """One cell: everything a user tunes."""
+
+    name: str = Field(min_length=1)
+    arms: dict[Side, ArmConfig] = Field(min_length=1)
+    obstacles: dict[str, ObstacleConfig] = Field(default_factory=dict)
+    srdf: str | None = Field(None, description="a file of pairs that need no watching, as q2r2 check --pairs writes it")
+    loop_rate_hz: float = Field(1000.0, ge=50, le=2000, description="control loop [Hz]")
+    controller: ControllerKind = Field(ControllerKind.BUILTIN, description="builtin, or external: for q2r2 ros up")
+    external: ExternalConfig | None = Field(None, description="controllers of others; with controller: external")
+    control: ControllerSettings = ControllerSettings()
+    impedance: ImpedanceSettings = ImpedanceSettings()
+    admittance: AdmittanceSettings = AdmittanceSettings()
+    teleop: TeleopSettings = TeleopSettings()
+    headset: HeadsetConfig = HeadsetConfig()
+    mujoco: MujocoConfig = MujocoConfig()
+
+
+def load_config(path: str | os.PathLike[str]) -> Config:
+    """Read and check a cell's YAML.
+
+    ``path`` is looked up from the working directory first, then among the files shipped with the package.
+    Raises :class:`ConfigError` with one line that names file, key, value and what is allowed.
+    """
+    file = find_resource(path)
+    try:
+        data = yaml.load(file.read_text(encoding="utf-8"), Loader=_Loader)
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: cannot be read: {_line(error)}") from error
+    # Values such as dates and huge integers, and nesting without end, raise Python's own exceptions.
+    except (yaml.YAMLError, ValueError, TypeError, RecursionError) as error:
+        raise ConfigError(f"{path}: not YAML: {_line(error)}") from error
+    if not isinstance(data, dict):
+        raise ConfigError(f"{path}: expected a mapping of keys such as name, arms, obstacles; got {data!r:.60}")
+    try:
+        # Strict, or `off` would pass for 0.0; by way of JSON, where sequences are tuples and names are enums.
+        config = Config.model_validate_json(json.dumps(data, default=str), strict=True)
+        check_priority(config.control.priority, config.arms)
+        check_external(config.controller, config.external, config.arms)
+        return config
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from error
+    except ValidationError as error:
+        raise ConfigError(f"{path}: {_first_fault(error)}") from error
+    except (ValueError, TypeError, RecursionError) as error:
+        raise ConfigError(f"{path}: expected plain keys and values: {_line(error)}") from error
+
+
+class _Loader(yaml.SafeLoader):
+    """Stricter than plain YAML 1.1, where a later key silently replaces an earlier one and 1e-3 is a text."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        seen: set[Any] = set()
+        for key_node, _ in node.value:
+            if key_node.tag == "tag:yaml.org,2002:merge":
+                continue  # `<<: *other`: keys of the mapping itself may replace the merged ones
+            key = self.construct_object(key_node, deep=True)
+            if key in seen:
+                raise yaml.constructor.ConstructorError(None, None, f"key {key!r} is given twice", key_node.start_mark)
+            seen.add(key)
+        return super().construct_mapping(node, deep)
+
+
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float", re.compile(r"[-+]?[0-9]+(\.[0-9]*)?[eE][-+]?[0-9]+"), list("-+0123456789")
+)
+
+
+def _first_fault(error: ValidationError) -> str:
+    """One line about the first fault: key, value, what is allowed, and how many more there are."""
+    # A misspelt key leaves others missing or empty; the misspelling says more.
+    faults = sorted(error.errors(), key=lambda fault: fault["type"] != "extra_forbidden")
+    fault = faults[0]
+    key = _line(".".join(str(part) for part in fault["loc"] if part != "[key]")) or "(top level)"
+    more = f" (and {len(faults) - 1} more)" if len(faults) > 1 else ""
+    if fault["type"] == "missing":
+        return f"{key}: missing, and has no default{more}"
+    allowed = fault["msg"].removeprefix("Value error, ")
+    if fault["type"] == "extra_forbidden":
+        allowed = f"unknown key; allowed here: {', '.join(_keys_at(fault['loc'][:-1]))}"
+    return f"{key} = {fault['input']!r:.60}: {allowed}{more}"
+
+
+def _line(text: object) -> str:
+    """``text`` as one line of bounded length."""
+    return " ".join(str(text).split())[:300]
+
+
+def _keys_at(location: tuple[int | str, ...]) -> list[str]:
+    """Names of the keys that the model at ``location`` accepts."""
+    model: Any = Config
+    for part in location:
+        annotation = model.model_fields[part].annotation if part in getattr(model, "model_fields", {}) else None
+        if annotation is None:
+            continue
+        arguments = [given for given in getattr(annotation, "__args__", ()) if given is not type(None)]
+        model = arguments[-1] if arguments else annotation
+    return sorted(getattr(model, "model_fields", {}))

@@ -1,0 +1,205 @@
+"""The block ``external`` of a cell's YAML: controllers of others that move its arms, and where they are in ROS."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping
+from enum import StrEnum
+from typing import Annotated, Any, Literal
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator, model_validator
+
+from q2r2_control.config.presets import BUILTIN, PRESETS, Mode, Preset, preset_of
+from q2r2_control.config.teleop import GuardSettings
+from q2r2_control.errors import ConfigError
+
+_NAME = re.compile(r"/?([A-Za-z_][A-Za-z0-9_]*)(/[A-Za-z_][A-Za-z0-9_]*)*")
+
+
+def _ros_name(name: str) -> str:
+    if not _NAME.fullmatch(name):
+        raise ValueError("allowed is a ROS name such as /robot/left_arm_controller, without / at its end")
+    return name
+
+
+def _absolute(name: str) -> str:
+    if not name.startswith("/"):
+        raise ValueError("allowed is a ROS name that begins with /, such as /robot/left_arm_controller")
+    return name
+
+
+RosName = Annotated[str, AfterValidator(_ros_name)]
+AbsoluteName = Annotated[str, AfterValidator(_absolute), AfterValidator(_ros_name)]
+FrameName = Annotated[str, Field(min_length=1, max_length=200, pattern=r"^\S+$")]
+
+
+class ControllerKind(StrEnum):
+    """Who turns targets into the arms' motion."""
+
+    BUILTIN = "builtin"
+    EXTERNAL = "external"
+
+
+class GripperType(StrEnum):
+    """What a gripper is driven by."""
+
+    GRIPPER_COMMAND = "GripperCommand"
+    PARALLEL_GRIPPER_COMMAND = "ParallelGripperCommand"
+    FLOAT64_MULTI_ARRAY = "Float64MultiArray"
+
+
+class _Model(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class GripperSettings(_Model):
+    """How a gripper is told to open and close."""
+
+    action_type: GripperType = Field(
+        GripperType.GRIPPER_COMMAND, description="GripperCommand, ParallelGripperCommand or Float64MultiArray"
+    )
+    open_position: float = Field(0.0, ge=-3.15, le=3.15, description="goal that opens [m or rad]")
+    closed_position: float = Field(0.05, ge=-3.15, le=3.15, description="goal that closes [m or rad]")
+    max_effort: float = Field(5.0, ge=0, le=500, description="of a goal [N or Nm]")
+    joint_name: str = Field("", description="joint of a ParallelGripperCommand")
+
+    @model_validator(mode="after")
+    def _opens(self) -> GripperSettings:
+        if self.open_position == self.closed_position:
+            raise ValueError(f"open_position and closed_position have to differ, both are {self.open_position:g}")
+        return self
+
+
+class ExternalGripper(GripperSettings):
+    """An arm's gripper."""
+
+    topic: RosName | None = Field(None, description="its action or topic; none: /q2r2/left_gripper/gripper_cmd")
+
+    def settings(self) -> GripperSettings:
+        """How it is told to open and close, without where."""
+        return GripperSettings(**self.model_dump(exclude={"topic"}))
+
+
+class GuardLimits(_Model):
+    """How fast a target may move; none: as the preset says."""
+
+    max_velocity: float | None = Field(None, gt=0, le=5, description="of the target's position [m/s]")
+    max_acceleration: float | None = Field(None, gt=0, le=100, description="of the target's position [m/s^2]")
+    max_angular_velocity: float | None = Field(None, gt=0, le=20, description="of the target's rotation [rad/s]")
+    max_angular_acceleration: float | None = Field(None, gt=0, le=400, description="of the target's rotation [rad/s^2]")
+
+    def over(self, guard: GuardSettings) -> GuardSettings:
+        """``guard`` with what is given here in its place."""
+        return guard.model_copy(update=self.model_dump(exclude_none=True))
+
+
+class ExternalArm(_Model):
+    """One arm's controller."""
+
+    ctrl_prefix: AbsoluteName = Field(description="name of the controller's node, with its namespace")
+    base_frame: FrameName = Field(description="frame_id of its targets; a frame of /tf")
+    tool_frame: FrameName | None = Field(None, description="frame of /tf that the operator moves; none: the cell's")
+    target_topic: RosName | None = Field(None, description="of its targets or joint commands; none: the preset's")
+    joint_states_topic: RosName = Field("joint_states", description="where the arm's joint states are")
+    gripper: ExternalGripper = ExternalGripper()
+
+
+_EXTERNAL = tuple(name for name in PRESETS if name != BUILTIN.name)
+
+
+class ExternalConfig(_Model):
+    """What drives the arms instead of the built-in controller, and what it is sent."""
+
+    preset: str = Field(description=f"its terms: {', '.join(_EXTERNAL)}")
+    mode: Mode = Field(
+        Mode.RAW, description="raw: the hand's target; filtered: what the built-in controller makes of it"
+    )
+    rate: float | None = Field(None, ge=1, le=1000, description="of what it is sent; none: as the preset says [Hz]")
+    world_frame: FrameName | None = Field(
+        None, description="frame of /tf that is the cell's world, whose axes the hands' are; none: base_frame"
+    )
+    limits: GuardLimits = GuardLimits()
+    arms: dict[Literal["left", "right"], ExternalArm] = Field(min_length=1)
+
+    @field_validator("preset")
+    @classmethod
+    def _is_known(cls, name: str) -> str:
+        if name not in _EXTERNAL:
+            raise ValueError(f"allowed are {', '.join(_EXTERNAL)}")
+        return name
+
+    @model_validator(mode="after")
+    def _fits_the_preset(self) -> ExternalConfig:
+        try:
+            preset, _ = preset_of(self.preset, self.mode)
+        except ConfigError as error:
+            raise ValueError(str(error)) from error
+        if self.rate is not None and self.rate < preset.lowest_rate:
+            raise ValueError(f"rate = {self.rate:g}: preset {preset.name} needs at least {preset.lowest_rate:g} Hz")
+        if not preset.takes_poses and (given := [key for key, value in self.limits if value is not None]):
+            raise ValueError(
+                f"limits.{given[0]}: is for targets; preset {preset.name} gets joint positions within the limits of "
+                "the block control"
+            )
+        return self
+
+    @property
+    def terms(self) -> Preset:
+        """The preset."""
+        return PRESETS[self.preset]
+
+    @property
+    def filtered(self) -> bool:
+        """Whether the built-in controller runs between hands and arms."""
+        return self.mode is Mode.FILTERED
+
+    def topic(self, arm: str) -> str:
+        """Where an arm's targets or joint commands go."""
+        made = self.arm(arm)
+        return made.target_topic or self.terms.topic.format(ctrl=made.ctrl_prefix)
+
+    def arm(self, name: str) -> ExternalArm:
+        """One arm's controller."""
+        return next(arm for side, arm in self.arms.items() if side == name)
+
+
+def check_external(kind: ControllerKind, external: ExternalConfig | None, arms: Iterable[str]) -> None:
+    """Raise :class:`ConfigError` unless there is an ``external`` for all arms, or none is wanted."""
+    if kind is ControllerKind.BUILTIN:
+        if external is not None:
+            raise ConfigError("external: allowed with controller: external only")
+        return
+    if external is None:
+        raise ConfigError("controller = 'external': needs the block external, with preset and arms")
+    if missing := set(arms) - set(external.arms):
+        raise ConfigError(f"external.arms: without {', '.join(sorted(missing))}; needed: {', '.join(arms)}")
+    if surplus := set(external.arms) - set(arms):
+        raise ConfigError(f"external.arms.{sorted(surplus)[0]}: the cell has no such arm; allowed: {', '.join(arms)}")
+    _check_apart(external)
+
+
+def _check_apart(external: ExternalConfig) -> None:
+    """Two arms that share a topic would be pulled to and fro."""
+    topics = {arm: external.topic(arm) for arm in external.arms}
+    frames = {arm: made.tool_frame for arm, made in external.arms.items() if made.tool_frame is not None}
+    for what, values in (("commands", topics), ("tool_frame", frames)):
+        if (value := _twice(values)) is not None:
+            raise ConfigError(f"external.arms: both have {what} {value}; allowed: one of its own for each arm")
+
+
+def _twice(values: Mapping[Any, str]) -> str | None:
+    return next((value for value in values.values() if list(values.values()).count(value) > 1), None)
+
+
+def describe(external: ExternalConfig) -> dict[str, str]:
+    """What is driven and how, one line an arm."""
+    preset = external.terms
+    source = "the hand's target"
+    if external.filtered:
+        source = f"what the built-in controller makes of {source}"
+    lines: dict[str, str] = {}
+    for arm, made in external.arms.items():
+        message = preset.message.rpartition("/")[2] + (f" in {made.base_frame}" if preset.takes_poses else "")
+        rate = external.rate or preset.rate
+        lines[arm] = f"{preset.name}: {message} on {external.topic(arm)} at {rate:g} Hz, {source}"
+    return lines

@@ -1,0 +1,44 @@
+"""Where the shipped config/ and robots/ files are: in a checkout beside the package, installed under share/."""
+
+from __future__ import annotations
+
+import os
+import sysconfig
+from pathlib import Path
+
+from q2r2_control.errors import ConfigError
+
+_CHECKOUT = Path(__file__).resolve().parents[2]
+
+
+def resource_roots() -> list[Path]:
+    """Folders that can hold config/ and robots/, nearest first."""
+    installed = [Path(sysconfig.get_path("data", scheme)) for scheme in ("venv", "posix_user", "posix_prefix")]
+    # pip --target puts share/ beside the package, colcon beside the lib/ of lib/python3.x/site-packages.
+    installed += [_CHECKOUT, *_CHECKOUT.parents[2:3]]
+    return [_CHECKOUT, *(root / "share" / "q2r2_control" for root in installed)]
+
+
+def find_resource(path: str | os.PathLike[str]) -> Path:
+    """Resolve ``path`` from the working directory, then among the shipped files. Raises :class:`ConfigError`."""
+    wanted = Path(path)
+    try:
+        wanted = wanted.expanduser()
+        candidates = [wanted] if wanted.is_absolute() else [wanted, *(root / wanted for root in resource_roots())]
+        for candidate in candidates:
+            if candidate.is_file():
+                return candidate
+    except (OSError, ValueError, RuntimeError) as error:
+        # A name that is too long, a folder that may not be entered, the home of an unknown user.
+        raise ConfigError(f"{path!s:.120}: cannot be looked up: {error!s:.120}") from error
+    raise ConfigError(f"{path}: no such file here, nor among the shipped ones ({_shipped(wanted)})")
+
+
+def _shipped(wanted: Path) -> str:
+    names = {
+        f"{folder}/{file.name}"
+        for root in resource_roots()
+        for folder in ("config", "robots")
+        for file in (root / folder).glob(f"*{wanted.suffix or '.yaml'}")
+    }
+    return ", ".join(sorted(names)) or "none found"

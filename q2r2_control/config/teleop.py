@@ -1,0 +1,98 @@
+"""Everything an operator tunes about teleoperation, with units and ranges."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+
+from pydantic import BaseModel, ConfigDict, Field, field_validator
+
+from q2r2_control.config.axes import axes_matrix
+
+
+class Stance(StrEnum):
+    """Where the operator stands and which hand moves which arm."""
+
+    SIDE_BY_SIDE = "side_by_side"  # beside the robot, facing the same way: left moves left
+    MIRROR = "mirror"  # facing the robot: hands swapped, the room's axes kept
+    MIRROR_REFLECTED = "mirror_reflected"  # hands swapped and the motion reflected left to right
+
+
+class RotationFrame(StrEnum):
+    """Frame in which the hand's rotation is applied to the tool."""
+
+    BASE = "base"
+    TOOL = "tool"
+
+
+class FilterSettings(BaseModel):
+    """Interpolation between samples, then a One-Euro filter (Casiez, Roussel, Vogel, CHI 2012).
+
+    The hand's delay is interpolation_delay + smoothing_delay, at any speed.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    interpolation_delay: float = Field(0.02, ge=0.005, le=0.2, description="1.5 periods of a 75 Hz headset [s]")
+    smoothing_delay: float = Field(0.025, ge=0, le=0.2, description="of a motion at constant speed [s]")
+    min_cutoff: float = Field(1.5, gt=0, le=100, description="cutoff frequency at rest; tremor is 8-12 Hz [Hz]")
+    beta: float = Field(10.0, ge=0, le=1000, description="cutoff added per speed [Hz s/m]")
+    rotation_beta: float = Field(3.0, ge=0, le=1000, description="cutoff added per speed [Hz s/rad]")
+    derivative_cutoff: float = Field(2.0, gt=0, le=100, description="cutoff of the speed estimate [Hz]")
+
+
+class GateSettings(BaseModel):
+    """What makes a hand sample unfit to move an arm."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    timeout: float = Field(0.15, gt=0, le=2, description="no pose for this long disengages [s]")
+    max_jump: float = Field(0.15, gt=0, le=2, description="position change between two samples [m]")
+    max_rotation_jump: float = Field(1.0, gt=0, le=3.14, description="rotation between two samples [rad]")
+
+
+class LeashSettings(BaseModel):
+    """How far a target may be from its tool; beyond that it slips along. None: as far as the hand goes."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    distance: float | None = Field(0.1, ge=0.02, le=2, description="of positions [m]; none: no leash")
+    angle: float | None = Field(0.5, ge=0.1, le=2, description="of rotations [rad]; none: no leash")
+
+
+class TeleopSettings(BaseModel):
+    """Settings of the teleop layer; every range is checked when the object is made."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    stance: Stance = Field(Stance.SIDE_BY_SIDE, description="side_by_side, mirror or mirror_reflected")
+    position_scale: float = Field(1.0, gt=0, le=10, description="tool metres per hand metre")
+    rotation_scale: float = Field(1.0, ge=0, le=5, description="tool radians per hand radian")
+    rotation_frame: RotationFrame = Field(RotationFrame.BASE, description="base or tool")
+    axes: tuple[str, str, str] = Field(
+        ("+x", "+y", "+z"),
+        description="hand axes that become the world's x, y, z; e.g. [+z, -x, +y] for raw Unity (left-handed)",
+    )
+    chord_window: float = Field(
+        0.08, ge=0, le=0.5, description="a button waits this long for the other, which makes it a chord [s]"
+    )
+    linked: bool = Field(True, description="a fault of one hand disengages both arms")
+    filter: FilterSettings = Field(default_factory=FilterSettings)
+    leash: LeashSettings = Field(default_factory=LeashSettings)
+    gate: GateSettings = Field(default_factory=GateSettings)
+
+    @field_validator("axes")
+    @classmethod
+    def _axes_are_a_signed_permutation(cls, axes: tuple[str, str, str]) -> tuple[str, str, str]:
+        axes_matrix(axes)
+        return axes
+
+
+class GuardSettings(BaseModel):
+    """How fast a target may move, whatever the hand does."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    max_velocity: float = Field(0.5, gt=0, le=5, description="of the target's position [m/s]")
+    max_acceleration: float = Field(5.0, gt=0, le=100, description="of the target's position [m/s^2]")
+    max_angular_velocity: float = Field(2.0, gt=0, le=20, description="of the target's rotation [rad/s]")
+    max_angular_acceleration: float = Field(20.0, gt=0, le=400, description="of the target's rotation [rad/s^2]")

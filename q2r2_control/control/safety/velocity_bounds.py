@@ -1,0 +1,81 @@
+"""How fast geometries move, and with that how fast two of them can close in at most, compiled.
+
+A geometry lies in the ball of radius s around its middle. With the middle moving at u and the link turning at w, no
+point of it is faster than |u| + |w| s, so the distance of two geometries falls no faster than
+
+    |u_2 - u_1| + |w_1| s_1 + |w_2| s_2.
+
+Arms that move alike do not close in at all, however fast they are; the joints' own bound (braking.py) cannot see that.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from q2r2_control.control.geometry.collision import Bodies, Posed
+from q2r2_control.control.geometry.kinematics import Chain, Placements
+from q2r2_control.control.jit import lean_kernel
+from q2r2_control.types import Array
+
+
+class Pace(NamedTuple):
+    """Velocities in world axes, written by :func:`find_pace`."""
+
+    linear: Array  # (n, 3) of joint frames' origins [m/s]
+    angular: Array  # (n, 3) [rad/s]
+    middle: Array  # (g, 3) of geometries' middles [m/s]
+    swing: Array  # (g,) fastest of a geometry's points about its middle [m/s]
+
+    @classmethod
+    def empty(cls, chain: Chain, bodies: Bodies) -> Pace:
+        n, g = len(chain.parent), len(bodies.joint)
+        return cls(np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((g, 3)), np.zeros(g))
+
+
+@lean_kernel
+def find_pace(chain: Chain, placements: Placements, bodies: Bodies, posed: Posed, v: Array, pace: Pace) -> None:
+    """Velocities of all joint frames and geometries at joint velocities ``v`` (nv,)."""
+    linear, angular = pace.linear, pace.angular
+    for i in range(1, chain.parent.shape[0]):
+        parent = chain.parent[i]
+        _velocity_at(
+            linear[parent], angular[parent], placements.translation[parent], placements.translation[i], linear[i]
+        )
+        rate = v[i - 1]
+        slides = chain.prismatic[i] == 1
+        for k in range(3):
+            along = rate * placements.axis[i, k]
+            angular[i, k] = angular[parent, k] + (0.0 if slides else along)
+            if slides:
+                linear[i, k] += along
+    for g in range(bodies.joint.shape[0]):
+        joint = bodies.joint[g]
+        middle = pace.middle[g]
+        for k in range(3):
+            middle[k] = 0.5 * (posed.start[g, k] + posed.end[g, k])
+        _velocity_at(linear[joint], angular[joint], placements.translation[joint], middle, middle)
+        square = 0.0
+        for k in range(3):
+            square += angular[joint, k] * angular[joint, k]
+        pace.swing[g] = np.sqrt(square) * bodies.size[g]
+
+
+@lean_kernel
+def _velocity_at(linear: Array, angular: Array, origin: Array, point: Array, out: Array) -> None:
+    """Velocity of ``point`` on a link whose frame at ``origin`` moves; ``out`` may be ``point`` itself."""
+    x, y, z = point[0] - origin[0], point[1] - origin[1], point[2] - origin[2]
+    out[0] = linear[0] + angular[1] * z - angular[2] * y
+    out[1] = linear[1] + angular[2] * x - angular[0] * z
+    out[2] = linear[2] + angular[0] * y - angular[1] * x
+
+
+@lean_kernel
+def fastest_approach(pace: Pace, first: int, second: int) -> float:
+    """Bound on how fast two geometries close in [m/s]."""
+    square = 0.0
+    for k in range(3):
+        between = pace.middle[second, k] - pace.middle[first, k]
+        square += between * between
+    return np.sqrt(square) + pace.swing[first] + pace.swing[second]

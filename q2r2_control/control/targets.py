@@ -1,0 +1,190 @@
+"""What each arm is asked to do: checked targets, their own velocity, and what a held arm holds."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import pinocchio as pin
+
+from q2r2_control.config.control import ControllerSettings
+from q2r2_control.control.jit import Held, hold, kernel, lean_kernel
+from q2r2_control.control.kernel_data import Cell, Goals, Trial
+from q2r2_control.control.tasks.frame import rotation_vector
+from q2r2_control.types import Array
+
+# Farther than any cell; keeps squares of what is merely far away finite.
+_FARTHEST = 100.0  # [m]
+_ORTHONORMAL = 1e-3
+# A target faster than this many times the tool's own limit did not move, it was put elsewhere.
+_TELEPORT = 3.0
+_AT_REST = 1e-2  # [rad/s]
+
+
+_NONE, _POSE, _NO_POSE = 0, 1, 2  # what was offered to an arm
+
+
+class GoalTracker:
+    """Keeps the last usable target of each arm and the smoothed twist with which it moves (feed-forward)."""
+
+    def __init__(self, cell: Cell, arms: tuple[str, ...], settings: ControllerSettings) -> None:
+        self._arms, self._home = arms, cell.home
+        teleport = (_TELEPORT * settings.max_linear_speed, _TELEPORT * settings.max_angular_speed)
+        self._goals = Goals.empty(cell, np.array([settings.feed_forward_time, *teleport]))
+        self._pose, self._offered = self._goals.pose, self._goals.offered
+        self.held = hold(self._goals)
+
+    def reset(self, q: Array) -> None:
+        """Forget all targets; every arm holds where it is, ``q`` (nv,) [rad]."""
+        self._goals.latched[:] = 0
+        self._goals.follows[:] = 0
+        self._goals.hold[:] = q
+        self._goals.posture[:] = self._home
+
+    def aim_posture(self, posture: Array | None) -> None:
+        """Let the free joints go to ``posture`` (nv,) [rad], home where there is none; a bad one changes nothing."""
+        if posture is None:
+            self._goals.posture[:] = self._home
+        elif posture.shape == self._home.shape and np.isfinite(posture).all():
+            self._goals.posture[:] = posture
+
+    def update(self, targets: Mapping[str, pin.SE3 | None], dt: float, q: Array, v: Array) -> tuple[str, ...]:
+        """Take the targets of one tick; returns the names whose target is not usable, unknown names among them."""
+        known = 0
+        for i, arm in enumerate(self._arms):
+            target = targets.get(arm)
+            if isinstance(target, pin.SE3):
+                self._pose[i] = target.homogeneous
+                self._offered[i] = _POSE
+            else:
+                self._offered[i] = _NONE if target is None else _NO_POSE
+            known += arm in targets
+        usable = take_targets(self.held, q, v, dt)
+        if usable and known == len(targets):
+            return ()
+        rejected = [arm for arm, offered in zip(self._arms, self._offered, strict=True) if offered == _NO_POSE]
+        return (*rejected, *(str(name) for name in targets if name not in self._arms))
+
+
+@kernel
+def take_targets(held_goals: Held, q: Array, v: Array, dt: float) -> bool:
+    """Make what was offered each arm's goal, or hold it where there is nothing usable; False if something was not.
+
+    What is no pose is marked so in ``goals.offered``.
+    """
+    goals = held_goals.value
+    all_usable = True
+    for i in range(goals.offered.shape[0]):
+        if goals.offered[i] == _POSE and _take_pose(goals, i, dt):
+            continue
+        if goals.offered[i] == _NONE:
+            if goals.follows[i] == 1:
+                goals.follows[i] = 0
+                goals.latched[i] = 0
+        else:
+            goals.offered[i] = _NO_POSE
+            goals.feed_forward[i] = 0.0
+            all_usable = False
+        if goals.follows[i] == 0 and goals.latched[i] == 0:
+            _hold(goals, i, q, v)
+    return all_usable
+
+
+@lean_kernel
+def _hold(goals: Goals, i: int, q: Array, v: Array) -> None:
+    """A moving arm is braked first and holds where it comes to rest, so that it need not come back."""
+    speed = 0.0
+    for j in range(q.shape[0]):
+        if goals.member[i, j] == 1.0:
+            goals.hold[j] = q[j]
+            speed = max(speed, abs(v[j]))
+    if speed < _AT_REST:
+        goals.latched[i] = 1
+
+
+@lean_kernel
+def _take_pose(goals: Goals, i: int, dt: float) -> bool:
+    """Make the offered homogeneous pose the goal of arm ``i``; False, and no change, if it is not a finite pose.
+
+    A goal that moves has its twist smoothed over a time; one that was put elsewhere, faster than any tool, has none.
+    """
+    trial = goals.trial
+    if not _checked_pose(goals.pose[i], trial):
+        return False
+    moved = trial.moved
+    if goals.follows[i] == 1 and dt > 0.0:
+        for k in range(3):
+            moved[k] = (trial.translation[k] - goals.translation[i, k]) / dt
+        _times_transposed(trial.rotation, goals.rotation[i], trial.gram)
+        turned = moved[3:6]
+        rotation_vector(trial.gram, turned)
+        for k in range(3):
+            turned[k] /= dt
+        put_elsewhere = _size(moved[0:3]) > goals.smoothing[1] or _size(turned) > goals.smoothing[2]
+        share = 1.0 - np.exp(-dt / goals.smoothing[0])
+        for k in range(6):
+            velocity = 0.0 if put_elsewhere else moved[k]
+            goals.feed_forward[i, k] += share * (velocity - goals.feed_forward[i, k])
+    else:
+        goals.feed_forward[i] = 0.0
+    goals.follows[i] = 1
+    for row in range(3):
+        goals.translation[i, row] = trial.translation[row]
+        for column in range(3):
+            goals.rotation[i, row, column] = trial.rotation[row, column]
+    return True
+
+
+@lean_kernel
+def _size(vector: Array) -> float:
+    return np.sqrt(vector[0] * vector[0] + vector[1] * vector[1] + vector[2] * vector[2])
+
+
+@lean_kernel
+def _times_transposed(A: Array, B: Array, product: Array) -> None:
+    """A B' of two 3 by 3 matrices."""
+    for i in range(3):
+        for j in range(3):
+            product[i, j] = A[i, 0] * B[j, 0] + A[i, 1] * B[j, 1] + A[i, 2] * B[j, 2]
+
+
+@lean_kernel
+def _checked_pose(pose: Array, trial: Trial) -> bool:
+    """Split a pose (4, 4) into ``trial``, its rotation made orthonormal; False if not finite or no rotation."""
+    rotation, translation, gram = trial.rotation, trial.translation, trial.gram
+    largest = 0.0
+    total = 0.0
+    for i in range(3):
+        for j in range(3):
+            rotation[i, j] = pose[i, j]
+        translation[i] = pose[i, 3]
+        largest = max(largest, abs(translation[i]))
+        total += translation[i]
+    _times_transposed(rotation, rotation, gram)
+    error = 0.0
+    for i in range(3):
+        gram[i, i] -= 1.0
+        for j in range(3):
+            total += gram[i, j]
+            error = max(error, abs(gram[i, j]))
+    determinant = (
+        rotation[0, 0] * (rotation[1, 1] * rotation[2, 2] - rotation[1, 2] * rotation[2, 1])
+        - rotation[0, 1] * (rotation[1, 0] * rotation[2, 2] - rotation[1, 2] * rotation[2, 0])
+        + rotation[0, 2] * (rotation[1, 0] * rotation[2, 1] - rotation[1, 1] * rotation[2, 0])
+    )
+    # A maximum may pass over NaN and infinities may cancel; what is not finite shows in the sum.
+    if not (np.isfinite(total) and error < _ORTHONORMAL and determinant > 0.0):
+        return False
+    if largest > _FARTHEST:
+        for i in range(3):
+            translation[i] *= _FARTHEST / largest
+    # A Newton step towards the nearest rotation, R - (R R' - I) R / 2 (Higham, Functions of Matrices, 2008, eq. 8.20).
+    for i in range(3):
+        for j in range(3):
+            trial.correction[i, j] = 0.5 * (
+                gram[i, 0] * rotation[0, j] + gram[i, 1] * rotation[1, j] + gram[i, 2] * rotation[2, j]
+            )
+    for i in range(3):
+        for j in range(3):
+            rotation[i, j] -= trial.correction[i, j]
+    return True

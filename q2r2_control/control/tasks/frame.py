@@ -1,0 +1,262 @@
+"""Costs of the QP: tool twists, posture, hold, as H and g of  1/2 v' H v + g' v, compiled.
+
+For each following arm:  |J v - u|^2_W + v' M v, u the wanted tool twist, W = diag(1, 1, 1, l^2, l^2, l^2) with the
+length l that makes a radian comparable to a metre. For all joints: w |v - v_p|^2 with the posture velocity v_p
+projected into the tools' nullspace, so that at rest it leaves no tool error.
+
+**Damping M.** Stretched out towards an unreachable target, the gradient of the reach with respect to the elbow angle
+vanishes like L theta. Under a wanted speed s the loop near that posture therefore has the gain L s / mu, which without
+damping mu is unbounded, and with bounded accelerations ends in a limit cycle. In general the wanted velocity s adds the
+geometric stiffness E_ij = s' d2x / dq_i dq_j, and only its negative part, the pull outwards, needs damping: the pull
+inwards drives the arm away from the singular posture, as it should. Joint i gets mu_i = d_i + sum_j min(|E_ij|, d_i)
+over k, with d_i = max(0, -E_ii); where an arm is pulled straight, |E_ij| <= d_i, so that by Gershgorin's theorem the
+gain is at most k. M vanishes at the target.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from q2r2_control.control.geometry.kinematics import Chain, IntArray, Placements
+from q2r2_control.control.jit import kernel, lean_kernel
+from q2r2_control.types import Array
+
+ROTATION_LENGTH = 0.3  # [m/rad]
+_PROJECTION_DAMPING = 1e-3
+
+
+class Tools(NamedTuple):
+    """The tool frame of each arm."""
+
+    joint: IntArray  # (n,) joint that carries it
+    rotation: Array  # (n, 3, 3) in the joint's frame
+    translation: Array  # (n, 3) [m]
+    member: Array  # (n, nv) 1 where a joint moves the tool
+
+
+class Motion(NamedTuple):
+    """How a tool approaches its target, linear then angular."""
+
+    gain: Array  # (2,) [1/s]
+    deceleration: Array  # (2,) [m/s^2, rad/s^2]
+    full_speed: Array  # (2,) [m/s, rad/s]
+    stretch_gain: float  # k [1/s]
+
+
+@lean_kernel
+def tool_pose(placements: Placements, tools: Tools, i: int, rotation: Array, translation: Array) -> None:
+    """World pose of tool ``i`` into ``rotation`` (3, 3) and ``translation`` (3,)."""
+    joint = tools.joint[i]
+    for row in range(3):
+        translation[row] = placements.translation[joint, row]
+        for column in range(3):
+            total = 0.0
+            for k in range(3):
+                total += placements.rotation[joint, row, k] * tools.rotation[i, k, column]
+            rotation[row, column] = total
+            translation[row] += placements.rotation[joint, row, column] * tools.translation[i, column]
+
+
+@lean_kernel
+def tool_jacobian(chain: Chain, placements: Placements, tools: Tools, i: int, translation: Array, J: Array) -> None:
+    """Jacobian (6, nv) of tool ``i``: linear, then angular velocity in world axes at the tool's origin."""
+    J[:] = 0.0
+    joint = tools.joint[i]
+    while joint != 0:
+        axis = placements.axis[joint]
+        j = joint - 1
+        if chain.prismatic[joint] == 1:
+            for k in range(3):
+                J[k, j] = axis[k]
+        else:
+            x = translation[0] - placements.translation[joint, 0]
+            y = translation[1] - placements.translation[joint, 1]
+            z = translation[2] - placements.translation[joint, 2]
+            J[0, j] = axis[1] * z - axis[2] * y
+            J[1, j] = axis[2] * x - axis[0] * z
+            J[2, j] = axis[0] * y - axis[1] * x
+            for k in range(3):
+                J[3 + k, j] = axis[k]
+        joint = chain.parent[joint]
+
+
+@lean_kernel
+def rotation_vector(R: Array, out: Array) -> None:
+    """Rotation vector [rad] of a rotation matrix (3, 3), angle in [0, pi], through its quaternion of largest part."""
+    trace = R[0, 0] + R[1, 1] + R[2, 2]
+    if trace > 0.0:
+        w = 1.0 + trace
+        out[0] = R[2, 1] - R[1, 2]
+        out[1] = R[0, 2] - R[2, 0]
+        out[2] = R[1, 0] - R[0, 1]
+    else:
+        i = 0
+        if R[1, 1] > R[0, 0]:
+            i = 1
+        if R[2, 2] > R[i, i]:
+            i = 2
+        j = (i + 1) % 3
+        k = (i + 2) % 3
+        w = R[k, j] - R[j, k]
+        sign = 1.0 if w >= 0.0 else -1.0
+        w *= sign
+        out[i] = sign * (1.0 + R[i, i] - R[j, j] - R[k, k])
+        out[j] = sign * (R[j, i] + R[i, j])
+        out[k] = sign * (R[k, i] + R[i, k])
+    imaginary = np.sqrt(out[0] * out[0] + out[1] * out[1] + out[2] * out[2])
+    factor = 2.0 * np.arctan2(imaginary, w) / imaginary if imaginary > 1e-12 else 2.0 / w
+    for k in range(3):
+        out[k] *= factor
+
+
+@lean_kernel
+def approach_speed(error: float, gain: float, deceleration: float) -> float:
+    """Speed towards a target ``error`` away: proportional when near, that of constant deceleration when far.
+
+    v = gain e up to e0 = deceleration / gain^2, then v = sqrt(2 deceleration e - (deceleration / gain)^2), which
+    continues it smoothly. A purely proportional law asks for deceleration gain v, more than the joints have at speed.
+    """
+    if error * gain * gain <= deceleration:
+        return gain * error
+    return np.sqrt(2.0 * deceleration * error - (deceleration / gain) ** 2)
+
+
+@lean_kernel
+def wanted_twist(
+    rotation: Array,
+    translation: Array,
+    goal_rotation: Array,
+    goal_translation: Array,
+    feed_forward: Array,
+    motion: Motion,
+    speed_limit: float,
+    twist: Array,
+    feedback: Array,
+    relative: Array,
+) -> None:
+    """Tool twist towards the goal into ``twist`` (6,).
+
+    ``feedback`` (6,) receives the part that the error makes. ``speed_limit`` [m/s] caps the linear part and, in
+    proportion, the angular part. ``relative`` (3, 3) is scratch.
+    """
+    for row in range(3):
+        for column in range(3):
+            total = 0.0
+            for k in range(3):
+                total += goal_rotation[row, k] * rotation[column, k]
+            relative[row, column] = total
+    for k in range(3):
+        twist[k] = goal_translation[k] - translation[k]
+    rotation_vector(relative, twist[3:6])
+    for part in range(2):
+        piece = twist[3 * part : 3 * part + 3]
+        error = np.sqrt(piece[0] ** 2 + piece[1] ** 2 + piece[2] ** 2)
+        full = motion.full_speed[part]
+        cap = min(full, speed_limit * full / motion.full_speed[0])
+        speed = min(approach_speed(error, motion.gain[part], motion.deceleration[part]), cap)
+        scale = speed / error if error > 1e-12 else 1.0
+        for k in range(3):
+            feedback[3 * part + k] = scale * piece[k]
+            piece[k] = feedback[3 * part + k] + feed_forward[3 * part + k]
+        size = np.sqrt(piece[0] ** 2 + piece[1] ** 2 + piece[2] ** 2)
+        if size > cap:
+            for k in range(3):
+                piece[k] *= cap / size
+
+
+@lean_kernel
+def add_tool_task(J: Array, twist: Array, weight: float, H: Array, g: Array) -> None:
+    """Add ``weight`` |J v - twist|^2_W of one arm to H (nv, nv) and g (nv,)."""
+    nv = g.shape[0]
+    square = weight * ROTATION_LENGTH * ROTATION_LENGTH
+    for i in range(nv):
+        # Other arms' joints do not move this tool; a revolute one that does turns it, a sliding one shifts it.
+        if J[0, i] == J[1, i] == J[2, i] == J[3, i] == J[4, i] == J[5, i] == 0.0:
+            continue
+        for k in range(6):
+            g[i] -= (weight if k < 3 else square) * J[k, i] * twist[k]
+        for j in range(i + 1):
+            linear = J[0, i] * J[0, j] + J[1, i] * J[1, j] + J[2, i] * J[2, j]
+            angular = J[3, i] * J[3, j] + J[4, i] * J[4, j] + J[5, i] * J[5, j]
+            both = weight * linear + square * angular
+            H[i, j] += both
+            if i != j:
+                H[j, i] += both
+
+
+@lean_kernel
+def add_stretch_damping(
+    chain: Chain, placements: Placements, joint: int, J: Array, feedback: Array, gain: float, weight: float, H: Array
+) -> None:
+    """Add ``weight`` times the damping M of the tool that ``joint`` carries to H (nv, nv), ``J`` (6, nv) its Jacobian.
+
+    For joint i between the base and joint j, d2x / dq_i dq_j = z_i x J_j (linear part). For the angular part, whose
+    second derivative is no Hessian, the same bound in magnitude stands in: J_j turns with joint i by at most |z_i|.
+    """
+    turning = 0.0
+    for k in range(3):
+        turning += feedback[3 + k] * feedback[3 + k]
+    turning = ROTATION_LENGTH * ROTATION_LENGTH * np.sqrt(turning)
+    scale = weight / gain
+    far = joint
+    while far != 0:
+        j = far - 1
+        pull_j = max(0.0, -_stiffness(chain, placements, far, far, J, feedback))
+        H[j, j] += scale * (turning + pull_j)
+        near = chain.parent[far]
+        while near != 0:
+            i = near - 1
+            pull_i = max(0.0, -_stiffness(chain, placements, near, near, J, feedback))
+            coupling = abs(_stiffness(chain, placements, near, far, J, feedback))
+            H[j, j] += scale * min(coupling, pull_j)
+            H[i, i] += scale * min(coupling, pull_i)
+            near = chain.parent[near]
+        far = chain.parent[far]
+
+
+@lean_kernel
+def _stiffness(chain: Chain, placements: Placements, near: int, far: int, J: Array, s: Array) -> float:
+    """s' d2x / dq_near dq_far for the linear part of the tool's motion: z_near x J_far, none for a sliding joint."""
+    if chain.prismatic[near] == 1:
+        return 0.0
+    x, y, z = placements.axis[near, 0], placements.axis[near, 1], placements.axis[near, 2]
+    j = far - 1
+    return s[0] * (y * J[2, j] - z * J[1, j]) + s[1] * (z * J[0, j] - x * J[2, j]) + s[2] * (x * J[1, j] - y * J[0, j])
+
+
+@kernel
+def project_to_nullspace(J: Array, v: Array) -> None:
+    """Remove from ``v`` (nv,) what moves the tools: v -= J' (J J' + d I)^-1 J v, by Cholesky; J (6n, nv)."""
+    m = J.shape[0]
+    nv = J.shape[1]
+    A = np.empty((m, m))
+    y = np.empty(m)
+    for i in range(m):
+        for j in range(i + 1):
+            total = 0.0
+            for k in range(nv):
+                total += J[i, k] * J[j, k]
+            A[i, j] = total
+        A[i, i] += _PROJECTION_DAMPING * _PROJECTION_DAMPING
+        total = 0.0
+        for k in range(nv):
+            total += J[i, k] * v[k]
+        y[i] = total
+    for i in range(m):
+        for j in range(i + 1):
+            total = A[i, j]
+            for k in range(j):
+                total -= A[i, k] * A[j, k]
+            A[i, j] = np.sqrt(total) if i == j else total / A[j, j]
+        for k in range(i):
+            y[i] -= A[i, k] * y[k]
+        y[i] /= A[i, i]
+    for i in range(m - 1, -1, -1):
+        for k in range(i + 1, m):
+            y[i] -= A[k, i] * y[k]
+        y[i] /= A[i, i]
+    for j in range(nv):
+        for i in range(m):
+            v[j] -= J[i, j] * y[i]

@@ -1,0 +1,151 @@
+"""What arrives from a headset, and what to look at when nothing does."""
+
+from __future__ import annotations
+
+import socket
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from q2r2_control.config import Config
+from q2r2_control.config.axes import axes_matrix
+from q2r2_control.inputs.headset import HeadsetServer
+from q2r2_control.inputs.statistics import HeadsetStatistics
+from q2r2_control.types import SIDES, Array, HandSample
+
+SILENCE = 2.0  # without data before advice is given [s]
+_PERIOD = 0.05  # [s]
+_WINDOW = 0.5  # of the movement that is put in words [s]
+_STILL = 0.02  # a hand that moved less in the window is still [m]
+_DIRECTIONS = (("back -x", "forward +x"), ("right -y", "left +y"), ("down -z", "up +z"))
+
+
+class HandMovement:
+    """Puts one hand's recent movement in words, in the world's axes as the config's ``teleop.axes`` makes them."""
+
+    def __init__(self, axes: tuple[str, str, str]) -> None:
+        self._axes: Array = axes_matrix(axes)
+        self._positions: deque[tuple[float, Array]] = deque(maxlen=1000)
+
+    def add(self, sample: HandSample) -> None:
+        """Take a sample; one that is not finite has no direction."""
+        if np.isfinite(sample.position).all():
+            self._positions.append((sample.pose_stamp, self._axes @ sample.position))
+
+    def in_words(self, now: float) -> str:
+        """The dominant direction of the last half second: "forward +x", ..., "still", or "no data"."""
+        while self._positions and self._positions[0][0] < now - _WINDOW:
+            self._positions.popleft()
+        if not self._positions:
+            return "no data"
+        with np.errstate(over="ignore"):
+            way = self._positions[-1][1] - self._positions[0][1]
+        axis = int(np.abs(way).argmax())
+        if not np.abs(way[axis]) >= _STILL:
+            return "still"
+        return _DIRECTIONS[axis][int(way[axis] > 0)]
+
+    @property
+    def position(self) -> Array | None:
+        """(3,) newest position of the window [m]."""
+        return self._positions[-1][1] if self._positions else None
+
+
+@dataclass(frozen=True, slots=True)
+class HeadsetCheck:
+    """A look at the connection."""
+
+    statistics: HeadsetStatistics
+    directions: dict[str, str]  # hand -> where it moves
+    positions: dict[str, Array | None]  # hand -> world position [m]
+    heard: bool  # data arrived at some time
+    advice: tuple[str, ...]  # lines; empty while data arrives
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain data for the JSON writer."""
+        statistics = self.statistics
+        return {
+            "address": list(statistics.address),
+            "connected": statistics.peer is not None,
+            "peer": statistics.peer,
+            "dialect": statistics.dialect,
+            "connections": statistics.connections,
+            "last_disconnect": statistics.last_disconnect,
+            "topics": {
+                name: {"count": topic.count, "rate_hz": topic.rate, "age_s": topic.age, "last": topic.last}
+                for name, topic in statistics.topics.items()
+            },
+            "unknown_topics": statistics.unknown_topics,
+            "published": statistics.published,
+            "subscribed": statistics.subscribed,
+            "hands": {hand: {"direction": self.directions[hand], "position_m": self.positions[hand]} for hand in SIDES},
+            "heard": self.heard,
+            "advice": self.advice,
+        }
+
+
+def watch_headset(
+    server: HeadsetServer, config: Config, duration: float | None, show: Callable[[HeadsetCheck], None]
+) -> HeadsetCheck:
+    """Watch a started server for ``duration`` [s] or until Ctrl-C, with every look shown; returns the last."""
+    hands = {hand: HandMovement(config.teleop.axes) for hand in SIDES}
+    start = now = last_data = time.monotonic()
+    heard = False
+    check = HeadsetCheck(server.statistics, dict.fromkeys(hands, "no data"), dict.fromkeys(hands), False, ())
+    while duration is None or now - start < duration:
+        now = time.monotonic()
+        for sample in server.poll(now):
+            hands[sample.hand].add(sample)
+            last_data, heard = now, True
+        statistics = server.statistics
+        check = HeadsetCheck(
+            statistics=statistics,
+            directions={hand: movement.in_words(now) for hand, movement in hands.items()},
+            positions={hand: movement.position for hand, movement in hands.items()},
+            heard=heard,
+            advice=advice(statistics) if now - last_data > SILENCE else (),
+        )
+        show(check)
+        try:
+            time.sleep(_PERIOD)
+        except KeyboardInterrupt:
+            break
+    return check
+
+
+def advice(statistics: HeadsetStatistics) -> tuple[str, ...]:
+    """What to look at when nothing arrives, the likeliest first."""
+    host, port = statistics.address
+    lines = [f"nothing arrives for {SILENCE:g} s on {host}:{port}"]
+    if statistics.peer is not None:
+        return (
+            *lines,
+            f"{statistics.peer} is connected but sends no hand data: put the headset on, keep both controllers in view",
+            "look at the protocol setting in the app: ROS2 and ROS1 are both understood, but has it been started?",
+        )
+    if statistics.last_disconnect is not None:
+        lines.append(f"the last connection ended: {statistics.last_disconnect}")
+    if host in ("127.0.0.1", "::1", "localhost"):
+        lines.append(f"{host} can be reached from this machine only: start again with --host 0.0.0.0")
+    return (
+        *lines,
+        f"what the app has to have: address {_own_address(host)}, port {port}, protocol ROS2",
+        "headset and this machine have to be in the same network, one that lets its members talk to each other",
+        f"a firewall on this machine must let TCP port {port} in (ufw allow {port}/tcp)",
+    )
+
+
+def _own_address(host: str) -> str:
+    """What to type in the app. Connecting a UDP socket sends nothing; it only picks the way out."""
+    if host not in ("", "0.0.0.0", "::"):
+        return host
+    try:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            probe.connect(("192.0.2.1", 9))  # of a range that is for documentation only
+            return str(probe.getsockname()[0])
+    except OSError:
+        return "of this machine (it has no network now)"

@@ -1,0 +1,199 @@
+"""Parameters of an arm controller."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+from q2r2_control.config import load_config
+from q2r2_control.config.external import GripperSettings, GuardLimits
+from q2r2_control.config.presets import BUILTIN, Mode, Preset, preset_of
+from q2r2_control.config.teleop import GuardSettings, Stance, TeleopSettings
+from q2r2_control.errors import ConfigError
+from q2r2_control.ros.bridge.base_node import BaseNode
+from q2r2_control.ros.bridge.parameters import declared, settings_from_parameters
+
+
+@dataclass(frozen=True, slots=True)
+class ArmDefaults:
+    """What a subclass of :class:`BaseArmController` gives."""
+
+    arm_name: str  # left or right
+    robot_name: str
+    mirror: bool
+    base_frame_id: str
+    end_effector_link_name: str
+    ctrl_prefix: str
+    gripper_action_topic: str
+    filter_window_size: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class ArmParameters:
+    """What an arm controller runs with."""
+
+    base_frame: str  # that the controller reads its targets in
+    world_frame: str  # whose axes the hand's are
+    tool_frame: str
+    controller: str  # name of the controller's node
+    prefix: str  # for the preset's {ctrl}
+    target_topic: str
+    current_pose_topic: str  # "": from /tf
+    safe_target_topic: str
+    following_topic: str
+    builtin_prefix: str
+    tool_timeout: float  # [s]
+    link_timeout: float  # [s]
+    listener_timeout: float  # [s]
+    rate: float  # [Hz]
+    preset: Preset
+    mode: Mode
+    gripper_topic: str
+    gripper: GripperSettings
+    guard: GuardSettings
+    teleop: TeleopSettings
+
+
+@dataclass(frozen=True, slots=True)
+class _Given:
+    """Defaults of the parameters."""
+
+    ctrl_prefix: str
+    base_frame_id: str
+    end_effector_link_name: str
+    gripper_action_topic: str
+    teleop: TeleopSettings
+    preset: str = BUILTIN.name
+    mode: Mode = Mode.RAW
+    rate: float | None = None
+    target_topic: str = ""
+    world_frame_id: str = ""
+    gripper: GripperSettings = field(default_factory=GripperSettings)
+    limits: GuardLimits = field(default_factory=GuardLimits)
+
+
+def arm_parameters(node: BaseNode, subclass: ArmDefaults) -> ArmParameters:
+    """Declare all parameters and check them together. Raises :class:`ConfigError` for what is not allowed.
+
+    Defaults are the cell's where the parameter ``config`` names one, and else the subclass's.
+    """
+    arm = subclass.arm_name
+    config = declared(node, "config", "", 'YAML of the cell, whose teleop and external are defaults of these; "": none')
+    given = _of_cell(subclass, config) if config else _of_subclass(subclass)
+    preset, mode = preset_of(
+        declared(node, "preset", given.preset, "terms of the controller that is driven, by its name"),
+        declared(node, "mode", given.mode.value, "raw: the hand's target; filtered: through the built-in controller"),
+    )
+    prefix = declared(node, "ctrl_prefix", given.ctrl_prefix, "the controller's node, with its namespace").rstrip("/")
+    base = declared(node, "base_frame_id", given.base_frame_id, "frame_id of targets")
+    world = declared(node, "world_frame_id", given.world_frame_id, 'whose axes the hand\'s are; "": base_frame_id')
+    topic = declared(node, "target_topic", given.target_topic, 'where targets go; "": as the preset says')
+    controller = declared(node, "controller_node", "", 'whose restart pauses the arm; "": ctrl_prefix')
+    return ArmParameters(
+        base_frame=base,
+        world_frame=world or base,
+        tool_frame=declared(
+            node, "end_effector_link_name", given.end_effector_link_name, "frame that the operator moves"
+        ),
+        controller=controller or ("/cartesian_controller" if preset is BUILTIN else prefix),
+        prefix=prefix,
+        target_topic=topic or preset.topic.format(ctrl=prefix),
+        current_pose_topic=declared(node, "current_pose_topic", "", 'PoseStamped of the tool; "": from /tf'),
+        safe_target_topic=declared(
+            node, "safe_target_topic", f"/cartesian_controller/safe_target/{arm}", "what the built-in controller allows"
+        ),
+        following_topic=declared(
+            node, "following_topic", f"/cartesian_controller/following/{arm}", "whether the built-in controller follows"
+        ),
+        builtin_prefix=declared(node, "builtin_prefix", f"/q2r2/{arm}", "where mode filtered sends the hand's target"),
+        tool_timeout=declared(
+            node,
+            "tool_timeout",
+            0.15,
+            "an older pose of the tool, or safe target, does not count [s]",
+            at_least=0.01,
+            at_most=2.0,
+        ),
+        listener_timeout=declared(
+            node, "listener_timeout", 0.15, "targets may not be acknowledged [s]", at_least=0.1, at_most=10.0
+        ),
+        link_timeout=declared(
+            node, "link_timeout", 0.15, "the other arm's node may be silent [s]", at_least=0.1, at_most=10.0
+        ),
+        rate=_rate(node, preset, given.rate),
+        preset=preset,
+        mode=mode,
+        gripper_topic=declared(node, "gripper_action_topic", given.gripper_action_topic, "action or topic"),
+        gripper=settings_from_parameters(node, "gripper", given.gripper, frozenset()),
+        guard=settings_from_parameters(node, "guard", given.limits.over(preset.guard), frozenset()),
+        teleop=_teleop_settings(node, given.teleop),
+    )
+
+
+def _of_subclass(subclass: ArmDefaults) -> _Given:
+    teleop = TeleopSettings(stance=Stance.MIRROR if subclass.mirror else Stance.SIDE_BY_SIDE)
+    if subclass.filter_window_size is not None:
+        # A mean over n samples of a 75 Hz headset comes (n - 1) / 2 periods late.
+        delay = min(max((subclass.filter_window_size - 1) / 2 / 75.0, 0.0), 0.2)
+        teleop = teleop.model_copy(update={"filter": teleop.filter.model_copy(update={"smoothing_delay": delay})})
+    return _Given(
+        subclass.ctrl_prefix,
+        subclass.base_frame_id,
+        subclass.end_effector_link_name,
+        subclass.gripper_action_topic,
+        teleop,
+    )
+
+
+def _of_cell(subclass: ArmDefaults, path: str) -> _Given:
+    """What a cell says, and of what it does not say the subclass's."""
+    cell, side = load_config(path), subclass.arm_name
+    arm = next((arm for name, arm in cell.arms.items() if name == side), None)
+    if arm is None:
+        raise ConfigError(f"parameter config: {path} has no arm {side}; allowed: {', '.join(cell.arms)}")
+    given = replace(_of_subclass(subclass), teleop=cell.teleop)
+    if arm.tool.frame is not None:
+        given = replace(given, end_effector_link_name=f"{side}_{arm.tool.frame}")
+    if cell.external is None:
+        return given
+    external, theirs = cell.external, cell.external.arm(side)
+    given = replace(
+        given,
+        preset=external.preset,
+        mode=external.mode,
+        ctrl_prefix=theirs.ctrl_prefix,
+        base_frame_id=theirs.base_frame,
+        world_frame_id=external.world_frame or "",
+        end_effector_link_name=theirs.tool_frame or given.end_effector_link_name,
+        gripper_action_topic=theirs.gripper.topic or given.gripper_action_topic,
+        gripper=theirs.gripper.settings(),
+        limits=external.limits,
+    )
+    if not external.terms.takes_poses:
+        return given  # rate and topic are those of joint commands, which another node sends
+    return replace(given, rate=external.rate, target_topic=theirs.target_topic or "")
+
+
+def _rate(node: BaseNode, preset: Preset, wanted: float | None) -> float:
+    rate = float(declared(node, "rate", wanted or preset.rate, "of targets [Hz]", at_least=1.0, at_most=1000.0))
+    if rate < preset.lowest_rate:
+        raise ConfigError(
+            f"parameter rate = {rate:g}: preset {preset.name} needs at least {preset.lowest_rate:g}, "
+            f"better {preset.rate:g}"
+        )
+    return rate
+
+
+def _teleop_settings(node: BaseNode, default: TeleopSettings) -> TeleopSettings:
+    swapped = default.stance is not Stance.SIDE_BY_SIDE
+    mirror = declared(node, "mirror", swapped, "facing the robot: the other hand moves this arm")
+    reflected = declared(
+        node,
+        "mirror_reflected",
+        mirror and default.stance is Stance.MIRROR_REFLECTED,
+        "with mirror: motion to the left becomes motion to the right",
+    )
+    if reflected and not mirror:
+        raise ConfigError("parameter mirror_reflected = True: allowed with mirror = True only")
+    stance = Stance.SIDE_BY_SIDE if not mirror else Stance.MIRROR_REFLECTED if reflected else Stance.MIRROR
+    default = default.model_copy(update={"stance": stance})
+    return settings_from_parameters(node, "teleop", default, frozenset({"stance"}))

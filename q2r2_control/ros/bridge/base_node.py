@@ -1,0 +1,182 @@
+"""What every node has in common: parameters with ranges, QoS, its own state, diagnostics, an orderly end."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from rclpy.duration import Duration
+from rclpy.exceptions import ParameterException
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from std_msgs.msg import String
+
+from q2r2_control.errors import ConfigError, Q2R2Error
+from q2r2_control.ros.launch.middleware import set_up_middleware
+
+# Commands: only the newest counts, and it has to arrive.
+COMMAND_QOS = QoSProfile(
+    history=HistoryPolicy.KEEP_LAST,
+    depth=1,
+    reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.VOLATILE,
+)
+# The same for those who send them: a reliable sender repeats what has not arrived, also when a link has been down for a
+# while, and a target of then is a jump now. Judged by the sender's clock alone; a receiver's may be another.
+SENT_COMMAND_QOS = QoSProfile(
+    history=HistoryPolicy.KEEP_LAST,
+    depth=1,
+    reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.VOLATILE,
+    lifespan=Duration(seconds=0.1),
+)
+# Streams of a headset or of joint states: a late one is worth less than the next.
+STREAM_QOS = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
+# What late comers have to get too, such as robot_description.
+LATCHED_QOS = QoSProfile(
+    history=HistoryPolicy.KEEP_LAST,
+    depth=1,
+    reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.TRANSIENT_LOCAL,
+)
+_DIAGNOSTICS_PERIOD = 0.5  # [s]
+_CLOCK_TIMEOUT = 1.0  # simulated time that stands still for this long is told [s]
+
+OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
+
+
+class BaseNode(Node):
+    """A node with described parameters, ``/diagnostics`` and ``~/state`` (one JSON object in a String).
+
+    Subclasses override :meth:`health`. Setting ``exit_code`` ends the executable with it.
+    """
+
+    exit_code: int | None = None
+
+    def __init__(self, name: str, **kwargs: Any) -> None:
+        super().__init__(name, **kwargs)
+        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        self._state = self.create_publisher(String, "~/state", 10)
+        self._ros_time = 0.0, time.monotonic()  # the newest ROS time, and when it was first seen [s]
+        # Whoever asks why nothing moves has to get an answer, above all where ROS time stands still.
+        self.create_timer(_DIAGNOSTICS_PERIOD, self.report_health, clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+    def parameter(
+        self,
+        name: str,
+        default: Any,
+        description: str,
+        *,
+        at_least: float | None = None,
+        at_most: float | None = None,
+        one_of: Sequence[str] = (),
+        read_only: bool = True,
+    ) -> Any:
+        """Declare a parameter and return its value.
+
+        A range is kept by rclpy itself, ``one_of`` only at the start. Raises :class:`ConfigError` for a value of
+        another type, outside the range or not in ``one_of``.
+        """
+        descriptor = ParameterDescriptor(description=description, read_only=read_only)
+        if one_of:
+            descriptor.additional_constraints = f"one of {', '.join(one_of)}"
+        if at_least is not None and at_most is not None:
+            if isinstance(default, int) and not isinstance(default, bool):
+                descriptor.integer_range = [IntegerRange(from_value=int(at_least), to_value=int(at_most), step=0)]
+            else:
+                descriptor.floating_point_range = [
+                    FloatingPointRange(from_value=float(at_least), to_value=float(at_most), step=0.0)
+                ]
+        try:
+            value = self.declare_parameter(name, default, descriptor).value
+        except ParameterException as error:
+            allowed = (
+                f"; allowed is {at_least:g} .. {at_most:g}" if at_least is not None and at_most is not None else ""
+            )
+            raise ConfigError(f"parameter {name}: {' '.join(str(error).split())}{allowed}") from None
+        if one_of and value not in one_of:
+            raise ConfigError(f"parameter {name}: {value!r}: allowed are {', '.join(one_of)}")
+        return value
+
+    @property
+    def now(self) -> float:
+        """The node's clock [s]: ROS time, so that use_sim_time counts."""
+        return float(self.get_clock().now().nanoseconds) * 1e-9
+
+    def health(self) -> tuple[bytes, str, Mapping[str, Any]]:
+        """Level (OK, WARN, ERROR), one line, and figures."""
+        return OK, "running", {}
+
+    def report_health(self) -> None:
+        """Publish :meth:`health` now; a timer does it twice a second, a change that matters need not wait."""
+        level, line, values = self.health()
+        if (problem := self._clock_problem()) is not None:
+            level, line = max(level, WARN), f"{problem}; {line}"
+        status = DiagnosticStatus(level=level, name=self.get_fully_qualified_name(), message=line)
+        status.values = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
+        array = DiagnosticArray(status=[status])
+        array.header.stamp = self.get_clock().now().to_msg()
+        self._diagnostics.publish(array)
+        state = {"level": {OK: "ok", WARN: "warn", ERROR: "error"}[level], "message": line, **values}
+        self._state.publish(String(data=json.dumps(state, default=str)))
+
+    def _clock_problem(self) -> str | None:
+        """What keeps ROS time from moving, if it is a simulation's and does not."""
+        clock: Any = self.get_clock()
+        now, wall = self.now, time.monotonic()
+        if now != self._ros_time[0]:
+            self._ros_time = now, wall
+        if not clock.ros_time_is_active or wall - self._ros_time[1] < _CLOCK_TIMEOUT:
+            return None
+        if now == 0.0:
+            return "use_sim_time is set and nothing comes on /clock"
+        return "use_sim_time is set and the time on /clock stands still"
+
+
+def run_node(make: Callable[[], Node], args: Sequence[str] | None = None) -> int:
+    """Main function of an executable: make the node, spin until Ctrl-C or SIGTERM, close it; the exit code.
+
+    A fault of its configuration is one line on stderr and exit code 2. ``node.close()`` is called if there is one.
+    """
+    name = sys.argv[0].rsplit("/", 1)[-1]
+    set_up_middleware(os.environ)
+    try:
+        rclpy.init(args=list(sys.argv if args is None else args), signal_handler_options=rclpy.SignalHandlerOptions.NO)
+    except rclpy_implementation.RCLError as error:  # such as arguments that cannot be parsed
+        print(f"{name}: {error}", file=sys.stderr)
+        return 2
+    stop = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    node: Any = None
+    try:
+        node = make()
+        executor = SingleThreadedExecutor()
+        executor.add_node(node)
+        while rclpy.ok() and not stop.is_set() and getattr(node, "exit_code", None) is None:
+            executor.spin_once(timeout_sec=0.1)
+    except (Q2R2Error, ParameterException) as error:
+        print(f"{name}: {error}", file=sys.stderr)
+        return 2
+    except ExternalShutdownException:
+        pass
+    finally:
+        if node is not None:
+            if hasattr(node, "close"):
+                node.close()
+            node.destroy_node()
+        rclpy.try_shutdown()
+    return getattr(node, "exit_code", None) or 0

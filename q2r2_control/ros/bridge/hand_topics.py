@@ -1,0 +1,96 @@
+"""The topics that a headset publishes, on either side of ROS."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable
+from typing import Any
+
+from geometry_msgs.msg import PoseStamped, Twist
+from quest2ros.msg import OVR2ROSInputs
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+
+from q2r2_control.inputs.messages import HandMessage, HandPose, HandTwist, MessageType
+from q2r2_control.inputs.session import HAND_TOPICS
+from q2r2_control.ros.bridge.base_node import STREAM_QOS
+from q2r2_control.ros.bridge.messages import (
+    hand_inputs,
+    hand_pose,
+    hand_pose_message,
+    hand_twist,
+    hand_twist_message,
+    inputs_message,
+)
+from q2r2_control.ros.monitoring.publishers import Publishers
+
+# Reliable, so that every subscriber can have it: a best-effort publisher has no reliable subscribers.
+PUBLISHED_QOS = QoSProfile(
+    history=HistoryPolicy.KEEP_LAST,
+    depth=10,
+    reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.VOLATILE,
+)
+_TYPES = {MessageType.POSE: PoseStamped, MessageType.TWIST: Twist, MessageType.INPUTS: OVR2ROSInputs}
+_READERS: dict[MessageType, Callable[[Any], HandMessage]] = {
+    MessageType.POSE: hand_pose,
+    MessageType.TWIST: hand_twist,
+    MessageType.INPUTS: hand_inputs,
+}
+
+
+class HandPublishers:
+    """Publishes what a headset says, on topics of the same names. May be used by any one thread."""
+
+    def __init__(self, node: Node, topics: Iterable[str]) -> None:
+        """``topics`` are of :data:`HAND_TOPICS`."""
+        self._publishers = {
+            topic: node.create_publisher(_TYPES[HAND_TOPICS[topic].kind], topic, PUBLISHED_QOS) for topic in topics
+        }
+
+    def publish(self, topic: str, message: HandMessage, frame: str, t: float) -> None:
+        """Publish at once. A pose is in ``frame`` at ``t`` [s]; other messages have neither."""
+        if isinstance(message, HandPose):
+            self._publishers[topic].publish(hand_pose_message(message, frame, t))
+        elif isinstance(message, HandTwist):
+            self._publishers[topic].publish(hand_twist_message(message))
+        else:
+            self._publishers[topic].publish(inputs_message(message))
+
+    def subscribers(self, hand: str) -> int:
+        """How many subscribers the topics of ``hand`` have."""
+        publishers = (publisher for topic, publisher in self._publishers.items() if HAND_TOPICS[topic].hand == hand)
+        return sum(publisher.get_subscription_count() for publisher in publishers)
+
+
+class HandWatch:
+    """Says which node's data of a hand have ceased. Poses and buttons are needed both: one guides, the other stops."""
+
+    def __init__(self, node: Node, hand: str, timeout: float) -> None:
+        self._hand, self._timeout = hand, timeout
+        self._topics = {"pose": f"q2r_{hand}_hand_pose", "button data": f"q2r_{hand}_hand_inputs"}
+        self._publishers = Publishers(node, self._topics.values())
+        self._publishers.look_steadily()
+
+    def silence(self, now: float, pose_stamp: float, inputs_stamp: float) -> str | None:
+        """One line, or None; the stamps are receipt times of the newest, -inf before the first [s]."""
+        ages = {"pose": now - pose_stamp, "button data": now - inputs_stamp}
+        missing = [what for what, age in ages.items() if age > self._timeout]
+        if not missing:
+            return None
+        what = "data" if len(missing) == len(ages) else missing[0]
+        source = self._publishers.source(self._topics[missing[0]])
+        age = min(ages[what] for what in missing)
+        since = f"for {age:.2f} s" if age < math.inf else "yet"
+        return f"no {what} of the {self._hand} hand{source} {since}"
+
+
+def subscribe_to_hands(node: Node, listener: Callable[[str, HandMessage], None]) -> None:
+    """Call ``listener`` with topic and message for whatever any hand says."""
+    for name, topic in HAND_TOPICS.items():
+        read = _READERS[topic.kind]
+
+        def hear(message: Any, name: str = name, read: Callable[[Any], HandMessage] = read) -> None:
+            listener(name, read(message))
+
+        node.create_subscription(_TYPES[topic.kind], name, hear, STREAM_QOS)

@@ -1,0 +1,247 @@
+"""``cartesian_controller``: the built-in controller for all arms of a cell, between target poses and joint commands.
+
+Every topic is one of all arms or one an arm, as the robot's layout asks for: targets on ``/q2r2/left/target_frame`` or
+``left.target_topic``, joint states on ``joint_states`` or ``left.joint_states_topic``, commands on ``output_topic`` or
+``left.output_topic``. So a controller an arm in one namespace (``/robot/left_arm_controller/joint_trajectory``) and a
+namespace an arm (``/left/joint_states``) both work. With output ``none`` another controller moves the arms and only
+``~/safe_target/left`` is published for it. What is done with targets: :mod:`supervisor`.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any
+
+from geometry_msgs.msg import PoseStamped
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from rclpy.parameter import Parameter
+from std_msgs.msg import Bool
+from std_srvs.srv import SetBool, Trigger
+
+from q2r2_control.config import load_config
+from q2r2_control.control.controller import LONGEST_DT, CartesianController
+from q2r2_control.robot.robot import Robot
+from q2r2_control.ros.bridge.base_node import ERROR, LATCHED_QOS, OK, SENT_COMMAND_QOS, WARN, BaseNode, run_node
+from q2r2_control.ros.bridge.joint_intake import JointIntake
+from q2r2_control.ros.bridge.make_output import NONE, make_output, output_name
+from q2r2_control.ros.bridge.messages import stamped_pose
+from q2r2_control.ros.bridge.target_intake import TargetIntake
+from q2r2_control.supervision.external_arms import LedArms, LedSettings, settings_to_lead
+from q2r2_control.supervision.joint_watch import WatchSettings
+from q2r2_control.supervision.supervisor import Phase, Supervisor
+from q2r2_control.supervision.target_stream import Origins, StreamSettings
+from q2r2_control.types import Reference
+
+_LONGEST_STOP = 3.0  # [s]
+_LOOK_PERIOD = 0.5  # between two looks at the graph [s]
+
+# Parameters that may change while the node runs: name, unit or meaning, least and greatest value.
+_Table = tuple[tuple[str, str, str, float, float], ...]
+_STREAM_PARAMETERS: _Table = (
+    ("timeout", "target_timeout", "an arm without targets for this long holds [s]", 0.02, 2.0),
+    ("engage_distance", "engage_distance", "targets have to begin this near to the tool [m]", 0.0, 0.2),
+    ("engage_angle", "engage_angle", "and turned from it by no more [rad]", 0.0, 1.5),
+)
+_WATCH_PARAMETERS: _Table = (
+    ("timeout", "joint_state_timeout", "without joint states for this long the arms brake [s]", 0.01, 1.0),
+    ("settle_time", "settle_time", "joint states have to be good and at rest before activation [s]", 0.02, 10.0),
+    ("deviation", "max_deviation", "of a joint from its reference [rad]", 0.01, 3.0),
+    ("deviation_time", "deviation_time", "for this long stops the arms [s]", 0.05, 10.0),
+)
+_LED_PARAMETERS: _Table = (
+    ("tolerance", "distance_tolerance", "output none: measured pairs may be closer than min_distance [m]", 0.0, 0.1),
+)
+
+
+class CartesianControllerNode(BaseNode):
+    """Feeds a :class:`Supervisor` from its topics and publishes the reference that comes of it."""
+
+    def __init__(self) -> None:
+        super().__init__("cartesian_controller")
+        config = load_config(self.parameter("config", "config/dual_iiwa7.yaml", "YAML of the cell"))
+        rate = self.parameter("rate", 250.0, "of the control loop [Hz]", at_least=20, at_most=1000)
+        output = output_name(self)
+        if output == NONE:
+            config = settings_to_lead(config)
+        robot = Robot.from_config(config)
+        self._period = 1.0 / rate
+        self._output = make_output(output, self, robot, config, self._period)
+        self._targets = TargetIntake(self, robot, self.report_health)
+        self._joints = JointIntake(self, robot)
+        streams, watch, led = StreamSettings(), WatchSettings(), LedSettings()
+        self._settings: dict[str, tuple[Any, str]] = {}
+        for target, table in ((streams, _STREAM_PARAMETERS), (watch, _WATCH_PARAMETERS), (led, _LED_PARAMETERS)):
+            self._declare(target, table)
+        self.add_post_set_parameters_callback(self._on_parameters)
+        self._controller = CartesianController(robot, config.control)
+        self._supervisor = Supervisor(
+            robot,
+            self._controller,
+            streams,
+            watch,
+            Origins(self._joints.source, self._targets.source),
+            LedArms(robot, self._controller, led, streams, watch) if output == NONE else None,
+        )
+        self._reference: Reference | None = None
+        self._ticks, self._reported_at, self._last_tick = 0, time.monotonic(), self.now
+        self._connect()
+        self.get_logger().info(f"{config.name}: {', '.join(robot.arms)}; waits for joint states")
+
+    def _declare(self, target: Any, table: _Table) -> None:
+        for field, name, description, least, greatest in table:
+            value = self.parameter(
+                name, getattr(target, field), description, at_least=least, at_most=greatest, read_only=False
+            )
+            setattr(target, field, value)
+            self._settings[name] = (target, field)
+
+    def _on_parameters(self, parameters: list[Parameter]) -> None:
+        for parameter in parameters:
+            if parameter.name in self._settings:
+                target, field = self._settings[parameter.name]
+                setattr(target, field, parameter.value)
+
+    def _connect(self) -> None:
+        self._safe_targets = {
+            arm: self.create_publisher(PoseStamped, f"~/safe_target/{arm}", SENT_COMMAND_QOS)
+            for arm in self._targets.topics
+        }
+        self._follows: dict[str, bool | None] = dict.fromkeys(self._targets.topics)
+        self._following = {arm: self.create_publisher(Bool, f"~/following/{arm}", LATCHED_QOS) for arm in self._follows}
+        self._targets.subscribe(self._supervisor.take_target)
+        self._joints.subscribe(self._supervisor.take_joint_state)
+        self.create_service(SetBool, "~/pause", self._on_pause)
+        services: dict[str, Callable[[], str | None]] = {
+            "home": self._supervisor.go_home,
+            "reset": self._supervisor.reset,
+            "stop": self._stop,
+        }
+        for name, act in services.items():
+            self.create_service(Trigger, f"~/{name}", partial(_serve, act))
+        self.create_timer(self._period, self._tick)
+        # Looks even while /clock stands still.
+        self.create_timer(_LOOK_PERIOD, self._look, clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+    def _tick(self) -> None:
+        now = self.now
+        # A late tick moves the arms no faster; a clock that was set back moves nothing.
+        dt = min(now - self._last_tick, LONGEST_DT)
+        if now - self._last_tick > LONGEST_DT:
+            self._supervisor.stalled(now - self._last_tick, now)
+        self._last_tick = now
+        self._ticks += 1
+        if dt > 0.0:
+            self._advance(now, dt)
+        self._tell_followed()
+
+    def _advance(self, now: float, dt: float) -> None:
+        began = time.monotonic()
+        # What the arms do not follow is nothing to ask of somebody who was not there before.
+        if fault := self._output.doubt(self._supervisor.astray):
+            self._supervisor.abandon(fault, now)
+        was_active = self._supervisor.phase is Phase.ACTIVE
+        reference, state = self._supervisor.tick(now, dt), self._joints.state
+        if not was_active and self._supervisor.phase is Phase.ACTIVE and state is not None:
+            self._output.activate(state)
+        if time.monotonic() - began > LONGEST_DT:
+            return  # frozen in between: what was to be sent is of the past, and the next tick finds out
+        if reference is not None and state is not None:
+            self._output.send(reference, state, dt, now, self._supervisor.trusted)
+            self._reference = reference
+            self._publish_safe_targets(now)
+        self._tell_events()
+
+    def _publish_safe_targets(self, now: float) -> None:
+        for arm, publisher in self._safe_targets.items():
+            if publisher.get_subscription_count():
+                frame = self._targets.frames[arm]
+                tool = frame.pose.actInv(self._controller.tool_pose(arm))
+                publisher.publish(stamped_pose(tool, frame.name, now))
+
+    def _tell_followed(self) -> None:
+        """Say of each arm whether its targets are followed, when that changes."""
+        for arm, publisher in self._following.items():
+            follows = self._supervisor.follows(arm)
+            if follows != self._follows[arm]:
+                self._follows[arm] = follows
+                publisher.publish(Bool(data=follows))
+
+    def _tell_events(self) -> None:
+        if not self._supervisor.events:
+            return
+        for event in self._supervisor.events:
+            self.get_logger().warning(event)
+        self._supervisor.events.clear()
+        self.report_health()
+
+    def _look(self) -> None:
+        """Remember who publishes what."""
+        self._targets.look()
+        self._joints.look()
+
+    def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+        self._supervisor.pause(request.data)
+        return _answer(response, None)
+
+    def _stop(self) -> str | None:
+        self._supervisor.stop("stopped by ~/stop; ~/reset activates again")
+        return None
+
+    def health(self) -> tuple[bytes, str, Mapping[str, Any]]:
+        supervisor, now, wall = self._supervisor, self.now, time.monotonic()
+        values: dict[str, Any] = {
+            "phase": supervisor.phase,
+            "loop_rate_hz": round(self._ticks / max(wall - self._reported_at, 1e-9), 1),
+        }
+        self._ticks, self._reported_at = 0, wall
+        for arm, rejected in self._targets.rejected.items():
+            values[f"{arm}_state"] = "paused" if supervisor.paused else supervisor.arm_state(arm)
+            age = supervisor.target_age(arm, now)
+            values[f"{arm}_target_age_s"] = round(age, 3) if age < 1e6 else "none"
+            values[f"{arm}_targets_rejected"] = rejected
+            values[f"{arm}_targets_from"] = self._targets.publishers(arm)
+        if self._reference is not None:
+            report = self._reference.report
+            values["qp_status"] = str(report.status)
+            values["closest_pair"] = "|".join(report.closest_pair)
+            values["closest_distance_m"] = round(report.closest_distance, 4)
+        level, line = self._judge()
+        return level, line, values
+
+    def _judge(self) -> tuple[bytes, str]:
+        if self._supervisor.fault is not None:
+            return ERROR, self._supervisor.fault
+        ceased = list(self._supervisor.ceased.values())
+        if faults := self._targets.faults():
+            return WARN, "; ".join(faults + ceased)
+        return OK, "; ".join(["paused" if self._supervisor.paused else "active", *ceased])
+
+    def close(self) -> None:
+        """Bring the arms to rest along the certified stop before the commands end."""
+        self._supervisor.stop("ending")
+        deadline = time.monotonic() + _LONGEST_STOP
+        while self._supervisor.phase is Phase.BRAKING and time.monotonic() < deadline:
+            time.sleep(self._period)
+            self._advance(self.now, self._period)  # simulated time may have ended already
+
+
+def _serve(act: Callable[[], str | None], request: Any, response: Any) -> Any:
+    return _answer(response, act())
+
+
+def _answer(response: Any, refusal: str | None) -> Any:
+    response.success, response.message = refusal is None, refusal or "done"
+    return response
+
+
+def main() -> int:
+    """The executable ``cartesian_controller``."""
+    return run_node(CartesianControllerNode)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

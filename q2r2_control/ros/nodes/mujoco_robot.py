@@ -1,0 +1,204 @@
+"""``mujoco_robot``: the simulated cell as a ROS robot. It takes joint commands; Cartesian targets are a controller's.
+
+Joint positions come in on any one of ``joint_trajectory`` (one point), ``joint_commands`` (JointState) and
+``position_commands`` (Float64MultiArray in the order of the joints in ``joint_states``, all arms), joint torques on
+``torque_commands`` (the same order); the newest command counts. Without commands the arms brake, and after
+``hold_after`` they stand on their position servos, whatever drove them before.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from geometry_msgs.msg import TransformStamped
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray, String
+from std_srvs.srv import Trigger
+from tf2_msgs.msg import TFMessage
+from trajectory_msgs.msg import JointTrajectory
+
+from q2r2_control.config import load_config
+from q2r2_control.errors import ConfigError
+from q2r2_control.plants.simulated_cell import JointSetpoint, SimulatedCell
+from q2r2_control.robot.compose import WORLD
+from q2r2_control.robot.robot import Robot
+from q2r2_control.ros.bridge.base_node import LATCHED_QOS, OK, WARN, BaseNode, run_node
+from q2r2_control.ros.bridge.gripper_server import GripperServer, Stroke
+from q2r2_control.ros.bridge.messages import joint_state_message, seconds, transform_message
+from q2r2_control.types import RobotState
+
+
+class MujocoRobot(BaseNode):
+    """Runs a :class:`SimulatedCell` in real time between its topics, services and actions."""
+
+    def __init__(self) -> None:
+        super().__init__("mujoco_robot")
+        config = load_config(self.parameter("config", "config/dual_iiwa7.yaml", "YAML of the cell"))
+        rate = self.parameter("rate", 250.0, "joint states per second [Hz]", at_least=20, at_most=1000)
+        tf_rate = self.parameter("tf_rate", 50.0, "transforms per second [Hz]", at_least=1, at_most=1000)
+        hold_after = self.parameter("hold_after", 0.1, "without commands [s]", at_least=0.01, at_most=1)
+        max_jump = self.parameter("max_jump", 0.1, "of a commanded position [rad]", at_least=0.001, at_most=7)
+        stroke = Stroke(
+            self.parameter("gripper_open_position", 0.0, "in goals, fully open [m]", at_least=-0.2, at_most=0.2),
+            self.parameter("gripper_closed_position", 0.05, "in goals, closed [m]", at_least=-0.2, at_most=0.2),
+        )
+        if stroke.open_position == stroke.closed_position:
+            raise ConfigError("gripper_open_position, gripper_closed_position: allowed: two different numbers")
+        self._robot = Robot.from_config(config)
+        self._cell = SimulatedCell(self._robot, config, hold_after, max_jump)
+        self._refused: dict[str, str] = {}
+        self._refusals = 0
+        self._ticks, self._reported_at = 0, time.monotonic()
+        self._make_publishers()
+        self._make_subscriptions()
+        self._grippers = {arm: self._gripper(arm, stroke) for arm in self._cell.plant.gripper_openings()}
+        self.create_service(Trigger, "~/reset", self._reset)
+        steady = Clock(clock_type=ClockType.STEADY_TIME)  # the simulation makes its own time, whatever /clock says
+        self.create_timer(1.0 / rate, self._tick, clock=steady)
+        self.create_timer(1.0 / tf_rate, self._publish_transforms, clock=steady)
+        self.get_logger().info(f"{config.name}: {', '.join(self._robot.joint_names)}")
+
+    def _make_publishers(self) -> None:
+        self._joint_states = self.create_publisher(JointState, "joint_states", 10)
+        self._external = self.create_publisher(JointState, "~/external_torque", 10)
+        self._tf = self.create_publisher(TFMessage, "/tf", 10)
+        self._tf_static = self.create_publisher(TFMessage, "/tf_static", LATCHED_QOS)
+        self._description = self.create_publisher(String, "robot_description", LATCHED_QOS)
+        self._description.publish(String(data=self._robot.urdf))
+        model = self._cell.plant.model
+        links = [index for index in range(1, model.nbody) if model.body(index).name not in self._cell.loose_objects]
+        moving = [index for index in links if model.body_weldid[index] != 0]
+        self._moving = {index: _transform(model.body(index).name) for index in moving}
+        fixed = {index: _transform(model.body(index).name) for index in links if index not in self._moving}
+        self._tf_static.publish(self._placed(fixed))
+
+    def _make_subscriptions(self) -> None:
+        # Each arm may have a sender of its own, and the one's message is not to take the place of the other's.
+        commands = QoSProfile(depth=2 * len(self._robot.arms), reliability=ReliabilityPolicy.RELIABLE)
+        for kind, topic, callback in (
+            (JointTrajectory, "joint_trajectory", self._on_trajectory),
+            (JointState, "joint_commands", self._on_joint_state),
+            (Float64MultiArray, "position_commands", self._on_positions),
+            (Float64MultiArray, "torque_commands", self._on_torques),
+        ):
+            self.create_subscription(kind, topic, callback, commands)
+
+    def _gripper(self, arm: str, stroke: Stroke) -> GripperServer:
+        return GripperServer(
+            self,
+            f"/q2r2/{arm}_gripper/gripper_cmd",
+            stroke,
+            lambda opening: self._cell.command_gripper(arm, opening),
+            lambda fault: self._note(f"{arm}_gripper", fault),
+        )
+
+    def _on_trajectory(self, message: JointTrajectory) -> None:
+        if len(message.points) != 1:
+            self._note("joint_trajectory", f"{len(message.points)} points; allowed: one, a setpoint of a stream")
+            return
+        point = message.points[0]
+        self._follow("joint_trajectory", message.joint_names, point.positions, point.velocities, point.time_from_start)
+
+    def _on_joint_state(self, message: JointState) -> None:
+        self._follow("joint_commands", message.name, message.position, message.velocity)
+
+    def _on_positions(self, message: Float64MultiArray) -> None:
+        self._follow("position_commands", self._robot.joint_names, message.data, ())
+
+    def _on_torques(self, message: Float64MultiArray) -> None:
+        self._note("torque_commands", self._cell.command_torques(np.array(message.data, float), time.monotonic()))
+
+    def _follow(self, topic: str, names: Any, positions: Any, velocities: Any, delay: Any = None) -> None:
+        v = np.array(velocities, float) if len(velocities) else None
+        setpoint = JointSetpoint(names, np.array(positions, float), v, 0.0 if delay is None else seconds(delay))
+        self._note(topic, self._cell.command_positions(setpoint, time.monotonic()))
+
+    def _note(self, topic: str, fault: str | None) -> None:
+        """Say what was refused: once, until the topic brings something good again."""
+        if fault is None:
+            self._refused.pop(topic, None)
+            return
+        self._refusals += 1
+        if topic not in self._refused:
+            self.get_logger().warning(f"{topic}: refused: {fault}")
+            self._refused[topic] = fault
+            self.report_health()
+
+    def _tick(self) -> None:
+        cell, now = self._cell, time.monotonic()
+        state = cell.advance(now)
+        self._ticks += 1
+        stamp = self.now
+        self._joint_states.publish(self._measured(state, stamp))
+        if state.tau_external is not None and self._external.get_subscription_count():
+            names, zero = self._robot.joint_names, np.zeros(0)
+            self._external.publish(joint_state_message(names, zero, zero, state.tau_external, stamp))
+        openings = cell.plant.gripper_openings()
+        for arm, gripper in self._grippers.items():
+            gripper.update(now, openings[arm], cell.gripper_force(arm))
+
+    def _measured(self, state: RobotState, stamp: float) -> JointState:
+        cell = self._cell
+        return joint_state_message(
+            (*self._robot.joint_names, *cell.fingers),
+            np.concatenate((state.q, cell.finger_positions())),
+            np.concatenate((state.v, cell.finger_velocities())),
+            np.concatenate((state.tau, np.zeros(len(cell.fingers)))),
+            stamp,
+        )
+
+    def _publish_transforms(self) -> None:
+        self._tf.publish(self._placed(self._moving))
+
+    def _placed(self, transforms: Mapping[int, TransformStamped]) -> TFMessage:
+        """The transforms of MuJoCo's bodies, each straight from the world."""
+        data, stamp = self._cell.plant.data, self.get_clock().now().to_msg()
+        for index, message in transforms.items():
+            message.header.stamp = stamp
+            message.transform = transform_message(data.xpos[index], data.xquat[index][[1, 2, 3, 0]])  # from w first
+        return TFMessage(transforms=list(transforms.values()))
+
+    def _reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        self._cell.reset()
+        response.success, response.message = True, "at home"
+        return response
+
+    def health(self) -> tuple[bytes, str, Mapping[str, Any]]:
+        now = time.monotonic()
+        mode = self._cell.mode(now)
+        values = {
+            "mode": mode,
+            "loop_rate_hz": round(self._ticks / max(now - self._reported_at, 1e-9), 1),
+            "time_dropped_s": round(self._cell.dropped, 3),
+            "refused_commands": self._refusals,
+        }
+        self._ticks, self._reported_at = 0, now
+        if self._refused:
+            return WARN, "; ".join(f"{topic}: refused: {fault}" for topic, fault in self._refused.items()), values
+        return OK, mode, values
+
+    def close(self) -> None:
+        """Give the plant back."""
+        self._cell.plant.close()
+
+
+def _transform(link: str) -> TransformStamped:
+    message = TransformStamped(child_frame_id=link)
+    message.header.frame_id = WORLD
+    return message
+
+
+def main() -> int:
+    """The executable ``mujoco_robot``."""
+    return run_node(MujocoRobot)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

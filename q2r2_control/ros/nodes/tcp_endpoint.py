@@ -1,0 +1,120 @@
+"""``tcp_endpoint``: the Quest2ROS app on one side, topics on the other.
+
+Each message is published in the thread that receives it, as soon as its bytes are there: a poll would add up to its
+period, join messages that the app sends apart, and leave twists out.
+"""
+
+from __future__ import annotations
+
+import logging
+import sys
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from geometry_msgs.msg import Twist
+from quest2ros.msg import OVR2ROSHapticFeedback
+
+from q2r2_control.inputs.headset import HeadsetServer
+from q2r2_control.inputs.headset_check import SILENCE
+from q2r2_control.inputs.messages import PROP_TOPICS, HandPose, PropTwist
+from q2r2_control.inputs.session import HAND_TOPICS, HAPTIC_TOPICS, Reception
+from q2r2_control.ros.bridge.base_node import OK, STREAM_QOS, WARN, BaseNode, run_node
+from q2r2_control.ros.bridge.hand_topics import HandPublishers
+from q2r2_control.ros.bridge.messages import hand_twist
+from q2r2_control.types import SIDES, HapticFeedback
+
+_SERVER_LOG = logging.getLogger("q2r2_control.inputs.headset")
+
+
+class TcpEndpoint(BaseNode):
+    """Serves one headset at a time.
+
+    Poses are stamped with this node's clock when they are received, since the headset's clock is not ours; numbers are
+    passed on as they came, and so is the frame unless one is configured. Nothing is published that was not received:
+    after a disconnect the topics are silent. What is sent to the app while none listens is lost.
+
+    Raises :class:`InputError` when host and port cannot be bound.
+    """
+
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__("tcp_endpoint", **kwargs)
+        host = self.parameter("host", "127.0.0.1", "Address to listen on; 0.0.0.0 admits the network.")
+        port = self.parameter("port", 10000, "TCP port; 0 takes any free one.", at_least=0, at_most=65535)
+        self._frames = {
+            hand: self.parameter(f"{hand}_frame_id", "", f"Frame of {hand} poses; empty: what the headset says.")
+            for hand in SIDES
+        }
+        self._publishers_of_hands = HandPublishers(self, HAND_TOPICS)
+        self._server = HeadsetServer(host, port, listener=self._publish)
+        for hand, topic in HAPTIC_TOPICS.items():
+            self.create_subscription(OVR2ROSHapticFeedback, topic, self._vibrate(hand), STREAM_QOS)
+        for topic in PROP_TOPICS:
+            self.create_subscription(Twist, topic, self._move(topic), STREAM_QOS)
+        self._log = _ToRosLog(self.get_logger())
+        _SERVER_LOG.addHandler(self._log)
+        _SERVER_LOG.setLevel(logging.INFO)
+        self._server.start()
+        self.get_logger().info("listening on {}:{}".format(*self._server.address))
+
+    def health(self) -> tuple[bytes, str, Mapping[str, Any]]:
+        """Who is connected, and how often each topic comes."""
+        statistics = self._server.statistics
+        address = "{}:{}".format(*statistics.address)
+        values = {
+            "address": address,
+            "peer": statistics.peer,
+            "dialect": statistics.dialect,
+            "connections": statistics.connections,
+            "last_disconnect": statistics.last_disconnect,
+            "rate_hz": {name: topic.rate for name, topic in statistics.topics.items()},
+            "unknown_topics": statistics.unknown_topics,
+        }
+        if statistics.peer is None:
+            return WARN, f"no headset is connected to {address}", values
+        if all(topic.age > SILENCE for topic in statistics.topics.values()):
+            return WARN, f"{statistics.peer} is connected but sends no hand data", values
+        return OK, f"{statistics.peer} is connected", values
+
+    def close(self) -> None:
+        """Drop the headset and stop listening."""
+        self._server.close()
+        _SERVER_LOG.removeHandler(self._log)
+
+    def _publish(self, reception: Reception) -> None:
+        message = reception.message
+        frame = self._frames[reception.hand] or (message.frame_id if isinstance(message, HandPose) else "")
+        self._publishers_of_hands.publish(reception.topic, message, frame, self.now)
+
+    def _vibrate(self, hand: str) -> Callable[[OVR2ROSHapticFeedback], None]:
+        return lambda message: self._server.send_haptic(HapticFeedback(hand, message.frequency, message.amplitude))
+
+    def _move(self, topic: str) -> Callable[[Twist], None]:
+        def send(message: Twist) -> None:
+            twist = hand_twist(message)
+            self._server.send_twist(PropTwist(topic, twist.linear, twist.angular))
+
+        return send
+
+
+class _ToRosLog(logging.Handler):
+    """What the server logs, where ROS users look for it."""
+
+    def __init__(self, logger: Any) -> None:
+        super().__init__()
+        self._logger = logger
+
+    def emit(self, record: logging.LogRecord) -> None:
+        # rclpy allows one severity for each line of code.
+        if record.levelno >= logging.WARNING:
+            self._logger.warning(self.format(record))
+        else:
+            self._logger.info(self.format(record))
+
+
+def main() -> int:
+    """Run the node."""
+    return run_node(TcpEndpoint)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,243 @@
+"""What a run amounted to: figures gathered tick by tick in constant memory."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from q2r2_control.config.control import ControllerSettings
+from q2r2_control.drives.drive import DriveReport
+from q2r2_control.robot.robot import Robot
+from q2r2_control.runtime.torque_summary import TorqueStatistics, TorqueSummary
+from q2r2_control.types import ArmTarget, Array, Event, HandSample, Reference
+
+EVENTS_KEPT = 10_000  # the newest; no operator makes that many, but a broken button can
+_REST = 1e-3  # [rad/s]
+
+
+@dataclass(frozen=True, slots=True)
+class Percentiles:
+    """Of a duration; p50 and p99 to one part in a thousand of the unit, None where nothing was measured."""
+
+    p50: float | None
+    p99: float | None
+    max: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class ArmSummary:
+    """One arm, over the ticks in which it was engaged.
+
+    Errors: measured tool against the target that the operator asked for, whatever lies between them: lag, limits, the
+    other arm, and what the tool yields to a push, on its spring or by an admittance.
+    """
+
+    engaged_s: float
+    position_error_mm_rms: float | None  # None: never engaged
+    rotation_error_deg_rms: float | None
+    gripper_changes: int
+    slip_mm_max: float  # largest slip of one engagement: how far the target went along with a tool held up
+    slip_deg_max: float
+    yielded_mm_max: float  # largest displacement of its target by the admittance, in position mode
+    yielded_deg_max: float
+
+
+@dataclass(frozen=True, slots=True)
+class RunSummary:
+    """A whole run. Ratios and margins are the worst of all ticks; 1 is the limit."""
+
+    ticks: int
+    duration_s: float
+    loop_rate_hz: float
+    tick_us: Percentiles  # from polling the input to the command, plant not included
+    input_to_command_ms: Percentiles  # from a sample's receipt to the command it led to
+    arms: dict[str, ArmSummary]
+    min_distance_mm: float | None  # None: no monitored pair
+    closest_pair: tuple[str, str] | None
+    max_velocity_ratio: float
+    max_acceleration_ratio: float
+    min_position_margin_rad: float  # beyond the configured margin
+    fallback_ticks: int
+    uncertified_ticks: int
+    rejected_targets: int
+    at_rest: bool  # the reference stood still when the run ended
+    torque: TorqueSummary | None  # None: position mode
+    events: list[Event]
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain data for ``json.dumps``."""
+        data = asdict(self)
+        data["events"] = [
+            {"t": event.t, "arm": event.arm, "from": event.source, "to": event.destination, "reason": event.reason}
+            for event in self.events
+        ]
+        return data
+
+
+class Histogram:
+    """Counts of durations in thousandths of ``unit`` [s], up to 100 units: percentiles of any number of values."""
+
+    def __init__(self, unit: float) -> None:
+        self._bin = unit * 1e-3
+        self._unit = unit
+        self._counts = np.zeros(100_000, dtype=np.int64)
+        self._largest = 0.0
+
+    def add(self, duration: float) -> None:
+        """Count one duration [s]; one below zero counts as zero, one that is not finite does not count."""
+        if not math.isfinite(duration):
+            return
+        self._counts[min(max(int(duration / self._bin), 0), len(self._counts) - 1)] += 1
+        self._largest = max(self._largest, duration)
+
+    def percentiles(self) -> Percentiles:
+        """In multiples of the unit."""
+        total = int(self._counts.sum())
+        if total == 0:
+            return Percentiles(None, None, None)
+        cumulative = np.cumsum(self._counts)
+        largest = self._largest / self._unit
+        bins = (int(np.searchsorted(cumulative, share * total)) for share in (0.5, 0.99))
+        middle, high = (largest if i == len(cumulative) - 1 else min((i + 1) * 1e-3, largest) for i in bins)
+        return Percentiles(middle, high, largest)
+
+
+@dataclass(slots=True)
+class _ArmFigures:
+    engaged: float = 0.0
+    ticks: int = 0
+    position: float = 0.0  # sum of squares [m^2]
+    rotation: float = 0.0  # [rad^2]
+    gripper: float | None = None
+    gripper_changes: int = 0
+    slip: float = 0.0  # largest [m]
+    slip_angle: float = 0.0  # largest [rad]
+    yielded: float = 0.0  # largest [m]
+    yielded_angle: float = 0.0  # largest [rad]
+
+
+@dataclass(slots=True)
+class RunStatistics:
+    """Gathers a :class:`RunSummary`."""
+
+    robot: Robot
+    control: ControllerSettings
+    tick: Histogram = field(default_factory=lambda: Histogram(1e-3))
+    latency: Histogram = field(default_factory=lambda: Histogram(1e-3))
+    events: deque[Event] = field(default_factory=lambda: deque(maxlen=EVENTS_KEPT))
+    _arms: dict[str, _ArmFigures] = field(init=False)
+    _torque: TorqueStatistics = field(init=False)
+    _velocity_limit: Array = field(init=False)
+    _ticks: int = 0
+    _duration: float = 0.0
+    _distance: float = float("inf")
+    _pair: tuple[str, str] | None = None
+    _velocity: float = 0.0
+    _acceleration: float = 0.0
+    _margin: float = float("inf")
+    _fallback: int = 0
+    _uncertified: int = 0
+    _rejected: int = 0
+    _rest: bool = True
+
+    def __post_init__(self) -> None:
+        self._arms = {name: _ArmFigures() for name in self.robot.arms}
+        self._torque = TorqueStatistics.of(tuple(self.robot.arms))
+        self._velocity_limit = self.control.velocity_scale * self.robot.velocity_limit
+
+    def add(
+        self,
+        dt: float,
+        reference: Reference,
+        targets: dict[str, ArmTarget],
+        tools: dict[str, pin.SE3],
+        engaged: dict[str, bool],
+    ) -> None:
+        """Count one tick; ``tools`` are the poses that the targets of the tick before led to."""
+        robot, control, report = self.robot, self.control, reference.report
+        self._ticks += 1
+        self._duration += dt
+        self._velocity = max(self._velocity, float(np.max(np.abs(reference.v) / self._velocity_limit)))
+        self._acceleration = max(self._acceleration, float(np.abs(reference.a).max()) / control.acceleration_limit)
+        room: Array = np.minimum(reference.q - robot.position_lower, robot.position_upper - reference.q)
+        self._margin = min(self._margin, float(room.min()) - control.position_margin)
+        if report.closest_distance < self._distance:
+            self._distance, self._pair = report.closest_distance, report.closest_pair
+        self._fallback += report.fallback
+        self._uncertified += not report.certified
+        self._rejected += len(report.rejected)
+        self._rest = bool(np.abs(reference.v).max() < _REST)
+        for name, target in targets.items():
+            figures = self._arms[name]
+            if figures.gripper is not None and figures.gripper != target.gripper:
+                figures.gripper_changes += 1
+            figures.gripper = target.gripper
+            figures.slip = max(figures.slip, target.slip)
+            figures.slip_angle = max(figures.slip_angle, target.slip_angle)
+            if engaged[name] and target.pose is not None:
+                error = tools[name].actInv(target.pose)
+                figures.engaged += dt
+                if not math.isfinite(float(error.translation.sum())):
+                    continue  # nothing was measured
+                figures.ticks += 1
+                figures.position += float(error.translation @ error.translation)
+                figures.rotation += float(np.sum(pin.log3(error.rotation) ** 2))
+
+    def add_latency(self, samples: list[HandSample], now: float) -> None:
+        """Count the time from the newest of the ``samples`` that a tick took in to its command, sent at ``now`` [s]."""
+        if samples:
+            self.latency.add(now - max(max(sample.pose_stamp, sample.inputs_stamp) for sample in samples))
+
+    def add_drive(self, dt: float, report: DriveReport) -> None:
+        """Count what the mode's own laws did in one tick."""
+        if report.impedance is not None and report.wall is not None:
+            self._torque.add(dt, report.impedance, report.wall)
+        if report.admittance is not None:
+            for name, arm in report.admittance.arms.items():
+                figures = self._arms[name]
+                figures.yielded = max(figures.yielded, math.hypot(*arm.displacement[:3]))
+                figures.yielded_angle = max(figures.yielded_angle, math.hypot(*arm.displacement[3:]))
+
+    def summary(self, wall_time: float) -> RunSummary:
+        """The run so far; ``wall_time`` [s] is what it took."""
+        tick = self.tick.percentiles()
+        return RunSummary(
+            ticks=self._ticks,
+            duration_s=self._duration,
+            loop_rate_hz=self._ticks / wall_time if wall_time > 0 else 0.0,
+            tick_us=Percentiles(*(None if x is None else 1e3 * x for x in (tick.p50, tick.p99, tick.max))),
+            input_to_command_ms=self.latency.percentiles(),
+            arms={name: _arm_summary(figures) for name, figures in self._arms.items()},
+            min_distance_mm=1e3 * self._distance if self._pair else None,
+            closest_pair=self._pair,
+            max_velocity_ratio=self._velocity,
+            max_acceleration_ratio=self._acceleration,
+            min_position_margin_rad=self._margin if self._ticks else 0.0,
+            fallback_ticks=self._fallback,
+            uncertified_ticks=self._uncertified,
+            rejected_targets=self._rejected,
+            at_rest=self._rest,
+            torque=self._torque.summary(),
+            events=list(self.events),
+        )
+
+
+def _arm_summary(figures: _ArmFigures) -> ArmSummary:
+    rms = [
+        None if not figures.ticks else (total / figures.ticks) ** 0.5 for total in (figures.position, figures.rotation)
+    ]
+    return ArmSummary(
+        engaged_s=figures.engaged,
+        position_error_mm_rms=None if rms[0] is None else 1e3 * rms[0],
+        rotation_error_deg_rms=None if rms[1] is None else float(np.degrees(rms[1])),
+        gripper_changes=figures.gripper_changes,
+        slip_mm_max=1e3 * figures.slip,
+        slip_deg_max=math.degrees(figures.slip_angle),
+        yielded_mm_max=1e3 * figures.yielded,
+        yielded_deg_max=math.degrees(figures.yielded_angle),
+    )

@@ -1,0 +1,108 @@
+"""Arms that another controller moves after our safe targets: the tools are led, the elbows go where that one lets them.
+
+The reference keeps the arms apart only as far as it is where they are. So its elbows follow the measured ones, its
+tools hold by their pose and not by joint positions, and what was measured is looked at itself: it may not come closer
+than the reference may, less a tolerance for what an arm lags behind.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+
+from q2r2_control.config import Config
+from q2r2_control.control.controller import CartesianController
+from q2r2_control.robot.robot import Robot
+from q2r2_control.supervision.joint_watch import WatchSettings
+from q2r2_control.supervision.target_stream import StreamSettings, apart
+from q2r2_control.types import Array, Reference, RobotState
+
+_REST = 0.01  # a held arm's joints are slower before its tool's pose is taken [rad/s]
+# How fast the reference's elbows follow the measured ones [1/s], [rad/s].
+_FOLLOW = {"posture_gain": 10.0, "posture_speed": 1.5, "manipulability_gain": 0.0}
+
+
+@dataclass(slots=True)
+class LedSettings:
+    """What is allowed of arms that another controller moves; may be changed at run time."""
+
+    tolerance: float = 0.01  # measured pairs may be closer than the least distance by this [m]
+
+
+def settings_to_lead(config: Config) -> Config:
+    """The cell's configuration with elbows that are free to follow."""
+    arms = {
+        name: arm.model_copy(update={"swivel": arm.swivel.model_copy(update={"gain": 0.0})})
+        for name, arm in config.arms.items()
+    }
+    return config.model_copy(update={"arms": arms, "control": config.control.model_copy(update=_FOLLOW)})
+
+
+class LedArms:
+    """What the controller is asked for, and what is looked at, where it only leads."""
+
+    def __init__(
+        self,
+        robot: Robot,
+        controller: CartesianController,
+        settings: LedSettings,
+        streams: StreamSettings,
+        watch: WatchSettings,
+    ) -> None:
+        self._robot, self._controller, self._settings = robot, controller, settings
+        self._streams, self._watch = streams, watch
+        self._near_at: dict[str, float] = {}  # when an arm's tool was last seen near [s]
+        self._held: dict[str, pin.SE3] = {}
+        self._v: Array = np.zeros_like(robot.home)
+
+    def begin(self) -> None:
+        """Start anew at rest."""
+        self._held.clear()
+        self._near_at.clear()
+        self._v = np.zeros_like(self._v)
+
+    def note(self, reference: Reference) -> None:
+        """The reference that came of the last targets."""
+        self._v = reference.v
+
+    def targets(self, wanted: dict[str, pin.SE3 | None]) -> dict[str, pin.SE3 | None]:
+        """The same targets with the tool's own pose for each arm that has none and has come to rest."""
+        for arm, pose in wanted.items():
+            if pose is not None:
+                self._held.pop(arm, None)
+            elif arm not in self._held and np.abs(self._v[self._robot.arms[arm].joints]).max() < _REST:
+                self._held[arm] = self._controller.tool_pose(arm)
+        return {arm: self._held.get(arm, pose) for arm, pose in wanted.items()}
+
+    def left_behind(self, state: RobotState, holding: Iterable[str], now: float) -> str | None:
+        """Says so where a tool of ``holding`` arms has been away from its reference's for too long.
+
+        Nobody moves that arm, nor could anybody engage it: a stream has to begin where tool and reference are both.
+        """
+        holding = set(holding)
+        for arm in self._robot.arms:
+            tool, led = self._robot.tool_pose(state.q, arm), self._controller.tool_pose(arm)
+            way, turn = apart(tool, led)
+            near = way <= self._streams.engage_distance and turn <= self._streams.engage_angle
+            if near or arm not in holding or arm not in self._near_at:
+                self._near_at[arm] = now
+            elif now - self._near_at[arm] > self._watch.deviation_time:
+                return (
+                    f"{arm}: the tool is {way:.3f} m and {turn:.2f} rad from where it was led; begins anew where it is"
+                )
+        return None
+
+    def too_close(self, state: RobotState) -> str | None:
+        """Says so where a measured pair is closer than allowed."""
+        least = self._controller.settings.min_distance
+        allowed = least - self._settings.tolerance
+        if self._robot.distance_values(state.q).min() >= allowed:
+            return None
+        pair = min(self._robot.distances(state.q), key=lambda each: each.distance)
+        return (
+            f"measured: {pair.name_a}|{pair.name_b} are {pair.distance:.4f} m apart; allowed: {allowed:.4f}, "
+            f"min_distance {least:g} less distance_tolerance {self._settings.tolerance:g}"
+        )

@@ -1,0 +1,189 @@
+"""What a soak does to a controller: segments of hostile targets, uneven ticks, failing solvers and odd starts."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from q2r2_control.control.qp import QpProblem, QpSolution, Solver
+from q2r2_control.robot.robot import Robot
+from q2r2_control.types import Array
+from q2r2_control.verification.adversary import Adversary, Stream
+
+# Solver failures after which the certified stop is due. A solution of absurd numbers is cut to the limits instead.
+STOPPING_FAULTS = ("none", "nan", "one_nan", "infinite", "late")
+FAULTS = (*STOPPING_FAULTS, "absurd", "noise")
+_TIMINGS = {  # share of the segments
+    "1 ms": 0.42,
+    "1 ms, jittering": 0.20,
+    "a few ms": 0.15,
+    "any": 0.08,
+    "tiny": 0.05,
+    "long": 0.04,
+    "partly invalid": 0.06,
+}
+_INVALID_DT: tuple[Any, ...] = (0.0, -0.001, math.nan, math.inf, -math.inf, None, "soon", 0.2, 5.0)
+_STARTS = ("home", "apart", "anywhere", "outside", "at limits", "moving", "too fast", "in penetration")
+LATE = 1.0  # [s]
+
+
+class FaultySolver:
+    """A real solver that fails as told; its solutions count as in time, so that a soak depends on no clock."""
+
+    def __init__(self, inner: Solver, random: np.random.Generator) -> None:
+        self._inner, self._random = inner, random
+        self.fault: str | None = None
+
+    def solve(self, problem: QpProblem) -> QpSolution:
+        """See :class:`Solver`."""
+        v, nv = self._inner.solve(problem).v, len(problem.g)
+        if self.fault is None:
+            return QpSolution(v, 0.0)
+        if self.fault == "one_nan":
+            broken = np.zeros(nv) if v is None else np.array(v)
+            broken[self._random.integers(nv)] = np.nan
+            return QpSolution(broken, 0.0)
+        return {
+            "none": QpSolution(None, 0.0),
+            "nan": QpSolution(np.full(nv, np.nan), 0.0),
+            "infinite": QpSolution(np.full(nv, -np.inf), 0.0),
+            "late": QpSolution(v, LATE),
+            "absurd": QpSolution(np.full(nv, 1e12), 0.0),
+            "noise": QpSolution(self._random.normal(size=nv) * 10.0, 0.0),
+        }[self.fault]
+
+
+@dataclass(frozen=True, slots=True)
+class Start:
+    """What a controller is reset to."""
+
+    name: str
+    q: Array  # (nv,) [rad]
+    v: Array  # (nv,) [rad/s]
+
+
+@dataclass(frozen=True, slots=True)
+class Segment:
+    """A stretch of ticks of one kind."""
+
+    targets: str
+    timing: str
+    ticks: int
+    start: Start | None  # None: goes on from where the last segment ended
+    fault: str | None
+    fault_period: int  # the solver fails in every other period [ticks]
+    stream: Stream
+    dt: Callable[[], Any]
+
+    def fault_at(self, tick: int) -> str | None:
+        """How the solver fails in a tick of this segment."""
+        return self.fault if (tick // self.fault_period) % 2 == 0 else None
+
+    def __str__(self) -> str:
+        start = "" if self.start is None else f", from {self.start.name}"
+        fault = "" if self.fault is None else f", solver: {self.fault}"
+        return f"{self.targets}, dt {self.timing}{start}{fault}"
+
+
+def segments(robot: Robot, min_distance: float, random: np.random.Generator) -> Iterator[Segment]:
+    """Endless; the first one starts at home."""
+    adversary, starts = Adversary(robot, random), Starts(robot, min_distance, random)
+    start: Start | None = starts.draw("home")
+    while True:
+        timing = str(random.choice(list(_TIMINGS), p=list(_TIMINGS.values())))
+        name = str(random.choice(Adversary.names))
+        longest = 60 if timing == "long" else 300 if timing == "any" else 2500
+        yield Segment(
+            targets=name,
+            timing=timing,
+            ticks=int(np.exp(random.uniform(np.log(20), np.log(longest)))),
+            start=start,
+            fault=str(random.choice(FAULTS)) if random.random() < 0.2 else None,
+            fault_period=int(random.integers(1, 150)),
+            stream=adversary.stream(name),
+            dt=_ticks(timing, random),
+        )
+        start = starts.draw(str(random.choice(_STARTS))) if random.random() < 0.3 else None
+
+
+def _ticks(timing: str, random: np.random.Generator) -> Callable[[], Any]:
+    if timing == "1 ms":
+        return lambda: 0.001
+    if timing == "1 ms, jittering":
+        return lambda: 0.001 * random.uniform(0.2, 2.5)
+    if timing == "a few ms":
+        middle = float(random.choice([0.002, 0.004, 0.005, 0.01]))
+        return lambda: middle * random.uniform(0.8, 1.2)
+    if timing == "any":
+        return lambda: 10.0 ** random.uniform(-6.0, -1.0)
+    if timing == "tiny":
+        return lambda: 10.0 ** random.uniform(-6.0, -4.0)
+    if timing == "long":
+        return lambda: random.uniform(0.02, 0.1)
+    return lambda: _INVALID_DT[random.integers(len(_INVALID_DT))] if random.random() < 0.1 else 0.001
+
+
+class Starts:
+    """Draws what a controller is reset to."""
+
+    def __init__(self, robot: Robot, min_distance: float, random: np.random.Generator) -> None:
+        self._robot, self._min_distance, self._random = robot, min_distance, random
+
+    def draw(self, name: str) -> Start:
+        """A start of one of the kinds; at rest but for "moving" and "too fast"."""
+        robot, random = self._robot, self._random
+        nv = robot.model.nv
+        v = np.zeros(nv)
+        if name == "home":
+            q = robot.home.copy()
+        elif name == "anywhere":
+            q = self._posture()
+        elif name == "in penetration":
+            q = self._in_penetration()
+        else:
+            q = self._apart()
+        if name == "outside":
+            joints = random.random(nv) < 0.2
+            beyond = random.uniform(-0.01, 0.1, size=nv)
+            q = np.where(joints, np.where(q > 0, robot.position_upper + beyond, robot.position_lower - beyond), q)
+        elif name == "at limits":
+            margin = float(random.choice([0.0, 0.01]))
+            nearest = np.where(q > 0, robot.position_upper - margin, robot.position_lower + margin)
+            q = np.where(random.random(nv) < 0.3, nearest, q)
+        elif name in ("moving", "too fast"):
+            v = random.uniform(-1.0, 1.0, size=nv) * robot.velocity_limit * (0.5 if name == "moving" else 1.5)
+        return Start(name, q, v)
+
+    def _posture(self) -> Array:
+        return self._random.uniform(self._robot.position_lower, self._robot.position_upper)
+
+    def _least(self, q: Array) -> float:
+        return float(self._robot.distance_values(q).min(initial=np.inf))
+
+    def _apart(self) -> Array:
+        """A random posture with all pairs apart; home where none is found soon."""
+        for _ in range(50):
+            q = self._posture()
+            if self._least(q) >= self._min_distance:
+                return q
+        return self._robot.home.copy()
+
+    def _in_penetration(self) -> Array:
+        """On the way from home to a posture that is closer than allowed, where it has just become so."""
+        far = self._posture()
+        for _ in range(50):
+            if self._least(far) < 0.0:
+                break
+            far = self._posture()
+        wanted = self._random.uniform(-0.03, self._min_distance)
+        low, high = 0.0, 1.0
+        for _ in range(12):
+            share = 0.5 * (low + high)
+            closer = self._least(self._robot.home + share * (far - self._robot.home)) < wanted
+            low, high = (low, share) if closer else (share, high)
+        q: Array = self._robot.home + high * (far - self._robot.home)
+        return q

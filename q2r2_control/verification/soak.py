@@ -1,0 +1,203 @@
+"""A long adversarial run of the controller in which every promise of its contract is checked at every tick."""
+
+from __future__ import annotations
+
+import gc
+import os
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import pinocchio as pin
+
+from q2r2_control.config import Config
+from q2r2_control.config.control import ControllerSettings
+from q2r2_control.control.controller import CartesianController
+from q2r2_control.control.qp import make_solver
+from q2r2_control.errors import ConfigError
+from q2r2_control.robot.robot import Robot
+from q2r2_control.types import Array, Reference
+from q2r2_control.verification.adversary import Asked
+from q2r2_control.verification.contract import ContractWatch, time_of
+from q2r2_control.verification.fault_injection import STOPPING_FAULTS, FaultySolver, Segment, segments
+from q2r2_control.verification.margins import Margin
+
+FEWEST_TICKS = 100
+_SETTLED = 0.1  # share of the ticks after which memory should have stopped growing
+MEMORY_ALLOWED = 5.0  # [MB]
+
+
+class Steppable(Protocol):
+    """What a soak needs of a controller: that of :class:`CartesianController`."""
+
+    robot: Robot
+    settings: ControllerSettings
+
+    def reset(self, q: Array, v: Array | None = None) -> None: ...
+
+    def step(self, targets: Any, dt: Any) -> Reference: ...
+
+
+@dataclass(frozen=True, slots=True)
+class Violation:
+    """The first time that a promise was broken, with what was asked then."""
+
+    promise: str
+    tick: int
+    segment: str
+    since_segment: int  # ticks
+    q: Array  # (nv,) before the tick [rad]
+    v: Array  # (nv,) [rad/s]
+    targets: dict[str, Any]  # arm -> homogeneous matrix (4, 4)
+    dt: str
+    error: str  # of an exception
+
+
+@dataclass(frozen=True, slots=True)
+class SoakReport:
+    """What a soak found."""
+
+    cell: str
+    seed: int
+    ticks: int
+    simulated_s: float
+    segments: int
+    resets: int
+    solver_faults: int  # ticks
+    fallbacks: int  # ticks, of all
+    fallbacks_healthy: int  # ticks, of those with a healthy solver
+    margins: list[Margin]
+    memory_growth_mb: float | None  # None where the system does not tell
+    broken: list[Violation]  # the first of each promise, in the order of their ticks
+
+    @property
+    def passed(self) -> bool:
+        """Whether every promise was kept, and memory."""
+        lean = self.memory_growth_mb is None or self.memory_growth_mb <= MEMORY_ALLOWED
+        return lean and not any(margin.violations for margin in self.margins)
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain data for ``json.dumps``."""
+        return asdict(self) | {"passed": self.passed}
+
+
+def run_soak(config: Config, ticks: int, seed: int, progress: Callable[[str], None] = lambda what: None) -> SoakReport:
+    """Soak the controller of a cell. Raises :class:`ConfigError` for fewer than 100 ticks or a negative seed."""
+    if ticks < FEWEST_TICKS:
+        raise ConfigError(f"soak: ticks = {ticks}: allowed: {FEWEST_TICKS} or more")
+    if seed < 0:
+        raise ConfigError(f"soak: seed = {seed}: allowed: 0 or more")
+    robot = Robot.from_config(config)
+    settings = config.control.model_copy(update={"solve_time_limit": config.control.solve_time_limit or 0.005})
+    # The solver gets no time limit: a soak that finds something has to find it again.
+    solver = FaultySolver(make_solver(settings.solver, robot.model.nv, None), np.random.default_rng([seed, 1]))
+    controller = CartesianController(robot, settings, solver=solver)
+    return Soak(config.name, controller, solver, seed, progress).run(ticks)
+
+
+class Soak:
+    """Drives a controller through random segments and has every tick checked."""
+
+    def __init__(
+        self,
+        cell: str,
+        controller: Steppable,
+        solver: FaultySolver,
+        seed: int,
+        progress: Callable[[str], None] = lambda what: None,
+    ) -> None:
+        self._cell, self._controller, self._solver, self._seed = cell, controller, solver, seed
+        self._progress = progress
+        self._watch = ContractWatch(controller.robot, controller.settings, np.random.default_rng([seed, 2]))
+        self._broken: dict[str, Violation] = {}
+        self._counts = dict.fromkeys(("segments", "resets", "solver_faults", "fallbacks", "fallbacks_healthy"), 0)
+        self._simulated = 0.0
+
+    def run(self, ticks: int) -> SoakReport:
+        """Run ``ticks`` ticks."""
+        settled, before = int(_SETTLED * ticks), None
+        for tick, (segment, since) in enumerate(self._ticks(ticks)):
+            if tick == settled:
+                before = _memory_mb()
+            if tick % max(ticks // 20, 1) == 0:
+                self._progress(f"tick {tick} of {ticks}")
+            self._tick(tick, segment, since)
+        after = _memory_mb()
+        return SoakReport(
+            cell=self._cell,
+            seed=self._seed,
+            ticks=ticks,
+            simulated_s=self._simulated,
+            margins=list(self._watch.margins.values()),
+            memory_growth_mb=None if before is None or after is None else after - before,
+            broken=list(self._broken.values()),
+            **self._counts,
+        )
+
+    def _ticks(self, ticks: int) -> Iterator[tuple[Segment, int]]:
+        """The segment of each tick and the tick within it; the controller is reset where a segment starts anew."""
+        left = ticks
+        robot, settings = self._controller.robot, self._controller.settings
+        for segment in segments(robot, settings.min_distance, np.random.default_rng([self._seed, 0])):
+            self._counts["segments"] += 1
+            if segment.start is not None:
+                self._reset(segment.start.q, segment.start.v)
+            for since in range(min(segment.ticks, left)):
+                yield segment, since
+            left -= segment.ticks
+            if left <= 0:
+                return
+
+    def _reset(self, q: Array, v: Array) -> None:
+        self._counts["resets"] += 1
+        self._controller.reset(q, v)
+        self._watch.start(q, v)
+        self._q, self._v = q, v
+
+    def _tick(self, tick: int, segment: Segment, since: int) -> None:
+        fault, dt = segment.fault_at(since), segment.dt()
+        asked = segment.stream(since, self._q)
+        self._solver.fault = fault
+        try:
+            reference = self._controller.step(asked.targets, dt)
+        except Exception as error:  # that there is none is what is promised
+            self._watch.margins["exceptions"].note(1.0, tick)
+            self._keep(tick, segment, since, asked, dt, ["exceptions"], f"{type(error).__name__}: {error}")
+            self._reset(self._controller.robot.home, np.zeros_like(self._q))
+            return
+        self._watch.margins["exceptions"].note(0.0, tick)
+        broken = self._watch.check(tick, reference, dt, asked.unusable, fault in STOPPING_FAULTS)
+        if broken:
+            self._keep(tick, segment, since, asked, dt, broken, "")
+        if "not_finite" in broken:
+            self._reset(self._controller.robot.home, np.zeros_like(self._q))
+            return
+        self._q, self._v = reference.q, reference.v
+        self._simulated += time_of(dt)
+        self._counts["solver_faults"] += fault is not None
+        self._counts["fallbacks"] += reference.report.fallback
+        self._counts["fallbacks_healthy"] += reference.report.fallback and fault is None
+
+    def _keep(
+        self, tick: int, segment: Segment, since: int, asked: Asked, dt: Any, broken: list[str], error: str
+    ) -> None:
+        poses = {
+            arm: target.homogeneous if isinstance(target, pin.SE3) else repr(target)
+            for arm, target in asked.targets.items()
+        }
+        for key in broken:
+            name = self._watch.margins[key].name
+            found = Violation(name, tick, str(segment), since, self._q, self._v, poses, repr(dt), error)
+            self._broken.setdefault(key, found)
+
+
+def _memory_mb() -> float | None:
+    """Resident memory of this process after collecting garbage [MB]; None where the system does not tell."""
+    gc.collect()
+    try:
+        pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
+    except (OSError, ValueError, IndexError):
+        return None
+    return pages * os.sysconf("SC_PAGE_SIZE") / 2**20

@@ -1,0 +1,113 @@
+"""Peers follow targets on the same cell; each is skipped where its package is not installed."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from q2r2_control.benchmark.peers.base import INSTALL, PEERS, Candidate, Setup, is_installed, make_peer
+from q2r2_control.config import load_config
+from q2r2_control.robot.robot import Robot
+
+DT = 0.001
+CONFIG = load_config("config/dual_iiwa7.yaml")
+
+
+@cache
+def robot() -> Robot:
+    return Robot.from_config(CONFIG)
+
+
+@cache
+def peer_of(name: str) -> Candidate:
+    return make_peer(name, Setup(robot(), CONFIG, DT))
+
+
+@pytest.fixture(params=PEERS)
+def peer(request: pytest.FixtureRequest) -> Candidate:
+    """Each peer at rest at home."""
+    if not is_installed(request.param):
+        pytest.skip(f"{PEERS[request.param]} is not installed; {INSTALL}")
+    found = peer_of(request.param)
+    found.reset(robot().home)
+    return found
+
+
+def home() -> dict[str, pin.SE3]:
+    return {arm: robot().tool_pose(robot().home, arm) for arm in robot().arms}
+
+
+def test_a_peer_bears_its_name_and_says_what_it_cannot(peer: Candidate) -> None:
+    assert peer.name in PEERS
+    assert "certificate" in peer.cannot
+
+
+def test_a_peer_that_is_where_it_should_be_stays(peer: Candidate) -> None:
+    for _ in range(20):
+        q, v = peer.step(home(), DT)
+        np.testing.assert_allclose(q, robot().home, atol=1e-4)
+        np.testing.assert_allclose(v, 0.0, atol=1e-2)
+
+
+def test_a_peer_reaches_a_target_within_the_velocity_limits(peer: Candidate) -> None:
+    turn = pin.exp3(np.array([0.1, -0.1, 0.2]))
+    goals = {
+        arm: pin.SE3(turn @ pose.rotation, pose.translation + np.array([0.02, 0.0, 0.05]))
+        for arm, pose in home().items()
+    }
+    for _ in range(1200):
+        q, v = peer.step(goals, DT)
+        assert (np.abs(v) <= robot().velocity_limit * (1.0 + 1e-3)).all()
+    for arm, pose in goals.items():
+        error = robot().tool_pose(q, arm).actInv(pose)
+        assert np.linalg.norm(error.translation) < 0.005
+        assert np.linalg.norm(pin.log3(error.rotation)) < 0.05
+
+
+def test_velocities_are_those_of_the_positions(peer: Candidate) -> None:
+    goals = {arm: pin.SE3(pose.rotation, pose.translation + 0.1) for arm, pose in home().items()}
+    before = robot().home
+    for _ in range(10):
+        q, v = peer.step(goals, DT)
+        np.testing.assert_allclose(q - before, v * DT, atol=1e-12)
+        before = q
+
+
+def test_a_peer_that_holds_stands_where_it_was(peer: Candidate) -> None:
+    goals = {arm: pin.SE3(pose.rotation, pose.translation + 0.1) for arm, pose in home().items()}
+    for _ in range(10):
+        q, _ = peer.step(goals, DT)
+    held, v = peer.hold()
+    np.testing.assert_array_equal(held, q)
+    assert not v.any()
+
+
+@pytest.mark.parametrize("name", [name for name in PEERS if not name.startswith("mink")])
+def test_a_peer_with_an_acceleration_limit_starts_as_slowly_as_we_do(name: str) -> None:
+    pytest.importorskip(PEERS[name])
+    peer = peer_of(name)
+    peer.reset(robot().home)
+    goals = {arm: pin.SE3(pose.rotation, pose.translation + 0.1) for arm, pose in home().items()}
+    _, v = peer.step(goals, DT)
+    # roboplan's solver tolerance, 1e-6 rad in a tick, is a tenth of what the limit allows.
+    assert np.abs(v).max() <= 1.25 * CONFIG.control.acceleration_limit * DT
+
+
+def test_roboplan_watches_exactly_our_pairs() -> None:
+    pytest.importorskip("roboplan")
+    assert peer_of("roboplan").pairs == len(robot().collision_model.collisionPairs)  # type: ignore[attr-defined]
+
+
+def test_mink_watches_our_pairs_but_those_of_a_body_and_its_parent() -> None:
+    pytest.importorskip("mink")
+    pairs = robot().collision_model.collisionPairs
+    joints = [
+        [robot().collision_model.geometryObjects[index].parentJoint for index in (pair.first, pair.second)]
+        for pair in pairs
+    ]
+    neighbours = sum(robot().model.parents[max(both)] == min(both) for both in joints)
+    assert neighbours > 0
+    assert peer_of("mink").pairs == len(pairs) - neighbours  # type: ignore[attr-defined]

@@ -1,0 +1,376 @@
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from pydantic import ValidationError
+
+from q2r2_control.compliance.admittance import Admittance
+from q2r2_control.config import Config, load_config
+from q2r2_control.config.control import AdmittanceSettings
+from q2r2_control.control.controller import CartesianController
+from q2r2_control.plants.mujoco import MujocoPlant
+from q2r2_control.types import Array, Command, CommandMode, RobotState
+from tests.control.cells import cell
+from tests.control.contract import Contract
+
+ROBOT = cell("dual_iiwa7").robot
+REST = np.zeros(len(ROBOT.home))
+GOALS: dict[str, pin.SE3 | None] = {arm: ROBOT.tool_pose(ROBOT.home, arm) for arm in ROBOT.arms}
+DEFAULT = AdmittanceSettings()
+DT = 0.001
+
+
+def _wrench(axis: int, size: float) -> Array:
+    return size * np.eye(6)[axis]
+
+
+def _state(q: Array, tau: Array | None) -> RobotState:
+    return RobotState(q, REST, REST, tau, 0.0)
+
+
+def _touch(wrench: Array, arm: str = "left", q: Array = ROBOT.home) -> RobotState:
+    """A state in which ``wrench`` acts on the arm's tool."""
+    data = ROBOT.model.createData()
+    pin.computeJointJacobians(ROBOT.model, data, q)
+    J = pin.getFrameJacobian(ROBOT.model, data, ROBOT.arms[arm].frame_id, pin.LOCAL_WORLD_ALIGNED)
+    return _state(q, J.T @ wrench)
+
+
+UNTOUCHED = _state(ROBOT.home, REST)
+
+
+def _away(pose: pin.SE3 | None, goal: pin.SE3 | None) -> Array:
+    """Translation and rotation vector (6,) from ``goal`` to ``pose``, world axes."""
+    assert pose is not None
+    assert goal is not None
+    return np.concatenate([pose.translation - goal.translation, pin.log3(pose.rotation @ goal.rotation.T)])
+
+
+def _displaced(admittance: Admittance, state: RobotState, ticks: int, dt: float = DT) -> list[Array]:
+    """Displacements of the left target."""
+    return [_away(admittance.update(GOALS, state, dt)["left"], GOALS["left"]) for _ in range(ticks)]
+
+
+def _stiffness(axis: int) -> float:
+    return DEFAULT.stiffness if axis < 3 else DEFAULT.rotation_stiffness
+
+
+def _ratio(x: Array) -> float:
+    """Damping ratio from the first two extremes of a decaying oscillation that starts at rest."""
+    first = int(np.argmin(x * np.sign(x[0])))
+    second = first + int(np.argmax(x[first:] * np.sign(x[0])))
+    logarithm = float(np.log(abs(x[first]) / abs(x[second])))
+    return logarithm / float(np.hypot(np.pi, logarithm))
+
+
+AXES = pytest.mark.parametrize("axis", range(6), ids=["along x", "along y", "along z", "about x", "about y", "about z"])
+
+
+@AXES
+@pytest.mark.parametrize("sign", [1.0, -1.0], ids=["forwards", "backwards"])
+def test_a_constant_wrench_displaces_the_target_by_the_wrench_over_the_stiffness(axis: int, sign: float) -> None:
+    push = sign * (20.0 if axis < 3 else 5.0)
+    end = _displaced(Admittance(ROBOT), _touch(_wrench(axis, push)), 2000)[-1]
+    expected = _wrench(axis, push / _stiffness(axis))
+    assert end[axis] == pytest.approx(expected[axis], rel=0.05)
+    np.testing.assert_allclose(end, expected, atol=0.05 * abs(expected[axis]))
+
+
+@pytest.mark.parametrize("dt", [0.001, 0.01], ids=["1 ms", "10 ms"])
+@pytest.mark.parametrize("ratio", [0.2, 0.4, 0.6])
+@pytest.mark.parametrize("axis", [0, 5], ids=["moved", "turned"])
+def test_released_it_returns_with_the_damping_ratio_asked_for(axis: int, ratio: float, dt: float) -> None:
+    admittance = Admittance(ROBOT, AdmittanceSettings(damping_ratio=ratio))
+    _displaced(admittance, _touch(_wrench(axis, 20.0 if axis < 3 else 5.0)), round(4.0 / dt), dt)
+    back = np.array(_displaced(admittance, UNTOUCHED, round(1.5 / dt), dt))[:, axis]
+    assert _ratio(back) == pytest.approx(ratio, abs=0.05)
+
+
+def test_critically_damped_it_returns_steadily_and_in_the_end_leaves_the_target_as_it_is() -> None:
+    admittance = Admittance(ROBOT)
+    _displaced(admittance, _touch(_wrench(2, -20.0)), 2000)
+    back = np.array(_displaced(admittance, UNTOUCHED, 4000))[:, 2]
+    # Below the dead band the low-pass still falls: a filter's time later nothing pushes.
+    assert (np.diff(back) >= 0.0).all()
+    assert back[0] < -0.019
+    assert admittance.update(GOALS, UNTOUCHED, DT)["left"] is GOALS["left"]
+
+
+@AXES
+def test_below_the_dead_band_nothing_moves_however_long(axis: int) -> None:
+    admittance, band = Admittance(ROBOT), DEFAULT.force_dead_band if axis < 3 else DEFAULT.torque_dead_band
+    state = _touch(_wrench(axis, 0.99 * band))
+    for _ in range(500):
+        assert admittance.update(GOALS, state, 0.01) == GOALS
+    assert not admittance.report().arms["left"].displacement.any()
+    assert admittance.report().arms["left"].wrench[axis] == pytest.approx(0.99 * band)
+
+
+def test_the_dead_band_ends_without_a_step_and_soon_leaves_the_whole_force() -> None:
+    forces = np.linspace(1.5, 30.0, 115)
+    ends = np.array([_displaced(Admittance(ROBOT), _touch(_wrench(0, force)), 100, 0.1)[-1][0] for force in forces])
+    slopes = np.diff(ends) / np.diff(forces)
+    assert (slopes >= 0.0).all()
+    assert slopes.max() <= 2.0 / DEFAULT.stiffness
+    lost = forces - DEFAULT.stiffness * ends
+    assert lost[forces >= 14.0].max() < 0.02 * 14.0 + 0.02
+
+
+def test_noise_of_the_torque_sensors_moves_nothing() -> None:
+    random, admittance = np.random.default_rng(51), Admittance(ROBOT)
+    for _ in range(3000):
+        noisy = _state(ROBOT.home, random.normal(0.0, 0.1, len(REST)))
+        assert admittance.update(GOALS, noisy, DT) == GOALS
+
+
+def test_the_motion_does_not_depend_on_how_time_is_cut_into_ticks() -> None:
+    random, push = np.random.default_rng(52), _touch(_wrench(1, 15.0))
+    settings = AdmittanceSettings(damping_ratio=0.3, filter_time=0.0)
+    steady, jittery, rough = (Admittance(ROBOT, settings) for _ in range(3))
+    _displaced(steady, push, 600)
+    ticks = random.uniform(0.001, 0.01, 400)
+    ticks = ticks[: int(np.searchsorted(np.cumsum(ticks), 0.59))]
+    for dt in (*ticks, 0.6 - ticks.sum()):
+        jittery.update(GOALS, push, float(dt))
+    _displaced(rough, push, 6, 0.1)
+    for other in (jittery, rough):
+        np.testing.assert_allclose(
+            other.report().arms["left"].displacement, steady.report().arms["left"].displacement, atol=1e-12
+        )
+
+
+def test_any_wrench_at_any_tick_keeps_the_displacement_inside_its_limits() -> None:
+    random, admittance = np.random.default_rng(53), Admittance(ROBOT, AdmittanceSettings(damping_ratio=0.1))
+    farthest = np.zeros(2)
+    for _ in range(3000):
+        push = random.normal(0.0, 1.0, 6) * 10.0 ** random.uniform(0.0, 4.0)
+        dt = float(10.0 ** random.uniform(-6.0, -1.0))
+        x = _displaced(admittance, _touch(push), 1, dt)[0]
+        assert np.isfinite(x).all()
+        size = np.array([np.linalg.norm(x[:3]), np.linalg.norm(x[3:])])
+        assert size[0] <= DEFAULT.max_displacement + 1e-12
+        assert size[1] <= DEFAULT.max_rotation + 1e-9
+        farthest = np.maximum(farthest, size)
+    np.testing.assert_allclose(farthest, [DEFAULT.max_displacement, DEFAULT.max_rotation], rtol=1e-6)
+
+
+def test_from_its_limit_it_sets_off_at_once_when_the_force_falls() -> None:
+    admittance = Admittance(ROBOT)
+    at_limit = _displaced(admittance, _touch(_wrench(0, 2000.0)), 3000)[-1]
+    np.testing.assert_allclose(at_limit, _wrench(0, DEFAULT.max_displacement), atol=1e-6)
+    back = np.array(_displaced(admittance, _touch(_wrench(0, 20.0)), 300))[:, 0]
+    # The low-pass needs 50 ms to come down from 2000 N, the virtual mass the rest.
+    assert back[150] < DEFAULT.max_displacement - 0.02
+
+
+def test_the_limit_takes_the_speed_with_which_it_is_met() -> None:
+    admittance = Admittance(ROBOT, AdmittanceSettings(damping_ratio=0.1, filter_time=0.0))
+    push, x = _touch(_wrench(0, 95.0)), 0.0
+    while x < DEFAULT.max_displacement - 1e-9:
+        x = _displaced(admittance, push, 1)[0][0]
+    back = np.array(_displaced(admittance, UNTOUCHED, 50))[:, 0]
+    assert (np.diff([x, *back]) < 0.0).all()
+
+
+def test_an_arm_yields_to_its_own_push_only() -> None:
+    admittance = Admittance(ROBOT)
+    for _ in range(500):
+        targets = admittance.update(GOALS, _touch(_wrench(2, 20.0), "right"), DT)
+    assert targets["left"] is GOALS["left"]
+    assert _away(targets["right"], GOALS["right"])[2] > 0.01
+
+
+def test_an_arm_that_holds_is_not_displaced_and_starts_again_from_its_new_target() -> None:
+    admittance, push = Admittance(ROBOT), _touch(_wrench(0, 20.0))
+    assert _displaced(admittance, push, 1000)[-1][0] > 0.015
+    for holding in ({"left": None, "right": GOALS["right"]}, {"right": GOALS["right"]}):
+        assert admittance.update(holding, push, DT) == holding
+        assert not admittance.report().arms["left"].displacement.any()
+        assert admittance.report().arms["left"].wrench[0] == pytest.approx(20.0, rel=1e-3)
+    # The push is still there: it sets off from rest, at the virtual mass's acceleration.
+    first = _displaced(admittance, push, 1)[0]
+    assert 0.0 < first[0] <= 0.5 * 20.0 / DEFAULT.mass * DT**2 * 1.001
+
+
+def test_a_plant_that_cannot_tell_leaves_the_targets_as_they_are() -> None:
+    admittance = Admittance(ROBOT)
+    for _ in range(100):
+        targets = admittance.update(GOALS, _state(ROBOT.home, None), DT)
+        assert all(targets[arm] is goal for arm, goal in GOALS.items())
+    assert not admittance.report().rejected
+
+
+def test_a_sensor_that_falls_silent_lets_the_target_return_without_a_jump() -> None:
+    admittance = Admittance(ROBOT)
+    pushed = _displaced(admittance, _touch(_wrench(0, 20.0)), 1000)
+    after = _displaced(admittance, _state(ROBOT.home, None), 2000)
+    assert np.abs(np.diff([pushed[-1], *after], axis=0)).max() < 2e-4
+    assert np.abs(after[-1]).max() < 1e-6
+
+
+BAD = {
+    "torque": (np.where(np.arange(14) == 3, np.nan, 0.0), ROBOT.home),
+    "infinite torque": (np.where(np.arange(14) == 9, np.inf, 0.0), ROBOT.home),
+    "posture": (REST, np.where(np.arange(14) == 3, np.nan, ROBOT.home)),
+}
+
+
+@pytest.mark.parametrize("kind", BAD)
+def test_a_measurement_that_is_no_number_holds_the_last_wrench_and_is_reported(kind: str) -> None:
+    admittance, (tau, q) = Admittance(ROBOT), BAD[kind]
+    _displaced(admittance, _touch(_wrench(1, 20.0)), 3000)
+    before = admittance.report().arms["left"]
+    for x in _displaced(admittance, _state(q, tau), 200):
+        np.testing.assert_allclose(x, before.displacement, atol=1e-6)
+        assert admittance.report().rejected
+        np.testing.assert_array_equal(admittance.report().arms["left"].wrench, before.wrench)
+    _displaced(admittance, UNTOUCHED, 1)
+    assert not admittance.report().rejected
+
+
+@pytest.mark.parametrize("dt", [0.0, -0.001, np.nan, np.inf])
+def test_a_time_that_cannot_be_moves_nothing_and_is_reported(dt: float) -> None:
+    admittance, push = Admittance(ROBOT), _touch(_wrench(1, 20.0))
+    before = _displaced(admittance, push, 100)[-1]
+    np.testing.assert_array_equal(_displaced(admittance, push, 1, dt)[0], before)
+    assert admittance.report().rejected
+
+
+def test_a_target_that_is_no_pose_stays_for_the_controller_to_refuse() -> None:
+    admittance, controller = Admittance(ROBOT), CartesianController(ROBOT)
+    bad = {"left": pin.SE3(np.eye(3), np.full(3, np.nan)), "right": GOALS["right"]}
+    for _ in range(20):
+        reference = controller.step(admittance.update(bad, _touch(_wrench(0, 20.0)), DT), DT)
+        assert reference.report.rejected == ("left",)
+    assert np.isfinite(admittance.report().arms["left"].displacement).all()
+
+
+def test_reset_forgets_wrench_and_displacement() -> None:
+    admittance = Admittance(ROBOT)
+    _displaced(admittance, _touch(_wrench(0, 20.0)), 500)
+    admittance.reset()
+    assert admittance.update(GOALS, UNTOUCHED, DT) == GOALS
+    assert not admittance.report().arms["left"].wrench.any()
+
+
+@pytest.mark.parametrize("key", ["stiffness", "rotation_stiffness", "damping_ratio", "mass", "inertia"])
+@pytest.mark.parametrize("value", [0.0, -1.0, float("nan")])
+def test_settings_that_would_drift_or_add_energy_are_refused(key: str, value: float) -> None:
+    with pytest.raises(ValidationError, match=key):
+        AdmittanceSettings(**{key: value})
+
+
+@cache
+def _controller() -> CartesianController:
+    return CartesianController(ROBOT)
+
+
+@cache
+def _config(servo_stiffness: float) -> Config:
+    config = load_config("config/dual_iiwa7.yaml")
+    servos = config.mujoco.model_copy(update={"position_stiffness": servo_stiffness, "objects": {}})
+    return config.model_copy(update={"mujoco": servos})
+
+
+SOFT, FIRM = 4000.0, 40000.0  # servos [Nm/rad]
+
+
+@cache
+def _plant(servo_stiffness: float) -> MujocoPlant:
+    return MujocoPlant(ROBOT, _config(servo_stiffness))
+
+
+@dataclass(frozen=True)
+class _Loop:
+    """Ticks of the closed loop; each one keeps the controller's contract."""
+
+    plant: MujocoPlant
+    admittance: Admittance
+
+    def run(self, goals: dict[str, pin.SE3 | None], ticks: Iterator[float]) -> Iterator[Array]:
+        """Yields the reference's displacement of the left tool from its goal."""
+        controller = _controller()
+        self.plant.reset()
+        controller.reset(ROBOT.home)
+        contract = Contract(controller, ROBOT.home)
+        for dt in ticks:
+            targets = self.admittance.update(goals, self.plant.state(), dt)
+            reference = controller.step(targets, dt)
+            contract.check(reference, dt)
+            self.plant.apply(Command(CommandMode.POSITION, reference.q, reference.v, REST, {}))
+            self.plant.advance(dt)
+            yield _away(controller.tool_pose("left"), goals["left"])
+
+    def measured(self, goals: dict[str, pin.SE3 | None]) -> Array:
+        return _away(ROBOT.tool_pose(self.plant.state().q, "left"), goals["left"])
+
+
+@AXES
+def test_pushed_in_mujoco_the_tool_moves_by_the_wrench_over_the_stiffness_and_the_servos_give(axis: int) -> None:
+    push = _wrench(axis, 20.0 if axis < 3 else 5.0)
+    loop = _Loop(_plant(SOFT), Admittance(ROBOT))
+    for tick, x in enumerate(loop.run(GOALS, iter([0.002] * 1500))):
+        if tick == 50:
+            np.testing.assert_allclose(x, 0.0, atol=1e-6)  # no drift before
+            loop.plant.push("left", push, 1.95)
+        if tick == 1000:
+            expected = push[axis] / _stiffness(axis)
+            assert x[axis] == pytest.approx(expected, rel=0.05)
+            np.testing.assert_allclose(np.delete(x, axis), 0.0, atol=0.05 * expected)
+            J = pin.computeFrameJacobian(
+                ROBOT.model, ROBOT.model.createData(), ROBOT.home, ROBOT.arms["left"].frame_id, pin.LOCAL_WORLD_ALIGNED
+            )
+            give = J @ J.T @ push / SOFT
+            assert loop.measured(GOALS)[axis] == pytest.approx(expected + give[axis], rel=0.05)
+    np.testing.assert_allclose(x, 0.0, atol=1e-4)
+
+
+def test_above_firm_servos_the_measured_tool_moves_by_the_force_over_the_stiffness() -> None:
+    loop = _Loop(_plant(FIRM), Admittance(ROBOT))
+    for axis in range(3):
+        for tick, _ in enumerate(loop.run(GOALS, iter([0.002] * 800))):
+            if tick == 0:
+                loop.plant.push("left", _wrench(axis, 20.0), 10.0)
+        assert loop.measured(GOALS)[axis] == pytest.approx(20.0 / DEFAULT.stiffness, rel=0.05)
+
+
+@pytest.mark.parametrize("ratio", [0.3, 0.5])
+def test_released_in_mujoco_the_tool_returns_with_the_damping_ratio_within_a_tenth(ratio: float) -> None:
+    loop, back = _Loop(_plant(FIRM), Admittance(ROBOT, AdmittanceSettings(damping_ratio=ratio))), []
+    for tick, _ in enumerate(loop.run(GOALS, iter([0.002] * 1800))):
+        if tick == 0:
+            loop.plant.push("left", _wrench(2, 20.0), 2.0)
+        if tick > 1000:
+            back.append(loop.measured(GOALS)[2])
+    assert _ratio(np.array(back)) == pytest.approx(ratio, abs=0.1)
+
+
+def test_ticks_of_one_to_ten_milliseconds_keep_the_contract_and_end_at_rest() -> None:
+    ticks = np.random.default_rng(54).uniform(0.001, 0.01, 600)
+    loop, seen = _Loop(_plant(SOFT), Admittance(ROBOT)), []
+    for tick, x in enumerate(loop.run(GOALS, iter(ticks.tolist()))):
+        if tick == 0:
+            loop.plant.push("left", np.array([15.0, -10.0, 20.0, 1.0, 2.0, -1.0]), 60.0)
+        seen.append(x)
+    assert np.abs(seen[-1]).max() > 0.01
+    assert np.abs(np.array(seen[-100:]) - seen[-1]).max() < 1e-5
+
+
+def test_leaning_on_a_body_of_ten_kilonewtons_per_metre_it_comes_to_rest() -> None:
+    body = 10000.0
+    surface = ROBOT.tool_pose(ROBOT.home, "left").translation[2] - 0.02
+    below = {arm: pin.SE3(goal.rotation, goal.translation - [0.0, 0.0, 0.06]) for arm, goal in GOALS.items() if goal}
+    loop, forces = _Loop(_plant(SOFT), Admittance(ROBOT)), []
+    for _ in loop.run(dict(below), iter([0.001] * 2500)):
+        height = ROBOT.tool_pose(loop.plant.state().q, "left").translation[2]
+        forces.append(max(0.0, body * (surface - height)))
+        loop.plant.push("left", _wrench(2, forces[-1]), DT)
+    settled = np.array(forces[-500:])
+    assert np.ptp(settled) < 0.1
+    in_series = 0.04 / (1 / DEFAULT.stiffness + 1 / body)
+    assert settled[-1] == pytest.approx(in_series, rel=0.1)

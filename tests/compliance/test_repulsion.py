@@ -1,0 +1,282 @@
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import cache
+from itertools import pairwise
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from pydantic import ValidationError
+
+from q2r2_control.compliance.repulsion import MeasuredSeparation, WallReport
+from q2r2_control.config import load_config
+from q2r2_control.config.control import ControllerSettings, WallSettings
+from q2r2_control.plants.mujoco import MujocoPlant
+from q2r2_control.robot.robot import Robot
+from q2r2_control.types import Array, Command, CommandMode
+from tests.control.cells import cell, random_posture
+
+ROBOT = cell("dual_iiwa7").robot
+SHELL = ControllerSettings().min_distance
+REST = np.zeros(len(ROBOT.home))
+
+
+@cache
+def wall(**settings: float) -> MeasuredSeparation:
+    return MeasuredSeparation(ROBOT, ControllerSettings(), WallSettings(**settings))
+
+
+@cache
+def _postures() -> list[tuple[Array, WallReport]]:
+    """Postures in which the wall presses and nothing touches."""
+    random, found = np.random.default_rng(31), []
+    for _ in range(12000):
+        q = random_posture(ROBOT, random)
+        report = wall().update(q, REST)
+        if report.pressing and report.closest_distance > 0.0:
+            found.append((q, report))
+    return found
+
+
+def _of_two_arms(pair: tuple[str, str]) -> bool:
+    return {name.split("_")[0] for name in pair} == {"left", "right"}
+
+
+def _with_the_table(pair: tuple[str, str]) -> bool:
+    return any(name.startswith("table") for name in pair)
+
+
+def _mass_matrix(q: Array) -> Array:
+    upper = np.triu(pin.crba(ROBOT.model, ROBOT.model.createData(), q))
+    return np.asarray(upper + np.triu(upper, 1).T)
+
+
+@pytest.mark.parametrize("kind", [_of_two_arms, _with_the_table], ids=["two arms", "an arm and the table"])
+def test_the_torque_at_rest_is_the_gradient_of_the_walls_energy(kind: Callable[[tuple[str, str]], bool]) -> None:
+    chosen = [(q, report) for q, report in _postures() if any(map(kind, report.pressing))][:40]
+    assert len(chosen) >= 20
+    assert max(len(report.pressing) for _, report in chosen) >= 3
+    for q, report in chosen:
+        slope = np.zeros(len(q))
+        for j in range(len(q)):
+            step = 1e-6 * np.eye(len(q))[j]
+            slope[j] = (wall().update(q + step, REST).energy - wall().update(q - step, REST).energy) / 2e-6
+        np.testing.assert_allclose(report.tau, -slope, rtol=1e-4, atol=1e-3)
+        assert np.abs(report.tau).max() > 0.0
+
+
+def test_the_energy_is_that_of_a_spring_over_each_pairs_depth_as_coal_measures_it() -> None:
+    stiffness = WallSettings().stiffness
+    for q, report in _postures()[:100]:
+        depth = np.array([max(SHELL - pair.distance, 0.0) for pair in ROBOT.distances(q)])
+        spring = 0.5 * stiffness * float((depth**2).sum())
+        # Smooth distances are up to 0.3 mm longer.
+        least = 0.5 * stiffness * float((np.maximum(depth - 3e-4, 0.0) ** 2).sum())
+        assert least - 1e-9 <= report.energy <= spring + 1e-4
+
+
+def test_the_report_names_what_presses_and_the_closest_pair() -> None:
+    for q, report in _postures()[:50]:
+        distances = {frozenset((pair.name_a, pair.name_b)): pair.distance for pair in ROBOT.distances(q)}
+        assert distances[frozenset(report.closest_pair)] == pytest.approx(report.closest_distance, abs=1e-4)
+        assert report.closest_distance == pytest.approx(min(distances.values()), abs=1e-4)
+        pressing = {frozenset(pair) for pair in report.pressing}
+        assert all(distances[pair] < SHELL for pair in pressing)
+        assert all(pair in pressing for pair, distance in distances.items() if distance < SHELL - 4e-4)
+
+
+def test_there_is_no_torque_outside_the_shell_at_any_speed() -> None:
+    random, seen = np.random.default_rng(32), 0
+    for _ in range(400):
+        q, v = random_posture(ROBOT, random), random.normal(0.0, 2.0, len(REST))
+        if min(pair.distance for pair in ROBOT.distances(q)) > SHELL:
+            report = wall().update(q, v)
+            assert not report.tau.any()
+            assert report.pressing == ()
+            assert report.force == report.energy == 0.0
+            seen += 1
+    assert seen > 20
+
+
+def test_no_speed_makes_the_wall_pull_a_pair_together() -> None:
+    single = [(q, report) for q, report in _postures() if len(report.pressing) == 1 and report.force > 5.0][:30]
+    assert len(single) >= 10
+    for q, report in single:
+        away = report.tau / np.linalg.norm(report.tau)
+        weaker = 0
+        for speed in (-5.0, -0.5, -0.05, 0.05, 0.5, 5.0):
+            torque = wall().update(q, speed * away).tau
+            along = float(torque @ away)
+            np.testing.assert_allclose(torque, along * away, atol=1e-9)
+            assert along >= 0.0
+            assert (along >= np.linalg.norm(report.tau) - 1e-9) == (speed < 0.0), "more when closing, less when opening"
+            weaker += along == 0.0
+        assert weaker >= 1, "fast enough out, it lets go"
+
+
+def test_the_damping_takes_energy_at_every_velocity() -> None:
+    random = np.random.default_rng(33)
+    for q, report in _postures()[:200]:
+        v = random.normal(0.0, 0.3, len(REST))
+        assert (wall().update(q, v).tau - report.tau) @ v <= 1e-9
+
+
+def test_the_torque_grows_gradually_into_the_shell_while_closing() -> None:
+    crossed = 0
+    for q, report in _postures()[:12]:
+        # From outside along the torque, at a speed of its own, in steps of a few micrometres.
+        direction = report.tau / np.linalg.norm(report.tau)
+        way = np.linspace(0.1, 0.0, 8001)
+        torques = np.array([wall().update(q + s * direction, -0.3 * direction).tau for s in way])
+        assert np.linalg.norm(np.diff(torques, axis=0), axis=1).max() < 1.5
+        crossed += bool(not torques[0].any() and np.linalg.norm(torques[-1]) > 10.0)
+    assert crossed >= 3
+
+
+def test_default_stiffness_is_never_scaled_down_and_stacked_pairs_of_a_hard_wall_are() -> None:
+    firm = {"maximum_force": 2000.0}
+    stiffest = max(_postures(), key=lambda posture: len(posture[1].pressing))[0]
+    for q, _ in _postures():
+        soft, default = (wall(stiffness=k, **firm).update(q, REST).tau for k in (5e3, 1e4))
+        np.testing.assert_allclose(default, 2.0 * soft, rtol=1e-9, atol=1e-9)
+    soft, hard = (wall(stiffness=k, **firm).update(stiffest, REST).tau for k in (5e3, 1e5))
+    assert np.linalg.norm(hard) < 19.0 * np.linalg.norm(soft)
+
+
+@pytest.mark.parametrize("stiffness", [1e4, 1e5])
+def test_damping_of_all_pairs_together_stays_a_quarter_of_what_two_milliseconds_can_take(stiffness: float) -> None:
+    separation, bound = wall(stiffness=stiffness, damping_ratio=2.0, maximum_force=2000.0), 0.5 / 0.002
+    stacked = sorted(_postures(), key=lambda posture: -len(posture[1].pressing))[:40]
+    reached = 0.0
+    for q, _ in stacked:
+        still = separation.update(q, REST).tau
+        columns = [(still - separation.update(q, 1e-7 * unit).tau) / 1e-7 for unit in np.eye(len(q))]
+        fastest = float(np.linalg.eigvals(np.linalg.solve(_mass_matrix(q), np.array(columns).T)).real.max())
+        assert fastest <= bound * (1 + 1e-4)
+        reached = max(reached, fastest)
+    assert reached > 0.5 * bound
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_numbers_that_are_not_finite_give_no_torque_and_no_distance(bad: float) -> None:
+    q = _postures()[0][0]
+    broken = q.copy()
+    broken[3] = bad
+    for report in (wall().update(broken, REST), wall().update(q, broken)):
+        assert not report.tau.any()
+        assert np.isnan(report.closest_distance)
+    assert wall().update(q, REST).pressing, "and the next tick is as ever"
+
+
+@pytest.mark.parametrize("key", ["stiffness", "damping_ratio", "maximum_force"])
+@pytest.mark.parametrize("value", [0.0, -1.0, float("nan")])
+def test_settings_that_would_not_push_apart_or_would_add_energy_are_refused(key: str, value: float) -> None:
+    with pytest.raises(ValidationError, match=key):
+        WallSettings(**{key: value})
+
+
+WEIGHTLESS = """<robot name="rod"><link name="base"/><link name="rod"/><joint name="hinge" type="revolute">
+<parent link="base"/><child link="rod"/><limit lower="-1" upper="1" velocity="1" effort="1"/></joint></robot>"""
+
+
+def test_a_robot_without_pairs_meets_no_wall() -> None:
+    weight = '<link name="rod"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/>'
+    robot = Robot.from_urdf(WEIGHTLESS.replace('<link name="rod"/>', weight + "</inertial></link>"), {"left": "rod"})
+    report = MeasuredSeparation(robot, ControllerSettings()).update(np.zeros(1), np.ones(1))
+    assert not report.tau.any()
+    assert report.closest_distance == np.inf
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """One tick of a simulated push."""
+
+    report: WallReport
+    energy: float  # kinetic, of the wall and of what holds the right arm [J]
+    work: float  # done so far by the push [J]
+    distance: float  # of the closest pair by Coal [m]
+
+
+HOLD, HOLD_DAMPING = 2000.0, 60.0  # of the right arm's joints [Nm/rad, Nm s/rad]
+
+
+def _pushed(force: float, friction: float, dt: float, separation: MeasuredSeparation) -> Iterator[_Seen]:
+    """The left hand, 60 mm from the right one, is pushed at it for 1.5 s and released for 1.5 s."""
+    q = ROBOT.home.copy()
+    while separation.update(q, REST).closest_distance > 0.06:
+        q += 0.005 * np.array([-1, *[0] * 6, 1, *[0] * 6])
+    plant, data, held = MujocoPlant(ROBOT, load_config("config/dual_iiwa7.yaml")), ROBOT.model.createData(), q[7:]
+    plant.reset(q)
+    plant.push("left", np.array([0.0, -force, 0.0, 0.0, 0.0, 0.0]), 1.5)
+    work, before = 0.0, ROBOT.tool_pose(q, "left").translation[1]
+    for tick in range(round(3.0 / dt)):
+        state = plant.state()
+        here = ROBOT.tool_pose(state.q, "left").translation[1]
+        work += -force * (here - before) * (tick * dt <= 1.5)
+        before = here
+        report = separation.update(state.q, state.v)
+        tau = pin.computeGeneralizedGravity(ROBOT.model, data, state.q) + report.tau - friction * state.v
+        tau[7:] += HOLD * (held - state.q[7:]) - HOLD_DAMPING * state.v[7:]
+        kinetic = 0.5 * float(state.v @ _mass_matrix(state.q) @ state.v)
+        spring = 0.5 * HOLD * float(((held - state.q[7:]) ** 2).sum())
+        coal = min(pair.distance for pair in ROBOT.distances(state.q)) if tick % 5 == 0 else report.closest_distance
+        yield _Seen(report, kinetic + spring + report.energy, work, coal)
+        plant.apply(Command(CommandMode.TORQUE, state.q, state.v, tau, {}))
+        plant.advance(dt)
+
+
+@pytest.mark.parametrize(
+    ("friction", "dt", "stiffness", "least"),
+    [
+        pytest.param(1.0, 0.001, 1e4, 0.002, id="hardly braked"),
+        pytest.param(10.0, 0.001, 1e4, 0.01, id="braked"),
+        pytest.param(10.0, 0.002, 1e4, 0.01, id="braked, slow loop"),
+        pytest.param(10.0, 0.002, 1e5, 0.01, id="braked, slow loop, ten times the stiffness"),
+    ],
+)
+def test_an_arm_pushed_at_the_other_with_40_newtons_never_touches_it_and_gets_no_energy_from_the_wall(
+    friction: float, dt: float, stiffness: float, least: float
+) -> None:
+    pressed, released = 0, []
+    for tick, seen in enumerate(_pushed(40.0, friction, dt, wall(stiffness=stiffness))):
+        assert seen.distance > least
+        assert seen.energy <= seen.work + 0.01, "the push's work is all there is"
+        pressed += bool(seen.report.pressing)
+        if tick * dt > 1.5:
+            released.append(seen.energy)
+            assert released[-1] <= released[0] + 1e-3
+            assert len(released) < 2 or released[-1] <= released[-2] + 2e-4
+    assert pressed * dt > 0.1
+    assert released[-1] < 0.7 * released[0]
+
+
+def test_released_from_the_wall_the_arm_comes_out_once_and_stays_out() -> None:
+    after = [seen for tick, seen in enumerate(_pushed(40.0, 20.0, 0.001, wall())) if tick > 1500]
+    pressing = [bool(seen.report.pressing) for seen in after]
+    assert pressing[0]
+    assert sum(first != second for first, second in pairwise(pressing)) == 1
+    distances = np.array([seen.report.closest_distance for seen in after])
+    assert distances.argmax() > 300
+    assert distances[-1] > SHELL
+    assert (np.diff(distances)[:300] > -1e-6).all(), "opens steadily"
+
+
+def test_pressed_towards_the_table_the_arm_rests_where_the_spring_bears_the_force_and_the_torque_is_quiet() -> None:
+    plant, data = MujocoPlant(ROBOT, load_config("config/dual_iiwa7.yaml")), ROBOT.model.createData()
+    plant.push("left", np.array([0.0, 0.0, -40.0, 0.0, 0.0, 0.0]), 10.0)
+    depths, torques = [], []
+    for _ in range(2000):
+        state = plant.state()
+        report = wall().update(state.q, state.v)
+        assert report.closest_distance > 0.005
+        depths.append(SHELL - report.closest_distance)
+        torques.append(report.tau)
+        tau = pin.computeGeneralizedGravity(ROBOT.model, data, state.q) + report.tau - 10.0 * state.v
+        plant.apply(Command(CommandMode.TORQUE, state.q, state.v, tau, {}))
+        plant.advance(0.002)
+    assert report.pressing
+    assert all(map(_with_the_table, report.pressing))
+    assert sum(depths[-100:]) / 100 == pytest.approx(40.0 / WallSettings().stiffness, abs=5e-4)
+    assert np.abs(np.diff(torques[-500:], axis=0)).max() < 0.02

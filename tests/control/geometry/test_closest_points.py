@@ -1,0 +1,277 @@
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
+
+import coal
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from q2r2_control.control.geometry.closest_points import segment_box, segment_segment
+from q2r2_control.types import Array
+
+SAMPLES = 300
+
+
+class Segments(NamedTuple):
+    a0: Array
+    a1: Array
+    b0: Array
+    b1: Array
+
+
+def _apart(random: np.random.Generator) -> Segments:
+    return Segments(*random.uniform(-1, 1, (4, 3)))
+
+
+def _parallel(random: np.random.Generator) -> Segments:
+    a0, a1, b0 = random.uniform(-1, 1, (3, 3))
+    return Segments(a0, a1, b0, b0 + random.uniform(-2, 2) * (a1 - a0))
+
+
+def _nearly_parallel(random: np.random.Generator) -> Segments:
+    a0, a1, b0, b1 = _parallel(random)
+    return Segments(a0, a1, b0, b1 + 10.0 ** random.uniform(-10, -3) * random.normal(size=3))
+
+
+def _on_one_line(random: np.random.Generator) -> Segments:
+    origin, direction = random.uniform(-1, 1, (2, 3))
+    return Segments(*(origin + s * direction for s in random.uniform(-1, 1, 4)))
+
+
+def _crossing(random: np.random.Generator) -> Segments:
+    meeting, u, w = random.uniform(-1, 1, (3, 3))
+    s, t = random.uniform(0.1, 0.9, 2)
+    return Segments(meeting - s * u, meeting + (1 - s) * u, meeting - t * w, meeting + (1 - t) * w)
+
+
+def _point_and_segment(random: np.random.Generator) -> Segments:
+    a0, b0, b1 = random.uniform(-1, 1, (3, 3))
+    return Segments(a0, a0.copy(), b0, b1)
+
+
+def _two_points(random: np.random.Generator) -> Segments:
+    a0, b0 = random.uniform(-1, 1, (2, 3))
+    return Segments(a0, a0.copy(), b0, b0.copy())
+
+
+def _sharing_an_end(random: np.random.Generator) -> Segments:
+    a0, a1, b1 = random.uniform(-1, 1, (3, 3))
+    return Segments(a0, a1, a0.copy(), b1)
+
+
+KINDS = [
+    _apart,
+    _parallel,
+    _nearly_parallel,
+    _on_one_line,
+    _crossing,
+    _point_and_segment,
+    _two_points,
+    _sharing_an_end,
+]
+
+
+def _kind_name(kind: Callable[..., object]) -> str:
+    return kind.__name__.strip("_").replace("_", " ")
+
+
+def _to_segment(point: Array, start: Array, end: Array) -> float:
+    along = end - start
+    square = float(along @ along)
+    share = np.clip((point - start) @ along / square, 0.0, 1.0) if square > 0.0 else 0.0
+    return float(np.linalg.norm(point - start - share * along))
+
+
+def _least_distance(segments: Segments) -> float:
+    """A convex quadratic on a square is least at its free minimum, if that is inside, or on one of the four sides."""
+    a0, a1, b0, b1 = segments
+    candidates = [_to_segment(a0, b0, b1), _to_segment(a1, b0, b1), _to_segment(b0, a0, a1), _to_segment(b1, a0, a1)]
+    directions = np.column_stack([a1 - a0, b0 - b1])
+    s, t = np.linalg.lstsq(directions, b0 - a0, rcond=1e-12)[0]
+    if 0.0 <= s <= 1.0 and 0.0 <= t <= 1.0:
+        candidates.append(float(np.linalg.norm(directions @ [s, t] - (b0 - a0))))
+    return min(candidates)
+
+
+@pytest.mark.parametrize("kind", KINDS, ids=_kind_name)
+def test_segments_are_as_far_apart_as_their_closest_points(kind: Callable[[np.random.Generator], Segments]) -> None:
+    random = np.random.default_rng(1)
+    on_a, on_b = np.zeros(3), np.zeros(3)
+    # What is parallel but for rounding is measured in the middle of the overlap, not at its nearer end.
+    tolerance = 1e-7 if kind is _nearly_parallel else 1e-9
+    for _ in range(SAMPLES):
+        segments = kind(random)
+        distance = segment_segment(*segments, on_a, on_b)
+        assert distance == pytest.approx(_least_distance(segments), abs=tolerance)
+        assert distance == pytest.approx(np.linalg.norm(on_a - on_b), abs=1e-12)
+        assert _to_segment(on_a, segments.a0, segments.a1) < 1e-9
+        assert _to_segment(on_b, segments.b0, segments.b1) < 1e-9
+        swapped = segment_segment(segments.b0, segments.b1, segments.a0, segments.a1, on_b, on_a)
+        assert swapped == pytest.approx(distance, abs=tolerance)
+
+
+def test_parallel_segments_meet_in_the_middle_of_their_overlap() -> None:
+    on_a, on_b = np.zeros(3), np.zeros(3)
+    distance = segment_segment(*np.array([[0.0, 0, 0], [1, 0, 0], [0.5, 0.3, 0], [3, 0.3, 0]]), on_a, on_b)
+    assert distance == pytest.approx(0.3)
+    np.testing.assert_allclose(on_a, [0.75, 0, 0])
+    np.testing.assert_allclose(on_b, [0.75, 0.3, 0])
+
+
+class BoxAnswer(NamedTuple):
+    distance: float
+    on_a: Array
+    on_box: Array
+    normal: Array
+
+
+def _to_box(a0: npt.ArrayLike, a1: npt.ArrayLike, half: Array) -> BoxAnswer:
+    on_a, on_box, normal = np.zeros(3), np.zeros(3), np.zeros(3)
+    distance = segment_box(np.asarray(a0, dtype=float), np.asarray(a1, dtype=float), half, on_a, on_box, normal)
+    return BoxAnswer(distance, on_a, on_box, normal)
+
+
+def _outside(points: Array, half: Array) -> Array:
+    """Distance of points (..., 3) from a box; 0 inside."""
+    return np.asarray(np.linalg.norm(points - np.clip(points, -half, half), axis=-1))
+
+
+def _nearest_along(a0: Array, a1: Array, half: Array) -> float:
+    """The squared distance is convex along the segment: halve where its slope changes sign."""
+    low, high = 0.0, 1.0
+    for _ in range(100):
+        middle = 0.5 * (low + high)
+        point = a0 + middle * (a1 - a0)
+        if (point - np.clip(point, -half, half)) @ (a1 - a0) > 0.0:
+            high = middle
+        else:
+            low = middle
+    ends = a0 + np.array([[0.0], [low], [high], [1.0]]) * (a1 - a0)
+    return float(_outside(ends, half).min())
+
+
+def _boxes_and_segments(count: int, spread: float = 1.0) -> Iterator[tuple[Array, Array, Array]]:
+    random = np.random.default_rng(2)
+    for _ in range(count):
+        half = random.uniform(0.02, 0.5, 3)
+        a0, a1 = random.uniform(-spread, spread, (2, 3))
+        yield a0, a1, half
+
+
+def test_a_segment_outside_a_box_is_as_far_as_its_nearest_point() -> None:
+    outside = 0
+    for a0, a1, half in _boxes_and_segments(1000):
+        expected = _nearest_along(a0, a1, half)
+        if expected < 1e-6:
+            continue
+        outside += 1
+        answer = _to_box(a0, a1, half)
+        assert answer.distance == pytest.approx(expected, abs=1e-9)
+        _assert_witnesses(answer, a0, a1, half)
+    assert outside > 500
+
+
+def _assert_witnesses(answer: BoxAnswer, a0: Array, a1: Array, half: Array) -> None:
+    assert _to_segment(answer.on_a, a0, a1) < 1e-9
+    assert _outside(answer.on_box, half) < 1e-9
+    assert np.linalg.norm(answer.normal) == pytest.approx(1.0, abs=1e-9)
+    np.testing.assert_allclose(answer.on_box - answer.on_a, answer.distance * answer.normal, atol=1e-9)
+
+
+SPECIAL = {
+    "along a face": ([-0.1, 0.0, 0.5], [0.3, 0.1, 0.5], 0.2),
+    "along a face and beyond it": ([-0.5, 0.0, 0.5], [0.9, 0.0, 0.5], 0.2),
+    "along an edge": ([0.6, -0.1, 0.7], [0.6, 0.1, 0.7], np.hypot(0.2, 0.4)),
+    "upright above a face": ([0.1, 0.0, 0.4], [0.1, 0.0, 0.9], 0.1),
+    "pointing at a corner": ([0.6, 0.4, 0.5], [1.2, 0.8, 1.0], np.sqrt(0.12)),
+    "a point before a face": ([0.0, 0.0, 0.8], [0.0, 0.0, 0.8], 0.5),
+    "a point before an edge": ([0.7, 0.0, 0.7], [0.7, 0.0, 0.7], 0.5),
+    "touching a face from outside": ([0.0, 0.0, 0.3], [0.0, 0.0, 0.8], 0.0),
+    "lying on a face": ([-0.1, 0.0, 0.3], [0.1, 0.0, 0.3], 0.0),
+    "ending at a corner": ([0.4, 0.2, 0.3], [0.9, 0.9, 0.9], 0.0),
+    "a point inside": ([0.0, 0.1, 0.0], [0.0, 0.1, 0.0], -0.1),
+    "wholly inside": ([-0.1, 0.0, 0.2], [0.1, 0.0, 0.2], -0.1),
+    "dipping into the top": ([0.0, 0.0, 0.25], [0.0, 0.0, 0.9], -0.05),
+    "dipping into the bottom": ([0.0, 0.0, -0.9], [0.0, 0.0, -0.25], -0.05),
+    "dipping into the left": ([0.0, -0.9, 0.0], [0.0, -0.15, 0.0], -0.05),
+}
+
+
+@pytest.mark.parametrize(("a0", "a1", "expected"), SPECIAL.values(), ids=SPECIAL.keys())
+def test_special_positions_of_a_segment_and_a_box(a0: list[float], a1: list[float], expected: float) -> None:
+    half = np.array([0.4, 0.2, 0.3])
+    for start, end in ((a0, a1), (a1, a0)):
+        answer = _to_box(np.array(start), np.array(end), half)
+        assert answer.distance == pytest.approx(expected, abs=1e-9)
+        _assert_witnesses(answer, np.array(start), np.array(end), half)
+
+
+def test_a_segment_along_a_face_meets_it_in_the_middle() -> None:
+    half = np.array([0.4, 0.2, 0.3])
+    answer = _to_box([-1.0, 0.0, 0.5], [0.8, 0.0, 0.5], half)
+    np.testing.assert_allclose(answer.on_a, np.array([0.0, 0.0, 0.5]), atol=1e-9)
+
+
+def test_a_segment_that_enters_a_box_leaves_it_by_the_shortest_way_of_all_directions() -> None:
+    directions = np.random.default_rng(8).normal(size=(400, 3))
+    directions = np.vstack([directions / np.linalg.norm(directions, axis=1, keepdims=True), np.eye(3), -np.eye(3)])
+    entered = across = 0
+    for a0, a1, half in _boxes_and_segments(1000, spread=0.4):
+        if _nearest_along(a0, a1, half) > 1e-9:
+            continue
+        entered += 1
+        answer = _to_box(a0, a1, half)
+        assert answer.distance <= 0.0
+        assert _to_segment(answer.on_a, a0, a1) < 1e-9
+        np.testing.assert_allclose(answer.on_box - answer.on_a, answer.distance * answer.normal, atol=1e-9)
+        assert np.abs(np.abs(answer.on_box) - half).min() < 1e-9, "the way out ends on the box"
+        across += np.abs(answer.normal).max() < 1.0 - 1e-9
+        # Moved by t n the segment is out once its nearest end has passed the box's farthest corner.
+        ways = np.abs(directions) @ half - np.minimum(directions @ a0, directions @ a1)
+        assert -answer.distance <= ways.min() + 1e-9
+        out = answer.distance * answer.normal
+        assert _to_box(a0 + 1.0001 * out, a1 + 1.0001 * out, half).distance >= 0.0
+    assert entered > 200
+    assert across > 20
+
+
+def test_the_depth_grows_from_nothing_where_a_segment_begins_to_cut_an_edge() -> None:
+    half = np.array([0.4, 0.2, 0.3])
+    for depth in (-1e-3, -1e-6, 1e-6, 1e-3):
+        corner = np.array([0.4, 0.0, 0.3]) - depth * np.array([1.0, 0.0, 1.0]) / np.sqrt(2.0)
+        along = np.array([1.0, 0.0, -1.0])
+        assert _to_box(corner - along, corner + along, half).distance == pytest.approx(-depth, abs=1e-9)
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0], ids=["from above", "from below"])
+@pytest.mark.parametrize("depth", [0.05, 0.0, -0.05], ids=["before", "touching", "inside"])
+def test_the_normal_points_from_the_segment_into_the_box_before_and_after_contact(side: float, depth: float) -> None:
+    half = np.array([0.4, 0.2, 0.3])
+    z = side * (0.3 + depth)
+    answer = _to_box([0.0, 0.0, z], [0.1, 0.0, z], half)
+    np.testing.assert_allclose(answer.normal, np.array([0.0, 0.0, -side]), atol=1e-9)
+
+
+def _coal_distance(a0: Array, a1: Array, radius: float, half: Array) -> float:
+    length = np.linalg.norm(a1 - a0)
+    z = (a1 - a0) / length
+    x = np.cross(z, np.eye(3)[np.argmin(np.abs(z))])
+    x /= np.linalg.norm(x)
+    placement = coal.Transform3s(np.column_stack([x, np.cross(z, x), z]), 0.5 * (a0 + a1))
+    capsule, box = coal.Capsule(radius, length), coal.Box(*(2 * half))
+    return float(
+        coal.distance(capsule, placement, box, coal.Transform3s(), coal.DistanceRequest(), coal.DistanceResult())
+    )
+
+
+def test_coal_agrees_on_capsules_and_boxes_until_the_capsules_axis_enters() -> None:
+    penetrating = 0
+    for a0, a1, half in _boxes_and_segments(500):
+        if _nearest_along(a0, a1, half) < 1e-3:
+            continue
+        ours = _to_box(a0, a1, half).distance - 0.15
+        penetrating += ours < 0.0
+        assert ours == pytest.approx(_coal_distance(a0, a1, 0.15, half), abs=1e-4)
+    assert penetrating > 50

@@ -1,0 +1,204 @@
+from __future__ import annotations
+
+import coal
+import numpy as np
+import pinocchio as pin
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from q2r2_control.control.geometry.collision import Contact, at_least, bodies_of, distance_row, measure, pairs_of
+from q2r2_control.errors import RobotError
+from q2r2_control.robot.robot import Robot
+from q2r2_control.types import Array
+from tests.control.cells import NAMES, CellArrays, arrays_of, cell, distances, placed, random_posture
+
+# Coal finds capsule and capsule in closed form, capsule and box by iteration.
+EXACT, ITERATED = 1e-9, 1e-4
+STEP = 1e-6  # of finite differences [rad]
+
+
+def _coal_distances(robot: Robot, q: Array) -> Array:
+    return np.array([pair.distance for pair in robot.distances(q)])
+
+
+def _core_distance(cell: CellArrays) -> Array:
+    """Distance (p,) below which the closed forms stop being smooth: the segment itself touches."""
+    return np.asarray(-cell.bodies.radius[cell.pairs.first] - cell.bodies.radius[cell.pairs.second])
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_distances_of_all_pairs_equal_coals_on_both_sides_of_contact(name: str) -> None:
+    arrays, random = cell(name), np.random.default_rng(8)
+    postures = np.array([arrays.robot.home, *(random_posture(arrays.robot, random) for _ in range(60))])
+    ours = distances(arrays, postures)
+    coals = np.array([_coal_distances(arrays.robot, q) for q in postures])
+    round_pair = arrays.pairs.round == 1
+    comparable = ours > _core_distance(arrays) + 1e-3
+    for kind, tolerance in ((round_pair, EXACT), (~round_pair, ITERATED)):
+        seen = comparable & kind
+        assert seen.any()
+        np.testing.assert_allclose(ours[seen], coals[seen], rtol=0, atol=tolerance)
+    assert (ours[comparable] < 0.0).sum() > 20, "penetrations among them"
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_cheap_bound_is_never_more_than_the_distance(name: str) -> None:
+    arrays, random = cell(name), np.random.default_rng(9)
+    for _ in range(20):
+        q = random_posture(arrays.robot, random)
+        _, posed = placed(arrays, q)
+        for p, exact in enumerate(distances(arrays, q[None])[0]):
+            assert at_least(arrays.bodies, posed, arrays.pairs.first[p], arrays.pairs.second[p]) <= exact + 1e-12
+
+
+def _row(arrays: CellArrays, q: Array, p: int) -> Array:
+    placements, posed = placed(arrays, q)
+    first, contact, row = arrays.pairs.first[p], Contact.empty(), np.zeros(len(q))
+    measure(arrays.bodies, posed, first, arrays.pairs.second[p], posed.start[first], posed.end[first], contact)
+    distance_row(arrays.chain, placements, arrays.pairs, p, contact, row)
+    return row
+
+
+def _differences(arrays: CellArrays, q: Array, step: float) -> Array:
+    """Central differences (nv, p) of all distances."""
+    steps = step * np.eye(len(q))
+    return (distances(arrays, q + steps) - distances(arrays, q - steps)) / (2 * step)
+
+
+def _assert_rows_are_gradients(arrays: CellArrays, q: Array) -> tuple[int, int]:
+    """Returns the numbers of pairs compared outside and in penetration."""
+    here = distances(arrays, q[None])[0]
+    slopes, coarse = _differences(arrays, q, STEP), _differences(arrays, q, 10 * STEP)
+    outside = penetrating = 0
+    for p, distance in enumerate(here):
+        # Where the closest points jump there is no gradient: two step sizes disagree there.
+        smooth = np.abs(slopes[:, p] - coarse[:, p]).max() < 1e-4
+        if distance < _core_distance(arrays)[p] + 1e-3 or not smooth:
+            continue
+        np.testing.assert_allclose(_row(arrays, q, p), slopes[:, p], rtol=0, atol=1e-4)
+        outside, penetrating = outside + (distance > 0.0), penetrating + (distance <= 0.0)
+    return outside, penetrating
+
+
+@given(seed=st.integers(0, 2**32 - 1), name=st.sampled_from(NAMES))
+@settings(derandomize=True, max_examples=40, deadline=None)
+def test_rows_are_the_gradients_of_the_distances(seed: int, name: str) -> None:
+    arrays = cell(name)
+    q = random_posture(arrays.robot, np.random.default_rng(seed))
+    outside, penetrating = _assert_rows_are_gradients(arrays, q)
+    assert outside + penetrating > 0.5 * len(arrays.pairs.first)
+
+
+def _towards_contact(arrays: CellArrays, random: np.random.Generator, depth: float) -> tuple[Array, int]:
+    """A posture in which a pair is ``depth`` from contact, found by following its row; and that pair."""
+    while True:
+        q, p = random_posture(arrays.robot, random), int(random.integers(len(arrays.pairs.first)))
+        for _ in range(60):
+            row = _row(arrays, q, p)
+            square = float(row @ row)
+            miss = depth - distances(arrays, q[None])[0, p]
+            if abs(miss) < 1e-9 or square < 1e-6:
+                break
+            q = q + np.clip(row * miss / square, -0.2, 0.2)
+        if abs(depth - distances(arrays, q[None])[0, p]) < 1e-6 and depth > _core_distance(arrays)[p] + 2e-3:
+            return q, p
+
+
+@pytest.mark.parametrize("depth", [0.02, 1e-4, -1e-4, -0.02], ids="{} m".format)
+@pytest.mark.parametrize("name", ["dual_iiwa7", "dual_panda"])
+def test_following_the_row_parts_a_pair_just_before_and_just_after_contact(name: str, depth: float) -> None:
+    arrays, random = cell(name), np.random.default_rng(10)
+    for _ in range(10):
+        q, p = _towards_contact(arrays, random, depth)
+        row = _row(arrays, q, p)
+        apart = distances(arrays, np.array([q - 1e-5 * row, q, q + 1e-5 * row]))[:, p]
+        assert apart[0] < apart[1] < apart[2]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_joint_that_moves_both_bodies_or_neither_changes_no_distance(name: str) -> None:
+    arrays, random = cell(name), np.random.default_rng(11)
+    for _ in range(5):
+        q = random_posture(arrays.robot, random)
+        before = distances(arrays, q[None])[0]
+        for j in range(len(q)):
+            moved = q.copy()
+            moved[j] += 0.3
+            unmoved = ~(arrays.pairs.joint == j + 1).any(axis=1)
+            np.testing.assert_allclose(distances(arrays, moved[None])[0, unmoved], before[unmoved], atol=1e-12)
+
+
+def _way_bound(arrays: CellArrays, way: Array) -> Array:
+    """S (p,) of braking.py for joint ways (nv,)."""
+    padded = np.concatenate([[0.0], way])
+    return np.asarray((arrays.pairs.reach * padded[arrays.pairs.joint]).sum(axis=1))
+
+
+@given(seed=st.integers(0, 2**32 - 1), name=st.sampled_from(NAMES), size=st.floats(1e-4, 3.0))
+@settings(derandomize=True, max_examples=150, deadline=None)
+def test_no_distance_changes_by_more_than_the_reach_times_the_joints_ways(seed: int, name: str, size: float) -> None:
+    arrays, random = cell(name), np.random.default_rng(seed)
+    q = random_posture(arrays.robot, random)
+    other = np.clip(q + random.uniform(-size, size, len(q)), arrays.robot.position_lower, arrays.robot.position_upper)
+    here, there = distances(arrays, np.array([q, other]))
+    # Where a box has a segment enter it over an edge, its way out is not continuous.
+    comparable = np.minimum(here, there) > _core_distance(arrays) + 1e-9
+    excess = np.abs(here - there) - _way_bound(arrays, np.abs(other - q))
+    assert excess[comparable].max() <= 1e-12
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_no_point_of_a_body_is_farther_from_a_joints_axis_than_its_reach(name: str) -> None:
+    arrays, random = cell(name), np.random.default_rng(12)
+    for _ in range(5):
+        placements, posed = placed(arrays, random_posture(arrays.robot, random))
+        for p in range(len(arrays.pairs.first)):
+            for joint, sign, reach in zip(
+                arrays.pairs.joint[p], arrays.pairs.sign[p], arrays.pairs.reach[p], strict=True
+            ):
+                if joint == 0:
+                    continue
+                body = arrays.pairs.second[p] if sign > 0 else arrays.pairs.first[p]
+                for point in (posed.start[body], posed.end[body]):
+                    offset = point - placements.translation[joint]
+                    assert np.linalg.norm(np.cross(placements.axis[joint], offset)) <= reach + 1e-12
+
+
+SLIDING = """<robot name="slide"><link name="base"><collision><origin xyz="0.9 0 0"/>
+<geometry><sphere radius="0.05"/></geometry></collision></link><link name="carriage"/>
+<joint name="slide" type="prismatic"><parent link="base"/><child link="carriage"/><axis xyz="1 0 0"/>
+<limit lower="-0.5" upper="0.5" velocity="1" effort="1"/></joint>
+<link name="turned"/>
+<joint name="swing" type="revolute"><parent link="carriage"/><child link="turned"/><axis xyz="0 0 1"/>
+<limit lower="-1" upper="1" velocity="1" effort="1"/></joint>
+<link name="tip"><collision><origin xyz="0.2 0 0"/><geometry><sphere radius="0.05"/></geometry></collision></link>
+<joint name="push" type="prismatic"><parent link="turned"/><child link="tip"/><axis xyz="0 1 0"/>
+<limit lower="-0.3" upper="0.3" velocity="1" effort="1"/></joint></robot>"""
+
+
+def test_slides_have_rows_and_reaches_too() -> None:
+    arrays, random = arrays_of(Robot.from_urdf(SLIDING, {"left": "tip"})), np.random.default_rng(13)
+    assert arrays.pairs.joint.tolist() == [[1, 2, 3]]
+    for _ in range(200):
+        q, other = random_posture(arrays.robot, random), random_posture(arrays.robot, random)
+        np.testing.assert_allclose(_row(arrays, q, 0), _differences(arrays, q, STEP)[:, 0], rtol=0, atol=1e-6)
+        here, there = distances(arrays, np.array([q, other]))[:, 0]
+        assert abs(here - there) <= _way_bound(arrays, np.abs(other - q))[0] + 1e-12
+
+
+def test_a_shape_that_no_kernel_measures_is_refused_by_name() -> None:
+    model = pin.GeometryModel()
+    model.addGeometryObject(pin.GeometryObject("funnel", 0, pin.SE3.Identity(), coal.Cone(0.1, 0.2)))
+    with pytest.raises(RobotError, match=r"funnel.*Cone.*capsule, sphere, box"):
+        bodies_of(model)
+
+
+def test_two_boxes_are_refused() -> None:
+    arrays = cell("dual_iiwa7")
+    model = pin.GeometryModel()
+    for name in ("crate", "table"):
+        model.addGeometryObject(pin.GeometryObject(name, 0, pin.SE3.Identity(), coal.Box(1.0, 1.0, 1.0)))
+    model.addCollisionPair(pin.CollisionPair(0, 1))
+    with pytest.raises(RobotError, match=r"two boxes; allowed: at most one box"):
+        pairs_of(model, arrays.chain, bodies_of(model), np.ones(14))

@@ -1,0 +1,227 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from q2r2_control.control.safety.joint_limits import fastest_towards, next_velocity_box
+from q2r2_control.types import Array
+
+JOINTS = 60  # stepped side by side
+STEPS = 800
+RETURN_SPEED = 0.2
+# Of what the accumulated rounding of positions may cost.
+EXACT = 1e-9
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """Limits of many independent joints, (n,) each."""
+
+    lower: Array
+    upper: Array
+    velocity: Array
+    acceleration: Array
+    longest: float  # step [s]
+
+
+@dataclass(frozen=True)
+class Box:
+    lower: Array
+    upper: Array
+    inside: bool
+
+
+def _bounds(random: np.random.Generator, longest: float, n: int = JOINTS) -> Bounds:
+    middle, width = random.uniform(-2, 2, n), 10.0 ** random.uniform(-2, 0.7, n)
+    return Bounds(
+        lower=middle - 0.5 * width,
+        upper=middle + 0.5 * width,
+        velocity=10.0 ** random.uniform(-1, 0.7, n),
+        acceleration=10.0 ** random.uniform(0, 1.5, n),
+        longest=longest,
+    )
+
+
+def _box(q: Array, v: Array, bounds: Bounds, h: float) -> Box:
+    lower, upper = np.zeros_like(q), np.zeros_like(q)
+    inside = next_velocity_box(
+        q,
+        v,
+        bounds.lower,
+        bounds.upper,
+        bounds.velocity,
+        bounds.acceleration,
+        h,
+        bounds.longest,
+        RETURN_SPEED,
+        lower,
+        upper,
+        np.zeros((len(q), 2), dtype=np.int64),
+    )
+    return Box(lower, upper, inside)
+
+
+def _stoppable(room: Array, v: Array, bounds: Bounds) -> npt.NDArray[np.bool_]:
+    """P of limits.py towards one side, with rounding."""
+    return np.where(v <= 0.0, room >= -EXACT, v**2 / (2 * bounds.acceleration) + bounds.longest * v <= room + EXACT)
+
+
+def _keeps_p(q: Array, v: Array, bounds: Bounds) -> bool:
+    up, down = _stoppable(bounds.upper - q, v, bounds), _stoppable(q - bounds.lower, -v, bounds)
+    return bool((up & down & (np.abs(v) <= bounds.velocity + EXACT)).all())
+
+
+def _fastest_in_p(room: Array, bounds: Bounds) -> Array:
+    """Largest speed for which P holds with this much room."""
+    a, H = bounds.acceleration, bounds.longest
+    return np.minimum(bounds.velocity, -a * H + np.sqrt((a * H) ** 2 + 2 * a * np.maximum(room, 0.0)))
+
+
+def _start_on_the_edge_of_p(random: np.random.Generator, bounds: Bounds) -> tuple[Array, Array]:
+    q = random.uniform(bounds.lower, bounds.upper)
+    share: Array = random.choice(np.array([0.0, 0.5, 1.0]), len(q))
+    upward = random.random(len(q)) < 0.5
+    return q, share * np.where(
+        upward, _fastest_in_p(bounds.upper - q, bounds), -_fastest_in_p(q - bounds.lower, bounds)
+    )
+
+
+Choice = Callable[[Box, Array, np.random.Generator], Array]
+
+
+def _outwards(box: Box, v: Array, random: np.random.Generator) -> Array:
+    return box.upper
+
+
+def _back_and_forth(box: Box, v: Array, random: np.random.Generator) -> Array:
+    return np.where(random.random(len(v)) < 0.02, box.lower, box.upper)
+
+
+def _either_corner(box: Box, v: Array, random: np.random.Generator) -> Array:
+    return np.where(random.random(len(v)) < 0.5, box.lower, box.upper)
+
+
+def _anything(box: Box, v: Array, random: np.random.Generator) -> Array:
+    return box.lower + random.random(len(v)) * (box.upper - box.lower)
+
+
+CHOICES = {"upwards": _outwards, "turning": _back_and_forth, "either corner": _either_corner, "anything": _anything}
+
+
+@pytest.mark.parametrize("longest", [0.0005, 0.002, 0.02], ids="longest step {} s".format)
+@pytest.mark.parametrize("choose", CHOICES.values(), ids=CHOICES.keys())
+def test_whatever_is_chosen_from_the_box_every_limit_holds_also_between_steps(choose: Choice, longest: float) -> None:
+    random = np.random.default_rng(6)
+    bounds = _bounds(random, longest)
+    q, v = _start_on_the_edge_of_p(random, bounds)
+    for _ in range(STEPS):
+        h = longest * random.choice([1.0, 1.0, 0.5, 1e-3, random.uniform(1e-6, 1.0)])
+        box = _box(q, v, bounds, h)
+        assert box.inside
+        braked = v - np.clip(v, -bounds.acceleration * h, bounds.acceleration * h)
+        assert (box.lower <= braked + EXACT).all()
+        assert (braked <= box.upper + EXACT).all()
+        chosen = choose(box, v, random)
+        assert (np.abs(chosen - v) <= bounds.acceleration * h * (1 + EXACT) + 1e-15).all()
+        for share in (0.25, 0.5, 0.75, _turning_point(v, chosen)):
+            t = share * h
+            between = q + v * t + 0.5 * (chosen - v) / h * t**2
+            assert (bounds.lower - EXACT <= between).all()
+            assert (between <= bounds.upper + EXACT).all()
+        q, v = q + 0.5 * h * (v + chosen), chosen
+        assert _keeps_p(q, v, bounds)
+
+
+def _turning_point(v: Array, chosen: Array) -> Array:
+    """Share of the step at which a joint that turns round is at rest; its end where none turns."""
+    turns = v * chosen < 0.0
+    return np.where(turns, v / np.where(turns, v - chosen, 1.0), 1.0)
+
+
+@given(
+    room=st.floats(0.0, 10.0),
+    share=st.floats(0.0, 1.0),
+    a=st.floats(0.1, 100.0),
+    longest=st.floats(1e-4, 0.02),
+    part=st.floats(1e-3, 1.0),
+)
+@settings(derandomize=True, max_examples=500, deadline=None)
+def test_the_bound_is_the_fastest_that_can_still_stop(
+    room: float, share: float, a: float, longest: float, part: float
+) -> None:
+    h = part * longest
+    v = share * (-a * longest + np.sqrt((a * longest) ** 2 + 2 * a * room))
+    bound = fastest_towards(room, v, a, h, longest, RETURN_SPEED)
+    left = room - 0.5 * h * (v + bound)
+    assert bound**2 / (2 * a) + longest * bound == pytest.approx(left, abs=EXACT)
+    assert bound >= v - a * h - EXACT
+
+
+def _recover(q: Array, v: Array, bounds: Bounds, choose: Choice, seconds: float) -> tuple[Array, Array]:
+    """Positions and velocities (t, n) of joints that start outside P; acceleration is checked on the way."""
+    random, h = np.random.default_rng(7), bounds.longest
+    positions, velocities = [q], [v]
+    for _ in range(int(seconds / h)):
+        box = _box(q, v, bounds, h)
+        assert (box.lower <= box.upper).all()
+        chosen = choose(box, v, random)
+        assert (np.abs(chosen - v) <= bounds.acceleration * h * (1 + EXACT) + 1e-15).all()
+        q, v = q + 0.5 * h * (v + chosen), chosen
+        positions.append(q)
+        velocities.append(v)
+    assert _box(q, v, bounds, h).inside
+    assert _keeps_p(q, v, bounds)
+    return np.array(positions), np.array(velocities)
+
+
+def _wide_bounds(n: int = JOINTS) -> Bounds:
+    ones = np.ones(n)
+    return Bounds(-2.0 * ones, 2.0 * ones, 1.5 * ones, 10.0 * ones, 0.002)
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0], ids=["above", "below"])
+@pytest.mark.parametrize("choose", CHOICES.values(), ids=CHOICES.keys())
+def test_a_joint_outside_returns_without_a_jump_at_bounded_speed(choose: Choice, side: float) -> None:
+    bounds = _wide_bounds()
+    outside = np.linspace(1e-6, 0.3, JOINTS)
+    start = side * (2.0 + outside)
+    assert not _box(start, np.zeros(JOINTS), bounds, 0.002).inside
+    positions, velocities = _recover(start, np.zeros(JOINTS), bounds, choose, 3.5)
+    beyond = side * positions - 2.0
+    while_outside = beyond[:-1] > 0.0
+    assert (np.diff(beyond, axis=0)[while_outside] <= EXACT).all(), "never further out"
+    assert (side * velocities[:-1][while_outside] <= EXACT).all()
+    if choose is _outwards and side > 0.0:
+        assert (-velocities[1:][while_outside] <= RETURN_SPEED + EXACT).all(), "no faster inward than asked for"
+
+
+def test_a_joint_too_fast_to_stop_in_time_brakes_fully_and_comes_back() -> None:
+    bounds = _wide_bounds()
+    v = np.linspace(1.0, 1.5, JOINTS)
+    overshoot = v**2 / 20 - 0.03
+    positions, velocities = _recover(np.full(JOINTS, 1.97), v, bounds, _outwards, 3.0)
+    np.testing.assert_array_less(positions.max(axis=0) - 2.0, overshoot + 1e-5)
+    braking = velocities[:-1] > bounds.acceleration * bounds.longest
+    np.testing.assert_allclose(np.diff(velocities, axis=0)[braking], -0.02, atol=1e-12)
+
+
+def test_a_joint_beyond_its_velocity_limit_slows_down_as_fast_as_it_may() -> None:
+    bounds = _wide_bounds()
+    _, velocities = _recover(np.zeros(JOINTS), np.linspace(1.6, 3.0, JOINTS), bounds, _outwards, 1.0)
+    too_fast = velocities[:-1] > 1.5 + 0.02
+    np.testing.assert_allclose(np.diff(velocities, axis=0)[too_fast], -0.02, atol=1e-12)
+    assert (velocities[200:] <= 1.5 + EXACT).all()
+
+
+def test_a_range_too_narrow_to_move_in_keeps_the_joint_still() -> None:
+    still = np.zeros(1)
+    bounds = Bounds(still, still.copy(), np.ones(1), np.full(1, 10.0), 0.002)
+    box = _box(still, still, bounds, 0.001)
+    assert box.inside
+    np.testing.assert_allclose([box.lower[0], box.upper[0]], 0.0, atol=1e-12)

@@ -1,0 +1,82 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from q2r2_control.control.geometry.collision import Contact, measure
+from q2r2_control.control.safety.separating_plane import step_keeps_beyond
+from q2r2_control.types import Array
+from tests.control.cells import NAMES, cell, distances, placed, random_posture
+
+H = 0.002
+
+
+def _moved(q: Array, v: Array, v_next: Array, t: Array) -> Array:
+    t = t[:, None]
+    return np.asarray(q + v * t + (v_next - v) * t**2 / (2.0 * H))
+
+
+def _proven(name: str, p: int, q: Array, v: Array, v_next: Array, threshold: float) -> bool:
+    arrays = cell(name)
+    placements, posed = placed(arrays, q)
+    contact, first = Contact.empty(), arrays.pairs.first[p]
+    measure(arrays.bodies, posed, first, arrays.pairs.second[p], posed.start[first], posed.end[first], contact)
+    way = np.abs(_moved(q, v, v_next, np.linspace(0.0, H, 50)) - q).max(axis=0)
+    return bool(
+        step_keeps_beyond(
+            arrays.chain,
+            placements,
+            arrays.bodies,
+            posed,
+            arrays.pairs,
+            p,
+            contact,
+            v,
+            v_next,
+            H,
+            way,
+            threshold,
+        )
+    )
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_what_is_proven_is_true_all_along_the_step_and_little_room_suffices(name: str) -> None:
+    random, robot = np.random.default_rng(21), cell(name).robot
+    proven = 0
+    for _ in range(40):
+        q = random_posture(robot, random)
+        v = 0.3 * random.uniform(-1.0, 1.0, len(q))
+        v_next = v + 0.02 * random.uniform(-1.0, 1.0, len(q))
+        along = distances(cell(name), _moved(q, v, v_next, np.linspace(0.0, H, 20)))
+        for p in np.flatnonzero((along[0] > 1e-3) & (along[0] < 0.3)).tolist():
+            least = float(along[:, p].min())
+            assert not _proven(name, p, q, v, v_next, least + 1e-9)
+            proven += _proven(name, p, q, v, v_next, least - 2e-5)
+    assert proven > 100
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_pair_without_any_room_is_proven_to_part(name: str) -> None:
+    """The distance alone proves nothing then: half of the way that the joints travel would have to be free."""
+    random, robot = np.random.default_rng(22), cell(name).robot
+    parted = 0
+    for _ in range(40):
+        q, step = random_posture(robot, random), 1e-6
+        here = distances(cell(name), q[None])[0]
+        gradient = (distances(cell(name), q + step * np.eye(len(q))) - here) / step
+        # The height of a first link above the table, say, is nobody's to change.
+        movable = np.abs(gradient).max(axis=0) > 0.01
+        for p in np.flatnonzero((here > 1e-3) & (here < 0.3) & movable)[:4].tolist():
+            away = gradient[:, p] / np.abs(gradient[:, p]).max()
+            if np.abs(_difference(name, q, away, p) - gradient[:, p] @ away) > 1e-3:
+                continue  # the closest points jump here: there is no gradient
+            parted += _proven(name, p, q, np.zeros(len(q)), 0.02 * away, float(here[p]) - 1e-9)
+            assert not _proven(name, p, q, np.zeros(len(q)), -0.02 * away, float(here[p]) - 1e-9)
+    assert parted > 40
+
+
+def _difference(name: str, q: Array, direction: Array, p: int) -> float:
+    small = 1e-6
+    after = distances(cell(name), (q + small * direction)[None])[0, p]
+    return float((after - distances(cell(name), q[None])[0, p]) / small)

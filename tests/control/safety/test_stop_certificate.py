@@ -1,0 +1,239 @@
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from q2r2_control.control.safety.stop_certificate import Rollout, brake, certify, step_way
+from q2r2_control.types import Array
+from tests.control.cells import NAMES, CellArrays, cell, distances, placed, random_posture
+
+MIN_DISTANCE = 0.02
+ACCELERATION = 10.0
+H = 0.002
+DENSE = 500  # samples of a motion
+
+
+def _braked(q: Array, v: Array, a: Array, t: float) -> tuple[Array, Array]:
+    q_out, v_out = np.zeros_like(q), np.zeros_like(v)
+    brake(q, v, a, t, q_out, v_out)
+    return q_out, v_out
+
+
+def _some_stop(seed: int) -> tuple[Array, Array, Array]:
+    random = np.random.default_rng(seed)
+    v = random.uniform(-3, 3, 14)
+    v[:3] = 0.0, -0.0, 1e-12
+    return random.uniform(-3, 3, 14), v, 10.0 ** random.uniform(0, 1.5, 14)
+
+
+def test_every_joint_stops_after_its_own_time_and_way() -> None:
+    q, v, a = _some_stop(14)
+    end, rest = _braked(q, v, a, 100.0)
+    np.testing.assert_array_equal(rest, 0.0)
+    np.testing.assert_allclose(end, q + np.sign(v) * v**2 / (2 * a), rtol=0, atol=1e-15)
+    times = np.abs(v) / a
+    for t in np.linspace(0.0, 1.2 * times.max(), 40):
+        ran = np.minimum(t, times)
+        between, speed = _braked(q, v, a, t)
+        np.testing.assert_allclose(between, q + v * ran - np.sign(v) * a * ran**2 / 2, rtol=0, atol=1e-14)
+        np.testing.assert_allclose(speed, v - np.sign(v) * a * ran, rtol=0, atol=1e-14)
+
+
+@given(seed=st.integers(0, 1000), parts=st.lists(st.floats(1e-6, 0.1), min_size=1, max_size=40))
+@settings(derandomize=True, max_examples=100, deadline=None)
+def test_the_stop_is_the_same_motion_however_it_is_cut_into_ticks(seed: int, parts: list[float]) -> None:
+    q, v, a = _some_stop(seed)
+    expected = _braked(q, v, a, float(np.sum(parts)))
+    for t in parts:
+        q, v = _braked(q, v, a, t)
+    np.testing.assert_allclose(q, expected[0], rtol=0, atol=1e-13)
+    np.testing.assert_allclose(v, expected[1], rtol=0, atol=1e-12)
+
+
+@given(v=st.floats(-3, 3), v_next=st.floats(-3, 3), h=st.floats(1e-5, 0.02))
+@settings(derandomize=True, max_examples=200, deadline=None)
+def test_the_way_of_a_step_counts_there_and_back(v: float, v_next: float, h: float) -> None:
+    t = np.linspace(0.0, h, 2001)
+    q = v * t + 0.5 * (v_next - v) / h * t**2
+    way = float(np.abs(np.diff(q)).sum())
+    assert way - 1e-15 <= step_way(v, v_next, h) <= way + 1e-6 * h * (abs(v) + abs(v_next)) + 1e-15
+
+
+@dataclass(frozen=True)
+class Motion:
+    """A step and the stop after it."""
+
+    q: Array
+    v: Array
+    v_next: Array
+
+    @property
+    def q_next(self) -> Array:
+        return np.asarray(self.q + 0.5 * H * (self.v + self.v_next))
+
+    def step(self) -> Array:
+        t = np.linspace(0.0, H, DENSE // 25)[:, None]
+        return np.asarray(self.q + self.v * t + 0.5 * (self.v_next - self.v) / H * t**2)
+
+    def stop(self) -> Array:
+        t = np.linspace(0.0, np.abs(self.v_next).max() / ACCELERATION, DENSE)[:, None]
+        ran = np.minimum(t, np.abs(self.v_next) / ACCELERATION)
+        return np.asarray(self.q_next + self.v_next * ran - np.sign(self.v_next) * ACCELERATION * ran**2 / 2)
+
+
+def _least(name: str, motion: Motion) -> Array:
+    """Least distance (p,) of each pair along the whole motion; only a bound where it is far."""
+    samples = np.concatenate([motion.step(), motion.stop()])
+    return np.asarray(distances(cell(name), samples, exact_below=0.05).min(axis=0))
+
+
+@cache
+def _rollout(name: str) -> Rollout:
+    return Rollout.empty(cell(name).chain, cell(name).bodies)
+
+
+def _certified(name: str, motion: Motion, known: Array | None = None) -> bool:
+    arrays = cell(name)
+    before = distances(arrays, motion.q[None])[0] if known is None else known
+    placements, posed = placed(arrays, motion.q)
+    return bool(
+        certify(
+            arrays.chain,
+            placements,
+            arrays.bodies,
+            arrays.pairs,
+            before,
+            posed,
+            motion.v,
+            motion.q_next,
+            motion.v_next,
+            np.full(14, ACCELERATION),
+            H,
+            MIN_DISTANCE,
+            _rollout(name),
+        )
+    )
+
+
+def _motions_from(name: str, starts: Iterator[Array], random: np.random.Generator) -> Iterator[Motion]:
+    limit = cell(name).robot.velocity_limit
+    for q in starts:
+        v = random.choice([0.1, 0.5, 1.0]) * random.uniform(-limit, limit)
+        yield Motion(q, v, v + random.uniform(-1, 1, 14) * ACCELERATION * H)
+
+
+def _starts_apart(name: str, random: np.random.Generator, near: bool, count: int) -> Iterator[Array]:
+    """Postures with every pair apart; ``near``: on the way from one into a collision, just before it."""
+    arrays, found = cell(name), 0
+    while found < count:
+        q, other = random_posture(arrays.robot, random), random_posture(arrays.robot, random)
+        if distances(arrays, q[None])[0].min() < MIN_DISTANCE:
+            continue
+        if near:
+            way = q + np.linspace(0.0, 1.0, 200)[:, None] * (other - q)
+            apart = distances(arrays, way).min(axis=1) >= MIN_DISTANCE
+            if apart.all():
+                continue
+            q = way[np.argmin(apart) - 1]
+        found += 1
+        yield q
+
+
+@pytest.mark.parametrize("near", [False, True], ids=["anywhere", "just before contact"])
+@pytest.mark.parametrize("name", NAMES)
+def test_nothing_comes_too_close_in_a_certified_motion_and_most_safe_motions_are_certified(
+    name: str, near: bool
+) -> None:
+    random = np.random.default_rng(15)
+    refused = certified = clearly_safe = 0
+    for motion in _motions_from(name, _starts_apart(name, random, near, 40), random):
+        least = _least(name, motion).min()
+        if _certified(name, motion):
+            certified += 1
+            assert least >= MIN_DISTANCE
+        elif least >= MIN_DISTANCE + 0.02:
+            refused += 1
+        clearly_safe += bool(least >= MIN_DISTANCE + 0.02)
+    assert certified > 5
+    assert refused <= 0.2 * clearly_safe, "safe by 20 mm"
+
+
+def _aimed_at_the_threshold(name: str, random: np.random.Generator, count: int) -> Iterator[Motion]:
+    """Motions whose speed is scaled so that their stop ends within a hair of the least distance."""
+    found = 0
+    for motion in _motions_from(name, _starts_apart(name, random, True, 10 * count), random):
+        low, high = 0.0, 2.0
+        for _ in range(8):
+            share = 0.5 * (low + high)
+            scaled = Motion(motion.q, share * motion.v, share * motion.v)
+            if _least(name, scaled).min() >= MIN_DISTANCE:
+                low = share
+            else:
+                high = share
+        if low > 0.0 and high < 2.0:
+            found += 1
+            yield Motion(motion.q, *2 * [1.01 * high * motion.v])
+            yield Motion(motion.q, *2 * [0.5 * low * motion.v])
+        if found == count:
+            return
+
+
+@pytest.mark.parametrize("name", ["dual_iiwa7", "dual_panda"])
+def test_the_certificate_tells_motions_apart_that_end_just_inside_and_well_outside(name: str) -> None:
+    accepted = total = 0
+    for number, motion in enumerate(_aimed_at_the_threshold(name, np.random.default_rng(16), 6)):
+        if number % 2 == 0:
+            assert not _certified(name, motion), "it comes closer than the least distance"
+        else:
+            accepted, total = accepted + _certified(name, motion), total + 1
+    assert total >= 5
+    assert accepted >= 0.5 * total
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_lower_bounds_in_place_of_distances_prove_nothing_that_is_not_so(name: str) -> None:
+    arrays, random = cell(name), np.random.default_rng(17)
+    for motion in _motions_from(name, _starts_apart(name, random, True, 20), random):
+        exact = distances(arrays, motion.q[None])[0]
+        bounds = np.maximum(exact - random.uniform(0.0, 0.3, len(exact)), MIN_DISTANCE)
+        if _certified(name, motion, np.minimum(bounds, exact)):
+            assert _least(name, motion).min() >= MIN_DISTANCE
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_rest_with_everything_apart_is_certified(name: str) -> None:
+    random, still = np.random.default_rng(18), np.zeros(14)
+    for q in _starts_apart(name, random, True, 20):
+        assert _certified(name, Motion(q, still, still))
+
+
+def _too_close(arrays: CellArrays, random: np.random.Generator, count: int) -> Iterator[Array]:
+    found = 0
+    while found < count:
+        q = random_posture(arrays.robot, random)
+        if distances(arrays, q[None])[0].min() < MIN_DISTANCE:
+            found += 1
+            yield q
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_pair_that_starts_too_close_comes_no_closer_in_a_certified_motion(name: str) -> None:
+    arrays, random = cell(name), np.random.default_rng(19)
+    certified = 0
+    for motion in _motions_from(name, _too_close(arrays, random, 100), random):
+        slow = Motion(motion.q, 0.1 * motion.v, 0.1 * motion.v)
+        if not _certified(name, slow):
+            continue
+        certified += 1
+        before = distances(arrays, slow.q[None])[0]
+        close = before < MIN_DISTANCE
+        during = _least(name, slow)
+        assert (during[close] >= before[close] - 1e-6).all()
+        assert (during[~close] >= MIN_DISTANCE).all()
+    assert certified > 3

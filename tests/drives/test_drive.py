@@ -1,0 +1,211 @@
+"""Both modes of driving a plant, through whole runs in MuJoCo: pushed arms, yielding targets, lost measurements."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from q2r2_control.config import Config
+from q2r2_control.drives.drive import LONGEST_BLIND
+from q2r2_control.errors import ConfigError, PlantError
+from q2r2_control.pipeline import Pipeline, Tick
+from q2r2_control.plants.mujoco import MujocoPlant
+from q2r2_control.robot.robot import Robot
+from q2r2_control.types import SIDES, Array, RobotState
+from tests.support.hands_input import HandsInput
+from tests.support.watch import Watch, assert_torque_bounds, cell
+
+ENGAGED = 0.3  # hands that stay where they are have long engaged both arms [s]
+
+
+def configured(**sections: dict[str, object]) -> Config:
+    """The shipped cell at 500 Hz, with keys of its sections changed."""
+    changed = {name: getattr(cell(), name).model_copy(update=keys) for name, keys in sections.items()}
+    return cell().model_copy(update={"loop_rate_hz": 500.0, **changed})
+
+
+def at(t: float, action: Callable[[], object]) -> Callable[[Tick], None]:
+    """A listener that acts once, at time ``t`` [s]."""
+    done: list[Tick] = []
+
+    def listener(tick: Tick) -> None:
+        if not done and tick.t >= t:
+            done.append(tick)
+            action()
+
+    return listener
+
+
+def pushed(config: Config, mode: str, push: Array, start: float, duration: float) -> tuple[Pipeline, Watch]:
+    """A pipeline with still hands, whose left tool is pushed from ``start`` on for ``duration`` [s]."""
+    loop = Pipeline.from_config(config, input=HandsInput(), plant="mujoco", mode=mode)
+    plant = loop.plant
+    assert isinstance(plant, MujocoPlant)
+    loop.listeners.append(at(start, lambda: plant.push("left", push, duration)))
+    return loop, Watch(loop)
+
+
+def way(watch: Watch, arm: str) -> Array:
+    """How far (n,) [m] the arm's measured tool is from where it was when the push began."""
+    start = next(tick for tick in watch.ticks if tick.t >= ENGAGED)
+    return np.array(
+        [np.linalg.norm(tick.tools[arm].translation - start.tools[arm].translation) for tick in watch.ticks]
+    )
+
+
+def test_an_arm_pushed_into_the_other_by_torque_presses_the_wall_never_touches_and_comes_back() -> None:
+    # A soft spring, so that the push overcomes it and the wall is what holds the rest.
+    config = configured(impedance={"translational_stiffness": 300.0, "rotational_stiffness": 100.0})
+    loop, watch = pushed(config, "torque", np.array([0.0, -100.0, 0.0, 0.0, 0.0, 0.0]), ENGAGED, 1.5)
+    summary = loop.run(6.5, realtime=False)
+    assert_torque_bounds(loop, watch.ticks)
+    for index, tick in enumerate(watch.ticks):
+        assert tick.wall is not None
+        assert tick.wall.closest_distance > 0.005
+        if index % 20 == 0:
+            assert min(pair.distance for pair in loop.robot.distances(tick.state.q)) > 0.005
+    pressing = [tick for tick in watch.ticks if tick.wall is not None and tick.wall.pressing]
+    assert pressing
+    assert pressing[0].t < 1.6
+    last = watch.ticks[-1]
+    assert last.wall is not None
+    assert not last.wall.pressing
+    assert way(watch, "left").max() > 0.1
+    for arm in SIDES:
+        assert way(watch, arm)[-1] < 2e-3
+    torque = summary.torque
+    assert torque is not None
+    assert torque.pressed_pairs == sorted({pair for tick in pressing for pair in tick.wall.pressing})  # type: ignore[union-attr]
+    assert any({name.split("_")[0] for name in pair} == set(SIDES) for pair in torque.pressed_pairs)
+    assert torque.min_measured_distance_mm is not None
+    assert 5.0 < torque.min_measured_distance_mm < 1e3 * config.control.min_distance
+    assert 20.0 < torque.max_wall_force_n <= config.impedance.wall.maximum_force
+    assert torque.off_reference_s["left"] > 1.0
+    assert torque.held_ticks == 0
+    assert json.loads(json.dumps(summary.as_json(), allow_nan=False))["torque"]["pressed_pairs"]
+
+
+def test_in_position_mode_with_the_admittance_a_push_moves_the_tool_and_it_returns() -> None:
+    config = configured(admittance={"enabled": True})
+    loop, watch = pushed(config, "position", np.array([0.0, 30.0, 0.0, 0.0, 0.0, 0.0]), ENGAGED, 1.2)
+    summary = loop.run(3.0, realtime=False)
+    settled = next(index for index, tick in enumerate(watch.ticks) if tick.t >= 1.4)
+    band = 1.0 - (config.admittance.force_dead_band / 30.0) ** 2
+    asked = 30.0 * band / config.admittance.stiffness
+    tick = watch.ticks[settled]
+    assert tick.admittance is not None
+    arm = tick.admittance.arms["left"]
+    np.testing.assert_allclose(arm.wrench[:3], [0.0, 30.0, 0.0], atol=0.5)
+    np.testing.assert_allclose(arm.displacement[:3], [0.0, asked, 0.0], atol=1e-3)
+    # The servos give way besides, by some millimetres.
+    assert asked - 1e-3 < way(watch, "left")[settled] < asked + 6e-3
+    assert way(watch, "right").max() < 1e-3
+    engaged = [index for index, tick in enumerate(watch.ticks) if all(tick.engaged.values())]
+    assert way(watch, "left")[engaged[-1]] < 5e-4
+    targets = [watch.ticks[index].targets["left"].pose for index in engaged]
+    for target in targets[1:]:
+        assert target is not None
+        assert targets[0] is not None
+        np.testing.assert_allclose(target.homogeneous, targets[0].homogeneous, atol=1e-9)
+    # The error is against what the operator asks for: it has the displacement in it.
+    errors = [way(watch, "left")[index] for index in engaged]
+    figures = summary.arms["left"]
+    assert figures.position_error_mm_rms == pytest.approx(1e3 * np.sqrt(np.mean(np.square(errors))), rel=0.05)
+    assert figures.yielded_mm_max == pytest.approx(1e3 * asked, abs=1.0)
+    assert summary.arms["right"].yielded_mm_max == 0.0
+    assert summary.torque is None
+    assert summary.fallback_ticks == 0
+
+
+def test_an_admittance_on_a_plant_that_measures_no_external_torque_is_refused() -> None:
+    loop = Pipeline.from_config(configured(admittance={"enabled": True}), input=HandsInput(), plant="kinematic")
+    with pytest.raises(ConfigError, match=r"admittance\.enabled = true: allowed with a plant that measures external"):
+        loop.run(0.1, realtime=False)
+
+
+def test_in_torque_mode_an_admittance_is_not_used() -> None:
+    config = configured(admittance={"enabled": True})
+    loop, watch = pushed(config, "torque", np.array([0.0, 20.0, 0.0, 0.0, 0.0, 0.0]), ENGAGED, 1.0)
+    summary = loop.run(1.2, realtime=False)
+    assert all(tick.admittance is None for tick in watch.ticks)
+    assert summary.arms["left"].yielded_mm_max == 0.0
+    # The spring's own give, F / K.
+    assert way(watch, "left").max() == pytest.approx(20.0 / config.impedance.translational_stiffness, rel=0.1)
+
+
+class BlindPlant(MujocoPlant):
+    """A simulated cell whose sensors fail: ``broken`` is what one joint is said to be at."""
+
+    broken: float | None = None
+    what = "q"
+
+    def state(self) -> RobotState:
+        state = super().state()
+        if self.broken is None:
+            return state
+        values = getattr(state, self.what).copy()
+        values[3] = self.broken
+        return replace(state, **{self.what: values})
+
+
+def blinded(what: str, value: float, start: float, duration: float) -> tuple[Pipeline, Watch, BlindPlant]:
+    """A pipeline whose hands swing sideways, and whose measurement fails at ``start`` for ``duration`` [s]."""
+    config = configured()
+    robot = Robot.from_config(config)
+    plant = BlindPlant(robot, config)
+    plant.what = what
+
+    def swing(t: float) -> Array:
+        return np.array([0.0, 0.0, 0.05 * (1.0 - np.cos(4.0 * max(t - 0.5, 0.0))), 0.0, 0.0, 0.0])
+
+    loop = Pipeline(config, robot, HandsInput(left=swing, right=swing), plant, "torque")
+    watch = Watch(loop)
+    loop.listeners.append(at(start, lambda: setattr(plant, "broken", value)))
+    loop.listeners.append(at(start + duration, lambda: setattr(plant, "broken", None)))
+    return loop, watch, plant
+
+
+@pytest.mark.parametrize(("what", "value"), [("q", np.nan), ("v", np.inf)])
+def test_a_measurement_that_is_lost_for_a_moment_is_bridged_and_counted(what: str, value: float) -> None:
+    loop, watch, _ = blinded(what, value, 0.9, 0.8 * LONGEST_BLIND)
+    summary = loop.run(1.6, realtime=False)
+    assert summary.torque is not None
+    assert summary.torque.held_ticks == sum(tick.impedance is not None and tick.impedance.held for tick in watch.ticks)
+    assert 15 <= summary.torque.held_ticks <= 25
+    assert summary.torque.min_measured_distance_mm is not None
+    json.dumps(summary.as_json(), allow_nan=False)
+    for tick in watch.ticks:
+        assert np.isfinite(tick.state.tau).all()
+        assert (np.abs(tick.state.tau) <= loop.robot.torque_limit).all()
+    last = watch.ticks[-1]
+    np.testing.assert_allclose(last.state.q, last.reference.q, atol=5e-3)
+
+
+@pytest.mark.parametrize(
+    ("what", "value", "message"),
+    [
+        ("q", np.nan, "measured position of left_A4 = nan for more than 50 ms; allowed: finite numbers"),
+        ("v", -np.inf, "measured velocity of left_A4 = -inf for more than 50 ms; allowed: finite numbers"),
+    ],
+)
+def test_a_measurement_that_stays_lost_ends_the_run_and_the_plant_s_own_servos_bring_the_arms_to_rest(
+    what: str, value: float, message: str
+) -> None:
+    loop, watch, plant = blinded(what, value, 0.9, 60.0)
+    with pytest.raises(PlantError) as caught:
+        loop.run(60.0, realtime=False)
+    assert str(caught.value) == message
+    held = [tick for tick in watch.ticks if tick.impedance is not None and tick.impedance.held]
+    assert np.abs(held[0].reference.v).max() > 0.05, "it was moving"
+    assert held[0].t > 0.9
+    assert watch.ticks[-1].t < 0.9 + LONGEST_BLIND + 1.0
+    assert np.abs(watch.ticks[-1].reference.v).max() < 1e-3
+    plant.broken = None
+    plant.advance(0.2)
+    rest = plant.state()
+    assert np.abs(rest.v).max() < 1e-2
+    np.testing.assert_allclose(rest.q, watch.ticks[-1].reference.q, atol=5e-3)

@@ -1,0 +1,72 @@
+"""The loop's clock, on a computer's clock whose sleeps are as late as a test says."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from q2r2_control.runtime import loop_clock
+from q2r2_control.runtime.loop_clock import LoopClock
+
+PERIOD = 0.01
+
+
+class LateSleeper:
+    """Stands for the module ``time``: sleeping takes longer than asked for by what ``delays`` says next."""
+
+    def __init__(self, delays: list[float]) -> None:
+        self._now, self._delays = 100.0, delays
+
+    def monotonic(self) -> float:
+        return self._now
+
+    def perf_counter(self) -> float:
+        return self._now
+
+    def sleep(self, duration: float) -> None:
+        self._now += duration + (self._delays.pop(0) if self._delays else 0.0)
+
+
+def _ticks(monkeypatch: pytest.MonkeyPatch, delays: list[float], count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Times of the ticks since the start, and the dt that each was told [s]."""
+    monkeypatch.setattr(loop_clock, "time", LateSleeper(delays))
+    loop = LoopClock(PERIOD, realtime=True)
+    seen = []
+    for _ in range(count):
+        dt = loop.wait()
+        seen.append((loop.now - loop.start, dt))
+    times, steps = np.array(seen).T
+    return times, steps
+
+
+def test_late_wake_ups_do_not_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    delays = np.random.default_rng(1).uniform(0.0, 0.8 * PERIOD, 200).tolist()
+    times, _ = _ticks(monkeypatch, delays, 200)
+    lateness = times - PERIOD * np.arange(1, 201)
+    assert (lateness >= -1e-9).all()
+    assert (lateness <= 0.8 * PERIOD + 1e-9).all()
+
+
+def test_every_tick_is_told_the_time_that_really_passed(monkeypatch: pytest.MonkeyPatch) -> None:
+    delays = np.random.default_rng(2).uniform(0.0, 3.0 * PERIOD, 100).tolist()
+    times, steps = _ticks(monkeypatch, delays, 100)
+    np.testing.assert_allclose(np.diff(times, prepend=0.0), steps, atol=2e-6)
+
+
+def test_ticks_that_were_missed_are_not_made_up_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    times, steps = _ticks(monkeypatch, [0.0, 0.07, 0.0, 0.0, 0.0], 6)
+    assert steps[1] == pytest.approx(0.08)
+    assert np.sum(np.diff(times) < 0.5 * PERIOD) <= 1, "one tick follows at once, then the grid goes on"
+
+
+def test_a_stall_is_told_no_longer_than_a_tenth_of_a_second(monkeypatch: pytest.MonkeyPatch) -> None:
+    _, steps = _ticks(monkeypatch, [2.0], 2)
+    assert steps[0] == 0.1
+
+
+def test_simulated_time_takes_no_time() -> None:
+    loop = LoopClock(PERIOD, realtime=False)
+    assert [loop.wait() for _ in range(3)] == [PERIOD] * 3
+    assert loop.now == pytest.approx(3 * PERIOD)
+    assert loop.after(3 * PERIOD)
+    assert not loop.after(4 * PERIOD)

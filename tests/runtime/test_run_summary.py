@@ -1,0 +1,226 @@
+"""A run's figures: what they mean, that they are numbers, and that they are right."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from q2r2_control.config import Config
+from q2r2_control.inputs.scripted import ScriptedInput
+from q2r2_control.pipeline import Pipeline
+from q2r2_control.plants.kinematic import KinematicPlant
+from q2r2_control.robot.robot import Robot
+from q2r2_control.runtime.run_summary import EVENTS_KEPT, Histogram, RunStatistics
+from q2r2_control.types import ArmTarget, Event, Reference, StepReport, StepStatus
+from tests.support.watch import cell
+
+# What scripts and dashboards rely on.
+KEYS: dict[str, type | set[str]] = {
+    "ticks": int,
+    "duration_s": float,
+    "loop_rate_hz": float,
+    "tick_us": {"p50", "p99", "max"},
+    "input_to_command_ms": {"p50", "p99", "max"},
+    "arms": {"left", "right"},
+    "min_distance_mm": float,
+    "closest_pair": list,
+    "max_velocity_ratio": float,
+    "max_acceleration_ratio": float,
+    "min_position_margin_rad": float,
+    "fallback_ticks": int,
+    "uncertified_ticks": int,
+    "rejected_targets": int,
+    "at_rest": bool,
+    "torque": type(None),
+    "events": list,
+}
+ARM_KEYS = {
+    "engaged_s",
+    "position_error_mm_rms",
+    "rotation_error_deg_rms",
+    "gripper_changes",
+    "slip_mm_max",
+    "slip_deg_max",
+    "yielded_mm_max",
+    "yielded_deg_max",
+}
+
+REPORT = StepReport(StepStatus.OK, (), (), ("left_a", "right_b"), 0.2, True, False, 0.0, 1e-5)
+
+
+@pytest.fixture
+def statistics() -> RunStatistics:
+    return RunStatistics(Robot.from_config(cell()), cell().control)
+
+
+def add(statistics: RunStatistics, *, error: pin.SE3 | None = None, gripper: float = 1.0, **changes: object) -> None:
+    """One tick of 1 ms at home, both arms engaged when there is an ``error`` of the tool against its target."""
+    reference = Reference(statistics.robot.home, np.zeros(14), np.zeros(14), REPORT)
+    target = None if error is None else pin.SE3.Identity()
+    tools = {arm: error or pin.SE3.Identity() for arm in statistics.robot.arms}
+    statistics.add(
+        0.001,
+        replace(reference, **changes),  # type: ignore[arg-type]
+        {arm: ArmTarget(target, gripper) for arm in tools},
+        tools,
+        dict.fromkeys(tools, error is not None),
+    )
+
+
+def test_the_largest_slip_of_an_engagement_is_told(statistics: RunStatistics) -> None:
+    reference = Reference(statistics.robot.home, np.zeros(14), np.zeros(14), REPORT)
+    tools = {arm: pin.SE3.Identity() for arm in statistics.robot.arms}
+    for slip, angle in ((0.0, 0.0), (0.2, np.pi / 6), (0.05, np.pi / 3), (0.0, 0.0)):
+        targets = {"left": ArmTarget(pin.SE3.Identity(), 1.0, slip, angle), "right": ArmTarget(None, 1.0)}
+        statistics.add(0.001, reference, targets, tools, {"left": True, "right": False})
+    figures = statistics.summary(1.0).arms
+    assert figures["left"].slip_mm_max == pytest.approx(200.0)
+    assert figures["left"].slip_deg_max == pytest.approx(60.0)
+    assert figures["right"].slip_mm_max == figures["right"].slip_deg_max == 0.0
+
+
+def test_a_run_s_json_has_every_key_that_others_read() -> None:
+    loop = Pipeline.from_config(cell(), input=ScriptedInput("circle"), plant="kinematic")
+    data = json.loads(json.dumps(loop.run(1.0, realtime=False).as_json(), allow_nan=False))
+    assert list(data) == list(KEYS)
+    for key, expected in KEYS.items():
+        if isinstance(expected, set):
+            assert set(data[key]) == expected, key
+        else:
+            assert isinstance(data[key], expected), key
+    assert all(set(figures) == ARM_KEYS for figures in data["arms"].values())
+    assert [(event["arm"], event["from"], event["to"], event["reason"]) for event in data["events"]] == [
+        ("left", "paused", "engaged", "lower button"),
+        ("right", "paused", "engaged", "lower button"),
+    ]
+    assert data["events"][0]["t"] == pytest.approx(0.68, abs=0.05)
+
+
+@pytest.mark.parametrize("arms", [("left", "right"), ("left",)], ids=["two arms", "one arm"])
+@pytest.mark.parametrize("obstacles", [True, False], ids=["with a table", "with nothing"])
+@pytest.mark.parametrize("hands", [("left", "right"), ()], ids=["with hands", "never engaged"])
+def test_every_cell_and_run_makes_valid_json(arms: tuple[str, ...], obstacles: bool, hands: tuple[str, ...]) -> None:
+    config = cell().model_copy(
+        update={
+            "arms": {side: arm for side, arm in cell().arms.items() if side in arms},
+            "obstacles": cell().obstacles if obstacles else {},
+        }
+    )
+    loop = Pipeline.from_config(config, input=ScriptedInput("circle", hands=hands), plant="kinematic")
+    data = loop.run(0.8, realtime=False).as_json()
+    assert json.loads(json.dumps(data, allow_nan=False))
+    for arm in arms:
+        assert (data["arms"][arm]["position_error_mm_rms"] is None) == (not hands)
+    assert (data["min_distance_mm"] is None) == (data["closest_pair"] is None)
+
+
+def test_an_arm_without_any_monitored_pair_has_no_distance() -> None:
+    arm = cell().arms["left"].model_dump(include={"model", "home"})
+    bare = Config.model_validate({"name": "bare", "arms": {"left": arm}})
+    robot = Robot.from_config(bare)
+    robot.collision_model.removeAllCollisionPairs()
+    loop = Pipeline(bare, robot, ScriptedInput("circle"), KinematicPlant(robot, bare))
+    summary = loop.run(0.8, realtime=False)
+    assert summary.min_distance_mm is None
+    assert summary.closest_pair is None
+    json.dumps(summary.as_json(), allow_nan=False)
+
+
+def test_no_tick_at_all_makes_valid_json(statistics: RunStatistics) -> None:
+    summary = statistics.summary(0.0)
+    assert (summary.ticks, summary.duration_s, summary.loop_rate_hz) == (0, 0.0, 0.0)
+    assert summary.tick_us.p50 is None
+    assert summary.at_rest
+    json.dumps(summary.as_json(), allow_nan=False)
+
+
+class TestHistogram:
+    @pytest.mark.parametrize("size", [1, 2, 10, 99, 101, 5000])
+    @pytest.mark.parametrize("scale", [1e-5, 3e-4, 5e-3])
+    def test_percentiles_are_numpy_s_to_a_thousandth_of_the_unit(self, size: int, scale: float) -> None:
+        values = np.random.default_rng(size).exponential(scale, size)
+        histogram = Histogram(1e-3)
+        for value in values:
+            histogram.add(value)
+        found = histogram.percentiles()
+        expected = 1e3 * np.percentile(values, [50, 99], method="inverted_cdf")
+        assert [found.p50, found.p99] == pytest.approx(expected, abs=1.001e-3)
+        assert found.max == pytest.approx(1e3 * values.max(), rel=1e-12)
+
+    def test_what_is_beyond_its_range_counts_as_the_largest(self) -> None:
+        histogram = Histogram(1e-3)
+        for value in (0.2, 0.5, 3.0):
+            histogram.add(value)
+        assert histogram.percentiles().p50 == pytest.approx(3000.0)
+
+    @pytest.mark.parametrize("value", [float("nan"), float("inf"), float("-inf")])
+    def test_what_is_no_duration_does_not_count(self, value: float) -> None:
+        histogram = Histogram(1e-3)
+        histogram.add(value)
+        assert histogram.percentiles().max is None
+
+    @pytest.mark.parametrize("value", [-1.0, -1e300, 1e300])
+    def test_any_finite_number_can_be_added(self, value: float) -> None:
+        histogram = Histogram(1e-3)
+        histogram.add(value)
+        histogram.add(1e-3)
+        assert histogram.percentiles().p50 is not None
+
+
+def test_errors_are_root_mean_squares_over_the_engaged_ticks(statistics: RunStatistics) -> None:
+    for millimetres, radians in ((3.0, 0.01), (4.0, 0.02)):
+        add(
+            statistics, error=pin.SE3(pin.exp3(np.array([0.0, radians, 0.0])), np.array([0.0, 0.0, 1e-3 * millimetres]))
+        )
+    add(statistics)
+    figures = statistics.summary(1.0).arms["left"]
+    assert figures.engaged_s == pytest.approx(0.002)
+    assert figures.position_error_mm_rms == pytest.approx(np.sqrt(12.5))
+    assert figures.rotation_error_deg_rms == pytest.approx(np.degrees(np.sqrt(0.00025)))
+
+
+def test_a_gripper_s_changes_are_counted_not_its_first_opening(statistics: RunStatistics) -> None:
+    for gripper in (0.0, 0.0, 1.0, 1.0, 0.0):
+        add(statistics, gripper=gripper)
+    assert statistics.summary(1.0).arms["right"].gripper_changes == 2
+
+
+def test_ratios_and_margin_are_the_worst_of_all_ticks_against_the_limits_in_force() -> None:
+    control = cell().control.model_copy(update={"velocity_scale": 0.5, "acceleration_limit": 4.0})
+    statistics = RunStatistics(Robot.from_config(cell()), control)
+    add(statistics, v=-0.25 * statistics.robot.velocity_limit, a=np.full(14, -3.0))
+    near = statistics.robot.home.copy()
+    near[3] = statistics.robot.position_lower[3] + control.position_margin + 0.02
+    add(statistics, q=near)
+    summary = statistics.summary(1.0)
+    assert summary.max_velocity_ratio == pytest.approx(0.5)
+    assert summary.max_acceleration_ratio == pytest.approx(0.75)
+    assert summary.min_position_margin_rad == pytest.approx(0.02)
+
+
+def test_counts_and_the_closest_pair_come_from_the_reports(statistics: RunStatistics) -> None:
+    add(statistics)
+    add(statistics, report=replace(REPORT, closest_distance=0.03, closest_pair=("tool", "table"), fallback=True))
+    add(statistics, report=replace(REPORT, certified=False, rejected=("left", "right")))
+    summary = statistics.summary(1.5)
+    assert (summary.min_distance_mm, summary.closest_pair) == (pytest.approx(30.0), ("tool", "table"))
+    assert (summary.fallback_ticks, summary.uncertified_ticks, summary.rejected_targets) == (1, 1, 2)
+    assert (summary.ticks, summary.loop_rate_hz) == (3, pytest.approx(2.0))
+
+
+@pytest.mark.parametrize(("speed", "at_rest"), [(0.0, True), (0.01, False)])
+def test_whether_the_run_ended_at_rest(statistics: RunStatistics, speed: float, at_rest: bool) -> None:
+    add(statistics, v=np.full(14, 0.5))
+    add(statistics, v=np.full(14, -speed))
+    assert statistics.summary(1.0).at_rest is at_rest
+
+
+def test_a_broken_button_cannot_fill_the_memory(statistics: RunStatistics) -> None:
+    statistics.events.extend(Event(float(i), "left", "a", "b", "c") for i in range(EVENTS_KEPT + 10))
+    events = statistics.summary(1.0).events
+    assert len(events) == EVENTS_KEPT
+    assert events[-1].t == EVENTS_KEPT + 9

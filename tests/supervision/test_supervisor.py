@@ -1,0 +1,225 @@
+"""The rules by which the controller moves arms, with the real controller and without ROS or a clock."""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from q2r2_control import CartesianController, Robot, load_config
+from q2r2_control.supervision.joint_watch import WatchSettings
+from q2r2_control.supervision.supervisor import Phase, Supervisor
+from q2r2_control.supervision.target_stream import StreamSettings, TargetStream
+from q2r2_control.types import Array, RobotState
+
+DT = 0.004
+TOOL = pin.SE3(np.eye(3), np.array([0.5, 0.2, 0.4]))
+
+
+@pytest.fixture(scope="module")
+def robot() -> Robot:
+    return Robot.from_config(load_config("config/dual_iiwa7.yaml"))
+
+
+@pytest.fixture(scope="module")
+def controller(robot: Robot) -> CartesianController:
+    return CartesianController(robot, load_config("config/dual_iiwa7.yaml").control)
+
+
+class World:
+    """A supervisor and arms that are where its references are, as long as they are not blocked."""
+
+    def __init__(self, robot: Robot, controller: CartesianController) -> None:
+        self.supervisor = Supervisor(robot, controller, StreamSettings(), WatchSettings())
+        self.q, self.now, self.blocked = robot.home.copy(), 0.0, False
+        self.v, self.lag = np.zeros_like(self.q), DT  # [s]
+        self.commanded: list[Array | None] = []
+
+    def is_in(self, phase: Phase) -> bool:
+        return self.supervisor.phase is phase
+
+    def faults(self) -> bool:
+        return self.supervisor.fault is not None
+
+    def run(self, seconds: float, target: pin.SE3 | None = None, sees: bool = True) -> None:
+        """Let time pass, with a steady target of the left arm, and with joint states or without."""
+        zero = np.zeros_like(self.q)
+        for _ in range(round(seconds / DT)):
+            self.now += DT
+            if sees:
+                self.supervisor.take_joint_state(RobotState(self.q, self.v, zero, None, self.now), self.now)
+            if target is not None:
+                self.supervisor.take_target("left", target, self.now)
+            reference = self.supervisor.tick(self.now, DT)
+            self.commanded.append(None if reference is None else reference.q)
+            self.v = zero if reference is None or self.blocked else (reference.q - self.q) / self.lag
+            self.q = self.q + self.v * DT
+
+
+@pytest.fixture
+def world(robot: Robot, controller: CartesianController) -> World:
+    return World(robot, controller)
+
+
+def raised(pose: pin.SE3, by: float) -> pin.SE3:
+    return pin.SE3(pose.rotation, pose.translation + np.array([0.0, 0.0, by]))
+
+
+def test_nothing_is_commanded_before_joint_states_are_good_and_at_rest(world: World, robot: Robot) -> None:
+    world.run(0.5, sees=False)
+    assert world.commanded == [None] * len(world.commanded)
+    for step in range(50):  # pushed by somebody
+        world.q = robot.home + 0.005 * step
+        world.run(0.008)
+    assert world.is_in(Phase.INACTIVE)
+    world.run(0.2)
+    assert world.is_in(Phase.ACTIVE)
+    first = next(q for q in world.commanded if q is not None)
+    assert np.allclose(first, world.q, atol=1e-9)
+
+
+def test_a_loop_that_stood_still_commands_nothing_of_the_past_and_follows_no_target_that_waited(
+    world: World, controller: CartesianController
+) -> None:
+    world.run(0.2)
+    tool = controller.tool_pose("left")
+    world.run(0.02, tool)
+    world.run(0.3, raised(tool, 0.1))
+    assert world.supervisor.arm_state("left") == "following"
+    rest, before = world.q, len(world.commanded)  # where the robot has come to rest by itself, as far as it is known
+    waited = controller.tool_pose("left")
+    world.now += 1.0
+    world.supervisor.stalled(1.0, world.now)
+    assert world.supervisor.fault == "the control loop stood still for 1.00 s"
+    world.run(0.05, raised(waited, 0.01))
+    assert world.commanded[before:] == [None] * (len(world.commanded) - before)
+    world.run(1.0, raised(waited, 0.01))
+    assert world.is_in(Phase.ACTIVE)
+    assert world.supervisor.arm_state("left") == "holding"
+    assert np.allclose(world.q, rest, atol=1e-9)
+
+
+def test_lost_joint_states_brake_the_arms_and_their_return_moves_nothing(
+    world: World, controller: CartesianController
+) -> None:
+    world.run(0.2)
+    tool = controller.tool_pose("left")
+    world.run(0.02, tool)
+    world.run(0.3, raised(tool, 0.1))
+    before = world.q
+    world.run(0.6, raised(tool, 0.1), sees=False)
+    assert world.is_in(Phase.INACTIVE)
+    assert world.faults()
+    assert np.abs(world.q - before).max() < 0.3
+    rest = world.q
+    world.run(1.0, raised(tool, 0.1))
+    assert world.is_in(Phase.ACTIVE)
+    assert not world.faults()
+    assert np.allclose(world.q, rest, atol=1e-9)
+    assert [event for event in world.supervisor.events if "no joint states for" in event] == world.supervisor.events[
+        1:2
+    ]
+
+
+def test_arms_that_do_not_follow_their_reference_are_stopped_until_a_reset(
+    world: World, controller: CartesianController
+) -> None:
+    world.run(0.2)
+    tool = controller.tool_pose("left")
+    world.run(0.02, tool)
+    world.blocked = True
+    world.run(2.0, raised(tool, 0.2))
+    assert world.is_in(Phase.STOPPED)
+    assert "from its reference" in str(world.supervisor.fault)
+    world.run(1.0)
+    assert world.is_in(Phase.STOPPED)
+    assert world.supervisor.reset() is None
+    world.blocked = False
+    rest = world.q
+    world.run(0.3, raised(tool, 0.2))
+    assert world.is_in(Phase.ACTIVE)
+    assert np.allclose(world.q, rest, atol=1e-9)
+
+
+def test_homing_ends_at_home_and_takes_no_targets(world: World, robot: Robot, controller: CartesianController) -> None:
+    world.run(0.2)
+    tool = controller.tool_pose("left")
+    world.run(0.02, tool)
+    world.run(1.0, raised(tool, 0.1))
+    assert world.supervisor.go_home() is None
+    world.run(4.0, raised(tool, 0.1))
+    assert "homing ended: at home" in world.supervisor.events
+    assert np.linalg.norm(controller.tool_pose("left").translation - tool.translation) < 3e-3
+    assert world.supervisor.arm_state("left") == "holding"
+
+
+def test_a_stream_that_begins_at_the_tool_is_followed_until_it_ceases() -> None:
+    stream = TargetStream(StreamSettings())
+    assert stream.offer(TOOL, TOOL, 0.0) is None
+    assert stream.offer(raised(TOOL, 0.5), TOOL, 0.1) is None
+    assert not stream.expire(0.25)
+    assert stream.expire(0.26)
+    assert stream.pose is None
+    assert not stream.expire(1.0)
+
+
+def test_a_stream_that_begins_elsewhere_is_refused_even_where_it_comes_by() -> None:
+    stream = TargetStream(StreamSettings())
+    for step in range(100):
+        assert stream.offer(raised(TOOL, 0.5 - 0.01 * step), TOOL, 0.01 * step) is not None
+    assert stream.pose is None
+
+
+def test_targets_that_were_refused_are_followed_once_they_jump_to_the_tool_or_begin_there_after_a_silence() -> None:
+    jumping, silent = TargetStream(StreamSettings()), TargetStream(StreamSettings())
+    for stream in (jumping, silent):
+        assert stream.offer(raised(TOOL, 0.2), TOOL, 0.0) is not None
+    assert jumping.offer(TOOL, TOOL, 0.01) is None
+    assert silent.offer(raised(TOOL, 0.04), TOOL, 0.01) is not None
+    assert silent.offer(TOOL, TOOL, 0.02) is not None  # came by within a hand's speed
+    assert silent.offer(TOOL, TOOL, 0.2) is None
+
+
+def test_a_stream_that_was_dropped_is_not_taken_up_again_where_it_stands() -> None:
+    stream = TargetStream(StreamSettings())
+    assert stream.offer(TOOL, TOOL, 0.0) is None
+    stream.drop()
+    assert stream.offer(TOOL, TOOL, 0.01) is not None
+    stream.reset()
+    assert stream.offer(TOOL, TOOL, 0.02) is None
+
+
+def test_where_nobody_moves_the_arms_they_go_astray_and_whoever_comes_is_asked_for_nothing_elsewhere(
+    world: World, robot: Robot
+) -> None:
+    world.run(0.3)
+    tool = robot.tool_pose(world.q, "left")
+    world.run(0.1, tool)
+    world.blocked = True  # whoever moved the arms is gone
+    world.run(0.3, raised(tool, 0.06))
+    last = world.commanded[-1]
+    assert last is not None
+    assert 0.05 < np.abs(last - world.q).max() < 0.15
+    assert world.supervisor.astray
+    world.supervisor.abandon("somebody new takes the commands", world.now)
+    assert world.is_in(Phase.INACTIVE)
+    began = len(world.commanded)
+    world.run(0.5, raised(tool, 0.06))
+    assert world.is_in(Phase.ACTIVE)
+    assert all(np.abs(q - world.q).max() < 1e-6 for q in world.commanded[began:] if q is not None)
+    assert not world.supervisor.follows("left")
+
+
+def test_arms_that_lag_behind_the_commands_are_not_astray(world: World, robot: Robot) -> None:
+    world.run(0.3)
+    tool = robot.tool_pose(world.q, "left")
+    world.run(0.1, tool)
+    world.lag = 0.06
+    deviation = 0.0
+    for _ in range(100):
+        world.run(DT, raised(tool, 0.1))
+        assert world.commanded[-1] is not None
+        deviation = max(deviation, float(np.abs(world.commanded[-1] - world.q).max()))
+        assert not world.supervisor.astray
+    assert deviation > 0.03
+    assert world.supervisor.follows("left")
