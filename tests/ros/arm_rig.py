@@ -72,7 +72,7 @@ class ArmRig:
     def start(self, processes: Processes, parameters: dict[str, Any] | None = None, module: str = "") -> RosProcess:
         """Start the arm's controller; returns when it and the rig know each other."""
         arguments = [f"-p {name}:={value}" for name, value in (PATIENT | (parameters or {})).items()]
-        module = module or f"q2r2_control.ros.{self.arm}_arm_controller"
+        module = module or f"q2r2_control.ros.nodes.{self.arm}_arm_controller"
         process = processes.start_module(module, "--ros-args", *" ".join(arguments).split())
         self.wait(lambda: self.state.get("hand_age") is not None, "the controller sees the hand")
         return process

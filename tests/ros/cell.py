@@ -158,7 +158,7 @@ def call(node: Any, service: str, request: Any = None) -> Any:
 def start(processes: Processes, name: str, *arguments: str, **environment: str) -> RosProcess:
     """Start a node of the cell."""
     given = parameters(f"config:={CONFIG}", *([f"rate:={NODE_RATE}"] if name in BUSY else []))
-    return processes.start_module(f"q2r2_control.ros.{name}", "--ros-args", *given, *arguments, **environment)
+    return processes.start_module(f"q2r2_control.ros.nodes.{name}", "--ros-args", *given, *arguments, **environment)
 
 
 def parameters(*given: str) -> list[str]:

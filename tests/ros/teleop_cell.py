@@ -55,7 +55,7 @@ class TeleopCell:
 
     def start(self, name: str, *parameters: str) -> RosProcess:
         """Start one of the package's nodes, or start it again."""
-        module = f"q2r2_control.ros.{name}"
+        module = f"q2r2_control.ros.nodes.{name}"
         given = [] if name == "tcp_endpoint" else [f"rate:={RATE}"]
         given += [f"config:={CONFIG}"] if name in ("mujoco_robot", "cartesian_controller") else []
         arguments = [part for parameter in (*given, *parameters) for part in ("-p", parameter)]

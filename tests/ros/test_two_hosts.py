@@ -44,9 +44,9 @@ class Hosts:
         self.states: dict[str, tuple[float, dict[str, Any]]] = {}
         self._network, self._processes = network, processes
         for name in ("mujoco_robot", "cartesian_controller"):
-            self.start("robot", f"q2r2_control.ros.{name}", f"rate:={RATE}", f"config:={CONFIG}")
+            self.start("robot", f"q2r2_control.ros.nodes.{name}", f"rate:={RATE}", f"config:={CONFIG}")
         for name in ("left_arm_controller", "right_arm_controller"):
-            self.start("operator", f"q2r2_control.ros.{name}", f"rate:={RATE}")
+            self.start("operator", f"q2r2_control.ros.nodes.{name}", f"rate:={RATE}")
         self._observe("robot", "cartesian_controller")
         self._observe("operator", *ARMS)
 

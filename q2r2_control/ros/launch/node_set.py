@@ -56,7 +56,7 @@ def nodes_of(path: str, source: str = "scripted", robot: str = "auto") -> list[N
 
 
 def _node(name: str, parameters: Mapping[str, str | float]) -> NodeProcess:
-    return NodeProcess(name, f"q2r2_control.ros.{name}", parameters)
+    return NodeProcess(name, f"q2r2_control.ros.nodes.{name}", parameters)
 
 
 def _relayed(external: ExternalConfig) -> dict[str, str | float]:
