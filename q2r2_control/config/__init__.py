@@ -7,6 +7,7 @@ describe controllers of others that can move the arms; ``resources`` finds the f
 from q2r2_control.config.cell import Config, load_config
 from q2r2_control.config.control import AdmittanceSettings, ControllerSettings, ImpedanceSettings
 from q2r2_control.config.resources import find_resource
+from q2r2_control.config.supervision import SupervisionSettings
 from q2r2_control.config.teleop import TeleopSettings
 
 __all__ = [
@@ -14,6 +15,7 @@ __all__ = [
     "Config",
     "ControllerSettings",
     "ImpedanceSettings",
+    "SupervisionSettings",
     "TeleopSettings",
     "find_resource",
     "load_config",
