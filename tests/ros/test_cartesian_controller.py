@@ -30,7 +30,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import SetBool
 
-from q2r2_control.ros.bridge.base_node import COMMAND_QOS
+from q2r2_control.ros.base_node import COMMAND_QOS
 from q2r2_control.ros.bridge.messages import pose_message, stamped_pose, time_message
 from tests.ros.cell import CONFIG, PATIENT, STILL, Cell, Stream, at_rest, parameters, shifted, start, wait
 

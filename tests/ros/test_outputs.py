@@ -15,9 +15,9 @@ pytest.importorskip("rclpy", reason=NEEDS_ROS)
 
 from std_msgs.msg import Float64MultiArray
 
-from q2r2_control.ros.bridge.base_node import COMMAND_QOS
+from q2r2_control.ros.base_node import COMMAND_QOS
 from q2r2_control.ros.bridge.outputs import Channel, ChannelOutput
-from q2r2_control.ros.monitoring.watched_publisher import WatchedPublisher
+from q2r2_control.ros.monitoring.endpoints import WatchedPublisher
 
 TIMEOUT = 0.5  # more than a busy machine takes to acknowledge [s]
 

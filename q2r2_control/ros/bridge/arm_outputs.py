@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+import math
+from importlib import import_module
+from typing import Any
+
 import pinocchio as pin
+from rclpy.node import Node
+from std_msgs.msg import Bool
 
 from q2r2_control.config.presets import BUILTIN, Mode
-from q2r2_control.ros.bridge.arm_parameters import ArmParameters
-from q2r2_control.ros.bridge.base_node import BaseNode
-from q2r2_control.ros.bridge.command_type import CommandType
-from q2r2_control.ros.bridge.pose_source import PoseTopic
+from q2r2_control.ros.base_node import LATCHED_QOS, BaseNode
+from q2r2_control.ros.bridge.frames import PoseTopic
+from q2r2_control.ros.bridge.parameters import ArmParameters
 from q2r2_control.ros.bridge.target_output import TargetOutput, near
-from q2r2_control.ros.monitoring.follow_watch import FollowWatch
 
 # Farther from the measured pose than sag explains, a commanded one is not where the tool is.
 SAG = 0.05, 0.1  # [m, rad]
 _BUILTIN_NODE = "/cartesian_controller"
+_POSE = 2  # of moveit_msgs/srv/ServoCommandType
+_PATIENCE = 1.0  # for an answer, before asking again [s]
 
 
 class ArmOutputs:
@@ -113,3 +119,76 @@ class ArmOutputs:
         for output in self._all:
             output.forget(now)
         self._relaying = False
+
+
+class FollowWatch:
+    """Without it an arm would count as engaged whose targets the controller refuses, and a press would pause it.
+
+    The controller refuses a stream that it has dropped for reasons of its own, such as joint states that stalled, and
+    may follow again only what begins anew. One that says nothing, as those of others, is believed to follow.
+    """
+
+    def __init__(self, node: Node, topic: str, patience: float) -> None:
+        self._topic, self._patience = topic, patience
+        self._follows: bool | None = None
+        self._since = math.inf  # targets are sent that are not followed [s]
+        node.create_subscription(Bool, topic, self._take, LATCHED_QOS)
+
+    def refusal(self, asked: bool, now: float) -> str | None:
+        """One line where targets, which are sent as long as ``asked``, have not been followed for too long."""
+        if not asked or self._follows is not False:
+            self._since = math.inf
+            return None
+        self._since = min(self._since, now)
+        return f"{self._topic} says that targets are not followed" if now - self._since > self._patience else None
+
+    def _take(self, message: Bool) -> None:
+        self._follows = bool(message.data)
+
+
+class CommandType:
+    """Asks for poses until the service agrees, again whenever its node has come anew; nothing here waits.
+
+    Without moveit_msgs it cannot ask: ``advice`` says so, and engaging is then the user's to decide.
+    """
+
+    def __init__(self, node: BaseNode, service: str) -> None:
+        self._service, self._client = service, None
+        self.advice: str | None = None
+        try:
+            self._kind: Any = import_module("moveit_msgs.srv").ServoCommandType
+        except ImportError:
+            self.advice = f"moveit_msgs cannot be imported: call {service} with {_POSE} yourself"
+            return
+        self._client = node.create_client(self._kind, service)
+        self._lives, self._agreed = -1, False
+        self._asked = float("-inf")
+        self._answer: Any = None  # future
+
+    @property
+    def unready(self) -> str | None:
+        """Why poses do not count yet."""
+        if self._client is None or self._agreed:
+            return None
+        return f"{self._service} has not agreed to poses yet"
+
+    def step(self, lives: int, now: float) -> None:
+        """Ask where that is due; ``lives``: how often the controller was seen to come."""
+        if self._client is None:
+            return
+        if lives != self._lives:
+            self._lives, self._agreed, self._asked = lives, False, float("-inf")
+            self._forget()
+        if self._answer is not None and self._answer.done():
+            self._agreed = bool(self._answer.result().success)
+            self._answer = None
+        if not self._agreed and now - self._asked > _PATIENCE and self._client.service_is_ready():
+            self._forget()
+            self._asked = now
+            self._answer = self._client.call_async(self._kind.Request(command_type=_POSE))
+
+    def _forget(self) -> None:
+        """An answer that is late is one of the past."""
+        if self._answer is not None and self._client is not None:
+            self._client.remove_pending_request(self._answer)
+        self._answer = None

@@ -13,7 +13,7 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 
 from q2r2_control.inputs.messages import HandMessage, HandPose, HandTwist, MessageType
 from q2r2_control.inputs.session import HAND_TOPICS
-from q2r2_control.ros.bridge.base_node import STREAM_QOS
+from q2r2_control.ros.base_node import STREAM_QOS
 from q2r2_control.ros.bridge.messages import (
     hand_inputs,
     hand_pose,
@@ -22,7 +22,7 @@ from q2r2_control.ros.bridge.messages import (
     hand_twist_message,
     inputs_message,
 )
-from q2r2_control.ros.monitoring.publishers import Publishers
+from q2r2_control.ros.monitoring.endpoints import Publishers
 
 # Reliable, so that every subscriber can have it: a best-effort publisher has no reliable subscribers.
 PUBLISHED_QOS = QoSProfile(

@@ -10,7 +10,7 @@ from trajectory_msgs.msg import JointTrajectory
 
 from q2r2_control.config import Config
 from q2r2_control.robot.robot import Robot
-from q2r2_control.ros.bridge.base_node import BaseNode
+from q2r2_control.ros.base_node import BaseNode
 from q2r2_control.ros.bridge.outputs import (
     Channel,
     NoOutput,

@@ -15,7 +15,7 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from q2r2_control.robot.robot import Robot
 from q2r2_control.ros.bridge.messages import joint_state_message
-from q2r2_control.ros.monitoring.watched_publisher import WatchedPublisher
+from q2r2_control.ros.monitoring.endpoints import WatchedPublisher
 from q2r2_control.types import Array, Reference, RobotState
 
 # What makes a message of joint names, positions, velocities and the time [s] of the node's clock.

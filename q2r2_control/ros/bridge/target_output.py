@@ -9,9 +9,9 @@ from geometry_msgs.msg import PoseStamped, WrenchStamped
 
 from q2r2_control.config.presets import Hold, Preset
 from q2r2_control.config.teleop import GuardSettings
-from q2r2_control.ros.bridge.base_node import LATCHED_QOS, BaseNode
+from q2r2_control.ros.base_node import LATCHED_QOS, BaseNode
 from q2r2_control.ros.bridge.messages import stamped_pose, time_message
-from q2r2_control.ros.monitoring.watched_publisher import WatchedPublisher
+from q2r2_control.ros.monitoring.endpoints import WatchedPublisher
 from q2r2_control.supervision.target_stream import apart
 from q2r2_control.teleop.guard import TargetGuard
 

@@ -12,7 +12,7 @@ from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from std_msgs.msg import String
 
-from q2r2_control.ros.bridge.base_node import LATCHED_QOS
+from q2r2_control.ros.base_node import LATCHED_QOS
 from q2r2_control.types import SIDES
 
 _PERIOD = 0.04  # of the sign of life [s]

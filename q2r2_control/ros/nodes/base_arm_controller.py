@@ -14,15 +14,14 @@ from visualization_msgs.msg import Marker
 from q2r2_control.errors import ConfigError
 from q2r2_control.inputs.samples import SampleQueue
 from q2r2_control.inputs.session import HAPTIC_TOPICS
+from q2r2_control.ros.base_node import COMMAND_QOS, ERROR, OK, STREAM_QOS, WARN, BaseNode
 from q2r2_control.ros.bridge.arm_outputs import SAG, ArmOutputs
-from q2r2_control.ros.bridge.arm_parameters import ArmDefaults, ArmParameters, arm_parameters
-from q2r2_control.ros.bridge.base_node import COMMAND_QOS, ERROR, OK, STREAM_QOS, WARN, BaseNode
-from q2r2_control.ros.bridge.frames import FrameListener
-from q2r2_control.ros.bridge.gripper_client import GripperClient
+from q2r2_control.ros.bridge.frames import FrameListener, PoseTopic, ToolFrame
+from q2r2_control.ros.bridge.grippers import GripperClient
 from q2r2_control.ros.bridge.hand_topics import HandWatch
 from q2r2_control.ros.bridge.markers import TargetMarkers
 from q2r2_control.ros.bridge.messages import hand_sample
-from q2r2_control.ros.bridge.pose_source import PoseTopic, ToolFrame
+from q2r2_control.ros.bridge.parameters import ArmDefaults, ArmParameters, arm_parameters
 from q2r2_control.ros.bridge.target_output import near
 from q2r2_control.ros.monitoring.arm_link import ArmLink
 from q2r2_control.teleop.arm import OPEN, ArmState

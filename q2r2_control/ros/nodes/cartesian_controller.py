@@ -25,11 +25,10 @@ from std_srvs.srv import SetBool, Trigger
 from q2r2_control.config import load_config
 from q2r2_control.control.controller import LONGEST_DT, CartesianController
 from q2r2_control.robot.robot import Robot
-from q2r2_control.ros.bridge.base_node import ERROR, LATCHED_QOS, OK, SENT_COMMAND_QOS, WARN, BaseNode, run_node
-from q2r2_control.ros.bridge.joint_intake import JointIntake
+from q2r2_control.ros.base_node import ERROR, LATCHED_QOS, OK, SENT_COMMAND_QOS, WARN, BaseNode, run_node
+from q2r2_control.ros.bridge.intakes import JointIntake, TargetIntake
 from q2r2_control.ros.bridge.make_output import NONE, make_output, output_name
 from q2r2_control.ros.bridge.messages import stamped_pose
-from q2r2_control.ros.bridge.target_intake import TargetIntake
 from q2r2_control.supervision.external_arms import LedArms, LedSettings, settings_to_lead
 from q2r2_control.supervision.joint_watch import WatchSettings
 from q2r2_control.supervision.supervisor import Phase, Supervisor

@@ -15,7 +15,7 @@ from q2r2_control.inputs.headset_check import SILENCE
 from q2r2_control.inputs.messages import HandMessage
 from q2r2_control.inputs.session import HAND_TOPICS
 from q2r2_control.inputs.statistics import TopicRecorder, TopicStatistics
-from q2r2_control.ros.bridge.base_node import ERROR, OK, WARN, BaseNode, run_node
+from q2r2_control.ros.base_node import ERROR, OK, WARN, BaseNode, run_node
 from q2r2_control.ros.bridge.hand_topics import subscribe_to_hands
 from q2r2_control.viewer.topic_table import topic_line, topic_table
 

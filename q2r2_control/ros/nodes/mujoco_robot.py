@@ -29,8 +29,8 @@ from q2r2_control.errors import ConfigError
 from q2r2_control.plants.simulated_cell import JointSetpoint, SimulatedCell
 from q2r2_control.robot.compose import WORLD
 from q2r2_control.robot.robot import Robot
-from q2r2_control.ros.bridge.base_node import LATCHED_QOS, OK, WARN, BaseNode, run_node
-from q2r2_control.ros.bridge.gripper_server import GripperServer, Stroke
+from q2r2_control.ros.base_node import LATCHED_QOS, OK, WARN, BaseNode, run_node
+from q2r2_control.ros.bridge.grippers import GripperServer, Stroke
 from q2r2_control.ros.bridge.messages import joint_state_message, seconds, transform_message
 from q2r2_control.types import RobotState
 

@@ -12,7 +12,7 @@ from q2r2_control.inputs.messages import HandMessage, HandPose, HandTwist, Messa
 from q2r2_control.inputs.scripted import ScriptedInput
 from q2r2_control.inputs.session import HAND_TOPICS
 from q2r2_control.inputs.trajectories import TRAJECTORIES
-from q2r2_control.ros.bridge.base_node import OK, WARN, BaseNode, run_node
+from q2r2_control.ros.base_node import OK, WARN, BaseNode, run_node
 from q2r2_control.ros.bridge.hand_topics import HandPublishers
 from q2r2_control.types import SIDES, HandSample
 

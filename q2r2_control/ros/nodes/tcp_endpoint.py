@@ -18,7 +18,7 @@ from q2r2_control.inputs.headset import HeadsetServer
 from q2r2_control.inputs.headset_check import SILENCE
 from q2r2_control.inputs.messages import PROP_TOPICS, HandPose, PropTwist
 from q2r2_control.inputs.session import HAND_TOPICS, HAPTIC_TOPICS, Reception
-from q2r2_control.ros.bridge.base_node import OK, STREAM_QOS, WARN, BaseNode, run_node
+from q2r2_control.ros.base_node import OK, STREAM_QOS, WARN, BaseNode, run_node
 from q2r2_control.ros.bridge.hand_topics import HandPublishers
 from q2r2_control.ros.bridge.messages import hand_twist
 from q2r2_control.types import SIDES, HapticFeedback
