@@ -9,6 +9,7 @@ from std_msgs.msg import Float64MultiArray
 from trajectory_msgs.msg import JointTrajectory
 
 from q2r2_control.config import Config
+from q2r2_control.config.timeouts import STREAM_TIMEOUT
 from q2r2_control.robot.robot import Robot
 from q2r2_control.ros.base_node import BaseNode
 from q2r2_control.ros.bridge.outputs import (
@@ -50,7 +51,7 @@ def make_output(name: str, node: BaseNode, robot: Robot, config: Config, period:
     """
     topics = _topics(name, node, robot)
     what = "arms that do not follow and whose joint positions nobody acknowledges are given up after [s]"
-    listener_timeout = node.parameter("listener_timeout", 0.15, what, at_least=0.1, at_most=5.0)
+    listener_timeout = node.parameter("listener_timeout", STREAM_TIMEOUT, what, at_least=0.1, at_most=5.0)
 
     def on(kind: type) -> list[Channel]:
         return channels(node, kind, topics, robot, listener_timeout)

@@ -13,16 +13,18 @@ from q2r2_control.config import load_config
 from q2r2_control.config.external import GripperSettings, GuardLimits
 from q2r2_control.config.presets import BUILTIN, Mode, Preset, preset_of
 from q2r2_control.config.teleop import GuardSettings, Stance, TeleopSettings
+from q2r2_control.config.timeouts import STREAM_TIMEOUT
 from q2r2_control.errors import ConfigError
 from q2r2_control.ros.base_node import BaseNode
 
 Model = TypeVar("Model", bound=BaseModel)
+BUILTIN_NODE = "/cartesian_controller"
 _NONE = 0.0  # stands for no number; no field that may be none allows zero
 
 
 @dataclass(frozen=True, slots=True)
 class ArmDefaults:
-    """What a subclass of :class:`BaseArmController` gives."""
+    """What a subclass of :class:`BaseArmController` passes to its constructor."""
 
     arm_name: str  # left or right
     robot_name: str
@@ -36,7 +38,7 @@ class ArmDefaults:
 
 @dataclass(frozen=True, slots=True)
 class ArmParameters:
-    """What an arm controller runs with."""
+    """The checked parameters of an arm controller."""
 
     base_frame: str  # that the controller reads its targets in
     world_frame: str  # whose axes the hand's are
@@ -61,8 +63,8 @@ class ArmParameters:
 
 
 @dataclass(frozen=True, slots=True)
-class _Given:
-    """Defaults of the parameters."""
+class _Defaults:
+    """Defaults of the parameters, of the cell or of the subclass."""
 
     ctrl_prefix: str
     base_frame_id: str
@@ -83,65 +85,60 @@ def arm_parameters(node: BaseNode, subclass: ArmDefaults) -> ArmParameters:
 
     Defaults are the cell's where the parameter ``config`` names one, and else the subclass's.
     """
-    arm = subclass.arm_name
-    config = node.parameter("config", "", 'YAML of the cell, whose teleop and external are defaults of these; "": none')
+    arm, declare = subclass.arm_name, node.parameter
+    config = declare("config", "", 'YAML of the cell, whose teleop and external are defaults of these; "": none')
     given = _of_cell(subclass, config) if config else _of_subclass(subclass)
     preset, mode = preset_of(
-        node.parameter("preset", given.preset, "terms of the controller that is driven, by its name"),
-        node.parameter("mode", given.mode.value, "raw: the hand's target; filtered: through the built-in controller"),
+        declare("preset", given.preset, "terms of the controller that is driven, by its name"),
+        declare("mode", given.mode.value, "raw: the hand's target; filtered: through the built-in controller"),
     )
-    prefix = node.parameter("ctrl_prefix", given.ctrl_prefix, "the controller's node, with its namespace").rstrip("/")
-    base = node.parameter("base_frame_id", given.base_frame_id, "frame_id of targets")
-    world = node.parameter("world_frame_id", given.world_frame_id, 'whose axes the hand\'s are; "": base_frame_id')
-    topic = node.parameter("target_topic", given.target_topic, 'where targets go; "": as the preset says')
-    controller = node.parameter("controller_node", "", 'whose restart pauses the arm; "": ctrl_prefix')
+    prefix = declare("ctrl_prefix", given.ctrl_prefix, "the controller's node, with its namespace").rstrip("/")
+    base = declare("base_frame_id", given.base_frame_id, "frame_id of targets")
+    world = declare("world_frame_id", given.world_frame_id, 'whose axes the hand\'s are; "": base_frame_id')
+    topic = declare("target_topic", given.target_topic, 'where targets go; "": as the preset says')
+    controller = declare("controller_node", "", 'whose restart pauses the arm; "": ctrl_prefix')
     return ArmParameters(
         base_frame=base,
         world_frame=world or base,
-        tool_frame=node.parameter(
-            "end_effector_link_name", given.end_effector_link_name, "frame that the operator moves"
-        ),
-        controller=controller or ("/cartesian_controller" if preset is BUILTIN else prefix),
+        tool_frame=declare("end_effector_link_name", given.end_effector_link_name, "frame that the operator moves"),
+        controller=controller or (BUILTIN_NODE if preset is BUILTIN else prefix),
         prefix=prefix,
         target_topic=topic or preset.topic.format(ctrl=prefix),
-        current_pose_topic=node.parameter("current_pose_topic", "", 'PoseStamped of the tool; "": from /tf'),
-        safe_target_topic=node.parameter(
-            "safe_target_topic", f"/cartesian_controller/safe_target/{arm}", "what the built-in controller allows"
+        current_pose_topic=declare("current_pose_topic", "", 'PoseStamped of the tool; "": from /tf'),
+        safe_target_topic=declare(
+            "safe_target_topic", f"{BUILTIN_NODE}/safe_target/{arm}", "safe target of the built-in controller"
         ),
-        following_topic=node.parameter(
-            "following_topic", f"/cartesian_controller/following/{arm}", "whether the built-in controller follows"
+        following_topic=declare(
+            "following_topic", f"{BUILTIN_NODE}/following/{arm}", "whether the built-in controller follows"
         ),
-        builtin_prefix=node.parameter("builtin_prefix", f"/q2r2/{arm}", "where mode filtered sends the hand's target"),
-        tool_timeout=node.parameter(
-            "tool_timeout",
-            0.15,
-            "an older pose of the tool, or safe target, does not count [s]",
-            at_least=0.01,
-            at_most=2.0,
+        builtin_prefix=declare("builtin_prefix", f"/q2r2/{arm}", "where mode filtered sends the hand's target"),
+        tool_timeout=_timeout(
+            node, "tool_timeout", "an older pose of the tool, or safe target, does not count", 0.01, 2.0
         ),
-        listener_timeout=node.parameter(
-            "listener_timeout", 0.15, "targets may not be acknowledged [s]", at_least=0.1, at_most=10.0
-        ),
-        link_timeout=node.parameter(
-            "link_timeout", 0.15, "the other arm's node may be silent [s]", at_least=0.1, at_most=10.0
-        ),
+        listener_timeout=_timeout(node, "listener_timeout", "targets may not be acknowledged", 0.1, 10.0),
+        link_timeout=_timeout(node, "link_timeout", "the other arm's node may be silent", 0.1, 10.0),
         rate=_rate(node, preset, given.rate),
         preset=preset,
         mode=mode,
-        gripper_topic=node.parameter("gripper_action_topic", given.gripper_action_topic, "action or topic"),
+        gripper_topic=declare("gripper_action_topic", given.gripper_action_topic, "action or topic"),
         gripper=settings_from_parameters(node, "gripper", given.gripper, frozenset()),
         guard=settings_from_parameters(node, "guard", given.limits.over(preset.guard), frozenset()),
         teleop=_teleop_settings(node, given.teleop),
     )
 
 
-def _of_subclass(subclass: ArmDefaults) -> _Given:
+def _timeout(node: BaseNode, name: str, description: str, at_least: float, at_most: float) -> float:
+    value = node.parameter(name, STREAM_TIMEOUT, f"{description} [s]", at_least=at_least, at_most=at_most)
+    return float(value)
+
+
+def _of_subclass(subclass: ArmDefaults) -> _Defaults:
     teleop = TeleopSettings(stance=Stance.MIRROR if subclass.mirror else Stance.SIDE_BY_SIDE)
     if subclass.filter_window_size is not None:
         # A mean over n samples of a 75 Hz headset comes (n - 1) / 2 periods late.
         delay = min(max((subclass.filter_window_size - 1) / 2 / 75.0, 0.0), 0.2)
         teleop = teleop.model_copy(update={"filter": teleop.filter.model_copy(update={"smoothing_delay": delay})})
-    return _Given(
+    return _Defaults(
         subclass.ctrl_prefix,
         subclass.base_frame_id,
         subclass.end_effector_link_name,
@@ -150,8 +147,8 @@ def _of_subclass(subclass: ArmDefaults) -> _Given:
     )
 
 
-def _of_cell(subclass: ArmDefaults, path: str) -> _Given:
-    """What a cell says, and of what it does not say the subclass's."""
+def _of_cell(subclass: ArmDefaults, path: str) -> _Defaults:
+    """The cell's, and the subclass's where the cell says nothing."""
     cell, side = load_config(path), subclass.arm_name
     arm = next((arm for name, arm in cell.arms.items() if name == side), None)
     if arm is None:
@@ -247,7 +244,7 @@ def _value(node: BaseNode, name: str, default: Any, field: FieldInfo) -> Any:
 
 
 def _range(field: FieldInfo) -> dict[str, Any]:
-    """The closed range of a field; open ends are the model's to check."""
+    """The closed range of a field; whether the ends are allowed is checked by the model."""
     bounds: dict[str, Any] = {}
     for entry in field.metadata:
         for attribute, bound in (("ge", "at_least"), ("gt", "at_least"), ("le", "at_most"), ("lt", "at_most")):
