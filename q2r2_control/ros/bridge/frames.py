@@ -20,7 +20,7 @@ _UNIT = 1e-3  # a quaternion's norm may be off by this
 
 
 class _Edge:
-    """Where a child is in its parent; put together when it is asked for, since most frames of a robot never are."""
+    """Pose of a child frame in its parent; computed when asked for, since most frames of a robot never are."""
 
     __slots__ = ("_pose", "_transform", "parent", "received")
 
@@ -42,7 +42,7 @@ class Placement(NamedTuple):
     """Where a frame is in another."""
 
     pose: pin.SE3
-    received: float  # the oldest receipt time of what it was put together from [s]; inf: all of it is static
+    received: float  # the oldest receipt time of the transforms in it [s]; inf: all of them are static
 
 
 class FrameTree:
@@ -52,12 +52,12 @@ class FrameTree:
         self._edges: dict[str, _Edge] = {}
 
     def set(self, transform: TransformStamped, received: float) -> None:
-        """Take one transform; numbers that are not finite or no rotation are passed over."""
+        """Store one transform; one with numbers that are not finite, or without a unit quaternion, is ignored."""
         if _is_pose(transform):
             self._edges[_name(transform.child_frame_id)] = _Edge(transform, received)
 
     def find(self, frame: str, within: str) -> Placement | None:
-        """Pose of ``frame`` in ``within``; None where no chain of transforms joins them."""
+        """Pose of ``frame`` in ``within``; None if no chain of transforms connects them."""
         up = dict(self._upwards(_name(within)))
         for name, placement in self._upwards(_name(frame)):
             if name in up:
@@ -66,7 +66,7 @@ class FrameTree:
         return None
 
     def _upwards(self, frame: str) -> Iterator[tuple[str, Placement]]:
-        """The frame and all above it, with the frame's pose in each; ends even where parents form a ring."""
+        """The frame and all its ancestors, with the frame's pose in each; ends also if parents form a ring."""
         pose, received = pin.SE3.Identity(), math.inf
         seen: set[str] = set()
         while frame not in seen:
@@ -112,7 +112,7 @@ class ToolFrame:
         self.problem: str | None = None
 
     def at(self, now: float) -> pin.SE3 | None:
-        """The newest pose at ``now`` [s]; None where it is not known, which ``problem`` explains."""
+        """The newest pose at ``now`` [s]; None if it is not known, and then ``problem`` says why."""
         placement = self._tree.find(self._frame, self._world)
         self.problem = None
         if placement is None:
@@ -124,7 +124,7 @@ class ToolFrame:
 
 
 class PoseTopic:
-    """The pose that a topic tells, in the world; its frame is the message's, through /tf."""
+    """The pose on a topic, in the world; the message's frame is looked up on /tf."""
 
     def __init__(self, node: BaseNode, topic: str, tree: FrameTree, world: str, timeout: float) -> None:
         self._tree, self._world, self._timeout = tree, world, timeout
@@ -135,7 +135,7 @@ class PoseTopic:
         node.create_subscription(PoseStamped, topic, lambda message: self._take(message, node.now), STREAM_QOS)
 
     def at(self, now: float) -> pin.SE3 | None:
-        """The newest pose at ``now`` [s]; None where it is not known, which ``problem`` explains."""
+        """The newest pose at ``now`` [s]; None if it is not known, and then ``problem`` says why."""
         if self._newest is None:
             self.problem = f"nothing on {self._topic}"
             return None
@@ -157,7 +157,7 @@ class PoseTopic:
         return None
 
     def take_silence(self, now: float) -> str | None:
-        """Says once that what had come comes no more."""
+        """One line, returned once, if poses came and have stopped coming."""
         if self._newest is None or now - self._newest[1] <= self._timeout:
             return None
         self.at(now)

@@ -1,4 +1,4 @@
-"""Grippers: a client that opens and closes one of a kind that users have, and the server of a simulated one."""
+"""Grippers: a client for the kinds of grippers in use, and the action server of a simulated one."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from q2r2_control.config.external import GripperSettings, GripperType
 from q2r2_control.ros.base_node import COMMAND_QOS
 
 # The client.
-_PATIENCE = 10.0  # for a result; after that the gripper counts as silent [s]
+_RESULT_TIMEOUT = 10.0  # of a goal [s]
 # The server.
 _REACHED = 0.02  # of the stroke
 _STALLED_AFTER = 0.3  # without moving by the following [s]
@@ -27,18 +27,18 @@ _OUTSIDE = 0.02  # a goal this much beyond the stroke still counts as its end
 
 
 class GripperClient:
-    """Opens and closes one gripper; nothing here waits.
+    """Opens and closes one gripper; no call waits.
 
-    ``closed`` is what the gripper is known to be: it changes when a result says so, and a gripper that has stalled on
-    something holds it, which is success whatever the status of the goal. A topic gives no result; there it changes with
-    the command. Before the first result the gripper counts as open.
+    ``closed`` is the known state of the gripper. It changes with the result of a goal; a gripper that has stalled holds
+    an object, which is success whatever the status of the goal. A topic gives no result, so there it changes with the
+    command. Before the first result the gripper counts as open.
     """
 
     def __init__(self, node: Node, name: str, settings: GripperSettings) -> None:
         self.closed = False
         self.problem: str | None = None
         self._node, self._name, self._settings = node, name, settings
-        self._wish: bool | None = None  # closed or not, while a goal is under way
+        self._goal_closed: bool | None = None  # closed or not, while a goal is under way
         self._sent = 0.0  # [s]
         self._goals = 0
         kind = settings.action_type
@@ -52,18 +52,18 @@ class GripperClient:
     @property
     def state(self) -> str:
         """One word: open, closed, opening or closing."""
-        if self._wish is None:
+        if self._goal_closed is None:
             return "closed" if self.closed else "open"
-        return "closing" if self._wish else "opening"
+        return "closing" if self._goal_closed else "opening"
 
     def toggle(self, now: float) -> None:
-        """Ask for the opposite of what the gripper is, or of what it is about to be."""
-        self.command(not (self.closed if self._wish is None else self._wish), now)
+        """Ask for the opposite of the gripper's state, or of the state that it is moving to."""
+        self.command(not (self.closed if self._goal_closed is None else self._goal_closed), now)
 
     def command(self, close: bool, now: float) -> None:
-        """Ask to close or open; a server that is not there is told in ``problem``, and the wish is dropped.
+        """Ask to close or open. If there is no server, ``problem`` says so and the request is dropped.
 
-        It is not kept for later, since a gripper that moves when its server comes up would surprise.
+        It is not kept for later: a gripper that moves when its server starts would be a surprise.
         """
         position = self._settings.closed_position if close else self._settings.open_position
         self.problem = None
@@ -76,15 +76,15 @@ class GripperClient:
             self.problem = f"no gripper server at {self._name}"
             return
         self._goals += 1
-        self._wish, self._sent = close, now
+        self._goal_closed, self._sent = close, now
         number = self._goals
         answer = self._client.send_goal_async(self._goal(position))
         answer.add_done_callback(lambda future: self._answered(future.result(), number))
 
     def check(self, now: float) -> None:
-        """Give up a goal that nobody answers."""
-        if self._wish is not None and now - self._sent > _PATIENCE:
-            self._end(f"no result from {self._name} for {_PATIENCE:g} s")
+        """Give up a goal that is not answered in time."""
+        if self._goal_closed is not None and now - self._sent > _RESULT_TIMEOUT:
+            self._end(f"no result from {self._name} for {_RESULT_TIMEOUT:g} s")
 
     def _goal(self, position: float) -> Any:
         goal = self._action.Goal()
@@ -106,25 +106,25 @@ class GripperClient:
             handle.get_result_async().add_done_callback(lambda future: self._done(future.result(), number))
 
     def _done(self, answer: Any, number: int) -> None:
-        if number != self._goals or self._wish is None:
+        if number != self._goals or self._goal_closed is None:
             return  # another goal has taken its place
         result = answer.result
         if answer.status == GoalStatus.STATUS_SUCCEEDED or result.stalled or result.reached_goal:
-            self.closed = self._wish
+            self.closed = self._goal_closed
             self._end(None)
         else:
             self._end(f"{self._name} ended with status {answer.status}, neither stalled nor at its goal")
 
     def _end(self, problem: str | None) -> None:
-        self._wish, self.problem = None, problem
-        self._goals += 1  # whatever still comes of it is late
+        self._goal_closed, self.problem = None, problem
+        self._goals += 1  # later answers to this goal are ignored
         if problem is not None:
             self._node.get_logger().warning(problem)
 
 
 @dataclass(frozen=True, slots=True)
 class Stroke:
-    """What the positions of the action's messages mean [m]."""
+    """Positions in the action's messages for the fully open and the closed gripper [m]."""
 
     open_position: float
     closed_position: float
@@ -149,8 +149,8 @@ class _Motion:
 class GripperServer:
     """Serves ``topic``. A newer goal aborts the older one; fingers that stop on something have succeeded: stalled.
 
-    A goal's ``max_effort`` is not used: the force is that of the simulated gripper. Goals are kept and looked at by
-    :meth:`update`, since a callback that waits would stop the node's only thread.
+    A goal's ``max_effort`` is not used: the force is that of the simulated gripper. :meth:`update` works on the goals,
+    since a callback that waits would block the node's only thread.
     """
 
     def __init__(
@@ -163,14 +163,14 @@ class GripperServer:
             node,
             GripperCommand,
             topic,
-            execute_callback=lambda _: GripperCommand.Result(),  # each goal gets its own when it is through
+            execute_callback=lambda _: GripperCommand.Result(),  # each goal gets its own when it ends
             goal_callback=self._check,
             handle_accepted_callback=self._accept,
             cancel_callback=lambda _: CancelResponse.ACCEPT,
         )
 
     def update(self, now: float, opening: float, effort: float) -> None:
-        """Look at the gripper, open by ``opening`` 0..1 and pressing with ``effort`` [N], at ``now`` [s]."""
+        """Go on with the goal at ``now`` [s]: the gripper is open by ``opening`` 0..1 and presses by ``effort`` [N]."""
         if self._newest is not None:
             if self._motion is not None:
                 self._finish(self._motion.handle, "abort", opening, effort, reached=False, stalled=False)
@@ -218,7 +218,7 @@ class GripperServer:
 
     def _end(self, handle: ServerGoalHandle, outcome: str, result: GripperCommand.Result) -> None:
         def conclude(handle: ServerGoalHandle) -> GripperCommand.Result:
-            # A cancellation may have come in between, and leaves no other way out.
+            # A goal that is being cancelled can end as canceled only.
             getattr(handle, "canceled" if handle.is_cancel_requested else outcome)()
             return result
 

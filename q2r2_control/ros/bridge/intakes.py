@@ -1,4 +1,4 @@
-"""What comes into the built-in controller: targets, one topic an arm, and joint states, merged by joint name."""
+"""Inputs of the built-in controller: targets, one topic for each arm, and joint states, merged by joint name."""
 
 from __future__ import annotations
 
@@ -22,21 +22,21 @@ from q2r2_control.ros.monitoring.endpoints import Publishers
 from q2r2_control.supervision.target_stream import Refusal
 from q2r2_control.types import RobotState
 
-_RECENT = 1.0  # refused targets are a warning for this long [s]
-# Takes an arm's target in the world frame, or None for one that is no pose, the time [s], and the message's number.
+_WARNING_TIME = 1.0  # refused targets are reported for this long [s]
+# Takes an arm's target in the world frame, or None if it is no pose, the time [s], and the message's number.
 Take = Callable[[str, pin.SE3 | None, float, int | None], Refusal | None]
 
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """What target poses are given in."""
+    """The frame of target poses."""
 
     name: str
     pose: pin.SE3  # in the world
 
 
 class TargetIntake:
-    """Listens to the targets of all arms. ``changed`` is called when what :meth:`faults` says has changed."""
+    """Subscribes to the targets of all arms. Calls ``changed`` when :meth:`faults` has something new."""
 
     def __init__(self, node: BaseNode, robot: Robot, changed: Callable[[], None]) -> None:
         self._node, self._changed = node, changed
@@ -52,12 +52,12 @@ class TargetIntake:
         self.rejected = dict.fromkeys(robot.arms, 0)
 
     def subscribe(self, take: Take) -> None:
-        """Hand each target to ``take``."""
+        """Pass each target to ``take``."""
         for arm, topic in self.topics.items():
             self._node.create_subscription(PoseStamped, topic, partial(self._on_target, take, arm), COMMAND_QOS)
 
     def look(self) -> None:
-        """Ask the graph who publishes."""
+        """Ask the graph which nodes publish."""
         self._publishers.look()
 
     def publishers(self, arm: str) -> str:
@@ -69,9 +69,9 @@ class TargetIntake:
         return self._publishers.source(self.topics[arm])
 
     def faults(self) -> list[str]:
-        """A line for each arm whose targets were not used of late."""
+        """A line for each arm whose targets were refused lately."""
         now = self._node.now
-        self._refused = {arm: entry for arm, entry in self._refused.items() if now - entry[1] <= _RECENT}
+        self._refused = {arm: entry for arm, entry in self._refused.items() if now - entry[1] <= _WARNING_TIME}
         return [f"target of {arm} not used: {refusal.line}" for arm, (refusal, _) in self._refused.items()]
 
     def _on_target(self, take: Take, arm: str, message: PoseStamped, info: Mapping[str, int | None]) -> None:
@@ -89,7 +89,7 @@ class TargetIntake:
             self._refused.pop(arm, None)
 
     def _refuse(self, arm: str, refusal: Refusal) -> None:
-        """Say why targets are not used: once for each kind of fault, until one is used again or none come any more."""
+        """Log why targets are not used: once for each kind of fault, until a target is used again or none comes."""
         self.rejected[arm] += 1
         before = self._refused.get(arm)
         self._refused[arm] = (refusal, self._node.now)
@@ -115,13 +115,16 @@ def _frame_of(node: BaseNode, robot: Robot, arm: str) -> Frame:
 
 
 class JointIntake:
-    """Makes one state of all arms; it is as old as the oldest of its parts."""
+    """Makes one state of all arms from joint states on one topic, or on one topic for each arm.
+
+    The state is as old as the oldest of its parts.
+    """
 
     def __init__(self, node: BaseNode, robot: Robot) -> None:
         self._node = node
-        self._topics: dict[str, list[str]] = {}  # to the arms whose joints they bring
+        self._topics: dict[str, list[str]] = {}  # the arms whose joints each topic carries
         for arm in robot.arms:
-            topic = node.parameter(f"{arm}.joint_states_topic", "joint_states", "brings all joints of this arm")
+            topic = node.parameter(f"{arm}.joint_states_topic", "joint_states", "carries all joints of this arm")
             self._topics.setdefault(topic, []).append(arm)
         self._joints = {topic: joints_of(robot, arms) for topic, arms in self._topics.items()}
         self._stamps = dict.fromkeys(self._topics, -math.inf)
@@ -132,16 +135,16 @@ class JointIntake:
         self.state: RobotState | None = None  # the newest of all arms
 
     def subscribe(self, take: Callable[[RobotState | str, float], None]) -> None:
-        """Hand each state of all arms, or what is wrong with a message, to ``take``, with the time [s]."""
+        """Pass each state of all arms, or what is wrong with a message, to ``take``, with the time [s]."""
         for topic in self._topics:
             self._node.create_subscription(JointState, topic, partial(self._on_message, take, topic), STREAM_QOS)
 
     def look(self) -> None:
-        """Ask the graph who publishes."""
+        """Ask the graph which nodes publish."""
         self._publishers.look()
 
     def source(self) -> str:
-        """Where those come from that have not come for longest, for the middle of a sentence."""
+        """The publishers of the oldest joint states, for the middle of a sentence."""
         topic = min(self._stamps, key=lambda name: self._stamps[name])
         where = f" on {topic}" if len(self._topics) > 1 else ""
         return self._publishers.source(topic) + where

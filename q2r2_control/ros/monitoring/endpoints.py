@@ -1,4 +1,4 @@
-"""The other ends of a topic: which nodes publish on it, and whether those that listen still take what is sent."""
+"""The other ends of a topic: which nodes publish on it, and whether its subscribers still acknowledge messages."""
 
 from __future__ import annotations
 
@@ -14,19 +14,26 @@ from rclpy.node import Node
 
 from q2r2_control.ros.base_node import SENT_COMMAND_QOS
 
-_FRESH = 0.1  # the graph's answer is good for so long [s]
-_PERIOD = 1.0  # of the looks of a node that has no other reason to look [s]
-_AT_ONCE = Duration(nanoseconds=0)
-# A listener may take 5 ms to acknowledge, longer than the period of a fast stream. So now and then a message is left
-# out until the one before has been acknowledged, or for this long [s].
-_LOOK, _GAP = 0.05, 0.015
+_MAX_AGE = 0.1  # of the graph's answer, before it is asked again [s]
+_PERIOD = 1.0  # of asking the graph where no other code asks [s]
+_NO_WAIT = Duration(nanoseconds=0)
+# A subscriber may take 5 ms to acknowledge, longer than the period of a fast stream. So messages are left out every
+# _CHECK seconds, until the one before has been acknowledged, or for at most _GAP seconds.
+_CHECK, _GAP = 0.05, 0.015
+
+
+def node_of(endpoint: Any) -> str | None:
+    """Full name of the node that an endpoint of the graph belongs to; None while the graph does not know it yet."""
+    if endpoint.node_name.startswith("_NODE_NAME_"):  # as rcl puts it
+        return None
+    return f"{endpoint.node_namespace.rstrip('/')}/{endpoint.node_name}"
 
 
 class Publishers:
-    """Remembers the publishers' nodes, since those that have ended leave the graph at once or after a while.
+    """Which nodes publish on some topics. The names are kept after a node has ended and left the graph.
 
-    The graph is asked now and then and never for each message. Two publishers of one topic may also be one that was
-    killed, which the graph does not tell, and the one that was started in its place.
+    The graph is asked now and then, never for each message. It cannot tell two publishers from one that was killed and
+    its successor: for some seconds it lists both.
     """
 
     def __init__(self, node: Node, topics: Iterable[str]) -> None:
@@ -35,7 +42,7 @@ class Publishers:
         self._asked_at = dict.fromkeys(self._names, -math.inf)
 
     def look_steadily(self) -> None:
-        """Let the node look now and then by itself."""
+        """Ask the graph by a timer, for a node that has no other occasion."""
         self._node.create_timer(_PERIOD, self.look, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def look(self) -> None:
@@ -44,40 +51,37 @@ class Publishers:
             self._ask(topic)
 
     def of(self, topic: str) -> str:
-        """Full names of the nodes that publish on ``topic``, or did when there last were any; "" for none ever."""
-        if time.monotonic() - self._asked_at[topic] > _FRESH:
+        """Full names of the nodes that publish on ``topic``, or of the last ones that did; "" if there were none."""
+        if time.monotonic() - self._asked_at[topic] > _MAX_AGE:
             self._ask(topic)
         return self._names[topic]
 
     def source(self, topic: str) -> str:
-        """The same for the middle of a sentence: " from /node", or nothing."""
+        """The same for the middle of a sentence: " from /node", or "" if there were none."""
         names = self.of(topic)
         return f" from {names}" if names else ""
 
     def _ask(self, topic: str) -> None:
         self._asked_at[topic] = time.monotonic()
-        infos = self._node.get_publishers_info_by_topic(topic)
-        # A publisher may be known before its node is.
-        known = [info for info in infos if not info.node_name.startswith("_NODE_NAME_")]
-        if known:
-            names = {f"{info.node_namespace.rstrip('/')}/{info.node_name}" for info in known}
-            self._names[topic] = " and ".join(sorted(names))
+        names = {node_of(endpoint) for endpoint in self._node.get_publishers_info_by_topic(topic)}
+        if known := sorted(name for name in names if name is not None):
+            self._names[topic] = " and ".join(known)
 
 
 class WatchedPublisher:
-    """Finds out about a listener that was killed or hangs: it acknowledges nothing any more.
+    """A publisher of targets or commands that notices when a subscriber was killed or hangs: it acknowledges no more.
 
-    The graph keeps such a listener for seconds. Meanwhile a hand moves on, and whoever is started in its place would be
-    asked to be where the hand is by then. A stream that never was acknowledged is not judged, since what is
-    left of a listener that ended before does not acknowledge either. Best-effort listeners never do, nor need to.
-    Acknowledging takes real time, whatever time a simulation has.
+    The graph lists such a subscriber for seconds. Meanwhile the targets move on, and a subscriber that is started in
+    its place would begin with a jump. A stream of which nothing was ever acknowledged is not judged, because the
+    remains of a subscriber that ended earlier do not acknowledge either. Best-effort subscribers never acknowledge and
+    do not count. All times are real time, also where a simulation has its own.
     """
 
     def __init__(self, node: Node, kind: type, topic: str, timeout: float) -> None:
         self._publisher: Any = node.create_publisher(kind, topic, SENT_COMMAND_QOS)
         self._timeout = timeout
         self._streaming = False
-        self._acknowledged: float | None = None  # when all was last; None: not yet in this stream [s]
+        self._acknowledged: float | None = None  # when all messages last were; None: not yet in this stream [s]
         self._gap_began = -math.inf  # [s]
 
     @property
@@ -86,11 +90,11 @@ class WatchedPublisher:
 
     @property
     def listeners(self) -> int:
-        """How many are known; some may be no more."""
+        """How many subscribers the graph lists; some may have ended."""
         return int(self._publisher.get_subscription_count())
 
     def begin(self, acknowledged: bool = False) -> None:
-        """The next message begins a stream; where what was sent before is taken as ``acknowledged`` it is judged."""
+        """The next message begins a stream; with ``acknowledged`` all that was sent before counts as acknowledged."""
         self._streaming, self._gap_began = False, -math.inf
         self._acknowledged = time.monotonic() if acknowledged else None
 
@@ -100,20 +104,20 @@ class WatchedPublisher:
         self._streaming = True
 
     def waits(self) -> bool:
-        """Whether the next message is better left out, so that the last one can be acknowledged."""
+        """Whether the next message should be left out, so that the last one can be acknowledged."""
         now = time.monotonic()
-        if not self._streaming or (self._acknowledged is not None and now - self._acknowledged < _LOOK):
+        if not self._streaming or (self._acknowledged is not None and now - self._acknowledged < _CHECK):
             return False
-        if now - self._gap_began >= _LOOK:
+        if now - self._gap_began >= _CHECK:
             self._gap_began = now
         return now - self._gap_began < _GAP
 
     def silence(self) -> str | None:
-        """One line where nothing was acknowledged for too long; to be asked before each message."""
+        """One line if nothing was acknowledged for longer than the timeout; call it before each message."""
         if not self._streaming:
             return None
         now = time.monotonic()
-        if self._publisher.wait_for_all_acked(_AT_ONCE):
+        if self._publisher.wait_for_all_acked(_NO_WAIT):
             self._acknowledged = now
         if self._acknowledged is None or now - self._acknowledged <= self._timeout:
             return None
