@@ -29,7 +29,7 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.runtime.loop_clock import LoopClock
 from q2r2_control.runtime.process import few_garbage_collections, stop_on_signals
 from q2r2_control.runtime.run_summary import RunStatistics, RunSummary
-from q2r2_control.supervision.joint_watch import WatchSettings
+from q2r2_control.supervision.joint_watch import watch_settings
 from q2r2_control.supervision.supervisor import Phase, Supervisor
 from q2r2_control.supervision.target_stream import StreamSettings
 from q2r2_control.supervision.tick_pacer import TickPacer
@@ -75,7 +75,8 @@ class Pipeline:
     called again; it ends the run like :meth:`stop`, and then its exception goes to the caller. A plant that measures
     what cannot be, or does not follow, ends it with a :class:`PlantError`: see ``supervision``.
 
-    ``realtime``: the loop follows the clock, and a late tick moves no joint farther than a period allows. Otherwise time is simulated, as fast as the machine can, and the run is repeatable.
+    ``realtime``: the loop follows the clock, and a late tick moves no joint farther than a period allows. Otherwise
+    time is simulated, as fast as the machine can, and the run is repeatable.
     """
 
     def __init__(
@@ -149,14 +150,7 @@ class Pipeline:
 
     def _begin_anew(self) -> None:
         self.teleop = Teleop(self.config.teleop, tuple(self.robot.arms))
-        limits = self.config.supervision
-        watch = WatchSettings(
-            timeout=limits.state_timeout,
-            unusable_time=limits.unusable_time,
-            settle_time=limits.settle_time,
-            deviation=limits.max_deviation_torque if self.drive.yields else limits.max_deviation,
-            deviation_time=limits.deviation_time,
-        )
+        watch = watch_settings(self.config.supervision, self.drive.yields)
         self.supervisor = Supervisor(
             self.robot, self.controller, StreamSettings(), watch, displace=self.drive.displaced
         )

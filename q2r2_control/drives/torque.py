@@ -54,7 +54,8 @@ class TorqueDrive:
             self.report = DriveReport()
             if self._has_servos:
                 return position_command(reference, grippers)
-            return Command(self.mode, reference.q, reference.v, self.gravity(self._believed), grippers)
+            q = state.q if np.isfinite(state.q).all() else self._believed
+            return Command(self.mode, reference.q, reference.v, self.gravity(q), grippers)
         wall = self.wall.update(state.q, state.v)
         torque = self.impedance.step(reference, state, dt, wall.tau)
         self.report = DriveReport(torque.report, wall)
@@ -68,8 +69,8 @@ class TorqueDrive:
 
     def at_rest(self, state: RobotState) -> bool:
         """See :meth:`Drive.at_rest`. What cannot be seen is not waited for."""
-        fastest = float(np.abs(state.v).max())
-        return not np.isfinite(state.q).all() or not fastest > _STILL
+        seen = np.isfinite(state.q).all() and np.isfinite(state.v).all()
+        return not seen or float(np.abs(state.v).max()) <= _STILL
 
     def last_command(self, state: RobotState, grippers: Openings) -> Command | None:
         """See :meth:`Drive.last_command`: a torque that nobody renews holds nothing, position servos do."""

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from q2r2_control.config.supervision import SupervisionSettings
 from q2r2_control.types import Array, RobotState
 
 # Above what the joints may move between two states: noise, and stamps that a busy machine spreads.
@@ -25,8 +26,19 @@ class WatchSettings:
     # States that are not finite are bridged for this long [s]; 0: the first one is a fault.
     unusable_time: float = 0.0
     settle_time: float = 0.1  # that states have to be good and at rest before the arms are activated [s]
-    deviation: float | None = 0.15  # of a joint from the reference [rad]; None: any
+    deviation: float = 0.15  # of a joint from the reference [rad]
     deviation_time: float = 0.5  # [s]
+
+
+def watch_settings(settings: SupervisionSettings, yields: bool) -> WatchSettings:
+    """What the cell's settings ask for; ``yields``: whether arms that are pushed leave their reference by design."""
+    return WatchSettings(
+        timeout=settings.state_timeout,
+        unusable_time=settings.unusable_time,
+        settle_time=settings.settle_time,
+        deviation=settings.max_deviation_torque if yields else settings.max_deviation,
+        deviation_time=settings.deviation_time,
+    )
 
 
 class JointWatch:
@@ -86,8 +98,6 @@ class JointWatch:
         """One line where the arms have been too far from ``reference`` for too long, else None."""
         assert self.state is not None
         allowed = self._settings.deviation
-        if allowed is None:
-            return None
         deviation = np.abs(self.state.q - reference)
         if self._near_at is None or deviation.max() <= allowed:
             self._near_at = now

@@ -16,6 +16,8 @@ from typing import NamedTuple
 
 import pinocchio as pin
 
+from q2r2_control.config.timeouts import STREAM_TIMEOUT
+
 # A jump that no hand makes between two messages, and so the beginning of something new [m], [rad].
 _JUMP, _TURN = 0.05, 0.25
 
@@ -24,7 +26,7 @@ _JUMP, _TURN = 0.05, 0.25
 class StreamSettings:
     """What a stream of targets is; may be changed at run time."""
 
-    timeout: float = 0.15  # [s]
+    timeout: float = STREAM_TIMEOUT  # [s]
     engage_distance: float = 0.03  # [m]
     engage_angle: float = 0.3  # [rad]
 

@@ -1,7 +1,7 @@
 """Joint commands out: the drive's commands as messages, on one topic or one an arm.
 
-The parameter ``output`` says which kind: it chooses the drive, the same that the pipeline has, and the messages that its
-commands become. Whether anything still takes them is found out while they are sent.
+The parameter ``output`` says which kind: it chooses the drive, the same that the pipeline has, and the messages that
+its commands become. Whether anything still takes them is found out while they are sent.
 """
 
 from __future__ import annotations
@@ -13,12 +13,13 @@ from typing import Any
 import numpy as np
 
 from q2r2_control.config import Config
+from q2r2_control.config.timeouts import STREAM_TIMEOUT
 from q2r2_control.drives import Drive, make_drive
 from q2r2_control.errors import ConfigError
 from q2r2_control.robot.robot import Robot
-from q2r2_control.ros.bridge.base_node import BaseNode
+from q2r2_control.ros.base_node import BaseNode
 from q2r2_control.ros.bridge.joint_messages import KINDS, NONE, JointCommand, Kind
-from q2r2_control.ros.monitoring.watched_publisher import WatchedPublisher
+from q2r2_control.ros.monitoring.endpoints import WatchedPublisher
 from q2r2_control.types import CommandMode, Reference, RobotState
 
 _ARM = "{arm}"  # where an arm's name goes in a topic
@@ -48,7 +49,8 @@ class JointOutput:
 
     def activate(self, state: RobotState) -> None:
         """Begin anew at a measured state."""
-        self.drive.reset(state)
+        if self._channels:
+            self.drive.reset(state)
 
     def send(self, reference: Reference, state: RobotState, dt: float, t: float, trusted: bool) -> None:
         """Command the reference that is due ``dt`` [s] from now, at ``t`` [s] of the node's clock.
@@ -105,7 +107,7 @@ def make_output(name: str, node: BaseNode, robot: Robot, config: Config, period:
     Raises :class:`ConfigError`.
     """
     what = "arms that do not follow and whose joint positions nobody acknowledges are given up after [s]"
-    listener_timeout = node.parameter("listener_timeout", 0.15, what, at_least=0.1, at_most=5.0)
+    listener_timeout = node.parameter("listener_timeout", STREAM_TIMEOUT, what, at_least=0.1, at_most=5.0)
     topics = _topics(name, node, robot)
     if name == NONE:
         return JointOutput(make_drive(CommandMode.POSITION, robot, config), KINDS["trajectory"](period, robot), [])
