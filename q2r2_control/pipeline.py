@@ -202,7 +202,7 @@ class _Run:
         self._bring_to_rest()
         if self._failure is not None:
             raise self._failure
-        return self._statistics.summary(self._clock.wall_time())
+        return self._statistics.summary(self._clock.wall_time(), self._pacer.missed_ticks, self._pacer.stretched)
 
     def _bring_to_rest(self) -> None:
         """Tick without input and targets until all stands still; no fault of an input can prevent it."""
