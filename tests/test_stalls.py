@@ -16,10 +16,11 @@ import numpy as np
 import pytest
 
 from q2r2_control.errors import PlantError
-from q2r2_control.pipeline import Pipeline, Tick
+from q2r2_control.pipeline import Pipeline
 from q2r2_control.plants.kinematic import KinematicPlant
 from q2r2_control.robot.robot import Robot
 from q2r2_control.runtime import loop_clock
+from q2r2_control.runtime.recorder import Tick
 from q2r2_control.types import SIDES, Array, Command, HandInputs, HandSample, HapticFeedback, RobotState
 from tests.support.hands_input import HandsInput
 from tests.support.watch import Watch, cell, speed

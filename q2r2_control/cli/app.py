@@ -30,9 +30,9 @@ from q2r2_control.cli.tables import (
 )
 from q2r2_control.config.cell import Config, HeadsetConfig, load_config
 from q2r2_control.errors import ConfigError
+from q2r2_control.inputs.factory import DEFAULT_TRAJECTORY
 from q2r2_control.inputs.headset_check import watch_headset
 from q2r2_control.inputs.trajectories import TRAJECTORIES
-from q2r2_control.pipeline import DEFAULT_TRAJECTORY
 from q2r2_control.runtime.run_summary import RunSummary
 from q2r2_control.types import CommandMode
 from q2r2_control.viewer.live import HeadsetDisplay

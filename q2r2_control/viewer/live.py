@@ -15,7 +15,7 @@ from rich.table import Table
 
 from q2r2_control.cli.tables import headset_table
 from q2r2_control.inputs.headset_check import HeadsetCheck
-from q2r2_control.pipeline import Tick
+from q2r2_control.runtime.recorder import Tick
 from q2r2_control.viewer.history import tracking_error
 
 _REFRESH_RATE = 6.0  # [Hz]
