@@ -32,10 +32,13 @@ LATE = 1.0  # [s]
 
 
 class FaultySolver:
-    """A real solver that fails as told; its solutions count as in time, so that a soak depends on no clock."""
+    """A real solver that fails as :attr:`fault` says: one of ``FAULTS``, or None for a healthy one.
 
-    def __init__(self, inner: Solver, random: np.random.Generator) -> None:
-        self._inner, self._random = inner, random
+    Its solve times are made up, so that no outcome depends on the load of the machine.
+    """
+
+    def __init__(self, inner: Solver, random: np.random.Generator | None = None) -> None:
+        self._inner, self._random = inner, np.random.default_rng(0) if random is None else random
         self.fault: str | None = None
 
     def solve(self, problem: QpProblem) -> QpSolution:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import gc
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -13,27 +13,22 @@ import numpy as np
 import pinocchio as pin
 
 from q2r2_control.config import Config
-from q2r2_control.config.control import ControllerSettings
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.control.qp import make_solver
 from q2r2_control.errors import ConfigError
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, Reference
 from q2r2_control.verification.adversary import Asked
-from q2r2_control.verification.contract import ContractWatch, time_of
+from q2r2_control.verification.contract import Checked, Contract, Margin, time_of
 from q2r2_control.verification.fault_injection import STOPPING_FAULTS, FaultySolver, Segment, segments
-from q2r2_control.verification.margins import Margin
 
 FEWEST_TICKS = 100
 _SETTLED = 0.1  # share of the ticks after which memory should have stopped growing
 MEMORY_ALLOWED = 5.0  # [MB]
 
 
-class Steppable(Protocol):
+class Steppable(Checked, Protocol):
     """What a soak needs of a controller: that of :class:`CartesianController`."""
-
-    robot: Robot
-    settings: ControllerSettings
 
     def reset(self, q: Array, v: Array | None = None) -> None: ...
 
@@ -110,7 +105,7 @@ class Soak:
     ) -> None:
         self._cell, self._controller, self._solver, self._seed = cell, controller, solver, seed
         self._progress = progress
-        self._watch = ContractWatch(controller.robot, controller.settings, np.random.default_rng([seed, 2]))
+        self._contract = Contract(controller, random=np.random.default_rng([seed, 2]))
         self._broken: dict[str, Violation] = {}
         self._counts = dict.fromkeys(("segments", "resets", "solver_faults", "fallbacks", "fallbacks_healthy"), 0)
         self._simulated = 0.0
@@ -130,7 +125,7 @@ class Soak:
             seed=self._seed,
             ticks=ticks,
             simulated_s=self._simulated,
-            margins=list(self._watch.margins.values()),
+            margins=list(self._contract.margins.values()),
             memory_growth_mb=None if before is None or after is None else after - before,
             broken=list(self._broken.values()),
             **self._counts,
@@ -153,7 +148,7 @@ class Soak:
     def _reset(self, q: Array, v: Array) -> None:
         self._counts["resets"] += 1
         self._controller.reset(q, v)
-        self._watch.start(q, v)
+        self._contract.start(q, v)
         self._q, self._v = q, v
 
     def _tick(self, tick: int, segment: Segment, since: int) -> None:
@@ -163,12 +158,11 @@ class Soak:
         try:
             reference = self._controller.step(asked.targets, dt)
         except Exception as error:  # that there is none is what is promised
-            self._watch.margins["exceptions"].note(1.0, tick)
+            self._contract.raised()
             self._keep(tick, segment, since, asked, dt, ["exceptions"], f"{type(error).__name__}: {error}")
             self._reset(self._controller.robot.home, np.zeros_like(self._q))
             return
-        self._watch.margins["exceptions"].note(0.0, tick)
-        broken = self._watch.check(tick, reference, dt, asked.unusable, fault in STOPPING_FAULTS)
+        broken = self._contract.observe(reference, dt, asked.unusable, fault in STOPPING_FAULTS)
         if broken:
             self._keep(tick, segment, since, asked, dt, broken, "")
         if "not_finite" in broken:
@@ -181,14 +175,14 @@ class Soak:
         self._counts["fallbacks_healthy"] += reference.report.fallback and fault is None
 
     def _keep(
-        self, tick: int, segment: Segment, since: int, asked: Asked, dt: Any, broken: list[str], error: str
+        self, tick: int, segment: Segment, since: int, asked: Asked, dt: Any, broken: Iterable[str], error: str
     ) -> None:
         poses = {
             arm: target.homogeneous if isinstance(target, pin.SE3) else repr(target)
             for arm, target in asked.targets.items()
         }
         for key in broken:
-            name = self._watch.margins[key].name
+            name = self._contract.margins[key].name
             found = Violation(name, tick, str(segment), since, self._q, self._v, poses, repr(dt), error)
             self._broken.setdefault(key, found)
 
