@@ -13,6 +13,7 @@ from q2r2_control.config import ControllerSettings, load_config
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, Reference, StepReport, StepStatus
 from q2r2_control.verification.contract import Contract, Margin
+from tests.control.test_scenarios import in_penetration
 
 SETTINGS = ControllerSettings()
 DT = 0.001
@@ -116,6 +117,57 @@ def test_a_joint_that_started_outside_its_limits_may_not_go_further_out(robot: R
     q[JOINT] = robot.position_upper[JOINT] + 0.05
     assert list(contract_of(robot, q).observe(moved(q, np.zeros(14), 1e-6, apart), DT)) == ["outward"]
     assert not contract_of(robot, q).observe(moved(q, np.zeros(14), -1e-6, apart), DT)
+
+
+def test_a_joint_that_has_returned_into_its_limits_stays_there(robot: Robot, apart: StepReport) -> None:
+    limit = robot.position_upper[JOINT] - SETTINGS.position_margin
+    q = robot.home.copy()
+    q[JOINT] = limit + 1e-5
+    contract = contract_of(robot, q)
+    inside = Reference(q - one(2e-5), np.zeros(14), np.zeros(14), apart)
+    contract.observe(inside, DT)
+    assert "position" in contract.observe(moved(inside.q + one(2e-5), np.zeros(14), 0.0, apart), DT)
+
+
+def test_a_tick_of_no_time_moves_nothing(robot: Robot, apart: StepReport) -> None:
+    assert list(contract_of(robot).observe(Reference(robot.home + one(1e-12), *np.zeros((2, 14)), apart), 0.0)) == [
+        "idle"
+    ]
+
+
+def test_a_joint_that_cannot_stop_before_its_limit_is_found(robot: Robot, apart: StepReport) -> None:
+    q = robot.home.copy()
+    q[JOINT] = robot.position_upper[JOINT] - SETTINGS.position_margin - 7e-6
+    contract = Contract(SimpleNamespace(robot=robot, settings=SETTINGS), q, sample_all=True)
+    assert "stop_position" in contract.observe(moved(q, np.zeros(14), FASTEST, apart), DT)
+
+
+def test_recovering_pairs_never_come_closer_again_and_once_apart_keep_their_distance(
+    robot: Robot, apart: StepReport
+) -> None:
+    q, v = in_penetration(robot)
+    contract = contract_of(robot, q)
+
+    def observed(distance: float, certified: bool = False) -> list[str]:
+        report = replace(apart, closest_distance=distance, certified=certified)
+        return list(contract.observe(moved(q, v, 0.0, report), DT))
+
+    assert observed(-0.03) == observed(-0.02) == []
+    assert observed(-0.0201) == ["approach"]
+    assert observed(0.021) == []
+    assert observed(0.0199) == ["distance"]
+    assert observed(0.021, certified=True) == []
+    assert observed(0.021) == ["uncertified"]
+
+
+def test_pairs_that_were_apart_stay_apart_while_others_recover(robot: Robot, apart: StepReport) -> None:
+    q, v = in_penetration(robot)
+    contract = Contract(SimpleNamespace(robot=robot, settings=SETTINGS), q, sample_all=True)
+    into_the_table = robot.home.copy()
+    into_the_table[1] = 1.0
+    assert min(robot.distances(into_the_table), key=lambda pair: pair.distance).name_b == "table_0"
+    broken = contract.observe(Reference(into_the_table, v, v, replace(apart, certified=False)), DT)
+    assert "bystanders" in broken
 
 
 def test_a_wrong_distance_is_found_by_coal(robot: Robot, apart: StepReport) -> None:
