@@ -13,8 +13,6 @@ from rich.live import Live
 from rich.markup import escape
 from rich.table import Table
 
-from q2r2_control.cli.tables import headset_table
-from q2r2_control.inputs.headset_check import HeadsetCheck
 from q2r2_control.pipeline import Tick
 from q2r2_control.viewer.history import tracking_error
 
@@ -105,33 +103,3 @@ def _figure(value: float, unit: str, digits: int) -> str:
 def _some(names: list[str]) -> str:
     more = f" and {len(names) - _LIMITS_SHOWN} more" if len(names) > _LIMITS_SHOWN else ""
     return ", ".join(names[:_LIMITS_SHOWN]) + more if names else "-"
-
-
-class HeadsetDisplay:
-    """Shows looks at a headset: as a table on a terminal, elsewhere only when advice begins and ends."""
-
-    def __init__(self, console: Console) -> None:
-        self._console = console
-        self._live = Live(console=console, auto_refresh=False, transient=True) if console.is_terminal else None
-        self._drawn = -np.inf
-        self._advised = False
-
-    def __enter__(self) -> HeadsetDisplay:
-        if self._live is not None:
-            self._live.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._live is not None:
-            self._live.stop()
-
-    def show(self, check: HeadsetCheck) -> None:
-        """Show the newest look."""
-        if self._live is None:
-            if check.advice and not self._advised:
-                for line in check.advice:
-                    self._console.print(line, soft_wrap=True, highlight=False, markup=False)
-            self._advised = bool(check.advice)
-        elif time.monotonic() - self._drawn >= 1.0 / _REFRESH_RATE:
-            self._drawn = time.monotonic()
-            self._live.update(headset_table(check), refresh=True)

@@ -130,7 +130,7 @@ def test_a_joint_that_has_returned_into_its_limits_stays_there(robot: Robot, apa
 
 
 def test_a_tick_of_no_time_moves_nothing(robot: Robot, apart: StepReport) -> None:
-    assert list(contract_of(robot).observe(Reference(robot.home + one(1e-12), *np.zeros((2, 14)), apart), 0.0)) == [
+    assert list(contract_of(robot).observe(Reference(robot.home + one(1e-12), one(0.0), one(0.0), apart), 0.0)) == [
         "idle"
     ]
 

@@ -9,7 +9,7 @@ from rich.console import Console
 
 from q2r2_control.benchmark.tick_times import BenchReport, BenchRow
 from q2r2_control.benchmark.timed_run import Deeds
-from q2r2_control.cli.bench_tables import deeds_table, soak_table, times_table
+from q2r2_control.cli.bench import deeds_table, soak_table, times_table
 from q2r2_control.verification.contract import Margin
 from q2r2_control.verification.soak import SoakReport, Violation
 
