@@ -28,19 +28,20 @@ _RATE = 250.0  # of the controller's node by default [Hz]
 
 def bench(
     ticks: Annotated[
-        int | None, typer.Option(min=100, help=f"Of each scenario, {_TICKS} by itself; soak: {_SOAK_TICKS}.")
+        int | None, typer.Option(min=100, help=f"Of each scenario, {_TICKS} by default; of a soak {_SOAK_TICKS}.")
     ] = None,
     peers: Annotated[bool, typer.Option(help="Time roboplan, mink and pink too, where they are installed.")] = True,
     soak: Annotated[
         bool, typer.Option("--soak", help="Check every promise in hostile ticks instead of timing.")
     ] = False,
     seed: Annotated[int, typer.Option(min=0, help="Of the soak.")] = 0,
-    ros: Annotated[bool, typer.Option("--ros", help="Time the way through the ROS nodes instead.")] = False,
+    ros: Annotated[bool, typer.Option("--ros", help="Time the ROS nodes instead.")] = False,
     duration: Annotated[
-        float | None, typer.Option(min=1, max=3600, help=f"Of each way in, {_SECONDS:g} by itself; with --ros [s].")
+        float | None, typer.Option(min=1, max=3600, help=f"Of each input, {_SECONDS:g} by default; with --ros [s].")
     ] = None,
     rate: Annotated[
-        float | None, typer.Option(min=20, max=1000, help=f"Of the controller's node, {_RATE:g}; with --ros [Hz].")
+        float | None,
+        typer.Option(min=20, max=1000, help=f"Of the controller's node, {_RATE:g} by default; with --ros [Hz]."),
     ] = None,
     json: Json = False,
 ) -> None:
@@ -79,7 +80,7 @@ def _show_times(ticks: int, peers: tuple[str, ...], console: Console, json: bool
     else:
         out = Console()
         out.print(times_table(report))
-        out.print(deeds_table(report))
+        out.print(motion_table(report))
 
 
 def _show_soak(report: SoakReport, json: bool) -> NoReturn:
@@ -107,14 +108,14 @@ def _show_latency(duration: float, rate: float, console: Console, json: bool) ->
 
 
 def _progress(console: Console) -> Callable[[str], None]:
-    """Prints lines, to people only: a live line would need a thread, which would be in the times."""
+    """Prints lines, on a terminal only; a live line would need a thread, which would add to the times."""
     if not console.is_terminal:
         return lambda what: None
     return lambda what: console.print(what, highlight=False)
 
 
 def times_table(report: BenchReport) -> Table:
-    """How long a tick takes."""
+    """Times of a tick."""
     table = _table(
         f"{report.cell}: one tick of 1 ms with {report.pairs} pairs, each run of {report.rows[0].ticks} ticks",
         "controller",
@@ -127,23 +128,23 @@ def times_table(report: BenchReport) -> Table:
     return table
 
 
-def deeds_table(report: BenchReport) -> Table:
-    """What the controllers did in the meantime; the notes say what each has no means for."""
+def motion_table(report: BenchReport) -> Table:
+    """Metrics of the controllers' motions, with notes on the limitations of each."""
     table = _table(
-        "what they did",
+        "motion",
         "controller",
         ("a / limit", "v / limit", "room [rad]", "nearest [mm]", "held", "tail [rad/s^2]"),
     )
     for row in _by_scenario(report, table):
-        deeds = row.deeds
+        metrics = row.metrics
         table.add_row(
             f"  {row.controller}",
-            f"{deeds.max_acceleration_ratio:.2f}",
-            f"{deeds.max_velocity_ratio:.2f}",
-            f"{deeds.min_position_margin_rad:.3f}",
-            f"{deeds.min_distance_mm:.2f}",
-            str(deeds.failures if row.fallback_ticks is None else row.fallback_ticks),
-            f"{deeds.tail_acceleration:.3f}",
+            f"{metrics.max_acceleration_ratio:.2f}",
+            f"{metrics.max_velocity_ratio:.2f}",
+            f"{metrics.min_position_margin_rad:.3f}",
+            f"{metrics.min_distance_mm:.2f}",
+            str(metrics.failures if row.fallback_ticks is None else row.fallback_ticks),
+            f"{metrics.tail_acceleration:.3f}",
         )
     held = "held: ticks without a solution, in which a peer's arms stand still and ours execute the certified stop"
     table.caption = Text("\n".join([held, *report.notes]))
@@ -152,7 +153,7 @@ def deeds_table(report: BenchReport) -> Table:
 
 
 def _by_scenario(report: BenchReport, table: Table) -> Iterator[BenchRow]:
-    """The rows; a heading is put into the table before each scenario's first one."""
+    """The rows; each scenario's heading is added to the table before its first row."""
     heading = ""
     for row in report.rows:
         if row.name != heading:
@@ -177,30 +178,31 @@ def soak_table(report: SoakReport) -> Table:
     if report.memory_growth_mb is not None:
         grown, broken = f"{report.memory_growth_mb:.2f} MB", str(int(report.memory_growth_mb > MEMORY_ALLOWED))
         table.add_row("memory growth after a tenth of it", grown, f"<= {MEMORY_ALLOWED:g}", "1", broken)
-    table.caption = Text(_circumstances(report))
+    table.caption = Text(_soak_notes(report))
     table.caption_justify = "left"
     return table
 
 
 def latency_table(report: LatencyReport) -> Table:
-    """How long it takes through the nodes."""
+    """Latencies through the ROS nodes."""
     table = _table(
         f"from an input topic to the joint command that answers it, controller at {report.loop_rate_hz:g} Hz",
-        "way",
+        "path",
         ("p50 [ms]", "p99 [ms]", "max [ms]", "steps", "missed"),
     )
     for row in report.rows:
         times = ("" if time is None else f"{time:.1f}" for time in (row.p50_ms, row.p99_ms, row.max_ms))
-        table.add_row(row.way, *times, str(row.steps), str(row.missed))
+        table.add_row(row.path, *times, str(row.steps), str(row.missed))
     table.caption = Text(
         f"one joint command between two processes: p50 {report.transport_p50_ms:.2f} ms, p99 "
-        f"{report.transport_p99_ms:.2f} ms\nof the hand's way the least interpolation is 5 ms; its filters are off"
+        f"{report.transport_p99_ms:.2f} ms\n"
+        "the hand's latency includes an interpolation of 5 ms, the shortest; its filters are off"
     )
     table.caption_justify = "left"
     return table
 
 
-def _circumstances(report: SoakReport) -> str:
+def _soak_notes(report: SoakReport) -> str:
     lines = [
         f"{report.segments} segments, {report.resets} resets, {report.solver_faults} ticks with a failing solver,"
         f" {report.fallbacks} stops ({report.fallbacks_healthy} with a healthy solver)"
@@ -218,9 +220,9 @@ def _circumstances(report: SoakReport) -> str:
     return "\n".join(lines)
 
 
-def _table(title: str, words: str, figures: tuple[str, ...]) -> Table:
+def _table(title: str, names: str, figures: tuple[str, ...]) -> Table:
     table = Table(title=Text(title), title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
-    table.add_column(words, no_wrap=True)
+    table.add_column(names, no_wrap=True)
     for figure in figures:
         table.add_column(Text(figure.replace(" ", "\n", 1)), justify="right", no_wrap=True)
     return table

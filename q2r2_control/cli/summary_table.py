@@ -9,7 +9,7 @@ from q2r2_control.runtime.torque_summary import TorqueSummary
 
 
 def summary_table(summary: RunSummary) -> Table:
-    """What a run amounted to."""
+    """The figures of a run."""
     table = Table(title="summary", title_justify="left", show_header=False)
     table.add_row("duration", f"{summary.duration_s:.2f} s, {summary.ticks} ticks, {summary.loop_rate_hz:.0f} Hz")
     table.add_row("tick", _percentiles(summary.tick_us, "us", 0))

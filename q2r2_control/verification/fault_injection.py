@@ -1,4 +1,4 @@
-"""What a soak does to a controller: segments of hostile targets, uneven ticks, failing solvers and odd starts."""
+"""What a soak feeds to a controller: segments of hostile targets, uneven ticks, failing solvers and bad starts."""
 
 from __future__ import annotations
 
@@ -176,7 +176,7 @@ class Starts:
         return self._robot.home.copy()
 
     def _in_penetration(self) -> Array:
-        """On the way from home to a posture that is closer than allowed, where it has just become so."""
+        """A posture between home and a random one in penetration, where the distance has just become too small."""
         far = self._posture()
         for _ in range(50):
             if self._least(far) < 0.0:

@@ -18,7 +18,7 @@ from q2r2_control.control.qp import make_solver
 from q2r2_control.errors import ConfigError
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, Reference
-from q2r2_control.verification.adversary import Asked
+from q2r2_control.verification.adversary import Request
 from q2r2_control.verification.contract import Checked, Contract, Margin, time_of
 from q2r2_control.verification.fault_injection import STOPPING_FAULTS, FaultySolver, Segment, segments
 
@@ -37,7 +37,7 @@ class Steppable(Checked, Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Violation:
-    """The first time that a promise was broken, with what was asked then."""
+    """The first time that a promise was broken, with the request at that tick."""
 
     promise: str
     tick: int
@@ -69,12 +69,12 @@ class SoakReport:
 
     @property
     def passed(self) -> bool:
-        """Whether every promise was kept, and memory."""
+        """Whether every promise was kept and memory did not grow."""
         lean = self.memory_growth_mb is None or self.memory_growth_mb <= MEMORY_ALLOWED
         return lean and not any(margin.violations for margin in self.margins)
 
     def as_json(self) -> dict[str, Any]:
-        """Plain data for ``json.dumps``."""
+        """Data for ``json.dumps``."""
         return asdict(self) | {"passed": self.passed}
 
 
@@ -132,7 +132,7 @@ class Soak:
         )
 
     def _ticks(self, ticks: int) -> Iterator[tuple[Segment, int]]:
-        """The segment of each tick and the tick within it; the controller is reset where a segment starts anew."""
+        """The segment of each tick and the tick within it; the controller is reset where a segment has a start."""
         left = ticks
         robot, settings = self._controller.robot, self._controller.settings
         for segment in segments(robot, settings.min_distance, np.random.default_rng([self._seed, 0])):
@@ -153,18 +153,18 @@ class Soak:
 
     def _tick(self, tick: int, segment: Segment, since: int) -> None:
         fault, dt = segment.fault_at(since), segment.dt()
-        asked = segment.stream(since, self._q)
+        request = segment.stream(since, self._q)
         self._solver.fault = fault
         try:
-            reference = self._controller.step(asked.targets, dt)
-        except Exception as error:  # that there is none is what is promised
+            reference = self._controller.step(request.targets, dt)
+        except Exception as error:  # the contract promises none
             self._contract.raised()
-            self._keep(tick, segment, since, asked, dt, ["exceptions"], f"{type(error).__name__}: {error}")
+            self._keep(tick, segment, since, request, dt, ["exceptions"], f"{type(error).__name__}: {error}")
             self._reset(self._controller.robot.home, np.zeros_like(self._q))
             return
-        broken = self._contract.observe(reference, dt, asked.unusable, fault in STOPPING_FAULTS)
+        broken = self._contract.observe(reference, dt, request.unusable, fault in STOPPING_FAULTS)
         if broken:
-            self._keep(tick, segment, since, asked, dt, broken, "")
+            self._keep(tick, segment, since, request, dt, broken, "")
         if "not_finite" in broken:
             self._reset(self._controller.robot.home, np.zeros_like(self._q))
             return
@@ -175,11 +175,11 @@ class Soak:
         self._counts["fallbacks_healthy"] += reference.report.fallback and fault is None
 
     def _keep(
-        self, tick: int, segment: Segment, since: int, asked: Asked, dt: Any, broken: Iterable[str], error: str
+        self, tick: int, segment: Segment, since: int, request: Request, dt: Any, broken: Iterable[str], error: str
     ) -> None:
         poses = {
             arm: target.homogeneous if isinstance(target, pin.SE3) else repr(target)
-            for arm, target in asked.targets.items()
+            for arm, target in request.targets.items()
         }
         for key in broken:
             name = self._contract.margins[key].name

@@ -1,4 +1,4 @@
-"""What a headset sends, as a table that is drawn again and again or once."""
+"""What a headset sends, as a table: live or once."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _REFRESH_RATE = 6.0  # [Hz]
 def headset_table(check: HeadsetCheck) -> Table:
     """Connection, topics, and where the hands move."""
     statistics = check.statistics
-    state = f"{statistics.peer} connected" if statistics.peer else "nobody is connected"
+    state = f"{statistics.peer} connected" if statistics.peer else "not connected"
     dialect = f", dialect {statistics.dialect}" if statistics.dialect else ""
     address = "{}:{}".format(*statistics.address)
     table = topic_table(f"headset on {address}: {state}{dialect}", dict(sorted(statistics.topics.items())))
@@ -30,14 +30,14 @@ def headset_table(check: HeadsetCheck) -> Table:
         position = check.positions[hand]
         where = "" if position is None else "at " + " ".join(f"{value:.2f}" for value in position)
         table.add_row(f"{hand} hand moves", "", "", "", f"{direction}  {where}")
-    # Text, since a reason may quote what the other side sent, and markup would be obeyed.
+    # Text without markup, since a reason may quote what the client sent.
     table.caption = Text("\n".join(check.advice)) if check.advice else None
     table.caption_justify = "left"
     return table
 
 
 class HeadsetDisplay:
-    """Shows looks at a headset: as a table on a terminal, elsewhere only when advice begins and ends."""
+    """Shows the state of a headset: as a live table on a terminal; elsewhere only advice, when it begins."""
 
     def __init__(self, console: Console) -> None:
         self._console = console
@@ -55,7 +55,7 @@ class HeadsetDisplay:
             self._live.stop()
 
     def show(self, check: HeadsetCheck) -> None:
-        """Show the newest look."""
+        """Show the newest state."""
         if self._live is None:
             if check.advice and not self._advised:
                 for line in check.advice:

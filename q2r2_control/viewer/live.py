@@ -1,4 +1,4 @@
-"""A table that shows a run while it goes on."""
+"""The live table of a run."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _LIMITS_SHOWN = 4
 
 
 class LiveTable:
-    """Listens to a run and shows its newest tick, drawn by a thread of its own: a tick only leaves a reference."""
+    """Shows the newest tick of a run. A separate thread draws; a tick only stores a reference."""
 
     def __init__(self, title: str, min_distance: float) -> None:
         self._title = title
@@ -34,7 +34,7 @@ class LiveTable:
         self._drawn = (time.monotonic(), 0)
 
     def __call__(self, tick: Tick) -> None:
-        """Listen to one tick."""
+        """Store one tick."""
         self._newest = tick
         self._count += 1
         if tick.reference.report.binding:
@@ -52,7 +52,7 @@ class LiveTable:
             sys.setswitchinterval(interval)
 
     def render(self) -> Table:
-        """The table of now."""
+        """The table at this moment."""
         tick, rate = self._newest, self._rate()
         table = Table(title=self._title, title_justify="left", min_width=76)
         table.add_column("", style="dim")

@@ -25,7 +25,7 @@ _LABEL_ROOM = 0.09  # between two labels beside the joints' plot, in its units
 
 
 def draw_report(history: History, summary: RunSummary, min_distance: float, title: str, file: Path) -> None:
-    """Write the plots of ``history`` to ``file``; ``min_distance`` [m] is drawn as the limit it is."""
+    """Write the plots of ``history`` to ``file``; ``min_distance`` [m] is drawn as a limit."""
     # Imported here, since it takes longer than all else that a command without a report needs.
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
