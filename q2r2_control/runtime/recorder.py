@@ -39,7 +39,7 @@ class Tick:
 
 
 class RunRecorder:
-    """Tells the listeners of every tick, and adds it up. A listener that raises is not called again and ends the run."""
+    """Tells the listeners of every tick and adds it up. A listener that raises ends the run and is not called again."""
 
     def __init__(
         self,

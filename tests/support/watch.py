@@ -10,7 +10,7 @@ from q2r2_control.config import Config, load_config
 from q2r2_control.pipeline import Pipeline
 from q2r2_control.runtime.recorder import Tick
 from q2r2_control.types import Event
-from tests.control.contract import Contract
+from q2r2_control.verification.contract import Contract
 
 CELL = "config/dual_iiwa7.yaml"
 
