@@ -1,0 +1,175 @@
+"""What leaves the controller's node: no jump after a stall, and the modes that the in-process loop has too."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from collections.abc import Mapping
+from functools import partial
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+import yaml
+
+from q2r2_control import Robot, load_config
+from q2r2_control.types import Array
+from tests.ros.conftest import NEEDS_ROS
+from tests.ros.processes import ROOT, Processes
+
+pytest.importorskip("rclpy", reason=NEEDS_ROS)
+pytest.importorskip("control_msgs", reason="needs control_msgs: q2r2 ros build-interfaces")
+pytest.importorskip("tf2_msgs", reason="needs tf2_msgs: q2r2 ros build-interfaces")
+
+import pinocchio as pin
+from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import JointState
+from trajectory_msgs.msg import JointTrajectory
+
+from tests.ros.cell import CONFIG, PATIENT, Cell, parameters, shifted, start, wait
+
+RATE = 125.0  # of the control loop [Hz]
+COMMANDS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE, history=HistoryPolicy.KEEP_LAST)
+SAG = 0.03  # a command that begins anew is no farther from what was measured [rad]
+
+
+@pytest.fixture(scope="module")
+def robot() -> Robot:
+    return Robot.from_config(load_config(CONFIG))
+
+
+class Commanded(NamedTuple):
+    """One command: its number at the publisher, where the joints were measured then, and where they have to be."""
+
+    number: int
+    measured: Array
+    q: Array
+
+
+class Recorder:
+    """Takes every command of a controller."""
+
+    def __init__(self, cell: Cell, robot: Robot) -> None:
+        self.commands: list[Commanded] = []
+        self._cell, self._names = cell, robot.joint_names
+        cell.node.create_subscription(JointTrajectory, "/joint_trajectory", self._take, COMMANDS)
+
+    def _take(self, message: JointTrajectory, info: Mapping[str, Any]) -> None:
+        place = {name: index for index, name in enumerate(message.joint_names)}
+        q = np.array([message.points[0].positions[place[name]] for name in self._names])
+        measured = self._cell.q if self._cell.measured else q
+        self.commands.append(Commanded(info["publication_sequence_number"], measured, q))
+
+
+@pytest.mark.parametrize("stall", [0.02, 0.05, 0.1])
+def test_a_controller_that_is_stopped_for_a_while_publishes_no_jump(
+    stall: float, robot: Robot, processes: Processes, node: Any
+) -> None:
+    cell = Cell(node, robot, start(processes, "mujoco_robot"))
+    controller = start(processes, "cartesian_controller", *PATIENT, *parameters(f"rate:={RATE}"))
+    cell.wait_until_active()
+    recorder = Recorder(cell, robot)
+    stream = cell.engage("left")
+    try:
+        for times in range(4):
+            begin = len(recorder.commands)
+            home = stream.poses["left"]
+            stream.poses["left"] = shifted(home, 0.0, 0.0, 0.15 if times % 2 == 0 else -0.15)
+            wait(partial(moves_fast, recorder, begin), "the arm moves fast")
+            os.kill(controller.pid, signal.SIGSTOP)
+            time.sleep(stall)
+            os.kill(controller.pid, signal.SIGCONT)
+            time.sleep(0.7)
+            if cell.state("left_state") != "following":  # a longer stall starts over
+                stream.end()
+                cell.wait_until_active()
+                time.sleep(0.6)
+                stream = cell.engage("left")
+    finally:
+        stream.end()
+    limit = robot.velocity_limit / RATE
+    for before, after in pairwise(recorder.commands):
+        way = np.abs(after.q - before.q)
+        periods = after.number - before.number
+        anew = np.abs(after.q - after.measured).max() < SAG
+        assert (way <= periods * limit * (1.0 + 1e-6)).all() or (anew and stall >= 0.1), (way / limit).max() / periods
+
+
+def moves_fast(recorder: Recorder, begin: int) -> bool:
+    """Whether commands from index ``begin`` on have become fast."""
+    return fastest(recorder.commands[begin:]) > 0.7
+
+
+def fastest(commands: list[Commanded]) -> float:
+    """Largest speed of a joint between the newest commands [rad/s]."""
+    if len(commands) < 2:
+        return 0.0
+    before, after = commands[-2:]
+    return float(np.abs(after.q - before.q).max() / max(after.number - before.number, 1) * RATE)
+
+
+def test_in_velocity_mode_the_arm_follows_and_stays_where_it_was_left(
+    robot: Robot, processes: Processes, node: Any
+) -> None:
+    cell = Cell(node, robot, start(processes, "mujoco_robot"))
+    start(processes, "cartesian_controller", *PATIENT, *parameters("output:=velocity"))
+    cell.wait_until_active()
+    stream = cell.engage("left")
+    begin = stream.poses["left"]
+    stream.move("left", (0.0, 0.0, 0.1))
+    wait(lambda: off(cell, "left", shifted(begin, 0.0, 0.0, 0.1)) < 4e-3, "the arm is there")
+    stream.end()
+    wait(lambda: cell.state("left_state") == "holding", "the arm holds")
+    rest = cell.q
+    assert cell.call("/cartesian_controller/stop").success
+    time.sleep(1.0)
+    assert np.abs(cell.q - rest).max() < 5e-3
+
+
+def off(cell: Cell, arm: str, pose: pin.SE3) -> float:
+    """Distance of an arm's tool from a pose [m]."""
+    return float(np.linalg.norm(cell.tool(arm).translation - pose.translation))
+
+
+def yielding_cell(folder: Path) -> str:
+    """The cell's file with the admittance enabled."""
+    cell = yaml.safe_load((ROOT / CONFIG).read_text())
+    cell["admittance"] = {"enabled": True, "stiffness": 500.0, "force_dead_band": 0.0}
+    file = folder / "yielding.yaml"
+    file.write_text(yaml.safe_dump(cell))
+    return str(file)
+
+
+def test_with_the_admittance_a_measured_force_displaces_the_target_and_without_its_topic_the_node_ends(
+    robot: Robot, processes: Processes, node: Any, tmp_path: Path
+) -> None:
+    config = parameters(f"config:={yielding_cell(tmp_path)}")
+    refused = start(processes, "cartesian_controller", *config, "-r", "__node:=refused")
+    assert refused.wait() == 2
+    assert "admittance.enabled = true: set the parameter external_torque_topic" in refused.output
+    torques = node.create_publisher(JointState, "/felt", 10)
+    force = np.zeros(3)
+
+    def publish() -> None:
+        frame = robot.arms["left"].frame_id
+        data = robot.model.createData()
+        q = cell.q if cell.measured else robot.home
+        J = pin.computeFrameJacobian(robot.model, data, q, frame, pin.LOCAL_WORLD_ALIGNED)
+        torques.publish(JointState(name=list(robot.joint_names), effort=(J[:3].T @ force).tolist()))
+
+    cell = Cell(node, robot, start(processes, "mujoco_robot"))
+    timer = node.create_timer(0.01, publish)
+    start(processes, "cartesian_controller", *PATIENT, *config, *parameters("external_torque_topic:=/felt"))
+    cell.wait_until_active()
+    stream = cell.engage("left")
+    begin = stream.poses["left"]
+    force[2] = 20.0
+    pushed = shifted(begin, 0.0, 0.0, 20.0 / 500.0)
+    wait(lambda: off(cell, "left", pushed) < 6e-3, "the tool yields by force over stiffness")
+    force[2] = 0.0
+    wait(lambda: off(cell, "left", begin) < 6e-3, "the tool is back")
+    stream.end()
+    node.destroy_timer(timer)
