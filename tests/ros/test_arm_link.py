@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from tests.ros.conftest import NEEDS_ROS, spun_node
-from tests.ros.waiting import eventually
+from tests.ros.waiting import wait_until
 
 pytest.importorskip("rclpy", reason=NEEDS_ROS)
 
@@ -67,7 +67,7 @@ def meet(left: End, right: End) -> None:
     """Until each hears the other: a fault of a paused arm is told to a paused arm, and forgotten."""
     for speaker, hearer in ((left, right), (right, left)):
         speaker.link.report("hello")
-        eventually(hearer.hears("hello"), "a fault is heard")
+        wait_until(hearer.hears("hello"), "a fault is heard")
     for end in (left, right):
         end.listen_for_a_while()
         end.told.clear()
@@ -77,12 +77,12 @@ def test_a_fault_pauses_the_other_arm_once_however_often_it_is_repeated(pair: tu
     left, right = pair
     right.link.engaged()
     left.link.report("the hand jumped")
-    eventually(right.hears("the hand jumped"), "the fault is told")
+    wait_until(right.hears("the hand jumped"), "the fault is told")
     assert right.listen_for_a_while() == ["linked to left: the hand jumped"]
     right.link.engaged()
     assert right.listen_for_a_while() == ["linked to left: the hand jumped"]
     left.link.report("the hand jumped")
-    eventually(lambda: len(right.listen()) == 2, "the same fault once more is another fault")
+    wait_until(lambda: len(right.listen()) == 2, "the same fault once more is another fault")
 
 
 def test_a_fault_whose_first_messages_are_lost_is_told_by_the_next_ones(make: Make) -> None:
@@ -91,7 +91,7 @@ def test_a_fault_whose_first_messages_are_lost_is_told_by_the_next_ones(make: Ma
     left = make("left")
     left.link.report("no pose")  # before anybody can have subscribed
     left.link.engaged()  # and its own arm is engaged again at once
-    eventually(right.hears("no pose"), "the fault is told")
+    wait_until(right.hears("no pose"), "the fault is told")
     assert right.listen_for_a_while() == ["linked to left: no pose"]
 
 
@@ -107,7 +107,7 @@ def test_messages_that_a_node_had_no_time_to_read_cost_no_fault(domain: int, mak
     executor.add_node(busy)
     try:
         right = End(busy, "right")
-        eventually(lambda: left.node.count_subscribers("/robot/left/link") == 1, "it is subscribed")
+        wait_until(lambda: left.node.count_subscribers("/robot/left/link") == 1, "it is subscribed")
         right.link.engaged()
         left.link.report("no pose")
         time.sleep(0.8)  # twice what its queue of ten messages holds
@@ -128,10 +128,10 @@ def test_an_old_fault_pauses_nobody_who_came_later_or_was_engaged_since(make: Ma
     time.sleep(0.5)  # far more than what a message takes while two nodes are getting to know each other
     right = make("right")
     right.link.engaged()
-    eventually(lambda: right.node.count_publishers("/robot/left/link") == 1, "they know each other")
+    wait_until(lambda: right.node.count_publishers("/robot/left/link") == 1, "they know each other")
     assert right.listen_for_a_while() == []
     left.link.report("new")
-    eventually(right.hears("new"), "a new fault is told")
+    wait_until(right.hears("new"), "a new fault is told")
     assert right.told == ["linked to left: new"]
 
 
@@ -141,14 +141,14 @@ def test_both_at_fault_pause_once_each_and_are_engaged_one_by_one(pair: tuple[En
         end.link.engaged()
     left.link.report("left is lost")
     right.link.report("right is lost")
-    eventually(left.hears("right is lost"), "left is told")
-    eventually(right.hears("left is lost"), "right is told")
+    wait_until(left.hears("right is lost"), "left is told")
+    wait_until(right.hears("left is lost"), "right is told")
     left.link.engaged()  # while the right arm's fault stands
     assert left.listen_for_a_while() == ["linked to right: right is lost"]
     right.link.engaged()
     assert right.listen_for_a_while() == ["linked to left: left is lost"]
     right.link.report("right is lost again")
-    eventually(left.hears("right is lost again"), "left is told of the next fault")
+    wait_until(left.hears("right is lost again"), "left is told of the next fault")
     assert len(right.listen()) == 1
 
 
@@ -158,15 +158,15 @@ def test_a_node_that_dies_is_named_and_its_return_pauses_nobody_until_its_next_f
         left = End(node, "left")
         meet(left, right)
         right.link.engaged()
-    eventually(right.hears("silent"), "its silence is told")
+    wait_until(right.hears("silent"), "its silence is told")
     (line,) = right.told
     assert line.startswith("linked to left: /left_arm is silent for 1.")
     right.link.engaged()  # alone
     again = make("left")
-    eventually(lambda: right.node.count_publishers("/robot/left/link") == 1, "it is back")
+    wait_until(lambda: right.node.count_publishers("/robot/left/link") == 1, "it is back")
     assert right.listen_for_a_while() == [line]
     again.link.report("first fault of its new life")
-    eventually(right.hears("first fault of its new life"), "numbers begin anew with a node")
+    wait_until(right.hears("first fault of its new life"), "numbers begin anew with a node")
 
 
 def test_a_node_started_anew_before_its_silence_is_noticed_pauses_the_other_arm(make: Make, domain: int) -> None:
@@ -176,7 +176,7 @@ def test_a_node_started_anew_before_its_silence_is_noticed_pauses_the_other_arm(
         meet(left, right)
         right.link.engaged()
         make("left")
-        eventually(right.hears("/left_arm was restarted without announcing its end, or runs twice"), "it is reported")
+        wait_until(right.hears("/left_arm was restarted without announcing its end, or runs twice"), "it is reported")
 
 
 def test_a_node_that_ends_in_order_pauses_the_other_arm_once_and_is_not_missed(make: Make, domain: int) -> None:
@@ -187,7 +187,7 @@ def test_a_node_that_ends_in_order_pauses_the_other_arm_once_and_is_not_missed(m
         right.link.engaged()
         node.destroy_timer(next(iter(node.timers)))  # the announced end is a node's last message
         left.link.close()
-        eventually(right.hears("/left_arm has ended"), "the end is announced")
+        wait_until(right.hears("/left_arm has ended"), "the end is announced")
     time.sleep(TIMEOUT)
     assert right.listen_for_a_while() == ["linked to left: /left_arm has ended"]
 

@@ -36,6 +36,17 @@ PUBLISHED_FIELDS = {
 }
 
 
+TOPIC = "q2r_left_hand_inputs"
+INPUTS = {
+    "button_upper": False,
+    "button_lower": True,
+    "thumb_stick_horizontal": -0.5,
+    "thumb_stick_vertical": 0.25,
+    "press_index": 0.75,
+    "press_middle": 1.0,
+}
+
+
 def built_hash(kind: str) -> str:
     """The type hash that the generators wrote beside the installed definition."""
     package, folder, name = kind.split("/")
@@ -65,11 +76,10 @@ def test_tf_has_the_hash_that_jazzy_prints() -> None:
 def test_inputs_of_a_hand_arrive_from_another_process(node: Any, processes: Processes) -> None:
     from quest2ros.msg import OVR2ROSInputs
 
-    from tests.ros.headset_node import INPUTS, TOPIC
-
     received: Queue[Any] = Queue()
     node.create_subscription(OVR2ROSInputs, TOPIC, received.put, 10)
-    headset = processes.start_module("tests.ros.headset_node")
+    program = "tests.ros.programs.publish"
+    headset = processes.start_module(program, "quest2ros/OVR2ROSInputs", TOPIC, json.dumps(INPUTS))
     message = received.get(timeout=PATIENCE)
     assert {name: getattr(message, name) for name in INPUTS} == INPUTS
     (publisher,) = node.get_publishers_info_by_topic(f"/{TOPIC}")
@@ -82,9 +92,9 @@ def test_a_gripper_in_another_process_takes_a_goal_tells_and_can_be_cancelled(no
     from control_msgs.action import GripperCommand
     from rclpy.action import ActionClient
 
-    from tests.ros.gripper import HELD, OPEN
+    from tests.ros.programs.gripper import HELD, OPEN
 
-    gripper = processes.start_module("tests.ros.gripper")
+    gripper = processes.start_module("tests.ros.programs.gripper")
     gripper.wait_for("ready")
     client = ActionClient(node, GripperCommand, "gripper/command")
     assert client.wait_for_server(PATIENCE)

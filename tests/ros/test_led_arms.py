@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 import yaml
 
-from q2r2_control import Robot, load_config
+from q2r2_control import Robot
 from q2r2_control.types import Array
 from tests.ros.conftest import NEEDS_ROS
 from tests.ros.processes import ROOT, Processes
-from tests.ros.waiting import States, eventually
+from tests.ros.waiting import States, wait_until
 
 pytest.importorskip("rclpy", reason=NEEDS_ROS)
 
@@ -32,11 +32,6 @@ SPEED = 0.3  # of the elbow's swing, in the norm of the joints' velocities [rad/
 FREE, TOO_FAR = 0.7, 1.5  # how far the elbow swings at first and then, a post being in its way [rad]
 POST, RADIUS = 2.6, 0.04  # where the post is on the elbow's way, and its own radius [rad], [m]
 MIN_DISTANCE, TOLERANCE = 0.02, 0.01  # [m]
-
-
-@pytest.fixture(scope="module")
-def robot() -> Robot:
-    return Robot.from_config(load_config(CONFIG))
 
 
 def swung(robot: Robot, way: float) -> list[Array]:
@@ -120,10 +115,10 @@ def test_elbows_may_swing_while_the_tools_stay_until_what_is_measured_comes_too_
         *("-p", f"distance_tolerance:={TOLERANCE}", "-p", "joint_state_timeout:=0.5"),
     )
     states.wait_for("active")
-    eventually(lambda: safe, "safe targets come")
+    wait_until(lambda: safe, "safe targets come")
 
     elbow.swing(FREE)
-    eventually(lambda: elbow.arrived, "the elbow has swung")
+    wait_until(lambda: elbow.arrived, "the elbow has swung")
     time.sleep(1.0)  # what stops arms that deviate takes 0.5 s
     assert states.wait_for("active")["phase"] == "active"
     assert np.abs(elbow.q - robot.home).max() > 0.5
@@ -134,7 +129,7 @@ def test_elbows_may_swing_while_the_tools_stay_until_what_is_measured_comes_too_
     elbow.swing(TOO_FAR)
     state = states.wait_for("measured: ")
     assert state["level"] == "error"
-    eventually(lambda: states.wait_for("measured: ")["phase"] == "stopped", "the reference is at rest")
+    wait_until(lambda: states.wait_for("measured: ")["phase"] == "stopped", "the reference is at rest")
     pair, distance = state["message"].split(" are ")
     assert pair.startswith("measured: left_link_")
     assert pair.endswith("|post_0")
