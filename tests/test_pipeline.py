@@ -219,8 +219,11 @@ def test_a_duration_that_is_no_time_is_refused(duration: float) -> None:
     [
         ({"input": "mouse"}, "input 'mouse': allowed are scripted, headset"),
         ({"plant": "gazebo"}, "plant 'gazebo': allowed are mujoco, kinematic"),
-        ({"mode": "velocity"}, "mode velocity: MujocoPlant follows position, torque commands only"),
-        ({"plant": "kinematic", "mode": "torque"}, "mode torque: KinematicPlant follows position commands only"),
+        ({"mode": "jerk"}, "mode jerk: MujocoPlant follows position, velocity, torque commands only"),
+        (
+            {"plant": "kinematic", "mode": "torque"},
+            "mode torque: KinematicPlant follows position, velocity commands only",
+        ),
     ],
 )
 def test_an_unknown_input_or_plant_and_a_mode_that_the_plant_does_not_have_are_refused(

@@ -8,6 +8,7 @@ describe controllers of others that can move the arms; ``timeouts`` has the defa
 from q2r2_control.config.cell import Config, load_config
 from q2r2_control.config.control import AdmittanceSettings, ControllerSettings, ImpedanceSettings
 from q2r2_control.config.resources import find_resource
+from q2r2_control.config.supervision import SupervisionSettings
 from q2r2_control.config.teleop import TeleopSettings
 
 __all__ = [
@@ -15,6 +16,7 @@ __all__ = [
     "Config",
     "ControllerSettings",
     "ImpedanceSettings",
+    "SupervisionSettings",
     "TeleopSettings",
     "find_resource",
     "load_config",

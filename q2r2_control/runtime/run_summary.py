@@ -11,7 +11,7 @@ import numpy as np
 import pinocchio as pin
 
 from q2r2_control.config.control import ControllerSettings
-from q2r2_control.drives.drive import DriveReport
+from q2r2_control.drives import DriveReport
 from q2r2_control.robot.robot import Robot
 from q2r2_control.runtime.torque_summary import TorqueStatistics, TorqueSummary
 from q2r2_control.types import ArmTarget, Array, Event, HandSample, Reference

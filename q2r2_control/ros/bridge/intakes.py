@@ -12,15 +12,16 @@ import pinocchio as pin
 from geometry_msgs.msg import PoseStamped
 from sensor_msgs.msg import JointState
 
+from q2r2_control.config.timeouts import STREAM_TIMEOUT
 from q2r2_control.errors import ConfigError
 from q2r2_control.robot.compose import WORLD
 from q2r2_control.robot.robot import Robot
 from q2r2_control.ros.base_node import COMMAND_QOS, STREAM_QOS, BaseNode
+from q2r2_control.ros.bridge.joint_outputs import joints_of
 from q2r2_control.ros.bridge.messages import pose_of, robot_state
-from q2r2_control.ros.bridge.outputs import joints_of
 from q2r2_control.ros.monitoring.endpoints import Publishers
 from q2r2_control.supervision.target_stream import Refusal
-from q2r2_control.types import RobotState
+from q2r2_control.types import Array, RobotState
 
 _WARNING_TIME = 1.0  # refused targets are reported for this long [s]
 # Takes an arm's target in the world frame, or None if it is no pose, the time [s], and the message's number.
@@ -130,6 +131,11 @@ class JointIntake:
         self._stamps = dict.fromkeys(self._topics, -math.inf)
         self._names = {topic: [robot.joint_names[joint] for joint in joints] for topic, joints in self._joints.items()}
         self._expected = {topic: set(names) for topic, names in self._names.items()}
+        what = 'external torques of all joints, for the admittance, as the effort of a JointState; "": none'
+        self._external_topic = node.parameter("external_torque_topic", "", what)
+        self._external: Array | None = None  # newest (nv,) [Nm]
+        self._external_stamp = -math.inf
+        self._joint_names = list(robot.joint_names)
         self._publishers = Publishers(node, self._topics)
         self._values = np.zeros((3, len(robot.joint_names)))
         self.state: RobotState | None = None  # the newest of all arms
@@ -138,6 +144,13 @@ class JointIntake:
         """Pass each state of all arms, or what is wrong with a message, to ``take``, with the time [s]."""
         for topic in self._topics:
             self._node.create_subscription(JointState, topic, partial(self._on_message, take, topic), STREAM_QOS)
+        if self._external_topic:
+            self._node.create_subscription(JointState, self._external_topic, self._on_external, STREAM_QOS)
+
+    @property
+    def measures_external_torque(self) -> bool:
+        """Whether there is a topic of external torques."""
+        return bool(self._external_topic)
 
     def look(self) -> None:
         """Ask the graph which nodes publish."""
@@ -163,5 +176,15 @@ class JointIntake:
         oldest = min(self._stamps.values())
         if oldest > -math.inf:
             q, v, tau = self._values.copy()
-            self.state = RobotState(q=q, v=v, tau=tau, tau_external=None, stamp=oldest)
-            take(self.state, now)
+            self.state = RobotState(q=q, v=v, tau=tau, tau_external=self._external, stamp=oldest)
+            if self._external_topic and now - self._external_stamp > STREAM_TIMEOUT:
+                take(f"no external torques on {self._external_topic}", now)
+            else:
+                take(self.state, now)
+
+    def _on_external(self, message: JointState) -> None:
+        columns = {name: index for index, name in enumerate(message.name)}
+        if len(message.effort) == len(message.name) and all(name in columns for name in self._joint_names):
+            torques = np.array([message.effort[columns[name]] for name in self._joint_names])
+            if np.isfinite(torques).all():
+                self._external, self._external_stamp = torques, self._node.now
