@@ -7,28 +7,24 @@ import math
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import pinocchio as pin
 
-from q2r2_control.compliance.admittance import AdmittanceReport
-from q2r2_control.compliance.impedance import ImpedanceReport
-from q2r2_control.compliance.repulsion import WallReport
 from q2r2_control.config import Config
 from q2r2_control.control.controller import LONGEST_DT, CartesianController
 from q2r2_control.drives import make_drive
 from q2r2_control.errors import ConfigError, PlantError
 from q2r2_control.inputs.base import Input
-from q2r2_control.inputs.headset import HeadsetServer
-from q2r2_control.inputs.scripted import ScriptedInput
+from q2r2_control.inputs.factory import make_input
 from q2r2_control.plants.base import Plant
-from q2r2_control.plants.kinematic import KinematicPlant
-from q2r2_control.plants.mujoco import MujocoPlant
+from q2r2_control.plants.factory import check_mode, make_plant
 from q2r2_control.robot.robot import Robot
 from q2r2_control.runtime.loop_clock import LoopClock
 from q2r2_control.runtime.process import few_garbage_collections, stop_on_signals
-from q2r2_control.runtime.run_summary import RunStatistics, RunSummary
+from q2r2_control.runtime.recorder import RunRecorder, Tick
+from q2r2_control.runtime.run_summary import RunSummary
 from q2r2_control.supervision.joint_watch import watch_settings
 from q2r2_control.supervision.supervisor import Phase, Supervisor
 from q2r2_control.supervision.target_stream import StreamSettings
@@ -37,35 +33,12 @@ from q2r2_control.teleop.arm import OPEN
 from q2r2_control.teleop.teleop import Teleop
 from q2r2_control.types import ArmTarget, CommandMode, HandSample, Reference, RobotState, StepStatus
 
-INPUTS = ("scripted", "headset")
-PLANTS = ("mujoco", "kinematic")
-DEFAULT_TRAJECTORY = "reach_grasp_handover"
 STOPPING = "stopping"  # state of every arm while the run ends
 # Added to the time that full braking takes; an arm that still recovers into its limits is not waited for longer.
 _STOP_ALLOWANCE = 1.0  # [s]
 _REST = 1e-6  # of the reference [rad/s]
 
 _logger = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True, slots=True)
-class Tick:
-    """All that one tick did, for whoever listens."""
-
-    t: float  # since the start of the run [s]
-    dt: float  # that passed since the last tick [s]
-    samples: list[HandSample]
-    targets: dict[str, ArmTarget]  # as the operator asks for them, whatever an admittance makes of them
-    engaged: dict[str, bool]
-    states: dict[str, str]  # of the teleop layer, or STOPPING
-    reference: Reference
-    state: RobotState  # measured before the tick's command
-    tools: dict[str, pin.SE3]  # measured tool poses, world frame
-    grippers: dict[str, float]  # measured openings
-    compute_time: float  # [s]
-    impedance: ImpedanceReport | None = None  # of torque mode
-    wall: WallReport | None = None  # of torque mode
-    admittance: AdmittanceReport | None = None  # of position mode, where it is enabled
 
 
 class Pipeline:
@@ -91,7 +64,7 @@ class Pipeline:
         self.robot = robot
         self.input = input
         self.plant = plant
-        self.drive = make_drive(_mode_of(mode, plant), robot, config)
+        self.drive = make_drive(check_mode(mode, plant), robot, config)
         self.controller = CartesianController(robot, config.control)
         self._begin_anew()
         self.listeners: list[Callable[[Tick], None]] = []
@@ -114,7 +87,7 @@ class Pipeline:
         that the plant does not have.
         """
         robot = Robot.from_config(config)
-        return cls(config, robot, _input_of(input, config), _plant_of(plant, robot, config), mode)
+        return cls(config, robot, make_input(input, config), make_plant(plant, robot, config), mode)
 
     def stop(self) -> None:
         """Bring the arms to rest and end the run, or the next one if none runs; from any thread or signal handler."""
@@ -166,10 +139,8 @@ class _Run:
 
     def __init__(self, pipeline: Pipeline, realtime: bool) -> None:
         self._pipeline = pipeline
-        self._statistics = RunStatistics(pipeline.robot, pipeline.config.control)
+        self._recorder = RunRecorder(pipeline.robot, pipeline.config.control, pipeline.listeners, pipeline.stop)
         self._data = pipeline.robot.model.createData()
-        self._listeners = list(pipeline.listeners)
-        self._failure: Exception | None = None  # of a listener
         self._targets = {arm: ArmTarget(None, OPEN) for arm in pipeline.robot.arms}
         self._following = True
         self._connected = False
@@ -200,9 +171,7 @@ class _Run:
                 self._bring_to_rest()
             raise
         self._bring_to_rest()
-        if self._failure is not None:
-            raise self._failure
-        return self._statistics.summary(self._clock.wall_time())
+        return self._recorder.summary(self._clock.wall_time(), self._pacer)
 
     def _bring_to_rest(self) -> None:
         """Tick without input and targets until all stands still; no fault of an input can prevent it."""
@@ -242,7 +211,7 @@ class _Run:
         reference = self._advance(state, dt)
         pipeline.plant.apply(drive.command(reference, state, self._grippers(), dt, self._supervisor.state_is_good))
         compute_time = time.perf_counter() - began
-        self._statistics.add_latency(samples, self._clock.read())
+        self._recorder.add_latency(samples, self._clock.read())
         # A plant that is simulated lets no more time pass at once, as if the computer had stood still.
         pipeline.plant.advance(min(gap, LONGEST_DT))
         self._record(gap, samples, reference, state, tools, compute_time)
@@ -313,13 +282,9 @@ class _Run:
         tools: dict[str, pin.SE3],
         compute_time: float,
     ) -> None:
-        teleop, statistics, report = self._pipeline.teleop, self._statistics, self._pipeline.drive.report
+        teleop, report = self._pipeline.teleop, self._pipeline.drive.report
         engaged = {arm: self._following and value for arm, value in teleop.engaged.items()}
-        statistics.tick.add(compute_time)
-        statistics.add(dt, reference, self._targets, tools, engaged)
-        statistics.add_drive(dt, report)
-        for event in teleop.take_events():
-            statistics.events.append(replace(event, t=event.t - self._clock.start))
+        events = [replace(event, t=event.t - self._clock.start) for event in teleop.take_events()]
         tick = Tick(
             t=self._clock.now - self._clock.start,
             dt=dt,
@@ -336,41 +301,4 @@ class _Run:
             wall=report.wall,
             admittance=report.admittance,
         )
-        self._tell(tick)
-
-    def _tell(self, tick: Tick) -> None:
-        """Call every listener; the first exception is kept until the arms are at rest."""
-        for listener in list(self._listeners):
-            try:
-                listener(tick)
-            except Exception as error:
-                self._listeners.remove(listener)
-                self._failure = self._failure or error
-                self._pipeline.stop()
-
-
-def _mode_of(mode: CommandMode | str, plant: Plant) -> CommandMode:
-    if mode not in plant.modes:
-        allowed = ", ".join(plant.modes)
-        raise ConfigError(f"mode {mode!s:.40}: {type(plant).__name__} follows {allowed} commands only")
-    return CommandMode(mode)
-
-
-def _input_of(source: Input | str, config: Config) -> Input:
-    if source == "scripted":
-        return ScriptedInput(DEFAULT_TRAJECTORY)
-    if source == "headset":
-        return HeadsetServer(config.headset.host, config.headset.port)
-    if isinstance(source, str):
-        raise ConfigError(f"input {source!r}: allowed are {', '.join(INPUTS)}")
-    return source
-
-
-def _plant_of(plant: Plant | str, robot: Robot, config: Config) -> Plant:
-    if plant == "mujoco":
-        return MujocoPlant(robot, config)
-    if plant == "kinematic":
-        return KinematicPlant(robot, config)
-    if isinstance(plant, str):
-        raise ConfigError(f"plant {plant!r}: allowed are {', '.join(PLANTS)}")
-    return plant
+        self._recorder.add(tick, events)

@@ -21,9 +21,10 @@ import pytest
 from q2r2_control.errors import ConfigError, InputError
 from q2r2_control.inputs.headset import HeadsetServer
 from q2r2_control.inputs.scripted import ScriptedInput
-from q2r2_control.pipeline import STOPPING, Pipeline, Tick
+from q2r2_control.pipeline import STOPPING, Pipeline
 from q2r2_control.plants.kinematic import KinematicPlant
 from q2r2_control.robot.robot import Robot
+from q2r2_control.runtime.recorder import Tick
 from q2r2_control.runtime.run_summary import RunSummary
 from q2r2_control.types import SIDES, Command, HandSample
 from tests.support.watch import Watch, assert_torque_bounds, cell, changes, speed
