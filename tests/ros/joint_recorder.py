@@ -20,6 +20,7 @@ REST = 0.01  # [rad/s]
 REST_TIME = 0.3  # that joints have to be slower than that [s]
 USUAL_GAP = 0.03  # between two joint states, on a machine that is not overloaded [s]
 ACCELERATION_WINDOW = 0.02  # over which a change of velocity is measured [s]
+SPEED_WINDOW = 0.2  # [s]
 
 
 class Joints(NamedTuple):
@@ -91,6 +92,20 @@ class JointRecorder:
         recent = self.since(time.monotonic() - duration)
         return np.max([np.abs(state.v) for state in recent], axis=0) if recent else np.zeros(self._robot.model.nv)
 
+    def fastest(self, since: float) -> float:
+        """Greatest speed of any joint since [s], as a mean over a window [rad/s].
+
+        The window is longer than what a simulated robot that had no processor time catches up with, and shorter than a
+        jump to an old target would take.
+        """
+        states, first, fastest = self.since(since), 0, 0.0
+        for state in states:
+            while state.stamp - states[first].stamp > SPEED_WINDOW:
+                change = float(np.abs(state.q - states[first].q).max())
+                fastest = max(fastest, change / (state.stamp - states[first].stamp))
+                first += 1
+        return fastest
+
     def farthest_from(self, posture: Array, since: float) -> float:
         """How far any joint has been from ``posture`` [rad]."""
         return max(float(np.abs(state.q - posture).max()) for state in self.since(since))
@@ -109,14 +124,6 @@ class JointRecorder:
 
         wait_until(rests, "the arms are at rest")
         return self.q
-
-    def wait_for_tool(self, arm: str, position: Array, within: float) -> None:
-        """Wait until an arm's tool has come to ``position`` [m]."""
-
-        def distance() -> float:
-            return float(np.linalg.norm(self.tool(arm).translation - position))
-
-        wait_until(lambda: distance() <= within, f"{arm} arrives", lambda: f"it is {distance():.4f} m away")
 
     def stop_after(self, fault: float) -> Stop:
         """Wait until all joints rest after a fault at ``fault`` [s]."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import time
 from collections.abc import Iterator
@@ -31,6 +32,8 @@ from tests.ros.waiting import call, wait_until
 PATIENT = ("joint_state_timeout:=1.0", "target_timeout:=1.0", "deviation_time:=2.0", "listener_timeout:=0.5")
 STILL = 2e-3  # how far a tool at rest may move [m]
 NEAR = 5e-3  # a tool this near has arrived [m]
+ATTEMPTS = 5  # to move the arms without a pause
+TIMEOUTS = r"for \d\.\d+ s|\d s old|not followed"  # reasons of a pause that other load on the machine can cause
 
 
 class PresetBench:
@@ -156,12 +159,30 @@ def run_through(bench: PresetBench, rigs: ArmRigs, controllers: StrictController
 
 
 def move(bench: PresetBench, rigs: ArmRigs, by: tuple[float, float, float], turn: float = 0.0) -> None:
-    """Move the hands, and wait until the arms have followed."""
-    tools = {rig.arm: bench.joints.tool(rig.arm).translation for rig in rigs.rigs}
-    rigs.move(by, 0.3, turn)
-    for arm, tool in tools.items():
-        bench.joints.wait_for_tool(arm, tool + np.array(by), NEAR)
-    bench.joints.wait_for_rest()
+    """Move the hands, and wait until the arms have followed; again if a timeout has paused one meanwhile.
+
+    An overloaded machine exceeds timeouts now and then. No other reason for a pause is accepted.
+    """
+    for _ in range(ATTEMPTS):
+        tools = {rig.arm: bench.joints.tool(rig.arm).translation for rig in rigs.rigs}
+        rigs.move(by, 0.3, turn)
+
+        def arrived(tools: dict[str, Any] = tools) -> bool:
+            ways = [bench.joints.tool(arm).translation - tool - np.array(by) for arm, tool in tools.items()]
+            return all(float(np.linalg.norm(way)) < NEAR for way in ways)
+
+        wait_until(lambda: arrived() or not all_engaged(rigs), "the arms arrive")
+        bench.joints.wait_for_rest()
+        if all_engaged(rigs):
+            return
+        for rig in rigs.rigs:
+            assert rig.state.get("engaged") or re.search(TIMEOUTS, rig.state["last_event"]), rig.state
+        rigs.engage()
+    raise AssertionError(f"timeouts have paused an arm {ATTEMPTS} times")
+
+
+def all_engaged(rigs: ArmRigs) -> bool:
+    return all(rig.state.get("engaged") for rig in rigs.rigs)
 
 
 @contextmanager

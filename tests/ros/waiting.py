@@ -17,7 +17,7 @@ def wait_until(condition: Callable[[], object], what: str, details: Callable[[],
     while not condition():
         if time.monotonic() > deadline:
             raise AssertionError(f"not within {PATIENCE:g} s: {what}" + (f"; {details()}" if details else ""))
-        time.sleep(0.01)
+        time.sleep(0.002)
 
 
 def call(node: Any, service: str, request: Any = None) -> Any:

@@ -27,7 +27,8 @@ def main() -> None:
         print(json.dumps({"t": time.monotonic(), "kind": kind, "value": value}), flush=True)
 
     def on_joint_state(message: JointState) -> None:
-        write("joints", [list(message.name), list(message.position), list(message.velocity)])
+        stamp = message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
+        write("joints", [list(message.name), list(message.position), list(message.velocity), stamp])
 
     node.create_subscription(JointState, "/joint_states", on_joint_state, STREAM_QOS)
 

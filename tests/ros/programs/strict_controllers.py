@@ -75,6 +75,9 @@ class Controller(Node):
             ),
         }
         kind, callback = kinds[terms.message]
+        self._deactivated = False  # the sender of joint positions has announced it since the last one
+        if terms.message != "pose":
+            self.create_subscription(String, "/cartesian_controller/state", self._on_sender_state, 10)
         self._topic = f"/robot/{self.get_name()}/{terms.topic}"
         if terms.command_type:
             service = import_module("moveit_msgs.srv").ServoCommandType
@@ -161,9 +164,14 @@ class Controller(Node):
         allowed = SETTLED_JOINT + (0.0 if self._last is None else FASTEST_JOINT * period)
         if np.abs(target - before).max() > allowed:
             self._report(f"jump of {np.abs(target - before).max():.4f} rad, allowed {allowed:.4f}")
-        if LONGEST_SILENCE < period < math.inf:
+        if LONGEST_SILENCE < period < math.inf and not self._deactivated:
             self._report(f"nothing for {period:.3f} s")
+        self._deactivated = False
         self._take(target, now)
+
+    def _on_sender_state(self, message: String) -> None:
+        if json.loads(message.data)["phase"] != "active":
+            self._deactivated = True
 
     def _take(self, target: Any, stamp: float) -> None:
         if (publishers := self.count_publishers(self._topic)) != 1:
