@@ -14,7 +14,7 @@ from q2r2_control.ros.launch.middleware import set_up_middleware
 
 ROOT = Path(__file__).resolve().parents[2]
 CONFIG = "config/dual_iiwa7.yaml"
-PATIENCE = 30.0  # [s], for starting Python and finding each other on a busy machine
+PATIENCE = 30.0  # for starting Python and discovery on an overloaded machine [s]
 
 
 class RosProcess:

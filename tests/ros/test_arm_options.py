@@ -1,4 +1,4 @@
-"""What an arm controller can be told: by a cell's YAML, by topics in place of /tf and actions; real processes."""
+"""Settings of an arm controller: from a cell's YAML, and topics in place of /tf and actions; real processes."""
 
 from __future__ import annotations
 

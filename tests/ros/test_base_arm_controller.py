@@ -1,4 +1,4 @@
-"""An arm's teleop node as the rest of a ROS system meets it: topics, actions, services, state; real processes."""
+"""The teleoperation node of an arm as a process: topics, actions, services, state."""
 
 from __future__ import annotations
 
@@ -70,7 +70,10 @@ def test_a_silent_hand_pauses_the_arm_and_its_return_moves_nothing(rig: ArmRig, 
     rig.sends_hand = False
     rig.wait(lambda: rig.state["state"] == "paused", "the watchdog pauses the arm")
     assert re.match(r"paused: no (data|pose) of the left hand from /test for 0\.5", rig.state["last_event"])
-    rig.wait(lambda: "of the left hand from /test for" in rig.state["message"], "diagnostics name whose data ceased")
+    rig.wait(
+        lambda: "of the left hand from /test for" in rig.state["message"],
+        "diagnostics name the node",
+    )
     assert rig.state["level"] == "warn"
     held = rig.wait_for_rest()
     rig.hand = offset(rig.hand, (0.3, 0.3, 0.0))
@@ -101,7 +104,7 @@ def test_without_its_tools_pose_an_arm_is_not_engaged_nor_a_gripper_closed_witho
 
     rig.sends_tool = True
     rig.press("upper")
-    rig.wait(lambda: "no gripper server at /q2r2/left_gripper/gripper_cmd" in rig.state["message"], "it is told")
+    rig.wait(lambda: "no gripper server at /q2r2/left_gripper/gripper_cmd" in rig.state["message"], "it is reported")
     assert rig.state["gripper"] == "open"
 
 
@@ -187,7 +190,7 @@ def test_a_gripper_is_closed_when_its_result_says_so_even_stalled(
         server = ActionServer(other, action, "/q2r2/left_gripper/gripper_cmd", execute)
         joint = {"gripper.joint_name": "finger"} if kind == "ParallelGripperCommand" else {}
         rig.start(processes, {"gripper.action_type": kind, "gripper.open_position": 0.04, **joint})
-        while goals.empty():  # a press before the server was found asks nobody
+        while goals.empty():  # a press before the server is discovered has no effect
             rig.press("upper")
             rig.wait(lambda: not goals.empty() or "no gripper server" in rig.state["message"], "an answer to the press")
         command = goals.get()
@@ -203,7 +206,7 @@ def test_a_gripper_is_closed_when_its_result_says_so_even_stalled(
         command = goals.get(timeout=PATIENCE)
         assert (command.position if kind == "GripperCommand" else command.position[0]) == 0.04
         answers.put({"stalled": False})
-        rig.wait(lambda: "neither stalled nor at its goal" in rig.state["message"], "the failure is told")
+        rig.wait(lambda: "neither stalled nor at its goal" in rig.state["message"], "the failure is reported")
         assert rig.state["gripper"] == "closed"
         server.destroy()
 

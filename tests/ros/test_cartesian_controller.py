@@ -172,7 +172,7 @@ def test_an_arm_holds_without_targets_and_follows_only_a_stream_that_begins_at_i
     assert cell.state("left_state") == "holding"
     again.poses["left"] = far
     time.sleep(0.1)
-    again.poses["left"] = cell.tool("left")  # engaged anew, while the targets never cease
+    again.poses["left"] = cell.tool("left")  # engaged again, without a gap in the targets
     wait_until(lambda: cell.state("left_state") == "following", "the arm follows")
 
 
@@ -206,7 +206,7 @@ def test_arms_stop_when_their_controller_is_killed_and_stay_when_it_is_restarted
     started.processes = (started.processes[0], back)
     started.states.pop("cartesian_controller", None)
     cell.wait_until_active()
-    time.sleep(0.5)  # targets still come, from where nobody engaged anew
+    time.sleep(0.5)  # targets still come, but no new stream
     assert np.abs(cell.q - rest).max() < STILL
     assert cell.state("left_state") == "holding"
 

@@ -1,4 +1,4 @@
-"""The interface packages, as other ROS programs meet them: types, type hashes, topics and actions between processes."""
+"""The message packages as other ROS programs use them: types, type hashes, topics and actions between processes."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def test_inputs_of_a_hand_arrive_from_another_process(node: Any, processes: Proc
     assert headset.interrupt() == 0
 
 
-def test_a_gripper_in_another_process_takes_a_goal_tells_and_can_be_cancelled(node: Any, processes: Processes) -> None:
+def test_a_gripper_in_another_process_takes_a_goal_and_can_be_cancelled(node: Any, processes: Processes) -> None:
     from action_msgs.msg import GoalStatus
     from control_msgs.action import GripperCommand
     from rclpy.action import ActionClient
@@ -101,13 +101,13 @@ def test_a_gripper_in_another_process_takes_a_goal_tells_and_can_be_cancelled(no
     goal = GripperCommand.Goal()
     goal.command.position = 0.0
     goal.command.max_effort = 40.0
-    told: Queue[Any] = Queue()
-    handle = outcome(client.send_goal_async(goal, told.put))
+    feedbacks: Queue[Any] = Queue()
+    handle = outcome(client.send_goal_async(goal, feedbacks.put))
     assert handle.accepted
 
     # Feedback is a topic of its own: the first messages may be sent before both sides know each other.
     last = OPEN
-    while not (feedback := told.get(timeout=PATIENCE).feedback).stalled:
+    while not (feedback := feedbacks.get(timeout=PATIENCE).feedback).stalled:
         assert HELD < feedback.position <= last
         last = feedback.position
     assert feedback.position == HELD

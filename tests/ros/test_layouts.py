@@ -46,7 +46,7 @@ def started(domain: int, robot: Robot, tmp_path_factory: pytest.TempPathFactory)
 
 @pytest.fixture
 def cell(started: Cell) -> Cell:
-    """At home, commanded by nobody."""
+    """At home, without commands."""
     wait_until(lambda: started.state("mode", "mujoco_robot") == "holding", "the robot holds")
     started.call("/mujoco_robot/reset")
     started.states.pop("cartesian_controller", None)
@@ -57,14 +57,14 @@ def cell(started: Cell) -> Cell:
 @pytest.fixture
 def engage(cell: Cell) -> Iterator[Engage]:
     """Begins streams of targets at tools, which end with the test."""
-    begun: list[Stream] = []
+    streams: list[Stream] = []
 
     def begin(*arms: str) -> Stream:
-        begun.append(cell.engage(*arms))
-        return begun[-1]
+        streams.append(cell.engage(*arms))
+        return streams[-1]
 
     yield begin
-    for stream in begun:
+    for stream in streams:
         stream.end()
 
 

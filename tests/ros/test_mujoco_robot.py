@@ -56,7 +56,7 @@ def started(domain: int, robot: Robot, tmp_path_factory: pytest.TempPathFactory)
 
 @pytest.fixture
 def cell(started: Cell, robot: Robot) -> Cell:
-    """At home, at rest, commanded by nobody."""
+    """At home, at rest, without commands."""
     wait_until(lambda: started.state("mode", "mujoco_robot") == "holding", "the robot holds")
     started.call("/mujoco_robot/reset")
     wait_until(lambda: np.abs(started.q - robot.home).max() < 1e-3, "the arms are at home")
@@ -169,7 +169,7 @@ def test_commands_that_cannot_be_followed_move_nothing_and_are_reported_once(cel
     assert cell.processes[0].output.count("joint_trajectory: refused") == 1
 
 
-def test_a_torque_that_nobody_renews_gives_way_to_position_servos(cell: Cell, robot: Robot) -> None:
+def test_without_further_torques_position_servos_take_over(cell: Cell, robot: Robot) -> None:
     publisher = cell.node.create_publisher(Float64MultiArray, "torque_commands", COMMAND_QOS)
     # With less than gravity's torque the arms begin to fall, slowly enough not to meet the table.
     tau = 0.7 * pin.computeGeneralizedGravity(robot.model, robot.model.createData(), robot.home)

@@ -72,7 +72,7 @@ def test_targets_keep_the_rules_of_a_controller_in_both_modes_and_its_arm_moves_
     with arm_controllers(bench, processes, name, modes, other_interfaces) as rigs:
         run_through(bench, rigs, controllers, PRESETS[name].guard)
         stamps = [target.header.stamp.sec + 1e-9 * target.header.stamp.nanosec for target in rigs.rigs[0].targets]
-    # Half of it, since a busy machine may not have the time; that the node asks for enough is tested below.
+    # Half of it, for an overloaded machine; that the preset asks for enough is tested below.
     assert 1.0 / np.median(np.diff(stamps)) > 0.5 * POSES[name].lowest_rate
 
 
@@ -156,7 +156,7 @@ def test_where_moveit_msgs_is_missing_the_user_is_told_to_switch_to_poses(
     node.create_subscription(PoseStamped, "/robot/left_ctrl/pose_target_cmds", lambda _: None, 1)
     with arm_controllers(bench, processes, "moveit_servo", {"left": "raw"}, {}) as rigs:
         text = "moveit_msgs cannot be imported: call /robot/left_ctrl/switch_command_type with 2 yourself"
-        rigs.wait(lambda rig: rig.state.get("message") == text, "the user is told")
+        rigs.wait(lambda rig: rig.state.get("message") == text, "the user is informed")
 
 
 def test_the_presets_are_those_whose_rules_are_tested() -> None:

@@ -46,7 +46,7 @@ def children(pid: int) -> list[int]:
 
 
 def alive(pid: int) -> bool:
-    """Whether it runs; one that has ended may wait for whoever reaps orphans here."""
+    """Whether it runs; a process that has ended may remain as a zombie."""
     try:
         with open(f"/proc/{pid}/stat") as file:
             return file.read().rpartition(")")[2].split()[0] != "Z"

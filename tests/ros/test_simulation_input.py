@@ -76,7 +76,7 @@ def test_poses_inputs_and_twists_are_the_scripts_own(node: Any, processes: Proce
     assert_a_part_of(np.hstack([linear, angular]), np.array([[*m.linear, *m.angular] for m in motions]), 1e-6)
 
 
-def test_a_mode_publishes_its_topics_alone(node: Any, processes: Processes) -> None:
+def test_a_mode_publishes_only_its_topics(node: Any, processes: Processes) -> None:
     left, right = subscribe(node, "left"), subscribe(node, "right")
     start(processes, side="left", mode="teleop")
     start(processes, side="right", mode="velocity")

@@ -66,7 +66,7 @@ class Hosts:
             raise AssertionError(f"{error}: {self.states}") from None
 
     def play(self) -> RosProcess:
-        """Start the script, and with it press, until both arms move: a busy machine may look like a fault."""
+        """Start the script, which presses once, until both arms move; again if that press had no effect."""
         arms = [arm.joints for arm in self.robot.arms.values()]
         for _ in range(5):
             script = self.start("operator", "q2r2_control.ros.nodes.simulation_input")
