@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -42,6 +43,8 @@ POSES = {
     "crisp": Terms("target_pose", frame="ignored"),
     "moveit_servo": Terms("pose_target_cmds", frame="any", lowest_rate=10.0, longest_age=0.1, command_type=True),
 }
+# Not run, since they are as another one but for their names.
+ALIKE = {"fzi": "kuka_lbr_clik", "mayr": "kuka_lbr_clik"}
 JOINTS = {
     "lbr_position": Terms("command/joint_position", message="lbr", lowest_rate=100.0),
     "forward_position": Terms("commands", message="array", lowest_rate=100.0),
@@ -61,7 +64,7 @@ def bench(domain: int, robot: Robot, tmp_path_factory: pytest.TempPathFactory) -
         running.end_all()
 
 
-@pytest.mark.parametrize("name", POSES)
+@pytest.mark.parametrize("name", sorted(POSES.keys() - ALIKE.keys()))
 def test_targets_keep_the_rules_of_a_controller_in_both_modes_and_its_arm_moves_smoothly(
     name: str, bench: PresetBench, processes: Processes, other_interfaces: dict[str, str]
 ) -> None:
@@ -157,6 +160,13 @@ def test_where_moveit_msgs_is_missing_the_user_is_told_to_switch_to_poses(
     with arm_controllers(bench, processes, "moveit_servo", {"left": "raw"}, {}) as rigs:
         text = "moveit_msgs cannot be imported: call /robot/left_ctrl/switch_command_type with 2 yourself"
         rigs.wait(lambda rig: rig.state.get("message") == text, "the user is informed")
+
+
+@pytest.mark.parametrize("name", ALIKE)
+def test_presets_that_are_not_run_differ_in_names_only_from_one_that_is(name: str) -> None:
+    preset, other = PRESETS[name], PRESETS[ALIKE[name]]
+    assert replace(preset, name=other.name, topic=other.topic, activation=other.activation) == other
+    assert replace(POSES[name], topic=POSES[ALIKE[name]].topic) == POSES[ALIKE[name]]
 
 
 def test_the_presets_are_those_whose_rules_are_tested() -> None:
