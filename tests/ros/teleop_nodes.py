@@ -18,7 +18,7 @@ from q2r2_control.ros.base_node import COMMAND_QOS, STREAM_QOS
 from q2r2_control.types import Array
 from tests.ros.joint_recorder import JointRecorder
 from tests.ros.processes import CONFIG, Processes, RosProcess
-from tests.ros.waiting import wait_until
+from tests.ros.waiting import call, wait_until
 
 ARMS = ("left", "right")
 RATE = 100.0  # half of the nodes' default or less, since six processes share a test machine [Hz]
@@ -54,6 +54,8 @@ class TeleopNodes:
         """Start a node."""
         given = [] if name == "tcp_endpoint" else [f"rate:={RATE}"]
         given += [f"config:={CONFIG}"] if name in ("mujoco_robot", "cartesian_controller") else []
+        # The robot makes a jump that it is asked for, up to this size, so that tests see it in the joint states.
+        given += ["max_jump:=1.0"] if name == "mujoco_robot" else []
         self._running[name] = self._processes.start_node(name, *given, *parameters)
         return self._running[name]
 
@@ -90,6 +92,11 @@ class TeleopNodes:
         """Whether nothing keeps an arm from being engaged, by reports after ``since`` [s]."""
         level = self._state(f"{arm}_q2r2_arm_controller", since).get("level")
         return level == "ok" and self.controller_is("active", since)
+
+    def reset_if_stopped(self) -> None:
+        """Let the controller forget a stop, which takes a reset: arms on an overloaded machine may deviate for long."""
+        if self.controller_is("stopped", 0.0):
+            call(self.node, "/cartesian_controller/reset")
 
     def wait_until_ready(self) -> None:
         """Wait until nothing keeps either arm from being engaged, by reports from now on."""

@@ -68,10 +68,12 @@ class Teleoperation:
 
     def press(self) -> None:
         """Engage both arms, each by its own hand; again if other load on the machine has looked like a fault."""
+        self.nodes.reset_if_stopped()
         self.nodes.wait_until_ready()
         deadline = time.monotonic() + PATIENCE
         while paused := [arm for arm in ARMS if not self.nodes.engaged(arm)]:
             assert time.monotonic() < deadline, f"{paused} cannot be engaged: {self.nodes.diagnoses[-5:]}"
+            self.nodes.reset_if_stopped()
             self.operator.press(*paused)
             time.sleep(0.1)
 
@@ -96,6 +98,7 @@ class Teleoperation:
     def play(self) -> None:
         """Start the script, which presses once, until both arms follow; again if that press had no effect."""
         for _ in range(ATTEMPTS):
+            self.nodes.reset_if_stopped()
             self.nodes.start("simulation_input")
             deadline = time.monotonic() + PATIENCE / 3.0
             while time.monotonic() < deadline:
