@@ -26,9 +26,9 @@ from trajectory_msgs.msg import JointTrajectory
 from q2r2_control.benchmark.command_responses import LatencyReport, Recording, latency_report
 from q2r2_control.config import load_config
 from q2r2_control.errors import Q2R2Error
-from q2r2_control.ros.bridge.base_node import COMMAND_QOS, STREAM_QOS
+from q2r2_control.ros.base_node import COMMAND_QOS, STREAM_QOS
 from q2r2_control.ros.launch.middleware import set_up_middleware
-from q2r2_control.ros.launch.node_set import NodeProcess
+from q2r2_control.ros.launch.processes import NodeProcess
 
 _START_TIMEOUT = 300.0  # kernels may have to be compiled [s]
 _STEP = 0.002  # [m]

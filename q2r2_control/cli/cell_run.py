@@ -17,8 +17,9 @@ from q2r2_control.config.external import ControllerKind
 from q2r2_control.errors import ConfigError
 from q2r2_control.inputs.base import Input
 from q2r2_control.inputs.scripted import ScriptedInput
-from q2r2_control.pipeline import Pipeline, Tick
+from q2r2_control.pipeline import Pipeline
 from q2r2_control.plants.mujoco import MujocoPlant
+from q2r2_control.runtime.recorder import Tick
 from q2r2_control.runtime.run_summary import RunSummary
 from q2r2_control.supervision.preflight import preflight_faults
 from q2r2_control.viewer.history import History

@@ -10,7 +10,7 @@ from q2r2_control.cli.cell_run import RunOptions, print_summary, run_cell
 from q2r2_control.cli.options import DEMO_CONFIG, Headless, Human, Json, Viewer, positive, shows_table
 from q2r2_control.cli.output import stderr_console
 from q2r2_control.config import load_config
-from q2r2_control.pipeline import DEFAULT_TRAJECTORY
+from q2r2_control.inputs.factory import DEFAULT_TRAJECTORY
 
 
 def demo(

@@ -13,8 +13,8 @@ from q2r2_control.cli.options import ConfigFile, Headless, Human, Json, Viewer, 
 from q2r2_control.cli.output import stderr_console
 from q2r2_control.config import load_config
 from q2r2_control.errors import ConfigError
+from q2r2_control.inputs.factory import DEFAULT_TRAJECTORY
 from q2r2_control.inputs.trajectories import TRAJECTORIES
-from q2r2_control.pipeline import DEFAULT_TRAJECTORY
 from q2r2_control.types import CommandMode
 
 

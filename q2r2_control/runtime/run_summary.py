@@ -11,7 +11,7 @@ import numpy as np
 import pinocchio as pin
 
 from q2r2_control.config.control import ControllerSettings
-from q2r2_control.drives.drive import DriveReport
+from q2r2_control.drives import DriveReport
 from q2r2_control.robot.robot import Robot
 from q2r2_control.runtime.torque_summary import TorqueStatistics, TorqueSummary
 from q2r2_control.types import ArmTarget, Array, Event, HandSample, Reference
@@ -65,6 +65,8 @@ class RunSummary:
     fallback_ticks: int
     uncertified_ticks: int
     rejected_targets: int
+    missed_ticks: int  # that were due and did not come, since the loop was late
+    stretched_s: float  # by how much that made the motion late
     at_rest: bool  # the reference was at rest when the run ended
     torque: TorqueSummary | None  # None: position mode
     events: list[Event]
@@ -203,8 +205,8 @@ class RunStatistics:
                 figures.yielded = max(figures.yielded, math.hypot(*arm.displacement[:3]))
                 figures.yielded_angle = max(figures.yielded_angle, math.hypot(*arm.displacement[3:]))
 
-    def summary(self, wall_time: float) -> RunSummary:
-        """The run so far, which took ``wall_time`` [s]."""
+    def summary(self, wall_time: float, missed_ticks: int = 0, stretched: float = 0.0) -> RunSummary:
+        """The run so far; ``wall_time`` and ``stretched`` [s] are what it took and how late the motion is."""
         tick = self.tick.percentiles()
         return RunSummary(
             ticks=self._ticks,
@@ -221,6 +223,8 @@ class RunStatistics:
             fallback_ticks=self._fallback,
             uncertified_ticks=self._uncertified,
             rejected_targets=self._rejected,
+            missed_ticks=missed_ticks,
+            stretched_s=stretched,
             at_rest=self._rest,
             torque=self._torque.summary(),
             events=list(self.events),

@@ -13,7 +13,7 @@ from rich.live import Live
 from rich.markup import escape
 from rich.table import Table
 
-from q2r2_control.pipeline import Tick
+from q2r2_control.runtime.recorder import Tick
 from q2r2_control.viewer.history import tracking_error
 
 _REFRESH_RATE = 6.0  # [Hz]
