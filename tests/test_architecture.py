@@ -143,7 +143,7 @@ HEAVY = (f"{PACKAGE}.control.controller", "mujoco", "numba", "matplotlib")
 @pytest.mark.parametrize(
     ("module", "forbidden"),
     [
-        pytest.param("ros.bridge.arm_parameters", HEAVY, id="parameters of the teleop nodes"),
+        pytest.param("ros.bridge.parameters", HEAVY, id="parameters of the teleop nodes"),
         pytest.param("ros.nodes.base_arm_controller", HEAVY, id="a teleop node"),
         pytest.param("ros.nodes.tcp_endpoint", HEAVY, id="the headset's node"),
         pytest.param("teleop", HEAVY, id="teleop"),

@@ -1,8 +1,8 @@
 """What moves. To add a plant, implement ``Plant`` of ``base``, which also checks commands.
 
-``kinematic`` follows commands exactly. ``mujoco`` simulates the cell: ``mujoco_model`` and ``scene`` build it,
-``servo`` drives joints by position, ``mujoco_view`` shows it. ``follower`` and ``simulated_cell`` run it from commands
-that come at any time, as from ROS. MuJoCo is imported only where it is used.
+``factory`` makes a plant by name. ``kinematic`` follows commands exactly. ``mujoco`` simulates the
+cell: ``mujoco_model`` and ``scene`` build it, ``servo`` drives its joints, ``mujoco_view`` shows it. ``follower`` and
+``simulated_cell`` run it from commands that come at any time, as from ROS. MuJoCo is imported only where it is used.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from q2r2_control._lazy import lazy_exports
 
 if TYPE_CHECKING:
     from q2r2_control.plants.base import Plant
+    from q2r2_control.plants.factory import check_mode, make_plant
     from q2r2_control.plants.kinematic import KinematicPlant
     from q2r2_control.plants.mujoco import MujocoPlant
     from q2r2_control.plants.simulated_cell import SimulatedCell
@@ -22,6 +23,8 @@ __all__ = [
     "MujocoPlant",
     "Plant",
     "SimulatedCell",
+    "check_mode",
+    "make_plant",
 ]
 
 __getattr__ = lazy_exports(
@@ -31,5 +34,7 @@ __getattr__ = lazy_exports(
         "MujocoPlant": "mujoco",
         "Plant": "base",
         "SimulatedCell": "simulated_cell",
+        "check_mode": "factory",
+        "make_plant": "factory",
     },
 )
