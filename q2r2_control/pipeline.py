@@ -31,7 +31,7 @@ from q2r2_control.supervision.target_stream import StreamSettings
 from q2r2_control.supervision.tick_pacer import TickPacer
 from q2r2_control.teleop.arm import OPEN
 from q2r2_control.teleop.teleop import Teleop
-from q2r2_control.types import ArmTarget, CommandMode, HandSample, Reference, RobotState, StepStatus
+from q2r2_control.types import ArmTarget, CommandMode, HandSample, Reference, RobotState
 
 STOPPING = "stopping"  # state of every arm while the run ends
 # Added to the time that full braking takes; an arm that still recovers into its limits is not waited for longer.
@@ -155,8 +155,7 @@ class _Run:
         self._supervisor = pipeline.supervisor
         self._supervisor.activate(replace(state, stamp=self._clock.now), self._clock.now)
         pipeline.drive.reset(state)
-        self._last: Reference | None = None
-        self._last_velocity = np.zeros(pipeline.robot.model.nv)
+        self._velocity = np.zeros(pipeline.robot.model.nv)
 
     def until(self, duration: float | None) -> RunSummary:
         """Tick until ``duration`` is over or a stop is asked for, then until the arms are at rest."""
@@ -198,7 +197,7 @@ class _Run:
         """One line of the way of the data: sample -> target -> reference -> command -> state."""
         pipeline, drive = self._pipeline, self._pipeline.drive
         gap = self._clock.wait()
-        dt = self._pacer.step(gap, self._last_velocity)
+        dt = self._pacer.step(gap, self._velocity)
         began = time.perf_counter()
         samples = self._poll() if self._following else []
         state = pipeline.plant.state()
@@ -208,7 +207,7 @@ class _Run:
             commanded = {arm: pipeline.controller.tool_pose(arm) for arm in pipeline.robot.arms}
             self._targets = pipeline.teleop.update(samples, tools, self._clock.now, commanded)
             self._hand_over(tools)
-        reference = self._advance(state, dt)
+        reference = self._advance(dt)
         pipeline.plant.apply(drive.command(reference, state, self._grippers(), dt, self._supervisor.state_is_good))
         compute_time = time.perf_counter() - began
         self._recorder.add_latency(samples, self._clock.read())
@@ -239,20 +238,13 @@ class _Run:
             elif refusal := self._supervisor.take_target(arm, target.pose, now, measured=tools[arm]):
                 self._pipeline.teleop.pause(now, refusal.line)
 
-    def _advance(self, state: RobotState, dt: float) -> Reference:
-        """The reference of this tick; the last one, at rest, once the arms were stopped."""
+    def _advance(self, dt: float) -> Reference:
+        """The reference of this tick; once the arms were stopped, what is left of their motion."""
         reference = self._supervisor.tick(self._clock.now, dt)
-        self._last = self._held(state) if reference is None else reference
-        self._last_velocity = self._last.v
-        return self._last
-
-    def _held(self, state: RobotState) -> Reference:
-        if self._last is None:
-            # Nothing has moved yet: the run was stopped before its first tick.
-            self._last = self._pipeline.controller.step({}, 0.0)
-        zero = np.zeros_like(state.q)
-        report = replace(self._last.report, status=StepStatus.HELD, binding=(), fallback=False, slack=0.0)
-        return Reference(self._last.q, zero, zero, report)
+        if reference is None:
+            reference = self._pipeline.controller.step({}, dt)
+        self._velocity = reference.v
+        return reference
 
     def _grippers(self) -> dict[str, float]:
         return {arm: target.gripper for arm, target in self._targets.items()}

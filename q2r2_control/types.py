@@ -96,7 +96,6 @@ class StepStatus(StrEnum):
     DT_REJECTED = "dt_rejected"  # dt was not in (0, 0.1] s
     RECOVERING = "recovering"  # outside a limit or closer than min_distance, on the way back
     FALLBACK = "fallback"  # the stopping motion was executed instead of the QP's solution
-    HELD = "held"  # supervision lets nothing move: the last reference, at rest
 
 
 @dataclass(frozen=True, slots=True)

@@ -110,7 +110,7 @@ def test_the_help_lists_every_command(command: str) -> None:
         pytest.param(("run", CELL, "--mode", "speed"), "'speed'", id="an unknown mode"),
         pytest.param(
             ("run", CELL, "--plant", "kinematic", "--mode", "torque", "--duration", "1"),
-            "mode torque: KinematicPlant follows position commands only",
+            "mode torque: KinematicPlant follows position, velocity commands only",
             id="torque of a plant that has none",
         ),
         pytest.param(("run", CELL, "--duration", "soon"), "--duration", id="a duration that is no number"),

@@ -1,11 +1,13 @@
-"""A hand and a robot for one arm controller: what the headset sends, where the tool is, and all that comes back."""
+"""Test rig of arm controllers: it sends hand data and tool poses, and records what comes back."""
 
 from __future__ import annotations
 
 import json
+import threading
 import time
 from collections import Counter
 from collections.abc import Callable
+from functools import partial
 from itertools import pairwise
 from typing import Any
 
@@ -19,18 +21,19 @@ from tf2_msgs.msg import TFMessage
 from q2r2_control.ros.base_node import COMMAND_QOS, STREAM_QOS
 from q2r2_control.ros.bridge.messages import pose_of, stamped_pose, transform_message
 from tests.ros.processes import PATIENCE, Processes, RosProcess
+from tests.ros.waiting import wait_until
 
 PERIOD = 1.0 / 72.0  # of the hand's messages, as a Quest sends them, and of /tf [s]
 HAND = pin.SE3(pin.exp3(np.array([0.2, -0.4, 0.6])), np.array([0.3, 0.1, 1.0]))
 TOOL = pin.SE3(pin.exp3(np.array([3.0, 0.2, 0.1])), np.array([0.5, 0.25, 0.38]))
-# A busy machine must not look like a fault: only the tests of these timeouts leave them as they are.
+# Longer than by default, so that other load on the machine does not look like a fault.
 PATIENT = {"teleop.gate.timeout": 1.0, "tool_timeout": 1.0, "link_timeout": 3.0, "listener_timeout": 1.0}
 
 
 class ArmRig:
-    """Plays the hand ``hand`` and the robot of the arm ``arm`` on a node that a thread spins.
+    """The hand ``hand`` and the robot of the arm ``arm``, on a node that a thread spins.
 
-    The tool follows the targets at once while ``follows``; it is told on /tf while ``tells_tool``.
+    While ``follows`` the tool is at the newest target; while ``sends_tool`` it is published on /tf.
     """
 
     def __init__(
@@ -46,7 +49,7 @@ class ArmRig:
         self.arm, self.node = arm, node
         self.hand, self.tool = HAND, TOOL
         self.lower = self.upper = False
-        self.sends_hand = self.tells_tool = self.follows = True
+        self.sends_hand = self.sends_tool = self.follows = True
         self.targets: list[PoseStamped] = []
         self.state: dict[str, Any] = {}
         self.levels: Counter[str] = Counter()
@@ -69,20 +72,20 @@ class ArmRig:
         ]
         self._timer = node.create_timer(PERIOD, self._send)
 
-    def start(self, processes: Processes, parameters: dict[str, Any] | None = None, module: str = "") -> RosProcess:
-        """Start the arm's controller; returns when it and the rig know each other."""
-        arguments = [f"-p {name}:={value}" for name, value in (PATIENT | (parameters or {})).items()]
-        module = module or f"q2r2_control.ros.nodes.{self.arm}_arm_controller"
-        process = processes.start_module(module, "--ros-args", *" ".join(arguments).split())
-        self.wait(lambda: self.state.get("hand_age") is not None, "the controller sees the hand")
+    def start(self, processes: Processes, parameters: dict[str, Any] | None = None) -> RosProcess:
+        """Start the arm's controller; returns when it receives the hand."""
+        given = (f"{name}:={value}" for name, value in (PATIENT | (parameters or {})).items())
+        process = processes.start_node(f"{self.arm}_arm_controller", *given)
+        self.wait_until_connected()
         return process
 
-    def wait(self, condition: Callable[[], Any], what: str, timeout: float = PATIENCE) -> None:
-        """Return once ``condition`` holds."""
-        deadline = time.monotonic() + timeout
-        while not condition():
-            assert time.monotonic() < deadline, f"waited {timeout:g} s until {what}; state {self.state}"
-            time.sleep(0.005)
+    def wait_until_connected(self) -> None:
+        """Wait until the arm's controller receives the hand."""
+        self.wait(lambda: self.state.get("hand_age") is not None, "the controller receives the hand")
+
+    def wait(self, condition: Callable[[], Any], what: str) -> None:
+        """See :func:`wait_until`."""
+        wait_until(condition, what, lambda: self.state)
 
     def press(self, button: str = "lower") -> None:
         """A press that is no chord."""
@@ -92,14 +95,12 @@ class ArmRig:
         time.sleep(0.1)
 
     def engage(self) -> None:
-        """Press until the arm follows; what was sent before does not count."""
-        self.wait(lambda: self.state.get("level") == "ok", "nothing keeps the arm from being engaged")
-        self.press()
-        self.wait(lambda: self.state.get("engaged"), "the arm is engaged")
+        """Press until the arm follows."""
+        ArmRigs([self]).engage()
 
     def pause(self) -> None:
-        self.press()
-        self.wait(lambda: self.state.get("state") == "paused", "the arm is paused")
+        """Press until the arm is paused."""
+        ArmRigs([self]).pause()
 
     def move(self, by: tuple[float, float, float], duration: float = 0.4, turn: float = 0.0) -> None:
         """Move the hand evenly, turning about z."""
@@ -116,7 +117,7 @@ class ArmRig:
         return pose
 
     def wait_for_rest(self) -> pin.SE3:
-        """The target once it stands still, or no more comes."""
+        """Wait until the target stands still, or no more comes; the target."""
         deadline = time.monotonic() + PATIENCE
         while time.monotonic() < deadline:
             before = self.newest()
@@ -136,7 +137,7 @@ class ArmRig:
         if self.sends_hand:
             pose.publish(stamped_pose(self.hand, "", now))
             inputs.publish(OVR2ROSInputs(button_upper=self.upper, button_lower=self.lower))
-        if self.tells_tool:
+        if self.sends_tool:
             tf.publish(TFMessage(transforms=[stamped_transform("world", self._frame, self.tool)]))
 
     def _on_target(self, message: PoseStamped) -> None:
@@ -149,8 +150,63 @@ class ArmRig:
         self.levels[self.state["level"]] += 1
 
 
+class ArmRigs:
+    """Several rigs whose hands do the same at the same time."""
+
+    def __init__(self, rigs: list[ArmRig]) -> None:
+        self.rigs = rigs
+
+    def wait(self, condition: Callable[[ArmRig], Any], what: str) -> None:
+        """Wait until ``condition`` holds for all."""
+        for rig in self.rigs:
+            rig.wait(partial(condition, rig), f"{rig.arm}: {what}")
+
+    def engage(self) -> None:
+        """Press until all follow."""
+        self.wait(lambda rig: rig.state.get("level") == "ok", "nothing keeps the arm from being engaged")
+        self._press_until(lambda rig: rig.state.get("engaged"), "the arm is engaged")
+
+    def pause(self) -> None:
+        """Press until all are paused."""
+        self._press_until(lambda rig: rig.state.get("state") == "paused", "the arm is paused")
+
+    def wait_for_pause(self) -> None:
+        self.wait(lambda rig: rig.state.get("state") == "paused", "the arm is paused")
+
+    def move(self, by: tuple[float, float, float], duration: float, turn: float = 0.0) -> None:
+        """See :meth:`ArmRig.move`."""
+        threads = [threading.Thread(target=rig.move, args=(by, duration, turn)) for rig in self.rigs]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+
+    def interrupt_hand_data(self) -> None:
+        """Send no hand data until all arms are paused; then send them from elsewhere."""
+        for rig in self.rigs:
+            rig.sends_hand = False
+        self.wait_for_pause()
+        for rig in self.rigs:
+            rig.hand = pin.SE3(rig.hand.rotation, rig.hand.translation + np.array([0.4, -0.4, 0.4]))
+            rig.sends_hand = True
+
+    def _press_until(self, condition: Callable[[ArmRig], Any], what: str) -> None:
+        """Press again where a press had no effect for long: an overloaded machine loses one now and then."""
+        deadline = time.monotonic() + PATIENCE
+        while rigs := [rig for rig in self.rigs if not condition(rig)]:
+            assert time.monotonic() < deadline, f"{rigs[0].arm}: waited until {what}; state {rigs[0].state}"
+            for rig in rigs:
+                rig.lower = True
+            time.sleep(0.15)
+            for rig in rigs:
+                rig.lower = False
+            patience = time.monotonic() + 3.0
+            while not all(map(condition, rigs)) and time.monotonic() < patience:
+                time.sleep(0.01)
+
+
 def stamped_transform(parent: str, child: str, pose: pin.SE3) -> TransformStamped:
-    """Where a frame is in another, as /tf tells it; its stamp means nothing."""
+    """Where a frame is in another, as on /tf; the stamp is not set."""
     transform = transform_message(pose.translation, pin.Quaternion(pose.rotation).coeffs())
     message = TransformStamped(child_frame_id=child, transform=transform)
     message.header.frame_id = parent

@@ -1,4 +1,4 @@
-"""ROS 2 in tests: a private domain for each worker, processes and nodes in it, and the interfaces that they need.
+"""ROS 2 in tests: a private domain for each worker, processes and nodes in it, and the message packages they need.
 
 Modules that need ROS say ``pytest.importorskip("rclpy", reason=...)`` on top or use one of these fixtures, which skip.
 """
@@ -18,8 +18,8 @@ import pytest
 from q2r2_control import CartesianController, Robot, load_config
 from q2r2_control.compliance.impedance import ImpedanceController
 from q2r2_control.ros.launch.build import interface_packages, missing_tools
-from tests.ros.built import built
-from tests.ros.processes import Processes, environment_of
+from tests.ros.built_interfaces import build_interfaces
+from tests.ros.processes import CONFIG, Processes, environment_of
 
 NEEDS_ROS = "needs ROS 2 Jazzy: pip install 'q2r2_control[ros]', or source an install"
 _PROCESSES = pytest.StashKey[Processes]()
@@ -36,11 +36,16 @@ def domain(tmp_path_factory: pytest.TempPathFactory) -> Iterator[int]:
         yield number
 
 
+@pytest.fixture(scope="session")
+def robot() -> Robot:
+    """The arms of the cell that the tests run."""
+    return Robot.from_config(load_config(CONFIG))
+
+
 @pytest.fixture(scope="session", autouse=True)
-def kernels() -> None:
+def kernels(robot: Robot) -> None:
     """Compiled before any process is waited for: the first time that takes a minute or two."""
-    config = load_config("config/dual_iiwa7.yaml")
-    robot = Robot.from_config(config)
+    config = load_config(CONFIG)
     CartesianController(robot, config.control).step({}, 0.001)
     ImpedanceController(robot, config.impedance)
 
@@ -57,16 +62,11 @@ def interfaces() -> None:
 
 
 @pytest.fixture(scope="session")
-def others(domain: int, tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
-    """Variables for processes that speak as MoveIt Servo and an LBR's driver do; built once for all workers."""
+def other_interfaces(domain: int, tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """Variables for processes that import moveit_msgs or lbr_fri_idl, built once for all workers."""
     folder = tmp_path_factory.getbasetemp()
-    return built(folder.parent if "PYTEST_XDIST_WORKER" in os.environ else folder, "moveit_msgs", "lbr_fri_idl")
-
-
-@pytest.fixture(scope="session")
-def lbr_environment(others: dict[str, str]) -> dict[str, str]:
-    """Variables for processes that import ``lbr_fri_idl``."""
-    return others
+    shared = folder.parent if "PYTEST_XDIST_WORKER" in os.environ else folder
+    return build_interfaces(shared, "moveit_msgs", "lbr_fri_idl")
 
 
 @pytest.fixture
@@ -111,7 +111,7 @@ def spun_node(domain: int, name: str = "test") -> Iterator[Any]:
     ended = Event()
 
     def spin() -> None:
-        # A test may destroy an entity that the executor is just about to wait for; the others are still to be served.
+        # A test may destroy an entity that the executor is about to wait for; go on with the other entities.
         while not ended.is_set():
             with suppress(InvalidHandle):
                 executor.spin()

@@ -1,4 +1,4 @@
-"""Processes of a test: ended by their own id, their output kept for the message of a failure."""
+"""Processes that a test starts; each is ended by its own id, and its output is kept for the report of a failure."""
 
 from __future__ import annotations
 
@@ -10,10 +10,23 @@ import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import pytest
+
 from q2r2_control.ros.launch.middleware import set_up_middleware
 
 ROOT = Path(__file__).resolve().parents[2]
-PATIENCE = 30.0  # [s], for starting Python and finding each other on a busy machine
+CONFIG = "config/dual_iiwa7.yaml"
+PATIENCE = 30.0  # for starting Python and discovery on an overloaded machine [s]
+
+
+def skip_if_overloaded(what: str) -> None:
+    """Skip a test that could not begin where other programs take most of the machine; otherwise do nothing.
+
+    A set of nodes keeps two cores busy with a load of 3 at most; timeouts of 150 ms hold no longer at twice as much.
+    """
+    load, cores = os.getloadavg()[0], os.cpu_count() or 1
+    if load > 3.0 * cores:
+        pytest.skip(f"{what}, on a machine with a load of {load:.0f} on {cores} cores")
 
 
 class RosProcess:
@@ -44,7 +57,7 @@ class RosProcess:
         """The first whole line of output that contains ``text``; fails when the process ends or time runs out."""
         deadline = time.monotonic() + timeout
         while True:
-            ended = not self.running  # asked before reading, so that its last words are read
+            ended = not self.running  # asked before reading, so that all of its output is read
             for line in self.output.splitlines(keepends=True):
                 if text in line and line.endswith("\n"):
                     return line.rstrip("\n")
@@ -65,7 +78,7 @@ class RosProcess:
         return self.wait(timeout)
 
     def end(self) -> None:
-        """End it however it takes: politely, then not."""
+        """End it: by SIGTERM, then by SIGKILL."""
         for means in (self._process.terminate, self._process.kill):
             if self.running:
                 means()
@@ -95,6 +108,11 @@ class Processes:
         """Start ``python -m module``, unbuffered."""
         return self.start(sys.executable, "-u", "-m", module, *arguments, name=module.split(".")[-1], **environment)
 
+    def start_node(self, name: str, *parameters: str, **environment: str) -> RosProcess:
+        """Start one of the package's nodes with ``parameters``, each as ``name:=value``."""
+        arguments = [part for parameter in parameters for part in ("-p", parameter)]
+        return self.start_module(f"q2r2_control.ros.nodes.{name}", "--ros-args", *arguments, **environment)
+
     def end_all(self) -> None:
         """Last started, first ended."""
         for process in reversed(self.started):
@@ -104,7 +122,7 @@ class Processes:
 def environment_of(domain: int, folder: Path) -> dict[str, str]:
     """This process's environment with ROS confined to ``domain`` on this machine, and its logs to ``folder``.
 
-    Test processes use the middleware as nodes do: one that is killed is to hold up nobody.
+    Test processes use the middleware as nodes do: one that is killed must not delay others.
     """
     paths = [str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]
     environment = dict(os.environ) | {

@@ -1,4 +1,4 @@
-"""What one arm's node makes of what the other one says; real nodes and real messages, also those that are lost."""
+"""The link between the arms' nodes, with real nodes and real messages, some of which are lost."""
 
 from __future__ import annotations
 
@@ -10,39 +10,39 @@ from typing import Any
 import pytest
 
 from tests.ros.conftest import NEEDS_ROS, spun_node
-from tests.ros.waiting import eventually
+from tests.ros.waiting import wait_until
 
 pytest.importorskip("rclpy", reason=NEEDS_ROS)
 
 from q2r2_control.ros.monitoring.arm_link import ArmLink
 
-TIMEOUT = 1.0  # a busy machine must not look like silence [s]
-MEANWHILE = 0.3  # time for several signs of life [s]
+TIMEOUT = 1.0  # longer than by default, so that other load on the machine does not look like silence [s]
+MEANWHILE = 0.3  # time for several heartbeats [s]
 
 
 class End:
-    """One arm's node with its end of the link, and all faults that it was told."""
+    """One arm's node with its end of the link, and the faults that it received."""
 
     def __init__(self, node: Any, arm: str) -> None:
         self.node = node
         self.link = ArmLink(node, "robot", arm, "side_by_side", TIMEOUT)
-        self.told: list[str] = []
+        self.faults: list[str] = []
 
     def listen(self) -> list[str]:
         if (fault := self.link.take_fault()) is not None:
-            self.told.append(fault)
-        return self.told
+            self.faults.append(fault)
+        return self.faults
 
     def hears(self, text: str) -> Callable[[], bool]:
         return lambda: any(text in line for line in self.listen())
 
     def listen_for_a_while(self) -> list[str]:
-        """All faults told so far and while several more signs of life come."""
+        """All faults received until several more heartbeats have come."""
         deadline = time.monotonic() + MEANWHILE
         while time.monotonic() < deadline:
             self.listen()
             time.sleep(0.01)
-        return self.told
+        return self.faults
 
 
 Make = Callable[[str], End]
@@ -64,25 +64,25 @@ def pair(make: Make) -> tuple[End, End]:
 
 
 def meet(left: End, right: End) -> None:
-    """Until each hears the other: a fault of a paused arm is told to a paused arm, and forgotten."""
+    """Wait until each receives the other's heartbeat, by faults that are then forgotten."""
     for speaker, hearer in ((left, right), (right, left)):
         speaker.link.report("hello")
-        eventually(hearer.hears("hello"), "a fault is heard")
+        wait_until(hearer.hears("hello"), "a fault is heard")
     for end in (left, right):
         end.listen_for_a_while()
-        end.told.clear()
+        end.faults.clear()
 
 
 def test_a_fault_pauses_the_other_arm_once_however_often_it_is_repeated(pair: tuple[End, End]) -> None:
     left, right = pair
     right.link.engaged()
     left.link.report("the hand jumped")
-    eventually(right.hears("the hand jumped"), "the fault is told")
+    wait_until(right.hears("the hand jumped"), "the fault is received")
     assert right.listen_for_a_while() == ["linked to left: the hand jumped"]
     right.link.engaged()
     assert right.listen_for_a_while() == ["linked to left: the hand jumped"]
     left.link.report("the hand jumped")
-    eventually(lambda: len(right.listen()) == 2, "the same fault once more is another fault")
+    wait_until(lambda: len(right.listen()) == 2, "the same fault once more is another fault")
 
 
 def test_a_fault_whose_first_messages_are_lost_is_told_by_the_next_ones(make: Make) -> None:
@@ -91,7 +91,7 @@ def test_a_fault_whose_first_messages_are_lost_is_told_by_the_next_ones(make: Ma
     left = make("left")
     left.link.report("no pose")  # before anybody can have subscribed
     left.link.engaged()  # and its own arm is engaged again at once
-    eventually(right.hears("no pose"), "the fault is told")
+    wait_until(right.hears("no pose"), "the fault is received")
     assert right.listen_for_a_while() == ["linked to left: no pose"]
 
 
@@ -107,32 +107,32 @@ def test_messages_that_a_node_had_no_time_to_read_cost_no_fault(domain: int, mak
     executor.add_node(busy)
     try:
         right = End(busy, "right")
-        eventually(lambda: left.node.count_subscribers("/robot/left/link") == 1, "it is subscribed")
+        wait_until(lambda: left.node.count_subscribers("/robot/left/link") == 1, "it is subscribed")
         right.link.engaged()
         left.link.report("no pose")
         time.sleep(0.8)  # twice what its queue of ten messages holds
         deadline = time.monotonic() + TIMEOUT
-        while not right.told and time.monotonic() < deadline:
+        while not right.faults and time.monotonic() < deadline:
             executor.spin_once(timeout_sec=0.1)
             right.listen()
-        assert right.told == ["linked to left: no pose"]
+        assert right.faults == ["linked to left: no pose"]
     finally:
         executor.shutdown()
         busy.destroy_node()
         context.try_shutdown()
 
 
-def test_an_old_fault_pauses_nobody_who_came_later_or_was_engaged_since(make: Make) -> None:
+def test_an_old_fault_pauses_no_arm_that_started_later_or_was_engaged_since(make: Make) -> None:
     left = make("left")
     left.link.report("old")
     time.sleep(0.5)  # far more than what a message takes while two nodes are getting to know each other
     right = make("right")
     right.link.engaged()
-    eventually(lambda: right.node.count_publishers("/robot/left/link") == 1, "they know each other")
+    wait_until(lambda: right.node.count_publishers("/robot/left/link") == 1, "they know each other")
     assert right.listen_for_a_while() == []
     left.link.report("new")
-    eventually(right.hears("new"), "a new fault is told")
-    assert right.told == ["linked to left: new"]
+    wait_until(right.hears("new"), "a new fault is received")
+    assert right.faults == ["linked to left: new"]
 
 
 def test_both_at_fault_pause_once_each_and_are_engaged_one_by_one(pair: tuple[End, End]) -> None:
@@ -141,45 +141,45 @@ def test_both_at_fault_pause_once_each_and_are_engaged_one_by_one(pair: tuple[En
         end.link.engaged()
     left.link.report("left is lost")
     right.link.report("right is lost")
-    eventually(left.hears("right is lost"), "left is told")
-    eventually(right.hears("left is lost"), "right is told")
+    wait_until(left.hears("right is lost"), "left receives it")
+    wait_until(right.hears("left is lost"), "right receives it")
     left.link.engaged()  # while the right arm's fault stands
     assert left.listen_for_a_while() == ["linked to right: right is lost"]
     right.link.engaged()
     assert right.listen_for_a_while() == ["linked to left: left is lost"]
     right.link.report("right is lost again")
-    eventually(left.hears("right is lost again"), "left is told of the next fault")
+    wait_until(left.hears("right is lost again"), "left receives the next fault")
     assert len(right.listen()) == 1
 
 
-def test_a_node_that_dies_is_named_and_its_return_pauses_nobody_until_its_next_fault(make: Make, domain: int) -> None:
+def test_a_node_that_dies_is_named_and_its_restart_pauses_no_arm_until_its_next_fault(make: Make, domain: int) -> None:
     right = make("right")
     with spun_node(domain, "left_arm") as node:
         left = End(node, "left")
         meet(left, right)
         right.link.engaged()
-    eventually(right.hears("silent"), "its silence is told")
-    (line,) = right.told
+    wait_until(right.hears("silent"), "its silence is reported")
+    (line,) = right.faults
     assert line.startswith("linked to left: /left_arm is silent for 1.")
     right.link.engaged()  # alone
     again = make("left")
-    eventually(lambda: right.node.count_publishers("/robot/left/link") == 1, "it is back")
+    wait_until(lambda: right.node.count_publishers("/robot/left/link") == 1, "it is back")
     assert right.listen_for_a_while() == [line]
-    again.link.report("first fault of its new life")
-    eventually(right.hears("first fault of its new life"), "numbers begin anew with a node")
+    again.link.report("first fault after the restart")
+    wait_until(right.hears("first fault after the restart"), "numbers begin anew with a node")
 
 
-def test_a_node_started_anew_before_its_silence_is_noticed_pauses_the_other_arm(make: Make, domain: int) -> None:
+def test_a_node_restarted_before_its_silence_is_noticed_pauses_the_other_arm(make: Make, domain: int) -> None:
     right = make("right")
     with spun_node(domain, "left_arm") as node:
         left = End(node, "left")
         meet(left, right)
         right.link.engaged()
         make("left")
-        eventually(right.hears("/left_arm was restarted without announcing its end, or runs twice"), "it is reported")
+        wait_until(right.hears("/left_arm was restarted without announcing its end, or runs twice"), "it is reported")
 
 
-def test_a_node_that_ends_in_order_pauses_the_other_arm_once_and_is_not_missed(make: Make, domain: int) -> None:
+def test_a_node_that_ends_in_order_pauses_the_other_arm_once(make: Make, domain: int) -> None:
     right = make("right")
     with spun_node(domain, "left_arm") as node:
         left = End(node, "left")
@@ -187,18 +187,18 @@ def test_a_node_that_ends_in_order_pauses_the_other_arm_once_and_is_not_missed(m
         right.link.engaged()
         node.destroy_timer(next(iter(node.timers)))  # the announced end is a node's last message
         left.link.close()
-        eventually(right.hears("/left_arm has ended"), "the end is announced")
+        wait_until(right.hears("/left_arm has ended"), "the end is announced")
     time.sleep(TIMEOUT)
     assert right.listen_for_a_while() == ["linked to left: /left_arm has ended"]
 
 
-def test_what_is_no_sign_of_life_is_passed_over(make: Make) -> None:
+def test_messages_that_are_no_heartbeats_are_ignored(make: Make) -> None:
     from std_msgs.msg import String
 
     right = make("right")
-    stranger = right.node.create_publisher(String, "/robot/left/link", 10)
+    sender = right.node.create_publisher(String, "/robot/left/link", 10)
     right.link.engaged()
     for text in ("alive", "{}", '{"node": "/x", "id": "1", "fault": -1}', '{"node": "/x", "id": "1", "age": null}'):
-        stranger.publish(String(data=text))
+        sender.publish(String(data=text))
     time.sleep(TIMEOUT)
-    assert right.listen_for_a_while() == [], "a stranger's silence is no fault either"
+    assert right.listen_for_a_while() == [], "its silence is no fault either"

@@ -1,4 +1,4 @@
-"""What an arm controller can be told: by a cell's YAML, by topics in place of /tf and actions; real processes."""
+"""Settings of an arm controller: from a cell's YAML, and topics in place of /tf and actions; real processes."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def test_a_cells_yaml_gives_stance_and_scale_and_parameters_change_them(
     assert_same(rig.wait_for_rest(), offset(TOOL, (0.04, -0.06, 0.0)), 1e-3)
     assert rig.state["stance"] == "mirror_reflected"
     assert mirrored.interrupt() == 0
-    rig.sends_hand = rig.tells_tool = False
+    rig.sends_hand = rig.sends_tool = False
 
     rig = ArmRig(node, "left")
     rig.start(processes, {"config": config, "mirror": "false", "teleop.position_scale": 2.0})
@@ -80,12 +80,22 @@ def test_a_cells_yaml_names_the_external_controller_and_parameters_change_that(c
         RightArmController(context=context, cli_args=arguments)
 
 
-def test_a_tool_that_a_topic_tells_is_engaged_where_it_is_and_paused_when_the_topic_ends(
+def test_a_subclass_may_mirror_its_arm_and_give_its_filter_in_samples(context: Any) -> None:
+    from q2r2_control.ros import BaseArmController
+
+    made = BaseArmController("right", "bh_robot", mirror=True, filter_window_size=4, context=context)
+    assert made.get_name() == "right_bh_robot_arm_controller"
+    assert (made.parameters.teleop.stance, made.hand) == ("mirror", "left")
+    assert made.parameters.teleop.filter.smoothing_delay == pytest.approx(1.5 / 75.0)  # half of 4 - 1 periods
+    made.destroy_node()
+
+
+def test_a_tool_on_a_topic_is_engaged_where_it_is_and_paused_when_the_topic_ends(
     rig: ArmRig, node: Any, processes: Processes
 ) -> None:
     from geometry_msgs.msg import PoseStamped
 
-    rig.tells_tool = False
+    rig.sends_tool = False
     publisher = node.create_publisher(PoseStamped, "/left/current_pose", 10)
     now = node.get_clock().now
     timer = node.create_timer(
@@ -98,11 +108,11 @@ def test_a_tool_that_a_topic_tells_is_engaged_where_it_is_and_paused_when_the_to
     rig.move((0.05, 0.0, 0.0))
     assert_same(rig.wait_for_rest(), offset(TOOL, (0.05, 0.0, 0.0)), 1e-3)
     node.destroy_timer(timer)
-    rig.wait(lambda: rig.state["state"] == "paused", "an arm whose tool is not told any more is paused")
-    rig.wait(lambda: "/left/current_pose from /test is silent" in rig.state["message"], "the reason is told")
+    rig.wait(lambda: rig.state["state"] == "paused", "an arm without tool poses is paused")
+    rig.wait(lambda: "/left/current_pose from /test is silent" in rig.state["message"], "the reason is reported")
 
 
-def test_a_gripper_behind_a_topic_is_told_its_positions(rig: ArmRig, node: Any, processes: Processes) -> None:
+def test_a_gripper_behind_a_topic_gets_its_positions(rig: ArmRig, node: Any, processes: Processes) -> None:
     from std_msgs.msg import Float64MultiArray
 
     commands: Queue[list[float]] = Queue()
@@ -129,6 +139,6 @@ def test_a_target_that_slips_on_its_leash_is_felt(rig: ArmRig, processes: Proces
     assert rig.pulses == []
     rig.move((0.09, 0.0, 0.0), 0.6)
     rig.wait(lambda: rig.pulses.count((0.2, 0.2)) >= 3, "every two centimetres of slip are felt")
-    rig.wait(lambda: rig.state["slip"] > 0.06, "the slip is told")
+    rig.wait(lambda: rig.state["slip"] > 0.06, "the slip is reported")
     assert set(rig.pulses) == {(0.2, 0.2), (0.0, 0.0)}
     assert np.linalg.norm(rig.wait_for_rest().translation - TOOL.translation) < 0.051

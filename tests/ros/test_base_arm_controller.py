@@ -1,4 +1,4 @@
-"""An arm's teleop node as the rest of a ROS system meets it: topics, actions, services, state; real processes."""
+"""The teleoperation node of an arm as a process: topics, actions, services, state."""
 
 from __future__ import annotations
 
@@ -8,19 +8,18 @@ from queue import Queue
 from typing import Any
 
 import numpy as np
-import pinocchio as pin
 import pytest
 
 from tests.ros.conftest import NEEDS_ROS, spun_node
 from tests.ros.processes import PATIENCE, Processes, RosProcess
+from tests.ros.waiting import call
 
 pytest.importorskip("rclpy", reason=NEEDS_ROS)
 pytest.importorskip("quest2ros", reason="needs q2r2 ros build-interfaces")
 pytestmark = pytest.mark.usefixtures("interfaces")
 
 from q2r2_control.errors import ConfigError  # noqa: E402
-from q2r2_control.ros.bridge.messages import pose_of  # noqa: E402
-from tests.ros.arm_rig import TOOL, ArmRig, assert_same, first, offset, stamped_transform, steps  # noqa: E402
+from tests.ros.arm_rig import TOOL, ArmRig, assert_same, first, offset, steps  # noqa: E402
 
 
 @pytest.fixture
@@ -71,7 +70,10 @@ def test_a_silent_hand_pauses_the_arm_and_its_return_moves_nothing(rig: ArmRig, 
     rig.sends_hand = False
     rig.wait(lambda: rig.state["state"] == "paused", "the watchdog pauses the arm")
     assert re.match(r"paused: no (data|pose) of the left hand from /test for 0\.5", rig.state["last_event"])
-    rig.wait(lambda: "of the left hand from /test for" in rig.state["message"], "diagnostics name whose data ceased")
+    rig.wait(
+        lambda: "of the left hand from /test for" in rig.state["message"],
+        "diagnostics name the node",
+    )
     assert rig.state["level"] == "warn"
     held = rig.wait_for_rest()
     rig.hand = offset(rig.hand, (0.3, 0.3, 0.0))
@@ -87,33 +89,23 @@ def test_a_silent_hand_pauses_the_arm_and_its_return_moves_nothing(rig: ArmRig, 
 def test_without_its_tools_pose_an_arm_is_not_engaged_nor_a_gripper_closed_without_server(
     rig: ArmRig, processes: Processes
 ) -> None:
-    rig.tells_tool = False
+    rig.sends_tool = False
     rig.start(processes)
     rig.press()
     rig.wait(lambda: "the tool's pose is not known" in rig.state["last_event"], "the press is refused")
     assert rig.state["level"] == "warn"
     assert "no transform from left_tool_frame to world" in rig.state["message"]
-    rig.tells_tool = True
+    rig.sends_tool = True
     rig.engage()
     rig.wait(lambda: rig.targets, "targets come")
-    rig.tells_tool = False
+    rig.sends_tool = False
     rig.wait(lambda: rig.state["state"] == "paused", "an arm whose tool is not seen any more is paused")
     assert "left_tool_frame on /tf from /test is 1.0" in rig.state["last_event"]
 
-    rig.tells_tool = True
+    rig.sends_tool = True
     rig.press("upper")
-    rig.wait(lambda: "no gripper server at /q2r2/left_gripper/gripper_cmd" in rig.state["message"], "it is told")
+    rig.wait(lambda: "no gripper server at /q2r2/left_gripper/gripper_cmd" in rig.state["message"], "it is reported")
     assert rig.state["gripper"] == "open"
-
-
-def call(node: Any, service: str) -> bool:
-    from std_srvs.srv import Trigger
-
-    client = node.create_client(Trigger, f"/left_q2r2_arm_controller/{service}")
-    assert client.wait_for_service(PATIENCE)
-    answers: Queue[Any] = Queue()
-    client.call_async(Trigger.Request()).add_done_callback(lambda future: answers.put(future.result()))
-    return bool(answers.get(timeout=PATIENCE).success)
 
 
 def test_services_and_a_second_publisher_of_targets_pause_the_arm(rig: ArmRig, node: Any, processes: Processes) -> None:
@@ -131,7 +123,7 @@ def test_services_and_a_second_publisher_of_targets_pause_the_arm(rig: ArmRig, n
     rig.start(processes)
     for service in ("pause", "reset"):
         rig.engage()
-        assert call(node, service)
+        assert call(node, f"/left_q2r2_arm_controller/{service}").success
         rig.wait(lambda: rig.state["state"] == "paused", "the service pauses the arm")
 
     rig.engage()
@@ -171,43 +163,10 @@ def test_arms_with_different_mirror_settings_refuse_to_engage_and_a_fault_of_one
 
 
 def start_mirrored(rig: ArmRig, processes: Processes) -> RosProcess:
-    process = processes.start_module(
-        f"q2r2_control.ros.nodes.{rig.arm}_arm_controller", "--ros-args", "-p", "mirror:=true"
-    )
+    process = processes.start_node(f"{rig.arm}_arm_controller", "mirror:=true")
     rig.wait(lambda: rig.state.get("stance") == "mirror", "the mirrored arm is there")
     rig.state = {}
     return process
-
-
-def test_a_subclass_with_other_names_works_in_its_robots_frame(node: Any, processes: Processes) -> None:
-    from tf2_msgs.msg import TFMessage
-    from visualization_msgs.msg import Marker
-
-    from q2r2_control.ros.base_node import LATCHED_QOS
-
-    base = pin.SE3(pin.exp3(np.array([0.0, 0.0, 1.2])), np.array([0.1, -0.4, 0.3]))
-    static = node.create_publisher(TFMessage, "/tf_static", LATCHED_QOS)
-    static.publish(TFMessage(transforms=[stamped_transform("world", "bh_robot_base", base)]))
-    shown: dict[str, Any] = {}
-    node.create_subscription(Marker, "/visualization_marker", lambda marker: shown.update({marker.ns: marker}), 10)
-
-    topic = "/bh_robot/right_arm_clik_controller/target_frame"
-    rig = ArmRig(node, "right", hand="left", topic=topic, tool_frame="right_arm_link_ee", robot="bh_robot")
-    rig.follows = False
-    rig.start(processes, {"world_frame_id": "world", "teleop.leash.distance": 0.0}, "tests.ros.third_arm")
-    rig.engage()
-    rig.wait(lambda: rig.targets, "targets come")
-    assert rig.targets[0].header.frame_id == "bh_robot_base"
-    assert_same(base * first(rig), TOOL, 1e-9)
-    rig.move((0.0, 0.1, 0.0))
-    assert_same(base * rig.wait_for_rest(), offset(TOOL, (0.0, 0.1, 0.0)), 1e-3)
-
-    rig.wait(lambda: {"right_engaged", "right_axes", "right_path"} <= shown.keys(), "markers come")
-    assert shown["right_axes"].header.frame_id == "right_arm_link_ee"
-    assert_same(TOOL * (pose_of(shown["right_axes"].pose) or pin.SE3.Identity()), offset(TOOL, (0.0, 0.1, 0.0)), 2e-3)
-    rig.pause()
-    rig.wait(lambda: shown["right_engaged"].color.a < 1.0, "the marker fades")
-    assert_same(pose_of(shown["right_engaged"].pose), pin.SE3.Identity(), 1e-9)
 
 
 @pytest.mark.parametrize("kind", ["GripperCommand", "ParallelGripperCommand"])
@@ -231,7 +190,7 @@ def test_a_gripper_is_closed_when_its_result_says_so_even_stalled(
         server = ActionServer(other, action, "/q2r2/left_gripper/gripper_cmd", execute)
         joint = {"gripper.joint_name": "finger"} if kind == "ParallelGripperCommand" else {}
         rig.start(processes, {"gripper.action_type": kind, "gripper.open_position": 0.04, **joint})
-        while goals.empty():  # a press before the server was found asks nobody
+        while goals.empty():  # a press before the server is discovered has no effect
             rig.press("upper")
             rig.wait(lambda: not goals.empty() or "no gripper server" in rig.state["message"], "an answer to the press")
         command = goals.get()
@@ -247,7 +206,7 @@ def test_a_gripper_is_closed_when_its_result_says_so_even_stalled(
         command = goals.get(timeout=PATIENCE)
         assert (command.position if kind == "GripperCommand" else command.position[0]) == 0.04
         answers.put({"stalled": False})
-        rig.wait(lambda: "neither stalled nor at its goal" in rig.state["message"], "the failure is told")
+        rig.wait(lambda: "neither stalled nor at its goal" in rig.state["message"], "the failure is reported")
         assert rig.state["gripper"] == "closed"
         server.destroy()
 
@@ -276,6 +235,6 @@ def test_a_bad_parameter_is_refused_with_one_line(given: str, context: Any) -> N
 
 
 def test_a_node_with_a_bad_parameter_ends_with_that_line(processes: Processes) -> None:
-    process = processes.start_module("q2r2_control.ros.nodes.left_arm_controller", "--ros-args", "-p", "mode:=direct")
+    process = processes.start_node("left_arm_controller", "mode:=direct")
     assert process.wait() == 2
     assert process.output == "left_arm_controller.py: mode = 'direct': allowed are raw, filtered\n"

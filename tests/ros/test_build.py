@@ -86,10 +86,10 @@ def test_a_package_built_beside_a_sourced_install_is_used_after_sourcing_it_too(
     python = bare_environment / "bin" / "python"
     packages = bare_environment / SITE_PACKAGES
     path = os.pathsep.join([str(packages), sourced["PYTHONPATH"]])
-    told = build_interfaces(python=python, **(sourced | {"PYTHONPATH": path})).stdout.splitlines()
-    assert f"quest2ros: already there ({packages / 'quest2ros'})" in told
+    lines = build_interfaces(python=python, **(sourced | {"PYTHONPATH": path})).stdout.splitlines()
+    assert f"quest2ros: already there ({packages / 'quest2ros'})" in lines
     setup_file = bare_environment / "share" / "quest2ros" / "local_setup.bash"
-    assert told[-1] == f"before use: source {setup_file}"
+    assert lines[-1] == f"before use: source {setup_file}"
 
     script = (
         "from rclpy.serialization import deserialize_message, serialize_message\n"

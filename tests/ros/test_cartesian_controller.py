@@ -15,7 +15,7 @@ import pytest
 
 from q2r2_control import Robot, load_config
 from tests.ros.conftest import NEEDS_ROS, spun_node
-from tests.ros.processes import PATIENCE, Processes
+from tests.ros.processes import CONFIG, PATIENCE, Processes
 
 pytest.importorskip("rclpy", reason=NEEDS_ROS)
 pytest.importorskip("control_msgs", reason="needs control_msgs: q2r2 ros build-interfaces")
@@ -32,15 +32,11 @@ from std_srvs.srv import SetBool
 
 from q2r2_control.ros.base_node import COMMAND_QOS
 from q2r2_control.ros.bridge.messages import pose_message, stamped_pose, time_message
-from tests.ros.cell import CONFIG, PATIENT, STILL, Cell, Stream, at_rest, parameters, shifted, start, wait
+from tests.ros.cell import PATIENT, STILL, Cell, Stream, shifted, start_controller, start_robot
+from tests.ros.waiting import wait_until
 
 # How far the simulated arms lag behind their reference at the speeds of these tests, between two arms.
 TRACKING = 0.01  # [m]
-
-
-@pytest.fixture(scope="module")
-def robot() -> Robot:
-    return Robot.from_config(load_config(CONFIG))
 
 
 @pytest.fixture(scope="module")
@@ -54,20 +50,19 @@ def running(domain: int, tmp_path_factory: pytest.TempPathFactory) -> Iterator[P
 @pytest.fixture(scope="module")
 def started(domain: int, running: Processes, robot: Robot) -> Iterator[Cell]:
     with spun_node(domain) as node:
-        yield Cell(node, robot, start(running, "mujoco_robot"), start(running, "cartesian_controller", *PATIENT))
+        yield Cell(node, robot, start_robot(running), start_controller(running, *PATIENT))
 
 
 @pytest.fixture
 def cell(started: Cell, running: Processes) -> Cell:
     """At home, active, without targets."""
     started.call("/cartesian_controller/stop")
-    wait(lambda: started.state("phase") == "stopped", "the controller is stopped")
+    wait_until(lambda: started.state("phase") == "stopped", "the controller is stopped")
     started.call("/mujoco_robot/reset")
     started.call("/cartesian_controller/reset")
     started.wait_until_active()
     time.sleep(0.1)  # transforms of before the reset are past
-    started.measured.clear()
-    wait(lambda: started.measured, "joint states come")
+    started.forget()
     return started
 
 
@@ -91,10 +86,10 @@ def test_an_arm_follows_its_target_and_the_other_one_holds(cell: Cell, robot: Ro
     stream.move("left", (0.05, 0.0, 0.0))
     goal = stream.poses["left"]
     assert np.linalg.norm(goal.translation - begin.translation) == pytest.approx(0.05)
-    wait(lambda: np.linalg.norm(cell.tool("left").translation - goal.translation) < 2e-3, "the arm is there")
-    wait(lambda: np.linalg.norm(pin.log3(cell.tool("left").rotation.T @ goal.rotation)) < 5e-3, "it is turned so")
+    wait_until(lambda: np.linalg.norm(cell.tool("left").translation - goal.translation) < 2e-3, "the arm is there")
+    wait_until(lambda: np.linalg.norm(pin.log3(cell.tool("left").rotation.T @ goal.rotation)) < 5e-3, "it is turned so")
     right = robot.arms["right"].joints
-    assert all(np.abs((measured.q - start_q)[right]).max() < STILL for measured in cell.measured)
+    assert all(np.abs((q - start_q)[right]).max() < STILL for q in cell.postures)
 
 
 def test_crossing_targets_never_bring_the_arms_nearer_than_the_least_distance(
@@ -107,19 +102,19 @@ def test_crossing_targets_never_bring_the_arms_nearer_than_the_least_distance(
             stream.poses[arm] = shifted(stream.poses[arm], 0.0, 0.02 * sign, 0.0)
         time.sleep(0.04)
     time.sleep(1.0)
-    nearest = min(float(robot.distance_values(measured.q).min()) for measured in cell.measured)
+    nearest = min(float(robot.distance_values(q).min()) for q in cell.postures)
     assert nearest < least + 0.02  # they did meet
     assert nearest >= least - TRACKING
 
 
-def test_safe_targets_are_the_tool_poses_that_the_arms_are_led_to(cell: Cell, streams: list[Stream]) -> None:
+def test_safe_targets_are_the_tool_poses_of_the_reference(cell: Cell, streams: list[Stream]) -> None:
     poses: list[PoseStamped] = []
     subscription = cell.node.create_subscription(
         PoseStamped, "/cartesian_controller/safe_target/left", poses.append, 10
     )
     engage(cell, streams, "left").move("left", (0.0, 0.0, 0.05))
-    wait(lambda: poses, "safe targets come")
-    at_rest(cell)
+    wait_until(lambda: poses, "safe targets come")
+    cell.joints.wait_for_rest()
     position = poses[-1].pose.position
     assert poses[-1].header.frame_id == "world"
     assert np.allclose([position.x, position.y, position.z], cell.tool("left").translation, atol=3e-3)
@@ -147,15 +142,15 @@ def bad_target(kind: str, pose: pin.SE3) -> PoseStamped:
     ],
 )
 def test_a_bad_target_moves_nothing_and_is_reported_once(cell: Cell, kind: str, said: str) -> None:
-    wait(lambda: cell.state("level") == "ok", "nothing is wrong")
+    wait_until(lambda: cell.state("level") == "ok", "nothing is wrong")
     before, output = cell.q, cell.processes[1].output
     pose = shifted(cell.tool("left"), 0.1, 0.0, 0.0) if kind == "far from the tool" else cell.tool("left")
     for _ in range(30):
         cell.send_message("left", bad_target(kind, pose))
         time.sleep(0.01)
-    wait(lambda: cell.state("level") == "warn", "it is in the diagnostics")
+    wait_until(lambda: cell.state("level") == "warn", "it is in the diagnostics")
     assert "target of left not used" in cell.state("message")
-    assert all(np.abs(measured.q - before).max() < STILL for measured in cell.measured)
+    assert all(np.abs(q - before).max() < STILL for q in cell.postures)
     added = cell.processes[1].output[len(output) :]
     assert added.count("target of left not used") == added.count(said) == 1
     assert cell.processes[1].running
@@ -167,8 +162,8 @@ def test_an_arm_holds_without_targets_and_follows_only_a_stream_that_begins_at_i
     stream = engage(cell, streams, "left")
     stream.move("left", (0.05, 0.0, 0.0))
     stream.end()
-    wait(lambda: cell.state("left_state") == "holding", "the arm holds")
-    rest = at_rest(cell)
+    wait_until(lambda: cell.state("left_state") == "holding", "the arm holds")
+    rest = cell.joints.wait_for_rest()
     far = shifted(stream.poses["left"], 0.0, 0.0, 0.1)
     streams.append(again := Stream(cell, {"left": far}))
     again.move("left", (0.0, 0.0, -0.1))  # comes by where the arm is
@@ -177,41 +172,41 @@ def test_an_arm_holds_without_targets_and_follows_only_a_stream_that_begins_at_i
     assert cell.state("left_state") == "holding"
     again.poses["left"] = far
     time.sleep(0.1)
-    again.poses["left"] = cell.tool("left")  # engaged anew, while the targets never cease
-    wait(lambda: cell.state("left_state") == "following", "the arm follows")
+    again.poses["left"] = cell.tool("left")  # engaged again, without a gap in the targets
+    wait_until(lambda: cell.state("left_state") == "following", "the arm follows")
 
 
 def test_pause_stop_and_home(cell: Cell, robot: Robot, streams: list[Stream]) -> None:
     stream = engage(cell, streams, "left")
     stream.move("left", (0.0, 0.0, 0.06))
     assert cell.call("/cartesian_controller/pause", SetBool.Request(data=True)).success
-    rest = at_rest(cell)
+    rest = cell.joints.wait_for_rest()
     stream.move("left", (0.05, 0.0, 0.0))
     assert np.abs(cell.q - rest).max() < STILL
     assert not cell.call("/cartesian_controller/home").success
     assert cell.call("/cartesian_controller/pause", SetBool.Request(data=False)).success
     assert cell.call("/cartesian_controller/home").success
     home = robot.tool_pose(robot.home, "left")
-    wait(lambda: np.linalg.norm(cell.tool("left").translation - home.translation) < 4e-3, "the tool is at home")
+    wait_until(lambda: np.linalg.norm(cell.tool("left").translation - home.translation) < 4e-3, "the tool is at home")
     assert cell.call("/cartesian_controller/stop").success
-    wait(lambda: cell.state("phase") == "stopped", "the controller is stopped")
-    wait(lambda: cell.state("mode", "mujoco_robot") == "holding", "nothing is commanded")
+    wait_until(lambda: cell.state("phase") == "stopped", "the controller is stopped")
+    wait_until(lambda: cell.state("mode", "mujoco_robot") == "holding", "nothing is commanded")
 
 
-def test_a_controller_that_is_killed_leaves_the_arms_to_stop_and_its_return_does_not_move_them(
+def test_arms_stop_when_their_controller_is_killed_and_stay_when_it_is_restarted(
     started: Cell, cell: Cell, running: Processes, streams: list[Stream]
 ) -> None:
     stream = engage(cell, streams, "left", "right")
     begin = stream.poses["left"]
     stream.poses["left"] = shifted(begin, 0.25, 0.0, 0.1)
-    wait(lambda: np.linalg.norm(cell.tool("left").translation - begin.translation) > 0.05, "the arm is in mid-motion")
+    wait_until(lambda: np.linalg.norm(cell.tool("left").translation - begin.translation) > 0.05, "the arm moves")
     os.kill(cell.processes[1].pid, signal.SIGKILL)
-    rest = at_rest(cell)  # how soon is measured by test_faults
-    back = start(running, "cartesian_controller", *PATIENT)
+    rest = cell.joints.wait_for_rest()  # how soon is measured by test_faults
+    back = start_controller(running, *PATIENT)
     started.processes = (started.processes[0], back)
     started.states.pop("cartesian_controller", None)
     cell.wait_until_active()
-    time.sleep(0.5)  # targets still come, from where nobody engaged anew
+    time.sleep(0.5)  # targets still come, but no new stream
     assert np.abs(cell.q - rest).max() < STILL
     assert cell.state("left_state") == "holding"
 
@@ -236,7 +231,7 @@ def faulty_joint_state(kind: str, robot: Robot, q: np.ndarray) -> JointState:
         ("a stall", "no joint states from /mujoco_robot for"),
     ],
 )
-def test_joint_states_that_cannot_be_believed_stop_the_arms_with_one_diagnostic(
+def test_invalid_joint_states_stop_the_arms_with_one_diagnostic(
     cell: Cell, robot: Robot, streams: list[Stream], kind: str, said: str
 ) -> None:
     output = cell.processes[1].output
@@ -249,15 +244,17 @@ def test_joint_states_that_cannot_be_believed_stop_the_arms_with_one_diagnostic(
     else:
         publisher = cell.node.create_publisher(JointState, "/joint_states", 10)
         message = faulty_joint_state(kind, robot, cell.q)
-        # Whoever was killed before counts as a listener for a while: only the report says that it has arrived.
-        wait(lambda: publisher.publish(message) or said in cell.processes[1].output[len(output) :], "it is reported")
+        # A controller that was killed before is listed as a subscriber for a while: only the report counts.
+        wait_until(
+            lambda: publisher.publish(message) or said in cell.processes[1].output[len(output) :], "it is reported"
+        )
         cell.node.destroy_publisher(publisher)
-    wait(lambda: f"joint states: {said}" in cell.processes[1].output[len(output) :], "it is reported")
-    wait(lambda: "active: " in cell.processes[1].output[len(output) :], "the controller is active again")
+    wait_until(lambda: f"joint states: {said}" in cell.processes[1].output[len(output) :], "it is reported")
+    wait_until(lambda: "active: " in cell.processes[1].output[len(output) :], "the controller is active again")
     stream.move("left", (0.05, 0.0, 0.0))
     assert cell.processes[1].output[len(output) :].count(f"joint states: {said}") == 1
-    wait(lambda: cell.state("left_state") == "holding", "the arm holds")
-    rest = at_rest(cell)
+    wait_until(lambda: cell.state("left_state") == "holding", "the arm holds")
+    rest = cell.joints.wait_for_rest()
     time.sleep(0.3)
     assert np.abs(cell.q - rest).max() < STILL
 
@@ -267,11 +264,11 @@ def test_joint_states_are_matched_by_name_whatever_their_order(cell: Cell, robot
     order = np.random.default_rng(2).permutation(len(robot.joint_names))
     names, output = [robot.joint_names[index] for index in order], cell.processes[1].output
     publisher = cell.node.create_publisher(JointState, "/joint_states", 10)
-    wait(lambda: publisher.get_subscription_count() >= 2, "the controller listens")
+    wait_until(lambda: publisher.get_subscription_count() >= 2, "the controller listens")
     for _ in range(50):
         publisher.publish(JointState(name=names, position=cell.q[order].tolist()))
         time.sleep(0.005)
-    publisher.publish(JointState(name=["of_somebody_else"], position=[math.nan]))
+    publisher.publish(JointState(name=["of_another_robot"], position=[math.nan]))
     time.sleep(0.2)
     cell.node.destroy_publisher(publisher)
     assert cell.state("left_state") == "following"
@@ -283,10 +280,10 @@ def test_parameters_change_together_or_not_at_all(cell: Cell) -> None:
     assert client.wait_for_services(PATIENCE)
     good, bad = Parameter("target_timeout", value=0.2), Parameter("engage_distance", value=9.0)
     sent = client.set_parameters_atomically([good, bad])
-    wait(sent.done, "the parameters are answered")
+    wait_until(sent.done, "the parameters are answered")
     assert not sent.result().result.successful
     read = client.get_parameters(["target_timeout", "engage_distance"])
-    wait(read.done, "the parameters are read")
+    wait_until(read.done, "the parameters are read")
     assert [value.double_value for value in read.result().values] == [0.5, 0.03]
 
 
@@ -295,33 +292,34 @@ def test_it_follows_in_another_layout_and_frame_with_another_output_and_on_simul
 ) -> None:
     cell.call("/cartesian_controller/stop")
     layout = ("left.target_topic:=/left/target_pose", "left.target_frame_id:=left_link_0", "output:=joint_state")
-    arguments = parameters(*layout, "use_sim_time:=true")
-    start(processes, "cartesian_controller", *arguments, "-r", "__node:=second")
+    arguments = [part for parameter in (*layout, "use_sim_time:=true") for part in ("-p", parameter)]
+    module = "q2r2_control.ros.nodes.cartesian_controller"
+    processes.start_module(module, "--ros-args", *arguments, "-r", "__node:=second")
     states: list[dict[str, Any]] = []
     node = cell.node
     subscription = node.create_subscription(String, "/second/state", lambda m: states.append(json.loads(m.data)), 10)
     clock = node.create_publisher(Clock, "/clock", 10)
     targets = node.create_publisher(PoseStamped, "/left/target_pose", COMMAND_QOS)
-    wait(lambda: states and "nothing comes on /clock" in states[-1]["message"], "the missing clock is reported")
+    wait_until(lambda: states and "nothing comes on /clock" in states[-1]["message"], "the missing clock is reported")
     began = time.monotonic()
     timer = node.create_timer(0.005, lambda: clock.publish(Clock(clock=time_message(100 + time.monotonic() - began))))
-    wait(lambda: states and states[-1]["phase"] == "active", "the second controller is active")
+    wait_until(lambda: states and states[-1]["phase"] == "active", "the second controller is active")
     base = robot.model.frames[robot.model.getFrameId("left_link_0")].placement
     tool = cell.tool("left")
     for step in range(51):
         goal = base.actInv(shifted(tool, 0.0, 0.001 * step, 0.0))
         targets.publish(stamped_pose(goal, "left_link_0", 0.0))
         time.sleep(0.02)
-    wait(lambda: abs(cell.tool("left").translation[1] - tool.translation[1] - 0.05) < 4e-3, "the arm is there")
+    wait_until(lambda: abs(cell.tool("left").translation[1] - tool.translation[1] - 0.05) < 4e-3, "the arm is there")
     node.destroy_timer(timer)
     for publisher in (clock, targets):
         node.destroy_publisher(publisher)
     node.destroy_subscription(subscription)
 
 
-def test_what_cannot_be_had_ends_in_one_line(processes: Processes) -> None:
+def test_an_impossible_parameter_ends_in_one_line(processes: Processes) -> None:
     faults = {"output:=lbr_torque": "lbr_fri_idl", "rate:=5000.0": "rate"}
-    begun = {said: start(processes, "cartesian_controller", "-p", fault) for fault, said in faults.items()}
+    begun = {said: start_controller(processes, fault) for fault, said in faults.items()}
     for said, process in begun.items():
         assert process.wait() == 2
         (line,) = (line for line in process.output.splitlines() if line)

@@ -11,7 +11,7 @@ import pytest
 
 from tests.ros.conftest import NEEDS_ROS
 from tests.ros.processes import PATIENCE, Processes
-from tests.ros.waiting import States, eventually
+from tests.ros.waiting import States, wait_until
 
 pytest.importorskip("rclpy", reason=NEEDS_ROS)
 pytestmark = pytest.mark.usefixtures("interfaces")
@@ -55,11 +55,11 @@ def test_it_shows_values_rate_and_age_and_tells_a_timeout(node: Any, processes: 
         assert state["rate_hz"]["q2r_left_hand_pose"] > 0.0
         assert "q2r_left_hand_pose" in table.wait_for("1.00 2.00 -3.00 m")
         # The left hand's lines may have said so too, before the table's process had found the publishers.
-        eventually(
+        wait_until(
             lambda: any("right_hand" in x and "timeout  nothing yet" in x for x in table.output.splitlines()),
             "the table says that the right hand never came",
         )
-    eventually(lambda: re.search(r"q2r_left_hand_pose: timeout, \d+ messages", check.output), "a timeout of the pose")
+    wait_until(lambda: re.search(r"q2r_left_hand_pose: timeout, \d+ messages", check.output), "a timeout of the pose")
     assert "q2r_left_hand_pose" in table.wait_for("timeout  1.00 2.00 -3.00 m")
     assert states.wait_for("q2r_left_hand_pose")["level"] == "error"
     assert (check.interrupt(), table.interrupt()) == (0, 0)

@@ -1,4 +1,4 @@
-"""Every node of a running set is killed or frozen while both arms move: they stop, and nothing but a press moves them.
+"""Each node is killed or frozen while both arms move: the arms stop, and only a press moves them again.
 
 Times are those of joint states received here, on the machine's steady clock.
 """
@@ -14,20 +14,19 @@ from functools import partial
 import numpy as np
 import pytest
 
-from q2r2_control import Robot, load_config
+from q2r2_control import Robot
 from q2r2_control.config.timeouts import STREAM_TIMEOUT
-from tests.ros.cell import CONFIG
 from tests.ros.conftest import NEEDS_ROS, spun_node
-from tests.ros.processes import PATIENCE, Processes
-from tests.ros.waiting import eventually
+from tests.ros.processes import PATIENCE, Processes, skip_if_overloaded
+from tests.ros.waiting import call, wait_until
 
 pytest.importorskip("rclpy", reason=NEEDS_ROS)
 pytest.importorskip("quest2ros", reason="needs q2r2 ros build-interfaces")
 pytestmark = [pytest.mark.usefixtures("interfaces"), pytest.mark.alone]
 
-from tests.ros.headset_operator import Operator  # noqa: E402
-from tests.ros.joint_log import LONGEST_STARVED, Stop  # noqa: E402
-from tests.ros.teleop_cell import ARMS, TeleopCell, address_of  # noqa: E402
+from tests.ros.circling_operator import Operator  # noqa: E402
+from tests.ros.joint_recorder import Stop  # noqa: E402
+from tests.ros.teleop_nodes import ARMS, TeleopNodes, address_of  # noqa: E402
 
 BRAKING = 10.0  # acceleration_limit of the cell [rad/s^2]
 # Allowance for messages, for processes to get their turn, and for an arm that is paused while its controller lives: it
@@ -53,24 +52,28 @@ FROZEN = {
 }
 
 Record = Callable[[str, object], None]
+ATTEMPTS = 5  # to catch both arms in motion, and to measure while the machine is not overloaded
+LONGEST_STARVED = 0.1  # time without joint states that is allowed for; a longer one makes a measurement void [s]
 
 
-class Scene:
-    """The set of nodes and its operator."""
+class Teleoperation:
+    """The nodes and the operator."""
 
-    def __init__(self, cell: TeleopCell, operator: Operator, port: int) -> None:
-        self.cell, self.operator, self._port = cell, operator, port
+    def __init__(self, nodes: TeleopNodes, operator: Operator, port: int) -> None:
+        self.nodes, self.operator, self._port = nodes, operator, port
 
-    def mend(self, name: str) -> None:
-        """Start what was killed, wake what was frozen."""
-        self.cell.mend(name, *([f"port:={self._port}"] if name == "tcp_endpoint" else []))
+    def restore(self, name: str) -> None:
+        """Restart a node that was killed, continue one that is frozen."""
+        self.nodes.restore(name, *([f"port:={self._port}"] if name == "tcp_endpoint" else []))
 
     def press(self) -> None:
-        """Engage both arms, each by its own hand; again, where a busy machine has looked like a fault."""
-        self.cell.wait_until_ready()
+        """Engage both arms, each by its own hand; again if other load on the machine has looked like a fault."""
+        self.nodes.reset_if_stopped()
+        self.nodes.wait_until_ready()
         deadline = time.monotonic() + PATIENCE
-        while paused := [arm for arm in ARMS if not self.cell.engaged(arm)]:
-            assert time.monotonic() < deadline, f"{paused} cannot be engaged: {self.cell.diagnoses[-5:]}"
+        while paused := [arm for arm in ARMS if not self.nodes.engaged(arm)]:
+            assert time.monotonic() < deadline, f"{paused} cannot be engaged: {self.nodes.diagnoses[-5:]}"
+            self.nodes.reset_if_stopped()
             self.operator.press(*paused)
             time.sleep(0.1)
 
@@ -79,170 +82,186 @@ class Scene:
         deadline = time.monotonic() + PATIENCE
         since: float | None = None
         while since is None or time.monotonic() - since < 0.3:
-            assert time.monotonic() < deadline, f"the arms do not follow: {self.cell.diagnoses[-5:]}"
-            if not all(map(self.cell.engaged, ARMS)):
+            if time.monotonic() > deadline:
+                skip_if_overloaded("the arms are paused again and again")
+                raise AssertionError(f"the arms do not follow: {self.nodes.diagnoses[-5:]}")
+            if not all(map(self.nodes.engaged, ARMS)):
                 self.press()
             self.operator.moves = True
-            since = (since or time.monotonic()) if self.cell.moving else None
+            since = (since or time.monotonic()) if self.nodes.moving else None
             time.sleep(0.01)
 
     def move_again(self, name: str) -> None:
-        """Mend a node, and let both arms follow anew."""
-        self.mend(name)
+        """Restore a node, and let both arms follow again."""
+        self.restore(name)
         self.operator.rest()
         self.move()
 
     def play(self) -> None:
-        """Start the script, and with it press, until both arms follow: a busy machine may look like a fault."""
-        for _ in range(3):
-            self.cell.start("simulation_input")
+        """Start the script, which presses once, until both arms follow; again if that press had no effect."""
+        for _ in range(ATTEMPTS):
+            self.nodes.reset_if_stopped()
+            self.nodes.start("simulation_input")
             deadline = time.monotonic() + PATIENCE / 3.0
             while time.monotonic() < deadline:
-                if self.cell.moving:
-                    time.sleep(0.3)  # it gathers speed
+                if self.nodes.moving:
+                    time.sleep(0.3)  # until it is fast
                     return
                 time.sleep(0.01)
-            self.cell.kill("simulation_input")
-        raise AssertionError(f"the arms do not follow the script: {self.cell.diagnoses[-5:]}")
+            self.nodes.kill("simulation_input")
+        skip_if_overloaded("the arms are paused again and again")
+        raise AssertionError(f"the arms do not follow the script: {self.nodes.diagnoses[-5:]}")
 
-    def measure_stop(self, what: str, hurt: Callable[[], float], again: Callable[[], None], record: Record) -> Stop:
-        """How both arms come to rest after a fault, which may take them no longer than it has to.
+    def measure_stop(self, what: str, fault: Callable[[], float], again: Callable[[], None], record: Record) -> Stop:
+        """How both arms come to rest after a ``fault``, which may take them no longer than it has to.
 
-        ``hurt`` does it and says when. Where the robot or this test stood still meanwhile, which says nothing of the
-        nodes, both arms move ``again`` and it is done once more.
+        ``fault`` causes it and returns when that was. The measurement is void if the arms did not move at the fault,
+        since the load of the machine had looked like another fault before, or if no joint states came for long. Then
+        ``again`` moves the arms once more.
         """
-        stop = self.cell.joints.stop_after(hurt())
-        for _ in range(2):
-            if stop.starved <= LONGEST_STARVED:
+        stop = self.nodes.joints.stop_after(fault())
+        for _ in range(ATTEMPTS - 1):
+            if stop.speed > 0.1 and stop.starved <= LONGEST_STARVED:
                 break
-            print(f"\n{what}: no joint state came for {stop.starved:.2f} s; once more")
+            print(f"\n{what}: at {stop.speed:.2f} rad/s, no joint state came for {stop.starved:.2f} s; once more")
             again()
-            stop = self.cell.joints.stop_after(hurt())
+            stop = self.nodes.joints.stop_after(fault())
+        if stop.speed <= 0.1 or stop.starved > LONGEST_STARVED:
+            skip_if_overloaded("no stop could be measured")
+        assert stop.speed > 0.1, "the arms did not move at the fault"
         # A machine that has no time for the robot or for this test has none for the node that has to act either.
-        assert stop.starved <= LONGEST_STARVED, "the robot or this test stood still"
+        assert stop.starved <= LONGEST_STARVED, "the robot or this test did not run"
         allowed = STREAM_TIMEOUT + stop.speed / BRAKING + DELIVERY + 2.0 * stop.starved
         line = (
             f"from {stop.speed:.2f} rad/s slow within {1e3 * stop.slow:.0f} ms, allowed {1e3 * allowed:.0f}, "
             f"at rest within {1e3 * stop.rest:.0f} ms, allowed {1e3 * (allowed + STREAM_TIMEOUT):.0f}; "
-            f"of which for a starved machine {2e3 * stop.starved:.0f}"
+            f"of which for an overloaded machine {2e3 * stop.starved:.0f}"
         )
         record(what, line)
         print(f"\n{what}: {line}")
-        assert stop.speed > 0.1
         assert stop.slow <= allowed
-        assert stop.rest <= allowed + STREAM_TIMEOUT  # of the targets, which end when the hand's data have been missed
+        assert stop.rest <= allowed + STREAM_TIMEOUT  # the hand's data end first, then the targets
         return stop
 
     def assert_only_a_press_moves(self, stop: Stop) -> None:
         """Nothing has moved since the stop; a press moves nothing either, but from then on the arms follow."""
-        joints = self.cell.joints
-        self.cell.wait_until_ready()
+        joints = self.nodes.joints
+        self.nodes.wait_until_ready()
         time.sleep(AWHILE)
         assert joints.farthest_from(stop.posture, stop.t) < STILL
         self.operator.rest(stop.t)
         began = time.monotonic()
         self.press()
         time.sleep(AWHILE)
-        assert self.cell.tools_moved(stop.posture, began) < ANCHORED  # elbows may, towards their usual posture
+        assert joints.tool_farthest_from(stop.posture, began) < ANCHORED  # elbows may, towards their usual posture
         self.move()
-        assert max(np.abs(state.v).max() for state in joints.since(began)) < FAST
+        assert joints.fastest(began) < FAST
 
 
 @pytest.fixture(scope="module")
-def scene(domain: int, interfaces: None, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Scene]:
-    """All nodes and a headset that is on."""
+def teleop(
+    domain: int, robot: Robot, interfaces: None, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Teleoperation]:
+    """All nodes and a connected headset."""
     folder = tmp_path_factory.mktemp("faults")
     processes = Processes(folder, os.environ)
     with spun_node(domain) as node:
-        cell = TeleopCell(node, Robot.from_config(load_config(CONFIG)), processes)
+        nodes = TeleopNodes(node, robot, processes)
         try:
             for name in NODES[:-1]:
-                cell.start(name)
-            address = address_of(cell.start(NODES[-1], "port:=0"))
-            with Operator(address).wearing() as operator:
-                yield Scene(cell, operator, address[1])
+                nodes.start(name)
+            address = address_of(nodes.start(NODES[-1], "port:=0"))
+            with Operator(address).streaming() as operator:
+                yield Teleoperation(nodes, operator, address[1])
         finally:
             processes.end_all()
 
 
 @pytest.fixture
-def moving(scene: Scene) -> Scene:
-    """Both arms follow their hands, whatever a test before has left behind."""
+def moving(teleop: Teleoperation) -> Teleoperation:
+    """Both arms follow their hands, whatever state an earlier test has left."""
     for name in NODES:
-        scene.mend(name)
-    scene.move()
-    return scene
+        teleop.restore(name)
+    teleop.move()
+    return teleop
 
 
 @pytest.mark.parametrize("name", KILLED)
-def test_a_killed_node_stops_both_arms_and_its_return_moves_none(
-    name: str, moving: Scene, record_property: Record
+def test_a_killed_node_stops_both_arms_and_its_restart_moves_none(
+    name: str, moving: Teleoperation, record_property: Record
 ) -> None:
     again = partial(moving.move_again, name)
-    stop = moving.measure_stop(f"{name} killed", partial(moving.cell.kill, name), again, record_property)
-    moving.cell.wait_for_diagnosis(stop.fault, KILLED[name], " for 0.")
-    moving.mend(name)
+    stop = moving.measure_stop(f"{name} killed", partial(moving.nodes.kill, name), again, record_property)
+    moving.nodes.wait_for_diagnosis(stop.fault, KILLED[name], " for 0.")
+    moving.restore(name)
     moving.assert_only_a_press_moves(stop)
 
 
-def test_a_killed_robot_is_missed_and_greeted_with_no_command_of_the_past(moving: Scene) -> None:
-    cell = moving.cell
-    fault = cell.kill("mujoco_robot")
-    cell.wait_for_diagnosis(fault, "left_tool_frame on /tf from /mujoco_robot is 0.")
-    cell.wait_for_diagnosis(fault, "no joint states from /mujoco_robot for 0.1")
-    eventually(lambda: cell.controller_is("inactive", fault), "the controller has braked")
+def test_a_killed_robot_is_reported_and_gets_no_old_command_when_it_is_restarted(moving: Teleoperation) -> None:
+    nodes = moving.nodes
+    fault = nodes.kill("mujoco_robot")
+    nodes.wait_for_diagnosis(fault, "left_tool_frame on /tf from /mujoco_robot is 0.")
+    nodes.wait_for_diagnosis(fault, "no joint states from /mujoco_robot for 0.1")
+    wait_until(lambda: nodes.controller_is("inactive", fault), "the controller has braked")
     time.sleep(0.1)
     silence = time.monotonic()
-    moving.mend("mujoco_robot")
-    eventually(lambda: cell.joints.since(silence), "the robot is back")
-    back = cell.joints.since(silence)[0]
-    cell.wait_until_ready()
+    moving.restore("mujoco_robot")
+    wait_until(lambda: nodes.joints.since(silence), "the robot is back")
+    back = nodes.joints.since(silence)[0]
+    nodes.wait_until_ready()
     time.sleep(AWHILE)
     # The controller may have found the robot before this test did; whatever it commands, it is where the robot stands.
-    commands = [np.abs(q - back.q).max() for t, q in cell.commands if t > silence]
+    commands = [np.abs(q - back.q).max() for t, q in nodes.commands if t > silence]
     assert commands, "the controller holds the arms where they are"
     assert max(commands) < STILL
-    assert cell.joints.farthest_from(back.q, back.t) < STILL
+    assert nodes.joints.farthest_from(back.q, back.t) < STILL
     moving.operator.rest()
     moving.press()
     moving.move()
 
 
-def test_a_script_that_died_stops_both_arms_and_its_return_waits_to_be_asked(
-    scene: Scene, record_property: Record
+def test_a_killed_script_stops_both_arms_and_its_restart_waits_for_a_request(
+    teleop: Teleoperation, record_property: Record
 ) -> None:
-    """Started by hand it plays at once, as it was asked to; started again by whatever does that, it does not."""
-    cell = scene.cell
+    """Started by a user it plays at once; restarted with start_on_request it does not."""
+    nodes = teleop.nodes
     for name in NODES:
-        scene.mend(name)
-    scene.operator.online = False
+        teleop.restore(name)
+    teleop.operator.online = False
     try:
-        eventually(lambda: not any(map(cell.engaged, ARMS)), "the headset is off")
-        scene.play()
+        wait_until(lambda: not any(map(nodes.engaged, ARMS)), "the headset is off")
+        teleop.play()
         name = "simulation_input"
-        stop = scene.measure_stop(f"{name} killed", lambda: cell.kill(name), scene.play, record_property)
-        cell.wait_for_diagnosis(stop.fault, "of the left hand from /simulation_input")
-        cell.start("simulation_input", "start_on_request:=true")
+        stop = teleop.measure_stop(f"{name} killed", lambda: nodes.kill(name), teleop.play, record_property)
+        nodes.wait_for_diagnosis(stop.fault, "of the left hand from /simulation_input")
+        nodes.start("simulation_input", "start_on_request:=true")
         back = time.monotonic()
-        cell.wait_for_diagnosis(back, "waits for a call of ~/start")
+        nodes.wait_for_diagnosis(back, "waits for a call of ~/start")
         time.sleep(3.0 * AWHILE)  # longer than it takes the script to press and move
-        assert cell.joints.farthest_from(stop.posture, stop.t) < STILL
-        cell.call("/simulation_input/start")
-        eventually(lambda: cell.moving, "both arms follow again")
-        assert max(np.abs(state.v).max() for state in cell.joints.since(back)) < FAST
+        assert nodes.joints.farthest_from(stop.posture, stop.t) < STILL
+        assert call(nodes.node, "/simulation_input/start").success
+        wait_until(lambda: nodes.moving, "both arms follow again")
+        assert nodes.joints.fastest(back) < FAST
     finally:
-        cell.kill("simulation_input")
-        scene.operator.rest()
-        scene.operator.online = True
+        nodes.kill("simulation_input")
+        teleop.operator.rest()
+        teleop.operator.online = True
 
 
 @pytest.mark.parametrize("name", FROZEN)
-def test_a_frozen_node_stops_both_arms_and_when_it_wakes_it_moves_none(
-    name: str, moving: Scene, record_property: Record
+def test_a_frozen_node_stops_both_arms_and_moves_none_when_it_continues(
+    name: str, moving: Teleoperation, record_property: Record
 ) -> None:
-    freeze = partial(moving.cell.signal, name, signal.SIGSTOP)
+    nodes = moving.nodes
+
+    def freeze() -> float:
+        # Between two commands: one that was being published at this moment would be sent later, at the wake-up.
+        count = len(nodes.commands)
+        wait_until(lambda: len(nodes.commands) > count, "a command comes")
+        return nodes.signal(name, signal.SIGSTOP)
+
     stop = moving.measure_stop(f"{name} frozen", freeze, partial(moving.move_again, name), record_property)
     time.sleep(max(stop.fault + 1.0 - time.monotonic(), 0.0))
-    woken = moving.cell.signal(name, signal.SIGCONT)
-    moving.cell.wait_for_diagnosis(woken, FROZEN[name])
+    woken = nodes.signal(name, signal.SIGCONT)
+    nodes.wait_for_diagnosis(woken, FROZEN[name])
     moving.assert_only_a_press_moves(stop)

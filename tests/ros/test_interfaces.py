@@ -1,4 +1,4 @@
-"""The interface packages, as other ROS programs meet them: types, type hashes, topics and actions between processes."""
+"""The message packages as other ROS programs use them: types, type hashes, topics and actions between processes."""
 
 from __future__ import annotations
 
@@ -36,6 +36,17 @@ PUBLISHED_FIELDS = {
 }
 
 
+TOPIC = "q2r_left_hand_inputs"
+INPUTS = {
+    "button_upper": False,
+    "button_lower": True,
+    "thumb_stick_horizontal": -0.5,
+    "thumb_stick_vertical": 0.25,
+    "press_index": 0.75,
+    "press_middle": 1.0,
+}
+
+
 def built_hash(kind: str) -> str:
     """The type hash that the generators wrote beside the installed definition."""
     package, folder, name = kind.split("/")
@@ -65,11 +76,10 @@ def test_tf_has_the_hash_that_jazzy_prints() -> None:
 def test_inputs_of_a_hand_arrive_from_another_process(node: Any, processes: Processes) -> None:
     from quest2ros.msg import OVR2ROSInputs
 
-    from tests.ros.headset_node import INPUTS, TOPIC
-
     received: Queue[Any] = Queue()
     node.create_subscription(OVR2ROSInputs, TOPIC, received.put, 10)
-    headset = processes.start_module("tests.ros.headset_node")
+    program = "tests.ros.programs.publish"
+    headset = processes.start_module(program, "quest2ros/OVR2ROSInputs", TOPIC, json.dumps(INPUTS))
     message = received.get(timeout=PATIENCE)
     assert {name: getattr(message, name) for name in INPUTS} == INPUTS
     (publisher,) = node.get_publishers_info_by_topic(f"/{TOPIC}")
@@ -77,27 +87,27 @@ def test_inputs_of_a_hand_arrive_from_another_process(node: Any, processes: Proc
     assert headset.interrupt() == 0
 
 
-def test_a_gripper_in_another_process_takes_a_goal_tells_and_can_be_cancelled(node: Any, processes: Processes) -> None:
+def test_a_gripper_in_another_process_takes_a_goal_and_can_be_cancelled(node: Any, processes: Processes) -> None:
     from action_msgs.msg import GoalStatus
     from control_msgs.action import GripperCommand
     from rclpy.action import ActionClient
 
-    from tests.ros.gripper import HELD, OPEN
+    from tests.ros.programs.gripper import HELD, OPEN
 
-    gripper = processes.start_module("tests.ros.gripper")
+    gripper = processes.start_module("tests.ros.programs.gripper")
     gripper.wait_for("ready")
     client = ActionClient(node, GripperCommand, "gripper/command")
     assert client.wait_for_server(PATIENCE)
     goal = GripperCommand.Goal()
     goal.command.position = 0.0
     goal.command.max_effort = 40.0
-    told: Queue[Any] = Queue()
-    handle = outcome(client.send_goal_async(goal, told.put))
+    feedbacks: Queue[Any] = Queue()
+    handle = outcome(client.send_goal_async(goal, feedbacks.put))
     assert handle.accepted
 
     # Feedback is a topic of its own: the first messages may be sent before both sides know each other.
     last = OPEN
-    while not (feedback := told.get(timeout=PATIENCE).feedback).stalled:
+    while not (feedback := feedbacks.get(timeout=PATIENCE).feedback).stalled:
         assert HELD < feedback.position <= last
         last = feedback.position
     assert feedback.position == HELD

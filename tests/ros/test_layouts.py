@@ -15,7 +15,7 @@ import pytest
 
 from q2r2_control import Robot, load_config
 from tests.ros.conftest import NEEDS_ROS, spun_node
-from tests.ros.processes import Processes, RosProcess
+from tests.ros.processes import CONFIG, Processes, RosProcess
 
 pytest.importorskip("rclpy", reason=NEEDS_ROS)
 pytest.importorskip("control_msgs", reason="needs control_msgs: q2r2 ros build-interfaces")
@@ -26,7 +26,9 @@ from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory
 
 from q2r2_control.ros.base_node import COMMAND_QOS
-from tests.ros.cell import CONFIG, PATIENT, STILL, Cell, Measured, Stream, at_rest, parameters, start, wait
+from q2r2_control.types import Array
+from tests.ros.cell import PATIENT, STILL, Cell, Stream, start_controller, start_robot
+from tests.ros.waiting import wait_until
 
 Engage = Callable[..., Stream]
 TARGETS = "/{arm}/target_pose"
@@ -34,41 +36,35 @@ TARGET_TOPICS = [f"{arm}.target_topic:=/{arm}/target_pose" for arm in ("left", "
 
 
 @pytest.fixture(scope="module")
-def robot() -> Robot:
-    return Robot.from_config(load_config(CONFIG))
-
-
-@pytest.fixture(scope="module")
 def started(domain: int, robot: Robot, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cell]:
     """One simulated robot for all tests; each brings a controller of its own."""
     processes = Processes(tmp_path_factory.mktemp("cell"), os.environ)
     with spun_node(domain) as node:
-        yield Cell(node, robot, start(processes, "mujoco_robot"), targets=TARGETS)
+        yield Cell(node, robot, start_robot(processes), targets=TARGETS)
         processes.end_all()
 
 
 @pytest.fixture
 def cell(started: Cell) -> Cell:
-    """At home, commanded by nobody."""
-    wait(lambda: started.state("mode", "mujoco_robot") == "holding", "the robot holds")
+    """At home, without commands."""
+    wait_until(lambda: started.state("mode", "mujoco_robot") == "holding", "the robot holds")
     started.call("/mujoco_robot/reset")
     started.states.pop("cartesian_controller", None)
-    started.measured.clear()
-    wait(lambda: started.measured, "joint states come")
+    started.forget()
     return started
 
 
 @pytest.fixture
 def engage(cell: Cell) -> Iterator[Engage]:
     """Begins streams of targets at tools, which end with the test."""
-    begun: list[Stream] = []
+    streams: list[Stream] = []
 
     def begin(*arms: str) -> Stream:
-        begun.append(cell.engage(*arms))
-        return begun[-1]
+        streams.append(cell.engage(*arms))
+        return streams[-1]
 
     yield begin
-    for stream in begun:
+    for stream in streams:
         stream.end()
 
 
@@ -130,46 +126,46 @@ def test_a_namespace_an_arm_is_merged_by_name_and_commanded_apart(
     # Its right arm is named by the pattern for all, its left one by itself.
     layout += ["output_topic:=/{arm}/arm_controller/joint_trajectory"]
     layout += ["left.output_topic:=/left/arm_controller/joint_trajectory"]
-    start(processes, "cartesian_controller", *parameters(*TARGET_TOPICS, *layout), *PATIENT)
+    start_controller(processes, *TARGET_TOPICS, *layout, *PATIENT)
     cell.wait_until_active()
     stream = engage("left", "right")
     begin = cell.q
     stream.move("left", (0.0, 0.0, 0.05))
     stream.move("right", (0.05, 0.0, 0.0))
-    wait(lambda: away(cell, stream) < 3e-3, "both arms are there")
+    wait_until(lambda: away(cell, stream) < 3e-3, "both arms are there")
     assert np.abs(cell.q - begin).max() > 0.05
     joints = {arm: tuple(name for name in robot.joint_names if name.startswith(arm)) for arm in robot.arms}
     assert relay.commanded == {arm: {names} for arm, names in joints.items()}
 
     relay.silent = "right"
-    wait(lambda: cell.state("level") == "error", "the stall is reported")
+    wait_until(lambda: cell.state("level") == "error", "the stall is reported")
     assert "no joint states from /test on /right/joint_states for 0." in cell.state("message")
     relay.silent = ""
-    wait(lambda: cell.state("phase") == "active", "the controller is active again")
+    wait_until(lambda: cell.state("phase") == "active", "the controller is active again")
     relay.lost = "right_A3"
-    wait(lambda: "/right/joint_states: no joint right_A3" in cell.state("message"), "the missing joint is reported")
+    wait_until(lambda: "/right/joint_states: no joint right_A3" in cell.state("message"), "the lost joint is reported")
     relay.lost = ""
-    wait(lambda: cell.state("phase") == "active", "the controller is active again")
+    wait_until(lambda: cell.state("phase") == "active", "the controller is active again")
 
 
 def test_torques_move_an_arm_and_leave_it_on_its_servos_when_the_controller_is_killed(
     cell: Cell, processes: Processes, engage: Engage
 ) -> None:
-    controller = start(processes, "cartesian_controller", *parameters(*TARGET_TOPICS, "output:=torque"), *PATIENT)
+    controller = start_controller(processes, *TARGET_TOPICS, "output:=torque", *PATIENT)
     cell.wait_until_active()
-    wait(lambda: cell.state("mode", "mujoco_robot") == "torque", "the robot is driven by torques")
+    wait_until(lambda: cell.state("mode", "mujoco_robot") == "torque", "the robot is driven by torques")
     stream = engage("left")
     stream.move("left", (0.0, 0.0, 0.05), speed=0.1)
-    wait(lambda: away(cell, stream) < 3e-3, "the arm is there")
-    before = at_rest(cell)
+    wait_until(lambda: away(cell, stream) < 3e-3, "the arm is there")
+    before = cell.joints.wait_for_rest()
     assert away(cell, stream) < 3e-3
     assert cell.state("mode", "mujoco_robot") == "torque"
-    cell.measured.clear()
+    cell.forget()
     os.kill(controller.pid, signal.SIGKILL)
     stream.end()
-    wait(lambda: cell.state("mode", "mujoco_robot") == "holding", "the robot holds")
+    wait_until(lambda: cell.state("mode", "mujoco_robot") == "holding", "the robot holds")
     time.sleep(0.5)
-    assert max(np.abs(measured.q - before).max() for measured in cell.measured) < STILL
+    assert max(np.abs(q - before).max() for q in cell.postures) < STILL
 
 
 def lbr_commands(listener: RosProcess, arm: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -182,59 +178,59 @@ def lbr_commands(listener: RosProcess, arm: str) -> tuple[np.ndarray, np.ndarray
 
 def start_lbr(
     cell: Cell, processes: Processes, environment: dict[str, str], output: str, message: str
-) -> tuple[RosProcess, Measured]:
-    """Start drivers and a controller; the listener, and what was measured before."""
-    listener = processes.start_module("tests.ros.lbr_listener", message, "left", "right", **environment)
+) -> tuple[RosProcess, Array]:
+    """Start drivers and a controller; the drivers, and the joint positions before."""
+    listener = processes.start_module("tests.ros.programs.lbr_driver", message, "left", "right", **environment)
     listener.wait_for("listens")
-    before = cell.measured[-1]
-    arguments = parameters(*TARGET_TOPICS, f"output:={output}", "max_deviation:=3.0")
-    start(processes, "cartesian_controller", *arguments, *PATIENT, **environment)
+    before = cell.q
+    given = (*TARGET_TOPICS, f"output:={output}", "max_deviation:=3.0", *PATIENT)
+    start_controller(processes, *given, **environment)
     cell.wait_until_active()
-    wait(lambda: all(len(lbr_commands(listener, arm)[0]) for arm in ("left", "right")), "commands come")
+    wait_until(lambda: all(len(lbr_commands(listener, arm)[0]) for arm in ("left", "right")), "commands come")
     return listener, before
 
 
-def test_an_lbr_is_led_by_positions_that_begin_where_it_is_and_step_no_further_than_its_joints_may(
-    cell: Cell, robot: Robot, processes: Processes, engage: Engage, lbr_environment: dict[str, str]
+def test_positions_for_an_lbr_begin_where_it_is_and_step_no_further_than_its_joints_may(
+    cell: Cell, robot: Robot, processes: Processes, engage: Engage, other_interfaces: dict[str, str]
 ) -> None:
-    listener, before = start_lbr(cell, processes, lbr_environment, "lbr_position", "LBRJointPositionCommand")
+    listener, before = start_lbr(cell, processes, other_interfaces, "lbr_position", "LBRJointPositionCommand")
     # Found late, the driver would ask the robot for a jump.
-    wait(lambda: cell.state("mode", "mujoco_robot") == "position", "the robot is commanded")
+    wait_until(lambda: cell.state("mode", "mujoco_robot") == "position", "the robot is commanded")
     stream = engage("left")
     stream.move("left", (0.0, 0.0, 0.05))
-    wait(lambda: away(cell, stream) < 3e-3, "the arm is there")
+    wait_until(lambda: away(cell, stream) < 3e-3, "the arm is there")
     for arm in ("left", "right"):
         joints = robot.arms[arm].joints
         q, _, t = lbr_commands(listener, arm)
-        assert np.abs(q[0] - before.q[joints]).max() < 1e-5
+        assert np.abs(q[0] - before[joints]).max() < 1e-5
         # The tick's own length is what the step may use; it shows in the times up to what the messages are late.
         longest = robot.velocity_limit[joints] * (np.diff(t)[:, None] + 0.02)
         assert (np.abs(np.diff(q, axis=0)) <= longest).all()
 
 
-def test_an_lbr_is_given_torques_without_gravity_beside_its_measured_positions(
-    cell: Cell, robot: Robot, processes: Processes, engage: Engage, lbr_environment: dict[str, str]
+def test_torques_for_an_lbr_are_without_gravity_and_come_with_its_measured_positions(
+    cell: Cell, robot: Robot, processes: Processes, engage: Engage, other_interfaces: dict[str, str]
 ) -> None:
-    listener, before = start_lbr(cell, processes, lbr_environment, "lbr_torque", "LBRTorqueCommand")
-    gravity = pin.computeGeneralizedGravity(robot.model, robot.model.createData(), before.q)
+    listener, before = start_lbr(cell, processes, other_interfaces, "lbr_torque", "LBRTorqueCommand")
+    gravity = pin.computeGeneralizedGravity(robot.model, robot.model.createData(), before)
     for arm in ("left", "right"):
         joints = robot.arms[arm].joints
         assert np.abs(gravity[joints]).max() > 20.0
         q, tau, _ = lbr_commands(listener, arm)
         assert np.abs(tau[0]).max() < 0.5
-        assert np.abs(q[0] - before.q[joints]).max() < 1e-5
+        assert np.abs(q[0] - before[joints]).max() < 1e-5
     stream = engage("left")
     stream.move("left", (0.0, 0.0, 0.02))
     # The simulated arm stays where it is, so the torque is that of a spring stretched by 20 mm: F = J^-T tau.
     data = robot.model.createData()
-    J = pin.computeFrameJacobian(robot.model, data, before.q, robot.arms["left"].frame_id, pin.LOCAL_WORLD_ALIGNED)
+    J = pin.computeFrameJacobian(robot.model, data, before, robot.arms["left"].frame_id, pin.LOCAL_WORLD_ALIGNED)
     to_force = np.linalg.pinv(J[:, robot.arms["left"].joints].T)
     wanted = load_config(CONFIG).impedance.translational_stiffness * 0.02
 
     def force() -> float:
         return float((to_force @ lbr_commands(listener, "left")[1][-1])[2])
 
-    wait(lambda: abs(force() - wanted) < 0.05 * wanted, "the spring is stretched")
+    wait_until(lambda: abs(force() - wanted) < 0.05 * wanted, "the spring is stretched")
     time.sleep(0.3)
     assert force() == pytest.approx(wanted, rel=0.05)
     assert np.isfinite(lbr_commands(listener, "left")[1]).all()

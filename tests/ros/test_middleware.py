@@ -11,7 +11,7 @@ import pytest
 from q2r2_control.ros.launch.middleware import set_up_middleware
 from tests.ros.conftest import NEEDS_ROS
 from tests.ros.processes import Processes
-from tests.ros.waiting import eventually
+from tests.ros.waiting import wait_until
 
 LISTENER = """
 import rclpy
@@ -74,5 +74,5 @@ def test_who_finds_others_on_this_machine_alone_hears_both_kinds_and_shares_memo
         environment["FASTRTPS_DEFAULT_PROFILES_FILE"] = ""
     listener = processes.start(sys.executable, "-c", LISTENER, name="listener", **environment)
     publisher = node.create_publisher(String, "/words", 10)
-    eventually(lambda: publisher.publish(String(data="hello")) or "hello" in listener.output, "the listener hears")
+    wait_until(lambda: publisher.publish(String(data="hello")) or "hello" in listener.output, "the listener hears")
     assert (not shared_memory(listener)) == ours

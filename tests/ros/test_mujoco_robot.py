@@ -15,9 +15,9 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from q2r2_control import Robot, load_config
+from q2r2_control import Robot
 from tests.ros.conftest import NEEDS_ROS, spun_node
-from tests.ros.processes import PATIENCE, Processes
+from tests.ros.processes import CONFIG, PATIENCE, Processes
 
 pytest.importorskip("rclpy", reason=NEEDS_ROS)
 pytest.importorskip("control_msgs", reason="needs control_msgs: q2r2 ros build-interfaces")
@@ -31,14 +31,10 @@ from tf2_msgs.msg import TFMessage
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from q2r2_control.ros.base_node import COMMAND_QOS, LATCHED_QOS
-from tests.ros.cell import CONFIG, Cell, wait
+from tests.ros.cell import Cell
+from tests.ros.waiting import wait_until
 
 FINGERS = tuple(f"{side}_finger_joint_{number}" for side in ("left", "right") for number in (1, 2))
-
-
-@pytest.fixture(scope="module")
-def robot() -> Robot:
-    return Robot.from_config(load_config(CONFIG))
 
 
 @pytest.fixture(scope="module")
@@ -49,10 +45,10 @@ def started(domain: int, robot: Robot, tmp_path_factory: pytest.TempPathFactory)
         cell = Cell(
             node,
             robot,
-            processes.start_module("q2r2_control.ros.nodes.mujoco_robot", "--ros-args", "-p", f"config:={CONFIG}"),
+            processes.start_node("mujoco_robot", f"config:={CONFIG}"),
         )
         try:
-            wait(lambda: cell.measured, "joint states come")
+            wait_until(lambda: cell.joints.states, "joint states come")
             yield cell
         finally:
             processes.end_all()
@@ -60,15 +56,15 @@ def started(domain: int, robot: Robot, tmp_path_factory: pytest.TempPathFactory)
 
 @pytest.fixture
 def cell(started: Cell, robot: Robot) -> Cell:
-    """At home, at rest, commanded by nobody."""
-    wait(lambda: started.state("mode", "mujoco_robot") == "holding", "the robot holds")
+    """At home, at rest, without commands."""
+    wait_until(lambda: started.state("mode", "mujoco_robot") == "holding", "the robot holds")
     started.call("/mujoco_robot/reset")
-    wait(lambda: np.abs(started.q - robot.home).max() < 1e-3, "the arms are at home")
+    wait_until(lambda: np.abs(started.q - robot.home).max() < 1e-3, "the arms are at home")
     return started
 
 
 def publish_steadily(publisher: Any, messages: list[Any], period: float = 0.01) -> None:
-    wait(publisher.get_subscription_count, "commands are listened to")
+    wait_until(publisher.get_subscription_count, "commands are listened to")
     for message in messages:
         publisher.publish(message)
         time.sleep(period)
@@ -77,7 +73,7 @@ def publish_steadily(publisher: Any, messages: list[Any], period: float = 0.01) 
 def send_until_refused(cell: Cell, publisher: Any, message: Any) -> None:
     before = cell.state("refused_commands", "mujoco_robot")
     publish_steadily(publisher, [message] * 10)
-    wait(lambda: cell.state("refused_commands", "mujoco_robot") > before, "it is refused")
+    wait_until(lambda: cell.state("refused_commands", "mujoco_robot") > before, "it is refused")
 
 
 def ramp(robot: Robot, joint: int, way: float, count: int) -> list[np.ndarray]:
@@ -107,7 +103,7 @@ def test_it_publishes_joints_by_name_all_links_and_the_description(cell: Cell, r
     assert names.get(timeout=PATIENCE) == [*robot.joint_names, *FINGERS]
     urdf = description.get(timeout=PATIENCE)
     assert urdf == robot.urdf
-    wait(lambda: cell.tools, "transforms come")
+    wait_until(lambda: cell.tools, "transforms come")
     links = {line.split('"')[1] for line in urdf.splitlines() if line.strip().startswith("<link ")}
     assert set(fixed.get(timeout=PATIENCE)) | set(cell.tools) == links - {"world"}
     for arm in robot.arms:
@@ -129,7 +125,7 @@ def test_it_follows_positions_in_any_order_of_names_and_stays_where_they_end(
     else:
         messages = [Float64MultiArray(data=q.tolist()) for q in postures]
     publish_steadily(cell.node.create_publisher(type(messages[0]), kind, COMMAND_QOS), messages)
-    wait(lambda: cell.state("mode", "mujoco_robot") == "holding", "the robot holds")
+    wait_until(lambda: cell.state("mode", "mujoco_robot") == "holding", "the robot holds")
     assert np.abs(np.delete(cell.q - robot.home, 0)).max() < 0.01
     assert cell.q[0] - robot.home[0] == pytest.approx(0.2, abs=0.01)
     before = cell.q
@@ -141,7 +137,7 @@ def test_each_arm_may_have_a_sender_of_its_own_on_one_topic(cell: Cell, robot: R
     joints = {arm: robot.arms[arm].joints for arm in robot.arms}
     senders = {arm: cell.node.create_publisher(JointTrajectory, "joint_trajectory", COMMAND_QOS) for arm in joints}
     for sender in senders.values():
-        wait(sender.get_subscription_count, "commands are listened to")
+        wait_until(sender.get_subscription_count, "commands are listened to")
     for way in (0.02, 0.04, 0.02, 0.0, 0.02, 0.04):
         goal = robot.home + way
         os.kill(cell.processes[0].pid, signal.SIGSTOP)
@@ -149,7 +145,7 @@ def test_each_arm_may_have_a_sender_of_its_own_on_one_topic(cell: Cell, robot: R
             senders[arm].publish(trajectory(robot, goal[its], tuple(robot.joint_names[joint] for joint in its)))
         time.sleep(0.05)
         os.kill(cell.processes[0].pid, signal.SIGCONT)  # both have arrived before either is taken
-        wait(partial(is_at, cell, goal), "both arms are there", 5.0)
+        wait_until(partial(is_at, cell, goal), "both arms are there")
 
 
 def is_at(cell: Cell, q: np.ndarray) -> bool:
@@ -173,24 +169,24 @@ def test_commands_that_cannot_be_followed_move_nothing_and_are_reported_once(cel
     assert cell.processes[0].output.count("joint_trajectory: refused") == 1
 
 
-def test_a_torque_that_nobody_renews_gives_way_to_position_servos(cell: Cell, robot: Robot) -> None:
+def test_without_further_torques_position_servos_take_over(cell: Cell, robot: Robot) -> None:
     publisher = cell.node.create_publisher(Float64MultiArray, "torque_commands", COMMAND_QOS)
     # With less than gravity's torque the arms begin to fall, slowly enough not to meet the table.
     tau = 0.7 * pin.computeGeneralizedGravity(robot.model, robot.model.createData(), robot.home)
     publish_steadily(publisher, [Float64MultiArray(data=tau.tolist())] * 15)
     assert cell.state("mode", "mujoco_robot") is not None
-    wait(lambda: cell.state("mode", "mujoco_robot") == "holding", "the robot holds")
+    wait_until(lambda: cell.state("mode", "mujoco_robot") == "holding", "the robot holds")
     assert np.abs(cell.q - robot.home).max() > 0.01
-    wait(lambda: np.ptp([m.q for m in cell.measured[-50:]], axis=0).max() < 5e-4, "the arms stand")
+    cell.joints.wait_for_rest()
     assert np.abs(cell.q - robot.home).max() < 0.3
 
 
 def test_reset_brings_the_arms_home(cell: Cell, robot: Robot) -> None:
     messages = [trajectory(robot, q) for q in ramp(robot, 0, 0.2, 50)]
     publish_steadily(cell.node.create_publisher(JointTrajectory, "joint_trajectory", COMMAND_QOS), messages)
-    wait(lambda: abs(cell.q[0] - robot.home[0]) > 0.1, "the joint moves")
+    wait_until(lambda: abs(cell.q[0] - robot.home[0]) > 0.1, "the joint moves")
     assert cell.call("/mujoco_robot/reset").success
-    wait(lambda: np.abs(cell.q - robot.home).max() < 1e-3, "the arms are at home")
+    wait_until(lambda: np.abs(cell.q - robot.home).max() < 1e-3, "the arms are at home")
 
 
 def test_a_gripper_closes_on_nothing_opens_and_refuses_what_it_cannot_reach(cell: Cell) -> None:
@@ -209,9 +205,9 @@ def result_of(client: ActionClient, position: float) -> Any:
     goal = GripperCommand.Goal()
     goal.command.position, goal.command.max_effort = position, 5.0
     sent = client.send_goal_async(goal)
-    wait(sent.done, "the goal is answered")
+    wait_until(sent.done, "the goal is answered")
     if not sent.result().accepted:
         return None
     ended = sent.result().get_result_async()
-    wait(ended.done, "the goal has ended")
+    wait_until(ended.done, "the goal has ended")
     return ended.result().result

@@ -9,7 +9,7 @@ import pytest
 
 from tests.ros.conftest import NEEDS_ROS
 from tests.ros.processes import Processes
-from tests.ros.waiting import States, eventually
+from tests.ros.waiting import States, wait_until
 
 pytest.importorskip("rclpy", reason=NEEDS_ROS)
 pytestmark = pytest.mark.usefixtures("interfaces")
@@ -30,7 +30,7 @@ def test_a_node_in_simulated_time_says_that_no_clock_comes_until_one_does_and_wh
     )
     state = states.wait_for("use_sim_time is set and nothing comes on /clock; waits for a subscriber of the left hand")
     assert state["level"] == "warn"
-    eventually(lambda: any("nothing comes on /clock" in status.message for status in diagnostics), "it is diagnosed")
+    wait_until(lambda: any("nothing comes on /clock" in status.message for status in diagnostics), "it is diagnosed")
     assert {(status.name, status.level) for status in diagnostics} == {("/simulation_input", DiagnosticStatus.WARN)}
 
     publisher = node.create_publisher(Clock, "/clock", 1)
@@ -41,6 +41,6 @@ def test_a_node_in_simulated_time_says_that_no_clock_comes_until_one_does_and_wh
         publisher.publish(Clock(clock=Time(sec=1 + int(elapsed), nanosec=int(elapsed % 1.0 * 1e9))))
 
     timer = node.create_timer(0.02, tick)
-    eventually(lambda: diagnostics and "clock" not in diagnostics[-1].message, "the warning goes when the clock comes")
+    wait_until(lambda: diagnostics and "clock" not in diagnostics[-1].message, "the warning goes when the clock comes")
     node.destroy_timer(timer)
     states.wait_for("use_sim_time is set and the time on /clock stands still")

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from tests.ros.conftest import NEEDS_ROS
-from tests.ros.waiting import eventually
+from tests.ros.waiting import wait_until
 
 pytest.importorskip("rclpy", reason=NEEDS_ROS)
 
@@ -43,7 +43,7 @@ class Commands:
         """One more listener."""
         known = self._publisher.listeners
         self._node.create_subscription(Float64MultiArray, "/commands", self._take, COMMAND_QOS)
-        eventually(lambda: self._publisher.listeners > known, "the listener is found")
+        wait_until(lambda: self._publisher.listeners > known, "the listener is found")
 
     def send(self, seconds: float, off_reference: bool) -> str | None:
         """Send 200 commands a second; what was found to be wrong, if anything."""

@@ -1,4 +1,4 @@
-"""The README's port of another robot starts, and ends in order."""
+"""The README's port of another robot works as it stands there."""
 
 from __future__ import annotations
 
@@ -7,22 +7,54 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import pinocchio as pin
 import pytest
 
 from tests.ros.conftest import NEEDS_ROS
 from tests.ros.processes import PATIENCE, ROOT, Processes
-from tests.ros.waiting import States
 
 pytest.importorskip("rclpy", reason=NEEDS_ROS)
+pytest.importorskip("quest2ros", reason="needs q2r2 ros build-interfaces")
 pytestmark = pytest.mark.usefixtures("interfaces")
 
+from q2r2_control.ros.base_node import LATCHED_QOS  # noqa: E402
+from q2r2_control.ros.bridge.messages import pose_of  # noqa: E402
+from tests.ros.arm_rig import PATIENT, TOOL, ArmRig, assert_same, first, offset, stamped_transform  # noqa: E402
 
-def test_the_subclass_in_the_readme_is_a_node_that_waits_paused(
-    processes: Processes, node: Any, tmp_path: Path
+
+def test_the_subclass_in_the_readme_teleoperates_its_arm_in_its_robots_frame(
+    node: Any, processes: Processes, tmp_path: Path
 ) -> None:
+    from tf2_msgs.msg import TFMessage
+    from visualization_msgs.msg import Marker
+
+    base = pin.SE3(pin.exp3(np.array([0.0, 0.0, 1.2])), np.array([0.1, -0.4, 0.3]))
+    static = node.create_publisher(TFMessage, "/tf_static", LATCHED_QOS)
+    static.publish(TFMessage(transforms=[stamped_transform("world", "bh_robot_base", base)]))
+    shown: dict[str, Any] = {}
+    node.create_subscription(Marker, "/visualization_marker", lambda marker: shown.update({marker.ns: marker}), 10)
+
+    topic = "/bh_robot/right_arm_clik_controller/target_frame"
+    rig = ArmRig(node, "right", topic=topic, tool_frame="right_arm_link_ee", robot="bh_robot")
+    rig.follows = False
     code, _ = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
     (file := tmp_path / "right_arm.py").write_text(code)
-    states = States(node, "right_bh_robot_arm_controller")
-    process = processes.start(sys.executable, str(file), name="right_arm")
-    assert states.wait_for("no transform from right_arm_link_ee to bh_robot_base")["state"] == "paused"
+    parameters = PATIENT | {"world_frame_id": "world", "teleop.leash.distance": 0.0}
+    arguments = [part for name, value in parameters.items() for part in ("-p", f"{name}:={value}")]
+    process = processes.start(sys.executable, str(file), "--ros-args", *arguments, name="right_arm")
+    rig.wait_until_connected()
+    rig.engage()
+    rig.wait(lambda: rig.targets, "targets come")
+    assert rig.targets[0].header.frame_id == "bh_robot_base"
+    assert_same(base * first(rig), TOOL, 1e-9)
+    rig.move((0.0, 0.1, 0.0))
+    assert_same(base * rig.wait_for_rest(), offset(TOOL, (0.0, 0.1, 0.0)), 1e-3)
+
+    rig.wait(lambda: {"right_engaged", "right_axes", "right_path"} <= shown.keys(), "markers come")
+    assert shown["right_axes"].header.frame_id == "right_arm_link_ee"
+    assert_same(TOOL * (pose_of(shown["right_axes"].pose) or pin.SE3.Identity()), offset(TOOL, (0.0, 0.1, 0.0)), 2e-3)
+    rig.pause()
+    rig.wait(lambda: shown["right_engaged"].color.a < 1.0, "the marker fades")
+    assert_same(pose_of(shown["right_engaged"].pose), pin.SE3.Identity(), 1e-9)
     assert process.interrupt(PATIENCE) == 0

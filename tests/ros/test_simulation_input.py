@@ -13,7 +13,7 @@ from q2r2_control.inputs.scripted import ScriptedInput
 from q2r2_control.types import Array
 from tests.ros.conftest import NEEDS_ROS
 from tests.ros.processes import PATIENCE, Processes
-from tests.ros.waiting import States, drained, eventually
+from tests.ros.waiting import States, drained, wait_until
 
 pytest.importorskip("rclpy", reason=NEEDS_ROS)
 pytestmark = pytest.mark.usefixtures("interfaces")
@@ -48,9 +48,9 @@ def assert_a_part_of(received: Array, script: Array, tolerance: float = 0.0) -> 
 def test_poses_inputs_and_twists_are_the_scripts_own(node: Any, processes: Processes) -> None:
     queues = subscribe(node, "right")
     start(processes, side="right", trajectory="rotate", rate=RATE)
-    eventually(lambda: queues["pose"].qsize() >= 150, "three seconds of poses")
-    eventually(lambda: queues["inputs"].qsize() >= 150, "three seconds of inputs")
-    eventually(lambda: queues["twist"].qsize() >= 150, "three seconds of twists")
+    wait_until(lambda: queues["pose"].qsize() >= 150, "three seconds of poses")
+    wait_until(lambda: queues["inputs"].qsize() >= 150, "three seconds of inputs")
+    wait_until(lambda: queues["twist"].qsize() >= 150, "three seconds of twists")
     poses, inputs, twists = (drained(queues[suffix])[:150] for suffix in ("pose", "inputs", "twist"))
 
     script = ScriptedInput("rotate", ["right"], rate_hz=RATE)
@@ -76,7 +76,7 @@ def test_poses_inputs_and_twists_are_the_scripts_own(node: Any, processes: Proce
     assert_a_part_of(np.hstack([linear, angular]), np.array([[*m.linear, *m.angular] for m in motions]), 1e-6)
 
 
-def test_a_mode_publishes_its_topics_alone(node: Any, processes: Processes) -> None:
+def test_a_mode_publishes_only_its_topics(node: Any, processes: Processes) -> None:
     left, right = subscribe(node, "left"), subscribe(node, "right")
     start(processes, side="left", mode="teleop")
     start(processes, side="right", mode="velocity")

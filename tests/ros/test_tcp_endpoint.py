@@ -38,14 +38,14 @@ def start_endpoint(processes: Processes, *parameters: str) -> tuple[RosProcess, 
     return process, (host, int(port))
 
 
-class LivingHeadset(FakeHeadset):
-    """Sends a keepalive now and then, as the app does, so that no slow machine makes it look dead."""
+class KeepaliveHeadset(FakeHeadset):
+    """Sends a keepalive now and then, as the app does, so that a slow machine does not make it look dead."""
 
     def __init__(self, address: tuple[str, int], dialect: str = "ros2") -> None:
         super().__init__(address, dialect)
         self._sending = Lock()
         self._closed = Event()
-        self._thread = Thread(target=self._live, daemon=True)
+        self._thread = Thread(target=self._send_keepalives, daemon=True)
         self._thread.start()
 
     def send(self, data: bytes) -> None:
@@ -57,7 +57,7 @@ class LivingHeadset(FakeHeadset):
         self._thread.join()
         super().close()
 
-    def _live(self) -> None:
+    def _send_keepalives(self) -> None:
         with suppress(ConnectionError):
             while not self._closed.wait(0.5):
                 self.send(KEEPALIVE)
@@ -112,11 +112,11 @@ def numbers(message: Any) -> list[float]:
 
 
 @every_dialect
-def test_what_a_headset_says_is_published_number_by_number(node: Any, processes: Processes, dialect: str) -> None:
+def test_headset_data_are_published_number_by_number(node: Any, processes: Processes, dialect: str) -> None:
     _, address = start_endpoint(processes)
     hands = [Hand(node, name) for name in ("left", "right")]
     random = np.random.default_rng(3)
-    with LivingHeadset(address, dialect) as headset:
+    with KeepaliveHeadset(address, dialect) as headset:
         headset.send(headset.registrations())
         for hand in hands:
             hand.meet(headset)
@@ -163,7 +163,7 @@ def test_best_effort_subscribers_hear_too_and_a_configured_frame_replaces_the_he
         received[hand] = Queue()
         node.create_subscription(PoseStamped, f"q2r_{hand}_hand_pose", received[hand].put, STREAM_QOS)
     frames: dict[str, str] = {}
-    with LivingHeadset(address) as headset:
+    with KeepaliveHeadset(address) as headset:
         deadline = time.monotonic() + PATIENCE
         while len(frames) < 2:
             assert time.monotonic() < deadline
@@ -203,20 +203,20 @@ def test_vibrations_and_twists_reach_a_headset_that_subscribed_byte_by_byte(
     haptic = node.create_publisher(OVR2ROSHapticFeedback, "q2r_right_hand_haptic_feedback", 10)
     dice, q2r = (node.create_publisher(Twist, topic, 10) for topic in PROP_TOPICS)
     twist = Twist(linear=Vector3(x=1.0, y=2.0, z=3.0), angular=Vector3(x=4.0, y=5.0, z=6.0))
-    with LivingHeadset(address, dialect) as headset:
+    with KeepaliveHeadset(address, dialect) as headset:
         headset.send(headset.registrations())
         headset.send(headset.command("__subscribe", topic="dice_twist", message_name="geometry_msgs/Twist"))
         headset.read_until("__topic_list")
         payload = send_until_received(haptic, OVR2ROSHapticFeedback(frequency=0.25, amplitude=7.0), headset)
         assert payload == header + struct.pack("<2f", 0.25, 1.0)
-    with LivingHeadset(address, dialect) as headset:
+    with KeepaliveHeadset(address, dialect) as headset:
         headset.send(headset.command("__subscribe", topic="dice_twist", message_name="geometry_msgs/Twist"))
         headset.send(headset.command("__topic_list"))
         headset.read_until("__topic_list")
         for _ in range(20):
             q2r.publish(twist)  # it did not subscribe to this one
         assert send_until_received(dice, twist, headset) == pack_twist(dialect, (1.0, 2.0, 3.0), (4.0, 5.0, 6.0))
-    with LivingHeadset(address, dialect) as headset:
+    with KeepaliveHeadset(address, dialect) as headset:
         headset.send(headset.command("__subscribe", topic="q2r_twist", message_name="geometry_msgs/Twist"))
         headset.send(headset.command("__topic_list"))
         headset.read_until("__topic_list")
@@ -230,7 +230,7 @@ def test_topics_are_silent_without_a_headset_and_a_headset_of_the_other_dialect_
     states = States(node, "tcp_endpoint")
     assert states.wait_for("no headset is connected")["level"] == "warn"
     hand = Hand(node, "left")
-    with LivingHeadset(address, "ros2") as headset:
+    with KeepaliveHeadset(address, "ros2") as headset:
         headset.send(headset.registrations())
         hand.meet(headset)
         headset.send(headset.pose("left", (1.0, 0.0, 0.0), IDENTITY) + headset.inputs("left", lower=True))
@@ -241,9 +241,9 @@ def test_topics_are_silent_without_a_headset_and_a_headset_of_the_other_dialect_
     state = states.wait_for("no headset is connected")
     assert state["last_disconnect"]
     time.sleep(0.5)
-    assert all(not drained(queue) for queue in hand.queues.values()), "something was published that nobody sent"
+    assert all(not drained(queue) for queue in hand.queues.values()), "something was published that was not received"
     assert len(node.get_publishers_info_by_topic("/q2r_left_hand_pose")) == 1
-    with LivingHeadset(address, "ros1") as headset:
+    with KeepaliveHeadset(address, "ros1") as headset:
         headset.send(headset.registrations() + headset.pose("left", (2.0, 0.0, 0.0), IDENTITY))
         assert numbers(hand.next("pose", 1)[0]) == [2.0, 0.0, 0.0]
         state = states.wait_for("is connected")

@@ -9,23 +9,21 @@ import time
 from collections.abc import Iterator
 from typing import Any
 
-import numpy as np
 import pytest
 
-from q2r2_control import Robot, load_config
+from q2r2_control import Robot
 from q2r2_control.config.timeouts import STREAM_TIMEOUT
-from tests.ros.cell import CONFIG
 from tests.ros.conftest import NEEDS_ROS
-from tests.ros.processes import Processes, RosProcess
+from tests.ros.processes import CONFIG, Processes, RosProcess, skip_if_overloaded
 from tests.ros.two_hosts import NotPermittedError, TwoHosts
-from tests.ros.waiting import eventually
+from tests.ros.waiting import wait_until
 
 pytest.importorskip("rclpy", reason=NEEDS_ROS)
 pytest.importorskip("quest2ros", reason="needs q2r2 ros build-interfaces")
 pytestmark = [pytest.mark.usefixtures("interfaces"), pytest.mark.alone]
 
 from q2r2_control.ros.launch.middleware import set_up_middleware  # noqa: E402
-from tests.ros.joint_log import JointLog  # noqa: E402
+from tests.ros.joint_recorder import JointRecorder  # noqa: E402
 
 ARMS = ("left_q2r2_arm_controller", "right_q2r2_arm_controller")
 RATE = 100.0  # of the nodes, fewer than usual for a machine that plays two [Hz]
@@ -40,7 +38,7 @@ class Hosts:
     """The nodes on both hosts, and observers that print what they hear there."""
 
     def __init__(self, network: TwoHosts, processes: Processes, robot: Robot) -> None:
-        self.joints = JointLog(robot.joint_names)
+        self.joints = JointRecorder(robot)
         self.robot = robot
         self.states: dict[str, tuple[float, dict[str, Any]]] = {}
         self._network, self._processes = network, processes
@@ -63,12 +61,12 @@ class Hosts:
     def wait_until_arms(self, **values: Any) -> None:
         now = time.monotonic()
         try:
-            eventually(lambda: all(self.says(arm, now, **values) for arm in ARMS), f"both arms are {values}")
+            wait_until(lambda: all(self.says(arm, now, **values) for arm in ARMS), f"both arms are {values}")
         except AssertionError as error:
             raise AssertionError(f"{error}: {self.states}") from None
 
     def play(self) -> RosProcess:
-        """Start the script, and with it press, until both arms move: a busy machine may look like a fault."""
+        """Start the script, which presses once, until both arms move; again if that press had no effect."""
         arms = [arm.joints for arm in self.robot.arms.values()]
         for _ in range(5):
             script = self.start("operator", "q2r2_control.ros.nodes.simulation_input")
@@ -78,6 +76,7 @@ class Hosts:
                     return script
                 time.sleep(0.02)
             script.end()
+        skip_if_overloaded("the arms are paused again and again")
         raise AssertionError(f"the arms do not follow the script: {self.states}")
 
     def _run(self, host: str, module: str, *arguments: str) -> RosProcess:
@@ -85,7 +84,7 @@ class Hosts:
         return self._processes.start(*command, name=module.split(".")[-1], **NETWORK)
 
     def _observe(self, host: str, *nodes: str) -> None:
-        process = self._run(host, "tests.ros.observer", *nodes)
+        process = self._run(host, "tests.ros.programs.observe", *nodes)
         threading.Thread(target=self._read, args=(process, host), daemon=True).start()
 
     def _read(self, process: RosProcess, host: str) -> None:
@@ -104,8 +103,8 @@ class Hosts:
         if said["kind"] != "joints":
             self.states[said["kind"]] = said["t"], said["value"]
         elif host == "robot":
-            names, q, v = said["value"]
-            self.joints.take(names, q, v, said["t"])
+            names, q, v, stamp = said["value"]
+            self.joints.take(names, q, v, said["t"], stamp)
 
 
 @pytest.fixture
@@ -118,10 +117,10 @@ def network() -> Iterator[TwoHosts]:
 
 
 def test_arms_follow_across_hosts_stop_when_the_cable_is_pulled_and_wait_for_a_press(
-    domain: int, network: TwoHosts, processes: Processes, record_property: Any
+    domain: int, robot: Robot, network: TwoHosts, processes: Processes, record_property: Any
 ) -> None:
-    hosts = Hosts(network, processes, Robot.from_config(load_config(CONFIG)))
-    eventually(lambda: hosts.joints.states, "joint states come")
+    hosts = Hosts(network, processes, robot)
+    wait_until(lambda: hosts.joints.states, "joint states come")
     hosts.wait_until_arms(state="paused")
     script = hosts.play()
     time.sleep(0.5)
@@ -147,4 +146,4 @@ def test_arms_follow_across_hosts_stop_when_the_cable_is_pulled_and_wait_for_a_p
     script.end()
     began = time.monotonic()
     hosts.play()
-    assert max(np.abs(state.v).max() for state in hosts.joints.since(began)) < FAST
+    assert hosts.joints.fastest(began) < FAST

@@ -6,7 +6,7 @@ import os
 import subprocess
 from types import TracebackType
 
-_SUBNET = "10.79.0"  # of nobody else, since no namespace sees another's
+_SUBNET = "10.79.0"  # seen by these namespaces only
 
 
 class NotPermittedError(Exception):

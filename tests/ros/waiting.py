@@ -1,4 +1,4 @@
-"""What tests of nodes wait for, far longer than it takes."""
+"""Waiting for nodes: for a condition, a state that a node reports, or the answer of a service."""
 
 from __future__ import annotations
 
@@ -11,16 +11,31 @@ from typing import Any
 from tests.ros.processes import PATIENCE
 
 
-def eventually(condition: Callable[[], object], what: str) -> None:
-    """Wait until ``condition`` holds."""
+def wait_until(condition: Callable[[], object], what: str, details: Callable[[], object] | None = None) -> None:
+    """Wait until ``condition`` holds; fails with ``what`` and ``details`` after a time far longer than it takes."""
     deadline = time.monotonic() + PATIENCE
     while not condition():
-        assert time.monotonic() < deadline, f"never happened: {what}"
-        time.sleep(0.01)
+        if time.monotonic() > deadline:
+            raise AssertionError(f"not within {PATIENCE:g} s: {what}" + (f"; {details()}" if details else ""))
+        time.sleep(0.002)
+
+
+def call(node: Any, service: str, request: Any = None) -> Any:
+    """The response of a Trigger service, or of a SetBool one for its ``request``; another thread spins ``node``."""
+    from std_srvs.srv import SetBool, Trigger
+
+    client = node.create_client(Trigger if request is None else SetBool, service)
+    try:
+        wait_until(client.service_is_ready, f"{service} is there")
+        future = client.call_async(Trigger.Request() if request is None else request)
+        wait_until(future.done, f"{service} answers")
+        return future.result()
+    finally:
+        node.destroy_client(client)
 
 
 def drained(queue: Queue[Any]) -> list[Any]:
-    """All that waits in ``queue``."""
+    """All that is in ``queue``."""
     items = []
     while True:
         try:

@@ -34,6 +34,8 @@ KEYS: dict[str, type | set[str]] = {
     "fallback_ticks": int,
     "uncertified_ticks": int,
     "rejected_targets": int,
+    "missed_ticks": int,
+    "stretched_s": float,
     "at_rest": bool,
     "torque": type(None),
     "events": list,

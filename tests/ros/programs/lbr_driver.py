@@ -1,4 +1,4 @@
-"""Prints the commands of two LBR robots and follows their positions: ``python -m tests.ros.lbr_listener KIND ARM ...``.
+"""Prints the commands of LBR robots and follows positions: ``python -m tests.ros.programs.lbr_driver KIND ARM ...``.
 
 KIND is a message of lbr_fri_idl, its topics are ``/ARM/command/...`` as the robots' drivers listen to. Each command is
 a line of JSON. Positions go on to a robot that listens to ``joint_commands``.

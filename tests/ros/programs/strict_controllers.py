@@ -1,8 +1,9 @@
-"""Two arms' controllers as strict as the community's, on the simulated robot: ``python -m tests.ros.stand_in TERMS``.
+"""Controllers of two arms that check each target: ``python -m tests.ros.programs.strict_controllers TERMS``.
 
-TERMS is the JSON of :class:`Terms`. Each arm's controller is a node of its own, ``/robot/left_ctrl``, that prints a
-line for every rule that a target breaks. Both arms are driven as damped springs by torques for what ``joint_states``
-says; an arm without a target holds the posture it has. It knows nothing of the package under test.
+They stand in for the controllers of other projects, whose rules are TERMS, the JSON of :class:`Terms`. Each arm's
+controller is a node of its own, ``/robot/left_ctrl``, that prints a line for every rule that a target breaks. The arms
+of the simulated robot are driven by the torques of an impedance; an arm without a target holds its posture. Nothing
+here uses the package under test.
 """
 
 from __future__ import annotations
@@ -26,28 +27,28 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, String
 from trajectory_msgs.msg import JointTrajectory
 
-from tests.ros.springs import Springs
+from tests.ros.programs.impedance_model import ImpedanceModel
 
 ARMS = ("left", "right")
 FASTEST = 0.55  # that a target may move, where nothing else is said [m/s]
 FASTEST_JOINT = 2.5  # that a joint's target may move [rad/s]
-LONGEST_GAP = 0.3  # that a busy machine may leave in a stream [s]
+LONGEST_GAP = 0.3  # in a stream, on an overloaded machine [s]
 SETTLED, SETTLED_TURN, SETTLED_JOINT = 0.004, 0.02, 0.02  # from a tool or a target that rests [m], [rad], [rad]
-WRENCH_PATIENCE = 0.5  # [s]
-LONGEST_SILENCE = 1.0  # in a stream of joint positions [s]
-OLD_AT_ONCE = 3  # stamps in a row that a sender alone is to blame for, and not a machine that took its turn away
-STALLED = 0.1  # a sender that stalled for longer makes up for no more [s]
+WRENCH_TIMEOUT = 0.5  # [s]
+LONGEST_SILENCE = 1.0  # between two joint positions [s]
+OLD_IN_A_ROW = 3  # stamps that are too old: fewer are the delay of an overloaded machine
+STALL = 0.1  # after a longer stall a sender catches up no more than this [s]
 
 
 @dataclass(frozen=True)
 class Terms:
-    """What a controller's own documentation asks for."""
+    """What a controller's own documentation requires."""
 
     topic: str  # below the controller's name
     message: str = "pose"  # or array, trajectory, lbr
-    frame: str = "base"  # its own base link and no other; any: whichever; ignored: numbers are in the base link
+    frame: str = "base"  # frame_id has to be its base link; any: any link; ignored: numbers are in the base link
     lowest_rate: float = 50.0  # [Hz]
-    longest_age: float = 0.5  # of a stamp; longer than 0.1 it is no rule, but a bound on our own delay [s]
+    longest_age: float = 0.5  # of a stamp [s]; above 0.1 it is no rule of the controller, but a bound on our delay
     wrench: bool = False  # wants a zero one
     command_type: bool = False  # targets count after a call of switch_command_type with 2
     fastest: float = FASTEST  # that a target may move [m/s]
@@ -55,11 +56,11 @@ class Terms:
 
 
 class Controller(Node):
-    """One arm's."""
+    """The controller of one arm."""
 
-    def __init__(self, arm: str, terms: Terms, springs: Springs) -> None:
+    def __init__(self, arm: str, terms: Terms, model: ImpedanceModel) -> None:
         super().__init__(f"{arm}_ctrl", namespace="/robot")
-        self.arm, self.terms, self.springs = arm, terms, springs
+        self.arm, self.terms, self.model = arm, terms, model
         self._last: tuple[Any, float] | None = None  # target and stamp
         self._began, self._zero_wrench = math.inf, False
         self._old = 0  # stamps in a row
@@ -74,6 +75,9 @@ class Controller(Node):
             ),
         }
         kind, callback = kinds[terms.message]
+        self._deactivated = False  # the sender of joint positions has announced it since the last one
+        if terms.message != "pose":
+            self.create_subscription(String, "/cartesian_controller/state", self._on_sender_state, 10)
         self._topic = f"/robot/{self.get_name()}/{terms.topic}"
         if terms.command_type:
             service = import_module("moveit_msgs.srv").ServoCommandType
@@ -86,7 +90,7 @@ class Controller(Node):
     def _now(self) -> float:
         return float(self.get_clock().now().nanoseconds) * 1e-9
 
-    def _say(self, fault: str) -> None:
+    def _report(self, fault: str) -> None:
         print(f"violation: {self.arm}: {fault}", flush=True)
 
     def _on_command_type(self, request: Any, response: Any) -> Any:
@@ -97,89 +101,94 @@ class Controller(Node):
         force, torque = message.wrench.force, message.wrench.torque
         self._zero_wrench = (force.x, force.y, force.z, torque.x, torque.y, torque.z) == (0.0,) * 6
         if message.header.frame_id != f"{self.arm}_link_0":
-            self._say(f"wrench in frame {message.header.frame_id!r}")
+            self._report(f"wrench in frame {message.header.frame_id!r}")
 
     def _on_pose(self, message: PoseStamped, info: Any) -> None:
         stamp = message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
-        # As it was sent: how late it is taken here is the machine's matter.
+        # At the time of sending: the delay until here depends on the load of the machine.
         age = 1e-9 * info["source_timestamp"] - stamp
         self._old = self._old + 1 if age > self.terms.longest_age else 0
-        if self._old >= OLD_AT_ONCE:
-            self._say(f"stamp is {age:.3f} s old")
+        if self._old >= OLD_IN_A_ROW:
+            self._report(f"stamp is {age:.3f} s old")
         at, turned = message.pose.position, message.pose.orientation
         position = np.array([at.x, at.y, at.z])
         rotation = np.array([turned.x, turned.y, turned.z, turned.w])
         if not (np.isfinite(position).all() and abs(np.linalg.norm(rotation) - 1.0) < 1e-6):
-            self._say("not a unit quaternion, or not finite")
+            self._report("not a unit quaternion, or not finite")
             return
         own = f"{self.arm}_link_0"
-        frame = self.springs.frame(message.header.frame_id if self.terms.frame == "any" else own)
+        frame = self.model.frame(message.header.frame_id if self.terms.frame == "any" else own)
         if frame is None or (self.terms.frame == "base" and message.header.frame_id != own):
-            self._say(f"frame {message.header.frame_id!r}")
+            self._report(f"frame {message.header.frame_id!r}")
             return
         if not self._switched:
-            self._say("a pose before the switch to poses")
+            self._report("a pose before the switch to poses")
             return
         self._step(frame * pin.SE3(pin.Quaternion(rotation).toRotationMatrix(), position), stamp)
 
     def _step(self, target: pin.SE3, stamp: float) -> None:
-        tool, last = self.springs.tool(self.arm), self._last
+        tool, last = self.model.tool(self.arm), self._last
         gap = math.inf if last is None else max(stamp - last[1], 0.0)
         fastest, turning, faults = self.terms.fastest, self.terms.fastest_turn, []
         # A stream that begins, or begins again, does so at the tool.
         for before, period in ((None if last is None else last[0], gap), (tool if gap > LONGEST_GAP else None, 0.0)):
             if before is not None:
-                period = min(period, STALLED if gap > LONGEST_GAP else LONGEST_GAP)
+                period = min(period, STALL if gap > LONGEST_GAP else LONGEST_GAP)
                 way = math.dist(target.translation, before.translation)
                 turn = float(np.linalg.norm(pin.log3(before.rotation.T @ target.rotation)))
                 far = way > fastest * period + SETTLED or turn > turning * period + SETTLED_TURN
                 faults.append(f"jump of {way:.4f} m, {turn:.3f} rad in {gap:.3f} s" if far else "")
         if all(faults):
-            self._say(faults[0])
-        if self.terms.wrench and not self._zero_wrench and self._now - self._began > WRENCH_PATIENCE:
-            self._say("no zero wrench")
+            self._report(faults[0])
+        if self.terms.wrench and not self._zero_wrench and self._now - self._began > WRENCH_TIMEOUT:
+            self._report("no zero wrench")
         self._take(target, stamp)
 
     def _on_trajectory(self, message: JointTrajectory) -> None:
         names, count = list(message.joint_names), len(message.points)
-        if names != self.springs.joints(self.arm) or count != 1:
-            self._say(f"{count} points for {names}")
+        if names != self.model.joints(self.arm) or count != 1:
+            self._report(f"{count} points for {names}")
             return
         due = message.points[0].time_from_start.sec + 1e-9 * message.points[0].time_from_start.nanosec
         if not 0.0 < due <= 0.1:
-            self._say(f"due in {due:.3f} s")
+            self._report(f"due in {due:.3f} s")
         self._on_joints(message.points[0].positions)
 
     def _on_joints(self, positions: Any) -> None:
         target, now = np.array(positions, float), self._now
         if target.shape != (7,) or not np.isfinite(target).all():
-            self._say(f"not 7 finite positions: {list(positions)}")
+            self._report(f"not 7 finite positions: {list(positions)}")
             return
         period = math.inf if self._last is None else now - self._last[1]
-        before = self.springs.positions(self.arm) if self._last is None else self._last[0]
+        before = self.model.positions(self.arm) if self._last is None else self._last[0]
         allowed = SETTLED_JOINT + (0.0 if self._last is None else FASTEST_JOINT * period)
         if np.abs(target - before).max() > allowed:
-            self._say(f"jump of {np.abs(target - before).max():.4f} rad, allowed {allowed:.4f}")
-        if LONGEST_SILENCE < period < math.inf:
-            self._say(f"nothing for {period:.3f} s")
+            self._report(f"jump of {np.abs(target - before).max():.4f} rad, allowed {allowed:.4f}")
+        if LONGEST_SILENCE < period < math.inf and not self._deactivated:
+            self._report(f"nothing for {period:.3f} s")
+        self._deactivated = False
         self._take(target, now)
+
+    def _on_sender_state(self, message: String) -> None:
+        if json.loads(message.data)["phase"] != "active":
+            self._deactivated = True
 
     def _take(self, target: Any, stamp: float) -> None:
         if (publishers := self.count_publishers(self._topic)) != 1:
-            self._say(f"{publishers} publishers")
+            self._report(f"{publishers} publishers")
         if self._last is None:
             self._began = self._now
             print(f"first target of {self.arm}", flush=True)
         self._last = target, stamp
-        self.springs.goals[self.arm] = target
+        self.model.goals[self.arm] = target
 
 
 class Driver(Node):
-    """Both arms' torques."""
+    """Commands the torques of both arms."""
 
     def __init__(self) -> None:
-        super().__init__("springs", namespace="/robot")
-        self.springs: Springs | None = None
+        super().__init__("impedance", namespace="/robot")
+        self.model: ImpedanceModel | None = None
         self.controllers: list[Controller] = []
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         newest = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -189,12 +198,12 @@ class Driver(Node):
         self.driving = False
 
     def _on_description(self, message: String) -> None:
-        self.springs = Springs(message.data, {arm: f"{arm}_tool_frame" for arm in ARMS})
+        self.model = ImpedanceModel(message.data, {arm: f"{arm}_tool_frame" for arm in ARMS})
 
     def _on_joint_state(self, message: JointState) -> None:
-        if self.springs is not None:
-            self.springs.measure(message.name, message.position, message.velocity)
-            self._torques.publish(Float64MultiArray(data=self.springs.torques()))
+        if self.model is not None:
+            self.model.measure(message.name, message.position, message.velocity)
+            self._torques.publish(Float64MultiArray(data=self.model.torques()))
             self.driving = self._torques.get_subscription_count() > 0
 
 
@@ -206,9 +215,9 @@ def main() -> None:
     try:
         while not driver.driving:
             executor.spin_once()
-        assert driver.springs is not None
+        assert driver.model is not None
         for arm in ARMS:
-            executor.add_node(Controller(arm, terms, driver.springs))
+            executor.add_node(Controller(arm, terms, driver.model))
         print("ready", flush=True)
         executor.spin()
     except (KeyboardInterrupt, ExternalShutdownException):

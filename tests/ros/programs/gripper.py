@@ -1,4 +1,4 @@
-"""A gripper behind control_msgs/action/GripperCommand: ``python -m tests.ros.gripper``.
+"""A gripper behind control_msgs/action/GripperCommand: ``python -m tests.ros.programs.gripper``.
 
 It closes from 50 mm, stalls at 20 mm as if something were between its fingers, and holds that until it is cancelled.
 """

@@ -1,6 +1,6 @@
-"""Prints joint states and nodes' states as lines of JSON until it is ended: ``python -m tests.ros.observer NODE ...``.
+"""Prints joint states and nodes' states as lines of JSON: ``python -m tests.ros.programs.observe NODE ...``.
 
-For tests that cannot be where the topics are. Times are of the machine's steady clock, the same for all processes.
+For tests on another network than the topics. Times are of the machine's steady clock, the same for all processes.
 """
 
 from __future__ import annotations
@@ -23,16 +23,17 @@ def main() -> None:
     rclpy.init()
     node = rclpy.create_node("observer")
 
-    def say(kind: str, value: Any) -> None:
+    def write(kind: str, value: Any) -> None:
         print(json.dumps({"t": time.monotonic(), "kind": kind, "value": value}), flush=True)
 
     def on_joint_state(message: JointState) -> None:
-        say("joints", [list(message.name), list(message.position), list(message.velocity)])
+        stamp = message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
+        write("joints", [list(message.name), list(message.position), list(message.velocity), stamp])
 
     node.create_subscription(JointState, "/joint_states", on_joint_state, STREAM_QOS)
 
     def on_state(name: str, message: String) -> None:
-        say(name, json.loads(message.data))
+        write(name, json.loads(message.data))
 
     for name in sys.argv[1:]:
         node.create_subscription(String, f"/{name}/state", partial(on_state, name), 10)

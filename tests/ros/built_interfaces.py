@@ -1,4 +1,4 @@
-"""Interface packages of others, as far as tests need them, built beside the environment."""
+"""Message packages of other projects, as far as tests need them, built beside the environment."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from q2r2_control.ros.launch.build import Interfaces, build, missing_tools
 INTERFACES = Path(__file__).parent / "interfaces"
 
 
-def built(folder: Path, *names: str) -> dict[str, str]:
-    """Variables for processes that import the packages ``names``, built into ``folder`` by whoever asks first."""
-    prefix = folder / "others"
+def build_interfaces(folder: Path, *names: str) -> dict[str, str]:
+    """Variables for processes that import the packages ``names``, built into ``folder`` by the first worker."""
+    prefix = folder / "interfaces"
     if missing := missing_tools(Path(sys.prefix)):
         pytest.skip(f"{', '.join(names)} cannot be built here: missing {'; '.join(missing)}")
-    done = folder / "others.done"
-    with (folder / "others.lock").open("w") as lock:
+    done = folder / "interfaces.done"
+    with (folder / "interfaces.lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         if not done.exists():
             _build(prefix, names)

@@ -1,4 +1,4 @@
-"""A publisher that misses its listener, against a real one that is frozen and killed."""
+"""A publisher notices that its subscriber is gone: tested with a real one that is frozen and killed."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 
 from tests.ros.conftest import NEEDS_ROS
 from tests.ros.processes import Processes, RosProcess
-from tests.ros.waiting import eventually
+from tests.ros.waiting import wait_until
 
 pytest.importorskip("rclpy", reason=NEEDS_ROS)
 
@@ -20,7 +20,7 @@ from geometry_msgs.msg import PoseStamped
 
 from q2r2_control.ros.monitoring.endpoints import WatchedPublisher
 
-TIMEOUT = 0.5  # more than a busy machine takes to acknowledge [s]
+TIMEOUT = 0.5  # longer than an acknowledgement takes on an overloaded machine [s]
 LISTENER = """
 import rclpy
 from geometry_msgs.msg import PoseStamped
@@ -39,7 +39,7 @@ class Stream:
         self.published = self.left_out = 0
 
     def run(self, seconds: float) -> str | None:
-        """Publish for so long; what was said of the listener, if anything was."""
+        """Publish for so long; returns the reported silence of the listener, if there was one."""
         end = time.monotonic() + seconds
         while time.monotonic() < end:
             if (silence := self._publisher.silence()) is not None:
@@ -58,12 +58,12 @@ def listener(processes: Processes) -> RosProcess:
     return processes.start(sys.executable, "-c", LISTENER, name="listener")
 
 
-@pytest.mark.parametrize(("rate", "acknowledged"), [(50.0, False), (200.0, True), (500.0, False), (500.0, True)])
-def test_a_listener_is_missed_when_it_hangs_and_never_while_it_lives(
+@pytest.mark.parametrize(("rate", "acknowledged"), [(50.0, False), (500.0, True)])
+def test_a_frozen_listener_is_reported_and_a_running_one_never(
     rate: float, acknowledged: bool, node: Any, listener: RosProcess
 ) -> None:
     publisher = WatchedPublisher(node, PoseStamped, "/watched", TIMEOUT)
-    eventually(lambda: publisher.listeners == 1, "the listener is found")
+    wait_until(lambda: publisher.listeners == 1, "the listener is found")
     publisher.begin(acknowledged)
     stream = Stream(publisher, rate)
     assert stream.run(2.0) is None
@@ -75,14 +75,14 @@ def test_a_listener_is_missed_when_it_hangs_and_never_while_it_lives(
     assert silence.startswith("messages on /watched are not acknowledged for 0.5")
     assert time.monotonic() - frozen < 2.0 * TIMEOUT
     os.kill(listener.pid, signal.SIGCONT)
-    eventually(lambda: publisher.silence() is None, "it is there again")
+    wait_until(lambda: publisher.silence() is None, "it is there again")
 
 
-def test_what_is_left_of_a_listener_that_ended_before_the_stream_is_not_missed(
+def test_a_listener_that_ended_before_the_stream_is_not_reported(
     node: Any, listener: RosProcess, processes: Processes
 ) -> None:
     publisher = WatchedPublisher(node, PoseStamped, "/watched", TIMEOUT)
-    eventually(lambda: publisher.listeners == 1, "the listener is found")
+    wait_until(lambda: publisher.listeners == 1, "the listener is found")
     os.kill(listener.pid, signal.SIGKILL)
     listener.wait()
     publisher.begin()

@@ -17,9 +17,8 @@ import pytest
 import yaml
 
 from q2r2_control.ros.launch.processes import SOURCES, NodeProcess, nodes_of
-from tests.ros.cell import CONFIG
 from tests.ros.conftest import NEEDS_ROS
-from tests.ros.processes import ROOT, Processes, RosProcess
+from tests.ros.processes import CONFIG, ROOT, Processes, RosProcess
 from tests.support.external_cell import external
 
 pytest.importorskip("rclpy", reason=NEEDS_ROS)
@@ -28,8 +27,7 @@ pytestmark = pytest.mark.usefixtures("interfaces")
 # The robot and the controller alone, through the same functions as the command.
 PAIR = f"""
 import sys
-from q2r2_control.ros.launch.processes import nodes_of
-from q2r2_control.ros.launch.processes import run_together
+from q2r2_control.ros.launch.processes import nodes_of, run_together
 sys.exit(run_together(nodes_of({CONFIG!r}, "none")[:2], lambda line: print(line, flush=True)))
 """
 
@@ -48,7 +46,7 @@ def children(pid: int) -> list[int]:
 
 
 def alive(pid: int) -> bool:
-    """Whether it runs; one that has ended may wait for whoever reaps orphans here."""
+    """Whether it runs; a process that has ended may remain as a zombie."""
     try:
         with open(f"/proc/{pid}/stat") as file:
             return file.read().rpartition(")")[2].split()[0] != "Z"

@@ -1,4 +1,4 @@
-"""The arms of a robot description as damped springs: what a controller of others would command them with.
+"""Torques of a task-space or joint impedance on the arms of a robot description: what other controllers command.
 
 It knows nothing of the package under test. Its accelerations are those of a critically damped spring, w^2 e - 2 w v,
 in the tool's space for a pose and in the joints' for a posture; the model's inertia makes torques of them.
@@ -13,19 +13,20 @@ from xml.etree import ElementTree
 import numpy as np
 import pinocchio as pin
 
-STIFFNESS = 20.0  # w [1/s]
+# Low, so that the loop through ROS is stable with delays of up to 80 ms, which an overloaded machine brings.
+NATURAL_FREQUENCY = 10.0  # w [rad/s]
 NULLSPACE_DAMPING = 10.0  # [1/s]
-LONGEST_ERROR, WIDEST_ERROR = 0.1, 0.5  # a spring is never longer [m, rad]
+MAX_ERROR, MAX_TURN = 0.1, 0.5  # the error of a pose is clipped [m, rad]
 SINGULAR = 1e-4
 
 
-class Springs:
+class ImpedanceModel:
     """Torques for all revolute joints, in the order of the joint states."""
 
     def __init__(self, description: str, tools: dict[str, str]) -> None:
         self._model = pin.buildModelFromXML(description)
         for joint in ElementTree.fromstring(description).findall("joint"):
-            if (rotor := joint.find("rotor")) is not None:  # URDF has no place of its own for it
+            if (rotor := joint.find("rotor")) is not None:  # no standard element of URDF
                 inertia = float(rotor.get("inertia", 0.0)) * float(rotor.get("gear", 1.0)) ** 2
                 self._model.armature[self._column(joint.get("name", ""))] = inertia
         self._data = self._model.createData()
@@ -41,7 +42,7 @@ class Springs:
             joint = self._model.joints[self._model.getJointId(name)]
             q[joint.idx_q], v[joint.idx_v] = position, velocity
         if not self._joints:
-            self._joints = [name for name in names if self._turns(name)]
+            self._joints = [name for name in names if self._is_revolute(name)]
             for arm in self._frames:
                 self._columns[arm] = [self._column(name) for name in self._joints if name.startswith(arm)]
         self._q, self._v = q, v
@@ -79,7 +80,7 @@ class Springs:
             if isinstance(goal, pin.SE3):
                 tau[columns] += self._to_pose(arm, goal, M, columns, v)
             else:
-                tau[columns] += M @ (STIFFNESS**2 * (goal - self._q[columns]) - 2.0 * STIFFNESS * v)
+                tau[columns] += M @ (NATURAL_FREQUENCY**2 * (goal - self._q[columns]) - 2.0 * NATURAL_FREQUENCY * v)
         return [float(tau[self._column(name)]) for name in self._joints]
 
     def _to_pose(self, arm: str, goal: pin.SE3, M: Any, columns: list[int], v: Any) -> Any:
@@ -87,17 +88,17 @@ class Springs:
         J = pin.getFrameJacobian(self._model, self._data, self._frames[arm], pin.LOCAL_WORLD_ALIGNED)[:, columns]
         error = np.concatenate(
             (
-                _at_most(goal.translation - tool.translation, LONGEST_ERROR),
-                _at_most(tool.rotation @ pin.log3(tool.rotation.T @ goal.rotation), WIDEST_ERROR),
+                _clipped(goal.translation - tool.translation, MAX_ERROR),
+                _clipped(tool.rotation @ pin.log3(tool.rotation.T @ goal.rotation), MAX_TURN),
             )
         )
         to_tool = np.linalg.solve(M, J.T)
         inertia = np.linalg.inv(J @ to_tool + SINGULAR * np.eye(6))
-        force = inertia @ (STIFFNESS**2 * error - 2.0 * STIFFNESS * (J @ v))
+        force = inertia @ (NATURAL_FREQUENCY**2 * error - 2.0 * NATURAL_FREQUENCY * (J @ v))
         own = -NULLSPACE_DAMPING * v
         return J.T @ force + M @ (own - to_tool @ (inertia @ (J @ own)))
 
-    def _turns(self, name: str) -> bool:
+    def _is_revolute(self, name: str) -> bool:
         kind: str = self._model.joints[self._model.getJointId(name)].shortname()
         return kind.startswith("JointModelR")
 
@@ -105,6 +106,6 @@ class Springs:
         return int(self._model.joints[self._model.getJointId(name)].idx_v)
 
 
-def _at_most(vector: Any, length: float) -> Any:
+def _clipped(vector: Any, length: float) -> Any:
     norm = float(np.linalg.norm(vector))
     return vector if norm <= length else vector * (length / norm)

@@ -1,4 +1,4 @@
-"""An operator with a headset: both hands circle steadily, on a TCP connection that is made anew when it is lost."""
+"""An operator's headset: both hands move in circles, on a TCP connection that is renewed when it is lost."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from tests.support.operator_script import HANDS, START, Vector
 
 RADIUS, SPEED = 0.08, 0.3  # of the hands' circles [m], [m/s]
 RAMP = 0.3  # from rest to that speed [s]
-PRESS = 0.2  # longer than what tells a press from a chord [s]
+PRESS = 0.2  # longer than a chord's window [s]
 
 
 class Operator:
-    """Streams both hands while :meth:`wearing` and ``online``; ``moves`` is the test's to set as well."""
+    """Streams both hands while :meth:`streaming` and ``online``; they circle while ``moves``. Tests set both."""
 
     def __init__(self, address: tuple[str, int]) -> None:
         self.online = True
@@ -26,12 +26,12 @@ class Operator:
         self._lower: frozenset[str] = frozenset()
         self._address = address
         self._angle = self._rate = 0.0
-        self._was: deque[tuple[float, float]] = deque(maxlen=int(60.0 * RATE_HZ))  # when [s], and the angle
+        self._angles: deque[tuple[float, float]] = deque(maxlen=int(60.0 * RATE_HZ))  # when [s], and the angle
         self._ended = threading.Event()
 
     @contextmanager
-    def wearing(self) -> Iterator[Operator]:
-        """The headset is on, and tries to connect as often as it has to."""
+    def streaming(self) -> Iterator[Operator]:
+        """Connect, as often as necessary, and stream."""
         thread = threading.Thread(target=self._run, daemon=True)
         thread.start()
         try:
@@ -47,17 +47,17 @@ class Operator:
         self._lower = frozenset()
         time.sleep(0.1)
 
-    def rest(self, where_they_were: float | None = None) -> None:
-        """Put both hands at rest where they were at that time [s], or at the start; a jump while no arm follows."""
+    def rest(self, at: float | None = None) -> None:
+        """Put both hands at rest where they were at that time [s], or at the start; no arm may follow meanwhile."""
         self.moves = False
         self._rate = 0.0
-        self._angle = next((angle for t, angle in reversed(self._was) if t <= (where_they_were or -1.0)), 0.0)
+        self._angle = next((angle for t, angle in reversed(self._angles) if t <= (at or -1.0)), 0.0)
 
     def _run(self) -> None:
         while not self._ended.wait(0.1):
             if not self.online:
                 continue
-            # Nobody may listen yet, or not any more.
+            # The server may not listen yet, or have ended.
             with suppress(OSError), FakeHeadset(self._address, connect_timeout=0.0) as headset:
                 headset.send(headset.registrations())
                 self._stream(headset)
@@ -75,7 +75,7 @@ class Operator:
         change = dt / RAMP * full
         self._rate = min(self._rate + change, full) if self.moves else max(self._rate - change, 0.0)
         self._angle += self._rate * dt
-        self._was.append((time.monotonic(), self._angle))
+        self._angles.append((time.monotonic(), self._angle))
 
     def _position(self, hand: str) -> Vector:
         x, y, z = START[hand]

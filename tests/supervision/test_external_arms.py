@@ -1,0 +1,124 @@
+"""Arms that another controller moves: their elbows go where they like, and what is measured may not come too close."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import pytest
+import yaml
+
+from q2r2_control import CartesianController, Robot, load_config
+from q2r2_control.config import Config, find_resource
+from q2r2_control.supervision.external_arms import ExternalArms, ExternalSettings, settings_for_external_arms
+from q2r2_control.supervision.joint_watch import WatchSettings
+from q2r2_control.supervision.supervisor import Phase, Supervisor
+from q2r2_control.supervision.target_stream import StreamSettings
+from q2r2_control.types import Array, RobotState
+
+CONFIG = "config/dual_iiwa7.yaml"
+DT = 0.005  # [s]
+SPEED = 0.3  # of the elbow's swing, in the norm of the joints' velocities [rad/s]
+POST, RADIUS = 2.6, 0.04  # where a post is on the elbow's way, and its own radius [rad], [m]
+MIN_DISTANCE, TOLERANCE = 0.02, 0.01  # [m]
+
+
+def swing(robot: Robot, angle: float) -> list[Array]:
+    """Postures from home on, with the left elbow swinging inwards by ``angle`` [rad] while no tool moves."""
+    data, arm, q = robot.model.createData(), robot.arms["left"], robot.home.copy()
+    tool, step = robot.tool_pose(q, "left"), SPEED * DT
+    postures, last = [q.copy()], np.eye(7)[2]
+    for _ in range(round(angle / step)):
+        J = pin.computeFrameJacobian(robot.model, data, q, arm.frame_id, pin.LOCAL_WORLD_ALIGNED)[:, arm.joints]
+        free = np.linalg.svd(J)[2][-1]
+        last = free if free @ last > 0.0 else -free
+        pose = robot.tool_pose(q, "left")
+        back = np.r_[tool.translation - pose.translation, pin.log3(tool.rotation @ pose.rotation.T)]
+        q[arm.joints] += step * last + np.linalg.pinv(J) @ back
+        postures.append(q.copy())
+    return postures
+
+
+@pytest.fixture(scope="module")
+def robot() -> Robot:
+    return Robot.from_config(load_config(CONFIG))
+
+
+@pytest.fixture(scope="module")
+def config(robot: Robot, tmp_path_factory: pytest.TempPathFactory) -> Config:
+    """The cell with a post that the left elbow meets on its way, but not the reference's elbow."""
+    data = robot.model.createData()
+    pin.forwardKinematics(robot.model, data, swing(robot, POST)[-1])
+    elbow = data.oMi[robot.model.getJointId("left_A4")].translation
+    cell = yaml.safe_load(find_resource(CONFIG).read_text())
+    cell["obstacles"]["post"] = {"shape": "sphere", "size": [RADIUS], "position": elbow.tolist()}
+    file: Path = tmp_path_factory.mktemp("cell") / "post.yaml"
+    file.write_text(yaml.safe_dump(cell))
+    return settings_for_external_arms(load_config(str(file)))
+
+
+class World:
+    """A supervisor of arms that another controller moves; its references are not commanded."""
+
+    def __init__(self, config: Config) -> None:
+        self.robot = Robot.from_config(config)
+        self.controller = CartesianController(self.robot, config.control)
+        streams, watch = StreamSettings(), WatchSettings()
+        settings = ExternalSettings(tolerance=TOLERANCE)
+        external = ExternalArms(self.robot, self.controller, settings, streams, watch)
+        self.supervisor = Supervisor(self.robot, self.controller, streams, watch, external=external)
+        self.now = 0.0
+
+    def show(self, postures: list[Array]) -> None:
+        """One measured posture and one tick after another."""
+        zero = np.zeros_like(self.robot.home)
+        for q in postures:
+            self.now += DT
+            self.supervisor.take_joint_state(RobotState(q, zero, zero, None, self.now), self.now)
+            self.supervisor.tick(self.now, DT)
+
+
+@pytest.fixture
+def world(config: Config) -> World:
+    made = World(config)
+    made.show([made.robot.home] * 50)
+    assert made.supervisor.phase is Phase.ACTIVE
+    made.supervisor.events.clear()
+    return made
+
+
+def test_elbows_may_swing_while_the_tools_stay(world: World) -> None:
+    postures = swing(world.robot, 0.7)
+    home = world.controller.tool_pose("left").translation
+    world.show(postures + postures[-1:] * round(1.0 / DT))  # longer than a deviation may last
+    assert np.abs(postures[-1] - world.robot.home).max() > 0.5
+    assert world.supervisor.phase is Phase.ACTIVE
+    assert world.supervisor.events == []
+    assert np.linalg.norm(world.controller.tool_pose("left").translation - home) < 1e-3
+
+
+def test_measured_arms_that_come_too_close_stop_the_reference_and_are_named(world: World) -> None:
+    postures = swing(world.robot, 1.5)
+    world.show(postures + postures[-1:] * round(0.5 / DT))
+    assert world.supervisor.phase is Phase.STOPPED
+    (event,) = world.supervisor.events
+    pair, distance = event.split(" are ")
+    assert pair.startswith("measured: left_link_")
+    assert pair.endswith("|post_0")
+    # The first state that is too close counts: the next one is nearer by no more than the elbow moves meanwhile.
+    assert MIN_DISTANCE - TOLERANCE - 1e-3 < float(distance.split(" m")[0]) <= MIN_DISTANCE - TOLERANCE
+
+
+def test_a_tool_that_is_not_where_its_reference_is_starts_over(world: World) -> None:
+    moved = world.robot.home.copy()
+    moved[0] += 0.1  # farther than a stream may begin, nearer than a joint may deviate
+    steps = [world.robot.home + share * (moved - world.robot.home) for share in np.linspace(0.0, 1.0, 40)]
+    world.show(steps + [moved] * round(0.4 / DT))
+    assert world.supervisor.events == []
+    world.show([moved] * round(0.4 / DT))
+    assert "left: the tool is 0.0" in world.supervisor.events[0]
+    world.show([moved] * 50)
+    assert world.supervisor.phase is Phase.ACTIVE
+    tool = world.robot.tool_pose(moved, "left").translation
+    assert np.linalg.norm(world.controller.tool_pose("left").translation - tool) < 1e-3
