@@ -6,8 +6,9 @@ passes messages on need not wait for the solver and its compiled kernels.
 
 from __future__ import annotations
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from q2r2_control._lazy import lazy_exports
 
 if TYPE_CHECKING:
     from q2r2_control.config import load_config
@@ -31,23 +32,20 @@ __all__ = [
     "load_config",
 ]
 
-_MODULES = {
-    "CartesianController": "control.controller",
-    "ConfigError": "errors",
-    "ControllerSettings": "config.control",
-    "Pipeline": "pipeline",
-    "Q2R2Error": "errors",
-    "RelativeMotion": "teleop.relative",
-    "Robot": "robot.robot",
-    "RunSummary": "runtime.run_summary",
-    "load_config": "config",
-}
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _MODULES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)
+__getattr__ = lazy_exports(
+    __name__,
+    {
+        "CartesianController": "control.controller",
+        "ConfigError": "errors",
+        "ControllerSettings": "config.control",
+        "Pipeline": "pipeline",
+        "Q2R2Error": "errors",
+        "RelativeMotion": "teleop.relative",
+        "Robot": "robot.robot",
+        "RunSummary": "runtime.run_summary",
+        "load_config": "config",
+    },
+)
 
 
 def __dir__() -> list[str]:

@@ -213,7 +213,7 @@ class _Run:
         self._recorder.add_latency(samples, self._clock.read())
         # A plant that is simulated lets no more time pass at once, as if the computer had stood still.
         pipeline.plant.advance(min(gap, LONGEST_DT))
-        self._record(gap, samples, reference, state, tools, compute_time)
+        self._record(gap, dt, samples, reference, state, tools, compute_time)
         return reference
 
     def _observe(self, state: RobotState, gap: float) -> None:
@@ -268,6 +268,7 @@ class _Run:
     def _record(
         self,
         dt: float,
+        step: float,
         samples: list[HandSample],
         reference: Reference,
         state: RobotState,
@@ -280,6 +281,7 @@ class _Run:
         tick = Tick(
             t=self._clock.now - self._clock.start,
             dt=dt,
+            step=step,
             samples=samples,
             targets=self._targets,
             engaged=engaged,

@@ -1,0 +1,20 @@
+"""Where hand samples come from. To add an input, implement ``Input`` of ``base``.
+
+``factory`` makes an input by name. ``scripted`` plays ``trajectories``. ``headset`` is the TCP server for the
+Quest2ROS app: ``framing``, ``messages``, ``session`` and ``client`` are its protocol without sockets, ``samples`` the
+queue between its thread and the loop, ``statistics`` and ``headset_check`` what people see of it.
+"""
+
+from q2r2_control.inputs.base import Input
+from q2r2_control.inputs.factory import make_input
+from q2r2_control.inputs.headset import HeadsetServer
+from q2r2_control.inputs.scripted import ScriptedInput
+from q2r2_control.inputs.trajectories import TRAJECTORIES
+
+__all__ = [
+    "TRAJECTORIES",
+    "HeadsetServer",
+    "Input",
+    "ScriptedInput",
+    "make_input",
+]

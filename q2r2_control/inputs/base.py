@@ -1,4 +1,4 @@
-"""What every input offers, wherever its hand samples come from: a script, the headset, a recording."""
+"""The interface of every source of hand samples: a script, the headset, a recording."""
 
 from __future__ import annotations
 
@@ -35,5 +35,5 @@ class Input(Protocol):
         ...
 
     def close(self) -> None:
-        """Give back every resource; may be called twice."""
+        """Release every resource; may be called twice."""
         ...

@@ -1,4 +1,4 @@
-"""What the headset server keeps of the headset that is connected."""
+"""The state of the connected headset in the server."""
 
 from __future__ import annotations
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 from q2r2_control.errors import ProtocolError
 
-MAX_FRAME_BYTES = 1 << 20  # a hand message has under 200: whoever announces more than this has lost the thread
+MAX_FRAME_BYTES = 1 << 20  # a hand message has under 200; a longer frame means that the stream is out of step
 KEEPALIVE = bytes(8)  # a frame without destination and payload
 
 _LENGTH = struct.Struct("<I")
@@ -38,7 +38,7 @@ def encode_frame(destination: str, payload: bytes) -> bytes:
 class FrameDecoder:
     """Cuts a byte stream into frames, however the network has split or joined them.
 
-    Frames are taken one by one, so that what came in whole before a fault is still used. Holds at most one frame of
+    Frames are taken one by one, so that whole frames before a fault are still used. Holds at most one frame of
     ``MAX_FRAME_BYTES`` and what :meth:`feed` was last given. After a :class:`ProtocolError` the stream has no known
     frame border any more and the decoder must be thrown away.
     """

@@ -35,10 +35,10 @@ class HeadsetServer:
 
     Samples are stamped with ``clock`` when their bytes are received. The loop's thread never waits for the network
     or for decoding. A client that breaks the protocol, floods, or is silent for ``SILENCE_ALLOWED`` is dropped with one
-    logged line, and the next one is welcome; while one drives, others are refused.
+    logged line, and another one may connect; while one is connected, others are refused.
 
-    Where a ``listener`` is given, each message goes to it alone, in the receiving thread and at once, and
-    :meth:`poll` returns nothing: this is for passing on what the headset said, message by message.
+    Where a ``listener`` is given, each message goes only to it, at once and in the receiving thread, and :meth:`poll`
+    returns nothing: this is for forwarding messages one by one.
     """
 
     def __init__(
@@ -54,7 +54,7 @@ class HeadsetServer:
         self._thread: threading.Thread | None = None
         self._stop = threading.Event()
         self._samples = SampleQueue()
-        self._owed: dict[str, AppMessage] = {}  # newest of each topic
+        self._owed: dict[str, AppMessage] = {}  # the newest message of each topic
         self._owed_lock = threading.Lock()
         self._statistics_lock = threading.Lock()  # never taken by poll or what sends
         self._client: Client | None = None
@@ -145,7 +145,7 @@ class HeadsetServer:
             self._wake()
 
     def _wake(self) -> None:
-        # A full pipe wakes just as well, a closed one has nobody to wake.
+        # A full pipe wakes the thread as well; with a closed one there is no thread.
         with suppress(OSError):
             self._waker.send(b"\0")
 
@@ -153,9 +153,9 @@ class HeadsetServer:
         last_fault = ""
         while not self._stop.is_set():
             try:
-                self._turn()
+                self._serve_once()
             except Exception as error:
-                # Whatever it was, the loop's watchdog and the next headset need this thread; the culprit has to go.
+                # After any exception this thread has to go on for the next headset; the client is dropped.
                 if repr(error) != last_fault:
                     _LOG.exception("headset server: unexpected fault, dropping the headset")
                 last_fault = repr(error)
@@ -167,13 +167,13 @@ class HeadsetServer:
             open_socket.close()
         self._selector.close()
 
-    def _turn(self) -> None:
+    def _serve_once(self) -> None:
         """Wait for the network once and handle what there is."""
         for key, _ in self._selector.select(_TURN):
             key.data()
         now = self._clock()
         if self._client is not None:
-            self._attend(self._client, now)
+            self._send_due(self._client, now)
 
     def _drain_waiter(self) -> None:
         self._waiter.recv(_RECEIVE_BYTES)
@@ -194,7 +194,7 @@ class HeadsetServer:
             if address[0] not in driving.refused_hosts and len(driving.refused_hosts) < MAX_HOSTS_NAMED:
                 driving.refused_hosts.add(address[0])
                 _LOG.warning("headset %s refused: %s drives", peer, driving.peer)
-            _dismiss(connection, f"refused: {driving.peer} drives")
+            _close_with_text(connection, f"refused: {driving.peer} drives")
             return
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         client = Client(connection, peer, self._clock())
@@ -229,7 +229,7 @@ class HeadsetServer:
         client.decoder.feed(data)
         while (frame := client.decoder.next_frame()) is not None:
             client.count_frame(now)
-            # Taken for each frame alone, so that a snapshot never waits for a whole burst.
+            # Locked for each frame, so that a snapshot never waits for a whole burst.
             with self._statistics_lock:
                 reception = client.session.receive(frame)
                 if reception is not None:
@@ -241,14 +241,14 @@ class HeadsetServer:
             elif (sample := client.tracker.update(reception.hand, reception.message, now)) is not None:
                 self._samples.put(sample)
 
-    def _attend(self, client: Client, now: float) -> None:
-        """Send what is owed, and drop a client that is silent: its half-open connection would keep others out."""
+    def _send_due(self, client: Client, now: float) -> None:
+        """Send what is due, and drop a silent client: its half-open connection would keep others out."""
         if now - client.last_frame > SILENCE_ALLOWED:
             self._drop(f"no frame for {SILENCE_ALLOWED:g} s")
             return
         outgoing = client.session.outgoing
         if not outgoing:
-            # Only now, so that a client that does not read is owed the newest vibration and not all of them.
+            # Encoded only now, so that a client that does not read gets the newest vibration and not all of them.
             with self._owed_lock:
                 owed, self._owed = self._owed, {}
             for message in owed.values():
@@ -270,7 +270,7 @@ class HeadsetServer:
             self._selector.modify(client.socket, events, key.data)
 
     def _drop(self, reason: str) -> None:
-        """End the connection by our own decision, with the one line that says why."""
+        """End the connection from this side, with one logged line that says why."""
         if self._client is not None:
             reason = " ".join(reason.split())
             _LOG.warning("headset %s dropped: %s", self._client.peer, reason)
@@ -286,11 +286,11 @@ class HeadsetServer:
             self._last_disconnect = reason
         self._selector.unregister(client.socket)
         # Behind half a frame the text could not be read.
-        _dismiss(client.socket, None if client.session.outgoing else f"dropped: {reason}")
+        _close_with_text(client.socket, None if client.session.outgoing else f"dropped: {reason}")
 
 
-def _dismiss(connection: socket.socket, text: str | None) -> None:
-    """Close, with a last word for the app's console where the network takes it at once."""
+def _close_with_text(connection: socket.socket, text: str | None) -> None:
+    """Close, after a line for the app's console if it can be sent at once."""
     with connection, suppress(OSError):
         if text is not None:
             connection.send(log_frame("error", text))

@@ -1,4 +1,4 @@
-"""What arrives from a headset, and what to look at when nothing does."""
+"""What a headset sends, and advice when no data comes."""
 
 from __future__ import annotations
 
@@ -57,16 +57,16 @@ class HandMovement:
 
 @dataclass(frozen=True, slots=True)
 class HeadsetCheck:
-    """A look at the connection."""
+    """The state of the connection at one time."""
 
     statistics: HeadsetStatistics
     directions: dict[str, str]  # hand -> where it moves
     positions: dict[str, Array | None]  # hand -> world position [m]
-    heard: bool  # data arrived at some time
-    advice: tuple[str, ...]  # lines; empty while data arrives
+    heard: bool  # data came at some time
+    advice: tuple[str, ...]  # lines; empty while data comes
 
     def as_json(self) -> dict[str, Any]:
-        """Plain data for the JSON writer."""
+        """Data for the JSON writer."""
         statistics = self.statistics
         return {
             "address": list(statistics.address),
@@ -91,7 +91,7 @@ class HeadsetCheck:
 def watch_headset(
     server: HeadsetServer, config: Config, duration: float | None, show: Callable[[HeadsetCheck], None]
 ) -> HeadsetCheck:
-    """Watch a started server for ``duration`` [s] or until Ctrl-C, with every look shown; returns the last."""
+    """Watch a started server for ``duration`` [s] or until Ctrl-C; ``show`` gets every state. Returns the last."""
     hands = {hand: HandMovement(config.teleop.axes) for hand in SIDES}
     start = now = last_data = time.monotonic()
     heard = False
@@ -118,7 +118,7 @@ def watch_headset(
 
 
 def advice(statistics: HeadsetStatistics) -> tuple[str, ...]:
-    """What to look at when nothing arrives, the likeliest first."""
+    """What to check when no data comes, the most likely cause first."""
     host, port = statistics.address
     lines = [f"nothing arrives for {SILENCE:g} s on {host}:{port}"]
     if statistics.peer is not None:

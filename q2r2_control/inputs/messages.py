@@ -1,6 +1,6 @@
 """The Quest2ROS app's messages in both dialects, (de)serialised by rosbags and checked more strictly than it does.
 
-Strictness is what keeps the dialects apart: read with the wrong one, a pose is noise and a button is pressed for ever.
+Strict checks distinguish the dialects: read with the wrong one, a pose is noise and a button stays pressed.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from q2r2_control.types import Array, HandInputs, HapticFeedback
 
 
 class Dialect(StrEnum):
-    """How the app serialises: chosen in its settings, told by nothing but the bytes."""
+    """How the app serialises: chosen in its settings, and visible in the bytes only."""
 
     ROS1 = "ROS1"
     ROS2 = "ROS2"
@@ -169,7 +169,7 @@ def _store(dialect: Dialect) -> Typestore:
 
 
 def _check_bytes(kind: MessageType, payload: bytes, dialect: Dialect) -> None:
-    """Refuse what rosbags lets pass: spare bytes, other encapsulations, strings without their NUL, booleans above 1."""
+    """Refuse what rosbags accepts: spare bytes, other encapsulations, strings without their NUL, booleans above 1."""
     expected = _expected_size(kind, payload, dialect)
     if len(payload) != expected:
         raise ProtocolError(f"a {dialect} {kind} has {expected} bytes here, got {len(payload)}")

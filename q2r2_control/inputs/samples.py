@@ -1,4 +1,4 @@
-"""Between the thread that receives and the loop that polls: messages become samples, which wait in a bounded queue."""
+"""Turns messages into samples, and queues them between the receiving thread and the loop that polls."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ SAMPLES_KEPT = 64  # of each hand between two polls: over 0.4 s of pose and inpu
 
 
 class HandTracker:
-    """Joins pose and inputs, which travel apart, into samples that carry the newest of both.
+    """Joins poses and inputs, which are separate messages, into samples with the newest of both.
 
     One tracker lives as long as one connection, so that no pose or button outlives the client that sent it.
     """
@@ -39,11 +39,11 @@ class HandTracker:
 class SampleQueue:
     """Bounded queue between two threads that keeps the newest samples and every button edge, and shows a cut.
 
-    A full queue gives up the oldest sample of that hand whose buttons its successor repeats: poses between are lost,
-    no press or release is. Only a hand that pressed ``SAMPLES_KEPT`` times between two polls loses the oldest press.
+    A full queue drops the oldest sample whose buttons equal those of the same hand's next one: poses are lost, but no
+    press or release. Only a hand that pressed ``SAMPLES_KEPT`` times between two polls loses the oldest press.
 
     After :meth:`cut` the next two takes are empty and :attr:`is_cut` stays true from the cut until the second: a loop
-    that looks once a tick, before or after it takes, cannot miss a connection that was lost and made anew in between,
+    that checks once a tick, before or after it takes, cannot miss that a connection was lost and made again in between,
     and so never reads two clients' poses as one motion.
     """
 
@@ -73,7 +73,7 @@ class SampleQueue:
             return samples
 
     def cut(self) -> None:
-        """The connection is lost: forget what waits, which the hand may long have left behind."""
+        """The connection is lost: forget queued samples, which may be old."""
         with self._lock:
             self._samples.clear()
             self._takes_owed = 2

@@ -26,7 +26,7 @@ _RECEIPT_JITTER = 0.0015  # [s], scale of an exponential distribution
 _POSITION_NOISE, _ROTATION_NOISE = 1e-4, math.radians(0.03)
 # Half a central difference of the ideal pose [s].
 _DIFFERENCE = 1e-4
-# While nobody polls for longer than this, the script waits [s].
+# The script pauses when it is not polled for longer than this [s].
 _LONGEST_BACKLOG = 1.0
 
 
@@ -78,7 +78,7 @@ class ScriptedInput:
         self._connected = False
 
     def send_haptic(self, feedback: HapticFeedback) -> None:
-        """A script feels nothing."""
+        """Does nothing: a script has no vibration."""
 
     def hand_pose(self, hand: str, t: float) -> pin.SE3:
         """Where ``hand`` ideally is at ``t`` [s], on the clock of the samples' stamps; script time before any poll."""
@@ -138,7 +138,7 @@ class _Scripted:
 
 
 class _Human:
-    """What a real hand and a real headset add to the ideal: tremor, noise, irregular and missing samples."""
+    """What a real hand and headset add: tremor, noise, irregular and missing samples."""
 
     def __init__(self, hand: str, seed: int) -> None:
         self._random = np.random.default_rng([seed, SIDES.index(hand)])

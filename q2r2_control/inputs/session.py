@@ -1,4 +1,4 @@
-"""What one client says and is answered: the ROS-TCP-Connector 0.7 protocol without sockets, threads or clocks."""
+"""The session of one client: the ROS-TCP-Connector 0.7 protocol without sockets, threads or clocks."""
 
 from __future__ import annotations
 
@@ -71,11 +71,11 @@ def log_frame(level: str, text: str) -> bytes:
 class HeadsetSession:
     """Protocol state of one client: frames in through :meth:`receive`, bytes out through :attr:`outgoing`.
 
-    The server speaks first, before anything tells the client's dialect. It says ROS2, the one that Quest2ROS2's users
+    The server sends first, before the client's dialect is known. It uses ROS2, the one that Quest2ROS2's users
     set; an app that is set to ROS1 logs an error on its own side and goes on.
 
     The dialect is read from the NUL that only ROS2 clients put behind every destination, then each payload has to fit
-    it. Two pieces of evidence that contradict each other end the session: no message is ever read by guess.
+    it. Contradictory evidence ends the session: no message is read by guessing.
 
     Data on topics outside ``HAND_TOPICS`` is counted and ignored, because an app that publishes more than we know
     still has hands to follow. An unknown system command, a name that no topic can have, or a payload that its topic
@@ -106,7 +106,7 @@ class HeadsetSession:
         return self._data(frame)
 
     def queue_keepalive(self) -> None:
-        """Tell the client that the server lives."""
+        """Tell the client that the server is alive."""
         self.outgoing += KEEPALIVE
 
     def queue_message(self, message: AppMessage) -> None:
@@ -167,7 +167,7 @@ class HeadsetSession:
                 self._skip_body = True
                 self._answer("__error", {"text": "__request: q2r2 offers no services"})
             case "__response":
-                self._skip_body = True  # nobody asked
+                self._skip_body = True  # not requested
             case _:
                 raise ProtocolError(f"unknown system command {command!r:.60}")
 
@@ -213,7 +213,7 @@ def _topic_name(name: str) -> str:
 
 
 def _register(registrations: dict[str, str], topic: str, value: str) -> None:
-    """Idempotent: the app registers anew whenever it likes."""
+    """Idempotent: the app may register again at any time."""
     registrations[topic] = value
     if len(registrations) > MAX_TOPICS:
         raise ProtocolError(f"more than {MAX_TOPICS} topics registered")

@@ -1,4 +1,4 @@
-"""What a headset connection looks like from outside, for people: counts, rates, ages, last values, reasons."""
+"""Statistics of a headset connection, for people: counts, rates, ages, last values, reasons."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from q2r2_control.inputs.messages import Dialect, HandMessage
 
 RATE_WINDOW = 1.0  # [s]
-_STAMPS_KEPT = 1000  # above what any headset sends in RATE_WINDOW
+_STAMPS_KEPT = 1000  # more than any headset sends in RATE_WINDOW
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""Ideal hand motions with their button presses, to see the robot's answer to an input without an operator.
+"""Ideal hand motions with their button presses, to test the robot's response without an operator.
 
 All are written for the left hand, as displacements from wherever the hand starts; the right hand mirrors them left to
 right. Axes: x forwards, y to the left, z up. Only the handover goes below

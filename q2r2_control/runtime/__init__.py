@@ -1,0 +1,45 @@
+"""What a control loop needs besides its data: time, signals, garbage collection, and the figures of a run.
+
+``loop_clock`` says when a tick is due, ``process`` stops on signals without interrupting a tick. ``recorder`` gives
+each ``Tick`` to listeners and to ``run_summary`` and ``torque_summary``, which gather a run's figures.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from q2r2_control._lazy import lazy_exports
+
+if TYPE_CHECKING:
+    from q2r2_control.runtime.loop_clock import LoopClock
+    from q2r2_control.runtime.process import few_garbage_collections, stop_on_signals
+    from q2r2_control.runtime.recorder import RunRecorder, Tick
+    from q2r2_control.runtime.run_summary import RunStatistics, RunSummary
+    from q2r2_control.runtime.torque_summary import TorqueStatistics, TorqueSummary
+
+__all__ = [
+    "LoopClock",
+    "RunRecorder",
+    "RunStatistics",
+    "RunSummary",
+    "Tick",
+    "TorqueStatistics",
+    "TorqueSummary",
+    "few_garbage_collections",
+    "stop_on_signals",
+]
+
+__getattr__ = lazy_exports(
+    __name__,
+    {
+        "LoopClock": "loop_clock",
+        "RunRecorder": "recorder",
+        "RunStatistics": "run_summary",
+        "RunSummary": "run_summary",
+        "Tick": "recorder",
+        "TorqueStatistics": "torque_summary",
+        "TorqueSummary": "torque_summary",
+        "few_garbage_collections": "process",
+        "stop_on_signals": "process",
+    },
+)

@@ -24,6 +24,7 @@ class Tick:
 
     t: float  # since the start of the run [s]
     dt: float  # that passed since the last tick [s]
+    step: float  # by which the reference moved, less than dt where motion is stretched after a late tick [s]
     samples: list[HandSample]
     targets: dict[str, ArmTarget]  # as the operator asks for them, whatever an admittance makes of them
     engaged: dict[str, bool]

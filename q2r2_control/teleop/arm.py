@@ -1,4 +1,4 @@
-"""The state machine of one arm: what its hand, its buttons and the faults of both make of it."""
+"""The state machine of one arm: its hand, its buttons, and the faults of both."""
 
 from __future__ import annotations
 
@@ -24,15 +24,14 @@ class ArmState(StrEnum):
     PAUSED = "paused"
     ENGAGED = "engaged"
     PAUSING = "pausing"  # stopped by the lower button, which may still turn out to be half a chord
-    ALIGNING = "aligning"  # stopped by the alignment chord; an anchor is owed when the buttons are released
+    ALIGNING = "aligning"  # stopped by the alignment chord; anchored when the buttons are released
 
 
 class ArmTeleop:
     """Teleoperation of one arm by one hand.
 
-    Every way into ENGAGED leads through :meth:`_anchor`, which takes hand and tool as they are at that moment and
-    starts the filter at rest there. So there is no catch-up motion: what the hand did before is not in any state that
-    could replay it.
+    Every transition to ENGAGED calls :meth:`_anchor`, which anchors hand and tool at their current poses and starts the
+    filter at rest there. So there is no catch-up motion: no state holds what the hand did before.
     """
 
     def __init__(self, arm: str, settings: TeleopSettings) -> None:
@@ -66,17 +65,17 @@ class ArmTeleop:
         return self._buttons.chord
 
     def receive(self, sample: HandSample, now: float) -> str | None:
-        """Take one sample of this arm's hand; returns the fault that forbids to go on following it, if any."""
+        """Process one sample of this arm's hand; returns the fault that forbids to follow it any longer, or None."""
         self._presses += self._buttons.receive(sample.inputs, sample.inputs_stamp, now)
         usable, fault = self._gate.receive(sample, now)
         if usable and fault is None and self.state is ArmState.ENGAGED and self._gate.pose is not None:
             self._filter.add(self._gate.pose, self._gate.stamp, now)
         if usable and self.state is ArmState.ALIGNING:
-            return None  # a jump is what the chord is for, and the arm is not following
+            return None  # realigning makes the pose jump, and the arm is not following
         return fault
 
     def watchdog(self, now: float) -> str | None:
-        """The fault of a stream that stopped, if any."""
+        """The fault of a stream that has stopped, or None."""
         if self._gate.stale(now):
             return f"no pose for {self._timeout:g} s"
         if self._buttons.stale(now, self._timeout):
@@ -90,16 +89,16 @@ class ArmTeleop:
         self._go(ArmState.PAUSED, now, reason)
 
     def forget(self) -> None:
-        """Trust nothing received so far: poses are gone, buttons count as held until seen released."""
+        """Drop everything received: poses are forgotten, buttons count as held until they are seen released."""
         self._gate.reset()
         self._buttons.forget()
         self._presses.clear()
 
     def act(self, tool: pin.SE3 | None, now: float, chord: bool, obstacle: str | None = None) -> None:
-        """Let buttons and chords change the state.
+        """Change the state by buttons and chords.
 
         ``tool``: pose to anchor to, None if not known; ``chord``: whether an alignment chord stops this arm;
-        ``obstacle``: why it may not be engaged now, if it may not.
+        ``obstacle``: why the arm may not be engaged now, or None.
         """
         self._obstacle = obstacle
         if chord:

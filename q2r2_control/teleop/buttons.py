@@ -1,4 +1,4 @@
-"""Edges of a hand's two buttons, told apart from the headset's alignment chord."""
+"""Presses of a hand's two buttons, distinguished from the headset's alignment chord."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ class Press(Enum):
 
 @dataclass
 class _Button:
-    """One button's level and the press that waits to be told from a chord."""
+    """One button's level, and its press while that may still become a chord."""
 
     down: bool = True  # as held until seen released, so that only a press that was seen from its start counts
-    pressed_at: float | None = None  # of the press that waits [s]
+    pressed_at: float | None = None  # of the delayed press [s]
 
 
 @dataclass
 class ButtonArbiter:
     """Turns levels into presses, each reported once.
 
-    The fingers of a chord never come down in the same sample, so a press is held back for ``chord_window`` [s] (or
-    until release, if that is earlier): when the other button follows, it was a chord and neither press is reported.
-    Only stopping cannot wait: ``LOWER_DOWN`` reports the lower button at once, and acting on it may do nothing but stop
-    motion, which a chord does as well. A button that goes down while the other is held makes a chord however late.
+    The two buttons of a chord never go down in the same sample, so a press is delayed by ``chord_window`` [s] (or until
+    release, if that is earlier): when the other button follows, it was a chord and neither press is reported. Only
+    stopping must not wait: ``LOWER_DOWN`` reports the lower button at once, and may only be used to stop motion, which
+    a chord does as well. A button that goes down while the other one is held makes a chord at any time.
 
     After a chord both buttons have to be released before either counts again.
     """
@@ -44,11 +44,11 @@ class ButtonArbiter:
     _stamp: float = -math.inf
 
     def cancel(self) -> None:
-        """Drop what waits; a button that is held has to be released before it counts again."""
+        """Drop delayed presses; a button that is held has to be released before it counts again."""
         self._upper.pressed_at = self._lower.pressed_at = None
 
     def forget(self) -> None:
-        """Drop what waits and treat both buttons as held until they are seen released."""
+        """Drop delayed presses and treat both buttons as held until they are seen released."""
         self.chord = False
         self._upper, self._lower, self._stamp = _Button(), _Button(), -math.inf
 
@@ -57,7 +57,7 @@ class ButtonArbiter:
         return now - self._stamp > timeout
 
     def receive(self, inputs: HandInputs, stamp: float, now: float) -> list[Press]:
-        """Take one reading received at ``stamp`` [s]; older ones than the last are passed over."""
+        """Process one reading received at ``stamp`` [s]; one that is older than the last is ignored."""
         stamp = min(stamp, now)
         if not self._stamp <= stamp or stamp == -math.inf:
             return []
@@ -88,7 +88,7 @@ class ButtonArbiter:
         return presses
 
     def _released(self, upper: bool, lower: bool) -> list[Press]:
-        """Presses that end here; once a finger is up again no chord can follow."""
+        """Presses that end by release; no chord can follow."""
         presses = []
         for button, held, press in ((self._upper, upper, Press.UPPER), (self._lower, lower, Press.LOWER)):
             if button.pressed_at is not None and not held:

@@ -1,4 +1,4 @@
-"""From jittery samples of a shaking hand to a smooth pose at every control tick, with one known delay.
+"""From irregular samples of a trembling hand to a smooth pose at every control tick, with one known delay.
 
 Two stages. :class:`Interpolator` plays the samples back a constant time after their receipt, so that the control loop
 sees straight lines instead of 13 ms steps. :class:`OneEuro` then takes the tremor out. Everything is in seconds and
@@ -25,8 +25,8 @@ _MIN_SPACING = 0.005
 class Interpolator:
     """Plays samples back ``delay`` seconds after their receipt, straight from each to the next.
 
-    When samples stay out for longer than ``delay`` it rests at the newest, and sets off from there when they return:
-    the output is continuous whatever arrives, and nothing is ever extrapolated.
+    When no sample comes for longer than ``delay``, it rests at the newest, and continues from there later: the output
+    is continuous for any samples, and nothing is extrapolated.
     """
 
     def __init__(self, delay: float) -> None:
@@ -41,7 +41,7 @@ class Interpolator:
         """Append a sample received at ``stamp`` <= ``now`` [s]; ``reset`` has to come first."""
         while len(self._knots) > 1 and stamp - self._knots[-1][0] < _MIN_SPACING:
             self._knots.pop()
-        # In time there is the whole delay to get there; a late sample is not raced to.
+        # A sample in time is reached after the whole delay; so is a late one, without a faster motion.
         earliest = self._knots[0][0] + max(self.delay / 2.0, _MIN_SPACING)
         self._knots.append((max(stamp, earliest), pose))
 
@@ -60,7 +60,7 @@ class Interpolator:
 
 
 def _between(first: pin.SE3, second: pin.SE3, fraction: float) -> pin.SE3:
-    """Straight in position, by one rotation about a fixed axis in orientation."""
+    """Interpolate linearly in position, and about one fixed axis in rotation."""
     position = first.translation + fraction * (second.translation - first.translation)
     turn = pin.log3(second.rotation @ first.rotation.T)
     return pin.SE3(pin.exp3(fraction * turn) @ first.rotation, position)
@@ -72,7 +72,7 @@ class OneEuro:
     The cutoff rises with speed: f = min_cutoff + beta |v|. The original lags by tau = 1 / (2 pi f), thus by an amount
     that changes along the path and bends it. Here the input is led by (tau - delay) v, v being the velocity estimate
     that the filter has anyway, so at any constant velocity the output lags by exactly ``delay``. Since
-    tau v <= 1 / (2 pi beta), the lead is bounded, and so is what it adds when the hand stops dead.
+    tau v <= 1 / (2 pi beta), the lead is bounded, and so is what it adds when the hand stops suddenly.
     """
 
     def __init__(self, min_cutoff: float, beta: float, derivative_cutoff: float, delay: float) -> None:
@@ -119,7 +119,7 @@ class PoseFilter:
         return self._interpolator.delay + self._position.delay
 
     def reset(self, pose: pin.SE3, now: float) -> None:
-        """Rest at ``pose``; what came before is forgotten."""
+        """Rest at ``pose``; earlier samples are forgotten."""
         self._interpolator.reset(pose, now)
         self._position.reset()
         self._rotation.reset()
@@ -127,7 +127,7 @@ class PoseFilter:
         self._now = now
 
     def add(self, pose: pin.SE3, stamp: float, now: float) -> None:
-        """Take a sample received at ``stamp`` [s]."""
+        """Add a sample received at ``stamp`` [s]."""
         self._interpolator.add(pose, stamp, now)
 
     def at(self, now: float) -> pin.SE3:

@@ -1,4 +1,4 @@
-"""The gate every hand pose passes before it may move an arm."""
+"""Checks every hand pose before it may move an arm."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from q2r2_control.types import Array, HandSample
 
 # Beyond this, doubles no longer resolve a tenth of a nanometre, and no tracking system reaches as far [m].
 _MAX_COORDINATE = 1e6
-# A quaternion of a length outside this range is not a rotation that lost some digits on the way.
+# A quaternion with a norm outside this range is not a rotation with rounding errors.
 _QUATERNION_LENGTHS = (1e-6, 1e6)
 
 
 class PoseGate:
-    """Lets usable poses of one hand through and says what is wrong with the others.
+    """Accepts usable poses of one hand, and says what is wrong with the others.
 
-    Time is receipt time: a stamp later than ``now`` counts as ``now``, so that it cannot hold the watchdog off. A stamp
-    older than the last one's is a message overtaken by a newer one and is passed over in silence.
+    Time is receipt time: a stamp later than ``now`` counts as ``now``, so that it cannot disable the watchdog. A sample
+    with an older stamp than the last was overtaken by a newer message, and is ignored.
     """
 
     def __init__(self, settings: GateSettings) -> None:
@@ -44,13 +44,13 @@ class PoseGate:
         self._stamp = -math.inf
 
     def stale(self, now: float) -> bool:
-        """Whether the watchdog has run out: no pose received for ``timeout``."""
+        """Whether no pose was received for ``timeout``."""
         return now - self._stamp > self._settings.timeout
 
     def receive(self, sample: HandSample, now: float) -> tuple[bool, str | None]:
-        """Take one sample; returns whether its pose is new and usable, and what forbids to follow it, if anything.
+        """Process one sample; returns whether its pose is new and usable, and what forbids to follow it, or None.
 
-        A jump is usable (an arm may be anchored to it) and yet forbids to follow: the arm must not go where it leads.
+        A pose after a jump is usable, since an arm may be anchored to it, but must not be followed.
         """
         stamp = min(float(sample.pose_stamp), now)
         if math.isnan(stamp):

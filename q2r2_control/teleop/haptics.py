@@ -1,4 +1,4 @@
-"""What an operator feels: short vibrations that tell a hand what became of its arm."""
+"""Short vibrations that tell a hand about the state of its arm."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ _SLIP_ANGLE_STEP = 0.1  # or by this [rad]
 
 
 class HapticPulses:
-    """Vibrations of one hand: on engaging, on pausing, longer on a fault, and at every stretch that a target slips.
+    """Vibrations of one hand: on engaging, on pausing, longer on a fault, and whenever a target slips by a step.
 
-    The app vibrates until it is told otherwise, so the end of a pulse is a message as well.
+    The app vibrates until the next message, so the end of a pulse is a message as well.
     """
 
     def __init__(self, hand: str) -> None:
@@ -38,7 +38,7 @@ class HapticPulses:
         self._waiting: Pulse | None = None
 
     def tell(self, event: Event) -> None:
-        """Take a change of the arm's state; a refused press is felt as a fault."""
+        """Start the pulse for a change of the arm's state; that of a refused press is that of a fault."""
         if event.destination == ArmState.ENGAGED:
             self._want(ENGAGED)
         elif event.source == ArmState.ENGAGED:
@@ -47,7 +47,7 @@ class HapticPulses:
             self._want(FAULT)
 
     def slip(self, slip: float, slip_angle: float) -> None:
-        """Take how far the target has slipped along since engaging [m, rad]."""
+        """Start a pulse where the target has slipped by another step since engaging [m, rad]."""
         if slip < self._felt[0] or slip_angle < self._felt[1]:
             self._felt = (slip, slip_angle)
         elif slip >= self._felt[0] + _SLIP_STEP or slip_angle >= self._felt[1] + _SLIP_ANGLE_STEP:
@@ -55,7 +55,7 @@ class HapticPulses:
             self._want(SLIP)
 
     def at(self, now: float) -> HapticFeedback | None:
-        """What to send at ``now`` [s], if anything."""
+        """What to send at ``now`` [s], or None."""
         pulse, self._waiting = self._waiting, None
         if pulse is not None and (self._ends is None or pulse.amplitude >= self._strength):
             self._ends, self._strength = now + pulse.duration, pulse.amplitude

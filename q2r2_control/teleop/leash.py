@@ -1,20 +1,20 @@
-"""The leash between a tool and its target: a target that cannot be reached slips along, and comes back at once.
+"""The leash between a tool and its target: it bounds how far a target gets from a tool that cannot follow.
 
 An arm that is stretched out, or blocked by the table or the other arm, cannot follow its hand. Without a leash the hand
 would have to come all the way back before the arm moves again. The leash is the farthest that a target gets from the
 tool: beyond it, the anchor of the relative motion shifts, so that the target stays where the leash ends and the hand
 moves it from there. Position and rotation have a leash each.
 
-**Slack.** When a leash is taut, the tool held up in its direction, and the hand comes back by more than tremor, the
+**Slack.** When a leash is taut, the tool is blocked in its direction, and the hand comes back by more than tremor, the
 target is put at the tool, which follows the hand from there. Whether the hand comes back is read from its unfiltered
 poses: when a hand stops, the filtered ones swing back by millimetres. Position and rotation are put there together: a
-tool that is held up rests where the pulls of both balance, and would follow the one that is left. Stretched out to
-0.1 m from its target, a tool was pulled back 50 mm by its rotation alone.
+blocked tool rests where the pulls of both balance, and would follow the one that is left. Stretched out to 0.1 m from
+its target, a tool was pulled back 50 mm by its rotation alone.
 
-**Why that makes no lurch.** A tool at rest under a pull has nothing to give back when the pull ends: the controller
-keeps no state but the reference, which stands still, and that is what it is asked for. The controller also follows its
-target's own velocity. A step that is faster than three times the tool's limit, 9 m/s or 30 rad/s at most, it takes for
-no motion; dropped slack is made to be such a step, by waiting for a tick that is short enough.
+**Why the arm does not jump.** The only state of the controller is its reference, which is at rest while the tool is
+blocked; a target at the tool therefore asks for no motion. The controller also follows its target's own velocity, but
+not that of a step faster than three times the tool's limit, 9 m/s or 30 rad/s at most; slack is dropped in a tick that
+is short enough to make such a step.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ from q2r2_control.types import Array
 
 # The way back that drops the slack: more than tremor of 0.2 mm and 0.2 degrees to either side, and noise.
 _WAY_BACK = 0.9e-3, 12e-3  # [m, rad]
-# Slower than this a tool counts as held up. Stopping from there takes a fraction of a millimetre.
+# Slower than this a tool counts as blocked. Stopping from there takes a fraction of a millimetre.
 _HELD_UP = 0.05, 0.2  # [m/s, rad/s]
 # A step faster than this is no motion of a target, whatever the controller's settings.
 _NO_MOTION = 10.0, 35.0  # [m/s, rad/s]
 
 
-class Strand:
-    """The leash of a position or of a rotation; ways are vectors (3,) in the world frame [m or rad]."""
+class ComponentLeash:
+    """The leash of a position or of a rotation; displacements are vectors (3,) in the world frame [m or rad]."""
 
     def __init__(self, length: float | None, way_back: float, held_up: float, no_motion: float) -> None:
         self._length = math.inf if length is None else length
@@ -51,7 +51,7 @@ class Strand:
         self.taut = False
         self._back = 0.0  # of the hand, since it was farthest
 
-    def lets_go(self, way: Array, by_hand: Array, by_tool: Array, dt: float) -> bool:
+    def releases_slack(self, way: Array, by_hand: Array, by_tool: Array, dt: float) -> bool:
         """Whether the slack is to be dropped.
 
         ``way`` is from the tool to the target; ``by_hand`` and ``by_tool`` are what the unfiltered hand and the tool
@@ -61,7 +61,7 @@ class Strand:
         if distance >= self._length:
             self.taut = True
         if distance < 0.5 * self._length:
-            self.taut = False  # the tool has come after by itself
+            self.taut = False  # the tool has followed by itself
         if not self.taut:
             self._back = 0.0
             return False
@@ -89,7 +89,7 @@ class Leash:
 
     def __init__(self, settings: LeashSettings) -> None:
         limits = list(zip(_WAY_BACK, _HELD_UP, _NO_MOTION, strict=True))
-        self._strands = Strand(settings.distance, *limits[0]), Strand(settings.angle, *limits[1])
+        self._components = ComponentLeash(settings.distance, *limits[0]), ComponentLeash(settings.angle, *limits[1])
         self._distance = math.inf if settings.distance is None else settings.distance
         # Of a trace, 1 + 2 cos(angle); a little more than the leash's, so that it is looked at in time.
         self._trace = -math.inf if settings.angle is None else 1.0 + 2.0 * math.cos(settings.angle) + 1e-9
@@ -98,17 +98,17 @@ class Leash:
     @property
     def slip(self) -> float:
         """How far the target's position has slipped since the reset, to and fro counted [m]."""
-        return self._strands[0].slip
+        return self._components[0].slip
 
     @property
     def slip_angle(self) -> float:
         """How far the target's rotation has slipped since the reset, to and fro counted [rad]."""
-        return self._strands[1].slip
+        return self._components[1].slip
 
     def reset(self) -> None:
         """Slack, nothing slipped: for a new anchor."""
-        for strand in self._strands:
-            strand.reset()
+        for component in self._components:
+            component.reset()
         self._last = None
 
     def target(self, motion: RelativeMotion, hand: pin.SE3, newest: pin.SE3, tool: pin.SE3, now: float) -> pin.SE3:
@@ -120,7 +120,7 @@ class Leash:
         target, last = motion.target(hand), self._last
         self._last = _Tick(tool, newest, now)
         # The first target is the anchor, which must not move the arm wherever the plant says the tool is.
-        if last is None or not (any(strand.taut for strand in self._strands) or self._ends(tool, target)):
+        if last is None or not (any(component.taut for component in self._components) or self._ends(tool, target)):
             return target
         position, rotation = self._pull(_ways(tool, target), last, self._last)
         if position is not None:
@@ -140,16 +140,19 @@ class Leash:
 
     def _pull(self, ways: tuple[Array, Array], last: _Tick, this: _Tick) -> list[Array | None]:
         """Ways from the tool to the target's new position and rotation, None for what the leash leaves alone."""
-        moves = zip(self._strands, ways, _ways(last.newest, this.newest), _ways(last.tool, this.tool), strict=True)
+        moves = zip(self._components, ways, _ways(last.newest, this.newest), _ways(last.tool, this.tool), strict=True)
         # Both are asked, since each has to see every tick.
-        let_go = [strand.lets_go(way, by_hand, by_tool, this.now - last.now) for strand, way, by_hand, by_tool in moves]
-        if any(let_go):
-            return [strand.drop(way) for strand, way in zip(self._strands, ways, strict=True)]
-        return [strand.hold(way) for strand, way in zip(self._strands, ways, strict=True)]
+        releases = [
+            component.releases_slack(way, by_hand, by_tool, this.now - last.now)
+            for component, way, by_hand, by_tool in moves
+        ]
+        if any(releases):
+            return [component.drop(way) for component, way in zip(self._components, ways, strict=True)]
+        return [component.hold(way) for component, way in zip(self._components, ways, strict=True)]
 
 
 class _Tick(NamedTuple):
-    """What the next tick compares itself with."""
+    """The last tick."""
 
     tool: pin.SE3
     newest: pin.SE3

@@ -64,7 +64,7 @@ class Teleop:
         commanded: Mapping[str, pin.SE3] | None = None,
         obstacles: Mapping[str, str] | None = None,
     ) -> dict[str, ArmTarget]:
-        """One tick: take what arrived and say where every arm should go.
+        """One tick: process the samples and compute every arm's target.
 
         ``tools``: measured tool poses in the world frame. ``commanded``: tool poses of the controller's reference; when
         engaging, the position anchors to the measured tool and the orientation to the commanded one, so that sag
@@ -99,7 +99,7 @@ class Teleop:
         return targets
 
     def connection_lost(self, now: float) -> None:
-        """The input is gone: every arm pauses, and nothing received before counts any more."""
+        """The input is lost: every arm pauses, and everything received is forgotten."""
         self._clock(now)
         for arm in self._arms.values():
             arm.disengage(self._now if self._now is not None else 0.0, "connection lost")
@@ -112,7 +112,7 @@ class Teleop:
             arm.disengage(self._now if self._now is not None else 0.0, reason)
 
     def _clock(self, now: float) -> str | None:
-        """Advance the time; returns the fault of a clock that cannot be followed, if any."""
+        """Advance the time; returns the fault of a clock that cannot be followed, or None."""
         last = self._now
         if not math.isfinite(now):
             return "the clock is not finite"
@@ -128,7 +128,7 @@ class Teleop:
         return f"the clock went back by {last - now:.3f} s"
 
     def _disengage(self, faults: Mapping[str, str | None], now: float) -> None:
-        """Pause the arms whose hand is at fault; a fault of a hand whose arm is paused already concerns nobody."""
+        """Pause the arms whose hand has a fault; that of a hand whose arm is already paused has no effect."""
         active = {name: fault for name, fault in faults.items() if fault and self._is_active(name)}
         for name, fault in active.items():
             self._arms[name].disengage(now, fault)
@@ -142,7 +142,7 @@ class Teleop:
         return self._arms[name].state is not ArmState.PAUSED
 
     def _tool(self, name: str, tools: Mapping[str, pin.SE3], commanded: Mapping[str, pin.SE3] | None) -> pin.SE3 | None:
-        """What an anchor takes as the tool's pose: measured position, commanded orientation."""
+        """The tool's pose for an anchor: measured position, commanded orientation."""
         measured = tools.get(name)
         if measured is None:
             return None

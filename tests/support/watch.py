@@ -33,7 +33,7 @@ class Watch:
     def __call__(self, tick: Tick) -> None:
         if self._contract is None:
             self._contract = Contract(self._pipeline.controller, self._pipeline.robot.home)
-        self._contract.check(tick.reference, tick.dt)
+        self._contract.check(tick.reference, tick.step)
         self.ticks.append(tick)
 
     def engagements(self, arm: str) -> list[int]:

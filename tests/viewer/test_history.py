@@ -29,6 +29,7 @@ def tick_at(robot: Robot, t: float, acceleration: float = 0.0, distance: float =
     return Tick(
         t=t,
         dt=0.001,
+        step=0.001,
         samples=[],
         targets={arm: ArmTarget(pose * offset if engaged else None, 1.0) for arm, pose in tools.items()},
         engaged=dict.fromkeys(robot.arms, engaged),
