@@ -12,17 +12,13 @@ import pytest
 import yaml
 from pydantic import BaseModel
 
+from q2r2_control.config.arms import ArmConfig, GripperConfig, PoseConfig, RobotConfig, SwivelConfig, ToolConfig
 from q2r2_control.config.cell import (
-    ArmConfig,
     Config,
-    GripperConfig,
     HeadsetConfig,
     MujocoConfig,
     ObjectConfig,
     ObstacleConfig,
-    PoseConfig,
-    SwivelConfig,
-    ToolConfig,
     load_config,
 )
 from q2r2_control.config.control import AdmittanceSettings, ControllerSettings, ImpedanceSettings, WallSettings
@@ -30,7 +26,7 @@ from q2r2_control.config.external import ExternalArm, ExternalConfig, ExternalGr
 from q2r2_control.config.teleop import FilterSettings, GateSettings, LeashSettings, TeleopSettings
 from q2r2_control.errors import ConfigError, Q2R2Error
 from q2r2_control.robot.robot import Robot
-from tests.support.external_cell import external, external_text
+from tests.support.external_cell import external, external_text, robot_text
 
 SHIPPED = Path(__file__).resolve().parents[2] / "config"
 CELL = SHIPPED / "dual_iiwa7.yaml"
@@ -80,6 +76,7 @@ class TestTheShippedCellShowsAllThereIsToTune:
     # Models at every place where they occur, each with one example of it in the file.
     PLACES: tuple[tuple[str, type[BaseModel]], ...] = (
         ("", Config),
+        ("robot", RobotConfig),
         ("arms.left", ArmConfig),
         ("arms.left.mount", PoseConfig),
         ("arms.left.tool", ToolConfig),
@@ -124,10 +121,10 @@ class TestTheShippedCellShowsAllThereIsToTune:
 
     @pytest.mark.parametrize(("place", "model"), PLACES, ids=lambda value: value if isinstance(value, str) else "")
     def test_every_key_is_written_and_commented(self, place: str, model: type[BaseModel]) -> None:
-        data = external()
+        text = robot_text() if place == "robot" else external_text()
+        data, lines = yaml.safe_load(text), text.splitlines()
         for part in filter(None, place.split(".")):
             data = data[part]
-        lines = external_text().splitlines()
         for key in model.model_fields:
             path = f"{place}.{key}".lstrip(".")
             if path in self.SHOWN_ELSEWHERE:
