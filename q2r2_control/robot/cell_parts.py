@@ -57,9 +57,9 @@ class Arm:
         self.carrier = carrier
         self.chain = self.tree.chain(self.frame)
         if not self.chain:
+            named = "tip" if config.tip == self.frame else "tool.frame"
             raise ConfigError(
-                f"{self.key}.tool.frame = {self.frame!r:.60}: no movable joint carries it; name a link that the arm "
-                "moves, as tip or tool.frame"
+                f"{self.key}.{named} = {self.frame!r:.60}: no movable joint carries it; name a link that the arm moves"
             )
         self.joints = named_joints(self.tree, self.frame, config.joints, self.key)
 
@@ -90,18 +90,16 @@ class Arm:
 
     def tool_urdf(self) -> list[ET.Element]:
         """What the tool adds to the cell."""
-        return (
-            []
-            if self.tool is None
-            else [renamed(part, self.name_in_cell) for part in [self.tool_joint, *self.tool.parts]]
-        )
+        if self.tool is None:
+            return []
+        return [renamed(part, self.name_in_cell) for part in [self.tool_joint, *self.tool.parts]]
 
     def tool_exclusions(self) -> list[ET.Element]:
         """Pairs of the tool's links, and of those of the tool flat on just this model's tip."""
         if self.tool is None:
             return []
         parts = list(self.tool.exclusions)
-        if self.config.tool.mount == PoseConfig():
+        if self.config.tool.mount == PoseConfig() and self.carrier == _usual_tip(self.model.tree):
             parts += _exclusions_of_the_two(self.model.description, self.tool.description)
         return renamed_exclusions(parts, self.name_in_cell)
 
@@ -115,21 +113,21 @@ class Arm:
                 f"{self.key}.home = {list(config.home)}: {len(config.home)} value(s), expected {len(names)}: "
                 f"{', '.join(names)}{hint}"
             )
-        posture = dict(zip(names, config.home, strict=True))
         for index, joint in enumerate(self.joints):
             check_position(joint, config.home[index], f"{self.key}.home[{index}]")
+        return dict(zip(names, config.home, strict=True)) | self._open_gripper()
+
+    def _open_gripper(self) -> dict[str, float]:
+        gripper, key = self.config.gripper, f"{self.key}.gripper"
         carrying = {joint.get("name", "") for joint in self.chain}
-        free = {name: joint for name, joint in self.tree.movable().items() if name not in carrying}
-        for finger in config.gripper.joints:
+        free = {name: self.tree.movable()[name] for name in self._beyond() if name not in carrying}
+        for finger in gripper.joints:
             if finger not in free:
-                allowed = ", ".join(free) or "none: the model has no joints beside the arm's"
-                raise ConfigError(
-                    f"{self.key}.gripper.joints = {finger!r:.60}: no such finger joint; allowed: {allowed}"
-                )
-            for end in ("open_position", "closed_position"):
-                check_position(free[finger], getattr(config.gripper, end), f"{self.key}.gripper.{end}")
-            posture[finger] = config.gripper.open_position
-        return posture
+                allowed = ", ".join(free) or "none: the arm carries no joints"
+                raise ConfigError(f"{key}.joints = {finger!r:.60}: no such finger joint; allowed: {allowed}")
+            check_position(free[finger], gripper.open_position, f"{key}.open_position")
+            check_position(free[finger], gripper.closed_position, f"{key}.closed_position")
+        return dict.fromkeys(gripper.joints, gripper.open_position)
 
     def _carrier(self) -> str:
         """The arm's last link, of those of its model."""
@@ -184,7 +182,14 @@ def _check_clash(arm: Model, tool: Model, key: str) -> None:
             raise ConfigError(f"{key} = {tools!r}: {tag} names {', '.join(sorted(clash))} occur in the arm as well")
 
 
+def _usual_tip(tree: LinkTree) -> str | None:
+    try:
+        return default_tip(tree, (), "")
+    except ConfigError:
+        return None
+
+
 def _exclusions_of_the_two(arm: Description, tool: Description) -> list[ET.Element]:
     """Pairs known of just this tool flat on just this arm's last link: ``TOOL_on_ARM.srdf`` beside the tool."""
-    file = tool.file.with_name(f"{tool.file.stem}_on_{arm.file.stem}.srdf")
+    file = tool.file.with_name(f"{tool.stem}_on_{arm.stem}.srdf")
     return [*parse_srdf(file.read_text(encoding="utf-8"), str(file))] if file.is_file() else []

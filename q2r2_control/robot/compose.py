@@ -53,10 +53,9 @@ def compose(config: Config) -> ComposedCell:
     srdf = ET.Element("robot", name=config.name)
     ET.SubElement(urdf, "link", name=WORLD)
     arms = _arms(config)
-    for side, arm in arms.items():
-        first_of_its_model = next(other for other in arms.values() if other.model is arm.model)
-        if arm is first_of_its_model:
-            urdf.extend(arm.model.urdf((config.robot or config.arms[side]).mount))
+    for arm in arms.values():
+        if arm is next(other for other in arms.values() if other.model is arm.model):
+            urdf.extend(arm.model.urdf((config.robot or arm.config).mount))
             srdf.extend(renamed_exclusions(arm.model.exclusions, arm.model.name_in_cell))
         urdf.extend(arm.tool_urdf())
         srdf.extend(arm.tool_exclusions())
@@ -114,10 +113,10 @@ def _home(urdf: ET.Element, arms: Mapping[str, Arm]) -> dict[str, float]:
                 raise ConfigError(f"{arm.key}: joint {name} is one of {owner[name]} as well; allowed: one arm a joint")
             home[name], owner[name] = position, arm.key
         fingers |= set(arm.finger_names())
-    for joint in urdf.findall("joint"):
-        mimic = joint.find("mimic")
+    for follower in urdf.findall("joint"):
+        mimic = follower.find("mimic")
         if mimic is not None and mimic.get("joint") in fingers:
-            home.setdefault(joint.get("name", ""), _mimicked(mimic, home))
+            home.setdefault(follower.get("name", ""), _mimicked(mimic, home))
     return home
 
 

@@ -53,7 +53,12 @@ class Description:
     @property
     def name(self) -> str:
         """The model's own name."""
-        return self.urdf.get("name", self.file.stem)
+        return self.urdf.get("name", self.stem)
+
+    @property
+    def stem(self) -> str:
+        """The file's name without its endings."""
+        return _stem(self.file)
 
 
 def load_description(
@@ -70,7 +75,7 @@ def load_description(
         file, srdf_file = _example_robot(model.removeprefix(EXAMPLE_ROBOT_DATA))
     else:
         file = _model_file(model, packages)
-        srdf_file = file.with_name(f"{file.name.removesuffix('.xacro').removesuffix('.urdf')}.srdf")
+        srdf_file = file.with_name(f"{_stem(file)}.srdf")
     if file.suffix == ".xacro":
         text = expand_xacro(file, xacro_args or {}, packages)
     elif xacro_args:
@@ -264,6 +269,10 @@ def _model_file(model: str, packages: Mapping[str, str]) -> Path:
     if model.endswith((".urdf", ".xacro")):
         return find_resource(model).resolve()
     return find_resource(f"robots/{model}.urdf")
+
+
+def _stem(file: Path) -> str:
+    return file.name.removesuffix(".xacro").removesuffix(".urdf")
 
 
 def _read(file: Path) -> str:

@@ -13,7 +13,7 @@ from q2r2_control.robot.description import LinkTree, load_description
 
 
 def tree(*joints: str) -> LinkTree:
-    """A model of joints, each written as its parent, child, kind (by default fixed) and name (by default its child's)."""
+    """A model of joints, each written as parent, child, kind (by default fixed) and name (by default its child's)."""
     robot = ET.Element("robot")
     links: dict[str, None] = {}
     for text in joints:

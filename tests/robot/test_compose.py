@@ -124,8 +124,9 @@ def test_a_finger_that_mimics_a_driven_one_moves_with_it() -> None:
 def test_pairs_of_tool_and_arm_are_excluded_only_where_the_tool_sits_flat_on_the_flange() -> None:
     flat = compose(one_arm(tool=HAND)).srdf
     moved = compose(one_arm(tool=HAND | {"mount": {"position": [0, 0, 0.2]}})).srdf
+    elsewhere = compose(one_arm(tool=HAND | {"link": "link_3"}, home=[0.0] * 3)).srdf
     assert '"left_hand_e_envelope" link2="left_link_4"' in flat
-    assert '"left_hand_e_envelope" link2="left_link_4"' not in moved
+    assert '"left_hand_e_envelope" link2="left_link_4"' not in moved + elsewhere
 
 
 @pytest.mark.parametrize(
