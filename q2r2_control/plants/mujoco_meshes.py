@@ -26,7 +26,8 @@ def load_meshes(spec: mujoco.MjSpec) -> None:
         try:
             read = coal.MeshLoader().load(mesh.file, np.ones(3))
         except (ValueError, RuntimeError) as error:
-            raise PlantError(f"{mesh.file}: neither MuJoCo nor Coal can read it: {error!s:.200}") from error
+            reason = " ".join(str(error).split())[-200:]
+            raise PlantError(f"{mesh.file}: neither MuJoCo nor Coal can read it: {reason}") from error
         triangles = [read.tri_indices(index) for index in range(read.num_tris)]
         mesh.uservert = np.asarray(read.vertices(), dtype=float).ravel()
         mesh.userface = np.array([[corner[0], corner[1], corner[2]] for corner in triangles], dtype=int).ravel()
