@@ -31,7 +31,7 @@ def test_a_locked_joint_stands_where_pinocchio_has_it_at_that_position(model: st
             built.data.oMf[built.getFrameId(link.get("name", ""), pin.FrameType.BODY)].homogeneous
             for built in (whole, locked)
         ]
-        np.testing.assert_allclose(*frames, atol=1e-6)
+        np.testing.assert_allclose(frames[0], frames[1], atol=1e-6)
 
 
 @pytest.mark.parametrize(("lower", "upper", "rest"), [(-1, 1, 0.0), (0.5, 1, 0.5), (-2, -1, -1.0)])
