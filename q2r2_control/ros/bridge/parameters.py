@@ -154,8 +154,8 @@ def _of_cell(subclass: ArmDefaults, path: str) -> _Defaults:
     if arm is None:
         raise ConfigError(f"parameter config: {path} has no arm {side}; allowed: {', '.join(cell.arms)}")
     given = replace(_of_subclass(subclass), teleop=cell.teleop)
-    if arm.tool.frame is not None:
-        given = replace(given, end_effector_link_name=f"{side}_{arm.tool.frame}")
+    if (tool_frame := cell.named_tool_frame(side)) is not None:
+        given = replace(given, end_effector_link_name=tool_frame)
     if cell.external is None:
         return given
     external, theirs = cell.external, cell.external.arm(side)
