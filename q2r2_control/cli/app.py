@@ -15,7 +15,7 @@ from rich.console import Console
 
 from q2r2_control.cli.bench import bench
 from q2r2_control.cli.cell_report import check_cell, write_pairs
-from q2r2_control.cli.cell_run import AnnouncedHeadset, RunOptions
+from q2r2_control.cli.cell_run import AnnouncedHeadset, RunOptions, notice_of_compiling
 from q2r2_control.cli.cell_run import run as run_cell
 from q2r2_control.cli.json_output import as_json_text
 from q2r2_control.cli.one_line_errors import OneLineErrors
@@ -187,7 +187,8 @@ def check(
         else:
             Console().print(pair_reach_table(found))
         return
-    result = check_cell(load_config(config))
+    with notice_of_compiling(_stderr()):
+        result = check_cell(load_config(config))
     if json:
         print(as_json_text(result.as_json()))
     else:

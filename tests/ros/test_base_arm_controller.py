@@ -171,7 +171,9 @@ def test_arms_with_different_mirror_settings_refuse_to_engage_and_a_fault_of_one
 
 
 def start_mirrored(rig: ArmRig, processes: Processes) -> RosProcess:
-    process = processes.start_module(f"q2r2_control.ros.nodes.{rig.arm}_arm_controller", "--ros-args", "-p", "mirror:=true")
+    process = processes.start_module(
+        f"q2r2_control.ros.nodes.{rig.arm}_arm_controller", "--ros-args", "-p", "mirror:=true"
+    )
     rig.wait(lambda: rig.state.get("stance") == "mirror", "the mirrored arm is there")
     rig.state = {}
     return process
