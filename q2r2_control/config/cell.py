@@ -139,6 +139,7 @@ class Config(_Model):
     name: str = Field(min_length=1)
     arms: dict[Side, ArmConfig] = Field(min_length=1)
     obstacles: dict[str, ObstacleConfig] = Field(default_factory=dict)
+    floor: Coordinate | None = Field(0.0, description="height of the floor, which arms keep off [m]; none: no floor")
     srdf: str | None = Field(None, description="a file of pairs that need no watching, as q2r2 check --pairs writes it")
     loop_rate_hz: float = Field(1000.0, ge=50, le=2000, description="control loop [Hz]")
     controller: ControllerKind = Field(ControllerKind.BUILTIN, description="builtin, or external: for q2r2 ros up")

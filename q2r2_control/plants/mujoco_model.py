@@ -52,7 +52,7 @@ def build_model(robot: Robot, config: Config) -> mujoco.MjModel:
         _set_grippers(spec, config)
         _exclude_contacts(spec, robot)
         _add_objects(spec, config.mujoco)
-        furnish(spec)
+        furnish(spec, floor=config.floor is not None)
         return spec.compile()
     except (ValueError, RuntimeError, mujoco.FatalError) as error:
         raise PlantError(f"{robot.name}: MuJoCo cannot make a model of it: {' '.join(str(error).split())}") from error
