@@ -8,21 +8,24 @@ import sys
 from dataclasses import asdict
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from rich.console import Console
+from rich.table import Table
 
 from q2r2_control.cli.bench import bench
-from q2r2_control.cli.cell_report import check_cell, write_pairs
+from q2r2_control.cli.cell_report import check_cell, write_model_pairs, write_pairs
 from q2r2_control.cli.cell_run import AnnouncedHeadset, RunOptions, notice_of_compiling
 from q2r2_control.cli.cell_run import run as run_cell
 from q2r2_control.cli.json_output import as_json_text
 from q2r2_control.cli.one_line_errors import OneLineErrors
+from q2r2_control.cli.progress_lines import ProgressLines
 from q2r2_control.cli.ros import app as ros_app
 from q2r2_control.cli.tables import (
     arm_table,
     headset_table,
+    model_pairs_table,
     obstacle_table,
     pair_reach_table,
     pair_table,
@@ -175,17 +178,28 @@ def check(
         Path | None,
         typer.Option(metavar="FILE", help="Find pairs that can never meet and write them as an SRDF for the key srdf."),
     ] = None,
-    samples: Annotated[int, typer.Option(help="Random postures that --pairs looks at.")] = 20_000,
+    model_pairs: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FOLDER", help="Find such pairs of each arm and tool alone, and write ARM.srdf and so on."
+        ),
+    ] = None,
+    samples: Annotated[int, typer.Option(help="Random postures that --pairs and --model-pairs look at.")] = 20_000,
     clearance: Annotated[float, typer.Option(help="Pairs that stay farther apart need no watching [m].")] = 0.05,
     json: Json = False,
 ) -> None:
     """Validate a cell and print its arms, limits, obstacles and distances at home; exit 1 where home is unsafe."""
+    if pairs is not None and model_pairs is not None:
+        raise ConfigError("--pairs and --model-pairs exclude each other")
     if pairs is not None:
-        found = write_pairs(load_config(config), pairs, samples, clearance)
-        if json:
-            print(as_json_text(asdict(found)))
-        else:
-            Console().print(pair_reach_table(found))
+        found = write_pairs(load_config(config), pairs, samples, clearance, progress=ProgressLines(_stderr()))
+        _print(asdict(found), pair_reach_table(found), json)
+        return
+    if model_pairs is not None:
+        files = write_model_pairs(
+            load_config(config), model_pairs, samples, clearance, progress=ProgressLines(_stderr())
+        )
+        _print(files, model_pairs_table(files), json)
         return
     with notice_of_compiling(_stderr()):
         result = check_cell(load_config(config))
@@ -262,7 +276,11 @@ def _stderr() -> Console:
 
 
 def _show(summary: RunSummary, json: bool) -> None:
+    _print(summary.as_json(), summary_table(summary), json)
+
+
+def _print(data: dict[str, Any], table: Table, json: bool) -> None:
     if json:
-        print(as_json_text(summary.as_json()))
+        print(as_json_text(data))
     else:
-        Console().print(summary_table(summary))
+        Console().print(table)

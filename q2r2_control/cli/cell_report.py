@@ -10,7 +10,8 @@ from q2r2_control.config.cell import Config, ObstacleConfig
 from q2r2_control.config.external import describe
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.errors import ConfigError
-from q2r2_control.robot.reachability import PairReach, nearest_approaches, srdf_of
+from q2r2_control.robot.model_srdf import model_srdfs
+from q2r2_control.robot.reachability import PairReach, Progress, nearest_approaches, srdf_of
 from q2r2_control.robot.robot import PairDistance, Robot
 from q2r2_control.supervision.preflight import preflight_faults
 
@@ -48,6 +49,7 @@ class CellCheck:
     name: str
     arms: tuple[ArmCheck, ...]
     obstacles: dict[str, ObstacleConfig]
+    floor: float | None  # height [m]
     monitored_pairs: int
     ignored_pairs: tuple[tuple[str, str], ...]  # overlap by construction
     min_distance: float
@@ -71,6 +73,7 @@ def check_cell(config: Config) -> CellCheck:
         name=config.name,
         arms=tuple(_arm_check(config, robot, name) for name in robot.arms),
         obstacles=dict(config.obstacles),
+        floor=config.floor,
         monitored_pairs=len(distances),
         ignored_pairs=robot.ignored_pairs,
         min_distance=settings.min_distance,
@@ -91,22 +94,19 @@ class PairsWritten:
     watched: tuple[PairReach, ...]  # the others, nearest first
 
 
-def write_pairs(config: Config, file: Path, samples: int, clearance: float, seed: int = 0) -> PairsWritten:
+def write_pairs(
+    config: Config, file: Path, samples: int, clearance: float, seed: int = 0, progress: Progress | None = None
+) -> PairsWritten:
     """Sample which pairs of a cell can meet and write those that cannot as an SRDF to ``file``, which is not replaced.
 
     Raises :class:`ConfigError` for a clearance that is not above ``control.min_distance``, and for a file that exists.
     """
-    least = config.control.min_distance
-    if not least < clearance <= 1.0:
-        raise ConfigError(f"clearance = {clearance:g} m: allowed: above control.min_distance, {least:g}, up to 1")
+    _check_clearance(config, clearance)
     if file.exists():
         raise ConfigError(f"{file}: exists; give the name of a new file")
     robot = Robot.from_config(config)
-    approaches = nearest_approaches(robot, samples, seed)
-    try:
-        file.write_text(srdf_of(robot, approaches, clearance, samples), encoding="utf-8")
-    except OSError as error:
-        raise ConfigError(f"{file}: cannot be written: {error}") from error
+    approaches = nearest_approaches(robot, samples, seed, progress)
+    _write(file, srdf_of(robot, approaches, clearance, samples))
     return PairsWritten(
         file=str(file),
         samples=samples,
@@ -114,6 +114,41 @@ def write_pairs(config: Config, file: Path, samples: int, clearance: float, seed
         never=tuple(pair for pair in approaches if pair.nearest > clearance),
         watched=tuple(pair for pair in approaches if pair.nearest <= clearance),
     )
+
+
+def write_model_pairs(
+    config: Config, folder: Path, samples: int, clearance: float, seed: int = 0, progress: Progress | None = None
+) -> dict[str, bool]:
+    """Write the SRDF of each model of a cell to ``folder``; returns by path whether the file is new.
+
+    Raises :class:`ConfigError` as :func:`write_pairs` does, and before anything is written for a file that exists and
+    says something else.
+    """
+    _check_clearance(config, clearance)
+    if not folder.is_dir():
+        raise ConfigError(f"{folder}: no such folder")
+    files = {folder / name: text for name, text in model_srdfs(config, clearance, samples, seed, progress).items()}
+    for file, text in files.items():
+        if file.exists() and file.read_bytes() != text.encode():
+            raise ConfigError(f"{file}: exists and says something else; remove it to have it written anew")
+    new = {str(file): not file.exists() for file in files}
+    for file, text in files.items():
+        if new[str(file)]:
+            _write(file, text)
+    return new
+
+
+def _check_clearance(config: Config, clearance: float) -> None:
+    least = config.control.min_distance
+    if not least < clearance <= 1.0:
+        raise ConfigError(f"clearance = {clearance:g} m: allowed: above control.min_distance, {least:g}, up to 1")
+
+
+def _write(file: Path, text: str) -> None:
+    try:
+        file.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(f"{file}: cannot be written: {error}") from error
 
 
 def _arm_check(config: Config, robot: Robot, name: str) -> ArmCheck:
