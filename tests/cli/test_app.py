@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import signal
 import subprocess
 import sys
@@ -220,6 +221,8 @@ def test_check_as_json_has_limits_and_distances_in_order() -> None:
     [
         pytest.param("home: [0.0204, 0.348,", "home: [0.0204, 1.0,", "left_hand_e_envelope_1 and table_0", id="table"),
         pytest.param("0.0204, 0.348,", "0.0204, 2.09,", "left_A2 = 2.09; allowed: -2.0844 .. 2.0844", id="limits"),
+        pytest.param("floor: 0.0 ", "floor: 0.35 ", "left_hand_e_envelope_1 and floor_0 are", id="floor"),
+        pytest.param("[0.0, 0.4, 0.0]", "[0.0, 0.4, -0.6]", "left_hand_e_envelope_1 and floor_0 are", id="a low mount"),
     ],
 )
 def test_check_lists_what_is_wrong_at_home_and_exits_with_1(tmp_path: Path, old: str, new: str, fault: str) -> None:
@@ -230,6 +233,23 @@ def test_check_lists_what_is_wrong_at_home_and_exits_with_1(tmp_path: Path, old:
     result = q2r2("check", file, "--json")
     assert result.exit_code == 1
     assert any(fault in line for line in one_object(result.stdout)["faults"])
+
+
+def test_check_says_how_to_do_without_the_floor_that_is_in_the_way(tmp_path: Path) -> None:
+    low = changed_cell(tmp_path, "[0.0, 0.4, 0.0]", "[0.0, 0.4, -0.6]")
+    lines = [line for line in q2r2("check", low).stdout.splitlines() if line.startswith("FAULT") and "floor_0" in line]
+    assert lines
+    assert all(line.endswith("; the key floor takes another height, or null for no floor") for line in lines)
+    text = Path(low).read_text(encoding="utf-8").replace("floor: 0.0 ", "floor: null ")
+    Path(low).write_text(text.replace("position: [0.75, 0.0, 0.1]", "position: [0.75, 0.0, -0.6]"), encoding="utf-8")
+    result = q2r2("check", low)
+    assert (result.exit_code, "floor" in result.stdout) == (0, False)
+
+
+def test_check_lists_the_floor_with_the_obstacles(tmp_path: Path) -> None:
+    file = changed_cell(tmp_path, "floor: 0.0 ", "floor: -0.125 ")
+    assert re.search(r"floor +│ plane +│ +│ 0 0 -0\.125", q2r2("check", file).stdout)
+    assert one_object(q2r2("check", file, "--json").stdout)["floor"] == -0.125
 
 
 @pytest.mark.parametrize("command", ["check", "run", "headset-check"])
