@@ -201,8 +201,7 @@ def check(
         )
         _print(files, model_pairs_table(files), json)
         return
-    with notice_of_compiling(_stderr()):
-        result = check_cell(load_config(config))
+    result = check_cell(load_config(config), notice_of_compiling(_stderr()))
     if json:
         print(as_json_text(result.as_json()))
     else:
@@ -212,6 +211,8 @@ def check(
             console.print(table)
         for arm, line in (result.driven or {"arms": "the built-in controller"}).items():
             console.print(f"{arm} driven by {line}", highlight=False, markup=False, soft_wrap=True)
+        for note in result.notes:
+            console.print(f"NOTE {note}", highlight=False, markup=False, soft_wrap=True)
         for fault in result.faults:
             console.print(f"FAULT {fault}", style="red", highlight=False, soft_wrap=True)
     raise typer.Exit(1 if result.faults else 0)

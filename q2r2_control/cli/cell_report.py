@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from q2r2_control.errors import ConfigError
 from q2r2_control.robot.model_srdf import model_srdfs
 from q2r2_control.robot.reachability import PairReach, Progress, nearest_approaches, srdf_of
 from q2r2_control.robot.robot import PairDistance, Robot
+from q2r2_control.robot.stop_torque import StopTorque, stop_torques
 from q2r2_control.supervision.preflight import preflight_faults
 
 _NEAREST = 8
@@ -55,18 +57,30 @@ class CellCheck:
     min_distance: float
     nearest: tuple[PairDistance, ...]  # nearest first
     faults: tuple[str, ...]
+    stop_torques: tuple[StopTorque, ...]  # by arm
     driven: dict[str, str]  # by arm: what controllers of others are sent, empty for the built-in one
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """One line for each thing that a user should know of and that is no fault."""
+        return tuple(_stop_note(stop) for stop in self.stop_torques if stop.ratio > 1.0)
 
     def as_json(self) -> dict[str, Any]:
         """Plain data and dataclasses for the JSON writer."""
         data = {name: getattr(self, name) for name in self.__slots__}
+        data["notes"] = self.notes
         data["obstacles"] = {name: obstacle.model_dump(mode="json") for name, obstacle in self.obstacles.items()}
         return data
 
 
-def check_cell(config: Config) -> CellCheck:
-    """Build the cell and look at it at home. Raises :class:`Q2R2Error` where it cannot be built."""
+def check_cell(config: Config, compiling: AbstractContextManager[None] | None = None) -> CellCheck:
+    """Build the cell and look at it at home; ``compiling`` surrounds what may have to compile the controller first.
+
+    Raises :class:`Q2R2Error` where the cell cannot be built.
+    """
     robot = Robot.from_config(config)
+    with compiling or nullcontext():
+        controller = CartesianController(robot, config.control)
     distances = sorted(robot.distances(robot.home), key=lambda pair: pair.distance)
     settings = config.control
     return CellCheck(
@@ -78,7 +92,8 @@ def check_cell(config: Config) -> CellCheck:
         ignored_pairs=robot.ignored_pairs,
         min_distance=settings.min_distance,
         nearest=tuple(distances[:_NEAREST]),
-        faults=preflight_faults(robot, settings, CartesianController(robot, settings)),
+        faults=preflight_faults(robot, settings, controller),
+        stop_torques=stop_torques(robot, settings.acceleration_limit),
         driven={} if config.external is None else describe(config.external),
     )
 
@@ -149,6 +164,16 @@ def _write(file: Path, text: str) -> None:
         file.write_text(text, encoding="utf-8")
     except OSError as error:
         raise ConfigError(f"{file}: cannot be written: {error}") from error
+
+
+def _stop_note(stop: StopTorque) -> str:
+    posture = " ".join(f"{position:.2f}" for position in stop.posture)
+    return (
+        f"{stop.arm} arm: where all joints stop at {stop.acceleration:g} rad/s^2 from low speed, with the worst signs, "
+        f"{stop.joint} is asked for up to {stop.ratio:.2f} times its torque limit, at {posture} rad. In "
+        f"{100 * stop.share_over:.1f} % of {stop.postures} random postures a joint is asked for more than it has; with "
+        f"control.acceleration_limit up to {stop.bearable:.1f}, in none of them"
+    )
 
 
 def _arm_check(config: Config, robot: Robot, name: str) -> ArmCheck:

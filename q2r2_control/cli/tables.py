@@ -61,8 +61,9 @@ def arm_table(arm: ArmCheck) -> Table:
     position = " ".join(f"{value:.3f}" for value in arm.tool_position)
     title = f"{arm.name} arm: {arm.model}, tool {arm.tool_model or 'none'}; {arm.tool_frame} at home at {position} m"
     table = _table_of(title, "joint")
-    for column in ("min [rad]", "home [rad]", "max [rad]", "speed [rad/s]", "torque [Nm]"):
-        table.add_column(Text(column), justify="right", min_width=max(map(len, column.split())))
+    # Units below, which leaves 26 of 80 columns for names.
+    for column in ("min\n[rad]", "home\n[rad]", "max\n[rad]", "speed\n[rad/s]", "torque\n[Nm]"):
+        table.add_column(Text(column), justify="right", min_width=7)
     for joint in arm.joints:
         figures = (joint.lower, joint.home, joint.upper, joint.velocity, joint.torque)
         table.add_row(Text(joint.name), *(f"{value:.3f}" for value in figures))

@@ -246,6 +246,20 @@ def test_check_says_how_to_do_without_the_floor_that_is_in_the_way(tmp_path: Pat
     assert (result.exit_code, "floor" in result.stdout) == (0, False)
 
 
+def test_check_notes_where_a_stop_asks_for_more_torque_than_there_is_and_that_is_no_fault() -> None:
+    result = q2r2("check", CELL)
+    notes = [line for line in result.stdout.splitlines() if line.startswith("NOTE ")]
+    assert [note.split()[1] for note in notes] == ["left", "right"]
+    assert all(
+        re.search(r"_A2 is asked for up to 1\.\d\d times its torque limit, at .* rad\. In 9\.", n) for n in notes
+    )
+    assert result.exit_code == 0
+    cell = one_object(q2r2("check", CELL, "--json").stdout)
+    assert [f"NOTE {note}" for note in cell["notes"]] == notes
+    assert cell["stop_torques"][0]["acceleration"] == 10.0
+    assert "NOTE" not in q2r2("check", "config/dual_iiwa14.yaml").stdout
+
+
 def test_check_lists_the_floor_with_the_obstacles(tmp_path: Path) -> None:
     file = changed_cell(tmp_path, "floor: 0.0 ", "floor: -0.125 ")
     assert re.search(r"floor +│ plane +│ +│ 0 0 -0\.125", q2r2("check", file).stdout)

@@ -24,18 +24,21 @@ def printed(table: object, width: int = 120) -> str:
 
 def test_every_figure_of_an_arm_has_its_unit() -> None:
     text = printed(arm_table(check_cell(load_config("config/dual_iiwa7.yaml")).arms[0]))
-    for unit in ("min [rad]", "max [rad]", "speed [rad/s]", "torque [Nm]"):
-        assert unit in text
+    names, units = (line.replace("┃", " ").split() for line in text.splitlines() if line.startswith("┃"))
+    assert names == ["min", "home", "max", "speed", "torque"]
+    assert units == ["joint", "[rad]", "[rad]", "[rad]", "[rad/s]", "[Nm]"]
 
 
 def test_names_of_joints_and_links_are_whole_in_80_columns() -> None:
     """Tiago's are long: in 80 columns the figures are whole too, and what is longer than its column goes on below."""
     side = "left_arm_left_gripper_left_finger_joint"
-    joint = JointCheck(f"{side}_1", -12.566, -1.234, 12.566, 10.472, 1000.0)
+    joint = JointCheck(f"{side}_1", -12.566, -1.234, 12.566, 10.472, 320.0)
     arm = ArmCheck("left", "example-robot-data:tiago_dual", None, "left_tool", (0.0, 0.0, 0.0), (joint,))
     text = printed(arm_table(arm), width=80)
-    assert joined(text, 0).startswith(f"{side}_1")
-    for figure in ("-12.566", "-1.234", "10.472", "1000.000"):
+    assert joined(text, 0) == f"{side}_1"
+    usual = replace(joint, name="left_arm_left_1_joint")
+    assert "│ left_arm_left_1_joint " in printed(arm_table(replace(arm, joints=(usual,))), width=80)
+    for figure in ("-12.566", "-1.234", "10.472", "320.000"):
         assert figure in text
     check = check_cell(load_config("config/dual_iiwa7.yaml"))
     pair = PairDistance(f"{side}_link_1_0", f"right_{side}_link_with_a_still_longer_name_0", 0.0416)
