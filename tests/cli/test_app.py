@@ -137,6 +137,10 @@ def test_the_help_lists_every_command(command: str) -> None:
         pytest.param(("headset-check", "--host", "no such host"), "no such host", id="a host that cannot be bound"),
         pytest.param(("headset-check", "--duration", "inf"), "--duration inf", id="a check without end"),
         pytest.param(("check", "pyproject.toml"), "pyproject.toml", id="a file that is no cell"),
+        pytest.param(
+            ("check", CELL, "--pairs", "a.srdf", "--model-pairs", "."), "exclude each other", id="two kinds of pairs"
+        ),
+        pytest.param(("check", CELL, "--model-pairs", "nowhere"), "nowhere: no such folder", id="no folder"),
         pytest.param(("bench", "--ticks", "0"), "--ticks", id="a benchmark of nothing"),
         pytest.param(("bench", "--seed", "3"), "--seed", id="a seed of what draws nothing"),
         pytest.param(("bench", "--soak", "--ros"), "exclude each other", id="two kinds of benchmark"),
