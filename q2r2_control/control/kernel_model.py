@@ -50,7 +50,7 @@ def cell_of(robot: Robot, settings: ControllerSettings) -> Cell:
         ),
         priority=_priority(robot, settings),
         swivels=swivels,
-        pair_arm=_arms_slowed(pairs, tools.member),
+        pair_arm=_arms_slowed(robot, pairs, tools.member),
         lower=lower,
         upper=upper,
         velocity=robot.velocity_limit * settings.velocity_scale,
@@ -117,14 +117,30 @@ def _swivels(robot: Robot, chain: Chain) -> Swivels:
     return swivels
 
 
-def _arms_slowed(pairs: Pairs, member: Array) -> Array:
-    """Which pairs slow which arms: round bodies of two arms, or of an arm and a fixed round body."""
+def _arms_slowed(robot: Robot, pairs: Pairs, member: Array) -> Array:
+    """Which pairs slow which arms: round bodies of two arms, or of an arm and a fixed round body.
+
+    Not two bodies of one arm, its base included: they are near each other in all postures, and would always slow it.
+    """
+    owned = _owned(robot)
     slowed = np.zeros((len(pairs.first), len(member)))
     for p in range(len(pairs.first)):
         moving = pairs.joint[p][pairs.joint[p] > 0] - 1
-        touched = member[:, moving].any(axis=1)
-        both_sides = len(set(pairs.sign[p][pairs.joint[p] > 0])) == 2
-        within_one_arm = both_sides and touched.sum() == 1
+        within_one_arm = (owned[pairs.first[p]] & owned[pairs.second[p]]).any()
         if pairs.round[p] and not within_one_arm:
-            slowed[p, touched] = 1.0
+            slowed[p, member[:, moving].any(axis=1)] = 1.0
     return slowed
+
+
+def _owned(robot: Robot) -> np.ndarray:
+    """Which geometries (g, n) belong to which arms: what its joints carry, and what carries its first joint."""
+    objects = robot.collision_model.geometryObjects
+    owned = np.zeros((len(objects), len(robot.arms)), dtype=bool)
+    for i, arm in enumerate(robot.arms.values()):
+        joints = {int(index) + 1 for index in arm.joints}
+        path, frame = set(), arm.frame_id
+        while frame not in path:  # the first frame is its own parent
+            path.add(frame)
+            frame = robot.model.frames[frame].parentFrame
+        owned[:, i] = [item.parentJoint in joints or item.parentFrame in path for item in objects]
+    return owned
