@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 
-from q2r2_control.control.controller import LONGEST_DT
+from q2r2_control.types import LONGEST_DT
 
 _SHORTEST_DT = 1e-6  # [s]
 

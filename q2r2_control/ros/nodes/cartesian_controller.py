@@ -23,7 +23,7 @@ from std_msgs.msg import Bool
 from std_srvs.srv import SetBool, Trigger
 
 from q2r2_control.config import load_config
-from q2r2_control.control.controller import LONGEST_DT, CartesianController
+from q2r2_control.control.controller import CartesianController
 from q2r2_control.robot.robot import Robot
 from q2r2_control.ros.bridge.base_node import ERROR, LATCHED_QOS, OK, SENT_COMMAND_QOS, WARN, BaseNode, run_node
 from q2r2_control.ros.bridge.joint_intake import JointIntake
@@ -34,7 +34,7 @@ from q2r2_control.supervision.external_arms import LedArms, LedSettings, setting
 from q2r2_control.supervision.joint_watch import WatchSettings
 from q2r2_control.supervision.supervisor import Phase, Supervisor
 from q2r2_control.supervision.target_stream import Origins, StreamSettings
-from q2r2_control.types import Reference
+from q2r2_control.types import LONGEST_DT, Reference
 
 _LONGEST_STOP = 3.0  # [s]
 _LOOK_PERIOD = 0.5  # between two looks at the graph [s]
