@@ -171,7 +171,9 @@ def test_arms_with_different_mirror_settings_refuse_to_engage_and_a_fault_of_one
 
 
 def start_mirrored(rig: ArmRig, processes: Processes) -> RosProcess:
-    process = processes.start_module(f"q2r2_control.ros.nodes.{rig.arm}_arm_controller", "--ros-args", "-p", "mirror:=true")
+    process = processes.start_module(
+        f"q2r2_control.ros.nodes.{rig.arm}_arm_controller", "--ros-args", "-p", "mirror:=true"
+    )
     rig.wait(lambda: rig.state.get("stance") == "mirror", "the mirrored arm is there")
     rig.state = {}
     return process
@@ -181,7 +183,7 @@ def test_a_subclass_with_other_names_works_in_its_robots_frame(node: Any, proces
     from tf2_msgs.msg import TFMessage
     from visualization_msgs.msg import Marker
 
-    from q2r2_control.ros.bridge.base_node import LATCHED_QOS
+    from q2r2_control.ros.base_node import LATCHED_QOS
 
     base = pin.SE3(pin.exp3(np.array([0.0, 0.0, 1.2])), np.array([0.1, -0.4, 0.3]))
     static = node.create_publisher(TFMessage, "/tf_static", LATCHED_QOS)

@@ -14,8 +14,8 @@ from q2r2_control.control.tasks.manipulability import add_manipulability, manipu
 from q2r2_control.control.tasks.task_data import TaskData
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
+from q2r2_control.verification.contract import Contract
 from tests.control.cells import NAMES, cell, kernel_data, kernel_model, random_posture
-from tests.control.contract import Contract
 
 
 def jacobian(robot: Robot, q: Array, arm: str) -> Array:

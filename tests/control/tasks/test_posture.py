@@ -11,8 +11,8 @@ from q2r2_control.control.tasks.frame import tool_jacobian, tool_pose
 from q2r2_control.control.tasks.posture import project_to_nullspace
 from q2r2_control.control.tasks.task_model import tools_of
 from q2r2_control.types import Array
+from q2r2_control.verification.contract import Contract
 from tests.control.cells import NAMES, cell, placed
-from tests.control.contract import Contract
 
 DT = 0.002
 
