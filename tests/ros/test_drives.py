@@ -15,10 +15,11 @@ import numpy as np
 import pytest
 import yaml
 
-from q2r2_control import Robot, load_config
+from q2r2_control import Robot
 from q2r2_control.types import Array
 from tests.ros.conftest import NEEDS_ROS
-from tests.ros.processes import ROOT, Processes
+from tests.ros.processes import CONFIG, ROOT, Processes
+from tests.ros.waiting import wait_until
 
 pytest.importorskip("rclpy", reason=NEEDS_ROS)
 pytest.importorskip("control_msgs", reason="needs control_msgs: q2r2 ros build-interfaces")
@@ -29,16 +30,11 @@ from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory
 
-from tests.ros.cell import CONFIG, PATIENT, Cell, parameters, shifted, start, wait
+from tests.ros.cell import PATIENT, Cell, shifted, start_controller, start_robot
 
 RATE = 125.0  # of the control loop [Hz]
 COMMANDS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE, history=HistoryPolicy.KEEP_LAST)
 SAG = 0.03  # a command that begins anew is no farther from what was measured [rad]
-
-
-@pytest.fixture(scope="module")
-def robot() -> Robot:
-    return Robot.from_config(load_config(CONFIG))
 
 
 class Commanded(NamedTuple):
@@ -60,7 +56,7 @@ class Recorder:
     def _take(self, message: JointTrajectory, info: Mapping[str, Any]) -> None:
         place = {name: index for index, name in enumerate(message.joint_names)}
         q = np.array([message.points[0].positions[place[name]] for name in self._names])
-        measured = self._cell.q if self._cell.measured else q
+        measured = self._cell.q if self._cell.joints.states else q
         self.commands.append(Commanded(info["publication_sequence_number"], measured, q))
 
 
@@ -68,8 +64,8 @@ class Recorder:
 def test_a_controller_that_is_stopped_for_a_while_publishes_no_jump(
     stall: float, robot: Robot, processes: Processes, node: Any
 ) -> None:
-    cell = Cell(node, robot, start(processes, "mujoco_robot"))
-    controller = start(processes, "cartesian_controller", *PATIENT, *parameters(f"rate:={RATE}"))
+    cell = Cell(node, robot, start_robot(processes))
+    controller = start_controller(processes, *PATIENT, f"rate:={RATE}")
     cell.wait_until_active()
     recorder = Recorder(cell, robot)
     stream = cell.engage("left")
@@ -78,7 +74,7 @@ def test_a_controller_that_is_stopped_for_a_while_publishes_no_jump(
             begin = len(recorder.commands)
             home = stream.poses["left"]
             stream.poses["left"] = shifted(home, 0.0, 0.0, 0.15 if times % 2 == 0 else -0.15)
-            wait(partial(moves_fast, recorder, begin), "the arm moves fast")
+            wait_until(partial(moves_fast, recorder, begin), "the arm moves fast")
             os.kill(controller.pid, signal.SIGSTOP)
             time.sleep(stall)
             os.kill(controller.pid, signal.SIGCONT)
@@ -114,15 +110,15 @@ def fastest(commands: list[Commanded]) -> float:
 def test_in_velocity_mode_the_arm_follows_and_stays_where_it_was_left(
     robot: Robot, processes: Processes, node: Any
 ) -> None:
-    cell = Cell(node, robot, start(processes, "mujoco_robot"))
-    start(processes, "cartesian_controller", *PATIENT, *parameters("output:=velocity"))
+    cell = Cell(node, robot, start_robot(processes))
+    start_controller(processes, *PATIENT, "output:=velocity")
     cell.wait_until_active()
     stream = cell.engage("left")
     begin = stream.poses["left"]
     stream.move("left", (0.0, 0.0, 0.1))
-    wait(lambda: off(cell, "left", shifted(begin, 0.0, 0.0, 0.1)) < 4e-3, "the arm is there")
+    wait_until(lambda: off(cell, "left", shifted(begin, 0.0, 0.0, 0.1)) < 4e-3, "the arm is there")
     stream.end()
-    wait(lambda: cell.state("left_state") == "holding", "the arm holds")
+    wait_until(lambda: cell.state("left_state") == "holding", "the arm holds")
     rest = cell.q
     assert cell.call("/cartesian_controller/stop").success
     time.sleep(1.0)
@@ -146,8 +142,8 @@ def yielding_cell(folder: Path) -> str:
 def test_with_the_admittance_a_measured_force_displaces_the_target_and_without_its_topic_the_node_ends(
     robot: Robot, processes: Processes, node: Any, tmp_path: Path
 ) -> None:
-    config = parameters(f"config:={yielding_cell(tmp_path)}")
-    refused = start(processes, "cartesian_controller", *config, "-r", "__node:=refused")
+    config = f"config:={yielding_cell(tmp_path)}"
+    refused = start_controller(processes, config)
     assert refused.wait() == 2
     assert "admittance.enabled = true: set the parameter external_torque_topic" in refused.output
     torques = node.create_publisher(JointState, "/felt", 10)
@@ -156,20 +152,20 @@ def test_with_the_admittance_a_measured_force_displaces_the_target_and_without_i
     def publish() -> None:
         frame = robot.arms["left"].frame_id
         data = robot.model.createData()
-        q = cell.q if cell.measured else robot.home
+        q = cell.q if cell.joints.states else robot.home
         J = pin.computeFrameJacobian(robot.model, data, q, frame, pin.LOCAL_WORLD_ALIGNED)
         torques.publish(JointState(name=list(robot.joint_names), effort=(J[:3].T @ force).tolist()))
 
-    cell = Cell(node, robot, start(processes, "mujoco_robot"))
+    cell = Cell(node, robot, start_robot(processes))
     timer = node.create_timer(0.01, publish)
-    start(processes, "cartesian_controller", *PATIENT, *config, *parameters("external_torque_topic:=/felt"))
+    start_controller(processes, *PATIENT, config, "external_torque_topic:=/felt")
     cell.wait_until_active()
     stream = cell.engage("left")
     begin = stream.poses["left"]
     force[2] = 20.0
     pushed = shifted(begin, 0.0, 0.0, 20.0 / 500.0)
-    wait(lambda: off(cell, "left", pushed) < 6e-3, "the tool yields by force over stiffness")
+    wait_until(lambda: off(cell, "left", pushed) < 6e-3, "the tool yields by force over stiffness")
     force[2] = 0.0
-    wait(lambda: off(cell, "left", begin) < 6e-3, "the tool is back")
+    wait_until(lambda: off(cell, "left", begin) < 6e-3, "the tool is back")
     stream.end()
     node.destroy_timer(timer)
