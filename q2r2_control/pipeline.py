@@ -13,7 +13,7 @@ import numpy as np
 import pinocchio as pin
 
 from q2r2_control.config import Config
-from q2r2_control.control.controller import LONGEST_DT, CartesianController
+from q2r2_control.control.controller import CartesianController
 from q2r2_control.drives import make_drive
 from q2r2_control.errors import ConfigError, PlantError
 from q2r2_control.inputs.base import Input
@@ -31,7 +31,7 @@ from q2r2_control.supervision.target_stream import StreamSettings
 from q2r2_control.supervision.tick_pacer import TickPacer
 from q2r2_control.teleop.arm import OPEN
 from q2r2_control.teleop.teleop import Teleop
-from q2r2_control.types import ArmTarget, CommandMode, HandSample, Reference, RobotState
+from q2r2_control.types import LONGEST_DT, ArmTarget, CommandMode, HandSample, Reference, RobotState
 
 STOPPING = "stopping"  # state of every arm while the run ends
 # Added to the time that full braking takes; an arm that still recovers into its limits is not waited for longer.

@@ -16,6 +16,7 @@ import pinocchio as pin
 Array = npt.NDArray[np.float64]
 
 SIDES = ("left", "right")
+LONGEST_DT = 0.1  # [s] of a tick; after a longer gap nothing moves further than in this time
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,17 +110,22 @@ class StepReport:
     closest_distance: float  # [m]
     certified: bool  # a stopping motion that keeps limits and separation is known
     fallback: bool
-    slack: float  # largest violation of a separation row [m/s]
+    slack: float  # largest violation of a separation row of unit norm [rad/s]
     solve_time: float  # solver's own time [s]
 
 
 @dataclass(frozen=True, slots=True)
 class Reference:
-    """Joint motion that the QP allows, once per tick; acceleration is constant from the previous tick to this one."""
+    """Joint motion that the QP allows, once per tick.
+
+    Within a substep of the controller (``max_substep``) acceleration is constant, but in one of a stop, where a joint
+    may come to rest in between. So ``a`` leads from the last tick's velocity to ``v``, while ``q`` is not in general
+    where that acceleration alone would lead.
+    """
 
     q: Array  # (nv,) [rad]
     v: Array  # (nv,) [rad/s]
-    a: Array  # (nv,) [rad/s^2]
+    a: Array  # (nv,) mean since the last tick [rad/s^2]
     report: StepReport
 
 

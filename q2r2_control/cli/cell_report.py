@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,8 +11,10 @@ from q2r2_control.config.cell import Config, ObstacleConfig
 from q2r2_control.config.external import describe
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.errors import ConfigError
-from q2r2_control.robot.reachability import PairReach, nearest_approaches, srdf_of
+from q2r2_control.robot.model_srdf import model_srdfs
+from q2r2_control.robot.reachability import PairReach, Progress, nearest_approaches, srdf_of
 from q2r2_control.robot.robot import PairDistance, Robot
+from q2r2_control.robot.stop_torque import StopTorque, stop_torques
 from q2r2_control.supervision.preflight import preflight_faults
 
 _NEAREST = 8
@@ -48,34 +51,49 @@ class CellCheck:
     name: str
     arms: tuple[ArmCheck, ...]
     obstacles: dict[str, ObstacleConfig]
+    floor: float | None  # height [m]
     monitored_pairs: int
     ignored_pairs: tuple[tuple[str, str], ...]  # overlap by construction
     min_distance: float
     nearest: tuple[PairDistance, ...]  # nearest first
     faults: tuple[str, ...]
+    stop_torques: tuple[StopTorque, ...]  # by arm
     driven: dict[str, str]  # by arm: what controllers of others are sent, empty for the built-in one
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """One line for each thing that a user should know of and that is no fault."""
+        return tuple(_stop_note(stop) for stop in self.stop_torques if stop.ratio > 1.0)
 
     def as_json(self) -> dict[str, Any]:
         """Plain data and dataclasses for the JSON writer."""
         data = {name: getattr(self, name) for name in self.__slots__}
+        data["notes"] = self.notes
         data["obstacles"] = {name: obstacle.model_dump(mode="json") for name, obstacle in self.obstacles.items()}
         return data
 
 
-def check_cell(config: Config) -> CellCheck:
-    """Build the cell and look at it at home. Raises :class:`Q2R2Error` where it cannot be built."""
+def check_cell(config: Config, compiling: AbstractContextManager[None] | None = None) -> CellCheck:
+    """Build the cell and look at it at home; ``compiling`` surrounds what may have to compile the controller first.
+
+    Raises :class:`Q2R2Error` where the cell cannot be built.
+    """
     robot = Robot.from_config(config)
+    with compiling or nullcontext():
+        controller = CartesianController(robot, config.control)
     distances = sorted(robot.distances(robot.home), key=lambda pair: pair.distance)
     settings = config.control
     return CellCheck(
         name=config.name,
         arms=tuple(_arm_check(config, robot, name) for name in robot.arms),
         obstacles=dict(config.obstacles),
+        floor=config.floor,
         monitored_pairs=len(distances),
         ignored_pairs=robot.ignored_pairs,
         min_distance=settings.min_distance,
         nearest=tuple(distances[:_NEAREST]),
-        faults=preflight_faults(robot, settings, CartesianController(robot, settings)),
+        faults=preflight_faults(robot, settings, controller),
+        stop_torques=stop_torques(robot, settings.acceleration_limit),
         driven={} if config.external is None else describe(config.external),
     )
 
@@ -91,28 +109,70 @@ class PairsWritten:
     watched: tuple[PairReach, ...]  # the others, nearest first
 
 
-def write_pairs(config: Config, file: Path, samples: int, clearance: float, seed: int = 0) -> PairsWritten:
+def write_pairs(
+    config: Config, file: Path, samples: int, clearance: float, seed: int = 0, progress: Progress | None = None
+) -> PairsWritten:
     """Sample which pairs of a cell can meet and write those that cannot as an SRDF to ``file``, which is not replaced.
 
     Raises :class:`ConfigError` for a clearance that is not above ``control.min_distance``, and for a file that exists.
     """
-    least = config.control.min_distance
-    if not least < clearance <= 1.0:
-        raise ConfigError(f"clearance = {clearance:g} m: allowed: above control.min_distance, {least:g}, up to 1")
+    _check_clearance(config, clearance)
     if file.exists():
         raise ConfigError(f"{file}: exists; give the name of a new file")
     robot = Robot.from_config(config)
-    approaches = nearest_approaches(robot, samples, seed)
-    try:
-        file.write_text(srdf_of(robot, approaches, clearance, samples), encoding="utf-8")
-    except OSError as error:
-        raise ConfigError(f"{file}: cannot be written: {error}") from error
+    approaches = nearest_approaches(robot, samples, seed, progress)
+    _write(file, srdf_of(robot, approaches, clearance, samples))
     return PairsWritten(
         file=str(file),
         samples=samples,
         clearance=clearance,
         never=tuple(pair for pair in approaches if pair.nearest > clearance),
         watched=tuple(pair for pair in approaches if pair.nearest <= clearance),
+    )
+
+
+def write_model_pairs(
+    config: Config, folder: Path, samples: int, clearance: float, seed: int = 0, progress: Progress | None = None
+) -> dict[str, bool]:
+    """Write the SRDF of each model of a cell to ``folder``; returns by path whether the file is new.
+
+    Raises :class:`ConfigError` as :func:`write_pairs` does, and before anything is written for a file that exists and
+    says something else.
+    """
+    _check_clearance(config, clearance)
+    if not folder.is_dir():
+        raise ConfigError(f"{folder}: no such folder")
+    files = {folder / name: text for name, text in model_srdfs(config, clearance, samples, seed, progress).items()}
+    for file, text in files.items():
+        if file.exists() and file.read_bytes() != text.encode():
+            raise ConfigError(f"{file}: exists and says something else; remove it to have it written anew")
+    new = {str(file): not file.exists() for file in files}
+    for file, text in files.items():
+        if new[str(file)]:
+            _write(file, text)
+    return new
+
+
+def _check_clearance(config: Config, clearance: float) -> None:
+    least = config.control.min_distance
+    if not least < clearance <= 1.0:
+        raise ConfigError(f"clearance = {clearance:g} m: allowed: above control.min_distance, {least:g}, up to 1")
+
+
+def _write(file: Path, text: str) -> None:
+    try:
+        file.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(f"{file}: cannot be written: {error}") from error
+
+
+def _stop_note(stop: StopTorque) -> str:
+    posture = " ".join(f"{position:.2f}" for position in stop.posture)
+    return (
+        f"{stop.arm} arm: where all joints stop at {stop.acceleration:g} rad/s^2 from low speed, with the worst signs, "
+        f"{stop.joint} is asked for up to {stop.ratio:.2f} times its torque limit, at {posture} rad. In "
+        f"{100 * stop.share_over:.1f} % of {stop.postures} random postures a joint is asked for more than it has; with "
+        f"control.acceleration_limit up to {stop.bearable:.1f}, in none of them"
     )
 
 

@@ -4,9 +4,9 @@ In the tick it stands between teleop and control:  target -> Admittance.update -
 every limit and distance whatever is asked of it, so the displacement needs no bounds but those for the operator's
 sake. Only the QP sees the displaced target: recordings and the teleop layer go on with the operator's own.
 
-The law and its reasons stand in compliance.py. What the tool shows is the admittance in series with the servos below
-it: a tool held by soft servos moves by their own give besides. Against a stiff body the loop closes through QP and
-servos with their delay: with the defaults a simulated arm leans quietly on 10 kN/m, and on 30 kN/m with twice the
+The law and its reasons stand in admittance_kernels.py. What the tool shows is the admittance in series with the servos
+below it: a tool held by soft servos moves by their own give besides. Against a stiff body the loop closes through QP
+and servos with their delay: with the defaults a simulated arm leans quietly on 10 kN/m, and on 30 kN/m with twice the
 damping ratio or four times the mass. What the tool carries without its model knowing counts as a push downwards.
 """
 
@@ -19,9 +19,17 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio as pin
 
-from q2r2_control.compliance.admittance_kernels import NOT_MEASURED, TOUCHED, UNUSABLE, Law, Yielding, comply
+from q2r2_control.compliance.admittance_kernels import (
+    NOT_MEASURED,
+    TOUCHED,
+    UNUSABLE,
+    AdmittanceData,
+    AdmittanceModel,
+    step_admittance,
+)
 from q2r2_control.config.control import AdmittanceSettings
 from q2r2_control.control.jit import hold
+from q2r2_control.control.tasks.task_model import tools_of
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, RobotState
 
@@ -49,15 +57,15 @@ class Admittance:
         self.settings = settings or AdmittanceSettings()
         self._model, self._data = robot.model, robot.model.createData()
         self._frames = {name: arm.frame_id for name, arm in robot.arms.items()}
-        self._state = Yielding.empty(len(robot.arms), robot.model.nv)
-        self._held_law, self._held_state = hold(_law_of(robot, self.settings)), hold(self._state)
+        self._kernel_data = AdmittanceData.empty(len(robot.arms), robot.model.nv)
+        self._held_model, self._held_data = hold(_model_of(robot, self.settings)), hold(self._kernel_data)
         # The kernel runs once here, so that it is not compiled in mid-motion.
-        comply(self._held_law, self._held_state, NOT_MEASURED, 0.001)
+        step_admittance(self._held_model, self._held_data, NOT_MEASURED, 0.001)
         self.reset()
 
     def reset(self) -> None:
         """Forget wrenches and displacements."""
-        for array in (self._state.wrench, self._state.x, self._state.v):
+        for array in (self._kernel_data.wrench, self._kernel_data.x, self._kernel_data.v):
             array[:] = 0.0
         self._rejected = False
 
@@ -76,10 +84,10 @@ class Admittance:
         if math.isfinite(dt) and dt > 0.0:
             measured = self._measure(state)
             self._rejected = measured == UNUSABLE
-            self._state.follows[:] = [targets.get(name) is not None for name in self._frames]
-            comply(self._held_law, self._held_state, measured, float(dt))
+            self._kernel_data.follows[:] = [targets.get(name) is not None for name in self._frames]
+            step_admittance(self._held_model, self._held_data, measured, float(dt))
         displaced = dict(targets)
-        for x, name in zip(self._state.x, self._frames, strict=True):
+        for x, name in zip(self._kernel_data.x, self._frames, strict=True):
             target = targets.get(name)
             if target is not None and x.any():
                 displaced[name] = pin.SE3(pin.exp3(x[3:]) @ target.rotation, target.translation + x[:3])
@@ -87,7 +95,7 @@ class Admittance:
 
     def report(self) -> AdmittanceReport:
         """Of the last update."""
-        arms = zip(self._frames, self._state.wrench.copy(), self._state.x.copy(), strict=True)
+        arms = zip(self._frames, self._kernel_data.wrench.copy(), self._kernel_data.x.copy(), strict=True)
         return AdmittanceReport({name: ArmCompliance(wrench, x) for name, wrench, x in arms}, self._rejected)
 
     def _measure(self, state: RobotState) -> int:
@@ -96,23 +104,20 @@ class Admittance:
             return NOT_MEASURED
         if not (math.isfinite(tau.sum()) and math.isfinite(q.sum())):
             return UNUSABLE
-        self._state.tau[:] = tau
+        self._kernel_data.tau[:] = tau
         pin.computeJointJacobians(self._model, self._data, q)
-        for J, frame in zip(self._state.J, self._frames.values(), strict=True):
+        for J, frame in zip(self._kernel_data.J, self._frames.values(), strict=True):
             J[:] = pin.getFrameJacobian(self._model, self._data, frame, pin.LOCAL_WORLD_ALIGNED).reshape(J.shape)
         return TOUCHED
 
 
-def _law_of(robot: Robot, settings: AdmittanceSettings) -> Law:
-    member = np.zeros((len(robot.arms), robot.model.nv))
-    for i, arm in enumerate(robot.arms.values()):
-        member[i, arm.joints] = 1.0
-    return Law(
+def _model_of(robot: Robot, settings: AdmittanceSettings) -> AdmittanceModel:
+    return AdmittanceModel(
         stiffness=np.array([settings.stiffness, settings.rotation_stiffness]),
         inertia=np.array([settings.mass, settings.inertia]),
         dead_band=np.array([settings.force_dead_band, settings.torque_dead_band]),
         limit=np.array([settings.max_displacement, settings.max_rotation]),
         damping_ratio=settings.damping_ratio,
         filter_time=settings.filter_time,
-        member=member,
+        member=tools_of(robot).member,
     )

@@ -38,8 +38,8 @@ _NOTHING = 1e-9
 NOT_MEASURED, TOUCHED, UNUSABLE = 0, 1, 2
 
 
-class Law(NamedTuple):
-    """Settings, linear then angular."""
+class AdmittanceModel(NamedTuple):
+    """What does not change between ticks; settings linear, then angular."""
 
     stiffness: Array  # (2,) [N/m, Nm/rad]
     inertia: Array  # (2,) [kg, kg m^2]
@@ -50,8 +50,8 @@ class Law(NamedTuple):
     member: Array  # (n, nv) 1 where a joint moves the arm's tool
 
 
-class Yielding(NamedTuple):
-    """What is measured of each arm, and how its target yields. World axes at the tool's origin."""
+class AdmittanceData(NamedTuple):
+    """What is measured of each arm, and how its target is displaced. World axes at the tool's origin."""
 
     tau: Array  # (nv,) external torque [Nm]
     J: Array  # (n, 6, nv) tool Jacobians
@@ -64,7 +64,7 @@ class Yielding(NamedTuple):
     directions: Array  # (6, 6)
 
     @classmethod
-    def empty(cls, arms: int, nv: int) -> Yielding:
+    def empty(cls, arms: int, nv: int) -> AdmittanceData:
         return cls(
             tau=np.zeros(nv),
             J=np.zeros((arms, 6, nv)),
@@ -79,16 +79,16 @@ class Yielding(NamedTuple):
 
 
 @kernel
-def comply(held_law: Held, held_yielding: Held, measured: int, dt: float) -> None:
+def step_admittance(held_model: Held, held_data: Held, measured: int, dt: float) -> None:
     """Move every arm's displacement by ``dt`` [s].
 
     ``measured``: TOUCHED with ``tau`` and ``J`` filled in, NOT_MEASURED for no touch, UNUSABLE to hold the wrench.
     """
-    law, arms = held_law.value, held_yielding.value
-    share = 1.0 - np.exp(-dt / law.filter_time) if law.filter_time > 0.0 else 1.0
+    model, arms = held_model.value, held_data.value
+    share = 1.0 - np.exp(-dt / model.filter_time) if model.filter_time > 0.0 else 1.0
     for i in range(arms.x.shape[0]):
         if measured == TOUCHED:
-            estimate_wrench(arms.J[i], arms.tau, law.member[i], arms.square, arms.directions, arms.estimate)
+            estimate_wrench(arms.J[i], arms.tau, model.member[i], arms.square, arms.directions, arms.estimate)
         elif measured == NOT_MEASURED:
             arms.estimate[:] = 0.0
         for k in range(6):
@@ -100,37 +100,37 @@ def comply(held_law: Held, held_yielding: Held, measured: int, dt: float) -> Non
         if arms.follows[i] == 1.0:
             still = True
             for part in range(2):
-                still &= _yield(law, part, arms.wrench[i], arms.x[i], arms.v[i], dt)
+                still &= _displace(model, part, arms.wrench[i], arms.x[i], arms.v[i], dt)
             if still:
                 arms.x[i] = 0.0
                 arms.v[i] = 0.0
 
 
 @lean_kernel
-def _yield(law: Law, part: int, wrench: Array, x: Array, v: Array, dt: float) -> bool:
+def _displace(model: AdmittanceModel, part: int, wrench: Array, x: Array, v: Array, dt: float) -> bool:
     """Move three of the six components; whether they are as good as zero and stay so."""
     first = 3 * part
     size = _length(wrench, first)
-    band, stiffness = law.dead_band[part], law.stiffness[part]
+    band, stiffness = model.dead_band[part], model.stiffness[part]
     pull = 0.0  # rest displacement, as a part of the wrench
     if size > band:
-        pull = min((1.0 - (band / size) ** 2) / stiffness, law.limit[part] / size)
-    frequency = np.sqrt(stiffness / law.inertia[part])
+        pull = min((1.0 - (band / size) ** 2) / stiffness, model.limit[part] / size)
+    frequency = np.sqrt(stiffness / model.inertia[part])
     still = pull == 0.0
     for k in range(first, first + 3):
         rest = pull * wrench[k]
-        away, v[k] = oscillate(x[k] - rest, v[k], frequency, law.damping_ratio, dt)
+        away, v[k] = oscillate(x[k] - rest, v[k], frequency, model.damping_ratio, dt)
         x[k] = rest + away
         still &= abs(x[k]) < _NOTHING and abs(v[k]) < _NOTHING
     length = _length(x, first)
-    if length > law.limit[part]:
+    if length > model.limit[part]:
         # At the limit, without speed outwards.
         outwards = 0.0
         for k in range(first, first + 3):
             outwards += x[k] / length * v[k]
         for k in range(first, first + 3):
             v[k] -= max(outwards, 0.0) * x[k] / length
-            x[k] *= law.limit[part] / length
+            x[k] *= model.limit[part] / length
     return still
 
 

@@ -26,16 +26,15 @@ import numpy as np
 import pinocchio as pin
 from pydantic import ValidationError
 
-from q2r2_control.compliance.impedance_kernels import Pull, Springs, pull_arms
-from q2r2_control.compliance.impedance_terms import BoolArray, bound_torque
+from q2r2_control.compliance.impedance_kernels import ImpedanceData, ImpedanceModel, add_impedance_torque
+from q2r2_control.compliance.impedance_terms import BoolArray, PositionLimits, bound_torque
 from q2r2_control.config.control import ImpedanceSettings
-from q2r2_control.control.controller import LONGEST_DT
 from q2r2_control.control.geometry.kinematics import chain_of
 from q2r2_control.control.jit import hold
-from q2r2_control.control.kernel_model import tools_of
+from q2r2_control.control.tasks.task_model import tools_of
 from q2r2_control.errors import ConfigError, RobotError
 from q2r2_control.robot.robot import Robot
-from q2r2_control.types import Array, Reference, RobotState
+from q2r2_control.types import LONGEST_DT, Array, Reference, RobotState
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,16 +70,16 @@ class ImpedanceController:
         self.settings = settings or ImpedanceSettings()
         self._limit = self.settings.torque_scale * robot.torque_limit
         self._data = robot.model.createData()
-        springs = _springs_of(robot, self.settings)
-        self._pull = Pull.empty(springs)
-        self._held_springs, self._held_pull = hold(springs), hold(self._pull)
-        self._pull.stiffness[:] = self.settings.translational_stiffness, self.settings.rotational_stiffness
-        self._goal = self._pull.stiffness.copy()  # of a ramp (k, 2) [N/m, Nm/rad]
-        self._ramp_rate = np.zeros_like(self._goal)
+        model = _model_of(robot, self.settings)
+        self._kernel_data = ImpedanceData.empty(model)
+        self._held_model, self._held_data = hold(model), hold(self._kernel_data)
+        self._kernel_data.stiffness[:] = self.settings.translational_stiffness, self.settings.rotational_stiffness
+        self._wanted_stiffness = self._kernel_data.stiffness.copy()  # at the end of a ramp (k, 2) [N/m, Nm/rad]
+        self._ramp_rate = np.zeros_like(self._wanted_stiffness)
         self._ramping = False
         self._begin(robot.home, np.zeros(robot.model.nv))
         # Every kernel runs once here, so that none is compiled in mid-motion.
-        pull_arms(self._held_springs, self._held_pull)
+        add_impedance_torque(self._held_model, self._held_data)
         bound_torque(self._last, self._last, self._limit, 0.0)
 
     def reset(self, state: RobotState) -> None:
@@ -92,7 +91,7 @@ class ImpedanceController:
         q = np.array(state.q, dtype=np.float64)
         if q.shape != self._limit.shape or not np.isfinite(q).all():
             raise RobotError(f"impedance reset: q = {q!s:.80}: expected {len(self._limit)} finite numbers")
-        self._pull.stiffness[:] = self._goal
+        self._kernel_data.stiffness[:] = self._wanted_stiffness
         self._ramping = False
         self._begin(q, np.zeros_like(q))
 
@@ -122,13 +121,14 @@ class ImpedanceController:
             raise ConfigError(f"{fault['loc'][0]} = {fault['input']!r:.40}: {fault['msg']}") from error
         for i in range(len(arms)) if arm is None else (arms.index(arm),):
             for k, wanted in enumerate((translational, rotational)):
-                self._goal[i, k] = self._goal[i, k] if wanted is None else wanted
-            self._ramp_rate[i] = np.abs(self._goal[i] - self._pull.stiffness[i]) / self.settings.ramp_time
+                self._wanted_stiffness[i, k] = self._wanted_stiffness[i, k] if wanted is None else wanted
+            way = self._wanted_stiffness[i] - self._kernel_data.stiffness[i]
+            self._ramp_rate[i] = np.abs(way) / self.settings.ramp_time
         self._ramping = True
 
     def stiffness(self, arm: str) -> tuple[float, float]:
         """Stiffness of an arm's tool in force now: translational [N/m], rotational [Nm/rad]."""
-        translational, rotational = self._pull.stiffness[list(self.robot.arms).index(arm)]
+        translational, rotational = self._kernel_data.stiffness[list(self.robot.arms).index(arm)]
         return float(translational), float(rotational)
 
     def step(self, reference: Reference, state: RobotState, dt: float, extra: Array | None = None) -> TorqueCommand:
@@ -146,7 +146,7 @@ class ImpedanceController:
         gravity = self._law(state, acceleration) if _finite(state.q, state.v) else None
         wanted = self._gravity
         if gravity is not None:
-            wanted = self._pull.tau if extra is None else self._pull.tau + extra
+            wanted = self._kernel_data.tau if extra is None else self._kernel_data.tau + extra
             if _finite(wanted):
                 self._gravity = gravity
             else:
@@ -160,21 +160,21 @@ class ImpedanceController:
             clipped=() if held else clipped,
             saturated=self._names(bounded.saturated),
             rate_limited=self._names(bounded.rate_limited),
-            repelled=() if held else self._names(self._pull.repulsion != 0.0),
+            repelled=() if held else self._names(self._kernel_data.repulsion != 0.0),
             held=held,
         )
         return TorqueCommand(bounded.tau.copy(), report)
 
     def _errors(self) -> tuple[dict[str, Array], tuple[str, ...]]:
         """Of the last law: each arm's clipped error, and the arms whose error was longer."""
-        pull, arms = self._pull, self.robot.arms
-        clipped = tuple(name for name, was in zip(arms, pull.clipped.tolist(), strict=True) if was)
-        return dict(zip(arms, pull.errors.copy(), strict=True)), clipped
+        data, arms = self._kernel_data, self.robot.arms
+        clipped = tuple(name for name, was in zip(arms, data.clipped.tolist(), strict=True) if was)
+        return dict(zip(arms, data.errors.copy(), strict=True)), clipped
 
     def _ramp(self, time: float) -> None:
-        reach = self._ramp_rate * time
-        self._pull.stiffness[:] += np.minimum(np.maximum(self._goal - self._pull.stiffness, -reach), reach)
-        self._ramping = bool((self._pull.stiffness != self._goal).any())
+        reach, stiffness = self._ramp_rate * time, self._kernel_data.stiffness
+        stiffness[:] += np.minimum(np.maximum(self._wanted_stiffness - stiffness, -reach), reach)
+        self._ramping = bool((stiffness != self._wanted_stiffness).any())
 
     def _exchange(self, reference: Reference) -> Array:
         """Take the newest reference in for the next tick; returns the acceleration (nv,) that leads to it."""
@@ -186,18 +186,19 @@ class ImpedanceController:
         return self._due_v
 
     def _law(self, state: RobotState, acceleration: Array) -> Array | None:
-        """Pull at all arms, without bounds, and return gravity's torque.
+        """The torque of all arms, without bounds, into the kernel's data; returns gravity's.
 
         None where the numbers are too large to be computed with.
         """
-        model, data, pull = self.robot.model, self._data, self._pull
-        pull.q[:], pull.v[:], pull.wanted_q[:], pull.wanted_v[:] = state.q, state.v, self._wanted_q, self._wanted_v
-        gravity = np.array(pin.computeGeneralizedGravity(model, data, pull.q))
-        pull.tau[:] = pin.rnea(model, data, pull.q, pull.v, acceleration)
-        pull.M[:] = pin.crba(model, data, pull.q)
-        pull.M_inverse[:] = pin.computeMinverse(model, data, pull.q)
+        model, data, kernel_data = self.robot.model, self._data, self._kernel_data
+        kernel_data.q[:], kernel_data.v[:] = state.q, state.v
+        kernel_data.wanted_q[:], kernel_data.wanted_v[:] = self._wanted_q, self._wanted_v
+        gravity = np.array(pin.computeGeneralizedGravity(model, data, kernel_data.q))
+        kernel_data.tau[:] = pin.rnea(model, data, kernel_data.q, kernel_data.v, acceleration)
+        kernel_data.M[:] = pin.crba(model, data, kernel_data.q)
+        kernel_data.M_inverse[:] = pin.computeMinverse(model, data, kernel_data.q)
         try:
-            pull_arms(self._held_springs, self._held_pull)
+            add_impedance_torque(self._held_model, self._held_data)
         except np.linalg.LinAlgError:
             return None
         return gravity
@@ -208,21 +209,23 @@ class ImpedanceController:
         return tuple(self.robot.joint_names[index] for index in np.flatnonzero(which))
 
 
-def _springs_of(robot: Robot, settings: ImpedanceSettings) -> Springs:
+def _model_of(robot: Robot, settings: ImpedanceSettings) -> ImpedanceModel:
     arms = list(robot.arms.values())
     joints = np.zeros((len(arms), max(len(arm.joints) for arm in arms)), dtype=np.int64)
     for row, arm in zip(joints, arms, strict=True):
         row[: len(arm.joints)] = arm.joints
-    return Springs(
+    return ImpedanceModel(
         chain=chain_of(robot.model),
         tools=tools_of(robot),
         joints=joints,
         dofs=np.array([len(arm.joints) for arm in arms]),
-        lower=robot.position_lower,
-        upper=robot.position_upper,
-        limit_stiffness=settings.limit_stiffness,
-        limit_damping=settings.limit_damping,
-        limit_distance=settings.limit_distance,
+        limits=PositionLimits(
+            lower=robot.position_lower,
+            upper=robot.position_upper,
+            stiffness=settings.limit_stiffness,
+            damping=settings.limit_damping,
+            distance=settings.limit_distance,
+        ),
         damping_ratio=settings.damping_ratio,
         posture_stiffness=settings.nullspace_stiffness,
         posture_damping_ratio=settings.nullspace_damping_ratio,

@@ -1,10 +1,9 @@
-"""Pure pieces of Cartesian impedance control: pose error, task inertia, damping design, nullspaces, torque bounds.
+"""Pure pieces of Cartesian impedance control: task inertia, damping design, nullspaces, torque bounds, compiled.
 
 Task vectors (6,) are linear, then angular, in world axes at the tool's origin; J (6, n) is that Jacobian of an arm's n
 joints. Stiffness [N/m, Nm/rad], damping [Ns/m, Nms/rad], task inertia [kg, kg m^2].
 
-Compiled, but for what takes a pose; spring.py puts them together. Matrices that are not finite raise
-:class:`numpy.linalg.LinAlgError`.
+impedance_kernels.py puts them together. Matrices that are not finite raise :class:`numpy.linalg.LinAlgError`.
 """
 
 from __future__ import annotations
@@ -13,15 +12,15 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-import pinocchio as pin
 
 from q2r2_control.control.jit import kernel
+from q2r2_control.control.tasks.frame import ROTATION_LENGTH
 from q2r2_control.types import Array
 
 BoolArray = npt.NDArray[np.bool_]
 
-# A length that makes a radian comparable to a metre [m/rad], as in the QP's tool task.
-_METRES = np.array([1.0, 1.0, 1.0, 0.3, 0.3, 0.3])
+# Makes radians comparable to metres, as in the QP's tool task.
+_METRES = np.array([1.0, 1.0, 1.0, ROTATION_LENGTH, ROTATION_LENGTH, ROTATION_LENGTH])
 _SCALE = np.outer(_METRES, _METRES)
 _ROWS = _METRES.reshape(6, 1)
 # No direction of a tool counts for more than this [kg], a rotation for this times 0.3^2 [kg m^2]. An arm whose
@@ -31,9 +30,14 @@ _HEAVIEST = 1000.0
 _LEAST_MOTION = 0.05  # [m/rad]
 
 
-def pose_error(goal: pin.SE3, pose: pin.SE3) -> Array:
-    """Way from ``pose`` to ``goal`` (6,): difference of positions [m], rotation vector [rad], in world axes."""
-    return np.concatenate([goal.translation - pose.translation, pin.log3(goal.rotation @ pose.rotation.T)])
+class PositionLimits(NamedTuple):
+    """Position limits with the spring that begins before each."""
+
+    lower: Array  # (n,) [rad]
+    upper: Array  # (n,)
+    stiffness: float  # [Nm/rad]
+    damping: float  # [Nms/rad]
+    distance: float  # where the spring begins [rad]
 
 
 @kernel
@@ -96,20 +100,19 @@ def kinematic_projector(J: Array) -> Array:
 
 
 @kernel
-def limit_repulsion(
-    q: Array, v: Array, wanted: Array, lower: Array, upper: Array, stiffness: float, damping: float, reach: float
-) -> Array:
-    """Torque (n,) [Nm] away from position limits, a spring [Nm/rad] that begins ``reach`` [rad] before each.
+def limit_repulsion(limits: PositionLimits, q: Array, v: Array, wanted: Array) -> Array:
+    """Torque (n,) [Nm] away from position limits, of a spring that begins some way before each.
 
     Where ``wanted`` (n,), the reference, lies nearer to the limit, the spring begins there: the reference keeps the
     limits by itself, and what holds a joint off its reference would hold the tool off its target. The damping
-    [Nms/rad] grows from 0 over the reach, so that the torque does not jump, and it only brakes, it never pulls.
+    grows from 0 over that way, so that the torque does not jump, and it only brakes, it never pulls.
     """
-    below = np.maximum(np.minimum(lower + reach, wanted) - q, 0.0)
-    above = np.maximum(q - np.maximum(upper - reach, wanted), 0.0)
-    share = damping / reach
-    towards_upper = np.maximum(stiffness * below - share * np.minimum(below, reach) * v, 0.0)
-    towards_lower = np.maximum(stiffness * above + share * np.minimum(above, reach) * v, 0.0)
+    reach = limits.distance
+    below = np.maximum(np.minimum(limits.lower + reach, wanted) - q, 0.0)
+    above = np.maximum(q - np.maximum(limits.upper - reach, wanted), 0.0)
+    share = limits.damping / reach
+    towards_upper = np.maximum(limits.stiffness * below - share * np.minimum(below, reach) * v, 0.0)
+    towards_lower = np.maximum(limits.stiffness * above + share * np.minimum(above, reach) * v, 0.0)
     return towards_upper - towards_lower
 
 

@@ -2,7 +2,7 @@
 
 In the tick it comes after the QP, beside the impedance:  tau = impedance + gravity and Coriolis + wall,  from the
 measured q and v of the same tick and before torques are saturated. The reference keeps min_distance by itself; an arm
-that is pushed away from it meets this wall. The law, and why it is stable, stands in wall_force.py.
+that is pushed away from it meets this wall. The law, and why it is stable, stands in repulsion_kernels.py.
 
 **What it can take.** At rest a force of k min_distance or F_max, whichever is less. In motion it takes up at most the
 energy F_max min_distance for each pair, beside what the joints take; bodies that meet with more than that are slowed
@@ -17,10 +17,9 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio as pin
 
-from q2r2_control.compliance.repulsion_kernels import Scratch, Wall, find_near, wall_torque
+from q2r2_control.compliance.repulsion_kernels import RepulsionData, RepulsionModel, find_near, repulsion_torque
 from q2r2_control.config.control import ControllerSettings, WallSettings
-from q2r2_control.control.geometry.collision import bodies_of, pairs_of
-from q2r2_control.control.geometry.kinematics import chain_of
+from q2r2_control.control.geometry.collision import collision_model_of
 from q2r2_control.control.jit import hold
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
@@ -52,14 +51,11 @@ class MeasuredSeparation:
         Raises :class:`RobotError` for a shape that no kernel measures.
         """
         law, self._model, self._data = wall_settings or WallSettings(), robot.model, robot.model.createData()
-        chain, bodies = chain_of(robot.model), bodies_of(robot.collision_model)
-        travel = np.maximum(np.abs(robot.position_lower), np.abs(robot.position_upper))
-        pairs = pairs_of(robot.collision_model, chain, bodies, travel)
-        radii = bodies.radius[pairs.first] + bodies.radius[pairs.second]
-        wall = Wall(
-            chain=chain,
-            bodies=bodies,
-            pairs=pairs,
+        collision = collision_model_of(robot)
+        pairs, radius = collision.pairs, collision.bodies.radius
+        radii = radius[pairs.first] + radius[pairs.second]
+        model = RepulsionModel(
+            collision=collision,
             smoothing=(_SMOOTHING * (radii + settings.min_distance)) ** 2,
             deep=(_DEEP - 1.0) * radii,
             shell=settings.min_distance,
@@ -67,8 +63,8 @@ class MeasuredSeparation:
             damping_ratio=law.damping_ratio,
             maximum_force=law.maximum_force,
         )
-        self._scratch = Scratch.empty(wall)
-        self._held_wall, self._held_scratch = hold(wall), hold(self._scratch)
+        self._kernel_data = RepulsionData.empty(model)
+        self._held_model, self._held_data = hold(model), hold(self._kernel_data)
         names = [geometry.name for geometry in robot.collision_model.geometryObjects]
         indices = zip(pairs.first.tolist(), pairs.second.tolist(), strict=True)
         self._pair_names = [(names[first], names[second]) for first, second in indices]
@@ -88,16 +84,16 @@ class MeasuredSeparation:
         pair = self._pair_names[closest] if self._pair_names else ("", "")
         if not energy:
             return WallReport(np.zeros(len(q)), (), 0.0, 0.0, pair, distance)
-        force = self._scratch.force[:count]
-        pressing = tuple(self._pair_names[self._scratch.near[i]] for i in np.flatnonzero(force > 0.0))
-        return WallReport(self._scratch.tau.copy(), pressing, float(force.max()), energy, pair, distance)
+        force = self._kernel_data.force[:count]
+        pressing = tuple(self._pair_names[self._kernel_data.near[i]] for i in np.flatnonzero(force > 0.0))
+        return WallReport(self._kernel_data.tau.copy(), pressing, float(force.max()), energy, pair, distance)
 
     def _find(self, q: Array, v: Array) -> tuple[int, int, float]:
-        self._scratch.q[:] = q
-        self._scratch.v[:] = v
-        found: tuple[int, int, float] = find_near(self._held_wall, self._held_scratch)
+        self._kernel_data.q[:] = q
+        self._kernel_data.v[:] = v
+        found: tuple[int, int, float] = find_near(self._held_model, self._held_data)
         return found
 
     def _press(self, count: int) -> float:
-        self._scratch.M[:] = pin.crba(self._model, self._data, self._scratch.q)
-        return float(wall_torque(self._held_wall, self._held_scratch, count))
+        self._kernel_data.M[:] = pin.crba(self._model, self._data, self._kernel_data.q)
+        return float(repulsion_torque(self._held_model, self._held_data, count))

@@ -7,8 +7,8 @@ Each monitored pair closer than min_distance by the depth x presses itself apart
 d' the rate of distance, c the damping of ratio xi at the pair's effective mass m = 1 / (g' M^-1 g), g = dd/dq
 (Khatib, IJRR 1987), rising from 0 to its value in the first two millimetres. So the torque is continuous in q and v,
 never pulls two bodies together, and its elastic part is the gradient of  U = sum k x^2 / 2:  what the wall gives back
-is at most what was put in. Distances are those of smooth.py, so that bodies that lie along each other do not make the
-torque switch from end to end.
+is at most what was put in. Distances are those of smooth_distance.py, so that bodies that lie along each other do not
+make the torque switch from end to end.
 
 **Why many pairs do not add up to an unstable stiffness.** Each wrist link presses against each link nearby, and all
 pairs act through the same joints. With K = sum k g g' and D = sum c g g' the fastest mode of M^-1 K is no faster than
@@ -30,18 +30,10 @@ from typing import NamedTuple
 import numpy as np
 
 from q2r2_control.control.geometry.closest_points import clamp
-from q2r2_control.control.geometry.collision import (
-    Bodies,
-    Contact,
-    Pairs,
-    Posed,
-    at_least,
-    distance_row,
-    measure,
-    pose_bodies,
-)
-from q2r2_control.control.geometry.kinematics import Chain, IntArray, Placements, place
-from q2r2_control.control.geometry.smooth_distance import smooth_distance
+from q2r2_control.control.geometry.collision import CollisionData, CollisionModel, update_placements
+from q2r2_control.control.geometry.kinematics import IntArray
+from q2r2_control.control.geometry.pair_distance import at_least, distance_row, measure
+from q2r2_control.control.geometry.smooth_distance import measure_smooth
 from q2r2_control.control.jit import Held, kernel, lean_kernel
 from q2r2_control.types import Array
 
@@ -52,29 +44,25 @@ _BAND = 0.002  # over which damping fades in inside the shell, and a pair's shar
 _IMMOBILE = 1e-9  # [1/kg]
 
 
-class Wall(NamedTuple):
+class RepulsionModel(NamedTuple):
     """What does not change between ticks."""
 
-    chain: Chain
-    bodies: Bodies
-    pairs: Pairs
+    collision: CollisionModel
     smoothing: Array  # (p,) [m^2]
     deep: Array  # (p,) distance from which it is measured as it is [m]
     shell: float  # min_distance [m]
-    stiffness: float
+    stiffness: float  # [N/m]
     damping_ratio: float
-    maximum_force: float
+    maximum_force: float  # [N]
 
 
-class Scratch(NamedTuple):
+class RepulsionData(NamedTuple):
     """One tick's measurement and arrays written anew."""
 
     q: Array  # (nv,)
     v: Array  # (nv,)
     M: Array  # (nv, nv) mass matrix, read from its upper triangle; overwritten
-    placements: Placements
-    posed: Posed
-    contact: Contact
+    collision: CollisionData  # at q
     near: IntArray  # (p,) pairs in the shell or just outside
     depth: Array  # (p,) of them [m]
     rows: Array  # (p, nv) gradients of their distances
@@ -84,15 +72,13 @@ class Scratch(NamedTuple):
     tau: Array  # (nv,)
 
     @classmethod
-    def empty(cls, wall: Wall) -> Scratch:
-        pairs, nv = len(wall.pairs.first), len(wall.chain.parent) - 1
+    def empty(cls, model: RepulsionModel) -> RepulsionData:
+        pairs, nv = len(model.collision.pairs.first), len(model.collision.chain.parent) - 1
         return cls(
             q=np.zeros(nv),
             v=np.zeros(nv),
             M=np.eye(nv),
-            placements=Placements.empty(wall.chain),
-            posed=Posed.empty(wall.bodies),
-            contact=Contact.empty(),
+            collision=CollisionData.empty(model.collision),
             near=np.zeros(pairs, dtype=np.int64),
             depth=np.zeros(pairs),
             rows=np.zeros((pairs, nv)),
@@ -104,69 +90,66 @@ class Scratch(NamedTuple):
 
 
 @kernel
-def find_near(held_wall: Held, held_scratch: Held) -> tuple[int, int, float]:
+def find_near(held_model: Held, held_data: Held) -> tuple[int, int, float]:
     """Depths and gradients of the pairs in the shell or just outside.
 
     Returns how many these are, the closest pair of all and its distance.
     """
-    wall, scratch = held_wall.value, held_scratch.value
-    bodies, pairs, posed, contact = wall.bodies, wall.pairs, scratch.posed, scratch.contact
-    place(wall.chain, scratch.q, scratch.placements)
-    pose_bodies(bodies, scratch.placements, posed)
+    model, data = held_model.value, held_data.value
+    update_placements(model.collision, data.collision, data.q)
     count, closest, least = 0, 0, np.inf
-    for p in range(pairs.first.shape[0]):
-        first, second = pairs.first[p], pairs.second[p]
-        if at_least(bodies, posed, first, second) >= max(least, wall.shell + _BAND):
+    for p in range(model.collision.pairs.first.shape[0]):
+        if at_least(model.collision, data.collision, p) >= max(least, model.shell + _BAND):
             continue
-        distance = measure(bodies, posed, first, second, posed.start[first], posed.end[first], contact)
+        distance = measure(model.collision, data.collision, p)
         if distance < least:
             least, closest = distance, p
         # The smooth distance is no smaller.
-        if distance >= wall.shell + _BAND:
+        if distance >= model.shell + _BAND:
             continue
-        if distance > wall.deep[p]:
-            distance = smooth_distance(bodies, posed, first, second, wall.smoothing[p], contact)
-        scratch.near[count] = p
-        scratch.depth[count] = wall.shell - distance
-        distance_row(wall.chain, scratch.placements, pairs, p, contact, scratch.rows[count])
+        if distance > model.deep[p]:
+            distance = measure_smooth(model.collision, data.collision, p, model.smoothing[p])
+        data.near[count] = p
+        data.depth[count] = model.shell - distance
+        distance_row(model.collision, data.collision, p, data.rows[count])
         count += 1
     return count, closest, least
 
 
 @kernel
-def wall_torque(held_wall: Held, held_scratch: Held, count: int) -> float:
+def repulsion_torque(held_model: Held, held_data: Held, count: int) -> float:
     """Add up the torques of the ``count`` pairs found near; returns the energy stored in the wall [J]."""
-    wall, scratch = held_wall.value, held_scratch.value
-    depth, mobility, force = scratch.depth, scratch.mobility, scratch.force
-    _factorise(scratch.M)
+    model, data = held_model.value, held_data.value
+    depth, mobility, force = data.depth, data.mobility, data.force
+    _factorise(data.M)
     total = 0.0
     for i in range(count):
-        mobility[i] = _mobility(scratch.M, scratch.rows[i], scratch.row)
-        total += wall.stiffness * mobility[i] * clamp(1.0 + depth[i] / _BAND, 0.0, 1.0)
-    stiffness = wall.stiffness * min(1.0, _STIFFEST / max(total, _IMMOBILE))
+        mobility[i] = _mobility(data.M, data.rows[i], data.row)
+        total += model.stiffness * mobility[i] * clamp(1.0 + depth[i] / _BAND, 0.0, 1.0)
+    stiffness = model.stiffness * min(1.0, _STIFFEST / max(total, _IMMOBILE))
     total = 0.0
     for i in range(count):
         # c = 2 xi sqrt(k m), thus c / m = 2 xi sqrt(k / m)
         share = clamp(depth[i] / _BAND, 0.0, 1.0)
-        total += share * 2.0 * wall.damping_ratio * np.sqrt(stiffness * mobility[i])
-    damping = 2.0 * wall.damping_ratio * min(1.0, _MOST_DAMPED / max(total, _IMMOBILE))
-    scratch.tau[:] = 0.0
+        total += share * 2.0 * model.damping_ratio * np.sqrt(stiffness * mobility[i])
+    damping = 2.0 * model.damping_ratio * min(1.0, _MOST_DAMPED / max(total, _IMMOBILE))
+    data.tau[:] = 0.0
     energy = 0.0
-    softest = wall.maximum_force / stiffness  # depth from which the force is constant
+    softest = model.maximum_force / stiffness  # depth from which the force is constant
     for i in range(count):
         force[i] = 0.0
         x = depth[i]
         if x <= 0.0 or mobility[i] <= _IMMOBILE:
             continue
         rate = 0.0
-        for j in range(scratch.v.shape[0]):
-            rate += scratch.rows[i, j] * scratch.v[j]
+        for j in range(data.v.shape[0]):
+            rate += data.rows[i, j] * data.v[j]
         elastic = stiffness * min(x, softest)
         damped = damping * np.sqrt(stiffness / mobility[i]) * clamp(x / _BAND, 0.0, 1.0) * rate
-        force[i] = clamp(elastic - damped, 0.0, wall.maximum_force)
+        force[i] = clamp(elastic - damped, 0.0, model.maximum_force)
         energy += elastic * (x - 0.5 * min(x, softest))
-        for j in range(scratch.v.shape[0]):
-            scratch.tau[j] += force[i] * scratch.rows[i, j]
+        for j in range(data.v.shape[0]):
+            data.tau[j] += force[i] * data.rows[i, j]
     return energy
 
 

@@ -17,6 +17,7 @@ from q2r2_control.config.arms import (
     ArmConfig,
     CellModel,
     Colour,
+    Coordinate,
     Extent,
     LocalPath,
     Metres3,
@@ -89,6 +90,7 @@ class Config(CellModel):
         default_factory=dict, description="folders of ROS packages, by name: for package:// and $(find ...)"
     )
     obstacles: dict[str, ObstacleConfig] = Field(default_factory=dict)
+    floor: Coordinate | None = Field(0.0, description="height of the floor, which arms keep off [m]; none: no floor")
     srdf: LocalPath | None = Field(
         None, description="a file of pairs that need no watching, as q2r2 check --pairs writes it"
     )

@@ -10,18 +10,18 @@ import pinocchio as pin
 
 from q2r2_control.config.control import ControllerSettings
 from q2r2_control.control.jit import hold
-from q2r2_control.control.kernel_data import Workspace
-from q2r2_control.control.kernel_model import cell_of
+from q2r2_control.control.kernel_data import KernelData
+from q2r2_control.control.kernel_model import kernel_model_of
 from q2r2_control.control.qp import QpProblem, Solver, make_solver
 from q2r2_control.control.qp_assembly import assemble
+from q2r2_control.control.reference import move_reference, start_reference
 from q2r2_control.control.safety.joint_limits import ACCELERATION, POSITION, VELOCITY
-from q2r2_control.control.safety.safety_filter import FOLLOWED, STOPPED, commit, first_look
-from q2r2_control.control.targets import GoalTracker
+from q2r2_control.control.safety.safety_filter import FOLLOWED, SEPARATION, STOPPED
+from q2r2_control.control.targets import TargetTracker
 from q2r2_control.errors import RobotError
 from q2r2_control.robot.robot import Robot
-from q2r2_control.types import Array, Reference, StepReport, StepStatus
+from q2r2_control.types import LONGEST_DT, Array, Reference, StepReport, StepStatus
 
-LONGEST_DT = 0.1  # [s]; a longer gap between ticks moves the reference no further than this
 _LIMIT_NAMES = {POSITION: "position", VELOCITY: "velocity", ACCELERATION: "acceleration"}
 
 
@@ -33,8 +33,8 @@ class CartesianController:
     a stop; rest under a constant target. The reference is the controller's own state: it follows the targets, not the
     plant's measurement, so that noise never enters it.
 
-    One tick is three calls: :func:`assemble` writes the QP, a solver solves it, :func:`commit` takes of the solution
-    what can be certified and moves the reference.
+    One tick is three calls: :func:`assemble` writes the QP, a solver solves it, :func:`move_reference` takes of the
+    solution what can be certified and moves the reference.
     """
 
     def __init__(
@@ -45,12 +45,14 @@ class CartesianController:
         self._nv = robot.model.nv
         self._arms = tuple(robot.arms)
         self._solver = solver or make_solver(self.settings.solver, self._nv, self.settings.solve_time_limit)
-        cell = cell_of(robot, self.settings)
-        self._work = Workspace.empty(cell)
-        self._goals = GoalTracker(cell, self._arms, self.settings)
-        self._held_cell, self._held_work = hold(cell), hold(self._work)
+        model = kernel_model_of(robot, self.settings)
+        data = KernelData.empty(model)
+        self._safety, self._tasks = data.safety, data.tasks
+        self._targets = TargetTracker(model.tasks, self._arms, self.settings)
+        self._held_model, self._held_data = hold(model), hold(data)
         names = [geometry.name for geometry in robot.collision_model.geometryObjects]
-        pairs = zip(cell.pairs.first.tolist(), cell.pairs.second.tolist(), strict=True)
+        watched = model.safety.collision.pairs
+        pairs = zip(watched.first.tolist(), watched.second.tolist(), strict=True)
         self._pair_names = [(names[first], names[second]) for first, second in pairs]
         self._compile()
         self.reset(robot.home)
@@ -61,15 +63,16 @@ class CartesianController:
         self.step({arm: self.tool_pose(arm) for arm in self._arms}, self.settings.max_substep)
 
     def reset(self, q: Array, v: Array | None = None) -> None:
-        """Start anew at joint positions ``q`` [rad] and velocities ``v`` [rad/s], (nv,) each; goals are forgotten.
+        """Start anew at joint positions ``q`` [rad] and velocities ``v`` [rad/s], (nv,) each; targets are forgotten.
 
         Raises :class:`RobotError` for a wrong shape or a number that is not finite. A start outside the limits or in
         penetration is allowed: the controller recovers from it.
         """
-        self._work.q[:] = self._checked("q", q)
-        self._work.v[:] = 0.0 if v is None else self._checked("v", v)
-        self._goals.reset(self._work.q)
-        self._closest, self._distance, proven = first_look(self._held_cell, self._held_work)
+        state = self._safety.state
+        state.q[:] = self._checked("q", q)
+        state.v[:] = 0.0 if v is None else self._checked("v", v)
+        self._targets.reset(state.q)
+        self._closest, self._distance, proven = start_reference(self._held_model, self._held_data)
         self._apart = self._distance >= self.settings.min_distance
         self._certified = proven and self._apart
 
@@ -91,10 +94,10 @@ class CartesianController:
         """
         usable = isinstance(dt, int | float | np.floating) and math.isfinite(dt) and dt > 0.0
         time = min(float(dt), LONGEST_DT) if usable else 0.0
-        work = self._work
-        self._goals.aim_posture(posture)
-        rejected = self._goals.update(targets, time, work.q, work.v)
-        work.a[:] = 0.0
+        state = self._safety.state
+        self._targets.aim_posture(posture)
+        rejected = self._targets.update(targets, time, state.q, state.v)
+        state.a[:] = 0.0
         summary = _Summary()
         if time > 0.0:
             substeps = max(math.ceil(time / self.settings.max_substep - 1e-9), 1)
@@ -111,32 +114,32 @@ class CartesianController:
             slack=summary.slack,
             solve_time=summary.solve_time,
         )
-        return Reference(work.q.copy(), work.v.copy(), work.a.copy(), report)
+        return Reference(state.q.copy(), state.v.copy(), state.a.copy(), report)
 
     def tool_pose(self, arm: str) -> pin.SE3:
         """World pose of an arm's tool at the reference."""
         i = self._arms.index(arm)
-        return pin.SE3(self._work.rotation[i].copy(), self._work.translation[i].copy())
+        return pin.SE3(self._tasks.rotation[i].copy(), self._tasks.translation[i].copy())
 
     def _advance(self, h: float, share: float, summary: _Summary) -> None:
         """One substep, which is a ``share`` of the tick: build, solve, certify and move."""
-        work = self._work
-        summary.inside &= assemble(self._held_cell, self._goals.held, self._held_work, h)
-        count = int(work.rows.used[0])
+        summary.inside &= assemble(self._held_model, self._targets.held, self._held_data, h)
+        safety, tasks = self._safety, self._tasks
+        count = int(safety.rows.used[0])
         problem = QpProblem(
-            H=work.H,
-            g=work.g,
-            lower=work.box_lower,
-            upper=work.box_upper,
-            rows=work.rows.matrix[:count],
-            rows_lower=work.rows.lower[:count],
+            H=tasks.H,
+            g=tasks.g,
+            lower=safety.box.lower,
+            upper=safety.box.upper,
+            rows=safety.rows.matrix[:count],
+            rows_lower=safety.rows.lower[:count],
         )
         solution = self._solver.solve(problem)
         limit = self.settings.solve_time_limit
         usable = solution.v is not None and (limit is None or solution.solve_time <= limit)
-        wanted = solution.v if usable else work.wanted
-        outcome, self._closest, self._distance, slack = commit(
-            self._held_cell, self._held_work, wanted, usable, h, share
+        wanted = solution.v if usable else safety.wanted
+        outcome, self._closest, self._distance, slack = move_reference(
+            self._held_model, self._held_data, wanted, usable, h, share
         )
         summary.fallback |= outcome != FOLLOWED
         summary.slack = max(summary.slack, slack)
@@ -156,17 +159,17 @@ class CartesianController:
 
     def _binding(self) -> tuple[str, ...]:
         """Names of limits and pairs that held the last step back."""
-        active = self._work.active
+        active = self._safety.active
         found = int(active.used[0])
         if not found:
             return ()
-        return tuple(dict.fromkeys(self._limit_name(code) for code in active.code[:found].tolist()))
+        bounds = zip(active.kind[:found].tolist(), active.subject[:found].tolist(), strict=True)
+        return tuple(dict.fromkeys(self._bound_name(kind, subject) for kind, subject in bounds))
 
-    def _limit_name(self, code: int) -> str:
-        if code < 0:
-            return "|".join(self._pair_names[-1 - code])
-        joint, kind = divmod(code, 4)
-        return f"{self.robot.joint_names[joint]} {_LIMIT_NAMES[kind]}"
+    def _bound_name(self, kind: int, subject: int) -> str:
+        if kind == SEPARATION:
+            return "|".join(self._pair_names[subject])
+        return f"{self.robot.joint_names[subject]} {_LIMIT_NAMES[kind]}"
 
 
 class _Summary:

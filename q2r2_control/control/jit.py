@@ -21,7 +21,7 @@ from numba.core import types
 from numba.experimental import structref
 
 _ROOMS = ("control", "compliance")
-_COMPILED = re.compile(r"^@(lean_)?kernel|\bNamedTuple\b|\bstructref\b", re.MULTILINE)
+_COMPILED = re.compile(r"^@(lean_|inlined_)?kernel|\bNamedTuple\b|\bstructref\b", re.MULTILINE)
 
 
 def compiled_sources() -> list[Path]:
@@ -84,6 +84,14 @@ def lean_kernel(function: Callable[..., Any]) -> Callable[..., Any]:
     Counting references to the twenty arrays of a call takes longer than measuring a pair of capsules.
     """
     return _compiled(function, _nrt=False)
+
+
+def inlined_kernel(function: Callable[..., Any]) -> Callable[..., Any]:
+    """A :func:`lean_kernel` that becomes part of its callers: for a small one that is handed a whole model and data.
+
+    Passing a hundred arrays that it does not read takes longer than its work.
+    """
+    return _compiled(function, _nrt=False, forceinline=True)
 
 
 def _compiled(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:

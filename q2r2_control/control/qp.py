@@ -3,9 +3,10 @@
     minimise    1/2 v' H v + g' v + 1/2 sum_i s_i^2 / rho_i,    rho_i = SOFTNESS a_i' H^-1 a_i,  a_i the i-th row
     subject to  lower <= v <= upper,    rows v + s >= rows_lower,    s >= 0
 
-The box is never empty (limits.py) and the rows are soft, so a solution always exists. Rows have unit norm, so that a
-slack is a joint speed. H^-1 along a row is what the cost yields to it: a row alone gives way by the part SOFTNESS of
-what it corrects, however strong the cost. This is DAQP's own notion of softness; the other solvers are given the same.
+The box is never empty (joint_limits.py) and the rows are soft, so a solution always exists. Rows have unit norm, so
+that a slack is a joint speed. H^-1 along a row is what the cost yields to it: a row alone gives way by the part
+SOFTNESS of what it corrects, however strong the cost. This is DAQP's own notion of softness; the other solvers are
+given the same.
 """
 
 from __future__ import annotations
@@ -41,10 +42,6 @@ class QpProblem:
     def softness(self) -> Array:
         """rho (m,): how far each row gives way per unit of its multiplier."""
         return np.asarray(SOFTNESS * np.sum(self.rows * np.linalg.solve(self.H, self.rows.T).T, axis=1))
-
-    def slack(self, v: Array) -> float:
-        """Largest violation of a row by ``v`` (nv,) [rad/s]."""
-        return float(max(0.0, np.max(self.rows_lower - self.rows @ v))) if len(self.rows_lower) else 0.0
 
 
 @dataclass(slots=True)

@@ -9,8 +9,9 @@ import pinocchio as pin
 
 from q2r2_control.config.control import ControllerSettings
 from q2r2_control.control.jit import Held, hold, kernel, lean_kernel
-from q2r2_control.control.kernel_data import Cell, Goals, Trial
 from q2r2_control.control.tasks.frame import rotation_vector
+from q2r2_control.control.tasks.task_data import PoseScratch, Targets
+from q2r2_control.control.tasks.task_model import TaskModel
 from q2r2_control.types import Array
 
 # Farther than any cell; keeps squares of what is merely far away finite.
@@ -24,29 +25,33 @@ _AT_REST = 1e-2  # [rad/s]
 _NONE, _POSE, _NO_POSE = 0, 1, 2  # what was offered to an arm
 
 
-class GoalTracker:
+class TargetTracker:
     """Keeps the last usable target of each arm and the smoothed twist with which it moves (feed-forward)."""
 
-    def __init__(self, cell: Cell, arms: tuple[str, ...], settings: ControllerSettings) -> None:
-        self._arms, self._home = arms, cell.home
-        teleport = (_TELEPORT * settings.max_linear_speed, _TELEPORT * settings.max_angular_speed)
-        self._goals = Goals.empty(cell, np.array([settings.feed_forward_time, *teleport]))
-        self._pose, self._offered = self._goals.pose, self._goals.offered
-        self.held = hold(self._goals)
+    def __init__(self, model: TaskModel, arms: tuple[str, ...], settings: ControllerSettings) -> None:
+        self._arms, self._home = arms, model.posture.home
+        self._targets = Targets.empty(
+            model,
+            settings.feed_forward_time,
+            _TELEPORT * settings.max_linear_speed,
+            _TELEPORT * settings.max_angular_speed,
+        )
+        self._pose, self._offered = self._targets.pose, self._targets.offered
+        self.held = hold(self._targets)
 
     def reset(self, q: Array) -> None:
         """Forget all targets; every arm holds where it is, ``q`` (nv,) [rad]."""
-        self._goals.latched[:] = 0
-        self._goals.follows[:] = 0
-        self._goals.hold[:] = q
-        self._goals.posture[:] = self._home
+        self._targets.latched[:] = 0
+        self._targets.follows[:] = 0
+        self._targets.hold[:] = q
+        self._targets.posture[:] = self._home
 
     def aim_posture(self, posture: Array | None) -> None:
         """Let the free joints go to ``posture`` (nv,) [rad], home where there is none; a bad one changes nothing."""
         if posture is None:
-            self._goals.posture[:] = self._home
+            self._targets.posture[:] = self._home
         elif posture.shape == self._home.shape and np.isfinite(posture).all():
-            self._goals.posture[:] = posture
+            self._targets.posture[:] = posture
 
     def update(self, targets: Mapping[str, pin.SE3 | None], dt: float, q: Array, v: Array) -> tuple[str, ...]:
         """Take the targets of one tick; returns the names whose target is not usable, unknown names among them."""
@@ -67,71 +72,71 @@ class GoalTracker:
 
 
 @kernel
-def take_targets(held_goals: Held, q: Array, v: Array, dt: float) -> bool:
-    """Make what was offered each arm's goal, or hold it where there is nothing usable; False if something was not.
+def take_targets(held_targets: Held, q: Array, v: Array, dt: float) -> bool:
+    """Make what was offered each arm's target, or hold it where there is nothing usable; False if something was not.
 
-    What is no pose is marked so in ``goals.offered``.
+    What is no pose is marked so in ``targets.offered``.
     """
-    goals = held_goals.value
+    targets = held_targets.value
     all_usable = True
-    for i in range(goals.offered.shape[0]):
-        if goals.offered[i] == _POSE and _take_pose(goals, i, dt):
+    for i in range(targets.offered.shape[0]):
+        if targets.offered[i] == _POSE and _take_pose(targets, i, dt):
             continue
-        if goals.offered[i] == _NONE:
-            if goals.follows[i] == 1:
-                goals.follows[i] = 0
-                goals.latched[i] = 0
+        if targets.offered[i] == _NONE:
+            if targets.follows[i] == 1:
+                targets.follows[i] = 0
+                targets.latched[i] = 0
         else:
-            goals.offered[i] = _NO_POSE
-            goals.feed_forward[i] = 0.0
+            targets.offered[i] = _NO_POSE
+            targets.feed_forward[i] = 0.0
             all_usable = False
-        if goals.follows[i] == 0 and goals.latched[i] == 0:
-            _hold(goals, i, q, v)
+        if targets.follows[i] == 0 and targets.latched[i] == 0:
+            _hold(targets, i, q, v)
     return all_usable
 
 
 @lean_kernel
-def _hold(goals: Goals, i: int, q: Array, v: Array) -> None:
+def _hold(targets: Targets, i: int, q: Array, v: Array) -> None:
     """A moving arm is braked first and holds where it comes to rest, so that it need not come back."""
     speed = 0.0
     for j in range(q.shape[0]):
-        if goals.member[i, j] == 1.0:
-            goals.hold[j] = q[j]
+        if targets.member[i, j] == 1.0:
+            targets.hold[j] = q[j]
             speed = max(speed, abs(v[j]))
     if speed < _AT_REST:
-        goals.latched[i] = 1
+        targets.latched[i] = 1
 
 
 @lean_kernel
-def _take_pose(goals: Goals, i: int, dt: float) -> bool:
-    """Make the offered homogeneous pose the goal of arm ``i``; False, and no change, if it is not a finite pose.
+def _take_pose(targets: Targets, i: int, dt: float) -> bool:
+    """Make the offered homogeneous pose the target of arm ``i``; False, and no change, if it is not a finite pose.
 
-    A goal that moves has its twist smoothed over a time; one that was put elsewhere, faster than any tool, has none.
+    A target that moves has its twist smoothed over a time; one that was put elsewhere, faster than any tool, has none.
     """
-    trial = goals.trial
-    if not _checked_pose(goals.pose[i], trial):
+    scratch = targets.scratch
+    if not _checked_pose(targets.pose[i], scratch):
         return False
-    moved = trial.moved
-    if goals.follows[i] == 1 and dt > 0.0:
+    moved = scratch.moved
+    if targets.follows[i] == 1 and dt > 0.0:
         for k in range(3):
-            moved[k] = (trial.translation[k] - goals.translation[i, k]) / dt
-        _times_transposed(trial.rotation, goals.rotation[i], trial.gram)
+            moved[k] = (scratch.translation[k] - targets.translation[i, k]) / dt
+        _times_transposed(scratch.rotation, targets.rotation[i], scratch.gram)
         turned = moved[3:6]
-        rotation_vector(trial.gram, turned)
+        rotation_vector(scratch.gram, turned)
         for k in range(3):
             turned[k] /= dt
-        put_elsewhere = _size(moved[0:3]) > goals.smoothing[1] or _size(turned) > goals.smoothing[2]
-        share = 1.0 - np.exp(-dt / goals.smoothing[0])
+        put_elsewhere = _size(moved[0:3]) > targets.teleport_speed or _size(turned) > targets.teleport_turn
+        share = 1.0 - np.exp(-dt / targets.feed_forward_time)
         for k in range(6):
             velocity = 0.0 if put_elsewhere else moved[k]
-            goals.feed_forward[i, k] += share * (velocity - goals.feed_forward[i, k])
+            targets.feed_forward[i, k] += share * (velocity - targets.feed_forward[i, k])
     else:
-        goals.feed_forward[i] = 0.0
-    goals.follows[i] = 1
+        targets.feed_forward[i] = 0.0
+    targets.follows[i] = 1
     for row in range(3):
-        goals.translation[i, row] = trial.translation[row]
+        targets.translation[i, row] = scratch.translation[row]
         for column in range(3):
-            goals.rotation[i, row, column] = trial.rotation[row, column]
+            targets.rotation[i, row, column] = scratch.rotation[row, column]
     return True
 
 
@@ -149,9 +154,9 @@ def _times_transposed(A: Array, B: Array, product: Array) -> None:
 
 
 @lean_kernel
-def _checked_pose(pose: Array, trial: Trial) -> bool:
-    """Split a pose (4, 4) into ``trial``, its rotation made orthonormal; False if not finite or no rotation."""
-    rotation, translation, gram = trial.rotation, trial.translation, trial.gram
+def _checked_pose(pose: Array, scratch: PoseScratch) -> bool:
+    """Split a pose (4, 4) into ``scratch``, its rotation made orthonormal; False if not finite or no rotation."""
+    rotation, translation, gram = scratch.rotation, scratch.translation, scratch.gram
     largest = 0.0
     total = 0.0
     for i in range(3):
@@ -181,10 +186,10 @@ def _checked_pose(pose: Array, trial: Trial) -> bool:
     # A Newton step towards the nearest rotation, R - (R R' - I) R / 2 (Higham, Functions of Matrices, 2008, eq. 8.20).
     for i in range(3):
         for j in range(3):
-            trial.correction[i, j] = 0.5 * (
+            scratch.correction[i, j] = 0.5 * (
                 gram[i, 0] * rotation[0, j] + gram[i, 1] * rotation[1, j] + gram[i, 2] * rotation[2, j]
             )
     for i in range(3):
         for j in range(3):
-            rotation[i, j] -= trial.correction[i, j]
+            rotation[i, j] -= scratch.correction[i, j]
     return True

@@ -16,11 +16,9 @@ from q2r2_control.config.cell import Config, MujocoConfig
 from q2r2_control.errors import PlantError
 from q2r2_control.plants.mujoco_meshes import is_readable, load_meshes
 from q2r2_control.plants.scene import COLLISION_GROUP, ENVELOPE_GROUP, VISUAL_GROUP, furnish
+from q2r2_control.robot.model_srdf import ENVELOPE
 from q2r2_control.robot.pairs import link_of, pair_names
 from q2r2_control.robot.robot import Robot
-
-# Collision shapes of this name ending stand for a hand at every finger opening: watched from afar, never touched.
-_ENVELOPE = "_envelope"
 
 # Least viscous friction [Nm s/rad]: it keeps light wrist joints steady and is far below what a controller feels.
 _MIN_DAMPING = 0.2
@@ -55,7 +53,7 @@ def build_model(robot: Robot, config: Config) -> mujoco.MjModel:
         _set_grippers(spec, robot, config)
         _exclude_contacts(spec, robot)
         _add_objects(spec, config.mujoco)
-        furnish(spec)
+        furnish(spec, floor=config.floor is not None)
         return spec.compile()
     except (ValueError, RuntimeError, mujoco.FatalError) as error:
         raise PlantError(f"{robot.name}: MuJoCo cannot make a model of it: {' '.join(str(error).split())}") from error
@@ -123,7 +121,7 @@ def _set_shapes(spec: mujoco.MjSpec, capsules: set[str]) -> None:
                 geom.type = mujoco.mjtGeom.mjGEOM_CAPSULE
             if not geom.contype:
                 geom.group = VISUAL_GROUP
-            elif geom.name.endswith(_ENVELOPE):
+            elif geom.name.endswith(ENVELOPE):
                 geom.group, geom.contype, geom.conaffinity = ENVELOPE_GROUP, 0, 0
             elif drawn:
                 geom.group = COLLISION_GROUP

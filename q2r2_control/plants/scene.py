@@ -1,17 +1,23 @@
-"""What makes the simulated cell pleasant to look at: floor, sky and light. Only the floor can be touched."""
+"""What makes the simulated cell pleasant to look at: floor, sky and light. Only the floor can be touched.
+
+The floor is a plane at the height of the cell's floor. A cell without one (``floor: null``) gets a drawing of one at
+z = 0 that touches nothing, since its arms may reach below.
+"""
 
 from __future__ import annotations
 
 import mujoco
 
+from q2r2_control.robot.compose import FLOOR
+
 # Geom groups: MuJoCo's viewers draw 0 to 2 and leave out the others until asked.
 VISUAL_GROUP, COLLISION_GROUP, ENVELOPE_GROUP = 2, 3, 4
 
 
-def furnish(spec: mujoco.MjSpec) -> None:
-    """Add floor , sky and lights, and set the view that a window opens with."""
+def furnish(spec: mujoco.MjSpec, floor: bool) -> None:
+    """Add sky and lights, make a plane of the cell's ``floor`` if it has one, and set the view of a window."""
     _add_sky(spec)
-    _add_floor(spec)
+    _add_floor(spec, None if not floor else spec.body(FLOOR))
     _add_lights(spec)
     spec.visual.headlight.ambient = (0.25, 0.25, 0.25)
     spec.visual.headlight.diffuse = (0.25, 0.25, 0.25)
@@ -36,7 +42,7 @@ def _add_sky(spec: mujoco.MjSpec) -> None:
     )
 
 
-def _add_floor(spec: mujoco.MjSpec) -> None:
+def _add_floor(spec: mujoco.MjSpec, body: mujoco.MjsBody | None) -> None:
     spec.add_texture(
         name="tiles",
         type=mujoco.mjtTexture.mjTEXTURE_2D,
@@ -50,9 +56,14 @@ def _add_floor(spec: mujoco.MjSpec) -> None:
     )
     material = spec.add_material(name="floor", texrepeat=(1, 1), texuniform=True)
     material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "tiles"
-    spec.worldbody.add_geom(
-        name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=(0, 0, 0.5), material="floor", group=VISUAL_GROUP
+    plane = (body or spec.worldbody).add_geom(
+        name=FLOOR, type=mujoco.mjtGeom.mjGEOM_PLANE, size=(0, 0, 0.5), material="floor", group=VISUAL_GROUP
     )
+    if body is None:
+        plane.contype, plane.conaffinity = 0, 0
+        return
+    for box in body.geoms[:-1]:  # what the URDF has for want of planes
+        spec.delete(box)
 
 
 def _add_lights(spec: mujoco.MjSpec) -> None:

@@ -6,6 +6,7 @@ import xml.etree.ElementTree as ET
 from collections.abc import Callable, Iterable, Sequence
 from itertools import combinations
 
+import coal
 import numpy as np
 import pinocchio as pin
 
@@ -13,6 +14,11 @@ from q2r2_control.config.resources import find_resource
 from q2r2_control.errors import ConfigError, RobotError
 from q2r2_control.robot.description import LinkTree, joint_end, parse_srdf
 from q2r2_control.types import Array
+
+# Links that always stay farther apart than this need no watching: more than twice what is usually kept [m].
+CLEARANCE = 0.05
+
+_UPRIGHT = 1e-9  # sine of the angle to the vertical [-]
 
 
 def link_of(geometry_name: str) -> str:
@@ -89,6 +95,60 @@ def remove_overlapping_own_pairs(
     removed = tuple(pair for pair, touches in zip(names, touching, strict=True) if touches)
     _keep(geometry, lambda a, b: (a, b) not in removed)
     return removed
+
+
+def remove_unreachable_floor_pairs(model: pin.Model, geometry: pin.GeometryModel, floor: str) -> None:
+    """Remove pairs of link ``floor``, a horizontal surface, with bodies that cannot come nearer to it than now.
+
+    Two kinds, both proven: bodies that turn about vertical axes only, as an arm's first link does, and stay as high as
+    they are; and bodies whose distance from the first joint that can tip them is too short to come within
+    :data:`CLEARANCE`.
+    """
+    data = model.createData()
+    pin.computeJointJacobians(model, data, pin.neutral(model))
+    items = {item.name: item for item in geometry.geometryObjects}
+
+    def can_meet(a: str, b: str) -> bool:
+        surface, body = items[a], items[b]
+        if not _is_level_surface(surface, floor):
+            surface, body = body, surface
+        if not _is_level_surface(surface, floor):
+            return True
+        lowest = _lowest(model, data, body)
+        top = surface.placement.translation[2] + surface.geometry.halfSide[2]
+        return lowest is not None and lowest - top <= CLEARANCE
+
+    _keep(geometry, can_meet)
+
+
+def _is_level_surface(item: pin.GeometryObject, link: str) -> bool:
+    fixed_box = isinstance(item.geometry, coal.Box) and item.parentJoint == 0
+    return fixed_box and link_of(item.name) == link and bool(item.placement.rotation[2, 2] > 1.0 - _UPRIGHT)
+
+
+def _lowest(model: pin.Model, data: pin.Data, item: pin.GeometryObject) -> float | None:
+    """Height that no point of a capsule or sphere is ever below [m]; None where no joint raises or lowers it.
+
+    Joints that turn about vertical axes or slide along level ones leave all heights as they are at zero, for which
+    ``data`` has frames and Jacobians. So the first other joint's origin keeps its height, and what hangs on that joint
+    lies in a ball around it.
+    """
+    height, world_axes = None, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+    reach = float(np.linalg.norm(item.placement.translation)) + item.geometry.radius
+    reach += getattr(item.geometry, "halfLength", 0.0)
+    for joint in list(model.supports[item.parentJoint])[1:]:
+        index = model.joints[joint].idx_v
+        twist = pin.getJointJacobian(model, data, joint, world_axes)[:, index]  # of the joint's origin
+        slides = np.linalg.norm(twist[:3]) > 0.5
+        if height is None:
+            if (abs(twist[2]) if slides else np.linalg.norm(twist[3:5])) <= _UPRIGHT:
+                continue
+            height = float(data.oMi[joint].translation[2])
+        else:
+            reach += float(np.linalg.norm(model.jointPlacements[joint].translation))
+        if slides:
+            reach += max(abs(model.lowerPositionLimit[index]), abs(model.upperPositionLimit[index]))
+    return None if height is None else height - reach
 
 
 def pair_names(geometry: pin.GeometryModel) -> tuple[tuple[str, str], ...]:

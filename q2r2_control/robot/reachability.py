@@ -7,8 +7,9 @@ distance that the controller keeps.
 
 from __future__ import annotations
 
+import textwrap
 import xml.etree.ElementTree as ET
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,6 +20,9 @@ from q2r2_control.errors import RobotError
 from q2r2_control.robot.pairs import link_of, pair_names
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
+
+# Told how far a search has got: what it does, how much of it is done, how much there is.
+Progress = Callable[[str, int, int], None]
 
 _STARTS = 8  # nearest samples of each pair that are followed downhill
 _STEPS = 30
@@ -33,41 +37,56 @@ class PairReach:
     nearest: float  # least distance found [m]
 
 
-def nearest_approaches(robot: Robot, samples: int, seed: int) -> list[PairReach]:
+def nearest_approaches(robot: Robot, samples: int, seed: int, progress: Progress | None = None) -> list[PairReach]:
     """Least distance found of every monitored pair of links, nearest first; ``samples`` postures are looked at.
 
-    Raises :class:`RobotError` for fewer than 100 samples.
+    ``progress`` is called often. Raises :class:`RobotError` for fewer than 100 samples.
     """
     if samples < 100:
         raise RobotError(f"samples = {samples}: allowed: 100 or more")
     search = _Search(robot, np.random.default_rng(seed))
     postures = search.random.uniform(robot.position_lower, robot.position_upper, (samples, robot.model.nv))
-    distances = np.array([search.all_distances(q) for q in postures]).reshape(samples, -1)
+    names = pair_names(robot.collision_model)
+    distances = np.zeros((samples, len(names)))
+    for i, q in enumerate(postures):
+        distances[i] = search.all_distances(q)
+        if progress is not None:
+            progress("random postures", i + 1, samples)
     nearest: dict[tuple[str, str], float] = {}
-    for p, (a, b) in enumerate(pair_names(robot.collision_model)):
+    for p, (a, b) in enumerate(names):
         starts = np.argsort(distances[:, p])[:_STARTS]
         least = float(distances[starts[0], p])
         if least > 0.0:
             least = min(search.downhill(p, postures[i]) for i in starts)
         links = (link_of(a), link_of(b))
         nearest[links] = min(nearest.get(links, np.inf), least)
+        if progress is not None:
+            progress("pairs followed downhill", p + 1, len(names))
     return sorted((PairReach(a, b, d) for (a, b), d in nearest.items()), key=lambda pair: pair.nearest)
 
 
 def srdf_of(robot: Robot, approaches: Sequence[PairReach], clearance: float, samples: int) -> str:
     """SRDF text that disables links which never come nearer than ``clearance`` [m], or overlap by construction."""
-    root = ET.Element("robot", name=robot.name)
-    root.append(
-        ET.Comment(
-            f" Found by looking at {samples} random postures inside the joint limits and going downhill from the "
-            f"nearest ones: these links stay more than {1e3 * clearance:g} mm apart, or overlap by construction. "
-        )
+    comment = (
+        f"Found by looking at {samples} random postures inside the joint limits and going downhill from the "
+        f"nearest ones: these links stay more than {1e3 * clearance:g} mm apart, or overlap by construction."
     )
-    for a, b in dict.fromkeys((link_of(a), link_of(b)) for a, b in robot.ignored_pairs):
-        ET.SubElement(root, "disable_collisions", link1=a, link2=b, reason="Default")
-    for pair in approaches:
-        if pair.nearest > clearance:
-            ET.SubElement(root, "disable_collisions", link1=pair.link_a, link2=pair.link_b, reason="Never")
+    overlapping = dict.fromkeys((link_of(a), link_of(b)) for a, b in robot.ignored_pairs)
+    never = ((pair.link_a, pair.link_b) for pair in approaches if pair.nearest > clearance)
+    return srdf_text(
+        robot.name, comment, [*((a, b, "Always") for a, b in overlapping), *((a, b, "Never") for a, b in never)]
+    )
+
+
+def srdf_text(name: str, comment: str, pairs: Iterable[tuple[str, str, str]], links: Iterable[str] = ()) -> str:
+    """SRDF text that disables ``links``, and ``pairs`` of links with the reason, in MoveIt's words."""
+    root = ET.Element("robot", name=name)
+    lines = textwrap.wrap(comment, 112)
+    root.append(ET.Comment("\n    " + "\n    ".join(lines) + "\n  "))
+    for link in links:
+        ET.SubElement(root, "disable_default_collisions", link=link)
+    for a, b, reason in pairs:
+        ET.SubElement(root, "disable_collisions", link1=a, link2=b, reason=reason)
     ET.indent(root)
     return '<?xml version="1.0"?>\n' + ET.tostring(root, encoding="unicode") + "\n"
 

@@ -53,7 +53,7 @@ def fixed_joint(name: str, parent: str, child: str, pose: PoseConfig) -> ET.Elem
     joint = ET.Element("joint", name=name, type="fixed")
     ET.SubElement(joint, "parent", link=parent)
     ET.SubElement(joint, "child", link=child)
-    ET.SubElement(joint, "origin", xyz=_numbers(pose.position), rpy=_numbers(pose.rpy))
+    ET.SubElement(joint, "origin", xyz=numbers(pose.position), rpy=numbers(pose.rpy))
     return joint
 
 
@@ -65,7 +65,7 @@ def obstacle_link(name: str, config: ObstacleConfig) -> ET.Element:
         shape.append(_shape(config))
         if tag == "visual":
             material = ET.SubElement(shape, "material", name=f"{name}_colour")
-            ET.SubElement(material, "color", rgba=_numbers(config.colour))
+            ET.SubElement(material, "color", rgba=numbers(config.colour))
     if config.shape == "capsule":
         checking = ET.SubElement(link, "collision_checking")
         ET.SubElement(checking, "capsule", name=f"{name}_collision")
@@ -75,14 +75,14 @@ def obstacle_link(name: str, config: ObstacleConfig) -> ET.Element:
 def _shape(config: ObstacleConfig) -> ET.Element:
     geometry = ET.Element("geometry")
     if config.shape == "box":
-        ET.SubElement(geometry, "box", size=_numbers(config.size))
+        ET.SubElement(geometry, "box", size=numbers(config.size))
     elif config.shape == "sphere":
-        ET.SubElement(geometry, "sphere", radius=_numbers(config.size))
+        ET.SubElement(geometry, "sphere", radius=numbers(config.size))
     else:
         radius, length = config.size
-        ET.SubElement(geometry, "cylinder", radius=_numbers([radius]), length=_numbers([length]))
+        ET.SubElement(geometry, "cylinder", radius=numbers([radius]), length=numbers([length]))
     return geometry
 
 
-def _numbers(values: Sequence[float]) -> str:
+def numbers(values: Sequence[float]) -> str:
     return " ".join(repr(float(value)) for value in values)

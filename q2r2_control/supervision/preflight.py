@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from q2r2_control.config.control import ControllerSettings
 from q2r2_control.control.controller import CartesianController
-from q2r2_control.robot.robot import Robot
+from q2r2_control.robot.compose import FLOOR
+from q2r2_control.robot.pairs import link_of
+from q2r2_control.robot.robot import PairDistance, Robot
 from q2r2_control.types import Array
 
 
@@ -36,10 +38,16 @@ def _outside_limits(robot: Robot, home: Array, margin: float) -> list[str]:
 def _closer_than_allowed(robot: Robot, home: Array, min_distance: float) -> list[str]:
     return [
         f"home: {pair.name_a} and {pair.name_b} are {1e3 * pair.distance:.1f} mm apart; "
-        f"allowed: at least min_distance, {1e3 * min_distance:.1f} mm"
+        f"allowed: at least min_distance, {1e3 * min_distance:.1f} mm{_way_out(pair)}"
         for pair in sorted(robot.distances(home), key=lambda pair: pair.distance)
         if pair.distance < min_distance
     ]
+
+
+def _way_out(pair: PairDistance) -> str:
+    """What the cell's YAML says about a floor that is not where it was meant to be, or was not meant at all."""
+    with_floor = FLOOR in (link_of(pair.name_a), link_of(pair.name_b))
+    return "; the key floor takes another height, or null for no floor" if with_floor else ""
 
 
 def _without_certificate(controller: CartesianController) -> list[str]:

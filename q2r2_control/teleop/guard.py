@@ -8,10 +8,8 @@ import numpy as np
 import pinocchio as pin
 
 from q2r2_control.config.teleop import GuardSettings
-from q2r2_control.types import Array
+from q2r2_control.types import LONGEST_DT, Array
 
-# A step that is longer moves the target no farther: a loop that stalled has nothing to make up for [s].
-_LONGEST_DT = 0.1
 _REST = 1e-9  # slower than this is at rest [m/s, rad/s]
 
 
@@ -55,7 +53,7 @@ class TargetGuard:
 
         None before the first :meth:`reset`. A time that does not advance returns the same pose again.
         """
-        dt = min(now - self._now, _LONGEST_DT)
+        dt = min(now - self._now, LONGEST_DT)
         if self.pose is None or not dt > 0.0:
             return self.pose
         self._now = now

@@ -16,9 +16,8 @@ import numpy.typing as npt
 
 from q2r2_control.config.control import ControllerSettings
 from q2r2_control.robot.robot import Robot
-from q2r2_control.types import Array, Reference
+from q2r2_control.types import LONGEST_DT, Array, Reference
 
-LONGEST_DT = 0.1  # [s]
 _NEWEST = 5000  # ticks whose accelerations are kept
 _ROUNDING = 4.0 * np.finfo(np.float64).eps  # of a difference, relative to the numbers
 _RELATIVE = 1e-9  # to which the contract promises limits

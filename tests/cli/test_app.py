@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import signal
 import subprocess
 import sys
@@ -136,6 +137,10 @@ def test_the_help_lists_every_command(command: str) -> None:
         pytest.param(("headset-check", "--host", "no such host"), "no such host", id="a host that cannot be bound"),
         pytest.param(("headset-check", "--duration", "inf"), "--duration inf", id="a check without end"),
         pytest.param(("check", "pyproject.toml"), "pyproject.toml", id="a file that is no cell"),
+        pytest.param(
+            ("check", CELL, "--pairs", "a.srdf", "--model-pairs", "."), "exclude each other", id="two kinds of pairs"
+        ),
+        pytest.param(("check", CELL, "--model-pairs", "nowhere"), "nowhere: no such folder", id="no folder"),
         pytest.param(("bench", "--ticks", "0"), "--ticks", id="a benchmark of nothing"),
         pytest.param(("bench", "--seed", "3"), "--seed", id="a seed of what draws nothing"),
         pytest.param(("bench", "--soak", "--ros"), "exclude each other", id="two kinds of benchmark"),
@@ -220,6 +225,8 @@ def test_check_as_json_has_limits_and_distances_in_order() -> None:
     [
         pytest.param("home: [0.0204, 0.348,", "home: [0.0204, 1.0,", "left_hand_e_envelope_1 and table_0", id="table"),
         pytest.param("0.0204, 0.348,", "0.0204, 2.09,", "left_A2 = 2.09; allowed: -2.0844 .. 2.0844", id="limits"),
+        pytest.param("floor: 0.0 ", "floor: 0.35 ", "left_hand_e_envelope_1 and floor_0 are", id="floor"),
+        pytest.param("[0.0, 0.4, 0.0]", "[0.0, 0.4, -0.6]", "left_hand_e_envelope_1 and floor_0 are", id="a low mount"),
     ],
 )
 def test_check_lists_what_is_wrong_at_home_and_exits_with_1(tmp_path: Path, old: str, new: str, fault: str) -> None:
@@ -230,6 +237,37 @@ def test_check_lists_what_is_wrong_at_home_and_exits_with_1(tmp_path: Path, old:
     result = q2r2("check", file, "--json")
     assert result.exit_code == 1
     assert any(fault in line for line in one_object(result.stdout)["faults"])
+
+
+def test_check_says_how_to_do_without_the_floor_that_is_in_the_way(tmp_path: Path) -> None:
+    low = changed_cell(tmp_path, "[0.0, 0.4, 0.0]", "[0.0, 0.4, -0.6]")
+    lines = [line for line in q2r2("check", low).stdout.splitlines() if line.startswith("FAULT") and "floor_0" in line]
+    assert lines
+    assert all(line.endswith("; the key floor takes another height, or null for no floor") for line in lines)
+    text = Path(low).read_text(encoding="utf-8").replace("floor: 0.0 ", "floor: null ")
+    Path(low).write_text(text.replace("position: [0.75, 0.0, 0.1]", "position: [0.75, 0.0, -0.6]"), encoding="utf-8")
+    result = q2r2("check", low)
+    assert (result.exit_code, "floor" in result.stdout) == (0, False)
+
+
+def test_check_notes_where_a_stop_asks_for_more_torque_than_there_is_and_that_is_no_fault() -> None:
+    result = q2r2("check", CELL)
+    notes = [line for line in result.stdout.splitlines() if line.startswith("NOTE ")]
+    assert [note.split()[1] for note in notes] == ["left", "right"]
+    assert all(
+        re.search(r"_A2 is asked for up to 1\.\d\d times its torque limit, at .* rad\. In 9\.", n) for n in notes
+    )
+    assert result.exit_code == 0
+    cell = one_object(q2r2("check", CELL, "--json").stdout)
+    assert [f"NOTE {note}" for note in cell["notes"]] == notes
+    assert cell["stop_torques"][0]["acceleration"] == 10.0
+    assert "NOTE" not in q2r2("check", "config/dual_iiwa14.yaml").stdout
+
+
+def test_check_lists_the_floor_with_the_obstacles(tmp_path: Path) -> None:
+    file = changed_cell(tmp_path, "floor: 0.0 ", "floor: -0.125 ")
+    assert re.search(r"floor +│ plane +│ +│ 0 0 -0\.125", q2r2("check", file).stdout)
+    assert one_object(q2r2("check", file, "--json").stdout)["floor"] == -0.125
 
 
 @pytest.mark.parametrize("command", ["check", "run", "headset-check"])

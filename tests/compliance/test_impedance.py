@@ -12,13 +12,13 @@ from pydantic import ValidationError
 
 from q2r2_control.compliance.impedance import ImpedanceController
 from q2r2_control.compliance.impedance_terms import (
+    PositionLimits,
     bound_torque,
     clip_error,
     consistent_projector,
     double_diagonalised_damping,
     kinematic_projector,
     limit_repulsion,
-    pose_error,
     task_inertia,
 )
 from q2r2_control.config import load_config
@@ -26,6 +26,7 @@ from q2r2_control.config.control import ImpedanceSettings
 from q2r2_control.errors import ConfigError, RobotError
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, RobotState
+from tests.support.poses import pose_error
 from tests.support.torque_loop import reference
 
 DT = 0.001
@@ -64,20 +65,7 @@ def positive_definite(random: np.random.Generator, n: int) -> Array:
     return matrix
 
 
-class TestPoseError:
-    def test_it_is_the_velocity_that_reaches_the_goal_in_a_second_in_world_axes(self) -> None:
-        random = np.random.default_rng(1)
-        for _ in range(50):
-            pose, shift, turn = pin.SE3.Random(), random.normal(size=3), random.uniform(-1.8, 1.8, size=3)
-            goal = pin.SE3(pin.exp3(turn) @ pose.rotation, pose.translation + shift)
-            np.testing.assert_allclose(pose_error(goal, pose), np.concatenate([shift, turn]), atol=1e-9)
-
-    @pytest.mark.parametrize("axis", [0, 1, 2])
-    @pytest.mark.parametrize("angle", [np.pi - 1e-9, np.pi])
-    def test_half_a_turn_is_half_a_turn(self, axis: int, angle: float) -> None:
-        goal = pin.SE3(pin.exp3(angle * np.eye(3)[axis]), np.zeros(3))
-        assert np.linalg.norm(pose_error(goal, pin.SE3.Identity())[3:]) == pytest.approx(np.pi, abs=1e-6)
-
+class TestClipping:
     @pytest.mark.parametrize(
         ("error", "expected"),
         [
@@ -178,12 +166,10 @@ class TestNullspace:
 
 
 class TestLimitRepulsion:
-    LOWER, UPPER = np.full(3, -1.0), np.full(3, 1.0)
+    LIMITS = PositionLimits(np.full(3, -1.0), np.full(3, 1.0), stiffness=300.0, damping=20.0, distance=0.1)
 
     def torque(self, q: float, v: float = 0.0, wanted: float = 0.0) -> float:
-        torques = limit_repulsion(
-            np.full(3, q), np.full(3, v), np.full(3, wanted), self.LOWER, self.UPPER, 300.0, 20.0, 0.1
-        )
+        torques = limit_repulsion(self.LIMITS, np.full(3, q), np.full(3, v), np.full(3, wanted))
         assert np.ptp(torques) == 0
         return float(torques[0])
 

@@ -7,11 +7,11 @@ import pinocchio as pin
 import pytest
 
 from q2r2_control.compliance.impedance import ImpedanceController
-from q2r2_control.compliance.impedance_terms import pose_error
 from q2r2_control.config import load_config
 from q2r2_control.config.control import ImpedanceSettings
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, RobotState
+from tests.support.poses import pose_error
 from tests.support.torque_loop import reference
 
 ROBOT = Robot.from_config(load_config("config/dual_iiwa7.yaml"))

@@ -205,7 +205,7 @@ HOLD, HOLD_DAMPING = 2000.0, 60.0  # of the right arm's joints [Nm/rad, Nm s/rad
 def _pushed(force: float, friction: float, dt: float, separation: MeasuredSeparation) -> Iterator[_Seen]:
     """The left hand, 60 mm from the right one, is pushed at it for 1.5 s and released for 1.5 s."""
     q = ROBOT.home.copy()
-    while separation.update(q, REST).closest_distance > 0.06:
+    while min(pair.distance for pair in ROBOT.distances(q) if _of_two_arms((pair.name_a, pair.name_b))) > 0.06:
         q += 0.005 * np.array([-1, *[0] * 6, 1, *[0] * 6])
     plant, data, held = MujocoPlant(ROBOT, load_config("config/dual_iiwa7.yaml")), ROBOT.model.createData(), q[7:]
     plant.reset(q)

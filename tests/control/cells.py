@@ -8,19 +8,19 @@ from typing import NamedTuple
 import numpy as np
 
 from q2r2_control.config import Config, load_config
+from q2r2_control.config.control import ControllerSettings
 from q2r2_control.control.geometry.collision import (
     Bodies,
-    Contact,
+    CollisionData,
+    CollisionModel,
     Pairs,
-    Posed,
-    at_least,
-    bodies_of,
-    measure,
-    pairs_of,
-    pose_bodies,
+    collision_model_of,
+    update_placements,
 )
-from q2r2_control.control.geometry.kinematics import Chain, Placements, chain_of, place
+from q2r2_control.control.geometry.pair_distance import at_least, measure
 from q2r2_control.control.jit import kernel
+from q2r2_control.control.kernel_data import KernelData
+from q2r2_control.control.kernel_model import KernelModel, kernel_model_of
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 
@@ -28,12 +28,18 @@ NAMES = ("dual_iiwa7", "dual_iiwa14", "dual_panda")
 
 
 class CellArrays(NamedTuple):
-    """A robot and the arrays that the kernels read of it."""
+    """A robot and the arrays that the collision kernels read of it."""
 
     robot: Robot
-    chain: Chain
-    bodies: Bodies
-    pairs: Pairs
+    collision: CollisionModel
+
+    @property
+    def bodies(self) -> Bodies:
+        return self.collision.bodies
+
+    @property
+    def pairs(self) -> Pairs:
+        return self.collision.pairs
 
 
 @cache
@@ -44,9 +50,22 @@ def cell(name: str) -> CellArrays:
 
 
 def arrays_of(robot: Robot) -> CellArrays:
-    chain, bodies = chain_of(robot.model), bodies_of(robot.collision_model)
-    travel = np.maximum(np.abs(robot.position_lower), np.abs(robot.position_upper))
-    return CellArrays(robot, chain, bodies, pairs_of(robot.collision_model, chain, bodies, travel))
+    return CellArrays(robot, collision_model_of(robot))
+
+
+@cache
+def kernel_model(name: str) -> KernelModel:
+    """What the controller's kernels know of one of ``NAMES``, with the default settings."""
+    return kernel_model_of(cell(name).robot, ControllerSettings())
+
+
+def kernel_data(name: str, q: Array, v: Array | None = None) -> KernelData:
+    """The controller's data with bodies and joints placed at ``q`` (nv,), nothing else computed."""
+    data = KernelData.empty(kernel_model(name))
+    data.safety.state.q[:] = q
+    data.safety.state.v[:] = 0.0 if v is None else v
+    update_placements(kernel_model(name).safety.collision, data.safety.collision, data.safety.state.q)
+    return data
 
 
 def _pandas() -> Config:
@@ -67,12 +86,11 @@ def random_posture(robot: Robot, random: np.random.Generator) -> Array:
     return random.uniform(robot.position_lower, robot.position_upper)
 
 
-def placed(cell: CellArrays, q: Array) -> tuple[Placements, Posed]:
+def placed(cell: CellArrays, q: Array) -> CollisionData:
     """Joint frames and geometries in the world at ``q`` (nv,)."""
-    placements, posed = Placements.empty(cell.chain), Posed.empty(cell.bodies)
-    place(cell.chain, q, placements)
-    pose_bodies(cell.bodies, placements, posed)
-    return placements, posed
+    data = CollisionData.empty(cell.collision)
+    update_placements(cell.collision, data, q)
+    return data
 
 
 def distances(cell: CellArrays, motion: Array, exact_below: float = np.inf) -> Array:
@@ -81,28 +99,15 @@ def distances(cell: CellArrays, motion: Array, exact_below: float = np.inf) -> A
     Pairs that are clearly farther apart than ``exact_below`` get a lower bound instead, which saves most of the time.
     """
     out = np.zeros((len(motion), len(cell.pairs.first)))
-    placements, posed = Placements.empty(cell.chain), Posed.empty(cell.bodies)
-    _measure_all(cell.chain, cell.bodies, cell.pairs, motion, exact_below, placements, posed, Contact.empty(), out)
+    _measure_all(cell.collision, CollisionData.empty(cell.collision), motion, exact_below, out)
     return out
 
 
 @kernel
-def _measure_all(
-    chain: Chain,
-    bodies: Bodies,
-    pairs: Pairs,
-    motion: Array,
-    exact_below: float,
-    placements: Placements,
-    posed: Posed,
-    contact: Contact,
-    out: Array,
-) -> None:
+def _measure_all(model: CollisionModel, data: CollisionData, motion: Array, exact_below: float, out: Array) -> None:
     for i in range(motion.shape[0]):
-        place(chain, motion[i], placements)
-        pose_bodies(bodies, placements, posed)
-        for p in range(pairs.first.shape[0]):
-            first, second = pairs.first[p], pairs.second[p]
-            out[i, p] = at_least(bodies, posed, first, second)
+        update_placements(model, data, motion[i])
+        for p in range(model.pairs.first.shape[0]):
+            out[i, p] = at_least(model, data, p)
             if out[i, p] < exact_below:
-                out[i, p] = measure(bodies, posed, first, second, posed.start[first], posed.end[first], contact)
+                out[i, p] = measure(model, data, p)

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache
 from typing import Any
 
 import numpy as np
@@ -9,31 +8,25 @@ import pinocchio as pin
 import pytest
 
 from q2r2_control.config.control import ControllerSettings
-from q2r2_control.control.kernel_data import Goals
-from q2r2_control.control.kernel_model import cell_of
-from q2r2_control.control.targets import GoalTracker
+from q2r2_control.control.targets import TargetTracker
+from q2r2_control.control.tasks.task_data import Targets
 from q2r2_control.types import Array
-from tests.control.cells import cell
+from tests.control.cells import kernel_model
 
 ARMS = ("left", "right")
 STILL = np.zeros(14)
 SETTINGS = ControllerSettings(feed_forward_time=0.02)
 
 
-@cache
-def _cell() -> Any:
-    return cell_of(cell("dual_iiwa7").robot, SETTINGS)
-
-
 @pytest.fixture
-def tracker() -> GoalTracker:
-    made = GoalTracker(_cell(), ARMS, SETTINGS)
+def tracker() -> TargetTracker:
+    made = TargetTracker(kernel_model("dual_iiwa7").tasks, ARMS, SETTINGS)
     made.reset(STILL)
     return made
 
 
-def _goals(tracker: GoalTracker) -> Goals:
-    return tracker._goals  # kernels read them through ``held``, Python code need not
+def _taken(tracker: TargetTracker) -> Targets:
+    return tracker._targets  # kernels read them through ``held``, Python code need not
 
 
 def _pose(rotation: Array | None = None, translation: Array | None = None) -> pin.SE3:
@@ -71,39 +64,41 @@ UNUSABLE: dict[str, Callable[[], Any]] = {
 
 
 @pytest.mark.parametrize("bad", UNUSABLE.values(), ids=UNUSABLE.keys())
-def test_a_target_that_is_no_pose_is_named_and_the_last_one_stays(tracker: GoalTracker, bad: Callable[[], Any]) -> None:
+def test_a_target_that_is_no_pose_is_named_and_the_last_one_stays(
+    tracker: TargetTracker, bad: Callable[[], Any]
+) -> None:
     good = _pose(pin.exp3(np.array([0.1, 0.2, 0.3])))
     assert tracker.update({"left": good, "right": good}, 0.001, STILL, STILL) == ()
     assert tracker.update({"left": bad(), "right": good}, 0.001, STILL, STILL) == ("left",)
-    goals = _goals(tracker)
-    np.testing.assert_allclose(goals.rotation[0], good.rotation, atol=1e-12)
-    np.testing.assert_array_equal(goals.translation[0], good.translation)
-    np.testing.assert_array_equal(goals.follows, [1, 1])
-    assert np.isfinite(goals.feed_forward).all()
+    taken = _taken(tracker)
+    np.testing.assert_allclose(taken.rotation[0], good.rotation, atol=1e-12)
+    np.testing.assert_array_equal(taken.translation[0], good.translation)
+    np.testing.assert_array_equal(taken.follows, [1, 1])
+    assert np.isfinite(taken.feed_forward).all()
 
 
 @pytest.mark.parametrize("bad", UNUSABLE.values(), ids=UNUSABLE.keys())
-def test_an_arm_that_never_had_a_usable_target_holds(tracker: GoalTracker, bad: Callable[[], Any]) -> None:
+def test_an_arm_that_never_had_a_usable_target_holds(tracker: TargetTracker, bad: Callable[[], Any]) -> None:
     assert tracker.update({"right": bad()}, 0.001, STILL, STILL) == ("right",)
-    assert _goals(tracker).follows.tolist() == [0, 0]
+    assert _taken(tracker).follows.tolist() == [0, 0]
 
 
-def test_a_target_of_an_arm_that_is_not_there_is_named(tracker: GoalTracker) -> None:
+def test_a_target_of_an_arm_that_is_not_there_is_named(tracker: TargetTracker) -> None:
     assert tracker.update({"left": _pose(), "third": _pose()}, 0.001, STILL, STILL) == ("third",)
 
 
 @pytest.mark.parametrize("far", [150.0, 1e10, 1e150, 1e307], ids="{:g} m".format)
-def test_a_target_beyond_any_cell_keeps_its_direction_but_not_its_distance(tracker: GoalTracker, far: float) -> None:
+def test_a_target_beyond_any_cell_keeps_its_direction_but_not_its_distance(tracker: TargetTracker, far: float) -> None:
     assert tracker.update({"left": _pose(None, far * np.array([1.0, -0.5, 0.25]))}, 0.001, STILL, STILL) == ()
-    np.testing.assert_allclose(_goals(tracker).translation[0], [100.0, -50.0, 25.0])
+    np.testing.assert_allclose(_taken(tracker).translation[0], [100.0, -50.0, 25.0])
 
 
-def test_a_slightly_skewed_rotation_is_straightened(tracker: GoalTracker) -> None:
+def test_a_slightly_skewed_rotation_is_straightened(tracker: TargetTracker) -> None:
     random = np.random.default_rng(36)
     for _ in range(20):
         R = pin.exp3(random.normal(size=3))
         tracker.update({"left": _pose(R + random.uniform(-1e-4, 1e-4, (3, 3)))}, 0.001, STILL, STILL)
-        taken = _goals(tracker).rotation[0]
+        taken = _taken(tracker).rotation[0]
         np.testing.assert_allclose(taken @ taken.T, np.eye(3), atol=1e-6)
         np.testing.assert_allclose(taken, R, atol=1e-3)
 
@@ -113,22 +108,22 @@ def _moved(start: pin.SE3, twist: Array, t: float) -> pin.SE3:
 
 
 @pytest.mark.parametrize("dt", [0.0005, 0.001, 0.002, 0.005, 0.01, 0.1], ids="dt {} s".format)
-def test_the_feed_forward_of_a_moving_target_becomes_its_twist(tracker: GoalTracker, dt: float) -> None:
+def test_the_feed_forward_of_a_moving_target_becomes_its_twist(tracker: TargetTracker, dt: float) -> None:
     twist = np.array([0.2, -0.1, 0.05, 0.5, -0.3, 0.8])
     start = _pose(pin.exp3(np.array([1.0, -0.5, 0.2])))
     for tick in range(1 + int(np.ceil(0.5 / dt))):
         tracker.update({"left": _moved(start, twist, tick * dt)}, dt, STILL, STILL)
-    np.testing.assert_allclose(_goals(tracker).feed_forward[0], twist, atol=1e-6)
-    np.testing.assert_array_equal(_goals(tracker).feed_forward[1], 0.0)
+    np.testing.assert_allclose(_taken(tracker).feed_forward[0], twist, atol=1e-6)
+    np.testing.assert_array_equal(_taken(tracker).feed_forward[1], 0.0)
 
 
-def test_the_feed_forward_rises_with_the_same_time_constant_for_every_dt(tracker: GoalTracker) -> None:
+def test_the_feed_forward_rises_with_the_same_time_constant_for_every_dt(tracker: TargetTracker) -> None:
     twist = np.array([0.2, 0.0, 0.0, 0.0, 0.0, 0.0])
     for dt in (0.0005, 0.001, 0.002, 0.005):
         tracker.reset(STILL)
         for tick in range(1 + round(0.02 / dt)):
             tracker.update({"left": _moved(_pose(), twist, tick * dt)}, dt, STILL, STILL)
-        assert _goals(tracker).feed_forward[0, 0] == pytest.approx(0.2 * (1.0 - np.exp(-1.0)), rel=1e-9)
+        assert _taken(tracker).feed_forward[0, 0] == pytest.approx(0.2 * (1.0 - np.exp(-1.0)), rel=1e-9)
 
 
 TELEPORTS = {
@@ -139,46 +134,46 @@ TELEPORTS = {
 
 
 @pytest.mark.parametrize("elsewhere", TELEPORTS.values(), ids=TELEPORTS.keys())
-def test_a_target_that_is_put_elsewhere_has_no_velocity(tracker: GoalTracker, elsewhere: pin.SE3) -> None:
+def test_a_target_that_is_put_elsewhere_has_no_velocity(tracker: TargetTracker, elsewhere: pin.SE3) -> None:
     for pose in (_pose(), elsewhere, elsewhere):
         tracker.update({"left": pose}, 0.001, STILL, STILL)
-        np.testing.assert_array_equal(_goals(tracker).feed_forward[0], 0.0)
+        np.testing.assert_array_equal(_taken(tracker).feed_forward[0], 0.0)
 
 
-def test_the_first_target_after_a_hold_or_a_reset_has_no_velocity(tracker: GoalTracker) -> None:
+def test_the_first_target_after_a_hold_or_a_reset_has_no_velocity(tracker: TargetTracker) -> None:
     nearby = _pose(None, np.array([0.5005, 0.0, 0.4]))
     for forget in (lambda: tracker.update({}, 0.001, STILL, STILL), lambda: tracker.reset(STILL)):
         tracker.update({"left": _pose()}, 0.001, STILL, STILL)
         forget()
         tracker.update({"left": nearby}, 0.001, STILL, STILL)
-        np.testing.assert_array_equal(_goals(tracker).feed_forward[0], 0.0)
+        np.testing.assert_array_equal(_taken(tracker).feed_forward[0], 0.0)
 
 
 @pytest.mark.parametrize("dt", [0.0, -0.001], ids=["no time", "time backwards"])
-def test_without_time_passing_a_target_has_no_velocity(tracker: GoalTracker, dt: float) -> None:
+def test_without_time_passing_a_target_has_no_velocity(tracker: TargetTracker, dt: float) -> None:
     for x in (0.5, 0.6):
         assert tracker.update({"left": _pose(None, np.array([x, 0.0, 0.4]))}, dt, STILL, STILL) == ()
-        assert np.isfinite(_goals(tracker).feed_forward).all()
-    np.testing.assert_array_equal(_goals(tracker).feed_forward[0], 0.0)
+        assert np.isfinite(_taken(tracker).feed_forward).all()
+    np.testing.assert_array_equal(_taken(tracker).feed_forward[0], 0.0)
 
 
 @pytest.mark.parametrize("absent", [{}, {"left": None}], ids=["missing", "None"])
-def test_a_released_arm_brakes_and_holds_where_it_comes_to_rest(tracker: GoalTracker, absent: dict[str, Any]) -> None:
+def test_a_released_arm_brakes_and_holds_where_it_comes_to_rest(tracker: TargetTracker, absent: dict[str, Any]) -> None:
     tracker.update({"left": _pose(), "right": _pose()}, 0.001, STILL, STILL)
     left = np.arange(14) < 7
     q = STILL.copy()
     for speed in (1.0, 0.5, 0.1, 0.0):
         q = q + 0.1
         tracker.update({"right": _pose()} | absent, 0.001, q, np.where(left, speed, 1.0))
-        np.testing.assert_allclose(_goals(tracker).hold[left], q[left])
-    assert _goals(tracker).follows.tolist() == [0, 1]
+        np.testing.assert_allclose(_taken(tracker).hold[left], q[left])
+    assert _taken(tracker).follows.tolist() == [0, 1]
     for push in (0.01, 0.02):
         tracker.update({"right": _pose()} | absent, 0.001, q + push, STILL)
-        np.testing.assert_allclose(_goals(tracker).hold[left], q[left], err_msg="pushed aside it goes back")
+        np.testing.assert_allclose(_taken(tracker).hold[left], q[left], err_msg="pushed aside it goes back")
 
 
-def test_after_a_reset_every_arm_holds_where_it_is(tracker: GoalTracker) -> None:
+def test_after_a_reset_every_arm_holds_where_it_is(tracker: TargetTracker) -> None:
     tracker.update({"left": _pose(), "right": _pose()}, 0.001, STILL, STILL)
     tracker.reset(np.linspace(-1, 1, 14))
-    assert _goals(tracker).follows.tolist() == [0, 0]
-    np.testing.assert_array_equal(_goals(tracker).hold, np.linspace(-1, 1, 14))
+    assert _taken(tracker).follows.tolist() == [0, 0]
+    np.testing.assert_array_equal(_taken(tracker).hold, np.linspace(-1, 1, 14))

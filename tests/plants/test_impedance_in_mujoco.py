@@ -9,13 +9,13 @@ import pytest
 import scipy.linalg
 from scipy.integrate import cumulative_trapezoid
 
-from q2r2_control.compliance.impedance_terms import pose_error
 from q2r2_control.config import Config
 from q2r2_control.config.control import ImpedanceSettings
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 from tests.plants.conftest import tool_motion
+from tests.support.poses import pose_error
 from tests.support.torque_loop import DT, TorqueLoop, reference
 
 POSTURES = {

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from q2r2_control.config.cell import Config, MujocoConfig, ObjectConfig
+from q2r2_control.config.cell import Config, MujocoConfig, ObjectConfig, ObstacleConfig
 from q2r2_control.errors import PlantError
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.plants.mujoco_model import build_model
@@ -111,6 +111,44 @@ def test_only_the_blocks_on_the_table_are_in_contact_at_home(plant: MujocoPlant,
 def test_what_really_can_meet_collides(plant: MujocoPlant, q: list[float], prefixes: set[str]) -> None:
     plant.reset(np.array(q, dtype=float))
     assert prefixes in [{name.split("_")[0] for name in pair} for pair in _pairs_in_contact(plant)]
+
+
+@pytest.mark.parametrize(("floor", "rests_at"), [(0.0, 0.03), (-0.4, -0.37)])
+def test_the_simulated_floor_is_where_the_cells_is(config: Config, floor: float, rests_at: float) -> None:
+    plant = _with_a_falling_block(config, floor)
+    plant.advance(1.0)
+    assert plant.data.body("block").xpos[2] == pytest.approx(rests_at, abs=1e-3)
+
+
+def test_without_a_floor_one_is_drawn_that_nothing_touches(config: Config) -> None:
+    plant = _with_a_falling_block(config, None)
+    plant.advance(1.0)
+    assert plant.data.body("block").xpos[2] < -1.0
+    assert plant.model.geom("floor").type[0] == mujoco.mjtGeom.mjGEOM_PLANE
+
+
+def test_an_obstacle_called_floor_stays_what_it_is_in_a_cell_without_a_floor(config: Config) -> None:
+    slab = ObstacleConfig(shape="box", size=(9.0, 9.0, 0.1), position=(0.0, 0.0, -0.25))
+    plant = _with_a_falling_block(config.model_copy(update={"obstacles": {"floor": slab}}), None)
+    plant.advance(1.0)
+    assert plant.data.body("block").xpos[2] == pytest.approx(-0.2 + 0.03, abs=1e-3)
+
+
+def test_a_finger_meets_the_floor(config: Config) -> None:
+    plant = _with_a_falling_block(config, 0.2)
+    reaching_down = np.array([0.0, 1.6, 0.0, -0.9, 0.0, 0.6, 0.0])
+    plant.reset(np.concatenate([reaching_down, reaching_down]))
+    assert frozenset(("left_hand_e_finger_1_contact", "floor")) in _pairs_in_contact(plant)
+
+
+def _with_a_falling_block(config: Config, floor: float | None) -> MujocoPlant:
+    """The cell without its table, and a block 6 cm high, half a metre up behind the arms."""
+    block = ObjectConfig(size=(0.04, 0.04, 0.06), position=(-0.6, 0.0, 0.5))
+    obstacles = {name: thing for name, thing in config.obstacles.items() if name != "table"}
+    cell = config.model_copy(
+        update={"floor": floor, "obstacles": obstacles, "mujoco": MujocoConfig(objects={"block": block})}
+    )
+    return MujocoPlant(Robot.from_config(cell), cell)
 
 
 def test_neighbours_never_touch_anywhere_in_the_joint_range(plant: MujocoPlant, robot: Robot) -> None:

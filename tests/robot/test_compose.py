@@ -125,8 +125,8 @@ def test_pairs_of_tool_and_arm_are_excluded_only_where_the_tool_sits_flat_on_the
     flat = compose(one_arm(tool=HAND)).srdf
     moved = compose(one_arm(tool=HAND | {"mount": {"position": [0, 0, 0.2]}})).srdf
     elsewhere = compose(one_arm(tool=HAND | {"link": "link_3"}, home=[0.0] * 3)).srdf
-    assert '"left_hand_e_envelope" link2="left_link_4"' in flat
-    assert '"left_hand_e_envelope" link2="left_link_4"' not in moved + elsewhere
+    assert '"left_link_4" link2="left_hand_e_envelope"' in flat
+    assert '"left_link_4" link2="left_hand_e_envelope"' not in moved + elsewhere
 
 
 @pytest.mark.parametrize(
@@ -178,6 +178,29 @@ def test_obstacle_names_that_clash_or_break_out_are_refused(name: str) -> None:
     with pytest.raises(ConfigError, match=r"obstacles\..*allowed: letters") as error:
         compose(config)
     assert "\n" not in str(error.value)
+
+
+def test_the_floor_is_a_link_of_its_own_whose_surface_is_at_the_height_asked_for() -> None:
+    cell = compose(one_arm().model_copy(update={"floor": -0.25}))
+    model = pin.buildModelFromXML(cell.urdf)
+    geometry = pin.buildGeomFromUrdfString(model, cell.urdf, pin.GeometryType.COLLISION)
+    floor = geometry.geometryObjects[geometry.getGeometryId("floor_0")]
+    assert floor.parentJoint == 0
+    assert floor.placement.translation[2] + floor.geometry.halfSide[2] == pytest.approx(-0.25)
+    assert min(floor.geometry.halfSide[:2]) > 40.0  # mounts lie within 20 m of the origin
+    assert cell.obstacles == ()
+
+
+def test_without_a_floor_there_is_no_such_link() -> None:
+    assert "floor" not in compose(one_arm().model_copy(update={"floor": None})).urdf
+
+
+def test_an_obstacle_may_be_called_floor_only_where_the_cell_has_none_of_its_own() -> None:
+    slab = {"floor": {"shape": "box", "size": [2.0, 2.0, 0.1], "position": [0.0, 0.0, -0.05]}}
+    data = one_arm().model_dump() | {"obstacles": slab}
+    with pytest.raises(ConfigError, match=r"obstacles\.floor: the cell has a floor at z = 0 m; .* or set floor: null"):
+        compose(Config.model_validate(data))
+    assert compose(Config.model_validate(data | {"floor": None})).obstacles == ("floor",)
 
 
 def test_a_cell_name_cannot_break_out_of_the_text() -> None:

@@ -126,6 +126,7 @@ def test_rotors_reach_the_model_with_their_gear(robot: Robot, name: str) -> None
 
 def test_every_link_is_a_capsule_for_coal_and_the_last_a_sphere(robot: Robot) -> None:
     shapes = {item.name: item.geometry for item in robot.collision_model.geometryObjects}
+    del shapes["floor_0"]
     assert {name: type(shape) for name, shape in shapes.items()} == {
         **{f"left_link_{index}_0": coal.Capsule for index in range(7)},
         "left_link_7_0": coal.Sphere,
@@ -158,7 +159,7 @@ def test_capsule_runs_between_the_ends_that_enclose_the_mesh(
 
 
 def test_links_that_no_pair_watches_never_meet(name: str) -> None:
-    """Every pair that the SRDF calls Never stays apart in random and in extreme postures, with a Hand-E in the hand."""
+    """Every pair that the SRDF calls Never stays 50 mm apart in random and in extreme postures, with a Hand-E."""
     robot = Robot.from_config(one_arm(model=name, tool={"model": "hand_e", "frame": "tool_frame"}))
     geometry = robot.collision_model
     watched = {frozenset(map(link_of, names)) for names in pair_names(geometry)}
@@ -167,7 +168,7 @@ def test_links_that_no_pair_watches_never_meet(name: str) -> None:
     items = [
         (index, item)
         for index, item in enumerate(geometry.geometryObjects)
-        if "hand_e" not in item.name or "envelope" in item.name
+        if item.name != "floor_0" and ("hand_e" not in item.name or "envelope" in item.name)
     ]
     for number, (first, a) in enumerate(items):
         for second, b in items[:number]:
@@ -175,7 +176,7 @@ def test_links_that_no_pair_watches_never_meet(name: str) -> None:
             if apart and frozenset((link_of(a.name), link_of(b.name))) not in watched:
                 geometry.addCollisionPair(pin.CollisionPair(second, first))
     overlapping = {("left_link_5_0", "left_link_7_0")}
-    assert len(pair_names(geometry)) > 15
+    assert len(pair_names(geometry)) > 12
 
     data, geometry_data = robot.model.createData(), geometry.createData()
     random = np.random.default_rng(0)
@@ -186,4 +187,4 @@ def test_links_that_no_pair_watches_never_meet(name: str) -> None:
             q = np.where(random.random(7) < 0.6, extreme, q)
         pin.computeDistances(robot.model, data, geometry, geometry_data, q)
         for names, result in zip(pair_names(geometry), geometry_data.distanceResults, strict=True):
-            assert names in overlapping or result.min_distance > 0.005, (names, q)
+            assert names in overlapping or result.min_distance > 0.05, (names, q)

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import coal
+import numpy as np
+import pinocchio as pin
 import pytest
 
-from q2r2_control.robot.pairs import link_of, pair_names
+from q2r2_control.robot.compose import compose
+from q2r2_control.robot.pairs import CLEARANCE, link_of, pair_names
 from q2r2_control.robot.robot import Robot
+from tests.robot.conftest import one_arm
 
 MOVING = [*(f"link_{index}" for index in range(1, 8)), "hand_e_envelope"]
 
@@ -32,14 +36,57 @@ def test_every_moving_link_is_watched_against_the_table(dual_iiwa: Robot) -> Non
 @pytest.mark.parametrize("side", ["left", "right"])
 def test_own_links_that_can_meet_are_watched_and_no_others(dual_iiwa: Robot, side: str) -> None:
     hand = "hand_e_envelope"
-    can_meet = {
-        frozenset((f"{side}_{a}", f"{side}_{b}"))
-        for a, b in [
-            ("link_0", "link_4"), ("link_0", "link_5"), ("link_0", "link_6"), ("link_0", "link_7"), ("link_0", hand),
-            ("link_1", "link_7"), ("link_1", hand), ("link_2", hand),
-        ]
-    }  # fmt: skip
+    near = [
+        ("link_0", "link_2"), ("link_0", "link_3"), ("link_0", "link_4"), ("link_0", "link_5"), ("link_0", "link_6"),
+        ("link_0", "link_7"), ("link_0", hand), ("link_1", "link_3"), ("link_1", "link_5"), ("link_1", "link_7"),
+        ("link_1", hand), ("link_2", hand), ("link_3", "link_5"), ("link_5", hand),
+    ]  # fmt: skip
+    if dual_iiwa.name == "dual_iiwa14":
+        near.append(("link_1", "link_6"))
+    can_meet = {frozenset((f"{side}_{a}", f"{side}_{b}")) for a, b in near}
     assert {pair for pair in _links(dual_iiwa) if all(link.startswith(side) for link in pair)} == can_meet
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_the_floor_is_watched_against_the_links_that_can_come_near_it_and_no_others(
+    dual_iiwa: Robot, side: str
+) -> None:
+    """Link 1 turns about the vertical alone, and link 2 is too short."""
+    reach_it = {f"{side}_link_{index}" for index in range(3, 8)} | {f"{side}_hand_e_envelope"}
+    with_floor = {link for pair in _links(dual_iiwa) if "floor" in pair for link in pair if link.startswith(side)}
+    assert with_floor == reach_it
+
+
+@pytest.mark.parametrize("height", [0.0, -0.3, 0.1])
+@pytest.mark.parametrize(
+    "rpy", [(0.0, 0.0, 0.7), (0.0, 0.5, 0.0), (3.1416, 0.0, 0.0)], ids=["upright", "tilted", "hung"]
+)
+def test_a_link_that_is_not_watched_against_the_floor_cannot_come_within_50_mm_or_never_moves_towards_it(
+    rpy: tuple[float, ...], height: float
+) -> None:
+    mount = {"position": (0.0, 0.0, 0.0), "rpy": rpy}
+    robot = Robot.from_config(one_arm(mount=mount).model_copy(update={"floor": height}))
+    geometry = robot.collision_model.copy()
+    floor = geometry.getGeometryId("floor_0")
+    watched = {a for a, b in pair_names(geometry) if b == "floor_0"} | {b for a, b in pair_names(geometry)}
+    free = [index for index, item in enumerate(geometry.geometryObjects) if item.name not in watched and index != floor]
+    geometry.removeAllCollisionPairs()
+    for index in free:
+        geometry.addCollisionPair(pin.CollisionPair(index, floor))
+    data, geometry_data, random = robot.model.createData(), geometry.createData(), np.random.default_rng(3)
+    found = []
+    for _ in range(300):
+        q = random.uniform(robot.position_lower, robot.position_upper)
+        pin.computeDistances(robot.model, data, geometry, geometry_data, q)
+        found.append([result.min_distance for result in geometry_data.distanceResults])
+    lowest, highest = np.min(found, axis=0), np.max(found, axis=0)
+    assert ((lowest > CLEARANCE) | (highest - lowest < 1e-5)).all()
+
+
+def test_a_link_named_floor_that_is_no_level_surface_is_a_link_like_any_other() -> None:
+    urdf = compose(one_arm().model_copy(update={"floor": None})).urdf.replace("left_link_5", "floor")
+    robot = Robot.from_urdf(urdf, arms={"left": "left_link_ee"})
+    assert frozenset(("left_link_1", "floor")) in _links(robot)
 
 
 @pytest.mark.parametrize(

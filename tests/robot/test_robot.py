@@ -50,7 +50,7 @@ def test_at_home_the_tools_point_straight_down_mirrored_and_clear(dual_iiwa: Rob
     pose = dual_iiwa.tool_pose(dual_iiwa.home, side)
     np.testing.assert_allclose(pose.translation, [0.5, 0.25 * sign, 0.38], atol=2e-4)
     np.testing.assert_allclose(pose.rotation, np.diag([-1.0, 1.0, -1.0]), atol=2e-4)
-    assert min(pair.distance for pair in dual_iiwa.distances(dual_iiwa.home)) > 0.1
+    assert min(pair.distance for pair in dual_iiwa.distances(dual_iiwa.home)) > 0.04
 
 
 def test_a_pose_that_was_returned_does_not_change_with_the_next_one(dual_iiwa7: Robot) -> None:

@@ -19,7 +19,6 @@ from q2r2_control import Robot
 from q2r2_control.types import Array
 from tests.ros.conftest import NEEDS_ROS
 from tests.ros.processes import CONFIG, ROOT, Processes
-from tests.ros.waiting import wait_until
 
 pytest.importorskip("rclpy", reason=NEEDS_ROS)
 pytest.importorskip("control_msgs", reason="needs control_msgs: q2r2 ros build-interfaces")
@@ -31,6 +30,7 @@ from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory
 
 from tests.ros.cell import PATIENT, Cell, shifted, start_controller, start_robot
+from tests.ros.waiting import wait_until
 
 RATE = 125.0  # of the control loop [Hz]
 COMMANDS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE, history=HistoryPolicy.KEEP_LAST)
@@ -56,7 +56,7 @@ class Recorder:
     def _take(self, message: JointTrajectory, info: Mapping[str, Any]) -> None:
         place = {name: index for index, name in enumerate(message.joint_names)}
         q = np.array([message.points[0].positions[place[name]] for name in self._names])
-        measured = self._cell.q if self._cell.joints.states else q
+        measured = self._cell.q if self._cell.postures else q
         self.commands.append(Commanded(info["publication_sequence_number"], measured, q))
 
 
@@ -152,7 +152,7 @@ def test_with_the_admittance_a_measured_force_displaces_the_target_and_without_i
     def publish() -> None:
         frame = robot.arms["left"].frame_id
         data = robot.model.createData()
-        q = cell.q if cell.joints.states else robot.home
+        q = cell.q if cell.postures else robot.home
         J = pin.computeFrameJacobian(robot.model, data, q, frame, pin.LOCAL_WORLD_ALIGNED)
         torques.publish(JointState(name=list(robot.joint_names), effort=(J[:3].T @ force).tolist()))
 

@@ -8,11 +8,11 @@ import numpy as np
 import pinocchio as pin
 
 from q2r2_control.compliance.impedance import ImpedanceController, TorqueCommand
-from q2r2_control.compliance.impedance_terms import pose_error
 from q2r2_control.config.control import ImpedanceSettings
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, Command, CommandMode, Reference, StepReport, StepStatus
+from tests.support.poses import pose_error
 
 DT = 0.001
 _ROUNDING = 1e-9  # [Nm]

@@ -1,8 +1,7 @@
-"""Monitored pairs as arrays, their signed distances, and the rows that keep them apart, compiled.
+"""A robot's collision geometries and monitored pairs as arrays, and where they are at a posture, compiled.
 
-Every geometry is a segment with a radius (capsule, sphere) or a box. For the closest points p1, p2 and the unit normal
-n from the first body to the second, the distance changes with d' = n' (J_p2 - J_p1) v: only joints that move one body
-relative to the other appear in it.
+Every geometry is a segment with a radius (capsule, sphere) or a box. Only joints that move one body of a pair relative
+to the other are listed with the pair.
 """
 
 from __future__ import annotations
@@ -13,10 +12,10 @@ import coal
 import numpy as np
 import pinocchio as pin
 
-from q2r2_control.control.geometry.closest_points import dot, segment_box, segment_segment
-from q2r2_control.control.geometry.kinematics import Chain, IntArray, Placements
+from q2r2_control.control.geometry.kinematics import Chain, IntArray, Placements, chain_of, place
 from q2r2_control.control.jit import lean_kernel
 from q2r2_control.errors import RobotError
+from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 
 
@@ -45,8 +44,16 @@ class Pairs(NamedTuple):
     round: IntArray  # (p,) 1 where both are capsules, whose normal turns as they slide past each other
 
 
+class CollisionModel(NamedTuple):
+    """What does not change with the posture."""
+
+    chain: Chain
+    bodies: Bodies
+    pairs: Pairs
+
+
 class Posed(NamedTuple):
-    """Geometries in the world, written by :func:`pose_bodies`."""
+    """Geometries in the world, written by :func:`update_placements`."""
 
     start: Array  # (g, 3)
     end: Array  # (g, 3)
@@ -59,17 +66,36 @@ class Posed(NamedTuple):
 
 
 class Contact(NamedTuple):
-    """Scratch for one pair: closest points and normal in the world, (3,) each."""
+    """The last pair that was measured, in the world."""
 
-    first: Array
-    second: Array
-    normal: Array
-    local: Array  # (3, 3)
-    witness: Array  # (3,)
+    first: Array  # (3,) closest points [m]
+    second: Array  # (3,)
+    normal: Array  # (3,) from the first to the second body
+    local: Array  # (3, 3) scratch
+    witness: Array  # (3,) scratch
 
     @classmethod
     def empty(cls) -> Contact:
         return cls(np.zeros(3), np.zeros(3), np.zeros(3), np.zeros((3, 3)), np.zeros(3))
+
+
+class CollisionData(NamedTuple):
+    """A posture as :func:`update_placements` writes it, and scratch to measure a pair there."""
+
+    placements: Placements
+    posed: Posed
+    contact: Contact
+
+    @classmethod
+    def empty(cls, model: CollisionModel) -> CollisionData:
+        return cls(Placements.empty(model.chain), Posed.empty(model.bodies), Contact.empty())
+
+
+def collision_model_of(robot: Robot) -> CollisionModel:
+    """Joints, geometries and monitored pairs of a robot. Raises :class:`RobotError` for what no kernel handles."""
+    chain, bodies = chain_of(robot.model), bodies_of(robot.collision_model)
+    travel = np.maximum(np.abs(robot.position_lower), np.abs(robot.position_upper))
+    return CollisionModel(chain, bodies, pairs_of(robot.collision_model, chain, bodies, travel))
 
 
 def bodies_of(model: pin.GeometryModel) -> Bodies:
@@ -149,7 +175,14 @@ def pairs_of(model: pin.GeometryModel, chain: Chain, bodies: Bodies, travel: Arr
 
 
 @lean_kernel
-def pose_bodies(bodies: Bodies, placements: Placements, posed: Posed) -> None:
+def update_placements(model: CollisionModel, data: CollisionData, q: Array) -> None:
+    """Joint frames and geometries in the world at ``q`` (nv,)."""
+    place(model.chain, q, data.placements)
+    _pose_bodies(model.bodies, data.placements, data.posed)
+
+
+@lean_kernel
+def _pose_bodies(bodies: Bodies, placements: Placements, posed: Posed) -> None:
     """Move every geometry to the world."""
     for g in range(bodies.joint.shape[0]):
         joint = bodies.joint[g]
@@ -167,102 +200,3 @@ def pose_bodies(bodies: Bodies, placements: Placements, posed: Posed) -> None:
                     for k in range(3):
                         turned += placements.rotation[joint, row, k] * bodies.rotation[g, k, column]
                     posed.rotation[g, row, column] = turned
-
-
-@lean_kernel
-def at_least(bodies: Bodies, posed: Posed, first: int, second: int) -> float:
-    """Cheap lower bound on the distance of two geometries, from the balls around them, or ball and box [m]."""
-    square = 0.0
-    if bodies.box[second] == 1:
-        x = 0.5 * (posed.start[first, 0] + posed.end[first, 0]) - posed.start[second, 0]
-        y = 0.5 * (posed.start[first, 1] + posed.end[first, 1]) - posed.start[second, 1]
-        z = 0.5 * (posed.start[first, 2] + posed.end[first, 2]) - posed.start[second, 2]
-        axes = posed.rotation[second]
-        inside = np.inf
-        for k in range(3):
-            depth = bodies.half[second, k] - abs(axes[0, k] * x + axes[1, k] * y + axes[2, k] * z)
-            inside = min(inside, depth)
-            square += min(depth, 0.0) ** 2
-        return (-inside if inside > 0.0 else np.sqrt(square)) - bodies.size[first]
-    for k in range(3):
-        between = posed.start[first, k] + posed.end[first, k] - posed.start[second, k] - posed.end[second, k]
-        square += between * between
-    return 0.5 * np.sqrt(square) - bodies.size[first] - bodies.size[second]
-
-
-@lean_kernel
-def measure(bodies: Bodies, posed: Posed, first: int, second: int, start: Array, end: Array, contact: Contact) -> float:
-    """Signed distance [m] of the part ``start``-``end`` of geometry ``first`` from ``second``; fills ``contact``.
-
-    The points lie on the core segment, not on the capsule's surface: they differ by a multiple of the normal, which
-    changes no rate of distance.
-    """
-    if bodies.box[second] == 1:
-        local = contact.local
-        axes = posed.rotation[second]
-        for k in range(3):
-            along_start = 0.0
-            along_end = 0.0
-            for row in range(3):
-                along_start += axes[row, k] * (start[row] - posed.start[second, row])
-                along_end += axes[row, k] * (end[row] - posed.start[second, row])
-            local[0, k] = along_start
-            local[1, k] = along_end
-        normal = local[2]
-        distance = segment_box(local[0], local[1], bodies.half[second], contact.first, contact.second, normal)
-        for points in (contact.first, contact.second):
-            x, y, z = points[0], points[1], points[2]
-            for row in range(3):
-                points[row] = posed.start[second, row] + axes[row, 0] * x + axes[row, 1] * y + axes[row, 2] * z
-        for row in range(3):
-            contact.normal[row] = axes[row, 0] * normal[0] + axes[row, 1] * normal[1] + axes[row, 2] * normal[2]
-        return distance - bodies.radius[first]
-    distance = segment_segment(start, end, posed.start[second], posed.end[second], contact.first, contact.second)
-    if distance > 1e-9:
-        for k in range(3):
-            contact.normal[k] = (contact.second[k] - contact.first[k]) / distance
-    else:
-        _any_normal(posed.start[first], posed.end[first], posed.start[second], posed.end[second], contact.normal)
-    return distance - bodies.radius[first] - bodies.radius[second]
-
-
-@lean_kernel
-def _any_normal(a0: Array, a1: Array, b0: Array, b1: Array, normal: Array) -> None:
-    """A unit normal for segments that touch: across both, or between their middles if they are parallel."""
-    between = 0.0
-    for k in range(3):
-        i, j = (k + 1) % 3, (k + 2) % 3
-        normal[k] = (a1[i] - a0[i]) * (b1[j] - b0[j]) - (a1[j] - a0[j]) * (b1[i] - b0[i])
-        between += normal[k] * (b0[k] + b1[k] - a0[k] - a1[k])
-    if dot(normal, normal) < 1e-18:
-        for k in range(3):
-            normal[k] = b0[k] + b1[k] - a0[k] - a1[k]
-    if dot(normal, normal) < 1e-18:
-        normal[2] = 1.0
-    size = np.sqrt(dot(normal, normal)) if between >= 0.0 else -np.sqrt(dot(normal, normal))
-    for k in range(3):
-        normal[k] /= size
-
-
-@lean_kernel
-def distance_row(chain: Chain, placements: Placements, pairs: Pairs, p: int, contact: Contact, row: Array) -> None:
-    """Gradient of pair ``p``'s distance with respect to q into ``row`` (nv,) [m/rad]."""
-    row[:] = 0.0
-    nx, ny, nz = contact.normal[0], contact.normal[1], contact.normal[2]
-    for k in range(pairs.joint.shape[1]):
-        joint = pairs.joint[p, k]
-        if joint == 0:
-            break
-        sign = pairs.sign[p, k]
-        ax, ay, az = placements.axis[joint, 0], placements.axis[joint, 1], placements.axis[joint, 2]
-        if chain.prismatic[joint] == 1:
-            row[joint - 1] = sign * (nx * ax + ny * ay + nz * az)
-            continue
-        if sign < 0.0:
-            x, y, z = contact.first[0], contact.first[1], contact.first[2]
-        else:
-            x, y, z = contact.second[0], contact.second[1], contact.second[2]
-        x -= placements.translation[joint, 0]
-        y -= placements.translation[joint, 1]
-        z -= placements.translation[joint, 2]
-        row[joint - 1] = sign * (nx * (ay * z - az * y) + ny * (az * x - ax * z) + nz * (ax * y - ay * x))

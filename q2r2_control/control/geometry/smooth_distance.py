@@ -16,7 +16,7 @@ from __future__ import annotations
 import numpy as np
 
 from q2r2_control.control.geometry.closest_points import clamp
-from q2r2_control.control.geometry.collision import Bodies, Contact, Posed
+from q2r2_control.control.geometry.collision import CollisionData, CollisionModel, Contact, Posed
 from q2r2_control.control.jit import lean_kernel
 from q2r2_control.types import Array
 
@@ -24,11 +24,13 @@ _HALVINGS = 40
 
 
 @lean_kernel
-def smooth_distance(bodies: Bodies, posed: Posed, first: int, second: int, smoothing: float, contact: Contact) -> float:
-    """Smooth signed distance [m] of two geometries whose cores are apart; fills ``contact`` for the row.
+def measure_smooth(model: CollisionModel, data: CollisionData, p: int, smoothing: float) -> float:
+    """Smooth signed distance [m] of pair ``p``, whose cores are apart; fills ``data.contact`` for the row.
 
-    ``smoothing`` is e [m^2]. ``first`` is no box.
+    ``smoothing`` is e [m^2].
     """
+    bodies, posed, contact = model.bodies, data.posed, data.contact
+    first, second = model.pairs.first[p], model.pairs.second[p]
     start, end = posed.start[first], posed.end[first]
     if bodies.box[second] == 1:
         core = _segment_box(start, end, posed, bodies.half[second], second, smoothing, contact)
@@ -41,7 +43,7 @@ def smooth_distance(bodies: Bodies, posed: Posed, first: int, second: int, smoot
 
 @lean_kernel
 def _segment_segment(a0: Array, a1: Array, b0: Array, b1: Array, smoothing: float, contact: Contact) -> float:
-    """D of two segments; the quadratic is strictly convex, so no case is degenerate (compare geometry.py)."""
+    """D of two segments; the quadratic is strictly convex, so no case is degenerate (compare closest_points.py)."""
     aa = smoothing
     bb = smoothing
     ab = 0.0

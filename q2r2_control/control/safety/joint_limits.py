@@ -23,9 +23,12 @@ every limit. Then the acceleration limit wins, and the joint brakes and returns 
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from q2r2_control.control.geometry.closest_points import clamp
+from q2r2_control.control.geometry.kinematics import IntArray
 from q2r2_control.control.jit import lean_kernel
 from q2r2_control.types import Array
 
@@ -33,7 +36,31 @@ from q2r2_control.types import Array
 _RETURN_GAIN = 4.0  # [1/s]
 _RETURN_DEPTH = 1e-3  # [rad]
 
-NO_LIMIT, POSITION, VELOCITY, ACCELERATION = 0, 1, 2, 3
+NO_LIMIT, POSITION, VELOCITY, ACCELERATION = 0, 1, 2, 3  # what may hold a joint back
+
+
+class JointLimits(NamedTuple):
+    """What every joint keeps."""
+
+    lower: Array  # (nv,) positions, the margin taken off [rad]
+    upper: Array  # (nv,)
+    velocity: Array  # (nv,) [rad/s]
+    acceleration: Array  # (nv,) [rad/s^2]
+    longest_step: float  # H [s]
+    return_speed: float  # inward, of a joint outside its limits [rad/s]
+
+
+class VelocityBox(NamedTuple):
+    """Interval of next velocities per joint, and which limit makes each side of it."""
+
+    lower: Array  # (nv,) [rad/s]
+    upper: Array  # (nv,)
+    lower_limit: IntArray  # (nv,) POSITION, VELOCITY or ACCELERATION
+    upper_limit: IntArray  # (nv,)
+
+    @classmethod
+    def empty(cls, nv: int) -> VelocityBox:
+        return cls(np.zeros(nv), np.zeros(nv), np.zeros(nv, dtype=np.int64), np.zeros(nv, dtype=np.int64))
 
 
 @lean_kernel
@@ -53,46 +80,33 @@ def fastest_towards(room: float, v: float, a: float, h: float, longest: float, r
 
 
 @lean_kernel
-def next_velocity_box(
-    q: Array,
-    v: Array,
-    lower: Array,
-    upper: Array,
-    velocity: Array,
-    a: Array,
-    h: float,
-    longest: float,
-    return_speed: float,
-    box_lower: Array,
-    box_upper: Array,
-    binding: Array,
-) -> bool:
-    """Interval of next velocities per joint into ``box_lower`` and ``box_upper`` (nv,) [rad/s].
+def next_velocity_box(limits: JointLimits, q: Array, v: Array, h: float, box: VelocityBox) -> bool:
+    """Fill ``box`` for a step of ``h`` from ``q`` [rad] and ``v`` [rad/s], (nv,) each.
 
-    ``lower``, ``upper`` [rad] already contain the margin; ``velocity``, ``a`` are limits (nv,). ``binding`` (nv, 2)
-    receives which limit makes each side. Returns False where some joint is outside P, that is, recovers.
+    Returns False where some joint is outside P, that is, recovers.
     """
     inside = True
     for j in range(q.shape[0]):
-        slowest = v[j] - a[j] * h
-        fastest = v[j] + a[j] * h
-        up = fastest_towards(upper[j] - q[j], v[j], a[j], h, longest, return_speed)
-        down = -fastest_towards(q[j] - lower[j], -v[j], a[j], h, longest, return_speed)
-        binding[j, 0] = POSITION if down > -velocity[j] else VELOCITY
-        binding[j, 1] = POSITION if up < velocity[j] else VELOCITY
-        up = min(up, velocity[j])
-        down = max(down, -velocity[j])
+        a = limits.acceleration[j]
+        slowest = v[j] - a * h
+        fastest = v[j] + a * h
+        up = fastest_towards(limits.upper[j] - q[j], v[j], a, h, limits.longest_step, limits.return_speed)
+        down = -fastest_towards(q[j] - limits.lower[j], -v[j], a, h, limits.longest_step, limits.return_speed)
+        box.lower_limit[j] = POSITION if down > -limits.velocity[j] else VELOCITY
+        box.upper_limit[j] = POSITION if up < limits.velocity[j] else VELOCITY
+        up = min(up, limits.velocity[j])
+        down = max(down, -limits.velocity[j])
         if up < slowest or down > fastest or up < down:
             # A last bit lost to rounding is not recovery.
             scale = 1e-9 * (1.0 + abs(v[j]))
             if up < slowest - scale or down > fastest + scale or up < down - scale:
                 inside = False
-        if upper[j] < q[j] or q[j] < lower[j]:
+        if limits.upper[j] < q[j] or q[j] < limits.lower[j]:
             inside = False
         if fastest < up:
-            binding[j, 1] = ACCELERATION
+            box.upper_limit[j] = ACCELERATION
         if slowest > down:
-            binding[j, 0] = ACCELERATION
-        box_upper[j] = clamp(up, slowest, fastest)
-        box_lower[j] = min(clamp(down, slowest, fastest), box_upper[j])
+            box.lower_limit[j] = ACCELERATION
+        box.upper[j] = clamp(up, slowest, fastest)
+        box.lower[j] = min(clamp(down, slowest, fastest), box.upper[j])
     return inside

@@ -1,11 +1,11 @@
 """Proof that a step keeps two geometries apart where their distance alone leaves no room for one, compiled.
 
-The bound of braking.py counts every way a joint travels as if it led straight to the other body. A pair that rests at
-min_distance to the micrometre could then never be shown to part again. Here the direction counts.
+The bound by reach (stop_certificate.py) counts every way a joint travels as if it led straight to the other body. A
+pair that rests at min_distance to the micrometre could then never be shown to part again. Here the direction counts.
 
 **Claim.** Let n be the unit normal of two convex cores that do not meet, e_1 and e_2 their corners (the ends of a
-segment, the corners of a box), J_e the Jacobian of a corner at the start, r the joints' reach (braking.py). If the
-joints move by D(t) with |D_j(t)| <= w_j, then at every t the distance is at least
+segment, the corners of a box), J_e the Jacobian of a corner at the start, r the joints' reach. If the joints move by
+D(t) with |D_j(t)| <= w_j, then at every t the distance is at least
 
     min over corners of  n'(e_2 - e_1) + n'(J_e2 - J_e1) D(t)   -   1/2 (sum_j w_j) (sum_j r_j w_j)   -   radii.
 
@@ -20,40 +20,31 @@ In a step D(t) = v t + (v+ - v) t^2 / (2 h), so what is to be bounded is a parab
 
 from __future__ import annotations
 
-from q2r2_control.control.geometry.collision import Bodies, Contact, Pairs, Posed
-from q2r2_control.control.geometry.kinematics import Chain, Placements
+from q2r2_control.control.geometry.collision import Bodies, CollisionData, CollisionModel, Posed
 from q2r2_control.control.jit import lean_kernel
+from q2r2_control.control.safety.safety_data import SafetyData
+from q2r2_control.control.safety.safety_model import SafetyModel
 from q2r2_control.types import Array
 
 
 @lean_kernel
-def step_keeps_beyond(
-    chain: Chain,
-    placements: Placements,
-    bodies: Bodies,
-    posed: Posed,
-    pairs: Pairs,
-    p: int,
-    contact: Contact,
-    v: Array,
-    v_next: Array,
-    h: float,
-    way: Array,
-    threshold: float,
-) -> bool:
-    """Whether the plane between pair ``p``, as measured in ``contact``, proves it beyond ``threshold`` in a step ``h``.
+def step_keeps_beyond(model: SafetyModel, data: SafetyData, p: int, h: float, threshold: float) -> bool:
+    """Whether the plane between pair ``p`` proves it beyond ``threshold`` [m] in a step ``h`` to the candidate.
 
-    ``placements`` and ``posed`` are of the step's start, ``way`` (nv,) bounds how far each joint gets from there [rad].
+    The pair has been measured at the reference just before; ``data.rollout.step_travel`` bounds how far each joint
+    gets from there.
     """
+    pairs, bodies, contact = model.collision.pairs, model.collision.bodies, data.collision.contact
     first, second = pairs.first[p], pairs.second[p]
+    travel = data.rollout.step_travel
     total = 0.0
     levered = 0.0
     for k in range(pairs.joint.shape[1]):
         joint = pairs.joint[p, k]
         if joint == 0:
             break
-        total += way[joint - 1]
-        levered += pairs.reach[p, k] * way[joint - 1]
+        total += travel[joint - 1]
+        levered += pairs.reach[p, k] * travel[joint - 1]
     needed = threshold + bodies.radius[first] + bodies.radius[second] + 0.5 * total * levered
     corner = contact.witness
     for i in range(2):
@@ -62,12 +53,12 @@ def step_keeps_beyond(
             rate = 0.0
             change = 0.0
             for side in range(2):
-                _corner(bodies, posed, second if side == 1 else first, j if side == 1 else i, corner)
+                _corner(bodies, data.collision.posed, second if side == 1 else first, j if side == 1 else i, corner)
                 sign = 1.0 if side == 1 else -1.0
                 for k in range(3):
                     gap += sign * contact.normal[k] * corner[k]
-                rate += _rate(chain, placements, pairs, p, sign, corner, contact.normal, v)
-                change += _rate(chain, placements, pairs, p, sign, corner, contact.normal, v_next)
+                rate += _corner_rate(model.collision, data.collision, p, sign, data.state.v)
+                change += _corner_rate(model.collision, data.collision, p, sign, data.candidate.v)
             if _least_on_the_way(gap, rate, (change - rate) / h, h) < needed:
                 return False
     return True
@@ -85,10 +76,13 @@ def _corner(bodies: Bodies, posed: Posed, body: int, number: int, out: Array) ->
 
 
 @lean_kernel
-def _rate(
-    chain: Chain, placements: Placements, pairs: Pairs, p: int, side: float, point: Array, normal: Array, v: Array
-) -> float:
-    """What joints on one side of a pair, -1 the first's or 1 the second's, add to the gap's rate at ``point`` [m/s]."""
+def _corner_rate(model: CollisionModel, data: CollisionData, p: int, side: float, v: Array) -> float:
+    """What joints on one side of a pair, -1 the first's or 1 the second's, add to the gap's rate at the corner [m/s].
+
+    The corner is the contact's ``witness``.
+    """
+    chain, pairs, placements = model.chain, model.pairs, data.placements
+    point, normal = data.contact.witness, data.contact.normal
     rate = 0.0
     for k in range(pairs.joint.shape[1]):
         joint = pairs.joint[p, k]

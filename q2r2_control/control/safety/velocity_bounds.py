@@ -5,7 +5,8 @@ point of it is faster than |u| + |w| s, so the distance of two geometries falls 
 
     |u_2 - u_1| + |w_1| s_1 + |w_2| s_2.
 
-Arms that move alike do not close in at all, however fast they are; the joints' own bound (braking.py) cannot see that.
+Arms that move alike do not close in at all, however fast they are; the bound by reach (stop_certificate.py) cannot see
+that.
 """
 
 from __future__ import annotations
@@ -14,14 +15,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from q2r2_control.control.geometry.collision import Bodies, Posed
-from q2r2_control.control.geometry.kinematics import Chain, Placements
+from q2r2_control.control.geometry.collision import CollisionData, CollisionModel
 from q2r2_control.control.jit import lean_kernel
 from q2r2_control.types import Array
 
 
-class Pace(NamedTuple):
-    """Velocities in world axes, written by :func:`find_pace`."""
+class BodyVelocities(NamedTuple):
+    """Velocities in world axes, written by :func:`update_body_velocities`."""
 
     linear: Array  # (n, 3) of joint frames' origins [m/s]
     angular: Array  # (n, 3) [rad/s]
@@ -29,15 +29,16 @@ class Pace(NamedTuple):
     swing: Array  # (g,) fastest of a geometry's points about its middle [m/s]
 
     @classmethod
-    def empty(cls, chain: Chain, bodies: Bodies) -> Pace:
-        n, g = len(chain.parent), len(bodies.joint)
+    def empty(cls, model: CollisionModel) -> BodyVelocities:
+        n, g = len(model.chain.parent), len(model.bodies.joint)
         return cls(np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((g, 3)), np.zeros(g))
 
 
 @lean_kernel
-def find_pace(chain: Chain, placements: Placements, bodies: Bodies, posed: Posed, v: Array, pace: Pace) -> None:
-    """Velocities of all joint frames and geometries at joint velocities ``v`` (nv,)."""
-    linear, angular = pace.linear, pace.angular
+def update_body_velocities(model: CollisionModel, data: CollisionData, v: Array, velocities: BodyVelocities) -> None:
+    """Velocities of all joint frames and geometries where they are placed, at joint velocities ``v`` (nv,)."""
+    chain, bodies, placements, posed = model.chain, model.bodies, data.placements, data.posed
+    linear, angular = velocities.linear, velocities.angular
     for i in range(1, chain.parent.shape[0]):
         parent = chain.parent[i]
         _velocity_at(
@@ -52,14 +53,14 @@ def find_pace(chain: Chain, placements: Placements, bodies: Bodies, posed: Posed
                 linear[i, k] += along
     for g in range(bodies.joint.shape[0]):
         joint = bodies.joint[g]
-        middle = pace.middle[g]
+        middle = velocities.middle[g]
         for k in range(3):
             middle[k] = 0.5 * (posed.start[g, k] + posed.end[g, k])
         _velocity_at(linear[joint], angular[joint], placements.translation[joint], middle, middle)
         square = 0.0
         for k in range(3):
             square += angular[joint, k] * angular[joint, k]
-        pace.swing[g] = np.sqrt(square) * bodies.size[g]
+        velocities.swing[g] = np.sqrt(square) * bodies.size[g]
 
 
 @lean_kernel
@@ -72,10 +73,10 @@ def _velocity_at(linear: Array, angular: Array, origin: Array, point: Array, out
 
 
 @lean_kernel
-def fastest_approach(pace: Pace, first: int, second: int) -> float:
+def fastest_approach(velocities: BodyVelocities, first: int, second: int) -> float:
     """Bound on how fast two geometries close in [m/s]."""
     square = 0.0
     for k in range(3):
-        between = pace.middle[second, k] - pace.middle[first, k]
+        between = velocities.middle[second, k] - velocities.middle[first, k]
         square += between * between
-    return np.sqrt(square) + pace.swing[first] + pace.swing[second]
+    return np.sqrt(square) + velocities.swing[first] + velocities.swing[second]

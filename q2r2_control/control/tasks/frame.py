@@ -1,8 +1,7 @@
-"""Costs of the QP: tool twists, posture, hold, as H and g of  1/2 v' H v + g' v, compiled.
+"""The cost of a tool that follows its target, as H and g of  1/2 v' H v + g' v, compiled.
 
 For each following arm:  |J v - u|^2_W + v' M v, u the wanted tool twist, W = diag(1, 1, 1, l^2, l^2, l^2) with the
-length l that makes a radian comparable to a metre. For all joints: w |v - v_p|^2 with the posture velocity v_p
-projected into the tools' nullspace, so that at rest it leaves no tool error.
+length l that makes a radian comparable to a metre.
 
 **Damping M.** Stretched out towards an unreachable target, the gradient of the reach with respect to the elbow angle
 vanishes like L theta. Under a wanted speed s the loop near that posture therefore has the gain L s / mu, which without
@@ -15,34 +14,15 @@ gain is at most k. M vanishes at the target.
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
-from q2r2_control.control.geometry.kinematics import Chain, IntArray, Placements
-from q2r2_control.control.jit import kernel, lean_kernel
+from q2r2_control.control.geometry.kinematics import Chain, Placements
+from q2r2_control.control.jit import lean_kernel
+from q2r2_control.control.tasks.task_data import Targets, TaskData
+from q2r2_control.control.tasks.task_model import Motion, TaskModel, Tools
 from q2r2_control.types import Array
 
 ROTATION_LENGTH = 0.3  # [m/rad]
-_PROJECTION_DAMPING = 1e-3
-
-
-class Tools(NamedTuple):
-    """The tool frame of each arm."""
-
-    joint: IntArray  # (n,) joint that carries it
-    rotation: Array  # (n, 3, 3) in the joint's frame
-    translation: Array  # (n, 3) [m]
-    member: Array  # (n, nv) 1 where a joint moves the tool
-
-
-class Motion(NamedTuple):
-    """How a tool approaches its target, linear then angular."""
-
-    gain: Array  # (2,) [1/s]
-    deceleration: Array  # (2,) [m/s^2, rad/s^2]
-    full_speed: Array  # (2,) [m/s, rad/s]
-    stretch_gain: float  # k [1/s]
 
 
 @lean_kernel
@@ -124,32 +104,21 @@ def approach_speed(error: float, gain: float, deceleration: float) -> float:
 
 
 @lean_kernel
-def wanted_twist(
-    rotation: Array,
-    translation: Array,
-    goal_rotation: Array,
-    goal_translation: Array,
-    feed_forward: Array,
-    motion: Motion,
-    speed_limit: float,
-    twist: Array,
-    feedback: Array,
-    relative: Array,
-) -> None:
-    """Tool twist towards the goal into ``twist`` (6,).
+def wanted_twist(motion: Motion, data: TaskData, targets: Targets, i: int, speed_limit: float) -> None:
+    """Twist of tool ``i`` towards its target into ``data.twist``, and the part that the error makes.
 
-    ``feedback`` (6,) receives the part that the error makes. ``speed_limit`` [m/s] caps the linear part and, in
-    proportion, the angular part. ``relative`` (3, 3) is scratch.
+    ``speed_limit`` [m/s] caps the linear part and, in proportion, the angular part.
     """
+    twist, feedback, feed_forward = data.twist[i], data.feedback[i], targets.feed_forward[i]
     for row in range(3):
         for column in range(3):
             total = 0.0
             for k in range(3):
-                total += goal_rotation[row, k] * rotation[column, k]
-            relative[row, column] = total
+                total += targets.rotation[i, row, k] * data.rotation[i, column, k]
+            data.turn[row, column] = total
     for k in range(3):
-        twist[k] = goal_translation[k] - translation[k]
-    rotation_vector(relative, twist[3:6])
+        twist[k] = targets.translation[i, k] - data.translation[i, k]
+    rotation_vector(data.turn, twist[3:6])
     for part in range(2):
         piece = twist[3 * part : 3 * part + 3]
         error = np.sqrt(piece[0] ** 2 + piece[1] ** 2 + piece[2] ** 2)
@@ -187,31 +156,31 @@ def add_tool_task(J: Array, twist: Array, weight: float, H: Array, g: Array) -> 
 
 
 @lean_kernel
-def add_stretch_damping(
-    chain: Chain, placements: Placements, joint: int, J: Array, feedback: Array, gain: float, weight: float, H: Array
-) -> None:
-    """Add ``weight`` times the damping M of the tool that ``joint`` carries to H (nv, nv), ``J`` (6, nv) its Jacobian.
+def add_stretch_damping(model: TaskModel, data: TaskData, i: int) -> None:
+    """Add the damping M of tool ``i``, with the arm's weight, to ``data.H``.
 
-    For joint i between the base and joint j, d2x / dq_i dq_j = z_i x J_j (linear part). For the angular part, whose
-    second derivative is no Hessian, the same bound in magnitude stands in: J_j turns with joint i by at most |z_i|.
+    For joint k between the base and joint j, d2x / dq_k dq_j = z_k x J_j (linear part). For the angular part, whose
+    second derivative is no Hessian, the same bound in magnitude stands in: J_j turns with joint k by at most |z_k|.
     """
+    chain, placements, H = model.chain, data.placements, data.H
+    J, feedback = data.J[6 * i : 6 * i + 6], data.feedback[i]
     turning = 0.0
     for k in range(3):
         turning += feedback[3 + k] * feedback[3 + k]
     turning = ROTATION_LENGTH * ROTATION_LENGTH * np.sqrt(turning)
-    scale = weight / gain
-    far = joint
+    scale = model.priority.weight[i] / model.motion.stretch_gain
+    far = model.tools.joint[i]
     while far != 0:
         j = far - 1
         pull_j = max(0.0, -_stiffness(chain, placements, far, far, J, feedback))
         H[j, j] += scale * (turning + pull_j)
         near = chain.parent[far]
         while near != 0:
-            i = near - 1
-            pull_i = max(0.0, -_stiffness(chain, placements, near, near, J, feedback))
+            k = near - 1
+            pull_k = max(0.0, -_stiffness(chain, placements, near, near, J, feedback))
             coupling = abs(_stiffness(chain, placements, near, far, J, feedback))
             H[j, j] += scale * min(coupling, pull_j)
-            H[i, i] += scale * min(coupling, pull_i)
+            H[k, k] += scale * min(coupling, pull_k)
             near = chain.parent[near]
         far = chain.parent[far]
 
@@ -224,39 +193,3 @@ def _stiffness(chain: Chain, placements: Placements, near: int, far: int, J: Arr
     x, y, z = placements.axis[near, 0], placements.axis[near, 1], placements.axis[near, 2]
     j = far - 1
     return s[0] * (y * J[2, j] - z * J[1, j]) + s[1] * (z * J[0, j] - x * J[2, j]) + s[2] * (x * J[1, j] - y * J[0, j])
-
-
-@kernel
-def project_to_nullspace(J: Array, v: Array) -> None:
-    """Remove from ``v`` (nv,) what moves the tools: v -= J' (J J' + d I)^-1 J v, by Cholesky; J (6n, nv)."""
-    m = J.shape[0]
-    nv = J.shape[1]
-    A = np.empty((m, m))
-    y = np.empty(m)
-    for i in range(m):
-        for j in range(i + 1):
-            total = 0.0
-            for k in range(nv):
-                total += J[i, k] * J[j, k]
-            A[i, j] = total
-        A[i, i] += _PROJECTION_DAMPING * _PROJECTION_DAMPING
-        total = 0.0
-        for k in range(nv):
-            total += J[i, k] * v[k]
-        y[i] = total
-    for i in range(m):
-        for j in range(i + 1):
-            total = A[i, j]
-            for k in range(j):
-                total -= A[i, k] * A[j, k]
-            A[i, j] = np.sqrt(total) if i == j else total / A[j, j]
-        for k in range(i):
-            y[i] -= A[i, k] * y[k]
-        y[i] /= A[i, i]
-    for i in range(m - 1, -1, -1):
-        for k in range(i + 1, m):
-            y[i] -= A[k, i] * y[k]
-        y[i] /= A[i, i]
-    for j in range(nv):
-        for i in range(m):
-            v[j] -= J[i, j] * y[i]

@@ -15,65 +15,39 @@ J J' gets a little damping on its diagonal, so that the gradient stays finite wh
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
-from q2r2_control.control.geometry.kinematics import Chain, Placements
 from q2r2_control.control.jit import lean_kernel
 from q2r2_control.control.tasks.frame import ROTATION_LENGTH
-from q2r2_control.types import Array
+from q2r2_control.control.tasks.task_data import TaskData
+from q2r2_control.control.tasks.task_model import TaskModel
 
 _DAMPING = 1e-3  # least singular value that counts
 
 
-class ManipulabilityScratch(NamedTuple):
-    """Arrays that :func:`manipulability_gradient` writes."""
-
-    gram: Array  # (6, 6)
-    weights: Array  # (6, nv) (J J')^-1 J
-    gradient: Array  # (nv,)
-
-    @classmethod
-    def empty(cls, nv: int) -> ManipulabilityScratch:
-        return cls(np.zeros((6, 6)), np.zeros((6, nv)), np.zeros(nv))
-
-
 @lean_kernel
-def add_manipulability(
-    chain: Chain,
-    placements: Placements,
-    joint: int,
-    J: Array,
-    gain: float,
-    fastest: float,
-    scratch: ManipulabilityScratch,
-    posture: Array,
-) -> None:
-    """Add ``gain`` times the gradient of log m to ``posture`` (nv,) [rad/s], no joint by more than ``fastest``.
-
-    ``J`` (6, nv) is the Jacobian of the tool that ``joint`` carries.
-    """
-    manipulability_gradient(chain, placements, joint, J, scratch)
+def add_manipulability(model: TaskModel, data: TaskData, i: int) -> None:
+    """Add the gradient of arm ``i``'s log m times the gain to ``data.posture``, no joint beyond the posture's speed."""
+    manipulability_gradient(model, data, i)
+    posture, gradient = data.posture, data.manipulability.gradient
     largest = 0.0
     for j in range(posture.shape[0]):
-        largest = max(largest, abs(scratch.gradient[j]))
+        largest = max(largest, abs(gradient[j]))
     # Scaled as a whole: clipped joint by joint it would no longer be a direction in which m rises.
-    factor = min(gain, fastest / largest) if largest > 0.0 else 0.0
+    factor = min(model.manipulability_gain, model.posture.speed / largest) if largest > 0.0 else 0.0
     for j in range(posture.shape[0]):
-        posture[j] += factor * scratch.gradient[j]
+        posture[j] += factor * gradient[j]
 
 
 @lean_kernel
-def manipulability_gradient(
-    chain: Chain, placements: Placements, joint: int, J: Array, scratch: ManipulabilityScratch
-) -> None:
-    """Gradient of log m into ``scratch.gradient`` (nv,) [1/rad] for the tool that ``joint`` carries."""
-    _weigh(chain, joint, J, scratch)
-    gradient, weights = scratch.gradient, scratch.weights
+def manipulability_gradient(model: TaskModel, data: TaskData, i: int) -> None:
+    """Gradient of log m of arm ``i`` into ``data.manipulability.gradient`` (nv,) [1/rad]."""
+    _weigh(model, data, i)
+    chain, placements, J = model.chain, data.placements, data.J[6 * i : 6 * i + 6]
+    gradient, weights = data.manipulability.gradient, data.manipulability.weights
     gradient[:] = 0.0
     square = ROTATION_LENGTH * ROTATION_LENGTH
-    far = joint
+    far = model.tools.joint[i]
     while far != 0:
         j = far - 1
         near = far
@@ -94,38 +68,39 @@ def manipulability_gradient(
 
 
 @lean_kernel
-def _weigh(chain: Chain, joint: int, J: Array, scratch: ManipulabilityScratch) -> None:
-    """(J J')^-1 J into ``scratch.weights`` by Cholesky, the angular rows divided by the length they carry twice."""
-    gram, weights = scratch.gram, scratch.weights
-    for i in range(6):
-        for k in range(i + 1):
-            gram[i, k] = 0.0
+def _weigh(model: TaskModel, data: TaskData, i: int) -> None:
+    """(J J')^-1 J into the scratch's weights by Cholesky, the angular rows divided by the length they carry twice."""
+    chain, joint, J = model.chain, model.tools.joint[i], data.J[6 * i : 6 * i + 6]
+    gram, weights = data.manipulability.gram, data.manipulability.weights
+    for row in range(6):
+        for k in range(row + 1):
+            gram[row, k] = 0.0
             far = joint
             while far != 0:
-                gram[i, k] += _row_scale(i) * J[i, far - 1] * _row_scale(k) * J[k, far - 1]
+                gram[row, k] += _row_scale(row) * J[row, far - 1] * _row_scale(k) * J[k, far - 1]
                 far = chain.parent[far]
-        gram[i, i] += _DAMPING * _DAMPING
-    for i in range(6):
-        for k in range(i + 1):
-            total = gram[i, k]
+        gram[row, row] += _DAMPING * _DAMPING
+    for row in range(6):
+        for k in range(row + 1):
+            total = gram[row, k]
             for m in range(k):
-                total -= gram[i, m] * gram[k, m]
-            gram[i, k] = np.sqrt(total) if i == k else total / gram[k, k]
+                total -= gram[row, m] * gram[k, m]
+            gram[row, k] = np.sqrt(total) if row == k else total / gram[k, k]
     far = joint
     while far != 0:
         j = far - 1
-        for i in range(6):
-            total = _row_scale(i) * J[i, j]
-            for k in range(i):
-                total -= gram[i, k] * weights[k, j]
-            weights[i, j] = total / gram[i, i]
-        for i in range(5, -1, -1):
-            total = weights[i, j]
-            for k in range(i + 1, 6):
-                total -= gram[k, i] * weights[k, j]
-            weights[i, j] = total / gram[i, i]
-        for i in range(3, 6):
-            weights[i, j] /= ROTATION_LENGTH
+        for row in range(6):
+            total = _row_scale(row) * J[row, j]
+            for k in range(row):
+                total -= gram[row, k] * weights[k, j]
+            weights[row, j] = total / gram[row, row]
+        for row in range(5, -1, -1):
+            total = weights[row, j]
+            for k in range(row + 1, 6):
+                total -= gram[k, row] * weights[k, j]
+            weights[row, j] = total / gram[row, row]
+        for row in range(3, 6):
+            weights[row, j] /= ROTATION_LENGTH
         far = chain.parent[far]
 
 

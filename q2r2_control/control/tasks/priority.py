@@ -10,66 +10,58 @@ An arm without a target holds its joints, and holding is never given up: it does
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
-from q2r2_control.control.geometry.kinematics import IntArray
+from q2r2_control.control.geometry.closest_points import clamp
 from q2r2_control.control.jit import lean_kernel
-from q2r2_control.control.safety.separation_rows import speed_near
+from q2r2_control.control.tasks.task_data import Targets
+from q2r2_control.control.tasks.task_model import Proximity, TaskModel
 from q2r2_control.types import Array
 
 
-class Priority(NamedTuple):
-    """What the arms' costs weigh, and how fast the arm with priority may push."""
-
-    weight: Array  # (n,) of an arm's costs while it follows a target: 1, less if it gives way
-    posture_weight: Array  # (nv,) the same for each joint, times the posture's own weight
-    pushes: IntArray  # (n,) 1 for the arm with priority
-    yield_speed: float  # its tool's speed where another arm, which gives way, is closest [m/s]
-
-
 @lean_kernel
-def tool_speed(
-    i: int,
-    distance: Array,
-    pair_arm: Array,
-    follows: IntArray,
-    priority: Priority,
-    stop_distance: float,
-    contact_speed: float,
-    full_speed: float,
-    full_at: float,
-) -> float:
+def tool_speed(model: TaskModel, targets: Targets, distance: Array, i: int) -> float:
     """Speed allowed to arm ``i``'s tool [m/s] by round bodies near the arm: see :func:`speed_near`.
 
-    ``distance`` (p,) [m]; ``pair_arm`` (p, n) says which pairs slow which arms; ``follows`` (n,) which arms have a
-    target.
+    ``distance`` (p,) of the pairs [m].
     """
+    proximity, priority, full_speed = model.proximity, model.priority, model.motion.full_speed[0]
     nearest = np.inf
     if priority.pushes[i] == 0:
         for p in range(distance.shape[0]):
-            if pair_arm[p, i] == 1.0 and distance[p] < nearest:
+            if proximity.pair_arm[p, i] == 1.0 and distance[p] < nearest:
                 nearest = distance[p]
-        return speed_near(nearest, stop_distance, contact_speed, full_speed, full_at)
+        return speed_near(proximity, nearest, proximity.contact_speed, full_speed)
     nearest_yielding = np.inf
     for p in range(distance.shape[0]):
-        if pair_arm[p, i] != 1.0:
+        if proximity.pair_arm[p, i] != 1.0:
             continue
-        if _gives_way(pair_arm, p, i, follows):
+        if _gives_way(proximity, targets, p, i):
             nearest_yielding = min(nearest_yielding, distance[p])
         else:
             nearest = min(nearest, distance[p])
+    pushing = max(priority.yield_speed, proximity.contact_speed)
     return min(
-        speed_near(nearest, stop_distance, contact_speed, full_speed, full_at),
-        speed_near(nearest_yielding, stop_distance, max(priority.yield_speed, contact_speed), full_speed, full_at),
+        speed_near(proximity, nearest, proximity.contact_speed, full_speed),
+        speed_near(proximity, nearest_yielding, pushing, full_speed),
     )
 
 
 @lean_kernel
-def _gives_way(pair_arm: Array, p: int, i: int, follows: IntArray) -> bool:
+def speed_near(proximity: Proximity, nearest: float, contact_speed: float, full_speed: float) -> float:
+    """Tool speed allowed with two round bodies ``nearest`` apart [m]: contact speed if closest, full from ``full_at``.
+
+    Round bodies that slide past each other turn the normal; the acceleration this takes grows with the square of the
+    sliding speed, so it has to fall before the joints, shared between rows, run out of it.
+    """
+    share = clamp((nearest - proximity.stop_distance) / proximity.full_at, 0.0, 1.0)
+    return contact_speed + share * max(full_speed - contact_speed, 0.0)
+
+
+@lean_kernel
+def _gives_way(proximity: Proximity, targets: Targets, p: int, i: int) -> bool:
     """Whether the other body of pair ``p`` is one of another arm that follows a target."""
     yields = False
-    for other in range(pair_arm.shape[1]):
-        yields |= other != i and pair_arm[p, other] == 1.0 and follows[other] == 1
+    for other in range(proximity.pair_arm.shape[1]):
+        yields |= other != i and proximity.pair_arm[p, other] == 1.0 and targets.follows[other] == 1
     return yields

@@ -21,13 +21,14 @@ manipulability, which have their say as it fades out.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 
 from q2r2_control.control.geometry.closest_points import clamp, dot
-from q2r2_control.control.geometry.kinematics import Chain, IntArray, Placements
+from q2r2_control.control.geometry.kinematics import Chain, Placements
 from q2r2_control.control.jit import lean_kernel
+from q2r2_control.control.tasks.task_data import SwivelScratch, Targets, TaskData
+from q2r2_control.control.tasks.task_model import Swivels, TaskModel
 from q2r2_control.types import Array
 
 # Below these the task fades out: |p|, and |l|, the sine of the angle between the line and V.
@@ -36,49 +37,6 @@ _FULL_SINE = 0.2
 _TINY = 1e-9
 # Keeps the velocity finite where the nullspace does not turn the elbow.
 _DAMPING = 1e-6
-
-
-class Swivels(NamedTuple):
-    """The swivel task of each arm. A point is on its joint's axis, ``along`` it from the joint's origin."""
-
-    joint: IntArray  # (n, 3) joints of shoulder, elbow, wrist
-    along: Array  # (n, 3) [m]
-    angle: Array  # (n,) wanted [rad]
-    gain: Array  # (n,) [1/s]; 0: no task
-
-    @classmethod
-    def none(cls, n: int) -> Swivels:
-        return cls(np.zeros((n, 3), dtype=np.int64), np.zeros((n, 3)), np.zeros(n), np.zeros(n))
-
-
-class SwivelScratch(NamedTuple):
-    """Vectors that :func:`swivel_row` writes, and the row of each arm."""
-
-    points: Array  # (3, 3) S, E, W
-    line: Array  # (3,) w
-    offset: Array  # (3,) p, then t_p
-    reference: Array  # (3,) l, then t_l
-    by_elbow: Array  # (3,) dpsi / de
-    by_wrist: Array  # (3,) dpsi / d(W - S)
-    row: Array  # (nv,) of all arms
-    free: Array  # (nv,) its part in the tools' nullspace
-    rate: Array  # (n,)
-    share: Array  # (n,)
-
-    @classmethod
-    def empty(cls, n: int, nv: int) -> SwivelScratch:
-        return cls(
-            points=np.zeros((3, 3)),
-            line=np.zeros(3),
-            offset=np.zeros(3),
-            reference=np.zeros(3),
-            by_elbow=np.zeros(3),
-            by_wrist=np.zeros(3),
-            row=np.zeros(nv),
-            free=np.zeros(nv),
-            rate=np.zeros(n),
-            share=np.zeros(n),
-        )
 
 
 def nearest_along(chain: Chain, joint: int) -> float:
@@ -186,21 +144,15 @@ def _point_rate(chain: Chain, placements: Placements, joint: int, point: Array, 
 
 
 @lean_kernel
-def write_rows(
-    chain: Chain,
-    placements: Placements,
-    swivels: Swivels,
-    follows: IntArray,
-    fastest: float,
-    scratch: SwivelScratch,
-) -> None:
+def write_swivel_rows(model: TaskModel, data: TaskData, targets: Targets) -> None:
     """Rows, rates [rad/s times the row's size] and shares of all arms that have the task and follow a target."""
+    swivels, scratch, fastest = model.swivels, data.swivel, model.posture.speed
     scratch.row[:] = 0.0
     for i in range(swivels.gain.shape[0]):
         scratch.share[i] = 0.0
-        if swivels.gain[i] == 0.0 or follows[i] == 0:
+        if swivels.gain[i] == 0.0 or targets.follows[i] == 0:
             continue
-        angle, share, size = swivel_row(chain, placements, swivels, i, scratch)
+        angle, share, size = swivel_row(model.chain, data.placements, swivels, i, scratch)
         error = swivels.angle[i] - angle
         error -= 2.0 * np.pi * np.round(error / (2.0 * np.pi))
         scratch.share[i] = share
@@ -210,11 +162,12 @@ def write_rows(
 
 
 @lean_kernel
-def turn_elbows(member: Array, fastest: float, scratch: SwivelScratch, posture: Array) -> None:
-    """Let ``posture`` (nv,) [rad/s], which moves no tool, turn each elbow at its rate, no joint beyond ``fastest``.
+def turn_elbows(model: TaskModel, data: TaskData) -> None:
+    """Let ``data.posture``, which moves no tool, turn each elbow at its rate, no joint beyond the posture's speed.
 
-    ``member`` (n, nv) says which joints belong to which arm; ``scratch.free`` is the rows' part in the nullspace.
+    The scratch's ``free`` is the rows' part in the tools' nullspace.
     """
+    member, scratch, posture, fastest = model.tools.member, data.swivel, data.posture, model.posture.speed
     for i in range(member.shape[0]):
         if scratch.share[i] == 0.0:
             continue

@@ -24,7 +24,7 @@ from std_msgs.msg import Bool
 from std_srvs.srv import SetBool, Trigger
 
 from q2r2_control.config import Config, load_config
-from q2r2_control.control.controller import LONGEST_DT, CartesianController
+from q2r2_control.control.controller import CartesianController
 from q2r2_control.errors import ConfigError
 from q2r2_control.robot.robot import Robot
 from q2r2_control.ros.base_node import ERROR, LATCHED_QOS, OK, SENT_COMMAND_QOS, WARN, BaseNode, run_node
@@ -36,7 +36,7 @@ from q2r2_control.supervision.joint_watch import watch_settings
 from q2r2_control.supervision.supervisor import Displace, Phase, Supervisor
 from q2r2_control.supervision.target_stream import Origins, StreamSettings
 from q2r2_control.supervision.tick_pacer import TickPacer
-from q2r2_control.types import Reference
+from q2r2_control.types import LONGEST_DT, Reference
 
 _LONGEST_STOP = 3.0  # [s]
 _LOOK_PERIOD = 0.5  # between two looks at the graph [s]

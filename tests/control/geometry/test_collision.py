@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from q2r2_control.control.geometry.collision import Contact, at_least, bodies_of, distance_row, measure, pairs_of
+from q2r2_control.control.geometry.collision import bodies_of, pairs_of
+from q2r2_control.control.geometry.pair_distance import at_least, distance_row, measure
 from q2r2_control.errors import RobotError
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
@@ -47,16 +48,15 @@ def test_the_cheap_bound_is_never_more_than_the_distance(name: str) -> None:
     arrays, random = cell(name), np.random.default_rng(9)
     for _ in range(20):
         q = random_posture(arrays.robot, random)
-        _, posed = placed(arrays, q)
+        data = placed(arrays, q)
         for p, exact in enumerate(distances(arrays, q[None])[0]):
-            assert at_least(arrays.bodies, posed, arrays.pairs.first[p], arrays.pairs.second[p]) <= exact + 1e-12
+            assert at_least(arrays.collision, data, p) <= exact + 1e-12
 
 
 def _row(arrays: CellArrays, q: Array, p: int) -> Array:
-    placements, posed = placed(arrays, q)
-    first, contact, row = arrays.pairs.first[p], Contact.empty(), np.zeros(len(q))
-    measure(arrays.bodies, posed, first, arrays.pairs.second[p], posed.start[first], posed.end[first], contact)
-    distance_row(arrays.chain, placements, arrays.pairs, p, contact, row)
+    data, row = placed(arrays, q), np.zeros(len(q))
+    measure(arrays.collision, data, p)
+    distance_row(arrays.collision, data, p, row)
     return row
 
 
@@ -130,7 +130,7 @@ def test_a_joint_that_moves_both_bodies_or_neither_changes_no_distance(name: str
 
 
 def _way_bound(arrays: CellArrays, way: Array) -> Array:
-    """S (p,) of braking.py for joint ways (nv,)."""
+    """S (p,) of stop_certificate.py for joint ways (nv,)."""
     padded = np.concatenate([[0.0], way])
     return np.asarray((arrays.pairs.reach * padded[arrays.pairs.joint]).sum(axis=1))
 
@@ -152,7 +152,7 @@ def test_no_distance_changes_by_more_than_the_reach_times_the_joints_ways(seed: 
 def test_no_point_of_a_body_is_farther_from_a_joints_axis_than_its_reach(name: str) -> None:
     arrays, random = cell(name), np.random.default_rng(12)
     for _ in range(5):
-        placements, posed = placed(arrays, random_posture(arrays.robot, random))
+        placements, posed, _ = placed(arrays, random_posture(arrays.robot, random))
         for p in range(len(arrays.pairs.first)):
             for joint, sign, reach in zip(
                 arrays.pairs.joint[p], arrays.pairs.sign[p], arrays.pairs.reach[p], strict=True
@@ -201,4 +201,4 @@ def test_two_boxes_are_refused() -> None:
         model.addGeometryObject(pin.GeometryObject(name, 0, pin.SE3.Identity(), coal.Box(1.0, 1.0, 1.0)))
     model.addCollisionPair(pin.CollisionPair(0, 1))
     with pytest.raises(RobotError, match=r"two boxes; allowed: at most one box"):
-        pairs_of(model, arrays.chain, bodies_of(model), np.ones(14))
+        pairs_of(model, arrays.collision.chain, bodies_of(model), np.ones(14))

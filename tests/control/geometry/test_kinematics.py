@@ -57,12 +57,15 @@ def test_slides_and_oblique_axes_are_where_pinocchio_puts_them() -> None:
 
 
 def test_branches_start_from_their_own_parent() -> None:
-    model = pin.Model()
-    base = model.addJoint(0, pin.JointModelRZ(), pin.SE3.Random(), "base")
-    left = model.addJoint(base, pin.JointModelRX(), pin.SE3.Random(), "left")
-    model.addJoint(base, pin.JointModelRY(), pin.SE3.Random(), "right")
-    model.addJoint(left, pin.JointModelPZ(), pin.SE3.Random(), "left_slide")
-    random = np.random.default_rng(5)
+    model, random = pin.Model(), np.random.default_rng(5)
+
+    def offset() -> pin.SE3:
+        return pin.SE3(pin.exp3(random.normal(size=3)), random.normal(size=3))
+
+    base = model.addJoint(0, pin.JointModelRZ(), offset(), "base")
+    left = model.addJoint(base, pin.JointModelRX(), offset(), "left")
+    model.addJoint(base, pin.JointModelRY(), offset(), "right")
+    model.addJoint(left, pin.JointModelPZ(), offset(), "left_slide")
     _assert_equals_pinocchio(model, [random.uniform(-2, 2, 4) for _ in range(10)])
 
 

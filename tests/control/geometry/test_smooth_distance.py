@@ -3,8 +3,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from q2r2_control.control.geometry.collision import Contact, distance_row, measure
-from q2r2_control.control.geometry.smooth_distance import smooth_distance
+from q2r2_control.control.geometry.pair_distance import distance_row, measure
+from q2r2_control.control.geometry.smooth_distance import measure_smooth
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 from tests.control.cells import CellArrays, arrays_of, cell, placed, random_posture
@@ -15,14 +15,9 @@ CORES_APART = 0.03  # [m]
 
 def _looked_at(arrays: CellArrays, q: Array, p: int, smooth: bool = True) -> tuple[float, Array]:
     """Distance of pair ``p`` and its row."""
-    placements, posed = placed(arrays, q)
-    contact, row = Contact.empty(), np.zeros(len(q))
-    first, second = arrays.pairs.first[p], arrays.pairs.second[p]
-    if smooth:
-        distance = smooth_distance(arrays.bodies, posed, first, second, SMOOTHING, contact)
-    else:
-        distance = measure(arrays.bodies, posed, first, second, posed.start[first], posed.end[first], contact)
-    distance_row(arrays.chain, placements, arrays.pairs, p, contact, row)
+    data, row = placed(arrays, q), np.zeros(len(q))
+    distance = measure_smooth(arrays.collision, data, p, SMOOTHING) if smooth else measure(arrays.collision, data, p)
+    distance_row(arrays.collision, data, p, row)
     return distance, row
 
 
@@ -53,7 +48,7 @@ def test_the_smooth_distance_is_larger_than_the_distance_by_no_more_than_stated(
 def test_it_is_the_least_over_all_points_of_both_segments(seen: list[tuple[Array, int]]) -> None:
     arrays, parameters = cell("dual_iiwa7"), np.linspace(0.0, 1.0, 201)
     for q, p in seen[::5]:
-        _, posed = placed(arrays, q)
+        posed = placed(arrays, q).posed
         first, second = arrays.pairs.first[p], arrays.pairs.second[p]
         on_first = posed.start[first] + parameters[:, None] * (posed.end[first] - posed.start[first])
         cost = SMOOTHING * (parameters - 0.5) ** 2

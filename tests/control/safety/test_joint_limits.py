@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from q2r2_control.control.safety.joint_limits import fastest_towards, next_velocity_box
+from q2r2_control.control.safety.joint_limits import JointLimits, VelocityBox, fastest_towards, next_velocity_box
 from q2r2_control.types import Array
 
 JOINTS = 60  # stepped side by side
@@ -49,26 +49,14 @@ def _bounds(random: np.random.Generator, longest: float, n: int = JOINTS) -> Bou
 
 
 def _box(q: Array, v: Array, bounds: Bounds, h: float) -> Box:
-    lower, upper = np.zeros_like(q), np.zeros_like(q)
-    inside = next_velocity_box(
-        q,
-        v,
-        bounds.lower,
-        bounds.upper,
-        bounds.velocity,
-        bounds.acceleration,
-        h,
-        bounds.longest,
-        RETURN_SPEED,
-        lower,
-        upper,
-        np.zeros((len(q), 2), dtype=np.int64),
-    )
-    return Box(lower, upper, inside)
+    limits = JointLimits(bounds.lower, bounds.upper, bounds.velocity, bounds.acceleration, bounds.longest, RETURN_SPEED)
+    box = VelocityBox.empty(len(q))
+    inside = next_velocity_box(limits, q, v, h, box)
+    return Box(box.lower, box.upper, inside)
 
 
 def _stoppable(room: Array, v: Array, bounds: Bounds) -> npt.NDArray[np.bool_]:
-    """P of limits.py towards one side, with rounding."""
+    """P of joint_limits.py towards one side, with rounding."""
     return np.where(v <= 0.0, room >= -EXACT, v**2 / (2 * bounds.acceleration) + bounds.longest * v <= room + EXACT)
 
 

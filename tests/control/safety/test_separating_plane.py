@@ -3,10 +3,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from q2r2_control.control.geometry.collision import Contact, measure
+from q2r2_control.control.geometry.pair_distance import measure
 from q2r2_control.control.safety.separating_plane import step_keeps_beyond
 from q2r2_control.types import Array
-from tests.control.cells import NAMES, cell, distances, placed, random_posture
+from tests.control.cells import NAMES, cell, distances, kernel_data, kernel_model, random_posture
 
 H = 0.002
 
@@ -17,27 +17,11 @@ def _moved(q: Array, v: Array, v_next: Array, t: Array) -> Array:
 
 
 def _proven(name: str, p: int, q: Array, v: Array, v_next: Array, threshold: float) -> bool:
-    arrays = cell(name)
-    placements, posed = placed(arrays, q)
-    contact, first = Contact.empty(), arrays.pairs.first[p]
-    measure(arrays.bodies, posed, first, arrays.pairs.second[p], posed.start[first], posed.end[first], contact)
-    way = np.abs(_moved(q, v, v_next, np.linspace(0.0, H, 50)) - q).max(axis=0)
-    return bool(
-        step_keeps_beyond(
-            arrays.chain,
-            placements,
-            arrays.bodies,
-            posed,
-            arrays.pairs,
-            p,
-            contact,
-            v,
-            v_next,
-            H,
-            way,
-            threshold,
-        )
-    )
+    model, data = kernel_model(name).safety, kernel_data(name, q, v).safety
+    data.candidate.v[:] = v_next
+    data.rollout.step_travel[:] = np.abs(_moved(q, v, v_next, np.linspace(0.0, H, 50)) - q).max(axis=0)
+    measure(model.collision, data.collision, p)
+    return bool(step_keeps_beyond(model, data, p, H, threshold))
 
 
 @pytest.mark.parametrize("name", NAMES)

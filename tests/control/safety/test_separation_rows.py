@@ -5,42 +5,22 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from q2r2_control.control.geometry.collision import Contact
-from q2r2_control.control.safety.separation_rows import Approach, Rows, separation_rows, slowest_rate, speed_near
-from q2r2_control.control.safety.velocity_bounds import Pace, find_pace
+from q2r2_control.control.safety.separation_rows import slowest_rate, write_separation_rows
+from q2r2_control.control.safety.velocity_bounds import update_body_velocities
 from q2r2_control.types import Array
-from tests.control.cells import NAMES, cell, distances, placed, random_posture
+from tests.control.cells import NAMES, cell, distances, kernel_data, kernel_model, random_posture
 
-APPROACH = Approach(stop_distance=0.022, gain=4.0, recovery_speed=0.05, slow_below=0.122)
-A = np.full(14, 10.0)
-H = 0.002
+APPROACH = kernel_model("dual_iiwa7").safety.approach
 
 
 class Seen:
-    """What :func:`separation_rows` finds in one state."""
+    """What :func:`write_separation_rows` finds in one state."""
 
     def __init__(self, name: str, q: Array, v: Array) -> None:
-        arrays = cell(name)
-        placements, posed = placed(arrays, q)
-        pace = Pace.empty(arrays.chain, arrays.bodies)
-        find_pace(arrays.chain, placements, arrays.bodies, posed, v, pace)
-        rows = Rows.empty(len(arrays.pairs.first), len(q))
-        self.distance = np.zeros(len(arrays.pairs.first))
-        self.closest = separation_rows(
-            arrays.chain,
-            placements,
-            arrays.bodies,
-            posed,
-            arrays.pairs,
-            pace,
-            v,
-            A,
-            H,
-            APPROACH,
-            self.distance,
-            Contact.empty(),
-            rows,
-        )
+        model, data = kernel_model(name).safety, kernel_data(name, q, v).safety
+        update_body_velocities(model.collision, data.collision, v, data.velocities)
+        self.closest = write_separation_rows(model, data)
+        self.distance, rows = data.distance, data.rows
         used = int(rows.used[0])
         self.matrix, self.lower, self.pair = rows.matrix[:used], rows.lower[:used], rows.pair[:used]
 
@@ -63,7 +43,7 @@ def test_distances_are_exact_where_they_matter_and_never_too_large(seed: int, na
     matters = (exact <= APPROACH.stop_distance) | (round_pair & (exact <= APPROACH.slow_below))
     np.testing.assert_allclose(seen.distance[matters], exact[matters], rtol=0, atol=1e-12)
     assert seen.distance[seen.closest] == pytest.approx(exact.min(), abs=1e-12)
-    # braking.py takes a bound below the least distance for a pair that is too close.
+    # The stop certificate takes a bound below the least distance for a pair that is too close.
     assert (seen.distance[~matters] > APPROACH.stop_distance).all()
 
 
@@ -125,12 +105,3 @@ def test_closer_than_the_buffer_a_pair_opens_faster_the_deeper_it_is_up_to_the_r
     assert rates[0] == 0.0
     assert rates == sorted(rates)
     assert rates[1:] == pytest.approx([0.004, 0.02, 0.05, 0.05])
-
-
-def test_the_tool_speed_falls_steadily_from_full_to_contact_speed() -> None:
-    speeds = [speed_near(nearest, 0.022, 0.05, 1.0, 0.1) for nearest in np.linspace(-0.5, 1.0, 301)]
-    assert speeds == sorted(speeds)
-    assert speeds[0] == 0.05
-    assert speeds[-1] == 1.0
-    assert speed_near(0.072, 0.022, 0.05, 1.0, 0.1) == pytest.approx(0.525)
-    assert speed_near(np.inf, 0.022, 0.05, 1.0, 0.1) == 1.0

@@ -2,16 +2,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cache
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from q2r2_control.control.safety.stop_certificate import Rollout, brake, certify, step_way
+from q2r2_control.control.safety.stop_certificate import brake, certify, step_travel
 from q2r2_control.types import Array
-from tests.control.cells import NAMES, CellArrays, cell, distances, placed, random_posture
+from tests.control.cells import NAMES, CellArrays, cell, distances, kernel_data, kernel_model, random_posture
 
 MIN_DISTANCE = 0.02
 ACCELERATION = 10.0
@@ -62,7 +61,7 @@ def test_the_way_of_a_step_counts_there_and_back(v: float, v_next: float, h: flo
     t = np.linspace(0.0, h, 2001)
     q = v * t + 0.5 * (v_next - v) / h * t**2
     way = float(np.abs(np.diff(q)).sum())
-    assert way - 1e-15 <= step_way(v, v_next, h) <= way + 1e-6 * h * (abs(v) + abs(v_next)) + 1e-15
+    assert way - 1e-15 <= step_travel(v, v_next, h) <= way + 1e-6 * h * (abs(v) + abs(v_next)) + 1e-15
 
 
 @dataclass(frozen=True)
@@ -93,32 +92,13 @@ def _least(name: str, motion: Motion) -> Array:
     return np.asarray(distances(cell(name), samples, exact_below=0.05).min(axis=0))
 
 
-@cache
-def _rollout(name: str) -> Rollout:
-    return Rollout.empty(cell(name).chain, cell(name).bodies)
-
-
 def _certified(name: str, motion: Motion, known: Array | None = None) -> bool:
-    arrays = cell(name)
-    before = distances(arrays, motion.q[None])[0] if known is None else known
-    placements, posed = placed(arrays, motion.q)
-    return bool(
-        certify(
-            arrays.chain,
-            placements,
-            arrays.bodies,
-            arrays.pairs,
-            before,
-            posed,
-            motion.v,
-            motion.q_next,
-            motion.v_next,
-            np.full(14, ACCELERATION),
-            H,
-            MIN_DISTANCE,
-            _rollout(name),
-        )
-    )
+    model, data = kernel_model(name).safety, kernel_data(name, motion.q, motion.v).safety
+    data.distance[:] = distances(cell(name), motion.q[None])[0] if known is None else known
+    data.candidate.q[:] = motion.q_next
+    data.candidate.v[:] = motion.v_next
+    data.candidate.deceleration[:] = ACCELERATION
+    return bool(certify(model, data, H))
 
 
 def _motions_from(name: str, starts: Iterator[Array], random: np.random.Generator) -> Iterator[Motion]:

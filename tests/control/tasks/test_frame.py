@@ -8,48 +8,36 @@ from hypothesis import strategies as st
 
 from q2r2_control.control.tasks.frame import (
     ROTATION_LENGTH,
-    Motion,
-    Tools,
     add_tool_task,
     approach_speed,
-    project_to_nullspace,
     rotation_vector,
     tool_jacobian,
     tool_pose,
     wanted_twist,
 )
-from q2r2_control.robot.robot import Robot
+from q2r2_control.control.tasks.task_data import Targets
+from q2r2_control.control.tasks.task_model import Motion, tools_of
 from q2r2_control.types import Array
-from tests.control.cells import NAMES, cell, placed, random_posture
+from tests.control.cells import NAMES, cell, kernel_data, kernel_model, placed, random_posture
 
 MOTION = Motion(np.array([6.0, 5.0]), np.array([2.0, 5.0]), np.array([1.0, 2.5]), 0.02)
-
-
-def _tools(robot: Robot) -> Tools:
-    frames = [robot.model.frames[arm.frame_id] for arm in robot.arms.values()]
-    return Tools(
-        np.array([frame.parentJoint for frame in frames]),
-        np.array([frame.placement.rotation for frame in frames]),
-        np.array([frame.placement.translation for frame in frames]),
-        np.array([np.isin(np.arange(robot.model.nv), arm.joints).astype(float) for arm in robot.arms.values()]),
-    )
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_tool_poses_and_jacobians_equal_pinocchios(name: str) -> None:
     arrays, random = cell(name), np.random.default_rng(20)
-    model, data, tools = arrays.robot.model, arrays.robot.model.createData(), _tools(arrays.robot)
+    model, data, tools = arrays.robot.model, arrays.robot.model.createData(), tools_of(arrays.robot)
     rotation, translation, J = np.zeros((3, 3)), np.zeros(3), np.ones((6, model.nv))
     for _ in range(20):
         q = random_posture(arrays.robot, random)
-        placements, _ = placed(arrays, q)
+        placements = placed(arrays, q).placements
         pin.computeJointJacobians(model, data, q)
         for i, arm in enumerate(arrays.robot.arms.values()):
             pose = pin.updateFramePlacement(model, data, arm.frame_id)
             tool_pose(placements, tools, i, rotation, translation)
             np.testing.assert_allclose(rotation, pose.rotation, rtol=0, atol=1e-12)
             np.testing.assert_allclose(translation, pose.translation, rtol=0, atol=1e-12)
-            tool_jacobian(arrays.chain, placements, tools, i, translation, J)
+            tool_jacobian(arrays.collision.chain, placements, tools, i, translation, J)
             expected = pin.getFrameJacobian(model, data, arm.frame_id, pin.LOCAL_WORLD_ALIGNED)
             np.testing.assert_allclose(J, expected, rtol=0, atol=1e-12)
 
@@ -107,51 +95,44 @@ def test_following_the_approach_speed_asks_for_no_more_than_the_planned_decelera
     assert braking.min() >= 0.0
 
 
-def _twist(tool: pin.SE3, goal: pin.SE3, feed_forward: Array, speed_limit: float = 1.0) -> Array:
-    twist = np.zeros(6)
-    wanted_twist(
-        tool.rotation,
-        tool.translation,
-        goal.rotation,
-        goal.translation,
-        feed_forward,
-        MOTION,
-        speed_limit,
-        twist,
-        np.zeros(6),
-        np.zeros((3, 3)),
-    )
-    return twist
+def _twist(tool: pin.SE3, target: pin.SE3, feed_forward: Array, speed_limit: float = 1.0) -> Array:
+    model, arm = kernel_model("dual_iiwa7").tasks, 1
+    data, targets = kernel_data("dual_iiwa7", np.zeros(14)).tasks, Targets.empty(model, 1.0, 1.0, 1.0)
+    data.rotation[arm], data.translation[arm] = tool.rotation, tool.translation
+    targets.rotation[arm], targets.translation[arm] = target.rotation, target.translation
+    targets.feed_forward[arm] = feed_forward
+    wanted_twist(MOTION, data, targets, arm, speed_limit)
+    return data.twist[arm]
 
 
 def _poses(random: np.random.Generator) -> tuple[pin.SE3, pin.SE3]:
-    tool, goal = (pin.SE3(pin.exp3(random.normal(size=3)), random.uniform(-1, 1, 3)) for _ in range(2))
-    return tool, goal
+    tool, target = (pin.SE3(pin.exp3(random.normal(size=3)), random.uniform(-1, 1, 3)) for _ in range(2))
+    return tool, target
 
 
-def test_a_tool_that_moves_with_the_wanted_twist_reaches_its_goal() -> None:
+def test_a_tool_that_moves_with_the_wanted_twist_reaches_its_target() -> None:
     random, dt = np.random.default_rng(23), 0.01
     for _ in range(4):
-        tool, goal = _poses(random)
+        tool, target = _poses(random)
         for _ in range(600):
-            twist = _twist(tool, goal, np.zeros(6))
+            twist = _twist(tool, target, np.zeros(6))
             tool = pin.SE3(pin.exp3(twist[3:] * dt) @ tool.rotation, tool.translation + twist[:3] * dt)
-        assert np.linalg.norm(tool.translation - goal.translation) < 1e-6
-        assert np.linalg.norm(pin.log3(tool.rotation.T @ goal.rotation)) < 1e-6
+        assert np.linalg.norm(tool.translation - target.translation) < 1e-6
+        assert np.linalg.norm(pin.log3(tool.rotation.T @ target.rotation)) < 1e-6
 
 
 def test_the_wanted_twist_never_exceeds_the_speed_limits() -> None:
     random = np.random.default_rng(24)
     for _ in range(200):
-        tool, goal = _poses(random)
+        tool, target = _poses(random)
         limit = random.uniform(0.01, 2.0)
-        twist = _twist(tool, goal, 10.0 ** random.uniform(-2, 1) * random.normal(size=6), limit)
+        twist = _twist(tool, target, 10.0 ** random.uniform(-2, 1) * random.normal(size=6), limit)
         allowed = min(limit, 1.0)
         assert np.linalg.norm(twist[:3]) <= allowed * MOTION.full_speed[0] + 1e-12
         assert np.linalg.norm(twist[3:]) <= allowed * MOTION.full_speed[1] + 1e-12
 
 
-def test_at_the_goal_only_the_goals_own_motion_is_wanted() -> None:
+def test_at_the_target_only_the_targets_own_motion_is_wanted() -> None:
     tool, _ = _poses(np.random.default_rng(25))
     moving = np.array([0.1, -0.2, 0.3, 0.4, -0.5, 0.6])
     np.testing.assert_allclose(_twist(tool, tool, moving), moving, atol=1e-12)
@@ -166,36 +147,3 @@ def test_a_tool_task_is_the_weighted_square_of_its_twist_error() -> None:
     W = np.diag([1.0] * 3 + [ROTATION_LENGTH**2] * 3)
     np.testing.assert_allclose(H, 0.1 * J.T @ W @ J, atol=1e-12)
     np.testing.assert_allclose(g, -0.1 * J.T @ W @ twist, atol=1e-12)
-
-
-def test_what_is_left_in_the_nullspace_moves_no_tool() -> None:
-    random = np.random.default_rng(27)
-    for _ in range(20):
-        J = np.zeros((12, 14))
-        J[:6, :7], J[6:, 7:] = random.normal(size=(6, 7)), random.normal(size=(6, 7))
-        v = random.normal(size=14)
-        exact = v - np.linalg.pinv(J) @ J @ v
-        project_to_nullspace(J, v)
-        np.testing.assert_allclose(J @ v, 0.0, atol=1e-4)
-        np.testing.assert_allclose(v, exact, atol=1e-4)
-
-
-def test_a_tool_without_a_jacobian_leaves_the_posture_as_it_is() -> None:
-    v = np.arange(14.0)
-    project_to_nullspace(np.zeros((12, 14)), v)
-    np.testing.assert_array_equal(v, np.arange(14.0))
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_in_a_stretched_posture_the_nullspace_stays_finite(name: str) -> None:
-    arrays = cell(name)
-    tools = _tools(arrays.robot)
-    placements, _ = placed(arrays, np.zeros(14))
-    J, rotation, translation = np.zeros((12, 14)), np.zeros((3, 3)), np.zeros(3)
-    for i in range(2):
-        tool_pose(placements, tools, i, rotation, translation)
-        tool_jacobian(arrays.chain, placements, tools, i, translation, J[6 * i : 6 * i + 6])
-    v = np.full(14, 0.5)
-    project_to_nullspace(J, v)
-    assert np.linalg.norm(v) <= np.linalg.norm(np.full(14, 0.5)) + 1e-9
-    np.testing.assert_allclose(J @ v, 0.0, atol=1e-3)

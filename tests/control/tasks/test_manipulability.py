@@ -10,11 +10,12 @@ from q2r2_control.config import load_config
 from q2r2_control.config.control import ControllerSettings
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.control.tasks.frame import ROTATION_LENGTH
-from q2r2_control.control.tasks.manipulability import ManipulabilityScratch, add_manipulability, manipulability_gradient
+from q2r2_control.control.tasks.manipulability import add_manipulability, manipulability_gradient
+from q2r2_control.control.tasks.task_data import TaskData
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 from q2r2_control.verification.contract import Contract
-from tests.control.cells import NAMES, cell, placed, random_posture
+from tests.control.cells import NAMES, cell, kernel_data, kernel_model, random_posture
 
 
 def jacobian(robot: Robot, q: Array, arm: str) -> Array:
@@ -29,37 +30,38 @@ def log_manipulability(robot: Robot, q: Array, arm: str, damping: float = 1e-3) 
     return 0.5 * float(np.linalg.slogdet(scaled @ scaled.T + damping**2 * np.eye(6))[1])
 
 
+def task_data(name: str, q: Array) -> TaskData:
+    """Placements and tool Jacobians at ``q`` (nv,), nothing else."""
+    data, robot = kernel_data(name, q).tasks, cell(name).robot
+    for i, arm in enumerate(robot.arms):
+        data.J[6 * i : 6 * i + 6] = jacobian(robot, q, arm)
+    return data
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_the_gradient_equals_finite_differences(name: str) -> None:
-    arrays, random, step = cell(name), np.random.default_rng(41), 1e-5
-    robot = arrays.robot
-    scratch = ManipulabilityScratch.empty(14)
+    robot, random, step = cell(name).robot, np.random.default_rng(41), 1e-5
     for _ in range(10):
         q = random_posture(robot, random)
-        placements, _ = placed(arrays, q)
-        for arm in robot.arms:
-            joint = robot.model.frames[robot.arms[arm].frame_id].parentJoint
-            manipulability_gradient(arrays.chain, placements, joint, jacobian(robot, q, arm), scratch)
+        data = task_data(name, q)
+        for i, arm in enumerate(robot.arms):
+            manipulability_gradient(kernel_model(name).tasks, data, i)
             differences = [
                 (log_manipulability(robot, q + step * row, arm) - log_manipulability(robot, q - step * row, arm))
                 / (2 * step)
                 for row in np.eye(14)
             ]
-            np.testing.assert_allclose(scratch.gradient, differences, rtol=1e-4, atol=1e-5)
+            np.testing.assert_allclose(data.manipulability.gradient, differences, rtol=1e-4, atol=1e-5)
 
 
 def test_where_the_arm_is_stretched_out_the_addition_is_finite_and_bounded() -> None:
-    arrays = cell("dual_iiwa7")
-    robot, scratch = arrays.robot, ManipulabilityScratch.empty(14)
+    model = kernel_model("dual_iiwa7").tasks._replace(manipulability_gain=10.0)
     for offset in (0.0, 1e-12, 1e-6, 1e-3):
-        q = np.full(14, offset)
-        placements, _ = placed(arrays, q)
-        posture = np.zeros(14)
-        joint = robot.model.frames[robot.arms["left"].frame_id].parentJoint
-        add_manipulability(arrays.chain, placements, joint, jacobian(robot, q, "left"), 10.0, 0.5, scratch, posture)
-        assert np.isfinite(posture).all()
-        assert np.abs(posture).max() <= 0.5 * (1 + 1e-12)
-        assert not posture[7:].any()
+        data = task_data("dual_iiwa7", np.full(14, offset))
+        add_manipulability(model, data, 0)
+        assert np.isfinite(data.posture).all()
+        assert np.abs(data.posture).max() <= model.posture.speed * (1 + 1e-12)
+        assert not data.posture[7:].any()
 
 
 def test_manipulability_rises_while_the_tool_stays() -> None:

@@ -1,4 +1,4 @@
-"""A posture that is given at every tick, as of arms that something else moves: elbows go there, promises stay."""
+"""The nullspace alone, then a posture that is given at every tick: elbows go there, promises stay."""
 
 from __future__ import annotations
 
@@ -7,9 +7,12 @@ import pinocchio as pin
 import pytest
 
 from q2r2_control import CartesianController, ControllerSettings, Robot
+from q2r2_control.control.tasks.frame import tool_jacobian, tool_pose
+from q2r2_control.control.tasks.posture import project_to_nullspace
+from q2r2_control.control.tasks.task_model import tools_of
 from q2r2_control.types import Array
 from q2r2_control.verification.contract import Contract
-from tests.control.cells import cell
+from tests.control.cells import NAMES, cell, placed
 
 DT = 0.002
 
@@ -72,3 +75,35 @@ def test_postures_that_leap_anywhere_at_every_tick_break_no_promise(
         posture = random.uniform(robot.position_lower, robot.position_upper)
         contract.check(controller.step(goal, DT, posture), DT)
     assert contract.uncertified == 0
+
+
+def test_what_is_left_in_the_nullspace_moves_no_tool() -> None:
+    random = np.random.default_rng(27)
+    for _ in range(20):
+        J = np.zeros((12, 14))
+        J[:6, :7], J[6:, 7:] = random.normal(size=(6, 7)), random.normal(size=(6, 7))
+        v = random.normal(size=14)
+        exact = v - np.linalg.pinv(J) @ J @ v
+        project_to_nullspace(J, v)
+        np.testing.assert_allclose(J @ v, 0.0, atol=1e-4)
+        np.testing.assert_allclose(v, exact, atol=1e-4)
+
+
+def test_a_tool_without_a_jacobian_leaves_the_posture_as_it_is() -> None:
+    v = np.arange(14.0)
+    project_to_nullspace(np.zeros((12, 14)), v)
+    np.testing.assert_array_equal(v, np.arange(14.0))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_in_a_stretched_posture_the_nullspace_stays_finite(name: str) -> None:
+    arrays = cell(name)
+    tools, placements = tools_of(arrays.robot), placed(arrays, np.zeros(14)).placements
+    J, rotation, translation = np.zeros((12, 14)), np.zeros((3, 3)), np.zeros(3)
+    for i in range(2):
+        tool_pose(placements, tools, i, rotation, translation)
+        tool_jacobian(arrays.collision.chain, placements, tools, i, translation, J[6 * i : 6 * i + 6])
+    v = np.full(14, 0.5)
+    project_to_nullspace(J, v)
+    assert np.linalg.norm(v) <= np.linalg.norm(np.full(14, 0.5)) + 1e-9
+    np.testing.assert_allclose(J @ v, 0.0, atol=1e-3)

@@ -13,7 +13,9 @@ from q2r2_control.config import Config, load_config
 from q2r2_control.config.control import ControllerSettings
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.control.geometry.kinematics import Placements, place
-from q2r2_control.control.tasks.swivel import Swivels, SwivelScratch, nearest_along, swivel_angle, swivel_row
+from q2r2_control.control.tasks.swivel import nearest_along, swivel_angle, swivel_row
+from q2r2_control.control.tasks.task_data import SwivelScratch
+from q2r2_control.control.tasks.task_model import Swivels
 from q2r2_control.errors import ConfigError
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
@@ -43,13 +45,13 @@ def swivels_of(arrays: CellArrays) -> Swivels:
     swivels = Swivels.none(2)
     for i, arm in enumerate(arrays.robot.arms.values()):
         swivels.joint[i] = arm.joints[[1, 3, 5]] + 1
-        swivels.along[i] = [nearest_along(arrays.chain, int(joint)) for joint in swivels.joint[i]]
+        swivels.along[i] = [nearest_along(arrays.collision.chain, int(joint)) for joint in swivels.joint[i]]
     return swivels
 
 
 def angle_at(arrays: CellArrays, q: Array, i: int) -> tuple[float, float]:
-    placements = Placements.empty(arrays.chain)
-    place(arrays.chain, q, placements)
+    placements = Placements.empty(arrays.collision.chain)
+    place(arrays.collision.chain, q, placements)
     return swivel_angle(placements, swivels_of(arrays), i, SwivelScratch.empty(2, 14))
 
 
@@ -94,13 +96,13 @@ def test_a_raised_elbow_is_at_zero_and_one_that_hangs_at_half_a_turn() -> None:
 @pytest.mark.parametrize("name", ["dual_iiwa7", "dual_panda"])
 def test_the_row_is_the_gradient_of_the_angle(name: str) -> None:
     arrays, random, step = cell(name), np.random.default_rng(32), 1e-6
-    swivels, placements = swivels_of(arrays), Placements.empty(arrays.chain)
+    swivels, placements = swivels_of(arrays), Placements.empty(arrays.collision.chain)
     for _ in range(20):
         q = random_posture(arrays.robot, random)
-        place(arrays.chain, q, placements)
+        place(arrays.collision.chain, q, placements)
         for i in range(2):
             scratch = SwivelScratch.empty(2, 14)
-            _, share, size = swivel_row(arrays.chain, placements, swivels, i, scratch)
+            _, share, size = swivel_row(arrays.collision.chain, placements, swivels, i, scratch)
             differences = np.zeros(14)
             for j in range(14):
                 ends = [angle_at(arrays, q + sign * step * np.eye(14)[j], i)[0] for sign in (1, -1)]
@@ -123,9 +125,9 @@ def test_where_the_angle_is_not_defined_the_task_is_faded_out_and_finite(posture
         q = arrays.robot.home.copy()
         q[:7] = posture
         q += offset
-        placements, scratch = Placements.empty(arrays.chain), SwivelScratch.empty(2, 14)
-        place(arrays.chain, q, placements)
-        _, share, size = swivel_row(arrays.chain, placements, swivels_of(arrays), 0, scratch)
+        placements, scratch = Placements.empty(arrays.collision.chain), SwivelScratch.empty(2, 14)
+        place(arrays.collision.chain, q, placements)
+        _, share, size = swivel_row(arrays.collision.chain, placements, swivels_of(arrays), 0, scratch)
         assert 0.0 <= share < 0.05
         assert np.isfinite(scratch.row).all()
         assert np.abs(scratch.row).max() < 1.0

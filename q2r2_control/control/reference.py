@@ -1,0 +1,51 @@
+"""The reference: observed where it is, moved by what the safety filter lets through, compiled."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from q2r2_control.control.geometry.collision import update_placements
+from q2r2_control.control.jit import Held, kernel, lean_kernel
+from q2r2_control.control.kernel_data import KernelData
+from q2r2_control.control.kernel_model import KernelModel
+from q2r2_control.control.safety.safety_filter import apply_safety_filter, certify_start
+from q2r2_control.control.safety.separation_rows import normalise_rows, write_separation_rows
+from q2r2_control.control.safety.velocity_bounds import update_body_velocities
+from q2r2_control.control.tasks.frame import tool_pose
+from q2r2_control.types import Array
+
+
+@kernel
+def start_reference(held_model: Held, held_data: Held) -> tuple[int, float, bool]:
+    """Observe after a reset: the closest pair, its distance, and whether the stop is known to keep all apart."""
+    model, data = held_model.value, held_data.value
+    closest, distance = _observe(model, data)
+    return closest, distance, certify_start(model.safety, data.safety)
+
+
+@kernel
+def move_reference(
+    held_model: Held, held_data: Held, solution: Array, usable: bool, h: float, share: float
+) -> tuple[int, int, float, float]:
+    """One step of ``h`` [s] with the solver's next velocities (nv,), as far as :func:`apply_safety_filter` takes them.
+
+    Returns its outcome, the closest pair at the new state, its distance [m] (infinite if there is no pair), and the
+    largest violation of a row [rad/s].
+    """
+    model, data = held_model.value, held_data.value
+    outcome, slack = apply_safety_filter(model.safety, data.safety, solution, usable, h, share)
+    closest, distance = _observe(model, data)
+    return outcome, closest, distance, slack
+
+
+@lean_kernel
+def _observe(model: KernelModel, data: KernelData) -> tuple[int, float]:
+    """Tool poses, distances and separation rows at the reference; the closest pair and its distance [m]."""
+    collision, safety = model.safety.collision, data.safety
+    update_placements(collision, safety.collision, safety.state.q)
+    update_body_velocities(collision, safety.collision, safety.state.v, safety.velocities)
+    for i in range(model.tasks.tools.joint.shape[0]):
+        tool_pose(data.tasks.placements, model.tasks.tools, i, data.tasks.rotation[i], data.tasks.translation[i])
+    closest = write_separation_rows(model.safety, safety)
+    normalise_rows(safety)
+    return closest, safety.distance[closest] if safety.distance.shape[0] > 0 else np.inf

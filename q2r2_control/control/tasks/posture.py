@@ -1,0 +1,83 @@
+"""Joints that no tool needs: a cost on their velocity, and joints of held arms that stay where they are, compiled.
+
+For all joints w |v - v_p|^2 with the posture velocity v_p projected into the tools' nullspace, so that at rest it
+leaves no tool error. An arm without a target holds its joints by a cost of their own.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from q2r2_control.control.geometry.closest_points import clamp
+from q2r2_control.control.jit import kernel, lean_kernel
+from q2r2_control.control.tasks.task_data import Targets, TaskData
+from q2r2_control.control.tasks.task_model import TaskModel
+from q2r2_control.types import Array
+
+# A held arm is not pushed about by the other one's task, but may give way to recover separation.
+_HOLD_WEIGHT = 10.0
+_HOLD_GAIN = 4.0  # [1/s]
+_PROJECTION_DAMPING = 1e-3
+
+
+@lean_kernel
+def pull_to_posture(model: TaskModel, data: TaskData, targets: Targets, q: Array) -> None:
+    """Velocity of every joint from ``q`` (nv,) towards the posture that is asked for, into ``data.posture``."""
+    gain, speed = model.posture.gain, model.posture.speed
+    for j in range(q.shape[0]):
+        data.posture[j] = clamp(gain * (targets.posture[j] - q[j]), -speed, speed)
+
+
+@lean_kernel
+def add_hold_task(data: TaskData, targets: Targets, i: int, q: Array) -> None:
+    """Joints of the held arm ``i`` return to where they were latched; the posture pull does not move them."""
+    for j in range(q.shape[0]):
+        if targets.member[i, j] == 1.0:
+            data.H[j, j] += _HOLD_WEIGHT
+            data.g[j] -= _HOLD_WEIGHT * _HOLD_GAIN * (targets.hold[j] - q[j])
+            data.posture[j] = 0.0
+
+
+@lean_kernel
+def add_posture_task(model: TaskModel, data: TaskData) -> None:
+    """Add the cost of all joints' distance from ``data.posture``."""
+    for j in range(data.posture.shape[0]):
+        weight = model.priority.posture_weight[j]
+        data.H[j, j] += weight
+        data.g[j] -= weight * data.posture[j]
+
+
+@kernel
+def project_to_nullspace(J: Array, v: Array) -> None:
+    """Remove from ``v`` (nv,) what moves the tools: v -= J' (J J' + d I)^-1 J v, by Cholesky; J (6n, nv)."""
+    m = J.shape[0]
+    nv = J.shape[1]
+    A = np.empty((m, m))
+    y = np.empty(m)
+    for i in range(m):
+        for j in range(i + 1):
+            total = 0.0
+            for k in range(nv):
+                total += J[i, k] * J[j, k]
+            A[i, j] = total
+        A[i, i] += _PROJECTION_DAMPING * _PROJECTION_DAMPING
+        total = 0.0
+        for k in range(nv):
+            total += J[i, k] * v[k]
+        y[i] = total
+    for i in range(m):
+        for j in range(i + 1):
+            total = A[i, j]
+            for k in range(j):
+                total -= A[i, k] * A[j, k]
+            A[i, j] = np.sqrt(total) if i == j else total / A[j, j]
+        for k in range(i):
+            y[i] -= A[i, k] * y[k]
+        y[i] /= A[i, i]
+    for i in range(m - 1, -1, -1):
+        for k in range(i + 1, m):
+            y[i] -= A[k, i] * y[k]
+        y[i] /= A[i, i]
+    for j in range(nv):
+        for i in range(m):
+            v[j] -= J[i, j] * y[i]

@@ -1,0 +1,137 @@
+"""What the arms are asked to do, and the arrays that the task kernels write anew at each tick."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from q2r2_control.control.geometry.kinematics import IntArray, Placements
+from q2r2_control.control.tasks.task_model import TaskModel
+from q2r2_control.types import Array
+
+
+class PoseScratch(NamedTuple):
+    """Scratch of an offered pose that is being checked."""
+
+    rotation: Array  # (3, 3)
+    translation: Array  # (3,)
+    gram: Array  # (3, 3)
+    correction: Array  # (3, 3)
+    moved: Array  # (6,)
+
+
+class Targets(NamedTuple):
+    """What the arms are asked to do."""
+
+    member: Array  # (n, nv) 1 where a joint is the arm's
+    follows: IntArray  # (n,) 1: the tool follows its target, 0: the arm's joints hold
+    rotation: Array  # (n, 3, 3)
+    translation: Array  # (n, 3) [m]
+    feed_forward: Array  # (n, 6) the target's own twist [m/s, rad/s]
+    hold: Array  # (nv,) joint positions to hold [rad]
+    posture: Array  # (nv,) joint positions that the arms take where the tools leave them free to [rad]
+    latched: IntArray  # (n,) 1: the arm has come to rest where it holds
+    offered: IntArray  # (n,) what this tick brought: nothing, a pose, something else
+    pose: Array  # (n, 4, 4) homogeneous, as offered
+    feed_forward_time: float  # in which the feed-forward is smoothed [s]
+    teleport_speed: float  # a faster target did not move, it was put elsewhere [m/s]
+    teleport_turn: float  # [rad/s]
+    scratch: PoseScratch
+
+    @classmethod
+    def empty(cls, model: TaskModel, feed_forward_time: float, teleport_speed: float, teleport_turn: float) -> Targets:
+        n, nv = model.tools.member.shape
+        return cls(
+            member=model.tools.member,
+            follows=np.zeros(n, dtype=np.int64),
+            rotation=np.zeros((n, 3, 3)),
+            translation=np.zeros((n, 3)),
+            feed_forward=np.zeros((n, 6)),
+            hold=np.zeros(nv),
+            posture=model.posture.home.copy(),
+            latched=np.zeros(n, dtype=np.int64),
+            offered=np.zeros(n, dtype=np.int64),
+            pose=np.zeros((n, 4, 4)),
+            feed_forward_time=feed_forward_time,
+            teleport_speed=teleport_speed,
+            teleport_turn=teleport_turn,
+            scratch=PoseScratch(np.zeros((3, 3)), np.zeros(3), np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(6)),
+        )
+
+
+class ManipulabilityScratch(NamedTuple):
+    """Arrays of the manipulability's gradient."""
+
+    gram: Array  # (6, 6)
+    weights: Array  # (6, nv) (J J')^-1 J
+    gradient: Array  # (nv,)
+
+    @classmethod
+    def empty(cls, nv: int) -> ManipulabilityScratch:
+        return cls(np.zeros((6, 6)), np.zeros((6, nv)), np.zeros(nv))
+
+
+class SwivelScratch(NamedTuple):
+    """Vectors of one arm's swivel, and the row of each arm."""
+
+    points: Array  # (3, 3) S, E, W
+    line: Array  # (3,) w
+    offset: Array  # (3,) p, then t_p
+    reference: Array  # (3,) l, then t_l
+    by_elbow: Array  # (3,) dpsi / de
+    by_wrist: Array  # (3,) dpsi / d(W - S)
+    row: Array  # (nv,) of all arms
+    free: Array  # (nv,) its part in the tools' nullspace
+    rate: Array  # (n,)
+    share: Array  # (n,)
+
+    @classmethod
+    def empty(cls, n: int, nv: int) -> SwivelScratch:
+        return cls(
+            points=np.zeros((3, 3)),
+            line=np.zeros(3),
+            offset=np.zeros(3),
+            reference=np.zeros(3),
+            by_elbow=np.zeros(3),
+            by_wrist=np.zeros(3),
+            row=np.zeros(nv),
+            free=np.zeros(nv),
+            rate=np.zeros(n),
+            share=np.zeros(n),
+        )
+
+
+class TaskData(NamedTuple):
+    """Tools at the reference, what they and the posture should do, and the cost that this makes."""
+
+    placements: Placements  # of the joint frames at the reference
+    rotation: Array  # (n, 3, 3) of the tools
+    translation: Array  # (n, 3) [m]
+    J: Array  # (6 n, nv) tool Jacobians, one below the other
+    twist: Array  # (n, 6) wanted [m/s, rad/s]
+    feedback: Array  # (n, 6) the part of it that the error makes
+    turn: Array  # (3, 3) scratch: rotation from tool to target
+    posture: Array  # (nv,) wanted where the tools leave joints free [rad/s]
+    manipulability: ManipulabilityScratch
+    swivel: SwivelScratch
+    H: Array  # (nv, nv) of the cost 1/2 v' H v + g' v
+    g: Array  # (nv,)
+
+    @classmethod
+    def empty(cls, model: TaskModel, placements: Placements) -> TaskData:
+        n, nv = model.tools.member.shape
+        return cls(
+            placements=placements,
+            rotation=np.zeros((n, 3, 3)),
+            translation=np.zeros((n, 3)),
+            J=np.zeros((6 * n, nv)),
+            twist=np.zeros((n, 6)),
+            feedback=np.zeros((n, 6)),
+            turn=np.zeros((3, 3)),
+            posture=np.zeros(nv),
+            manipulability=ManipulabilityScratch.empty(nv),
+            swivel=SwivelScratch.empty(n, nv),
+            H=np.zeros((nv, nv)),
+            g=np.zeros(nv),
+        )

@@ -1,0 +1,103 @@
+"""The SRDF files that lie beside the models of arms and tools: which pairs of their links need no watching.
+
+``ARM.srdf`` speaks of an arm's own links, ``TOOL.srdf`` of a tool's, ``TOOL_on_ARM.srdf`` of both, with the tool flat
+on the arm's last link. The files of robots/ are made here, and a test makes them again.
+"""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from itertools import combinations
+
+from q2r2_control.config.arms import ArmConfig, PoseConfig, SwivelConfig, ToolConfig
+from q2r2_control.config.cell import Config
+from q2r2_control.errors import ConfigError
+from q2r2_control.robot.cell_parts import load_model
+from q2r2_control.robot.compose import compose
+from q2r2_control.robot.description import Description, parse_urdf
+from q2r2_control.robot.pairs import link_of
+from q2r2_control.robot.reachability import Progress, nearest_approaches, srdf_text
+from q2r2_control.robot.robot import Robot
+
+# Links and shapes of this name ending stand for a whole tool at every opening: watched from afar, never touched.
+ENVELOPE = "_envelope"
+
+_SIDE = "left"
+
+Disabled = tuple[str, str, str]  # two links, and why they need no watching
+
+
+def model_srdfs(
+    config: Config, clearance: float, samples: int, seed: int = 0, progress: Progress | None = None
+) -> dict[str, str]:
+    """Text of every such file by file name, for all models of ``config``'s arms.
+
+    What these files say now is not used. Listed are neighbours, pairs that overlap at every posture, and pairs that
+    stay more than ``clearance`` [m] apart, as far as ``samples`` postures and the way downhill from them show.
+    """
+    files: dict[str, str] = {}
+    if config.robot is not None:
+        raise ConfigError("a cell whose arms are parts of one robot: --pairs writes its SRDF, not --model-pairs")
+    for side, arm in config.arms.items():
+        model = load_model(arm, config.packages, f"arms.{side}")
+        tool = None if arm.tool.model is None else load_model(arm.tool, config.packages, f"arms.{side}.tool")
+        name = model.file.stem if tool is None else f"{tool.file.stem}_on_{model.file.stem}"
+        if f"{name}.srdf" in files:
+            continue
+        of_tool = set() if tool is None else {link.get("name", "") for link in tool.urdf.findall("link")}
+        disabled = _disabled(_alone(config, arm), _enveloped(tool), clearance, samples, seed, progress)
+        comment = (
+            f"Made by q2r2 check with its option model-pairs from {samples} random postures inside the joint limits. "
+            f"Always: the shapes overlap at every posture, by construction. "
+            f"Never: more than {1e3 * clearance:g} mm apart at every posture."
+        )
+        by_links_of_tool: list[list[Disabled]] = [[], [], []]
+        for pair in disabled:
+            by_links_of_tool[len(of_tool & set(pair[:2]))].append(pair)
+        files[f"{model.file.stem}.srdf"] = srdf_text(model.name, comment, by_links_of_tool[0])
+        if tool is not None:
+            files[f"{name}.srdf"] = srdf_text(name, comment, by_links_of_tool[1])
+            files[f"{tool.file.stem}.srdf"] = _tool_srdf(tool, by_links_of_tool[2])
+    return files
+
+
+def _alone(config: Config, arm: ArmConfig) -> Config:
+    """A cell of nothing but ``arm``, upright, its tool flat on its last link."""
+    tool = arm.tool if arm.tool.model is None else ToolConfig(model=arm.tool.model, frame=arm.tool.frame)
+    alone = arm.model_copy(update={"mount": PoseConfig(), "tool": tool, "swivel": SwivelConfig()})
+    return config.model_copy(update={"arms": {_SIDE: alone}, "obstacles": {}, "floor": None, "srdf": None})
+
+
+def _disabled(
+    config: Config, hidden: tuple[str, ...], clearance: float, samples: int, seed: int, progress: Progress | None
+) -> list[Disabled]:
+    """Pairs of links of one arm with its tool that need no watching, in the order of the chain, by reason."""
+    cell, prefix = compose(config), f"{_SIDE}_"
+    exclusions = [ET.Element("disable_default_collisions", link=prefix + link) for link in hidden]
+    robot = Robot(parse_urdf(cell.urdf, cell.name), exclusions, cell.tool_frames, cell.home, cell.name)
+    reasons = {frozenset(map(link_of, pair)): "Always" for pair in robot.ignored_pairs}
+    for pair in nearest_approaches(robot, samples, seed, progress):
+        reasons[frozenset((pair.link_a, pair.link_b))] = "Never" if pair.nearest > clearance else "watched"
+    links = dict.fromkeys(link_of(item.name) for item in robot.collision_model.geometryObjects)
+    found = [
+        (a.removeprefix(prefix), b.removeprefix(prefix), reasons.get(frozenset((a, b)), "Adjacent"))
+        for a, b in combinations(links, 2)
+        if not {a.removeprefix(prefix), b.removeprefix(prefix)} & set(hidden)
+    ]
+    return sorted((pair for pair in found if pair[2] != "watched"), key=lambda pair: pair[2])
+
+
+def _enveloped(tool: Description | None) -> tuple[str, ...]:
+    """Links with shapes of a tool that has an envelope, which stands for them."""
+    if tool is None:
+        return ()
+    links = [link.get("name", "") for link in tool.urdf.findall("link") if link.find("collision") is not None]
+    with_envelope = any(link.endswith(ENVELOPE) for link in links)
+    return tuple(link for link in links if with_envelope and not link.endswith(ENVELOPE))
+
+
+def _tool_srdf(tool: Description, disabled: list[Disabled]) -> str:
+    comment = "Made by q2r2 check with its option model-pairs."
+    if hidden := _enveloped(tool):
+        comment += " The envelope stands for hand and fingers, so that no distance depends on where the fingers are."
+    return srdf_text(tool.name, comment, disabled, hidden)

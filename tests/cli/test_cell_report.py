@@ -1,0 +1,33 @@
+"""What q2r2 check finds out about a cell, and what it writes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from q2r2_control.cli.cell_report import write_model_pairs
+from q2r2_control.errors import ConfigError
+from tests.robot.conftest import one_arm
+
+ARM = one_arm()
+
+
+def test_model_pairs_are_written_once_and_found_to_be_the_same_from_then_on(tmp_path: Path) -> None:
+    file = str(tmp_path / "iiwa7.srdf")
+    assert write_model_pairs(ARM, tmp_path, 100, 0.05) == {file: True}
+    assert write_model_pairs(ARM, tmp_path, 100, 0.05) == {file: False}
+
+
+def test_a_file_that_says_something_else_is_not_replaced(tmp_path: Path) -> None:
+    (tmp_path / "iiwa7.srdf").write_text("mine")
+    with pytest.raises(ConfigError, match=r"iiwa7\.srdf: exists and says something else; remove it"):
+        write_model_pairs(ARM, tmp_path, 100, 0.05)
+    assert (tmp_path / "iiwa7.srdf").read_text() == "mine"
+
+
+def test_a_folder_that_does_not_exist_and_a_clearance_too_small_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="nowhere: no such folder"):
+        write_model_pairs(ARM, tmp_path / "nowhere", 100, 0.05)
+    with pytest.raises(ConfigError, match=r"clearance = 0\.02 m: allowed: above control\.min_distance"):
+        write_model_pairs(ARM, tmp_path, 100, 0.02)

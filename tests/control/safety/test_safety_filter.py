@@ -1,0 +1,68 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from q2r2_control.control.safety.joint_limits import ACCELERATION, next_velocity_box
+from q2r2_control.control.safety.safety_data import SafetyData
+from q2r2_control.control.safety.safety_filter import FOLLOWED, STOPPED, apply_safety_filter, certify_start
+from q2r2_control.control.safety.stop_certificate import brake
+from q2r2_control.types import Array
+from tests.control.cells import cell, distances, kernel_data, kernel_model
+
+MODEL = kernel_model("dual_iiwa7").safety
+HOME = cell("dual_iiwa7").robot.home
+V = np.linspace(-0.2, 0.2, 14)
+H = 0.002
+
+
+def started() -> SafetyData:
+    """At home, moving slowly with a certified stop, the box of the next step known."""
+    data = kernel_data("dual_iiwa7", HOME, V).safety
+    data.distance[:] = distances(cell("dual_iiwa7"), HOME[None])[0]
+    assert certify_start(MODEL, data)
+    assert next_velocity_box(MODEL.limits, HOME, V, H, data.box)
+    return data
+
+
+def moved(data: SafetyData, wish: Array, usable: bool = True) -> int:
+    """What the filter did with a wish."""
+    outcome, _ = apply_safety_filter(MODEL, data, wish, usable, H, 1.0)
+    return int(outcome)
+
+
+def test_a_wish_within_the_box_and_far_from_everything_is_followed_as_it_is() -> None:
+    data, wish = started(), V + np.linspace(0.015, -0.015, 14)
+    assert moved(data, wish) == FOLLOWED
+    np.testing.assert_array_equal(data.state.v, wish)
+    np.testing.assert_allclose(data.state.q, HOME + 0.5 * H * (V + wish), rtol=0, atol=1e-15)
+    np.testing.assert_allclose(data.state.a, (wish - V) / H, rtol=1e-9)
+    assert data.active.used[0] == 0
+
+
+def test_a_wish_beyond_the_box_is_cut_to_it_joint_by_joint_and_the_joint_is_named() -> None:
+    data, wish = started(), V.copy()
+    wish[3] = 1e12
+    assert moved(data, wish) == FOLLOWED
+    assert data.state.v[3] == pytest.approx(V[3] + 10.0 * H)
+    np.testing.assert_array_equal(np.delete(data.state.v, 3), np.delete(V, 3))
+    assert data.active.used[0] == 1
+    assert (data.active.kind[0], data.active.subject[0]) == (ACCELERATION, 3)
+
+
+@pytest.mark.parametrize("number", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("joint", [0, 13])
+def test_a_single_number_that_is_not_finite_makes_the_certified_stop_go_on(number: float, joint: int) -> None:
+    data, wish = started(), V.copy()
+    wish[joint] = number
+    assert moved(data, wish) == STOPPED
+    q, v = np.zeros(14), np.zeros(14)
+    brake(HOME, V, np.full(14, 10.0), H, q, v)
+    np.testing.assert_array_equal(data.state.q, q)
+    np.testing.assert_array_equal(data.state.v, v)
+
+
+def test_a_wish_that_is_not_usable_is_not_looked_at() -> None:
+    data = started()
+    assert moved(data, V, usable=False) == STOPPED
+    assert (np.abs(data.state.v) <= np.abs(V)).all()

@@ -1,0 +1,58 @@
+"""Targets below the floor: arms stay above it, and say that it is the floor which holds them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from q2r2_control import CartesianController, Robot, load_config
+from q2r2_control.types import Reference
+
+CONFIG = load_config("config/dual_iiwa7.yaml")
+LEAST = CONFIG.control.min_distance
+DT = 0.002
+DOWN = pin.rpy.rpyToMatrix(np.pi, 0.0, np.pi)  # as at home
+BESIDE_THE_TABLE = {
+    "left": pin.SE3(DOWN, np.array([0.1, 1.0, -0.3])),
+    "right": pin.SE3(DOWN, np.array([0.1, -1.0, -0.3])),
+}
+
+
+def _controller(floor: float | None) -> CartesianController:
+    robot = Robot.from_config(CONFIG.model_copy(update={"floor": floor}))
+    return CartesianController(robot, CONFIG.control)
+
+
+def _driven(controller: CartesianController, seconds: float) -> Iterator[Reference]:
+    for _ in range(round(seconds / DT)):
+        yield controller.step(BESIDE_THE_TABLE, DT)
+
+
+def _height(controller: CartesianController, arm: str) -> float:
+    return float(controller.tool_pose(arm).translation[2])
+
+
+@pytest.mark.parametrize("floor", [0.0, -0.15])
+def test_every_link_keeps_off_the_floor_at_every_tick_and_the_arms_come_to_rest_above_it(floor: float) -> None:
+    controller = _controller(floor)
+    accelerations = []
+    for reference in _driven(controller, 4.0):
+        assert reference.report.certified
+        assert controller.robot.distance_values(reference.q).min() >= LEAST - 2e-6  # as exactly as Coal measures a box
+        assert min(_height(controller, arm) for arm in ("left", "right")) > floor + LEAST
+        accelerations.append(reference.a)
+    assert np.sqrt(np.mean(np.square(accelerations[-250:]), axis=0)).max() < 0.1
+    assert "floor_0" in reference.report.closest_pair
+    for arm in ("left", "right"):
+        assert _height(controller, arm) < floor + 0.08, "down to where the floor stops it"
+
+
+def test_without_a_floor_the_tools_go_where_they_are_sent() -> None:
+    controller = _controller(None)
+    for _ in _driven(controller, 4.0):
+        pass
+    for arm, target in BESIDE_THE_TABLE.items():
+        np.testing.assert_allclose(controller.tool_pose(arm).translation, target.translation, atol=0.02)

@@ -1,0 +1,51 @@
+"""The SRDF files beside the models: those that are shipped are those that the program makes."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import pytest
+
+from q2r2_control.config import load_config
+from q2r2_control.config.resources import find_resource
+from q2r2_control.robot.model_srdf import model_srdfs
+from q2r2_control.robot.pairs import CLEARANCE
+from tests.robot.conftest import one_arm
+
+SAMPLES = 2000
+
+
+def _disabled(text: str) -> set[tuple[str, ...]]:
+    return {(element.tag, *element.attrib.values()) for element in ET.fromstring(text)}
+
+
+@pytest.mark.parametrize("arm", ["iiwa7", "iiwa14"])
+def test_every_shipped_file_lists_what_the_program_finds(arm: str) -> None:
+    made = model_srdfs(load_config(f"config/dual_{arm}.yaml"), CLEARANCE, SAMPLES)
+    assert made.keys() == {f"{arm}.srdf", "hand_e.srdf", f"hand_e_on_{arm}.srdf"}
+    for name, text in made.items():
+        assert _disabled(text) == _disabled(find_resource(f"robots/{name}").read_text(encoding="utf-8"))
+
+
+def test_no_other_file_is_shipped() -> None:
+    shipped = {file.name for file in find_resource("robots/iiwa7.urdf").parent.glob("*.srdf")}
+    assert shipped == {"iiwa7.srdf", "iiwa14.srdf", "hand_e.srdf", "hand_e_on_iiwa7.srdf", "hand_e_on_iiwa14.srdf"}
+
+
+def test_what_a_file_beside_the_model_says_now_is_not_believed(tmp_path: Path) -> None:
+    (tmp_path / "arm.urdf").write_bytes(find_resource("robots/iiwa7.urdf").read_bytes())
+    (tmp_path / "arm.srdf").write_text('<robot><disable_default_collisions link="link_0"/></robot>')
+    made = model_srdfs(one_arm(model=str(tmp_path / "arm.urdf")), CLEARANCE, SAMPLES)
+    assert made.keys() == {"arm.srdf"}
+    assert _disabled(made["arm.srdf"]) == _disabled(find_resource("robots/iiwa7.srdf").read_text(encoding="utf-8"))
+
+
+def test_the_search_says_how_far_it_has_got() -> None:
+    told: list[tuple[str, int, int]] = []
+    model_srdfs(one_arm(), CLEARANCE, 100, progress=lambda what, done, total: told.append((what, done, total)))
+    by_phase = {what: [done for name, done, _ in told if name == what] for what, _, _ in told}
+    assert by_phase.keys() == {"random postures", "pairs followed downhill"}
+    for what, done in by_phase.items():
+        total = next(total for name, _, total in told if name == what)
+        assert done == list(range(1, total + 1))
