@@ -7,8 +7,9 @@ imports only those before it. ``interfaces`` holds message packages to build, no
 
 from __future__ import annotations
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from q2r2_control._lazy import lazy_exports
 
 if TYPE_CHECKING:
     from q2r2_control.ros.base_node import BaseNode, run_node
@@ -16,15 +17,6 @@ if TYPE_CHECKING:
 
 __all__ = ["BaseArmController", "BaseNode", "run_node"]
 
-_MODULES = {"BaseArmController": "nodes.base_arm_controller", "BaseNode": "base_node", "run_node": "base_node"}
-
-
-def __getattr__(name: str) -> Any:
-    """Import rclpy and a node only when asked for: ``q2r2 ros up`` and the launch file do without."""
-    if name not in _MODULES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)
-
-
-def __dir__() -> list[str]:
-    return sorted([*globals(), *__all__])
+__getattr__ = lazy_exports(
+    __name__, {"BaseArmController": "nodes.base_arm_controller", "BaseNode": "base_node", "run_node": "base_node"}
+)

@@ -142,7 +142,7 @@ def run_through(bench: PresetBench, rigs: ArmRigs, controllers: StrictController
         rigs.interrupt_hand_data()
         rigs.engage()
     move(bench, rigs, (0.0, 0.0, 0.06))
-    joints.assert_smooth(began, *limits)
+    assert_smooth(joints, began, limits)
 
     controllers.kill()
     rigs.move((0.1, 0.0, 0.0), 0.3)  # the restarted controller must not be asked to catch up with that
@@ -154,8 +154,17 @@ def run_through(bench: PresetBench, rigs: ArmRigs, controllers: StrictController
         began = time.monotonic()
         controllers.engage(rigs)
     move(bench, rigs, (-0.05, 0.0, 0.0))
-    joints.assert_smooth(began, *limits)
+    assert_smooth(joints, began, limits)
     assert controllers.violations == []
+
+
+def assert_smooth(joints: JointRecorder, began: float, limits: tuple[float, float, float]) -> None:
+    """See :meth:`JointRecorder.assert_smooth`; the torque loop through ROS is unstable on an overloaded machine."""
+    try:
+        joints.assert_smooth(began, *limits)
+    except AssertionError as error:
+        skip_if_overloaded(str(error))
+        raise
 
 
 def move(bench: PresetBench, rigs: ArmRigs, by: tuple[float, float, float], turn: float = 0.0) -> None:

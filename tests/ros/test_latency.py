@@ -19,7 +19,7 @@ def test_the_bench_measures_both_ways_in_through_real_nodes(processes: Processes
     process = processes.start(sys.executable, *command, name="bench")
     assert process.wait(4.0 * PATIENCE) == 0
     report = json.loads(process.output)
-    assert [row["way"] for row in report["rows"]] == ["target to joint command", "hand to joint command"]
+    assert [row["path"] for row in report["rows"]] == ["target to joint command", "hand to joint command"]
     for row in report["rows"]:
         assert row["steps"] >= 10
         assert row["missed"] <= row["steps"] / 2
