@@ -16,16 +16,11 @@ from dataclasses import dataclass
 from q2r2_control.config.cell import ArmConfig, Config, ObstacleConfig, PoseConfig
 from q2r2_control.errors import ConfigError, Q2R2Error
 from q2r2_control.robot.description import Description, LinkTree, joint_limits, load_description, parse_srdf
+from q2r2_control.robot.floor import floor_link
 from q2r2_control.robot.pairs import exclusions_of_file
 from q2r2_control.types import SIDES
 
 WORLD = "world"
-FLOOR = "floor"
-
-# The floor is a box whose top is at the floor's height: URDF has no plane, and the distance of a capsule from a fixed
-# box is exact in closed form. No arm reaches beyond its edges, since no mount is farther than 20 m from the origin; and
-# it is so thick that what is in it is pushed out through the top.
-_FLOOR_SIZE = (100.0, 100.0, 10.0)  # [m]
 
 # Elements that name links or joints, and the attribute that does.
 _NAMING = {"parent": "link", "child": "link", "mimic": "joint"}
@@ -73,10 +68,10 @@ def compose(config: Config) -> ComposedCell:
         urdf.extend(arm.urdf)
         srdf.extend(arm.srdf)
     for name, obstacle in config.obstacles.items():
-        _check_obstacle_name(name, config.floor)
+        _check_obstacle_name(name)
         urdf.extend(_obstacle(name, obstacle))
     if config.floor is not None:
-        urdf.extend(_floor(config.floor))
+        urdf.extend(floor_link(config.floor, WORLD, config.obstacles))
     if config.srdf is not None:
         srdf.extend(exclusions_of_file(config.srdf, {link.get("name", "") for link in urdf.findall("link")}))
     for tree in (urdf, srdf):
@@ -247,11 +242,7 @@ def _prefixed_exclusion(part: ET.Element, prefix: str) -> list[ET.Element]:
     return [part]
 
 
-def _check_obstacle_name(name: str, floor: float | None) -> None:
-    if name == FLOOR and floor is not None:
-        raise ConfigError(
-            f"obstacles.{name}: the cell has a floor at z = {floor:g} m; give this another name, or set floor: null"
-        )
+def _check_obstacle_name(name: str) -> None:
     if not _OBSTACLE_NAME.fullmatch(name) or _RESERVED_NAME.match(name):
         raise ConfigError(
             f"obstacles.{name!r:.60}: allowed: letters, digits and _, starting with a letter, "
@@ -272,15 +263,6 @@ def _obstacle(name: str, config: ObstacleConfig) -> list[ET.Element]:
         ET.SubElement(checking, "capsule", name=f"{name}_collision")
     pose = PoseConfig(position=config.position, rpy=config.rpy)
     return [link, _fixed_joint(f"{WORLD}_to_{name}", WORLD, name, pose)]
-
-
-def _floor(height: float) -> list[ET.Element]:
-    """What arms keep off, without a drawing: link ``floor`` lies in the floor's surface."""
-    link = ET.Element("link", name=FLOOR)
-    shape = ET.SubElement(link, "collision", name=f"{FLOOR}_collision")
-    ET.SubElement(shape, "origin", xyz=_numbers((0.0, 0.0, -_FLOOR_SIZE[2] / 2)))
-    ET.SubElement(ET.SubElement(shape, "geometry"), "box", size=_numbers(_FLOOR_SIZE))
-    return [link, _fixed_joint(f"{WORLD}_to_{FLOOR}", WORLD, FLOOR, PoseConfig(position=(0.0, 0.0, height)))]
 
 
 def _shape(config: ObstacleConfig) -> ET.Element:
