@@ -25,8 +25,13 @@ def project() -> dict[str, Any]:
     return table
 
 
+def distribution(entry: str) -> str:
+    """Name of what an entry of a list of dependencies asks for."""
+    return re.split(r"[<>=]", entry)[0]
+
+
 def dependencies() -> list[str]:
-    return [re.split(r"[<>=]", entry)[0] for entry in project()["dependencies"]]
+    return list(map(distribution, project()["dependencies"]))
 
 
 def dependencies_to_compare() -> set[str]:
@@ -37,6 +42,11 @@ def dependencies_to_compare() -> set[str]:
 def modules_of_dependencies() -> set[str]:
     # coal comes with pin, glfw with mujoco.
     return {IMPORTS.get(name, name) for name in dependencies()} | {"coal", "glfw"}
+
+
+def modules_of_formats() -> set[str]:
+    """What is imported only where a model has another format than URDF."""
+    return set(map(distribution, project()["optional-dependencies"]["xacro"]))
 
 
 def modules_of_ros() -> set[str]:
@@ -73,7 +83,8 @@ def test_every_dependency_is_imported_by_the_package(dependency: str) -> None:
 
 
 def test_everything_that_is_imported_outside_ros_is_a_dependency() -> None:
-    assert imported(modules_outside_ros()) - modules_of_dependencies() - dependencies_to_compare() == set()
+    optional = dependencies_to_compare() | modules_of_formats()
+    assert imported(modules_outside_ros()) - modules_of_dependencies() - optional == set()
 
 
 def test_everything_that_the_nodes_import_is_a_dependency_or_in_the_extra_ros() -> None:

@@ -181,7 +181,7 @@ def _arm_check(config: Config, robot: Robot, name: str) -> ArmCheck:
     settings = next(settings for side, settings in config.arms.items() if side == name)
     return ArmCheck(
         name=name,
-        model=settings.model,
+        model=config.model_of(name),
         tool_model=settings.tool.model,
         tool_frame=arm.tool_frame,
         tool_position=tuple(robot.tool_pose(robot.home, name).translation.tolist()),

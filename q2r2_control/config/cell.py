@@ -8,11 +8,24 @@ from __future__ import annotations
 import json
 import os
 import re
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import Field, ValidationError, model_validator
 
+from q2r2_control.config.arms import (
+    ArmConfig,
+    CellModel,
+    Colour,
+    Coordinate,
+    Extent,
+    LocalPath,
+    Metres3,
+    Radians3,
+    RobotConfig,
+    Side,
+    check_models,
+)
 from q2r2_control.config.control import AdmittanceSettings, ControllerSettings, ImpedanceSettings, check_priority
 from q2r2_control.config.external import ControllerKind, ExternalConfig, check_external
 from q2r2_control.config.resources import find_resource
@@ -20,75 +33,8 @@ from q2r2_control.config.supervision import SupervisionSettings
 from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.errors import ConfigError
 
-Side = Literal["left", "right"]
-# The ranges are there to catch millimetres and degrees.
-Coordinate = Annotated[float, Field(ge=-20, le=20)]  # [m]
-Extent = Annotated[float, Field(gt=0, le=20)]  # [m]
-Angle = Annotated[float, Field(ge=-6.2832, le=6.2832)]  # [rad]
-Share = Annotated[float, Field(ge=0, le=1)]
-Metres3 = Annotated[tuple[Coordinate, Coordinate, Coordinate], Field(description="x, y, z [m]")]
-Radians3 = Annotated[tuple[Angle, Angle, Angle], Field(description="roll, pitch, yaw [rad]")]
-Colour = tuple[Share, Share, Share, Share]
 
-
-class _Model(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-
-class PoseConfig(_Model):
-    """A fixed placement in the parent frame."""
-
-    position: Metres3 = (0.0, 0.0, 0.0)
-    rpy: Radians3 = (0.0, 0.0, 0.0)
-
-
-class ToolConfig(_Model):
-    """What is mounted on an arm's last link."""
-
-    model: str | None = Field(None, description="a file of robots/ without .urdf, or a path; none: bare flange")
-    link: str | None = Field(None, description="arm link that carries the tool; default: the arm's last link")
-    mount: PoseConfig = PoseConfig()
-    frame: str | None = Field(None, description="link of the tool that the operator moves; default: the last link")
-
-
-class GripperConfig(_Model):
-    """How an opening of 0..1 becomes finger joint positions."""
-
-    joints: tuple[str, ...] = Field((), description="finger joints of the tool, all driven alike")
-    open_position: float = Field(0.0, ge=-3.15, le=3.15, description="of each finger joint, open [m or rad]")
-    closed_position: float = Field(0.0, ge=-3.15, le=3.15, description="of each finger joint, closed [m or rad]")
-    speed: float = Field(0.1, gt=0, le=5, description="of each finger joint [m/s or rad/s]")
-    force: float = Field(60.0, gt=0, le=500, description="of each finger joint [N or Nm]")
-
-    @model_validator(mode="after")
-    def _opens(self) -> GripperConfig:
-        if self.joints and self.open_position == self.closed_position:
-            raise ValueError(f"open_position and closed_position have to differ, both are {self.open_position:g}")
-        return self
-
-
-class SwivelConfig(_Model):
-    """Where an arm's elbow is, about the line from shoulder to wrist. Names are joints of the arm's model."""
-
-    shoulder: str = Field("A2", description="joint in the shoulder")
-    elbow: str = Field("A4", description="joint in the elbow")
-    wrist: str = Field("A6", description="joint in the wrist")
-    angle: Angle | None = Field(None, description="0: elbow up, turning about that line [rad]; none: as at home")
-    gain: float = Field(0.0, ge=0, le=20, description="swivel speed per radian from the angle [1/s]; 0: off")
-
-
-class ArmConfig(_Model):
-    """One arm: model, mount, tool, home posture."""
-
-    model: str = Field(description="a file of robots/ without .urdf, example-robot-data:NAME, or a path")
-    mount: PoseConfig = PoseConfig()
-    tool: ToolConfig = ToolConfig()
-    gripper: GripperConfig = GripperConfig()
-    home: tuple[float, ...] = Field(description="joint positions [rad]")
-    swivel: SwivelConfig = SwivelConfig()
-
-
-class ObstacleConfig(_Model):
+class ObstacleConfig(CellModel):
     """A fixed body of the cell. Cylinders and capsules stand along z; a capsule's length is its segment's."""
 
     shape: Literal["box", "cylinder", "sphere", "capsule"]
@@ -109,14 +55,14 @@ class ObstacleConfig(_Model):
         return self
 
 
-class HeadsetConfig(_Model):
+class HeadsetConfig(CellModel):
     """The TCP server that the Quest2ROS app connects to."""
 
     host: str = Field("127.0.0.1", description="address to bind; 0.0.0.0 admits the network")
     port: int = Field(10000, ge=0, le=65535, description="0 takes any free port")
 
 
-class ObjectConfig(_Model):
+class ObjectConfig(CellModel):
     """A loose box in the simulated cell, to be grasped. The controller does not know of it."""
 
     size: tuple[Extent, Extent, Extent] = Field(description="x y z [m]")
@@ -125,7 +71,7 @@ class ObjectConfig(_Model):
     colour: Colour = (0.2, 0.45, 0.8, 1.0)
 
 
-class MujocoConfig(_Model):
+class MujocoConfig(CellModel):
     """The simulated cell."""
 
     timestep: float = Field(0.001, gt=0, le=0.001, description="physics step [s]")
@@ -134,14 +80,20 @@ class MujocoConfig(_Model):
     objects: dict[str, ObjectConfig] = Field(default_factory=dict, description="loose boxes by name")
 
 
-class Config(_Model):
+class Config(CellModel):
     """One cell: everything a user tunes."""
 
     name: str = Field(min_length=1)
+    robot: RobotConfig | None = Field(None, description="a model that all arms are parts of; none: one of its own each")
     arms: dict[Side, ArmConfig] = Field(min_length=1)
+    packages: dict[str, LocalPath] = Field(
+        default_factory=dict, description="folders of ROS packages, by name: for package:// and $(find ...)"
+    )
     obstacles: dict[str, ObstacleConfig] = Field(default_factory=dict)
     floor: Coordinate | None = Field(0.0, description="height of the floor, which arms keep off [m]; none: no floor")
-    srdf: str | None = Field(None, description="a file of pairs that need no watching, as q2r2 check --pairs writes it")
+    srdf: LocalPath | None = Field(
+        None, description="a file of pairs that need no watching, as q2r2 check --pairs writes it"
+    )
     supervision: SupervisionSettings = SupervisionSettings()
     loop_rate_hz: float = Field(1000.0, ge=50, le=2000, description="control loop [Hz]")
     controller: ControllerKind = Field(ControllerKind.BUILTIN, description="builtin, or external: for q2r2 ros up")
@@ -153,11 +105,25 @@ class Config(_Model):
     headset: HeadsetConfig = HeadsetConfig()
     mujoco: MujocoConfig = MujocoConfig()
 
+    def model_of(self, arm: str) -> str:
+        """The model that an arm is, or is part of."""
+        part_of = self.robot or next(made for side, made in self.arms.items() if side == arm)
+        return part_of.model or ""
+
+    def named_tool_frame(self, arm: str) -> str | None:
+        """Name in the cell of the link that the operator moves, where the file names that link."""
+        made = next(made for side, made in self.arms.items() if side == arm)
+        if made.tool.model is not None:
+            return None if made.tool.frame is None else f"{arm}_{made.tool.frame}"
+        frame = made.tool.frame or made.named_tip
+        return frame if frame is None or self.robot is not None else f"{arm}_{frame}"
+
 
 def load_config(path: str | os.PathLike[str]) -> Config:
     """Read and check a cell's YAML.
 
-    ``path`` is looked up from the working directory first, then among the files shipped with the package.
+    ``path`` is looked up from the working directory first, then among the files shipped with the package. Relative
+    paths in the file are looked up from its own folder before that.
     Raises :class:`ConfigError` with one line that names file, key, value and what is allowed.
     """
     file = find_resource(path)
@@ -172,7 +138,9 @@ def load_config(path: str | os.PathLike[str]) -> Config:
         raise ConfigError(f"{path}: expected a mapping of keys such as name, arms, obstacles; got {data!r:.60}")
     try:
         # Strict, or `off` would pass for 0.0; by way of JSON, where sequences are tuples and names are enums.
-        config = Config.model_validate_json(json.dumps(data, default=str), strict=True)
+        text = json.dumps(data, default=str)
+        config = Config.model_validate_json(text, strict=True, context={"folder": file.absolute().parent})
+        check_models(config.robot, config.arms)
         check_priority(config.control.priority, config.arms)
         check_external(config.controller, config.external, config.arms)
         return config

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from q2r2_control.config import Config
 from q2r2_control.errors import PlantError
 from q2r2_control.plants.base import GripperMotion, check_command, check_duration, check_joints
-from q2r2_control.plants.mujoco_model import build_model
+from q2r2_control.plants.mujoco_model import build_model, settle_mimics
 from q2r2_control.plants.mujoco_view import Camera, Window, take_picture
 from q2r2_control.plants.servo import ReferenceLine, ServoGains, servo_gains
 from q2r2_control.robot.robot import Robot
@@ -73,8 +73,8 @@ class MujocoPlant:
         self._grippers = GripperMotion(config)
         self._fingers: dict[str, _Fingers] = {
             side: _Fingers(
-                tuple(self.model.joint(f"{side}_{name}").qposadr[0] for name in arm.gripper.joints),
-                tuple(self.model.actuator(f"{side}_{name}").id for name in arm.gripper.joints),
+                tuple(self.model.joint(name).qposadr[0] for name in robot.arms[side].finger_joints),
+                tuple(self.model.actuator(name).id for name in robot.arms[side].finger_joints),
                 arm.gripper.open_position,
                 arm.gripper.closed_position,
             )
@@ -98,6 +98,7 @@ class MujocoPlant:
         self._grippers.reset()
         for fingers in self._fingers.values():
             self.data.qpos[list(fingers.positions)] = fingers.open_position
+        settle_mimics(self.model, self.data)
         self._reference = ReferenceLine(self.data.qpos[self._q_index])
         self._torque: Array | None = None  # commanded in torque mode
         self._velocity: Array | None = None  # commanded in velocity mode, for the next advance

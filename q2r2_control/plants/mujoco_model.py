@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import xml.etree.ElementTree as ET
 from itertools import combinations
-from pathlib import Path
 
 import mujoco
 import numpy as np
 
 from q2r2_control.config.cell import Config, MujocoConfig
 from q2r2_control.errors import PlantError
+from q2r2_control.plants.mujoco_meshes import is_readable, load_meshes
 from q2r2_control.plants.scene import COLLISION_GROUP, ENVELOPE_GROUP, VISUAL_GROUP, furnish
 from q2r2_control.robot.model_srdf import ENVELOPE
 from q2r2_control.robot.pairs import link_of, pair_names
@@ -22,6 +22,9 @@ from q2r2_control.robot.robot import Robot
 
 # Least viscous friction [Nm s/rad]: it keeps light wrist joints steady and is far below what a controller feels.
 _MIN_DAMPING = 0.2
+
+# [kg m^2]: a thousandth of what a drive's rotor adds to its joint.
+_NEGLIGIBLE_INERTIA = 1e-6
 
 # Rubber on a box: sliding 1, and torsion [m] and rolling [m] of a pad of about a square centimetre.
 _PAD_FRICTION = (1.0, 0.02, 0.001)
@@ -33,8 +36,6 @@ _PAD_STIFFNESS = (0.004, 1.0)
 # A finger servo gives its full force at this part of the stroke.
 _FINGER_SERVO_BAND = 0.05
 
-_MESH_FORMATS = (".stl", ".obj", ".msh")
-
 
 def build_model(robot: Robot, config: Config) -> mujoco.MjModel:
     """Compile the cell: actuators ``robot.joint_names`` first, in that order, then each gripper's finger joints.
@@ -44,10 +45,12 @@ def build_model(robot: Robot, config: Config) -> mujoco.MjModel:
     try:
         spec = mujoco.MjSpec.from_string(_readable_urdf(robot.urdf))
         spec.modelname = robot.name
+        load_meshes(spec)
+        _correct_inertias(spec)
         _set_solver(spec, config.mujoco)
         _set_shapes(spec, _capsules(robot.urdf))
         _set_arm_joints(spec, robot)
-        _set_grippers(spec, config)
+        _set_grippers(spec, robot, config)
         _exclude_contacts(spec, robot)
         _add_objects(spec, config.mujoco)
         furnish(spec, floor=config.floor is not None)
@@ -57,15 +60,21 @@ def build_model(robot: Robot, config: Config) -> mujoco.MjModel:
 
 
 def _readable_urdf(urdf: str) -> str:
-    """The URDF with every link kept as a body, drawings kept, and without the mesh drawings that MuJoCo cannot read."""
+    """The URDF with every link kept as a body and every drawing that MuJoCo can read.
+
+    Mimics are left out: not every MuJoCo reads them, and :func:`_set_grippers` couples the joints.
+    """
     root = ET.fromstring(urdf)
     extension = ET.SubElement(root, "mujoco")
     ET.SubElement(extension, "compiler", discardvisual="false", fusestatic="false", strippath="false")
     for link in root.findall("link"):
         for visual in link.findall("visual"):
             mesh = visual.find("geometry/mesh")
-            if mesh is not None and Path(mesh.get("filename", "")).suffix.lower() not in _MESH_FORMATS:
+            if mesh is not None and not is_readable(mesh.get("filename", "")):
                 link.remove(visual)
+    for joint in root.findall("joint"):
+        for mimic in joint.findall("mimic"):
+            joint.remove(mimic)
     return ET.tostring(root, encoding="unicode")
 
 
@@ -84,6 +93,21 @@ def _set_solver(spec: mujoco.MjSpec, config: MujocoConfig) -> None:
     # The elliptic cone with this ratio keeps what is grasped from creeping out of the fingers.
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     spec.option.impratio = 10
+
+
+def _correct_inertias(spec: mujoco.MjSpec) -> None:
+    """Raise eigenvalues of inertias that no body can have, as files have them of antennas of a milligram.
+
+    MuJoCo refuses such a file as a whole. What is added is far below what a joint feels, or it is refused after all.
+    """
+    for body in spec.bodies:
+        if not body.explicitinertial or np.isnan(body.fullinertia).any():
+            continue
+        xx, yy, zz, xy, xz, yz = body.fullinertia
+        values, axes = np.linalg.eigh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+        if -_NEGLIGIBLE_INERTIA < values[0] <= 0.0:
+            full = (axes * np.maximum(values, _NEGLIGIBLE_INERTIA)) @ axes.T
+            body.fullinertia = [*np.diag(full), full[0, 1], full[0, 2], full[1, 2]]
 
 
 def _set_shapes(spec: mujoco.MjSpec, capsules: set[str]) -> None:
@@ -114,10 +138,11 @@ def _set_arm_joints(spec: mujoco.MjSpec, robot: Robot) -> None:
         motor.forcerange = (-torque, torque)
 
 
-def _set_grippers(spec: mujoco.MjSpec, config: Config) -> None:
+def _set_grippers(spec: mujoco.MjSpec, robot: Robot, config: Config) -> None:
     """A servo for each finger joint, all of one gripper coupled as by its gear, with contacts that hold a box."""
+    mimics = [joint for joint in ET.fromstring(robot.urdf).iterfind("joint") if joint.find("mimic") is not None]
     for side, arm in config.arms.items():
-        gripper, names = arm.gripper, [f"{side}_{joint}" for joint in arm.gripper.joints]
+        gripper, names = arm.gripper, robot.arms[side].finger_joints
         if not names:
             continue
         stiffness = gripper.force / (_FINGER_SERVO_BAND * abs(gripper.open_position - gripper.closed_position))
@@ -126,16 +151,36 @@ def _set_grippers(spec: mujoco.MjSpec, config: Config) -> None:
             servo.set_to_position(kp=stiffness, dampratio=1.0)
             servo.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE
             servo.forcerange = (-gripper.force, gripper.force)
+        for name in names[1:]:
+            _couple(spec, name, names[0], multiplier=1.0, offset=0.0)
+        moved = list(names)
+        for joint in mimics:
+            mimic, name = joint.find("mimic"), joint.get("name", "")
+            if mimic is not None and mimic.get("joint") in names and name not in names:
+                multiplier, offset = float(mimic.get("multiplier", "1")), float(mimic.get("offset", "0"))
+                _couple(spec, name, mimic.get("joint", ""), multiplier, offset)
+                moved.append(name)
+        for name in moved:
             for geom in spec.joint(name).parent.geoms:
                 geom.condim, geom.friction, geom.solref = 4, _PAD_FRICTION, _PAD_STIFFNESS
                 geom.priority = 1
-        for name in names[1:]:
-            coupling = spec.add_equality(name=f"{name}_coupling", name1=name, name2=names[0])
-            coupling.type, coupling.objtype = mujoco.mjtEq.mjEQ_JOINT, mujoco.mjtObj.mjOBJ_JOINT
-            coupling.data[:5] = (0, 1, 0, 0, 0)
         # The joint limits keep the fingers apart already.
-        for first, second in combinations(names, 2):
+        for first, second in combinations(moved, 2):
             _exclude(spec, spec.joint(first).parent.name, spec.joint(second).parent.name)
+
+
+def _couple(spec: mujoco.MjSpec, follower: str, leader: str, multiplier: float, offset: float) -> None:
+    coupling = spec.add_equality(name=f"{follower}_coupling", name1=follower, name2=leader)
+    coupling.type, coupling.objtype = mujoco.mjtEq.mjEQ_JOINT, mujoco.mjtObj.mjOBJ_JOINT
+    coupling.data[:5] = (offset, multiplier, 0, 0, 0)
+
+
+def settle_mimics(model: mujoco.MjModel, data: mujoco.MjData) -> None:
+    """Put every joint that follows another one where its coupling wants it."""
+    for i in range(model.neq):
+        if model.eq_type[i] == mujoco.mjtEq.mjEQ_JOINT:
+            follower, leader = (model.jnt_qposadr[joint[i]] for joint in (model.eq_obj1id, model.eq_obj2id))
+            data.qpos[follower] = np.polynomial.polynomial.polyval(data.qpos[leader], model.eq_data[i, :5])
 
 
 def _exclude_contacts(spec: mujoco.MjSpec, robot: Robot) -> None:

@@ -43,12 +43,12 @@ class SimulatedCell:
         self._columns = {name: index for index, name in enumerate(robot.joint_names)}
         self._timestep = config.mujoco.timestep
         self._follower = JointFollower(robot.home, config.control.acceleration_limit, robot.velocity_limit)
-        self.fingers = tuple(f"{side}_{joint}" for side, arm in config.arms.items() for joint in arm.gripper.joints)
+        self.fingers = tuple(joint for arm in robot.arms.values() for joint in arm.finger_joints)
         self._finger_q = [self.plant.model.joint(name).qposadr[0] for name in self.fingers]
         self._finger_v = [self.plant.model.joint(name).dofadr[0] for name in self.fingers]
         self._finger_force: dict[str, list[int]] = {
-            side: [self.plant.model.actuator(f"{side}_{joint}").id for joint in arm.gripper.joints]
-            for side, arm in config.arms.items()
+            name: [self.plant.model.actuator(joint).id for joint in arm.finger_joints]
+            for name, arm in robot.arms.items()
         }
         self._time: float | None = None
         self.reset()

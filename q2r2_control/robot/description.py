@@ -6,15 +6,16 @@ Everything later relies on what is checked here: one tree, unique names, finite 
 from __future__ import annotations
 
 import math
-import os
 import re
 import xml.etree.ElementTree as ET
-from collections.abc import Callable
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 from q2r2_control.config.resources import find_resource
 from q2r2_control.errors import ConfigError, RobotError
+from q2r2_control.robot.packages import package_file
+from q2r2_control.robot.xacro_model import expand_xacro
 
 EXAMPLE_ROBOT_DATA = "example-robot-data:"
 
@@ -52,31 +53,48 @@ class Description:
     @property
     def name(self) -> str:
         """The model's own name."""
-        return self.urdf.get("name", self.file.stem)
+        return self.urdf.get("name", self.stem)
+
+    @property
+    def stem(self) -> str:
+        """The file's name without its endings."""
+        return _stem(self.file)
 
 
-def load_description(model: str) -> Description:
+def load_description(
+    model: str, xacro_args: Mapping[str, object] | None = None, packages: Mapping[str, str] | None = None
+) -> Description:
     """Find and parse ``model``: a file of robots/ without .urdf, ``example-robot-data:NAME``, or a path to a .urdf.
 
-    An SRDF of the same name beside the URDF belongs to it. Raises :class:`ConfigError` where there is no such model and
-    :class:`RobotError` where its files cannot be used.
+    A path may be ``package://NAME/...``, where ``packages`` has folders by name, and end in ``.xacro``, which is
+    expanded with ``xacro_args``. An SRDF of the same name beside the file belongs to it. Raises :class:`ConfigError`
+    where there is no such model and :class:`RobotError` where its files cannot be used.
     """
+    packages = packages or {}
     if model.startswith(EXAMPLE_ROBOT_DATA):
         file, srdf_file = _example_robot(model.removeprefix(EXAMPLE_ROBOT_DATA))
     else:
-        file = _urdf_file(model)
-        srdf_file = file.with_suffix(".srdf")
-    urdf = parse_urdf(_read(file), str(file), file.parent)
+        file = _model_file(model, packages)
+        srdf_file = file.with_name(f"{_stem(file)}.srdf")
+    if file.suffix == ".xacro":
+        text = expand_xacro(file, xacro_args or {}, packages)
+    elif xacro_args:
+        raise ConfigError(f"{model}: xacro_args are for models that end in .xacro")
+    else:
+        text = _read(file)
+    urdf = parse_urdf(text, str(file), file.parent, packages)
     srdf = parse_srdf(_read(srdf_file), str(srdf_file)) if srdf_file is not None and srdf_file.is_file() else None
     return Description(urdf=urdf, srdf=srdf, file=file)
 
 
-def parse_urdf(text: str, where: str, folder: Path | None = None) -> ET.Element:
+def parse_urdf(
+    text: str, where: str, folder: Path | None = None, packages: Mapping[str, str] | None = None
+) -> ET.Element:
     """Parse a URDF, check that it is one tree with unique names and finite numbers, and make mesh paths absolute.
 
     Continuous joints become revolute ones with :data:`CONTINUOUS_RANGE` each way, since the controller's guarantees
-    need a bound. ``where`` names the text in errors, ``folder`` is what relative mesh paths start from.
-    Raises :class:`RobotError`.
+    need a bound. ``where`` names the text in errors, ``folder`` is what relative mesh paths start from, ``packages``
+    has folders of ``package://`` by name. Raises :class:`RobotError`.
     """
     root = _parse(text, where)
     _check_numbers(root, where)
@@ -89,7 +107,7 @@ def parse_urdf(text: str, where: str, folder: Path | None = None) -> ET.Element:
             _bound(joint)
     LinkTree(root, where)
     for mesh in root.iter("mesh"):
-        mesh.set("filename", _mesh_file(mesh.get("filename", ""), where, folder))
+        mesh.set("filename", _mesh_file(mesh.get("filename", ""), where, folder, packages or {}))
     return root
 
 
@@ -123,6 +141,21 @@ class LinkTree:
         while path[-1] in self.joint_to and len(path) <= len(self.joint_to) + 1:
             path.append(joint_end(self.joint_to[path[-1]], "parent"))
         return path[::-1]
+
+    def movable(self) -> dict[str, ET.Element]:
+        """All joints that are not fixed, by name."""
+        return {joint.get("name", ""): joint for joint in self.joint_to.values() if joint.get("type") != "fixed"}
+
+    def fixed_to(self, link: str) -> list[str]:
+        """``link``, and all that fixed joints carry from there on."""
+        found = [link]
+        for carrier in found:  # grows meanwhile
+            found += [
+                child
+                for child, joint in self.joint_to.items()
+                if joint.get("type") == "fixed" and joint_end(joint, "parent") == carrier
+            ]
+        return found
 
     def chain(self, link: str) -> list[ET.Element]:
         """Movable joints from the root to ``link``."""
@@ -230,14 +263,16 @@ def _example_robot(name: str) -> tuple[Path, Path | None]:
     return folder / loader.urdf_subpath / loader.urdf_filename, srdf
 
 
-def _urdf_file(model: str) -> Path:
-    if model.endswith(".xacro"):
-        raise ConfigError(f"{model}: xacro has to be expanded to .urdf first")
+def _model_file(model: str, packages: Mapping[str, str]) -> Path:
     if model.startswith("package://"):
-        return _package_file(model, None)
-    if model.endswith(".urdf"):
+        return package_file(model, None, packages)
+    if model.endswith((".urdf", ".xacro")):
         return find_resource(model).resolve()
     return find_resource(f"robots/{model}.urdf")
+
+
+def _stem(file: Path) -> str:
+    return file.name.removesuffix(".xacro").removesuffix(".urdf")
 
 
 def _read(file: Path) -> str:
@@ -247,10 +282,10 @@ def _read(file: Path) -> str:
         raise RobotError(f"{file}: cannot be read: {error}") from error
 
 
-def _mesh_file(name: str, where: str, folder: Path | None) -> str:
+def _mesh_file(name: str, where: str, folder: Path | None, packages: Mapping[str, str]) -> str:
     if name.startswith("package://"):
         try:
-            return str(_package_file(name, folder))
+            return str(package_file(name, folder, packages))
         except ConfigError as error:
             raise RobotError(f"{where}: mesh {error}") from error
     file = Path(name.removeprefix("file://"))
@@ -258,25 +293,3 @@ def _mesh_file(name: str, where: str, folder: Path | None) -> str:
     if not file.is_file():
         raise RobotError(f"{where}: mesh {name!r:.200}: no such file")
     return str(file.resolve())
-
-
-def _package_file(url: str, folder: Path | None) -> Path:
-    """A ``package://NAME/PATH``: in the ROS paths, around ``folder``, or in example-robot-data."""
-    package, _, path = url.removeprefix("package://").lstrip("/").partition("/")
-    places: list[Callable[[], list[Path]]] = [
-        lambda: [Path(root) / "share" for root in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if root],
-        lambda: [Path(root) for root in os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep) if root],
-        lambda: [] if folder is None else [*folder.resolve().parents],
-        _example_robot_data_share,
-    ]
-    for place in places:
-        for root in place():
-            if package and path and (file := root / package / path).is_file():
-                return file.resolve()
-    raise ConfigError(f"{url}: not found in AMENT_PREFIX_PATH, ROS_PACKAGE_PATH or beside the file that names it")
-
-
-def _example_robot_data_share() -> list[Path]:
-    from example_robot_data.robots_loader import getModelPath
-
-    return [Path(getModelPath("panda_description")).parent.parent]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import os
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Mapping, Sequence
@@ -17,6 +18,7 @@ from q2r2_control.robot.compose import compose
 from q2r2_control.robot.description import LinkTree, joint_limits, parse_srdf, parse_urdf
 from q2r2_control.robot.enclose import enclose_shapes
 from q2r2_control.robot.floor import remove_unreachable_floor_pairs
+from q2r2_control.robot.locking import lock_joints
 from q2r2_control.robot.pairs import (
     add_movable_pairs,
     pair_names,
@@ -50,6 +52,7 @@ class Arm:
     frame_id: int  # of the tool frame in ``Robot.model``
     joints: np.ndarray  # velocity indices from base to tool; a joint that several arms hang on is in each of them
     swivel: Swivel | None = None  # None: the elbow is free
+    finger_joints: tuple[str, ...] = ()  # that its gripper drives
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +88,7 @@ class Robot:
         chains = {name: _checked_chain(tree, name, frame, where) for name, frame in tool_frames.items()}
         self.name: str = urdf.get("name", "robot")
         self.urdf: str = ET.tostring(urdf, encoding="unicode")
-        self.model, self.collision_model = _reduced(urdf, chains, home, where)
+        self.model, self.collision_model = _models(urdf, chains, home, where)
         self.joint_names: tuple[str, ...] = tuple(self.model.names)[1:]
         self.arms: dict[str, Arm] = {
             name: Arm(
@@ -102,7 +105,7 @@ class Robot:
         self.velocity_limit: Array = self.model.velocityLimit.copy()
         self.torque_limit: Array = self.model.effortLimit.copy()
         _set_rotors(self.model, urdf)
-        self.ignored_pairs = self._monitor(tree, exclusions, tool_frames)
+        self.ignored_pairs = self._monitor(tree, exclusions)
         self._data: pin.Data = self.model.createData()
         self._collision_data: pin.GeometryData = self.collision_model.createData()
 
@@ -113,7 +116,8 @@ class Robot:
         urdf = parse_urdf(cell.urdf, cell.name)
         robot = cls(urdf, parse_srdf(cell.srdf, cell.name), cell.tool_frames, cell.home, cell.name)
         for name, arm in robot.arms.items():
-            robot.arms[name] = replace(arm, swivel=_swivel(config, name, cell.arm_joints[name]))
+            swivel = _swivel(config, name, cell.arm_joints[name], cell.prefixes[name])
+            robot.arms[name] = replace(arm, swivel=swivel, finger_joints=cell.finger_joints[name])
         return robot
 
     @classmethod
@@ -151,9 +155,7 @@ class Robot:
         pin.computeDistances(self.model, self._data, self.collision_model, self._collision_data, q)
         return np.array([result.min_distance for result in self._collision_data.distanceResults], dtype=np.float64)
 
-    def _monitor(
-        self, tree: LinkTree, exclusions: Iterable[ET.Element] | None, tool_frames: Mapping[str, str]
-    ) -> tuple[tuple[str, str], ...]:
+    def _monitor(self, tree: LinkTree, exclusions: Iterable[ET.Element] | None) -> tuple[tuple[str, str], ...]:
         """Choose the pairs; returns those of one arm that overlap by construction and are left out."""
         enclose_shapes(self.collision_model)
         add_movable_pairs(self.model, self.collision_model, tree)
@@ -165,13 +167,19 @@ class Robot:
             # Who lists the pairs is believed: only what overlaps everywhere is dropped, since it can never be parted.
             random = np.random.default_rng(0)
             postures += [random.uniform(self.position_lower, self.position_upper) for _ in range(50)]
-        own_links = [set(tree.path(frame)) for frame in tool_frames.values()]
+        own_links = [set(tree.path(arm.tool_frame)) | self._moved_links(arm) for arm in self.arms.values()]
         return remove_overlapping_own_pairs(self.model, self.collision_model, own_links, postures)
 
+    def _moved_links(self, arm: Arm) -> set[str]:
+        """Links that an arm's joints carry, of branches beside the way to the tool too, such as fingers."""
+        joints = {int(index) + 1 for index in arm.joints}
+        bodies = (frame for frame in self.model.frames if frame.type == pin.FrameType.BODY)
+        return {body.name for body in bodies if body.parentJoint in joints}
 
-def _swivel(config: Config, arm: str, joints: Sequence[str]) -> Swivel | None:
+
+def _swivel(config: Config, arm: str, joints: Sequence[str], prefix: str) -> Swivel | None:
     """An arm's swivel task with the names that its joints have in the cell; raises :class:`ConfigError`."""
-    wanted, prefix = next(made.swivel for side, made in config.arms.items() if side == arm), f"{arm}_"
+    wanted = next(made.swivel for side, made in config.arms.items() if side == arm)
     if wanted.gain == 0.0:
         return None
     places = []
@@ -227,23 +235,19 @@ def _checked_chain(tree: LinkTree, arm: str, frame: str, where: str) -> list[str
     return [joint.get("name", "") for joint in chain]
 
 
-def _reduced(
+def _models(
     urdf: ET.Element, chains: Mapping[str, list[str]], home: Mapping[str, float], where: str
 ) -> tuple[pin.Model, pin.GeometryModel]:
     """Pinocchio's models with every joint outside ``chains`` locked at home."""
-    kept = {name for chain in chains.values() for name in chain}
+    locked = copy.deepcopy(urdf)
+    lock_joints(locked, {name for chain in chains.values() for name in chain}, home)
     try:
-        text = ET.tostring(urdf, encoding="unicode")
+        text = ET.tostring(locked, encoding="unicode")
         model = pin.buildModelFromXML(text)
         geometry = pin.buildGeomFromUrdfString(model, text, pin.GeometryType.COLLISION)
         if geometry.ngeoms != (written := len(urdf.findall("link/collision"))):
             raise RobotError(f"{where}: Pinocchio read {geometry.ngeoms} of {written} collision shapes")
-        posture = pin.neutral(model)
-        for joint, name in zip(model.joints[1:], list(model.names)[1:], strict=True):
-            if joint.nq == joint.nv == 1:
-                posture[joint.idx_q] = home[name]
-        locked = [index for index, name in enumerate(model.names) if index > 0 and name not in kept]
-        return pin.buildReducedModel(model, geometry, locked, posture)
+        return model, geometry
     except (ValueError, RuntimeError, IndexError) as error:
         raise RobotError(f"{where}: Pinocchio cannot read it: {' '.join(str(error).split())}") from error
 

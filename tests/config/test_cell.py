@@ -12,17 +12,13 @@ import pytest
 import yaml
 from pydantic import BaseModel
 
+from q2r2_control.config.arms import ArmConfig, GripperConfig, PoseConfig, RobotConfig, SwivelConfig, ToolConfig
 from q2r2_control.config.cell import (
-    ArmConfig,
     Config,
-    GripperConfig,
     HeadsetConfig,
     MujocoConfig,
     ObjectConfig,
     ObstacleConfig,
-    PoseConfig,
-    SwivelConfig,
-    ToolConfig,
     load_config,
 )
 from q2r2_control.config.control import AdmittanceSettings, ControllerSettings, ImpedanceSettings, WallSettings
@@ -30,7 +26,7 @@ from q2r2_control.config.external import ExternalArm, ExternalConfig, ExternalGr
 from q2r2_control.config.teleop import FilterSettings, GateSettings, LeashSettings, TeleopSettings
 from q2r2_control.errors import ConfigError, Q2R2Error
 from q2r2_control.robot.robot import Robot
-from tests.support.external_cell import external, external_text
+from tests.support.external_cell import external, external_text, robot_text
 
 SHIPPED = Path(__file__).resolve().parents[2] / "config"
 CELL = SHIPPED / "dual_iiwa7.yaml"
@@ -80,6 +76,7 @@ class TestTheShippedCellShowsAllThereIsToTune:
     # Models at every place where they occur, each with one example of it in the file.
     PLACES: tuple[tuple[str, type[BaseModel]], ...] = (
         ("", Config),
+        ("robot", RobotConfig),
         ("arms.left", ArmConfig),
         ("arms.left.mount", PoseConfig),
         ("arms.left.tool", ToolConfig),
@@ -124,10 +121,10 @@ class TestTheShippedCellShowsAllThereIsToTune:
 
     @pytest.mark.parametrize(("place", "model"), PLACES, ids=lambda value: value if isinstance(value, str) else "")
     def test_every_key_is_written_and_commented(self, place: str, model: type[BaseModel]) -> None:
-        data = external()
+        text = robot_text() if place == "robot" else external_text()
+        data, lines = yaml.safe_load(text), text.splitlines()
         for part in filter(None, place.split(".")):
             data = data[part]
-        lines = external_text().splitlines()
         for key in model.model_fields:
             path = f"{place}.{key}".lstrip(".")
             if path in self.SHOWN_ELSEWHERE:
@@ -443,3 +440,103 @@ def test_a_mapping_may_be_merged_into_another_and_changed_there(tmp_path: Path) 
     )
     arms = loaded(tmp_path, text).arms
     assert (arms["right"].model, arms["right"].home, arms["left"].home) == ("iiwa7", (1.0,), (0.0,))
+
+
+class TestRelativePathsAreLookedUp:
+    """From the file's folder, then from the working directory, then among what ships."""
+
+    URDF = (
+        '<robot name="{name}"><link name="base"/><link name="rod"/><joint name="hinge" type="revolute">'
+        '<parent link="base"/><child link="rod"/><limit lower="-1" upper="1" velocity="1" effort="1"/></joint></robot>'
+    )
+
+    @pytest.fixture
+    def folders(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, Path]:
+        """The folder of a YAML file and the working directory, each with everything."""
+        for name in ("cell", "work"):
+            folder = tmp_path / name
+            (folder / "robots").mkdir(parents=True)
+            for file in ("rod.urdf", "robots/rod.urdf"):
+                (folder / file).write_text(self.URDF.format(name=name))
+            (folder / "pairs.srdf").write_text(f'<robot name="{name}"/>')
+        monkeypatch.chdir(tmp_path / "work")
+        return tmp_path / "cell", tmp_path / "work"
+
+    def config(self, folder: Path, model: str) -> Config:
+        (folder / "cell.yaml").write_text(
+            f"name: x\nsrdf: pairs.srdf\narms: {{left: {{model: {model}, home: [0]}}}}\n", encoding="utf-8"
+        )
+        return load_config(folder / "cell.yaml")
+
+    @pytest.mark.parametrize("model", ["rod.urdf", "rod", "../cell/rod.urdf"])
+    def test_from_the_folder_of_the_file_first(self, folders: tuple[Path, Path], model: str) -> None:
+        cell, _ = folders
+        config = self.config(cell, model)
+        assert config.srdf == str(cell / "pairs.srdf")
+        assert Path(config.model_of("left")).resolve().is_relative_to(cell)
+        assert Robot.from_config(config).joint_names == ("left_hinge",)
+
+    @pytest.mark.parametrize("model", ["rod.urdf", "rod"])
+    def test_then_from_the_working_directory(self, folders: tuple[Path, Path], model: str) -> None:
+        cell, _ = folders
+        for file in ("rod.urdf", "robots/rod.urdf", "pairs.srdf"):
+            (cell / file).unlink()
+        config = self.config(cell, model)
+        assert (config.model_of("left"), config.srdf) == (model, "pairs.srdf")
+        assert Robot.from_config(config).joint_names == ("left_hinge",)
+
+    def test_then_among_what_ships(self, folders: tuple[Path, Path]) -> None:
+        cell, work = folders
+        for folder in (cell, work):
+            (folder / "pairs.srdf").unlink()
+        (cell / "cell.yaml").write_text("name: x\narms: {left: {model: iiwa7, home: [0, 0, 0, 0, 0, 0, 0]}}\n")
+        assert Robot.from_config(load_config(cell / "cell.yaml")).model.nv == 7
+
+    def test_of_a_robot_that_arms_share_and_of_tools_too(self, folders: tuple[Path, Path]) -> None:
+        cell, _ = folders
+        (cell / "cell.yaml").write_text(
+            "name: x\nrobot: {model: rod.urdf}\narms: {left: {home: [0], tool: {model: robots/rod.urdf}}}\n"
+            "packages: {mine: robots}\n"
+        )
+        config = load_config(cell / "cell.yaml")
+        assert config.model_of("left") == str(cell / "rod.urdf")
+        assert config.arms["left"].tool.model == str(cell / "robots" / "rod.urdf")
+        assert config.packages == {"mine": str(cell / "robots")}
+
+    @pytest.mark.parametrize("path", ["x" * 5000 + ".urdf", "a\x00.urdf", ""])
+    def test_and_what_no_file_can_be_called_ends_in_one_line(self, tmp_path: Path, path: str) -> None:
+        config = loaded(tmp_path, changed("arms.left.model", path))
+        with pytest.raises(Q2R2Error) as caught:
+            Robot.from_config(config)
+        assert len(str(caught.value).splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "frame"),
+    [
+        ("arms.left.tool.frame", "tool_frame", "left_tool_frame"),
+        ("arms.left.tool.frame", None, None),
+        ("arms.left.tool", {"frame": "link_7"}, "left_link_7"),
+        ("arms.left.tool", {"link": "link_7"}, "left_link_7"),
+        ("arms.left.tool", {}, None),
+    ],
+)
+def test_the_tool_frame_is_called_by_side_where_the_file_names_it(
+    tmp_path: Path, path: str, value: object, frame: str | None
+) -> None:
+    config = loaded(tmp_path, changed(path, value))
+    assert config.named_tool_frame("left") == frame
+
+
+def test_the_tool_frame_of_a_shared_robot_keeps_its_name(tmp_path: Path) -> None:
+    text = "name: x\nrobot: {model: iiwa7}\narms: {left: {tip: link_7, home: [0]}}\n"
+    assert loaded(tmp_path, text).named_tool_frame("left") == "link_7"
+
+
+@pytest.mark.parametrize(
+    ("key", "tool"), [("tool.link", {"model": "hand_e", "link": "link_7"}), ("tool.frame", {"frame": "link_7"})]
+)
+def test_two_different_links_for_the_end_of_one_arm_are_refused(tmp_path: Path, key: str, tool: dict[str, str]) -> None:
+    arm = {"model": "iiwa7", "home": [0] * 7, "tip": "link_ee", "tool": tool}
+    message = fault(tmp_path, changed("arms.left", arm))
+    assert f"tip = 'link_ee' and {key} = 'link_7' mean the same link: give one" in message

@@ -107,17 +107,26 @@ def test_the_tool_frame_is_by_default(arm: dict[str, Any], frame: str) -> None:
     assert compose(one_arm(**arm)).tool_frames == {"left": frame}
 
 
-def test_joints_that_nobody_drives_rest_as_near_zero_as_they_can() -> None:
+def test_joints_that_nobody_drives_are_fixed_as_near_zero_as_they_can() -> None:
     cell = compose(one_arm(model="example-robot-data:panda", home=[0, 0, 0, -1, 0, 1, 0]))
-    assert cell.home["left_panda_finger_joint1"] == 0.0
     assert cell.finger_joints == {"left": ()}
+    assert list(cell.home) == list(cell.arm_joints["left"])
+    assert list(pin.buildModelFromXML(cell.urdf).names)[1:] == list(cell.arm_joints["left"])
+
+
+def test_a_finger_that_mimics_a_driven_one_moves_with_it() -> None:
+    gripper = {"joints": ["panda_finger_joint1"], "open_position": 0.04}
+    cell = compose(one_arm(model="example-robot-data:panda", home=[0, 0, 0, -1, 0, 1, 0], gripper=gripper))
+    assert cell.finger_joints == {"left": ("left_panda_finger_joint1",)}
+    assert cell.home["left_panda_finger_joint2"] == 0.04
 
 
 def test_pairs_of_tool_and_arm_are_excluded_only_where_the_tool_sits_flat_on_the_flange() -> None:
     flat = compose(one_arm(tool=HAND)).srdf
     moved = compose(one_arm(tool=HAND | {"mount": {"position": [0, 0, 0.2]}})).srdf
+    elsewhere = compose(one_arm(tool=HAND | {"link": "link_3"}, home=[0.0] * 3)).srdf
     assert '"left_link_4" link2="left_hand_e_envelope"' in flat
-    assert '"left_link_4" link2="left_hand_e_envelope"' not in moved
+    assert '"left_link_4" link2="left_hand_e_envelope"' not in moved + elsewhere
 
 
 @pytest.mark.parametrize(
@@ -136,7 +145,9 @@ def test_pairs_of_tool_and_arm_are_excluded_only_where_the_tool_sits_flat_on_the
         pytest.param({"home": [0, 2.5, *[0] * 5]}, "home[1] = 2.5: joint A2 allows -2.0944 .. 2", id="home outside"),
         pytest.param({"gripper": FINGERS}, "no such finger joint; allowed: none", id="fingers without a hand"),
         pytest.param(
-            {"tool": HAND, "gripper": FINGERS | {"joints": ["A7"]}}, "allowed: finger_joint_1", id="arm joint as finger"
+            {"tool": HAND | {"link": "link_ee"}, "gripper": FINGERS | {"joints": ["A7"]}},
+            "allowed: finger_joint_1",
+            id="arm joint as finger",
         ),
         pytest.param(
             {"tool": HAND, "gripper": FINGERS | {"open_position": 0.05}},

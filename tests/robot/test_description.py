@@ -103,7 +103,7 @@ def test_a_chain_lists_the_movable_joints_from_the_root() -> None:
         pytest.param("example-robot-data:pandda", "panda", id="an unknown example robot lists the known ones"),
         pytest.param("example-robot-data:cassie", "no URDF", id="an example robot that is no URDF"),
         pytest.param("package://lbr/urdf/iiwa7.urdf", "AMENT_PREFIX_PATH", id="a ROS package that is not there"),
-        pytest.param("iiwa7.urdf.xacro", "expanded", id="xacro"),
+        pytest.param("iiwa7.urdf.xacro", "no such file", id="a xacro file that is not there"),
         pytest.param("../../../etc/passwd", "no such file", id="a path out of robots/"),
     ],
 )

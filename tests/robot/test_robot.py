@@ -6,8 +6,10 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
+from q2r2_control.config import Config
 from q2r2_control.errors import RobotError
 from q2r2_control.robot.compose import ComposedCell
+from q2r2_control.robot.description import load_description
 from q2r2_control.robot.pairs import link_of, pair_names
 from q2r2_control.robot.robot import Robot
 
@@ -206,3 +208,22 @@ def test_random_damage_to_the_text_never_ends_in_anything_but_a_robot_or_a_clear
             continue
         assert np.isfinite(robot.tool_pose(robot.home, "left").homogeneous).all()
         assert np.isfinite([pair.distance for pair in robot.distances(robot.home)]).all()
+
+
+def test_a_link_and_a_fixed_joint_may_have_one_name() -> None:
+    file = load_description("example-robot-data:z1").file
+    robot = Robot.from_urdf(file, {"left": "gripperMover"})
+    assert robot.joint_names == (*(f"joint{number}" for number in range(1, 7)), "jointGripper")
+    model = pin.buildModelFromUrdf(str(file))
+    data = model.createData()
+    q = np.linspace(0.1, 0.7, 7)
+    pin.framesForwardKinematics(model, data, q)
+    expected = data.oMf[model.getFrameId("gripperMover", pin.FrameType.BODY)]
+    np.testing.assert_allclose(robot.tool_pose(q, "left").homogeneous, expected.homogeneous, atol=1e-12)
+
+
+def test_an_arm_can_carry_a_tool_on_a_link_that_has_the_name_of_a_fixed_joint() -> None:
+    arm = {"model": "example-robot-data:z1", "home": [0, 1.5, -1.5, 0, 0, 0], "tool": {"model": "hand_e"}}
+    robot = Robot.from_config(Config.model_validate({"name": "z1", "arms": {"left": arm}}))
+    assert len(robot.joint_names) == 6
+    assert robot.arms["left"].tool_frame == "left_tool_frame"

@@ -1,4 +1,4 @@
-"""The shipped cell with its commented block ``external`` in force, as its own comment says how."""
+"""The shipped cell with a commented block in force, as its own comment says how."""
 
 from __future__ import annotations
 
@@ -11,12 +11,21 @@ CELL = Path(__file__).resolve().parents[2] / "config" / "dual_iiwa7.yaml"
 
 
 def external_text() -> str:
-    """The YAML, with all its other comments."""
-    before, marker, after = CELL.read_text(encoding="utf-8").partition("# external:\n")
+    """The YAML with its block ``external``, and with all its other comments."""
+    text = _uncommented("external", CELL.read_text(encoding="utf-8"))
+    assert "controller: builtin " in text
+    return text.replace("controller: builtin ", "controller: external ")
+
+
+def robot_text() -> str:
+    """The YAML with its block ``robot``, and with all its other comments."""
+    return _uncommented("robot", CELL.read_text(encoding="utf-8").replace("robot: null ", "# "))
+
+
+def _uncommented(key: str, text: str) -> str:
+    before, marker, after = text.partition(f"# {key}:\n")
     block, blank, rest = after.partition("\n\n")
-    lines = [line.removeprefix("# ") for line in (marker + block).splitlines()]
-    assert "controller: builtin " in before
-    return before.replace("controller: builtin ", "controller: external ") + "\n".join(lines) + blank + rest
+    return before + "\n".join(line.removeprefix("# ") for line in (marker + block).splitlines()) + blank + rest
 
 
 def external() -> dict[str, Any]:

@@ -1,0 +1,139 @@
+"""What the YAML says of robots and arms: models, mounts, tools, grippers, home postures."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationInfo, model_validator
+
+from q2r2_control.errors import ConfigError
+
+Side = Literal["left", "right"]
+# The ranges are there to catch millimetres and degrees.
+Coordinate = Annotated[float, Field(ge=-20, le=20)]  # [m]
+Extent = Annotated[float, Field(gt=0, le=20)]  # [m]
+Angle = Annotated[float, Field(ge=-6.2832, le=6.2832)]  # [rad]
+Share = Annotated[float, Field(ge=0, le=1)]
+Metres3 = Annotated[tuple[Coordinate, Coordinate, Coordinate], Field(description="x, y, z [m]")]
+Radians3 = Annotated[tuple[Angle, Angle, Angle], Field(description="roll, pitch, yaw [rad]")]
+Colour = tuple[Share, Share, Share, Share]
+
+
+def _beside_the_file(value: str, info: ValidationInfo) -> str:
+    """A relative path as an absolute one where the folder of the YAML has such a file or folder."""
+    folder: Path | None = (info.context or {}).get("folder")
+    # A model without ending is a name, as in robots/NAME.urdf.
+    path = f"robots/{value}.urdf" if info.field_name == "model" and not Path(value).suffix else value
+    try:
+        return str(folder / path) if folder is not None and value and (folder / path).exists() else value
+    except (OSError, ValueError):  # a name that no file can have; reading it will say so
+        return value
+
+
+# Looked up from the folder of the YAML first, then from the working directory, then among the shipped files.
+LocalPath = Annotated[str, AfterValidator(_beside_the_file)]
+XacroArgs = Annotated[dict[str, str | bool | int | float], Field(description="of a .xacro model, by name")]
+
+
+class CellModel(BaseModel):
+    """What every block of a cell has in common: no unknown keys, no change, finite numbers."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class PoseConfig(CellModel):
+    """A fixed placement in the parent frame."""
+
+    position: Metres3 = (0.0, 0.0, 0.0)
+    rpy: Radians3 = (0.0, 0.0, 0.0)
+
+
+class ToolConfig(CellModel):
+    """What is mounted on an arm's last link."""
+
+    model: LocalPath | None = Field(None, description="a file of robots/ without .urdf, or a path; none: bare flange")
+    xacro_args: XacroArgs = {}
+    link: str | None = Field(None, description="arm link that carries the tool; default: the arm's tip")
+    mount: PoseConfig = PoseConfig()
+    frame: str | None = Field(None, description="link of the tool that the operator moves; default: the last link")
+
+
+class GripperConfig(CellModel):
+    """How an opening of 0..1 becomes finger joint positions."""
+
+    joints: tuple[str, ...] = Field((), description="finger joints of the tool, all driven alike")
+    open_position: float = Field(0.0, ge=-3.15, le=3.15, description="of each finger joint, open [m or rad]")
+    closed_position: float = Field(0.0, ge=-3.15, le=3.15, description="of each finger joint, closed [m or rad]")
+    speed: float = Field(0.1, gt=0, le=5, description="of each finger joint [m/s or rad/s]")
+    force: float = Field(60.0, gt=0, le=500, description="of each finger joint [N or Nm]")
+
+    @model_validator(mode="after")
+    def _opens(self) -> GripperConfig:
+        if self.joints and self.open_position == self.closed_position:
+            raise ValueError(f"open_position and closed_position have to differ, both are {self.open_position:g}")
+        return self
+
+
+class SwivelConfig(CellModel):
+    """Where an arm's elbow is, about the line from shoulder to wrist. Names are joints of the arm's model."""
+
+    shoulder: str = Field("A2", description="joint in the shoulder")
+    elbow: str = Field("A4", description="joint in the elbow")
+    wrist: str = Field("A6", description="joint in the wrist")
+    angle: Angle | None = Field(None, description="0: elbow up, turning about that line [rad]; none: as at home")
+    gain: float = Field(0.0, ge=0, le=20, description="swivel speed per radian from the angle [1/s]; 0: off")
+
+
+class RobotConfig(CellModel):
+    """One model that several arms are parts of. Its links and joints keep their names."""
+
+    model: LocalPath = Field(description="as an arm's model")
+    xacro_args: XacroArgs = {}
+    mount: PoseConfig = PoseConfig()
+    home: dict[str, float] = Field(
+        default_factory=dict, description="where joints of no arm are locked, by name; the others as near 0 as allowed"
+    )
+
+
+class ArmConfig(CellModel):
+    """One arm: model and mount, unless it is part of the cell's ``robot``; tip, tool, home posture."""
+
+    model: LocalPath | None = Field(
+        None, description="a file of robots/ without .urdf, example-robot-data:NAME, or a path"
+    )
+    xacro_args: XacroArgs = {}
+    mount: PoseConfig = PoseConfig()
+    tip: str | None = Field(None, description="last link of the arm; none: found, where there is no doubt")
+    joints: tuple[str, ...] = Field((), description="of the arm, base to tip; none: all from base to tip")
+    tool: ToolConfig = ToolConfig()
+    gripper: GripperConfig = GripperConfig()
+    home: tuple[float, ...] = Field(description="joint positions [rad]")
+    swivel: SwivelConfig = SwivelConfig()
+
+    @model_validator(mode="after")
+    def _has_one_tip(self) -> ArmConfig:
+        named = {"tool.link": self.tool.link}
+        if self.tool.model is None:
+            named["tool.frame"] = self.tool.frame
+        for key, link in named.items():
+            if self.tip is not None and link not in (None, self.tip):
+                raise ValueError(f"tip = {self.tip!r:.60} and {key} = {link!r:.60} mean the same link: give one")
+        return self
+
+    @property
+    def named_tip(self) -> str | None:
+        """The arm's last link, where the file names it."""
+        return self.tip or self.tool.link
+
+
+def check_models(robot: RobotConfig | None, arms: Mapping[Side, ArmConfig]) -> None:
+    """Raise :class:`ConfigError` unless every arm has a model of its own, or all are parts of ``robot``."""
+    for side, arm in arms.items():
+        key = f"arms.{side}"
+        if robot is None and arm.model is None:
+            raise ConfigError(f"{key}.model: missing; give one, or the key robot: a model that all arms are parts of")
+        for part in ("model", "xacro_args", "mount"):
+            if robot is not None and part in arm.model_fields_set:
+                raise ConfigError(f"{key}.{part}: an arm of robot has none; set robot.{part}")

@@ -1,0 +1,126 @@
+"""Which joints and which link of a model make up an arm, where the configuration leaves it to the model.
+
+From the base, the arm follows the movable joints one by one and ends before a gripper's. Its tip is the end of what is
+fixed to the last of them. Where a model could be read in more than one way, the user is asked instead.
+"""
+
+from __future__ import annotations
+
+import re
+import xml.etree.ElementTree as ET
+from collections.abc import Collection, Sequence
+
+import numpy as np
+
+from q2r2_control.errors import ConfigError
+from q2r2_control.robot.description import LinkTree, joint_end
+from q2r2_control.robot.locking import joint_origin
+
+# What the joints of grippers are called; arms' are not.
+_GRIPPER_JOINT = re.compile(r"gripper|finger|jaw|thumb|knuckle", re.IGNORECASE)
+# What sticks out of a flange beside the tool, with all that it carries. A sensor may carry the tool.
+_SIDE_BRANCH = re.compile(r"finger|jaw|thumb|knuckle|camera|antenna|imu", re.IGNORECASE)
+_SENSOR = re.compile(r"sensor", re.IGNORECASE)
+# What a link is called that is there to be a tool frame, the most telling first.
+_TOOL_FRAMES = [
+    re.compile(pattern, re.IGNORECASE)
+    for pattern in (r"tcp", r"tool", r"(^|_)eef?(_|$)|end_?effector|endpoint", r"grasp|gripper_?frame", r"flange")
+]
+_SAME_PLACE = 1e-3  # [m]
+
+
+def default_tip(tree: LinkTree, gripper_joints: Collection[str], key: str) -> str:
+    """The link at the end of the one chain of movable joints that ``tree`` has.
+
+    Raises :class:`ConfigError` that begins with ``key`` and names the candidates where there are several.
+    """
+    link, depth = tree.root, 0
+    while True:
+        onwards = _arm_joints_from(tree, link, gripper_joints)
+        if len(onwards) > 1:
+            longest = max(_longest_chain(tree, joint) for joint in onwards)
+            if depth >= longest > 0:
+                break  # the fingers of a hand, whatever they are called
+            names = ", ".join(joint.get("name", "") for joint in onwards)
+            raise ConfigError(f"{key}: the model's chain branches at {link} into {names}: name the arm's last link")
+        if not onwards:
+            break
+        link, depth = joint_end(onwards[0], "child"), depth + 1
+    return end_of(tree, link, key)
+
+
+def end_of(tree: LinkTree, link: str, key: str) -> str:
+    """The outermost link that is fixed to ``link``, side branches such as fingers and cameras aside.
+
+    Raises :class:`ConfigError` that begins with ``key`` where several could be meant.
+    """
+    body = [name for name in tree.fixed_to(link) if not _is_side_branch(tree, link, name)]
+    carriers = {joint_end(tree.joint_to[name], "parent") for name in body if name != link}
+    ends = [name for name in body if name not in carriers]
+    ends = [name for name in ends if not _SENSOR.search(name)] or ends
+    for pattern in _TOOL_FRAMES:
+        if named := [name for name in ends if pattern.search(name)]:
+            ends = named
+            break
+    places = [_place_in(tree, link, name) for name in ends]
+    if any(np.linalg.norm(place - places[0]) > _SAME_PLACE for place in places):
+        raise ConfigError(f"{key}: the arm could end at {', '.join(ends)}: name the link that is meant")
+    return ends[0]
+
+
+def named_joints(tree: LinkTree, tip: str, names: Sequence[str], key: str) -> list[ET.Element]:
+    """The joints ``names`` of the chain to ``tip``; all of that chain without any names.
+
+    Raises :class:`ConfigError` unless they are movable joints of that chain, in the order from base to tip.
+    """
+    chain = tree.chain(tip)
+    order = [joint.get("name", "") for joint in chain]
+    for name in names:
+        if name not in order:
+            allowed = ", ".join(order) or "none"
+            raise ConfigError(f"{key}.joints = {name!r:.60}: no movable joint that carries {tip}; allowed: {allowed}")
+    if sorted(names, key=order.index) != list(names) or len(set(names)) < len(names):
+        wanted = ", ".join(name for name in order if name in names)
+        raise ConfigError(f"{key}.joints = {', '.join(names):.200}: expected from base to tip, once each: {wanted}")
+    return [joint for joint in chain if not names or joint.get("name") in names]
+
+
+def is_gripper_joint(tree: LinkTree, joint: ET.Element) -> bool:
+    """Whether a joint is a gripper's: its name says so, or another one mimics it, or it mimics one."""
+    name = joint.get("name", "")
+    mimicked = any(found.get("joint") == name for other in tree.joint_to.values() for found in other.findall("mimic"))
+    return mimicked or joint.find("mimic") is not None or _GRIPPER_JOINT.search(name) is not None
+
+
+def _arm_joints_from(tree: LinkTree, link: str, gripper_joints: Collection[str]) -> list[ET.Element]:
+    body = tree.fixed_to(link)
+    return [
+        joint
+        for joint in tree.joint_to.values()
+        if joint.get("type") != "fixed"
+        and joint_end(joint, "parent") in body
+        and joint.get("name") not in gripper_joints
+        and not is_gripper_joint(tree, joint)
+    ]
+
+
+def _longest_chain(tree: LinkTree, joint: ET.Element) -> int:
+    child = joint_end(joint, "child")
+    before = len(tree.chain(child)) - 1
+    return max(len(tree.chain(link)) - before for link in tree.joint_to if child in tree.path(link))
+
+
+def _is_side_branch(tree: LinkTree, link: str, end: str) -> bool:
+    path = tree.path(end)
+    beyond = path[path.index(link) + 1 :]
+    # A fixed joint that mimics one is a gripper's, out of use.
+    return any(_SIDE_BRANCH.search(name) or tree.joint_to[name].find("mimic") is not None for name in beyond)
+
+
+def _place_in(tree: LinkTree, link: str, end: str) -> np.ndarray:
+    """Origin of ``end`` in the frame of ``link``, to which it is fixed [m]."""
+    path = tree.path(end)
+    place = np.eye(4)
+    for name in path[path.index(link) + 1 :]:
+        place = place @ joint_origin(tree.joint_to[name]).homogeneous
+    return place[:3, 3]

@@ -1,0 +1,88 @@
+"""Elements of URDF and SRDF as a cell is put together from them: with other names, or made from a configuration."""
+
+from __future__ import annotations
+
+import copy
+import xml.etree.ElementTree as ET
+from collections import Counter
+from collections.abc import Callable, Sequence
+
+from q2r2_control.config.arms import PoseConfig
+from q2r2_control.config.cell import ObstacleConfig
+
+WORLD = "world"  # root link of every cell
+
+# Elements that name links or joints, and the attribute that does.
+_NAMING = {"parent": "link", "child": "link", "mimic": "joint"}
+
+
+def renamed(part: ET.Element, name_of: Callable[[str], str]) -> ET.Element:
+    """A copy of a link, joint or material with every name in it changed by ``name_of``."""
+    part = copy.deepcopy(part)
+    for element in part.iter():
+        if element.tag in _NAMING:
+            attribute = _NAMING[element.tag]
+            element.set(attribute, name_of(element.get(attribute, "")))
+        elif element.get("name"):
+            element.set("name", name_of(element.get("name", "")))
+    return part
+
+
+def renamed_exclusions(parts: Sequence[ET.Element], name_of: Callable[[str], str]) -> list[ET.Element]:
+    """Copies of what disables collisions among the elements of an SRDF, links renamed by ``name_of``."""
+    naming = {"disable_collisions": ("link1", "link2"), "disable_default_collisions": ("link",)}
+    found = [copy.deepcopy(part) for part in parts if part.tag in naming]
+    for part in found:
+        for attribute in naming[part.tag]:
+            part.set(attribute, name_of(part.get(attribute, "")))
+    return found
+
+
+def name_shapes(links: Sequence[ET.Element]) -> None:
+    """Give every shape a name of its own, which MuJoCo needs; shapes that share one or have none get their link's."""
+    for tag in ("collision", "visual"):
+        used = Counter(shape.get("name") for link in links for shape in link.findall(tag))
+        for link in links:
+            for index, shape in enumerate(link.findall(tag)):
+                if not shape.get("name") or used[shape.get("name")] > 1:
+                    shape.set("name", f"{link.get('name')}_{tag}_{index}")
+
+
+def fixed_joint(name: str, parent: str, child: str, pose: PoseConfig) -> ET.Element:
+    """A fixed joint that places ``child`` in ``parent``."""
+    joint = ET.Element("joint", name=name, type="fixed")
+    ET.SubElement(joint, "parent", link=parent)
+    ET.SubElement(joint, "child", link=child)
+    ET.SubElement(joint, "origin", xyz=_numbers(pose.position), rpy=_numbers(pose.rpy))
+    return joint
+
+
+def obstacle_link(name: str, config: ObstacleConfig) -> ET.Element:
+    """An obstacle as a link."""
+    link = ET.Element("link", name=name)
+    for tag in ("visual", "collision"):
+        shape = ET.SubElement(link, tag, name=f"{name}_{tag}")
+        shape.append(_shape(config))
+        if tag == "visual":
+            material = ET.SubElement(shape, "material", name=f"{name}_colour")
+            ET.SubElement(material, "color", rgba=_numbers(config.colour))
+    if config.shape == "capsule":
+        checking = ET.SubElement(link, "collision_checking")
+        ET.SubElement(checking, "capsule", name=f"{name}_collision")
+    return link
+
+
+def _shape(config: ObstacleConfig) -> ET.Element:
+    geometry = ET.Element("geometry")
+    if config.shape == "box":
+        ET.SubElement(geometry, "box", size=_numbers(config.size))
+    elif config.shape == "sphere":
+        ET.SubElement(geometry, "sphere", radius=_numbers(config.size))
+    else:
+        radius, length = config.size
+        ET.SubElement(geometry, "cylinder", radius=_numbers([radius]), length=_numbers([length]))
+    return geometry
+
+
+def _numbers(values: Sequence[float]) -> str:
+    return " ".join(repr(float(value)) for value in values)

@@ -1,0 +1,136 @@
+"""Which joints and which tip an arm has where the configuration names neither."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from collections.abc import Sequence
+
+import pytest
+
+from q2r2_control.errors import ConfigError
+from q2r2_control.robot.arm_chain import default_tip, end_of, named_joints
+from q2r2_control.robot.description import LinkTree, load_description
+
+
+def tree(*joints: str) -> LinkTree:
+    """A model of joints, each written as parent, child, kind (by default fixed) and name (by default its child's)."""
+    robot = ET.Element("robot")
+    links: dict[str, None] = {}
+    for text in joints:
+        parent, child, *rest = text.split()
+        kind, name = [*rest, *("fixed", f"to_{child}")[len(rest) :]]
+        joint = ET.SubElement(robot, "joint", name=name, type=kind)
+        ET.SubElement(joint, "parent", link=parent)
+        ET.SubElement(joint, "child", link=child)
+        ET.SubElement(joint, "origin", xyz=f"{len(links)} 0 0")  # every link at a place of its own
+        links |= {parent: None, child: None}
+    for link in links:
+        ET.SubElement(robot, "link", name=link)
+    return LinkTree(robot, "model")
+
+
+ARM = ("base one revolute", "one two revolute", "two flange")
+
+
+@pytest.mark.parametrize(
+    ("model", "tip", "joints"),
+    [
+        pytest.param("iiwa7", "link_ee", 7, id="a flange"),
+        pytest.param("example-robot-data:so101", "gripper_frame_link", 5, id="a gripper of one jaw beside its frame"),
+        pytest.param("example-robot-data:so100", "gripper", 5, id="a gripper of one jaw without a frame"),
+        pytest.param("example-robot-data:panda", "panda_hand_tcp", 7, id="a hand of two fingers"),
+        pytest.param("example-robot-data:xarm7", "link_eef", 7, id="a link for the end effector"),
+        pytest.param("example-robot-data:kinova", "j2s6s200_end_effector", 6, id="beside fixed fingers that go deeper"),
+        pytest.param("example-robot-data:ur5", "tool0", 6, id="two tool frames at one place"),
+        pytest.param("example-robot-data:z1", "gripperStator", 6, id="a gripper whose name is a joint's too"),
+        pytest.param("example-robot-data:bravo7_gripper", "grasping_poing", 6, id="beside a sensor and fingers"),
+        pytest.param("example-robot-data:talos_arm", "gripper_left_base_link", 6, id="a gripper of fixed mimics"),
+    ],
+)
+def test_of_a_known_arm_it_is(model: str, tip: str, joints: int) -> None:
+    known = LinkTree(load_description(model).urdf, model)
+    assert default_tip(known, (), "key") == tip
+    assert len(known.chain(tip)) == joints
+
+
+@pytest.mark.parametrize(
+    ("more", "tip"),
+    [
+        pytest.param(["flange antenna_mount", "antenna_mount antenna_tip"], "flange", id="not the antenna's end"),
+        pytest.param(["two camera_link", "camera_link optical_frame"], "flange", id="not the camera's"),
+        pytest.param(["flange ft_sensor", "ft_sensor tool"], "tool", id="the tool behind a sensor"),
+        pytest.param(["flange tcp", "flange bracket"], "tcp", id="what is called a tool centre point"),
+        pytest.param(["flange jaw_a revolute drive", "flange jaw_b revolute other"], "flange", id="before fingers"),
+        pytest.param(["flange jaw revolute jaw_joint"], "flange", id="before a joint that is called a jaw's"),
+    ],
+)
+def test_of_an_arm_with_a_side_branch_it_is(more: Sequence[str], tip: str) -> None:
+    assert default_tip(tree(*ARM, *more), (), "key") == tip
+
+
+def test_a_joint_that_the_gripper_drives_ends_the_arm() -> None:
+    model = tree(*ARM, "flange hook revolute drive")
+    assert default_tip(model, (), "key") == "hook"
+    assert default_tip(model, ("drive",), "key") == "flange"
+
+
+def test_a_joint_that_others_mimic_ends_the_arm() -> None:
+    model = tree(*ARM, "flange left revolute drive", "flange right revolute follower")
+    ET.SubElement(model.joint_to["right"], "mimic", joint="drive")
+    assert default_tip(model, (), "key") == "flange"
+
+
+@pytest.mark.parametrize(
+    ("more", "says"),
+    [
+        pytest.param(
+            ["base other revolute"],
+            "key: the model's chain branches at base into to_one, to_other: name the arm's last link",
+            id="two arms at the base",
+        ),
+        pytest.param(
+            ["one a revolute", "a b revolute"],
+            "key: the model's chain branches at one into to_two, to_a: name the arm's last link",
+            id="two arms on one torso",
+        ),
+        pytest.param(
+            ["flange plate", "flange stub"],
+            "key: the arm could end at plate, stub: name the link that is meant",
+            id="two ends that say nothing",
+        ),
+        pytest.param(
+            ["flange tool_a", "flange tool_b"],
+            "key: the arm could end at tool_a, tool_b: name the link that is meant",
+            id="two tools",
+        ),
+    ],
+)
+def test_where_there_is_doubt_the_user_is_asked(more: Sequence[str], says: str) -> None:
+    with pytest.raises(ConfigError) as error:
+        default_tip(tree(*ARM, *more), (), "key")
+    assert str(error.value) == says
+
+
+def test_a_tool_ends_at_its_frame_and_not_at_its_fingers() -> None:
+    tool = LinkTree(load_description("hand_e").urdf, "hand_e")
+    assert end_of(tool, tool.root, "key") == "tool_frame"
+
+
+@pytest.mark.parametrize(
+    ("names", "says"),
+    [
+        (["to_three"], "key.joints = 'to_three': no movable joint that carries flange; allowed: to_one, to_two"),
+        (["to_flange"], "key.joints = 'to_flange': no movable joint that carries flange; allowed: to_one, to_two"),
+        (["to_two", "to_one"], "key.joints = to_two, to_one: expected from base to tip, once each: to_one, to_two"),
+        (["to_one", "to_one"], "key.joints = to_one, to_one: expected from base to tip, once each: to_one"),
+    ],
+)
+def test_named_joints_that_are_not_the_chain_are_refused(names: list[str], says: str) -> None:
+    with pytest.raises(ConfigError) as error:
+        named_joints(tree(*ARM), "flange", names, "key")
+    assert str(error.value) == says
+
+
+def test_named_joints_leave_out_the_others_of_the_chain() -> None:
+    assert [joint.get("name") for joint in named_joints(tree(*ARM), "flange", ["to_two"], "key")] == ["to_two"]
+    assert len(named_joints(tree(*ARM), "flange", [], "key")) == 2

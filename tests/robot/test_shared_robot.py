@@ -1,0 +1,311 @@
+"""Cells whose arms are parts of one robot: Baxter, and TIAGo with two arms on a torso that lifts."""
+
+from __future__ import annotations
+
+import copy
+import json
+import xml.etree.ElementTree as ET
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pinocchio as pin
+import pytest
+import yaml
+from typer.testing import CliRunner
+
+from q2r2_control.cli.app import app
+from q2r2_control.config import Config, load_config
+from q2r2_control.errors import ConfigError
+from q2r2_control.plants.mujoco import MujocoPlant
+from q2r2_control.robot.compose import compose
+from q2r2_control.robot.description import load_description
+from q2r2_control.robot.pairs import link_of, pair_names
+from q2r2_control.robot.robot import Robot
+from q2r2_control.types import Command, CommandMode
+
+ARM = ("s0", "s1", "e0", "e1", "w0", "w1", "w2")
+LEFT, RIGHT = [f"left_{name}" for name in ARM], [f"right_{name}" for name in ARM]
+
+
+def _arm(side: str) -> dict[str, Any]:
+    finger = f"{side[0]}_gripper_l_finger_joint"
+    return {
+        "tip": f"{side}_gripper",
+        "home": [0.0, -0.55, 0.0, 0.75, 0.0, 1.26, 0.0],
+        "gripper": {"joints": [finger], "open_position": 0.02, "closed_position": 0.0},
+    }
+
+
+BAXTER: dict[str, Any] = {
+    "name": "baxter",
+    "robot": {
+        "model": "example-robot-data:baxter",
+        "mount": {"position": [0.0, 0.0, 0.93]},
+        "home": {"head_pan": 0.3},
+    },
+    "arms": {side: _arm(side) for side in ("left", "right")},
+}
+TIAGO: dict[str, Any] = {
+    "name": "tiago",
+    "robot": {"model": "example-robot-data:tiago_dual", "home": {"torso_lift_joint": 0.2}},
+    "srdf": "tiago.srdf",
+    "arms": {
+        side: {"tip": f"hand_{side}_grasping_frame", "home": [0.2, 0.5, 1.5, 1.6, 0.0, 0.0, 0.0]}
+        for side in ("left", "right")
+    },
+}
+
+
+def _tiago_pairs() -> str:
+    """What its maker did not list: the forearm's capsule reaches into the palm's, the torso's into the shoulder's."""
+    hand = ("safety_box", "palm_link", "index_link", "mrl_link", "thumb_link")
+    pairs = [(f"arm_{side}_5_link", f"hand_{side}_{part}") for side in ("left", "right") for part in hand]
+    pairs += [("torso_lift_link", f"arm_{side}_2_link") for side in ("left", "right")]
+    lines = "".join(f'<disable_collisions link1="{a}" link2="{b}" reason="User"/>' for a, b in pairs)
+    return f'<robot name="tiago">{lines}</robot>'
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A user's folder with both cells."""
+    folder = tmp_path_factory.mktemp("cells")
+    for cell in (BAXTER, TIAGO):
+        (folder / f"{cell['name']}.yaml").write_text(yaml.safe_dump(cell))
+    (folder / "tiago.srdf").write_text(_tiago_pairs())
+    return folder
+
+
+@pytest.fixture(scope="module")
+def baxter(folder: Path) -> Robot:
+    return Robot.from_config(load_config(folder / "baxter.yaml"))
+
+
+@pytest.fixture(scope="module")
+def tiago(folder: Path) -> Robot:
+    return Robot.from_config(load_config(folder / "tiago.yaml"))
+
+
+def test_both_arms_are_in_one_model_with_the_names_that_it_gives_them(baxter: Robot) -> None:
+    assert baxter.joint_names == (*LEFT, *RIGHT) or baxter.joint_names == (*RIGHT, *LEFT)
+    assert [arm.tool_frame for arm in baxter.arms.values()] == ["left_gripper", "right_gripper"]
+    own = {name: [baxter.joint_names[index] for index in arm.joints] for name, arm in baxter.arms.items()}
+    assert own == {"left": LEFT, "right": RIGHT}
+    links = [link.get("name") for link in ET.fromstring(baxter.urdf).iter("link") if link.get("name")]
+    assert links.count("torso") == 1
+
+
+def test_the_arms_watch_each_other_and_the_torso_that_carries_them(baxter: Robot) -> None:
+    watched = {frozenset(map(link_of, names)) for names in pair_names(baxter.collision_model)}
+    for pair in (
+        ("left_gripper_base_link", "right_gripper_base_link"),
+        ("left_wrist", "right_upper_forearm"),
+        ("l_gripper_l_finger", "right_hand_link"),
+        ("left_hand_link", "torso"),
+        ("right_upper_forearm", "torso"),
+        ("right_gripper_base_link", "pedestal"),
+        ("left_lower_forearm", "screen"),
+    ):
+        assert frozenset(pair) in watched, pair
+
+
+def test_a_robot_without_an_srdf_watches_everything_that_can_be_parted(tiago: Robot) -> None:
+    watched = {frozenset(map(link_of, names)) for names in pair_names(tiago.collision_model)}
+    for pair in (("arm_left_5_link", "arm_right_5_link"), ("arm_left_4_link", "torso_lift_link"),
+                 ("hand_left_palm_link", "head_2_link"), ("hand_right_palm_link", "base_link")):  # fmt: skip
+        assert frozenset(pair) in watched, pair
+    random = np.random.default_rng(1)
+    postures = [random.uniform(tiago.position_lower, tiago.position_upper) for _ in range(30)]
+    assert (np.max([tiago.distance_values(q) for q in postures], axis=0) > 0.0).all()
+
+
+@pytest.mark.parametrize("name", ["baxter", "tiago"])
+def test_dynamics_are_those_of_the_whole_model_with_its_other_joints_locked(
+    name: str, request: pytest.FixtureRequest
+) -> None:
+    robot: Robot = request.getfixturevalue(name)
+    cell = BAXTER if name == "baxter" else TIAGO
+    urdf = ET.tostring(load_description(cell["robot"]["model"]).urdf, encoding="unicode")
+    whole = pin.buildModelFromXML(urdf)
+    posture = pin.neutral(whole)
+    at = cell["robot"]["home"] | ({f"{side}_gripper_l_finger_joint": 0.02 for side in "lr"} if name == "baxter" else {})
+    at |= {f"{side}_gripper_r_finger_joint": -0.02 for side in "lr"} if name == "baxter" else {}
+    for joint, position in at.items():
+        posture[whole.joints[whole.getJointId(joint)].idx_q] = position
+    locked = [index for index, joint in enumerate(whole.names) if index and joint not in robot.joint_names]
+    expected = pin.buildReducedModel(whole, locked, posture)
+    expected.armature[:] = robot.model.armature
+    assert tuple(expected.names)[1:] == robot.joint_names
+    q = np.random.default_rng(2).uniform(robot.position_lower, robot.position_upper)
+    ours, theirs = robot.model.createData(), expected.createData()
+    np.testing.assert_allclose(pin.crba(robot.model, ours, q), pin.crba(expected, theirs, q), atol=1e-9)
+    np.testing.assert_allclose(
+        pin.computeGeneralizedGravity(robot.model, ours, q),
+        pin.computeGeneralizedGravity(expected, theirs, q),
+        atol=1e-9,
+    )
+    np.testing.assert_array_equal(robot.velocity_limit, expected.velocityLimit)
+    np.testing.assert_array_equal(robot.torque_limit, expected.effortLimit)
+
+
+def test_a_joint_that_carries_both_arms_is_locked_where_the_file_says(tiago: Robot) -> None:
+    assert all(joint.startswith("arm_") for joint in tiago.joint_names)
+    torso = tiago.model.frames[tiago.model.getFrameId("torso_lift_link", pin.FrameType.BODY)]
+    lowest = load_description("example-robot-data:tiago_dual").urdf
+    origin = lowest.find("joint[@name='torso_lift_joint']/origin")
+    assert origin is not None
+    fixed = tiago.model.frames[tiago.model.getFrameId("torso_fixed_link", pin.FrameType.BODY)]
+    height = float(origin.get("xyz", "").split()[2])
+    assert (fixed.placement.inverse() * torso.placement).translation[2] == pytest.approx(height + 0.2)
+
+
+def test_a_joint_that_one_arm_names_moves_the_tools_of_both() -> None:
+    cell = copy.deepcopy(TIAGO) | {"srdf": None, "robot": {"model": "example-robot-data:tiago_dual"}}
+    names = [f"arm_left_{number}_joint" for number in range(1, 8)]
+    left = cell["arms"]["left"]
+    left["joints"], left["home"] = ["torso_lift_joint", *names], [0.1, *left["home"]]
+    robot = Robot.from_config(Config.model_validate(cell))
+    assert robot.joint_names[0] == "torso_lift_joint"
+    assert robot.home[0] == 0.1
+    assert all(0 in arm.joints for arm in robot.arms.values())
+
+
+@pytest.mark.parametrize("name", ["baxter", "tiago"])
+def test_mujoco_has_the_same_masses_where_they_can_be_felt(
+    name: str, folder: Path, request: pytest.FixtureRequest
+) -> None:
+    robot: Robot = request.getfixturevalue(name)
+    plant = MujocoPlant(robot, load_config(folder / f"{name}.yaml"))
+    index = [plant.model.joint(joint).dofadr[0] for joint in robot.joint_names]
+    gravity = pin.computeGeneralizedGravity(robot.model, robot.model.createData(), robot.home)
+    np.testing.assert_allclose(plant.data.qfrc_bias[index], gravity, atol=1e-3)
+    inertia = np.zeros((plant.model.nv, plant.model.nv))
+    mujoco.mj_fullM(plant.model, plant.data, inertia)
+    expected = pin.crba(robot.model, robot.model.createData(), robot.home)
+    expected = np.triu(expected) + np.triu(expected, 1).T
+    np.testing.assert_allclose(inertia[np.ix_(index, index)], expected, atol=1e-4)
+
+
+def test_in_mujoco_a_finger_that_mimics_the_driven_one_closes_with_it(baxter: Robot, folder: Path) -> None:
+    plant = MujocoPlant(baxter, load_config(folder / "baxter.yaml"))
+    fingers = [plant.model.joint(f"l_gripper_{finger}_finger_joint").qposadr[0] for finger in "lr"]
+    np.testing.assert_allclose(plant.data.qpos[fingers], [0.02, -0.02])
+    plant.apply(Command(CommandMode.POSITION, baxter.home, np.zeros(14), np.zeros(14), {"left": 0.0}))
+    for _ in range(500):
+        plant.advance(0.001)
+    np.testing.assert_allclose(plant.data.qpos[fingers], 0.0, atol=1e-3)
+    assert plant.gripper_openings() == {"left": pytest.approx(0.0, abs=0.05), "right": pytest.approx(1.0, abs=0.05)}
+
+
+@pytest.mark.parametrize("name", ["baxter", "tiago"])
+def test_a_user_can_check_it_and_run_it(name: str, folder: Path) -> None:
+    file = str(folder / f"{name}.yaml")
+    checked = CliRunner().invoke(app, ["check", file, "--json"])
+    assert checked.exit_code == 0, checked.output
+    arms = json.loads(checked.stdout)["arms"]
+    assert [arm["model"] for arm in arms] == [f"example-robot-data:{name.replace('tiago', 'tiago_dual')}"] * 2
+    for plant in ("kinematic", "mujoco"):
+        arguments = ["run", file, "--plant", plant, "--fast", "--duration", "1", "--headless", "--json"]
+        ran = CliRunner().invoke(app, arguments)
+        assert ran.exit_code == 0, ran.output
+        summary = json.loads(ran.stdout)
+        assert summary["min_distance_mm"] >= 20.0 - 1e-6
+        assert all(arm["position_error_mm_rms"] < 20.0 for arm in summary["arms"].values())
+
+
+def test_each_arm_can_carry_a_tool_whose_names_are_told_apart() -> None:
+    cell = copy.deepcopy(BAXTER)
+    fingers = {"joints": ["finger_joint_1", "finger_joint_2"], "open_position": 0.025}
+    for arm in cell["arms"].values():
+        arm |= {"tool": {"model": "hand_e"}, "gripper": fingers}
+    composed = compose(Config.model_validate(cell))
+    assert composed.tool_frames == {"left": "left_tool_frame", "right": "right_tool_frame"}
+    assert composed.finger_joints["right"] == ("right_finger_joint_1", "right_finger_joint_2")
+    assert composed.arm_joints["right"] == tuple(RIGHT)
+
+
+def test_a_robot_whose_root_is_called_as_the_cells_can_be_shared() -> None:
+    cell = {"name": "ur", "robot": {"model": "example-robot-data:ur5"}, "arms": {"left": {"home": [0.0] * 6}}}
+    robot = Robot.from_config(Config.model_validate(cell))
+    assert robot.arms["left"].tool_frame == "tool0"
+
+
+def _changed(path: str, value: object) -> Config:
+    cell = copy.deepcopy(BAXTER)
+    *parents, key = path.split(".")
+    place = cell
+    for parent in parents:
+        place = place.setdefault(parent, {})
+    place[key] = value
+    if key == "joints" and "tip" in place:
+        del place["tip"]
+    return Config.model_validate(cell)
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "says"),
+    [
+        pytest.param("arms.right.tip", "left_gripper",
+                     "arms.left: every joint that carries left_gripper carries left_gripper of arms.right as well",
+                     id="one tip for both"),
+        pytest.param("arms.right.tip", "left_upper_elbow",
+                     "arms.right: every joint that carries left_upper_elbow carries left_gripper of arms.left",
+                     id="a tip inside the other arm"),
+        pytest.param("arms.right.tip", None, "arms.right.tip: the model's chain branches at base into head_pan, right_",
+                     id="no tip"),
+        pytest.param("arms.right.tip", "gripper", "arms.right.tip = 'gripper': baxter has no such link; allowed: base",
+                     id="a tip that does not exist"),
+        pytest.param("arms.right.tip", "torso", "arms.right.tip = 'torso': no movable joint carries it",
+                     id="a tip that nothing moves"),
+        pytest.param("arms.right.joints", [*RIGHT[:-1], "nope"], "arms.right.joints = 'nope': no such joint; allowed",
+                     id="a joint that does not exist"),
+        pytest.param("arms.right.joints", RIGHT, "arms.right.tip: the arm could end at right_hand_range_link, ",
+                     id="joints whose end is in doubt"),
+        pytest.param("arms.right.gripper.joints", ["l_gripper_l_finger_joint"],
+                     "arms.right.gripper.joints = 'l_gripper_l_finger_joint': no such finger joint; allowed: r_gripper",
+                     id="the other arm's finger"),
+        pytest.param("arms.right.gripper.joints", ["head_pan"], "no such finger joint; allowed: r_gripper",
+                     id="a finger that the arm does not carry"),
+        pytest.param("arms.right.gripper.joints", ["r_gripper_r_finger_joint"], "r_finger_joint allows -0.020833 .. 0",
+                     id="a finger that goes the other way"),
+        pytest.param("arms.right.model", "iiwa7", "arms.right.model: an arm of robot has none; set robot.model",
+                     id="a model beside the robot's"),
+        pytest.param("arms.right.mount", {}, "arms.right.mount: an arm of robot has none; set robot.mount",
+                     id="a mount beside the robot's"),
+        pytest.param("robot", None, "arms.left.model: missing; give one, or the key robot", id="no model at all"),
+        pytest.param("robot.model", "nope", "robot.model = 'nope': robots/nope.urdf: no such file", id="no such model"),
+        pytest.param("robot.home", {"left_s0": 0.1}, "robot.home.left_s0: no joint that rests; allowed: head_pan",
+                     id="a posture of an arm's joint"),
+        pytest.param("robot.home", {"head_pan": 9}, "robot.home.head_pan = 9: joint head_pan allows -1.3963 .. 1.3963",
+                     id="a posture outside the limits"),
+        pytest.param("obstacles", {"torso": {"shape": "sphere", "size": [0.1]}},
+                     "obstacles.torso: the cell has a link of this name", id="an obstacle with a link's name"),
+        pytest.param("arms.left.swivel", {"gain": 1.0}, "arms.left.swivel.shoulder = 'A2': no joint of the arm; "
+                     "allowed: left_s0", id="an elbow of another arm"),
+    ],
+)  # fmt: skip
+def test_a_bad_share_ends_in_one_line_that_names_key_value_and_what_is_allowed(
+    path: str, value: object, says: str
+) -> None:
+    with pytest.raises(ConfigError) as error:
+        Robot.from_config(_changed(path, value))
+    assert says in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_joints_of_the_other_arm_are_refused() -> None:
+    cell = copy.deepcopy(TIAGO) | {"srdf": None}
+    for side, arm in cell["arms"].items():
+        arm["joints"] = ["torso_lift_joint", *(f"arm_{side}_{number}_joint" for number in range(1, 8))]
+        arm["home"] = [0.1, *arm["home"]]
+    with pytest.raises(ConfigError, match=r"arms\.right: joint torso_lift_joint is one of arms.left as well") as error:
+        compose(Config.model_validate(cell))
+    assert "\n" not in str(error.value)
+
+
+def test_an_elbow_of_a_shared_robot_is_named_as_its_model_names_it() -> None:
+    swivel = {"gain": 1.0, "shoulder": "left_s1", "elbow": "left_e1", "wrist": "left_w1"}
+    robot = Robot.from_config(_changed("arms.left.swivel", swivel))
+    assert robot.arms["left"].swivel is not None
+    assert robot.arms["left"].swivel.elbow == "left_e1"
