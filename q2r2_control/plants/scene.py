@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import mujoco
 
-from q2r2_control.robot.compose import FLOOR
+from q2r2_control.robot.floor import FLOOR
 
 # Geom groups: MuJoCo's viewers draw 0 to 2 and leave out the others until asked.
 VISUAL_GROUP, COLLISION_GROUP, ENVELOPE_GROUP = 2, 3, 4

@@ -16,17 +16,12 @@ from q2r2_control.config.arms import PoseConfig, RobotConfig, check_models
 from q2r2_control.config.cell import Config
 from q2r2_control.errors import ConfigError
 from q2r2_control.robot.cell_parts import Arm, Model, check_position, load_model
+from q2r2_control.robot.floor import floor_link
 from q2r2_control.robot.locking import lock_joints, resting_position
 from q2r2_control.robot.pairs import exclusions_of_file
-from q2r2_control.robot.urdf_parts import WORLD, fixed_joint, name_shapes, numbers, obstacle_link, renamed_exclusions
+from q2r2_control.robot.urdf_parts import WORLD, fixed_joint, name_shapes, obstacle_link, renamed_exclusions
 from q2r2_control.types import SIDES
 
-FLOOR = "floor"
-
-# The floor is a box whose top is at the floor's height: URDF has no plane, and the distance of a capsule from a fixed
-# box is exact in closed form. No arm reaches beyond its edges, since no mount is farther than 20 m from the origin; and
-# it is so thick that what is in it is pushed out through the top.
-_FLOOR_SIZE = (100.0, 100.0, 10.0)  # [m]
 _OBSTACLE_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 _RESERVED_NAME = re.compile(rf"({WORLD}|universe|({'|'.join(SIDES)})_)")
 
@@ -71,13 +66,11 @@ def compose(config: Config) -> ComposedCell:
     lock_joints(urdf, home, _locked_at(urdf, home | resting))
     name_shapes(urdf.findall("link"))
     for name, obstacle in config.obstacles.items():
-        _check_obstacle_name(name, urdf, config.floor)
+        _check_obstacle_name(name, urdf)
         placement = PoseConfig(position=obstacle.position, rpy=obstacle.rpy)
         urdf.extend([obstacle_link(name, obstacle), fixed_joint(f"{WORLD}_to_{name}", WORLD, name, placement)])
     if config.floor is not None:
-        if urdf.find(f"link[@name='{FLOOR}']") is not None:
-            raise ConfigError(f"floor = {config.floor:g}: the robot has a link called {FLOOR}; allowed: floor: null")
-        urdf.extend(_floor(config.floor))
+        urdf.extend(floor_link(config.floor, WORLD, config.obstacles))
     if config.srdf is not None:
         srdf.extend(exclusions_of_file(config.srdf, {link.get("name", "") for link in urdf.findall("link")}))
     for tree in (urdf, srdf):
@@ -165,11 +158,7 @@ def _check_apart(urdf: ET.Element) -> None:
             raise ConfigError(f"robot.model: its {tag} {twice[0]} has the name of another one in the cell")
 
 
-def _check_obstacle_name(name: str, urdf: ET.Element, floor: float | None) -> None:
-    if name == FLOOR and floor is not None:
-        raise ConfigError(
-            f"obstacles.{name}: the cell has a floor at z = {floor:g} m; give this another name, or set floor: null"
-        )
+def _check_obstacle_name(name: str, urdf: ET.Element) -> None:
     if not _OBSTACLE_NAME.fullmatch(name) or _RESERVED_NAME.match(name):
         raise ConfigError(
             f"obstacles.{name!r:.60}: allowed: letters, digits and _, starting with a letter, "
@@ -177,12 +166,3 @@ def _check_obstacle_name(name: str, urdf: ET.Element, floor: float | None) -> No
         )
     if urdf.find(f"link[@name='{name}']") is not None:
         raise ConfigError(f"obstacles.{name}: the cell has a link of this name; allowed: another name")
-
-
-def _floor(height: float) -> list[ET.Element]:
-    """What arms keep off, without a drawing: link ``floor`` lies in the floor's surface."""
-    link = ET.Element("link", name=FLOOR)
-    shape = ET.SubElement(link, "collision", name=f"{FLOOR}_collision")
-    ET.SubElement(shape, "origin", xyz=numbers((0.0, 0.0, -_FLOOR_SIZE[2] / 2)))
-    ET.SubElement(ET.SubElement(shape, "geometry"), "box", size=numbers(_FLOOR_SIZE))
-    return [link, fixed_joint(f"{WORLD}_to_{FLOOR}", WORLD, FLOOR, PoseConfig(position=(0.0, 0.0, height)))]

@@ -9,7 +9,7 @@ from __future__ import annotations
 import xml.etree.ElementTree as ET
 from itertools import combinations
 
-from q2r2_control.config.arms import ArmConfig, PoseConfig, SwivelConfig, ToolConfig
+from q2r2_control.config.arms import ArmConfig, PoseConfig, SwivelConfig
 from q2r2_control.config.cell import Config
 from q2r2_control.errors import ConfigError
 from q2r2_control.robot.cell_parts import load_model
@@ -34,10 +34,11 @@ def model_srdfs(
 
     What these files say now is not used. Listed are neighbours, pairs that overlap at every posture, and pairs that
     stay more than ``clearance`` [m] apart, as far as ``samples`` postures and the way downhill from them show.
+    Raises :class:`ConfigError` for arms of one ``robot``.
     """
     files: dict[str, str] = {}
     if config.robot is not None:
-        raise ConfigError("a cell whose arms are parts of one robot: --pairs writes its SRDF, not --model-pairs")
+        raise ConfigError("robot: its arms have no models of their own; --pairs looks at the cell as a whole")
     for side, arm in config.arms.items():
         model = load_model(arm, config.packages, f"arms.{side}")
         tool = None if arm.tool.model is None else load_model(arm.tool, config.packages, f"arms.{side}.tool")
@@ -63,8 +64,10 @@ def model_srdfs(
 
 def _alone(config: Config, arm: ArmConfig) -> Config:
     """A cell of nothing but ``arm``, upright, its tool flat on its last link."""
-    tool = arm.tool if arm.tool.model is None else ToolConfig(model=arm.tool.model, frame=arm.tool.frame)
-    alone = arm.model_copy(update={"mount": PoseConfig(), "tool": tool, "swivel": SwivelConfig()})
+    flat = {"link": None, "mount": PoseConfig()}
+    tool = arm.tool if arm.tool.model is None else arm.tool.model_copy(update=flat)
+    changes = {"tip": arm.named_tip, "mount": PoseConfig(), "tool": tool, "swivel": SwivelConfig()}
+    alone = arm.model_copy(update=changes)
     return config.model_copy(update={"arms": {_SIDE: alone}, "obstacles": {}, "floor": None, "srdf": None})
 
 

@@ -6,7 +6,6 @@ import xml.etree.ElementTree as ET
 from collections.abc import Callable, Iterable, Sequence
 from itertools import combinations
 
-import coal
 import numpy as np
 import pinocchio as pin
 
@@ -17,8 +16,6 @@ from q2r2_control.types import Array
 
 # Links that always stay farther apart than this need no watching: more than twice what is usually kept [m].
 CLEARANCE = 0.05
-
-_UPRIGHT = 1e-9  # sine of the angle to the vertical [-]
 
 
 def link_of(geometry_name: str) -> str:
@@ -55,7 +52,7 @@ def remove_disabled_pairs(geometry: pin.GeometryModel, exclusions: Iterable[ET.E
             pairs.add(frozenset((element.get("link1", ""), element.get("link2", ""))))
         elif element.tag == "disable_default_collisions":
             links.add(element.get("link", ""))
-    _keep(
+    keep_pairs(
         geometry,
         lambda a, b: frozenset((link_of(a), link_of(b))) not in pairs and not links & {link_of(a), link_of(b)},
     )
@@ -93,62 +90,8 @@ def remove_overlapping_own_pairs(
         pin.computeDistances(model, data, geometry, geometry_data, q)
         touching &= np.array([result.min_distance <= 0 for result in geometry_data.distanceResults], dtype=bool)
     removed = tuple(pair for pair, touches in zip(names, touching, strict=True) if touches)
-    _keep(geometry, lambda a, b: (a, b) not in removed)
+    keep_pairs(geometry, lambda a, b: (a, b) not in removed)
     return removed
-
-
-def remove_unreachable_floor_pairs(model: pin.Model, geometry: pin.GeometryModel, floor: str) -> None:
-    """Remove pairs of link ``floor``, a horizontal surface, with bodies that cannot come nearer to it than now.
-
-    Two kinds, both proven: bodies that turn about vertical axes only, as an arm's first link does, and stay as high as
-    they are; and bodies whose distance from the first joint that can tip them is too short to come within
-    :data:`CLEARANCE`.
-    """
-    data = model.createData()
-    pin.computeJointJacobians(model, data, pin.neutral(model))
-    items = {item.name: item for item in geometry.geometryObjects}
-
-    def can_meet(a: str, b: str) -> bool:
-        surface, body = items[a], items[b]
-        if not _is_level_surface(surface, floor):
-            surface, body = body, surface
-        if not _is_level_surface(surface, floor):
-            return True
-        lowest = _lowest(model, data, body)
-        top = surface.placement.translation[2] + surface.geometry.halfSide[2]
-        return lowest is not None and lowest - top <= CLEARANCE
-
-    _keep(geometry, can_meet)
-
-
-def _is_level_surface(item: pin.GeometryObject, link: str) -> bool:
-    fixed_box = isinstance(item.geometry, coal.Box) and item.parentJoint == 0
-    return fixed_box and link_of(item.name) == link and bool(item.placement.rotation[2, 2] > 1.0 - _UPRIGHT)
-
-
-def _lowest(model: pin.Model, data: pin.Data, item: pin.GeometryObject) -> float | None:
-    """Height that no point of a capsule or sphere is ever below [m]; None where no joint raises or lowers it.
-
-    Joints that turn about vertical axes or slide along level ones leave all heights as they are at zero, for which
-    ``data`` has frames and Jacobians. So the first other joint's origin keeps its height, and what hangs on that joint
-    lies in a ball around it.
-    """
-    height, world_axes = None, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
-    reach = float(np.linalg.norm(item.placement.translation)) + item.geometry.radius
-    reach += getattr(item.geometry, "halfLength", 0.0)
-    for joint in list(model.supports[item.parentJoint])[1:]:
-        index = model.joints[joint].idx_v
-        twist = pin.getJointJacobian(model, data, joint, world_axes)[:, index]  # of the joint's origin
-        slides = np.linalg.norm(twist[:3]) > 0.5
-        if height is None:
-            if (abs(twist[2]) if slides else np.linalg.norm(twist[3:5])) <= _UPRIGHT:
-                continue
-            height = float(data.oMi[joint].translation[2])
-        else:
-            reach += float(np.linalg.norm(model.jointPlacements[joint].translation))
-        if slides:
-            reach += max(abs(model.lowerPositionLimit[index]), abs(model.upperPositionLimit[index]))
-    return None if height is None else height - reach
 
 
 def pair_names(geometry: pin.GeometryModel) -> tuple[tuple[str, str], ...]:
@@ -157,7 +100,8 @@ def pair_names(geometry: pin.GeometryModel) -> tuple[tuple[str, str], ...]:
     return tuple((objects[pair.first].name, objects[pair.second].name) for pair in geometry.collisionPairs)
 
 
-def _keep(geometry: pin.GeometryModel, wanted: Callable[[str, str], bool]) -> None:
+def keep_pairs(geometry: pin.GeometryModel, wanted: Callable[[str, str], bool]) -> None:
+    """Remove every pair but those whose two names are ``wanted``."""
     pairs = list(geometry.collisionPairs)
     names = pair_names(geometry)
     geometry.removeAllCollisionPairs()

@@ -14,16 +14,16 @@ import pinocchio as pin
 
 from q2r2_control.config import Config
 from q2r2_control.errors import ConfigError, RobotError
-from q2r2_control.robot.compose import FLOOR, compose
+from q2r2_control.robot.compose import compose
 from q2r2_control.robot.description import LinkTree, joint_limits, parse_srdf, parse_urdf
 from q2r2_control.robot.enclose import enclose_shapes
+from q2r2_control.robot.floor import remove_unreachable_floor_pairs
 from q2r2_control.robot.locking import lock_joints
 from q2r2_control.robot.pairs import (
     add_movable_pairs,
     pair_names,
     remove_disabled_pairs,
     remove_overlapping_own_pairs,
-    remove_unreachable_floor_pairs,
 )
 from q2r2_control.types import Array
 
@@ -159,7 +159,7 @@ class Robot:
         """Choose the pairs; returns those of one arm that overlap by construction and are left out."""
         enclose_shapes(self.collision_model)
         add_movable_pairs(self.model, self.collision_model, tree)
-        remove_unreachable_floor_pairs(self.model, self.collision_model, FLOOR)
+        remove_unreachable_floor_pairs(self.model, self.collision_model)
         if exclusions is not None:
             remove_disabled_pairs(self.collision_model, exclusions)
         postures = [self.home]

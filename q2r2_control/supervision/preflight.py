@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from q2r2_control.config.control import ControllerSettings
 from q2r2_control.control.controller import CartesianController
-from q2r2_control.robot.compose import FLOOR
+from q2r2_control.robot.floor import FLOOR
 from q2r2_control.robot.pairs import link_of
 from q2r2_control.robot.robot import PairDistance, Robot
 from q2r2_control.types import Array

@@ -1,0 +1,97 @@
+"""The floor of a cell: what stands for it in the URDF, and which links need no watching against it.
+
+It is a box whose top is at the floor's height: URDF has no plane, and the distance of a capsule from a fixed box is
+exact in closed form. No arm reaches beyond its edges, since no mount is farther than 20 m from the origin; and it is so
+thick that what is in it is pushed out through the top.
+"""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from collections.abc import Collection
+
+import coal
+import numpy as np
+import pinocchio as pin
+
+from q2r2_control.errors import ConfigError
+from q2r2_control.robot.pairs import CLEARANCE, keep_pairs, link_of
+
+FLOOR = "floor"  # link
+
+_SIZE = (100.0, 100.0, 10.0)  # [m]
+_UPRIGHT = 1e-9  # sine of the angle to the vertical [-]
+
+
+def floor_link(height: float, parent: str, obstacles: Collection[str]) -> list[ET.Element]:
+    """Link ``floor``, whose frame lies in the floor's surface, and the joint that fixes it to ``parent``; no drawing.
+
+    Raises :class:`ConfigError` where one of the ``obstacles`` has the name already.
+    """
+    if FLOOR in obstacles:
+        raise ConfigError(
+            f"obstacles.{FLOOR}: the cell has a floor at z = {height:g} m; give this another name, or set floor: null"
+        )
+    link = ET.Element("link", name=FLOOR)
+    shape = ET.SubElement(link, "collision", name=f"{FLOOR}_collision")
+    ET.SubElement(shape, "origin", xyz=f"0 0 {-_SIZE[2] / 2}")
+    ET.SubElement(ET.SubElement(shape, "geometry"), "box", size=" ".join(map(repr, _SIZE)))
+    joint = ET.Element("joint", name=f"{parent}_to_{FLOOR}", type="fixed")
+    ET.SubElement(joint, "parent", link=parent)
+    ET.SubElement(joint, "child", link=FLOOR)
+    ET.SubElement(joint, "origin", xyz=f"0 0 {height!r}")
+    return [link, joint]
+
+
+def remove_unreachable_floor_pairs(model: pin.Model, geometry: pin.GeometryModel) -> None:
+    """Remove pairs of the floor with bodies that cannot come nearer to it than now.
+
+    Two kinds, both proven: bodies that turn about vertical axes only, as an arm's first link does, and stay as high as
+    they are; and bodies whose distance from the first joint that can tip them is too short to come within
+    :data:`CLEARANCE`.
+    """
+    data = model.createData()
+    pin.computeJointJacobians(model, data, pin.neutral(model))
+    items = {item.name: item for item in geometry.geometryObjects}
+
+    def can_meet(a: str, b: str) -> bool:
+        surface, body = items[a], items[b]
+        if not _is_floor(surface):
+            surface, body = body, surface
+        if not _is_floor(surface):
+            return True
+        lowest = _lowest(model, data, body)
+        top = surface.placement.translation[2] + surface.geometry.halfSide[2]
+        return lowest is not None and lowest - top <= CLEARANCE
+
+    keep_pairs(geometry, can_meet)
+
+
+def _is_floor(item: pin.GeometryObject) -> bool:
+    fixed_box = isinstance(item.geometry, coal.Box) and item.parentJoint == 0
+    return fixed_box and link_of(item.name) == FLOOR and bool(item.placement.rotation[2, 2] > 1.0 - _UPRIGHT)
+
+
+def _lowest(model: pin.Model, data: pin.Data, item: pin.GeometryObject) -> float | None:
+    """Height that no point of a capsule or sphere is ever below [m]; None where no joint raises or lowers it.
+
+    Joints that turn about vertical axes or slide along level ones leave all heights as they are at zero, for which
+    ``data`` has frames and Jacobians. So the first other joint's origin keeps its height, and what hangs on that joint
+    lies in a ball around it.
+    """
+    height, world_axes = None, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+    reach = float(np.linalg.norm(item.placement.translation)) + item.geometry.radius
+    reach += getattr(item.geometry, "halfLength", 0.0)
+    for joint in list(model.supports[item.parentJoint])[1:]:
+        index = model.joints[joint].idx_v
+        twist = pin.getJointJacobian(model, data, joint, world_axes)[:, index]  # of the joint's origin
+        slides = np.linalg.norm(twist[:3]) > 0.5
+        if height is None:
+            if (abs(twist[2]) if slides else np.linalg.norm(twist[3:5])) <= _UPRIGHT:
+                continue
+            height = float(data.oMi[joint].translation[2])
+        else:
+            reach += float(np.linalg.norm(model.jointPlacements[joint].translation))
+        if slides:
+            reach += max(abs(model.lowerPositionLimit[index]), abs(model.upperPositionLimit[index]))
+    return None if height is None else height - reach
