@@ -6,7 +6,7 @@ from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 
-from q2r2_control.ros.launch.node_set import ROBOTS, SOURCES, nodes_of
+from q2r2_control.ros.launch.processes import ROBOTS, SOURCES, nodes_of
 
 
 def generate_launch_description():

@@ -2,73 +2,54 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import pinocchio as pin
 
-from q2r2_control.compliance.admittance import AdmittanceReport
-from q2r2_control.compliance.impedance import ImpedanceReport
-from q2r2_control.compliance.repulsion import WallReport
 from q2r2_control.config import Config
-from q2r2_control.control.controller import CartesianController
-from q2r2_control.drives.drive import drive_of
-from q2r2_control.errors import ConfigError
+from q2r2_control.control.controller import LONGEST_DT, CartesianController
+from q2r2_control.drives import make_drive
+from q2r2_control.errors import ConfigError, PlantError
 from q2r2_control.inputs.base import Input
-from q2r2_control.inputs.headset import HeadsetServer
-from q2r2_control.inputs.scripted import ScriptedInput
+from q2r2_control.inputs.factory import make_input
 from q2r2_control.plants.base import Plant
-from q2r2_control.plants.kinematic import KinematicPlant
-from q2r2_control.plants.mujoco import MujocoPlant
+from q2r2_control.plants.factory import check_mode, make_plant
 from q2r2_control.robot.robot import Robot
 from q2r2_control.runtime.loop_clock import LoopClock
 from q2r2_control.runtime.process import few_garbage_collections, stop_on_signals
-from q2r2_control.runtime.run_summary import RunStatistics, RunSummary
+from q2r2_control.runtime.recorder import RunRecorder, Tick
+from q2r2_control.runtime.run_summary import RunSummary
+from q2r2_control.supervision.joint_watch import watch_settings
+from q2r2_control.supervision.supervisor import Phase, Supervisor
+from q2r2_control.supervision.target_stream import StreamSettings
+from q2r2_control.supervision.tick_pacer import TickPacer
 from q2r2_control.teleop.arm import OPEN
 from q2r2_control.teleop.teleop import Teleop
-from q2r2_control.types import ArmTarget, CommandMode, HandSample, Reference, RobotState
+from q2r2_control.types import ArmTarget, CommandMode, HandSample, Reference, RobotState, StepStatus
 
-INPUTS = ("scripted", "headset")
-PLANTS = ("mujoco", "kinematic")
-DEFAULT_TRAJECTORY = "reach_grasp_handover"
 STOPPING = "stopping"  # state of every arm while the run ends
 # Added to the time that full braking takes; an arm that still recovers into its limits is not waited for longer.
 _STOP_ALLOWANCE = 1.0  # [s]
 _REST = 1e-6  # of the reference [rad/s]
 
-
-@dataclass(frozen=True, slots=True)
-class Tick:
-    """All that one tick did, for whoever listens."""
-
-    t: float  # since the start of the run [s]
-    dt: float  # [s]
-    samples: list[HandSample]
-    targets: dict[str, ArmTarget]  # as the operator asks for them, whatever an admittance makes of them
-    engaged: dict[str, bool]
-    states: dict[str, str]  # of the teleop layer, or STOPPING
-    reference: Reference
-    state: RobotState  # measured before the tick's command
-    tools: dict[str, pin.SE3]  # measured tool poses, world frame
-    grippers: dict[str, float]  # measured openings
-    compute_time: float  # [s]
-    impedance: ImpedanceReport | None = None  # of torque mode
-    wall: WallReport | None = None  # of torque mode
-    admittance: AdmittanceReport | None = None  # of position mode, where it is enabled
+_logger = logging.getLogger(__name__)
 
 
 class Pipeline:
     """Runs a cell. ``listeners`` are called with every :class:`Tick`; they must not take long.
 
     Whatever ends a run, the arms are brought to rest before input and plant are closed. A listener that raises is not
-    called again; it ends the run like :meth:`stop`, and then its exception goes to the caller.
+    called again; it ends the run like :meth:`stop`, and then its exception goes to the caller. A plant that measures
+    what cannot be, or does not follow, ends it with a :class:`PlantError`: see ``supervision``.
 
-    ``realtime``: the loop follows the clock, and a tick's dt is the time that really passed, so that a late loop moves
-    the robot no faster. Otherwise time is simulated, as fast as the machine can, and the run is repeatable.
+    ``realtime``: the loop follows the clock, and a late tick moves no joint farther than a period allows. Otherwise
+    time is simulated, as fast as the machine can, and the run is repeatable.
     """
 
     def __init__(
@@ -83,9 +64,9 @@ class Pipeline:
         self.robot = robot
         self.input = input
         self.plant = plant
-        self.drive = drive_of(mode, plant, robot, config)
+        self.drive = make_drive(check_mode(mode, plant), robot, config)
         self.controller = CartesianController(robot, config.control)
-        self.teleop = Teleop(config.teleop, tuple(robot.arms))
+        self._begin_anew()
         self.listeners: list[Callable[[Tick], None]] = []
         # A plain flag: unlike the locks of threading.Event, a signal handler can set it in the middle of anything.
         self._stopping = False
@@ -106,7 +87,7 @@ class Pipeline:
         that the plant does not have.
         """
         robot = Robot.from_config(config)
-        return cls(config, robot, _input_of(input, config), _plant_of(plant, robot, config), mode)
+        return cls(config, robot, make_input(input, config), make_plant(plant, robot, config), mode)
 
     def stop(self) -> None:
         """Bring the arms to rest and end the run, or the next one if none runs; from any thread or signal handler."""
@@ -133,12 +114,19 @@ class Pipeline:
 
     def _prepare(self, realtime: bool) -> None:
         """Nothing of an earlier run may move an arm: every run starts paused and with open grippers, as the plant."""
-        self.teleop = Teleop(self.config.teleop, tuple(self.robot.arms))
         # Whether a solution is late depends on the machine; a repeatable run must not.
         changes = {} if realtime else {"solve_time_limit": None}
         settings = self.config.control.model_copy(update=changes)
         if settings != self.controller.settings:
             self.controller = CartesianController(self.robot, settings)
+        self._begin_anew()
+
+    def _begin_anew(self) -> None:
+        self.teleop = Teleop(self.config.teleop, tuple(self.robot.arms))
+        watch = watch_settings(self.config.supervision, self.drive.yields)
+        self.supervisor = Supervisor(
+            self.robot, self.controller, StreamSettings(), watch, displace=self.drive.displaced
+        )
 
     @property
     def stopping(self) -> bool:
@@ -151,18 +139,24 @@ class _Run:
 
     def __init__(self, pipeline: Pipeline, realtime: bool) -> None:
         self._pipeline = pipeline
-        self._statistics = RunStatistics(pipeline.robot, pipeline.config.control)
+        self._recorder = RunRecorder(pipeline.robot, pipeline.config.control, pipeline.listeners, pipeline.stop)
         self._data = pipeline.robot.model.createData()
-        self._listeners = list(pipeline.listeners)
-        self._failure: Exception | None = None  # of a listener
         self._targets = {arm: ArmTarget(None, OPEN) for arm in pipeline.robot.arms}
         self._following = True
         self._connected = False
         pipeline.plant.reset()
         state = pipeline.plant.state()
-        pipeline.controller.reset(state.q)
+        period = 1.0 / pipeline.config.loop_rate_hz
+        self._clock = LoopClock(period, realtime)
+        control = pipeline.config.control
+        limit = pipeline.robot.velocity_limit * control.velocity_scale
+        self._pacer = TickPacer(period, limit, control.acceleration_limit)
+        self._stamp = state.stamp  # of the newest state, by the plant's clock [s]
+        self._supervisor = pipeline.supervisor
+        self._supervisor.activate(replace(state, stamp=self._clock.now), self._clock.now)
         pipeline.drive.reset(state)
-        self._clock = LoopClock(1.0 / pipeline.config.loop_rate_hz, realtime)
+        self._last: Reference | None = None
+        self._last_velocity = np.zeros(pipeline.robot.model.nv)
 
     def until(self, duration: float | None) -> RunSummary:
         """Tick until ``duration`` is over or a stop is asked for, then until the arms are at rest."""
@@ -170,50 +164,95 @@ class _Run:
         try:
             while not (self._clock.after(ends) or self._pipeline.stopping):
                 self._tick()
-                self._pipeline.drive.check()
+                self._raise_fault()
         except BaseException:
             # The arms come first, whatever failed. What failed may fail again; the first fault tells more.
             with suppress(Exception):
                 self._bring_to_rest()
             raise
         self._bring_to_rest()
-        self._pipeline.drive.check()
-        if self._failure is not None:
-            raise self._failure
-        return self._statistics.summary(self._clock.wall_time())
+        return self._recorder.summary(self._clock.wall_time(), self._pacer)
 
     def _bring_to_rest(self) -> None:
         """Tick without input and targets until all stands still; no fault of an input can prevent it."""
         self._following = False
         self._targets = {arm: ArmTarget(None, target.gripper) for arm, target in self._targets.items()}
         drive, plant = self._pipeline.drive, self._pipeline.plant
+        self._supervisor.stop("the run has ended")
         try:
             speed = float(np.abs(self._tick().v).max())
             deadline = self._clock.now + speed / self._pipeline.config.control.acceleration_limit + _STOP_ALLOWANCE
             while (speed > _REST or not drive.at_rest(plant.state())) and self._clock.now < deadline:
                 speed = float(np.abs(self._tick().v).max())
         finally:
-            drive.let_go(plant, self._grippers())
+            command = drive.last_command(plant.state(), self._grippers())
+            if command is not None:
+                plant.apply(command)
+
+    def _raise_fault(self) -> None:
+        """End the run where supervision has stopped the arms."""
+        if self._supervisor.phase is not Phase.ACTIVE:
+            raise PlantError(self._supervisor.fault or "the arms were stopped")
 
     def _tick(self) -> Reference:
         """One line of the way of the data: sample -> target -> reference -> command -> state."""
         pipeline, drive = self._pipeline, self._pipeline.drive
-        dt = self._clock.wait()
+        gap = self._clock.wait()
+        dt = self._pacer.step(gap, self._last_velocity)
         began = time.perf_counter()
         samples = self._poll() if self._following else []
         state = pipeline.plant.state()
         tools = self._tools(state)
+        self._observe(state, gap)
         if self._following:
             commanded = {arm: pipeline.controller.tool_pose(arm) for arm in pipeline.robot.arms}
             self._targets = pipeline.teleop.update(samples, tools, self._clock.now, commanded)
-        asked = {arm: target.pose for arm, target in self._targets.items()}
-        reference = pipeline.controller.step(drive.displaced(asked, state, dt), dt)
-        pipeline.plant.apply(drive.command(reference, state, self._grippers(), dt))
+            self._hand_over(tools)
+        reference = self._advance(state, dt)
+        pipeline.plant.apply(drive.command(reference, state, self._grippers(), dt, self._supervisor.state_is_good))
         compute_time = time.perf_counter() - began
-        self._statistics.add_latency(samples, self._clock.read())
-        pipeline.plant.advance(dt)
-        self._record(dt, samples, reference, state, tools, compute_time)
+        self._recorder.add_latency(samples, self._clock.read())
+        # A plant that is simulated lets no more time pass at once, as if the computer had stood still.
+        pipeline.plant.advance(min(gap, LONGEST_DT))
+        self._record(gap, samples, reference, state, tools, compute_time)
         return reference
+
+    def _observe(self, state: RobotState, gap: float) -> None:
+        """Let supervision look at what was measured, and at how late the tick is."""
+        supervisor, now = self._supervisor, self._clock.now
+        if state.stamp != self._stamp:  # a plant that hangs repeats its last state
+            self._stamp = state.stamp
+            supervisor.take_joint_state(replace(state, stamp=now), now)
+        if gap > LONGEST_DT:
+            supervisor.stalled(gap, now, exclusive=True)
+            self._pipeline.teleop.pause(now, f"the control loop stood still for {gap:.2f} s")
+        for line in supervisor.events:
+            _logger.debug(line)
+        supervisor.events.clear()
+
+    def _hand_over(self, tools: dict[str, pin.SE3]) -> None:
+        """Targets to supervision. One that is refused pauses the arm, or the operator would think that it follows."""
+        now = self._clock.now
+        for arm, target in self._targets.items():
+            if target.pose is None:
+                self._supervisor.release_target(arm)
+            elif refusal := self._supervisor.take_target(arm, target.pose, now, measured=tools[arm]):
+                self._pipeline.teleop.pause(now, refusal.line)
+
+    def _advance(self, state: RobotState, dt: float) -> Reference:
+        """The reference of this tick; the last one, at rest, once the arms were stopped."""
+        reference = self._supervisor.tick(self._clock.now, dt)
+        self._last = self._held(state) if reference is None else reference
+        self._last_velocity = self._last.v
+        return self._last
+
+    def _held(self, state: RobotState) -> Reference:
+        if self._last is None:
+            # Nothing has moved yet: the run was stopped before its first tick.
+            self._last = self._pipeline.controller.step({}, 0.0)
+        zero = np.zeros_like(state.q)
+        report = replace(self._last.report, status=StepStatus.HELD, binding=(), fallback=False, slack=0.0)
+        return Reference(self._last.q, zero, zero, report)
 
     def _grippers(self) -> dict[str, float]:
         return {arm: target.gripper for arm, target in self._targets.items()}
@@ -243,13 +282,9 @@ class _Run:
         tools: dict[str, pin.SE3],
         compute_time: float,
     ) -> None:
-        teleop, statistics, report = self._pipeline.teleop, self._statistics, self._pipeline.drive.report
+        teleop, report = self._pipeline.teleop, self._pipeline.drive.report
         engaged = {arm: self._following and value for arm, value in teleop.engaged.items()}
-        statistics.tick.add(compute_time)
-        statistics.add(dt, reference, self._targets, tools, engaged)
-        statistics.add_drive(dt, report)
-        for event in teleop.take_events():
-            statistics.events.append(replace(event, t=event.t - self._clock.start))
+        events = [replace(event, t=event.t - self._clock.start) for event in teleop.take_events()]
         tick = Tick(
             t=self._clock.now - self._clock.start,
             dt=dt,
@@ -266,34 +301,4 @@ class _Run:
             wall=report.wall,
             admittance=report.admittance,
         )
-        self._tell(tick)
-
-    def _tell(self, tick: Tick) -> None:
-        """Call every listener; the first exception is kept until the arms are at rest."""
-        for listener in list(self._listeners):
-            try:
-                listener(tick)
-            except Exception as error:
-                self._listeners.remove(listener)
-                self._failure = self._failure or error
-                self._pipeline.stop()
-
-
-def _input_of(source: Input | str, config: Config) -> Input:
-    if source == "scripted":
-        return ScriptedInput(DEFAULT_TRAJECTORY)
-    if source == "headset":
-        return HeadsetServer(config.headset.host, config.headset.port)
-    if isinstance(source, str):
-        raise ConfigError(f"input {source!r}: allowed are {', '.join(INPUTS)}")
-    return source
-
-
-def _plant_of(plant: Plant | str, robot: Robot, config: Config) -> Plant:
-    if plant == "mujoco":
-        return MujocoPlant(robot, config)
-    if plant == "kinematic":
-        return KinematicPlant(robot, config)
-    if isinstance(plant, str):
-        raise ConfigError(f"plant {plant!r}: allowed are {', '.join(PLANTS)}")
-    return plant
+        self._recorder.add(tick, events)

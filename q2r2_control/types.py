@@ -73,6 +73,7 @@ class CommandMode(StrEnum):
     """How a plant follows a command."""
 
     POSITION = "position"
+    VELOCITY = "velocity"
     TORQUE = "torque"
 
 
@@ -81,9 +82,9 @@ class Command:
     """What goes to the plant, in the joint order of ``Robot.model``."""
 
     mode: CommandMode
-    q: Array  # (nv,) [rad]; in torque mode the reference the torque is about
+    q: Array  # (nv,) [rad]; in velocity and torque mode the reference, for plants that show it
     v: Array  # (nv,) [rad/s]
-    tau: Array  # (nv,) [Nm]; ignored in position mode
+    tau: Array  # (nv,) [Nm]; of torque mode
     grippers: dict[str, float]  # arm -> opening, 0 closed .. 1 fully open
 
 
@@ -95,6 +96,7 @@ class StepStatus(StrEnum):
     DT_REJECTED = "dt_rejected"  # dt was not in (0, 0.1] s
     RECOVERING = "recovering"  # outside a limit or closer than min_distance, on the way back
     FALLBACK = "fallback"  # the stopping motion was executed instead of the QP's solution
+    HELD = "held"  # supervision lets nothing move: the last reference, at rest
 
 
 @dataclass(frozen=True, slots=True)

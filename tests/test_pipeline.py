@@ -21,9 +21,10 @@ import pytest
 from q2r2_control.errors import ConfigError, InputError
 from q2r2_control.inputs.headset import HeadsetServer
 from q2r2_control.inputs.scripted import ScriptedInput
-from q2r2_control.pipeline import STOPPING, Pipeline, Tick
+from q2r2_control.pipeline import STOPPING, Pipeline
 from q2r2_control.plants.kinematic import KinematicPlant
 from q2r2_control.robot.robot import Robot
+from q2r2_control.runtime.recorder import Tick
 from q2r2_control.runtime.run_summary import RunSummary
 from q2r2_control.types import SIDES, Command, HandSample
 from tests.support.watch import Watch, assert_torque_bounds, cell, changes, speed
@@ -219,8 +220,11 @@ def test_a_duration_that_is_no_time_is_refused(duration: float) -> None:
     [
         ({"input": "mouse"}, "input 'mouse': allowed are scripted, headset"),
         ({"plant": "gazebo"}, "plant 'gazebo': allowed are mujoco, kinematic"),
-        ({"mode": "velocity"}, "mode velocity: MujocoPlant follows position, torque commands only"),
-        ({"plant": "kinematic", "mode": "torque"}, "mode torque: KinematicPlant follows position commands only"),
+        ({"mode": "jerk"}, "mode jerk: MujocoPlant follows position, velocity, torque commands only"),
+        (
+            {"plant": "kinematic", "mode": "torque"},
+            "mode torque: KinematicPlant follows position, velocity commands only",
+        ),
     ],
 )
 def test_an_unknown_input_or_plant_and_a_mode_that_the_plant_does_not_have_are_refused(

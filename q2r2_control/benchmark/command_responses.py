@@ -1,4 +1,4 @@
-"""Which joint commands answered a step of their target, and how long that took. Knows no ROS."""
+"""Finds the joint command that answers a step of a target, and its latency. Imports no ROS."""
 
 from __future__ import annotations
 
@@ -10,25 +10,25 @@ import numpy as np
 
 from q2r2_control.types import Array
 
-# Of the acceleration limit: a step asks for all of it at once, and what the step before left has faded to a tenth.
-_ANSWER = 0.4
+# Share of the acceleration limit that marks an answer: a step asks for all of it, the one before for a tenth by then.
+_ANSWER_SHARE = 0.4
 
 
 @dataclass(frozen=True, slots=True)
 class Recording:
-    """Steps of one way in and the commands meanwhile; times of one clock [s], ascending."""
+    """Steps of one input and the joint commands meanwhile; times of one clock [s], ascending."""
 
-    steps: Sequence[float]  # when each was published
-    sent: Sequence[float]  # when commands were, by the middleware's stamps
-    received: Sequence[float]
+    steps: Sequence[float]  # when each step was published
+    sent: Sequence[float]  # when each command was published, by the middleware's stamps
+    received: Sequence[float]  # and received
     v: Array  # (n, nv) of the commands [rad/s]
 
 
 @dataclass(frozen=True, slots=True)
 class LatencyRow:
-    """Latencies of one way in, from the step until the command was received."""
+    """Latencies of one input, from the step until the command was received."""
 
-    way: str
+    path: str  # from which topic to which
     steps: int
     missed: int  # not answered before the next step
     p50_ms: float | None  # None without any answer
@@ -40,7 +40,7 @@ class LatencyRow:
 class LatencyReport:
     """What ``q2r2 bench --ros`` measured."""
 
-    loop_rate_hz: float  # of the controller, asked for
+    loop_rate_hz: float  # of the controller, as configured
     transport_p50_ms: float  # of a joint command between two processes, contained in all rows
     transport_p99_ms: float
     rows: tuple[LatencyRow, ...]
@@ -49,26 +49,30 @@ class LatencyReport:
         return asdict(self)
 
 
-def latency_report(rate: float, acceleration_limit: float, ways: Mapping[str, Recording]) -> LatencyReport:
-    """Judge what was recorded with the controller at ``rate`` [Hz] and its limit [rad/s^2]."""
-    transport = 1e3 * np.concatenate([np.subtract(way.received, way.sent) for way in ways.values()])
+def latency_report(rate: float, acceleration_limit: float, recordings: Mapping[str, Recording]) -> LatencyReport:
+    """Latencies by path, of a controller at ``rate`` [Hz] with ``acceleration_limit`` [rad/s^2]."""
+    transport = 1e3 * np.concatenate(
+        [np.subtract(recording.received, recording.sent) for recording in recordings.values()]
+    )
     median, tail = np.percentile(transport, [50.0, 99.0]).tolist()
-    return LatencyReport(rate, median, tail, tuple(_row(name, way, acceleration_limit) for name, way in ways.items()))
+    return LatencyReport(
+        rate, median, tail, tuple(_row(path, recording, acceleration_limit) for path, recording in recordings.items())
+    )
 
 
-def _row(name: str, way: Recording, acceleration_limit: float) -> LatencyRow:
-    """Find the first command after each step whose velocity changes as fast as only a step makes it."""
-    times = np.asarray(way.sent)
-    # A late tick changes the velocity by more, an early one by less; none is counted as shorter than half the usual.
+def _row(path: str, recording: Recording, acceleration_limit: float) -> LatencyRow:
+    """Find the first command after each step with an acceleration that only a step causes."""
+    times = np.asarray(recording.sent)
+    # Ticks may be early or late, so changes of velocity are divided by dt; half the usual dt is the least that counts.
     dt = np.diff(times)
-    acceleration = np.abs(np.diff(way.v, axis=0)).max(axis=1) / np.maximum(dt, 0.5 * np.median(dt))
-    answering = np.concatenate([[False], acceleration > _ANSWER * acceleration_limit])
+    acceleration = np.abs(np.diff(recording.v, axis=0)).max(axis=1) / np.maximum(dt, 0.5 * np.median(dt))
+    answering = np.concatenate([[False], acceleration > _ANSWER_SHARE * acceleration_limit])
     latencies = []
-    # The last one ends the recording, before it could be answered.
-    for step, following in zip(way.steps[:-1], way.steps[1:], strict=True):
+    # The last step is left out: the recording ends before its answer.
+    for step, following in zip(recording.steps[:-1], recording.steps[1:], strict=True):
         first, last = np.searchsorted(times, [step, following])
         if len(found := np.flatnonzero(answering[first:last])):
-            latencies.append(1e3 * (way.received[first + found[0]] - step))
-    counted = len(way.steps) - 1
+            latencies.append(1e3 * (recording.received[first + found[0]] - step))
+    counted = len(recording.steps) - 1
     percentiles = np.percentile(latencies, [50.0, 99.0, 100.0]).tolist() if latencies else (None, None, None)
-    return LatencyRow(name, counted, counted - len(latencies), *percentiles)
+    return LatencyRow(path, counted, counted - len(latencies), *percentiles)

@@ -1,7 +1,8 @@
-"""``q2r2 bench --ros``: how long it takes from a topic that comes in to the joint command that answers it.
+"""``q2r2 bench --ros``: the latency from an input topic to the joint command that answers it.
 
-Real processes on this machine, in a domain of their own that nobody else hears: the simulated robot, the controller,
-and one arm's teleoperation. The input is stepped to and fro by millimetres at random moments; see :mod:`responses`.
+Runs real processes on this machine, in a ROS domain that nothing else uses: the simulated robot, the controller, and
+one arm's teleoperation. The input steps up and down by millimetres at random times; :mod:`command_responses` finds the
+commands that answer.
 """
 
 from __future__ import annotations
@@ -25,26 +26,26 @@ from trajectory_msgs.msg import JointTrajectory
 from q2r2_control.benchmark.command_responses import LatencyReport, Recording, latency_report
 from q2r2_control.config import load_config
 from q2r2_control.errors import Q2R2Error
-from q2r2_control.ros.bridge.base_node import COMMAND_QOS, STREAM_QOS
+from q2r2_control.ros.base_node import COMMAND_QOS, STREAM_QOS
 from q2r2_control.ros.launch.middleware import set_up_middleware
-from q2r2_control.ros.launch.node_set import NodeProcess
+from q2r2_control.ros.launch.processes import NodeProcess
 
-_PATIENCE = 300.0  # kernels may have to be compiled [s]
+_START_TIMEOUT = 300.0  # kernels may have to be compiled [s]
 _STEP = 0.002  # [m]
 _PAUSES = 0.07, 0.11  # between two steps; shorter than any timeout of a stream [s]
 _PRESS, _CHORD = 0.3, 0.3  # the lower button is held, and what follows its release [s]
-# The least that the hand's filters allow, so that what is left is the way through the nodes.
-_LEAST_FILTER = {"interpolation_delay": 0.005, "smoothing_delay": 0.0, "min_cutoff": 100.0, "beta": 1000.0}
+# The shortest delays that the hand's filters allow, so that mostly the nodes are measured.
+_SHORTEST_FILTER = {"interpolation_delay": 0.005, "smoothing_delay": 0.0, "min_cutoff": 100.0, "beta": 1000.0}
 
 
 class LatencyError(Q2R2Error):
-    """The nodes did not come to life; the message says what was waited for."""
+    """A node did not start in time; the message says what was waited for."""
 
 
-def measure_latency(config: str, duration: float, rate: float, say: Callable[[str], None]) -> LatencyReport:
+def measure_latency(config: str, duration: float, rate: float, progress: Callable[[str], None]) -> LatencyReport:
     """Measure for ``duration`` [s] each way, with the controller at ``rate`` [Hz]. Raises :class:`LatencyError`."""
     limit = load_config(config).control.acceleration_limit
-    least = {f"teleop.filter.{name}": str(value) for name, value in _LEAST_FILTER.items()}
+    filters = {f"teleop.filter.{name}": str(value) for name, value in _SHORTEST_FILTER.items()}
     nodes = [
         NodeProcess("mujoco_robot", "q2r2_control.ros.nodes.mujoco_robot", {"config": config}),
         NodeProcess(
@@ -53,22 +54,22 @@ def measure_latency(config: str, duration: float, rate: float, say: Callable[[st
             {"config": config, "rate": f"{rate:.1f}"},
         ),
     ]
-    arm = NodeProcess("left_arm_controller", "q2r2_control.ros.nodes.left_arm_controller", least)
-    with _private_domain(), _running(nodes), _Probe() as probe:
-        say("waits for the controller")
+    arm = NodeProcess("left_arm_controller", "q2r2_control.ros.nodes.left_arm_controller", filters)
+    with _private_domain(), _started(nodes), _Probe() as probe:
+        progress("waiting for the controller")
         probe.wait_for_tool()
-        say(f"target topic to joint command: {duration:g} s")
+        progress(f"target topic to joint command: {duration:g} s")
         target = probe.step_targets(duration)
-        with _running([arm]):
-            say("waits for the arm's teleoperation")
+        with _started([arm]):
+            progress("waiting for the arm's teleoperation")
             probe.engage_hand()
-            say(f"hand topic to joint command: {duration:g} s")
+            progress(f"hand topic to joint command: {duration:g} s")
             hand = probe.step_hand(duration)
     return latency_report(rate, limit, {"target to joint command": target, "hand to joint command": hand})
 
 
 class _Probe:
-    """Steps inputs and listens to commands, in turns: times are the middleware's, so a late turn does not count."""
+    """Publishes steps and records commands. Their times are the middleware's, so a late callback changes none."""
 
     def __init__(self) -> None:
         self._context = rclpy.Context()
@@ -94,25 +95,25 @@ class _Probe:
         self._context.try_shutdown()
 
     def wait_for_tool(self) -> None:
-        """Until the controller is active, tells where the tool is, and listens."""
+        """Wait until the controller is active, has published the tool's pose, and subscribes to targets."""
         self._wait(lambda: self._tool is not None and self._commands, "cartesian_controller's commands")
         self._wait(lambda: self._target.get_subscription_count() > 0, "cartesian_controller's subscription")
 
     def step_targets(self, duration: float) -> Recording:
-        """Step the target about the tool."""
+        """Step the target up and down at the tool."""
         assert self._tool is not None
         recording = self._step(self._target, self._tool, duration, lambda: None)
         self._node.destroy_publisher(self._target)  # the next one is the arm controller's
         return recording
 
     def engage_hand(self) -> None:
-        """Press the lower button until targets come of it."""
+        """Press the lower button until the arm's node publishes targets."""
         targets: list[PoseStamped] = []
         subscription = self._node.create_subscription(PoseStamped, "/q2r2/left/target_frame", targets.append, 1)
-        deadline = time.monotonic() + _PATIENCE
+        deadline = time.monotonic() + _START_TIMEOUT
         while not targets:
             if time.monotonic() > deadline:
-                raise LatencyError(f"left_arm_controller was not engaged within {_PATIENCE:g} s")
+                raise LatencyError(f"left_arm_controller was not engaged within {_START_TIMEOUT:g} s")
             for pressed, period in ((True, _PRESS), (False, _CHORD)):
                 self._send_hand(pressed, period)
         self._node.destroy_subscription(subscription)
@@ -146,10 +147,10 @@ class _Probe:
             self._spin(0.02)
 
     def _wait(self, condition: Callable[[], object], what: str) -> None:
-        deadline = time.monotonic() + _PATIENCE
+        deadline = time.monotonic() + _START_TIMEOUT
         while not condition():
             if time.monotonic() > deadline:
-                raise LatencyError(f"waited {_PATIENCE:g} s for {what}")
+                raise LatencyError(f"waited {_START_TIMEOUT:g} s for {what}")
             self._spin(0.05)
 
     def _spin(self, period: float) -> None:
@@ -173,11 +174,11 @@ def _pose() -> PoseStamped:
 
 @contextmanager
 def _private_domain() -> Iterator[None]:
-    """Nothing of this reaches a robot that is on the network, nor the other way round."""
+    """A ROS domain of its own, on this host only: no message reaches a robot on the network, or comes from one."""
     with domain_coordinator.domain_id() as number:
-        own = {"ROS_DOMAIN_ID": str(number), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+        private = {"ROS_DOMAIN_ID": str(number), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
         before = dict(os.environ)
-        os.environ.update(own)
+        os.environ.update(private)
         set_up_middleware(os.environ)
         try:
             yield
@@ -187,8 +188,8 @@ def _private_domain() -> Iterator[None]:
 
 
 @contextmanager
-def _running(nodes: list[NodeProcess]) -> Iterator[None]:
-    """The nodes as processes; they end in order with the context."""
+def _started(nodes: list[NodeProcess]) -> Iterator[None]:
+    """Run the nodes as processes; at the end they are interrupted in reverse order."""
     processes = [
         subprocess.Popen(node.command(), stdin=subprocess.DEVNULL, stderr=subprocess.DEVNULL) for node in nodes
     ]

@@ -1,8 +1,8 @@
-"""How long one full tick of the controller takes, and how long peers take for the same motions, in turns.
+"""Times of one full tick of the controller, and of peers for the same motions, measured in turns.
 
-Everybody gets the same cell (URDF, limits, margins, pairs), the same targets, ticks of 1 ms and start, and runs open
-loop on its own configuration. A machine's speed wanders, so that a peer is compared with our run just before its own.
-What each peer has no means for stands in its module and is a note of the report.
+All controllers get the same cell (URDF, limits, margins, pairs), the same targets, ticks of 1 ms and start, and run
+open loop on a configuration of their own. The machine's speed varies over time, so a peer is compared with our run
+just before its own. The limitations of each peer stand in its module and are printed as notes.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from q2r2_control.benchmark.peers.base import INSTALL, PEERS, Candidate, Setup, is_installed, make_peer
-from q2r2_control.benchmark.timed_run import Deeds, Ours, Poses, Targets, Timed, deeds_of, timed_run
+from q2r2_control.benchmark.peers.base import INSTALL, PEERS, BenchController, Setup, is_installed, make_peer
+from q2r2_control.benchmark.timed_run import OwnController, Poses, RunMetrics, Targets, TimedRun, metrics_of, timed_run
 from q2r2_control.config import Config
 from q2r2_control.config.control import ControllerSettings
 from q2r2_control.control.controller import CartesianController
@@ -33,14 +33,14 @@ class BenchRow:
 
     name: str  # of the scenario
     controller: str
-    ticks: int  # timed ones of a round
+    ticks: int  # timed, of a round
     rounds: int
     median_us: float
     p99_us: float
     max_us: float
-    median_ratio: float | None  # over ours just before, the rounds' median; None: this is ours
+    median_ratio: float | None  # to our run just before, median over the rounds; None: our own row
     p99_ratio: float | None
-    deeds: Deeds  # of the last round
+    metrics: RunMetrics  # of the last round
     fallback_ticks: int | None  # of the last round; None: a peer has none
 
 
@@ -51,13 +51,13 @@ class BenchReport:
     cell: str
     pairs: int
     rows: list[BenchRow]
-    notes: list[str]  # what peers have no means for, and which are not installed
+    notes: list[str]  # limitations of the peers, and which are not installed
 
     def as_json(self) -> dict[str, Any]:
-        """Plain data for ``json.dumps``; what was done stands beside the times."""
-        plain = asdict(self)
-        plain["rows"] = [row | row.pop("deeds") for row in plain["rows"]]
-        return plain
+        """Data for ``json.dumps``; each row holds its metrics beside the times."""
+        data = asdict(self)
+        data["rows"] = [row | row.pop("metrics") for row in data["rows"]]
+        return data
 
 
 def run_bench(
@@ -66,25 +66,25 @@ def run_bench(
     peers: Sequence[str] = tuple(PEERS),
     progress: Callable[[str], None] = lambda what: None,
 ) -> BenchReport:
-    """Time ``ticks`` ticks of 1 ms of each scenario, ours and those of ``peers`` that are installed.
+    """Time ``ticks`` ticks of 1 ms of each scenario, for our controller and those of ``peers`` that are installed.
 
     Raises :class:`ConfigError` for fewer than 100 ticks.
     """
     if ticks < FEWEST_TICKS:
         raise ConfigError(f"bench: ticks = {ticks}: allowed: {FEWEST_TICKS} or more")
     robot = Robot.from_config(config)
-    # What is late depends on the machine that is being measured.
+    # Without a time limit, so that a slow machine computes the same motion.
     settings = config.control.model_copy(update={"solve_time_limit": None})
-    ours = Ours(CartesianController(robot, settings))
+    ours = OwnController(CartesianController(robot, settings))
     others, notes = _build(peers, Setup(robot, config, _DT))
     bench = _Bench(robot, settings, ours, others, ticks, progress)
     rows = [row for name, targets in SCENARIOS.items() for row in bench.rows(name, targets)]
     return BenchReport(config.name, len(robot.collision_model.collisionPairs), rows, notes)
 
 
-def _build(names: Sequence[str], setup: Setup) -> tuple[list[Candidate], list[str]]:
+def _build(names: Sequence[str], setup: Setup) -> tuple[list[BenchController], list[str]]:
     """The peers that can be built, and a line on each peer."""
-    peers: list[Candidate] = []
+    peers: list[BenchController] = []
     notes = []
     for name in names:
         if not is_installed(name):
@@ -92,50 +92,55 @@ def _build(names: Sequence[str], setup: Setup) -> tuple[list[Candidate], list[st
             continue
         try:
             peer = make_peer(name, setup)
-        except Exception as error:  # whatever a package of another version raises
+        except Exception as error:  # a package of another version may raise anything
             notes.append(f"{name}: cannot be built for this cell: {type(error).__name__}: {error}")
             continue
         peers.append(peer)
-        notes.append(f"{name}: {peer.cannot}")
+        notes.append(f"{name}: {peer.limitations}")
     return peers, notes
 
 
 class _Bench:
-    """Runs ours and each peer in turns."""
+    """Runs our controller and each peer in turns."""
 
     def __init__(
         self,
         robot: Robot,
         settings: ControllerSettings,
-        ours: Ours,
-        peers: Sequence[Candidate],
+        own: OwnController,
+        peers: Sequence[BenchController],
         ticks: int,
         progress: Callable[[str], None],
     ) -> None:
-        self._robot, self._settings, self._ours, self._peers = robot, settings, ours, peers
+        self._robot, self._settings, self._own, self._peers = robot, settings, own, peers
         self._ticks, self._progress = ticks, progress
 
     def rows(self, scenario: str, targets: Targets) -> list[BenchRow]:
-        """A row for ours and one for each peer."""
-        own: list[Timed] = []
-        pairs: dict[str, list[tuple[Timed, Timed]]] = {peer.name: [] for peer in self._peers}
+        """One row for our controller and one for each peer."""
+        own_runs: list[TimedRun] = []
+        pairs: dict[str, list[tuple[TimedRun, TimedRun]]] = {peer.name: [] for peer in self._peers}
         for turn in range(_ROUNDS):
             for peer in self._peers:
                 self._progress(f"{scenario}, {peer.name}, round {turn + 1} of {_ROUNDS}")
-                own.append(self._run(self._ours, targets))
-                pairs[peer.name].append((own[-1], self._run(peer, targets)))
+                own_runs.append(self._run(self._own, targets))
+                pairs[peer.name].append((own_runs[-1], self._run(peer, targets)))
             if not self._peers:
-                own.append(self._run(self._ours, targets))
-        rows = [self._row(scenario, self._ours.name, own, None, self._ours.fallbacks)]
+                own_runs.append(self._run(self._own, targets))
+        rows = [self._row(scenario, self._own.name, own_runs, None, self._own.fallbacks)]
         for name, runs in pairs.items():
             rows.append(self._row(scenario, name, [run for _, run in runs], [before for before, _ in runs], None))
         return rows
 
-    def _run(self, candidate: Candidate, targets: Targets) -> Timed:
-        return timed_run(candidate, self._robot, targets, self._ticks, _DT)
+    def _run(self, controller: BenchController, targets: Targets) -> TimedRun:
+        return timed_run(controller, self._robot, targets, self._ticks, _DT)
 
     def _row(
-        self, scenario: str, name: str, runs: Sequence[Timed], before: Sequence[Timed] | None, fallbacks: int | None
+        self,
+        scenario: str,
+        name: str,
+        runs: Sequence[TimedRun],
+        before: Sequence[TimedRun] | None,
+        fallbacks: int | None,
     ) -> BenchRow:
         times = np.concatenate([run.times_us for run in runs])
         return BenchRow(
@@ -148,12 +153,12 @@ class _Bench:
             max_us=float(times.max()),
             median_ratio=_ratio(runs, before, 50.0),
             p99_ratio=_ratio(runs, before, 99.0),
-            deeds=deeds_of(runs[-1], self._robot, self._settings),
+            metrics=metrics_of(runs[-1], self._robot, self._settings),
             fallback_ticks=fallbacks,
         )
 
 
-def _ratio(runs: Sequence[Timed], before: Sequence[Timed] | None, percentile: float) -> float | None:
+def _ratio(runs: Sequence[TimedRun], before: Sequence[TimedRun] | None, percentile: float) -> float | None:
     """Median over the rounds of a percentile of the times over that of the run just before."""
     if before is None:
         return None
@@ -164,14 +169,14 @@ def _ratio(runs: Sequence[Timed], before: Sequence[Timed] | None, percentile: fl
 
 
 def _circle(t: float, start: Poses) -> Poses:
-    """Circles of 0.1 m in the air, one in two seconds."""
+    """Circles of 0.1 m radius in free space, 0.5 Hz."""
     phase = np.pi * t
     by = np.array([0.0, 0.1 * np.sin(phase), 0.1 * (1.0 - np.cos(phase))])
     return {arm: pin.SE3(pose.rotation, pose.translation + by) for arm, pose in start.items()}
 
 
 def _crossing(t: float, start: Poses) -> Poses:
-    """Every tool is asked to be where another one started: the arms press against each other."""
+    """The target of each tool is where another one started: the arms block each other."""
     arms = list(start)
     return {arm: start[other] for arm, other in zip(arms, arms[1:] + arms[:1], strict=True)}
 

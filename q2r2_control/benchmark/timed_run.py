@@ -1,4 +1,4 @@
-"""One timed run of a controller, ours or a peer's, and what it did, measured alike for all."""
+"""One timed run of a controller, our own or a peer, and the same metrics of its motion for all."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio as pin
 
-from q2r2_control.benchmark.peers.base import Candidate
+from q2r2_control.benchmark.peers.base import BenchController
 from q2r2_control.config.control import ControllerSettings
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.robot.robot import Robot
@@ -21,27 +21,25 @@ Targets = Callable[[float, Poses], Poses]
 
 WARM_UP = 0.1  # share of the ticks that is not counted in times
 _TAIL = 0.5  # [s]
-
-
-_MOMENT = 1e-9  # a tick that moves nothing [s]
+_SHORTEST_DT = 1e-9  # a tick that moves nothing [s]
 
 
 @dataclass(frozen=True, slots=True)
-class Deeds:
-    """What a controller did in a run, warm-up included."""
+class RunMetrics:
+    """Metrics of the motion of a run, warm-up included."""
 
-    max_acceleration_ratio: float  # change of velocity in a tick over our limit
+    max_acceleration_ratio: float  # change of velocity in a tick, to our limit
     max_velocity_ratio: float
-    min_position_margin_rad: float  # to limits less the margin
+    min_position_margin_rad: float  # beyond the configured margin
     min_distance_mm: float  # of the monitored pairs, by Coal
     failures: int  # ticks: exception, no solution, not finite
     tail_acceleration: float  # RMS over the last 0.5 s, norm over the joints [rad/s^2]
-    position_error_mm: float  # of the tools, at the end, the larger
+    position_error_mm: float  # of the tool that is farther from its target at the end
 
 
 @dataclass(frozen=True, slots=True)
-class Timed:
-    """Times of the ticks after the warm-up, and the motion of all."""
+class TimedRun:
+    """Times of the ticks after the warm-up, and the motion of all ticks."""
 
     times_us: Array  # (ticks,)
     q: Array  # (n, nv) [rad]
@@ -51,62 +49,62 @@ class Timed:
     dt: float  # [s]
 
 
-class Ours:
-    """:class:`CartesianController` as the bench sees a controller: the full tick, certificate and report included."""
+class OwnController:
+    """:class:`CartesianController` in the bench: the full tick, certificate and report included."""
 
     name = "q2r2_control"
-    cannot = ""
+    limitations = ""
 
     def __init__(self, controller: CartesianController) -> None:
         self._controller = controller
         self.fallbacks = 0
 
     def reset(self, q: Array) -> None:
-        """See :class:`Candidate`."""
+        """See :class:`BenchController`."""
         self._controller.reset(q)
         self.fallbacks = 0
 
     def step(self, targets: Mapping[str, pin.SE3], dt: float) -> tuple[Array, Array]:
-        """See :class:`Candidate`."""
+        """See :class:`BenchController`."""
         reference = self._controller.step(targets, dt)
         self.fallbacks += reference.report.fallback
         return reference.q, reference.v
 
     def hold(self) -> tuple[Array, Array]:
-        """See :class:`Candidate`; a step that raised would be a broken promise, and is counted like a peer's."""
-        reference = self._controller.step({}, _MOMENT)
+        """See :class:`BenchController`; only called after a step that raised, which the contract forbids."""
+        reference = self._controller.step({}, _SHORTEST_DT)
         return reference.q, np.zeros_like(reference.v)
 
 
-def timed_run(candidate: Candidate, robot: Robot, targets: Targets, ticks: int, dt: float) -> Timed:
+def timed_run(controller: BenchController, robot: Robot, targets: Targets, ticks: int, dt: float) -> TimedRun:
     """Run from home for a warm-up and ``ticks`` ticks of ``dt`` [s]."""
     start = {arm: robot.tool_pose(robot.home, arm) for arm in robot.arms}
     goals = [targets(tick * dt, start) for tick in range(int(WARM_UP * ticks) + ticks)]
     times = np.empty(len(goals))
     q, v = np.empty((len(goals), robot.model.nv)), np.empty((len(goals), robot.model.nv))
     failures = 0
-    candidate.reset(robot.home)
+    controller.reset(robot.home)
     gc.collect()
     gc.disable()
     try:
         for tick, goal in enumerate(goals):
             began = time.perf_counter()
             try:
-                q[tick], v[tick] = candidate.step(goal, dt)
+                q[tick], v[tick] = controller.step(goal, dt)
                 solved = True
             except Exception:  # each peer has exceptions of its own
                 solved = False
             times[tick] = time.perf_counter() - began
             if not (solved and np.isfinite(np.sum(q[tick]) + np.sum(v[tick]))):
                 failures += 1
-                q[tick], v[tick] = candidate.hold()
+                q[tick], v[tick] = controller.hold()
     finally:
         gc.enable()
-    return Timed(1e6 * times[len(goals) - ticks :], q, v, goals[-1], failures, dt)
+    return TimedRun(1e6 * times[len(goals) - ticks :], q, v, goals[-1], failures, dt)
 
 
-def deeds_of(run: Timed, robot: Robot, settings: ControllerSettings) -> Deeds:
-    """What was done in a run, by the same measures for everybody."""
+def metrics_of(run: TimedRun, robot: Robot, settings: ControllerSettings) -> RunMetrics:
+    """Metrics of a run, computed in the same way for all controllers."""
     q, v = run.q, run.v
     a = np.diff(v, axis=0, prepend=0.0) / run.dt
     tail = a[-round(_TAIL / run.dt) :]
@@ -114,7 +112,7 @@ def deeds_of(run: Timed, robot: Robot, settings: ControllerSettings) -> Deeds:
     errors = [
         np.linalg.norm(robot.tool_pose(q[-1], arm).translation - pose.translation) for arm, pose in run.goal.items()
     ]
-    return Deeds(
+    return RunMetrics(
         max_acceleration_ratio=float(np.abs(a).max()) / settings.acceleration_limit,
         max_velocity_ratio=float((np.abs(v) / (robot.velocity_limit * settings.velocity_scale)).max()),
         min_position_margin_rad=float(room.min()),

@@ -3,45 +3,47 @@
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Iterator
 from typing import Annotated, NoReturn
 
 import typer
+from rich import box
 from rich.console import Console
+from rich.table import Table
+from rich.text import Text
 
+from q2r2_control.benchmark.command_responses import LatencyReport
 from q2r2_control.benchmark.peers.base import PEERS
-from q2r2_control.benchmark.tick_times import run_bench
-from q2r2_control.cli.bench_tables import deeds_table, latency_table, soak_table, times_table
-from q2r2_control.cli.cell_run import notice_of_compiling
-from q2r2_control.cli.json_output import as_json_text
+from q2r2_control.benchmark.tick_times import BenchReport, BenchRow, run_bench
+from q2r2_control.cli.options import DEMO_CONFIG, Json
+from q2r2_control.cli.output import as_json_text, notice_of_compiling, stderr_console
 from q2r2_control.config import load_config
 from q2r2_control.errors import ConfigError
-from q2r2_control.verification.soak import SoakReport, run_soak
+from q2r2_control.verification.soak import MEMORY_ALLOWED, SoakReport, run_soak
 
-_CONFIG = "config/dual_iiwa7.yaml"
 _TICKS, _SOAK_TICKS, _SECONDS = 3000, 1_000_000, 30.0
 _RATE = 250.0  # of the controller's node by default [Hz]
 
 
 def bench(
     ticks: Annotated[
-        int | None, typer.Option(min=100, help=f"Of each scenario, {_TICKS} by itself; soak: {_SOAK_TICKS}.")
+        int | None, typer.Option(min=100, help=f"Of each scenario, {_TICKS} by default; of a soak {_SOAK_TICKS}.")
     ] = None,
     peers: Annotated[bool, typer.Option(help="Time roboplan, mink and pink too, where they are installed.")] = True,
     soak: Annotated[
         bool, typer.Option("--soak", help="Check every promise in hostile ticks instead of timing.")
     ] = False,
     seed: Annotated[int, typer.Option(min=0, help="Of the soak.")] = 0,
-    ros: Annotated[bool, typer.Option("--ros", help="Time the way through the ROS nodes instead.")] = False,
+    ros: Annotated[bool, typer.Option("--ros", help="Time the ROS nodes instead.")] = False,
     duration: Annotated[
-        float | None, typer.Option(min=1, max=3600, help=f"Of each way in, {_SECONDS:g} by itself; with --ros [s].")
+        float | None, typer.Option(min=1, max=3600, help=f"Of each input, {_SECONDS:g} by default; with --ros [s].")
     ] = None,
     rate: Annotated[
-        float | None, typer.Option(min=20, max=1000, help=f"Of the controller's node, {_RATE:g}; with --ros [Hz].")
+        float | None,
+        typer.Option(min=20, max=1000, help=f"Of the controller's node, {_RATE:g} by default; with --ros [Hz]."),
     ] = None,
-    json: Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout, and all else on stderr.")] = (
-        False
-    ),
+    json: Json = False,
 ) -> None:
     """Time one tick of the controller with both arms, every pair and the certificate, and public peers beside it.
 
@@ -59,26 +61,26 @@ def bench(
         raise ConfigError("--ticks cannot be used with --ros, which takes --duration")
     if not ros and (duration is not None or rate is not None):
         raise ConfigError("--duration and --rate need --ros")
-    console = Console(stderr=True)
+    console = stderr_console()
     if ros:
         _show_latency(_SECONDS if duration is None else duration, rate or _RATE, console, json)
         return
     with notice_of_compiling(console):
         if soak:
-            report = run_soak(load_config(_CONFIG), _SOAK_TICKS if ticks is None else ticks, seed, _progress(console))
-            _show_soak(report, json)
+            soak_ticks = _SOAK_TICKS if ticks is None else ticks
+            _show_soak(run_soak(load_config(DEMO_CONFIG), soak_ticks, seed, _progress(console)), json)
         else:
             _show_times(_TICKS if ticks is None else ticks, tuple(PEERS) if peers else (), console, json)
 
 
 def _show_times(ticks: int, peers: tuple[str, ...], console: Console, json: bool) -> None:
-    report = run_bench(load_config(_CONFIG), ticks, peers, _progress(console))
+    report = run_bench(load_config(DEMO_CONFIG), ticks, peers, _progress(console))
     if json:
         print(as_json_text(report.as_json()))
     else:
         out = Console()
         out.print(times_table(report))
-        out.print(deeds_table(report))
+        out.print(motion_table(report))
 
 
 def _show_soak(report: SoakReport, json: bool) -> NoReturn:
@@ -98,7 +100,7 @@ def _show_latency(duration: float, rate: float, console: Console, json: bool) ->
         )
     from q2r2_control.benchmark.ros_latency import measure_latency  # all else works without ROS
 
-    report = measure_latency(_CONFIG, duration, rate, _progress(console))
+    report = measure_latency(DEMO_CONFIG, duration, rate, _progress(console))
     if json:
         print(as_json_text(report.as_json()))
     else:
@@ -106,7 +108,121 @@ def _show_latency(duration: float, rate: float, console: Console, json: bool) ->
 
 
 def _progress(console: Console) -> Callable[[str], None]:
-    """Prints lines, to people only: a live line would need a thread, which would be in the times."""
+    """Prints lines, on a terminal only; a live line would need a thread, which would add to the times."""
     if not console.is_terminal:
         return lambda what: None
     return lambda what: console.print(what, highlight=False)
+
+
+def times_table(report: BenchReport) -> Table:
+    """Times of a tick."""
+    table = _table(
+        f"{report.cell}: one tick of 1 ms with {report.pairs} pairs, each run of {report.rows[0].ticks} ticks",
+        "controller",
+        ("runs", "median [us]", "p99 [us]", "max [us]", "median / ours", "p99 / ours"),
+    )
+    for row in _by_scenario(report, table):
+        ratios = ("" if ratio is None else f"{ratio:.2f}" for ratio in (row.median_ratio, row.p99_ratio))
+        times = (f"{value:.0f}" for value in (row.median_us, row.p99_us, row.max_us))
+        table.add_row(f"  {row.controller}", str(row.rounds), *times, *ratios)
+    return table
+
+
+def motion_table(report: BenchReport) -> Table:
+    """Metrics of the controllers' motions, with notes on the limitations of each."""
+    table = _table(
+        "motion",
+        "controller",
+        ("a / limit", "v / limit", "room [rad]", "nearest [mm]", "held", "tail [rad/s^2]"),
+    )
+    for row in _by_scenario(report, table):
+        metrics = row.metrics
+        table.add_row(
+            f"  {row.controller}",
+            f"{metrics.max_acceleration_ratio:.2f}",
+            f"{metrics.max_velocity_ratio:.2f}",
+            f"{metrics.min_position_margin_rad:.3f}",
+            f"{metrics.min_distance_mm:.2f}",
+            str(metrics.failures if row.fallback_ticks is None else row.fallback_ticks),
+            f"{metrics.tail_acceleration:.3f}",
+        )
+    held = "held: ticks without a solution, in which a peer's arms stand still and ours execute the certified stop"
+    table.caption = Text("\n".join([held, *report.notes]))
+    table.caption_justify = "left"
+    return table
+
+
+def _by_scenario(report: BenchReport, table: Table) -> Iterator[BenchRow]:
+    """The rows; each scenario's heading is added to the table before its first row."""
+    heading = ""
+    for row in report.rows:
+        if row.name != heading:
+            heading = row.name
+            table.add_row(Text(heading, style="bold"))
+        yield row
+
+
+def soak_table(report: SoakReport) -> Table:
+    """Worst margin of every promise, and how often it was broken."""
+    table = _table(
+        f"{report.cell}: {report.ticks} hostile ticks, {report.simulated_s:.0f} s, seed {report.seed}",
+        "promise",
+        ("worst", "allowed", "checked", "broken"),
+    )
+    for margin in report.margins:
+        unit = f" {margin.unit}" if margin.unit else ""
+        worst = "" if math.isinf(margin.worst) and not margin.violations else f"{margin.worst:.2g}{unit}"
+        allowed = f"{margin.sense} {margin.allowed:.2g}"
+        style = "red" if margin.violations else None
+        table.add_row(Text(margin.name), worst, allowed, str(margin.checked), str(margin.violations), style=style)
+    if report.memory_growth_mb is not None:
+        grown, broken = f"{report.memory_growth_mb:.2f} MB", str(int(report.memory_growth_mb > MEMORY_ALLOWED))
+        table.add_row("memory growth after a tenth of it", grown, f"<= {MEMORY_ALLOWED:g}", "1", broken)
+    table.caption = Text(_soak_notes(report))
+    table.caption_justify = "left"
+    return table
+
+
+def latency_table(report: LatencyReport) -> Table:
+    """Latencies through the ROS nodes."""
+    table = _table(
+        f"from an input topic to the joint command that answers it, controller at {report.loop_rate_hz:g} Hz",
+        "path",
+        ("p50 [ms]", "p99 [ms]", "max [ms]", "steps", "missed"),
+    )
+    for row in report.rows:
+        times = ("" if time is None else f"{time:.1f}" for time in (row.p50_ms, row.p99_ms, row.max_ms))
+        table.add_row(row.path, *times, str(row.steps), str(row.missed))
+    table.caption = Text(
+        f"one joint command between two processes: p50 {report.transport_p50_ms:.2f} ms, p99 "
+        f"{report.transport_p99_ms:.2f} ms\n"
+        "the hand's latency includes an interpolation of 5 ms, the shortest; its filters are off"
+    )
+    table.caption_justify = "left"
+    return table
+
+
+def _soak_notes(report: SoakReport) -> str:
+    lines = [
+        f"{report.segments} segments, {report.resets} resets, {report.solver_faults} ticks with a failing solver,"
+        f" {report.fallbacks} stops ({report.fallbacks_healthy} with a healthy solver)"
+    ]
+    for found in report.broken:
+        error = f": {found.error}" if found.error else ""
+        lines.append(
+            f"first broken at tick {found.tick}: {found.promise}{error}"
+            f" [tick {found.since_segment} of: {found.segment}; dt {found.dt}]"
+        )
+    if report.broken:
+        lines.append(
+            f"to see the first again: q2r2 bench --soak --seed {report.seed} --ticks {report.broken[0].tick + 1}"
+        )
+    return "\n".join(lines)
+
+
+def _table(title: str, names: str, figures: tuple[str, ...]) -> Table:
+    table = Table(title=Text(title), title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
+    table.add_column(names, no_wrap=True)
+    for figure in figures:
+        table.add_column(Text(figure.replace(" ", "\n", 1)), justify="right", no_wrap=True)
+    return table

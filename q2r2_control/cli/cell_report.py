@@ -8,10 +8,11 @@ from typing import Any
 
 from q2r2_control.config.cell import Config, ObstacleConfig
 from q2r2_control.config.external import describe
+from q2r2_control.control.controller import CartesianController
 from q2r2_control.errors import ConfigError
 from q2r2_control.robot.reachability import PairReach, nearest_approaches, srdf_of
 from q2r2_control.robot.robot import PairDistance, Robot
-from q2r2_control.types import Array
+from q2r2_control.supervision.preflight import preflight_faults
 
 _NEAREST = 8
 
@@ -74,15 +75,7 @@ def check_cell(config: Config) -> CellCheck:
         ignored_pairs=robot.ignored_pairs,
         min_distance=settings.min_distance,
         nearest=tuple(distances[:_NEAREST]),
-        faults=(
-            *_home_outside_limits(robot, robot.home, settings.position_margin),
-            *(
-                f"home: {pair.name_a} and {pair.name_b} are {1e3 * pair.distance:.1f} mm apart; "
-                f"allowed: at least min_distance, {1e3 * settings.min_distance:.1f} mm"
-                for pair in distances
-                if pair.distance < settings.min_distance
-            ),
-        ),
+        faults=preflight_faults(robot, settings, CartesianController(robot, settings)),
         driven={} if config.external is None else describe(config.external),
     )
 
@@ -144,12 +137,3 @@ def _arm_check(config: Config, robot: Robot, name: str) -> ArmCheck:
             for index in arm.joints
         ),
     )
-
-
-def _home_outside_limits(robot: Robot, home: Array, margin: float) -> list[str]:
-    lower, upper = robot.position_lower + margin, robot.position_upper - margin
-    return [
-        f"home: {name} = {home[index]:g}; allowed: {lower[index]:g} .. {upper[index]:g} rad, position_margin included"
-        for index, name in enumerate(robot.joint_names)
-        if not lower[index] <= home[index] <= upper[index]
-    ]

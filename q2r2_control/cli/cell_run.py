@@ -2,30 +2,30 @@
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 
 from rich.console import Console
 
-from q2r2_control.cli.json_output import as_json_text
+from q2r2_control.cli.headset_server import AnnouncedHeadset
+from q2r2_control.cli.output import as_json_text, notice_of_compiling
+from q2r2_control.cli.summary_table import summary_table
 from q2r2_control.config import Config
 from q2r2_control.config.external import ControllerKind
 from q2r2_control.errors import ConfigError
 from q2r2_control.inputs.base import Input
-from q2r2_control.inputs.headset import HeadsetServer
 from q2r2_control.inputs.scripted import ScriptedInput
-from q2r2_control.pipeline import Pipeline, Tick
+from q2r2_control.pipeline import Pipeline
 from q2r2_control.plants.mujoco import MujocoPlant
+from q2r2_control.runtime.recorder import Tick
 from q2r2_control.runtime.run_summary import RunSummary
+from q2r2_control.supervision.preflight import preflight_faults
 from q2r2_control.viewer.history import History
 from q2r2_control.viewer.live import LiveTable
 from q2r2_control.viewer.report import draw_report
 
-_NOTICE_AFTER = 3.0  # [s]
 _WINDOW_PERIOD = 1.0 / 30.0  # [s]
 
 
@@ -45,9 +45,10 @@ class RunOptions:
     table: bool
     window: bool
     report: bool
+    force: bool  # run although q2r2 check finds faults
 
 
-def run(config: Config, options: RunOptions, console: Console) -> RunSummary:
+def run_cell(config: Config, options: RunOptions, console: Console) -> RunSummary:
     """Run a cell and tell ``console`` about it. Raises :class:`Q2R2Error` where that is not possible as asked."""
     if config.controller is ControllerKind.EXTERNAL:
         raise ConfigError(
@@ -58,6 +59,7 @@ def run(config: Config, options: RunOptions, console: Console) -> RunSummary:
     with notice_of_compiling(console):
         source = _input_of(config, options, console)
         pipeline = Pipeline.from_config(config, input=source, plant=options.plant, mode=options.mode)
+        _refuse_faults(pipeline, options.force, console)
     history = History(pipeline.robot, config.control.acceleration_limit)
     if options.report:
         pipeline.listeners.append(history)
@@ -76,17 +78,24 @@ def run(config: Config, options: RunOptions, console: Console) -> RunSummary:
     return summary
 
 
-class AnnouncedHeadset(HeadsetServer):
-    """A headset server that says where it listens, for people and for scripts that asked for port 0."""
+def print_summary(summary: RunSummary, json: bool) -> None:
+    """Print the summary of a run on stdout, as a table or as one JSON object."""
+    if json:
+        print(as_json_text(summary.as_json()))
+    else:
+        Console().print(summary_table(summary))
 
-    def __init__(self, config: Config, console: Console) -> None:
-        super().__init__(config.headset.host, config.headset.port)
-        self._console = console
 
-    def start(self) -> None:
-        """See :meth:`HeadsetServer.start`."""
-        super().start()
-        self._console.print(f"headset: listening on {self.address[0]}:{self.address[1]}", highlight=False)
+def _refuse_faults(pipeline: Pipeline, force: bool, console: Console) -> None:
+    """Raises :class:`ConfigError` for a cell in which ``q2r2 check`` finds a fault; with ``force`` only prints them."""
+    config = pipeline.config
+    faults = preflight_faults(pipeline.robot, config.control, pipeline.controller)
+    if not faults:
+        return
+    if not force:
+        raise ConfigError(f"{config.name}: {'; '.join(faults)}; --force runs it all the same")
+    for fault in faults:
+        console.print(f"FAULT {fault}", style="red", soft_wrap=True, highlight=False, markup=False)
 
 
 def _input_of(config: Config, options: RunOptions, console: Console) -> Input:
@@ -107,19 +116,6 @@ class _WindowListener:
             self._due = tick.t + _WINDOW_PERIOD
             if not self._plant.viewer_sync():
                 self._pipeline.stop()
-
-
-@contextmanager
-def notice_of_compiling(console: Console) -> Iterator[None]:
-    """Say what takes so long, where building the controller does."""
-    text = "compiling the controller for this machine: once for each version of the code, 1-2 minutes"
-    timer = threading.Timer(_NOTICE_AFTER, lambda: console.print(text, soft_wrap=True, highlight=False))
-    timer.daemon = True
-    timer.start()
-    try:
-        yield
-    finally:
-        timer.cancel()
 
 
 def _write_report(config: Config, options: RunOptions, history: History, summary: RunSummary) -> Path:

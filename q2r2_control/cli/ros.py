@@ -9,8 +9,7 @@ from typing import Annotated
 import typer
 
 from q2r2_control.ros.launch.build import BuildError, build_interfaces
-from q2r2_control.ros.launch.node_set import nodes_of
-from q2r2_control.ros.launch.up import run_together
+from q2r2_control.ros.launch.processes import nodes_of, run_together
 
 app = typer.Typer(rich_markup_mode=None, help="ROS 2 Jazzy, from apt or from the Python registry.")
 

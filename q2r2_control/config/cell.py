@@ -28,6 +28,7 @@ from q2r2_control.config.arms import (
 from q2r2_control.config.control import AdmittanceSettings, ControllerSettings, ImpedanceSettings, check_priority
 from q2r2_control.config.external import ControllerKind, ExternalConfig, check_external
 from q2r2_control.config.resources import find_resource
+from q2r2_control.config.supervision import SupervisionSettings
 from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.errors import ConfigError
 
@@ -91,6 +92,7 @@ class Config(CellModel):
     srdf: LocalPath | None = Field(
         None, description="a file of pairs that need no watching, as q2r2 check --pairs writes it"
     )
+    supervision: SupervisionSettings = SupervisionSettings()
     loop_rate_hz: float = Field(1000.0, ge=50, le=2000, description="control loop [Hz]")
     controller: ControllerKind = Field(ControllerKind.BUILTIN, description="builtin, or external: for q2r2 ros up")
     external: ExternalConfig | None = Field(None, description="controllers of others; with controller: external")

@@ -7,6 +7,7 @@ from enum import StrEnum
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from q2r2_control.config.axes import axes_matrix
+from q2r2_control.config.timeouts import STREAM_TIMEOUT
 
 
 class Stance(StrEnum):
@@ -45,7 +46,7 @@ class GateSettings(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
-    timeout: float = Field(0.15, gt=0, le=2, description="no pose for this long disengages [s]")
+    timeout: float = Field(STREAM_TIMEOUT, gt=0, le=2, description="no pose for this long disengages [s]")
     max_jump: float = Field(0.15, gt=0, le=2, description="position change between two samples [m]")
     max_rotation_jump: float = Field(1.0, gt=0, le=3.14, description="rotation between two samples [rad]")
 

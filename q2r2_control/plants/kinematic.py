@@ -11,9 +11,9 @@ from q2r2_control.types import Array, Command, CommandMode, RobotState
 
 
 class KinematicPlant:
-    """Perfect tracking of position commands; grippers move at their configured speed. Nothing has a mass here."""
+    """Perfect tracking of position and velocity commands; grippers move at their configured speed. No mass."""
 
-    modes: tuple[CommandMode, ...] = (CommandMode.POSITION,)
+    modes: tuple[CommandMode, ...] = (CommandMode.POSITION, CommandMode.VELOCITY)
 
     def __init__(self, robot: Robot, config: Config) -> None:
         self._robot = robot
@@ -26,14 +26,16 @@ class KinematicPlant:
         check_joints("reset q", posture, self._robot)
         self._q = np.array(posture, dtype=np.float64)
         self._v = np.zeros_like(self._q)
-        self._due_q, self._due_v = self._q, self._v
+        self._due_q: Array | None = self._q  # None: the velocity says where to go
+        self._due_v = self._v
         self._time = 0.0
         self._grippers.reset()
 
     def apply(self, command: Command) -> None:
         """See :meth:`Plant.apply`. Raises :class:`PlantError` in torque mode."""
         check_command(command, self._robot, self.modes)
-        self._due_q, self._due_v = command.q.copy(), command.v.copy()
+        self._due_q = None if command.mode is CommandMode.VELOCITY else command.q.copy()
+        self._due_v = command.v.copy()
         self._grippers.command(command.grippers)
 
     def advance(self, dt: float) -> None:
@@ -41,8 +43,8 @@ class KinematicPlant:
         check_duration(dt)
         if dt == 0:
             return
-        self._q, self._v = self._due_q, self._due_v
-        self._due_v = np.zeros_like(self._q)
+        self._q = self._q + dt * self._due_v if self._due_q is None else self._due_q
+        self._due_q, self._v, self._due_v = self._q, self._due_v, np.zeros_like(self._q)
         self._time += dt
         self._grippers.advance(dt)
 

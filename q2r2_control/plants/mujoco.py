@@ -47,17 +47,18 @@ class _Fingers:
 
 
 class MujocoPlant:
-    """The simulated cell, driven in one of two ways that each command chooses.
+    """The simulated cell, driven in one of three ways that each command chooses.
 
     Position: a servo on each joint, tau = K (q_ref - q) + D (v_ref - v) + M a_ref + bias, with the simulator's own M
     and bias (gravity, Coriolis), computed at each physics step about a reference that moves straight from the last
-    command to the newest, and clipped at the robot's torque limits. Torque: the command's, clipped; gravity is the
-    sender's to bear.
+    command to the newest, and clipped at the robot's torque limits. Velocity: the same servos about a reference that
+    goes on from its last position at the command's velocity, for one ``advance``. Torque: the command's, clipped;
+    gravity is the sender's to bear.
 
     ``model`` and ``data`` are MuJoCo's own, to look at.
     """
 
-    modes: tuple[CommandMode, ...] = (CommandMode.POSITION, CommandMode.TORQUE)
+    modes: tuple[CommandMode, ...] = (CommandMode.POSITION, CommandMode.VELOCITY, CommandMode.TORQUE)
 
     def __init__(self, robot: Robot, config: Config) -> None:
         """``robot`` has to be the one of ``config``. Raises :class:`PlantError` where MuJoCo cannot model it."""
@@ -100,6 +101,7 @@ class MujocoPlant:
         settle_mimics(self.model, self.data)
         self._reference = ReferenceLine(self.data.qpos[self._q_index])
         self._torque: Array | None = None  # commanded in torque mode
+        self._velocity: Array | None = None  # commanded in velocity mode, for the next advance
         self._pushes: dict[str, _Push] = {}
         self._steps = 0
         self._clock = 0.0
@@ -111,14 +113,17 @@ class MujocoPlant:
     def apply(self, command: Command) -> None:
         """See :meth:`Plant.apply`."""
         check_command(command, self._robot, self.modes)
+        self._velocity = command.v.copy() if command.mode is CommandMode.VELOCITY else None
         if command.mode is CommandMode.TORQUE:
             self._torque = command.tau.copy()
         else:
             if self._torque is not None:
                 # Back from torque mode there is no last command to start the line from.
-                self._reference = ReferenceLine(command.q)
+                measured = self.data.qpos[self._q_index]
+                self._reference = ReferenceLine(measured if self._velocity is not None else command.q)
                 self._torque = None
-            self._reference.command(command.q, command.v)
+            if self._velocity is None:
+                self._reference.command(command.q, command.v)
         self._grippers.command(command.grippers)
 
     def advance(self, dt: float) -> None:
@@ -130,6 +135,9 @@ class MujocoPlant:
         if dt == 0:
             return
         start, self._clock = self._clock, self._clock + dt
+        if self._velocity is not None:
+            self._reference.command(self._reference.end_q + dt * self._velocity, self._velocity)
+            self._velocity = None
         self._reference.begin_tick()
         self._grippers.advance(dt)
         self._drive_fingers()

@@ -43,6 +43,11 @@ class ReferenceLine:
         self._start_v = self._end_v = np.zeros_like(self._end_q)
         self._next: tuple[Array, Array] | None = None
 
+    @property
+    def end_q(self) -> Array:
+        """Where the last tick's line ended (nv,) [rad]."""
+        return self._end_q
+
     def command(self, q: Array, v: Array) -> None:
         """Set posture and velocity (nv,) due at the end of the next tick."""
         self._next = (q.copy(), v.copy())

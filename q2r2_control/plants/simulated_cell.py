@@ -89,6 +89,14 @@ class SimulatedCell:
         self._last_command = now
         return None
 
+    def command_velocities(self, v: Array, now: float) -> str | None:
+        """Move all joints on at velocities ``v`` (nv,) [rad/s] that came at ``now`` [s], from where they are due."""
+        q = self._follower.q if self._tau is None else self.plant.state().q
+        setpoint = JointSetpoint(self.robot.joint_names, q, v)
+        if len(v) != len(self._columns):
+            return f"{len(v)} velocities for {len(self._columns)} joints"
+        return self.command_positions(setpoint, now)
+
     def command_torques(self, tau: Array, now: float) -> str | None:
         """Apply joint torques (nv,) [Nm] that came at ``now`` [s]; gravity is the sender's to bear."""
         if len(tau) != len(self._columns):

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import time
 
-from q2r2_control.control.controller import LONGEST_DT
-
 _SHORTEST_DT = 1e-6  # [s]
 
 
@@ -19,7 +17,7 @@ class LoopClock:
         self._wall_start = time.perf_counter()
 
     def wait(self) -> float:
-        """Let the next tick come; returns the time since the last one [s]."""
+        """Let the next tick come; returns the time since the last one [s], however long that was."""
         self._ticks += 1
         if not self._realtime:
             self.now = self._ticks * self._period
@@ -31,7 +29,7 @@ class LoopClock:
         before, self.now = self.now, time.monotonic()
         # Late wake-ups do not add up, since ticks are due on a grid; ticks that were missed are not made up for.
         self._due = max(self._due, self.now - self._period)
-        return min(max(self.now - before, _SHORTEST_DT), LONGEST_DT)
+        return max(self.now - before, _SHORTEST_DT)
 
     def after(self, duration: float) -> bool:
         """Whether ``duration`` [s] is over; half a period early, so that rounding adds or loses no tick."""

@@ -1,4 +1,4 @@
-"""What a control loop asks of the process that it runs in."""
+"""Signals and garbage collection of the process that runs a control loop."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from contextlib import contextmanager
 
 @contextmanager
 def stop_on_signals(stop: Callable[[], None]) -> Iterator[None]:
-    """Ctrl-C and SIGTERM ask for a stop instead of tearing the loop apart in mid-motion; only the main thread may."""
+    """Ctrl-C and SIGTERM call ``stop`` instead of interrupting the loop; only where this is the main thread."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -26,7 +26,7 @@ def stop_on_signals(stop: Callable[[], None]) -> Iterator[None]:
 
 @contextmanager
 def few_garbage_collections() -> Iterator[None]:
-    """Take all that exists out of garbage collection, which would otherwise cost the loop several ticks each time."""
+    """Exclude all existing objects from garbage collection, which would otherwise take several ticks each time."""
     gc.collect()
     gc.freeze()
     try:

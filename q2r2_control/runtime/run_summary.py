@@ -1,4 +1,4 @@
-"""What a run amounted to: figures gathered tick by tick in constant memory."""
+"""Summary of a run: figures gathered at every tick, in constant memory."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ import numpy as np
 import pinocchio as pin
 
 from q2r2_control.config.control import ControllerSettings
-from q2r2_control.drives.drive import DriveReport
+from q2r2_control.drives import DriveReport
 from q2r2_control.robot.robot import Robot
 from q2r2_control.runtime.torque_summary import TorqueStatistics, TorqueSummary
 from q2r2_control.types import ArmTarget, Array, Event, HandSample, Reference
 
-EVENTS_KEPT = 10_000  # the newest; no operator makes that many, but a broken button can
+EVENTS_KEPT = 10_000  # the newest ones; a broken button can cause more
 _REST = 1e-3  # [rad/s]
 
 
@@ -33,17 +33,17 @@ class Percentiles:
 class ArmSummary:
     """One arm, over the ticks in which it was engaged.
 
-    Errors: measured tool against the target that the operator asked for, whatever lies between them: lag, limits, the
-    other arm, and what the tool yields to a push, on its spring or by an admittance.
+    Errors are between the measured tool and the operator's target. They include lag, limits, the other arm, and how far
+    the tool yields to a push, by impedance or by admittance.
     """
 
     engaged_s: float
     position_error_mm_rms: float | None  # None: never engaged
     rotation_error_deg_rms: float | None
     gripper_changes: int
-    slip_mm_max: float  # largest slip of one engagement: how far the target went along with a tool held up
+    slip_mm_max: float  # largest slip of one engagement: how far the leash moved the target
     slip_deg_max: float
-    yielded_mm_max: float  # largest displacement of its target by the admittance, in position mode
+    yielded_mm_max: float  # largest displacement of the target by the admittance, in position mode
     yielded_deg_max: float
 
 
@@ -65,12 +65,14 @@ class RunSummary:
     fallback_ticks: int
     uncertified_ticks: int
     rejected_targets: int
-    at_rest: bool  # the reference stood still when the run ended
+    missed_ticks: int  # that were due and did not come, since the loop was late
+    stretched_s: float  # by how much that made the motion late
+    at_rest: bool  # the reference was at rest when the run ended
     torque: TorqueSummary | None  # None: position mode
     events: list[Event]
 
     def as_json(self) -> dict[str, Any]:
-        """Plain data for ``json.dumps``."""
+        """Data for ``json.dumps``."""
         data = asdict(self)
         data["events"] = [
             {"t": event.t, "arm": event.arm, "from": event.source, "to": event.destination, "reason": event.reason}
@@ -158,7 +160,7 @@ class RunStatistics:
         tools: dict[str, pin.SE3],
         engaged: dict[str, bool],
     ) -> None:
-        """Count one tick; ``tools`` are the poses that the targets of the tick before led to."""
+        """Count one tick; ``tools`` are the poses measured before the tick's command."""
         robot, control, report = self.robot, self.control, reference.report
         self._ticks += 1
         self._duration += dt
@@ -189,12 +191,12 @@ class RunStatistics:
                 figures.rotation += float(np.sum(pin.log3(error.rotation) ** 2))
 
     def add_latency(self, samples: list[HandSample], now: float) -> None:
-        """Count the time from the newest of the ``samples`` that a tick took in to its command, sent at ``now`` [s]."""
+        """Count the time from the receipt of a tick's newest sample to its command, sent at ``now`` [s]."""
         if samples:
             self.latency.add(now - max(max(sample.pose_stamp, sample.inputs_stamp) for sample in samples))
 
     def add_drive(self, dt: float, report: DriveReport) -> None:
-        """Count what the mode's own laws did in one tick."""
+        """Count one tick's impedance and wall, or its admittance."""
         if report.impedance is not None and report.wall is not None:
             self._torque.add(dt, report.impedance, report.wall)
         if report.admittance is not None:
@@ -203,8 +205,8 @@ class RunStatistics:
                 figures.yielded = max(figures.yielded, math.hypot(*arm.displacement[:3]))
                 figures.yielded_angle = max(figures.yielded_angle, math.hypot(*arm.displacement[3:]))
 
-    def summary(self, wall_time: float) -> RunSummary:
-        """The run so far; ``wall_time`` [s] is what it took."""
+    def summary(self, wall_time: float, missed_ticks: int = 0, stretched: float = 0.0) -> RunSummary:
+        """The run so far; ``wall_time`` and ``stretched`` [s] are what it took and how late the motion is."""
         tick = self.tick.percentiles()
         return RunSummary(
             ticks=self._ticks,
@@ -221,6 +223,8 @@ class RunStatistics:
             fallback_ticks=self._fallback,
             uncertified_ticks=self._uncertified,
             rejected_targets=self._rejected,
+            missed_ticks=missed_ticks,
+            stretched_s=stretched,
             at_rest=self._rest,
             torque=self._torque.summary(),
             events=list(self.events),

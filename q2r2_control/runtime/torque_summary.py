@@ -1,4 +1,4 @@
-"""What the torques of a run amounted to: the arms on their springs, and the wall between their measured links."""
+"""Summary of a run in torque mode: torques, deviation from the reference, and the wall between measured links."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class TorqueSummary:
     max_wall_force_n: float  # on one pair
     saturated_ticks: int  # some joint would have needed more torque than its limit
     rate_limited_ticks: int  # some joint's torque could not change as fast as it should
-    held_ticks: int  # without a usable measurement: gravity's last torque
+    held_ticks: int  # without a usable measurement: the last gravity torque was held
     off_reference_s: dict[str, float]  # of each arm: further from its reference than the impedance's error clip
 
 
@@ -38,13 +38,13 @@ class TorqueStatistics:
 
     @classmethod
     def of(cls, arms: tuple[str, ...]) -> TorqueStatistics:
-        """Of nothing yet."""
+        """Before the first tick, for the arms named."""
         return cls(dict.fromkeys(arms, 0.0))
 
     def add(self, dt: float, impedance: ImpedanceReport, wall: WallReport) -> None:
         """Count one tick of ``dt`` [s]."""
         self._ticks += 1
-        # A distance that is NaN, since nothing was measured, is less than none; such a tick counts as held.
+        # A NaN distance, where nothing was measured, compares as not less; such a tick counts as held.
         if wall.closest_distance < self._distance:
             self._distance, self._pair = wall.closest_distance, wall.closest_pair
         self._pressed.update(wall.pressing)

@@ -26,13 +26,13 @@ _FOLLOW = {"posture_gain": 10.0, "posture_speed": 1.5, "manipulability_gain": 0.
 
 
 @dataclass(slots=True)
-class LedSettings:
+class ExternalSettings:
     """What is allowed of arms that another controller moves; may be changed at run time."""
 
     tolerance: float = 0.01  # measured pairs may be closer than the least distance by this [m]
 
 
-def settings_to_lead(config: Config) -> Config:
+def settings_for_external_arms(config: Config) -> Config:
     """The cell's configuration with elbows that are free to follow."""
     arms = {
         name: arm.model_copy(update={"swivel": arm.swivel.model_copy(update={"gain": 0.0})})
@@ -41,14 +41,14 @@ def settings_to_lead(config: Config) -> Config:
     return config.model_copy(update={"arms": arms, "control": config.control.model_copy(update=_FOLLOW)})
 
 
-class LedArms:
+class ExternalArms:
     """What the controller is asked for, and what is looked at, where it only leads."""
 
     def __init__(
         self,
         robot: Robot,
         controller: CartesianController,
-        settings: LedSettings,
+        settings: ExternalSettings,
         streams: StreamSettings,
         watch: WatchSettings,
     ) -> None:

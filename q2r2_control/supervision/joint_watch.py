@@ -1,4 +1,4 @@
-"""Whether joint states can be believed: complete, finite, fresh, without jumps, and near what was commanded."""
+"""Whether a measured state can be believed: finite, fresh, without jumps, and near what was commanded."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from q2r2_control.config.supervision import SupervisionSettings
 from q2r2_control.types import Array, RobotState
 
 # Above what the joints may move between two states: noise, and stamps that a busy machine spreads.
@@ -19,19 +20,36 @@ NONE_YET = "no joint states yet"
 
 @dataclass(slots=True)
 class WatchSettings:
-    """What joint states have to be; may be changed at run time."""
+    """What measured states have to be; may be changed at run time."""
 
-    timeout: float = 0.1  # [s]
-    settle_time: float = 0.1  # that they have to be good and at rest before the arms are activated [s]
-    deviation: float = 0.15  # from the reference [rad]
+    timeout: float = 0.1  # without a state for this long is a fault [s]
+    # States that are not finite are bridged for this long [s]; 0: the first one is a fault.
+    unusable_time: float = 0.0
+    settle_time: float = 0.1  # that states have to be good and at rest before the arms are activated [s]
+    deviation: float = 0.15  # of a joint from the reference [rad]
     deviation_time: float = 0.5  # [s]
 
 
+def watch_settings(settings: SupervisionSettings, yields: bool) -> WatchSettings:
+    """What the cell's settings ask for; ``yields``: whether arms that are pushed leave their reference by design."""
+    return WatchSettings(
+        timeout=settings.state_timeout,
+        unusable_time=settings.unusable_time,
+        settle_time=settings.settle_time,
+        deviation=settings.max_deviation_torque if yields else settings.max_deviation,
+        deviation_time=settings.deviation_time,
+    )
+
+
 class JointWatch:
-    """Looks at every joint state. Times are receipt times [s]; arrays are (nv,)."""
+    """Looks at every measured state, whose stamp is when its oldest part was received [s]; arrays are (nv,)."""
 
     def __init__(
-        self, names: Sequence[str], velocity_limit: Array, settings: WatchSettings, source: Callable[[], str]
+        self,
+        names: Sequence[str],
+        velocity_limit: Array,
+        settings: WatchSettings,
+        source: Callable[[], str] = lambda: "",
     ) -> None:
         self._names, self._velocity_limit, self._settings = names, velocity_limit, settings
         self._source = source  # where states come from, as " from /node", or ""
@@ -41,9 +59,15 @@ class JointWatch:
         self._near_at: float | None = None
 
     def take(self, state: RobotState | str, now: float) -> None:
-        """Look at a joint state, or at what is wrong with it."""
+        """Look at a state, or at what is wrong with it."""
         if isinstance(state, str):
             self._fail(state)
+            return
+        if fault := self._unusable(state):
+            allowed = self._settings.unusable_time
+            if now - self._stamp > allowed:
+                bridged = f" for more than {1e3 * allowed:g} ms" if allowed else ""
+                self._fail(f"{fault}{bridged}; allowed: finite numbers")
             return
         last, self.state = self.state, state
         if last is None or self._still_since == math.inf:
@@ -59,23 +83,23 @@ class JointWatch:
 
     def settled(self, now: float) -> bool:
         """Whether states have been good and at rest for the settle time."""
-        fresh = self.state is not None and now - self.state.stamp <= self._settings.timeout
+        fresh = now - self._stamp <= self._settings.timeout
         return fresh and now - self._still_since >= self._settings.settle_time
 
     def check(self, now: float) -> str | None:
         """What is wrong now, or None."""
         if self.fault is not None:
             return self.fault
-        assert self.state is not None
-        if (age := now - self.state.stamp) > self._settings.timeout:
+        if (age := now - self._stamp) > self._settings.timeout:
             self._fail(f"no joint states{self._source()} for {age:.3f} s; allowed: {self._settings.timeout:g}")
         return self.fault
 
     def deviates(self, reference: Array, now: float) -> str | None:
-        """Says so where the arms have been too far from ``reference`` for too long."""
+        """One line where the arms have been too far from ``reference`` for too long, else None."""
         assert self.state is not None
+        allowed = self._settings.deviation
         deviation = np.abs(self.state.q - reference)
-        if self._near_at is None or deviation.max() <= self._settings.deviation:
+        if self._near_at is None or deviation.max() <= allowed:
             self._near_at = now
             return None
         if now - self._near_at <= self._settings.deviation_time:
@@ -83,12 +107,30 @@ class JointWatch:
         worst = int(deviation.argmax())
         return (
             f"{self._names[worst]} is {deviation[worst]:.3f} rad from its reference for {now - self._near_at:.1f} s; "
-            f"allowed: {self._settings.deviation:g} rad for {self._settings.deviation_time:g} s"
+            f"allowed: {allowed:g} rad for {self._settings.deviation_time:g} s"
         )
 
     def accept(self) -> None:
         """Believe from now on what :meth:`settled` found good."""
         self.fault, self._near_at = None, None
+
+    def accept_at_once(self, state: RobotState, now: float) -> None:
+        """Believe ``state`` without waiting: the arms are known to be at rest there."""
+        self.state = state
+        self._begin(state.q, now)
+        self.accept()
+
+    @property
+    def _stamp(self) -> float:
+        return -math.inf if self.state is None else self.state.stamp
+
+    def _unusable(self, state: RobotState) -> str | None:
+        for what, values in (("position", state.q), ("velocity", state.v)):
+            # The usual case costs one sum; the joint is looked for only where there is something to say.
+            if not math.isfinite(values.sum()) and not np.isfinite(values).all():
+                worst = int(np.flatnonzero(~np.isfinite(values))[0])
+                return f"measured {what} of {self._names[worst]} = {values[worst]}"
+        return None
 
     def _begin(self, q: Array, now: float) -> None:
         self._still_since, self._still_at = now, q

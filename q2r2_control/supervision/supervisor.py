@@ -1,15 +1,17 @@
-"""When the controller may move the arms: activation, loss, pause, stop, homing. Knows no ROS; times are passed in.
+"""When the controller may move the arms: activation, loss, pause, stop, homing. The same object for every loop.
 
     inactive --joint states good and at rest--> active --fault--> braking --at rest--> inactive
                                                 active --stop--> braking --at rest--> stopped --reset--> inactive
 
-Inactive and stopped command nothing, so that whoever else holds the arms is not disturbed. Activation starts the
+Inactive and stopped command nothing, so that whatever else holds the arms is not disturbed. Activation starts the
 reference at the measured posture and forgets all targets: nothing moves until a stream of targets begins anew at the
-tool, see :mod:`target_stream`. A fault brakes along the controller's certified stop.
+tool, see :mod:`target_stream`. A fault brakes along the controller's certified stop. Knows no ROS and no clock: times
+are passed in.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from enum import StrEnum
 
 import numpy as np
@@ -17,15 +19,19 @@ import pinocchio as pin
 
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.robot.robot import Robot
-from q2r2_control.supervision.external_arms import LedArms
+from q2r2_control.supervision.external_arms import ExternalArms
 from q2r2_control.supervision.homing import Homing
 from q2r2_control.supervision.joint_watch import NONE_YET, JointWatch, WatchSettings
-from q2r2_control.supervision.sequence_watch import SequenceWatch
-from q2r2_control.supervision.target_stream import Origins, Refusal, StreamSettings, TargetStream
+from q2r2_control.supervision.target_stream import Origins, Refusal, StreamSettings
+from q2r2_control.supervision.targets import Targets
 from q2r2_control.types import Reference, RobotState
 
 _REST = 1e-4  # of the reference [rad/s]
-_ASTRAY, _STILL = 0.02, 0.05  # a joint that stands still is not where the reference is [rad], [rad/s]
+# A joint that stands still this far from the reference may have nothing that moves it [rad], [rad/s].
+_OFF_REFERENCE, _STILL = 0.02, 0.05
+
+# What the mode of driving makes of the targets, of the measured state and a time [s]: an admittance displaces them.
+Displace = Callable[[dict[str, pin.SE3 | None], RobotState, float], dict[str, pin.SE3 | None]]
 
 
 class Phase(StrEnum):
@@ -40,7 +46,7 @@ class Phase(StrEnum):
 class Supervisor:
     """Decides at every tick what the controller is asked for, and whether its reference is commanded.
 
-    With ``led`` the reference only leads arms that another controller moves.
+    With ``external`` the reference only leads arms that another controller moves.
     """
 
     def __init__(
@@ -50,20 +56,20 @@ class Supervisor:
         streams: StreamSettings,
         watch: WatchSettings,
         origins: Origins | None = None,
-        led: LedArms | None = None,
+        external: ExternalArms | None = None,
+        displace: Displace | None = None,
     ) -> None:
-        self._controller, self._stream_settings, self._led = controller, streams, led
+        self._robot, self._controller, self._external = robot, controller, external
+        self._displace = displace
         self._origins = origins or Origins()
         self._home = {arm: robot.tool_pose(robot.home, arm) for arm in robot.arms}
-        self._streams = {arm: TargetStream(streams) for arm in robot.arms}
-        self._sequences = {arm: SequenceWatch() for arm in robot.arms}
+        self._targets = Targets(robot.arms, streams, self._origins)
         self._watch = JointWatch(robot.joint_names, robot.velocity_limit, watch, self._origins.joint_states)
         self._homing: Homing | None = None
         self._stopped: str | None = None  # why it takes a reset
         self._last: Reference | None = None
         self.phase = Phase.INACTIVE
         self.paused = False
-        self.ceased: dict[str, str] = {}  # arms that hold since their targets ceased, with a line that says so
         self.events: list[str] = []  # what happened, for the log; taken by whoever writes it
 
     @property
@@ -76,6 +82,11 @@ class Supervisor:
     @property
     def homing(self) -> bool:
         return self._homing is not None
+
+    @property
+    def state_is_good(self) -> bool:
+        """Whether the newest measured state can be believed."""
+        return self._watch.fault is None
 
     @property
     def trusted(self) -> bool:
@@ -92,11 +103,16 @@ class Supervisor:
 
     def follows(self, arm: str) -> bool:
         """Whether an arm follows its targets."""
-        return self.phase is Phase.ACTIVE and self._streams[arm].following
+        return self.phase is Phase.ACTIVE and self._targets.follows(arm)
 
     def target_age(self, arm: str, now: float) -> float:
-        """Since the last target of an arm that was a pose [s]."""
-        return now - self._streams[arm].stamp
+        """Time since the last target of an arm that was a pose [s]."""
+        return self._targets.age(arm, now)
+
+    @property
+    def ended_targets(self) -> list[str]:
+        """A line for each arm that holds since its targets ended."""
+        return list(self._targets.ended.values())
 
     def take_joint_state(self, state: RobotState | str, now: float) -> None:
         """A joint state, or what is wrong with it."""
@@ -105,38 +121,26 @@ class Supervisor:
         if self.phase is Phase.INACTIVE and self._watch.fault not in (None, before):
             self.events.append(f"joint states: {self._watch.fault}")
 
-    def take_target(self, arm: str, pose: pin.SE3 | None, now: float, number: int | None = None) -> Refusal | None:
+    def take_target(
+        self, arm: str, pose: pin.SE3 | None, now: float, number: int | None = None, measured: pin.SE3 | None = None
+    ) -> Refusal | None:
         """A target in the world frame, or None for one that was no pose; returns why it is not followed, or None.
 
-        ``number`` is the one among its publisher's messages, where the middleware tells.
+        ``number`` is the one among its publisher's messages, where the middleware tells; ``measured`` the tool's pose
+        at the measured state, which is computed where it is needed and not given.
         """
-        stream = self._streams[arm]
-        crowd = None if number is None else self._crowd(arm, number, now)
-        refusal = None if pose is None else stream.offer(pose, self._controller.tool_pose(arm), now)
-        if crowd is not None:
-            stream.drop()
-            return crowd
-        if pose is None:
-            return None
-        if why := self._no_targets():
-            stream.drop()
-            return Refusal("stream", why)
-        if refusal is None:
-            self.ceased.pop(arm, None)
-            return None
-        return Refusal("stream", refusal)
+        tools = [self._controller.tool_pose(arm)]
+        if not self._targets.follows(arm) and self._external is None and self._watch.state is not None:
+            tools.append(self._robot.tool_pose(self._watch.state.q, arm) if measured is None else measured)
+        return self._targets.take(arm, pose, tools, now, number, self.no_targets)
 
-    def _crowd(self, arm: str, number: int, now: float) -> Refusal | None:
-        """Says so where not one publisher alone has sent an arm's targets lately."""
-        breaks = self._sequences[arm].take(number, now, self._stream_settings.timeout)
-        if breaks == 0:
-            return None
-        if breaks == 1:
-            line = f"another publisher took over{self._origins.targets(arm)}; the targets have to begin anew"
-            return Refusal("took over", line)
-        return Refusal("publishers", f"two publishers at a time{self._origins.targets(arm)}; allowed: one")
+    def release_target(self, arm: str) -> None:
+        """The sender of an arm's targets ended them: the arm holds, and the next target begins a stream."""
+        self._targets.release(arm)
 
-    def _no_targets(self) -> str | None:
+    @property
+    def no_targets(self) -> str | None:
+        """Why no arm may follow targets now, or None."""
         if self.phase is not Phase.ACTIVE:
             return f"the controller is {self.phase}"
         if self.paused:
@@ -151,7 +155,7 @@ class Supervisor:
             return None
         if self.phase is Phase.ACTIVE:
             self._look(now)
-        reference = self._step(self._targets(now, dt), dt)
+        reference = self._step(self._wanted(now, dt), dt)
         self._last = reference
         if self.phase is Phase.ACTIVE:
             self._compare(reference, now)
@@ -162,23 +166,27 @@ class Supervisor:
 
     def _step(self, targets: dict[str, pin.SE3 | None], dt: float) -> Reference:
         state = self._watch.state
-        if self._led is None or state is None or self.phase is not Phase.ACTIVE:
+        if state is None or self.phase is not Phase.ACTIVE:
             return self._controller.step(targets, dt)
-        reference = self._controller.step(self._led.targets(targets), dt, state.q)
-        self._led.note(reference)
+        if self._displace is not None:
+            targets = self._displace(targets, state, dt)
+        if self._external is None:
+            return self._controller.step(targets, dt)
+        reference = self._controller.step(self._external.targets(targets), dt, state.q)
+        self._external.note(reference)
         return reference
 
     def _compare(self, reference: Reference, now: float) -> None:
-        """Whether the arms are where the reference is. Those that are only led may have nobody who moves them."""
+        """Whether the arms are where the reference is. Those that another controller moves may have none that does."""
         away, state = self._watch.deviates(reference.q, now), self._watch.state
-        if self._led is None or state is None:
+        if self._external is None or state is None:
             if away is not None:
                 self.stop(away)
-        elif too_close := self._led.too_close(state):
+        elif too_close := self._external.too_close(state):
             self.stop(too_close)
         else:
-            holding = [arm for arm, stream in self._streams.items() if not stream.following]
-            if behind := away or self._led.left_behind(state, holding, now):
+            holding = [arm for arm in self._targets.arms if not self._targets.follows(arm)]
+            if behind := away or self._external.left_behind(state, holding, now):
                 self.start_over(behind, now)
 
     def pause(self, paused: bool) -> None:
@@ -186,41 +194,44 @@ class Supervisor:
         self.paused = paused
         self._forget_targets()
 
-    def stalled(self, duration: float, now: float) -> None:
+    def stalled(self, duration: float, now: float, exclusive: bool = False) -> None:
         """The loop stood still for ``duration`` [s]: what it was about to command is of the past.
 
-        The arms have come to rest by themselves meanwhile, so there is nothing to brake, and going on from the
-        reference would be a jump. They are activated anew where they rest; targets that waited are no new stream.
+        Targets are forgotten; those that waited are no new stream. With ``exclusive`` nothing else can have moved the
+        arms or taken their commands: they rest where they were commanded to be, and the reference brakes from there,
+        one period a tick. Otherwise going on from the reference could be a jump, and the arms are activated anew where
+        they rest.
         """
         if self.phase not in (Phase.ACTIVE, Phase.BRAKING):
             return
         fault = f"the control loop stood still for {duration:.2f} s"
+        if exclusive:
+            self.events.append(fault)
+            self._forget_targets()
+            return
         self._watch.take(fault, now)
         self._brake(fault)
         self.phase = Phase.INACTIVE if self._stopped is None else Phase.STOPPED
 
     @property
-    def astray(self) -> bool:
-        """Whether a joint stands still elsewhere than in the reference: maybe nobody moves it. One that lags moves."""
+    def off_reference(self) -> bool:
+        """Whether a joint stands still away from the reference: maybe nothing moves it. A joint that lags moves."""
         state = self._watch.state
         if self.phase is not Phase.ACTIVE or self._last is None or state is None:
             return False
-        return bool(((np.abs(state.q - self._last.q) > _ASTRAY) & (np.abs(state.v) < _STILL)).any())
+        return bool(((np.abs(state.q - self._last.q) > _OFF_REFERENCE) & (np.abs(state.v) < _STILL)).any())
 
-    def abandon(self, fault: str, now: float) -> None:
-        """Nobody takes the commands, or somebody else than before: whoever it is, the reference may have gone on.
+    def let_go(self, fault: str, now: float) -> None:
+        """Nothing takes the commands, or something else than before, and the reference may have gone on meanwhile.
 
-        Then nothing more is commanded, not even the way to rest, which would be a jump to who comes.
+        Then nothing more is commanded, not even the way to rest, which would be a jump to the new receiver.
         """
         if self.phase is Phase.ACTIVE:
             self.start_over(fault, now)
             self.phase = Phase.INACTIVE
 
     def start_over(self, fault: str, now: float) -> None:
-        """Nobody goes where the reference goes: brake, and be activated anew where the arms are then.
-
-        Whoever takes commands next is not to be asked for a reference that went on meanwhile.
-        """
+        """The arms do not go where the reference goes: brake, and be activated anew where the arms are then."""
         if self.phase is Phase.ACTIVE:
             self._watch.take(fault, now)
             self._brake(fault)
@@ -237,9 +248,7 @@ class Supervisor:
         if self.phase is Phase.BRAKING:
             return "the arms are braking"
         self._stopped, self.paused = None, False
-        self.ceased.clear()
-        for stream in self._streams.values():
-            stream.reset()
+        self._targets.reset()
         self._homing = None
         if self.phase is Phase.STOPPED:
             self.phase = Phase.INACTIVE
@@ -253,13 +262,20 @@ class Supervisor:
         self._homing = Homing(self._tools(), self._home)
         return None
 
+    def activate(self, state: RobotState, now: float) -> None:
+        """Start at once at ``state``, at which the arms are known to be at rest. Raises :class:`RobotError`."""
+        self._stopped, self.paused = None, False
+        self._targets.reset()
+        self._watch.accept_at_once(state, now)
+        self._activate()
+
     def _activate(self) -> None:
         state = self._watch.state
         assert state is not None
         self._controller.reset(state.q)
         self._forget_targets()
-        if self._led is not None:
-            self._led.begin()
+        if self._external is not None:
+            self._external.begin()
         self._watch.accept()
         self._last = None
         self.phase = Phase.ACTIVE
@@ -277,17 +293,11 @@ class Supervisor:
 
     def _forget_targets(self) -> None:
         self._homing = None
-        for stream in self._streams.values():
-            stream.drop()
+        self._targets.drop()
 
-    def _targets(self, now: float, dt: float) -> dict[str, pin.SE3 | None]:
-        for arm, stream in self._streams.items():
-            if stream.expire(now):
-                self.ceased[arm] = f"{arm}: targets{self._origins.targets(arm)} have ceased, the arm holds"
-                self.events.append(self.ceased[arm])
-        if self._homing is not None:
-            return self._homing.targets(dt)
-        return {arm: stream.pose for arm, stream in self._streams.items()}
+    def _wanted(self, now: float, dt: float) -> dict[str, pin.SE3 | None]:
+        self.events += self._targets.expire(now)
+        return self._targets.poses if self._homing is None else self._homing.targets(dt)
 
     def _look_home(self) -> None:
         if self._homing is not None and (outcome := self._homing.outcome(self._tools())):
@@ -295,4 +305,4 @@ class Supervisor:
             self.events.append(f"homing ended: {outcome}")
 
     def _tools(self) -> dict[str, pin.SE3]:
-        return {arm: self._controller.tool_pose(arm) for arm in self._streams}
+        return {arm: self._controller.tool_pose(arm) for arm in self._targets.arms}

@@ -10,11 +10,13 @@ tool, as those of an operator do who engages anew while the targets never cease.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import pinocchio as pin
+
+from q2r2_control.config.timeouts import STREAM_TIMEOUT
 
 # A jump that no hand makes between two messages, and so the beginning of something new [m], [rad].
 _JUMP, _TURN = 0.05, 0.25
@@ -24,7 +26,7 @@ _JUMP, _TURN = 0.05, 0.25
 class StreamSettings:
     """What a stream of targets is; may be changed at run time."""
 
-    timeout: float = 0.15  # [s]
+    timeout: float = STREAM_TIMEOUT  # [s]
     engage_distance: float = 0.03  # [m]
     engage_angle: float = 0.3  # [rad]
 
@@ -73,15 +75,22 @@ class TargetStream:
         self.reset()
         return was_following
 
-    def offer(self, pose: pin.SE3, tool: pin.SE3, now: float) -> str | None:
-        """Take a target; ``tool`` is the reference's tool pose. Returns why it is not followed, or None."""
+    def offer(self, pose: pin.SE3, tools: Sequence[pin.SE3], now: float) -> str | None:
+        """Take a target; returns why it is not followed, or None.
+
+        ``tools`` are the poses that count as the tool's: the reference's, and the measured one where it is known. An
+        arm that was pushed away from its reference is engaged where it is.
+        """
         self.expire(now)
         begins, self.stamp = self._begins(pose), now
         self._last = pose
         if self.following:
             self.pose = pose
             return None
-        distance, angle = apart(pose, tool)
+        offsets = [apart(pose, tool) for tool in tools]
+        # Position and rotation may each be near another one of the poses: an operator's first target has the
+        # measured position and the commanded rotation.
+        distance, angle = min(way for way, _ in offsets), min(turn for _, turn in offsets)
         near = distance <= self._settings.engage_distance and angle <= self._settings.engage_angle
         if begins and near:
             self.pose = pose

@@ -1,4 +1,4 @@
-"""Streams of targets that a controller has to survive: hostile ones, drawn at random from a seed."""
+"""Hostile streams of targets, drawn at random from a seed."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 
 
-class Asked(NamedTuple):
+class Request(NamedTuple):
     """What one tick asks of the controller."""
 
     targets: dict[str, Any]
     unusable: frozenset[str]  # arms whose target has to be reported as rejected
 
 
-# From the tick within the segment and the last reference's joint positions (nv,) to what is asked.
-Stream = Callable[[int, Array], Asked]
+# From the tick within the segment and the last reference's joint positions (nv,) to the request.
+Stream = Callable[[int, Array], Request]
 _NONE: frozenset[str] = frozenset()
 _WORKSPACE = np.array([[-0.6, -1.1, -0.1], [1.1, 1.1, 1.4]])  # [m]
 
@@ -62,8 +62,8 @@ class Adversary:
         return pin.SE3(pin.exp3(self._random.normal(size=3) * 1.5), self._random.uniform(*_WORKSPACE))
 
     def _constant(self, targets: dict[str, Any]) -> Stream:
-        asked = Asked(targets, _NONE)
-        return lambda tick, q: asked
+        request = Request(targets, _NONE)
+        return lambda tick, q: request
 
     def _poses(self) -> dict[str, Any]:
         return {arm: self.pose() for arm in self._arms}
@@ -78,7 +78,7 @@ class Adversary:
         return self._constant(dict(self._home))
 
     def _teleport(self) -> Stream:
-        """Somewhere else every now and then, each time for as long."""
+        """A new pose every so many ticks, the same number each time."""
         return self._renewed(int(self._random.integers(5, 800)), self._poses)
 
     def _postures(self) -> Stream:
@@ -93,18 +93,18 @@ class Adversary:
         return self._renewed(int(self._random.integers(100, 1500)), poses)
 
     def _renewed(self, period: int, poses: Callable[[], dict[str, Any]]) -> Stream:
-        asked = Asked({}, _NONE)
+        request = Request({}, _NONE)
 
-        def stream(tick: int, q: Array) -> Asked:
-            nonlocal asked
+        def stream(tick: int, q: Array) -> Request:
+            nonlocal request
             if tick % period == 0:
-                asked = Asked(poses(), _NONE)
-            return asked
+                request = Request(poses(), _NONE)
+            return request
 
         return stream
 
     def _crossing(self) -> Stream:
-        """Each tool is asked to be where another one started."""
+        """The target of each tool is where another one started."""
         return self._constant({arm: self._home[self._others[arm]] for arm in self._arms})
 
     def _same_point(self) -> Stream:
@@ -112,7 +112,7 @@ class Adversary:
         return self._constant({arm: pin.SE3(pose.rotation, place) for arm, pose in self._home.items()})
 
     def _unreachable(self) -> Stream:
-        """Metres away, or farther than any cell is large."""
+        """Metres away, or astronomically far."""
         size = 10.0 ** self._random.uniform(0.3, 200.0 if self._random.random() < 0.2 else 2.0)
         return self._constant(self._moved(lambda: self._random.normal(size=3) * size))
 
@@ -121,34 +121,34 @@ class Adversary:
         return self._constant(self._moved(lambda: np.array([*self._random.uniform(-0.3, 0.3, size=2), -depth])))
 
     def _random_walk(self) -> Stream:
-        """Speeds far above what an arm can do; the walk is drawn back to home."""
+        """Faster than an arm can move; drawn back towards home."""
         speed, turn = self._random.uniform(0.001, 0.05), self._random.uniform(0.0, 0.1)
         poses = {arm: pose.copy() for arm, pose in self._home.items()}
 
-        def stream(tick: int, q: Array) -> Asked:
+        def stream(tick: int, q: Array) -> Request:
             for arm, pose in poses.items():
                 back = 0.002 * (self._home[arm].translation - pose.translation)
                 rotation = pin.exp3(turn * self._random.normal(size=3)) @ pose.rotation
                 poses[arm] = pin.SE3(rotation, pose.translation + back + speed * self._random.normal(size=3))
-            return Asked(dict(poses), _NONE)
+            return Request(dict(poses), _NONE)
 
         return stream
 
     def _garbage(self) -> Stream:
-        """Something useless for some arms, and for arms that there are not."""
+        """Unusable targets for some arms, and targets for an arm that does not exist."""
 
-        def stream(tick: int, q: Array) -> Asked:
+        def stream(tick: int, q: Array) -> Request:
             targets: dict[str, Any] = self._poses()
             unusable = set()
             for arm in (*self._arms, "nobody"):
                 if self._random.random() < 0.5:
-                    targets[arm] = self._useless()
+                    targets[arm] = self._unusable()
                     unusable.add(arm)
-            return Asked(targets, frozenset(unusable))
+            return Request(targets, frozenset(unusable))
 
         return stream
 
-    def _useless(self) -> Any:
+    def _unusable(self) -> Any:
         kind = int(self._random.integers(7))
         pose = self.pose()
         if kind == 0:
@@ -166,44 +166,44 @@ class Adversary:
         return pose
 
     def _missing_arms(self) -> Stream:
-        """An arm is asked something in one tick and nothing in the next."""
+        """Each arm has a target in some ticks and none in others."""
         poses = self._poses()
 
-        def stream(tick: int, q: Array) -> Asked:
+        def stream(tick: int, q: Array) -> Request:
             present = {arm: pose for arm, pose in poses.items() if self._random.random() < 0.7}
-            return Asked(present | {arm: None for arm in self._arms if self._random.random() < 0.2}, _NONE)
+            return Request(present | {arm: None for arm in self._arms if self._random.random() < 0.2}, _NONE)
 
         return stream
 
     def _elbow(self) -> Stream:
-        """One tool reaches for the middle of another arm, which reaches elsewhere."""
+        """One tool reaches for the elbow or wrist of another arm, which moves elsewhere."""
         chaser = str(self._random.choice(self._arms))
         joint = int(self._robot.arms[self._others[chaser]].joints[3 if self._random.random() < 0.5 else 5]) + 1
-        asked = Asked({}, _NONE)
+        request = Request({}, _NONE)
         elsewhere = self._poses()
 
-        def stream(tick: int, q: Array) -> Asked:
-            nonlocal asked
+        def stream(tick: int, q: Array) -> Request:
+            nonlocal request
             if tick % 10 == 0:
                 pin.forwardKinematics(self._robot.model, self._data, q)
                 there = pin.SE3(self._home[chaser].rotation, self._data.oMi[joint].translation.copy())
-                asked = Asked(elsewhere | {chaser: there}, _NONE)
-            return asked
+                request = Request(elsewhere | {chaser: there}, _NONE)
+            return request
 
         return stream
 
     def _chatter(self) -> Stream:
         """Back and forth at every tick."""
-        pair = [Asked(self._poses(), _NONE), Asked(self._poses(), _NONE)]
+        pair = [Request(self._poses(), _NONE), Request(self._poses(), _NONE)]
         return lambda tick, q: pair[tick % 2]
 
     def _shaking(self) -> Stream:
-        """As fast as the tool can go or faster, sideways towards the other arm."""
+        """Oscillates at up to more than the tool's speed, mainly towards the other arm."""
         size, rate = self._random.uniform(0.05, 0.6), self._random.uniform(0.005, 0.1)
         along = self._random.normal(size=3) * [0.3, 1.0, 0.3]
 
-        def stream(tick: int, q: Array) -> Asked:
+        def stream(tick: int, q: Array) -> Request:
             by = size * np.sin(rate * tick) * along
-            return Asked(self._moved(lambda: by), _NONE)
+            return Request(self._moved(lambda: by), _NONE)
 
         return stream

@@ -1,9 +1,15 @@
-"""Checks every promise of the Cartesian controller at every tick, from its references alone."""
+"""The contract of the Cartesian controller, checked at every tick from its references alone.
+
+One checker for tests, soaks and live runs: :meth:`Contract.check` raises at the first promise that is broken,
+:meth:`Contract.observe` only keeps the worst margin of each.
+"""
 
 from __future__ import annotations
 
 import math
-from typing import Any
+from collections import deque
+from dataclasses import dataclass, field
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -11,12 +17,79 @@ import numpy.typing as npt
 from q2r2_control.config.control import ControllerSettings
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, Reference
-from q2r2_control.verification.margins import contract_margins
 
 LONGEST_DT = 0.1  # [s]
+_NEWEST = 5000  # ticks whose accelerations are kept
 _ROUNDING = 4.0 * np.finfo(np.float64).eps  # of a difference, relative to the numbers
-_BETWEEN_SHARE, _BETWEEN_SAMPLES = 0.02, 4
+_RELATIVE = 1e-9  # to which the contract promises limits
+_COAL = 2e-6  # how exactly Coal measures a capsule from a box [m]
+_BETWEEN_SHARE, _BETWEEN_SAMPLES = 0.02, 4  # share of the ticks that are sampled, and postures in each
 _STOP_SHARE, _STOP_SAMPLES = 0.005, 41
+
+_PROMISES = {  # key: name, unit, and what its value has to be
+    "exceptions": ("exceptions raised by step", "", "<=", 0.0),
+    "not_finite": ("references that are not finite", "", "<=", 0.0),
+    "unreported": ("unusable targets not reported", "", "<=", 0.0),
+    "refused": ("usable targets rejected", "", "<=", 0.0),
+    "idle": ("motion in a dt that is no time", "rad", "<=", 0.0),
+    "acceleration": ("acceleration / limit", "", "<=", 1.0 + _RELATIVE),
+    "velocity": ("velocity / limit", "", "<=", 1.0 + _RELATIVE),
+    "too_fast": ("started too fast: faster still", "rad/s", "<=", 0.0),
+    "position": ("room to position limits", "rad", ">=", -1e-11),
+    "outward": ("started outside limits: further out", "rad", "<=", 0.0),
+    "jump": ("travel in a tick / what v allows", "", "<=", 1.0),
+    "parabola": ("off constant acceleration or the stop", "rad", "<=", 1e-11),
+    "distance": ("distance - min_distance, at ticks", "m", ">=", 0.0),
+    "between": ("distance - min_distance, between ticks", "m", ">=", -_COAL),
+    "stop": ("distance - min_distance, full stops", "m", ">=", -_COAL),
+    "stop_position": ("room to position limits, full stops", "rad", ">=", -_RELATIVE),
+    "coal": ("reported distance off Coal's", "m", "<=", _COAL),
+    "bystanders": ("pairs apart while others recover", "m", ">=", -_COAL),
+    "uncertified": ("certificates lost", "", "<=", 0.0),
+    "approach": ("recovery: closer by, in a tick", "m", "<=", 1e-9),
+    "not_stopped": ("solver failed: off the stop", "rad", "<=", 1e-11),
+    "unsaid": ("solver failed: stop not reported", "", "<=", 0.0),
+}
+
+
+@dataclass(slots=True)
+class Margin:
+    """One promise: ``worst`` has to stay at or below ``allowed`` (``sense`` "<=") or at or above it (">=")."""
+
+    name: str
+    unit: str
+    sense: str
+    allowed: float
+    worst: float = field(init=False)
+    tick: int | None = None  # of the worst
+    checked: int = 0
+    violations: int = 0
+
+    def __post_init__(self) -> None:
+        self.worst = -math.inf if self.sense == "<=" else math.inf
+
+    def note(self, value: float, tick: int) -> bool:
+        """Keep the worst; False where the promise is broken. What is not a number breaks it."""
+        self.checked += 1
+        if self.sense == "<=":
+            worse, kept = not value <= self.worst, value <= self.allowed
+        else:
+            worse, kept = not value >= self.worst, value >= self.allowed
+        if worse and not math.isnan(self.worst):
+            self.worst, self.tick = value, tick
+        self.violations += not kept
+        return kept
+
+    def described(self, value: float) -> str:
+        """One value of this promise beside what is allowed."""
+        return f"{self.name}: {f'{value:.12g} {self.unit}'.rstrip()}, allowed {self.sense} {self.allowed:.12g}"
+
+
+class Checked(Protocol):
+    """What a contract has to know of its controller."""
+
+    robot: Robot
+    settings: ControllerSettings
 
 
 def time_of(dt: Any) -> float:
@@ -26,31 +99,44 @@ def time_of(dt: Any) -> float:
     return min(float(dt), LONGEST_DT)
 
 
-class ContractWatch:
-    """Keeps the worst margin of every promise; distances between ticks and during stops are sampled, by Coal.
+class Contract:
+    """Checks one reference after another, from a start at ``q`` [rad], ``v`` [rad/s], (nv,) each; by default at home.
 
     A start outside the limits, too fast or in penetration is allowed: for what it breaks the promise is to recover, and
-    the margins say so. Ticks longer than one substep move along several parabolas that a reference does not show; they
-    are checked at the ticks.
+    the margins say so. Distances between ticks and during full stops are measured by Coal, in ticks drawn by
+    ``random``, or in all of them with ``sample_all``. Ticks longer than one substep move along several parabolas that a
+    reference does not show; they are checked at the ticks.
     """
 
-    def __init__(self, robot: Robot, settings: ControllerSettings, random: np.random.Generator) -> None:
-        self.margins = contract_margins()
-        self.broken: list[str] = []  # keys of the margins that the last tick broke
-        self._robot, self._random = robot, random
+    def __init__(
+        self,
+        controller: Checked,
+        q: Array | None = None,
+        v: Array | None = None,
+        *,
+        random: np.random.Generator | None = None,
+        sample_all: bool = False,
+    ) -> None:
+        self.margins = {key: Margin(*row) for key, row in _PROMISES.items()}
+        self.ticks = self.fallbacks = self.uncertified = 0
+        self._broken: dict[str, float] = {}
+        robot, settings = controller.robot, controller.settings
+        self._robot, self._random = robot, np.random.default_rng(0) if random is None else random
+        self._sample_all = sample_all
         self._a = settings.acceleration_limit
         self._v_max = robot.velocity_limit * settings.velocity_scale
         self._lower = robot.position_lower + settings.position_margin
         self._upper = robot.position_upper - settings.position_margin
         self._min_distance = settings.min_distance
         self._substep = settings.max_substep
-        self._tick = 0
+        self.start(robot.home if q is None else q, v)
 
-    def start(self, q: Array, v: Array) -> None:
-        """The controller was reset to ``q`` [rad], ``v`` [rad/s], (nv,) each."""
+    def start(self, q: Array, v: Array | None = None) -> None:
+        """The controller was reset to ``q`` [rad], ``v`` [rad/s], (nv,) each; without ``v`` at rest."""
+        v = np.zeros_like(q) if v is None else v
         self._q, self._v = q.copy(), v.copy()
         self._outside = np.maximum(np.maximum(self._lower - q, q - self._upper), 0.0)
-        self._excess = np.maximum(np.abs(v) - self._v_max, 0.0)
+        self._excess = self._excess_of(v)
         self._can_stop = self._stops_inside(q, v)
         self._slow = self._excess == 0.0
         distances = self._robot.distance_values(q)
@@ -59,39 +145,82 @@ class ContractWatch:
         # Whether a certificate has to be known from now on. A start at rest with all apart is its own.
         self._certain = self._from_rest and bool(self._apart.all())
         self._least = float(distances.min(initial=np.inf)) if self._certain else -np.inf
+        self._newest: deque[tuple[float, float]] = deque(maxlen=_NEWEST)  # duration [s], duration times |a|^2
 
-    def check(self, tick: int, reference: Reference, dt: Any, unusable: frozenset[str], failed: bool) -> list[str]:
-        """One tick; ``failed``: every solution of it was unusable. Returns the keys of the promises that it broke."""
-        self._tick, self.broken = tick, []
+    def check(
+        self, reference: Reference, dt: Any, unusable: frozenset[str] | None = None, failed: bool = False
+    ) -> None:
+        """Like :meth:`observe`. Raises :class:`AssertionError` with the broken promises and the values seen."""
+        broken = self.observe(reference, dt, unusable, failed)
+        if broken:
+            found = "; ".join(self.margins[key].described(value) for key, value in broken.items())
+            raise AssertionError(f"tick {self.ticks - 1}: {found}")
+
+    def observe(
+        self, reference: Reference, dt: Any, unusable: frozenset[str] | None = None, failed: bool = False
+    ) -> dict[str, float]:
+        """Check one tick of ``dt`` [s]. Returns the keys of the promises that it broke, with the values seen.
+
+        ``unusable``: arms whose target has to be reported as rejected, and no others; None: not checked.
+        ``failed``: every solution of this tick was unusable, so that the stop has to be executed.
+        """
+        self._broken = {}
         q, v, h, report = reference.q, reference.v, time_of(dt), reference.report
         finite = bool(np.isfinite(np.sum(q) + np.sum(v) + np.sum(reference.a)))
+        self._note("exceptions", 0.0)
         self._note("not_finite", float(not finite))
-        if not finite:
-            return self.broken
-        self._note("unreported", len(unusable.difference(report.rejected)))
-        self._note("refused", len(set(report.rejected) - unusable))
-        if h == 0.0:
-            self._note("idle", float(np.max(np.abs(q - self._q) + np.abs(v - self._v))))
-        else:
-            self._check_motion(q, v, reference.a, h)
-            if failed:
-                self._check_stopped(q, v, h, report.fallback)
-        self._check_limits(q, v)
-        self._check_distance(report.closest_distance, report.certified)
-        self._sample(q, v, h, report.closest_distance)
-        self._q, self._v = q, v
-        return self.broken
+        if finite:
+            if unusable is not None:
+                self._note("unreported", len(unusable.difference(report.rejected)))
+                self._note("refused", len(set(report.rejected) - unusable))
+            if h == 0.0:
+                self._note("idle", float(np.max(np.abs(q - self._q) + np.abs(v - self._v))))
+            else:
+                self._check_motion(q, v, reference.a, h)
+                if failed:
+                    self._check_stopped(q, v, h, report.fallback)
+            self._check_limits(q, v)
+            self._check_distance(report.closest_distance, report.certified)
+            self._sample(q, v, h, report.closest_distance)
+            self._count(reference, h)
+            self._q, self._v = q, v
+        self.ticks += 1
+        return self._broken
+
+    def raised(self) -> None:
+        """Count a tick in which ``step`` raised an exception instead of returning a reference."""
+        self._note("exceptions", 1.0)
+        self.ticks += 1
+
+    def tail_acceleration(self, duration: float = 0.5) -> float:
+        """Norm over the joints of the RMS acceleration over the last ``duration`` [s], in rad/s^2."""
+        total, time = 0.0, 0.0
+        for h, square in reversed(self._newest):
+            total, time = total + square, time + h
+            if time >= duration:
+                break
+        return math.sqrt(total / time)
+
+    @property
+    def fallback_share(self) -> float:
+        """Share of ticks that did not execute the solver's solution."""
+        return self.fallbacks / max(self.ticks, 1)
+
+    def _count(self, reference: Reference, h: float) -> None:
+        self.fallbacks += reference.report.fallback
+        self.uncertified += not reference.report.certified
+        self._newest.append((h, h * float(reference.a @ reference.a)))
 
     def _note(self, key: str, value: float) -> None:
-        if not self.margins[key].note(value, self._tick):
-            self.broken.append(key)
+        if not self.margins[key].note(value, self.ticks):
+            self._broken[key] = value
 
     def _check_motion(self, q: Array, v: Array, a: Array, h: float) -> None:
         speed = np.abs(v)
         change = np.abs(v - self._v) - _ROUNDING * speed
         self._note("acceleration", max(float(change.max()) / (self._a * h), float(np.abs(a).max()) / self._a))
-        way = np.abs(q - self._q) - _ROUNDING * np.abs(q)
-        self._note("jump", float(np.max(way / ((np.maximum(speed, np.abs(self._v)) + self._a * h) * h))))
+        travel = np.abs(q - self._q) - _ROUNDING * np.abs(q)
+        self._note("jump", float(np.max(travel / ((np.maximum(speed, np.abs(self._v)) + self._a * h) * h))))
         if h <= self._substep:
             self._parabola = bool(np.abs(self._q + 0.5 * h * (self._v + v) - q).max() <= 1e-11)
             self._note("parabola", 0.0 if self._parabola else self._off_the_stop(q, v, h))
@@ -117,25 +246,27 @@ class ContractWatch:
         return q + v * time - 0.5 * brake * time * time, v - brake * time
 
     def _check_limits(self, q: Array, v: Array) -> None:
-        excess = np.abs(v) - self._v_max
-        if self._slow.all():
-            self._note("velocity", float(np.max(np.abs(v) / self._v_max)))
-        else:
-            above = np.maximum(excess, 0.0)
-            self._note("too_fast", float(np.max(above - self._excess)))
-            self._excess = above
-            self._slow |= above == 0.0
+        excess = self._excess_of(v)
+        if self._slow.any():
+            self._note("velocity", float(np.max((np.abs(v) / self._v_max)[self._slow])))
+        if not self._slow.all():
+            self._note("too_fast", float(np.max((excess - self._excess)[~self._slow])))
+        self._excess = excess
+        self._slow |= excess == 0.0
         room = np.minimum(q - self._lower, self._upper - q)
-        if self._can_stop.all():
-            self._note("position", float(room.min()))
-            return
         if self._can_stop.any():
             self._note("position", float(room[self._can_stop].min()))
+        if self._can_stop.all():
+            return
         outside = np.maximum(-room, 0.0)
         coasting = np.abs(v) >= np.abs(self._v)
-        self._note("outward", float(np.max(np.where(coasting, outside - self._outside, 0.0))))
+        self._note("outward", float(np.max(np.where(coasting & ~self._can_stop, outside - self._outside, 0.0))))
         self._outside = outside
         self._can_stop |= self._stops_inside(q, v)
+
+    def _excess_of(self, v: Array) -> Array:
+        """Speed above the limit (nv,) [rad/s]."""
+        return np.asarray(np.maximum(np.abs(v) - self._v_max * (1.0 + _RELATIVE), 0.0))
 
     def _stops_inside(self, q: Array, v: Array) -> npt.NDArray[np.bool_]:
         """Joints inside their limits that full braking, begun one substep late, keeps there."""
@@ -144,21 +275,22 @@ class ContractWatch:
         return np.asarray(inside, dtype=np.bool_)
 
     def _check_distance(self, least: float, certified: bool) -> None:
-        if self._certain:
+        if self._certain or (self._from_rest and self._least >= self._min_distance):
             self._note("distance", least - self._min_distance)
-            self._note("uncertified", float(not certified))
         elif self._from_rest and self._least > -np.inf:
-            self._note("approach", min(self._least, self._min_distance) - least)
+            self._note("approach", self._least - least)
+        if self._certain:
+            self._note("uncertified", float(not certified))
         self._certain |= certified
         self._least = least
 
     def _sample(self, q: Array, v: Array, h: float, least: float) -> None:
-        """Every now and then look closer, at distances that the controller did not measure itself."""
-        draw = self._random.random()
+        """Measure distances that the controller did not measure itself."""
+        draw = 0.0 if self._sample_all else self._random.random()
         if draw < _BETWEEN_SHARE:
             values = self._robot.distance_values(q)
             if values.min(initial=np.inf) > 0.0:  # Coal's penetration depth is another quantity
-                self._note("truth", abs(float(values.min()) - least) if len(values) else 0.0)
+                self._note("coal", abs(float(values.min()) - least) if len(values) else 0.0)
             if not self._certain and self._apart.any():
                 self._note("bystanders", float(values[self._apart].min()) - self._min_distance)
             if self._certain and 0.0 < h <= self._substep:

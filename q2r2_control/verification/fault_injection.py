@@ -1,4 +1,4 @@
-"""What a soak does to a controller: segments of hostile targets, uneven ticks, failing solvers and odd starts."""
+"""What a soak feeds to a controller: segments of hostile targets, uneven ticks, failing solvers and bad starts."""
 
 from __future__ import annotations
 
@@ -32,10 +32,13 @@ LATE = 1.0  # [s]
 
 
 class FaultySolver:
-    """A real solver that fails as told; its solutions count as in time, so that a soak depends on no clock."""
+    """A real solver that fails as :attr:`fault` says: one of ``FAULTS``, or None for a healthy one.
 
-    def __init__(self, inner: Solver, random: np.random.Generator) -> None:
-        self._inner, self._random = inner, random
+    Its solve times are made up, so that no outcome depends on the load of the machine.
+    """
+
+    def __init__(self, inner: Solver, random: np.random.Generator | None = None) -> None:
+        self._inner, self._random = inner, np.random.default_rng(0) if random is None else random
         self.fault: str | None = None
 
     def solve(self, problem: QpProblem) -> QpSolution:
@@ -173,7 +176,7 @@ class Starts:
         return self._robot.home.copy()
 
     def _in_penetration(self) -> Array:
-        """On the way from home to a posture that is closer than allowed, where it has just become so."""
+        """A posture between home and a random one in penetration, where the distance has just become too small."""
         far = self._posture()
         for _ in range(50):
             if self._least(far) < 0.0:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import gc
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -13,27 +13,22 @@ import numpy as np
 import pinocchio as pin
 
 from q2r2_control.config import Config
-from q2r2_control.config.control import ControllerSettings
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.control.qp import make_solver
 from q2r2_control.errors import ConfigError
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, Reference
-from q2r2_control.verification.adversary import Asked
-from q2r2_control.verification.contract import ContractWatch, time_of
+from q2r2_control.verification.adversary import Request
+from q2r2_control.verification.contract import Checked, Contract, Margin, time_of
 from q2r2_control.verification.fault_injection import STOPPING_FAULTS, FaultySolver, Segment, segments
-from q2r2_control.verification.margins import Margin
 
 FEWEST_TICKS = 100
 _SETTLED = 0.1  # share of the ticks after which memory should have stopped growing
 MEMORY_ALLOWED = 5.0  # [MB]
 
 
-class Steppable(Protocol):
+class Steppable(Checked, Protocol):
     """What a soak needs of a controller: that of :class:`CartesianController`."""
-
-    robot: Robot
-    settings: ControllerSettings
 
     def reset(self, q: Array, v: Array | None = None) -> None: ...
 
@@ -42,7 +37,7 @@ class Steppable(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Violation:
-    """The first time that a promise was broken, with what was asked then."""
+    """The first time that a promise was broken, with the request at that tick."""
 
     promise: str
     tick: int
@@ -74,12 +69,12 @@ class SoakReport:
 
     @property
     def passed(self) -> bool:
-        """Whether every promise was kept, and memory."""
+        """Whether every promise was kept and memory did not grow."""
         lean = self.memory_growth_mb is None or self.memory_growth_mb <= MEMORY_ALLOWED
         return lean and not any(margin.violations for margin in self.margins)
 
     def as_json(self) -> dict[str, Any]:
-        """Plain data for ``json.dumps``."""
+        """Data for ``json.dumps``."""
         return asdict(self) | {"passed": self.passed}
 
 
@@ -110,7 +105,7 @@ class Soak:
     ) -> None:
         self._cell, self._controller, self._solver, self._seed = cell, controller, solver, seed
         self._progress = progress
-        self._watch = ContractWatch(controller.robot, controller.settings, np.random.default_rng([seed, 2]))
+        self._contract = Contract(controller, random=np.random.default_rng([seed, 2]))
         self._broken: dict[str, Violation] = {}
         self._counts = dict.fromkeys(("segments", "resets", "solver_faults", "fallbacks", "fallbacks_healthy"), 0)
         self._simulated = 0.0
@@ -130,14 +125,14 @@ class Soak:
             seed=self._seed,
             ticks=ticks,
             simulated_s=self._simulated,
-            margins=list(self._watch.margins.values()),
+            margins=list(self._contract.margins.values()),
             memory_growth_mb=None if before is None or after is None else after - before,
             broken=list(self._broken.values()),
             **self._counts,
         )
 
     def _ticks(self, ticks: int) -> Iterator[tuple[Segment, int]]:
-        """The segment of each tick and the tick within it; the controller is reset where a segment starts anew."""
+        """The segment of each tick and the tick within it; the controller is reset where a segment has a start."""
         left = ticks
         robot, settings = self._controller.robot, self._controller.settings
         for segment in segments(robot, settings.min_distance, np.random.default_rng([self._seed, 0])):
@@ -153,24 +148,23 @@ class Soak:
     def _reset(self, q: Array, v: Array) -> None:
         self._counts["resets"] += 1
         self._controller.reset(q, v)
-        self._watch.start(q, v)
+        self._contract.start(q, v)
         self._q, self._v = q, v
 
     def _tick(self, tick: int, segment: Segment, since: int) -> None:
         fault, dt = segment.fault_at(since), segment.dt()
-        asked = segment.stream(since, self._q)
+        request = segment.stream(since, self._q)
         self._solver.fault = fault
         try:
-            reference = self._controller.step(asked.targets, dt)
-        except Exception as error:  # that there is none is what is promised
-            self._watch.margins["exceptions"].note(1.0, tick)
-            self._keep(tick, segment, since, asked, dt, ["exceptions"], f"{type(error).__name__}: {error}")
+            reference = self._controller.step(request.targets, dt)
+        except Exception as error:  # the contract promises none
+            self._contract.raised()
+            self._keep(tick, segment, since, request, dt, ["exceptions"], f"{type(error).__name__}: {error}")
             self._reset(self._controller.robot.home, np.zeros_like(self._q))
             return
-        self._watch.margins["exceptions"].note(0.0, tick)
-        broken = self._watch.check(tick, reference, dt, asked.unusable, fault in STOPPING_FAULTS)
+        broken = self._contract.observe(reference, dt, request.unusable, fault in STOPPING_FAULTS)
         if broken:
-            self._keep(tick, segment, since, asked, dt, broken, "")
+            self._keep(tick, segment, since, request, dt, broken, "")
         if "not_finite" in broken:
             self._reset(self._controller.robot.home, np.zeros_like(self._q))
             return
@@ -181,14 +175,14 @@ class Soak:
         self._counts["fallbacks_healthy"] += reference.report.fallback and fault is None
 
     def _keep(
-        self, tick: int, segment: Segment, since: int, asked: Asked, dt: Any, broken: list[str], error: str
+        self, tick: int, segment: Segment, since: int, request: Request, dt: Any, broken: Iterable[str], error: str
     ) -> None:
         poses = {
             arm: target.homogeneous if isinstance(target, pin.SE3) else repr(target)
-            for arm, target in asked.targets.items()
+            for arm, target in request.targets.items()
         }
         for key in broken:
-            name = self._watch.margins[key].name
+            name = self._contract.margins[key].name
             found = Violation(name, tick, str(segment), since, self._q, self._v, poses, repr(dt), error)
             self._broken.setdefault(key, found)
 

@@ -1,11 +1,11 @@
-"""What a run's plots are drawn from: figures of every tick, thinned out to a bounded number of rows."""
+"""The data of a run's plots: figures of every tick, reduced to a bounded number of rows."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from q2r2_control.pipeline import Tick
 from q2r2_control.robot.robot import Robot
+from q2r2_control.runtime.recorder import Tick
 from q2r2_control.types import Array
 
 _FIRST_INTERVAL = 0.01  # between rows, as long as they fit [s]
@@ -15,11 +15,11 @@ _ARM_COLUMNS = 10
 class History:
     """Keeps at most ``max_rows`` rows: when they are full, each two become one and the interval doubles.
 
-    Extremes are of every tick, so that no peak is lost between rows; all else is as the interval ended.
+    Extremes cover every tick, so that no peak is lost between rows; other figures are those at the end of the interval.
     """
 
     def __init__(self, robot: Robot, acceleration_limit: float, max_rows: int = 4000) -> None:
-        """``acceleration_limit`` [rad/s^2] is what the acceleration's ratio is taken of; ``max_rows`` is even."""
+        """``acceleration_limit`` [rad/s^2] is what accelerations are divided by; ``max_rows`` is even."""
         self.robot = robot
         self._inverse_velocity_limit = 1.0 / robot.velocity_limit
         self._inverse_acceleration_limit = 1.0 / acceleration_limit

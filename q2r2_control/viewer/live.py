@@ -1,4 +1,4 @@
-"""A table that shows a run while it goes on."""
+"""The live table of a run."""
 
 from __future__ import annotations
 
@@ -13,9 +13,7 @@ from rich.live import Live
 from rich.markup import escape
 from rich.table import Table
 
-from q2r2_control.cli.tables import headset_table
-from q2r2_control.inputs.headset_check import HeadsetCheck
-from q2r2_control.pipeline import Tick
+from q2r2_control.runtime.recorder import Tick
 from q2r2_control.viewer.history import tracking_error
 
 _REFRESH_RATE = 6.0  # [Hz]
@@ -25,7 +23,7 @@ _LIMITS_SHOWN = 4
 
 
 class LiveTable:
-    """Listens to a run and shows its newest tick, drawn by a thread of its own: a tick only leaves a reference."""
+    """Shows the newest tick of a run. A separate thread draws; a tick only stores a reference."""
 
     def __init__(self, title: str, min_distance: float) -> None:
         self._title = title
@@ -36,7 +34,7 @@ class LiveTable:
         self._drawn = (time.monotonic(), 0)
 
     def __call__(self, tick: Tick) -> None:
-        """Listen to one tick."""
+        """Store one tick."""
         self._newest = tick
         self._count += 1
         if tick.reference.report.binding:
@@ -54,7 +52,7 @@ class LiveTable:
             sys.setswitchinterval(interval)
 
     def render(self) -> Table:
-        """The table of now."""
+        """The table at this moment."""
         tick, rate = self._newest, self._rate()
         table = Table(title=self._title, title_justify="left", min_width=76)
         table.add_column("", style="dim")
@@ -105,33 +103,3 @@ def _figure(value: float, unit: str, digits: int) -> str:
 def _some(names: list[str]) -> str:
     more = f" and {len(names) - _LIMITS_SHOWN} more" if len(names) > _LIMITS_SHOWN else ""
     return ", ".join(names[:_LIMITS_SHOWN]) + more if names else "-"
-
-
-class HeadsetDisplay:
-    """Shows looks at a headset: as a table on a terminal, elsewhere only when advice begins and ends."""
-
-    def __init__(self, console: Console) -> None:
-        self._console = console
-        self._live = Live(console=console, auto_refresh=False, transient=True) if console.is_terminal else None
-        self._drawn = -np.inf
-        self._advised = False
-
-    def __enter__(self) -> HeadsetDisplay:
-        if self._live is not None:
-            self._live.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._live is not None:
-            self._live.stop()
-
-    def show(self, check: HeadsetCheck) -> None:
-        """Show the newest look."""
-        if self._live is None:
-            if check.advice and not self._advised:
-                for line in check.advice:
-                    self._console.print(line, soft_wrap=True, highlight=False, markup=False)
-            self._advised = bool(check.advice)
-        elif time.monotonic() - self._drawn >= 1.0 / _REFRESH_RATE:
-            self._drawn = time.monotonic()
-            self._live.update(headset_table(check), refresh=True)

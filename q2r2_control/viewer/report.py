@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import itertools
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 
 from q2r2_control.runtime.run_summary import RunSummary
 from q2r2_control.types import Array
 from q2r2_control.viewer.history import History
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 _COLOURS = {"left": "#1f6fb2", "right": "#d9722b"}
 _LIMIT = "#b3202c"
@@ -25,7 +25,11 @@ _LABEL_ROOM = 0.09  # between two labels beside the joints' plot, in its units
 
 
 def draw_report(history: History, summary: RunSummary, min_distance: float, title: str, file: Path) -> None:
-    """Write the plots of ``history`` to ``file``; ``min_distance`` [m] is drawn as the limit it is."""
+    """Write the plots of ``history`` to ``file``; ``min_distance`` [m] is drawn as a limit."""
+    # Imported here, since it takes longer than all else that a command without a report needs.
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
     figure = Figure(figsize=(14.0, 15.0), layout="constrained")
     canvas = FigureCanvasAgg(figure)
     figure.suptitle(f"{title}\n{_headline(summary)}", fontsize=13)

@@ -1,4 +1,4 @@
-"""What arrives on the topics of a headset, as a table or line by line."""
+"""The topics of a headset, as a table or line by line: counts, rates, ages, last values."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def topic_table(title: str, topics: Mapping[str, TopicStatistics | None], silent
         if topic is None:
             row = ("0", "", "", "nothing yet")
         else:
-            row = (str(topic.count), f"{topic.rate:.0f}", f"{topic.age:.2f}", in_short(topic.last))
+            row = (str(topic.count), f"{topic.rate:.0f}", f"{topic.age:.2f}", short_text(topic.last))
         table.add_row(name, *row[:3], Text(f"timeout  {row[3]}" if name in silent else row[3]))
         if name in silent:
             table.rows[-1].style = "red"
@@ -30,15 +30,15 @@ def topic_table(title: str, topics: Mapping[str, TopicStatistics | None], silent
 
 
 def topic_line(name: str, topic: TopicStatistics | None, is_silent: bool) -> str:
-    """The same of one topic in one line."""
+    """One topic in one line."""
     prefix = f"{name}: timeout, " if is_silent else f"{name}: "
     if topic is None:
         return f"{prefix}nothing yet"
-    return f"{prefix}{topic.count} messages, {topic.rate:.0f} Hz, {topic.age:.2f} s old: {in_short(topic.last)}"
+    return f"{prefix}{topic.count} messages, {topic.rate:.0f} Hz, {topic.age:.2f} s old: {short_text(topic.last)}"
 
 
-def in_short(message: HandMessage) -> str:
-    """The values that people look at, rounded."""
+def short_text(message: HandMessage) -> str:
+    """A message's main values, rounded."""
     if isinstance(message, HandPose):
         return f"{_numbers(message.position)} m, quaternion {_numbers(message.quaternion)}"
     if isinstance(message, HandTwist):

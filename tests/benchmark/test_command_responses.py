@@ -24,7 +24,7 @@ def recording(steps: list[float], delays: list[float | None], noise: float = 0.0
 
 def test_a_latency_is_from_the_step_to_the_receipt_of_its_answer() -> None:
     (row,) = latency_report(250.0, LIMIT, {"way": recording([0.1, 0.2, 0.3, 0.9], [0.004, 0.004, 0.02, None])}).rows
-    assert (row.way, row.steps, row.missed) == ("way", 3, 0)
+    assert (row.path, row.steps, row.missed) == ("way", 3, 0)
     assert row.p50_ms == pytest.approx(5.0)
     assert row.max_ms == pytest.approx(21.0)
 

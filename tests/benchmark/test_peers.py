@@ -8,7 +8,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from q2r2_control.benchmark.peers.base import INSTALL, PEERS, Candidate, Setup, is_installed, make_peer
+from q2r2_control.benchmark.peers.base import INSTALL, PEERS, BenchController, Setup, is_installed, make_peer
 from q2r2_control.config import load_config
 from q2r2_control.robot.robot import Robot
 
@@ -22,12 +22,12 @@ def robot() -> Robot:
 
 
 @cache
-def peer_of(name: str) -> Candidate:
+def peer_of(name: str) -> BenchController:
     return make_peer(name, Setup(robot(), CONFIG, DT))
 
 
 @pytest.fixture(params=PEERS)
-def peer(request: pytest.FixtureRequest) -> Candidate:
+def peer(request: pytest.FixtureRequest) -> BenchController:
     """Each peer at rest at home."""
     if not is_installed(request.param):
         pytest.skip(f"{PEERS[request.param]} is not installed; {INSTALL}")
@@ -40,19 +40,19 @@ def home() -> dict[str, pin.SE3]:
     return {arm: robot().tool_pose(robot().home, arm) for arm in robot().arms}
 
 
-def test_a_peer_bears_its_name_and_says_what_it_cannot(peer: Candidate) -> None:
+def test_a_peer_has_a_name_and_says_what_it_cannot_keep(peer: BenchController) -> None:
     assert peer.name in PEERS
-    assert "certificate" in peer.cannot
+    assert "certificate" in peer.limitations
 
 
-def test_a_peer_that_is_where_it_should_be_stays(peer: Candidate) -> None:
+def test_a_peer_at_its_targets_stays_there(peer: BenchController) -> None:
     for _ in range(20):
         q, v = peer.step(home(), DT)
         np.testing.assert_allclose(q, robot().home, atol=1e-4)
         np.testing.assert_allclose(v, 0.0, atol=1e-2)
 
 
-def test_a_peer_reaches_a_target_within_the_velocity_limits(peer: Candidate) -> None:
+def test_a_peer_reaches_a_target_within_the_velocity_limits(peer: BenchController) -> None:
     turn = pin.exp3(np.array([0.1, -0.1, 0.2]))
     goals = {
         arm: pin.SE3(turn @ pose.rotation, pose.translation + np.array([0.02, 0.0, 0.05]))
@@ -67,7 +67,7 @@ def test_a_peer_reaches_a_target_within_the_velocity_limits(peer: Candidate) -> 
         assert np.linalg.norm(pin.log3(error.rotation)) < 0.05
 
 
-def test_velocities_are_those_of_the_positions(peer: Candidate) -> None:
+def test_velocities_are_those_of_the_positions(peer: BenchController) -> None:
     goals = {arm: pin.SE3(pose.rotation, pose.translation + 0.1) for arm, pose in home().items()}
     before = robot().home
     for _ in range(10):
@@ -76,7 +76,7 @@ def test_velocities_are_those_of_the_positions(peer: Candidate) -> None:
         before = q
 
 
-def test_a_peer_that_holds_stands_where_it_was(peer: Candidate) -> None:
+def test_a_peer_that_holds_stands_where_it_was(peer: BenchController) -> None:
     goals = {arm: pin.SE3(pose.rotation, pose.translation + 0.1) for arm, pose in home().items()}
     for _ in range(10):
         q, _ = peer.step(goals, DT)

@@ -1,4 +1,4 @@
-"""The bench measures everybody alike, does without peers that are not there, and counts their failures."""
+"""The bench measures all controllers in the same way, works without missing peers, and counts failures."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 
 from q2r2_control.benchmark.peers.base import INSTALL, PEERS, is_installed
 from q2r2_control.benchmark.tick_times import SCENARIOS, run_bench
-from q2r2_control.benchmark.timed_run import Poses, deeds_of, timed_run
+from q2r2_control.benchmark.timed_run import Poses, metrics_of, timed_run
 from q2r2_control.config import load_config
 from q2r2_control.errors import ConfigError
 from q2r2_control.robot.robot import Robot
@@ -20,10 +20,10 @@ CONFIG = load_config("config/dual_iiwa7.yaml")
 DT = 0.001
 
 
-class Pushing:
+class ConstantSpeed:
     """Turns one joint at a constant speed, and fails as told in some ticks."""
 
-    name, cannot = "pushing", "everything"
+    name, limitations = "constant speed", "everything"
 
     def __init__(self, joint: int, speed: float, fault: str = "", failing: tuple[int, ...] = ()) -> None:
         self._joint, self._speed, self._fault, self._failing = joint, speed, fault, failing
@@ -55,26 +55,26 @@ def stay(t: float, start: Poses) -> Poses:
     return start
 
 
-def test_what_was_done_is_measured_from_the_motion_alone(robot: Robot) -> None:
-    run = timed_run(Pushing(joint=0, speed=-0.5), robot, stay, 100, DT)
-    deeds = deeds_of(run, robot, CONFIG.control)
+def test_metrics_are_computed_from_the_motion_alone(robot: Robot) -> None:
+    run = timed_run(ConstantSpeed(joint=0, speed=-0.5), robot, stay, 100, DT)
+    metrics = metrics_of(run, robot, CONFIG.control)
     q = robot.home.copy()
     q[0] -= 110 * 0.5 * DT
     assert len(run.times_us) == 100
-    assert deeds.failures == 0
-    assert deeds.max_acceleration_ratio == pytest.approx(0.5 / DT / CONFIG.control.acceleration_limit)
-    assert deeds.max_velocity_ratio == pytest.approx(0.5 / robot.velocity_limit[0])
+    assert metrics.failures == 0
+    assert metrics.max_acceleration_ratio == pytest.approx(0.5 / DT / CONFIG.control.acceleration_limit)
+    assert metrics.max_velocity_ratio == pytest.approx(0.5 / robot.velocity_limit[0])
     way = np.linalg.norm(robot.tool_pose(q, "left").translation - robot.tool_pose(robot.home, "left").translation)
-    assert deeds.position_error_mm == pytest.approx(1e3 * way)
+    assert metrics.position_error_mm == pytest.approx(1e3 * way)
     distances = [min(pair.distance for pair in robot.distances(posture)) for posture in run.q]
-    assert deeds.min_distance_mm == pytest.approx(1e3 * min(distances))
+    assert metrics.min_distance_mm == pytest.approx(1e3 * min(distances))
     room = np.minimum(run.q - robot.position_lower, robot.position_upper - run.q) - CONFIG.control.position_margin
-    assert deeds.min_position_margin_rad == pytest.approx(room.min())
+    assert metrics.min_position_margin_rad == pytest.approx(room.min())
 
 
 @pytest.mark.parametrize("fault", ["raises", "not finite"])
 def test_a_failure_is_counted_and_the_arms_stand_still_in_that_tick(robot: Robot, fault: str) -> None:
-    run = timed_run(Pushing(0, 0.5, fault, failing=(3, 60)), robot, stay, 100, DT)
+    run = timed_run(ConstantSpeed(0, 0.5, fault, failing=(3, 60)), robot, stay, 100, DT)
     assert run.failures == 2
     np.testing.assert_array_equal(run.q[3], run.q[2])
     assert not run.v[3].any()

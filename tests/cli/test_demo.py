@@ -5,10 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from q2r2_control.config import Config, load_config
+from q2r2_control.inputs.factory import DEFAULT_TRAJECTORY
 from q2r2_control.inputs.scripted import ScriptedInput
-from q2r2_control.pipeline import DEFAULT_TRAJECTORY, Pipeline, Tick
+from q2r2_control.pipeline import Pipeline
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.robot.robot import Robot
+from q2r2_control.runtime.recorder import Tick
 from q2r2_control.types import Array, CommandMode
 from tests.support.watch import assert_torque_bounds
 

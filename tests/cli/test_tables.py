@@ -8,7 +8,8 @@ from dataclasses import replace
 from rich.console import Console
 
 from q2r2_control.cli.cell_report import check_cell
-from q2r2_control.cli.tables import arm_table, summary_table
+from q2r2_control.cli.summary_table import summary_table
+from q2r2_control.cli.tables import arm_table
 from q2r2_control.config import load_config
 from q2r2_control.pipeline import Pipeline
 

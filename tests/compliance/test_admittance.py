@@ -15,8 +15,8 @@ from q2r2_control.config.control import AdmittanceSettings
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.types import Array, Command, CommandMode, RobotState
+from q2r2_control.verification.contract import Contract
 from tests.control.cells import cell
-from tests.control.contract import Contract
 
 ROBOT = cell("dual_iiwa7").robot
 REST = np.zeros(len(ROBOT.home))

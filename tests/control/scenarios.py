@@ -13,7 +13,7 @@ Scenario = Callable[[float, Mapping[str, pin.SE3]], Targets]
 _RANDOM = np.random.default_rng(7)
 _PLACES = [
     {
-        side: pin.SE3(pin.SE3.Random().rotation, _RANDOM.uniform([0.1, -0.8, 0.1], [0.9, 0.8, 1.1]))
+        side: pin.SE3(pin.exp3(_RANDOM.normal(size=3) * 1.5), _RANDOM.uniform([0.1, -0.8, 0.1], [0.9, 0.8, 1.1]))
         for side in ("left", "right")
     }
     for _ in range(20)

@@ -15,14 +15,15 @@ from q2r2_control.control.controller import CartesianController
 from q2r2_control.control.qp import make_solver
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, StepStatus
-from tests.control.contract import Contract
+from q2r2_control.verification.contract import Contract
+from q2r2_control.verification.fault_injection import FaultySolver
 from tests.control.scenarios import SCENARIOS, circle, crossing
-from tests.control.test_scenarios import FaultySolver, controller_of, in_penetration, robot_of
+from tests.control.test_scenarios import controller_of, in_penetration, robot_of
 
 
 def iiwa7s() -> CartesianController:
     controller, solver = controller_of("iiwa7")
-    solver.fault = ""
+    solver.fault = None
     return controller
 
 
@@ -150,7 +151,7 @@ def test_a_dt_above_a_tenth_of_a_second_moves_no_further_than_that() -> None:
     assert [result.report.status for result in results] == [StepStatus.OK, StepStatus.DT_REJECTED]
 
 
-@pytest.mark.parametrize("joint", range(14))
+@pytest.mark.parametrize("joint", range(7))  # of the left arm, whose mirror image the right one is
 @pytest.mark.parametrize("side", [-1.0, 1.0], ids=["lower", "upper"])
 def test_started_outside_a_position_limit_it_returns_without_a_jump(joint: int, side: float) -> None:
     controller = iiwa7s()
@@ -188,7 +189,8 @@ def test_started_with_a_velocity_it_brakes_within_the_limits(share: float) -> No
         signs = np.random.default_rng(seed).choice([-1.0, 1.0], size=14)
         v = share * signs * controller.robot.velocity_limit
         q = 0.2 * controller.robot.home + np.array([0.0, -0.5, 0.0, -0.8, 0.0, 0.4, 0.0] * 2)
-        run(controller, lambda t, start: {}, 1.0, 0.002, q=q, v=0.3 * v if share < 1.5 else v)
+        contract = run(controller, lambda t, start: {}, 1.0, 0.002, q=q, v=0.3 * v if share < 1.5 else v)
+        assert contract.uncertified == 0
 
 
 def test_both_arms_can_leave_after_having_blocked_each_other() -> None:
@@ -210,10 +212,8 @@ def _state(controller: CartesianController) -> tuple[Array, Array]:
 def test_an_arm_that_holds_is_not_pushed_about_by_the_other() -> None:
     controller = iiwa7s()
     run(controller, SCENARIOS["one arm frozen"], 5.0, 0.005)
-    moved = (
-        controller.robot.tool_pose(controller.robot.home, "left").translation - controller.tool_pose("left").translation
-    )
-    assert np.linalg.norm(moved) < 0.02
+    home = controller.robot.tool_pose(controller.robot.home, "left")
+    assert np.linalg.norm(home.translation - controller.tool_pose("left").translation) < 0.4e-3
 
 
 def test_it_leaves_a_stretched_posture_in_little_more_than_the_time_the_acceleration_limit_needs() -> None:
@@ -251,15 +251,14 @@ def _towards(robot: Robot, arm: str, pose: pin.SE3) -> Array:
 def test_a_solver_that_never_answers_brings_the_arms_to_rest_along_the_certified_stop() -> None:
     robot = robot_of("iiwa7")
     faulty = FaultySolver(make_solver("daqp", 14, None))
-    faulty.share = 1.0
     controller = CartesianController(robot, solver=faulty)
     controller.reset(robot.home)
     start = {arm: controller.tool_pose(arm) for arm in robot.arms}
     contract = Contract(controller, robot.home)
     for tick in range(300):
-        faulty.fault = "" if tick < 200 else "no solution"
+        faulty.fault = None if tick < 200 else "none"
         reference = controller.step(crossing(0.0, start), 0.002)
-        contract.check(reference, 0.002)
+        contract.check(reference, 0.002, failed=tick >= 200)
         assert reference.report.certified
     assert not reference.v.any()
 
@@ -300,17 +299,14 @@ def test_the_report_names_what_holds_the_arms_back() -> None:
     assert not report.fallback
 
 
-def test_separation_between_ticks_holds_too() -> None:
-    """The reference moves along parabolas between ticks; Coal measures them densely."""
-    controller = iiwa7s()
-    robot, dt = controller.robot, 0.01
-    controller.reset(robot.home)
-    start = {arm: controller.tool_pose(arm) for arm in robot.arms}
-    for tick in range(150):
-        before_q, before_v = _state(controller)
-        reference = controller.step(crossing(0.0, start), dt)
-        if tick % 10:
-            continue
-        for share in np.linspace(0.0, 1.0, 8):
-            q = before_q + share * dt * before_v + 0.5 * share**2 * dt * (reference.v - before_v)
-            assert min(pair.distance for pair in robot.distances(q)) >= 0.02 - 1e-4
+def test_separation_holds_between_ticks_and_along_every_stop_where_the_arms_come_nearest() -> None:
+    """Without a buffer to speak of; Coal measures between all ticks, and along the full stop from each."""
+    settings = ControllerSettings(distance_buffer=1e-5, separation_gain=20.0)
+    controller = CartesianController(robot_of("iiwa7"), settings)
+    contract = Contract(controller, sample_all=True)
+    start = {arm: controller.tool_pose(arm) for arm in controller.robot.arms}
+    for _ in range(500):
+        contract.check(controller.step(crossing(0.0, start), settings.max_substep), settings.max_substep)
+    for promise in ("distance", "between", "stop"):
+        assert contract.margins[promise].checked == 500
+        assert contract.margins[promise].worst < 1e-4, "the arms come near"

@@ -9,7 +9,7 @@ import pytest
 from q2r2_control.config import Config, load_config
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.robot.robot import Robot
-from tests.control.contract import Contract
+from q2r2_control.verification.contract import Contract
 
 SHAPES = {
     "box": [0.1, 0.1, 0.5],

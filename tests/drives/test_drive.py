@@ -10,15 +10,16 @@ import numpy as np
 import pytest
 
 from q2r2_control.config import Config
-from q2r2_control.drives.drive import LONGEST_BLIND
 from q2r2_control.errors import ConfigError, PlantError
-from q2r2_control.pipeline import Pipeline, Tick
+from q2r2_control.pipeline import Pipeline
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.robot.robot import Robot
+from q2r2_control.runtime.recorder import Tick
 from q2r2_control.types import SIDES, Array, RobotState
 from tests.support.hands_input import HandsInput
 from tests.support.watch import Watch, assert_torque_bounds, cell
 
+BLIND = cell().supervision.unusable_time
 ENGAGED = 0.3  # hands that stay where they are have long engaged both arms [s]
 
 
@@ -171,7 +172,7 @@ def blinded(what: str, value: float, start: float, duration: float) -> tuple[Pip
 
 @pytest.mark.parametrize(("what", "value"), [("q", np.nan), ("v", np.inf)])
 def test_a_measurement_that_is_lost_for_a_moment_is_bridged_and_counted(what: str, value: float) -> None:
-    loop, watch, _ = blinded(what, value, 0.9, 0.8 * LONGEST_BLIND)
+    loop, watch, _ = blinded(what, value, 0.9, 0.8 * BLIND)
     summary = loop.run(1.6, realtime=False)
     assert summary.torque is not None
     assert summary.torque.held_ticks == sum(tick.impedance is not None and tick.impedance.held for tick in watch.ticks)
@@ -202,7 +203,7 @@ def test_a_measurement_that_stays_lost_ends_the_run_and_the_plant_s_own_servos_b
     held = [tick for tick in watch.ticks if tick.impedance is not None and tick.impedance.held]
     assert np.abs(held[0].reference.v).max() > 0.05, "it was moving"
     assert held[0].t > 0.9
-    assert watch.ticks[-1].t < 0.9 + LONGEST_BLIND + 1.0
+    assert watch.ticks[-1].t < 0.9 + BLIND + 1.0
     assert np.abs(watch.ticks[-1].reference.v).max() < 1e-3
     plant.broken = None
     plant.advance(0.2)

@@ -83,7 +83,7 @@ def test_reset_forgets_command_time_and_grippers(plant: KinematicPlant, robot: R
 
 
 def test_torque_mode_is_refused_with_what_is_allowed(plant: KinematicPlant, robot: Robot) -> None:
-    with pytest.raises(PlantError, match=r"torque.*follows position commands only"):
+    with pytest.raises(PlantError, match=r"torque.*follows position, velocity commands only"):
         plant.apply(replace(hold(robot.home), mode=CommandMode.TORQUE))
 
 

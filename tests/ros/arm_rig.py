@@ -16,7 +16,7 @@ from quest2ros.msg import OVR2ROSHapticFeedback, OVR2ROSInputs
 from std_msgs.msg import String
 from tf2_msgs.msg import TFMessage
 
-from q2r2_control.ros.bridge.base_node import COMMAND_QOS, STREAM_QOS
+from q2r2_control.ros.base_node import COMMAND_QOS, STREAM_QOS
 from q2r2_control.ros.bridge.messages import pose_of, stamped_pose, transform_message
 from tests.ros.processes import PATIENCE, Processes, RosProcess
 

@@ -19,7 +19,7 @@ from std_srvs.srv import SetBool, Trigger
 from tf2_msgs.msg import TFMessage
 
 from q2r2_control import Robot
-from q2r2_control.ros.bridge.base_node import COMMAND_QOS
+from q2r2_control.ros.base_node import COMMAND_QOS
 from q2r2_control.ros.bridge.messages import pose_message
 from q2r2_control.types import Array
 from tests.ros.processes import PATIENCE, Processes, RosProcess

@@ -16,7 +16,7 @@ from rclpy.executors import ExternalShutdownException
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 
-from q2r2_control.ros.bridge.base_node import STREAM_QOS
+from q2r2_control.ros.base_node import STREAM_QOS
 
 
 def main() -> None:

@@ -9,7 +9,7 @@ import rclpy
 from geometry_msgs.msg import PoseStamped
 from rclpy.executors import ExternalShutdownException
 
-from q2r2_control.ros.bridge.base_node import COMMAND_QOS
+from q2r2_control.ros.base_node import COMMAND_QOS
 
 
 def main() -> None:

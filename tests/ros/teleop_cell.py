@@ -16,7 +16,7 @@ from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory
 
 from q2r2_control import Robot
-from q2r2_control.ros.bridge.base_node import COMMAND_QOS, STREAM_QOS
+from q2r2_control.ros.base_node import COMMAND_QOS, STREAM_QOS
 from q2r2_control.types import Array
 from tests.ros.cell import CONFIG
 from tests.ros.joint_log import JointLog

@@ -176,7 +176,7 @@ def test_a_node_started_anew_before_its_silence_is_noticed_pauses_the_other_arm(
         meet(left, right)
         right.link.engaged()
         make("left")
-        eventually(right.hears("/left_arm was started anew without a farewell, or runs twice"), "it is told")
+        eventually(right.hears("/left_arm was restarted without announcing its end, or runs twice"), "it is reported")
 
 
 def test_a_node_that_ends_in_order_pauses_the_other_arm_once_and_is_not_missed(make: Make, domain: int) -> None:
@@ -185,11 +185,11 @@ def test_a_node_that_ends_in_order_pauses_the_other_arm_once_and_is_not_missed(m
         left = End(node, "left")
         meet(left, right)
         right.link.engaged()
-        node.destroy_timer(next(iter(node.timers)))  # as the farewell is a node's last word
+        node.destroy_timer(next(iter(node.timers)))  # the announced end is a node's last message
         left.link.close()
-        eventually(right.hears("/left_arm was ended"), "the farewell is told")
+        eventually(right.hears("/left_arm has ended"), "the end is announced")
     time.sleep(TIMEOUT)
-    assert right.listen_for_a_while() == ["linked to left: /left_arm was ended"]
+    assert right.listen_for_a_while() == ["linked to left: /left_arm has ended"]
 
 
 def test_what_is_no_sign_of_life_is_passed_over(make: Make) -> None:

@@ -183,7 +183,7 @@ def test_a_subclass_with_other_names_works_in_its_robots_frame(node: Any, proces
     from tf2_msgs.msg import TFMessage
     from visualization_msgs.msg import Marker
 
-    from q2r2_control.ros.bridge.base_node import LATCHED_QOS
+    from q2r2_control.ros.base_node import LATCHED_QOS
 
     base = pin.SE3(pin.exp3(np.array([0.0, 0.0, 1.2])), np.array([0.1, -0.4, 0.3]))
     static = node.create_publisher(TFMessage, "/tf_static", LATCHED_QOS)

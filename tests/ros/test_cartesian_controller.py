@@ -30,7 +30,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import SetBool
 
-from q2r2_control.ros.bridge.base_node import COMMAND_QOS
+from q2r2_control.ros.base_node import COMMAND_QOS
 from q2r2_control.ros.bridge.messages import pose_message, stamped_pose, time_message
 from tests.ros.cell import CONFIG, PATIENT, STILL, Cell, Stream, at_rest, parameters, shifted, start, wait
 
@@ -206,11 +206,7 @@ def test_a_controller_that_is_killed_leaves_the_arms_to_stop_and_its_return_does
     stream.poses["left"] = shifted(begin, 0.25, 0.0, 0.1)
     wait(lambda: np.linalg.norm(cell.tool("left").translation - begin.translation) > 0.05, "the arm is in mid-motion")
     os.kill(cell.processes[1].pid, signal.SIGKILL)
-    killed = time.monotonic()
-    rest = at_rest(cell)
-    # Braking takes |v| / a, at most 1.75 / 10 s here; the rest is for a machine that delivers late.
-    moving = [measured.t for measured in cell.measured if np.abs(measured.q - rest).max() > 5e-3]
-    assert 0.0 < max(moving) - killed < 0.15 + 0.175 + 0.2
+    rest = at_rest(cell)  # how soon is measured by test_faults
     back = start(running, "cartesian_controller", *PATIENT)
     started.processes = (started.processes[0], back)
     started.states.pop("cartesian_controller", None)

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from q2r2_control import Robot, load_config
+from q2r2_control.config.timeouts import STREAM_TIMEOUT
 from tests.ros.cell import CONFIG
 from tests.ros.conftest import NEEDS_ROS, spun_node
 from tests.ros.processes import PATIENCE, Processes
@@ -28,7 +29,6 @@ from tests.ros.headset_operator import Operator  # noqa: E402
 from tests.ros.joint_log import LONGEST_STARVED, Stop  # noqa: E402
 from tests.ros.teleop_cell import ARMS, TeleopCell, address_of  # noqa: E402
 
-TIMEOUT = 0.15  # after which whatever is silent counts as lost [s]
 BRAKING = 10.0  # acceleration_limit of the cell [rad/s^2]
 # Allowance for messages, for processes to get their turn, and for an arm that is paused while its controller lives: it
 # comes to rest at its last target, at 2 m/s^2 of the tool and not at the limits of the joints [s].
@@ -120,17 +120,17 @@ class Scene:
             stop = self.cell.joints.stop_after(hurt())
         # A machine that has no time for the robot or for this test has none for the node that has to act either.
         assert stop.starved <= LONGEST_STARVED, "the robot or this test stood still"
-        allowed = TIMEOUT + stop.speed / BRAKING + DELIVERY + 2.0 * stop.starved
+        allowed = STREAM_TIMEOUT + stop.speed / BRAKING + DELIVERY + 2.0 * stop.starved
         line = (
             f"from {stop.speed:.2f} rad/s slow within {1e3 * stop.slow:.0f} ms, allowed {1e3 * allowed:.0f}, "
-            f"at rest within {1e3 * stop.rest:.0f} ms, allowed {1e3 * (allowed + TIMEOUT):.0f}; "
+            f"at rest within {1e3 * stop.rest:.0f} ms, allowed {1e3 * (allowed + STREAM_TIMEOUT):.0f}; "
             f"of which for a starved machine {2e3 * stop.starved:.0f}"
         )
         record(what, line)
         print(f"\n{what}: {line}")
         assert stop.speed > 0.1
         assert stop.slow <= allowed
-        assert stop.rest <= allowed + TIMEOUT  # of the targets, which end when the hand's data have been missed
+        assert stop.rest <= allowed + STREAM_TIMEOUT  # of the targets, which end when the hand's data have been missed
         return stop
 
     def assert_only_a_press_moves(self, stop: Stop) -> None:

@@ -25,7 +25,7 @@ import pinocchio as pin
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory
 
-from q2r2_control.ros.bridge.base_node import COMMAND_QOS
+from q2r2_control.ros.base_node import COMMAND_QOS
 from tests.ros.cell import CONFIG, PATIENT, STILL, Cell, Measured, Stream, at_rest, parameters, start, wait
 
 Engage = Callable[..., Stream]

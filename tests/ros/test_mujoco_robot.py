@@ -30,7 +30,7 @@ from std_msgs.msg import Float64MultiArray, String
 from tf2_msgs.msg import TFMessage
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from q2r2_control.ros.bridge.base_node import COMMAND_QOS, LATCHED_QOS
+from q2r2_control.ros.base_node import COMMAND_QOS, LATCHED_QOS
 from tests.ros.cell import CONFIG, Cell, wait
 
 FINGERS = tuple(f"{side}_finger_joint_{number}" for side in ("left", "right") for number in (1, 2))

@@ -1,4 +1,4 @@
-"""Whom an output doubts: nobody while the arms follow, and never who takes torques."""
+"""When an output gives its receiver up: not while the arms follow, and never a receiver of torques."""
 
 from __future__ import annotations
 
@@ -15,9 +15,12 @@ pytest.importorskip("rclpy", reason=NEEDS_ROS)
 
 from std_msgs.msg import Float64MultiArray
 
-from q2r2_control.ros.bridge.base_node import COMMAND_QOS
-from q2r2_control.ros.bridge.outputs import Channel, ChannelOutput
-from q2r2_control.ros.monitoring.watched_publisher import WatchedPublisher
+from q2r2_control import Robot, load_config
+from q2r2_control.drives import make_drive
+from q2r2_control.ros.base_node import COMMAND_QOS
+from q2r2_control.ros.bridge.joint_messages import PositionArray, TorqueArray
+from q2r2_control.ros.bridge.joint_outputs import Channel, JointOutput
+from q2r2_control.ros.monitoring.endpoints import WatchedPublisher
 
 TIMEOUT = 0.5  # more than a busy machine takes to acknowledge [s]
 
@@ -25,11 +28,15 @@ TIMEOUT = 0.5  # more than a busy machine takes to acknowledge [s]
 class Commands:
     """Sends commands, and listens to them as a joint controller."""
 
-    def __init__(self, node: Any, doubts: bool) -> None:
+    def __init__(self, node: Any, positions: bool) -> None:
         self._node, self.taken = node, 0
         self._publisher = WatchedPublisher(node, Float64MultiArray, "/commands", TIMEOUT)
         self._channel = Channel([], np.arange(0), self._publisher)
-        self.output = ChannelOutput([self._channel], doubts)
+        config = load_config("config/dual_iiwa7.yaml")
+        robot = Robot.from_config(config)
+        kind = PositionArray if positions else TorqueArray
+        drive = make_drive(kind.mode, robot, config, has_servos=False)
+        self.output = JointOutput(drive, kind(0.004, robot), [self._channel])
         self.listen()
 
     def listen(self) -> None:
@@ -38,11 +45,11 @@ class Commands:
         self._node.create_subscription(Float64MultiArray, "/commands", self._take, COMMAND_QOS)
         eventually(lambda: self._publisher.listeners > known, "the listener is found")
 
-    def send(self, seconds: float, astray: bool) -> str | None:
-        """Send 200 commands a second; what came of a doubt, if anything did."""
+    def send(self, seconds: float, off_reference: bool) -> str | None:
+        """Send 200 commands a second; what was found to be wrong, if anything."""
         end = time.monotonic() + seconds
         while time.monotonic() < end:
-            if (fault := self.output.doubt(astray)) is not None:
+            if (fault := self.output.listener_fault(off_reference)) is not None:
                 return fault
             self._channel.send(Float64MultiArray())
             time.sleep(0.005)
@@ -52,20 +59,20 @@ class Commands:
         self.taken += 1
 
 
-def test_who_takes_positions_is_not_given_up_while_the_arms_stand_elsewhere(node: Any) -> None:
-    commands = Commands(node, doubts=True)
-    assert commands.send(0.2, astray=False) is None
+def test_a_receiver_of_positions_is_not_given_up_while_the_arms_are_off_their_reference(node: Any) -> None:
+    commands = Commands(node, positions=True)
+    assert commands.send(0.2, off_reference=False) is None
     before = commands.taken
-    assert commands.send(3.0 * TIMEOUT, astray=True) is None
+    assert commands.send(3.0 * TIMEOUT, off_reference=True) is None
     assert commands.taken - before > 100  # of some 300: the others were left out, or late on a busy machine
 
 
-@pytest.mark.parametrize(("doubts", "astray"), [(True, True), (True, False), (False, True)])
-def test_somebody_new_is_doubted_where_the_arms_do_not_go_where_positions_ask(
-    doubts: bool, astray: bool, node: Any
+@pytest.mark.parametrize(("positions", "off_reference"), [(True, True), (True, False), (False, True)])
+def test_a_new_receiver_of_positions_is_noticed_where_the_arms_are_off_their_reference(
+    positions: bool, off_reference: bool, node: Any
 ) -> None:
-    commands = Commands(node, doubts)
-    assert commands.send(0.2, astray=False) is None
+    commands = Commands(node, positions)
+    assert commands.send(0.2, off_reference=False) is None
     commands.listen()
-    fault = commands.send(0.2, astray)
-    assert (fault is not None and "somebody new" in fault) == (doubts and astray)
+    fault = commands.send(0.2, off_reference)
+    assert (fault is not None and "new receiver" in fault) == (positions and off_reference)

@@ -155,7 +155,7 @@ def test_best_effort_subscribers_hear_too_and_a_configured_frame_replaces_the_he
 ) -> None:
     from geometry_msgs.msg import PoseStamped
 
-    from q2r2_control.ros.bridge.base_node import STREAM_QOS
+    from q2r2_control.ros.base_node import STREAM_QOS
 
     _, address = start_endpoint(processes, "left_frame_id:=base")
     received: dict[str, Queue[Any]] = {}

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from q2r2_control import Robot, load_config
+from q2r2_control.config.timeouts import STREAM_TIMEOUT
 from tests.ros.cell import CONFIG
 from tests.ros.conftest import NEEDS_ROS
 from tests.ros.processes import Processes, RosProcess
@@ -31,7 +32,7 @@ RATE = 100.0  # of the nodes, fewer than usual for a machine that plays two [Hz]
 # Discovery reaches the other host as it does on a real network, and no shared memory bypasses the cable.
 NETWORK = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET"}
 set_up_middleware(NETWORK)
-TIMEOUT, BRAKING, DELIVERY = 0.15, 10.0, 0.1  # [s], [rad/s^2], [s]
+BRAKING, DELIVERY = 10.0, 0.1  # [rad/s^2], [s]
 STILL, FAST = 0.005, 1.5  # [rad], [rad/s]
 
 
@@ -128,7 +129,7 @@ def test_arms_follow_across_hosts_stop_when_the_cable_is_pulled_and_wait_for_a_p
     pulled = time.monotonic()
     network.pull_cable()
     stop = hosts.joints.stop_after(pulled)
-    allowed = TIMEOUT + stop.speed / BRAKING + DELIVERY + 2.0 * stop.starved
+    allowed = STREAM_TIMEOUT + stop.speed / BRAKING + DELIVERY + 2.0 * stop.starved
     line = (
         f"from {stop.speed:.2f} rad/s slow within {1e3 * stop.slow:.0f} ms, allowed {1e3 * allowed:.0f}, "
         f"of which for a starved machine {2e3 * stop.starved:.0f}"

@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 import yaml
 
-from q2r2_control.ros.launch.node_set import SOURCES, NodeProcess, nodes_of
+from q2r2_control.ros.launch.processes import SOURCES, NodeProcess, nodes_of
 from tests.ros.cell import CONFIG
 from tests.ros.conftest import NEEDS_ROS
 from tests.ros.processes import ROOT, Processes, RosProcess
@@ -28,8 +28,8 @@ pytestmark = pytest.mark.usefixtures("interfaces")
 # The robot and the controller alone, through the same functions as the command.
 PAIR = f"""
 import sys
-from q2r2_control.ros.launch.node_set import nodes_of
-from q2r2_control.ros.launch.up import run_together
+from q2r2_control.ros.launch.processes import nodes_of
+from q2r2_control.ros.launch.processes import run_together
 sys.exit(run_together(nodes_of({CONFIG!r}, "none")[:2], lambda line: print(line, flush=True)))
 """
 

@@ -18,7 +18,7 @@ pytest.importorskip("rclpy", reason=NEEDS_ROS)
 
 from geometry_msgs.msg import PoseStamped
 
-from q2r2_control.ros.monitoring.watched_publisher import WatchedPublisher
+from q2r2_control.ros.monitoring.endpoints import WatchedPublisher
 
 TIMEOUT = 0.5  # more than a busy machine takes to acknowledge [s]
 LISTENER = """

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from typing import Any
 
-from q2r2_control.ros.bridge.base_node import run_node
+from q2r2_control.ros.base_node import run_node
 from q2r2_control.ros.nodes.base_arm_controller import BaseArmController
 
 

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import pytest
 
+from q2r2_control.config.timeouts import STREAM_TIMEOUT
 from q2r2_control.supervision.sequence_watch import SequenceWatch
 
-PERIOD, TIMEOUT = 0.01, 0.15
+PERIOD = 0.01  # [s]
 
 
 def breaks(numbers: list[int], period: float = PERIOD) -> list[int]:
     watch = SequenceWatch()
-    return [watch.take(number, period * index, TIMEOUT) for index, number in enumerate(numbers)]
+    return [watch.take(number, period * index, STREAM_TIMEOUT) for index, number in enumerate(numbers)]
 
 
 def test_rising_numbers_are_one_publisher_even_where_some_are_lost() -> None:
@@ -39,5 +40,5 @@ def test_one_that_takes_over_without_a_pause_is_one_break_and_forgotten_after_a_
 def test_numbers_begin_anew_after_a_silence_for_who_was_started_again() -> None:
     watch = SequenceWatch()
     for number in range(100):
-        watch.take(number, PERIOD * number, TIMEOUT)
-    assert watch.take(1, PERIOD * 99 + TIMEOUT + 0.01, TIMEOUT) == 0
+        watch.take(number, PERIOD * number, STREAM_TIMEOUT)
+    assert watch.take(1, PERIOD * 99 + STREAM_TIMEOUT + 0.01, STREAM_TIMEOUT) == 0

@@ -155,8 +155,8 @@ def test_homing_ends_at_home_and_takes_no_targets(world: World, robot: Robot, co
 
 def test_a_stream_that_begins_at_the_tool_is_followed_until_it_ceases() -> None:
     stream = TargetStream(StreamSettings())
-    assert stream.offer(TOOL, TOOL, 0.0) is None
-    assert stream.offer(raised(TOOL, 0.5), TOOL, 0.1) is None
+    assert stream.offer(TOOL, [TOOL], 0.0) is None
+    assert stream.offer(raised(TOOL, 0.5), [TOOL], 0.1) is None
     assert not stream.expire(0.25)
     assert stream.expire(0.26)
     assert stream.pose is None
@@ -166,27 +166,27 @@ def test_a_stream_that_begins_at_the_tool_is_followed_until_it_ceases() -> None:
 def test_a_stream_that_begins_elsewhere_is_refused_even_where_it_comes_by() -> None:
     stream = TargetStream(StreamSettings())
     for step in range(100):
-        assert stream.offer(raised(TOOL, 0.5 - 0.01 * step), TOOL, 0.01 * step) is not None
+        assert stream.offer(raised(TOOL, 0.5 - 0.01 * step), [TOOL], 0.01 * step) is not None
     assert stream.pose is None
 
 
 def test_targets_that_were_refused_are_followed_once_they_jump_to_the_tool_or_begin_there_after_a_silence() -> None:
     jumping, silent = TargetStream(StreamSettings()), TargetStream(StreamSettings())
     for stream in (jumping, silent):
-        assert stream.offer(raised(TOOL, 0.2), TOOL, 0.0) is not None
-    assert jumping.offer(TOOL, TOOL, 0.01) is None
-    assert silent.offer(raised(TOOL, 0.04), TOOL, 0.01) is not None
-    assert silent.offer(TOOL, TOOL, 0.02) is not None  # came by within a hand's speed
-    assert silent.offer(TOOL, TOOL, 0.2) is None
+        assert stream.offer(raised(TOOL, 0.2), [TOOL], 0.0) is not None
+    assert jumping.offer(TOOL, [TOOL], 0.01) is None
+    assert silent.offer(raised(TOOL, 0.04), [TOOL], 0.01) is not None
+    assert silent.offer(TOOL, [TOOL], 0.02) is not None  # came by within a hand's speed
+    assert silent.offer(TOOL, [TOOL], 0.2) is None
 
 
 def test_a_stream_that_was_dropped_is_not_taken_up_again_where_it_stands() -> None:
     stream = TargetStream(StreamSettings())
-    assert stream.offer(TOOL, TOOL, 0.0) is None
+    assert stream.offer(TOOL, [TOOL], 0.0) is None
     stream.drop()
-    assert stream.offer(TOOL, TOOL, 0.01) is not None
+    assert stream.offer(TOOL, [TOOL], 0.01) is not None
     stream.reset()
-    assert stream.offer(TOOL, TOOL, 0.02) is None
+    assert stream.offer(TOOL, [TOOL], 0.02) is None
 
 
 def test_where_nobody_moves_the_arms_they_go_astray_and_whoever_comes_is_asked_for_nothing_elsewhere(
@@ -200,8 +200,8 @@ def test_where_nobody_moves_the_arms_they_go_astray_and_whoever_comes_is_asked_f
     last = world.commanded[-1]
     assert last is not None
     assert 0.05 < np.abs(last - world.q).max() < 0.15
-    assert world.supervisor.astray
-    world.supervisor.abandon("somebody new takes the commands", world.now)
+    assert world.supervisor.off_reference
+    world.supervisor.let_go("somebody new takes the commands", world.now)
     assert world.is_in(Phase.INACTIVE)
     began = len(world.commanded)
     world.run(0.5, raised(tool, 0.06))
@@ -220,6 +220,6 @@ def test_arms_that_lag_behind_the_commands_are_not_astray(world: World, robot: R
         world.run(DT, raised(tool, 0.1))
         assert world.commanded[-1] is not None
         deviation = max(deviation, float(np.abs(world.commanded[-1] - world.q).max()))
-        assert not world.supervisor.astray
+        assert not world.supervisor.off_reference
     assert deviation > 0.03
     assert world.supervisor.follows("left")

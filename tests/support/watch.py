@@ -7,9 +7,10 @@ from functools import cache
 import numpy as np
 
 from q2r2_control.config import Config, load_config
-from q2r2_control.pipeline import Pipeline, Tick
+from q2r2_control.pipeline import Pipeline
+from q2r2_control.runtime.recorder import Tick
 from q2r2_control.types import Event
-from tests.control.contract import Contract
+from q2r2_control.verification.contract import Contract
 
 CELL = "config/dual_iiwa7.yaml"
 

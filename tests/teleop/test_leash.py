@@ -13,7 +13,8 @@ import pytest
 
 from q2r2_control.config import Config, load_config
 from q2r2_control.config.teleop import LeashSettings
-from q2r2_control.pipeline import Pipeline, Tick
+from q2r2_control.pipeline import Pipeline
+from q2r2_control.runtime.recorder import Tick
 from q2r2_control.runtime.run_summary import RunSummary
 from q2r2_control.teleop.leash import Leash
 from q2r2_control.teleop.relative import RelativeMotion

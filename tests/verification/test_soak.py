@@ -18,7 +18,6 @@ from q2r2_control.errors import ConfigError
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, Reference
 from q2r2_control.verification.fault_injection import FaultySolver
-from q2r2_control.verification.margins import Margin
 from q2r2_control.verification.soak import Soak, SoakReport, run_soak
 
 CONFIG = load_config("config/dual_iiwa7.yaml")
@@ -171,17 +170,6 @@ def test_what_is_found_can_be_asked_again() -> None:
     assert found.q.shape == found.v.shape == (14,)
     assert found.dt
     assert found.segment
-
-
-def test_a_margin_keeps_the_worst_and_counts_what_is_no_number_as_broken() -> None:
-    margin = Margin("distance", "m", ">=", 0.0)
-    assert margin.note(0.3, 1)
-    assert margin.note(0.1, 2)
-    assert margin.note(0.2, 3)
-    assert (margin.worst, margin.tick, margin.violations) == (0.1, 2, 0)
-    assert not margin.note(-0.1, 4)
-    assert not margin.note(float("nan"), 5)
-    assert (margin.violations, margin.tick, margin.checked) == (2, 5, 5)
 
 
 @pytest.mark.parametrize(("ticks", "seed", "named"), [(99, 0, "ticks = 99"), (100, -1, "seed = -1")])

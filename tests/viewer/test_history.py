@@ -9,8 +9,8 @@ import pinocchio as pin
 import pytest
 
 from q2r2_control.config import load_config
-from q2r2_control.pipeline import Tick
 from q2r2_control.robot.robot import Robot
+from q2r2_control.runtime.recorder import Tick
 from q2r2_control.types import ArmTarget, Reference, RobotState, StepReport, StepStatus
 from q2r2_control.viewer.history import History, tracking_error
 

@@ -7,7 +7,7 @@ import numpy as np
 from q2r2_control.inputs.messages import HandPose, HandTwist
 from q2r2_control.inputs.statistics import TopicStatistics
 from q2r2_control.types import HandInputs
-from q2r2_control.viewer.topic_table import in_short, topic_line, topic_table
+from q2r2_control.viewer.topic_table import short_text, topic_line, topic_table
 from tests.cli.test_tables import printed
 
 POSE = HandPose(np.array([0.1, -0.001, 2.0]), np.array([0.0, 0.0, 0.0, -1.0]), 0.0, "")
@@ -15,14 +15,14 @@ TOPIC = TopicStatistics(count=12, rate=75.0, age=0.25, last=POSE)
 
 
 def test_values_are_rounded_and_zero_has_no_sign() -> None:
-    assert in_short(POSE) == "0.10 0.00 2.00 m, quaternion 0.00 0.00 0.00 -1.00"
-    assert in_short(HandTwist(np.array([1.0, 2.0, 3.0]), np.zeros(3))) == "1.00 2.00 3.00 m/s, 0.00 0.00 0.00 rad/s"
+    assert short_text(POSE) == "0.10 0.00 2.00 m, quaternion 0.00 0.00 0.00 -1.00"
+    assert short_text(HandTwist(np.array([1.0, 2.0, 3.0]), np.zeros(3))) == "1.00 2.00 3.00 m/s, 0.00 0.00 0.00 rad/s"
 
 
 def test_inputs_say_which_buttons_are_held() -> None:
     inputs = HandInputs(button_upper=True, button_lower=True, press_middle=1.0, thumb_stick_vertical=-0.5)
-    assert in_short(inputs) == "held: upper lower, triggers 0.0 1.0, stick 0.0 -0.5"
-    assert in_short(HandInputs()).startswith("held: none")
+    assert short_text(inputs) == "held: upper lower, triggers 0.0 1.0, stick 0.0 -0.5"
+    assert short_text(HandInputs()).startswith("held: none")
 
 
 def test_a_line_says_count_rate_and_age_or_that_nothing_came() -> None:

@@ -1,4 +1,4 @@
-"""What the bench asks of a controller, its own or a peer, and what all peers are given alike."""
+"""The interface of a controller in the bench, and the settings that all peers get."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ NEAREST_ROWS = 10  # separation rows of a peer that is given the nearest pairs o
 DETECTION_DISTANCE = 0.25  # pairs farther apart than this need no exact distance [m]
 
 
-class Candidate(Protocol):
-    """Inverse kinematics that runs open loop, on a configuration of its own that it integrates."""
+class BenchController(Protocol):
+    """A controller that runs open loop: it integrates its own configuration."""
 
     name: str
-    cannot: str  # what of the contract it has no means for, in a few words
+    limitations: str  # which parts of our contract it cannot keep, in a few words
 
     def reset(self, q: Array) -> None:
         """Start at rest at ``q`` (nv,) [rad], in the order of ``Robot.joint_names``."""
@@ -40,12 +40,12 @@ class Candidate(Protocol):
         """One tick: positions [rad] and velocities [rad/s] after it, (nv,) each. Raises where it has no solution."""
 
     def hold(self) -> tuple[Array, Array]:
-        """The tick after a failure: the same positions, and no velocity."""
+        """The tick after a failure: the same positions, at rest."""
 
 
 @dataclass(frozen=True, slots=True)
 class Setup:
-    """Our settings in the units that peers take: gains per tick, limits with our margins."""
+    """Our settings in the units of the peers: gains per tick, limits with our margins."""
 
     robot: Robot
     config: Config
@@ -82,15 +82,15 @@ class Setup:
         return self.robot.position_upper - self.config.control.position_margin
 
     def home_of_others(self) -> dict[str, float]:
-        """Where the joints stand that move no tool, such as fingers."""
+        """Home positions of joints that move no tool, such as fingers."""
         home = compose(self.config).home
         return {name: value for name, value in home.items() if name not in self.robot.joint_names}
 
 
-def make_peer(name: str, setup: Setup) -> Candidate:
+def make_peer(name: str, setup: Setup) -> BenchController:
     """Build a peer of ``PEERS``. Raises what its package raises."""
     module = importlib.import_module(f"q2r2_control.benchmark.peers.{PEERS[name]}")
-    peer: Candidate = module.make(setup, name)
+    peer: BenchController = module.make(setup, name)
     return peer
 
 

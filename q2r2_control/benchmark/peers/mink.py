@@ -24,7 +24,9 @@ from q2r2_control.types import Array
 class Mink:
     """See the module."""
 
-    cannot = "no acceleration limit; no braking distance to pairs; no pairs of a body and its parent; no certificate"
+    limitations = (
+        "no acceleration limit; no braking distance to pairs; no pairs of a body and its parent; no certificate"
+    )
 
     def __init__(self, setup: Setup, name: str) -> None:
         self.name = name
@@ -73,11 +75,11 @@ class Mink:
         return full
 
     def reset(self, q: Array) -> None:
-        """See :class:`Candidate`."""
+        """See :class:`BenchController`."""
         self._configuration.update(self._full(q))
 
     def step(self, targets: Mapping[str, pin.SE3], dt: float) -> tuple[Array, Array]:
-        """See :class:`Candidate`."""
+        """See :class:`BenchController`."""
         for arm, task in self._tasks.items():
             task.set_target(mink.SE3.from_matrix(targets[arm].homogeneous))
         v = mink.solve_ik(
@@ -92,7 +94,7 @@ class Mink:
         return self._configuration.q[self._q_index], v[self._v_index]
 
     def hold(self) -> tuple[Array, Array]:
-        """See :class:`Candidate`."""
+        """See :class:`BenchController`."""
         return self._configuration.q[self._q_index], np.zeros(len(self._v_index))
 
 

@@ -24,7 +24,7 @@ from q2r2_control.types import Array
 class Pink:
     """See the module."""
 
-    cannot = "hard limits that can contradict each other; no braking distance to pairs; no certificate"
+    limitations = "hard limits that can contradict each other; no braking distance to pairs; no certificate"
 
     def __init__(self, setup: Setup, name: str) -> None:
         self.name = name
@@ -59,7 +59,7 @@ class Pink:
         self.reset(self._home)
 
     def reset(self, q: Array) -> None:
-        """See :class:`Candidate`."""
+        """See :class:`BenchController`."""
         self._configuration = pink.Configuration(
             self._model,
             self._model.createData(),
@@ -70,7 +70,7 @@ class Pink:
         self._acceleration.set_last_integration(np.zeros(self._model.nv), self._dt)
 
     def step(self, targets: Mapping[str, pin.SE3], dt: float) -> tuple[Array, Array]:
-        """See :class:`Candidate`."""
+        """See :class:`BenchController`."""
         for arm, task in self._tasks.items():
             task.set_target(targets[arm])
         v = pink.solve_ik(
@@ -86,7 +86,7 @@ class Pink:
         return self._configuration.q.copy(), v
 
     def hold(self) -> tuple[Array, Array]:
-        """See :class:`Candidate`."""
+        """See :class:`BenchController`."""
         v = np.zeros(self._model.nv)
         self._acceleration.set_last_integration(v, self._dt)
         return self._configuration.q.copy(), v

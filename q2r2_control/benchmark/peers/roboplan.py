@@ -30,7 +30,7 @@ _REGULARISATION = 1e-6
 class Roboplan:
     """See the module."""
 
-    cannot = "hard limits that can contradict each other; no braking distance to pairs; no certificate"
+    limitations = "hard limits that can contradict each other; no braking distance to pairs; no certificate"
 
     def __init__(self, setup: Setup, name: str) -> None:
         self.name = name
@@ -88,24 +88,24 @@ class Roboplan:
         return optimal_ik.FrameTask(self._ik, self._scene, goal, options)
 
     def reset(self, q: Array) -> None:
-        """See :class:`Candidate`."""
+        """See :class:`BenchController`."""
         self._q = self._rest.copy()
         self._q[self._indices] = q
         self._acceleration.reset()
 
     def step(self, targets: Mapping[str, pin.SE3], dt: float) -> tuple[Array, Array]:
-        """See :class:`Candidate`."""
+        """See :class:`BenchController`."""
         for arm, task in self._frame_tasks.items():
             task.setTargetFrameTransform(targets[arm].homogeneous)
-        way = np.zeros(len(self._indices))
-        self._ik.solveIk(self._q, self._tasks, self._constraints, self._barriers, way, _REGULARISATION)
-        self._q[self._indices] += way
-        v = way / dt
+        step = np.zeros(len(self._indices))
+        self._ik.solveIk(self._q, self._tasks, self._constraints, self._barriers, step, _REGULARISATION)
+        self._q[self._indices] += step
+        v = step / dt
         self._acceleration.setLastVelocity(v)
         return self._q[self._indices], v
 
     def hold(self) -> tuple[Array, Array]:
-        """See :class:`Candidate`."""
+        """See :class:`BenchController`."""
         self._acceleration.reset()
         return self._q[self._indices], np.zeros(len(self._indices))
 

@@ -1,27 +1,32 @@
-"""Where one arm's target goes: to the controller that moves the arm, or through the built-in one to it."""
+"""Where one arm's target goes: straight to the controller that moves the arm, or through the built-in controller."""
 
 from __future__ import annotations
 
+import math
+from importlib import import_module
+from typing import Any
+
 import pinocchio as pin
+from rclpy.node import Node
+from std_msgs.msg import Bool
 
 from q2r2_control.config.presets import BUILTIN, Mode
-from q2r2_control.ros.bridge.arm_parameters import ArmParameters
-from q2r2_control.ros.bridge.base_node import BaseNode
-from q2r2_control.ros.bridge.command_type import CommandType
-from q2r2_control.ros.bridge.pose_source import PoseTopic
+from q2r2_control.ros.base_node import LATCHED_QOS, BaseNode
+from q2r2_control.ros.bridge.frames import PoseTopic
+from q2r2_control.ros.bridge.parameters import BUILTIN_NODE, ArmParameters
 from q2r2_control.ros.bridge.target_output import TargetOutput, near
-from q2r2_control.ros.monitoring.follow_watch import FollowWatch
 
-# Farther from the measured pose than sag explains, a commanded one is not where the tool is.
+# A commanded pose may be this far from the measured one, because the arm sags under its load.
 SAG = 0.05, 0.1  # [m, rad]
-_BUILTIN_NODE = "/cartesian_controller"
+_POSE = 2  # of moveit_msgs/srv/ServoCommandType
+_RETRY = 1.0  # the service is called again if it has not answered for this long [s]
 
 
 class ArmOutputs:
-    """One output in mode raw. In mode filtered ``first`` is the built-in controller's, and what that allows is relayed.
+    """In mode raw one output. In mode filtered ``first`` drives the built-in controller, whose result is relayed.
 
-    The relay begins when the arm is engaged and the built-in controller's tool is where the arm's is. It lasts through
-    pauses, so that the arm comes to rest as the built-in controller does.
+    The relay starts when the arm is engaged and the built-in controller's tool is where the arm's tool is. It goes on
+    through pauses, so that the arm comes to rest as the built-in controller does.
     """
 
     def __init__(self, node: BaseNode, values: ArmParameters, safe_target: PoseTopic) -> None:
@@ -31,7 +36,7 @@ class ArmOutputs:
         if self._filtered:
             topic = BUILTIN.topic.format(ctrl=values.builtin_prefix)
             self.first = TargetOutput(
-                node, BUILTIN, _BUILTIN_NODE, topic, values.world_frame, BUILTIN.guard, values.listener_timeout
+                node, BUILTIN, BUILTIN_NODE, topic, values.world_frame, BUILTIN.guard, values.listener_timeout
             )
         if not self._filtered or (preset.takes_poses and preset is not BUILTIN):
             theirs = TargetOutput(
@@ -50,41 +55,41 @@ class ArmOutputs:
                 self.first = theirs
         self._follows: FollowWatch | None = None
         if self.first.preset is BUILTIN:
-            # Twice as long as anything else may be silent: the targets have to arrive, and the answer.
+            # Twice the usual timeout: the targets have to arrive first, and then the answer.
             self._follows = FollowWatch(node, values.following_topic, 2.0 * values.listener_timeout)
         self._all = [self.first] if self._last is None else [self.first, self._last]
         self._command_type: CommandType | None = None
         if preset.command_type is not None:
             self._command_type = CommandType(node, preset.command_type.format(ctrl=values.prefix))
-        self._allows = False  # the built-in controller says where the arm may go
+        self._has_safe_target = False  # of the built-in controller
         self._relaying = False
 
     @property
     def conflict(self) -> str | None:
-        """One line on publishers that should not be there."""
+        """One line if an output's topic has other publishers."""
         return next((line for output in self._all if (line := output.conflict)), None)
 
     @property
     def unready(self) -> str | None:
         """Why the arm may not be engaged yet."""
-        if unheard := next((line for output in self._all if (line := output.unheard)), None):
-            return unheard
-        if self._last is not None and not self._allows:
+        if unready := next((line for output in self._all if (line := output.unready)), None):
+            return unready
+        if self._last is not None and not self._has_safe_target:
             return self._safe_target.problem
         return None if self._command_type is None else self._command_type.unready
 
     @property
     def advice(self) -> str | None:
-        """What the user has to do, since it cannot be done here."""
+        """What the user has to do by hand."""
         return None if self._command_type is None else self._command_type.advice
 
     def take_fault(self, now: float) -> str | None:
-        """Look who is there; says once that a controller was started anew while it was driven."""
+        """Check the controllers; returns once why the arm has to pause because of one."""
         faults = [output.take_fault(now) for output in reversed(self._all)]
         if self._last is not None and faults[0] is not None:
             self._relaying = False
         if self._command_type is not None:
-            self._command_type.step(self._all[-1].lives, now)
+            self._command_type.step(self._all[-1].starts, now)
         if self._follows is not None:
             faults += [self._safe_target.take_silence(now), self._follows.refusal(self.first.following, now)]
         return next((fault for fault in faults if fault), None)
@@ -94,22 +99,97 @@ class ArmOutputs:
         return self.first.step(target, tool, pin.SE3.Identity() if self._filtered else base, now)
 
     def relay(self, engaged: bool, tool: pin.SE3 | None, base: pin.SE3 | None, now: float) -> str | None:
-        """Pass on what the built-in controller allows; returns why the arm has to pause."""
+        """Pass on the safe target of the built-in controller; returns why the arm has to pause."""
         if self._last is None:
             return None
         safe, fault = self._safe_target.at(now), None
-        self._allows = safe is not None
+        self._has_safe_target = safe is not None
         if not self._relaying and engaged:
             self._relaying = safe is not None and tool is not None and near(safe, tool, *SAG)
             if not self._relaying:
                 fault = self._safe_target.problem or f"{self._safe_topic} is not where the tool is"
         self._relaying = self._relaying and safe is not None
-        # The built-in controller's tool may be where the arm's is not, as far as the arm sags.
+        # A stream starts at the measured tool: the safe target may differ from it by the arm's sag.
         self._last.step(safe if self._relaying else None, tool, base, now, start=tool)
         return fault
 
     def forget(self, now: float) -> None:
-        """Hold nothing any more."""
+        """Drop all held targets."""
         for output in self._all:
             output.forget(now)
         self._relaying = False
+
+
+class FollowWatch:
+    """Whether the built-in controller follows the targets of an arm, as it publishes on ``~/following/<arm>``.
+
+    It drops a stream for reasons of its own, such as missing joint states, and then accepts only a new stream. The arm
+    has to be paused then: otherwise it would count as engaged, and the next press would pause it instead of starting a
+    new stream. A controller that publishes nothing here is taken to follow.
+    """
+
+    def __init__(self, node: Node, topic: str, timeout: float) -> None:
+        self._topic, self._timeout = topic, timeout
+        self._follows: bool | None = None
+        self._since = math.inf  # targets have been sent and not followed [s]
+        node.create_subscription(Bool, topic, self._on_following, LATCHED_QOS)
+
+    def refusal(self, sending: bool, now: float) -> str | None:
+        """One line if targets are ``sending`` and have not been followed for longer than the timeout."""
+        if not sending or self._follows is not False:
+            self._since = math.inf
+            return None
+        self._since = min(self._since, now)
+        return f"{self._topic} says that targets are not followed" if now - self._since > self._timeout else None
+
+    def _on_following(self, message: Bool) -> None:
+        self._follows = bool(message.data)
+
+
+class CommandType:
+    """Tells MoveIt Servo that targets are poses, after each of its starts: it takes none before. Never waits.
+
+    Without moveit_msgs the service cannot be called. Then ``advice`` says what the user has to call, and engaging is
+    the user's decision.
+    """
+
+    def __init__(self, node: BaseNode, service: str) -> None:
+        self._service, self._client = service, None
+        self.advice: str | None = None
+        try:
+            self._kind: Any = import_module("moveit_msgs.srv").ServoCommandType
+        except ImportError:
+            self.advice = f"moveit_msgs cannot be imported: call {service} with {_POSE} yourself"
+            return
+        self._client = node.create_client(self._kind, service)
+        self._starts, self._agreed = -1, False
+        self._asked = float("-inf")
+        self._answer: Any = None  # future
+
+    @property
+    def unready(self) -> str | None:
+        """One line while the service has not agreed to poses."""
+        if self._client is None or self._agreed:
+            return None
+        return f"{self._service} has not agreed to poses yet"
+
+    def step(self, starts: int, now: float) -> None:
+        """Call the service if that is due; ``starts``: how often the controller has appeared."""
+        if self._client is None:
+            return
+        if starts != self._starts:
+            self._starts, self._agreed, self._asked = starts, False, float("-inf")
+            self._drop_answer()
+        if self._answer is not None and self._answer.done():
+            self._agreed = bool(self._answer.result().success)
+            self._answer = None
+        if not self._agreed and now - self._asked > _RETRY and self._client.service_is_ready():
+            self._drop_answer()
+            self._asked = now
+            self._answer = self._client.call_async(self._kind.Request(command_type=_POSE))
+
+    def _drop_answer(self) -> None:
+        """A late answer belongs to an earlier call."""
+        if self._answer is not None and self._client is not None:
+            self._client.remove_pending_request(self._answer)
+        self._answer = None

@@ -1,4 +1,4 @@
-"""The tree of frames that /tf and /tf_static tell, as far as one arm needs it: where one frame is in another, now."""
+"""Where one frame is in another, now: from /tf and /tf_static, or from a topic of poses."""
 
 from __future__ import annotations
 
@@ -8,15 +8,19 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
-from geometry_msgs.msg import TransformStamped
+from geometry_msgs.msg import PoseStamped, TransformStamped
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from tf2_msgs.msg import TFMessage
+
+from q2r2_control.ros.base_node import STREAM_QOS, BaseNode
+from q2r2_control.ros.bridge.messages import pose_of
+from q2r2_control.ros.monitoring.endpoints import Publishers
 
 _UNIT = 1e-3  # a quaternion's norm may be off by this
 
 
 class _Edge:
-    """Where a child is in its parent; put together when it is asked for, since most frames of a robot never are."""
+    """Pose of a child frame in its parent; computed when asked for, since most frames of a robot never are."""
 
     __slots__ = ("_pose", "_transform", "parent", "received")
 
@@ -38,7 +42,7 @@ class Placement(NamedTuple):
     """Where a frame is in another."""
 
     pose: pin.SE3
-    received: float  # the oldest receipt time of what it was put together from [s]; inf: all of it is static
+    received: float  # the oldest receipt time of the transforms in it [s]; inf: all of them are static
 
 
 class FrameTree:
@@ -48,12 +52,12 @@ class FrameTree:
         self._edges: dict[str, _Edge] = {}
 
     def set(self, transform: TransformStamped, received: float) -> None:
-        """Take one transform; numbers that are not finite or no rotation are passed over."""
+        """Store one transform; one with numbers that are not finite, or without a unit quaternion, is ignored."""
         if _is_pose(transform):
             self._edges[_name(transform.child_frame_id)] = _Edge(transform, received)
 
     def find(self, frame: str, within: str) -> Placement | None:
-        """Pose of ``frame`` in ``within``; None where no chain of transforms joins them."""
+        """Pose of ``frame`` in ``within``; None if no chain of transforms connects them."""
         up = dict(self._upwards(_name(within)))
         for name, placement in self._upwards(_name(frame)):
             if name in up:
@@ -62,7 +66,7 @@ class FrameTree:
         return None
 
     def _upwards(self, frame: str) -> Iterator[tuple[str, Placement]]:
-        """The frame and all above it, with the frame's pose in each; ends even where parents form a ring."""
+        """The frame and all its ancestors, with the frame's pose in each; ends also if parents form a ring."""
         pose, received = pin.SE3.Identity(), math.inf
         seen: set[str] = set()
         while frame not in seen:
@@ -96,3 +100,69 @@ def _is_pose(message: TransformStamped) -> bool:
     p, r = message.transform.translation, message.transform.rotation
     # A sum or a norm with NaN or infinity in it is not finite.
     return math.isfinite(p.x + p.y + p.z) and abs(math.hypot(r.x, r.y, r.z, r.w) - 1.0) <= _UNIT
+
+
+class ToolFrame:
+    """The pose of a frame of /tf in the world."""
+
+    def __init__(self, node: BaseNode, tree: FrameTree, frame: str, world: str, timeout: float) -> None:
+        self._tree, self._frame, self._world, self._timeout = tree, frame, world, timeout
+        self._publishers = Publishers(node, ["/tf"])
+        self._publishers.look_steadily()
+        self.problem: str | None = None
+
+    def at(self, now: float) -> pin.SE3 | None:
+        """The newest pose at ``now`` [s]; None if it is not known, and then ``problem`` says why."""
+        placement = self._tree.find(self._frame, self._world)
+        self.problem = None
+        if placement is None:
+            self.problem = f"no transform from {self._frame} to {self._world} on /tf"
+        elif now - placement.received > self._timeout:
+            age = now - placement.received
+            self.problem = f"{self._frame} on /tf{self._publishers.source('/tf')} is {age:.2f} s old"
+        return None if placement is None or self.problem else placement.pose
+
+
+class PoseTopic:
+    """The pose on a topic, in the world; the message's frame is looked up on /tf."""
+
+    def __init__(self, node: BaseNode, topic: str, tree: FrameTree, world: str, timeout: float) -> None:
+        self._tree, self._world, self._timeout = tree, world, timeout
+        self._newest: tuple[PoseStamped, float] | None = None
+        self._topic, self._publishers = topic, Publishers(node, [topic])
+        self._publishers.look_steadily()
+        self.problem: str | None = None
+        node.create_subscription(PoseStamped, topic, lambda message: self._take(message, node.now), STREAM_QOS)
+
+    def at(self, now: float) -> pin.SE3 | None:
+        """The newest pose at ``now`` [s]; None if it is not known, and then ``problem`` says why."""
+        if self._newest is None:
+            self.problem = f"nothing on {self._topic}"
+            return None
+        message, received = self._newest
+        if now - received > self._timeout:
+            source = self._publishers.source(self._topic)
+            self.problem = f"{self._topic}{source} is silent for {now - received:.2f} s"
+            return None
+        frame = message.header.frame_id
+        placement = self._tree.find(frame, self._world) if frame else Placement(pin.SE3.Identity(), math.inf)
+        pose = pose_of(message.pose)
+        if pose is None:
+            self.problem = f"{self._topic}: not finite or not a rotation"
+        elif placement is None:
+            self.problem = f"no transform from {frame} of {self._topic} to {self._world} on /tf"
+        else:
+            self.problem = None
+            return placement.pose * pose
+        return None
+
+    def take_silence(self, now: float) -> str | None:
+        """One line, returned once, if poses came and have stopped coming."""
+        if self._newest is None or now - self._newest[1] <= self._timeout:
+            return None
+        self.at(now)
+        self._newest = None
+        return self.problem
+
+    def _take(self, message: PoseStamped, now: float) -> None:
+        self._newest = message, now

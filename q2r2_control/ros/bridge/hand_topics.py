@@ -1,4 +1,4 @@
-"""The topics that a headset publishes, on either side of ROS."""
+"""The topics of a headset's hands: publishers, subscriptions, and a watch for missing data."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 
 from q2r2_control.inputs.messages import HandMessage, HandPose, HandTwist, MessageType
 from q2r2_control.inputs.session import HAND_TOPICS
-from q2r2_control.ros.bridge.base_node import STREAM_QOS
+from q2r2_control.ros.base_node import STREAM_QOS
 from q2r2_control.ros.bridge.messages import (
     hand_inputs,
     hand_pose,
@@ -22,9 +22,9 @@ from q2r2_control.ros.bridge.messages import (
     hand_twist_message,
     inputs_message,
 )
-from q2r2_control.ros.monitoring.publishers import Publishers
+from q2r2_control.ros.monitoring.endpoints import Publishers
 
-# Reliable, so that every subscriber can have it: a best-effort publisher has no reliable subscribers.
+# Reliable, so that any subscriber matches: a best-effort publisher does not match reliable subscribers.
 PUBLISHED_QOS = QoSProfile(
     history=HistoryPolicy.KEEP_LAST,
     depth=10,
@@ -40,7 +40,7 @@ _READERS: dict[MessageType, Callable[[Any], HandMessage]] = {
 
 
 class HandPublishers:
-    """Publishes what a headset says, on topics of the same names. May be used by any one thread."""
+    """Publishes the messages of a headset on topics of the same names. May be used by any single thread."""
 
     def __init__(self, node: Node, topics: Iterable[str]) -> None:
         """``topics`` are of :data:`HAND_TOPICS`."""
@@ -64,7 +64,7 @@ class HandPublishers:
 
 
 class HandWatch:
-    """Says which node's data of a hand have ceased. Poses and buttons are needed both: one guides, the other stops."""
+    """Says which data of a hand are missing, and from which node. Both are needed: poses to move, buttons to stop."""
 
     def __init__(self, node: Node, hand: str, timeout: float) -> None:
         self._hand, self._timeout = hand, timeout
@@ -73,7 +73,7 @@ class HandWatch:
         self._publishers.look_steadily()
 
     def silence(self, now: float, pose_stamp: float, inputs_stamp: float) -> str | None:
-        """One line, or None; the stamps are receipt times of the newest, -inf before the first [s]."""
+        """One line if data are missing; the stamps are the receipt times of the newest, -inf before the first [s]."""
         ages = {"pose": now - pose_stamp, "button data": now - inputs_stamp}
         missing = [what for what, age in ages.items() if age > self._timeout]
         if not missing:
@@ -86,7 +86,7 @@ class HandWatch:
 
 
 def subscribe_to_hands(node: Node, listener: Callable[[str, HandMessage], None]) -> None:
-    """Call ``listener`` with topic and message for whatever any hand says."""
+    """Call ``listener`` with topic and message for every message of either hand."""
     for name, topic in HAND_TOPICS.items():
         read = _READERS[topic.kind]
 

@@ -1,4 +1,4 @@
-"""What RViz shows of one arm's teleoperation: the target's axes at the tool, its path, and whether it is engaged."""
+"""RViz markers of one arm's teleoperation: the target's axes at the tool, its path, and whether it is engaged."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Between ROS messages and the dataclasses of ``types.py``; nothing here decides anything.
+"""Conversion between ROS messages and the dataclasses of ``types.py``, and nothing else.
 
 Joints are matched by name, never by order. Stamps of messages are the sender's clock and stay with the message; times
 inside are receipt times on the node's own clock, given in seconds.
@@ -137,7 +137,7 @@ def joint_state_message(names: Sequence[str], q: Array, v: Array, tau: Array, t:
 def robot_state(message: JointState, names: Sequence[str], t: float) -> RobotState | str:
     """State in the order of ``names``, received at ``t`` [s]; or what is wrong with the message, in one line.
 
-    Joints of others may be in it. Velocities and torques may be missing as a whole and are then zero.
+    Other joints in the message are ignored. Velocities and torques may be missing as a whole and are then zero.
     """
     columns: Mapping[str, int] = {name: index for index, name in enumerate(message.name)}
     if len(columns) != len(message.name):

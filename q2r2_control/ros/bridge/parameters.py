@@ -1,36 +1,204 @@
-"""A settings model as parameters of a node: one for each field, with its description and range."""
+"""Parameters of an arm controller, and any settings model as parameters of a node."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
-from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
 
+from q2r2_control.config import load_config
+from q2r2_control.config.external import GripperSettings, GuardLimits
+from q2r2_control.config.presets import BUILTIN, Mode, Preset, preset_of
+from q2r2_control.config.teleop import GuardSettings, Stance, TeleopSettings
+from q2r2_control.config.timeouts import STREAM_TIMEOUT
 from q2r2_control.errors import ConfigError
-from q2r2_control.ros.bridge.base_node import BaseNode
+from q2r2_control.ros.base_node import BaseNode
 
 Model = TypeVar("Model", bound=BaseModel)
-NONE = 0.0  # of a number that may be none; no such field allows zero
+BUILTIN_NODE = "/cartesian_controller"
+_NONE = 0.0  # stands for no number; no field that may be none allows zero
 
 
-def declared(
-    node: BaseNode,
-    name: str,
-    default: Any,
-    description: str,
-    *,
-    at_least: float | None = None,
-    at_most: float | None = None,
-) -> Any:
-    """Declare a parameter and return its value. Raises :class:`ConfigError` for a value of wrong type or range."""
-    try:
-        return node.parameter(name, default, description, at_least=at_least, at_most=at_most)
-    except (InvalidParameterTypeException, InvalidParameterValueException) as error:
-        bounds = "" if at_least is None or at_most is None else f" from {at_least:g} to {at_most:g}"
-        raise ConfigError(f"parameter {name}: {error}; allowed is a {type(default).__name__}{bounds}") from error
+@dataclass(frozen=True, slots=True)
+class ArmDefaults:
+    """What a subclass of :class:`BaseArmController` passes to its constructor."""
+
+    arm_name: str  # left or right
+    robot_name: str
+    mirror: bool
+    base_frame_id: str
+    end_effector_link_name: str
+    ctrl_prefix: str
+    gripper_action_topic: str
+    filter_window_size: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class ArmParameters:
+    """The checked parameters of an arm controller."""
+
+    base_frame: str  # that the controller reads its targets in
+    world_frame: str  # whose axes the hand's are
+    tool_frame: str
+    controller: str  # name of the controller's node
+    prefix: str  # for the preset's {ctrl}
+    target_topic: str
+    current_pose_topic: str  # "": from /tf
+    safe_target_topic: str
+    following_topic: str
+    builtin_prefix: str
+    tool_timeout: float  # [s]
+    link_timeout: float  # [s]
+    listener_timeout: float  # [s]
+    rate: float  # [Hz]
+    preset: Preset
+    mode: Mode
+    gripper_topic: str
+    gripper: GripperSettings
+    guard: GuardSettings
+    teleop: TeleopSettings
+
+
+@dataclass(frozen=True, slots=True)
+class _Defaults:
+    """Defaults of the parameters, of the cell or of the subclass."""
+
+    ctrl_prefix: str
+    base_frame_id: str
+    end_effector_link_name: str
+    gripper_action_topic: str
+    teleop: TeleopSettings
+    preset: str = BUILTIN.name
+    mode: Mode = Mode.RAW
+    rate: float | None = None
+    target_topic: str = ""
+    world_frame_id: str = ""
+    gripper: GripperSettings = field(default_factory=GripperSettings)
+    limits: GuardLimits = field(default_factory=GuardLimits)
+
+
+def arm_parameters(node: BaseNode, subclass: ArmDefaults) -> ArmParameters:
+    """Declare all parameters and check them together. Raises :class:`ConfigError` for what is not allowed.
+
+    Defaults are the cell's where the parameter ``config`` names one, and else the subclass's.
+    """
+    arm, declare = subclass.arm_name, node.parameter
+    config = declare("config", "", 'YAML of the cell, whose teleop and external are defaults of these; "": none')
+    given = _of_cell(subclass, config) if config else _of_subclass(subclass)
+    preset, mode = preset_of(
+        declare("preset", given.preset, "terms of the controller that is driven, by its name"),
+        declare("mode", given.mode.value, "raw: the hand's target; filtered: through the built-in controller"),
+    )
+    prefix = declare("ctrl_prefix", given.ctrl_prefix, "the controller's node, with its namespace").rstrip("/")
+    base = declare("base_frame_id", given.base_frame_id, "frame_id of targets")
+    world = declare("world_frame_id", given.world_frame_id, 'whose axes the hand\'s are; "": base_frame_id')
+    topic = declare("target_topic", given.target_topic, 'where targets go; "": as the preset says')
+    controller = declare("controller_node", "", 'whose restart pauses the arm; "": ctrl_prefix')
+    return ArmParameters(
+        base_frame=base,
+        world_frame=world or base,
+        tool_frame=declare("end_effector_link_name", given.end_effector_link_name, "frame that the operator moves"),
+        controller=controller or (BUILTIN_NODE if preset is BUILTIN else prefix),
+        prefix=prefix,
+        target_topic=topic or preset.topic.format(ctrl=prefix),
+        current_pose_topic=declare("current_pose_topic", "", 'PoseStamped of the tool; "": from /tf'),
+        safe_target_topic=declare(
+            "safe_target_topic", f"{BUILTIN_NODE}/safe_target/{arm}", "safe target of the built-in controller"
+        ),
+        following_topic=declare(
+            "following_topic", f"{BUILTIN_NODE}/following/{arm}", "whether the built-in controller follows"
+        ),
+        builtin_prefix=declare("builtin_prefix", f"/q2r2/{arm}", "where mode filtered sends the hand's target"),
+        tool_timeout=_timeout(
+            node, "tool_timeout", "an older pose of the tool, or safe target, does not count", 0.01, 2.0
+        ),
+        listener_timeout=_timeout(node, "listener_timeout", "targets may not be acknowledged", 0.1, 10.0),
+        link_timeout=_timeout(node, "link_timeout", "the other arm's node may be silent", 0.1, 10.0),
+        rate=_rate(node, preset, given.rate),
+        preset=preset,
+        mode=mode,
+        gripper_topic=declare("gripper_action_topic", given.gripper_action_topic, "action or topic"),
+        gripper=settings_from_parameters(node, "gripper", given.gripper, frozenset()),
+        guard=settings_from_parameters(node, "guard", given.limits.over(preset.guard), frozenset()),
+        teleop=_teleop_settings(node, given.teleop),
+    )
+
+
+def _timeout(node: BaseNode, name: str, description: str, at_least: float, at_most: float) -> float:
+    value = node.parameter(name, STREAM_TIMEOUT, f"{description} [s]", at_least=at_least, at_most=at_most)
+    return float(value)
+
+
+def _of_subclass(subclass: ArmDefaults) -> _Defaults:
+    teleop = TeleopSettings(stance=Stance.MIRROR if subclass.mirror else Stance.SIDE_BY_SIDE)
+    if subclass.filter_window_size is not None:
+        # A mean over n samples of a 75 Hz headset comes (n - 1) / 2 periods late.
+        delay = min(max((subclass.filter_window_size - 1) / 2 / 75.0, 0.0), 0.2)
+        teleop = teleop.model_copy(update={"filter": teleop.filter.model_copy(update={"smoothing_delay": delay})})
+    return _Defaults(
+        subclass.ctrl_prefix,
+        subclass.base_frame_id,
+        subclass.end_effector_link_name,
+        subclass.gripper_action_topic,
+        teleop,
+    )
+
+
+def _of_cell(subclass: ArmDefaults, path: str) -> _Defaults:
+    """The cell's, and the subclass's where the cell says nothing."""
+    cell, side = load_config(path), subclass.arm_name
+    arm = next((arm for name, arm in cell.arms.items() if name == side), None)
+    if arm is None:
+        raise ConfigError(f"parameter config: {path} has no arm {side}; allowed: {', '.join(cell.arms)}")
+    given = replace(_of_subclass(subclass), teleop=cell.teleop)
+    if (tool_frame := cell.named_tool_frame(side)) is not None:
+        given = replace(given, end_effector_link_name=tool_frame)
+    if cell.external is None:
+        return given
+    external, theirs = cell.external, cell.external.arm(side)
+    given = replace(
+        given,
+        preset=external.preset,
+        mode=external.mode,
+        ctrl_prefix=theirs.ctrl_prefix,
+        base_frame_id=theirs.base_frame,
+        world_frame_id=external.world_frame or "",
+        end_effector_link_name=theirs.tool_frame or given.end_effector_link_name,
+        gripper_action_topic=theirs.gripper.topic or given.gripper_action_topic,
+        gripper=theirs.gripper.settings(),
+        limits=external.limits,
+    )
+    if not external.terms.takes_poses:
+        return given  # rate and topic are those of joint commands, which another node sends
+    return replace(given, rate=external.rate, target_topic=theirs.target_topic or "")
+
+
+def _rate(node: BaseNode, preset: Preset, wanted: float | None) -> float:
+    rate = float(node.parameter("rate", wanted or preset.rate, "of targets [Hz]", at_least=1.0, at_most=1000.0))
+    if rate < preset.lowest_rate:
+        raise ConfigError(
+            f"parameter rate = {rate:g}: preset {preset.name} needs at least {preset.lowest_rate:g}, "
+            f"better {preset.rate:g}"
+        )
+    return rate
+
+
+def _teleop_settings(node: BaseNode, default: TeleopSettings) -> TeleopSettings:
+    swapped = default.stance is not Stance.SIDE_BY_SIDE
+    mirror = node.parameter("mirror", swapped, "facing the robot: the other hand moves this arm")
+    reflected = node.parameter(
+        "mirror_reflected",
+        mirror and default.stance is Stance.MIRROR_REFLECTED,
+        "with mirror: motion to the left becomes motion to the right",
+    )
+    if reflected and not mirror:
+        raise ConfigError("parameter mirror_reflected = True: allowed with mirror = True only")
+    stance = Stance.SIDE_BY_SIDE if not mirror else Stance.MIRROR_REFLECTED if reflected else Stance.MIRROR
+    default = default.model_copy(update={"stance": stance})
+    return settings_from_parameters(node, "teleop", default, frozenset({"stance"}))
 
 
 def settings_from_parameters(node: BaseNode, prefix: str, default: Model, leave_out: frozenset[str]) -> Model:
@@ -51,14 +219,14 @@ def settings_from_parameters(node: BaseNode, prefix: str, default: Model, leave_
 
 def _values(node: BaseNode, prefix: str, default: BaseModel, leave_out: frozenset[str]) -> dict[str, Any]:
     values: dict[str, Any] = {}
-    for key, field in type(default).model_fields.items():
+    for key, info in type(default).model_fields.items():
         value = getattr(default, key)
         if key in leave_out:
             values[key] = value
         elif isinstance(value, BaseModel):
             values[key] = _values(node, f"{prefix}.{key}", value, leave_out)
         else:
-            values[key] = _value(node, f"{prefix}.{key}", value, field)
+            values[key] = _value(node, f"{prefix}.{key}", value, info)
     return values
 
 
@@ -66,18 +234,18 @@ def _value(node: BaseNode, name: str, default: Any, field: FieldInfo) -> Any:
     description = field.description or name
     may_be_none = type(None) in getattr(field.annotation, "__args__", ())
     if may_be_none:
-        given = declared(node, name, NONE if default is None else default, f"{description}; here 0")
-        return None if given == NONE else given
+        given = node.parameter(name, _NONE if default is None else default, f"{description}; here 0")
+        return None if given == _NONE else given
     if isinstance(default, Enum):
-        return declared(node, name, str(default.value), description)
+        return node.parameter(name, str(default.value), description)
     if isinstance(default, tuple):
-        return tuple(declared(node, name, list(default), description))
-    return declared(node, name, default, description, **_range(field))
+        return tuple(node.parameter(name, list(default), description))
+    return node.parameter(name, default, description, **_range(field))
 
 
-def _range(field: FieldInfo) -> dict[str, float]:
-    """The closed range of a field; open ends are the model's to check."""
-    bounds: dict[str, float] = {}
+def _range(field: FieldInfo) -> dict[str, Any]:
+    """The closed range of a field; whether the ends are allowed is checked by the model."""
+    bounds: dict[str, Any] = {}
     for entry in field.metadata:
         for attribute, bound in (("ge", "at_least"), ("gt", "at_least"), ("le", "at_most"), ("lt", "at_most")):
             if hasattr(entry, attribute):

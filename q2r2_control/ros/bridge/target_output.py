@@ -1,4 +1,4 @@
-"""The last step before a controller that is not ours: it gets targets on its own terms, or none."""
+"""The last step before the controller of an arm: it gets targets on its preset's terms, or none."""
 
 from __future__ import annotations
 
@@ -9,29 +9,27 @@ from geometry_msgs.msg import PoseStamped, WrenchStamped
 
 from q2r2_control.config.presets import Hold, Preset
 from q2r2_control.config.teleop import GuardSettings
-from q2r2_control.ros.bridge.base_node import LATCHED_QOS, BaseNode
+from q2r2_control.ros.base_node import LATCHED_QOS, BaseNode
 from q2r2_control.ros.bridge.messages import stamped_pose, time_message
-from q2r2_control.ros.monitoring.watched_publisher import WatchedPublisher
+from q2r2_control.ros.monitoring.endpoints import WatchedPublisher, node_of
 from q2r2_control.supervision.target_stream import apart
 from q2r2_control.teleop.guard import TargetGuard
 
-_GRAPH_PERIOD = 0.1  # between two looks at who else is there [s]
-# After somebody came every tick looks, since names are known later than endpoints. Until they are known nothing is
-# sent: it may be the controller, started anew, and what it is asked for first must not be a jump. After this long that
-# pauses an arm that is engaged [s].
-_ALERT = 3.0
-_NAMELESS = "_NODE_NAME_UNKNOWN_"  # as rcl says it
-# A tool farther from a held target than this was moved by something else, and the target is not asked for again.
+_GRAPH_PERIOD = 0.1  # of asking the graph for subscribers [s]
+# After a subscriber appeared the graph is asked at every tick, because it knows an endpoint before it knows its node.
+# Until the node is known nothing is sent: it may be the restarted controller, whose first target must not be a jump.
+# If that takes longer than this, an engaged arm is paused [s].
+_NAME_TIMEOUT = 3.0
+# A tool farther from a held target than this was moved by something else: the target is not repeated.
 _HELD = 0.15, 0.6  # [m, rad]
 
 
 class TargetOutput:
     """Publishes one arm's target to one controller.
 
-    While there is a target it is followed by a :class:`TargetGuard`, which starts where the tool is, so engaging moves
-    nothing. When there is none any more the guard brakes, and then the last pose is repeated
-    or not, as the preset says. It is never repeated to a tool that has gone elsewhere, nor to a controller that was
-    started anew: both would be a jump.
+    A :class:`TargetGuard` follows the target. It starts at the tool, so engaging moves nothing. When the target ends
+    the guard brakes, and then the last pose is repeated or not, as the preset says. It is never repeated when the tool
+    is elsewhere, nor to a controller that was restarted: both would be a jump.
     """
 
     def __init__(
@@ -56,10 +54,10 @@ class TargetOutput:
         self._restarted = False
         self._endpoints: set[bytes] = set()  # of the controller
         self._listeners = 0
-        self._strange = False  # somebody listens who is not known yet
-        self._looked = self._came = -math.inf
+        self._unknown = False  # a subscriber's node is not known yet
+        self._asked_at = self._appeared_at = -math.inf  # the graph, and a subscriber [s]
         self.sent = 0
-        self.lives = 0  # how often the controller was seen to come
+        self.starts = 0  # how often the controller has appeared
 
     @property
     def topic(self) -> str:
@@ -73,39 +71,39 @@ class TargetOutput:
 
     @property
     def conflict(self) -> str | None:
-        """One line on publishers that should not be there."""
+        """One line if there are other publishers of the same topic."""
         if self.others == 0:
             return None
         return f"{self.others + 1} publishers of {self.topic}, allowed is one (a killed one counts for some seconds)"
 
     @property
-    def unheard(self) -> str | None:
-        """One line where nobody takes the targets, or it is not known yet who will."""
+    def unready(self) -> str | None:
+        """One line if the topic has no subscriber, or one whose node is not known yet."""
         if self._publisher.listeners == 0:
-            return f"nobody listens to {self.topic}"
-        strange = self._strange and not self.following
-        return f"it is not known who listens to {self.topic}" if strange else None
+            return f"{self.topic} has no subscriber"
+        return self._unknown_node if self._unknown and not self.following else None
 
     def take_fault(self, now: float) -> str | None:
-        """Look who is there; says once that the controller was started anew, or is gone, while it was driven."""
+        """Check the subscribers; returns once why the controller that is driven is not there any more."""
         listeners = self._present
         if listeners > self._listeners or listeners == 0:
-            self._came = now
+            self._appeared_at = now
             if not self.following:
-                self.forget(now)  # whoever it is, it is not to be greeted with a target of the past
+                self.forget(now)  # a new subscriber must not get an old target
         self._listeners = listeners
-        if self._strange or now - self._came < _ALERT or not 0.0 <= now - self._looked <= _GRAPH_PERIOD:
-            self._looked = now
-            self._look(now)
-        if self._strange and self.following and now - self._came > _ALERT:
+        recently = now - self._appeared_at < _NAME_TIMEOUT
+        if self._unknown or recently or not 0.0 <= now - self._asked_at <= _GRAPH_PERIOD:
+            self._asked_at = now
+            self._ask_graph(now)
+        if self._unknown and self.following and now - self._appeared_at > _NAME_TIMEOUT:
             self.forget(now)
-            return f"it is not known who listens to {self.topic}"
+            return self._unknown_node
         restarted, self._restarted = self._restarted, False
         if restarted:
-            return f"{self._controller} was started anew"
+            return f"{self._controller} was restarted"
         silence = self._publisher.silence() if self.following else None
         if silence is not None:
-            self.forget(now)  # it is gone, and whoever comes is not to be asked for a target of the past
+            self.forget(now)  # the controller is gone, and its successor must not get an old target
             return f"{self._controller}: {silence}"
         return None
 
@@ -119,11 +117,11 @@ class TargetOutput:
     ) -> pin.SE3 | None:
         """Publish for ``now`` [s]; returns what was published, in the world frame.
 
-        ``target``: where the tool should be, None: nowhere new; ``tool``: where it is; both in the world frame, as is
-        ``base``, the frame that the controller reads its targets in. None of the latter two: not known.
-        ``start``: where a stream begins that does not begin at its first target.
+        ``target``: where the tool should be, None while paused; ``tool``: where it is; ``base``: the frame in which
+        the controller reads its targets. All are in the world frame; the latter two are None while not known.
+        ``start``: where a stream begins, by default at its first target.
         """
-        if self._strange or self._present > self._listeners:
+        if self._unknown or self._present > self._listeners:
             return None
         idle = not self.following and self.guard.at_rest
         self.following = target is not None
@@ -140,17 +138,17 @@ class TargetOutput:
         return pose
 
     def forget(self, now: float) -> None:
-        """Hold nothing any more; the next target starts anew."""
+        """Drop the held target; the next target begins a new stream."""
         self.following = False
         self.guard.reset(None, now)
 
     @property
     def _present(self) -> int:
-        """How many listen; the graph knows of one before anything can be sent to it."""
+        """Number of subscribers; the graph lists one before the publisher can send to it."""
         return max(self._publisher.listeners, self._node.count_subscribers(self.topic))
 
     def _holds(self, tool: pin.SE3 | None, now: float) -> bool:
-        """Whether the last target is repeated."""
+        """Whether the last target may be repeated."""
         if self.guard.pose is None:
             return False
         if tool is None or not near(self.guard.pose, tool, *_HELD):
@@ -158,17 +156,17 @@ class TargetOutput:
             return False
         return self.preset.hold is Hold.REPEAT
 
-    def _look(self, now: float) -> None:
-        """Notice a controller that has come."""
-        found = self._node.get_subscriptions_info_by_topic(self.topic)
-        self._strange = len(found) < self._listeners or any(info.node_name == _NAMELESS for info in found)
-        endpoints = {
-            bytes(info.endpoint_gid)
-            for info in found
-            if f"{info.node_namespace.rstrip('/')}/{info.node_name}" == self._controller
-        }
+    @property
+    def _unknown_node(self) -> str:
+        return f"{self.topic} has a subscriber whose node is not known yet"
+
+    def _ask_graph(self, now: float) -> None:
+        """Notice a controller that has appeared."""
+        found = [(node_of(info), info) for info in self._node.get_subscriptions_info_by_topic(self.topic)]
+        self._unknown = len(found) < self._listeners or any(name is None for name, _ in found)
+        endpoints = {bytes(info.endpoint_gid) for name, info in found if name == self._controller}
         if endpoints - self._endpoints:
-            self.lives += 1
+            self.starts += 1
             self._restarted = self.following
             self.forget(now)
             self._send_zero_wrench(now)
@@ -184,5 +182,5 @@ class TargetOutput:
 
 def near(pose: pin.SE3, other: pin.SE3, distance: float, angle: float) -> bool:
     """Whether two poses are within ``distance`` [m] and ``angle`` [rad] of each other."""
-    way, turn = apart(pose, other)
-    return way <= distance and turn <= angle
+    length, rotation = apart(pose, other)
+    return length <= distance and rotation <= angle

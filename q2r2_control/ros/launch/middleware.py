@@ -1,9 +1,9 @@
-"""How Fast DDS, the middleware that ROS 2 Jazzy comes with, is set up where the user has not done it.
+"""Sets up Fast DDS, the middleware of ROS 2 Jazzy, unless the user has done so.
 
-Shared memory is left out: a process that is killed while it holds a lock there holds up whoever writes to the same
-memory, and all who listen to him, for about a second. And a node that ended without a word is out of the graph after
-3 s instead of 20, so that the one in its place does not count as a second one for longer. Each process says that for
-itself: those of others stay as long as they say.
+Shared memory is switched off: a process that is killed while it holds a lock there delays all writers to the same
+memory, and all their subscribers, for about a second. And a node that died leaves the graph after 3 s instead of 20,
+so that its successor counts as a second publisher for no longer. Each process sets this for itself; nodes of other
+packages keep their own settings.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ _RANGE, _PEERS = "ROS_AUTOMATIC_DISCOVERY_RANGE", "ROS_STATIC_PEERS"
 
 
 def set_up_middleware(environment: MutableMapping[str, str]) -> None:
-    """Add what a process that has not called ``rclpy.init`` yet needs; what the user has set about Fast DDS stays.
+    """Add the variables that a process needs before it calls ``rclpy.init``; Fast DDS settings of the user are kept.
 
-    Nothing is added for another middleware: the range that is put into a profile here holds for all of them.
+    Nothing is added for another middleware, because the changed discovery range would apply to it too.
     """
     if not environment.get("RMW_IMPLEMENTATION", _FAST_DDS).startswith(_FAST_DDS):
         return
@@ -30,6 +30,6 @@ def set_up_middleware(environment: MutableMapping[str, str]) -> None:
     if environment.get(_RANGE) != "LOCALHOST":
         environment.update({_TRANSPORTS: "UDPv4", _PROFILES_FILE: str(_PROFILES / "subnet.xml")})
     elif not environment.get(_PEERS):
-        # For this range ROS 2 adds shared memory itself, whatever the profile says. For the system's default it adds
-        # nothing to it; nor would it static peers, so who names some keeps shared memory.
+        # For LOCALHOST ROS 2 adds shared memory whatever the profile says. For SYSTEM_DEFAULT it adds nothing, static
+        # peers neither: with static peers the range, and so the shared memory, stay as they are.
         environment.update({_RANGE: "SYSTEM_DEFAULT", _PROFILES_FILE: str(_PROFILES / "localhost.xml")})

@@ -1,4 +1,4 @@
-"""Teleoperation of one arm as a node. A robot is ported by a subclass that gives its names, see left_arm_controller."""
+"""Teleoperation of one arm as a node. Another robot is a subclass with its names, see left_arm_controller."""
 
 from __future__ import annotations
 
@@ -14,15 +14,14 @@ from visualization_msgs.msg import Marker
 from q2r2_control.errors import ConfigError
 from q2r2_control.inputs.samples import SampleQueue
 from q2r2_control.inputs.session import HAPTIC_TOPICS
+from q2r2_control.ros.base_node import COMMAND_QOS, ERROR, OK, STREAM_QOS, WARN, BaseNode
 from q2r2_control.ros.bridge.arm_outputs import SAG, ArmOutputs
-from q2r2_control.ros.bridge.arm_parameters import ArmDefaults, ArmParameters, arm_parameters
-from q2r2_control.ros.bridge.base_node import COMMAND_QOS, ERROR, OK, STREAM_QOS, WARN, BaseNode
-from q2r2_control.ros.bridge.frames import FrameListener
-from q2r2_control.ros.bridge.gripper_client import GripperClient
+from q2r2_control.ros.bridge.frames import FrameListener, PoseTopic, ToolFrame
+from q2r2_control.ros.bridge.grippers import GripperClient
 from q2r2_control.ros.bridge.hand_topics import HandWatch
 from q2r2_control.ros.bridge.markers import TargetMarkers
 from q2r2_control.ros.bridge.messages import hand_sample
-from q2r2_control.ros.bridge.pose_source import PoseTopic, ToolFrame
+from q2r2_control.ros.bridge.parameters import ArmDefaults, ArmParameters, arm_parameters
 from q2r2_control.ros.bridge.target_output import near
 from q2r2_control.ros.monitoring.arm_link import ArmLink
 from q2r2_control.teleop.arm import OPEN, ArmState
@@ -36,7 +35,8 @@ _MARKER_PERIOD = 0.05  # [s]
 class BaseArmController(BaseNode):
     """One arm follows one hand: hand topics in, target pose, gripper goals, markers and vibrations out.
 
-    The node is ``<arm_name>_<robot_name>_arm_controller``; the other arguments are defaults of parameters so named.
+    The node is ``<arm_name>_<robot_name>_arm_controller``; the other arguments are the defaults of parameters of that
+    name.
     ``filter_window_size``, in samples of a 75 Hz headset, sets ``teleop.filter.smoothing_delay``.
 
     Steps to override: :meth:`setup_parameters`, :meth:`setup_state`, :meth:`setup_interfaces`, :meth:`current_pose`,
@@ -74,7 +74,7 @@ class BaseArmController(BaseNode):
             self.setup_state()
             self.setup_interfaces()
         except BaseException:
-            self.destroy_node()  # a node that nobody gets to hold may keep the process from ending
+            self.destroy_node()  # a node that is never returned could keep the process from ending
             raise
 
     def setup_parameters(self) -> ArmParameters:
@@ -82,7 +82,7 @@ class BaseArmController(BaseNode):
         return arm_parameters(self, self.defaults)
 
     def setup_state(self) -> None:
-        """Make what the node remembers."""
+        """Make the objects that keep the node's state."""
         self.teleop = Teleop(self.parameters.teleop, (self.arm_name,))
         self.hand = self.teleop.hand_of(self.arm_name)
         self.haptics = HapticPulses(self.hand)
@@ -136,7 +136,7 @@ class BaseArmController(BaseNode):
         self.gripper.toggle(self.now)
 
     def tick(self) -> None:
-        """Take what arrived, and say where the tool should go."""
+        """Process what arrived, and publish where the tool should go."""
         now, tool = self.now, self.current_pose()
         base = self._base()
         self._refusal = self._refuse(tool, base, now)
@@ -152,15 +152,15 @@ class BaseArmController(BaseNode):
         toggled = target.gripper != self._target.gripper
         self._target = target
         if self.now - now > self.parameters.teleop.gate.timeout:
-            return  # frozen in between: what was to be sent is of the past, and the next tick finds out
+            return  # this process was frozen meanwhile: the target is out of date, and the next tick pauses the arm
         sent = self._outputs.step(target.pose, tool, base, now)
         if (fault := self._outputs.relay(self.state is ArmState.ENGAGED, tool, base, now)) is not None:
             self.teleop.pause(now, fault)
         if toggled:
             self.toggle_gripper()
         self.gripper.check(now)
-        self._tell_events(now)
-        self._tell_operator(sent, tool, now)
+        self._publish_events(now)
+        self._publish_feedback(sent, tool, now)
 
     @property
     def state(self) -> ArmState:
@@ -168,7 +168,7 @@ class BaseArmController(BaseNode):
         return self.teleop.states[self.arm_name]
 
     def health(self) -> tuple[bytes, str, Mapping[str, Any]]:
-        """State, what keeps the arm from being engaged, and figures."""
+        """State, the reason why the arm cannot be engaged, and figures."""
         output = self._outputs.first
         values = {
             "arm": self.arm_name,
@@ -196,7 +196,7 @@ class BaseArmController(BaseNode):
         return OK, self._last_event, values
 
     def close(self) -> None:
-        """Say good-bye to the other arm."""
+        """Announce the end of this node to the other arm."""
         self._link.close()
 
     def _base(self) -> pin.SE3 | None:
@@ -207,7 +207,7 @@ class BaseArmController(BaseNode):
         return None if placement is None else placement.pose
 
     def _refuse(self, tool: pin.SE3 | None, base: pin.SE3 | None, now: float) -> tuple[bytes, str] | None:
-        """Why the arm may not be engaged now, and how bad that is."""
+        """Why the arm may not be engaged now, with the level of the diagnostics."""
         for line in (self._link.disagreement, self._outputs.conflict):
             if line is not None:
                 return ERROR, line
@@ -221,22 +221,22 @@ class BaseArmController(BaseNode):
         return None if problem is None else (WARN, problem)
 
     def _faults(self, now: float) -> str | None:
-        """What pauses this arm, besides its hand: its own standing still first, which makes all others look silent."""
-        stood, self._ticked = now - self._ticked, now
-        stalled = f"this node stood still for {stood:.2f} s" if stood > self.parameters.teleop.gate.timeout else None
+        """What pauses this arm, besides its hand. A gap in its own ticks comes first: it makes others look silent."""
+        gap, self._ticked = now - self._ticked, now
+        stalled = f"this node stood still for {gap:.2f} s" if gap > self.parameters.teleop.gate.timeout else None
         linked = self._link.take_fault() if self.parameters.teleop.linked else None
         return stalled or self._outputs.take_fault(now) or linked
 
     def _commanded(self, tool: pin.SE3, now: float) -> pin.SE3:
-        """What the leash is tied to, and whose orientation an anchor takes."""
+        """The commanded tool pose: the leash is measured from it, and an anchor takes its orientation."""
         reference = self._safe_target.at(now)
         if self.state is ArmState.ENGAGED:
             return tool if reference is None else reference
         reference = reference or self._outputs.first.guard.pose
         return reference if reference is not None and near(reference, tool, *SAG) else tool
 
-    def _tell_events(self, now: float) -> None:
-        """Pass changes of the state on to the log, the hand and the other arm."""
+    def _publish_events(self, now: float) -> None:
+        """Report changes of the state: to the log, to the hand as vibrations, and to the other arm."""
         for event in self.teleop.take_events():
             self._last_event = f"{event.destination}: {event.reason}"
             self.get_logger().info(self._last_event)
@@ -248,8 +248,8 @@ class BaseArmController(BaseNode):
                 self._link.report(event.reason)
             self.report_health()
 
-    def _tell_operator(self, sent: pin.SE3 | None, tool: pin.SE3 | None, now: float) -> None:
-        """Markers and vibrations."""
+    def _publish_feedback(self, sent: pin.SE3 | None, tool: pin.SE3 | None, now: float) -> None:
+        """Publish markers and vibrations."""
         self.haptics.slip(self._target.slip, self._target.slip_angle)
         if (pulse := self.haptics.at(now)) is not None:
             self._haptics.publish(OVR2ROSHapticFeedback(frequency=pulse.frequency, amplitude=pulse.amplitude))
@@ -268,9 +268,9 @@ class BaseArmController(BaseNode):
         return response
 
     def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        """Trust nothing received so far and hold nothing; a press engages anew."""
+        """Drop all that was received and the held target; a press engages again."""
         now = self.now
         self.teleop.connection_lost(now)
         self._outputs.forget(now)
-        response.success, response.message = True, f"{self.arm_name} starts anew"
+        response.success, response.message = True, f"{self.arm_name} is reset"
         return response

@@ -15,6 +15,7 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
+import numpy as np
 from geometry_msgs.msg import PoseStamped
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
@@ -22,18 +23,19 @@ from rclpy.parameter import Parameter
 from std_msgs.msg import Bool
 from std_srvs.srv import SetBool, Trigger
 
-from q2r2_control.config import load_config
+from q2r2_control.config import Config, load_config
 from q2r2_control.control.controller import LONGEST_DT, CartesianController
+from q2r2_control.errors import ConfigError
 from q2r2_control.robot.robot import Robot
-from q2r2_control.ros.bridge.base_node import ERROR, LATCHED_QOS, OK, SENT_COMMAND_QOS, WARN, BaseNode, run_node
-from q2r2_control.ros.bridge.joint_intake import JointIntake
-from q2r2_control.ros.bridge.make_output import NONE, make_output, output_name
+from q2r2_control.ros.base_node import ERROR, LATCHED_QOS, OK, SENT_COMMAND_QOS, WARN, BaseNode, run_node
+from q2r2_control.ros.bridge.intakes import JointIntake, TargetIntake
+from q2r2_control.ros.bridge.joint_outputs import NONE, make_output, output_name
 from q2r2_control.ros.bridge.messages import stamped_pose
-from q2r2_control.ros.bridge.target_intake import TargetIntake
-from q2r2_control.supervision.external_arms import LedArms, LedSettings, settings_to_lead
-from q2r2_control.supervision.joint_watch import WatchSettings
-from q2r2_control.supervision.supervisor import Phase, Supervisor
+from q2r2_control.supervision.external_arms import ExternalArms, ExternalSettings, settings_for_external_arms
+from q2r2_control.supervision.joint_watch import watch_settings
+from q2r2_control.supervision.supervisor import Displace, Phase, Supervisor
 from q2r2_control.supervision.target_stream import Origins, StreamSettings
+from q2r2_control.supervision.tick_pacer import TickPacer
 from q2r2_control.types import Reference
 
 _LONGEST_STOP = 3.0  # [s]
@@ -52,7 +54,7 @@ _WATCH_PARAMETERS: _Table = (
     ("deviation", "max_deviation", "of a joint from its reference [rad]", 0.01, 3.0),
     ("deviation_time", "deviation_time", "for this long stops the arms [s]", 0.05, 10.0),
 )
-_LED_PARAMETERS: _Table = (
+_EXTERNAL_PARAMETERS: _Table = (
     ("tolerance", "distance_tolerance", "output none: measured pairs may be closer than min_distance [m]", 0.0, 0.1),
 )
 
@@ -66,16 +68,20 @@ class CartesianControllerNode(BaseNode):
         rate = self.parameter("rate", 250.0, "of the control loop [Hz]", at_least=20, at_most=1000)
         output = output_name(self)
         if output == NONE:
-            config = settings_to_lead(config)
+            config = settings_for_external_arms(config)
         robot = Robot.from_config(config)
         self._period = 1.0 / rate
         self._output = make_output(output, self, robot, config, self._period)
         self._targets = TargetIntake(self, robot, self.report_health)
         self._joints = JointIntake(self, robot)
-        streams, watch, led = StreamSettings(), WatchSettings(), LedSettings()
+        streams, external = StreamSettings(), ExternalSettings()
+        watch = watch_settings(config.supervision, self._output.drive.yields)
+        # A message with a bad number among good ones is another publisher's: no reason to bridge it.
+        watch.unusable_time = 0.0
         self._settings: dict[str, tuple[Any, str]] = {}
-        for target, table in ((streams, _STREAM_PARAMETERS), (watch, _WATCH_PARAMETERS), (led, _LED_PARAMETERS)):
-            self._declare(target, table)
+        self._declare(streams, _STREAM_PARAMETERS)
+        self._declare(watch, _WATCH_PARAMETERS)
+        self._declare(external, _EXTERNAL_PARAMETERS)
         self.add_post_set_parameters_callback(self._on_parameters)
         self._controller = CartesianController(robot, config.control)
         self._supervisor = Supervisor(
@@ -84,12 +90,25 @@ class CartesianControllerNode(BaseNode):
             streams,
             watch,
             Origins(self._joints.source, self._targets.source),
-            LedArms(robot, self._controller, led, streams, watch) if output == NONE else None,
+            ExternalArms(robot, self._controller, external, streams, watch) if output == NONE else None,
+            displace=self._displacement(config) if output != NONE else None,
         )
+        limit = robot.velocity_limit * config.control.velocity_scale
+        self._pacer = TickPacer(self._period, limit, config.control.acceleration_limit)
+        self._velocity = np.zeros(robot.model.nv)  # of the last reference [rad/s]
         self._reference: Reference | None = None
+        self._commanding = False
         self._ticks, self._reported_at, self._last_tick = 0, time.monotonic(), self.now
         self._connect()
         self.get_logger().info(f"{config.name}: {', '.join(robot.arms)}; waits for joint states")
+
+    def _displacement(self, config: Config) -> Displace | None:
+        """The drive's own, where the cell has an admittance. Raises :class:`ConfigError` where nothing is measured."""
+        if not config.admittance.enabled or self._output.drive.yields:
+            return None
+        if not self._joints.measures_external_torque:
+            raise ConfigError("admittance.enabled = true: set the parameter external_torque_topic, which it needs")
+        return self._output.drive.displaced
 
     def _declare(self, target: Any, table: _Table) -> None:
         for field, name, description, least, greatest in table:
@@ -128,10 +147,11 @@ class CartesianControllerNode(BaseNode):
 
     def _tick(self) -> None:
         now = self.now
-        # A late tick moves the arms no faster; a clock that was set back moves nothing.
-        dt = min(now - self._last_tick, LONGEST_DT)
-        if now - self._last_tick > LONGEST_DT:
-            self._supervisor.stalled(now - self._last_tick, now)
+        # A late tick is no jump; a clock that was set back moves nothing.
+        gap = now - self._last_tick
+        dt = self._pacer.step(gap, self._velocity)
+        if gap > LONGEST_DT:
+            self._supervisor.stalled(gap, now)
         self._last_tick = now
         self._ticks += 1
         if dt > 0.0:
@@ -140,9 +160,9 @@ class CartesianControllerNode(BaseNode):
 
     def _advance(self, now: float, dt: float) -> None:
         began = time.monotonic()
-        # What the arms do not follow is nothing to ask of somebody who was not there before.
-        if fault := self._output.doubt(self._supervisor.astray):
-            self._supervisor.abandon(fault, now)
+        # Commands that the arms do not follow are not for a receiver that has just come.
+        if fault := self._output.listener_fault(self._supervisor.off_reference):
+            self._supervisor.let_go(fault, now)
         was_active = self._supervisor.phase is Phase.ACTIVE
         reference, state = self._supervisor.tick(now, dt), self._joints.state
         if not was_active and self._supervisor.phase is Phase.ACTIVE and state is not None:
@@ -151,8 +171,11 @@ class CartesianControllerNode(BaseNode):
             return  # frozen in between: what was to be sent is of the past, and the next tick finds out
         if reference is not None and state is not None:
             self._output.send(reference, state, dt, now, self._supervisor.trusted)
-            self._reference = reference
+            self._reference, self._velocity = reference, reference.v
             self._publish_safe_targets(now)
+        elif self._commanding and state is not None:
+            self._output.end(state, now)
+        self._commanding = reference is not None
         self._tell_events()
 
     def _publish_safe_targets(self, now: float) -> None:
@@ -196,6 +219,7 @@ class CartesianControllerNode(BaseNode):
         values: dict[str, Any] = {
             "phase": supervisor.phase,
             "loop_rate_hz": round(self._ticks / max(wall - self._reported_at, 1e-9), 1),
+            "missed_ticks": self._pacer.missed_ticks,
         }
         self._ticks, self._reported_at = 0, wall
         for arm, rejected in self._targets.rejected.items():
@@ -215,10 +239,10 @@ class CartesianControllerNode(BaseNode):
     def _judge(self) -> tuple[bytes, str]:
         if self._supervisor.fault is not None:
             return ERROR, self._supervisor.fault
-        ceased = list(self._supervisor.ceased.values())
+        ended = self._supervisor.ended_targets
         if faults := self._targets.faults():
-            return WARN, "; ".join(faults + ceased)
-        return OK, "; ".join(["paused" if self._supervisor.paused else "active", *ceased])
+            return WARN, "; ".join(faults + ended)
+        return OK, "; ".join(["paused" if self._supervisor.paused else "active", *ended])
 
     def close(self) -> None:
         """Bring the arms to rest along the certified stop before the commands end."""
@@ -227,6 +251,7 @@ class CartesianControllerNode(BaseNode):
         while self._supervisor.phase is Phase.BRAKING and time.monotonic() < deadline:
             time.sleep(self._period)
             self._advance(self.now, self._period)  # simulated time may have ended already
+        self._advance(self.now, self._period)  # which sends what holds the arms
 
 
 def _serve(act: Callable[[], str | None], request: Any, response: Any) -> Any:

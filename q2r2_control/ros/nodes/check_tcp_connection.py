@@ -1,4 +1,4 @@
-"""``CheckTCPconnection``: what arrives of both hands, live."""
+"""``CheckTCPconnection``: a live view of the data of both hands."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from q2r2_control.inputs.headset_check import SILENCE
 from q2r2_control.inputs.messages import HandMessage
 from q2r2_control.inputs.session import HAND_TOPICS
 from q2r2_control.inputs.statistics import TopicRecorder, TopicStatistics
-from q2r2_control.ros.bridge.base_node import ERROR, OK, WARN, BaseNode, run_node
+from q2r2_control.ros.base_node import ERROR, OK, WARN, BaseNode, run_node
 from q2r2_control.ros.bridge.hand_topics import subscribe_to_hands
 from q2r2_control.viewer.topic_table import topic_line, topic_table
 
@@ -26,7 +26,7 @@ _LINES_PERIOD = 1.0  # [s]
 class CheckTcpConnection(BaseNode):
     """Shows pose, inputs and twist of both hands with rate and age: a table on a terminal, else a line a topic.
 
-    A topic that is silent for 2 s has timed out. Ages are of this machine's own steady clock, whatever ROS time does.
+    A topic that is silent for 2 s has timed out. Ages are measured with the machine's steady clock, not in ROS time.
     After ``duration`` it ends, with exit code 1 when every topic has timed out.
     """
 
@@ -58,7 +58,7 @@ class CheckTcpConnection(BaseNode):
         return level, f"timeout, nothing for {SILENCE:g} s: {', '.join(silent)}", {"rate_hz": values}
 
     def close(self) -> None:
-        """Give the terminal back; the last table stays."""
+        """Release the terminal; the last table stays."""
         if self._live is not None:
             self._live.stop()
 

@@ -29,8 +29,8 @@ from q2r2_control.errors import ConfigError
 from q2r2_control.plants.simulated_cell import JointSetpoint, SimulatedCell
 from q2r2_control.robot.compose import WORLD
 from q2r2_control.robot.robot import Robot
-from q2r2_control.ros.bridge.base_node import LATCHED_QOS, OK, WARN, BaseNode, run_node
-from q2r2_control.ros.bridge.gripper_server import GripperServer, Stroke
+from q2r2_control.ros.base_node import LATCHED_QOS, OK, WARN, BaseNode, run_node
+from q2r2_control.ros.bridge.grippers import GripperServer, Stroke
 from q2r2_control.ros.bridge.messages import joint_state_message, seconds, transform_message
 from q2r2_control.types import RobotState
 
@@ -86,6 +86,7 @@ class MujocoRobot(BaseNode):
             (JointTrajectory, "joint_trajectory", self._on_trajectory),
             (JointState, "joint_commands", self._on_joint_state),
             (Float64MultiArray, "position_commands", self._on_positions),
+            (Float64MultiArray, "velocity_commands", self._on_velocities),
             (Float64MultiArray, "torque_commands", self._on_torques),
         ):
             self.create_subscription(kind, topic, callback, commands)
@@ -111,6 +112,10 @@ class MujocoRobot(BaseNode):
 
     def _on_positions(self, message: Float64MultiArray) -> None:
         self._follow("position_commands", self._robot.joint_names, message.data, ())
+
+    def _on_velocities(self, message: Float64MultiArray) -> None:
+        fault = self._cell.command_velocities(np.array(message.data, float), time.monotonic())
+        self._note("velocity_commands", fault)
 
     def _on_torques(self, message: Float64MultiArray) -> None:
         self._note("torque_commands", self._cell.command_torques(np.array(message.data, float), time.monotonic()))

@@ -1,4 +1,4 @@
-"""``SimulationInput``: publishes what a headset would, from a script, to see the answer to an input without tremor."""
+"""``SimulationInput``: publishes the messages of a headset from a script, for tests with an input free of tremor."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from q2r2_control.inputs.messages import HandMessage, HandPose, HandTwist, Messa
 from q2r2_control.inputs.scripted import ScriptedInput
 from q2r2_control.inputs.session import HAND_TOPICS
 from q2r2_control.inputs.trajectories import TRAJECTORIES
-from q2r2_control.ros.bridge.base_node import OK, WARN, BaseNode, run_node
+from q2r2_control.ros.base_node import OK, WARN, BaseNode, run_node
 from q2r2_control.ros.bridge.hand_topics import HandPublishers
 from q2r2_control.types import SIDES, HandSample
 
@@ -25,14 +25,13 @@ _MODES = {
 
 
 class SimulationInput(BaseNode):
-    """Plays a scripted trajectory: presses the lower buttons once to engage, as people do, and does not hold them.
+    """Plays a scripted trajectory. It presses and releases the lower buttons once, early on, to engage the arms.
 
-    That press comes early, so the script starts only when every hand it plays has a subscriber, unless told otherwise.
+    So the script starts only when every hand that it plays has a subscriber, unless ``wait_for_subscribers`` is false.
 
-    It is the press of whoever started the node: who does that by hand asks for the motion, as an operator does by a
-    button. Whatever starts a node that has died again by itself, such as a launch file that respawns it, asks for
-    nothing, and arms that the death has stopped must not move then. There ``start_on_request`` belongs: nothing is
-    published until somebody calls ``~/start``, after every start of the node anew.
+    A user who starts the node asks for the motion, as an operator does with a button. A launch file that restarts the
+    node after a crash does not, and the arms that the crash has stopped must not move then. Use ``start_on_request``
+    there: after each start nothing is published until ``~/start`` is called.
     """
 
     def __init__(self, **kwargs: Any) -> None:
@@ -44,8 +43,12 @@ class SimulationInput(BaseNode):
         trajectory = self.parameter("trajectory", "circle", "What the hands do.", one_of=tuple(TRAJECTORIES))
         rate = self.parameter("rate", 75.0, "Samples of each hand [Hz].", at_least=1.0, at_most=250.0)
         self._frame = self.parameter("frame_id", "", "Frame of the poses; a headset gives none.")
-        self._waits = self.parameter("wait_for_subscribers", True, "Start when every hand has a subscriber.")
-        self._unasked = self.parameter("start_on_request", False, "Start when ~/start is called, and not before.")
+        self._waits_for_subscribers = self.parameter(
+            "wait_for_subscribers", True, "Start when every hand has a subscriber."
+        )
+        self._waits_for_request = self.parameter(
+            "start_on_request", False, "Start when ~/start is called, and not before."
+        )
         self._hands = SIDES if side == "both" else (side,)
         self._title = f"{trajectory} of {' and '.join(self._hands)}"
         self._topics = {
@@ -61,11 +64,11 @@ class SimulationInput(BaseNode):
         self.create_timer(_PERIOD, self._play)
 
     def health(self) -> tuple[bytes, str, Mapping[str, Any]]:
-        """What is played, or who is missing."""
+        """What is played, or which subscriber is missing."""
         values = {"samples": self._samples}
-        if self._unasked:
+        if self._waits_for_request:
             return WARN, "waits for a call of ~/start", values
-        if self._waits:
+        if self._waits_for_subscribers:
             return WARN, f"waits for a subscriber of {' and '.join(self._missing())}", values
         return OK, self._title, values
 
@@ -73,17 +76,20 @@ class SimulationInput(BaseNode):
         return [f"the {hand} hand" for hand in self._hands if not self._publishers_of_hands.subscribers(hand)]
 
     def _on_start(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        response.success, response.message = self._unasked, "starts" if self._unasked else "has started before"
-        self._unasked = False
+        response.success, response.message = (
+            self._waits_for_request,
+            "starts" if self._waits_for_request else "has started before",
+        )
+        self._waits_for_request = False
         return response
 
     def _play(self) -> None:
-        if self._unasked:
+        if self._waits_for_request:
             return
-        if self._waits:
+        if self._waits_for_subscribers:
             if self._missing():
                 return
-            self._waits = False
+            self._waits_for_subscribers = False
             self.get_logger().info(f"plays {self._title}")
         for sample in self._script.poll(self.now):
             self._publish(sample)

@@ -1,7 +1,7 @@
-"""``tcp_endpoint``: the Quest2ROS app on one side, topics on the other.
+"""``tcp_endpoint``: the TCP server of the Quest2ROS app, between its connection and ROS topics.
 
-Each message is published in the thread that receives it, as soon as its bytes are there: a poll would add up to its
-period, join messages that the app sends apart, and leave twists out.
+Each message is published by the thread that receives it, at once. Polling would add up to its period, merge messages
+that the app sends apart, and drop twists.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from q2r2_control.inputs.headset import HeadsetServer
 from q2r2_control.inputs.headset_check import SILENCE
 from q2r2_control.inputs.messages import PROP_TOPICS, HandPose, PropTwist
 from q2r2_control.inputs.session import HAND_TOPICS, HAPTIC_TOPICS, Reception
-from q2r2_control.ros.bridge.base_node import OK, STREAM_QOS, WARN, BaseNode, run_node
+from q2r2_control.ros.base_node import OK, STREAM_QOS, WARN, BaseNode, run_node
 from q2r2_control.ros.bridge.hand_topics import HandPublishers
 from q2r2_control.ros.bridge.messages import hand_twist
 from q2r2_control.types import SIDES, HapticFeedback
@@ -29,9 +29,9 @@ _SERVER_LOG = logging.getLogger("q2r2_control.inputs.headset")
 class TcpEndpoint(BaseNode):
     """Serves one headset at a time.
 
-    Poses are stamped with this node's clock when they are received, since the headset's clock is not ours; numbers are
-    passed on as they came, and so is the frame unless one is configured. Nothing is published that was not received:
-    after a disconnect the topics are silent. What is sent to the app while none listens is lost.
+    Poses are stamped with this node's clock when they are received, since the headset has a clock of its own. Numbers
+    are passed on unchanged, and so is the frame unless one is configured. Only what was received is published: after a
+    disconnect the topics are silent. What is sent to the app while none is connected is lost.
 
     Raises :class:`InputError` when host and port cannot be bound.
     """
@@ -57,7 +57,7 @@ class TcpEndpoint(BaseNode):
         self.get_logger().info("listening on {}:{}".format(*self._server.address))
 
     def health(self) -> tuple[bytes, str, Mapping[str, Any]]:
-        """Who is connected, and how often each topic comes."""
+        """Which headset is connected, and the rate of each topic."""
         statistics = self._server.statistics
         address = "{}:{}".format(*statistics.address)
         values = {
@@ -97,7 +97,7 @@ class TcpEndpoint(BaseNode):
 
 
 class _ToRosLog(logging.Handler):
-    """What the server logs, where ROS users look for it."""
+    """Passes the log of the server on to the log of the node."""
 
     def __init__(self, logger: Any) -> None:
         super().__init__()

@@ -13,8 +13,8 @@ from q2r2_control.control.tasks.frame import ROTATION_LENGTH
 from q2r2_control.control.tasks.manipulability import ManipulabilityScratch, add_manipulability, manipulability_gradient
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
+from q2r2_control.verification.contract import Contract
 from tests.control.cells import NAMES, cell, placed, random_posture
-from tests.control.contract import Contract
 
 
 def jacobian(robot: Robot, q: Array, arm: str) -> Array:

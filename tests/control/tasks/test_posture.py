@@ -8,8 +8,8 @@ import pytest
 
 from q2r2_control import CartesianController, ControllerSettings, Robot
 from q2r2_control.types import Array
+from q2r2_control.verification.contract import Contract
 from tests.control.cells import cell
-from tests.control.contract import Contract
 
 DT = 0.002
 

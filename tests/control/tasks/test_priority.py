@@ -15,7 +15,7 @@ from q2r2_control.config.control import ControllerSettings
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.errors import ConfigError
 from q2r2_control.robot.robot import Robot
-from tests.control.contract import Contract
+from q2r2_control.verification.contract import Contract
 from tests.control.scenarios import SCENARIOS, Scenario, Targets, circle
 from tests.control.test_contract import robot_of, run
 

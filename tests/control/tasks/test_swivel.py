@@ -17,8 +17,8 @@ from q2r2_control.control.tasks.swivel import Swivels, SwivelScratch, nearest_al
 from q2r2_control.errors import ConfigError
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
+from q2r2_control.verification.contract import Contract
 from tests.control.cells import CellArrays, cell, random_posture
-from tests.control.contract import Contract
 from tests.control.scenarios import SCENARIOS
 from tests.control.test_contract import run
 

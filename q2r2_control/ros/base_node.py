@@ -1,4 +1,4 @@
-"""What every node has in common: parameters with ranges, QoS, its own state, diagnostics, an orderly end."""
+"""What every node has: parameters with ranges, QoS, its own state, diagnostics, and the main function that runs it."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ from std_msgs.msg import String
 from q2r2_control.errors import ConfigError, Q2R2Error
 from q2r2_control.ros.launch.middleware import set_up_middleware
 
-# Commands: only the newest counts, and it has to arrive.
+# Commands, at the receiver: only the newest counts, and it has to arrive.
 COMMAND_QOS = QoSProfile(
     history=HistoryPolicy.KEEP_LAST,
     depth=1,
     reliability=ReliabilityPolicy.RELIABLE,
     durability=DurabilityPolicy.VOLATILE,
 )
-# The same for those who send them: a reliable sender repeats what has not arrived, also when a link has been down for a
-# while, and a target of then is a jump now. Judged by the sender's clock alone; a receiver's may be another.
+# Commands, at the sender: a reliable sender repeats what has not arrived, also after a link was down for a while, and
+# an old target would be a jump. The lifespan is judged by the sender's clock; the receiver's may differ.
 SENT_COMMAND_QOS = QoSProfile(
     history=HistoryPolicy.KEEP_LAST,
     depth=1,
@@ -43,9 +43,9 @@ SENT_COMMAND_QOS = QoSProfile(
     durability=DurabilityPolicy.VOLATILE,
     lifespan=Duration(seconds=0.1),
 )
-# Streams of a headset or of joint states: a late one is worth less than the next.
+# Streams of a headset or of joint states: a late message is worth less than the next one.
 STREAM_QOS = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
-# What late comers have to get too, such as robot_description.
+# What subscribers that start later have to get too, such as robot_description.
 LATCHED_QOS = QoSProfile(
     history=HistoryPolicy.KEEP_LAST,
     depth=1,
@@ -53,7 +53,7 @@ LATCHED_QOS = QoSProfile(
     durability=DurabilityPolicy.TRANSIENT_LOCAL,
 )
 _DIAGNOSTICS_PERIOD = 0.5  # [s]
-_CLOCK_TIMEOUT = 1.0  # simulated time that stands still for this long is told [s]
+_CLOCK_TIMEOUT = 1.0  # simulated time that stands still for longer is reported [s]
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 
@@ -70,8 +70,11 @@ class BaseNode(Node):
         super().__init__(name, **kwargs)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._state = self.create_publisher(String, "~/state", 10)
-        self._ros_time = 0.0, time.monotonic()  # the newest ROS time, and when it was first seen [s]
-        # Whoever asks why nothing moves has to get an answer, above all where ROS time stands still.
+        self._ros_time = (
+            0.0,
+            time.monotonic(),
+        )  # the newest ROS time, and the steady time at which it was first seen [s]
+        # Steady time, since the diagnostics have to say it when ROS time stands still.
         self.create_timer(_DIAGNOSTICS_PERIOD, self.report_health, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def parameter(
@@ -87,7 +90,7 @@ class BaseNode(Node):
     ) -> Any:
         """Declare a parameter and return its value.
 
-        A range is kept by rclpy itself, ``one_of`` only at the start. Raises :class:`ConfigError` for a value of
+        A range is enforced by rclpy, ``one_of`` only at the start. Raises :class:`ConfigError` for a value of
         another type, outside the range or not in ``one_of``.
         """
         descriptor = ParameterDescriptor(description=description, read_only=read_only)
@@ -113,7 +116,7 @@ class BaseNode(Node):
 
     @property
     def now(self) -> float:
-        """The node's clock [s]: ROS time, so that use_sim_time counts."""
+        """The node's clock [s]: ROS time, so that use_sim_time has its effect."""
         return float(self.get_clock().now().nanoseconds) * 1e-9
 
     def health(self) -> tuple[bytes, str, Mapping[str, Any]]:
@@ -121,7 +124,7 @@ class BaseNode(Node):
         return OK, "running", {}
 
     def report_health(self) -> None:
-        """Publish :meth:`health` now; a timer does it twice a second, a change that matters need not wait."""
+        """Publish :meth:`health` now. A timer does it twice a second; call it for a change that should not wait."""
         level, line, values = self.health()
         if (problem := self._clock_problem()) is not None:
             level, line = max(level, WARN), f"{problem}; {line}"
@@ -134,7 +137,7 @@ class BaseNode(Node):
         self._state.publish(String(data=json.dumps(state, default=str)))
 
     def _clock_problem(self) -> str | None:
-        """What keeps ROS time from moving, if it is a simulation's and does not."""
+        """One line if ROS time is simulated and stands still."""
         clock: Any = self.get_clock()
         now, wall = self.now, time.monotonic()
         if now != self._ros_time[0]:
@@ -149,7 +152,7 @@ class BaseNode(Node):
 def run_node(make: Callable[[], Node], args: Sequence[str] | None = None) -> int:
     """Main function of an executable: make the node, spin until Ctrl-C or SIGTERM, close it; the exit code.
 
-    A fault of its configuration is one line on stderr and exit code 2. ``node.close()`` is called if there is one.
+    A wrong configuration is one line on stderr and exit code 2. ``node.close()`` is called if there is one.
     """
     name = sys.argv[0].rsplit("/", 1)[-1]
     set_up_middleware(os.environ)

@@ -8,9 +8,9 @@ import numpy as np
 from rich.console import Console
 
 from q2r2_control.benchmark.tick_times import BenchReport, BenchRow
-from q2r2_control.benchmark.timed_run import Deeds
-from q2r2_control.cli.bench_tables import deeds_table, soak_table, times_table
-from q2r2_control.verification.margins import Margin
+from q2r2_control.benchmark.timed_run import RunMetrics
+from q2r2_control.cli.bench import motion_table, soak_table, times_table
+from q2r2_control.verification.contract import Margin
 from q2r2_control.verification.soak import SoakReport, Violation
 
 
@@ -22,16 +22,16 @@ def printed(table: object, width: int = 80) -> str:
 
 
 def report() -> BenchReport:
-    deeds = Deeds(1.0, 0.5, 0.2, 22.01, 3, 0.015, 1.0)
+    metrics = RunMetrics(1.0, 0.5, 0.2, 22.01, 3, 0.015, 1.0)
     rows = [
-        BenchRow("free motion", "q2r2_control", 3000, 12, 51.0, 99.0, 12345678.0, None, None, deeds, 0),
-        BenchRow("free motion", "roboplan, 10 nearest", 3000, 3, 902.0, 5000.0, 12345678.0, 17.7, 9.25, deeds, None),
+        BenchRow("free motion", "q2r2_control", 3000, 12, 51.0, 99.0, 12345678.0, None, None, metrics, 0),
+        BenchRow("free motion", "roboplan, 10 nearest", 3000, 3, 902.0, 5000.0, 12345678.0, 17.7, 9.25, metrics, None),
     ]
     return BenchReport("cell", 139, rows, ["roboplan: no certificate"])
 
 
 def test_eighty_columns_hold_every_heading_and_figure_of_the_bench() -> None:
-    text = printed(times_table(report())) + printed(deeds_table(report()))
+    text = printed(times_table(report())) + printed(motion_table(report()))
     for word in ("median", "[us]", "p99", "nearest", "[mm]", "room", "[rad]", "tail", "[rad/s^2]", "free motion"):
         assert word in text
     for figure in ("roboplan, 10 nearest", "12345678", "17.70", "9.25", "22.01", "0.015", "no certificate"):

@@ -14,7 +14,7 @@ from q2r2_control.errors import Q2R2Error
 _BadUsage: type[Exception] = typer.BadParameter.__mro__[2]
 
 
-class OneLineErrors(TyperGroup):
+class ErrorHandlingGroup(TyperGroup):
     """Commands whose bad usage and :class:`Q2R2Error` end in one line on stderr and exit code 2, Ctrl-C in 130."""
 
     def main(self, *args: Any, **extra: Any) -> Any:

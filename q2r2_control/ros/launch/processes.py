@@ -1,4 +1,4 @@
-"""``q2r2 ros up``: the nodes of a cell as processes that live and end together."""
+"""The nodes that a cell needs, and ``q2r2 ros up``, which runs them as processes that start and end together."""
 
 from __future__ import annotations
 
@@ -13,15 +13,78 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 
-from q2r2_control.errors import Q2R2Error
-from q2r2_control.ros.launch.node_set import NodeProcess
+from q2r2_control.config import load_config
+from q2r2_control.config.external import ControllerKind, ExternalConfig
+from q2r2_control.errors import ConfigError, Q2R2Error
+from q2r2_control.types import SIDES
 
-# What a process gets to end itself, first by SIGINT, then by SIGTERM; the next means is SIGKILL [s].
-_PATIENCE = {signal.SIGINT: 5.0, signal.SIGTERM: 3.0}
-# Looked up here, since little is safe between fork and exec.
+SOURCES = ("scripted", "headset", "none")
+ROBOTS = ("auto", "mujoco", "none")
+# Time for a process to end, after SIGINT and then after SIGTERM; SIGKILL follows [s].
+_END_TIMEOUTS = {signal.SIGINT: 5.0, signal.SIGTERM: 3.0}
+# Looked up here, because few calls are safe between fork and exec.
 _prctl = ctypes.CDLL(None).prctl if sys.platform == "linux" else None
 _PR_SET_PDEATHSIG = 1
+
+
+@dataclass(frozen=True, slots=True)
+class NodeProcess:
+    """One node to start: its executable's name, its module, and its parameters."""
+
+    name: str
+    module: str
+    parameters: Mapping[str, str | float] = field(default_factory=dict)
+
+    def command(self) -> list[str]:
+        """The command that starts it with this Python."""
+        parameters = [part for key, value in self.parameters.items() for part in ("-p", f"{key}:={value}")]
+        return [sys.executable, "-u", "-m", self.module, "--ros-args", *parameters]
+
+
+def nodes_of(path: str, source: str = "scripted", robot: str = "auto") -> list[NodeProcess]:
+    """The nodes for a cell's YAML, in the order of their start.
+
+    ``source`` of the hands: scripted, headset or none. ``robot``: mujoco, none, or auto, which is mujoco for
+    ``controller: builtin`` only. Raises :class:`ConfigError`.
+    """
+    for name, value, allowed in (("input", source, SOURCES), ("robot", robot, ROBOTS)):
+        if value not in allowed:
+            raise ConfigError(f"{name} = {value!r:.60}: allowed are {', '.join(allowed)}")
+    cell = load_config(path)
+    config: dict[str, str | float] = {"config": path}
+    nodes = []
+    if robot == "mujoco" or (robot == "auto" and cell.controller is ControllerKind.BUILTIN):
+        nodes.append(_node("mujoco_robot", config))
+    if cell.external is None:
+        nodes.append(_node("cartesian_controller", config))
+    elif cell.external.filtered:
+        nodes.append(_node("cartesian_controller", config | _relayed(cell.external)))
+    nodes += [_node(f"{arm}_arm_controller", config) for arm in SIDES if arm in cell.arms]
+    if source == "scripted":
+        nodes.append(NodeProcess("SimulationInput", "q2r2_control.ros.nodes.simulation_input"))
+    elif source == "headset":
+        nodes.append(_node("tcp_endpoint", config))
+    return nodes
+
+
+def _node(name: str, parameters: Mapping[str, str | float]) -> NodeProcess:
+    return NodeProcess(name, f"q2r2_control.ros.nodes.{name}", parameters)
+
+
+def _relayed(external: ExternalConfig) -> dict[str, str | float]:
+    """Parameters of the built-in controller for mode filtered: it publishes safe targets, or joint commands."""
+    preset = external.terms
+    parameters: dict[str, str | float] = {"output": preset.output}
+    if not preset.takes_poses:
+        parameters["rate"] = float(external.rate or preset.rate)
+    for arm, theirs in external.arms.items():
+        parameters[f"{arm}.target_frame_id"] = external.world_frame or theirs.base_frame
+        parameters[f"{arm}.joint_states_topic"] = theirs.joint_states_topic
+        if not preset.takes_poses:
+            parameters[f"{arm}.output_topic"] = external.topic(arm)
+    return parameters
 
 
 class UpError(Q2R2Error):
@@ -29,11 +92,11 @@ class UpError(Q2R2Error):
 
 
 def run_together(nodes: Sequence[NodeProcess], say: Callable[[str], None]) -> int:
-    """Start ``nodes`` and hand each line that they print to ``say``, after the node's name; the exit code.
+    """Start ``nodes`` and pass each line that they print to ``say``, after the node's name; returns the exit code.
 
-    Ctrl-C or SIGTERM ends all of them: 0. One that ends by itself is reported at once and ends the others: 1. None is
-    started again. Each is a session of its own, so that a terminal's Ctrl-C reaches it from here only, in order.
-    Where this process is killed, Linux interrupts them all: arms must not move for a teleoperation nobody can end.
+    Ctrl-C or SIGTERM ends all of them: 0. A node that ends by itself is reported at once and ends the others: 1. None
+    is restarted. Each is a session of its own, so that Ctrl-C in a terminal reaches it only from here, in order. If
+    this process is killed, Linux interrupts them all: arms must not move in a teleoperation that cannot be ended.
     Raises :class:`UpError`.
     """
     _check(nodes)
@@ -84,7 +147,7 @@ def _start(node: NodeProcess) -> subprocess.Popen[str]:
 
 
 def _end_with(parent: int) -> None:
-    """In the new process: be interrupted when ``parent`` ends, which it may have done already."""
+    """In the new process: ask Linux for SIGINT when ``parent`` ends, which it may have done already."""
     assert _prctl is not None
     _prctl(_PR_SET_PDEATHSIG, signal.SIGINT)
     if os.getppid() != parent:
@@ -118,12 +181,12 @@ def _watch(
 def _end(
     running: Mapping[str, subprocess.Popen[str]], lines: queue.SimpleQueue[str], say: Callable[[str], None]
 ) -> None:
-    """Last started, first ended, one after the other: the robot is there until the controller has braked it."""
+    """End them one by one, the last started first: the robot runs until the controller has braked it."""
     for process in reversed(list(running.values())):
-        for number, patience in _PATIENCE.items():
+        for number, timeout in _END_TIMEOUTS.items():
             if process.poll() is None:
                 process.send_signal(number)
-            deadline = time.monotonic() + patience
+            deadline = time.monotonic() + timeout
             while process.poll() is None and time.monotonic() < deadline:
                 _drain(lines, say)
                 time.sleep(0.02)

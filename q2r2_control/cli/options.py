@@ -1,0 +1,33 @@
+"""Options that several commands have, and their checks."""
+
+from __future__ import annotations
+
+import math
+import sys
+from typing import Annotated
+
+import typer
+
+from q2r2_control.errors import ConfigError
+
+DEMO_CONFIG = "config/dual_iiwa7.yaml"
+
+ConfigFile = Annotated[str, typer.Argument(metavar="CONFIG", help="The cell's YAML, such as config/dual_iiwa7.yaml.")]
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout, and all else on stderr.")]
+Headless = Annotated[bool, typer.Option("--headless", help="No live table, no window.")]
+Viewer = Annotated[bool, typer.Option("--viewer", help="Open MuJoCo's window; closing it ends the run.")]
+Human = Annotated[bool, typer.Option("--human", help="Scripted hands tremble, and samples get lost and late.")]
+
+
+def positive(option: str, value: float) -> float:
+    """``value`` [s] of ``option``. Raises :class:`ConfigError` unless it is positive and finite."""
+    if not (math.isfinite(value) and value > 0.0):
+        raise ConfigError(f"{option} {value:g}: allowed: a positive number of seconds")
+    return value
+
+
+def shows_table(headless: bool, viewer: bool) -> bool:
+    """Whether to show the live table. Raises :class:`ConfigError` where the options exclude each other."""
+    if headless and viewer:
+        raise ConfigError("--headless and --viewer exclude each other")
+    return not headless and sys.stderr.isatty()

@@ -1,0 +1,53 @@
+"""What commands print: JSON on stdout, and all else on stderr or as tables."""
+
+from __future__ import annotations
+
+import json
+import math
+import threading
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict, is_dataclass
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+
+_NOTICE_AFTER = 3.0  # [s]
+
+
+def as_json_text(value: Any) -> str:
+    """``value`` as strict JSON: dataclasses and mappings as objects, arrays as lists, what is not finite as null."""
+    return json.dumps(_jsonable(value), allow_nan=False)
+
+
+def _jsonable(value: Any) -> Any:
+    if is_dataclass(value) and not isinstance(value, type):
+        return _jsonable(asdict(value))
+    if isinstance(value, Mapping):
+        return {str(key): _jsonable(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_jsonable(item) for item in value]
+    if isinstance(value, np.ndarray | np.generic):
+        return _jsonable(value.tolist())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def stderr_console() -> Console:
+    """For what is not a command's result."""
+    return Console(stderr=True)
+
+
+@contextmanager
+def notice_of_compiling(console: Console) -> Iterator[None]:
+    """Say what takes so long, where building the controller does."""
+    text = "compiling the controller for this machine: once for each version of the code, 1-2 minutes"
+    timer = threading.Timer(_NOTICE_AFTER, lambda: console.print(text, soft_wrap=True, highlight=False))
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()

@@ -1,0 +1,84 @@
+"""``q2r2 run``: a cell with an input and a plant of the user's choice."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from typing import Annotated
+
+import typer
+
+from q2r2_control.cli.cell_run import RunOptions, print_summary, run_cell
+from q2r2_control.cli.headset_server import Host, Port, with_address
+from q2r2_control.cli.options import ConfigFile, Headless, Human, Json, Viewer, positive, shows_table
+from q2r2_control.cli.output import stderr_console
+from q2r2_control.config import load_config
+from q2r2_control.errors import ConfigError
+from q2r2_control.inputs.factory import DEFAULT_TRAJECTORY
+from q2r2_control.inputs.trajectories import TRAJECTORIES
+from q2r2_control.types import CommandMode
+
+
+class InputName(StrEnum):
+    """Where hand samples come from."""
+
+    SCRIPTED = "scripted"
+    HEADSET = "headset"
+
+
+class PlantName(StrEnum):
+    """What moves."""
+
+    MUJOCO = "mujoco"
+    KINEMATIC = "kinematic"
+
+
+def run(
+    config: ConfigFile,
+    input: Annotated[InputName, typer.Option(help="Where hand samples come from.")] = InputName.SCRIPTED,
+    plant: Annotated[PlantName, typer.Option(help="What moves.")] = PlantName.MUJOCO,
+    mode: Annotated[CommandMode, typer.Option(help="What the plant gets; torque: arms that yield.")] = (
+        CommandMode.POSITION
+    ),
+    duration: Annotated[float | None, typer.Option(help="[s]; without it, until Ctrl-C.")] = None,
+    fast: Annotated[bool, typer.Option("--fast", help="Simulated time, as fast as it can, repeatable.")] = False,
+    trajectory: Annotated[str | None, typer.Option(help=f"Scripted: {', '.join(TRAJECTORIES)}.")] = None,
+    human: Human = False,
+    seed: Annotated[int, typer.Option(min=0, help="Of what --human adds.")] = 0,
+    host: Host = None,
+    port: Port = None,
+    viewer: Viewer = False,
+    headless: Headless = False,
+    report: Annotated[bool, typer.Option(help="Write plots and a summary to a folder under runs/.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Run even where q2r2 check finds a fault.")] = False,
+    json: Json = False,
+) -> None:
+    """Run a cell until the duration is over or Ctrl-C; both bring the arms to rest first.
+
+    A cell in which q2r2 check finds a fault is refused with the same line and exit code 2, unless --force is given.
+    With the headset, one line on stderr says which address was bound: "headset: listening on HOST:PORT".
+    """
+    scripted_only = {"--trajectory": trajectory is not None, "--human": human, "--fast": fast, "--seed": seed != 0}
+    headset_only = {"--host": host is not None, "--port": port is not None}
+    unfit = headset_only if input is InputName.SCRIPTED else scripted_only
+    for option, given in unfit.items():
+        if given:
+            raise ConfigError(f"{option} cannot be used with --input {input.value}")
+    if fast and duration is None:
+        raise ConfigError("--fast needs --duration, since simulated time has no end of its own")
+    cell = with_address(load_config(config), host, port)
+    options = RunOptions(
+        name=cell.name,
+        input=input.value,
+        plant=plant.value,
+        mode=mode.value,
+        duration=None if duration is None else positive("--duration", duration),
+        fast=fast,
+        trajectory=trajectory or DEFAULT_TRAJECTORY,
+        human=human,
+        seed=seed,
+        table=shows_table(headless, viewer),
+        window=viewer,
+        report=report,
+        force=force,
+    )
+    print_summary(run_cell(cell, options, stderr_console()), json)

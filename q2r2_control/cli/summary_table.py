@@ -1,0 +1,62 @@
+"""The summary of a run as a table."""
+
+from __future__ import annotations
+
+from rich.table import Table
+
+from q2r2_control.runtime.run_summary import Percentiles, RunSummary
+from q2r2_control.runtime.torque_summary import TorqueSummary
+
+
+def summary_table(summary: RunSummary) -> Table:
+    """The figures of a run."""
+    table = Table(title="summary", title_justify="left", show_header=False)
+    table.add_row("duration", f"{summary.duration_s:.2f} s, {summary.ticks} ticks, {summary.loop_rate_hz:.0f} Hz")
+    table.add_row("tick", _percentiles(summary.tick_us, "us", 0))
+    table.add_row("input to command", _percentiles(summary.input_to_command_ms, "ms", 2))
+    for name, arm in summary.arms.items():
+        figures = f"engaged {arm.engaged_s:.2f} s"
+        if arm.position_error_mm_rms is not None and arm.rotation_error_deg_rms is not None:
+            figures += f", error {arm.position_error_mm_rms:.2f} mm, {arm.rotation_error_deg_rms:.2f} deg RMS"
+        if arm.slip_mm_max > 0.0 or arm.slip_deg_max > 0.0:
+            figures += f", target slipped {arm.slip_mm_max:.0f} mm, {arm.slip_deg_max:.0f} deg"
+        if arm.yielded_mm_max > 0.0 or arm.yielded_deg_max > 0.0:
+            figures += f", yielded {arm.yielded_mm_max:.0f} mm, {arm.yielded_deg_max:.0f} deg"
+        table.add_row(f"{name} arm", f"{figures}, gripper changes {arm.gripper_changes}")
+    if summary.min_distance_mm is not None and summary.closest_pair is not None:
+        table.add_row("nearest pair", f"{summary.min_distance_mm:.1f} mm, {' | '.join(summary.closest_pair)}")
+    table.add_row(
+        "velocity, acceleration",
+        f"{_share(summary.max_velocity_ratio)} of the limits at most, {_share(summary.max_acceleration_ratio)}",
+    )
+    table.add_row("room to position limits", f"{summary.min_position_margin_rad:.3f} rad at least")
+    table.add_row("certified stops executed", f"{summary.fallback_ticks} ticks, {summary.uncertified_ticks} without")
+    table.add_row("targets rejected", str(summary.rejected_targets))
+    if summary.torque is not None:
+        _add_torque(table, summary.torque)
+    table.add_row("arms at the end", "at rest" if summary.at_rest else "[red]moving[/]")
+    return table
+
+
+def _add_torque(table: Table, torque: TorqueSummary) -> None:
+    if torque.min_measured_distance_mm is not None and torque.measured_closest_pair is not None:
+        pair = " | ".join(torque.measured_closest_pair)
+        table.add_row("nearest measured pair", f"{torque.min_measured_distance_mm:.1f} mm, {pair}")
+    pressed = ", ".join(" | ".join(pair) for pair in torque.pressed_pairs)
+    force = f": {torque.max_wall_force_n:.0f} N at most" if pressed else ""
+    table.add_row("wall pressed by", f"{pressed or 'no pair'}{force}")
+    limits = f"{torque.saturated_ticks} ticks at a limit, {torque.rate_limited_ticks} at the rate limit"
+    table.add_row("torque", f"{limits}, {torque.held_ticks} held without a measurement")
+    for arm, time in torque.off_reference_s.items():
+        if time > 0.0:
+            table.add_row(f"{arm} arm off its reference", f"[red]{time:.2f} s[/] beyond the impedance's error clip")
+
+
+def _percentiles(values: Percentiles, unit: str, digits: int) -> str:
+    if values.p50 is None or values.p99 is None or values.max is None:
+        return "-"
+    return f"median {values.p50:.{digits}f} {unit}, p99 {values.p99:.{digits}f}, max {values.max:.{digits}f}"
+
+
+def _share(ratio: float) -> str:
+    return f"{100.0 * ratio:.0f} %"

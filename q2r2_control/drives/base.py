@@ -1,0 +1,71 @@
+"""What every mode of driving a plant has: from tool targets and a reference to a command."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import pinocchio as pin
+
+from q2r2_control.compliance.admittance import AdmittanceReport
+from q2r2_control.compliance.impedance import ImpedanceReport
+from q2r2_control.compliance.repulsion import WallReport
+from q2r2_control.types import Array, Command, CommandMode, Reference, RobotState
+
+Targets = dict[str, pin.SE3 | None]
+Openings = dict[str, float]
+
+
+@dataclass(frozen=True, slots=True)
+class DriveReport:
+    """What the mode's own laws did in one tick; None for those of the other modes, or not enabled."""
+
+    impedance: ImpedanceReport | None = None
+    wall: WallReport | None = None
+    admittance: AdmittanceReport | None = None
+
+
+class Drive(Protocol):
+    """One mode of driving a plant. What stops the arms is not decided here but in ``supervision``."""
+
+    mode: CommandMode
+    report: DriveReport  # of the last tick
+    yields: bool  # whether arms that are pushed leave the reference by design
+
+    def reset(self, state: RobotState) -> None:
+        """Start anew, at rest at the measured ``state``. Raises :class:`Q2R2Error` where that cannot be."""
+        ...
+
+    def displaced(self, targets: Targets, state: RobotState, dt: float) -> Targets:
+        """The tool targets that the controller is to follow in a tick of ``dt`` [s]."""
+        ...
+
+    def command(
+        self, reference: Reference, state: RobotState, grippers: Openings, dt: float, trusted: bool = True
+    ) -> Command:
+        """What goes to the plant in a tick of ``dt`` [s]; never raises because of a number.
+
+        ``trusted`` is False where ``state`` is out of date or not to be believed, and for the last command before there
+        are no more: what pushes according to the state must not push then.
+        """
+        ...
+
+    def at_rest(self, state: RobotState) -> bool:
+        """Whether the arms stand still, given that the reference does."""
+        ...
+
+    def last_command(self, state: RobotState, grippers: Openings) -> Command | None:
+        """What holds the arms when no more commands come; None: the last one does."""
+        ...
+
+
+def position_command(reference: Reference, grippers: Openings) -> Command:
+    """The reference itself."""
+    return Command(CommandMode.POSITION, reference.q, reference.v, np.zeros_like(reference.q), grippers)
+
+
+def holding_command(q: Array, grippers: Openings) -> Command:
+    """Stand still at ``q`` (nv,) [rad], held by the plant's own servos."""
+    zero = np.zeros_like(q)
+    return Command(CommandMode.POSITION, q, zero, zero, grippers)

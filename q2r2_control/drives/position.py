@@ -1,0 +1,86 @@
+"""Position and velocity mode: the plant's own servos follow the reference, compliance is an admittance."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from q2r2_control.compliance.admittance import Admittance
+from q2r2_control.config import Config
+from q2r2_control.drives.base import DriveReport, Openings, Targets, position_command
+from q2r2_control.errors import ConfigError
+from q2r2_control.robot.robot import Robot
+from q2r2_control.types import Array, Command, CommandMode, Reference, RobotState
+
+# Velocity mode: how fast the measured position is brought back to the reference [1/s]. A plant that answers with a
+# delay T is stable below about 1 / T; at 10 /s that leaves 100 ms.
+FEEDBACK_GAIN = 10.0
+
+
+class PositionDrive:
+    """The reference is the command. With the admittance enabled, what the tools feel displaces their targets."""
+
+    mode = CommandMode.POSITION
+    yields = False
+
+    def __init__(self, robot: Robot, config: Config) -> None:
+        self.admittance = Admittance(robot, config.admittance) if config.admittance.enabled else None
+        self.report = DriveReport()
+
+    def reset(self, state: RobotState) -> None:
+        """See :meth:`Drive.reset`."""
+        self.report = DriveReport()
+        if self.admittance is None:
+            return
+        if state.tau_external is None:
+            raise ConfigError("admittance.enabled = true: allowed with a plant that measures external torque only")
+        self.admittance.reset()
+
+    def displaced(self, targets: Targets, state: RobotState, dt: float) -> Targets:
+        """See :meth:`Drive.displaced`."""
+        if self.admittance is None:
+            return targets
+        displaced = self.admittance.update(targets, state, dt)
+        self.report = DriveReport(admittance=self.admittance.report())
+        return displaced
+
+    def command(
+        self, reference: Reference, state: RobotState, grippers: Openings, dt: float, trusted: bool = True
+    ) -> Command:
+        """See :meth:`Drive.command`: what was measured does not matter."""
+        return position_command(reference, grippers)
+
+    def at_rest(self, state: RobotState) -> bool:
+        """See :meth:`Drive.at_rest`: the plant's own servos follow."""
+        return True
+
+    def last_command(self, state: RobotState, grippers: Openings) -> Command | None:
+        """See :meth:`Drive.last_command`: a position holds by itself."""
+        return None
+
+
+class VelocityDrive(PositionDrive):
+    """The reference's velocity, and what brings the measured position back to it:  v = v_ref + k (q_ref - q).
+
+    Within the robot's velocity limits. Without a state to trust there is no feedback, so that an old measurement does
+    not drive the arms.
+    """
+
+    mode = CommandMode.VELOCITY
+
+    def __init__(self, robot: Robot, config: Config) -> None:
+        super().__init__(robot, config)
+        self._limit: Array = robot.velocity_limit
+
+    def command(
+        self, reference: Reference, state: RobotState, grippers: Openings, dt: float, trusted: bool = True
+    ) -> Command:
+        """See :meth:`Drive.command`."""
+        v = reference.v
+        if trusted and np.isfinite(state.q).all():
+            v = v + FEEDBACK_GAIN * (reference.q - state.q)
+        bounded = np.minimum(np.maximum(v, -self._limit), self._limit)
+        return Command(self.mode, reference.q, bounded, np.zeros_like(reference.q), grippers)
+
+    def last_command(self, state: RobotState, grippers: Openings) -> Command | None:
+        """See :meth:`Drive.last_command`: a velocity outlives its sender on many plants, so the last one is zero."""
+        return Command(self.mode, state.q, np.zeros_like(self._limit), np.zeros_like(self._limit), grippers)

@@ -1,0 +1,23 @@
+"""Inputs by name."""
+
+from __future__ import annotations
+
+from q2r2_control.config import Config
+from q2r2_control.errors import ConfigError
+from q2r2_control.inputs.base import Input
+from q2r2_control.inputs.headset import HeadsetServer
+from q2r2_control.inputs.scripted import ScriptedInput
+
+INPUTS = ("scripted", "headset")
+DEFAULT_TRAJECTORY = "reach_grasp_handover"
+
+
+def make_input(source: Input | str, config: Config) -> Input:
+    """The input called ``source``, or ``source`` itself. Raises :class:`ConfigError` for an unknown name."""
+    if source == "scripted":
+        return ScriptedInput(DEFAULT_TRAJECTORY)
+    if source == "headset":
+        return HeadsetServer(config.headset.host, config.headset.port)
+    if isinstance(source, str):
+        raise ConfigError(f"input {source!r}: allowed are {', '.join(INPUTS)}")
+    return source

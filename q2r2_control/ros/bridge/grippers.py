@@ -1,0 +1,225 @@
+"""Grippers: a client for the kinds of grippers in use, and the action server of a simulated one."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from control_msgs.action import GripperCommand, ParallelGripperCommand
+from rclpy.action import ActionClient, ActionServer, CancelResponse, GoalResponse
+from rclpy.action.client import GoalStatus
+from rclpy.action.server import ServerGoalHandle
+from rclpy.node import Node
+from std_msgs.msg import Float64MultiArray
+
+from q2r2_control.config.external import GripperSettings, GripperType
+from q2r2_control.ros.base_node import COMMAND_QOS
+
+# The client.
+_RESULT_TIMEOUT = 10.0  # of a goal [s]
+# The server.
+_REACHED = 0.02  # of the stroke
+_STALLED_AFTER = 0.3  # without moving by the following [s]
+_MOVES = 0.004  # of the stroke
+_OUTSIDE = 0.02  # a goal this much beyond the stroke still counts as its end
+
+
+class GripperClient:
+    """Opens and closes one gripper; no call waits.
+
+    ``closed`` is the known state of the gripper. It changes with the result of a goal; a gripper that has stalled holds
+    an object, which is success whatever the status of the goal. A topic gives no result, so there it changes with the
+    command. Before the first result the gripper counts as open.
+    """
+
+    def __init__(self, node: Node, name: str, settings: GripperSettings) -> None:
+        self.closed = False
+        self.problem: str | None = None
+        self._node, self._name, self._settings = node, name, settings
+        self._goal_closed: bool | None = None  # closed or not, while a goal is under way
+        self._sent = 0.0  # [s]
+        self._goals = 0
+        kind = settings.action_type
+        self._publisher = self._client = None
+        if kind is GripperType.FLOAT64_MULTI_ARRAY:
+            self._publisher = node.create_publisher(Float64MultiArray, name, COMMAND_QOS)
+        else:
+            self._action = GripperCommand if kind is GripperType.GRIPPER_COMMAND else ParallelGripperCommand
+            self._client = ActionClient(node, self._action, name)
+
+    @property
+    def state(self) -> str:
+        """One word: open, closed, opening or closing."""
+        if self._goal_closed is None:
+            return "closed" if self.closed else "open"
+        return "closing" if self._goal_closed else "opening"
+
+    def toggle(self, now: float) -> None:
+        """Ask for the opposite of the gripper's state, or of the state that it is moving to."""
+        self.command(not (self.closed if self._goal_closed is None else self._goal_closed), now)
+
+    def command(self, close: bool, now: float) -> None:
+        """Ask to close or open. If there is no server, ``problem`` says so and the request is dropped.
+
+        It is not kept for later: a gripper that moves when its server starts would be a surprise.
+        """
+        position = self._settings.closed_position if close else self._settings.open_position
+        self.problem = None
+        if self._publisher is not None:
+            self._publisher.publish(Float64MultiArray(data=[position]))
+            self.closed = close
+            return
+        assert self._client is not None
+        if not self._client.server_is_ready():
+            self.problem = f"no gripper server at {self._name}"
+            return
+        self._goals += 1
+        self._goal_closed, self._sent = close, now
+        number = self._goals
+        answer = self._client.send_goal_async(self._goal(position))
+        answer.add_done_callback(lambda future: self._answered(future.result(), number))
+
+    def check(self, now: float) -> None:
+        """Give up a goal that is not answered in time."""
+        if self._goal_closed is not None and now - self._sent > _RESULT_TIMEOUT:
+            self._end(f"no result from {self._name} for {_RESULT_TIMEOUT:g} s")
+
+    def _goal(self, position: float) -> Any:
+        goal = self._action.Goal()
+        if self._action is GripperCommand:
+            goal.command.position = position
+            goal.command.max_effort = self._settings.max_effort
+        else:
+            goal.command.name = [self._settings.joint_name]
+            goal.command.position = [position]
+            goal.command.effort = [self._settings.max_effort]
+        return goal
+
+    def _answered(self, handle: Any, number: int) -> None:
+        if number != self._goals:
+            return
+        if handle is None or not handle.accepted:
+            self._end(f"{self._name} refused the goal")
+        else:
+            handle.get_result_async().add_done_callback(lambda future: self._done(future.result(), number))
+
+    def _done(self, answer: Any, number: int) -> None:
+        if number != self._goals or self._goal_closed is None:
+            return  # another goal has taken its place
+        result = answer.result
+        if answer.status == GoalStatus.STATUS_SUCCEEDED or result.stalled or result.reached_goal:
+            self.closed = self._goal_closed
+            self._end(None)
+        else:
+            self._end(f"{self._name} ended with status {answer.status}, neither stalled nor at its goal")
+
+    def _end(self, problem: str | None) -> None:
+        self._goal_closed, self.problem = None, problem
+        self._goals += 1  # later answers to this goal are ignored
+        if problem is not None:
+            self._node.get_logger().warning(problem)
+
+
+@dataclass(frozen=True, slots=True)
+class Stroke:
+    """Positions in the action's messages for the fully open and the closed gripper [m]."""
+
+    open_position: float
+    closed_position: float
+
+    def opening(self, position: float) -> float:
+        """0 closed .. 1 open, unbounded."""
+        return (position - self.closed_position) / (self.open_position - self.closed_position)
+
+    def position(self, opening: float) -> float:
+        """The position [m] of an opening 0..1."""
+        return self.closed_position + opening * (self.open_position - self.closed_position)
+
+
+@dataclass(slots=True)
+class _Motion:
+    handle: ServerGoalHandle
+    goal: float  # opening
+    seen: float  # opening when it last moved
+    moved_at: float  # [s]
+
+
+class GripperServer:
+    """Serves ``topic``. A newer goal aborts the older one; fingers that stop on something have succeeded: stalled.
+
+    A goal's ``max_effort`` is not used: the force is that of the simulated gripper. :meth:`update` works on the goals,
+    since a callback that waits would block the node's only thread.
+    """
+
+    def __init__(
+        self, node: Node, topic: str, stroke: Stroke, command: Callable[[float], None], refuse: Callable[[str], None]
+    ) -> None:
+        self._stroke, self._command, self._refuse = stroke, command, refuse
+        self._motion: _Motion | None = None
+        self._newest: ServerGoalHandle | None = None
+        self._server = ActionServer(
+            node,
+            GripperCommand,
+            topic,
+            execute_callback=lambda _: GripperCommand.Result(),  # each goal gets its own when it ends
+            goal_callback=self._check,
+            handle_accepted_callback=self._accept,
+            cancel_callback=lambda _: CancelResponse.ACCEPT,
+        )
+
+    def update(self, now: float, opening: float, effort: float) -> None:
+        """Go on with the goal at ``now`` [s]: the gripper is open by ``opening`` 0..1 and presses by ``effort`` [N]."""
+        if self._newest is not None:
+            if self._motion is not None:
+                self._finish(self._motion.handle, "abort", opening, effort, reached=False, stalled=False)
+            goal = self._stroke.opening(self._newest.request.command.position)
+            self._motion = _Motion(self._newest, min(max(goal, 0.0), 1.0), opening, now)
+            self._newest = None
+            self._command(self._motion.goal)
+        motion = self._motion
+        if motion is None:
+            return
+        if abs(opening - motion.seen) > _MOVES:
+            motion.seen, motion.moved_at = opening, now
+        reached = abs(opening - motion.goal) <= _REACHED
+        stalled = not reached and now - motion.moved_at > _STALLED_AFTER
+        if motion.handle.is_cancel_requested:
+            self._command(opening)
+            self._finish(motion.handle, "canceled", opening, effort, reached, stalled)
+        elif reached or stalled:
+            self._finish(motion.handle, "succeed", opening, effort, reached, stalled)
+        else:
+            feedback = GripperCommand.Feedback(position=self._stroke.position(opening), effort=effort)
+            motion.handle.publish_feedback(feedback)
+            return
+        self._motion = None
+
+    def _check(self, goal: GripperCommand.Goal) -> GoalResponse:
+        position = goal.command.position
+        if math.isfinite(position) and -_OUTSIDE <= self._stroke.opening(position) <= 1.0 + _OUTSIDE:
+            return GoalResponse.ACCEPT
+        ends = sorted((self._stroke.open_position, self._stroke.closed_position))
+        self._refuse(f"gripper position {position:g} m; allowed: {ends[0]:g} .. {ends[1]:g}")
+        return GoalResponse.REJECT
+
+    def _accept(self, handle: ServerGoalHandle) -> None:
+        if self._newest is not None:
+            self._end(self._newest, "abort", GripperCommand.Result())
+        self._newest = handle
+
+    def _finish(
+        self, handle: ServerGoalHandle, outcome: str, opening: float, effort: float, reached: bool, stalled: bool
+    ) -> None:
+        position = self._stroke.position(opening)
+        result = GripperCommand.Result(position=position, effort=effort, reached_goal=reached, stalled=stalled)
+        self._end(handle, outcome, result)
+
+    def _end(self, handle: ServerGoalHandle, outcome: str, result: GripperCommand.Result) -> None:
+        def conclude(handle: ServerGoalHandle) -> GripperCommand.Result:
+            # A goal that is being cancelled can end as canceled only.
+            getattr(handle, "canceled" if handle.is_cancel_requested else outcome)()
+            return result
+
+        handle.execute(conclude)

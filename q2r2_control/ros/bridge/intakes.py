@@ -1,0 +1,190 @@
+"""Inputs of the built-in controller: targets, one topic for each arm, and joint states, merged by joint name."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+import pinocchio as pin
+from geometry_msgs.msg import PoseStamped
+from sensor_msgs.msg import JointState
+
+from q2r2_control.config.timeouts import STREAM_TIMEOUT
+from q2r2_control.errors import ConfigError
+from q2r2_control.robot.compose import WORLD
+from q2r2_control.robot.robot import Robot
+from q2r2_control.ros.base_node import COMMAND_QOS, STREAM_QOS, BaseNode
+from q2r2_control.ros.bridge.joint_outputs import joints_of
+from q2r2_control.ros.bridge.messages import pose_of, robot_state
+from q2r2_control.ros.monitoring.endpoints import Publishers
+from q2r2_control.supervision.target_stream import Refusal
+from q2r2_control.types import Array, RobotState
+
+_WARNING_TIME = 1.0  # refused targets are reported for this long [s]
+# Takes an arm's target in the world frame, or None if it is no pose, the time [s], and the message's number.
+Take = Callable[[str, pin.SE3 | None, float, int | None], Refusal | None]
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """The frame of target poses."""
+
+    name: str
+    pose: pin.SE3  # in the world
+
+
+class TargetIntake:
+    """Subscribes to the targets of all arms. Calls ``changed`` when :meth:`faults` has something new."""
+
+    def __init__(self, node: BaseNode, robot: Robot, changed: Callable[[], None]) -> None:
+        self._node, self._changed = node, changed
+        self.frames = {arm: _frame_of(node, robot, arm) for arm in robot.arms}
+        self.topics: dict[str, str] = {}
+        for arm in robot.arms:
+            topic = node.parameter(f"{arm}.target_topic", f"/q2r2/{arm}/target_frame", "targets of this arm")
+            if topic in self.topics.values():
+                raise ConfigError(f"{arm}.target_topic = {topic!r:.80}: another arm has it; allowed: one of its own")
+            self.topics[arm] = topic
+        self._publishers = Publishers(node, self.topics.values())
+        self._refused: dict[str, tuple[Refusal, float]] = {}  # why an arm's last target was not used, and when [s]
+        self.rejected = dict.fromkeys(robot.arms, 0)
+
+    def subscribe(self, take: Take) -> None:
+        """Pass each target to ``take``."""
+        for arm, topic in self.topics.items():
+            self._node.create_subscription(PoseStamped, topic, partial(self._on_target, take, arm), COMMAND_QOS)
+
+    def look(self) -> None:
+        """Ask the graph which nodes publish."""
+        self._publishers.look()
+
+    def publishers(self, arm: str) -> str:
+        """Nodes that publish an arm's targets."""
+        return self._publishers.of(self.topics[arm])
+
+    def source(self, arm: str) -> str:
+        """The same for the middle of a sentence."""
+        return self._publishers.source(self.topics[arm])
+
+    def faults(self) -> list[str]:
+        """A line for each arm whose targets were refused lately."""
+        now = self._node.now
+        self._refused = {arm: entry for arm, entry in self._refused.items() if now - entry[1] <= _WARNING_TIME}
+        return [f"target of {arm} not used: {refusal.line}" for arm, (refusal, _) in self._refused.items()]
+
+    def _on_target(self, take: Take, arm: str, message: PoseStamped, info: Mapping[str, int | None]) -> None:
+        frame, now = self.frames[arm], self._node.now
+        pose = pose_of(message.pose) if message.header.frame_id == frame.name else None
+        refusal = take(arm, None if pose is None else frame.pose * pose, now, info["publication_sequence_number"])
+        if refusal is not None:
+            self._refuse(arm, refusal)
+        elif message.header.frame_id != frame.name:
+            fault = f"frame_id {message.header.frame_id!r:.40}; allowed: {frame.name!r}"
+            self._refuse(arm, Refusal("frame", fault))
+        elif pose is None:
+            self._refuse(arm, Refusal("pose", "not a finite pose with a unit quaternion"))
+        else:
+            self._refused.pop(arm, None)
+
+    def _refuse(self, arm: str, refusal: Refusal) -> None:
+        """Log why targets are not used: once for each kind of fault, until a target is used again or none comes."""
+        self.rejected[arm] += 1
+        before = self._refused.get(arm)
+        self._refused[arm] = (refusal, self._node.now)
+        if before is None or before[0].kind != refusal.kind:
+            self._node.get_logger().warning(f"target of {arm} not used: {refusal.line}")
+            self._changed()
+
+
+def _frame_of(node: BaseNode, robot: Robot, arm: str) -> Frame:
+    """An arm's frame of targets. Raises :class:`ConfigError` for a link that moves."""
+    name = node.parameter(
+        f"{arm}.target_frame_id",
+        WORLD,
+        "frame_id that targets have to have: a link that does not move, or any other name for the cell's world",
+    )
+    model = robot.model
+    if name == WORLD or not model.existFrame(name, pin.FrameType.BODY):
+        return Frame(name, pin.SE3.Identity())
+    frame = model.frames[model.getFrameId(name, pin.FrameType.BODY)]
+    if frame.parentJoint != 0:
+        raise ConfigError(f"{arm}.target_frame_id = {name!r:.60}: that link moves; allowed: one that does not")
+    return Frame(name, frame.placement.copy())
+
+
+class JointIntake:
+    """Makes one state of all arms from joint states on one topic, or on one topic for each arm.
+
+    The state is as old as the oldest of its parts.
+    """
+
+    def __init__(self, node: BaseNode, robot: Robot) -> None:
+        self._node = node
+        self._topics: dict[str, list[str]] = {}  # the arms whose joints each topic carries
+        for arm in robot.arms:
+            topic = node.parameter(f"{arm}.joint_states_topic", "joint_states", "carries all joints of this arm")
+            self._topics.setdefault(topic, []).append(arm)
+        self._joints = {topic: joints_of(robot, arms) for topic, arms in self._topics.items()}
+        self._stamps = dict.fromkeys(self._topics, -math.inf)
+        self._names = {topic: [robot.joint_names[joint] for joint in joints] for topic, joints in self._joints.items()}
+        self._expected = {topic: set(names) for topic, names in self._names.items()}
+        what = 'external torques of all joints, for the admittance, as the effort of a JointState; "": none'
+        self._external_topic = node.parameter("external_torque_topic", "", what)
+        self._external: Array | None = None  # newest (nv,) [Nm]
+        self._external_stamp = -math.inf
+        self._joint_names = list(robot.joint_names)
+        self._publishers = Publishers(node, self._topics)
+        self._values = np.zeros((3, len(robot.joint_names)))
+        self.state: RobotState | None = None  # the newest of all arms
+
+    def subscribe(self, take: Callable[[RobotState | str, float], None]) -> None:
+        """Pass each state of all arms, or what is wrong with a message, to ``take``, with the time [s]."""
+        for topic in self._topics:
+            self._node.create_subscription(JointState, topic, partial(self._on_message, take, topic), STREAM_QOS)
+        if self._external_topic:
+            self._node.create_subscription(JointState, self._external_topic, self._on_external, STREAM_QOS)
+
+    @property
+    def measures_external_torque(self) -> bool:
+        """Whether there is a topic of external torques."""
+        return bool(self._external_topic)
+
+    def look(self) -> None:
+        """Ask the graph which nodes publish."""
+        self._publishers.look()
+
+    def source(self) -> str:
+        """The publishers of the oldest joint states, for the middle of a sentence."""
+        topic = min(self._stamps, key=lambda name: self._stamps[name])
+        where = f" on {topic}" if len(self._topics) > 1 else ""
+        return self._publishers.source(topic) + where
+
+    def _on_message(self, take: Callable[[RobotState | str, float], None], topic: str, message: JointState) -> None:
+        joints, names = self._joints[topic], self._names[topic]
+        if not self._expected[topic] & set(message.name):
+            return  # of a gripper or another robot
+        now = self._node.now
+        part = robot_state(message, names, now)
+        if isinstance(part, str):
+            take(part if len(self._topics) == 1 else f"{topic}: {part}", now)
+            return
+        self._stamps[topic] = now
+        self._values[:, joints] = part.q, part.v, part.tau
+        oldest = min(self._stamps.values())
+        if oldest > -math.inf:
+            q, v, tau = self._values.copy()
+            self.state = RobotState(q=q, v=v, tau=tau, tau_external=self._external, stamp=oldest)
+            if self._external_topic and now - self._external_stamp > STREAM_TIMEOUT:
+                take(f"no external torques on {self._external_topic}", now)
+            else:
+                take(self.state, now)
+
+    def _on_external(self, message: JointState) -> None:
+        columns = {name: index for index, name in enumerate(message.name)}
+        if len(message.effort) == len(message.name) and all(name in columns for name in self._joint_names):
+            torques = np.array([message.effort[columns[name]] for name in self._joint_names])
+            if np.isfinite(torques).all():
+                self._external, self._external_stamp = torques, self._node.now

@@ -1,0 +1,137 @@
+"""Joint commands out: the drive's commands as messages, on one topic or one an arm.
+
+The parameter ``output`` says which kind: it chooses the drive, the same that the pipeline has, and the messages that
+its commands become. Whether anything still takes them is found out while they are sent.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from q2r2_control.config import Config
+from q2r2_control.config.timeouts import STREAM_TIMEOUT
+from q2r2_control.drives import Drive, make_drive
+from q2r2_control.errors import ConfigError
+from q2r2_control.robot.robot import Robot
+from q2r2_control.ros.base_node import BaseNode
+from q2r2_control.ros.bridge.joint_messages import KINDS, NONE, JointCommand, Kind
+from q2r2_control.ros.monitoring.endpoints import WatchedPublisher
+from q2r2_control.types import CommandMode, Reference, RobotState
+
+_ARM = "{arm}"  # where an arm's name goes in a topic
+
+
+@dataclass(frozen=True, slots=True)
+class Channel:
+    """One topic and the joints that its messages are about."""
+
+    names: list[str]
+    joints: np.ndarray  # velocity indices in the robot's order
+    publisher: WatchedPublisher
+
+    def send(self, message: Any) -> None:
+        """Publish a message, or leave it out while the last one's acknowledgement is waited for."""
+        if not self.publisher.waits():
+            self.publisher.publish(message)
+
+
+class JointOutput:
+    """Where references go. Without channels, ``output: none``, another controller moves the arms."""
+
+    def __init__(self, drive: Drive, kind: Kind, channels: list[Channel]) -> None:
+        self.drive = drive
+        self._kind, self._channels = kind, channels
+        self._listeners = 0
+
+    def activate(self, state: RobotState) -> None:
+        """Begin anew at a measured state."""
+        if self._channels:
+            self.drive.reset(state)
+
+    def send(self, reference: Reference, state: RobotState, dt: float, t: float, trusted: bool) -> None:
+        """Command the reference that is due ``dt`` [s] from now, at ``t`` [s] of the node's clock.
+
+        ``trusted``: see :meth:`Drive.command`.
+        """
+        if self._channels:
+            command = self.drive.command(reference, state, {}, dt, trusted)
+            self._publish(JointCommand(command, state, t))
+
+    def end(self, state: RobotState, t: float) -> None:
+        """What holds the arms where no more commands come, for drives that need it."""
+        command = self.drive.last_command(state, {})
+        if self._channels and command is not None and command.mode is self.drive.mode:
+            self._publish(JointCommand(command, state, t))
+
+    def listener_fault(self, off_reference: bool) -> str | None:
+        """One line where what took the commands is gone, or is not alone any more; to be asked before each is sent.
+
+        Asked only where the arms are ``off_reference``, since looking costs a message now and then. Arms that yield
+        are off their reference by design, and a torque for where they are is no jump to a new receiver: those are
+        not asked about.
+        """
+        publishers = [channel.publisher for channel in self._channels]
+        before, self._listeners = self._listeners, sum(publisher.listeners for publisher in publishers)
+        if self.drive.yields or not off_reference:
+            for publisher in publishers:
+                publisher.begin(acknowledged=True)
+            return None
+        if self._listeners > before:
+            return "a new receiver takes the commands, and the arms are not where these are"
+        return next((line for publisher in publishers if (line := publisher.silence())), None)
+
+    def _publish(self, command: JointCommand) -> None:
+        for channel in self._channels:
+            channel.send(self._kind.encode(command, channel.names, channel.joints))
+
+
+def joints_of(robot: Robot, arms: Iterable[str]) -> np.ndarray:
+    """Velocity indices of the joints that move some of ``arms``, in the robot's order."""
+    return np.unique(np.concatenate([robot.arms[arm].joints for arm in arms]))
+
+
+def output_name(node: BaseNode) -> str:
+    """Declare the parameter ``output`` and return it."""
+    allowed = (*KINDS, NONE)
+    name: str = node.parameter("output", "trajectory", "what the arms are commanded with", one_of=allowed)
+    return name
+
+
+def make_output(name: str, node: BaseNode, robot: Robot, config: Config, period: float) -> JointOutput:
+    """The output called ``name`` on the topics that the parameters ask for; ``period`` [s] of the control loop.
+
+    Raises :class:`ConfigError`.
+    """
+    what = "arms that do not follow and whose joint positions nobody acknowledges are given up after [s]"
+    listener_timeout = node.parameter("listener_timeout", STREAM_TIMEOUT, what, at_least=0.1, at_most=5.0)
+    topics = _topics(name, node, robot)
+    if name == NONE:
+        return JointOutput(make_drive(CommandMode.POSITION, robot, config), KINDS["trajectory"](period, robot), [])
+    kind = KINDS[name](period, robot)
+    drive = make_drive(kind.mode, robot, config, has_servos=False)
+    channels = []
+    for topic in dict.fromkeys(topics.values()):
+        joints = joints_of(robot, (arm for arm, its in topics.items() if its == topic))
+        names = [robot.joint_names[joint] for joint in joints]
+        if kind.joints_each is not None and len(names) != kind.joints_each:
+            raise ConfigError(
+                f"output: {topic} carries {len(names)} joints; {name} has {kind.joints_each} a message, and each arm "
+                "needs a topic of its own"
+            )
+        channels.append(Channel(names, joints, WatchedPublisher(node, kind.message, topic, listener_timeout)))
+    return JointOutput(drive, kind, channels)
+
+
+def _topics(name: str, node: BaseNode, robot: Robot) -> dict[str, str]:
+    """The topic that carries each arm's joints; arms with the same one share its messages."""
+    what = f"joint commands of all arms, {_ARM} stands for an arm's name; \"\": the output's usual one"
+    shared = node.parameter("output_topic", "", what) or ("" if name == NONE else KINDS[name].topic)
+    topics: dict[str, str] = {}
+    for arm in robot.arms:
+        its = node.parameter(f"{arm}.output_topic", "", 'joint commands of this arm alone; "": output_topic')
+        topics[arm] = (its or shared).replace(_ARM, arm)
+    return topics

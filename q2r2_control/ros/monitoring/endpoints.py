@@ -1,0 +1,124 @@
+"""The other ends of a topic: which nodes publish on it, and whether its subscribers still acknowledge messages."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterable
+from typing import Any
+
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from rclpy.duration import Duration
+from rclpy.node import Node
+
+from q2r2_control.ros.base_node import SENT_COMMAND_QOS
+
+_MAX_AGE = 0.1  # of the graph's answer, before it is asked again [s]
+_PERIOD = 1.0  # of asking the graph where no other code asks [s]
+_NO_WAIT = Duration(nanoseconds=0)
+# A subscriber may take 5 ms to acknowledge, longer than the period of a fast stream. So messages are left out every
+# _CHECK seconds, until the one before has been acknowledged, or for at most _GAP seconds.
+_CHECK, _GAP = 0.05, 0.015
+
+
+def node_of(endpoint: Any) -> str | None:
+    """Full name of the node that an endpoint of the graph belongs to; None while the graph does not know it yet."""
+    if endpoint.node_name.startswith("_NODE_NAME_"):  # as rcl puts it
+        return None
+    return f"{endpoint.node_namespace.rstrip('/')}/{endpoint.node_name}"
+
+
+class Publishers:
+    """Which nodes publish on some topics. The names are kept after a node has ended and left the graph.
+
+    The graph is asked now and then, never for each message. It cannot tell two publishers from one that was killed and
+    its successor: for some seconds it lists both.
+    """
+
+    def __init__(self, node: Node, topics: Iterable[str]) -> None:
+        self._node = node
+        self._names: dict[str, str] = dict.fromkeys(topics, "")
+        self._asked_at = dict.fromkeys(self._names, -math.inf)
+
+    def look_steadily(self) -> None:
+        """Ask the graph by a timer, for a node that has no other occasion."""
+        self._node.create_timer(_PERIOD, self.look, clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+    def look(self) -> None:
+        """Ask the graph about all topics."""
+        for topic in self._names:
+            self._ask(topic)
+
+    def of(self, topic: str) -> str:
+        """Full names of the nodes that publish on ``topic``, or of the last ones that did; "" if there were none."""
+        if time.monotonic() - self._asked_at[topic] > _MAX_AGE:
+            self._ask(topic)
+        return self._names[topic]
+
+    def source(self, topic: str) -> str:
+        """The same for the middle of a sentence: " from /node", or "" if there were none."""
+        names = self.of(topic)
+        return f" from {names}" if names else ""
+
+    def _ask(self, topic: str) -> None:
+        self._asked_at[topic] = time.monotonic()
+        names = {node_of(endpoint) for endpoint in self._node.get_publishers_info_by_topic(topic)}
+        if known := sorted(name for name in names if name is not None):
+            self._names[topic] = " and ".join(known)
+
+
+class WatchedPublisher:
+    """A publisher of targets or commands that notices when a subscriber was killed or hangs: it acknowledges no more.
+
+    The graph lists such a subscriber for seconds. Meanwhile the targets move on, and a subscriber that is started in
+    its place would begin with a jump. A stream of which nothing was ever acknowledged is not judged, because the
+    remains of a subscriber that ended earlier do not acknowledge either. Best-effort subscribers never acknowledge and
+    do not count. All times are real time, also where a simulation has its own.
+    """
+
+    def __init__(self, node: Node, kind: type, topic: str, timeout: float) -> None:
+        self._publisher: Any = node.create_publisher(kind, topic, SENT_COMMAND_QOS)
+        self._timeout = timeout
+        self._streaming = False
+        self._acknowledged: float | None = None  # when all messages last were; None: not yet in this stream [s]
+        self._gap_began = -math.inf  # [s]
+
+    @property
+    def topic_name(self) -> str:
+        return str(self._publisher.topic_name)
+
+    @property
+    def listeners(self) -> int:
+        """How many subscribers the graph lists; some may have ended."""
+        return int(self._publisher.get_subscription_count())
+
+    def begin(self, acknowledged: bool = False) -> None:
+        """The next message begins a stream; with ``acknowledged`` all that was sent before counts as acknowledged."""
+        self._streaming, self._gap_began = False, -math.inf
+        self._acknowledged = time.monotonic() if acknowledged else None
+
+    def publish(self, message: Any) -> None:
+        """Publish a message of the stream."""
+        self._publisher.publish(message)
+        self._streaming = True
+
+    def waits(self) -> bool:
+        """Whether the next message should be left out, so that the last one can be acknowledged."""
+        now = time.monotonic()
+        if not self._streaming or (self._acknowledged is not None and now - self._acknowledged < _CHECK):
+            return False
+        if now - self._gap_began >= _CHECK:
+            self._gap_began = now
+        return now - self._gap_began < _GAP
+
+    def silence(self) -> str | None:
+        """One line if nothing was acknowledged for longer than the timeout; call it before each message."""
+        if not self._streaming:
+            return None
+        now = time.monotonic()
+        if self._publisher.wait_for_all_acked(_NO_WAIT):
+            self._acknowledged = now
+        if self._acknowledged is None or now - self._acknowledged <= self._timeout:
+            return None
+        return f"messages on {self.topic_name} are not acknowledged for {now - self._acknowledged:.2f} s"

@@ -1,0 +1,78 @@
+"""What a run leaves behind: every tick goes to the listeners and into the summary."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+import pinocchio as pin
+
+from q2r2_control.compliance.admittance import AdmittanceReport
+from q2r2_control.compliance.impedance import ImpedanceReport
+from q2r2_control.compliance.repulsion import WallReport
+from q2r2_control.config import ControllerSettings
+from q2r2_control.drives import DriveReport
+from q2r2_control.robot.robot import Robot
+from q2r2_control.runtime.run_summary import RunStatistics, RunSummary
+from q2r2_control.supervision.tick_pacer import TickPacer
+from q2r2_control.types import ArmTarget, Event, HandSample, Reference, RobotState
+
+
+@dataclass(frozen=True, slots=True)
+class Tick:
+    """All that one tick did, for the listeners."""
+
+    t: float  # since the start of the run [s]
+    dt: float  # that passed since the last tick [s]
+    samples: list[HandSample]
+    targets: dict[str, ArmTarget]  # as the operator asks for them, whatever an admittance makes of them
+    engaged: dict[str, bool]
+    states: dict[str, str]  # of the teleop layer, or STOPPING
+    reference: Reference
+    state: RobotState  # measured before the tick's command
+    tools: dict[str, pin.SE3]  # measured tool poses, world frame
+    grippers: dict[str, float]  # measured openings
+    compute_time: float  # [s]
+    impedance: ImpedanceReport | None = None  # of torque mode
+    wall: WallReport | None = None  # of torque mode
+    admittance: AdmittanceReport | None = None  # of position mode, where it is enabled
+
+
+class RunRecorder:
+    """Tells the listeners of every tick and adds it up. A listener that raises ends the run and is not called again."""
+
+    def __init__(
+        self,
+        robot: Robot,
+        control: ControllerSettings,
+        listeners: Iterable[Callable[[Tick], None]],
+        stop: Callable[[], None],
+    ) -> None:
+        self._statistics = RunStatistics(robot, control)
+        self._listeners, self._stop = list(listeners), stop
+        self._failure: Exception | None = None  # of a listener
+
+    def add_latency(self, samples: list[HandSample], now: float) -> None:
+        """See :meth:`RunStatistics.add_latency`."""
+        self._statistics.add_latency(samples, now)
+
+    def add(self, tick: Tick, events: Iterable[Event]) -> None:
+        """One tick, and what happened to the arms' teleoperation in it."""
+        statistics = self._statistics
+        statistics.tick.add(tick.compute_time)
+        statistics.add(tick.dt, tick.reference, tick.targets, tick.tools, tick.engaged)
+        statistics.add_drive(tick.dt, DriveReport(tick.impedance, tick.wall, tick.admittance))
+        statistics.events.extend(events)
+        for listener in list(self._listeners):
+            try:
+                listener(tick)
+            except Exception as error:
+                self._listeners.remove(listener)
+                self._failure = self._failure or error
+                self._stop()
+
+    def summary(self, wall_time: float, pacer: TickPacer) -> RunSummary:
+        """The run so far, which took ``wall_time`` [s]. Raises the first exception of a listener."""
+        if self._failure is not None:
+            raise self._failure
+        return self._statistics.summary(wall_time, pacer.missed_ticks, pacer.stretched)

@@ -1,0 +1,53 @@
+"""What keeps a cell from running, found before anything moves."""
+
+from __future__ import annotations
+
+from q2r2_control.config.control import ControllerSettings
+from q2r2_control.control.controller import CartesianController
+from q2r2_control.robot.robot import Robot
+from q2r2_control.types import Array
+
+
+def preflight_faults(
+    robot: Robot, settings: ControllerSettings, controller: CartesianController | None
+) -> tuple[str, ...]:
+    """One line for each reason why ``robot`` should not start at home; empty for a cell that may run.
+
+    Looked at are position limits with their margin, every monitored pair against ``min_distance``, and whether the
+    ``controller`` knows a certified stop at home; without one (None: it moves nothing here) only the first two.
+    The controller is left reset at home.
+    """
+    too_close = _closer_than_allowed(robot, robot.home, settings.min_distance)
+    faults = [*_outside_limits(robot, robot.home, settings.position_margin), *too_close]
+    if controller is not None and not too_close:  # a pair that is too close leaves no certificate, and says more
+        faults += _without_certificate(controller)
+    return tuple(faults)
+
+
+def _outside_limits(robot: Robot, home: Array, margin: float) -> list[str]:
+    lower, upper = robot.position_lower + margin, robot.position_upper - margin
+    return [
+        f"home: {name} = {home[index]:g}; allowed: {lower[index]:g} .. {upper[index]:g} rad, position_margin included"
+        for index, name in enumerate(robot.joint_names)
+        if not lower[index] <= home[index] <= upper[index]
+    ]
+
+
+def _closer_than_allowed(robot: Robot, home: Array, min_distance: float) -> list[str]:
+    return [
+        f"home: {pair.name_a} and {pair.name_b} are {1e3 * pair.distance:.1f} mm apart; "
+        f"allowed: at least min_distance, {1e3 * min_distance:.1f} mm"
+        for pair in sorted(robot.distances(home), key=lambda pair: pair.distance)
+        if pair.distance < min_distance
+    ]
+
+
+def _without_certificate(controller: CartesianController) -> list[str]:
+    home = controller.robot.home
+    controller.reset(home)
+    report = controller.step({}, controller.settings.max_substep).report  # every arm holds
+    controller.reset(home)
+    if report.certified:
+        return []
+    nearest = f"{' | '.join(report.closest_pair)} at {1e3 * report.closest_distance:.1f} mm"
+    return [f"home: the controller knows no certified stop from here; nearest pair: {nearest}"]

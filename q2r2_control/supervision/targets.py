@@ -1,0 +1,102 @@
+"""The targets of all arms: who may send them, which stream of them is followed, and when one has ended."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+import pinocchio as pin
+
+from q2r2_control.supervision.sequence_watch import SequenceWatch
+from q2r2_control.supervision.target_stream import Origins, Refusal, StreamSettings, TargetStream
+
+
+class Targets:
+    """One :class:`TargetStream` an arm. Poses are in the world frame, times are receipt times [s]."""
+
+    def __init__(self, arms: Iterable[str], settings: StreamSettings, origins: Origins) -> None:
+        self._settings, self._origins = settings, origins
+        self._streams = {arm: TargetStream(settings) for arm in arms}
+        self._sequences = {arm: SequenceWatch() for arm in self._streams}
+        self.ended: dict[str, str] = {}  # arms that hold since their targets ended, with a line that says so
+
+    @property
+    def poses(self) -> dict[str, pin.SE3 | None]:
+        """What each arm follows; None: it holds."""
+        return {arm: stream.pose for arm, stream in self._streams.items()}
+
+    @property
+    def arms(self) -> tuple[str, ...]:
+        """Names of all arms."""
+        return tuple(self._streams)
+
+    def follows(self, arm: str) -> bool:
+        """Whether an arm follows its targets."""
+        return self._streams[arm].following
+
+    def age(self, arm: str, now: float) -> float:
+        """Time since the last target of an arm that was a pose [s]."""
+        return now - self._streams[arm].stamp
+
+    def take(
+        self,
+        arm: str,
+        pose: pin.SE3 | None,
+        tools: Sequence[pin.SE3],
+        now: float,
+        number: int | None,
+        forbidden: str | None,
+    ) -> Refusal | None:
+        """Take a target, None for one that was no pose; returns why it is not followed, or None.
+
+        ``tools``: see :meth:`TargetStream.offer`; ``number``: of the message at its publisher, None where that is not
+        known; ``forbidden``: why no arm may follow targets now, or None.
+        """
+        stream = self._streams[arm]
+        others = None if number is None else self._other_publishers(arm, number, now)
+        refusal = None if pose is None else stream.offer(pose, tools, now)
+        if others is not None:
+            stream.drop()
+            return others
+        if pose is None:
+            return None
+        if forbidden is not None:
+            stream.drop()
+            return Refusal("stream", forbidden)
+        if refusal is None:
+            self.ended.pop(arm, None)
+            return None
+        return Refusal("stream", refusal)
+
+    def release(self, arm: str) -> None:
+        """The sender ended the arm's stream: it holds, and the next target begins a stream."""
+        self._streams[arm].reset()
+
+    def drop(self) -> None:
+        """All arms hold, and the streams that go on now are not followed any more."""
+        for stream in self._streams.values():
+            stream.drop()
+
+    def reset(self) -> None:
+        """All arms hold, and the next target of each begins a stream."""
+        self.ended.clear()
+        for stream in self._streams.values():
+            stream.reset()
+
+    def expire(self, now: float) -> list[str]:
+        """A line for each stream that was followed and has just ended by silence."""
+        lines = []
+        for arm, stream in self._streams.items():
+            if stream.expire(now):
+                self.ended[arm] = f"{arm}: targets{self._origins.targets(arm)} have ceased, the arm holds"
+                lines.append(self.ended[arm])
+        return lines
+
+    def _other_publishers(self, arm: str, number: int, now: float) -> Refusal | None:
+        """Says so where an arm's targets came from more than one publisher lately."""
+        breaks = self._sequences[arm].take(number, now, self._settings.timeout)
+        if breaks == 0:
+            return None
+        if breaks == 1:
+            line = f"another publisher took over{self._origins.targets(arm)}; the targets have to begin anew"
+            return Refusal("took over", line)
+        return Refusal("publishers", f"two publishers at a time{self._origins.targets(arm)}; allowed: one")

@@ -1,0 +1,52 @@
+"""A late tick is no jump: by how much time the reference may move in one tick.
+
+A plant takes one command a period, so what a joint may do between two commands is what its velocity limit allows in one
+period, however late the second one comes. A reference that moved on by a gap of 100 ms would ask a plant with a period
+of 4 ms to do in one period what takes up to twenty-five.
+
+A tick that is late moves the reference by the time t that passed, but no joint by more than its limit V allows in a
+period h:  |v| t + a t^2 / 2 <= V h  for each joint, with the acceleration limit a, or by one period, which no joint's
+limit forbids. So slow motion catches up at once, and fast motion is stretched in time: the same path, later. Time is
+stretched, rather than a command clipped joint by joint, because a clipped command leaves the path that was certified.
+The target is an absolute pose, so nothing of it is lost.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from q2r2_control.types import Array
+
+_ROUNDING = 1e-9  # of a period
+
+
+class TickPacer:
+    """Turns the time since the last tick into the time that the reference moves by, and counts what was late."""
+
+    def __init__(self, period: float, velocity_limit: Array, acceleration_limit: float) -> None:
+        """``period`` [s] of the commands; ``velocity_limit`` (nv,) [rad/s], ``acceleration_limit`` [rad/s^2]."""
+        self.period = period
+        self.missed_ticks = 0  # commands that were due and did not come
+        self.stretched = 0.0  # time by which the motion is late for it [s]
+        self._way = velocity_limit * period  # in one period [rad]
+        self._acceleration = acceleration_limit
+
+    def step(self, gap: float, v: Array) -> float:
+        """Time [s] for the reference to move by, ``gap`` [s] after the last tick, from velocities ``v`` (nv,) [rad/s].
+
+        Not more than ``gap``; 0 for a clock that did not advance.
+        """
+        if not gap > 0.0:
+            return 0.0
+        if gap <= self.period * (1.0 + _ROUNDING):
+            return gap
+        # Half a period late is jitter; from there on a command is missing.
+        self.missed_ticks += max(round(gap / self.period) - 1, 0)
+        step = min(gap, max(self.period, self._longest(v)))
+        self.stretched += gap - step
+        return step
+
+    def _longest(self, v: Array) -> float:
+        """The time in which the first joint can have used up its way."""
+        a, speed = self._acceleration, np.abs(v)
+        return float((2.0 * self._way / (speed + np.sqrt(speed * speed + 2.0 * a * self._way))).min())

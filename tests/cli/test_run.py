@@ -1,0 +1,47 @@
+"""A run refuses a cell in which the check finds a fault, unless it is forced."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from tests.cli.test_app import FAST, changed_cell, one_object, q2r2
+
+OPTIONS = (*FAST[2:], "--duration", "0.1")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "fault"),
+    [
+        pytest.param("home: [0.0204, 0.348,", "home: [0.0204, 1.0,", "left_hand_e_envelope_1 and table_0", id="table"),
+        pytest.param("0.0204, 0.348,", "0.0204, 2.09,", "left_A2 = 2.09; allowed: -2.0844 .. 2.0844", id="limits"),
+    ],
+)
+def test_what_check_refuses_is_refused_in_one_line_that_says_the_same(
+    tmp_path: Path, old: str, new: str, fault: str
+) -> None:
+    file = changed_cell(tmp_path, old, new)
+    refused = q2r2("run", file, *OPTIONS)
+    assert (refused.exit_code, refused.stdout) == (2, "")
+    assert refused.stderr.count("\n") == 1
+    faults = one_object(q2r2("check", file, "--json").stdout)["faults"]
+    assert any(fault in line for line in faults)
+    assert all(line in refused.stderr for line in faults)
+    assert "--force" in refused.stderr
+
+
+def test_a_home_without_a_certified_stop_is_refused_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    fault = "home: the controller knows no certified stop from here"
+    monkeypatch.setattr("q2r2_control.cli.cell_run.preflight_faults", lambda *_: (fault,))
+    refused = q2r2("run", changed_cell(tmp_path, "", ""), *OPTIONS)
+    assert refused.exit_code == 2
+    assert refused.stderr == f"q2r2: dual_iiwa7: {fault}; --force runs it all the same\n"
+
+
+def test_with_force_it_says_what_is_wrong_and_runs(tmp_path: Path) -> None:
+    file = changed_cell(tmp_path, "0.0204, 0.348,", "0.0204, 2.09,")
+    result = q2r2("run", file, *OPTIONS, "--force")
+    assert result.exit_code == 0
+    assert "FAULT home: left_A2 = 2.09" in result.stderr
+    assert one_object(result.stdout)["ticks"] > 0

@@ -1,0 +1,218 @@
+"""Loops that stand still for a while, and plants that do not do what they are told, in the in-process loop."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from q2r2_control.errors import PlantError
+from q2r2_control.pipeline import Pipeline
+from q2r2_control.plants.kinematic import KinematicPlant
+from q2r2_control.robot.robot import Robot
+from q2r2_control.runtime import loop_clock
+from q2r2_control.runtime.recorder import Tick
+from q2r2_control.types import SIDES, Array, Command, HandInputs, HandSample, HapticFeedback, RobotState
+from tests.support.hands_input import HandsInput
+from tests.support.watch import Watch, cell, speed
+
+CHECKOUT = Path(__file__).resolve().parents[1]
+RATE = 250.0  # [Hz]
+
+
+class RecordingPlant(KinematicPlant):
+    """Keeps every commanded posture, and measures what ``disturb`` makes of the truth."""
+
+    def __init__(self) -> None:
+        super().__init__(Robot.from_config(cell()), cell())
+        self.commanded: list[Array] = []
+        self.disturb: Callable[[RobotState], RobotState] = lambda state: state
+
+    def apply(self, command: Command) -> None:
+        super().apply(command)
+        self.commanded.append(command.q)
+
+    def state(self) -> RobotState:
+        return self.disturb(super().state())
+
+
+def swing(t: float) -> Array:
+    """A hand that swings as fast as the arms can just follow."""
+    return np.array([0.0, 0.12 * np.sin(6.0 * max(t - 0.5, 0.0)), 0.0, 0.0, 0.0, 0.0])
+
+
+def reach(t: float) -> Array:
+    """A hand that moves far and slowly."""
+    return np.array([0.0, 0.0, 0.2 * (1.0 - np.cos(1.5 * max(t - 0.5, 0.0))), 0.0, 0.0, 0.0])
+
+
+def swinging(plant: RecordingPlant, path: Callable[[float], Array] = swing) -> Pipeline:
+    config = cell().model_copy(update={"loop_rate_hz": RATE})
+    return Pipeline.from_config(config, input=HandsInput(left=path, right=path), plant=plant)
+
+
+def largest_step(plant: RecordingPlant, limit: Array) -> float:
+    """Of any joint between two commands, as a share of what its limit allows in one period."""
+    ways = np.abs(np.diff(np.array(plant.commanded), axis=0))
+    return float((ways / (limit / RATE)).max())
+
+
+class StallingClock:
+    """Stands for the module ``time``: every second the computer stands still for ``stall`` [s]."""
+
+    def __init__(self, stall: float) -> None:
+        self._now, self._stall, self._next = 0.0, stall, 0.9
+
+    def monotonic(self) -> float:
+        return self._now
+
+    def perf_counter(self) -> float:
+        return self._now
+
+    def sleep(self, duration: float) -> None:
+        self._now += duration
+        if self._now >= self._next:
+            self._next += 0.37
+            self._now += self._stall
+
+
+@pytest.mark.parametrize("stall", [0.02, 0.05, 0.1, 0.7])
+def test_after_a_stall_no_command_is_farther_from_the_last_than_a_joint_may_go_in_a_period(
+    stall: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(loop_clock, "time", StallingClock(stall))
+    plant = RecordingPlant()
+    loop = swinging(plant)
+    watch = Watch(loop)
+    summary = loop.run(4.0)
+    assert summary.missed_ticks >= 5
+    assert max(tick.dt for tick in watch.ticks) == pytest.approx(stall + 1.0 / RATE, abs=1.0 / RATE)
+    assert max(map(speed, watch.ticks)) > 0.5
+    assert largest_step(plant, loop.robot.velocity_limit) <= 1.0 + 1e-9
+    paused = [event for event in summary.events if event.destination == "paused"]
+    assert bool(paused) == (stall >= 0.1), "a long stall pauses, a short one does not"
+    assert all("stood still" in event.reason or "stalled" in event.reason for event in paused)
+
+
+class PersistentHands:
+    """Hands that swing from the first sample on, and press the button whenever an arm is not engaged."""
+
+    connected = True
+
+    def __init__(self) -> None:
+        self.loop: Pipeline | None = None
+        self._hands = HandsInput(left=swing, right=swing)
+        self._began: float | None = None
+
+    def start(self) -> None:
+        self._hands.start()
+
+    def poll(self, now: float) -> list[HandSample]:
+        self._began = now if self._began is None else self._began
+        engaged = {} if self.loop is None else self.loop.teleop.engaged
+        inputs = {hand: HandInputs(button_lower=not engaged.get(hand) and now % 0.4 < 0.2) for hand in SIDES}
+        return [
+            replace(sample, pose_stamp=now, inputs_stamp=now, inputs=inputs[sample.hand])
+            for sample in self._hands.poll(now - self._began)
+        ]
+
+    def send_haptic(self, feedback: HapticFeedback) -> None:
+        pass
+
+    def close(self) -> None:
+        pass
+
+
+def swing_until_stopped() -> None:
+    """Run until SIGTERM; says when the arms move fast, and at the end how many ticks were missed and the worst step."""
+    plant, hands = RecordingPlant(), PersistentHands()
+    config = cell().model_copy(update={"loop_rate_hz": RATE})
+    hands.loop = loop = Pipeline.from_config(config, input=hands, plant=plant)
+    loop.listeners.append(lambda tick: print("moving", flush=True) if speed(tick) > 0.5 else None)
+    summary = loop.run()
+    print(json.dumps([summary.missed_ticks, largest_step(plant, loop.robot.velocity_limit)]), flush=True)
+
+
+def test_stopped_and_continued_by_signals_no_command_is_a_jump() -> None:
+    script = "from tests.test_stalls import swing_until_stopped; swing_until_stopped()"
+    stalls = [0.02, 0.05, 0.1, 0.02, 0.05, 0.1]
+    with subprocess.Popen([sys.executable, "-c", script], cwd=CHECKOUT, stdout=subprocess.PIPE, text=True) as run:
+        assert run.stdout is not None
+        for stall in stalls:
+            for _ in range(5):  # lines that waited in the pipe tell of the past
+                assert run.stdout.readline() == "moving\n"
+            os.kill(run.pid, signal.SIGSTOP)
+            time.sleep(stall)
+            os.kill(run.pid, signal.SIGCONT)
+        run.send_signal(signal.SIGTERM)
+        *_, last = run.stdout.read().splitlines()
+        assert run.wait(30.0) == 0
+    missed, step = json.loads(last)
+    assert missed >= len(stalls)
+    assert step <= 1.0 + 1e-9
+
+
+def blocked(plant: RecordingPlant) -> Callable[[RobotState], RobotState]:
+    """From now on the arms stay where they are, and say so."""
+    q = plant.state().q
+    return lambda state: replace(state, q=q, v=np.zeros_like(q))
+
+
+def teleported(plant: RecordingPlant) -> Callable[[RobotState], RobotState]:
+    """From now on one joint is elsewhere."""
+    way = np.zeros_like(plant.state().q)
+    way[3] = 0.4
+    return lambda state: replace(state, q=state.q + way)
+
+
+def frozen(plant: RecordingPlant) -> Callable[[RobotState], RobotState]:
+    """From now on the last measurement is repeated."""
+    last = plant.state()
+    return lambda state: last
+
+
+def unreadable(plant: RecordingPlant) -> Callable[[RobotState], RobotState]:
+    """From now on one joint's position is not a number."""
+    bad = np.zeros_like(plant.state().q)
+    bad[3] = np.nan
+    return lambda state: replace(state, q=state.q + bad)
+
+
+@pytest.mark.parametrize(
+    ("fault", "message"),
+    [
+        (blocked, r"left_A\d is 0\.\d+ rad from its reference for 0\.5 s; allowed: 0\.15 rad for 0\.5 s"),
+        (teleported, r"left_A4 jumped by 0\.(39|40)\d rad"),
+        (frozen, r"no joint states for 0\.10\d s; allowed: 0\.1"),
+        (unreadable, r"measured position of left_A4 = nan for more than 50 ms; allowed: finite numbers"),
+    ],
+    ids=["blocked", "teleporting", "frozen", "not a number"],
+)
+def test_a_plant_that_does_not_do_what_it_is_told_ends_the_run_and_the_arms_brake_first(
+    fault: Callable[[RecordingPlant], Callable[[RobotState], RobotState]], message: str
+) -> None:
+    plant = RecordingPlant()
+    loop = swinging(plant, reach)
+    watch = Watch(loop)
+    broken: list[float] = []
+
+    def break_it(tick: Tick) -> None:
+        if not broken and speed(tick) > 0.2:
+            broken.append(tick.t)
+            plant.disturb = fault(plant)
+
+    loop.listeners.append(break_it)
+    with pytest.raises(PlantError, match=message):
+        loop.run(30.0, realtime=False)
+    assert watch.ticks[-1].t < broken[0] + 2.0
+    assert speed(watch.ticks[-1]) <= 1e-6
+    assert largest_step(plant, loop.robot.velocity_limit) <= 1.0 + 1e-9
