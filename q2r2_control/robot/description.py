@@ -39,6 +39,7 @@ _SCALARS = {
     "inertia": ("ixx", "ixy", "ixz", "iyy", "iyz", "izz"),
     "limit": ("lower", "upper", "velocity", "effort"),
     "rotor": ("inertia", "gear"),
+    "mimic": ("multiplier", "offset"),
 }
 
 

@@ -114,6 +114,23 @@ def test_joints_that_nobody_drives_are_fixed_as_near_zero_as_they_can() -> None:
     assert list(pin.buildModelFromXML(cell.urdf).names)[1:] == list(cell.arm_joints["left"])
 
 
+def test_a_joint_that_mimics_a_resting_one_is_fixed_where_that_puts_it(tmp_path: Path) -> None:
+    jaw = (
+        '<link name="{0}"/><joint name="{0}_joint" type="prismatic"><parent link="link_ee"/><child link="{0}"/>'
+        '<limit lower="-1" upper="1" velocity="1" effort="1"/>{1}</joint>'
+    )
+    jaws = jaw.format("jaw_a", "") + jaw.format("jaw_b", '<mimic joint="jaw_a_joint" multiplier="-1" offset="0.1"/>')
+    text = find_resource("robots/iiwa7.urdf").read_text().replace("</robot>", f"{jaws}</robot>")
+    (tmp_path / "arm.urdf").write_text(text)
+    model = pin.buildModelFromXML(compose(one_arm(model=str(tmp_path / "arm.urdf"))).urdf)
+    flange, jaw_a, jaw_b = (
+        model.frames[model.getFrameId(f"left_{link}", pin.FrameType.BODY)].placement.translation
+        for link in ("link_ee", "jaw_a", "jaw_b")
+    )
+    np.testing.assert_allclose(jaw_a, flange)
+    np.testing.assert_allclose(np.linalg.norm(jaw_b - flange), 0.1)
+
+
 def test_a_finger_that_mimics_a_driven_one_moves_with_it() -> None:
     gripper = {"joints": ["panda_finger_joint1"], "open_position": 0.04}
     cell = compose(one_arm(model="example-robot-data:panda", home=[0, 0, 0, -1, 0, 1, 0], gripper=gripper))

@@ -38,6 +38,9 @@ GOOD = """<robot name="two">
         pytest.param('xyz="0 0 1"', 'xyz="0 1"', "3 finite number", id="a vector of two"),
         pytest.param('xyz="0 0 1"', 'xyz="0 0 0"', "axis", id="an axis without direction"),
         pytest.param('value="1"', 'value="-1"', "0 or more", id="a negative mass"),
+        pytest.param(
+            "<axis", '<mimic joint="turn" multiplier="twice"/><axis', "multiplier = 'twice'", id="a mimic of no number"
+        ),
         pytest.param("<sphere", "<ball", "ball", id="a collision shape that no reader knows"),
         pytest.param('<sphere radius="0.1"/>', "", "shapes []", id="a collision without shape"),
         pytest.param('link="tip"', 'link="top"', "no child link", id="a child that does not exist"),

@@ -110,7 +110,8 @@ def test_the_arms_watch_each_other_and_the_torso_that_carries_them(baxter: Robot
         assert frozenset(pair) in watched, pair
 
 
-def test_a_robot_without_an_srdf_watches_everything_that_can_be_parted(tiago: Robot) -> None:
+def test_a_robot_without_an_srdf_watches_everything_that_can_be_parted() -> None:
+    tiago = Robot.from_config(Config.model_validate(TIAGO | {"srdf": None}))
     watched = {frozenset(map(link_of, names)) for names in pair_names(tiago.collision_model)}
     for pair in (("arm_left_5_link", "arm_right_5_link"), ("arm_left_4_link", "torso_lift_link"),
                  ("hand_left_palm_link", "head_2_link"), ("hand_right_palm_link", "base_link")):  # fmt: skip
