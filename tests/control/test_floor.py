@@ -12,7 +12,8 @@ from q2r2_control import CartesianController, Robot, load_config
 from q2r2_control.types import Reference
 
 CONFIG = load_config("config/dual_iiwa7.yaml")
-LEAST = CONFIG.control.min_distance
+SETTINGS = CONFIG.control.model_copy(update={"solve_time_limit": None})  # no outcome hangs on the clock
+LEAST = SETTINGS.min_distance
 DT = 0.002
 DOWN = pin.rpy.rpyToMatrix(np.pi, 0.0, np.pi)  # as at home
 BESIDE_THE_TABLE = {
@@ -23,7 +24,7 @@ BESIDE_THE_TABLE = {
 
 def _controller(floor: float | None) -> CartesianController:
     robot = Robot.from_config(CONFIG.model_copy(update={"floor": floor}))
-    return CartesianController(robot, CONFIG.control)
+    return CartesianController(robot, SETTINGS)
 
 
 def _driven(controller: CartesianController, seconds: float) -> Iterator[Reference]:

@@ -10,14 +10,15 @@ from q2r2_control import CartesianController, Robot, load_config
 from q2r2_control.supervision.preflight import preflight_faults
 
 CONFIG = load_config("config/dual_iiwa7.yaml")
-LEAST = CONFIG.control.min_distance
+SETTINGS = CONFIG.control.model_copy(update={"solve_time_limit": None})  # no outcome hangs on the clock
+LEAST = SETTINGS.min_distance
 HAND_AND_FOREARM = ("left_link_5_0", "left_hand_e_envelope_0")
 A6 = 5
 
 
 @pytest.fixture(scope="module")
 def controller() -> CartesianController:
-    return CartesianController(Robot.from_config(CONFIG), CONFIG.control)
+    return CartesianController(Robot.from_config(CONFIG), SETTINGS)
 
 
 def test_a_hand_bent_to_15_mm_from_the_forearm_is_too_close_and_not_certified(controller: CartesianController) -> None:
@@ -34,9 +35,9 @@ def test_a_hand_bent_to_15_mm_from_the_forearm_is_too_close_and_not_certified(co
 def test_a_cell_whose_home_bends_the_hand_that_far_is_not_to_be_run(monkeypatch: pytest.MonkeyPatch) -> None:
     robot = Robot.from_config(CONFIG)
     bent = robot.home.copy()
-    bent[A6] = robot.position_upper[A6] - CONFIG.control.position_margin
+    bent[A6] = robot.position_upper[A6] - SETTINGS.position_margin
     monkeypatch.setattr(robot, "home", bent)
-    (fault,) = preflight_faults(robot, CONFIG.control, None)
+    (fault,) = preflight_faults(robot, SETTINGS, None)
     assert " and ".join(HAND_AND_FOREARM) + " are 16.0 mm apart" in fault
 
 
