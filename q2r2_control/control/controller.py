@@ -47,7 +47,16 @@ class CartesianController:
         self._solver = solver or make_solver(self.settings.solver, self._nv, self.settings.solve_time_limit)
         model = kernel_model_of(robot, self.settings)
         data = KernelData.empty(model)
-        self._safety, self._tasks = data.safety, data.tasks
+        self._state, self._rows, self._active = data.safety.state, data.safety.rows, data.safety.active
+        self._wanted, self._tasks = data.safety.wanted, data.tasks
+        self._problem = QpProblem(
+            H=data.tasks.H,
+            g=data.tasks.g,
+            lower=data.safety.box.lower,
+            upper=data.safety.box.upper,
+            rows=self._rows.matrix[:0],
+            rows_lower=self._rows.lower[:0],
+        )
         self._targets = TargetTracker(model.tasks, self._arms, self.settings)
         self._held_model, self._held_data = hold(model), hold(data)
         names = [geometry.name for geometry in robot.collision_model.geometryObjects]
@@ -68,7 +77,7 @@ class CartesianController:
         Raises :class:`RobotError` for a wrong shape or a number that is not finite. A start outside the limits or in
         penetration is allowed: the controller recovers from it.
         """
-        state = self._safety.state
+        state = self._state
         state.q[:] = self._checked("q", q)
         state.v[:] = 0.0 if v is None else self._checked("v", v)
         self._targets.reset(state.q)
@@ -94,7 +103,7 @@ class CartesianController:
         """
         usable = isinstance(dt, int | float | np.floating) and math.isfinite(dt) and dt > 0.0
         time = min(float(dt), LONGEST_DT) if usable else 0.0
-        state = self._safety.state
+        state = self._state
         self._targets.aim_posture(posture)
         rejected = self._targets.update(targets, time, state.q, state.v)
         state.a[:] = 0.0
@@ -124,20 +133,12 @@ class CartesianController:
     def _advance(self, h: float, share: float, summary: _Summary) -> None:
         """One substep, which is a ``share`` of the tick: build, solve, certify and move."""
         summary.inside &= assemble(self._held_model, self._targets.held, self._held_data, h)
-        safety, tasks = self._safety, self._tasks
-        count = int(safety.rows.used[0])
-        problem = QpProblem(
-            H=tasks.H,
-            g=tasks.g,
-            lower=safety.box.lower,
-            upper=safety.box.upper,
-            rows=safety.rows.matrix[:count],
-            rows_lower=safety.rows.lower[:count],
-        )
-        solution = self._solver.solve(problem)
+        count = int(self._rows.used[0])
+        self._problem.rows, self._problem.rows_lower = self._rows.matrix[:count], self._rows.lower[:count]
+        solution = self._solver.solve(self._problem)
         limit = self.settings.solve_time_limit
         usable = solution.v is not None and (limit is None or solution.solve_time <= limit)
-        wanted = solution.v if usable else safety.wanted
+        wanted = solution.v if usable else self._wanted
         outcome, self._closest, self._distance, slack = move_reference(
             self._held_model, self._held_data, wanted, usable, h, share
         )
@@ -159,7 +160,7 @@ class CartesianController:
 
     def _binding(self) -> tuple[str, ...]:
         """Names of limits and pairs that held the last step back."""
-        active = self._safety.active
+        active = self._active
         found = int(active.used[0])
         if not found:
             return ()
