@@ -151,7 +151,7 @@ class _Run:
         control = pipeline.config.control
         limit = pipeline.robot.velocity_limit * control.velocity_scale
         self._pacer = TickPacer(period, limit, control.acceleration_limit)
-        self._stamp = state.stamp  # of the newest state, by the plant's clock [s]
+        self._stamp: float | None = None  # of the newest state of a tick, by the plant's clock [s]
         self._supervisor = pipeline.supervisor
         self._supervisor.activate(replace(state, stamp=self._clock.now), self._clock.now)
         pipeline.drive.reset(state)

@@ -30,13 +30,13 @@ from tests.support.watch import Watch, cell, changes, speed
 
 CHECKOUT = Path(__file__).resolve().parents[1]
 SESSION = 15.0  # [s]
-# Reasons of events that a starved machine causes, not the stack.
+# Reasons of events that an overloaded machine causes.
 STARVED = ("stalled", "no pose for", "no button data for", "jumped", "connection lost")
 ATTEMPTS = 3
 
 
 class ClockedServer(HeadsetServer):
-    """Remembers the loop's clock at every poll, which a tick does not tell."""
+    """Keeps the time of every poll by the loop's clock, which is not part of a tick."""
 
     def __init__(self) -> None:
         super().__init__(port=0)
@@ -75,7 +75,7 @@ class Live:
         while not condition():
             if self.failure is not None:
                 raise self.failure
-            assert time.monotonic() < deadline, f"waited in vain for {what}"
+            assert time.monotonic() < deadline, f"timed out waiting for {what}"
             time.sleep(0.005)
 
     def headset(self, *arguments: str) -> subprocess.Popen[bytes]:
@@ -87,7 +87,9 @@ class Live:
 def live(plant: str) -> Iterator[Live]:
     """A pipeline that listens, until the end of the block; then it is stopped, and a failure of the run raised."""
     server = ClockedServer()
-    loop = Pipeline.from_config(cell(), input=server, plant=plant)
+    # Without the solver's time limit, so that a busy machine causes no fallback.
+    config = cell().model_copy(update={"control": cell().control.model_copy(update={"solve_time_limit": None})})
+    loop = Pipeline.from_config(config, input=server, plant=plant)
     run = Live(server, loop, Watch(loop), delay=loop.teleop.delay)
     thread = threading.Thread(target=run.run)
     thread.start()
@@ -150,7 +152,7 @@ class TestSession:
             target = tick.targets[arm].pose
             assert target is not None
             assert np.linalg.norm(target.translation - tick.tools[arm].translation) < 1e-6
-            # Nor does anything jump afterwards: the hands still rest.
+            # Nothing jumps afterwards either: the hands still rest.
             before, after = tick.tools[arm], session.watch.ticks[index + 100].tools[arm]
             assert np.linalg.norm(after.translation - before.translation) < 1e-3
             assert np.linalg.norm(pin.log3(before.rotation.T @ after.rotation)) < np.radians(0.5)
@@ -193,11 +195,10 @@ class TestSession:
         assert session.summary.arms[arm].gripper_changes == 1
 
 
-def test_the_session_hardly_ever_needs_the_fallback_and_ends_at_rest(session: Live) -> None:
+def test_the_session_needs_no_fallback_and_ends_at_rest(session: Live) -> None:
     summary = session.summary
     assert summary is not None
-    # A machine that is busy elsewhere makes a solver late now and then; the certified stop bridges it.
-    assert summary.fallback_ticks < 0.02 * summary.ticks
+    assert summary.fallback_ticks == 0
     assert summary.uncertified_ticks == 0
     assert summary.rejected_targets == 0
     assert summary.at_rest
@@ -248,7 +249,7 @@ def cuts() -> tuple[Live, dict[str, Cut]]:
                 marks.append(len(run.watch.ticks) - 1)
                 time.sleep(0.5)
                 if end is signal.SIGSTOP:
-                    # The operator's hands moved on meanwhile, and go on moving.
+                    # The operator's hands have moved meanwhile, and go on moving.
                     headset.send_signal(signal.SIGCONT)
                     time.sleep(0.7)
             finally:
@@ -275,7 +276,7 @@ class TestConnectionEndsInMidMotion:
         moving = range(cut.last, rest + 1)
         assert speed(ticks[cut.last]) > 0.05, "in mid-motion"
         braking = max(speed(ticks[index]) for index in moving) / run.loop.config.control.acceleration_limit
-        # A tick that comes late sees the timeout late, and what is left of the braking one tick later.
+        # A late tick sees the timeout late, and the end of the braking one tick later.
         late = 3.0 * max(ticks[index].dt for index in moving)
         assert run.server.times[rest] - received <= STREAM_TIMEOUT + braking + late + 0.005
 

@@ -32,8 +32,8 @@ from tests.support.watch import Watch, assert_torque_bounds, cell, changes, spee
 CHECKOUT = Path(__file__).resolve().parents[1]
 
 
-class WitnessedPlant(KinematicPlant):
-    """Counts what is called, and fails when asked to."""
+class RecordingPlant(KinematicPlant):
+    """Keeps every command, counts calls of close, and fails at a given command."""
 
     def __init__(self) -> None:
         super().__init__(Robot.from_config(cell()), cell())
@@ -148,14 +148,14 @@ def test_two_simulated_runs_are_equal_bit_for_bit_also_on_the_same_pipeline(mode
         return bits, summary
 
     loop = pipeline(plant="mujoco", mode=mode)
-    (first, one), (again, two), (anew, _) = run(loop), run(loop), run(pipeline(plant="mujoco", mode=mode))
-    assert first == again == anew
+    (first, one), (again, two), (third, _) = run(loop), run(loop), run(pipeline(plant="mujoco", mode=mode))
+    assert first == again == third
     assert one.events == two.events
-    assert [tick_free(one), tick_free(two)] == [tick_free(one)] * 2
+    assert [without_times(one), without_times(two)] == [without_times(one)] * 2
 
 
-def tick_free(summary: RunSummary) -> str:
-    """All of a summary that does not depend on the machine's speed."""
+def without_times(summary: RunSummary) -> str:
+    """A summary as JSON without the figures that depend on the machine's speed."""
     data = summary.as_json()
     del data["tick_us"], data["loop_rate_hz"]
     return json.dumps(data)
@@ -275,7 +275,7 @@ class TestStop:
         watch = Watch(loop)
         assert_braked(loop, watch, loop.run(2.5, realtime=False))
 
-    def test_in_torque_mode_the_arms_come_to_rest_on_their_springs_and_nothing_drops_afterwards(self) -> None:
+    def test_in_torque_mode_the_arms_come_to_rest_at_the_reference_and_do_not_drop_afterwards(self) -> None:
         loop = pipeline(plant="mujoco", mode="torque")
         watch = Watch(loop)
         loop.listeners.append(when_moving(loop.stop))
@@ -294,7 +294,7 @@ class TestStop:
             np.testing.assert_allclose(loop.plant.state().q, rest.q, atol=1e-3)
 
     def test_waits_for_slow_braking(self) -> None:
-        # Braking takes longer than anything that is allowed for beside it.
+        # Braking takes longer than the second that is allowed for in addition.
         control = cell().control.model_copy(update={"acceleration_limit": 0.05})
         loop = pipeline(control=control)
         watch = Watch(loop)
@@ -332,7 +332,7 @@ class TestStop:
 
 
 def assert_braked(loop: Pipeline, watch: Watch, summary: RunSummary) -> None:
-    """At the end all stands still, reached without input; the contract was checked on the way."""
+    """The run ended at rest, without input from the stop on; the contract was checked at every tick."""
     stopping = [tick for tick in watch.ticks if STOPPING in tick.states.values()]
     assert stopping[0] is watch.ticks[-len(stopping)]
     assert all(not tick.samples and not any(tick.engaged.values()) for tick in stopping)
@@ -340,7 +340,7 @@ def assert_braked(loop: Pipeline, watch: Watch, summary: RunSummary) -> None:
     assert speed(watch.ticks[-1]) < 1e-3
     assert summary.at_rest
     braking = speed(watch.ticks[-len(stopping) - 1]) / loop.config.control.acceleration_limit
-    # What is left of the motion then, if anything, is the hold's last correction.
+    # Slower motion than that is the last correction of a posture that is held.
     rest = next(tick for tick in stopping if speed(tick) < 1e-3)
     assert rest.t - stopping[0].t <= 1.5 * braking + 0.05 + 3.0 * max(tick.dt for tick in stopping)
     assert not loop.stopping
@@ -377,7 +377,7 @@ class TestFailure:
 
     @pytest.mark.parametrize("who", ["plant", "listener", "reset", "nobody"])
     def test_leaves_no_thread_no_port_and_no_plant_behind(self, who: str, monkeypatch: pytest.MonkeyPatch) -> None:
-        plant, server = WitnessedPlant(), HeadsetServer(port=0)
+        plant, server = RecordingPlant(), HeadsetServer(port=0)
         loop = Pipeline.from_config(cell(), input=server, plant=plant)
 
         def fail(*_: object) -> None:
@@ -402,7 +402,7 @@ class TestFailure:
         assert gc.get_freeze_count() == 0
 
     def test_to_open_the_input_closes_the_plant_and_names_the_port(self) -> None:
-        plant = WitnessedPlant()
+        plant = RecordingPlant()
         with socket.create_server(("127.0.0.1", 0)) as taken:
             loop = Pipeline.from_config(cell(), input=HeadsetServer(port=taken.getsockname()[1]), plant=plant)
             with pytest.raises(InputError, match=str(taken.getsockname()[1])):
@@ -412,7 +412,7 @@ class TestFailure:
 
 
 class HostileInput:
-    """A hand that moves as it should and presses buttons, with samples among it that nothing should ever send."""
+    """A hand that moves normally and presses buttons, with invalid samples in between."""
 
     def __init__(self, seed: int) -> None:
         self._random = np.random.default_rng(seed)
@@ -428,12 +428,12 @@ class HostileInput:
             replace(sample, inputs=replace(sample.inputs, button_lower=pressed)) for sample in self._source.poll(now)
         ]
         if samples and random.random() < 0.05:
-            samples.append(self._spoilt(samples[-1]))
+            samples.append(self._invalid(samples[-1]))
         if samples and random.random() < 0.002:
-            samples += [self._spoilt(samples[0]) for _ in range(1000)]
+            samples += [self._invalid(samples[0]) for _ in range(1000)]
         return samples
 
-    def _spoilt(self, sample: HandSample) -> HandSample:
+    def _invalid(self, sample: HandSample) -> HandSample:
         random, bad = self._random, (np.nan, np.inf, -np.inf, 1e308, -1e-308, 0.0)
         changes: list[dict[str, object]] = [
             {"position": np.array(random.choice(bad, 3))},
@@ -460,7 +460,7 @@ def test_ten_thousand_ticks_of_hostile_samples_break_no_limit_and_raise_nothing(
     assert summary.ticks == len(watch.ticks) >= 10_000
     json.dumps(summary.as_json(), allow_nan=False)
     assert summary.at_rest
-    assert len(watch.engagements("left")) >= 5, "it was not just ignored"
+    assert len(watch.engagements("left")) >= 5, "valid samples are followed"
     assert max(map(speed, watch.ticks)) > 0.3
     reasons = " ".join(event.reason for event in summary.events)
     for fault in ("not finite", "jumped", "connection lost", "alignment chord"):

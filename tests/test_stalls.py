@@ -69,8 +69,8 @@ def largest_step(plant: RecordingPlant, limit: Array) -> float:
 class StallingClock:
     """Stands for the module ``time``: every second the computer stands still for ``stall`` [s]."""
 
-    def __init__(self, stall: float) -> None:
-        self._now, self._stall, self._next = 0.0, stall, 0.9
+    def __init__(self, stall: float, first: float = 0.9) -> None:
+        self._now, self._stall, self._next = 0.0, stall, first
 
     def monotonic(self) -> float:
         return self._now
@@ -101,6 +101,14 @@ def test_after_a_stall_no_command_is_farther_from_the_last_than_a_joint_may_go_i
     paused = [event for event in summary.events if event.destination == "paused"]
     assert bool(paused) == (stall >= 0.1), "a long stall pauses, a short one does not"
     assert all("stood still" in event.reason or "stalled" in event.reason for event in paused)
+
+
+def test_a_stall_before_the_first_tick_is_no_fault_of_the_plant(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(loop_clock, "time", StallingClock(0.3, first=0.0))
+    loop = swinging(RecordingPlant())
+    watch = Watch(loop)
+    assert loop.run(1.0).at_rest
+    assert watch.ticks[0].dt > 0.3
 
 
 class PersistentHands:

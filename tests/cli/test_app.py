@@ -332,8 +332,9 @@ def test_the_demo_leaves_a_picture_and_the_summary_in_a_folder_that_it_names(
 
 
 def test_headset_check_shows_a_headset_in_a_process_of_its_own() -> None:
-    with process("headset-check", "--port", "0", "--duration", "4", "--json") as running:
+    with process("headset-check", "--port", "0", "--json") as running:
         fake_headset(bound_port(running), 1.5)
+        running.send_signal(signal.SIGINT)
         stdout, _ = running.communicate(timeout=30)
     assert running.returncode == 0
     check = one_object(stdout)

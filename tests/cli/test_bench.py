@@ -1,4 +1,4 @@
-"""Tables of the bench and the soak: every figure with its unit, every peer, what was broken and where."""
+"""Tables of the bench and the soak: figures with units, every peer, and each broken promise with its tick."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def test_eighty_columns_hold_every_heading_and_figure_of_the_bench() -> None:
     assert "…" not in text
 
 
-def test_a_broken_promise_stands_in_the_table_with_its_tick_and_its_segment() -> None:
+def test_a_broken_promise_is_in_the_table_with_its_tick_and_its_segment() -> None:
     margin = Margin("least distance", "m", ">=", 0.0)
     margin.note(0.1, 1)
     margin.note(-0.25, 7)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import random
 import struct
-import time
 
 import numpy as np
 import pytest
@@ -20,7 +19,6 @@ from q2r2_control.inputs.messages import (
     decode,
     encode,
     fits,
-    warm_up,
 )
 from q2r2_control.types import HandInputs, HapticFeedback
 
@@ -221,15 +219,4 @@ def test_random_and_mutated_bytes_raise_nothing_but_protocol_errors() -> None:
             decode(kind, bytes(payload), dialect)
         except ProtocolError:
             refused += 1
-    assert 0 < refused < 3000
-
-
-def test_decoding_takes_far_less_than_the_control_loop_can_spare() -> None:
-    """The bound of 100 us is several times what a slow machine needs; the best of many runs leaves out the others."""
-    warm_up()
-    times = []
-    for _ in range(200):
-        start = time.perf_counter()
-        decode(MessageType.POSE, POSES[ROS2], ROS2)
-        times.append(time.perf_counter() - start)
-    assert min(times) < 100e-6
+    assert 1800 < refused < 2400

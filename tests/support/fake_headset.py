@@ -121,7 +121,7 @@ class FakeHeadset:
             pass
 
     def reset(self) -> None:
-        """Vanish with a TCP reset instead of a farewell."""
+        """End the connection by a TCP reset instead of closing it."""
         self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
         self.socket.close()
 

@@ -20,7 +20,7 @@ _NO_REPORT = StepReport(StepStatus.OK, (), (), ("", ""), np.inf, True, False, 0.
 
 
 def reference(q: Array, v: Array | None = None, a: Array | None = None) -> Reference:
-    """A reference that no QP made; at rest where ``v`` and ``a`` are left out."""
+    """A reference without a controller; at rest where ``v`` and ``a`` are left out."""
     zero = np.zeros_like(q)
     return Reference(q, zero if v is None else v, zero if a is None else a, _NO_REPORT)
 
@@ -66,7 +66,7 @@ class TorqueLoop:
             pass
 
     def settle(self, timeout: float = 8.0) -> None:
-        """Tick until all joints rest, which they have to do in time."""
+        """Tick until all joints rest. Raises :class:`AssertionError` after ``timeout`` [s]."""
         for _ in self.ticks(timeout):
             if np.abs(self.state.v).max() < 3e-4 and self.state.stamp > 0.3:
                 return

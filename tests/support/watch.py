@@ -1,4 +1,4 @@
-"""Watching a whole run: the controller's contract at every tick, and every tick kept to be looked at later."""
+"""A listener for runs in tests: checks the controller's contract at every tick, and keeps every tick."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def cell() -> Config:
 
 
 class Watch:
-    """A listener that fails the run at the first tick that breaks a limit."""
+    """A listener that keeps every tick, and fails the run at the first one that breaks the contract."""
 
     def __init__(self, pipeline: Pipeline) -> None:
         self.ticks: list[Tick] = []
@@ -43,7 +43,7 @@ class Watch:
 
 
 def assert_torque_bounds(pipeline: Pipeline, ticks: list[Tick]) -> None:
-    """Every torque that the plant gave from one tick to the next is within the limits, and so is its change."""
+    """The torque at every tick is within its limits, and so is its change between ticks."""
     settings = pipeline.config.impedance
     tau = np.array([tick.state.tau for tick in ticks])
     dt = np.array([tick.dt for tick in ticks])
@@ -58,5 +58,5 @@ def speed(tick: Tick) -> float:
 
 
 def changes(events: list[Event], arm: str) -> list[tuple[str, str, str]]:
-    """What happened to ``arm``: from, to, reason."""
+    """State changes of ``arm``: from, to, reason."""
     return [(str(event.source), str(event.destination), event.reason) for event in events if event.arm == arm]

@@ -135,7 +135,7 @@ def test_a_broken_promise_is_found_at_its_tick(change: Callable[[Reference], Ref
     assert next(margin for margin in report.margins if margin.name == promise).tick is not None
 
 
-def test_a_distance_that_lies_is_found_by_looking_oneself() -> None:
+def test_a_wrong_reported_distance_is_found_by_coal() -> None:
     report = soak(_report(closest_distance=1.0), first=0, ticks=600)
     assert [found.promise for found in report.broken] == ["reported distance off Coal's"]
 
@@ -165,7 +165,7 @@ def test_a_solver_fault_is_recognised_by_the_controller_it_is_given_to() -> None
     assert stopped.violations == 0
 
 
-def test_what_is_found_can_be_asked_again() -> None:
+def test_what_is_found_comes_with_the_request_and_the_state() -> None:
     found = soak(_faster, first=40, ticks=100).broken[0]
     assert found.q.shape == found.v.shape == (14,)
     assert found.dt
@@ -173,7 +173,7 @@ def test_what_is_found_can_be_asked_again() -> None:
 
 
 @pytest.mark.parametrize(("ticks", "seed", "named"), [(99, 0, "ticks = 99"), (100, -1, "seed = -1")])
-def test_a_soak_that_cannot_be_is_refused(ticks: int, seed: int, named: str) -> None:
+def test_a_soak_with_invalid_arguments_is_refused(ticks: int, seed: int, named: str) -> None:
     with pytest.raises(ConfigError, match=named):
         run_soak(CONFIG, ticks, seed)
 
