@@ -23,6 +23,7 @@ from q2r2_control.config.cell import (
 )
 from q2r2_control.config.control import AdmittanceSettings, ControllerSettings, ImpedanceSettings, WallSettings
 from q2r2_control.config.external import ExternalArm, ExternalConfig, ExternalGripper, GuardLimits
+from q2r2_control.config.supervision import SupervisionSettings
 from q2r2_control.config.teleop import FilterSettings, GateSettings, LeashSettings, TeleopSettings
 from q2r2_control.errors import ConfigError, Q2R2Error
 from q2r2_control.robot.robot import Robot
@@ -83,6 +84,7 @@ class TestTheShippedCellShowsAllThereIsToTune:
         ("arms.left.gripper", GripperConfig),
         ("arms.left.swivel", SwivelConfig),
         ("obstacles.table", ObstacleConfig),
+        ("supervision", SupervisionSettings),
         ("headset", HeadsetConfig),
         ("control", ControllerSettings),
         ("impedance", ImpedanceSettings),
