@@ -32,6 +32,7 @@ CHECKOUT = Path(__file__).resolve().parents[1]
 SESSION = 15.0  # [s]
 # Reasons of events that an overloaded machine causes.
 STARVED = ("stalled", "no pose for", "no button data for", "jumped", "connection lost")
+LATE = 0.02  # motion that late ticks have stretched by more than this is no measure of tracking [s]
 ATTEMPTS = 3
 
 
@@ -117,7 +118,8 @@ def session(tmp_path_factory: pytest.TempPathFactory) -> Live:
         end = run.sent[-1]["t"] - run.server.times[0]
         reasons = [event.reason for event in run.summary.events if event.t < end]
         starved = [reason for reason in reasons if any(fault in reason for fault in STARVED)]
-        if not starved or attempt == ATTEMPTS - 1:
+        late = run.summary.stretched_s > LATE
+        if not (starved or late) or attempt == ATTEMPTS - 1:
             break
     return run
 
@@ -158,6 +160,9 @@ class TestSession:
             assert np.linalg.norm(pin.log3(before.rotation.T @ after.rotation)) < np.radians(0.5)
 
     def test_the_tool_follows_the_hand_that_was_within_5_mm_and_1_degree(self, session: Live, arm: str) -> None:
+        assert session.summary is not None
+        if (late := session.summary.stretched_s) > LATE:
+            pytest.skip(f"the machine was too busy to measure: late ticks have stretched the motion by {late:.2f} s")
         times, positions, poses = hand_path(session, arm)
         clock, ticks = session.server.times, session.ticks
         shifts, turns, travelled = [], [], []
