@@ -32,7 +32,8 @@ CHECKOUT = Path(__file__).resolve().parents[1]
 SESSION = 15.0  # [s]
 # Reasons of events that an overloaded machine causes.
 STARVED = ("stalled", "no pose for", "no button data for", "jumped", "connection lost")
-LATE = 0.02  # motion that late ticks have stretched by more than this is no measure of tracking [s]
+# A tick that stretches the motion by more than this is no measure of tracking, nor is the time until it is made up [s].
+LATE, MADE_UP = 0.005, 0.5
 ATTEMPTS = 3
 
 
@@ -118,8 +119,7 @@ def session(tmp_path_factory: pytest.TempPathFactory) -> Live:
         end = run.sent[-1]["t"] - run.server.times[0]
         reasons = [event.reason for event in run.summary.events if event.t < end]
         starved = [reason for reason in reasons if any(fault in reason for fault in STARVED)]
-        late = run.summary.stretched_s > LATE
-        if not (starved or late) or attempt == ATTEMPTS - 1:
+        if not starved or attempt == ATTEMPTS - 1:
             break
     return run
 
@@ -160,9 +160,6 @@ class TestSession:
             assert np.linalg.norm(pin.log3(before.rotation.T @ after.rotation)) < np.radians(0.5)
 
     def test_the_tool_follows_the_hand_that_was_within_5_mm_and_1_degree(self, session: Live, arm: str) -> None:
-        assert session.summary is not None
-        if (late := session.summary.stretched_s) > LATE:
-            pytest.skip(f"the machine was too busy to measure: late ticks have stretched the motion by {late:.2f} s")
         times, positions, poses = hand_path(session, arm)
         clock, ticks = session.server.times, session.ticks
         shifts, turns, travelled = [], [], []
@@ -170,18 +167,24 @@ class TestSession:
         for start in starts:
             anchor, index = poses[np.searchsorted(times, clock[start]) - 1], start
             tool = ticks[start].tools[arm]
+            late_until = 0.0
             while index < len(ticks) and ticks[index].engaged[arm] and clock[index] < times[-1]:
                 due = clock[index] - session.delay
+                if ticks[index].dt - ticks[index].step > LATE:
+                    late_until = clock[index] + MADE_UP
                 if due > times[0]:
                     wanted = np.array([np.interp(due, times, column) for column in positions.T]) - anchor.translation
                     nearest = poses[int(np.argmin(np.abs(times - due)))]
                     turn = nearest.rotation @ anchor.rotation.T
                     got = ticks[index].tools[arm]
-                    shifts.append(_norm(got.translation - tool.translation - wanted))
-                    turns.append(_norm(pin.log3(got.rotation @ (turn @ tool.rotation).T)))
                     travelled.append(_norm(wanted))
+                    if clock[index] >= late_until:
+                        shifts.append(_norm(got.translation - tool.translation - wanted))
+                        turns.append(_norm(pin.log3(got.rotation @ (turn @ tool.rotation).T)))
                 index += 1
         assert max(travelled) > 0.19, "circles of 0.1 m radius"
+        if not shifts:
+            pytest.skip("the machine was so busy that every stretch of motion was late")
         assert root_mean_square(shifts) < 5e-3
         assert np.degrees(root_mean_square(turns)) < 1.0
 
