@@ -1,0 +1,58 @@
+"""What stops an arm, and what keeps one from starting: the same rules for the pipeline and the ROS nodes.
+
+``supervisor`` decides at every tick what the controller is asked for and whether the arms may move; ``joint_watch``
+judges measured states, ``targets`` and ``target_stream`` who is followed, ``tick_pacer`` what a late tick may move,
+``homing`` and ``external_arms`` two special ways to be led. ``preflight`` looks at a cell before it runs, and
+``target_guard`` limits targets for controllers that have no limits of their own. No ROS and no clock in here.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from q2r2_control._lazy import lazy_exports
+
+if TYPE_CHECKING:
+    from q2r2_control.supervision.homing import Homing
+    from q2r2_control.supervision.joint_watch import JointWatch, WatchSettings, watch_settings
+    from q2r2_control.supervision.preflight import preflight_faults
+    from q2r2_control.supervision.supervisor import Phase, Supervisor
+    from q2r2_control.supervision.target_guard import TargetGuard
+    from q2r2_control.supervision.target_stream import Origins, Refusal, StreamSettings, TargetStream
+    from q2r2_control.supervision.tick_pacer import TickPacer
+
+__all__ = [
+    "Homing",
+    "JointWatch",
+    "Origins",
+    "Phase",
+    "Refusal",
+    "StreamSettings",
+    "Supervisor",
+    "TargetGuard",
+    "TargetStream",
+    "TickPacer",
+    "WatchSettings",
+    "preflight_faults",
+    "watch_settings",
+]
+
+# Only those that drive arms need the controller and its kernels.
+__getattr__ = lazy_exports(
+    __name__,
+    {
+        "Homing": "homing",
+        "JointWatch": "joint_watch",
+        "Origins": "target_stream",
+        "Phase": "supervisor",
+        "Refusal": "target_stream",
+        "StreamSettings": "target_stream",
+        "Supervisor": "supervisor",
+        "TargetGuard": "target_guard",
+        "TargetStream": "target_stream",
+        "TickPacer": "tick_pacer",
+        "WatchSettings": "joint_watch",
+        "preflight_faults": "preflight",
+        "watch_settings": "joint_watch",
+    },
+)

@@ -36,7 +36,14 @@ class ArmOutputs:
         if self._filtered:
             topic = BUILTIN.topic.format(ctrl=values.builtin_prefix)
             self.first = TargetOutput(
-                node, BUILTIN, BUILTIN_NODE, topic, values.world_frame, BUILTIN.guard, values.listener_timeout
+                node,
+                BUILTIN,
+                BUILTIN_NODE,
+                topic,
+                values.world_frame,
+                BUILTIN.guard,
+                values.listener_timeout,
+                values.rate,
             )
         if not self._filtered or (preset.takes_poses and preset is not BUILTIN):
             theirs = TargetOutput(
@@ -47,6 +54,7 @@ class ArmOutputs:
                 values.base_frame,
                 values.guard,
                 values.listener_timeout,
+                values.rate,
                 values.prefix,
             )
             if self._filtered:

@@ -12,8 +12,8 @@ from q2r2_control.config.teleop import GuardSettings
 from q2r2_control.ros.base_node import LATCHED_QOS, BaseNode
 from q2r2_control.ros.bridge.messages import stamped_pose, time_message
 from q2r2_control.ros.monitoring.endpoints import WatchedPublisher, node_of
+from q2r2_control.supervision.target_guard import TargetGuard
 from q2r2_control.supervision.target_stream import apart
-from q2r2_control.teleop.guard import TargetGuard
 
 _GRAPH_PERIOD = 0.1  # of asking the graph for subscribers [s]
 # After a subscriber appeared the graph is asked at every tick, because it knows an endpoint before it knows its node.
@@ -41,10 +41,11 @@ class TargetOutput:
         frame: str,
         guard: GuardSettings,
         listener_timeout: float,
+        rate: float,
         prefix: str = "",
     ) -> None:
         self.preset = preset
-        self.guard = TargetGuard(guard)
+        self.guard = TargetGuard(guard, 1.0 / rate)
         self._node, self._controller, self._frame = node, controller, frame
         self._publisher = WatchedPublisher(node, PoseStamped, topic, listener_timeout)
         self._wrench = None

@@ -11,7 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from q2r2_control.config.teleop import GuardSettings
-from q2r2_control.teleop.guard import TargetGuard
+from q2r2_control.supervision.target_guard import TargetGuard
+from q2r2_control.supervision.tick_pacer import TickPacer
 from q2r2_control.types import Array
 from tests.teleop.hands import pose
 
@@ -22,8 +23,8 @@ LIMITS = GuardSettings(max_velocity=0.5, max_acceleration=5.0, max_angular_veloc
 class Watched:
     """A guard whose every step is checked against its limits."""
 
-    def __init__(self, start: pin.SE3 | None = None) -> None:
-        self.guard = TargetGuard(LIMITS)
+    def __init__(self, start: pin.SE3 | None = None, period: float = DT) -> None:
+        self.guard, self._period = TargetGuard(LIMITS, period), period
         self.now = 5.0
         self.guard.reset(start or pose(), self.now)
         self.velocity = np.zeros(3), np.zeros(3)
@@ -38,7 +39,13 @@ class Watched:
         self.now += dt
         after = self.guard.step(target, self.now)
         assert after is not None
-        dt = min(dt, 0.1)
+        if dt > self._period:  # late: a step moves it by no more than a period allows
+            for way, fastest in (
+                (after.translation - before.translation, LIMITS.max_velocity),
+                (pin.log3(after.rotation @ before.rotation.T), LIMITS.max_angular_velocity),
+            ):
+                assert math.hypot(*way) <= fastest * self._period * (1 + 1e-6) + 1e-9
+            dt = self._time_moved(dt)
         self.velocity = (
             (after.translation - before.translation) / dt,
             pin.log3(after.rotation @ before.rotation.T) / dt,
@@ -56,6 +63,13 @@ class Watched:
         assert np.abs(after.rotation.T @ after.rotation - np.eye(3)).max() < 1e-12
         return after
 
+    def _time_moved(self, gap: float) -> float:
+        """By how much time a late step moves it, from the velocities before."""
+        limits = np.array([LIMITS.max_velocity, LIMITS.max_angular_velocity])
+        accelerations = np.array([LIMITS.max_acceleration, LIMITS.max_angular_acceleration])
+        speeds = np.array([math.hypot(*velocity) for velocity in self.velocity])
+        return TickPacer(self._period, limits, 2.0 * accelerations).step(gap, speeds)
+
 
 def circle(t: float, radius: float, period: float) -> pin.SE3:
     """A circle through the origin that sets off within half a second, turning on its way."""
@@ -64,14 +78,14 @@ def circle(t: float, radius: float, period: float) -> pin.SE3:
 
 
 def test_without_a_reset_there_is_no_pose() -> None:
-    guard = TargetGuard(LIMITS)
+    guard = TargetGuard(LIMITS, DT)
     assert guard.step(pose(1.0), 1.0) is None
     assert guard.at_rest
 
 
 def test_the_first_pose_is_that_of_the_reset_exactly() -> None:
     start = pose(0.3, -0.2, 0.7, (0.1, 2.0, -0.4))
-    guard = TargetGuard(LIMITS)
+    guard = TargetGuard(LIMITS, DT)
     guard.reset(start, 5.0)
     first = guard.step(start, 5.0 + DT)
     assert first is not None
@@ -89,7 +103,7 @@ def test_a_motion_within_the_limits_is_followed_without_lag() -> None:
 
 @pytest.mark.parametrize("dt", [0.002, 0.005, 0.01, 0.02])
 def test_a_step_is_reached_without_overshoot_in_the_time_that_the_limits_take(dt: float) -> None:
-    watched, goal = Watched(), pose(0.4, 0.0, 0.0, (0.0, 0.0, 1.0))
+    watched, goal = Watched(period=dt), pose(0.4, 0.0, 0.0, (0.0, 0.0, 1.0))
     fastest = 0.4 / LIMITS.max_velocity + LIMITS.max_velocity / LIMITS.max_acceleration
     for _ in range(math.ceil(fastest / dt) + 4):
         after = watched.step(goal, dt)

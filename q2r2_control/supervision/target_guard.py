@@ -8,7 +8,8 @@ import numpy as np
 import pinocchio as pin
 
 from q2r2_control.config.teleop import GuardSettings
-from q2r2_control.types import LONGEST_DT, Array
+from q2r2_control.supervision.tick_pacer import TickPacer
+from q2r2_control.types import Array
 
 _REST = 1e-9  # slower than this is at rest [m/s, rad/s]
 
@@ -24,10 +25,12 @@ class TargetGuard:
 
     A step of the target faster than the limit is no motion of it; then u = 0. Rotations are limited the same way by
     the rotation vector from pose to target. Poses are in one frame, whichever; quaternions stay of unit length over any
-    number of steps. Nothing but :meth:`reset` makes the pose jump.
+    number of steps. Nothing but :meth:`reset` makes the pose jump, and a step that comes late moves it no farther than
+    the velocity limits allow in one period, see :mod:`tick_pacer`.
     """
 
-    def __init__(self, settings: GuardSettings) -> None:
+    def __init__(self, settings: GuardSettings, period: float) -> None:
+        """``period`` [s]: of the steps."""
         self.settings = settings
         self.pose: pin.SE3 | None = None
         self.clipped = 0  # steps in which a limit held the pose back, since the start
@@ -35,6 +38,10 @@ class TargetGuard:
         self._angular = _Limited(settings.max_angular_velocity, settings.max_angular_acceleration)
         self._target: pin.SE3 | None = None
         self._now = -math.inf
+        # A step changes the velocity first and moves by the new one for all of dt: |v| dt + a dt^2, not half of that.
+        velocities = np.array([settings.max_velocity, settings.max_angular_velocity])
+        accelerations = np.array([settings.max_acceleration, settings.max_angular_acceleration])
+        self._pacer = TickPacer(period, velocities, 2.0 * accelerations)
 
     @property
     def at_rest(self) -> bool:
@@ -53,9 +60,10 @@ class TargetGuard:
 
         None before the first :meth:`reset`. A time that does not advance returns the same pose again.
         """
-        dt = min(now - self._now, LONGEST_DT)
-        if self.pose is None or not dt > 0.0:
+        gap = now - self._now
+        if self.pose is None or not gap > 0.0:
             return self.pose
+        dt = self._pacer.step(gap, np.array([self._linear.speed, self._angular.speed]))
         self._now = now
         if target is None or not np.isfinite(target.homogeneous).all():
             limited = False
@@ -65,8 +73,10 @@ class TargetGuard:
             last, self._target = self._target or self.pose, target
             lag = last.translation - self.pose.translation, pin.log3(last.rotation @ self.pose.rotation.T)
             way = target.translation - last.translation, pin.log3(target.rotation @ last.rotation.T)
-            shift, slow = self._linear.follow(lag[0], way[0], dt)
-            turn, slow_turn = self._angular.follow(lag[1], way[1], dt)
+            # Of a late step only the part that is moved now counts as the target's own motion; the rest is lag.
+            now_share, late_share = dt / gap, 1.0 - dt / gap
+            shift, slow = self._linear.follow(lag[0] + late_share * way[0], now_share * way[0], dt)
+            turn, slow_turn = self._angular.follow(lag[1] + late_share * way[1], now_share * way[1], dt)
             limited = slow or slow_turn
         self.clipped += limited
         self.pose = _unit(pin.SE3(pin.exp3(turn) @ self.pose.rotation, self.pose.translation + shift))
