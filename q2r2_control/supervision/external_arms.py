@@ -1,8 +1,8 @@
-"""Arms that another controller moves after our safe targets: the tools are led, the elbows go where that one lets them.
+"""Arms that another controller moves after our safe targets: tools are led, elbows go where that controller puts them.
 
-The reference keeps the arms apart only as far as it is where they are. So its elbows follow the measured ones, its
-tools hold by their pose and not by joint positions, and what was measured is looked at itself: it may not come closer
-than the reference may, less a tolerance for what an arm lags behind.
+The reference keeps the arms apart only as far as the arms are where it is. So its elbows follow the measured ones, held
+tools keep their pose instead of joint positions, and the measured pairs are checked themselves: they may not be closer
+than the reference's may, less a tolerance for the lag of an arm.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def settings_for_external_arms(config: Config) -> Config:
 
 
 class ExternalArms:
-    """What the controller is asked for, and what is looked at, where it only leads."""
+    """What the controller is asked for, and what is checked, where it only leads."""
 
     def __init__(
         self,
@@ -78,9 +78,9 @@ class ExternalArms:
         return {arm: self._held.get(arm, pose) for arm, pose in wanted.items()}
 
     def left_behind(self, state: RobotState, holding: Iterable[str], now: float) -> str | None:
-        """Says so where a tool of ``holding`` arms has been away from its reference's for too long.
+        """One line where the tool of a ``holding`` arm has been away from its reference's for too long, else None.
 
-        Nobody moves that arm, nor could anybody engage it: a stream has to begin where tool and reference are both.
+        Nothing moves that arm, and it could not be engaged: a stream has to begin where tool and reference both are.
         """
         holding = set(holding)
         for arm in self._robot.arms:
@@ -96,7 +96,7 @@ class ExternalArms:
         return None
 
     def too_close(self, state: RobotState) -> str | None:
-        """Says so where a measured pair is closer than allowed."""
+        """One line where a measured pair is closer than allowed, else None."""
         least = self._controller.settings.min_distance
         allowed = least - self._settings.tolerance
         if self._robot.distance_values(state.q).min() >= allowed:

@@ -1,6 +1,6 @@
-"""Whether one publisher alone sends a stream, told by the numbers that every publisher gives its messages.
+"""Whether a single publisher sends a stream, by the sequence numbers of its messages.
 
-The graph cannot tell: it counts a publisher that was killed for seconds more.
+The ROS graph cannot tell: it counts a killed publisher for some seconds more.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ class SequenceWatch:
         self._breaks: deque[float] = deque()
 
     def take(self, number: int, now: float, timeout: float) -> int:
-        """Look at a message's number; returns how often the numbers broke off lately, 0 for one publisher alone.
+        """Look at a message's number; returns the number of recent breaks, 0 for a single publisher.
 
-        Within a stream numbers rise. After a silence of ``timeout`` they may begin anywhere: who was started again
-        counts from one. A single break is a publisher that took another's place, two are two that take turns.
+        Within a stream numbers rise. After a silence of ``timeout`` they may begin anywhere: a publisher that was
+        restarted counts from one. One break is a publisher that replaced another, two are two that take turns.
         """
         passed = now - self._stamp
         if passed <= timeout and not 0 < number - self._number <= 1 + _FASTEST * (passed + _LATEST):

@@ -70,7 +70,7 @@ class Supervisor:
         self._last: Reference | None = None
         self.phase = Phase.INACTIVE
         self.paused = False
-        self.events: list[str] = []  # what happened, for the log; taken by whoever writes it
+        self.events: list[str] = []  # what happened, for the log; its writer clears them
 
     @property
     def fault(self) -> str | None:

@@ -1,10 +1,10 @@
 """Which targets an arm may follow: only those of a stream that began where the arm was.
 
-An arm follows a stream of targets from the first one on, if that lies within ``engage_distance`` and ``engage_angle``
-of the reference's tool pose: whoever engages begins at the tool. What begins elsewhere is somebody who does not know
-that the arm was stopped meanwhile, and is refused as a whole, even where it later comes by. A new stream begins with
-the first target ever, after a silence of ``timeout``, after a reset, and where targets that were refused jump to the
-tool, as those of an operator do who engages anew while the targets never cease.
+An arm follows a stream from its first target on, if that lies within ``engage_distance`` and ``engage_angle`` of the
+tool, as it does when an operator engages. A stream that begins elsewhere comes from a sender that does not know that
+the arm was stopped meanwhile. It is refused as a whole, even where it later passes the tool. A new stream begins with
+the first target ever, after a silence of ``timeout``, after a reset, and where refused targets jump to the tool: that
+is an operator who engages again while the targets never stop.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import pinocchio as pin
 
 from q2r2_control.config.timeouts import STREAM_TIMEOUT
 
-# A jump that no hand makes between two messages, and so the beginning of something new [m], [rad].
+# A jump that no hand makes between two messages: a new stream begins [m], [rad].
 _JUMP, _TURN = 0.05, 0.25
 
 
@@ -33,7 +33,7 @@ class StreamSettings:
 
 @dataclass(frozen=True, slots=True)
 class Origins:
-    """Who sends what, for lines that say what is missing: " from /node", or nothing where that is not known."""
+    """Who sends what, for messages about missing data: " from /node", or "" where that is not known."""
 
     joint_states: Callable[[], str] = lambda: ""
     targets: Callable[[str], str] = lambda arm: ""

@@ -189,13 +189,13 @@ def test_a_stream_that_was_dropped_is_not_taken_up_again_where_it_stands() -> No
     assert stream.offer(TOOL, [TOOL], 0.02) is None
 
 
-def test_where_nobody_moves_the_arms_they_go_astray_and_whoever_comes_is_asked_for_nothing_elsewhere(
+def test_arms_that_nothing_moves_are_noticed_and_a_new_receiver_gets_no_command_away_from_them(
     world: World, robot: Robot
 ) -> None:
     world.run(0.3)
     tool = robot.tool_pose(world.q, "left")
     world.run(0.1, tool)
-    world.blocked = True  # whoever moved the arms is gone
+    world.blocked = True  # what moved the arms is gone
     world.run(0.3, raised(tool, 0.06))
     last = world.commanded[-1]
     assert last is not None
@@ -210,7 +210,7 @@ def test_where_nobody_moves_the_arms_they_go_astray_and_whoever_comes_is_asked_f
     assert not world.supervisor.follows("left")
 
 
-def test_arms_that_lag_behind_the_commands_are_not_astray(world: World, robot: Robot) -> None:
+def test_arms_that_lag_behind_the_commands_are_not_off_their_reference(world: World, robot: Robot) -> None:
     world.run(0.3)
     tool = robot.tool_pose(world.q, "left")
     world.run(0.1, tool)
