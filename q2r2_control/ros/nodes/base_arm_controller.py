@@ -222,10 +222,12 @@ class BaseArmController(BaseNode):
 
     def _faults(self, now: float) -> str | None:
         """What pauses this arm, besides its hand. A gap in its own ticks comes first: it makes others look silent."""
-        gap, self._ticked = now - self._ticked, now
-        stalled = f"this node stood still for {gap:.2f} s" if gap > self.parameters.teleop.gate.timeout else None
         linked = self._link.take_fault() if self.parameters.teleop.linked else None
-        return stalled or self._outputs.take_fault(now) or linked
+        output = self._outputs.take_fault(now)
+        # Read after the others were judged: the process may have been frozen in the middle of this tick.
+        gap, self._ticked = self.now - self._ticked, now
+        stalled = f"this node stood still for {gap:.2f} s" if gap > self.parameters.teleop.gate.timeout else None
+        return stalled or output or linked
 
     def _commanded(self, tool: pin.SE3, now: float) -> pin.SE3:
         """The commanded tool pose: the leash is measured from it, and an anchor takes its orientation."""
