@@ -64,7 +64,7 @@ class Pipeline:
         self.robot = robot
         self.input = input
         self.plant = plant
-        self.drive = make_drive(check_mode(mode, plant), robot, config)
+        self.drive = make_drive(check_mode(mode, plant), robot, config, CommandMode.POSITION in plant.modes)
         self.controller = CartesianController(robot, config.control)
         self._begin_anew()
         self.listeners: list[Callable[[Tick], None]] = []
@@ -82,9 +82,9 @@ class Pipeline:
     ) -> Pipeline:
         """Build a pipeline with an input (``scripted``, ``headset``) and a plant (``mujoco``, ``kinematic``).
 
-        Either may also be an object of one's own. ``mode``: the plant gets joint positions (``position``), or joint
-        torques of a Cartesian impedance (``torque``). Raises :class:`ConfigError` for an unknown name, and for a mode
-        that the plant does not have.
+        Either may also be an object of one's own. ``mode``: the plant gets joint positions (``position``), velocities
+        (``velocity``), or the torques of a Cartesian impedance (``torque``). Raises :class:`ConfigError` for an unknown
+        name, and for a mode that the plant does not have.
         """
         robot = Robot.from_config(config)
         return cls(config, robot, make_input(input, config), make_plant(plant, robot, config), mode)
@@ -150,8 +150,9 @@ class _Run:
         self._clock = LoopClock(period, realtime)
         control = pipeline.config.control
         limit = pipeline.robot.velocity_limit * control.velocity_scale
-        self._pacer = TickPacer(period, limit, control.acceleration_limit)
+        self._pacer = TickPacer(period, limit, control.acceleration_limit, pipeline.drive.coasts)
         self._stamp: float | None = None  # of the newest state of a tick, by the plant's clock [s]
+        self._state = state  # the newest that the plant gave
         self._supervisor = pipeline.supervisor
         self._supervisor.activate(replace(state, stamp=self._clock.now), self._clock.now)
         pipeline.drive.reset(state)
@@ -170,6 +171,8 @@ class _Run:
                 self._bring_to_rest()
             raise
         self._bring_to_rest()
+        if fault := self._supervisor.state_fault:
+            raise PlantError(fault)
         return self._recorder.summary(self._clock.wall_time(), self._pacer)
 
     def _bring_to_rest(self) -> None:
@@ -181,10 +184,11 @@ class _Run:
         try:
             speed = float(np.abs(self._tick().v).max())
             deadline = self._clock.now + speed / self._pipeline.config.control.acceleration_limit + _STOP_ALLOWANCE
-            while (speed > _REST or not drive.at_rest(plant.state())) and self._clock.now < deadline:
+            while (speed > _REST or not drive.at_rest(self._state)) and self._clock.now < deadline:
                 speed = float(np.abs(self._tick().v).max())
         finally:
-            command = drive.last_command(plant.state(), self._grippers())
+            # From the last state that came: a plant that has lost its sensors still takes commands.
+            command = drive.last_command(self._state, self._grippers())
             if command is not None:
                 plant.apply(command)
 
@@ -200,15 +204,15 @@ class _Run:
         dt = self._pacer.step(gap, self._velocity)
         began = time.perf_counter()
         samples = self._poll() if self._following else []
-        state = pipeline.plant.state()
+        state = self._state = pipeline.plant.state()
         tools = self._tools(state)
         self._observe(state, gap)
         if self._following:
             commanded = {arm: pipeline.controller.tool_pose(arm) for arm in pipeline.robot.arms}
             self._targets = pipeline.teleop.update(samples, tools, self._clock.now, commanded)
             self._hand_over(tools)
-        reference = self._advance(dt)
-        pipeline.plant.apply(drive.command(reference, state, self._grippers(), dt, self._supervisor.state_is_good))
+        reference, trusted = self._advance(dt), self._supervisor.state_fault is None
+        pipeline.plant.apply(drive.command(reference, state, self._grippers(), dt, trusted))
         compute_time = time.perf_counter() - began
         self._recorder.add_latency(samples, self._clock.read())
         # A plant that is simulated lets no more time pass at once, as if the computer had stood still.
@@ -220,8 +224,9 @@ class _Run:
         """Let supervision look at what was measured, and at how late the tick is."""
         supervisor, now = self._supervisor, self._clock.now
         if state.stamp != self._stamp:  # a plant that hangs repeats its last state
+            passed = 0.0 if self._stamp is None else state.stamp - self._stamp
             self._stamp = state.stamp
-            supervisor.take_joint_state(replace(state, stamp=now), now)
+            supervisor.take_joint_state(replace(state, stamp=now), now, passed)
         if gap > LONGEST_DT:
             supervisor.stalled(gap, now, exclusive=True)
             self._pipeline.teleop.pause(now, f"the control loop stood still for {gap:.2f} s")

@@ -10,6 +10,7 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -67,7 +68,7 @@ def largest_step(plant: RecordingPlant, limit: Array) -> float:
 
 
 class StallingClock:
-    """Stands for the module ``time``: every second the computer stands still for ``stall`` [s]."""
+    """Stands for the module ``time``: every 0.37 s the computer stands still for ``stall`` [s]."""
 
     def __init__(self, stall: float, first: float = 0.9) -> None:
         self._now, self._stall, self._next = 0.0, stall, first
@@ -109,6 +110,81 @@ def test_a_stall_before_the_first_tick_is_no_fault_of_the_plant(monkeypatch: pyt
     watch = Watch(loop)
     assert loop.run(1.0).at_rest
     assert watch.ticks[0].dt > 0.3
+
+
+@pytest.mark.parametrize("mode", ["position", "velocity", "torque"])
+@pytest.mark.parametrize("stall", [0.05, 0.09])
+def test_a_simulated_plant_that_makes_up_for_a_stall_is_no_plant_that_jumps(
+    stall: float, mode: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(loop_clock, "time", StallingClock(stall))
+    config = cell().model_copy(update={"loop_rate_hz": RATE})
+    loop = Pipeline.from_config(config, input=HandsInput(left=swing, right=swing), plant="mujoco", mode=mode)
+    watch = Watch(loop)
+    summary = loop.run(3.0)
+    assert summary.missed_ticks >= 5
+    assert max(map(speed, watch.ticks)) > 0.5
+    # Velocities and torques go on acting during a stall; the arms are brought back to the reference afterwards.
+    deviation = [np.abs(after.state.q - tick.reference.q).max() for tick, after in pairwise(watch.ticks)]
+    assert max(deviation) < {"position": 0.15, "velocity": 0.3, "torque": 0.5}[mode]
+    assert summary.at_rest
+    assert deviation[-1] < 0.02
+
+
+@pytest.mark.parametrize(("mode", "plant"), [("velocity", "kinematic"), ("velocity", "mujoco"), ("torque", "mujoco")])
+def test_states_that_are_lost_while_the_arms_brake_drive_them_no_more(mode: str, plant: str) -> None:
+    config = cell().model_copy(update={"loop_rate_hz": RATE})
+    loop = Pipeline.from_config(config, input=HandsInput(left=swing, right=swing), plant=plant, mode=mode)
+    watch = Watch(loop)
+    measure, commands = loop.plant.state, []
+    apply = loop.plant.apply
+
+    def lose_and_stop(tick: Tick) -> None:
+        if speed(tick) > 0.8 and not loop.stopping:
+            last = measure()
+            loop.plant.state = lambda: last  # type: ignore[method-assign]
+            loop.stop()
+
+    def record(command: Command) -> None:
+        commands.append(command)
+        apply(command)
+
+    loop.plant.apply = record  # type: ignore[method-assign]
+    loop.listeners.append(lose_and_stop)
+    with pytest.raises(PlantError, match="no joint states for"):
+        loop.run(30.0, realtime=False)
+    assert np.abs(commands[-1].v).max() < 1e-6
+    for _ in range(5):
+        loop.plant.advance(0.1)
+    rest = measure()
+    assert np.abs(rest.v).max() < 1e-2
+    assert np.abs(rest.q - watch.ticks[-1].reference.q).max() < 0.05
+
+
+def test_a_plant_that_gives_no_more_states_gets_a_last_command_that_holds_the_arms() -> None:
+    plant = RecordingPlant()
+    config = cell().model_copy(update={"loop_rate_hz": RATE})
+    loop = Pipeline.from_config(config, input=HandsInput(left=swing, right=swing), plant=plant, mode="velocity")
+    velocities: list[Array] = []
+    apply = plant.apply
+
+    def record(command: Command) -> None:
+        velocities.append(command.v)
+        apply(command)
+
+    def fail(state: RobotState) -> RobotState:
+        raise RuntimeError("the connection is lost")
+
+    def lose(tick: Tick) -> None:
+        if speed(tick) > 0.8:
+            plant.disturb = fail
+
+    plant.apply = record  # type: ignore[method-assign]
+    loop.listeners.append(lose)
+    with pytest.raises(RuntimeError, match="the connection is lost"):
+        loop.run(30.0, realtime=False)
+    assert np.abs(velocities[-2]).max() > 0.5
+    assert not velocities[-1].any()
 
 
 class PersistentHands:

@@ -13,7 +13,7 @@ from q2r2_control.compliance.impedance import ImpedanceReport
 from q2r2_control.compliance.repulsion import WallReport
 from q2r2_control.types import Array, Command, CommandMode, Reference, RobotState
 
-Targets = dict[str, pin.SE3 | None]
+ToolTargets = dict[str, pin.SE3 | None]
 Openings = dict[str, float]
 
 
@@ -32,12 +32,13 @@ class Drive(Protocol):
     mode: CommandMode
     report: DriveReport  # of the last tick
     yields: bool  # whether arms that are pushed leave the reference by design
+    coasts: bool  # whether a plant goes on moving by the last command while none comes
 
     def reset(self, state: RobotState) -> None:
         """Start anew, at rest at the measured ``state``. Raises :class:`Q2R2Error` where that cannot be."""
         ...
 
-    def displaced(self, targets: Targets, state: RobotState, dt: float) -> Targets:
+    def displaced(self, targets: ToolTargets, state: RobotState, dt: float) -> ToolTargets:
         """The tool targets that the controller is to follow in a tick of ``dt`` [s]."""
         ...
 

@@ -8,7 +8,7 @@ import pinocchio as pin
 from q2r2_control.compliance.impedance import ImpedanceController
 from q2r2_control.compliance.repulsion import MeasuredSeparation
 from q2r2_control.config import Config
-from q2r2_control.drives.base import DriveReport, Openings, Targets, holding_command, position_command
+from q2r2_control.drives.base import DriveReport, Openings, ToolTargets, holding_command, position_command
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, Command, CommandMode, Reference, RobotState
 
@@ -20,12 +20,13 @@ class TorqueDrive:
 
     **Without a state to trust.** A spring about a posture that was measured long ago could push anywhere. A plant with
     position servos (``has_servos``), which measure by themselves, follows the reference by those, so that the arms come
-    to rest with it. Otherwise the command is gravity's torque at the last posture that was believed: many drivers
+    to rest with it. Otherwise the command is gravity's torque at the newest measured posture: many drivers
     repeat the last command for ever, and gravity's does no harm.
     """
 
     mode = CommandMode.TORQUE
     yields = True
+    coasts = False
 
     def __init__(self, robot: Robot, config: Config, has_servos: bool = True) -> None:
         self.impedance = ImpedanceController(robot, config.impedance)
@@ -41,7 +42,7 @@ class TorqueDrive:
         self._believed = self._reference = state.q
         self.impedance.reset(state)
 
-    def displaced(self, targets: Targets, state: RobotState, dt: float) -> Targets:
+    def displaced(self, targets: ToolTargets, state: RobotState, dt: float) -> ToolTargets:
         """See :meth:`Drive.displaced`."""
         return targets
 
@@ -54,8 +55,7 @@ class TorqueDrive:
             self.report = DriveReport()
             if self._has_servos:
                 return position_command(reference, grippers)
-            q = state.q if np.isfinite(state.q).all() else self._believed
-            return Command(self.mode, reference.q, reference.v, self.gravity(q), grippers)
+            return Command(self.mode, reference.q, reference.v, self.gravity(self._posture(state)), grippers)
         wall = self.wall.update(state.q, state.v)
         torque = self.impedance.step(reference, state, dt, wall.tau)
         self.report = DriveReport(torque.report, wall)
@@ -76,5 +76,9 @@ class TorqueDrive:
         """See :meth:`Drive.last_command`: a torque that nobody renews holds nothing, position servos do."""
         if self._has_servos:
             return holding_command(state.q if np.isfinite(state.q).all() else self._reference, grippers)
-        q = self._believed
+        q = self._posture(state)
         return Command(self.mode, q, np.zeros_like(q), self.gravity(q), grippers)
+
+    def _posture(self, state: RobotState) -> Array:
+        """The newest measured posture that was a posture."""
+        return state.q if np.isfinite(state.q).all() else self._believed

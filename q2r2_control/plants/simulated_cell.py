@@ -29,7 +29,7 @@ class JointSetpoint:
 
 
 class SimulatedCell:
-    """Plant, follower of commands, and what happens without commands: a stop and position servos, in either mode.
+    """Plant, follower of commands, and what happens without commands: a stop and position servos, in any mode.
 
     Every refusal is a line of text that is returned; nothing is commanded then.
     """
@@ -92,6 +92,8 @@ class SimulatedCell:
     def command_velocities(self, v: Array, now: float) -> str | None:
         """Move all joints on at velocities ``v`` (nv,) [rad/s] that came at ``now`` [s], from where they are due."""
         q = self._follower.q if self._tau is None else self.plant.state().q
+        if self._time is not None and len(v) == len(q):  # where it is due now; the follower stands at the last step
+            q = q + v * min(max(now - self._time, 0.0), _LONGEST_CATCH_UP)
         setpoint = JointSetpoint(self.robot.joint_names, q, v)
         if len(v) != len(self._columns):
             return f"{len(v)} velocities for {len(self._columns)} joints"

@@ -58,8 +58,12 @@ class JointWatch:
         self._still_since, self._still_at = math.inf, np.zeros_like(velocity_limit)
         self._near_at: float | None = None
 
-    def take(self, state: RobotState | str, now: float) -> None:
-        """Look at a state, or at what is wrong with it."""
+    def take(self, state: RobotState | str, now: float, passed: float = 0.0) -> None:
+        """Look at a state, or at what is wrong with it.
+
+        ``passed`` [s] since the state before, by the clock of a plant that has one of its own: a simulated plant makes
+        up for a late tick after it.
+        """
         if isinstance(state, str):
             self._fail(state)
             return
@@ -74,7 +78,7 @@ class JointWatch:
             self._begin(state.q, now)
             return
         moved = np.abs(state.q - last.q)
-        reach = self._velocity_limit * (max(now - last.stamp, 0.0) + _JUMP_TIME) + _JUMP_ALLOWANCE
+        reach = self._velocity_limit * (max(now - last.stamp, passed, 0.0) + _JUMP_TIME) + _JUMP_ALLOWANCE
         if (moved > reach).any():
             worst = int((moved - reach).argmax())
             self._fail(f"{self._names[worst]} jumped by {moved[worst]:.3f} rad")
@@ -90,7 +94,8 @@ class JointWatch:
         """What is wrong now, or None."""
         if self.fault is not None:
             return self.fault
-        if (age := now - self._stamp) > self._settings.timeout:
+        # A clock that was set back would let lost states look fresh for as long.
+        if not -self._settings.timeout <= (age := now - self._stamp) <= self._settings.timeout:
             self._fail(f"no joint states{self._source()} for {age:.3f} s; allowed: {self._settings.timeout:g}")
         return self.fault
 
@@ -125,7 +130,8 @@ class JointWatch:
         return -math.inf if self.state is None else self.state.stamp
 
     def _unusable(self, state: RobotState) -> str | None:
-        for what, values in (("position", state.q), ("velocity", state.v)):
+        external = state.q if state.tau_external is None else state.tau_external
+        for what, values in (("position", state.q), ("velocity", state.v), ("external torque", external)):
             # The usual case costs one sum; the joint is looked for only where there is something to say.
             if not math.isfinite(values.sum()) and not np.isfinite(values).all():
                 worst = int(np.flatnonzero(~np.isfinite(values))[0])

@@ -3,7 +3,7 @@
     inactive --joint states good and at rest--> active --fault--> braking --at rest--> inactive
                                                 active --stop--> braking --at rest--> stopped --reset--> inactive
 
-Inactive and stopped command nothing, so that whatever else holds the arms is not disturbed. Activation starts the
+Inactive and stopped command nothing more, so that whatever else holds the arms is not disturbed. Activation starts the
 reference at the measured posture and forgets all targets: nothing moves until a stream of targets begins anew at the
 tool, see :mod:`target_stream`. A fault brakes along the controller's certified stop. Knows no ROS and no clock: times
 are passed in.
@@ -84,9 +84,9 @@ class Supervisor:
         return self._homing is not None
 
     @property
-    def state_is_good(self) -> bool:
-        """Whether the newest measured state can be believed."""
-        return self._watch.fault is None
+    def state_fault(self) -> str | None:
+        """Why the newest measured state cannot be believed, or None."""
+        return self._watch.fault
 
     @property
     def trusted(self) -> bool:
@@ -114,10 +114,10 @@ class Supervisor:
         """A line for each arm that holds since its targets ended."""
         return list(self._targets.ended.values())
 
-    def take_joint_state(self, state: RobotState | str, now: float) -> None:
-        """A joint state, or what is wrong with it."""
+    def take_joint_state(self, state: RobotState | str, now: float, passed: float = 0.0) -> None:
+        """A joint state, or what is wrong with it; ``passed`` [s]: see :meth:`JointWatch.take`."""
         before = self._watch.fault
-        self._watch.take(state, now)
+        self._watch.take(state, now, passed)
         if self.phase is Phase.INACTIVE and self._watch.fault not in (None, before):
             self.events.append(f"joint states: {self._watch.fault}")
 
@@ -149,12 +149,16 @@ class Supervisor:
 
     def tick(self, now: float, dt: float) -> Reference | None:
         """Move on by ``dt`` [s]; the reference to be commanded, or None."""
-        if self.phase in (Phase.INACTIVE, Phase.STOPPED):
-            if self.phase is Phase.INACTIVE and self._watch.settled(now):
+        if self.phase is Phase.INACTIVE:
+            if self._watch.settled(now):
                 self._activate()
             return None
-        if self.phase is Phase.ACTIVE:
-            self._look(now)
+        # Also while the arms brake and are held: a state that is lost then must not drive them any more.
+        fault = self._watch.check(now)
+        if self.phase is Phase.STOPPED:
+            return None
+        if self.phase is Phase.ACTIVE and fault is not None:
+            self._brake(f"joint states: {fault}")
         reference = self._step(self._wanted(now, dt), dt)
         self._last = reference
         if self.phase is Phase.ACTIVE:
@@ -280,10 +284,6 @@ class Supervisor:
         self._last = None
         self.phase = Phase.ACTIVE
         self.events.append("active: the reference starts at the measured posture")
-
-    def _look(self, now: float) -> None:
-        if fault := self._watch.check(now):
-            self._brake(f"joint states: {fault}")
 
     def _brake(self, why: str) -> None:
         self._forget_targets()

@@ -9,13 +9,16 @@ period h:  |v| t + a t^2 / 2 <= V h  for each joint, with the acceleration limit
 limit forbids. So slow motion catches up at once, and fast motion is stretched in time: the same path, later. Time is
 stretched, rather than a command clipped joint by joint, because a clipped command leaves the path that was certified.
 The target is an absolute pose, so nothing of it is lost.
+
+Velocity commands are another matter (``coasts``): a plant that is told a velocity goes on at it while no command comes.
+Then the reference goes on too, by the time that passed, up to 0.1 s; what is commanded stays within the velocity limit.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from q2r2_control.types import Array
+from q2r2_control.types import LONGEST_DT, Array
 
 _ROUNDING = 1e-9  # of a period
 
@@ -23,13 +26,16 @@ _ROUNDING = 1e-9  # of a period
 class TickPacer:
     """Turns the time since the last tick into the time that the reference moves by, and counts what was late."""
 
-    def __init__(self, period: float, velocity_limit: Array, acceleration_limit: float | Array) -> None:
+    def __init__(
+        self, period: float, velocity_limit: Array, acceleration_limit: float | Array, coasts: bool = False
+    ) -> None:
         """``period`` [s] of the commands; ``velocity_limit`` (n,) [rad/s], ``acceleration_limit`` [rad/s^2]."""
         self.period = period
         self.missed_ticks = 0  # commands that were due and did not come
         self.stretched = 0.0  # time by which the motion is late for it [s]
         self._way = velocity_limit * period  # in one period [rad]
         self._acceleration = acceleration_limit
+        self._coasts = coasts
 
     def step(self, gap: float, v: Array) -> float:
         """Time [s] for the reference to move by, ``gap`` [s] after the last tick, from velocities ``v`` (nv,) [rad/s].
@@ -42,7 +48,8 @@ class TickPacer:
             return gap
         # Half a period late is jitter; from there on a command is missing.
         self.missed_ticks += max(round(gap / self.period) - 1, 0)
-        step = min(gap, max(self.period, self._longest(v)))
+        longest = LONGEST_DT if self._coasts else max(self.period, self._longest(v))
+        step = min(gap, longest)
         self.stretched += gap - step
         return step
 

@@ -43,6 +43,7 @@ class Commanded(NamedTuple):
     number: int
     measured: Array
     q: Array
+    t: float  # of its receipt [s]
 
 
 class Recorder:
@@ -57,7 +58,7 @@ class Recorder:
         place = {name: index for index, name in enumerate(message.joint_names)}
         q = np.array([message.points[0].positions[place[name]] for name in self._names])
         measured = self._cell.q if self._cell.postures else q
-        self.commands.append(Commanded(info["publication_sequence_number"], measured, q))
+        self.commands.append(Commanded(info["publication_sequence_number"], measured, q, time.monotonic()))
 
 
 @pytest.mark.parametrize("stall", [0.02, 0.05, 0.1])
@@ -90,8 +91,9 @@ def test_a_controller_that_is_stopped_for_a_while_publishes_no_jump(
     for before, after in pairwise(recorder.commands):
         way = np.abs(after.q - before.q)
         periods = after.number - before.number
-        anew = np.abs(after.q - after.measured).max() < SAG
-        assert (way <= periods * limit * (1.0 + 1e-6)).all() or (anew and stall >= 0.1), (way / limit).max() / periods
+        # A gap of more than 100 ms, which a busy machine may make of any stall: the controller starts over at the arms.
+        anew = np.abs(after.q - after.measured).max() < SAG and after.t - before.t > 0.1
+        assert (way <= periods * limit * (1.0 + 1e-6)).all() or anew, (way / limit).max() / periods
 
 
 def moves_fast(recorder: Recorder, begin: int) -> bool:

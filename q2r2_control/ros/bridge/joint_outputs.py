@@ -64,8 +64,10 @@ class JointOutput:
     def end(self, state: RobotState, t: float) -> None:
         """What holds the arms where no more commands come, for drives that need it."""
         command = self.drive.last_command(state, {})
-        if self._channels and command is not None and command.mode is self.drive.mode:
-            self._publish(JointCommand(command, state, t))
+        if command is None or command.mode is not self.drive.mode:
+            return
+        for channel in self._channels:  # without waiting for an acknowledgement: there is no next one to send instead
+            channel.publisher.publish(self._kind.encode(JointCommand(command, state, t), channel.names, channel.joints))
 
     def listener_fault(self, off_reference: bool) -> str | None:
         """One line where what took the commands is gone, or is not alone any more; to be asked before each is sent.

@@ -94,10 +94,12 @@ class CartesianControllerNode(BaseNode):
             displace=self._displacement(config) if output != NONE else None,
         )
         limit = robot.velocity_limit * config.control.velocity_scale
-        self._pacer = TickPacer(self._period, limit, config.control.acceleration_limit)
+        drive = self._output.drive
+        self._pacer = TickPacer(self._period, limit, config.control.acceleration_limit, drive.coasts)
         self._velocity = np.zeros(robot.model.nv)  # of the last reference [rad/s]
         self._reference: Reference | None = None
         self._commanding = False
+        self._advances = 0
         self._ticks, self._reported_at, self._last_tick = 0, time.monotonic(), self.now
         self._connect()
         self.get_logger().info(f"{config.name}: {', '.join(robot.arms)}; waits for joint states")
@@ -159,6 +161,7 @@ class CartesianControllerNode(BaseNode):
         self._tell_followed()
 
     def _advance(self, now: float, dt: float) -> None:
+        self._advances += 1
         began = time.monotonic()
         # Commands that the arms do not follow are not for a receiver that has just come.
         if fault := self._output.listener_fault(self._supervisor.off_reference):
@@ -247,11 +250,21 @@ class CartesianControllerNode(BaseNode):
     def close(self) -> None:
         """Bring the arms to rest along the certified stop before the commands end."""
         self._supervisor.stop("ending")
-        deadline = time.monotonic() + _LONGEST_STOP
-        while self._supervisor.phase is Phase.BRAKING and time.monotonic() < deadline:
-            time.sleep(self._period)
-            self._advance(self.now, self._period)  # simulated time may have ended already
-        self._advance(self.now, self._period)  # which sends what holds the arms
+        deadline = last = time.monotonic()
+        deadline += _LONGEST_STOP
+        advances = self._advances
+        try:
+            while self._supervisor.phase is Phase.BRAKING and (now := time.monotonic()) < deadline:
+                # Joint states still have to come in; the timer does the rest, unless simulated time has ended already.
+                if self.executor is not None:
+                    self.executor.spin_once(timeout_sec=self._period)
+                if self._advances != advances:
+                    advances, last = self._advances, now
+                elif now - last > 2.0 * self._period:
+                    self._advance(self.now, self._period)
+        finally:
+            if self._commanding and self._joints.state is not None:
+                self._output.end(self._joints.state, self.now)
 
 
 def _serve(act: Callable[[], str | None], request: Any, response: Any) -> Any:
