@@ -6,10 +6,12 @@ import json
 import threading
 import time
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pinocchio as pin
+import yaml
 from geometry_msgs.msg import PoseStamped
 from std_msgs.msg import String
 from tf2_msgs.msg import TFMessage
@@ -20,7 +22,7 @@ from q2r2_control.ros.bridge.messages import pose_message
 from q2r2_control.types import Array
 from tests.ros import waiting
 from tests.ros.joint_recorder import JointRecorder
-from tests.ros.processes import CONFIG, Processes, RosProcess
+from tests.ros.processes import CONFIG, ROOT, Processes, RosProcess
 from tests.ros.waiting import wait_until
 
 RATE = 100.0  # of targets [Hz]
@@ -145,6 +147,21 @@ def start_controller(processes: Processes, *parameters: str, **environment: str)
     """Start the built-in controller."""
     given = (f"config:={CONFIG}", f"rate:={NODE_RATE}", *parameters)
     return processes.start_node("cartesian_controller", *given, **environment)
+
+
+def changed_cell(folder: Path, **sections: dict[str, Any]) -> str:
+    """File of the shipped cell with keys of some of its sections changed."""
+    cell = yaml.safe_load((ROOT / CONFIG).read_text())
+    for section, keys in sections.items():
+        cell[section] = cell[section] | keys
+    file = folder / "changed.yaml"
+    file.write_text(yaml.safe_dump(cell))
+    return str(file)
+
+
+# Torques through ROS arrive some periods late on a machine with other load. Springs of the default stiffness bear 8 ms
+# of delay, which is one period here; these bear several.
+SOFT = {"translational_stiffness": 300.0, "rotational_stiffness": 20.0, "nullspace_stiffness": 10.0}
 
 
 def shifted(pose: pin.SE3, x: float, y: float, z: float) -> pin.SE3:

@@ -13,12 +13,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
-import yaml
 
 from q2r2_control import Robot
 from q2r2_control.types import Array
 from tests.ros.conftest import NEEDS_ROS
-from tests.ros.processes import CONFIG, ROOT, Processes
+from tests.ros.processes import Processes
 
 pytest.importorskip("rclpy", reason=NEEDS_ROS)
 pytest.importorskip("control_msgs", reason="needs control_msgs: q2r2 ros build-interfaces")
@@ -29,11 +28,12 @@ from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory
 
-from tests.ros.cell import PATIENT, Cell, shifted, start_controller, start_robot
+from tests.ros.cell import PATIENT, Cell, changed_cell, shifted, start_controller, start_robot
 from tests.ros.waiting import wait_until
 
 RATE = 125.0  # of the control loop [Hz]
 COMMANDS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE, history=HistoryPolicy.KEEP_LAST)
+ADMITTANCE = {"enabled": True, "stiffness": 500.0, "force_dead_band": 0.0}
 SAG = 0.03  # a command that begins anew is no farther from what was measured [rad]
 
 
@@ -132,19 +132,10 @@ def off(cell: Cell, arm: str, pose: pin.SE3) -> float:
     return float(np.linalg.norm(cell.tool(arm).translation - pose.translation))
 
 
-def yielding_cell(folder: Path) -> str:
-    """The cell's file with the admittance enabled."""
-    cell = yaml.safe_load((ROOT / CONFIG).read_text())
-    cell["admittance"] = {"enabled": True, "stiffness": 500.0, "force_dead_band": 0.0}
-    file = folder / "yielding.yaml"
-    file.write_text(yaml.safe_dump(cell))
-    return str(file)
-
-
 def test_with_the_admittance_a_measured_force_displaces_the_target_and_without_its_topic_the_node_ends(
     robot: Robot, processes: Processes, node: Any, tmp_path: Path
 ) -> None:
-    config = f"config:={yielding_cell(tmp_path)}"
+    config = f"config:={changed_cell(tmp_path, admittance=ADMITTANCE)}"
     refused = start_controller(processes, config)
     assert refused.wait() == 2
     assert "admittance.enabled = true: set the parameter external_torque_topic" in refused.output

@@ -8,6 +8,7 @@ import signal
 import time
 from collections.abc import Callable, Iterator
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -27,7 +28,7 @@ from trajectory_msgs.msg import JointTrajectory
 
 from q2r2_control.ros.base_node import COMMAND_QOS
 from q2r2_control.types import Array
-from tests.ros.cell import PATIENT, STILL, Cell, Stream, start_controller, start_robot
+from tests.ros.cell import PATIENT, SOFT, STILL, Cell, Stream, changed_cell, start_controller, start_robot
 from tests.ros.waiting import wait_until
 
 Engage = Callable[..., Stream]
@@ -149,9 +150,10 @@ def test_a_namespace_an_arm_is_merged_by_name_and_commanded_apart(
 
 
 def test_torques_move_an_arm_and_leave_it_on_its_servos_when_the_controller_is_killed(
-    cell: Cell, processes: Processes, engage: Engage
+    cell: Cell, processes: Processes, engage: Engage, tmp_path: Path
 ) -> None:
-    controller = start_controller(processes, *TARGET_TOPICS, "output:=torque", *PATIENT)
+    soft = f"config:={changed_cell(tmp_path, impedance=SOFT)}"
+    controller = start_controller(processes, *TARGET_TOPICS, "output:=torque", *PATIENT, soft)
     cell.wait_until_active()
     wait_until(lambda: cell.state("mode", "mujoco_robot") == "torque", "the robot is driven by torques")
     stream = engage("left")
