@@ -155,6 +155,7 @@ class _Run:
         self._state = state  # the newest that the plant gave
         self._supervisor = pipeline.supervisor
         self._supervisor.activate(replace(state, stamp=self._clock.now), self._clock.now)
+        self._supervisor.events.clear()
         pipeline.drive.reset(state)
         self._velocity = np.zeros(pipeline.robot.model.nv)
 
@@ -181,6 +182,7 @@ class _Run:
         self._targets = {arm: ArmTarget(None, target.gripper) for arm, target in self._targets.items()}
         drive, plant = self._pipeline.drive, self._pipeline.plant
         self._supervisor.stop("the run has ended")
+        self._supervisor.events.clear()
         try:
             speed = float(np.abs(self._tick().v).max())
             deadline = self._clock.now + speed / self._pipeline.config.control.acceleration_limit + _STOP_ALLOWANCE
@@ -231,7 +233,7 @@ class _Run:
             supervisor.stalled(gap, now, exclusive=True)
             self._pipeline.teleop.pause(now, f"the control loop stood still for {gap:.2f} s")
         for line in supervisor.events:
-            _logger.debug(line)
+            _logger.warning(line)
         supervisor.events.clear()
 
     def _hand_over(self, tools: dict[str, pin.SE3]) -> None:

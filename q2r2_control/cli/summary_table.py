@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+from rich.markup import escape
 from rich.table import Table
 
 from q2r2_control.runtime.run_summary import Percentiles, RunSummary
 from q2r2_control.runtime.torque_summary import TorqueSummary
+from q2r2_control.types import Event
 
 
 def summary_table(summary: RunSummary) -> Table:
@@ -30,12 +34,30 @@ def summary_table(summary: RunSummary) -> Table:
         f"{_share(summary.max_velocity_ratio)} of the limits at most, {_share(summary.max_acceleration_ratio)}",
     )
     table.add_row("room to position limits", f"{summary.min_position_margin_rad:.3f} rad at least")
-    table.add_row("certified stops executed", f"{summary.fallback_ticks} ticks, {summary.uncertified_ticks} without")
+    uncertified = f"{summary.uncertified_ticks} ticks without a certificate"
+    if summary.uncertified_ticks:
+        uncertified = f"[red]{uncertified}[/]"
+    table.add_row("certified stops executed", f"{summary.fallback_ticks} ticks; {uncertified}")
     table.add_row("targets rejected", str(summary.rejected_targets))
+    table.add_row(
+        "ticks missed", f"{summary.missed_ticks}, which made the motion {summary.stretched_s:.2f} s late in all"
+    )
+    for name, event in _last_pauses(summary.events).items():
+        table.add_row(f"{name} arm paused by", f"[yellow]{escape(event.reason)}[/], at {event.t:.2f} s")
     if summary.torque is not None:
         _add_torque(table, summary.torque)
     table.add_row("arms at the end", "at rest" if summary.at_rest else "[red]moving[/]")
     return table
+
+
+def _last_pauses(events: Sequence[Event]) -> dict[str, Event]:
+    """The last event of each arm that was paused by something else than its button."""
+    last = {event.arm: event for event in events if event.destination in ("paused", "engaged")}
+    return {
+        arm: event
+        for arm, event in last.items()
+        if event.destination == "paused" and event.source == "engaged" and event.reason != "lower button"
+    }
 
 
 def _add_torque(table: Table, torque: TorqueSummary) -> None:

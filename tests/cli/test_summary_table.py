@@ -1,0 +1,48 @@
+"""What the summary's table says of a run that did not go as asked."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from io import StringIO
+
+import pytest
+from rich.console import Console
+
+from q2r2_control import Pipeline, RunSummary
+from q2r2_control.cli.summary_table import summary_table
+from q2r2_control.types import Event
+from tests.support.hands_input import HandsInput
+from tests.support.watch import cell
+
+
+@pytest.fixture(scope="module")
+def summary() -> RunSummary:
+    config = cell().model_copy(update={"loop_rate_hz": 100.0})
+    return Pipeline.from_config(config, input=HandsInput(), plant="kinematic").run(0.5, realtime=False)
+
+
+def text_of(summary: RunSummary) -> str:
+    console = Console(file=StringIO(), width=160)
+    console.print(summary_table(summary))
+    file = console.file
+    assert isinstance(file, StringIO)
+    return file.getvalue()
+
+
+def test_an_arm_that_was_paused_by_something_else_than_its_button_is_named_with_the_reason(
+    summary: RunSummary,
+) -> None:
+    reason = "the control loop stood still for 0.40 s"
+    paused = Event(4.07, "left", "engaged", "paused", reason)
+    pressed = Event(4.5, "right", "engaged", "paused", "lower button")
+    text = text_of(replace(summary, events=[*summary.events, paused, pressed]))
+    (row,) = (line for line in text.splitlines() if "left arm paused by" in line)
+    assert f"{reason}, at 4.07 s" in row
+    assert "right arm paused by" not in text
+    again = Event(5.0, "left", "paused", "engaged", "lower button")
+    assert "paused by" not in text_of(replace(summary, events=[paused, again]))
+
+
+def test_missed_ticks_are_told(summary: RunSummary) -> None:
+    text = text_of(replace(summary, missed_ticks=7, stretched_s=0.123))
+    assert "7; the motion is 0.12 s late in all" in text
