@@ -151,7 +151,8 @@ class _Run:
         control = pipeline.config.control
         limit = pipeline.robot.velocity_limit * control.velocity_scale
         self._pacer = TickPacer(period, limit, control.acceleration_limit, pipeline.drive.coasts)
-        self._stamp: float | None = None  # of the newest state of a tick, by the plant's clock [s]
+        self._stamp = state.stamp  # of the newest state, by the plant's clock [s]
+        self._unanswered = 0.0  # time that the plant was given since without a newer one [s]
         self._state = state  # the newest that the plant gave
         self._supervisor = pipeline.supervisor
         self._supervisor.activate(replace(state, stamp=self._clock.now), self._clock.now)
@@ -208,7 +209,7 @@ class _Run:
         samples = self._poll() if self._following else []
         state = self._state = pipeline.plant.state()
         tools = self._tools(state)
-        self._observe(state, gap)
+        self._observe(state)
         if self._following:
             commanded = {arm: pipeline.controller.tool_pose(arm) for arm in pipeline.robot.arms}
             self._targets = pipeline.teleop.update(samples, tools, self._clock.now, commanded)
@@ -218,20 +219,20 @@ class _Run:
         compute_time = time.perf_counter() - began
         self._recorder.add_latency(samples, self._clock.read())
         # A plant that is simulated lets no more time pass at once, as if the computer had stood still.
-        pipeline.plant.advance(min(gap, LONGEST_DT))
+        given = min(gap, LONGEST_DT)
+        pipeline.plant.advance(given)
+        self._unanswered += given
         self._record(gap, dt, samples, reference, state, tools, compute_time)
         return reference
 
-    def _observe(self, state: RobotState, gap: float) -> None:
-        """Let supervision look at what was measured, and at how late the tick is."""
+    def _observe(self, state: RobotState) -> None:
+        """Let supervision look at what was measured. A stall needs no more than that: nothing else moves this plant."""
         supervisor, now = self._supervisor, self._clock.now
-        if state.stamp != self._stamp:  # a plant that hangs repeats its last state
-            passed = 0.0 if self._stamp is None else state.stamp - self._stamp
-            self._stamp = state.stamp
-            supervisor.take_joint_state(replace(state, stamp=now), now, passed)
-        if gap > LONGEST_DT:
-            supervisor.stalled(gap, now, exclusive=True)
-            self._pipeline.teleop.pause(now, f"the control loop stood still for {gap:.2f} s")
+        passed = state.stamp - self._stamp
+        if passed != 0.0:
+            self._stamp, self._unanswered = state.stamp, 0.0
+        # A plant that hangs repeats its last state, which is as old as the time that it was given since.
+        supervisor.take_joint_state(replace(state, stamp=now - self._unanswered), now, passed)
         for line in supervisor.events:
             _logger.warning(line)
         supervisor.events.clear()

@@ -198,21 +198,15 @@ class Supervisor:
         self.paused = paused
         self._forget_targets()
 
-    def stalled(self, duration: float, now: float, exclusive: bool = False) -> None:
-        """The loop stood still for ``duration`` [s]: what it was about to command is of the past.
+    def stalled(self, duration: float, now: float) -> None:
+        """The loop stood still for ``duration`` [s], and something else may have moved the arms meanwhile.
 
-        Targets are forgotten; those that waited are no new stream. With ``exclusive`` nothing else can have moved the
-        arms or taken their commands: they rest where they were commanded to be, and the reference brakes from there,
-        one period a tick. Otherwise going on from the reference could be a jump, and the arms are activated anew where
-        they rest.
+        They have come to rest by themselves, so there is nothing to brake, and going on from the reference could be a
+        jump. They are activated anew where they rest; targets that waited are no new stream.
         """
         if self.phase not in (Phase.ACTIVE, Phase.BRAKING):
             return
         fault = f"the control loop stood still for {duration:.2f} s"
-        if exclusive:
-            self.events.append(fault)
-            self._forget_targets()
-            return
         self._watch.take(fault, now)
         self._brake(fault)
         self.phase = Phase.INACTIVE if self._stopped is None else Phase.STOPPED

@@ -45,4 +45,4 @@ def test_an_arm_that_was_paused_by_something_else_than_its_button_is_named_with_
 
 def test_missed_ticks_are_told(summary: RunSummary) -> None:
     text = text_of(replace(summary, missed_ticks=7, stretched_s=0.123))
-    assert "7; the motion is 0.12 s late in all" in text
+    assert "7, which made the motion 0.12 s late in all" in text
