@@ -6,7 +6,6 @@ import json
 import os
 import signal
 import sys
-import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -26,6 +25,7 @@ from std_msgs.msg import String
 
 from q2r2_control.errors import ConfigError, Q2R2Error
 from q2r2_control.ros.launch.middleware import set_up_middleware
+from q2r2_control.runtime.process import StopRequest
 
 # Commands, at the receiver: only the newest counts, and it has to arrive.
 COMMAND_QOS = QoSProfile(
@@ -161,15 +161,15 @@ def run_node(make: Callable[[], Node], args: Sequence[str] | None = None) -> int
     except rclpy_implementation.RCLError as error:  # such as arguments that cannot be parsed
         print(f"{name}: {error}", file=sys.stderr)
         return 2
-    stop = threading.Event()
+    stop = StopRequest()
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
+        signal.signal(number, lambda *_: stop.ask())
     node: Any = None
     try:
         node = make()
         executor = SingleThreadedExecutor()
         executor.add_node(node)
-        while rclpy.ok() and not stop.is_set() and getattr(node, "exit_code", None) is None:
+        while rclpy.ok() and not stop.asked and getattr(node, "exit_code", None) is None:
             executor.spin_once(timeout_sec=0.1)
     except (Q2R2Error, ParameterException) as error:
         print(f"{name}: {error}", file=sys.stderr)

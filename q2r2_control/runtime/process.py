@@ -9,6 +9,20 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 
+class StopRequest:
+    """What a signal handler sets and a loop asks.
+
+    A plain attribute: the lock of a ``threading.Event`` is not reentrant, so a signal that comes in the middle of
+    another one's handler would wait for it for ever, and the process with it.
+    """
+
+    asked = False
+
+    def ask(self) -> None:
+        """Ask the loop to end."""
+        self.asked = True
+
+
 @contextmanager
 def stop_on_signals(stop: Callable[[], None]) -> Iterator[None]:
     """Ctrl-C and SIGTERM call ``stop`` instead of interrupting the loop; only where this is the main thread."""

@@ -18,6 +18,7 @@ from dataclasses import dataclass, field
 from q2r2_control.config import load_config
 from q2r2_control.config.external import ControllerKind, ExternalConfig
 from q2r2_control.errors import ConfigError, Q2R2Error
+from q2r2_control.runtime.process import StopRequest, stop_on_signals
 from q2r2_control.types import SIDES
 
 SOURCES = ("scripted", "headset", "none")
@@ -162,12 +163,12 @@ def _read(name: str, process: subprocess.Popen[str], lines: queue.SimpleQueue[st
 
 def _watch(
     running: Mapping[str, subprocess.Popen[str]],
-    stop: threading.Event,
+    stop: StopRequest,
     lines: queue.SimpleQueue[str],
     say: Callable[[str], None],
 ) -> str | None:
     """Wait for the request to stop, or for a process to end by itself; its name."""
-    while not stop.is_set():
+    while not stop.asked:
         _drain(lines, say)
         for name, process in running.items():
             if (code := process.poll()) is not None:
@@ -203,13 +204,8 @@ def _drain(lines: queue.SimpleQueue[str], say: Callable[[str], None]) -> None:
 
 
 @contextmanager
-def _stop_requests() -> Iterator[threading.Event]:
-    """An event that Ctrl-C and SIGTERM set."""
-    stop = threading.Event()
-    numbers = (signal.SIGINT, signal.SIGTERM)
-    previous = [signal.signal(number, lambda *_: stop.set()) for number in numbers]
-    try:
+def _stop_requests() -> Iterator[StopRequest]:
+    """What Ctrl-C and SIGTERM set."""
+    stop = StopRequest()
+    with stop_on_signals(stop.ask):
         yield stop
-    finally:
-        for number, handler in zip(numbers, previous, strict=True):
-            signal.signal(number, handler)
