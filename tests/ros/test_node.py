@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import signal
 import time
 from typing import Any
 
@@ -46,16 +44,3 @@ def test_a_node_in_simulated_time_says_that_no_clock_comes_until_one_does_and_wh
     wait_until(lambda: diagnostics and "clock" not in diagnostics[-1].message, "the warning goes when the clock comes")
     node.destroy_timer(timer)
     states.wait_for("use_sim_time is set and the time on /clock stands still")
-
-
-def test_a_node_ends_however_many_signals_ask_it_to_at_once(processes: Processes) -> None:
-    # A signal that comes in the middle of another one's handler must not wait for it.
-    nodes = [processes.start_node("tcp_endpoint", "port:=0") for _ in range(3)]
-    for started in nodes:
-        started.wait_for("listen")
-    for _ in range(300):
-        for started in nodes:
-            if started.running:
-                os.kill(started.pid, signal.SIGTERM)
-                os.kill(started.pid, signal.SIGINT)
-    assert [started.wait() for started in nodes] == [0, 0, 0]
