@@ -16,6 +16,9 @@ from q2r2_control.types import Array, Command, CommandMode, RobotState
 
 # A loop that fell further behind drops the time instead of catching up in one leap [s].
 _LONGEST_CATCH_UP = 0.05
+# How long one torque acts [s]. A robot that is driven by torques stops by itself when its sender misses a few periods
+# of a millisecond; here, where nothing runs in real time, the simulation waits for the sender instead.
+_LONGEST_TORQUE = 0.012
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +41,7 @@ class SimulatedCell:
         self.robot = robot
         self.plant = MujocoPlant(robot, config)
         self.loose_objects = frozenset(config.mujoco.objects)
-        self.dropped = 0.0  # time that the simulation fell behind in all [s]
+        self.dropped = 0.0  # time that the simulation fell behind, or waited for torques, in all [s]
         self._hold_after, self._max_jump = hold_after, max_jump
         self._columns = {name: index for index, name in enumerate(robot.joint_names)}
         self._timestep = config.mujoco.timestep
@@ -132,14 +135,26 @@ class SimulatedCell:
             self._time = now
         behind = now - self._time
         if behind > _LONGEST_CATCH_UP:
-            self.dropped += behind - _LONGEST_CATCH_UP
-            self._time = now - _LONGEST_CATCH_UP
+            self._drop(behind - _LONGEST_CATCH_UP)
+        self._wait_for_torque(now)
         steps = math.floor((now - self._time) / self._timestep + 1e-6)
         if steps > 0:
             dt = steps * self._timestep
             self._time += dt
             self._drive(dt)
         return self.plant.state()
+
+    def _wait_for_torque(self, now: float) -> None:
+        """Drop the time in which the last torque is too old to act and not yet so old that the arms are held."""
+        assert self._time is not None
+        age = now - self._last_command
+        if self._tau is not None and _LONGEST_TORQUE < age <= self._hold_after:
+            self._drop(min(age - _LONGEST_TORQUE, now - self._time))
+
+    def _drop(self, duration: float) -> None:
+        assert self._time is not None
+        self.dropped += duration
+        self._time += duration
 
     def _drive(self, dt: float) -> None:
         assert self._time is not None
