@@ -30,14 +30,11 @@ class ControllerSettings(BaseModel):
 
     min_distance: float = Field(0.02, ge=0, le=0.2, description="every monitored pair stays this far apart [m]")
     distance_buffer: float = Field(0.002, gt=0, le=0.05, description="the QP aims to stop this much earlier [m]")
-    separation_gain: float = Field(4.0, gt=0, le=50, description="approach speed per metre of free distance [1/s]")
+    separation_gain: float = Field(10.0, gt=0, le=50, description="closing speed per metre left after a stop [1/s]")
     separation_recovery_speed: float = Field(0.05, gt=0, le=0.5, description="when too close, moving apart [m/s]")
-    contact_speed: float = Field(0.03, gt=0, le=1, description="tool speed where another arm is closest [m/s]")
-    full_speed_distance: float = Field(0.1, gt=0, le=1, description="free distance with full tool speed [m]")
 
     priority: str = Field(EQUAL, description="equal, or the arm that the other one gives way to")
     yield_weight: float = Field(0.01, gt=0, le=1, description="of the costs of the arm that gives way")
-    yield_speed: float = Field(0.1, gt=0, le=1, description="tool speed with which the arm with priority pushes [m/s]")
 
     position_gain: float = Field(8.0, gt=0, le=50, description="[1/s]")
     rotation_gain: float = Field(8.0, gt=0, le=50, description="[1/s]")

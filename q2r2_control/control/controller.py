@@ -48,6 +48,7 @@ class CartesianController:
         model = kernel_model_of(robot, self.settings)
         data = KernelData.empty(model)
         self._state, self._rows, self._active = data.safety.state, data.safety.rows, data.safety.active
+        self._stop = data.safety.certified
         self._wanted, self._tasks = data.safety.wanted, data.tasks
         self._problem = QpProblem(
             H=data.tasks.H,
@@ -129,6 +130,11 @@ class CartesianController:
         """World pose of an arm's tool at the reference."""
         i = self._arms.index(arm)
         return pin.SE3(self._tasks.rotation[i].copy(), self._tasks.translation[i].copy())
+
+    @property
+    def stop_deceleration(self) -> Array:
+        """Of each joint in the full stop from the reference that is known, (nv,) [rad/s^2]."""
+        return self._stop.copy()
 
     def _advance(self, h: float, share: float, summary: _Summary) -> None:
         """One substep, which is a ``share`` of the tick: build, solve, certify and move."""

@@ -7,15 +7,14 @@ from typing import NamedTuple
 import numpy as np
 
 from q2r2_control.config.control import EQUAL, ControllerSettings, check_priority
-from q2r2_control.control.geometry.collision import Pairs, collision_model_of
+from q2r2_control.control.geometry.collision import collision_model_of
 from q2r2_control.control.geometry.kinematics import Chain, Placements, place
 from q2r2_control.control.safety.joint_limits import JointLimits
 from q2r2_control.control.safety.safety_model import Approach, SafetyModel
 from q2r2_control.control.tasks.swivel import nearest_along, swivel_angle
 from q2r2_control.control.tasks.task_data import SwivelScratch
-from q2r2_control.control.tasks.task_model import Motion, Posture, Priority, Proximity, Swivels, TaskModel, tools_of
+from q2r2_control.control.tasks.task_model import Motion, Posture, Priority, Swivels, TaskModel, tools_of
 from q2r2_control.robot.robot import Robot
-from q2r2_control.types import Array
 
 
 class KernelModel(NamedTuple):
@@ -36,9 +35,13 @@ def kernel_model_of(robot: Robot, settings: ControllerSettings) -> KernelModel:
 
 
 def _safety_model(robot: Robot, settings: ControllerSettings) -> SafetyModel:
-    stop_distance = settings.min_distance + settings.distance_buffer
+    collision = collision_model_of(robot)
+    min_distance = np.full(len(collision.pairs.first), settings.min_distance)
+    arm = np.full(robot.model.nv, len(robot.arms), dtype=np.int64)
+    for i, joints in enumerate(robot.arms.values()):
+        arm[joints.joints] = i
     return SafetyModel(
-        collision=collision_model_of(robot),
+        collision=collision,
         limits=JointLimits(
             lower=robot.position_lower + settings.position_margin,
             upper=robot.position_upper - settings.position_margin,
@@ -48,12 +51,12 @@ def _safety_model(robot: Robot, settings: ControllerSettings) -> SafetyModel:
             return_speed=settings.recovery_velocity,
         ),
         approach=Approach(
-            stop_distance=stop_distance,
+            stop_distance=min_distance + settings.distance_buffer,
             gain=settings.separation_gain,
             recovery_speed=settings.separation_recovery_speed,
-            slow_below=stop_distance + settings.full_speed_distance,
         ),
-        min_distance=settings.min_distance,
+        min_distance=min_distance,
+        arm=arm,
     )
 
 
@@ -76,26 +79,17 @@ def _task_model(robot: Robot, settings: ControllerSettings, safety: SafetyModel)
         swivels=swivels,
         has_swivels=int(swivels.gain.any()),
         priority=_priority(robot, settings),
-        proximity=Proximity(
-            pair_arm=_arms_slowed(robot, safety.collision.pairs, tools.member),
-            stop_distance=safety.approach.stop_distance,
-            full_at=settings.full_speed_distance,
-            contact_speed=settings.contact_speed,
-        ),
     )
 
 
 def _priority(robot: Robot, settings: ControllerSettings) -> Priority:
     n, nv = len(robot.arms), robot.model.nv
-    priority = Priority(
-        np.ones(n), np.full(nv, settings.posture_weight), np.zeros(n, dtype=np.int64), settings.yield_speed
-    )
+    priority = Priority(np.ones(n), np.full(nv, settings.posture_weight))
     if settings.priority == EQUAL:
         return priority
     first = robot.arms[settings.priority].joints
     for i, (name, arm) in enumerate(robot.arms.items()):
         if name == settings.priority:
-            priority.pushes[i] = 1
             continue
         priority.weight[i] = settings.yield_weight
         # A joint that also moves the arm with priority keeps its full cost.
@@ -118,32 +112,3 @@ def _swivels(robot: Robot, chain: Chain) -> Swivels:
         at_home, _ = swivel_angle(placements, swivels, i, scratch)
         swivels.angle[i] = at_home if arm.swivel.angle is None else arm.swivel.angle
     return swivels
-
-
-def _arms_slowed(robot: Robot, pairs: Pairs, member: Array) -> Array:
-    """Which pairs slow which arms: round bodies of two arms, or of an arm and a fixed round body.
-
-    Not two bodies of one arm, its base included: they are near each other in all postures, and would always slow it.
-    """
-    owned = _owned(robot)
-    slowed = np.zeros((len(pairs.first), len(member)))
-    for p in range(len(pairs.first)):
-        moving = pairs.joint[p][pairs.joint[p] > 0] - 1
-        within_one_arm = (owned[pairs.first[p]] & owned[pairs.second[p]]).any()
-        if pairs.round[p] and not within_one_arm:
-            slowed[p, member[:, moving].any(axis=1)] = 1.0
-    return slowed
-
-
-def _owned(robot: Robot) -> np.ndarray:
-    """Which geometries (g, n) belong to which arms: what its joints carry, and what carries its first joint."""
-    objects = robot.collision_model.geometryObjects
-    owned = np.zeros((len(objects), len(robot.arms)), dtype=bool)
-    for i, arm in enumerate(robot.arms.values()):
-        joints = {int(index) + 1 for index in arm.joints}
-        path, frame = set(), arm.frame_id
-        while frame not in path:  # the first frame is its own parent
-            path.add(frame)
-            frame = robot.model.frames[frame].parentFrame
-        owned[:, i] = [item.parentJoint in joints or item.parentFrame in path for item in objects]
-    return owned

@@ -1,7 +1,4 @@
-"""One tick's problem: the cost of all tasks and the box of next velocities, compiled.
-
-The separation rows are written where the reference is observed (reference.py), since they need no target.
-"""
+"""One tick's problem: the cost of all tasks, the box of next velocities and the separation rows, compiled."""
 
 from __future__ import annotations
 
@@ -9,17 +6,17 @@ from q2r2_control.control.jit import Held, kernel, lean_kernel
 from q2r2_control.control.kernel_data import KernelData
 from q2r2_control.control.kernel_model import KernelModel
 from q2r2_control.control.safety.joint_limits import next_velocity_box
+from q2r2_control.control.safety.separation_rows import write_separation_rows
 from q2r2_control.control.tasks.frame import add_stretch_damping, add_tool_task, tool_jacobian, wanted_twist
 from q2r2_control.control.tasks.manipulability import add_manipulability
 from q2r2_control.control.tasks.posture import add_hold_task, add_posture_task, project_to_nullspace, pull_to_posture
-from q2r2_control.control.tasks.priority import tool_speed
 from q2r2_control.control.tasks.swivel import turn_elbows, write_swivel_rows
 from q2r2_control.control.tasks.task_data import Targets
 
 
 @kernel
 def assemble(held_model: Held, held_targets: Held, held_data: Held, h: float) -> bool:
-    """Cost and box for a step of ``h`` [s] from an observed reference. False where a joint is outside its limits."""
+    """Cost, rows and box of a step of ``h`` [s] from an observed reference; False: a joint is outside its limits."""
     model, targets, data = held_model.value, held_targets.value, held_data.value
     state, tasks = data.safety.state, data.tasks
     tasks.H[:] = 0.0
@@ -37,6 +34,7 @@ def assemble(held_model: Held, held_targets: Held, held_data: Held, h: float) ->
         project_to_nullspace(tasks.J, tasks.swivel.free)
         turn_elbows(model.tasks, tasks)
     add_posture_task(model.tasks, tasks)
+    write_separation_rows(model.safety, data.safety, h)
     return next_velocity_box(model.safety.limits, state.q, state.v, h, data.safety.box)
 
 
@@ -44,9 +42,8 @@ def assemble(held_model: Held, held_targets: Held, held_data: Held, h: float) ->
 def _follow(model: KernelModel, data: KernelData, targets: Targets, i: int) -> None:
     """Cost of tool ``i`` on the way to its target."""
     tasks, J = data.tasks, data.tasks.J[6 * i : 6 * i + 6]
-    speed = tool_speed(model.tasks, targets, data.safety.distance, i)
     tool_jacobian(model.tasks.chain, tasks.placements, model.tasks.tools, i, tasks.translation[i], J)
-    wanted_twist(model.tasks.motion, tasks, targets, i, speed)
+    wanted_twist(model.tasks.motion, tasks, targets, i)
     add_tool_task(J, tasks.twist[i], model.tasks.priority.weight[i], tasks.H, tasks.g)
     add_stretch_damping(model.tasks, tasks, i)
     if model.tasks.manipulability_gain > 0.0:

@@ -9,7 +9,7 @@ from q2r2_control.control.jit import Held, kernel, lean_kernel
 from q2r2_control.control.kernel_data import KernelData
 from q2r2_control.control.kernel_model import KernelModel
 from q2r2_control.control.safety.safety_filter import apply_safety_filter, certify_start
-from q2r2_control.control.safety.separation_rows import normalise_rows, write_separation_rows
+from q2r2_control.control.safety.separation_rows import measure_pairs
 from q2r2_control.control.safety.velocity_bounds import update_body_velocities
 from q2r2_control.control.tasks.frame import tool_pose
 from q2r2_control.types import Array
@@ -40,12 +40,11 @@ def move_reference(
 
 @lean_kernel
 def _observe(model: KernelModel, data: KernelData) -> tuple[int, float]:
-    """Tool poses, distances and separation rows at the reference; the closest pair and its distance [m]."""
+    """Tool poses and distances at the reference; the closest pair and its distance [m]."""
     collision, safety = model.safety.collision, data.safety
     update_placements(collision, safety.collision, safety.state.q)
     update_body_velocities(collision, safety.collision, safety.state.v, safety.velocities)
     for i in range(model.tasks.tools.joint.shape[0]):
         tool_pose(data.tasks.placements, model.tasks.tools, i, data.tasks.rotation[i], data.tasks.translation[i])
-    closest = write_separation_rows(model.safety, safety)
-    normalise_rows(safety)
+    closest = measure_pairs(model.safety, safety)
     return closest, safety.distance[closest] if safety.distance.shape[0] > 0 else np.inf

@@ -36,6 +36,7 @@ _PROMISES = {  # key: name, unit, and what its value has to be
     "too_fast": ("started too fast: faster still", "rad/s", "<=", 0.0),
     "position": ("room to position limits", "rad", ">=", -1e-11),
     "outward": ("started outside limits: further out", "rad", "<=", 0.0),
+    "deceleration": ("deceleration of the stop / limit", "", "<=", 1.0 + _RELATIVE),
     "jump": ("travel in a tick / what v allows", "", "<=", 1.0),
     "parabola": ("off constant acceleration or the stop", "rad", "<=", 1e-11),
     "distance": ("distance - min_distance, at ticks", "m", ">=", 0.0),
@@ -90,6 +91,9 @@ class Checked(Protocol):
     robot: Robot
     settings: ControllerSettings
 
+    @property
+    def stop_deceleration(self) -> Array: ...
+
 
 def time_of(dt: Any) -> float:
     """Seconds that a tick of ``dt`` moves the reference by: 0 for what is no time, 0.1 s at most."""
@@ -120,6 +124,7 @@ class Contract:
         self.ticks = self.fallbacks = self.uncertified = 0
         self._broken: dict[str, float] = {}
         robot, settings = controller.robot, controller.settings
+        self._controller = controller
         self._robot, self._random = robot, np.random.default_rng(0) if random is None else random
         self._sample_all = sample_all
         self._a = settings.acceleration_limit
@@ -133,7 +138,7 @@ class Contract:
     def start(self, q: Array, v: Array | None = None) -> None:
         """The controller was reset to ``q`` [rad], ``v`` [rad/s], (nv,) each; without ``v`` at rest."""
         v = np.zeros_like(q) if v is None else v
-        self._q, self._v = q.copy(), v.copy()
+        self._q, self._v, self._stop = q.copy(), v.copy(), self._controller.stop_deceleration
         self._outside = np.maximum(np.maximum(self._lower - q, q - self._upper), 0.0)
         self._excess = self._excess_of(v)
         self._can_stop = self._stops_inside(q, v)
@@ -180,9 +185,11 @@ class Contract:
                     self._check_stopped(q, v, h, report.fallback)
             self._check_limits(q, v)
             self._check_distance(report.closest_distance, report.certified)
-            self._sample(q, v, h, report.closest_distance)
+            stop = self._controller.stop_deceleration
+            self._note("deceleration", float(stop.max()) / self._a)
+            self._sample(q, v, stop, h, report.closest_distance)
             self._count(reference, h)
-            self._q, self._v = q, v
+            self._q, self._v, self._stop = q, v, stop
         self.ticks += 1
         return self._broken
 
@@ -229,19 +236,14 @@ class Contract:
         self._note("unsaid", float(not fallback))
 
     def _off_the_stop(self, q: Array, v: Array, h: float) -> float:
-        """How far a tick of ``h`` [s] was from full braking, or, in recovery, from stopping all joints together."""
-        stops = [self._braked(self._q, self._v, h)]
-        if not self._certain:
-            stops.append(self._braked(self._q, self._v, h, together=True))
-        return min(max(float(np.abs(stop_q - q).max()), float(np.abs(stop_v - v).max())) for stop_q, stop_v in stops)
+        """How far a tick of ``h`` [s] was from the stop that was known before it."""
+        stop_q, stop_v = self._braked(self._q, self._v, self._stop, h)
+        return max(float(np.abs(stop_q - q).max()), float(np.abs(stop_v - v).max()))
 
-    def _braked(self, q: Array, v: Array, t: float | Array, together: bool = False) -> tuple[Array, Array]:
-        """Position and velocity after full braking for ``t`` [s], a number or (s, 1); or all joints ``together``."""
-        duration = np.abs(v) / self._a
-        if together:
-            duration = np.full_like(v, duration.max())
-        time = np.minimum(t, duration)
-        brake = np.divide(v, duration, out=np.zeros_like(v), where=duration > 0.0)
+    def _braked(self, q: Array, v: Array, deceleration: Array, t: float | Array) -> tuple[Array, Array]:
+        """Position and velocity ``t`` [s] into a stop with a ``deceleration`` (nv,); ``t`` is a number or (s, 1)."""
+        time = np.minimum(t, np.abs(v) / deceleration)
+        brake = np.sign(v) * deceleration
         return q + v * time - 0.5 * brake * time * time, v - brake * time
 
     def _check_limits(self, q: Array, v: Array) -> None:
@@ -283,7 +285,7 @@ class Contract:
         self._certain |= certified
         self._least = least
 
-    def _sample(self, q: Array, v: Array, h: float, least: float) -> None:
+    def _sample(self, q: Array, v: Array, stop: Array, h: float, least: float) -> None:
         """Measure distances that the controller did not measure itself."""
         draw = 0.0 if self._sample_all else self._random.random()
         if draw < _BETWEEN_SHARE:
@@ -295,18 +297,18 @@ class Contract:
             if self._certain and 0.0 < h <= self._substep:
                 self._note("between", self._least_between(v, h) - self._min_distance)
         if draw < _STOP_SHARE and self._certain:
-            duration = float(np.abs(v).max()) / self._a
+            duration = float(np.max(np.abs(v) / stop))
             times = duration * (np.arange(_STOP_SAMPLES) + self._random.random()) / _STOP_SAMPLES
-            self._note("stop", self._least_of(self._braked(q, v, times[:, None])[0]) - self._min_distance)
+            self._note("stop", self._least_of(self._braked(q, v, stop, times[:, None])[0]) - self._min_distance)
         if draw < _STOP_SHARE and self._can_stop.all():
-            end = q + v * np.abs(v) / (2.0 * self._a)
+            end = q + v * np.abs(v) / (2.0 * stop)
             self._note("stop_position", float(np.minimum(end - self._lower, self._upper - end).min()))
 
     def _least_between(self, v: Array, h: float) -> float:
         times = h * self._random.random((_BETWEEN_SAMPLES, 1))
         if self._parabola:
             return self._least_of(self._q + times * self._v + 0.5 * times**2 / h * (v - self._v))
-        return self._least_of(self._braked(self._q, self._v, times)[0])
+        return self._least_of(self._braked(self._q, self._v, self._stop, times)[0])
 
     def _least_of(self, postures: Array) -> float:
         return min(float(self._robot.distance_values(q).min(initial=np.inf)) for q in postures)

@@ -158,20 +158,20 @@ def test_the_contract_holds_at_every_tick(name: str, robot: str, dt: float) -> N
     controller.reset(q, v)
     contract = Contract(controller, q, v)
     start = {arm: controller.tool_pose(arm) for arm in controller.robot.arms}
-    t, statuses, failed = 0.0, set(), 0
+    t, statuses, failed, unfounded = 0.0, set(), 0, 0
     for length in ticks_of(dt, case.jitter):
         solver.fault = case.fault_at(t)
         reference = controller.step(case.scenario(t, start), length)
         contract.check(reference, length, failed=solver.fault in STOPPING_FAULTS)
         failed += solver.fault in STOPPING_FAULTS
+        unfounded += reference.report.fallback and solver.fault is None
         statuses.add(reference.report.status)
         t += length
     # Only a start in penetration has no certificate at first.
     assert (contract.uncertified > 0) == (case.start is in_penetration)
     assert failed == 0 or case.fault in STOPPING_FAULTS
-    # A number too large is cut to the limits, and what is left of it may be certified.
-    others = contract.fallbacks - failed
-    assert others <= (0.02 if case.fault == "absurd" else 0.001) * contract.ticks
+    # After an absurd solution, which was followed as far as it could be certified, the arms may be where rows are late.
+    assert unfounded <= (0.01 if case.fault == "absurd" else 0.001) * contract.ticks
     if case.recovers:
         assert StepStatus.RECOVERING in statuses
         assert reference.report.status is not StepStatus.RECOVERING

@@ -35,7 +35,7 @@ def apart(robot: Robot) -> StepReport:
 
 
 def contract_of(robot: Robot, q: Array | None = None, v: Array | None = None) -> Contract:
-    return Contract(SimpleNamespace(robot=robot, settings=SETTINGS), q, v)
+    return Contract(SimpleNamespace(robot=robot, settings=SETTINGS, stop_deceleration=np.full(14, 10.0)), q, v)
 
 
 def one(value: float) -> Array:
@@ -138,7 +138,9 @@ def test_a_tick_of_no_time_moves_nothing(robot: Robot, apart: StepReport) -> Non
 def test_a_joint_that_cannot_stop_before_its_limit_is_found(robot: Robot, apart: StepReport) -> None:
     q = robot.home.copy()
     q[JOINT] = robot.position_upper[JOINT] - SETTINGS.position_margin - 7e-6
-    contract = Contract(SimpleNamespace(robot=robot, settings=SETTINGS), q, sample_all=True)
+    contract = Contract(
+        SimpleNamespace(robot=robot, settings=SETTINGS, stop_deceleration=np.full(14, 10.0)), q, sample_all=True
+    )
     assert "stop_position" in contract.observe(moved(q, np.zeros(14), FASTEST, apart), DT)
 
 
@@ -162,7 +164,9 @@ def test_recovering_pairs_never_come_closer_again_and_once_apart_keep_their_dist
 
 def test_pairs_that_were_apart_stay_apart_while_others_recover(robot: Robot, apart: StepReport) -> None:
     q, v = in_penetration(robot)
-    contract = Contract(SimpleNamespace(robot=robot, settings=SETTINGS), q, sample_all=True)
+    contract = Contract(
+        SimpleNamespace(robot=robot, settings=SETTINGS, stop_deceleration=np.full(14, 10.0)), q, sample_all=True
+    )
     into_the_table = robot.home.copy()
     into_the_table[1] = 1.0
     assert min(robot.distances(into_the_table), key=lambda pair: pair.distance).name_b == "table_0"
@@ -171,7 +175,9 @@ def test_pairs_that_were_apart_stay_apart_while_others_recover(robot: Robot, apa
 
 
 def test_a_wrong_distance_is_found_by_coal(robot: Robot, apart: StepReport) -> None:
-    contract = Contract(SimpleNamespace(robot=robot, settings=SETTINGS), sample_all=True)
+    contract = Contract(
+        SimpleNamespace(robot=robot, settings=SETTINGS, stop_deceleration=np.full(14, 10.0)), sample_all=True
+    )
     report = replace(apart, closest_distance=apart.closest_distance + 1e-5)
     assert list(contract.observe(moved(robot.home, np.zeros(14), 0.0, report), DT)) == ["coal"]
 

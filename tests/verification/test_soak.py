@@ -47,6 +47,10 @@ class Sabotaged:
     def reset(self, q: Array, v: Array | None = None) -> None:
         controller_and_solver()[0].reset(q, v)
 
+    @property
+    def stop_deceleration(self) -> Array:
+        return controller_and_solver()[0].stop_deceleration
+
     def step(self, targets: Any, dt: Any) -> Reference:
         reference = controller_and_solver()[0].step(targets, dt)
         self._ticks += 1

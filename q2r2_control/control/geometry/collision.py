@@ -41,7 +41,6 @@ class Pairs(NamedTuple):
     sign: Array  # (p, k) +1: the joint moves the second geometry, -1: the first
     reach: Array  # (p, k) bound on how far the geometry's points are from the joint's axis [m]; 1 for a sliding joint
     leverage: Array  # (p,) sum of reach
-    round: IntArray  # (p,) 1 where both are capsules, whose normal turns as they slide past each other
 
 
 class CollisionModel(NamedTuple):
@@ -165,7 +164,6 @@ def pairs_of(model: pin.GeometryModel, chain: Chain, bodies: Bodies, travel: Arr
         sign=np.zeros((len(rows), width)),
         reach=np.zeros((len(rows), width)),
         leverage=np.zeros(len(rows)),
-        round=np.array([1 - bodies.box[row[1]] for row in rows], dtype=np.int64),
     )
     for p, (_, _, moving) in enumerate(rows):
         for k, (joint, (sign, reach)) in enumerate(sorted(moving.items())):

@@ -51,36 +51,54 @@ class Candidate(NamedTuple):
         return cls(np.zeros(nv), np.zeros(nv), np.ones(nv))
 
 
+class Piece(NamedTuple):
+    """How the joints move in a piece of time: D_j(t) = rate t + change t^2 / 2, or anywhere from 0 to ``loose``."""
+
+    rate: Array  # (nv,) [rad/s]
+    change: Array  # (nv,) [rad/s^2]
+    loose: Array  # (nv,) [rad]
+    travel: Array  # (nv,) total variation [rad]
+
+    @classmethod
+    def empty(cls, nv: int) -> Piece:
+        return cls(np.zeros(nv), np.zeros(nv), np.zeros(nv), np.zeros(nv))
+
+
 class Rollout(NamedTuple):
-    """Scratch of the stop certificate: samples of the stop at up to 2^deepest + 1 instants."""
+    """Scratch of the stop certificate: samples of a stop at up to 2^deepest + 1 instants."""
 
     q: Array  # (s, nv)
-    v: Array  # (nv,)
+    v: Array  # (s, nv)
     start: Array  # (s, g, 3)
     end: Array  # (s, g, 3)
     rotation: Array  # (s, g, 3, 3)
-    distance: Array  # (s,)
+    translation: Array  # (s, n, 3) of joint frames
+    axis: Array  # (s, n, 3)
     known: Array  # (s,) 1 where the sample's bodies are placed
-    step_travel: Array  # (nv,) of each joint during the step [rad]
-    stop_travel: Array  # (nv,) during the stop [rad]
-    placements: Placements
+    frame: Array  # (n, 3, 3) rotations of joint frames, scratch
     contact: Contact
+    step: Piece  # from the reference to the candidate
+    piece: Piece  # of the candidate's stop
+    stop_travel: Array  # (nv,) during the whole stop [rad]
 
     @classmethod
     def empty(cls, model: CollisionModel) -> Rollout:
-        samples, nv, g = 2**_DEEPEST + 1, len(model.chain.parent) - 1, len(model.bodies.joint)
+        n, g = len(model.chain.parent), len(model.bodies.joint)
+        samples, nv = 2**_DEEPEST + 1, n - 1
         return cls(
             q=np.zeros((samples, nv)),
-            v=np.zeros(nv),
+            v=np.zeros((samples, nv)),
             start=np.zeros((samples, g, 3)),
             end=np.zeros((samples, g, 3)),
             rotation=np.zeros((samples, g, 3, 3)),
-            distance=np.zeros(samples),
+            translation=np.zeros((samples, n, 3)),
+            axis=np.zeros((samples, n, 3)),
             known=np.zeros(samples),
-            step_travel=np.zeros(nv),
-            stop_travel=np.zeros(nv),
-            placements=Placements.empty(model.chain),
+            frame=Placements.empty(model.chain).rotation,
             contact=Contact.empty(),
+            step=Piece.empty(nv),
+            piece=Piece.empty(nv),
+            stop_travel=np.zeros(nv),
         )
 
 
@@ -104,11 +122,12 @@ class SafetyData(NamedTuple):
     collision: CollisionData  # at the reference
     velocities: BodyVelocities
     distance: Array  # (p,) of each pair, or a lower bound where it is far [m]
+    near: IntArray  # (p,) 1 where a row may bind
     rows: SeparationRows
     box: VelocityBox
     wanted: Array  # (nv,) the solver's next velocities within the box [rad/s]
     braked: Array  # (nv,) next velocities of the certified stop [rad/s]
-    certified_deceleration: Array  # (nv,) of the certified stop [rad/s^2]
+    certified: Array  # (nv,) decelerations of the certified stop [rad/s^2]
     candidate: Candidate
     rollout: Rollout
     active: ActiveBounds
@@ -121,11 +140,12 @@ class SafetyData(NamedTuple):
             collision=CollisionData.empty(model.collision),
             velocities=BodyVelocities.empty(model.collision),
             distance=np.zeros(pairs),
+            near=np.zeros(pairs, dtype=np.int64),
             rows=SeparationRows.empty(pairs, nv),
             box=VelocityBox.empty(nv),
             wanted=np.zeros(nv),
             braked=np.zeros(nv),
-            certified_deceleration=np.ones(nv),
+            certified=np.ones(nv),
             candidate=Candidate.empty(nv),
             rollout=Rollout.empty(model.collision),
             active=ActiveBounds.empty(pairs, nv),

@@ -13,7 +13,8 @@ from q2r2_control.control.jit import lean_kernel
 from q2r2_control.control.safety.joint_limits import ACCELERATION, NO_LIMIT
 from q2r2_control.control.safety.safety_data import SafetyData
 from q2r2_control.control.safety.safety_model import SafetyModel
-from q2r2_control.control.safety.stop_certificate import brake, certify, stop_together
+from q2r2_control.control.safety.stop_certificate import certify
+from q2r2_control.control.safety.stop_shapes import SHAPES, brake, write_stop
 from q2r2_control.types import Array
 
 FOLLOWED, REDUCED, STOPPED = 0, 1, 2
@@ -43,7 +44,7 @@ def apply_safety_filter(
         if np.isfinite(total):
             outcome = _largest_certified(model, data, h)
     if outcome == STOPPED:
-        brake(q, v, data.certified_deceleration, h, candidate.q, candidate.v)
+        brake(q, v, data.certified, h, candidate.q, candidate.v)
     for j in range(q.shape[0]):
         # Rounding of a difference over a tiny h may exceed the limit that the velocities keep.
         limit = model.limits.acceleration[j]
@@ -55,13 +56,27 @@ def apply_safety_filter(
 
 @lean_kernel
 def certify_start(model: SafetyModel, data: SafetyData) -> bool:
-    """Whether the full stop from the reference as it is keeps all apart; it becomes the stop that is at hand."""
+    """Whether a full stop from the reference as it is keeps all apart; it becomes the stop that is at hand.
+
+    Where none does, joints that stop on their own are what is at hand.
+    """
     for j in range(data.state.q.shape[0]):
         data.candidate.q[j] = data.state.q[j]
         data.candidate.v[j] = data.state.v[j]
-        data.candidate.deceleration[j] = model.limits.acceleration[j]
-        data.certified_deceleration[j] = model.limits.acceleration[j]
-    return certify(model, data, 0.0)
+    for attempt in range(SHAPES + 1):
+        shape = attempt % SHAPES
+        write_stop(model, data.state.q, data.state.v, shape, data.candidate.deceleration)
+        if attempt < SHAPES and certify(model, data, 0.0):
+            break
+    _keep_stop(data)
+    return attempt < SHAPES
+
+
+@lean_kernel
+def _keep_stop(data: SafetyData) -> None:
+    """The candidate's stop is the one that is at hand."""
+    for j in range(data.candidate.v.shape[0]):
+        data.certified[j] = data.candidate.deceleration[j]
 
 
 @lean_kernel
@@ -72,40 +87,50 @@ def _largest_certified(model: SafetyModel, data: SafetyData, h: float) -> int:
     """
     too_close = False
     for p in range(data.distance.shape[0]):
-        too_close |= data.distance[p] < model.min_distance
-    brake(data.state.q, data.state.v, data.certified_deceleration, h, data.candidate.q, data.braked)
+        too_close |= data.distance[p] < model.min_distance[p]
+    brake(data.state.q, data.state.v, data.certified, h, data.candidate.q, data.braked)
+    if _certify_mixture(model, data, 1.0, h, too_close):
+        _keep_stop(data)
+        return FOLLOWED
     low = 0.0
     high = 1.0
-    share = 1.0
-    for attempt in range(1 + _BISECTIONS):
-        if _mix(model, data, share, h, too_close) and certify(model, data, h):
+    for _ in range(_BISECTIONS):
+        share = 0.5 * (low + high)
+        if _certify_mixture(model, data, share, h, too_close):
+            _keep_stop(data)
             low = share
-            if attempt == 0:
-                break
         else:
             high = share
-        share = 0.5 * (low + high)
     if low == 0.0:
         return STOPPED
-    _mix(model, data, low, h, too_close)
-    for j in range(data.certified_deceleration.shape[0]):
-        data.certified_deceleration[j] = data.candidate.deceleration[j]
-    return FOLLOWED if low == 1.0 else REDUCED
+    _mix(data, low, h)
+    return REDUCED
 
 
 @lean_kernel
-def _mix(model: SafetyModel, data: SafetyData, share: float, h: float, together: bool) -> bool:
-    """Candidate between the certified stop and the wanted velocities, and its own stop; False if that has no room."""
+def _certify_mixture(model: SafetyModel, data: SafetyData, share: float, h: float, together: bool) -> bool:
+    """Whether some shape of stop proves a mixture, which becomes the candidate.
+
+    The first that does is kept: rows of the QP that are made for joints that stop together move the arms most calmly
+    near each other, since they correct along the normal and not by the fastest joints. Out of a position that is too
+    close the joints stop ``together`` or not at all: then a pair that was opening goes on opening.
+    """
+    _mix(data, share, h)
+    for shape in range(1 if together else SHAPES):
+        write_stop(model, data.candidate.q, data.candidate.v, shape, data.candidate.deceleration)
+        if certify(model, data, h):
+            return True
+    return False
+
+
+@lean_kernel
+def _mix(data: SafetyData, share: float, h: float) -> None:
+    """Candidate between the certified stop and the wanted velocities."""
     state, candidate = data.state, data.candidate
     for j in range(state.q.shape[0]):
         braked, wanted = data.braked[j], data.wanted[j]
         candidate.v[j] = wanted if share == 1.0 else braked + share * (wanted - braked)
         candidate.q[j] = state.q[j] + 0.5 * h * (state.v[j] + candidate.v[j])
-    if together:
-        return stop_together(model.limits, candidate)
-    for j in range(state.q.shape[0]):
-        candidate.deceleration[j] = model.limits.acceleration[j]
-    return True
 
 
 @lean_kernel

@@ -5,16 +5,17 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from q2r2_control.control.geometry.collision import CollisionModel
+from q2r2_control.control.geometry.kinematics import IntArray
 from q2r2_control.control.safety.joint_limits import JointLimits
+from q2r2_control.types import Array
 
 
 class Approach(NamedTuple):
     """How pairs may approach each other in the QP."""
 
-    stop_distance: float  # min_distance + buffer [m]
+    stop_distance: Array  # (p,) min_distance + buffer [m]
     gain: float  # [1/s]
     recovery_speed: float  # [m/s]
-    slow_below: float  # distance at which round pairs begin to slow the arms down [m]
 
 
 class SafetyModel(NamedTuple):
@@ -23,4 +24,5 @@ class SafetyModel(NamedTuple):
     collision: CollisionModel
     limits: JointLimits
     approach: Approach
-    min_distance: float  # of every pair [m]
+    min_distance: Array  # (p,) of every pair [m]
+    arm: IntArray  # (nv,) number of the arm that a joint belongs to; joints of none share the last number

@@ -1,67 +1,78 @@
-"""Proof that a step keeps two geometries apart where their distance alone leaves no room for one, compiled.
+"""Proof that two geometries stay apart while the joints move, where their distance alone leaves no room, compiled.
 
 The bound by reach (stop_certificate.py) counts every way a joint travels as if it led straight to the other body. A
-pair that rests at min_distance to the micrometre could then never be shown to part again. Here the direction counts.
+pair that rests at min_distance to the micrometre could then never be shown to part again, nor could arms be that carry
+a box between them at full speed and close in by nothing. Here the direction counts.
 
 **Claim.** Let n be the unit normal of two convex cores that do not meet, e_1 and e_2 their corners (the ends of a
 segment, the corners of a box), J_e the Jacobian of a corner at the start, r the joints' reach. If the joints move by
 D(t) with |D_j(t)| <= w_j, then at every t the distance is at least
 
-    min over corners of  n'(e_2 - e_1) + n'(J_e2 - J_e1) D(t)   -   1/2 (sum_j w_j) (sum_j r_j w_j)   -   radii.
+    min over corners of  n'(e_2 - e_1) + n'(J_e2 - J_e1) D(t)   -   K_1 - K_2   -   radii,
+
+    K = 1/2 sum_k r_k w_k (w_k + 2 sum_(i before k) w_i)   over the joints that move one body relative to the other.
 
 *Proof.* The distance of convex sets is the largest gap between them over all directions, hence at least the gap along
 n, which is the least over their corners. Joints that carry both bodies change no distance and count as fixed; each of
-the others moves one corner. A corner moves by J_e D and a remainder: its second derivative with respect to joints i and
-j is a product of rotations about both axes with the lever of the outer one, at most r_j, so that Taylor's remainder is
-at most 1/2 sum_ij r_j w_i w_j. []
+the others moves one corner. A corner moves by J_e D and a remainder: its second derivative with respect to joint i and
+a later joint k of the same chain is a product of rotations about both axes with the lever of the outer one, at most
+r_k, so that Taylor's remainder is at most 1/2 sum_ik r_(the outer one) w_i w_k = K. (A slide has reach 1, and turns
+nothing: its second derivative with an inner joint is at most that, with an outer one nothing.) []
 
-In a step D(t) = v t + (v+ - v) t^2 / (2 h), so what is to be bounded is a parabola for each two corners.
+In a step, and between two instants of a stop, D_j(t) is a parabola; a joint that comes to rest meanwhile counts as
+anywhere between its ends. So what is to be bounded is a parabola for each two corners.
 """
 
 from __future__ import annotations
 
-from q2r2_control.control.geometry.collision import Bodies, CollisionData, CollisionModel, Posed
+from q2r2_control.control.geometry.collision import Bodies, CollisionData, CollisionModel, Pairs, Posed
 from q2r2_control.control.jit import lean_kernel
-from q2r2_control.control.safety.safety_data import SafetyData
-from q2r2_control.control.safety.safety_model import SafetyModel
+from q2r2_control.control.safety.safety_data import Piece
 from q2r2_control.types import Array
 
 
 @lean_kernel
-def step_keeps_beyond(model: SafetyModel, data: SafetyData, p: int, h: float, threshold: float) -> bool:
-    """Whether the plane between pair ``p`` proves it beyond ``threshold`` [m] in a step ``h`` to the candidate.
+def stays_beyond(
+    model: CollisionModel, data: CollisionData, p: int, piece: Piece, length: float, threshold: float
+) -> bool:
+    """Whether the plane between pair ``p`` proves it beyond ``threshold`` [m] in a ``piece`` of ``length`` [s].
 
-    The pair has been measured at the reference just before; ``data.rollout.step_travel`` bounds how far each joint
-    gets from there.
+    The pair has been measured in ``data``, where the piece begins, just before.
     """
-    pairs, bodies, contact = model.collision.pairs, model.collision.bodies, data.collision.contact
+    pairs, bodies, contact = model.pairs, model.bodies, data.contact
     first, second = pairs.first[p], pairs.second[p]
-    travel = data.rollout.step_travel
+    needed = threshold + bodies.radius[first] + bodies.radius[second] + _curvature(pairs, p, piece)
+    corner = contact.witness
+    for i in range(2):
+        _corner(bodies, data.posed, first, i, corner)
+        gap, rate, change, loose = _gap(model, data, p, -1.0, piece)
+        for j in range(8 if bodies.box[second] == 1 else 2):
+            _corner(bodies, data.posed, second, j, corner)
+            gap_2, rate_2, change_2, loose_2 = _gap(model, data, p, 1.0, piece)
+            least = _least_on_the_way(gap + gap_2, rate + rate_2, change + change_2, length)
+            if least + loose + loose_2 < needed:
+                return False
+    return True
+
+
+@lean_kernel
+def _curvature(pairs: Pairs, p: int, piece: Piece) -> float:
+    """K_1 + K_2 [m]; the joints of a pair are listed from the base outwards."""
     total = 0.0
-    levered = 0.0
+    before_first = 0.0
+    before_second = 0.0
     for k in range(pairs.joint.shape[1]):
         joint = pairs.joint[p, k]
         if joint == 0:
             break
-        total += travel[joint - 1]
-        levered += pairs.reach[p, k] * travel[joint - 1]
-    needed = threshold + bodies.radius[first] + bodies.radius[second] + 0.5 * total * levered
-    corner = contact.witness
-    for i in range(2):
-        for j in range(8 if bodies.box[second] == 1 else 2):
-            gap = 0.0
-            rate = 0.0
-            change = 0.0
-            for side in range(2):
-                _corner(bodies, data.collision.posed, second if side == 1 else first, j if side == 1 else i, corner)
-                sign = 1.0 if side == 1 else -1.0
-                for k in range(3):
-                    gap += sign * contact.normal[k] * corner[k]
-                rate += _corner_rate(model.collision, data.collision, p, sign, data.state.v)
-                change += _corner_rate(model.collision, data.collision, p, sign, data.candidate.v)
-            if _least_on_the_way(gap, rate, (change - rate) / h, h) < needed:
-                return False
-    return True
+        w = piece.travel[joint - 1]
+        before = before_first if pairs.sign[p, k] < 0.0 else before_second
+        total += pairs.reach[p, k] * w * (0.5 * w + before)
+        if pairs.sign[p, k] < 0.0:
+            before_first += w
+        else:
+            before_second += w
+    return total
 
 
 @lean_kernel
@@ -76,14 +87,19 @@ def _corner(bodies: Bodies, posed: Posed, body: int, number: int, out: Array) ->
 
 
 @lean_kernel
-def _corner_rate(model: CollisionModel, data: CollisionData, p: int, side: float, v: Array) -> float:
-    """What joints on one side of a pair, -1 the first's or 1 the second's, add to the gap's rate at the corner [m/s].
+def _gap(
+    model: CollisionModel, data: CollisionData, p: int, side: float, piece: Piece
+) -> tuple[float, float, float, float]:
+    """What one side of a pair, -1 the first's or 1 the second's, adds to the gap at a corner, the ``witness``.
 
-    The corner is the contact's ``witness``.
+    Returns the gap itself [m], its rate [m/s], the rate's change [m/s^2], and the least that loose joints add [m].
     """
     chain, pairs, placements = model.chain, model.pairs, data.placements
     point, normal = data.contact.witness, data.contact.normal
+    gap = side * (normal[0] * point[0] + normal[1] * point[1] + normal[2] * point[2])
     rate = 0.0
+    change = 0.0
+    loose = 0.0
     for k in range(pairs.joint.shape[1]):
         joint = pairs.joint[p, k]
         if joint == 0:
@@ -92,14 +108,17 @@ def _corner_rate(model: CollisionModel, data: CollisionData, p: int, side: float
             continue
         ax, ay, az = placements.axis[joint, 0], placements.axis[joint, 1], placements.axis[joint, 2]
         if chain.prismatic[joint] == 1:
-            rate += side * v[joint - 1] * (normal[0] * ax + normal[1] * ay + normal[2] * az)
-            continue
-        x = point[0] - placements.translation[joint, 0]
-        y = point[1] - placements.translation[joint, 1]
-        z = point[2] - placements.translation[joint, 2]
-        along = normal[0] * (ay * z - az * y) + normal[1] * (az * x - ax * z) + normal[2] * (ax * y - ay * x)
-        rate += side * v[joint - 1] * along
-    return rate
+            along = normal[0] * ax + normal[1] * ay + normal[2] * az
+        else:
+            x = point[0] - placements.translation[joint, 0]
+            y = point[1] - placements.translation[joint, 1]
+            z = point[2] - placements.translation[joint, 2]
+            along = normal[0] * (ay * z - az * y) + normal[1] * (az * x - ax * z) + normal[2] * (ax * y - ay * x)
+        along *= side
+        rate += along * piece.rate[joint - 1]
+        change += along * piece.change[joint - 1]
+        loose += min(0.0, along * piece.loose[joint - 1])
+    return gap, rate, change, loose
 
 
 @lean_kernel

@@ -1,12 +1,24 @@
 """Rows of the QP that keep monitored pairs apart, and what the pairs' distances are.
 
-For free distance x = d - min_distance - buffer a pair may close in with at most
+The rows tell the QP what the stop can do. Let B be the least free distance of a pair on the certified stop from here,
 
-    c(x) = min(gain x, sqrt(2 alpha x)),    alpha = share * sum_j |dd/dq_j| a_j,
+    B = min over the stop of  d - min_distance - buffer.
 
-the second being the speed that the deceleration alpha stops within x, alpha the part of what the acceleration limits
-leave along that row, since joints are shared between rows. Closer than the buffer the row asks for opening instead.
-The rows give comfort only: they are soft, so that the QP always has a solution; safety is the certificate's.
+It may be used up no faster than at a rate:
+
+    B(q+, v+) >= (1 - gain h) B(q, v)
+
+(a control barrier function made of a backup manoeuvre: Gurriet, Mote, Ames, Feron, CDC 2018). Motion that keeps its
+distance uses up nothing and is not slowed, however fast it is; motion that closes in is slowed in time for the stop,
+with the curvature of the way, by all pairs alike. B is linearised where it is least. Let joint j travel v_j s_j of the
+stop until there. With a stop of the same duration after the step,
+
+    D q_j = h (v_j + v+_j) / 2 + s_j (v+_j - v_j).
+
+(That the duration shrinks as the slowest joint brakes is left out: it would make that joint the lever of all rows, and
+the solution change from tick to tick.) For a pair at rest this is the usual row, n'(J_2 - J_1) v+ >= -gain B. Closer
+than the buffer the row asks for opening, as fast as a part of the acceleration limits gives. The rows give comfort
+only: they are soft, so that the QP always has a solution; safety is the certificate's.
 """
 
 from __future__ import annotations
@@ -14,68 +26,91 @@ from __future__ import annotations
 import numpy as np
 
 from q2r2_control.control.geometry.closest_points import segment_segment
+from q2r2_control.control.geometry.collision import CollisionData
 from q2r2_control.control.geometry.pair_distance import at_least, distance_row, measure, measure_part
 from q2r2_control.control.jit import lean_kernel
 from q2r2_control.control.safety.safety_data import SafetyData
-from q2r2_control.control.safety.safety_model import Approach, SafetyModel
+from q2r2_control.control.safety.safety_model import SafetyModel
+from q2r2_control.control.safety.stop_rollout import begin_rollout, sample_of
 from q2r2_control.control.safety.velocity_bounds import fastest_approach
 from q2r2_control.types import Array
 
 _SHARE = 0.25
 # Ends of near-parallel capsules get rows of their own, unless the closest point is practically there already.
 _SAME_POINT = 0.005  # [m]
+_INSTANTS = (0, 20, 64)  # of 64, where B is looked for: the start, half of the way, and the end of the stop
 
 
 @lean_kernel
-def slowest_rate(free: float, alpha: float, approach: Approach) -> float:
-    """Least rate of distance [m/s] allowed at the free distance ``free`` [m]."""
-    if free < 0.0:
-        return min(-approach.gain * free, approach.recovery_speed)
-    return -min(approach.gain * free, np.sqrt(2.0 * alpha * free))
-
-
-@lean_kernel
-def write_separation_rows(model: SafetyModel, data: SafetyData) -> int:
-    """Measure every pair at the reference and write the rows that can bind in a step of the longest time.
+def measure_pairs(model: SafetyModel, data: SafetyData) -> int:
+    """Measure every pair at the reference; returns the closest one.
 
     Needs the placements and velocities there. ``data.distance`` receives the exact distance where it matters (a row
-    could bind, the arms could have to slow down, the closest pair) and a lower bound elsewhere. Returns the closest
-    pair.
+    could bind, the closest pair) and a lower bound elsewhere, ``data.near`` where a row could bind.
     """
-    collision, approach, distance = model.collision, model.approach, data.distance
+    collision, approach, distance, v = model.collision, model.approach, data.distance, data.state.v
     pairs = collision.pairs
-    count = 0
     closest = 0
     least = np.inf
     surge = 0.0
-    for j in range(model.limits.acceleration.shape[0]):
+    duration = 0.0
+    for j in range(v.shape[0]):
         surge = max(surge, model.limits.acceleration[j] * model.limits.longest_step)
+        duration = max(duration, abs(v[j]) / data.certified[j])
     for p in range(pairs.first.shape[0]):
         distance[p] = at_least(collision, data.collision, p)
-        # The fastest that the pair can close in after this step. Farther than twice what the gain needs for that, a row
-        # could bind only through its root, at very low leverage: it would add comfort, and the certificate needs none.
+        # The fastest that the pair can close in after this step. Farther than twice what the gain needs for that, and
+        # the way of the stop, a row would bind at very low leverage: it would add comfort, and safety needs none.
         closing = fastest_approach(data.velocities, pairs.first[p], pairs.second[p]) + pairs.leverage[p] * surge
-        relevant = approach.stop_distance + 2.0 * closing / approach.gain
-        if pairs.round[p] == 1:
-            relevant = max(relevant, approach.slow_below)
+        relevant = approach.stop_distance[p] + (2.0 / approach.gain + 0.5 * duration) * closing
+        data.near[p] = 0
         if distance[p] > relevant and distance[p] >= least:
             continue
         distance[p] = measure(collision, data.collision, p)
         if distance[p] < least:
             least = distance[p]
             closest = p
-        if distance[p] > relevant:
-            continue
-        before = count
-        count = _append_row(model, data, p, distance[p], count)
-        if count > before:
-            count = _append_end_rows(model, data, p, count)
-    data.rows.used[0] = count
+        data.near[p] = 1 if distance[p] <= relevant else 0
     return closest
 
 
 @lean_kernel
-def normalise_rows(data: SafetyData) -> None:
+def write_separation_rows(model: SafetyModel, data: SafetyData, h: float) -> None:
+    """Rows of the pairs that can bind in a step of ``h`` [s] from the measured reference, of unit norm.
+
+    Uses the candidate and its rollout for the certified stop from here.
+    """
+    candidate = data.candidate
+    for j in range(data.state.v.shape[0]):
+        candidate.q[j] = data.state.q[j]
+        candidate.v[j] = data.state.v[j]
+        candidate.deceleration[j] = data.certified[j]
+    duration = begin_rollout(data)
+    count = 0
+    for p in range(data.near.shape[0]):
+        if data.near[p] == 0:
+            continue
+        instant = 0
+        least = data.distance[p]
+        if duration > 0.0 and least >= model.min_distance[p]:
+            for i in _INSTANTS[1:]:
+                distance = measure(model.collision, sample_of(model, data, i, duration), p)
+                if distance < least:
+                    least = distance
+                    instant = i
+        at = data.collision if instant == 0 else sample_of(model, data, instant, duration)
+        least = measure(model.collision, at, p)
+        t = duration * instant / _INSTANTS[-1]
+        before = count
+        count = _append_row(model, data, at, p, least, t, duration, h, count)
+        if count > before:
+            count = _append_end_rows(model, data, at, p, t, duration, h, count)
+    data.rows.used[0] = count
+    _normalise_rows(data)
+
+
+@lean_kernel
+def _normalise_rows(data: SafetyData) -> None:
     """Give every row unit norm, so that what it lacks is a joint speed."""
     rows = data.rows
     for i in range(rows.used[0]):
@@ -89,21 +124,44 @@ def normalise_rows(data: SafetyData) -> None:
 
 
 @lean_kernel
-def _append_row(model: SafetyModel, data: SafetyData, p: int, distance: float, count: int) -> int:
-    """Keep the row if some velocity that the acceleration allows (v +- a h) breaks it; any other cannot bind."""
-    a, h, v = model.limits.acceleration, model.limits.longest_step, data.state.v
-    row = data.rows.matrix[count]
-    distance_row(model.collision, data.collision, p, row)
+def _append_row(
+    model: SafetyModel,
+    data: SafetyData,
+    at: CollisionData,
+    p: int,
+    distance: float,
+    t: float,
+    duration: float,
+    h: float,
+    count: int,
+) -> int:
+    """Keep the row if some velocity that the acceleration allows (v +- a h) breaks it; any other cannot bind.
+
+    Pair ``p`` has been measured in ``at``, the posture ``t`` [s] into the stop.
+    """
+    a, v, row = model.limits.acceleration, data.state.v, data.rows.matrix[count]
+    distance_row(model.collision, at, p, row)
+    free = distance - model.approach.stop_distance[p]
+    lower = 0.0  # so far what v alone adds to the change of B
+    for j in range(row.shape[0]):
+        whole = abs(v[j]) / data.certified[j] if v[j] != 0.0 else duration
+        s = t - 0.5 * t * t / whole if t < whole else 0.5 * whole
+        # At rest a faster step lengthens the stop by as much as the step itself.
+        s = max(s, 0.5 * h)
+        lower += (s - 0.5 * h) * row[j] * v[j]
+        row[j] *= s + 0.5 * h
     rate = 0.0
     change = 0.0
     for j in range(row.shape[0]):
         rate += row[j] * v[j]
         change += abs(row[j]) * a[j] * h
-    lower = slowest_rate(distance - model.approach.stop_distance, _SHARE * change / h, model.approach)
-    if lower > 0.0:
+    allowed = -model.approach.gain * h * free
+    if free < 0.0:
         # Asked for more than the joints can do in this step, rows of several pairs would be weighed against each other,
         # and the deeper pair would be opened at the cost of closing another one.
-        lower = min(lower, max(rate, 0.0) + _SHARE * change)
+        allowed = min(allowed, model.approach.recovery_speed * h)
+        allowed = min(allowed, max(rate - lower, 0.0) + _SHARE * change)
+    lower += allowed
     if rate - change >= lower or change <= 0.0:
         return count
     data.rows.lower[count] = lower
@@ -112,22 +170,25 @@ def _append_row(model: SafetyModel, data: SafetyData, p: int, distance: float, c
 
 
 @lean_kernel
-def _append_end_rows(model: SafetyModel, data: SafetyData, p: int, count: int) -> int:
-    """Rows at the ends of both bodies of a pair that was measured just now.
+def _append_end_rows(
+    model: SafetyModel, data: SafetyData, at: CollisionData, p: int, t: float, duration: float, h: float, count: int
+) -> int:
+    """Rows at the ends of both bodies of a pair.
 
     The closest points of near-parallel bodies jump from end to end; rows at all ends leave nothing to jump.
     """
-    bodies, posed, contact = model.collision.bodies, data.collision.posed, data.collision.contact
+    bodies, posed, contact = model.collision.bodies, at.posed, at.contact
     first, second = model.collision.pairs.first[p], model.collision.pairs.second[p]
     start, end, witness = posed.start[first], posed.end[first], contact.witness
+    measure(model.collision, at, p)
     _copy(contact.first, witness)
     for point in (start, end):
         if not _near(point, witness):
-            reached = measure_part(model.collision, data.collision, p, point, point)
-            count = _append_row(model, data, p, reached, count)
+            reached = measure_part(model.collision, at, p, point, point)
+            count = _append_row(model, data, at, p, reached, t, duration, h, count)
     if bodies.box[second] == 1:
         return count
-    measure(model.collision, data.collision, p)
+    measure(model.collision, at, p)
     _copy(contact.second, witness)
     for point in (posed.start[second], posed.end[second]):
         if not _near(point, witness):
@@ -136,7 +197,7 @@ def _append_end_rows(model: SafetyModel, data: SafetyData, p: int, count: int) -
                 for k in range(3):
                     contact.normal[k] = (contact.second[k] - contact.first[k]) / reached
                 reached -= bodies.radius[first] + bodies.radius[second]
-                count = _append_row(model, data, p, reached, count)
+                count = _append_row(model, data, at, p, reached, t, duration, h, count)
     return count
 
 

@@ -8,7 +8,6 @@ move near each other. Each takes a ``TaskModel`` (fixed) and ``TaskData`` (rewri
 from q2r2_control.control.tasks.frame import add_stretch_damping, add_tool_task, tool_jacobian, tool_pose, wanted_twist
 from q2r2_control.control.tasks.manipulability import add_manipulability
 from q2r2_control.control.tasks.posture import add_hold_task, add_posture_task, project_to_nullspace, pull_to_posture
-from q2r2_control.control.tasks.priority import speed_near, tool_speed
 from q2r2_control.control.tasks.swivel import turn_elbows, write_swivel_rows
 from q2r2_control.control.tasks.task_data import Targets, TaskData
 from q2r2_control.control.tasks.task_model import TaskModel, tools_of
@@ -24,10 +23,8 @@ __all__ = [
     "add_tool_task",
     "project_to_nullspace",
     "pull_to_posture",
-    "speed_near",
     "tool_jacobian",
     "tool_pose",
-    "tool_speed",
     "tools_of",
     "turn_elbows",
     "wanted_twist",

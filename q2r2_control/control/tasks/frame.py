@@ -104,11 +104,8 @@ def approach_speed(error: float, gain: float, deceleration: float) -> float:
 
 
 @lean_kernel
-def wanted_twist(motion: Motion, data: TaskData, targets: Targets, i: int, speed_limit: float) -> None:
-    """Twist of tool ``i`` towards its target into ``data.twist``, and the part that the error makes.
-
-    ``speed_limit`` [m/s] caps the linear part and, in proportion, the angular part.
-    """
+def wanted_twist(motion: Motion, data: TaskData, targets: Targets, i: int) -> None:
+    """Twist of tool ``i`` towards its target into ``data.twist``, and the part that the error makes."""
     twist, feedback, feed_forward = data.twist[i], data.feedback[i], targets.feed_forward[i]
     for row in range(3):
         for column in range(3):
@@ -122,8 +119,7 @@ def wanted_twist(motion: Motion, data: TaskData, targets: Targets, i: int, speed
     for part in range(2):
         piece = twist[3 * part : 3 * part + 3]
         error = np.sqrt(piece[0] ** 2 + piece[1] ** 2 + piece[2] ** 2)
-        full = motion.full_speed[part]
-        cap = min(full, speed_limit * full / motion.full_speed[0])
+        cap = motion.full_speed[part]
         speed = min(approach_speed(error, motion.gain[part], motion.deceleration[part]), cap)
         scale = speed / error if error > 1e-12 else 1.0
         for k in range(3):

@@ -15,7 +15,7 @@ from q2r2_control.control.tasks.task_model import TaskModel
 from q2r2_control.types import Array
 
 # A held arm is not pushed about by the other one's task, but may give way to recover separation.
-_HOLD_WEIGHT = 10.0
+_HOLD_WEIGHT = 300.0
 _HOLD_GAIN = 4.0  # [1/s]
 _PROJECTION_DAMPING = 1e-3
 

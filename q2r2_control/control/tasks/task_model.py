@@ -51,21 +51,18 @@ class Swivels(NamedTuple):
 
 
 class Priority(NamedTuple):
-    """What the arms' costs weigh, and how fast the arm with priority may push."""
+    """Which arm gives way where two arms are in each other's way.
+
+    Arms meet in the QP only where separation rows couple their joints. There the costs decide: all costs of an arm that
+    gives way are multiplied by a small weight, so that a row that both arms need is paid for by its motion. Where no
+    row is active nothing changes, since the least of a sum of independent costs does not depend on their weights; that
+    is why posture and damping are scaled along with the tool's task.
+
+    An arm without a target holds its joints, and holding is never given up: it does not give way.
+    """
 
     weight: Array  # (n,) of an arm's costs while it follows a target: 1, less if it gives way
     posture_weight: Array  # (nv,) the same for each joint, times the posture's own weight
-    pushes: IntArray  # (n,) 1 for the arm with priority
-    yield_speed: float  # its tool's speed where another arm, which gives way, is closest [m/s]
-
-
-class Proximity(NamedTuple):
-    """How round bodies near an arm slow its tool down."""
-
-    pair_arm: Array  # (p, n) 1 where the pair slows arm n down when close
-    stop_distance: float  # [m]
-    full_at: float  # distance beyond that with full speed [m]
-    contact_speed: float  # tool speed where another body is closest [m/s]
 
 
 class TaskModel(NamedTuple):
@@ -79,7 +76,6 @@ class TaskModel(NamedTuple):
     swivels: Swivels
     has_swivels: int  # 1: some arm has a swivel task
     priority: Priority
-    proximity: Proximity
 
 
 def tools_of(robot: Robot) -> Tools:

@@ -34,7 +34,7 @@ def seen() -> list[tuple[Array, int]]:
         q, p = random_posture(arrays.robot, random), int(random.integers(len(arrays.pairs.first)))
         if _looked_at(arrays, q, p, smooth=False)[0] + _radii(arrays, p) > CORES_APART:
             found.append((q, p))
-    assert sum(not arrays.pairs.round[p] for _, p in found) > 10
+    assert sum(arrays.bodies.box[arrays.pairs.second[p]] for _, p in found) > 10
     return found
 
 
@@ -52,7 +52,7 @@ def test_it_is_the_least_over_all_points_of_both_segments(seen: list[tuple[Array
         first, second = arrays.pairs.first[p], arrays.pairs.second[p]
         on_first = posed.start[first] + parameters[:, None] * (posed.end[first] - posed.start[first])
         cost = SMOOTHING * (parameters - 0.5) ** 2
-        if arrays.pairs.round[p]:
+        if not arrays.bodies.box[arrays.pairs.second[p]]:
             on_second = posed.start[second] + parameters[:, None] * (posed.end[second] - posed.start[second])
             square = ((on_first[:, None] - on_second[None]) ** 2).sum(axis=2) + cost[:, None] + cost[None]
         else:

@@ -6,7 +6,7 @@ import pytest
 from q2r2_control.control.safety.joint_limits import ACCELERATION, next_velocity_box
 from q2r2_control.control.safety.safety_data import SafetyData
 from q2r2_control.control.safety.safety_filter import FOLLOWED, STOPPED, apply_safety_filter, certify_start
-from q2r2_control.control.safety.stop_certificate import brake
+from q2r2_control.control.safety.stop_shapes import brake
 from q2r2_control.types import Array
 from tests.control.cells import cell, distances, kernel_data, kernel_model
 
@@ -57,7 +57,7 @@ def test_a_single_number_that_is_not_finite_makes_the_certified_stop_go_on(numbe
     wish[joint] = number
     assert moved(data, wish) == STOPPED
     q, v = np.zeros(14), np.zeros(14)
-    brake(HOME, V, np.full(14, 10.0), H, q, v)
+    brake(HOME, V, data.certified, H, q, v)
     np.testing.assert_array_equal(data.state.q, q)
     np.testing.assert_array_equal(data.state.v, v)
 

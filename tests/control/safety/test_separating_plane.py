@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from q2r2_control.control.geometry.pair_distance import measure
-from q2r2_control.control.safety.separating_plane import step_keeps_beyond
+from q2r2_control.control.safety.separating_plane import stays_beyond
 from q2r2_control.types import Array
 from tests.control.cells import NAMES, cell, distances, kernel_data, kernel_model, random_posture
 
@@ -18,10 +18,11 @@ def _moved(q: Array, v: Array, v_next: Array, t: Array) -> Array:
 
 def _proven(name: str, p: int, q: Array, v: Array, v_next: Array, threshold: float) -> bool:
     model, data = kernel_model(name).safety, kernel_data(name, q, v).safety
-    data.candidate.v[:] = v_next
-    data.rollout.step_travel[:] = np.abs(_moved(q, v, v_next, np.linspace(0.0, H, 50)) - q).max(axis=0)
+    step = data.rollout.step
+    step.rate[:], step.change[:] = v, (v_next - v) / H
+    step.travel[:] = np.abs(_moved(q, v, v_next, np.linspace(0.0, H, 50)) - q).max(axis=0)
     measure(model.collision, data.collision, p)
-    return bool(step_keeps_beyond(model, data, p, H, threshold))
+    return bool(stays_beyond(model.collision, data.collision, p, step, H, threshold))
 
 
 @pytest.mark.parametrize("name", NAMES)

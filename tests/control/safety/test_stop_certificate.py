@@ -8,7 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from q2r2_control.control.safety.stop_certificate import brake, certify, step_travel
+from q2r2_control.control.safety.stop_certificate import certify, step_travel
+from q2r2_control.control.safety.stop_shapes import OWN, SHAPES, write_stop
 from q2r2_control.types import Array
 from tests.control.cells import NAMES, CellArrays, cell, distances, kernel_data, kernel_model, random_posture
 
@@ -16,43 +17,6 @@ MIN_DISTANCE = 0.02
 ACCELERATION = 10.0
 H = 0.002
 DENSE = 500  # samples of a motion
-
-
-def _braked(q: Array, v: Array, a: Array, t: float) -> tuple[Array, Array]:
-    q_out, v_out = np.zeros_like(q), np.zeros_like(v)
-    brake(q, v, a, t, q_out, v_out)
-    return q_out, v_out
-
-
-def _some_stop(seed: int) -> tuple[Array, Array, Array]:
-    random = np.random.default_rng(seed)
-    v = random.uniform(-3, 3, 14)
-    v[:3] = 0.0, -0.0, 1e-12
-    return random.uniform(-3, 3, 14), v, 10.0 ** random.uniform(0, 1.5, 14)
-
-
-def test_every_joint_stops_after_its_own_time_and_way() -> None:
-    q, v, a = _some_stop(14)
-    end, rest = _braked(q, v, a, 100.0)
-    np.testing.assert_array_equal(rest, 0.0)
-    np.testing.assert_allclose(end, q + np.sign(v) * v**2 / (2 * a), rtol=0, atol=1e-15)
-    times = np.abs(v) / a
-    for t in np.linspace(0.0, 1.2 * times.max(), 40):
-        ran = np.minimum(t, times)
-        between, speed = _braked(q, v, a, t)
-        np.testing.assert_allclose(between, q + v * ran - np.sign(v) * a * ran**2 / 2, rtol=0, atol=1e-14)
-        np.testing.assert_allclose(speed, v - np.sign(v) * a * ran, rtol=0, atol=1e-14)
-
-
-@given(seed=st.integers(0, 1000), parts=st.lists(st.floats(1e-6, 0.1), min_size=1, max_size=40))
-@settings(derandomize=True, max_examples=100, deadline=None)
-def test_the_stop_is_the_same_motion_however_it_is_cut_into_ticks(seed: int, parts: list[float]) -> None:
-    q, v, a = _some_stop(seed)
-    expected = _braked(q, v, a, float(np.sum(parts)))
-    for t in parts:
-        q, v = _braked(q, v, a, t)
-    np.testing.assert_allclose(q, expected[0], rtol=0, atol=1e-13)
-    np.testing.assert_allclose(v, expected[1], rtol=0, atol=1e-12)
 
 
 @given(v=st.floats(-3, 3), v_next=st.floats(-3, 3), h=st.floats(1e-5, 0.02))
@@ -71,6 +35,7 @@ class Motion:
     q: Array
     v: Array
     v_next: Array
+    deceleration: Array
 
     @property
     def q_next(self) -> Array:
@@ -81,9 +46,15 @@ class Motion:
         return np.asarray(self.q + self.v * t + 0.5 * (self.v_next - self.v) / H * t**2)
 
     def stop(self) -> Array:
-        t = np.linspace(0.0, np.abs(self.v_next).max() / ACCELERATION, DENSE)[:, None]
-        ran = np.minimum(t, np.abs(self.v_next) / ACCELERATION)
-        return np.asarray(self.q_next + self.v_next * ran - np.sign(self.v_next) * ACCELERATION * ran**2 / 2)
+        t = np.linspace(0.0, np.max(np.abs(self.v_next) / self.deceleration), DENSE)[:, None]
+        ran = np.minimum(t, np.abs(self.v_next) / self.deceleration)
+        return np.asarray(self.q_next + self.v_next * ran - np.sign(self.v_next) * self.deceleration * ran**2 / 2)
+
+
+def _motion(name: str, q: Array, v: Array, v_next: Array, shape: int = OWN) -> Motion:
+    deceleration = np.zeros(14)
+    write_stop(kernel_model(name).safety, q + 0.5 * H * (v + v_next), v_next, shape, deceleration)
+    return Motion(q, v, v_next, deceleration)
 
 
 def _least(name: str, motion: Motion) -> Array:
@@ -97,15 +68,17 @@ def _certified(name: str, motion: Motion, known: Array | None = None) -> bool:
     data.distance[:] = distances(cell(name), motion.q[None])[0] if known is None else known
     data.candidate.q[:] = motion.q_next
     data.candidate.v[:] = motion.v_next
-    data.candidate.deceleration[:] = ACCELERATION
+    data.candidate.deceleration[:] = motion.deceleration
     return bool(certify(model, data, H))
 
 
-def _motions_from(name: str, starts: Iterator[Array], random: np.random.Generator) -> Iterator[Motion]:
+def _motions_from(
+    name: str, starts: Iterator[Array], random: np.random.Generator, shape: int = OWN
+) -> Iterator[Motion]:
     limit = cell(name).robot.velocity_limit
     for q in starts:
         v = random.choice([0.1, 0.5, 1.0]) * random.uniform(-limit, limit)
-        yield Motion(q, v, v + random.uniform(-1, 1, 14) * ACCELERATION * H)
+        yield _motion(name, q, v, v + random.uniform(-1, 1, 14) * ACCELERATION * H, shape)
 
 
 def _starts_apart(name: str, random: np.random.Generator, near: bool, count: int) -> Iterator[Array]:
@@ -125,14 +98,15 @@ def _starts_apart(name: str, random: np.random.Generator, near: bool, count: int
         yield q
 
 
+@pytest.mark.parametrize("shape", range(SHAPES), ids=["together", "arm by arm", "own"])
 @pytest.mark.parametrize("near", [False, True], ids=["anywhere", "just before contact"])
 @pytest.mark.parametrize("name", NAMES)
 def test_nothing_comes_too_close_in_a_certified_motion_and_most_safe_motions_are_certified(
-    name: str, near: bool
+    name: str, near: bool, shape: int
 ) -> None:
     random = np.random.default_rng(15)
     refused = certified = clearly_safe = 0
-    for motion in _motions_from(name, _starts_apart(name, random, near, 40), random):
+    for motion in _motions_from(name, _starts_apart(name, random, near, 40), random, shape):
         least = _least(name, motion).min()
         if _certified(name, motion):
             certified += 1
@@ -144,30 +118,31 @@ def test_nothing_comes_too_close_in_a_certified_motion_and_most_safe_motions_are
     assert refused <= 0.2 * clearly_safe, "safe by 20 mm"
 
 
-def _aimed_at_the_threshold(name: str, random: np.random.Generator, count: int) -> Iterator[Motion]:
+def _aimed_at_the_threshold(name: str, random: np.random.Generator, count: int, shape: int) -> Iterator[Motion]:
     """Motions whose speed is scaled so that their stop ends within a hair of the least distance."""
     found = 0
     for motion in _motions_from(name, _starts_apart(name, random, True, 10 * count), random):
         low, high = 0.0, 2.0
         for _ in range(8):
             share = 0.5 * (low + high)
-            scaled = Motion(motion.q, share * motion.v, share * motion.v)
+            scaled = _motion(name, motion.q, share * motion.v, share * motion.v, shape)
             if _least(name, scaled).min() >= MIN_DISTANCE:
                 low = share
             else:
                 high = share
         if low > 0.0 and high < 2.0:
             found += 1
-            yield Motion(motion.q, *2 * [1.01 * high * motion.v])
-            yield Motion(motion.q, *2 * [0.5 * low * motion.v])
+            yield _motion(name, motion.q, *2 * [1.01 * high * motion.v], shape)
+            yield _motion(name, motion.q, *2 * [0.8 * low * motion.v], shape)
         if found == count:
             return
 
 
+@pytest.mark.parametrize("shape", range(SHAPES), ids=["together", "arm by arm", "own"])
 @pytest.mark.parametrize("name", ["dual_iiwa7", "dual_panda"])
-def test_the_certificate_tells_motions_apart_that_end_just_inside_and_well_outside(name: str) -> None:
+def test_the_certificate_tells_motions_apart_that_end_just_inside_and_well_outside(name: str, shape: int) -> None:
     accepted = total = 0
-    for number, motion in enumerate(_aimed_at_the_threshold(name, np.random.default_rng(16), 6)):
+    for number, motion in enumerate(_aimed_at_the_threshold(name, np.random.default_rng(16), 6, shape)):
         if number % 2 == 0:
             assert not _certified(name, motion), "it comes closer than the least distance"
         else:
@@ -190,7 +165,7 @@ def test_lower_bounds_in_place_of_distances_prove_nothing_that_is_not_so(name: s
 def test_rest_with_everything_apart_is_certified(name: str) -> None:
     random, still = np.random.default_rng(18), np.zeros(14)
     for q in _starts_apart(name, random, True, 20):
-        assert _certified(name, Motion(q, still, still))
+        assert _certified(name, _motion(name, q, still, still))
 
 
 def _too_close(arrays: CellArrays, random: np.random.Generator, count: int) -> Iterator[Array]:
@@ -207,7 +182,7 @@ def test_a_pair_that_starts_too_close_comes_no_closer_in_a_certified_motion(name
     arrays, random = cell(name), np.random.default_rng(19)
     certified = 0
     for motion in _motions_from(name, _too_close(arrays, random, 100), random):
-        slow = Motion(motion.q, 0.1 * motion.v, 0.1 * motion.v)
+        slow = _motion(name, motion.q, 0.1 * motion.v, 0.1 * motion.v)
         if not _certified(name, slow):
             continue
         certified += 1

@@ -95,13 +95,13 @@ def test_following_the_approach_speed_asks_for_no_more_than_the_planned_decelera
     assert braking.min() >= 0.0
 
 
-def _twist(tool: pin.SE3, target: pin.SE3, feed_forward: Array, speed_limit: float = 1.0) -> Array:
+def _twist(tool: pin.SE3, target: pin.SE3, feed_forward: Array) -> Array:
     model, arm = kernel_model("dual_iiwa7").tasks, 1
     data, targets = kernel_data("dual_iiwa7", np.zeros(14)).tasks, Targets.empty(model, 1.0, 1.0, 1.0)
     data.rotation[arm], data.translation[arm] = tool.rotation, tool.translation
     targets.rotation[arm], targets.translation[arm] = target.rotation, target.translation
     targets.feed_forward[arm] = feed_forward
-    wanted_twist(MOTION, data, targets, arm, speed_limit)
+    wanted_twist(MOTION, data, targets, arm)
     return data.twist[arm]
 
 
@@ -125,11 +125,9 @@ def test_the_wanted_twist_never_exceeds_the_speed_limits() -> None:
     random = np.random.default_rng(24)
     for _ in range(200):
         tool, target = _poses(random)
-        limit = random.uniform(0.01, 2.0)
-        twist = _twist(tool, target, 10.0 ** random.uniform(-2, 1) * random.normal(size=6), limit)
-        allowed = min(limit, 1.0)
-        assert np.linalg.norm(twist[:3]) <= allowed * MOTION.full_speed[0] + 1e-12
-        assert np.linalg.norm(twist[3:]) <= allowed * MOTION.full_speed[1] + 1e-12
+        twist = _twist(tool, target, 10.0 ** random.uniform(-2, 1) * random.normal(size=6))
+        assert np.linalg.norm(twist[:3]) <= MOTION.full_speed[0] + 1e-12
+        assert np.linalg.norm(twist[3:]) <= MOTION.full_speed[1] + 1e-12
 
 
 def test_at_the_target_only_the_targets_own_motion_is_wanted() -> None:

@@ -13,8 +13,6 @@ import pytest
 from q2r2_control.config import load_config
 from q2r2_control.config.control import ControllerSettings
 from q2r2_control.control.controller import CartesianController
-from q2r2_control.control.tasks.priority import speed_near
-from q2r2_control.control.tasks.task_model import Proximity
 from q2r2_control.errors import ConfigError
 from q2r2_control.robot.robot import Robot
 from q2r2_control.verification.contract import Contract
@@ -113,7 +111,6 @@ def test_arms_that_blocked_each_other_reach_their_targets_once_the_way_is_free(
 ) -> None:
     controller = controller_of(priority)
     scenario = freed(blocked, *arms)
-    # Equal arms first slide past each other at the speed that contact allows.
     contract = run(controller, scenario, 3.0 + (5.0 if priority == "equal" else 3.0), 0.005)
     assert contract.fallback_share < 0.01
     assert contract.uncertified == 0
@@ -151,13 +148,3 @@ def test_a_cell_with_one_arm_takes_no_other_one_s_priority() -> None:
     CartesianController(robot, ControllerSettings(priority="left"))
     with pytest.raises(ConfigError, match=r"= .right.: allowed here: equal, left$"):
         CartesianController(robot, ControllerSettings(priority="right"))
-
-
-def test_the_tool_speed_falls_steadily_from_full_to_contact_speed() -> None:
-    near = Proximity(pair_arm=np.zeros((1, 1)), stop_distance=0.022, full_at=0.1, contact_speed=0.05)
-    speeds = [speed_near(near, nearest, 0.05, 1.0) for nearest in np.linspace(-0.5, 1.0, 301)]
-    assert speeds == sorted(speeds)
-    assert speeds[0] == 0.05
-    assert speeds[-1] == 1.0
-    assert speed_near(near, 0.072, 0.05, 1.0) == pytest.approx(0.525)
-    assert speed_near(near, np.inf, 0.05, 1.0) == 1.0
