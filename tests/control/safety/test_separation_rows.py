@@ -62,7 +62,7 @@ def _gradient(name: str, q: Array, p: int) -> Array:
 def test_every_pair_that_is_too_close_is_asked_to_part_at_bounded_speed(seed: int, name: str) -> None:
     q, v = _state(name, seed, 0.0)
     seen, exact = Seen(name, q, v), distances(cell(name), q[None])[0]
-    for p in np.flatnonzero(exact < STOP_DISTANCE - 1e-3):
+    for p in np.flatnonzero(exact < STOP_DISTANCE - 1e-3).tolist():
         first = np.flatnonzero(seen.pair == p)[0]
         assert seen.lower[first] > 0.0
         if exact[p] > -0.03:

@@ -132,8 +132,8 @@ def _aimed_at_the_threshold(name: str, random: np.random.Generator, count: int, 
                 high = share
         if low > 0.0 and high < 2.0:
             found += 1
-            yield _motion(name, motion.q, *2 * [1.01 * high * motion.v], shape)
-            yield _motion(name, motion.q, *2 * [0.8 * low * motion.v], shape)
+            yield _motion(name, motion.q, 1.01 * high * motion.v, 1.01 * high * motion.v, shape)
+            yield _motion(name, motion.q, 0.8 * low * motion.v, 0.8 * low * motion.v, shape)
         if found == count:
             return
 
