@@ -78,8 +78,8 @@ class Rollout(NamedTuple):
     frame: Array  # (n, 3, 3) rotations of joint frames, scratch
     contact: Contact
     step: Piece  # from the reference to the candidate
-    piece: Piece  # of the candidate's stop
-    stop_travel: Array  # (nv,) during the whole stop [rad]
+    stop: Piece  # all of the candidate's stop
+    piece: Piece  # a part of it
 
     @classmethod
     def empty(cls, model: CollisionModel) -> Rollout:
@@ -97,8 +97,8 @@ class Rollout(NamedTuple):
             frame=Placements.empty(model.chain).rotation,
             contact=Contact.empty(),
             step=Piece.empty(nv),
+            stop=Piece.empty(nv),
             piece=Piece.empty(nv),
-            stop_travel=np.zeros(nv),
         )
 
 

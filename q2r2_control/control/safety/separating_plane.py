@@ -39,25 +39,55 @@ def stays_beyond(
 
     The pair has been measured in ``data``, where the piece begins, just before.
     """
+    return stay_beyond(model, data, p, piece, length, piece, 0.0, threshold)
+
+
+@lean_kernel
+def stay_beyond(
+    model: CollisionModel,
+    data: CollisionData,
+    p: int,
+    piece: Piece,
+    length: float,
+    then: Piece,
+    then_length: float,
+    threshold: float,
+) -> bool:
+    """As :func:`stays_beyond`, for a ``piece`` and another one after it."""
     pairs, bodies, contact = model.pairs, model.bodies, data.contact
     first, second = pairs.first[p], pairs.second[p]
-    needed = threshold + bodies.radius[first] + bodies.radius[second] + _curvature(pairs, p, piece)
+    needed = threshold + bodies.radius[first] + bodies.radius[second]
+    needed += curvature(pairs, p, piece.travel, then.travel, 1.0 if then_length > 0.0 else 0.0)
     corner = contact.witness
     for i in range(2):
         _corner(bodies, data.posed, first, i, corner)
-        gap, rate, change, loose = _gap(model, data, p, -1.0, piece)
+        first_gap = _gap(model, data, p, -1.0, piece, then)
         for j in range(8 if bodies.box[second] == 1 else 2):
             _corner(bodies, data.posed, second, j, corner)
-            gap_2, rate_2, change_2, loose_2 = _gap(model, data, p, 1.0, piece)
-            least = _least_on_the_way(gap + gap_2, rate + rate_2, change + change_2, length)
-            if least + loose + loose_2 < needed:
+            second_gap = _gap(model, data, p, 1.0, piece, then)
+            gap = first_gap[0] + second_gap[0] - needed
+            rate, change, loose = (
+                first_gap[1] + second_gap[1],
+                first_gap[2] + second_gap[2],
+                first_gap[3] + second_gap[3],
+            )
+            if _least_on_the_way(gap, rate, change, length) + loose < 0.0:
                 return False
+            if then_length > 0.0:
+                gap += rate * length + 0.5 * change * length * length + loose
+                rate, change = first_gap[4] + second_gap[4], first_gap[5] + second_gap[5]
+                loose = first_gap[6] + second_gap[6]
+                if _least_on_the_way(gap, rate, change, then_length) + loose < 0.0:
+                    return False
     return True
 
 
 @lean_kernel
-def _curvature(pairs: Pairs, p: int, piece: Piece) -> float:
-    """K_1 + K_2 [m]; the joints of a pair are listed from the base outwards."""
+def curvature(pairs: Pairs, p: int, travel: Array, then: Array, share: float) -> float:
+    """K_1 + K_2 [m] of ways ``travel`` and a ``share`` of ``then``, (nv,) each.
+
+    The joints of a pair are listed from the base outwards.
+    """
     total = 0.0
     before_first = 0.0
     before_second = 0.0
@@ -65,7 +95,7 @@ def _curvature(pairs: Pairs, p: int, piece: Piece) -> float:
         joint = pairs.joint[p, k]
         if joint == 0:
             break
-        w = piece.travel[joint - 1]
+        w = travel[joint - 1] + share * then[joint - 1]
         before = before_first if pairs.sign[p, k] < 0.0 else before_second
         total += pairs.reach[p, k] * w * (0.5 * w + before)
         if pairs.sign[p, k] < 0.0:
@@ -88,18 +118,18 @@ def _corner(bodies: Bodies, posed: Posed, body: int, number: int, out: Array) ->
 
 @lean_kernel
 def _gap(
-    model: CollisionModel, data: CollisionData, p: int, side: float, piece: Piece
-) -> tuple[float, float, float, float]:
+    model: CollisionModel, data: CollisionData, p: int, side: float, piece: Piece, then: Piece
+) -> tuple[float, float, float, float, float, float, float]:
     """What one side of a pair, -1 the first's or 1 the second's, adds to the gap at a corner, the ``witness``.
 
-    Returns the gap itself [m], its rate [m/s], the rate's change [m/s^2], and the least that loose joints add [m].
+    Returns the gap itself [m], and for each piece its rate [m/s], the rate's change [m/s^2], and the least that loose
+    joints add [m].
     """
     chain, pairs, placements = model.chain, model.pairs, data.placements
     point, normal = data.contact.witness, data.contact.normal
     gap = side * (normal[0] * point[0] + normal[1] * point[1] + normal[2] * point[2])
-    rate = 0.0
-    change = 0.0
-    loose = 0.0
+    rate, change, loose = 0.0, 0.0, 0.0
+    then_rate, then_change, then_loose = 0.0, 0.0, 0.0
     for k in range(pairs.joint.shape[1]):
         joint = pairs.joint[p, k]
         if joint == 0:
@@ -118,7 +148,10 @@ def _gap(
         rate += along * piece.rate[joint - 1]
         change += along * piece.change[joint - 1]
         loose += min(0.0, along * piece.loose[joint - 1])
-    return gap, rate, change, loose
+        then_rate += along * then.rate[joint - 1]
+        then_change += along * then.change[joint - 1]
+        then_loose += min(0.0, along * then.loose[joint - 1])
+    return gap, rate, change, loose, then_rate, then_change, then_loose
 
 
 @lean_kernel

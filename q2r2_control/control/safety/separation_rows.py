@@ -23,6 +23,8 @@ only: they are soft, so that the QP always has a solution; safety is the certifi
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from q2r2_control.control.geometry.closest_points import segment_segment
@@ -31,13 +33,26 @@ from q2r2_control.control.geometry.pair_distance import at_least, distance_row, 
 from q2r2_control.control.jit import lean_kernel
 from q2r2_control.control.safety.safety_data import SafetyData
 from q2r2_control.control.safety.safety_model import SafetyModel
+from q2r2_control.control.safety.separating_plane import curvature
 from q2r2_control.control.safety.stop_rollout import begin_rollout, sample_of
 from q2r2_control.control.safety.velocity_bounds import fastest_approach
 from q2r2_control.types import Array
 
+
+class Moment(NamedTuple):
+    """When of the stop a row looks at its pair."""
+
+    t: float  # into the stop [s]
+    duration: float  # of the stop [s]
+    straight: bool  # the pair is measured at the stop's start, and the row follows the tangent
+    h: float  # length of the step that the row is for [s]
+
+
 _SHARE = 0.25
 # Ends of near-parallel capsules get rows of their own, unless the closest point is practically there already.
 _SAME_POINT = 0.005  # [m]
+# A stop that takes a pair's points off the tangent by less than this is looked at from its start, along the tangent.
+_STRAIGHT = 2e-4  # [m]
 _INSTANTS = (0, 20, 64)  # of 64, where B is looked for: the start, half of the way, and the end of the stop
 
 
@@ -92,7 +107,9 @@ def write_separation_rows(model: SafetyModel, data: SafetyData, h: float) -> Non
             continue
         instant = 0
         least = data.distance[p]
-        if duration > 0.0 and least >= model.min_distance[p]:
+        stop = data.rollout.stop.travel
+        straight = curvature(model.collision.pairs, p, stop, stop, 0.0) < _STRAIGHT
+        if not straight and least >= model.min_distance[p]:
             for i in _INSTANTS[1:]:
                 distance = measure(model.collision, sample_of(model, data, i, duration), p)
                 if distance < least:
@@ -100,11 +117,12 @@ def write_separation_rows(model: SafetyModel, data: SafetyData, h: float) -> Non
                     instant = i
         at = data.collision if instant == 0 else sample_of(model, data, instant, duration)
         least = measure(model.collision, at, p)
-        t = duration * instant / _INSTANTS[-1]
+        t = duration if straight else duration * instant / _INSTANTS[-1]
+        moment = Moment(t, duration, straight, h)
         before = count
-        count = _append_row(model, data, at, p, least, t, duration, h, count)
+        count = _append_row(model, data, at, p, least, moment, count)
         if count > before:
-            count = _append_end_rows(model, data, at, p, t, duration, h, count)
+            count = _append_end_rows(model, data, at, p, moment, count)
     data.rows.used[0] = count
     _normalise_rows(data)
 
@@ -130,18 +148,26 @@ def _append_row(
     at: CollisionData,
     p: int,
     distance: float,
-    t: float,
-    duration: float,
-    h: float,
+    moment: Moment,
     count: int,
 ) -> int:
     """Keep the row if some velocity that the acceleration allows (v +- a h) breaks it; any other cannot bind.
 
-    Pair ``p`` has been measured in ``at``, the posture ``t`` [s] into the stop.
+    Pair ``p`` has been measured in ``at``, the posture at the ``moment``; of a straight stop that is its start, and the
+    row looks along the tangent at the end if the pair closes in until there.
     """
+    t, duration, h = moment.t, moment.duration, moment.h
     a, v, row = model.limits.acceleration, data.state.v, data.rows.matrix[count]
     distance_row(model.collision, at, p, row)
     free = distance - model.approach.stop_distance[p]
+    if moment.straight:
+        ahead = 0.0
+        for j in range(row.shape[0]):
+            ahead += row[j] * 0.5 * v[j] * abs(v[j]) / data.certified[j]
+        if ahead < 0.0 and distance >= model.min_distance[p]:
+            free += ahead
+        else:
+            t = 0.0
     lower = 0.0  # so far what v alone adds to the change of B
     for j in range(row.shape[0]):
         whole = abs(v[j]) / data.certified[j] if v[j] != 0.0 else duration
@@ -171,7 +197,12 @@ def _append_row(
 
 @lean_kernel
 def _append_end_rows(
-    model: SafetyModel, data: SafetyData, at: CollisionData, p: int, t: float, duration: float, h: float, count: int
+    model: SafetyModel,
+    data: SafetyData,
+    at: CollisionData,
+    p: int,
+    moment: Moment,
+    count: int,
 ) -> int:
     """Rows at the ends of both bodies of a pair.
 
@@ -185,7 +216,7 @@ def _append_end_rows(
     for point in (start, end):
         if not _near(point, witness):
             reached = measure_part(model.collision, at, p, point, point)
-            count = _append_row(model, data, at, p, reached, t, duration, h, count)
+            count = _append_row(model, data, at, p, reached, moment, count)
     if bodies.box[second] == 1:
         return count
     measure(model.collision, at, p)
@@ -197,7 +228,7 @@ def _append_end_rows(
                 for k in range(3):
                     contact.normal[k] = (contact.second[k] - contact.first[k]) / reached
                 reached -= bodies.radius[first] + bodies.radius[second]
-                count = _append_row(model, data, at, p, reached, t, duration, h, count)
+                count = _append_row(model, data, at, p, reached, moment, count)
     return count
 
 

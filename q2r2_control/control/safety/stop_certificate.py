@@ -17,7 +17,7 @@ from q2r2_control.control.geometry.pair_distance import measure
 from q2r2_control.control.jit import lean_kernel
 from q2r2_control.control.safety.safety_data import SafetyData
 from q2r2_control.control.safety.safety_model import SafetyModel
-from q2r2_control.control.safety.separating_plane import stays_beyond
+from q2r2_control.control.safety.separating_plane import stay_beyond, stays_beyond
 from q2r2_control.control.safety.stop_rollout import begin_rollout, sample_of, write_piece
 from q2r2_control.types import Array
 
@@ -46,13 +46,15 @@ def certify(model: SafetyModel, data: SafetyData, h: float) -> bool:
     _write_step(data, h)
     for p in range(distance.shape[0]):
         step = _way(model, p, data.rollout.step.travel)
-        stop = _way(model, p, data.rollout.stop_travel)
+        stop = _way(model, p, data.rollout.stop.travel)
         threshold = model.min_distance[p]
         if distance[p] - step - stop >= threshold:
             continue
         if distance[p] < threshold:
             if not _comes_no_closer(model, data, p, duration):
                 return False
+            continue
+        if _plane_keeps_apart(model, data, p, h, duration):
             continue
         if not (_step_keeps_apart(model, data, p, h, step, duration) and _stop_keeps_apart(model, data, p, duration)):
             return False
@@ -89,6 +91,16 @@ def _distance_at(model: SafetyModel, data: SafetyData, p: int, i: int, duration:
 
 
 @lean_kernel
+def _plane_keeps_apart(model: SafetyModel, data: SafetyData, p: int, h: float, duration: float) -> bool:
+    """Prove pair ``p`` apart in the step and in the stop by the plane at the reference, without a sample."""
+    threshold = model.min_distance[p]
+    data.distance[p] = measure(model.collision, data.collision, p)
+    if data.distance[p] < threshold:
+        return False
+    return stay_beyond(model.collision, data.collision, p, data.rollout.step, h, data.rollout.stop, duration, threshold)
+
+
+@lean_kernel
 def _step_keeps_apart(model: SafetyModel, data: SafetyData, p: int, h: float, way: float, duration: float) -> bool:
     """Prove pair ``p`` apart in the step: from both of its ends by the way, or else from the first by a plane."""
     after, threshold = _distance_at(model, data, p, 0, duration), model.min_distance[p]
@@ -96,9 +108,7 @@ def _step_keeps_apart(model: SafetyModel, data: SafetyData, p: int, h: float, wa
         return False
     if 0.5 * (data.distance[p] + after - way) >= threshold:
         return True
-    data.distance[p] = measure(model.collision, data.collision, p)
-    if 0.5 * (data.distance[p] + after - way) >= threshold:
-        return True
+    measure(model.collision, data.collision, p)
     return stays_beyond(model.collision, data.collision, p, data.rollout.step, h, threshold)
 
 
@@ -127,7 +137,8 @@ def _stop_keeps_apart(model: SafetyModel, data: SafetyData, p: int, duration: fl
             stride //= 2
         proven = False
         while not proven and stride >= 1:
-            length = write_piece(data, i, stride, duration)
+            length = duration * stride / last
+            write_piece(data, rollout.v[i], duration * i / last, length, rollout.piece)
             sample = sample_of(model, data, i, duration)
             proven = stays_beyond(model.collision, sample, p, rollout.piece, length, threshold)
             if not proven:

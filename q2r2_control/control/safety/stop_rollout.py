@@ -8,9 +8,10 @@ from __future__ import annotations
 from q2r2_control.control.geometry.collision import CollisionData, Posed, update_placements
 from q2r2_control.control.geometry.kinematics import Placements
 from q2r2_control.control.jit import inlined_kernel, lean_kernel
-from q2r2_control.control.safety.safety_data import SafetyData
+from q2r2_control.control.safety.safety_data import Piece, SafetyData
 from q2r2_control.control.safety.safety_model import SafetyModel
 from q2r2_control.control.safety.stop_shapes import brake
+from q2r2_control.types import Array
 
 # A joint that rests this much before the end of a piece of time counts as moving until then [s]; far more than
 # rounding, and the way that is counted wrong is d t^2 / 2, 1e-17 rad.
@@ -19,14 +20,14 @@ _SAME_TIME = 1e-9
 
 @lean_kernel
 def begin_rollout(data: SafetyData) -> float:
-    """Forget the samples of the last stop; returns how long the candidate's takes [s]."""
+    """Forget the samples of the last stop and write the candidate's as one piece; returns how long it takes [s]."""
     candidate, rollout = data.candidate, data.rollout
     rollout.known[:] = 0.0
     duration = 0.0
     for j in range(candidate.v.shape[0]):
         speed, deceleration = abs(candidate.v[j]), candidate.deceleration[j]
         duration = max(duration, speed / deceleration)
-        rollout.stop_travel[j] = speed * speed / (2.0 * deceleration)
+    write_piece(data, candidate.v, 0.0, duration, rollout.stop)
     return duration
 
 
@@ -52,30 +53,25 @@ def _place_sample(model: SafetyModel, data: SafetyData, i: int, duration: float,
 
 
 @lean_kernel
-def write_piece(data: SafetyData, i: int, stride: int, duration: float) -> float:
-    """The motion from sample ``i`` to the one ``stride`` later into ``data.rollout.piece``; returns its length [s].
+def write_piece(data: SafetyData, v: Array, start: float, length: float, piece: Piece) -> None:
+    """The motion of the candidate's stop from ``start`` on, where its velocities are ``v``, for ``length`` [s].
 
     A joint that comes to rest on the way is no parabola: all that is known of it is from where to where it moves.
     """
-    candidate, rollout = data.candidate, data.rollout
-    piece = rollout.piece
-    intervals = rollout.q.shape[0] - 1
-    start = duration * i / intervals
-    length = duration * stride / intervals
-    for j in range(candidate.v.shape[0]):
-        v, deceleration = rollout.v[i, j], candidate.deceleration[j]
-        sign = 1.0 if v >= 0.0 else -1.0
+    candidate = data.candidate
+    for j in range(v.shape[0]):
+        deceleration = candidate.deceleration[j]
+        sign = 1.0 if v[j] >= 0.0 else -1.0
         rest = abs(candidate.v[j]) / deceleration - start  # until the joint rests
         piece.rate[j] = 0.0
         piece.change[j] = 0.0
         piece.loose[j] = 0.0
-        if v == 0.0:
+        if v[j] == 0.0:
             piece.travel[j] = 0.0
         elif rest < length - _SAME_TIME:
-            piece.travel[j] = 0.5 * v * v / deceleration
+            piece.travel[j] = 0.5 * v[j] * v[j] / deceleration
             piece.loose[j] = sign * piece.travel[j]
         else:
-            piece.rate[j] = v
+            piece.rate[j] = v[j]
             piece.change[j] = -sign * deceleration
-            piece.travel[j] = abs(v) * length - 0.5 * deceleration * length * length
-    return length
+            piece.travel[j] = abs(v[j]) * length - 0.5 * deceleration * length * length
