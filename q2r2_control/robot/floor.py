@@ -20,6 +20,7 @@ from q2r2_control.robot.pairs import CLEARANCE, keep_pairs, link_of
 FLOOR = "floor"  # link
 
 _SIZE = (100.0, 100.0, 10.0)  # [m]
+_ON = 1e-3  # a box stands on the floor from this height on [m]
 _UPRIGHT = 1e-9  # sine of the angle to the vertical [-]
 
 
@@ -41,6 +42,27 @@ def floor_link(height: float, parent: str, obstacles: Collection[str]) -> list[E
     ET.SubElement(joint, "child", link=FLOOR)
     ET.SubElement(joint, "origin", xyz=f"0 0 {height!r}")
     return [link, joint]
+
+
+def sink_boxes_into_floor(geometry: pin.GeometryModel) -> None:
+    """Let fixed upright boxes that stand on the floor reach deep into it, so that nothing is pushed out downwards.
+
+    What is inside a box is pushed out through the nearest face. The underside of a box on the floor is no way out: a hand deep in it and the wrist above would be pushed apart and stay for ever. Above the floor nothing changes.
+    """
+    floor = next((item for item in geometry.geometryObjects if _is_floor(item)), None)
+    if floor is None:
+        return
+    height = floor.placement.translation[2] + floor.geometry.halfSide[2]
+    for item in geometry.geometryObjects:
+        if item is floor or item.parentJoint != 0 or not isinstance(item.geometry, coal.Box):
+            continue
+        half, centre = item.geometry.halfSide.copy(), item.placement.translation.copy()
+        top = centre[2] + half[2]
+        if item.placement.rotation[2, 2] < 1.0 - _UPRIGHT or not centre[2] - half[2] - _ON <= height < top:
+            continue
+        bottom = floor.placement.translation[2] - floor.geometry.halfSide[2]
+        item.geometry = coal.Box(2.0 * half[0], 2.0 * half[1], top - bottom)
+        item.placement = pin.SE3(item.placement.rotation, np.array([*centre[:2], 0.5 * (top + bottom)]))
 
 
 def remove_unreachable_floor_pairs(model: pin.Model, geometry: pin.GeometryModel) -> None:

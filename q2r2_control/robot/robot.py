@@ -17,7 +17,7 @@ from q2r2_control.errors import ConfigError, RobotError
 from q2r2_control.robot.compose import compose
 from q2r2_control.robot.description import LinkTree, joint_limits, parse_srdf, parse_urdf
 from q2r2_control.robot.enclose import enclose_shapes
-from q2r2_control.robot.floor import remove_unreachable_floor_pairs
+from q2r2_control.robot.floor import remove_unreachable_floor_pairs, sink_boxes_into_floor
 from q2r2_control.robot.locking import lock_joints
 from q2r2_control.robot.pairs import (
     add_movable_pairs,
@@ -158,6 +158,7 @@ class Robot:
     def _monitor(self, tree: LinkTree, exclusions: Iterable[ET.Element] | None) -> tuple[tuple[str, str], ...]:
         """Choose the pairs; returns those of one arm that overlap by construction and are left out."""
         enclose_shapes(self.collision_model)
+        sink_boxes_into_floor(self.collision_model)
         add_movable_pairs(self.model, self.collision_model, tree)
         remove_unreachable_floor_pairs(self.model, self.collision_model)
         if exclusions is not None:

@@ -57,3 +57,45 @@ def test_without_a_floor_the_tools_go_where_they_are_sent() -> None:
         pass
     for arm, target in BESIDE_THE_TABLE.items():
         np.testing.assert_allclose(controller.tool_pose(arm).translation, target.translation, atol=0.02)
+
+
+def _hands_in_the_table(depth: float) -> np.ndarray:
+    """A posture with both tools pointing down ``depth`` [m] below the table's surface, its links with them."""
+    ghost = Robot.from_config(CONFIG)
+    ghost.collision_model.removeAllCollisionPairs()
+    controller = CartesianController(ghost, SETTINGS)
+    targets = {arm: controller.tool_pose(arm) for arm in ghost.arms}
+    for pose in targets.values():
+        pose.translation = np.array([*pose.translation[:2], 0.2 - depth])
+    for _ in range(2000):
+        reference = controller.step(targets, DT)
+    return reference.q
+
+
+@pytest.mark.parametrize("depth", [0.09, 0.12, 0.18])
+def test_hands_and_wrists_deep_in_the_table_come_out_through_its_top(depth: float) -> None:
+    """The way out of a hand alone would be the underside, where the floor is, and the wrists' would be the top."""
+    controller = _controller(0.0)
+    home = {arm: controller.tool_pose(arm) for arm in controller.robot.arms}
+    controller.reset(_hands_in_the_table(depth))
+    least, ticks = -np.inf, 0
+    while ticks < 500:
+        report = controller.step(home, DT).report
+        assert report.closest_distance >= least - 1e-9, "it comes closer"
+        least, ticks = report.closest_distance, ticks + 1
+        if report.certified:
+            break
+    assert report.certified
+
+
+def test_where_nothing_can_be_certified_the_report_names_the_pairs_that_hold_the_arms() -> None:
+    """Without a floor the underside is a way out, and hand and wrist hold each other in the table."""
+    controller = _controller(None)
+    home = {arm: controller.tool_pose(arm) for arm in controller.robot.arms}
+    controller.reset(_hands_in_the_table(0.12))
+    for _ in range(50):
+        report = controller.step(home, DT).report
+    assert report.fallback
+    assert not report.certified
+    too_close = {"left_hand_e_envelope_0|table_0", "left_link_7_0|table_0", "right_hand_e_envelope_0|table_0"}
+    assert too_close <= set(report.binding)

@@ -51,7 +51,10 @@ def apply_safety_filter(
         data.state.a[j] += share * clamp((candidate.v[j] - v[j]) / h, -limit, limit)
         q[j] = candidate.q[j]
         v[j] = candidate.v[j]
-    return outcome, _note_active(data)
+    slack = _note_active(data)
+    if outcome == STOPPED:
+        _note_too_close(model, data)
+    return outcome, slack
 
 
 @lean_kernel
@@ -160,3 +163,14 @@ def _note_active(data: SafetyData) -> float:
             count += 1
     active.used[0] = count
     return slack
+
+
+@lean_kernel
+def _note_too_close(model: SafetyModel, data: SafetyData) -> None:
+    """List the pairs that were too close when nothing could be certified: they hold the arms."""
+    active = data.active
+    for p in range(data.distance.shape[0]):
+        if data.distance[p] < model.min_distance[p] and active.used[0] < active.kind.shape[0]:
+            active.kind[active.used[0]] = SEPARATION
+            active.subject[active.used[0]] = p
+            active.used[0] += 1
