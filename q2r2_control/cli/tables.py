@@ -6,6 +6,7 @@ from rich.table import Table
 from rich.text import Text
 
 from q2r2_control.cli.cell_report import ArmCheck, CellCheck, PairsWritten
+from q2r2_control.robot.stop_torque import StopTorque
 
 
 def arm_table(arm: ArmCheck) -> Table:
@@ -19,6 +20,18 @@ def arm_table(arm: ArmCheck) -> Table:
     for joint in arm.joints:
         figures = (joint.lower, joint.home, joint.upper, joint.velocity, joint.torque)
         table.add_row(Text(joint.name), *(f"{value:.3f}" for value in figures))
+    return table
+
+
+def stop_table(stop: StopTorque) -> Table:
+    """What a full stop of one arm asks of its joints."""
+    title = f"{stop.arm} arm: most torque in {stop.postures} random postures, of each joint's limit"
+    table = _table_of(title, "joint")
+    for column in ("stops at\n[rad/s^2]", "gravity\n[%]", "full stop\n[%]"):
+        table.add_column(Text(column), justify="right")
+    for joint in stop.joints:
+        shares = (f"{100 * share:.0f}" for share in (joint.gravity, joint.stop))
+        table.add_row(Text(joint.joint), f"{joint.acceleration:.2f}", *shares)
     return table
 
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationInfo, model_validator
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationInfo, model_validator
 
 from q2r2_control.errors import ConfigError
 
@@ -15,6 +15,7 @@ Side = Literal["left", "right"]
 Coordinate = Annotated[float, Field(ge=-20, le=20)]  # [m]
 Extent = Annotated[float, Field(gt=0, le=20)]  # [m]
 Angle = Annotated[float, Field(ge=-6.2832, le=6.2832)]  # [rad]
+Acceleration = Annotated[float, Field(gt=0, le=100)]  # [rad/s^2]
 Share = Annotated[float, Field(ge=0, le=1)]
 Metres3 = Annotated[tuple[Coordinate, Coordinate, Coordinate], Field(description="x, y, z [m]")]
 Radians3 = Annotated[tuple[Angle, Angle, Angle], Field(description="roll, pitch, yaw [rad]")]
@@ -30,6 +31,13 @@ def _beside_the_file(value: str, info: ValidationInfo) -> str:
         return str(folder / path) if folder is not None and value and (folder / path).exists() else value
     except (OSError, ValueError):  # a name that no file can have; reading it will say so
         return value
+
+
+def _by_joint(value: object) -> object:
+    """Refuses a list or a number, whose kind pydantic would ask for by a name that YAML has not."""
+    if not isinstance(value, Mapping):
+        raise ValueError("allowed: limits by joint, such as {A2: 5.4}")
+    return value
 
 
 # Looked up from the folder of the YAML first, then from the working directory, then among the shipped files.
@@ -110,6 +118,9 @@ class ArmConfig(CellModel):
     tool: ToolConfig = ToolConfig()
     gripper: GripperConfig = GripperConfig()
     home: tuple[float, ...] = Field(description="joint positions [rad]")
+    acceleration_limit: Annotated[dict[str, Acceleration], BeforeValidator(_by_joint)] = Field(
+        default_factory=dict, description="of joints, by name, in place of the model's [rad/s^2]"
+    )
     swivel: SwivelConfig = SwivelConfig()
 
     @model_validator(mode="after")

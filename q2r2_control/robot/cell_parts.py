@@ -103,6 +103,16 @@ class Arm:
             parts += _exclusions_of_the_two(self.model.description, self.tool.description)
         return renamed_exclusions(parts, self.name_in_cell)
 
+    def acceleration_limits(self) -> dict[str, float]:
+        """Limits [rad/s^2] that the file gives joints of the arm, by their names in the cell."""
+        limits, names = self.config.acceleration_limit, [joint.get("name", "") for joint in self.joints]
+        for name in limits:
+            if name not in names:
+                raise ConfigError(
+                    f"{self.key}.acceleration_limit.{name!s:.60}: no joint of the arm; allowed: {', '.join(names)}"
+                )
+        return {self.name_in_cell(name): value for name, value in limits.items()}
+
     def posture(self) -> dict[str, float]:
         """Position of each joint of arm and gripper: the arm at home, the gripper open."""
         config, names = self.config, [joint.get("name", "") for joint in self.joints]

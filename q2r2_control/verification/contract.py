@@ -122,7 +122,7 @@ class Contract:
         robot, settings = controller.robot, controller.settings
         self._robot, self._random = robot, np.random.default_rng(0) if random is None else random
         self._sample_all = sample_all
-        self._a = settings.acceleration_limit
+        self._a = robot.capped_acceleration(settings.acceleration_limit)
         self._v_max = robot.velocity_limit * settings.velocity_scale
         self._lower = robot.position_lower + settings.position_margin
         self._upper = robot.position_upper - settings.position_margin
@@ -217,7 +217,7 @@ class Contract:
     def _check_motion(self, q: Array, v: Array, a: Array, h: float) -> None:
         speed = np.abs(v)
         change = np.abs(v - self._v) - _ROUNDING * speed
-        self._note("acceleration", max(float(change.max()) / (self._a * h), float(np.abs(a).max()) / self._a))
+        self._note("acceleration", float((np.maximum(change / h, np.abs(a)) / self._a).max()))
         travel = np.abs(q - self._q) - _ROUNDING * np.abs(q)
         self._note("jump", float(np.max(travel / ((np.maximum(speed, np.abs(self._v)) + self._a * h) * h))))
         if h <= self._substep:
@@ -295,7 +295,7 @@ class Contract:
             if self._certain and 0.0 < h <= self._substep:
                 self._note("between", self._least_between(v, h) - self._min_distance)
         if draw < _STOP_SHARE and self._certain:
-            duration = float(np.abs(v).max()) / self._a
+            duration = float((np.abs(v) / self._a).max())
             times = duration * (np.arange(_STOP_SAMPLES) + self._random.random()) / _STOP_SAMPLES
             self._note("stop", self._least_of(self._braked(q, v, times[:, None])[0]) - self._min_distance)
         if draw < _STOP_SHARE and self._can_stop.all():

@@ -306,6 +306,11 @@ def test_a_misspelt_key_is_named_before_the_one_that_is_missing_for_it(tmp_path:
         ("teleop.axes", ["+x", "+x", "+z"], "once each"),
         ("control.acceleration_limit", 0, "greater than 0"),
         ("control.acceleration_limit", -10, "greater than 0"),
+        ("arms.left.acceleration_limit", 5.0, "allowed: limits by joint, such as {A2: 5.4}"),
+        ("arms.left.acceleration_limit", {"A1": -8}, "greater than 0"),
+        ("arms.left.acceleration_limit", {"A1": 500}, "less than or equal to 100"),
+        ("arms.left.acceleration_limit", {"A1": math.nan}, "finite number"),
+        ("arms.left.acceleration_limit", [8.65, 5.44], "allowed: limits by joint, such as {A2: 5.4}"),
         ("control.velocity_scale", 100, "less than or equal to 1"),
         ("control.min_distance", 20, "less than or equal to 0.2"),
         ("impedance.translational_stiffness", -1, "greater than 0"),
@@ -407,6 +412,7 @@ def test_what_is_no_cell_at_all_ends_in_one_line(tmp_path: Path, text: str | byt
         ("arms.left.gripper.joints", ["thumb"], "no such finger joint; allowed: finger_joint_1"),
         ("arms.left.home", [90, 0, 0, 0, 0, 0, 0], r"arms.left.home\[0\] = 90: joint A1 allows -2.96"),
         ("arms.left.home", [0, 0], "2 value.s., expected 7: A1"),
+        ("arms.left.acceleration_limit", {"A9": 5.0}, r"arms.left.acceleration_limit.A9: no joint .* allowed: A1, A2"),
     ],
 )
 def test_what_only_the_robot_can_tell_is_named_when_it_is_composed(
