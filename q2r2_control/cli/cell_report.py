@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from q2r2_control.config.arms import FlangeConfig
 from q2r2_control.config.cell import Config, ObstacleConfig
 from q2r2_control.config.external import describe
 from q2r2_control.control.controller import CartesianController
@@ -39,6 +40,7 @@ class ArmCheck:
 
     name: str
     model: str
+    flange: str | None  # model, or sizes
     tool_model: str | None
     tool_frame: str
     tool_position: tuple[float, ...]
@@ -190,12 +192,19 @@ def _stop_note(stop: StopTorque) -> str:
     )
 
 
+def _flange_of(config: FlangeConfig) -> str | None:
+    if config.thickness is None or config.radius is None:
+        return config.model
+    return f"{1e3 * config.thickness:g} mm thick, radius {1e3 * config.radius:g} mm"
+
+
 def _arm_check(config: Config, robot: Robot, name: str) -> ArmCheck:
     arm = robot.arms[name]
     settings = next(settings for side, settings in config.arms.items() if side == name)
     return ArmCheck(
         name=name,
         model=config.model_of(name),
+        flange=_flange_of(settings.flange),
         tool_model=settings.tool.model,
         tool_frame=arm.tool_frame,
         tool_position=tuple(robot.tool_pose(robot.home, name).translation.tolist()),

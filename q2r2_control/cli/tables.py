@@ -12,7 +12,9 @@ from q2r2_control.robot.stop_torque import StopTorque
 def arm_table(arm: ArmCheck) -> Table:
     """One arm's joints and limits."""
     position = " ".join(f"{value:.3f}" for value in arm.tool_position)
-    title = f"{arm.name} arm: {arm.model}, tool {arm.tool_model or 'none'}; {arm.tool_frame} at home at {position} m"
+    flange = "" if arm.flange is None else f", flange {arm.flange}"
+    tool = f"tool {arm.tool_model or 'none'}; {arm.tool_frame} at home at {position} m"
+    title = f"{arm.name} arm: {arm.model}{flange}, {tool}"
     table = _table_of(title, "joint")
     # Units below, which leaves 26 of 80 columns for names.
     for column in ("min\n[rad]", "home\n[rad]", "max\n[rad]", "speed\n[rad/s]", "torque\n[Nm]"):

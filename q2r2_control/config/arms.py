@@ -58,8 +58,36 @@ class PoseConfig(CellModel):
     rpy: Radians3 = (0.0, 0.0, 0.0)
 
 
+class FlangeConfig(CellModel):
+    """What is between an arm's last link and its tool: a model, or a cylinder of these sizes; by default nothing."""
+
+    model: LocalPath | None = Field(None, description="a file of robots/ without .urdf, or a path")
+    xacro_args: XacroArgs = {}
+    frame: str | None = Field(None, description="link of the model that carries the tool; default: the last link")
+    thickness: float | None = Field(None, gt=0, le=0.5, description="of a cylinder instead of a model, along z [m]")
+    radius: float | None = Field(None, gt=0, le=0.5, description="of that cylinder [m]")
+    mass: float = Field(0.0, ge=0, le=20, description="of that cylinder [kg]")
+
+    @model_validator(mode="after")
+    def _is_one_thing(self) -> FlangeConfig:
+        if (self.thickness is None) != (self.radius is None):
+            raise ValueError("thickness and radius describe a cylinder together: give both")
+        if self.model is not None and (self.thickness is not None or self.mass):
+            raise ValueError("a model has its own thickness, radius and mass: give the model or those")
+        if self.model is None and (self.frame is not None or self.xacro_args):
+            raise ValueError("frame and xacro_args are those of a model: give it as well")
+        if self.mass and self.thickness is None:
+            raise ValueError("mass is that of a cylinder: give its thickness and radius as well")
+        return self
+
+    @property
+    def is_none(self) -> bool:
+        """Whether the tool sits on the arm's last link itself."""
+        return self.model is None and self.thickness is None
+
+
 class ToolConfig(CellModel):
-    """What is mounted on an arm's last link."""
+    """What is mounted on an arm's last link or flange."""
 
     model: LocalPath | None = Field(None, description="a file of robots/ without .urdf, or a path; none: bare flange")
     xacro_args: XacroArgs = {}
@@ -115,6 +143,7 @@ class ArmConfig(CellModel):
     mount: PoseConfig = PoseConfig()
     tip: str | None = Field(None, description="last link of the arm; none: found, where there is no doubt")
     joints: tuple[str, ...] = Field((), description="of the arm, base to tip; none: all from base to tip")
+    flange: FlangeConfig = FlangeConfig()
     tool: ToolConfig = ToolConfig()
     gripper: GripperConfig = GripperConfig()
     home: tuple[float, ...] = Field(description="joint positions [rad]")
@@ -131,6 +160,11 @@ class ArmConfig(CellModel):
         for key, link in named.items():
             if self.tip is not None and link not in (None, self.tip):
                 raise ValueError(f"tip = {self.tip!r:.60} and {key} = {link!r:.60} mean the same link: give one")
+        if self.tool.frame is not None and self.tool.model is None and not self.flange.is_none:
+            raise ValueError(
+                f"tool.frame = {self.tool.frame!r:.60}: without a tool the end of the flange is what moves; "
+                "the arm's link that carries the flange is named by tip"
+            )
         return self
 
     @property

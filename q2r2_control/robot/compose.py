@@ -59,8 +59,8 @@ def compose(config: Config) -> ComposedCell:
         if arm is next(other for other in arms.values() if other.model is arm.model):
             urdf.extend(arm.model.urdf((config.robot or arm.config).mount))
             srdf.extend(renamed_exclusions(arm.model.exclusions, arm.model.name_in_cell))
-        urdf.extend(arm.tool_urdf())
-        srdf.extend(arm.tool_exclusions())
+        urdf.extend(arm.mounted_urdf())
+        srdf.extend(arm.mounted_exclusions())
     _check_apart(urdf)
     home = _home(urdf, arms)
     resting = {} if config.robot is None else _resting(urdf, config.robot, home)

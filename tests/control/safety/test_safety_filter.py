@@ -32,7 +32,7 @@ def moved(data: SafetyData, wish: Array, usable: bool = True) -> int:
 
 
 def test_a_wish_within_the_box_and_far_from_everything_is_followed_as_it_is() -> None:
-    data, wish = started(), V + np.linspace(0.015, -0.015, 14)
+    data, wish = started(), V + np.linspace(0.008, -0.008, 14)
     assert moved(data, wish) == FOLLOWED
     np.testing.assert_array_equal(data.state.v, wish)
     np.testing.assert_allclose(data.state.q, HOME + 0.5 * H * (V + wish), rtol=0, atol=1e-15)
@@ -57,7 +57,7 @@ def test_a_single_number_that_is_not_finite_makes_the_certified_stop_go_on(numbe
     wish[joint] = number
     assert moved(data, wish) == STOPPED
     q, v = np.zeros(14), np.zeros(14)
-    brake(HOME, V, np.full(14, 10.0), H, q, v)
+    brake(HOME, V, np.tile([8.65, 5.44, 5.69, 10.0, 10.0, 10.0, 10.0], 2), H, q, v)
     np.testing.assert_array_equal(data.state.q, q)
     np.testing.assert_array_equal(data.state.v, v)
 
