@@ -150,7 +150,8 @@ class _Run:
         self._clock = LoopClock(period, realtime)
         control = pipeline.config.control
         limit = pipeline.robot.velocity_limit * control.velocity_scale
-        self._pacer = TickPacer(period, limit, control.acceleration_limit, pipeline.drive.coasts)
+        self._acceleration = pipeline.robot.capped_acceleration(control.acceleration_limit)
+        self._pacer = TickPacer(period, limit, self._acceleration, pipeline.drive.coasts)
         self._stamp = state.stamp  # of the newest state, by the plant's clock [s]
         self._unanswered = 0.0  # time that the plant was given since without a newer one [s]
         self._state = state  # the newest that the plant gave
@@ -185,8 +186,9 @@ class _Run:
         self._supervisor.stop("the run has ended")
         self._supervisor.events.clear()
         try:
-            speed = float(np.abs(self._tick().v).max())
-            deadline = self._clock.now + speed / self._pipeline.config.control.acceleration_limit + _STOP_ALLOWANCE
+            velocity = np.abs(self._tick().v)
+            speed = float(velocity.max())
+            deadline = self._clock.now + float((velocity / self._acceleration).max()) + _STOP_ALLOWANCE
             while (speed > _REST or not drive.at_rest(self._state)) and self._clock.now < deadline:
                 speed = float(np.abs(self._tick().v).max())
         finally:

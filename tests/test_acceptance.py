@@ -283,7 +283,8 @@ class TestConnectionEndsInMidMotion:
         rest = next(index for index in after if speed(ticks[index]) < 1e-3)
         moving = range(cut.last, rest + 1)
         assert speed(ticks[cut.last]) > 0.05, "in mid-motion"
-        braking = max(speed(ticks[index]) for index in moving) / run.loop.config.control.acceleration_limit
+        limit = run.loop.robot.capped_acceleration(run.loop.config.control.acceleration_limit)
+        braking = max(float((np.abs(ticks[index].reference.v) / limit).max()) for index in moving)
         # A late tick sees the timeout late, and the end of the braking one tick later.
         late = 3.0 * max(ticks[index].dt for index in moving)
         assert run.server.times[rest] - received <= STREAM_TIMEOUT + braking + late + 0.005

@@ -339,7 +339,8 @@ def assert_braked(loop: Pipeline, watch: Watch, summary: RunSummary) -> None:
     assert speed(watch.ticks[-len(stopping) - 1]) > 0.05, "it was moving"
     assert speed(watch.ticks[-1]) < 1e-3
     assert summary.at_rest
-    braking = speed(watch.ticks[-len(stopping) - 1]) / loop.config.control.acceleration_limit
+    limit = loop.robot.capped_acceleration(loop.config.control.acceleration_limit)
+    braking = float((np.abs(watch.ticks[-len(stopping) - 1].reference.v) / limit).max())
     # Slower motion than that is the last correction of a posture that is held.
     rest = next(tick for tick in stopping if speed(tick) < 1e-3)
     assert rest.t - stopping[0].t <= 1.5 * braking + 0.05 + 3.0 * max(tick.dt for tick in stopping)

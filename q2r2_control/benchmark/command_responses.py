@@ -49,8 +49,8 @@ class LatencyReport:
         return asdict(self)
 
 
-def latency_report(rate: float, acceleration_limit: float, recordings: Mapping[str, Recording]) -> LatencyReport:
-    """Latencies by path, of a controller at ``rate`` [Hz] with ``acceleration_limit`` [rad/s^2]."""
+def latency_report(rate: float, acceleration_limit: Array, recordings: Mapping[str, Recording]) -> LatencyReport:
+    """Latencies by path, of a controller at ``rate`` [Hz] with ``acceleration_limit`` (nv,) [rad/s^2]."""
     transport = 1e3 * np.concatenate(
         [np.subtract(recording.received, recording.sent) for recording in recordings.values()]
     )
@@ -60,13 +60,13 @@ def latency_report(rate: float, acceleration_limit: float, recordings: Mapping[s
     )
 
 
-def _row(path: str, recording: Recording, acceleration_limit: float) -> LatencyRow:
+def _row(path: str, recording: Recording, acceleration_limit: Array) -> LatencyRow:
     """Find the first command after each step with an acceleration that only a step causes."""
     times = np.asarray(recording.sent)
     # Ticks may be early or late, so changes of velocity are divided by dt; half the usual dt is the least that counts.
     dt = np.diff(times)
-    acceleration = np.abs(np.diff(recording.v, axis=0)).max(axis=1) / np.maximum(dt, 0.5 * np.median(dt))
-    answering = np.concatenate([[False], acceleration > _ANSWER_SHARE * acceleration_limit])
+    change = np.abs(np.diff(recording.v, axis=0) / acceleration_limit).max(axis=1)
+    answering = np.concatenate([[False], change > _ANSWER_SHARE * np.maximum(dt, 0.5 * np.median(dt))])
     latencies = []
     # The last step is left out: the recording ends before its answer.
     for step, following in zip(recording.steps[:-1], recording.steps[1:], strict=True):

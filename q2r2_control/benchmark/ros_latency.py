@@ -26,6 +26,7 @@ from trajectory_msgs.msg import JointTrajectory
 from q2r2_control.benchmark.command_responses import LatencyReport, Recording, latency_report
 from q2r2_control.config import load_config
 from q2r2_control.errors import Q2R2Error
+from q2r2_control.robot.robot import Robot
 from q2r2_control.ros.base_node import COMMAND_QOS, STREAM_QOS
 from q2r2_control.ros.launch.middleware import set_up_middleware
 from q2r2_control.ros.launch.processes import NodeProcess
@@ -44,7 +45,8 @@ class LatencyError(Q2R2Error):
 
 def measure_latency(config: str, duration: float, rate: float, progress: Callable[[str], None]) -> LatencyReport:
     """Measure for ``duration`` [s] each way, with the controller at ``rate`` [Hz]. Raises :class:`LatencyError`."""
-    limit = load_config(config).control.acceleration_limit
+    cell = load_config(config)
+    limit = Robot.from_config(cell).capped_acceleration(cell.control.acceleration_limit)
     filters = {f"teleop.filter.{name}": str(value) for name, value in _SHORTEST_FILTER.items()}
     nodes = [
         NodeProcess("mujoco_robot", "q2r2_control.ros.nodes.mujoco_robot", {"config": config}),

@@ -113,7 +113,7 @@ def metrics_of(run: TimedRun, robot: Robot, settings: ControllerSettings) -> Run
         np.linalg.norm(robot.tool_pose(q[-1], arm).translation - pose.translation) for arm, pose in run.goal.items()
     ]
     return RunMetrics(
-        max_acceleration_ratio=float(np.abs(a).max()) / settings.acceleration_limit,
+        max_acceleration_ratio=float((np.abs(a) / robot.capped_acceleration(settings.acceleration_limit)).max()),
         max_velocity_ratio=float((np.abs(v) / (robot.velocity_limit * settings.velocity_scale)).max()),
         min_position_margin_rad=float(room.min()),
         min_distance_mm=1e3 * min(float(robot.distance_values(posture).min(initial=np.inf)) for posture in q),

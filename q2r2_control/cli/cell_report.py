@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from q2r2_control.config.arms import FlangeConfig
 from q2r2_control.config.cell import Config, ObstacleConfig
 from q2r2_control.config.external import describe
 from q2r2_control.control.controller import CartesianController
@@ -38,6 +40,7 @@ class ArmCheck:
 
     name: str
     model: str
+    flange: str | None  # model, or sizes
     tool_model: str | None
     tool_frame: str
     tool_position: tuple[float, ...]
@@ -63,7 +66,7 @@ class CellCheck:
     @property
     def notes(self) -> tuple[str, ...]:
         """One line for each thing that a user should know of and that is no fault."""
-        return tuple(_stop_note(stop) for stop in self.stop_torques if stop.ratio > 1.0)
+        return tuple(_stop_note(stop) for stop in self.stop_torques if stop.stop.ratio > 1.0)
 
     def as_json(self) -> dict[str, Any]:
         """Plain data and dataclasses for the JSON writer."""
@@ -93,7 +96,7 @@ def check_cell(config: Config, compiling: AbstractContextManager[None] | None = 
         min_distance=settings.min_distance,
         nearest=tuple(distances[:_NEAREST]),
         faults=preflight_faults(robot, settings, controller),
-        stop_torques=stop_torques(robot, settings.acceleration_limit),
+        stop_torques=stop_torques(robot, robot.capped_acceleration(settings.acceleration_limit)),
         driven={} if config.external is None else describe(config.external),
     )
 
@@ -167,13 +170,32 @@ def _write(file: Path, text: str) -> None:
 
 
 def _stop_note(stop: StopTorque) -> str:
-    posture = " ".join(f"{position:.2f}" for position in stop.posture)
-    return (
-        f"{stop.arm} arm: where all joints stop at {stop.acceleration:g} rad/s^2 from low speed, with the worst signs, "
-        f"{stop.joint} is asked for up to {stop.ratio:.2f} times its torque limit, at {posture} rad. In "
-        f"{100 * stop.share_over:.1f} % of {stop.postures} random postures a joint is asked for more than it has; with "
-        f"control.acceleration_limit up to {stop.bearable:.1f}, in none of them"
+    """What asks a joint of the arm for more torque than it has, where, how often, and what helps."""
+    heavy = stop.gravity.ratio > 1.0
+    worst = stop.gravity if heavy else stop.stop
+    posture = " ".join(f"{position:.2f}" for position in worst.posture)
+    most = f"{worst.joint} is asked for up to {worst.ratio:.2f} times its torque limit, at {posture} rad"
+    often = (
+        f"In {100 * worst.share_over:.1f} % of {stop.postures} random postures (seed {stop.seed}) a joint is asked for "
+        "more than it has"
     )
+    if heavy:
+        return (
+            f"{stop.arm} arm: by gravity alone, at rest, {most}. {often}, with a full stop in "
+            f"{100 * stop.stop.share_over:.1f} %. No acceleration limit changes the former, only the model's torque "
+            "limits, masses and ranges of positions"
+        )
+    return (
+        f"{stop.arm} arm: where all joints stop at their acceleration limits from low speed, with the worst signs, "
+        f"{most}. {often}; with {math.floor(100 * stop.bearable) / 100:.2f} times these limits, in none of them: "
+        f"arms.{stop.arm}.acceleration_limit, control.acceleration_limit"
+    )
+
+
+def _flange_of(config: FlangeConfig) -> str | None:
+    if config.thickness is None or config.radius is None:
+        return config.model
+    return f"{1e3 * config.thickness:g} mm thick, radius {1e3 * config.radius:g} mm"
 
 
 def _arm_check(config: Config, robot: Robot, name: str) -> ArmCheck:
@@ -182,6 +204,7 @@ def _arm_check(config: Config, robot: Robot, name: str) -> ArmCheck:
     return ArmCheck(
         name=name,
         model=config.model_of(name),
+        flange=_flange_of(settings.flange),
         tool_model=settings.tool.model,
         tool_frame=arm.tool_frame,
         tool_position=tuple(robot.tool_pose(robot.home, name).translation.tolist()),

@@ -60,7 +60,7 @@ def run_cell(config: Config, options: RunOptions, console: Console) -> RunSummar
         source = _input_of(config, options, console)
         pipeline = Pipeline.from_config(config, input=source, plant=options.plant, mode=options.mode)
         _refuse_faults(pipeline, options.force, console)
-    history = History(pipeline.robot, config.control.acceleration_limit)
+    history = History(pipeline.robot, pipeline.robot.capped_acceleration(config.control.acceleration_limit))
     if options.report:
         pipeline.listeners.append(history)
     with ExitStack() as stack:

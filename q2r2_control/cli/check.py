@@ -14,7 +14,14 @@ from q2r2_control.cli.cell_report import CellCheck, check_cell, write_model_pair
 from q2r2_control.cli.options import ConfigFile, Json
 from q2r2_control.cli.output import as_json_text, notice_of_compiling, stderr_console
 from q2r2_control.cli.progress_lines import ProgressLines
-from q2r2_control.cli.tables import arm_table, model_pairs_table, obstacle_table, pair_reach_table, pair_table
+from q2r2_control.cli.tables import (
+    arm_table,
+    model_pairs_table,
+    obstacle_table,
+    pair_reach_table,
+    pair_table,
+    stop_table,
+)
 from q2r2_control.config import load_config
 from q2r2_control.errors import ConfigError
 
@@ -59,7 +66,12 @@ def check(
 def _print_cell(result: CellCheck) -> None:
     console = Console()
     console.print(f"cell {result.name}", highlight=False)
-    for table in (*map(arm_table, result.arms), obstacle_table(result), pair_table(result)):
+    for table in (
+        *map(arm_table, result.arms),
+        *map(stop_table, result.stop_torques),
+        obstacle_table(result),
+        pair_table(result),
+    ):
         console.print(table)
     for arm, line in (result.driven or {"arms": "the built-in controller"}).items():
         console.print(f"{arm} driven by {line}", highlight=False, markup=False, soft_wrap=True)

@@ -6,12 +6,15 @@ from rich.table import Table
 from rich.text import Text
 
 from q2r2_control.cli.cell_report import ArmCheck, CellCheck, PairsWritten
+from q2r2_control.robot.stop_torque import StopTorque
 
 
 def arm_table(arm: ArmCheck) -> Table:
     """One arm's joints and limits."""
     position = " ".join(f"{value:.3f}" for value in arm.tool_position)
-    title = f"{arm.name} arm: {arm.model}, tool {arm.tool_model or 'none'}; {arm.tool_frame} at home at {position} m"
+    flange = "" if arm.flange is None else f", flange {arm.flange}"
+    tool = f"tool {arm.tool_model or 'none'}; {arm.tool_frame} at home at {position} m"
+    title = f"{arm.name} arm: {arm.model}{flange}, {tool}"
     table = _table_of(title, "joint")
     # Units below, which leaves 26 of 80 columns for names.
     for column in ("min\n[rad]", "home\n[rad]", "max\n[rad]", "speed\n[rad/s]", "torque\n[Nm]"):
@@ -19,6 +22,18 @@ def arm_table(arm: ArmCheck) -> Table:
     for joint in arm.joints:
         figures = (joint.lower, joint.home, joint.upper, joint.velocity, joint.torque)
         table.add_row(Text(joint.name), *(f"{value:.3f}" for value in figures))
+    return table
+
+
+def stop_table(stop: StopTorque) -> Table:
+    """What a full stop of one arm asks of its joints."""
+    title = f"{stop.arm} arm: most torque in {stop.postures} random postures, of each joint's limit"
+    table = _table_of(title, "joint")
+    for column in ("stops at\n[rad/s^2]", "gravity\n[%]", "full stop\n[%]"):
+        table.add_column(Text(column), justify="right")
+    for joint in stop.joints:
+        shares = (f"{100 * share:.0f}" for share in (joint.gravity, joint.stop))
+        table.add_row(Text(joint.joint), f"{joint.acceleration:.2f}", *shares)
     return table
 
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationInfo, model_validator
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationInfo, model_validator
 
 from q2r2_control.errors import ConfigError
 
@@ -15,6 +15,7 @@ Side = Literal["left", "right"]
 Coordinate = Annotated[float, Field(ge=-20, le=20)]  # [m]
 Extent = Annotated[float, Field(gt=0, le=20)]  # [m]
 Angle = Annotated[float, Field(ge=-6.2832, le=6.2832)]  # [rad]
+Acceleration = Annotated[float, Field(gt=0, le=100)]  # [rad/s^2]
 Share = Annotated[float, Field(ge=0, le=1)]
 Metres3 = Annotated[tuple[Coordinate, Coordinate, Coordinate], Field(description="x, y, z [m]")]
 Radians3 = Annotated[tuple[Angle, Angle, Angle], Field(description="roll, pitch, yaw [rad]")]
@@ -30,6 +31,13 @@ def _beside_the_file(value: str, info: ValidationInfo) -> str:
         return str(folder / path) if folder is not None and value and (folder / path).exists() else value
     except (OSError, ValueError):  # a name that no file can have; reading it will say so
         return value
+
+
+def _by_joint(value: object) -> object:
+    """Refuses a list or a number, whose kind pydantic would ask for by a name that YAML has not."""
+    if not isinstance(value, Mapping):
+        raise ValueError("allowed: limits by joint, such as {A2: 5.4}")
+    return value
 
 
 # Looked up from the folder of the YAML first, then from the working directory, then among the shipped files.
@@ -50,8 +58,36 @@ class PoseConfig(CellModel):
     rpy: Radians3 = (0.0, 0.0, 0.0)
 
 
+class FlangeConfig(CellModel):
+    """What is between an arm's last link and its tool: a model, or a cylinder of these sizes; by default nothing."""
+
+    model: LocalPath | None = Field(None, description="a file of robots/ without .urdf, or a path")
+    xacro_args: XacroArgs = {}
+    frame: str | None = Field(None, description="link of the model that carries the tool; default: the last link")
+    thickness: float | None = Field(None, gt=0, le=0.5, description="of a cylinder instead of a model, along z [m]")
+    radius: float | None = Field(None, gt=0, le=0.5, description="of that cylinder [m]")
+    mass: float = Field(0.0, ge=0, le=20, description="of that cylinder [kg]")
+
+    @model_validator(mode="after")
+    def _is_one_thing(self) -> FlangeConfig:
+        if (self.thickness is None) != (self.radius is None):
+            raise ValueError("thickness and radius describe a cylinder together: give both")
+        if self.model is not None and (self.thickness is not None or self.mass):
+            raise ValueError("a model has its own thickness, radius and mass: give the model or those")
+        if self.model is None and (self.frame is not None or self.xacro_args):
+            raise ValueError("frame and xacro_args are those of a model: give it as well")
+        if self.mass and self.thickness is None:
+            raise ValueError("mass is that of a cylinder: give its thickness and radius as well")
+        return self
+
+    @property
+    def is_none(self) -> bool:
+        """Whether the tool sits on the arm's last link itself."""
+        return self.model is None and self.thickness is None
+
+
 class ToolConfig(CellModel):
-    """What is mounted on an arm's last link."""
+    """What is mounted on an arm's last link or flange."""
 
     model: LocalPath | None = Field(None, description="a file of robots/ without .urdf, or a path; none: bare flange")
     xacro_args: XacroArgs = {}
@@ -107,9 +143,13 @@ class ArmConfig(CellModel):
     mount: PoseConfig = PoseConfig()
     tip: str | None = Field(None, description="last link of the arm; none: found, where there is no doubt")
     joints: tuple[str, ...] = Field((), description="of the arm, base to tip; none: all from base to tip")
+    flange: FlangeConfig = FlangeConfig()
     tool: ToolConfig = ToolConfig()
     gripper: GripperConfig = GripperConfig()
     home: tuple[float, ...] = Field(description="joint positions [rad]")
+    acceleration_limit: Annotated[dict[str, Acceleration], BeforeValidator(_by_joint)] = Field(
+        default_factory=dict, description="of joints, by name, in place of the model's [rad/s^2]"
+    )
     swivel: SwivelConfig = SwivelConfig()
 
     @model_validator(mode="after")
@@ -120,6 +160,11 @@ class ArmConfig(CellModel):
         for key, link in named.items():
             if self.tip is not None and link not in (None, self.tip):
                 raise ValueError(f"tip = {self.tip!r:.60} and {key} = {link!r:.60} mean the same link: give one")
+        if self.tool.frame is not None and self.tool.model is None and not self.flange.is_none:
+            raise ValueError(
+                f"tool.frame = {self.tool.frame!r:.60}: without a tool the end of the flange is what moves; "
+                "the arm's link that carries the flange is named by tip"
+            )
         return self
 
     @property

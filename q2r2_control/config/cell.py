@@ -115,6 +115,8 @@ class Config(CellModel):
         made = next(made for side, made in self.arms.items() if side == arm)
         if made.tool.model is not None:
             return None if made.tool.frame is None else f"{arm}_{made.tool.frame}"
+        if not made.flange.is_none:
+            return None
         frame = made.tool.frame or made.named_tip
         return frame if frame is None or self.robot is not None else f"{arm}_{frame}"
 

@@ -23,7 +23,7 @@ class ControllerSettings(BaseModel):
     )
     max_substep: float = Field(0.002, gt=0, le=0.02, description="a longer dt is split into equal parts below this [s]")
 
-    acceleration_limit: float = Field(10.0, gt=0, le=100, description="every joint [rad/s^2]")
+    acceleration_limit: float = Field(10.0, gt=0, le=100, description="cap of every joint's own limit [rad/s^2]")
     velocity_scale: float = Field(1.0, gt=0, le=1, description="fraction of the robot's velocity limits")
     position_margin: float = Field(0.01, ge=0, le=0.5, description="distance kept from position limits [rad]")
     recovery_velocity: float = Field(0.2, gt=0, le=1, description="inward speed when outside a limit [rad/s]")

@@ -46,7 +46,7 @@ def _safety_model(robot: Robot, settings: ControllerSettings) -> SafetyModel:
             lower=robot.position_lower + settings.position_margin,
             upper=robot.position_upper - settings.position_margin,
             velocity=robot.velocity_limit * settings.velocity_scale,
-            acceleration=np.full(robot.model.nv, settings.acceleration_limit),
+            acceleration=robot.capped_acceleration(settings.acceleration_limit),
             longest_step=settings.max_substep,
             return_speed=settings.recovery_velocity,
         ),

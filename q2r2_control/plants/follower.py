@@ -17,11 +17,12 @@ class JointFollower:
     """Where each joint has to be at any time, from the newest command that names it.
 
     A command says posture and velocity at a time; in between the joint moves on at that velocity. When the next command
-    stays out the joint brakes at ``acceleration_limit`` [rad/s^2], so that a velocity never outlives its sender. No
-    joint moves faster than its ``velocity_limit`` (nv,) [rad/s]. Times are seconds on one clock that is passed in.
+    stays out the joint brakes at its ``acceleration_limit`` (nv,) [rad/s^2], so that a velocity never outlives its
+    sender. No joint moves faster than its ``velocity_limit`` (nv,) [rad/s]. Times are seconds on one clock that is
+    passed in.
     """
 
-    def __init__(self, q: Array, acceleration_limit: float, velocity_limit: Array) -> None:
+    def __init__(self, q: Array, acceleration_limit: Array, velocity_limit: Array) -> None:
         self._acceleration, self._velocity_limit = acceleration_limit, velocity_limit
         self.stop(q, np.zeros_like(q))
 

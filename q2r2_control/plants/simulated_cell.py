@@ -45,7 +45,9 @@ class SimulatedCell:
         self._hold_after, self._max_jump = hold_after, max_jump
         self._columns = {name: index for index, name in enumerate(robot.joint_names)}
         self._timestep = config.mujoco.timestep
-        self._follower = JointFollower(robot.home, config.control.acceleration_limit, robot.velocity_limit)
+        self._follower = JointFollower(
+            robot.home, robot.capped_acceleration(config.control.acceleration_limit), robot.velocity_limit
+        )
         self.fingers = tuple(joint for arm in robot.arms.values() for joint in arm.finger_joints)
         self._finger_q = [self.plant.model.joint(name).qposadr[0] for name in self.fingers]
         self._finger_v = [self.plant.model.joint(name).dofadr[0] for name in self.fingers]

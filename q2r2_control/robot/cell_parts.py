@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
-from q2r2_control.config.arms import ArmConfig, PoseConfig, RobotConfig, ToolConfig
+from q2r2_control.config.arms import ArmConfig, FlangeConfig, PoseConfig, RobotConfig, ToolConfig
 from q2r2_control.errors import ConfigError, Q2R2Error
 from q2r2_control.robot.arm_chain import default_tip, end_of, named_joints
 from q2r2_control.robot.description import Description, LinkTree, joint_end, joint_limits, load_description, parse_srdf
+from q2r2_control.robot.flange import cylinder_flange
 from q2r2_control.robot.urdf_parts import WORLD, fixed_joint, renamed, renamed_exclusions
 
 
@@ -34,27 +36,36 @@ class Model:
         return [joint, *(renamed(part, self.name_in_cell) for part in self.parts)]
 
 
+class Mounted(NamedTuple):
+    """A flange or a tool on an arm."""
+
+    model: Model
+    joint: ET.Element  # to what carries it
+    is_flat: bool  # on the end of what carries it, and there is a file that can speak of the two
+
+
 class Arm:
-    """One arm of a model with its tool, and which joints and links of the two are the arm's."""
+    """One arm of a model with flange and tool, and which joints and links of them are the arm's."""
 
     def __init__(self, config: ArmConfig, model: Model, packages: Mapping[str, str], side: str) -> None:
         self.config, self.model, self.key = config, model, f"arms.{side}"
-        self.tool: Model | None = None
-        carrier = self._carrier()
-        self.tree, self.frame = model.tree, config.tool.frame or carrier
+        self.mounted: list[Mounted] = []
+        self.frame = carrier = self._carrier()
+        flat = carrier == _usual_tip(model.tree)
+        if (flange := load_flange(config.flange, packages, f"{self.key}.flange")) is not None:
+            flat = flat and config.flange.model is not None
+            self._mount(Model(flange, f"{side}_"), "flange", PoseConfig(), flat, config.flange.frame)
         if config.tool.model is None:
-            _check_link(self.frame, model, f"{self.key}.tool.frame")
+            if config.tool.frame is not None:
+                _check_link(self.frame, model, f"{self.key}.tool.frame")
         else:
-            tool_key = f"{self.key}.tool"
-            self.tool = Model(load_model(config.tool, packages, tool_key), f"{side}_")
-            _check_clash(model, self.tool, f"{tool_key}.model")
-            self.frame = config.tool.frame or end_of(self.tool.tree, self.tool.tree.root, f"{tool_key}.frame")
-            _check_link(self.frame, self.tool, f"{tool_key}.frame")
-            self.tool_joint = fixed_joint("tool_mount", carrier, self.tool.tree.root, config.tool.mount)
-            whole = ET.Element("robot")
-            whole.extend([*model.parts, *self.tool.parts, self.tool_joint])
-            self.tree = LinkTree(whole, self.key)
-        self.carrier = carrier
+            tool = Model(load_model(config.tool, packages, f"{self.key}.tool"), f"{side}_")
+            self._mount(tool, "tool", config.tool.mount, flat and config.tool.mount == PoseConfig(), config.tool.frame)
+        whole = ET.Element("robot")
+        whole.extend(
+            [*model.parts, *(part for mounted in self.mounted for part in [*mounted.model.parts, mounted.joint])]
+        )
+        self.tree = LinkTree(whole, self.key)
         self.chain = self.tree.chain(self.frame)
         if not self.chain:
             named = "tip" if config.tip == self.frame else "tool.frame"
@@ -63,9 +74,21 @@ class Arm:
             )
         self.joints = named_joints(self.tree, self.frame, config.joints, self.key)
 
+    def _mount(self, part: Model, what: str, mount: PoseConfig, is_flat: bool, frame: str | None = None) -> None:
+        """Put a flange or a tool on the arm as it is by now, whose end from then on is ``frame`` or the part's own."""
+        key = f"{self.key}.{what}"
+        for other in (self.model, *(mounted.model for mounted in self.mounted)):
+            _check_clash(other, part, f"{key}.model")
+        joint = fixed_joint(f"{what}_mount", self.frame, part.tree.root, mount)
+        self.mounted.append(Mounted(part, joint, is_flat))
+        self.frame = frame or end_of(part.tree, part.tree.root, f"{key}.frame")
+        _check_link(self.frame, part, f"{key}.frame")
+
     def name_in_cell(self, name: str) -> str:
-        of_tool = self.tool is not None and (name in self.tool.names or name == "tool_mount")
-        return (self.tool if of_tool and self.tool is not None else self.model).name_in_cell(name)
+        for mounted in self.mounted:
+            if name in mounted.model.names or name == mounted.joint.get("name"):
+                return mounted.model.name_in_cell(name)
+        return self.model.name_in_cell(name)
 
     def joint_names(self) -> tuple[str, ...]:
         """The arm's own joints, as they are called in the cell."""
@@ -88,20 +111,29 @@ class Arm:
                     "name another tip"
                 )
 
-    def tool_urdf(self) -> list[ET.Element]:
-        """What the tool adds to the cell."""
-        if self.tool is None:
-            return []
-        return [renamed(part, self.name_in_cell) for part in [self.tool_joint, *self.tool.parts]]
+    def mounted_urdf(self) -> list[ET.Element]:
+        """What flange and tool add to the cell."""
+        return [renamed(part, self.name_in_cell) for item in self.mounted for part in [item.joint, *item.model.parts]]
 
-    def tool_exclusions(self) -> list[ET.Element]:
-        """Pairs of the tool's links, and of those of the tool flat on just this model's tip."""
-        if self.tool is None:
-            return []
-        parts = list(self.tool.exclusions)
-        if self.config.tool.mount == PoseConfig() and self.carrier == _usual_tip(self.model.tree):
-            parts += _exclusions_of_the_two(self.model.description, self.tool.description)
+    def mounted_exclusions(self) -> list[ET.Element]:
+        """Pairs of the flange's links, of the tool's, and of those of each with what it sits on flat."""
+        parts, carriers = [], [self.model.description]
+        for mounted in self.mounted:
+            parts += mounted.model.exclusions
+            if mounted.is_flat:
+                parts += _exclusions_on(carriers, mounted.model.description)
+            carriers.append(mounted.model.description)
         return renamed_exclusions(parts, self.name_in_cell)
+
+    def acceleration_limits(self) -> dict[str, float]:
+        """Limits [rad/s^2] that the file gives joints of the arm, by their names in the cell."""
+        limits, names = self.config.acceleration_limit, [joint.get("name", "") for joint in self.joints]
+        for name in limits:
+            if name not in names:
+                raise ConfigError(
+                    f"{self.key}.acceleration_limit.{name!s:.60}: no joint of the arm; allowed: {', '.join(names)}"
+                )
+        return {self.name_in_cell(name): value for name, value in limits.items()}
 
     def posture(self) -> dict[str, float]:
         """Position of each joint of arm and gripper: the arm at home, the gripper open."""
@@ -152,13 +184,27 @@ class Arm:
         return [name for name, joint in found if last in self.tree.path(joint_end(joint, "parent"))]
 
 
-def load_model(config: ArmConfig | RobotConfig | ToolConfig, packages: Mapping[str, str], key: str) -> Description:
+def load_model(
+    config: ArmConfig | RobotConfig | FlangeConfig | ToolConfig, packages: Mapping[str, str], key: str
+) -> Description:
     """The description that the block ``key`` names. Raises :class:`ConfigError` that begins with it."""
     model = config.model or ""
     try:
         return load_description(model, config.xacro_args, packages)
     except Q2R2Error as error:
         raise ConfigError(f"{key}.model = {model!r:.120}: {error}") from error
+
+
+def load_flange(config: FlangeConfig, packages: Mapping[str, str], key: str) -> Description | None:
+    """The flange that the block ``key`` describes, if any. Raises :class:`ConfigError` that begins with ``key``."""
+    if config.thickness is not None and config.radius is not None:
+        return cylinder_flange(config.thickness, config.radius, config.mass)
+    return None if config.model is None else load_model(config, packages, key)
+
+
+def name_of_stack(parts: Sequence[Description]) -> str:
+    """Name, without .srdf, of the file about pairs of the outermost of ``parts`` with the others, the arm first."""
+    return "_on_".join(part.stem for part in reversed(parts))
 
 
 def check_position(joint: ET.Element, position: float, key: str) -> None:
@@ -174,12 +220,12 @@ def _check_link(link: str, model: Model, key: str) -> None:
         raise ConfigError(f"{key} = {link!r:.60}: {name} has no such link; allowed: {', '.join(model.links)}")
 
 
-def _check_clash(arm: Model, tool: Model, key: str) -> None:
+def _check_clash(carrier: Model, part: Model, key: str) -> None:
     for tag in ("link", "joint"):
-        names = {part.get("name", "") for part in arm.parts if part.tag == tag}
-        if clash := names & {part.get("name", "") for part in tool.parts if part.tag == tag}:
-            tools = tool.description.name
-            raise ConfigError(f"{key} = {tools!r}: {tag} names {', '.join(sorted(clash))} occur in the arm as well")
+        names = {element.get("name", "") for element in carrier.parts if element.tag == tag}
+        if clash := names & {element.get("name", "") for element in part.parts if element.tag == tag}:
+            name = part.description.name
+            raise ConfigError(f"{key} = {name!r}: {tag} names {', '.join(sorted(clash))} occur in the arm as well")
 
 
 def _usual_tip(tree: LinkTree) -> str | None:
@@ -189,7 +235,7 @@ def _usual_tip(tree: LinkTree) -> str | None:
         return None
 
 
-def _exclusions_of_the_two(arm: Description, tool: Description) -> list[ET.Element]:
-    """Pairs known of just this tool flat on just this arm's last link: ``TOOL_on_ARM.srdf`` beside the tool."""
-    file = tool.file.with_name(f"{tool.stem}_on_{arm.stem}.srdf")
+def _exclusions_on(carriers: Sequence[Description], part: Description) -> list[ET.Element]:
+    """Pairs known of just this part flat on just these: ``TOOL_on_ARM.srdf`` or ``TOOL_on_FLANGE_on_ARM.srdf``."""
+    file = part.file.with_name(f"{name_of_stack([*carriers, part])}.srdf")
     return [*parse_srdf(file.read_text(encoding="utf-8"), str(file))] if file.is_file() else []

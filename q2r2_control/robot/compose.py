@@ -17,6 +17,7 @@ from q2r2_control.config.cell import Config
 from q2r2_control.errors import ConfigError
 from q2r2_control.robot.cell_parts import Arm, Model, check_position, load_model
 from q2r2_control.robot.floor import floor_link
+from q2r2_control.robot.joint_accelerations import set_acceleration_limit
 from q2r2_control.robot.locking import lock_joints, resting_position
 from q2r2_control.robot.pairs import exclusions_of_file
 from q2r2_control.robot.urdf_parts import WORLD, fixed_joint, name_shapes, obstacle_link, renamed_exclusions
@@ -58,12 +59,15 @@ def compose(config: Config) -> ComposedCell:
         if arm is next(other for other in arms.values() if other.model is arm.model):
             urdf.extend(arm.model.urdf((config.robot or arm.config).mount))
             srdf.extend(renamed_exclusions(arm.model.exclusions, arm.model.name_in_cell))
-        urdf.extend(arm.tool_urdf())
-        srdf.extend(arm.tool_exclusions())
+        urdf.extend(arm.mounted_urdf())
+        srdf.extend(arm.mounted_exclusions())
     _check_apart(urdf)
     home = _home(urdf, arms)
     resting = {} if config.robot is None else _resting(urdf, config.robot, home)
     lock_joints(urdf, home, _locked_at(urdf, home | resting))
+    for arm in arms.values():
+        for name, limit in arm.acceleration_limits().items():
+            set_acceleration_limit(next(joint for joint in urdf.findall("joint") if joint.get("name") == name), limit)
     name_shapes(urdf.findall("link"))
     for name, obstacle in config.obstacles.items():
         _check_obstacle_name(name, urdf)

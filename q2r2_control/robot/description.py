@@ -14,6 +14,7 @@ from pathlib import Path
 
 from q2r2_control.config.resources import find_resource
 from q2r2_control.errors import ConfigError, RobotError
+from q2r2_control.robot.joint_accelerations import ATTRIBUTES
 from q2r2_control.robot.packages import package_file
 from q2r2_control.robot.xacro_model import expand_xacro
 
@@ -37,7 +38,7 @@ _SCALARS = {
     "sphere": ("radius",),
     "mass": ("value",),
     "inertia": ("ixx", "ixy", "ixz", "iyy", "iyz", "izz"),
-    "limit": ("lower", "upper", "velocity", "effort"),
+    "limit": ("lower", "upper", "velocity", "effort", *ATTRIBUTES),
     "rotor": ("inertia", "gear"),
     "mimic": ("multiplier", "offset"),
 }

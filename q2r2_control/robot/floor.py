@@ -47,7 +47,8 @@ def floor_link(height: float, parent: str, obstacles: Collection[str]) -> list[E
 def sink_boxes_into_floor(geometry: pin.GeometryModel) -> None:
     """Let fixed upright boxes that stand on the floor reach deep into it, so that nothing is pushed out downwards.
 
-    What is inside a box is pushed out through the nearest face. The underside of a box on the floor is no way out: a hand deep in it and the wrist above would be pushed apart and stay for ever. Above the floor nothing changes.
+    What is inside a box is pushed out through the nearest face. The underside of a box on the floor is no way out: a
+    hand deep in it and the wrist above would be pushed apart and stay for ever. Above the floor nothing changes.
     """
     floor = next((item for item in geometry.geometryObjects if _is_floor(item)), None)
     if floor is None:

@@ -1,18 +1,20 @@
 """The SRDF files that lie beside the models of arms and tools: which pairs of their links need no watching.
 
 ``ARM.srdf`` speaks of an arm's own links, ``TOOL.srdf`` of a tool's, ``TOOL_on_ARM.srdf`` of both, with the tool flat
-on the arm's last link. The files of robots/ are made here, and a test makes them again.
+on the arm's last link. With a flange between them there are ``FLANGE_on_ARM.srdf`` and ``TOOL_on_FLANGE_on_ARM.srdf``.
+The files of robots/ are made here, and a test makes them again.
 """
 
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
+from collections.abc import Mapping
 from itertools import combinations
 
 from q2r2_control.config.arms import ArmConfig, PoseConfig, SwivelConfig
 from q2r2_control.config.cell import Config
 from q2r2_control.errors import ConfigError
-from q2r2_control.robot.cell_parts import load_model
+from q2r2_control.robot.cell_parts import load_flange, load_model, name_of_stack
 from q2r2_control.robot.compose import compose
 from q2r2_control.robot.description import Description, parse_urdf
 from q2r2_control.robot.pairs import link_of
@@ -34,32 +36,45 @@ def model_srdfs(
 
     What these files say now is not used. Listed are neighbours, pairs that overlap at every posture, and pairs that
     stay more than ``clearance`` [m] apart, as far as ``samples`` postures and the way downhill from them show.
-    Raises :class:`ConfigError` for arms of one ``robot``.
+    Raises :class:`ConfigError` for arms of one ``robot``, and for a flange without a model.
     """
     files: dict[str, str] = {}
     if config.robot is not None:
         raise ConfigError("robot: its arms have no models of their own; --pairs looks at the cell as a whole")
     for side, arm in config.arms.items():
         model = load_model(arm, config.packages, f"arms.{side}")
+        if arm.flange.thickness is not None:
+            raise ConfigError(f"arms.{side}.flange: has no model that a file could speak of; --pairs looks at the cell")
+        flange = load_flange(arm.flange, config.packages, f"arms.{side}.flange")
         tool = None if arm.tool.model is None else load_model(arm.tool, config.packages, f"arms.{side}.tool")
-        name = model.file.stem if tool is None else f"{tool.file.stem}_on_{model.file.stem}"
-        if f"{name}.srdf" in files:
+        stack = [part for part in (model, flange, tool) if part is not None]
+        if f"{name_of_stack(stack)}.srdf" in files:
             continue
-        of_tool = set() if tool is None else {link.get("name", "") for link in tool.urdf.findall("link")}
+        layers = {link.get("name", ""): i for i, part in enumerate(stack) for link in part.urdf.findall("link")}
         disabled = _disabled(_alone(config, arm), _enveloped(tool), clearance, samples, seed, progress)
         comment = (
             f"Made by q2r2 check with its option model-pairs from {samples} random postures inside the joint limits. "
             f"Always: the shapes overlap at every posture, by construction. "
             f"Never: more than {1e3 * clearance:g} mm apart at every posture."
         )
-        by_links_of_tool: list[list[Disabled]] = [[], [], []]
-        for pair in disabled:
-            by_links_of_tool[len(of_tool & set(pair[:2]))].append(pair)
-        files[f"{model.file.stem}.srdf"] = srdf_text(model.name, comment, by_links_of_tool[0])
+        files[f"{model.stem}.srdf"] = srdf_text(model.name, comment, _of_layers(disabled, layers, {0}, 0))
+        for i in range(1, len(stack)):
+            name = name_of_stack(stack[: i + 1])
+            files[f"{name}.srdf"] = srdf_text(name, comment, _of_layers(disabled, layers, set(range(i)), i))
         if tool is not None:
-            files[f"{name}.srdf"] = srdf_text(name, comment, by_links_of_tool[1])
-            files[f"{tool.file.stem}.srdf"] = _tool_srdf(tool, by_links_of_tool[2])
+            within = _of_layers(disabled, layers, {len(stack) - 1}, len(stack) - 1)
+            files[f"{tool.stem}.srdf"] = _tool_srdf(tool, within)
     return files
+
+
+def _of_layers(disabled: list[Disabled], layers: Mapping[str, int], inner: set[int], outer: int) -> list[Disabled]:
+    """Pairs of a link of the part ``outer`` with one of the parts ``inner``, where 0 is the arm."""
+    found = []
+    for pair in disabled:
+        first, second = sorted(layers[link] for link in pair[:2])
+        if first in inner and second == outer:
+            found.append(pair)
+    return found
 
 
 def _alone(config: Config, arm: ArmConfig) -> Config:

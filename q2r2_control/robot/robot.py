@@ -18,6 +18,7 @@ from q2r2_control.robot.compose import compose
 from q2r2_control.robot.description import LinkTree, joint_limits, parse_srdf, parse_urdf
 from q2r2_control.robot.enclose import enclose_shapes
 from q2r2_control.robot.floor import remove_unreachable_floor_pairs, sink_boxes_into_floor
+from q2r2_control.robot.joint_accelerations import acceleration_limit
 from q2r2_control.robot.locking import lock_joints
 from q2r2_control.robot.pairs import (
     add_movable_pairs,
@@ -69,6 +70,8 @@ class Robot:
 
     All arrays are (nv,) in the order of ``model``'s velocity, which is that of ``joint_names``. Positions in rad (m for
     prismatic joints), velocities per second, torques in Nm (N). Made by :meth:`from_config` or :meth:`from_urdf`.
+    ``acceleration_limit`` is infinite for joints of which the model says none; what holds is
+    :meth:`capped_acceleration`.
 
     ``collision_model`` holds exactly the monitored pairs: each arm against the other with its base, against its own
     links that can meet, and against what stands in the cell. Every monitored shape is a capsule, a sphere, or a box
@@ -104,6 +107,8 @@ class Robot:
         self.position_upper: Array = self.model.upperPositionLimit.copy()
         self.velocity_limit: Array = self.model.velocityLimit.copy()
         self.torque_limit: Array = self.model.effortLimit.copy()
+        joints = {joint.get("name", ""): joint for joint in urdf.findall("joint")}
+        self.acceleration_limit: Array = np.array([acceleration_limit(joints[name]) for name in self.joint_names])
         _set_rotors(self.model, urdf)
         self.ignored_pairs = self._monitor(tree, exclusions)
         self._data: pin.Data = self.model.createData()
@@ -137,6 +142,10 @@ class Robot:
             raise RobotError(f"{where}: no arms given; expected a mapping such as {{'left': 'left_tool_frame'}}")
         home = {joint.get("name", ""): _resting(*joint_limits(joint)) for joint in urdf.findall("joint")}
         return cls(urdf, exclusions, dict(arms), home, where)
+
+    def capped_acceleration(self, cap: float) -> Array:
+        """Acceleration limits (nv,) with ``cap`` [rad/s^2] for every joint: the smaller one of it and the robot's."""
+        return np.minimum(self.acceleration_limit, cap)
 
     def tool_pose(self, q: Array, arm: str) -> pin.SE3:
         """Pose of the arm's tool frame in the world at ``q`` (nv,)."""
@@ -233,6 +242,8 @@ def _checked_chain(tree: LinkTree, arm: str, frame: str, where: str) -> list[str
             value = 0.0 if limit is None else float(limit.get(what, "0"))
             if not value > 0:
                 raise RobotError(f"{where}: joint {name} has {what} limit {value:g}; expected more than 0")
+        if not (value := acceleration_limit(joint)) > 0:
+            raise RobotError(f"{where}: joint {name} has acceleration limit {value:g}; expected more than 0, or none")
     return [joint.get("name", "") for joint in chain]
 
 

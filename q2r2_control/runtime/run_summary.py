@@ -135,6 +135,7 @@ class RunStatistics:
     _arms: dict[str, _ArmFigures] = field(init=False)
     _torque: TorqueStatistics = field(init=False)
     _velocity_limit: Array = field(init=False)
+    _acceleration_limit: Array = field(init=False)
     _ticks: int = 0
     _duration: float = 0.0
     _distance: float = float("inf")
@@ -151,6 +152,7 @@ class RunStatistics:
         self._arms = {name: _ArmFigures() for name in self.robot.arms}
         self._torque = TorqueStatistics.of(tuple(self.robot.arms))
         self._velocity_limit = self.control.velocity_scale * self.robot.velocity_limit
+        self._acceleration_limit = self.robot.capped_acceleration(self.control.acceleration_limit)
 
     def add(
         self,
@@ -165,7 +167,7 @@ class RunStatistics:
         self._ticks += 1
         self._duration += dt
         self._velocity = max(self._velocity, float(np.max(np.abs(reference.v) / self._velocity_limit)))
-        self._acceleration = max(self._acceleration, float(np.abs(reference.a).max()) / control.acceleration_limit)
+        self._acceleration = max(self._acceleration, float(np.max(np.abs(reference.a) / self._acceleration_limit)))
         room: Array = np.minimum(reference.q - robot.position_lower, robot.position_upper - reference.q)
         self._margin = min(self._margin, float(room.min()) - control.position_margin)
         if report.closest_distance < self._distance:

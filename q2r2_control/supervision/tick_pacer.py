@@ -26,10 +26,8 @@ _ROUNDING = 1e-9  # of a period
 class TickPacer:
     """Turns the time since the last tick into the time that the reference moves by, and counts what was late."""
 
-    def __init__(
-        self, period: float, velocity_limit: Array, acceleration_limit: float | Array, coasts: bool = False
-    ) -> None:
-        """``period`` [s] of the commands; ``velocity_limit`` (n,) [rad/s], ``acceleration_limit`` [rad/s^2]."""
+    def __init__(self, period: float, velocity_limit: Array, acceleration_limit: Array, coasts: bool = False) -> None:
+        """``period`` [s] of the commands; ``velocity_limit`` [rad/s], ``acceleration_limit`` [rad/s^2], (n,) each."""
         self.period = period
         self.missed_ticks = 0  # commands that were due and did not come
         self.stretched = 0.0  # time by which the motion is late for it [s]

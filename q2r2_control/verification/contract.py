@@ -127,7 +127,7 @@ class Contract:
         self._controller = controller
         self._robot, self._random = robot, np.random.default_rng(0) if random is None else random
         self._sample_all = sample_all
-        self._a = settings.acceleration_limit
+        self._a = robot.capped_acceleration(settings.acceleration_limit)
         self._v_max = robot.velocity_limit * settings.velocity_scale
         self._lower = robot.position_lower + settings.position_margin
         self._upper = robot.position_upper - settings.position_margin
@@ -186,7 +186,7 @@ class Contract:
             self._check_limits(q, v)
             self._check_distance(report.closest_distance, report.certified)
             stop = self._controller.stop_deceleration
-            self._note("deceleration", float(stop.max()) / self._a)
+            self._note("deceleration", float((stop / self._a).max()))
             self._sample(q, v, stop, h, report.closest_distance)
             self._count(reference, h)
             self._q, self._v, self._stop = q, v, stop
@@ -224,7 +224,7 @@ class Contract:
     def _check_motion(self, q: Array, v: Array, a: Array, h: float) -> None:
         speed = np.abs(v)
         change = np.abs(v - self._v) - _ROUNDING * speed
-        self._note("acceleration", max(float(change.max()) / (self._a * h), float(np.abs(a).max()) / self._a))
+        self._note("acceleration", float((np.maximum(change / h, np.abs(a)) / self._a).max()))
         travel = np.abs(q - self._q) - _ROUNDING * np.abs(q)
         self._note("jump", float(np.max(travel / ((np.maximum(speed, np.abs(self._v)) + self._a * h) * h))))
         if h <= self._substep:

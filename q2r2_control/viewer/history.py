@@ -18,8 +18,8 @@ class History:
     Extremes cover every tick, so that no peak is lost between rows; other figures are those at the end of the interval.
     """
 
-    def __init__(self, robot: Robot, acceleration_limit: float, max_rows: int = 4000) -> None:
-        """``acceleration_limit`` [rad/s^2] is what accelerations are divided by; ``max_rows`` is even."""
+    def __init__(self, robot: Robot, acceleration_limit: Array, max_rows: int = 4000) -> None:
+        """``acceleration_limit`` (nv,) [rad/s^2] is what accelerations are divided by; ``max_rows`` is even."""
         self.robot = robot
         self._inverse_velocity_limit = 1.0 / robot.velocity_limit
         self._inverse_acceleration_limit = 1.0 / acceleration_limit
@@ -38,15 +38,16 @@ class History:
         reference = tick.reference
         self._distance = min(self._distance, reference.report.closest_distance)
         self._velocity = max(self._velocity, float(np.abs(reference.v * self._inverse_velocity_limit).max()))
-        self._acceleration = max(self._acceleration, float(np.abs(reference.a).max()))
+        self._acceleration = max(
+            self._acceleration, float(np.abs(reference.a * self._inverse_acceleration_limit).max())
+        )
         if tick.t < self._due:
             return
         self._due = tick.t + self._interval
         if self._used == len(self._rows):
             self._thin_out()
         row = self._rows[self._used]
-        acceleration = self._acceleration * self._inverse_acceleration_limit
-        row[:4] = tick.t, self._distance, self._velocity, acceleration
+        row[:4] = tick.t, self._distance, self._velocity, self._acceleration
         row[4 : 4 + self._nv] = tick.state.q
         for index, arm in enumerate(self.robot.arms):
             row[self._columns(index)] = _arm_figures(tick, arm)
@@ -70,7 +71,7 @@ class History:
 
     @property
     def acceleration_ratio(self) -> Array:
-        """(n,) of the joint with the largest acceleration; 1 is the limit."""
+        """(n,) of the joint that is nearest to its acceleration limit; 1 is the limit."""
         return self._rows[: self._used, 3]
 
     @property

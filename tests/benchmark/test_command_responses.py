@@ -7,7 +7,8 @@ import pytest
 
 from q2r2_control.benchmark.command_responses import Recording, latency_report
 
-PERIOD, LIMIT = 0.004, 10.0  # [s], [rad/s^2]
+PERIOD = 0.004  # [s]
+LIMIT = np.array([20.0, 20.0, 20.0, 10.0, 20.0, 20.0, 20.0])  # [rad/s^2]
 
 
 def recording(steps: list[float], delays: list[float | None], noise: float = 0.0) -> Recording:
@@ -17,7 +18,7 @@ def recording(steps: list[float], delays: list[float | None], noise: float = 0.0
     for step, delay in zip(steps, delays, strict=True):
         if delay is not None:
             since = times - step - delay
-            v[:, 3] += np.where(since >= -1e-9, LIMIT * PERIOD * np.exp(-np.maximum(since, 0.0) / 0.1), 0.0)
+            v[:, 3] += np.where(since >= -1e-9, LIMIT[3] * PERIOD * np.exp(-np.maximum(since, 0.0) / 0.1), 0.0)
     v += noise * np.random.default_rng(1).normal(size=v.shape)
     return Recording(steps, times.tolist(), (times + 0.001).tolist(), v)
 

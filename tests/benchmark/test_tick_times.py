@@ -62,7 +62,7 @@ def test_metrics_are_computed_from_the_motion_alone(robot: Robot) -> None:
     q[0] -= 110 * 0.5 * DT
     assert len(run.times_us) == 100
     assert metrics.failures == 0
-    assert metrics.max_acceleration_ratio == pytest.approx(0.5 / DT / CONFIG.control.acceleration_limit)
+    assert metrics.max_acceleration_ratio == pytest.approx(0.5 / DT / robot.acceleration_limit[0])
     assert metrics.max_velocity_ratio == pytest.approx(0.5 / robot.velocity_limit[0])
     way = np.linalg.norm(robot.tool_pose(q, "left").translation - robot.tool_pose(robot.home, "left").translation)
     assert metrics.position_error_mm == pytest.approx(1e3 * way)

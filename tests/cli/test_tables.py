@@ -34,7 +34,7 @@ def test_names_of_joints_and_links_are_whole_in_80_columns() -> None:
     """Tiago's are long: in 80 columns the figures are whole too, and what is longer than its column goes on below."""
     side = "left_arm_left_gripper_left_finger_joint"
     joint = JointCheck(f"{side}_1", -12.566, -1.234, 12.566, 10.472, 320.0)
-    arm = ArmCheck("left", "example-robot-data:tiago_dual", None, "left_tool", (0.0, 0.0, 0.0), (joint,))
+    arm = ArmCheck("left", "example-robot-data:tiago_dual", None, None, "left_tool", (0.0, 0.0, 0.0), (joint,))
     text = printed(arm_table(arm), width=80)
     assert joined(text, 0) == f"{side}_1"
     usual = replace(joint, name="left_arm_left_1_joint")

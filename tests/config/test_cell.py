@@ -12,7 +12,15 @@ import pytest
 import yaml
 from pydantic import BaseModel
 
-from q2r2_control.config.arms import ArmConfig, GripperConfig, PoseConfig, RobotConfig, SwivelConfig, ToolConfig
+from q2r2_control.config.arms import (
+    ArmConfig,
+    FlangeConfig,
+    GripperConfig,
+    PoseConfig,
+    RobotConfig,
+    SwivelConfig,
+    ToolConfig,
+)
 from q2r2_control.config.cell import (
     Config,
     HeadsetConfig,
@@ -80,6 +88,7 @@ class TestTheShippedCellShowsAllThereIsToTune:
         ("robot", RobotConfig),
         ("arms.left", ArmConfig),
         ("arms.left.mount", PoseConfig),
+        ("arms.left.flange", FlangeConfig),
         ("arms.left.tool", ToolConfig),
         ("arms.left.gripper", GripperConfig),
         ("arms.left.swivel", SwivelConfig),
@@ -306,6 +315,17 @@ def test_a_misspelt_key_is_named_before_the_one_that_is_missing_for_it(tmp_path:
         ("teleop.axes", ["+x", "+x", "+z"], "once each"),
         ("control.acceleration_limit", 0, "greater than 0"),
         ("control.acceleration_limit", -10, "greater than 0"),
+        ("arms.left.flange", "media_flange_touch_pneumatic", "object"),
+        ("arms.left.flange", {"thickness": 0.03}, "give both"),
+        ("arms.left.flange.thickness", 26, "less than or equal to 0.5"),
+        ("arms.left.flange", {"model": "disc", "thickness": 0.03, "radius": 0.05}, "give the model or those"),
+        ("arms.left.flange", {"mass": 0.3}, "give its thickness and radius as well"),
+        ("arms.left.flange", {"frame": "end"}, "are those of a model: give it as well"),
+        ("arms.left.acceleration_limit", 5.0, "allowed: limits by joint, such as {A2: 5.4}"),
+        ("arms.left.acceleration_limit", {"A1": -8}, "greater than 0"),
+        ("arms.left.acceleration_limit", {"A1": 500}, "less than or equal to 100"),
+        ("arms.left.acceleration_limit", {"A1": math.nan}, "finite number"),
+        ("arms.left.acceleration_limit", [8.65, 5.44], "allowed: limits by joint, such as {A2: 5.4}"),
         ("control.velocity_scale", 100, "less than or equal to 1"),
         ("control.min_distance", 20, "less than or equal to 0.2"),
         ("impedance.translational_stiffness", -1, "greater than 0"),
@@ -407,6 +427,7 @@ def test_what_is_no_cell_at_all_ends_in_one_line(tmp_path: Path, text: str | byt
         ("arms.left.gripper.joints", ["thumb"], "no such finger joint; allowed: finger_joint_1"),
         ("arms.left.home", [90, 0, 0, 0, 0, 0, 0], r"arms.left.home\[0\] = 90: joint A1 allows -2.96"),
         ("arms.left.home", [0, 0], "2 value.s., expected 7: A1"),
+        ("arms.left.acceleration_limit", {"A9": 5.0}, r"arms.left.acceleration_limit.A9: no joint .* allowed: A1, A2"),
     ],
 )
 def test_what_only_the_robot_can_tell_is_named_when_it_is_composed(

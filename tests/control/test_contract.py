@@ -10,6 +10,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from q2r2_control.config import load_config
 from q2r2_control.config.control import ControllerSettings
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.control.qp import make_solver
@@ -218,7 +219,7 @@ def test_an_arm_that_holds_is_not_pushed_about_by_the_other() -> None:
 
 def test_it_leaves_a_stretched_posture_in_little_more_than_the_time_the_acceleration_limit_needs() -> None:
     controller = iiwa7s()
-    robot, a = controller.robot, controller.settings.acceleration_limit
+    robot = controller.robot
     q = robot.home.copy()
     for arm in robot.arms.values():
         q[arm.joints] = [0.0, 0.9, 0.0, 0.0, 0.0, 0.0, 0.0]  # elbow and wrist straight: the Jacobian has lost rank
@@ -237,8 +238,29 @@ def test_it_leaves_a_stretched_posture_in_little_more_than_the_time_the_accelera
             for arm, pose in goals.items()
         )
     # The joint with the longest way, at full acceleration half of it and at full deceleration the other half.
-    fastest = 2.0 * np.sqrt(np.abs(reference.q - q).max() / a)
+    limit = robot.capped_acceleration(controller.settings.acceleration_limit)
+    fastest = 2.0 * np.sqrt((np.abs(reference.q - q) / limit).max())
     assert time < 1.2 * fastest, (time, fastest)
+
+
+def test_every_joint_keeps_the_smaller_one_of_its_own_limit_and_of_the_setting_and_uses_it() -> None:
+    limits = {"A2": 1.5, "A3": 12.0, "A4": 4.0}
+    cell = load_config("config/dual_iiwa7.yaml")
+    arms = {side: arm.model_copy(update={"acceleration_limit": limits}) for side, arm in cell.arms.items()}
+    robot = Robot.from_config(cell.model_copy(update={"arms": arms}))
+    controller = CartesianController(robot, ControllerSettings(acceleration_limit=9.0))
+    start = {arm: controller.tool_pose(arm) for arm in robot.arms}
+    goals = {arm: pin.SE3(pose.rotation, pose.translation + np.array([-0.1, 0.0, 0.15])) for arm, pose in start.items()}
+    accelerations, before = [], np.zeros(14)
+    for _ in range(600):
+        reference = controller.step(goals, 0.001)
+        accelerations.append(np.maximum(np.abs(reference.a), np.abs(reference.v - before) / 0.001))
+        before = reference.v
+    largest = np.max(accelerations, axis=0)[:7]
+    allowed = np.array([8.65, 1.5, 9.0, 4.0, 9.0, 9.0, 9.0])
+    assert (largest <= allowed * (1.0 + 1e-9)).all()
+    np.testing.assert_allclose(largest[[1, 3]], [1.5, 4.0])
+    assert largest[5] > 4.0
 
 
 def _towards(robot: Robot, arm: str, pose: pin.SE3) -> Array:

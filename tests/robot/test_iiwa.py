@@ -27,6 +27,7 @@ class DataSheet:
     masses: tuple[float, ...]  # of link 0..7 [kg]
     velocity: tuple[float, ...]  # [deg/s]
     torque: tuple[float, ...]  # [Nm]
+    acceleration: tuple[float, ...]  # as Drake publishes it [rad/s^2]
     rotor: tuple[float, ...]  # inertia about the rotor's own axis [kg m^2]
     gear: tuple[float, ...]
 
@@ -37,6 +38,7 @@ SHEETS = {
         (4.855658, 3.394011, 4.031991, 3.394011, 4.031989, 1.529239, 2.403626, 0.259474),
         (98, 98, 100, 130, 140, 180, 180),
         (176, 176, 110, 110, 110, 40, 40),
+        (8.65, 5.44, 5.69, 11.01, 11.78, 13.76, 13.17),
         (7.17e-5, 1.737e-4, 1.266e-4, 7.10e-5, 5.44e-5, 5.48e-5, 5.44e-5),
         (160,) * 7,
     ),
@@ -45,6 +47,7 @@ SHEETS = {
         (7.050378, 5.289529, 5.688888, 3.461245, 4.122995, 1.563756, 2.457878, 0.265331),
         (85, 85, 100, 75, 130, 135, 135),
         (320, 320, 176, 176, 110, 40, 40),
+        (8.57, 8.57, 8.74, 11.36, 12.23, 15.72, 15.72),
         (1.321e-4,) * 5 + (4.54e-5,) * 2,
         (160, 160, 160, 160, 100, 160, 160),
     ),
@@ -112,6 +115,7 @@ def test_limits_are_those_of_the_data_sheet_and_never_above(robot: Robot, name: 
         (-robot.position_lower, position),
         (robot.velocity_limit, np.radians(SHEETS[name].velocity)),
         (robot.torque_limit, np.array(SHEETS[name].torque, dtype=float)),
+        (robot.acceleration_limit, np.array(SHEETS[name].acceleration)),
     ):
         np.testing.assert_allclose(actual, sheet, atol=2e-6)
         assert (actual <= sheet).all()

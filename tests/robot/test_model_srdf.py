@@ -9,11 +9,13 @@ import pytest
 
 from q2r2_control.config import load_config
 from q2r2_control.config.resources import find_resource
+from q2r2_control.errors import ConfigError
 from q2r2_control.robot.model_srdf import model_srdfs
 from q2r2_control.robot.pairs import CLEARANCE
 from tests.robot.conftest import one_arm
 
 SAMPLES = 2000
+TOUCH, HAND = "media_flange_touch_pneumatic", {"model": "hand_e"}
 
 
 def _disabled(text: str) -> set[tuple[str, ...]]:
@@ -28,9 +30,24 @@ def test_every_shipped_file_lists_what_the_program_finds(arm: str) -> None:
         assert _disabled(text) == _disabled(find_resource(f"robots/{name}").read_text(encoding="utf-8"))
 
 
+@pytest.mark.parametrize("arm", ["iiwa7", "iiwa14"])
+def test_every_shipped_file_about_a_flange_lists_what_the_program_finds(arm: str) -> None:
+    made = model_srdfs(one_arm(model=arm, flange={"model": TOUCH}, tool=HAND), CLEARANCE, SAMPLES)
+    assert made.keys() == {f"{arm}.srdf", f"{TOUCH}_on_{arm}.srdf", f"hand_e_on_{TOUCH}_on_{arm}.srdf", "hand_e.srdf"}
+    for name, text in made.items():
+        assert _disabled(text) == _disabled(find_resource(f"robots/{name}").read_text(encoding="utf-8"))
+
+
+def test_of_a_flange_without_a_model_no_file_can_speak() -> None:
+    with pytest.raises(ConfigError, match=r"arms\.left\.flange: has no model that a file could speak of; --pairs"):
+        model_srdfs(one_arm(flange={"thickness": 0.02, "radius": 0.05}), CLEARANCE, SAMPLES)
+
+
 def test_no_other_file_is_shipped() -> None:
     shipped = {file.name for file in find_resource("robots/iiwa7.urdf").parent.glob("*.srdf")}
-    assert shipped == {"iiwa7.srdf", "iiwa14.srdf", "hand_e.srdf", "hand_e_on_iiwa7.srdf", "hand_e_on_iiwa14.srdf"}
+    arms = [f"{stack}iiwa{size}.srdf" for stack in ("", "hand_e_on_") for size in (7, 14)]
+    flanges = [f"{tool}{TOUCH}_on_iiwa{size}.srdf" for tool in ("", "hand_e_on_") for size in (7, 14)]
+    assert shipped == {"hand_e.srdf", *arms, *flanges}
 
 
 def test_what_a_file_beside_the_model_says_now_is_not_believed(tmp_path: Path) -> None:

@@ -12,7 +12,8 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.robot.stop_torque import stop_torques
 from tests.robot.conftest import one_arm
 
-ACCELERATION = 10.0
+FAST = np.full(7, 10.0)  # [rad/s^2]; more than an iiwa 7 has torque for
+UNEQUAL = np.array([8.0, 5.0, 6.0, 10.0, 11.0, 12.0, 13.0])
 
 
 @pytest.fixture(scope="module")
@@ -22,32 +23,54 @@ def robot() -> Robot:
 
 @pytest.mark.parametrize("seed", range(5))
 def test_the_torque_is_the_most_that_any_signs_of_the_decelerations_ask_for(robot: Robot, seed: int) -> None:
-    (stop,) = stop_torques(robot, ACCELERATION, postures=1, seed=seed)
-    data, q, rest = robot.model.createData(), np.array(stop.posture), np.zeros(7)
+    (stop,) = stop_torques(robot, UNEQUAL, postures=1, seed=seed)
+    data, q, rest = robot.model.createData(), np.array(stop.stop.posture), np.zeros(7)
     asked = np.array(
         [
-            np.abs(pin.rnea(robot.model, data, q, rest, ACCELERATION * np.array(signs))) / robot.torque_limit
+            np.abs(pin.rnea(robot.model, data, q, rest, UNEQUAL * np.array(signs))) / robot.torque_limit
             for signs in product((-1.0, 1.0), repeat=7)
         ]
     )
-    assert stop.ratio == pytest.approx(asked.max(), rel=1e-9)
-    assert stop.joint == robot.joint_names[asked.max(axis=0).argmax()]
-    assert stop.share_over == (asked.max() > 1.0)
+    assert stop.stop.ratio == pytest.approx(asked.max(), rel=1e-9)
+    assert stop.stop.joint == robot.joint_names[asked.max(axis=0).argmax()]
+    assert stop.stop.share_over == (asked.max() > 1.0)
+    np.testing.assert_allclose([joint.stop for joint in stop.joints], asked.max(axis=0), rtol=1e-9)
+    assert [joint.acceleration for joint in stop.joints] == UNEQUAL.tolist()
+    assert [joint.joint for joint in stop.joints] == list(robot.joint_names)
+    at_rest = np.abs(pin.computeGeneralizedGravity(robot.model, data, q)) / robot.torque_limit
+    np.testing.assert_allclose([joint.gravity for joint in stop.joints], at_rest, rtol=1e-9)
+    assert (stop.gravity.ratio, stop.gravity.posture) == (pytest.approx(at_rest.max()), stop.stop.posture)
 
 
 def test_the_share_and_what_is_bearable_agree(robot: Robot) -> None:
-    (stop,) = stop_torques(robot, ACCELERATION, postures=1000)
-    assert 0.05 < stop.share_over < 0.15
-    assert 0.0 < stop.bearable < ACCELERATION
-    assert stop_torques(robot, 0.999 * stop.bearable, postures=1000)[0].share_over == 0.0
-    assert stop_torques(robot, 1.001 * stop.bearable, postures=1000)[0].share_over == 0.001
+    (stop,) = stop_torques(robot, FAST, postures=1000)
+    assert 0.05 < stop.stop.share_over < 0.15
+    assert 0.0 < stop.bearable < 1.0
+    assert stop_torques(robot, 0.999 * stop.bearable * FAST, postures=1000)[0].stop.share_over == 0.0
+    assert stop_torques(robot, 1.001 * stop.bearable * FAST, postures=1000)[0].stop.share_over == 0.001
+
+
+def test_gravity_that_is_more_than_a_joint_has_is_told_apart_from_a_stop(robot: Robot) -> None:
+    weak = Robot.from_config(one_arm(tool={"model": "hand_e"}))
+    weak.torque_limit[3] = 5.0
+    (stop,) = stop_torques(weak, FAST, postures=1000)
+    assert (stop.gravity.joint, stop.bearable) == ("left_A4", 0.0)
+    assert stop.gravity.ratio > 1.0
+    assert 0.0 < stop.gravity.share_over < stop.stop.share_over
+    assert stop_torques(robot, FAST, postures=1000)[0].gravity.share_over == 0.0
 
 
 def test_each_arm_is_judged_by_its_own_joints(dual_iiwa: Robot) -> None:
-    left, right = stop_torques(dual_iiwa, ACCELERATION, postures=1000)
+    left, right = stop_torques(dual_iiwa, np.full(14, 10.0), postures=1000)
     for arm, stop in (("left", left), ("right", right)):
         assert stop.arm == arm
-        assert stop.joint == f"{arm}_A2"
-        assert len(stop.posture) == 7
-        assert (stop.ratio > 1.0) == (dual_iiwa.name == "dual_iiwa7")
-        assert (stop.share_over > 0.0) == (dual_iiwa.name == "dual_iiwa7")
+        assert stop.stop.joint == f"{arm}_A2"
+        assert len(stop.stop.posture) == len(stop.joints) == 7
+        assert (stop.stop.ratio > 1.0) == (dual_iiwa.name == "dual_iiwa7")
+        assert (stop.stop.share_over > 0.0) == (dual_iiwa.name == "dual_iiwa7")
+
+
+def test_no_full_stop_at_the_limits_of_the_shipped_cells_asks_for_more_than_a_joint_has(dual_iiwa: Robot) -> None:
+    """Nor with their models' own limits, which a higher control.acceleration_limit lets hold."""
+    for acceleration in (dual_iiwa.capped_acceleration(10.0), dual_iiwa.acceleration_limit):
+        assert max(stop.stop.ratio for stop in stop_torques(dual_iiwa, acceleration, postures=1000)) < 0.9

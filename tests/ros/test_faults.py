@@ -28,7 +28,7 @@ from tests.ros.circling_operator import Operator  # noqa: E402
 from tests.ros.joint_recorder import Stop  # noqa: E402
 from tests.ros.teleop_nodes import ARMS, TeleopNodes, address_of  # noqa: E402
 
-BRAKING = 10.0  # acceleration_limit of the cell [rad/s^2]
+BRAKING = 5.44  # lowest acceleration limit of a joint of the cell [rad/s^2]
 # Allowance for messages, for processes to get their turn, and for an arm that is paused while its controller lives: it
 # comes to rest at its last target, at 2 m/s^2 of the tool and not at the limits of the joints [s].
 DELIVERY = 0.15

@@ -30,7 +30,7 @@ RATE = 100.0  # of the nodes, fewer than usual for a machine that plays two [Hz]
 # Discovery reaches the other host as it does on a real network, and no shared memory bypasses the cable.
 NETWORK = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET"}
 set_up_middleware(NETWORK)
-BRAKING = 10.0  # acceleration_limit of the cell [rad/s^2]
+BRAKING = 5.44  # lowest acceleration limit of a joint of the cell [rad/s^2]
 DELIVERY = 0.15  # allowance for messages and for a paused arm, which brakes at 2 m/s^2 of its tool [s]
 STILL, FAST = 0.005, 1.5  # [rad], [rad/s]
 

@@ -204,6 +204,14 @@ def test_ratios_and_margin_are_the_worst_of_all_ticks_against_the_limits_in_forc
     assert summary.min_position_margin_rad == pytest.approx(0.02)
 
 
+def test_an_acceleration_counts_against_the_limit_of_its_joint() -> None:
+    statistics = RunStatistics(Robot.from_config(cell()), cell().control)
+    a = np.zeros(14)
+    a[[0, 8]] = 3.0, -2.72  # A1 of the left arm, A2 of the right one, which may do less
+    add(statistics, a=a)
+    assert statistics.summary(1.0).max_acceleration_ratio == pytest.approx(2.72 / 5.44)
+
+
 def test_counts_and_the_closest_pair_come_from_the_reports(statistics: RunStatistics) -> None:
     add(statistics)
     add(statistics, report=replace(REPORT, closest_distance=0.03, closest_pair=("tool", "table"), fallback=True))

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from q2r2_control.supervision.tick_pacer import TickPacer
 
-PERIOD, ACCELERATION = 0.004, 10.0
+PERIOD, ACCELERATION = 0.004, np.array([10.0, 4.0])
 LIMIT = np.array([1.7, 3.1])
 
 

@@ -42,8 +42,11 @@ def tick_at(robot: Robot, t: float, acceleration: float = 0.0, distance: float =
     )
 
 
+LIMIT = np.linspace(10.0, 20.0, 14)  # [rad/s^2]
+
+
 def test_peaks_between_rows_are_kept_however_long_the_run_and_rows_stay_bounded(robot: Robot) -> None:
-    history = History(robot, acceleration_limit=10.0, max_rows=50)
+    history = History(robot, LIMIT, max_rows=50)
     calm, peak = tick_at(robot, 0.0), tick_at(robot, 0.0, acceleration=-7.0, distance=0.021)
     for index in range(20_000):
         history(replace(peak if index in (1234, 15_001) else calm, t=1e-3 * index))
@@ -58,7 +61,7 @@ def test_peaks_between_rows_are_kept_however_long_the_run_and_rows_stay_bounded(
 
 
 def test_a_row_has_the_tools_their_targets_and_errors(robot: Robot) -> None:
-    history = History(robot, 10.0)
+    history = History(robot, LIMIT)
     history(tick_at(robot, 0.0))
     np.testing.assert_allclose(history.tool("right")[0], robot.tool_pose(robot.home, "right").translation)
     np.testing.assert_allclose(history.position_error("left"), 0.003)
@@ -69,7 +72,7 @@ def test_a_row_has_the_tools_their_targets_and_errors(robot: Robot) -> None:
 
 
 def test_an_arm_that_is_not_engaged_has_no_error(robot: Robot) -> None:
-    history = History(robot, 10.0)
+    history = History(robot, LIMIT)
     history(tick_at(robot, 0.0, engaged=False))
     assert np.isnan(history.position_error("left")).all()
     assert np.isnan(history.target("left")).all()

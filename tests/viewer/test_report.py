@@ -32,7 +32,7 @@ def one_armed(config: Config) -> Config:
 def test_any_run_makes_a_picture(tmp_path: Path, arms: int, engaged: bool, ticks: int) -> None:
     config = load_config("config/dual_iiwa7.yaml")
     robot = Robot.from_config(config if arms == 2 else one_armed(config))
-    history = History(robot, 10.0)
+    history = History(robot, robot.capped_acceleration(10.0))
     for index in range(ticks):
         history(tick_at(robot, 0.01 * index, acceleration=0.1 * index, engaged=engaged, distance=0.5 - 0.003 * index))
     file = tmp_path / "report.png"

@@ -72,6 +72,11 @@ class Setup:
         return self.robot.velocity_limit * self.config.control.velocity_scale
 
     @property
+    def acceleration(self) -> Array:
+        """(nv,) [rad/s^2]"""
+        return self.robot.capped_acceleration(self.config.control.acceleration_limit)
+
+    @property
     def lower(self) -> Array:
         """(nv,) [rad]"""
         return self.robot.position_lower + self.config.control.position_margin

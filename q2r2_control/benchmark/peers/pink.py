@@ -39,8 +39,7 @@ class Pink:
         }
         self._posture = PostureTask(cost=setup.posture_cost, gain=setup.posture_gain)
         self._posture.set_target(self._home)
-        nv = self._model.nv
-        self._acceleration = AccelerationLimit(self._model, np.full(nv, control.acceleration_limit))
+        self._acceleration = AccelerationLimit(self._model, setup.acceleration)
         self._limits = [
             ConfigurationLimit(self._model),
             VelocityLimit(self._model, setup.velocity),

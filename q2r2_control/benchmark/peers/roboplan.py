@@ -52,7 +52,7 @@ class Roboplan:
             optimal_ik.ConfigurationTaskOptions(task_gain=setup.posture_gain),
         )
         self._tasks = [*self._frame_tasks.values(), posture]
-        self._acceleration = optimal_ik.AccelerationLimit(self._ik, dt, np.full(nv, control.acceleration_limit))
+        self._acceleration = optimal_ik.AccelerationLimit(self._ik, dt, setup.acceleration)
         self._constraints = [
             optimal_ik.PositionLimit(self._ik),
             optimal_ik.VelocityLimit(self._ik, dt, setup.velocity),

@@ -94,8 +94,8 @@ class CartesianControllerNode(BaseNode):
             displace=self._displacement(config) if output != NONE else None,
         )
         limit = robot.velocity_limit * config.control.velocity_scale
-        drive = self._output.drive
-        self._pacer = TickPacer(self._period, limit, config.control.acceleration_limit, drive.coasts)
+        acceleration = robot.capped_acceleration(config.control.acceleration_limit)
+        self._pacer = TickPacer(self._period, limit, acceleration, self._output.drive.coasts)
         self._velocity = np.zeros(robot.model.nv)  # of the last reference [rad/s]
         self._reference: Reference | None = None
         self._commanding = False

@@ -32,7 +32,7 @@ def moved(data: SafetyData, wish: Array, usable: bool = True) -> int:
 
 
 def test_a_wish_within_the_box_and_far_from_everything_is_followed_as_it_is() -> None:
-    data, wish = started(), V + np.linspace(0.015, -0.015, 14)
+    data, wish = started(), V + np.linspace(0.008, -0.008, 14)
     assert moved(data, wish) == FOLLOWED
     np.testing.assert_array_equal(data.state.v, wish)
     np.testing.assert_allclose(data.state.q, HOME + 0.5 * H * (V + wish), rtol=0, atol=1e-15)

@@ -1,0 +1,190 @@
+"""Flanges between an arm and its tool: where they put the tool, which of their pairs are watched, what is refused."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from pathlib import Path
+from typing import Any
+
+import coal
+import mujoco
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from q2r2_control.cli.cell_report import check_cell
+from q2r2_control.cli.tables import arm_table
+from q2r2_control.config import Config, load_config
+from q2r2_control.errors import ConfigError
+from q2r2_control.plants.mujoco_model import build_model
+from q2r2_control.robot.compose import compose
+from q2r2_control.robot.description import load_description
+from q2r2_control.robot.pairs import link_of, pair_names
+from q2r2_control.robot.robot import Robot
+from tests.robot.conftest import one_arm
+
+TOUCH = {"model": "media_flange_touch_pneumatic"}
+CYLINDER = {"thickness": 0.03, "radius": 0.05, "mass": 0.4}
+HAND = {"model": "hand_e", "frame": "tool_frame"}
+POSTURE = np.array([0.3, 0.5, -0.2, -1.3, 0.4, 1.1, -0.6])
+
+
+def with_flange(flange: dict[str, Any], cell: str = "dual_iiwa7") -> Config:
+    """A shipped cell whose arms both have a flange."""
+    data = load_config(f"config/{cell}.yaml").model_dump()
+    for arm in data["arms"].values():
+        arm["flange"] = flange
+    return Config.model_validate(data)
+
+
+def watched(robot: Robot) -> set[frozenset[str]]:
+    return {frozenset(map(link_of, pair)) for pair in pair_names(robot.collision_model)}
+
+
+@pytest.mark.parametrize(("flange", "thickness"), [(TOUCH, 0.026), (CYLINDER, 0.03)], ids=["a model", "sizes"])
+@pytest.mark.parametrize("tool", [HAND, {}], ids=["with a hand", "bare"])
+def test_the_tool_is_moved_outwards_by_the_thickness_and_not_turned(
+    flange: dict[str, Any], thickness: float, tool: dict[str, Any]
+) -> None:
+    plain, moved = (Robot.from_config(one_arm(tool=tool, flange=given)) for given in ({}, flange))
+    expected = plain.tool_pose(POSTURE, "left") * pin.SE3(np.eye(3), np.array([0.0, 0.0, thickness]))
+    np.testing.assert_allclose(moved.tool_pose(POSTURE, "left").homogeneous, expected.homogeneous, atol=1e-12)
+
+
+def test_without_a_tool_the_end_of_the_flange_is_what_moves() -> None:
+    assert compose(one_arm(flange=TOUCH)).tool_frames == {"left": "left_media_flange_end"}
+    assert one_arm(flange=TOUCH, tool={"link": "link_ee"}).named_tool_frame("left") is None
+
+
+def test_the_body_of_each_flange_is_watched_against_all_that_its_arm_can_meet() -> None:
+    plain, robot = Robot.from_config(load_config("config/dual_iiwa7.yaml")), Robot.from_config(with_flange(TOUCH))
+    new = watched(robot) - watched(plain)
+    assert watched(plain) <= watched(robot), "nothing else is watched less"
+    other = [f"left_link_{number}" for number in range(8)] + ["left_media_flange", "left_hand_e_envelope"]
+    own = [f"right_link_{number}" for number in (0, 1)]
+    for link in [*other, *own, "table", "floor"]:
+        assert frozenset(("right_media_flange", link)) in new
+    assert {link for pair in new for link in pair if link.startswith("right_link")} - {*own} == {
+        f"right_link_{number}" for number in range(2, 8)
+    }, "those only against the left arm's flange"
+    assert not {pair for pair in new if pair & {"right_media_flange"} and pair & {"right_link_5", "right_link_2"}}
+
+
+def test_the_body_of_a_cylinder_is_watched_and_enclosed() -> None:
+    robot = Robot.from_config(with_flange(CYLINDER))
+    for link in ("table", "floor", "right_link_5", "right_flange_body"):
+        assert frozenset(("left_flange_body", link)) in watched(robot)
+    geometry = robot.collision_model
+    body = geometry.geometryObjects[geometry.getGeometryId("left_flange_body_0")]
+    assert isinstance(body.geometry, coal.Capsule | coal.Sphere)
+    end = robot.model.frames[robot.model.getFrameId("left_flange_end", pin.FrameType.BODY)].placement
+    half = getattr(body.geometry, "halfLength", 0.0)
+    angle = np.linspace(0.0, 2.0 * np.pi, 60)
+    for z in (-0.03, 0.0):
+        rim = np.array([0.05 * np.cos(angle), 0.05 * np.sin(angle), np.full(60, z)])
+        local = [body.placement.actInv(end.act(point)) for point in rim.T]
+        distance = [np.linalg.norm(p - [0.0, 0.0, np.clip(p[2], -half, half)]) for p in local]
+        assert max(distance) <= body.geometry.radius * (1.0 + 1e-9)
+
+
+def test_the_sphere_of_the_touch_flange_encloses_its_drawing_and_what_link_7_does_not() -> None:
+    """Outline of the published mesh, from the end of the plain flanges, z outwards: radius at height [m]."""
+    outline = {-0.045: 0.055, -0.026: 0.0582, 0.0: 0.0553, 0.026: 0.0329}
+    urdf = load_description("media_flange_touch_pneumatic").urdf
+    sphere, centre = urdf.find("link/collision/geometry/sphere"), urdf.find("link/collision/origin")
+    assert sphere is not None
+    assert centre is not None
+    radius, z = float(sphere.get("radius", "nan")), float(centre.get("xyz", "").split()[2])
+    assert all(np.hypot(r, height - z) <= radius for height, r in outline.items())
+    link_7 = max(np.hypot(r, height + 0.038) - 0.053 for height, r in outline.items())
+    assert link_7 == pytest.approx(0.019, abs=5e-4)
+
+
+@pytest.mark.parametrize(("flange", "mass"), [(TOUCH, 0.13), (CYLINDER, 0.4), ({**CYLINDER, "mass": 0.0}, 0.0)])
+def test_the_arm_carries_the_flange_s_mass(flange: dict[str, Any], mass: float) -> None:
+    plain, heavier = (Robot.from_config(one_arm(flange=given)).model for given in ({}, flange))
+    assert heavier.inertias[7].mass - plain.inertias[7].mass == pytest.approx(mass)
+
+
+@pytest.mark.parametrize("flange", [TOUCH, CYLINDER], ids=["a model", "sizes"])
+def test_it_is_part_of_the_simulated_cell_where_nothing_of_an_arm_touches_itself_at_home(
+    flange: dict[str, Any],
+) -> None:
+    config = with_flange(flange)
+    robot = Robot.from_config(config)
+    model = build_model(robot, config)
+    data = mujoco.MjData(model)
+    for name, position in zip(robot.joint_names, robot.home, strict=True):
+        data.joint(name).qpos = position
+    mujoco.mj_forward(model, data)
+    body = robot.arms["left"].tool_frame.replace("tool_frame", "media_flange" if "model" in flange else "flange_body")
+    assert model.body(body).id > 0
+    arms = {i for i in range(model.nbody) if model.body(i).name.startswith(("left_", "right_"))}
+    touching = [{int(model.geom_bodyid[g]) for g in contact.geom} for contact in data.contact]
+    assert not [pair for pair in touching if pair <= arms]
+
+
+def test_pairs_known_of_tool_and_arm_are_not_believed_with_a_flange_between_them_that_no_file_knows() -> None:
+    far = '"left_link_4" link2="left_hand_e_envelope"'
+    assert far in compose(one_arm(tool=HAND)).srdf
+    assert far in compose(one_arm(tool=HAND, flange=TOUCH)).srdf
+    assert far not in compose(one_arm(tool=HAND, flange=CYLINDER)).srdf
+    elsewhere = one_arm(tool=HAND, flange=TOUCH, model="iiwa7", tip="link_6", home=[0.0] * 6)
+    assert "media_flange" not in compose(elsewhere).srdf
+
+
+def test_a_flange_of_one_s_own_is_a_urdf_whose_last_link_or_frame_carries_the_tool(tmp_path: Path) -> None:
+    """A coupler with a sensor beside it: two ends, of which the file names one."""
+    joint = '<joint name="{0}_joint" type="fixed"><parent link="disc"/><child link="{0}"/><origin xyz="{1}"/></joint>'
+    links = '<link name="disc"/><link name="end"/><link name="side"/>'
+    text = f'<robot name="disc">{links}{joint.format("end", "0 0 0.04")}{joint.format("side", "0.05 0 0.01")}</robot>'
+    (tmp_path / "disc.urdf").write_text(text)
+    model = str(tmp_path / "disc.urdf")
+    with pytest.raises(ConfigError, match=r"arms\.left\.flange\.frame: the arm could end at end, side: name the link"):
+        compose(one_arm(flange={"model": model}, tool=HAND))
+    robot = Robot.from_config(one_arm(flange={"model": model, "frame": "end"}, tool=HAND))
+    plain = Robot.from_config(one_arm(tool=HAND))
+    way = plain.tool_pose(POSTURE, "left").actInv(robot.tool_pose(POSTURE, "left"))
+    np.testing.assert_allclose(way.translation, [0.0, 0.0, 0.04], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("arm", "line"),
+    [
+        pytest.param(
+            {"flange": {"model": "media_touch"}},
+            "arms.left.flange.model = 'media_touch': robots/media_touch.urdf: no such file here, nor among the shipped",
+            id="an unknown name",
+        ),
+        pytest.param(
+            {"flange": {"model": "media_touch"}}, "robots/media_flange_touch_pneumatic.urdf", id="and the known ones"
+        ),
+        pytest.param(
+            {"flange": TOUCH | {"frame": "tip"}}, "no such link; allowed: media_flange", id="an unknown frame"
+        ),
+        pytest.param({"flange": {"model": "iiwa7"}}, "occur in the arm as well", id="a flange with the arm's names"),
+    ],
+)
+def test_a_bad_flange_ends_in_one_line_that_names_key_value_and_what_is_allowed(arm: dict[str, Any], line: str) -> None:
+    with pytest.raises(ConfigError) as error:
+        compose(one_arm(**arm))
+    assert line in str(error.value)
+    assert "arms.left.flange" in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_check_names_the_flange() -> None:
+    for flange, text in ((TOUCH, "media_flange_touch_pneumatic"), (CYLINDER, "30 mm thick, radius 50 mm")):
+        arm = check_cell(one_arm(flange=flange)).arms[0]
+        assert arm.flange == text
+        assert f"iiwa7, flange {text}, tool none" in str(arm_table(arm).title)
+    plain = check_cell(one_arm()).arms[0]
+    assert plain.flange is None
+    assert "flange" not in str(arm_table(plain).title)
+
+
+def test_the_shipped_cells_have_none() -> None:
+    for cell in ("dual_iiwa7", "dual_iiwa14"):
+        config = load_config(f"config/{cell}.yaml")
+        assert all(arm.flange.is_none for arm in config.arms.values())
+        assert "media_flange" not in ET.canonicalize(compose(config).urdf)
