@@ -63,8 +63,9 @@ def test_a_peer_reaches_a_target_within_the_velocity_limits(peer: BenchControlle
         assert (np.abs(v) <= robot().velocity_limit * (1.0 + 1e-3)).all()
     for arm, pose in goals.items():
         error = robot().tool_pose(q, arm).actInv(pose)
-        assert np.linalg.norm(error.translation) < 0.005
-        assert np.linalg.norm(pin.log3(error.rotation)) < 0.05
+        # What is left is the posture's pull, which weighs a thousandth of the tool's.
+        assert np.linalg.norm(error.translation) < 0.001
+        assert np.linalg.norm(pin.log3(error.rotation)) < 0.002
 
 
 def test_velocities_are_those_of_the_positions(peer: BenchController) -> None:

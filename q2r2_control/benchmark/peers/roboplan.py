@@ -48,7 +48,7 @@ class Roboplan:
         posture = optimal_ik.ConfigurationTask(
             self._ik,
             robot.home,
-            np.full(nv, setup.posture_cost),
+            np.full(nv, control.posture_weight),  # a weight as it is, where the others square a cost
             optimal_ik.ConfigurationTaskOptions(task_gain=setup.posture_gain),
         )
         self._tasks = [*self._frame_tasks.values(), posture]
