@@ -40,6 +40,7 @@ lint: setup
 
 bench: $(VENV)/.installed-bench
 	$(BIN)/q2r2 bench
+	$(BIN)/q2r2 bench --work
 
 # The peers to compare with. Where they cannot be had, the bench says so and does without.
 $(VENV)/.installed-bench: $(VENV)/.installed

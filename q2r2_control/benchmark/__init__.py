@@ -1,7 +1,9 @@
-"""Figures of this machine: times of a control tick beside public peers, and latencies through the ROS nodes.
+"""Figures of a controller and of public peers: times of a tick, work motions, and latencies through the ROS nodes.
 
-``tick_times`` times our controller and the ``peers`` in turns, by runs of ``timed_run``. ``command_responses`` finds
-the commands that answer steps of an input, and ``ros_latency``, which needs ROS, records them.
+``tick_times`` times our controller and the ``peers`` in turns, by runs of ``timed_run``. ``work_bench`` asks them for
+two-armed work, one motion and one controller at a time by ``motion_run``, which tests can use alone.
+``command_responses`` finds the commands that answer steps of an input, and ``ros_latency``, which needs ROS, records
+them.
 """
 
 from __future__ import annotations
@@ -12,18 +14,27 @@ from q2r2_control._lazy import lazy_exports
 
 if TYPE_CHECKING:
     from q2r2_control.benchmark.command_responses import LatencyReport, LatencyRow, latency_report
+    from q2r2_control.benchmark.motion_run import MotionFigures, own_controller, run_motion, without_pairs
     from q2r2_control.benchmark.tick_times import BenchReport, BenchRow, run_bench
     from q2r2_control.benchmark.timed_run import RunMetrics, TimedRun
+    from q2r2_control.benchmark.work_bench import WorkReport, WorkRow, run_work_bench
 
 __all__ = [
     "BenchReport",
     "BenchRow",
     "LatencyReport",
     "LatencyRow",
+    "MotionFigures",
     "RunMetrics",
     "TimedRun",
+    "WorkReport",
+    "WorkRow",
     "latency_report",
+    "own_controller",
     "run_bench",
+    "run_motion",
+    "run_work_bench",
+    "without_pairs",
 ]
 
 __getattr__ = lazy_exports(
@@ -33,9 +44,16 @@ __getattr__ = lazy_exports(
         "BenchRow": "tick_times",
         "LatencyReport": "command_responses",
         "LatencyRow": "command_responses",
+        "MotionFigures": "motion_run",
         "RunMetrics": "timed_run",
         "TimedRun": "timed_run",
+        "WorkReport": "work_bench",
+        "WorkRow": "work_bench",
         "latency_report": "command_responses",
+        "own_controller": "motion_run",
         "run_bench": "tick_times",
+        "run_motion": "motion_run",
+        "run_work_bench": "work_bench",
+        "without_pairs": "motion_run",
     },
 )

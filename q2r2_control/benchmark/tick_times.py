@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from q2r2_control.benchmark.peers.base import INSTALL, PEERS, BenchController, Setup, is_installed, make_peer
+from q2r2_control.benchmark.peers.base import PEERS, BenchController, Setup, build_peers
 from q2r2_control.benchmark.timed_run import OwnController, Poses, RunMetrics, Targets, TimedRun, metrics_of, timed_run
 from q2r2_control.config import Config
 from q2r2_control.config.control import ControllerSettings
@@ -76,28 +76,10 @@ def run_bench(
     # Without a time limit, so that a slow machine computes the same motion.
     settings = config.control.model_copy(update={"solve_time_limit": None})
     ours = OwnController(CartesianController(robot, settings))
-    others, notes = _build(peers, Setup(robot, config, _DT))
+    others, notes = build_peers(peers, Setup(robot, config, _DT))
     bench = _Bench(robot, settings, ours, others, ticks, progress)
     rows = [row for name, targets in SCENARIOS.items() for row in bench.rows(name, targets)]
     return BenchReport(config.name, len(robot.collision_model.collisionPairs), rows, notes)
-
-
-def _build(names: Sequence[str], setup: Setup) -> tuple[list[BenchController], list[str]]:
-    """The peers that can be built, and a line on each peer."""
-    peers: list[BenchController] = []
-    notes = []
-    for name in names:
-        if not is_installed(name):
-            notes.append(f"{name}: not installed; {INSTALL}")
-            continue
-        try:
-            peer = make_peer(name, setup)
-        except Exception as error:  # a package of another version may raise anything
-            notes.append(f"{name}: cannot be built for this cell: {type(error).__name__}: {error}")
-            continue
-        peers.append(peer)
-        notes.append(f"{name}: {peer.limitations}")
-    return peers, notes
 
 
 class _Bench:

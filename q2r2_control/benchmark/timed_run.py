@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import math
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -44,9 +45,14 @@ class TimedRun:
     times_us: Array  # (ticks,)
     q: Array  # (n, nv) [rad]
     v: Array  # (n, nv) [rad/s]
-    goal: Poses  # of the last tick
-    failures: int
+    goals: list[Poses]  # n
+    failed: Array  # (n,) bool
     dt: float  # [s]
+
+    @property
+    def failures(self) -> int:
+        """Ticks without a solution."""
+        return int(self.failed.sum())
 
 
 class OwnController:
@@ -57,17 +63,22 @@ class OwnController:
 
     def __init__(self, controller: CartesianController) -> None:
         self._controller = controller
-        self.fallbacks = 0
+        self.stopped: list[bool] = []  # of each tick since the reset: whether the certified stop was executed
+
+    @property
+    def fallbacks(self) -> int:
+        """Ticks since the reset in which the certified stop was executed."""
+        return sum(self.stopped)
 
     def reset(self, q: Array) -> None:
         """See :class:`BenchController`."""
         self._controller.reset(q)
-        self.fallbacks = 0
+        self.stopped.clear()
 
     def step(self, targets: Mapping[str, pin.SE3], dt: float) -> tuple[Array, Array]:
         """See :class:`BenchController`."""
         reference = self._controller.step(targets, dt)
-        self.fallbacks += reference.report.fallback
+        self.stopped.append(reference.report.fallback)
         return reference.q, reference.v
 
     def hold(self) -> tuple[Array, Array]:
@@ -76,41 +87,61 @@ class OwnController:
         return reference.q, np.zeros_like(reference.v)
 
 
-def timed_run(controller: BenchController, robot: Robot, targets: Targets, ticks: int, dt: float) -> TimedRun:
-    """Run from home for a warm-up and ``ticks`` ticks of ``dt`` [s]."""
+def timed_run(
+    controller: BenchController,
+    robot: Robot,
+    targets: Targets,
+    ticks: int,
+    dt: float,
+    *,
+    warm_up: int | None = None,
+    patience: float = math.inf,
+) -> TimedRun:
+    """Run from home for ``warm_up`` ticks of ``dt`` [s], a tenth of ``ticks`` by default, and ``ticks`` that are timed.
+
+    A run that has taken longer than ``patience`` [s], of this process alone, is left as it is, with fewer ticks.
+    """
+    untimed = int(WARM_UP * ticks) if warm_up is None else warm_up
     start = {arm: robot.tool_pose(robot.home, arm) for arm in robot.arms}
-    goals = [targets(tick * dt, start) for tick in range(int(WARM_UP * ticks) + ticks)]
-    times = np.empty(len(goals))
+    goals = [targets(tick * dt, start) for tick in range(untimed + ticks)]
+    times, failed = np.empty(len(goals)), np.zeros(len(goals), dtype=bool)
     q, v = np.empty((len(goals), robot.model.nv)), np.empty((len(goals), robot.model.nv))
-    failures = 0
+    done, deadline = 0, time.process_time() + patience
     controller.reset(robot.home)
     gc.collect()
     gc.disable()
     try:
-        for tick, goal in enumerate(goals):
+        while done < len(goals) and time.process_time() <= deadline:
             began = time.perf_counter()
             try:
-                q[tick], v[tick] = controller.step(goal, dt)
+                q[done], v[done] = controller.step(goals[done], dt)
                 solved = True
             except Exception:  # each peer has exceptions of its own
                 solved = False
-            times[tick] = time.perf_counter() - began
-            if not (solved and np.isfinite(np.sum(q[tick]) + np.sum(v[tick]))):
-                failures += 1
-                q[tick], v[tick] = controller.hold()
+            times[done] = time.perf_counter() - began
+            if not (solved and np.isfinite(np.sum(q[done]) + np.sum(v[done]))):
+                failed[done] = True
+                q[done], v[done] = controller.hold()
+            done += 1
     finally:
         gc.enable()
-    return TimedRun(1e6 * times[len(goals) - ticks :], q, v, goals[-1], failures, dt)
+    return TimedRun(1e6 * times[untimed:done], q[:done], v[:done], goals[:done], failed[:done], dt)
+
+
+def rest_acceleration(v: Array, dt: float) -> float:
+    """RMS over the last 0.5 s of velocities (n, nv) [rad/s], of the acceleration's norm over the joints [rad/s^2]."""
+    a = np.diff(v, axis=0, prepend=0.0)[-round(_TAIL / dt) :] / dt
+    return float(np.sqrt(np.mean(np.sum(a**2, axis=1))))
 
 
 def metrics_of(run: TimedRun, robot: Robot, settings: ControllerSettings) -> RunMetrics:
     """Metrics of a run, computed in the same way for all controllers."""
     q, v = run.q, run.v
     a = np.diff(v, axis=0, prepend=0.0) / run.dt
-    tail = a[-round(_TAIL / run.dt) :]
     room = np.minimum(q - robot.position_lower, robot.position_upper - q) - settings.position_margin
     errors = [
-        np.linalg.norm(robot.tool_pose(q[-1], arm).translation - pose.translation) for arm, pose in run.goal.items()
+        np.linalg.norm(robot.tool_pose(q[-1], arm).translation - pose.translation)
+        for arm, pose in run.goals[-1].items()
     ]
     return RunMetrics(
         max_acceleration_ratio=float((np.abs(a) / robot.capped_acceleration(settings.acceleration_limit)).max()),
@@ -118,6 +149,6 @@ def metrics_of(run: TimedRun, robot: Robot, settings: ControllerSettings) -> Run
         min_position_margin_rad=float(room.min()),
         min_distance_mm=1e3 * min(float(robot.distance_values(posture).min(initial=np.inf)) for posture in q),
         failures=run.failures,
-        tail_acceleration=float(np.sqrt(np.mean(np.sum(tail**2, axis=1)))),
+        tail_acceleration=rest_acceleration(v, run.dt),
         position_error_mm=1e3 * float(max(errors)),
     )

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import importlib.util
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Annotated, NoReturn
 
 import typer
-from rich import box
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
@@ -16,11 +15,15 @@ from rich.text import Text
 from q2r2_control.benchmark.command_responses import LatencyReport
 from q2r2_control.benchmark.peers.base import PEERS
 from q2r2_control.benchmark.tick_times import BenchReport, BenchRow, run_bench
+from q2r2_control.benchmark.work_bench import WORK_PEERS, run_work_bench
+from q2r2_control.cli.figure_table import figure_table
 from q2r2_control.cli.options import DEMO_CONFIG, Json
 from q2r2_control.cli.output import as_json_text, notice_of_compiling, stderr_console
+from q2r2_control.cli.work_table import work_table
 from q2r2_control.config import load_config
 from q2r2_control.errors import ConfigError
 from q2r2_control.verification.soak import MEMORY_ALLOWED, SoakReport, run_soak
+from q2r2_control.verification.work_motions import WORK_MOTIONS, WorkMotion, motions_named
 
 _TICKS, _SOAK_TICKS, _SECONDS = 3000, 1_000_000, 30.0
 _RATE = 250.0  # of the controller's node by default [Hz]
@@ -31,6 +34,13 @@ def bench(
         int | None, typer.Option(min=100, help=f"Of each scenario, {_TICKS} by default; of a soak {_SOAK_TICKS}.")
     ] = None,
     peers: Annotated[bool, typer.Option(help="Time roboplan, mink and pink too, where they are installed.")] = True,
+    work: Annotated[
+        bool, typer.Option("--work", help="Measure two-armed work motions: errors, distances, rest, times.")
+    ] = False,
+    motion: Annotated[
+        list[str] | None,
+        typer.Option(help="With --work: only this motion, or those that begin with it, such as carry; repeatable."),
+    ] = None,
     soak: Annotated[
         bool, typer.Option("--soak", help="Check every promise in hostile ticks instead of timing.")
     ] = False,
@@ -47,20 +57,27 @@ def bench(
 ) -> None:
     """Time one tick of the controller with both arms, every pair and the certificate, and public peers beside it.
 
+    With --work: both arms at work near each other and near the table, beside ours in free air, roboplan and mink.
+
     With --soak: random hostile targets, ticks, starts and solver failures; every promise of the controller is checked
     at every tick, and the worst margin of each is printed. Exit 1 if one was broken.
 
     With --ros: the time from a message on an input topic to the joint command that answers it, through real nodes on
     this machine, in a domain of their own.
     """
-    if soak and ros:
-        raise ConfigError("--soak and --ros exclude each other")
+    if sum((work, soak, ros)) > 1:
+        raise ConfigError("--work, --soak and --ros exclude each other")
+    if motion and not work:
+        raise ConfigError("--motion needs --work")
+    if work and ticks is not None:
+        raise ConfigError("--ticks cannot be used with --work, whose motions have a length of their own")
     if seed and not soak:
         raise ConfigError("--seed needs --soak, since nothing else draws")
     if ros and ticks is not None:
         raise ConfigError("--ticks cannot be used with --ros, which takes --duration")
     if not ros and (duration is not None or rate is not None):
         raise ConfigError("--duration and --rate need --ros")
+    motions = motions_named(WORK_MOTIONS if motion is None else motion)
     console = stderr_console()
     if ros:
         _show_latency(_SECONDS if duration is None else duration, rate or _RATE, console, json)
@@ -69,6 +86,8 @@ def bench(
         if soak:
             soak_ticks = _SOAK_TICKS if ticks is None else ticks
             _show_soak(run_soak(load_config(DEMO_CONFIG), soak_ticks, seed, _progress(console)), json)
+        elif work:
+            _show_work(motions, WORK_PEERS if peers else (), console, json)
         else:
             _show_times(_TICKS if ticks is None else ticks, tuple(PEERS) if peers else (), console, json)
 
@@ -81,6 +100,14 @@ def _show_times(ticks: int, peers: tuple[str, ...], console: Console, json: bool
         out = Console()
         out.print(times_table(report))
         out.print(motion_table(report))
+
+
+def _show_work(motions: Sequence[WorkMotion], peers: tuple[str, ...], console: Console, json: bool) -> None:
+    report = run_work_bench(load_config(DEMO_CONFIG), motions, peers, _progress(console))
+    if json:
+        print(as_json_text(report.as_json()))
+    else:
+        Console().print(work_table(report))
 
 
 def _show_soak(report: SoakReport, json: bool) -> NoReturn:
@@ -116,7 +143,7 @@ def _progress(console: Console) -> Callable[[str], None]:
 
 def times_table(report: BenchReport) -> Table:
     """Times of a tick."""
-    table = _table(
+    table = figure_table(
         f"{report.cell}: one tick of 1 ms with {report.pairs} pairs, each run of {report.rows[0].ticks} ticks",
         "controller",
         ("runs", "median [us]", "p99 [us]", "max [us]", "median / ours", "p99 / ours"),
@@ -130,7 +157,7 @@ def times_table(report: BenchReport) -> Table:
 
 def motion_table(report: BenchReport) -> Table:
     """Metrics of the controllers' motions, with notes on the limitations of each."""
-    table = _table(
+    table = figure_table(
         "motion",
         "controller",
         ("a / limit", "v / limit", "room [rad]", "nearest [mm]", "held", "tail [rad/s^2]"),
@@ -164,7 +191,7 @@ def _by_scenario(report: BenchReport, table: Table) -> Iterator[BenchRow]:
 
 def soak_table(report: SoakReport) -> Table:
     """Worst margin of every promise, and how often it was broken."""
-    table = _table(
+    table = figure_table(
         f"{report.cell}: {report.ticks} hostile ticks, {report.simulated_s:.0f} s, seed {report.seed}",
         "promise",
         ("worst", "allowed", "checked", "broken"),
@@ -185,7 +212,7 @@ def soak_table(report: SoakReport) -> Table:
 
 def latency_table(report: LatencyReport) -> Table:
     """Latencies through the ROS nodes."""
-    table = _table(
+    table = figure_table(
         f"from an input topic to the joint command that answers it, controller at {report.loop_rate_hz:g} Hz",
         "path",
         ("p50 [ms]", "p99 [ms]", "max [ms]", "steps", "missed"),
@@ -218,11 +245,3 @@ def _soak_notes(report: SoakReport) -> str:
             f"to see the first again: q2r2 bench --soak --seed {report.seed} --ticks {report.broken[0].tick + 1}"
         )
     return "\n".join(lines)
-
-
-def _table(title: str, names: str, figures: tuple[str, ...]) -> Table:
-    table = Table(title=Text(title), title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
-    table.add_column(names, no_wrap=True)
-    for figure in figures:
-        table.add_column(Text(figure.replace(" ", "\n", 1)), justify="right", no_wrap=True)
-    return table

@@ -74,7 +74,7 @@ def _rotate(t: float, frequency: float) -> tuple[Array, Array]:
     phase = _phase(t, frequency)
     turn = np.zeros(3)
     turn[int(phase / (2.0 * math.pi)) % 3] = math.radians(30.0) * (1.0 - math.cos(phase)) / 2.0
-    lift = 0.05 * _minimum_jerk((t - _START) / _RAMP)
+    lift = 0.05 * minimum_jerk((t - _START) / _RAMP)
     return np.array([0.0, 0.0, lift]), turn
 
 
@@ -103,12 +103,13 @@ def _reach_grasp_handover(t: float, frequency: float) -> tuple[Array, Array]:
     """
     times = _HANDOVER[:, 0]
     index = int(np.clip(np.searchsorted(times, t, side="right") - 1, 0, len(times) - 2))
-    fraction = _minimum_jerk((t - times[index]) / (times[index + 1] - times[index]))
+    fraction = minimum_jerk((t - times[index]) / (times[index + 1] - times[index]))
     where = (1.0 - fraction) * _HANDOVER[index, 1:] + fraction * _HANDOVER[index + 1, 1:]
     return where[:3], np.array([where[3], 0.0, 0.0])
 
 
-def _minimum_jerk(fraction: float) -> float:
+def minimum_jerk(fraction: float) -> float:
+    """Share of the way at a ``fraction`` of the time: 0 to 1, at rest at both ends; fractions beyond them are cut."""
     s = min(max(fraction, 0.0), 1.0)
     return s**3 * (10.0 - 15.0 * s + 6.0 * s**2)
 

@@ -2,6 +2,7 @@
 
 ``contract`` is the one checker, for tests, soaks and live runs. ``adversary`` draws streams of targets,
 ``fault_injection`` uneven ticks, bad starts and failing solvers, and ``soak`` runs a controller through all of them.
+``work_motions`` is the other side: what two arms do at work, for figures of how well they do it.
 """
 
 from __future__ import annotations
@@ -15,14 +16,18 @@ if TYPE_CHECKING:
     from q2r2_control.verification.contract import Contract, Margin
     from q2r2_control.verification.fault_injection import FaultySolver
     from q2r2_control.verification.soak import Soak, SoakReport, run_soak
+    from q2r2_control.verification.work_motions import WORK_MOTIONS, WorkMotion, motions_named
 
 __all__ = [
+    "WORK_MOTIONS",
     "Adversary",
     "Contract",
     "FaultySolver",
     "Margin",
     "Soak",
     "SoakReport",
+    "WorkMotion",
+    "motions_named",
     "run_soak",
 ]
 
@@ -35,6 +40,9 @@ __getattr__ = lazy_exports(
         "Margin": "contract",
         "Soak": "soak",
         "SoakReport": "soak",
+        "WORK_MOTIONS": "work_motions",
+        "WorkMotion": "work_motions",
+        "motions_named": "work_motions",
         "run_soak": "soak",
     },
 )

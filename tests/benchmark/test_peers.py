@@ -8,7 +8,15 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from q2r2_control.benchmark.peers.base import INSTALL, PEERS, BenchController, Setup, is_installed, make_peer
+from q2r2_control.benchmark.peers.base import (
+    INSTALL,
+    PEERS,
+    WITHOUT_ACCELERATION_LIMIT,
+    BenchController,
+    Setup,
+    is_installed,
+    make_peer,
+)
 from q2r2_control.config import load_config
 from q2r2_control.robot.robot import Robot
 
@@ -63,8 +71,9 @@ def test_a_peer_reaches_a_target_within_the_velocity_limits(peer: BenchControlle
         assert (np.abs(v) <= robot().velocity_limit * (1.0 + 1e-3)).all()
     for arm, pose in goals.items():
         error = robot().tool_pose(q, arm).actInv(pose)
-        assert np.linalg.norm(error.translation) < 0.005
-        assert np.linalg.norm(pin.log3(error.rotation)) < 0.05
+        # What is left is the posture's pull, which weighs a thousandth of the tool's.
+        assert np.linalg.norm(error.translation) < 0.001
+        assert np.linalg.norm(pin.log3(error.rotation)) < 0.002
 
 
 def test_velocities_are_those_of_the_positions(peer: BenchController) -> None:
@@ -85,7 +94,7 @@ def test_a_peer_that_holds_stands_where_it_was(peer: BenchController) -> None:
     assert not v.any()
 
 
-@pytest.mark.parametrize("name", [name for name in PEERS if not name.startswith("mink")])
+@pytest.mark.parametrize("name", [name for name in PEERS if name not in WITHOUT_ACCELERATION_LIMIT])
 def test_a_peer_with_an_acceleration_limit_starts_as_slowly_as_we_do(name: str) -> None:
     pytest.importorskip(PEERS[name])
     peer = peer_of(name)

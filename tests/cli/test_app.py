@@ -144,6 +144,12 @@ def test_the_help_lists_every_command(command: str) -> None:
         pytest.param(("bench", "--ticks", "0"), "--ticks", id="a benchmark of nothing"),
         pytest.param(("bench", "--seed", "3"), "--seed", id="a seed of what draws nothing"),
         pytest.param(("bench", "--soak", "--ros"), "exclude each other", id="two kinds of benchmark"),
+        pytest.param(("bench", "--work", "--soak"), "exclude each other", id="work and hostile ticks at once"),
+        pytest.param(
+            ("bench", "--work", "--motion", "dance"), "motion 'dance': allowed: carry-", id="an unknown motion"
+        ),
+        pytest.param(("bench", "--motion", "meet"), "needs --work", id="a motion of what times ticks"),
+        pytest.param(("bench", "--work", "--ticks", "200"), "--ticks", id="ticks of motions that have a length"),
         pytest.param(("bench", "--ros", "--ticks", "200"), "--ticks", id="ticks of what is timed by messages"),
         pytest.param(("bench", "--duration", "5"), "need --ros", id="a duration of what counts ticks"),
         pytest.param(("bench", "--ros", "--rate", "5000"), "--rate", id="a rate that the node does not take"),
@@ -391,6 +397,16 @@ def test_bench_times_every_scenario() -> None:
     assert all(row["min_distance_mm"] >= 20.0 for row in report["rows"])
     table = q2r2("bench", "--no-peers", "--ticks", "100").stdout
     assert all(row["name"] in table for row in report["rows"])
+
+
+def test_bench_measures_the_work_motions_that_are_asked_for() -> None:
+    result = q2r2("bench", "--work", "--no-peers", "--motion", "slide", "--motion", "reach", "--json")
+    report = one_object(result.stdout)
+    assert [row["motion"] for row in report["rows"]] == ["reach-under", "slide"]
+    assert all(figures["min_distance_mm"] >= 20.0 for row in report["rows"] for figures in row["figures"])
+    table = q2r2("bench", "--work", "--no-peers", "--motion", "slide").stdout
+    assert "slide (!)" in table
+    assert "q2r2_control" in table
 
 
 def test_a_soak_prints_every_promise_and_ends_in_0_when_all_were_kept() -> None:

@@ -7,11 +7,16 @@ import io
 import numpy as np
 from rich.console import Console
 
+from q2r2_control.benchmark.motion_run import MotionFigures
 from q2r2_control.benchmark.tick_times import BenchReport, BenchRow
 from q2r2_control.benchmark.timed_run import RunMetrics
+from q2r2_control.benchmark.work_bench import WorkReport, WorkRow
 from q2r2_control.cli.bench import motion_table, soak_table, times_table
+from q2r2_control.cli.work_table import work_table
 from q2r2_control.verification.contract import Margin
 from q2r2_control.verification.soak import SoakReport, Violation
+
+TIMES = ("1234", "18765")
 
 
 def printed(table: object, width: int = 80) -> str:
@@ -37,6 +42,42 @@ def test_eighty_columns_hold_every_heading_and_figure_of_the_bench() -> None:
     for figure in ("roboplan, 10 nearest", "12345678", "17.70", "9.25", "22.01", "0.015", "no certificate"):
         assert figure in text
     assert "…" not in text
+
+
+def figures_of(controller: str, **figures: float | None) -> MotionFigures:
+    known = {"rms_error_mm": 123.4, "max_error_mm": 234.5, "min_distance_mm": -48.3, "max_acceleration": 2034.2}
+    timed = {"rest_acceleration": 0.023, "median_us": 1234.5, "p99_us": 18765.4}
+    return MotionFigures("pass-back", controller, **{"done": 1.0, "ticks": 1000, **known, **timed, **figures})  # type: ignore[arg-type]
+
+
+def test_eighty_columns_hold_every_heading_and_figure_of_the_work_motions() -> None:
+    free = figures_of("free air", rms_error_mm=2.17, arrival_s=1.5)
+    rows = [
+        figures_of("q2r2_control", arrival_s=1.75, fallback_percent=12.34),
+        figures_of("roboplan, 10 nearest", failures=5),
+        figures_of("mink", done=0.58, rest_acceleration=None),
+    ]
+    report = WorkReport("cell", 167, [WorkRow("pass-back", "back again", False, free, rows)], ["mink: no certificate"])
+    text = printed(work_table(report))
+    for word in ("RMS", "[mm]", "there", "[s]", "held", "[%]", "near", "|a|", "[s-2]", "p99", "[us]"):
+        assert word in text
+    ours, roboplan, mink, gave_up = text.splitlines()[6:10]
+    assert ours.split() == ["q2r2_control", "123", "234", "2.17", "1.75", "12.3", "-48.3", "2034", "0.02", *TIMES]
+    assert roboplan.split()[3:] == ["123", "234", "no", "0.50", "-48.3", "2034", "0.02", *TIMES]
+    # No acceleration limit, and not at rest, since it was not waited for.
+    assert mink.split() == ["mink", "123", "234", "no", "0.00", "-48.3", "2034*", "-", *TIMES]
+    assert gave_up.strip() == "gave up at 58 %"
+    for words in ("pass-back (!)", "pass-back: back again", "mink: no certificate", "* has no acceleration limit"):
+        assert words in text
+    assert "…" not in text
+
+
+def test_a_motion_without_a_goal_has_no_time_of_arrival_and_one_that_never_began_no_figures() -> None:
+    nothing = MotionFigures("oscillate", "q2r2_control", done=0.01)
+    row = WorkRow("oscillate", "", True, figures_of("free air"), [figures_of("q2r2_control"), nothing])
+    ours, none = printed(work_table(WorkReport("cell", 1, [row], []))).splitlines()[6:8]
+    assert ours.split()[1:6] == ["123", "234", "123", "-", "0.00"]
+    assert set(none.split()[1:]) == {"-"}
 
 
 def test_a_broken_promise_is_in_the_table_with_its_tick_and_its_segment() -> None:

@@ -4,12 +4,13 @@
 ``mink``, ``pink`` and ``roboplan`` are built by ``make_peer`` where their packages are installed.
 """
 
-from q2r2_control.benchmark.peers.base import PEERS, BenchController, Setup, is_installed, make_peer
+from q2r2_control.benchmark.peers.base import PEERS, BenchController, Setup, build_peers, is_installed, make_peer
 
 __all__ = [
     "PEERS",
     "BenchController",
     "Setup",
+    "build_peers",
     "is_installed",
     "make_peer",
 ]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -22,6 +22,7 @@ PEERS = {
     "mink": "mink",
     "pink, 10 nearest": "pink",
 }
+WITHOUT_ACCELERATION_LIMIT = ("mink",)
 INSTALL = "pip install 'q2r2_control[bench]'"
 NEAREST_ROWS = 10  # separation rows of a peer that is given the nearest pairs only
 DETECTION_DISTANCE = 0.25  # pairs farther apart than this need no exact distance [m]
@@ -102,3 +103,21 @@ def make_peer(name: str, setup: Setup) -> BenchController:
 def is_installed(name: str) -> bool:
     """Whether a peer's package can be found."""
     return importlib.util.find_spec(PEERS[name]) is not None
+
+
+def build_peers(names: Sequence[str], setup: Setup) -> tuple[list[BenchController], list[str]]:
+    """The peers that can be built, and a line on each of ``names``: its limitations, or why there is none."""
+    peers: list[BenchController] = []
+    notes = []
+    for name in names:
+        if not is_installed(name):
+            notes.append(f"{name}: not installed; {INSTALL}")
+            continue
+        try:
+            peer = make_peer(name, setup)
+        except Exception as error:  # a package of another version may raise anything
+            notes.append(f"{name}: cannot be built for this cell: {type(error).__name__}: {error}")
+            continue
+        peers.append(peer)
+        notes.append(f"{name}: {peer.limitations}")
+    return peers, notes

@@ -17,6 +17,7 @@ import pinocchio as pin
 
 from q2r2_control.benchmark.peers.base import DETECTION_DISTANCE, Setup
 from q2r2_control.plants.mujoco_model import build_model
+from q2r2_control.robot.floor import FLOOR
 from q2r2_control.robot.pairs import pair_names
 from q2r2_control.types import Array
 
@@ -99,12 +100,13 @@ class Mink:
 
 
 def _mujoco_names(urdf: str) -> dict[str, str]:
-    """Pinocchio's name of each collision shape, LINK_0, LINK_1, ..., and the URDF's, which MuJoCo keeps."""
-    return {
+    """Pinocchio's name of each collision shape, LINK_0, LINK_1, ..., and MuJoCo's: the URDF's, but of the floor."""
+    shapes = {
         f"{link.get('name')}_{index}": shape.get("name", "")
         for link in ET.fromstring(urdf).iterfind("link")
         for index, shape in enumerate(link.findall("collision"))
     }
+    return shapes | {f"{FLOOR}_0": FLOOR}  # a plane in the simulation
 
 
 def make(setup: Setup, name: str) -> Mink:

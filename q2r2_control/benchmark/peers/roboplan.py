@@ -1,11 +1,11 @@
 """roboplan: OInK, differential inverse kinematics as one QP in C++, on Pinocchio, Coal and ProxQP.
 
 Has position, velocity and acceleration limits and a barrier on the nearest pairs. All are hard, so that they can
-contradict each other; its solver then looks for the nearest feasible problem, which can take it seconds. The barrier
-knows nothing of braking distances. It is given the same URDF with our margins in its position limits, the same capsules
-and pairs, and rows for every pair or for the ten nearest. Its solver's tolerance is left as it is (1e-6 rad a tick):
-tighter ones cost it up to two minutes in one tick. Its damping towards a safe displacement, gain 1 by itself, is
-off: with it the tools hardly follow at ticks of 1 ms.
+contradict each other; it raises then. By itself its solver would look for the nearest feasible problem instead, which
+took it up to a minute in one tick: that is off. The barrier knows nothing of braking distances. It is given the same
+URDF with our margins in its position limits, the same capsules and pairs, and rows for every pair or for the ten
+nearest. Its solver's tolerance is left as it is (1e-6 rad a tick): tighter ones cost it up to two minutes in one tick.
+Its damping towards a safe displacement, gain 1 by itself, is off: with it the tools hardly follow at ticks of 1 ms.
 """
 
 from __future__ import annotations
@@ -38,7 +38,9 @@ class Roboplan:
         self._scene = core.Scene(robot.name, core.loadUrdfSceneDescriptionFromXml(_with_margins(setup)))
         self._scene.addGroup(_GROUP, list(robot.joint_names))
         _watch_pairs(self._scene, robot)
-        self._ik = optimal_ik.Oink(self._scene, _GROUP)
+        solver = optimal_ik.OinkSettings()
+        solver.primal_infeasibility_solving = False
+        self._ik = optimal_ik.Oink(self._scene, _GROUP, solver)
         self._indices = np.array(self._ik.q_indices)
         self._rest = np.array(self._scene.getCurrentJointPositions())
         for joint, value in setup.home_of_others().items():
@@ -48,7 +50,7 @@ class Roboplan:
         posture = optimal_ik.ConfigurationTask(
             self._ik,
             robot.home,
-            np.full(nv, setup.posture_cost),
+            np.full(nv, control.posture_weight),  # a weight as it is, where the others square a cost
             optimal_ik.ConfigurationTaskOptions(task_gain=setup.posture_gain),
         )
         self._tasks = [*self._frame_tasks.values(), posture]

@@ -1,0 +1,125 @@
+"""One controller in one work motion, and the figures of it: the same for ours, for peers, and for tests."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from q2r2_control.benchmark.peers.base import BenchController
+from q2r2_control.benchmark.timed_run import OwnController, TimedRun, rest_acceleration, timed_run
+from q2r2_control.config import Config
+from q2r2_control.control.controller import CartesianController
+from q2r2_control.robot.robot import Robot
+from q2r2_control.types import Array
+from q2r2_control.verification.work_motions import WorkMotion
+
+DT = 0.001  # [s]
+ARRIVED = 0.01  # from the goal [m]
+PATIENCE = 3.0  # with a controller: how many times the motion's own time it may take
+_DISTANCE_TICKS = 4  # between postures whose distances are measured, but near the nearest
+
+
+@dataclass(frozen=True, slots=True)
+class MotionFigures:
+    """One controller in one motion, from the end of the approach on. None where it did not get that far."""
+
+    motion: str
+    controller: str
+    done: float  # share of the ticks, 1 unless the controller was too slow to wait for
+    ticks: int = 0  # measured
+    failures: int = 0  # of these: exception, no solution, not finite
+    rms_error_mm: float | None = None  # of the tool with the larger one, until the rest begins
+    max_error_mm: float | None = None  # of either tool, until the rest begins
+    end_error_mm: float | None = None  # of either tool, at the end
+    arrival_s: float | None = None  # since the motion began, to within 10 mm of the goal for good; also None: no goal
+    fallback_percent: float | None = None  # of the ticks; None: a peer, which has none
+    min_distance_mm: float | None = None  # of the monitored pairs, by Coal
+    closest_pair: tuple[str, str] | None = None
+    max_acceleration: float | None = None  # of a joint [rad/s^2]
+    rest_acceleration: float | None = None  # RMS over the last 0.5 s, norm over the joints [rad/s^2]
+    median_us: float | None = None  # of a tick
+    p99_us: float | None = None
+
+
+def run_motion(
+    controller: BenchController, robot: Robot, motion: WorkMotion, patience: float = math.inf, dt: float = DT
+) -> MotionFigures:
+    """Run ``motion`` from home in ticks of ``dt`` [s].
+
+    ``robot`` says which pairs are measured, and may be another one than the controller's; its arms have to be left and
+    right. A controller that takes ``patience`` times the motion's own time is not waited for any longer.
+    """
+    began, rests, ends = (round(time / dt) for time in (motion.begins, motion.rests, motion.ends))
+    run = timed_run(controller, robot, motion.targets, ends - began, dt, warm_up=began, patience=patience * motion.ends)
+    ticks, finished = len(run.q), len(run.q) == ends
+    if ticks <= began + 1:
+        return MotionFigures(motion.name, controller.name, ticks / ends)
+    errors, to_goal = _errors(run, robot, motion, began)
+    nearest, pair = _nearest(run.q[began:], robot)
+    moving = errors[: rests - began]
+    stopped = controller.stopped[began:] if isinstance(controller, OwnController) else None
+    a = np.diff(run.v, axis=0)[began:] / dt
+    return MotionFigures(
+        motion=motion.name,
+        controller=controller.name,
+        done=ticks / ends,
+        ticks=ticks - began,
+        failures=int(run.failed[began:].sum()),
+        rms_error_mm=1e3 * float(np.sqrt(np.mean(moving**2, axis=0)).max()),
+        max_error_mm=1e3 * float(moving.max()),
+        end_error_mm=1e3 * float(errors[-1].max()) if finished else None,
+        arrival_s=_arrival(to_goal, dt) if finished and motion.has_goal else None,
+        fallback_percent=None if stopped is None else 100.0 * sum(stopped) / len(stopped),
+        min_distance_mm=nearest,
+        closest_pair=pair,
+        max_acceleration=float(np.abs(a).max()),
+        rest_acceleration=rest_acceleration(run.v, dt) if finished else None,
+        median_us=float(np.median(run.times_us)),
+        p99_us=float(np.percentile(run.times_us, 99)),
+    )
+
+
+def without_pairs(config: Config) -> Robot:
+    """The robot of a cell in free air: no pair is monitored, so that the arms go through each other and all else."""
+    robot = Robot.from_config(config)
+    robot.collision_model.removeAllCollisionPairs()
+    return robot
+
+
+def own_controller(robot: Robot, config: Config, name: str = OwnController.name) -> OwnController:
+    """Our controller with a cell's settings but the time limit, so that a slow machine computes the same motion."""
+    settings = config.control.model_copy(update={"solve_time_limit": None})
+    controller = OwnController(CartesianController(robot, settings))
+    controller.name = name
+    return controller
+
+
+def _errors(run: TimedRun, robot: Robot, motion: WorkMotion, began: int) -> tuple[Array, Array]:
+    """Distances (n, arms) [m] of the tools from their targets, and from their last targets, at each tick measured."""
+    start = {arm: robot.tool_pose(robot.home, arm) for arm in robot.arms}
+    goal = motion.targets(motion.ends, start)
+    tools = np.array([[robot.tool_pose(q, arm).translation for arm in goal] for q in run.q[began:]])
+    asked = np.array([[pose.translation for pose in targets.values()] for targets in run.goals[began:]])
+    last = np.array([pose.translation for pose in goal.values()])
+    return np.linalg.norm(tools - asked, axis=2), np.linalg.norm(tools - last, axis=2)
+
+
+def _arrival(to_goal: Array, dt: float) -> float | None:
+    """Time [s] from which on both tools stay at the goal; None if they are not there at the end."""
+    away = np.flatnonzero((to_goal >= ARRIVED).any(axis=1))
+    first = int(away[-1]) + 1 if len(away) else 0
+    return first * dt if first < len(to_goal) else None
+
+
+def _nearest(q: Array, robot: Robot) -> tuple[float | None, tuple[str, str] | None]:
+    """Least distance [mm] over postures (n, nv) and its pair: every few of them first, then all around the nearest."""
+    if not len(robot.collision_model.collisionPairs):
+        return None, None
+    coarse = range(0, len(q), _DISTANCE_TICKS)
+    middle = min(coarse, key=lambda tick: robot.distance_values(q[tick]).min())
+    fine = range(max(middle - _DISTANCE_TICKS, 0), min(middle + _DISTANCE_TICKS + 1, len(q)))
+    pairs = [min(robot.distances(q[tick]), key=lambda pair: pair.distance) for tick in fine]
+    found = min(pairs, key=lambda pair: pair.distance)
+    return 1e3 * found.distance, (found.name_a, found.name_b)

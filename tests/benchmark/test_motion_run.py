@@ -1,0 +1,116 @@
+"""Figures of a work motion are those of the controller's motion, whoever it is."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from q2r2_control.benchmark.motion_run import DT, MotionFigures, own_controller, run_motion, without_pairs
+from q2r2_control.config import load_config
+from q2r2_control.robot.robot import Robot
+from q2r2_control.types import Array
+from q2r2_control.verification.work_motions import WORK_MOTIONS
+
+CONFIG = load_config("config/dual_iiwa7.yaml")
+SHORT = replace(
+    WORK_MOTIONS["stretch"],
+    name="short",
+    duration=0.2,
+    path=lambda t, home: home + np.array([[0.05 * t, 0.0, 0.0], [0.0, 0.0, 0.0]]),
+)
+
+
+class Standing:
+    """Stands still but for one joint in one tick, and has no solution in another one."""
+
+    name, limitations = "standing", "everything"
+
+    def __init__(self, jerked: int, failing: int) -> None:
+        self._jerked, self._failing = jerked, failing
+
+    def reset(self, q: Array) -> None:
+        self._q, self._tick = q, -1
+
+    def step(self, targets: Mapping[str, pin.SE3], dt: float) -> tuple[Array, Array]:
+        self._tick += 1
+        if self._tick == self._failing:
+            raise RuntimeError("no solution")
+        v = np.zeros(len(self._q))
+        v[3] = 0.002 if self._tick == self._jerked else 0.0
+        return self._q.copy(), v
+
+    def hold(self) -> tuple[Array, Array]:
+        return self._q.copy(), np.zeros(len(self._q))
+
+
+@pytest.fixture(scope="module")
+def robot() -> Robot:
+    return Robot.from_config(CONFIG)
+
+
+def test_figures_of_a_controller_that_stands_still_are_those_of_the_targets(robot: Robot) -> None:
+    ends = round(SHORT.ends / DT)
+    figures = run_motion(Standing(jerked=ends - 100, failing=ends - 50), robot, SHORT)
+    # The target goes 10 mm at a constant speed; the root mean square of that is 10 / sqrt(3).
+    assert figures.rms_error_mm == pytest.approx(10.0 / np.sqrt(3.0), rel=0.01)
+    assert figures.max_error_mm == pytest.approx(10.0, rel=0.01)
+    assert figures.end_error_mm == pytest.approx(10.0)
+    assert figures.arrival_s is None
+    assert figures.max_acceleration == pytest.approx(2.0)
+    # There and back in two of the last 500 ticks.
+    assert figures.rest_acceleration == pytest.approx(np.sqrt(2.0 * 2.0**2 / 500.0))
+    assert (figures.done, figures.failures, figures.fallback_percent) == (1.0, 1, None)
+    nearest = min(robot.distances(robot.home), key=lambda pair: pair.distance)
+    assert figures.min_distance_mm == pytest.approx(1e3 * nearest.distance)
+    assert figures.closest_pair == (nearest.name_a, nearest.name_b)
+
+
+def test_what_happens_during_the_approach_is_not_measured(robot: Robot) -> None:
+    began = round(SHORT.begins / DT)
+    figures = run_motion(Standing(jerked=began - 100, failing=began - 50), robot, SHORT)
+    assert (figures.max_acceleration, figures.failures) == (0.0, 0)
+
+
+@pytest.mark.parametrize(("goal", "arrival"), [(0.0099, 0.0), (0.0101, None)])
+def test_who_is_within_10_mm_of_the_goal_has_arrived(robot: Robot, goal: float, arrival: float | None) -> None:
+    away = replace(SHORT, path=lambda t, home: home + np.array([[0.0, goal, 0.0], [0.0, 0.0, 0.0]]))
+    assert run_motion(Standing(-1, -1), robot, away).arrival_s == arrival
+    assert run_motion(Standing(-1, -1), robot, replace(away, has_goal=False)).arrival_s is None
+
+
+def test_who_leaves_the_goal_has_arrived_when_it_is_back_for_good(robot: Robot) -> None:
+    there_and_back = replace(
+        SHORT, path=lambda t, home: home + 0.2 * min(t, 0.2 - t) * np.array([[1.0, 0, 0], [0, 0, 0]])
+    )
+    figures = run_motion(own_controller(robot, CONFIG), robot, there_and_back)
+    assert figures.max_error_mm is not None
+    assert figures.arrival_s is not None
+    assert 0.1 < figures.arrival_s < 0.4
+
+
+def test_a_controller_that_is_too_slow_to_wait_for_says_how_far_it_got(robot: Robot) -> None:
+    figures = run_motion(Standing(-1, -1), robot, SHORT, patience=0.0)
+    assert figures.done < 0.01
+    assert figures == MotionFigures("short", "standing", figures.done)
+
+
+def test_ours_passes_where_there_is_a_way_and_keeps_its_distance(robot: Robot) -> None:
+    figures = run_motion(own_controller(robot, CONFIG), robot, WORK_MOTIONS["pass"])
+    assert figures.arrival_s is not None
+    assert figures.min_distance_mm is not None
+    assert figures.min_distance_mm >= 1e3 * CONFIG.control.min_distance
+    assert figures.fallback_percent is not None
+
+
+def test_free_air_follows_what_the_pairs_forbid() -> None:
+    free = without_pairs(CONFIG)
+    figures = run_motion(own_controller(free, CONFIG), Robot.from_config(CONFIG), WORK_MOTIONS["slide"])
+    assert figures.rms_error_mm is not None
+    assert figures.rms_error_mm < 2.0
+    # The slide asks for 10 mm less than the table's 20.
+    assert figures.min_distance_mm == pytest.approx(10.0, abs=0.5)
+    assert figures.closest_pair == ("left_hand_e_envelope_1", "table_0")
