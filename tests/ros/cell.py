@@ -106,8 +106,26 @@ class Cell:
     def engage(self, *arms: str) -> Stream:
         """Begin streams of targets at the tools."""
         stream = Stream(self, {arm: self.tool(arm) for arm in arms})
-        wait_until(lambda: all(self.state(f"{arm}_state") == "following" for arm in arms), f"{arms} follow")
+        try:
+            wait_until(
+                lambda: all(self.state(f"{arm}_state") == "following" for arm in arms),
+                f"{arms} follow",
+                lambda: (self.states, {arm: (stream.poses[arm], self.tool(arm)) for arm in arms}),
+            )
+        except AssertionError:
+            stream.end()  # or it would pull at the arms in the tests after this one
+            raise
         return stream
+
+    def wait_until_home(self) -> None:
+        """Wait until /tf tells of tools at home: transforms of before a reset may come late."""
+
+        def at_home(arm: str) -> bool:
+            home = self.robot.tool_pose(self.robot.home, arm).translation
+            there = self.tools.get(self.robot.arms[arm].tool_frame)
+            return there is not None and float(np.linalg.norm(there.translation - home)) < 2e-3
+
+        wait_until(lambda: all(map(at_home, self.robot.arms)), "the tools are at home")
 
 
 class Stream:

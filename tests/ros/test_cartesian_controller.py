@@ -61,7 +61,7 @@ def cell(started: Cell, running: Processes) -> Cell:
     started.call("/mujoco_robot/reset")
     started.call("/cartesian_controller/reset")
     started.wait_until_active()
-    time.sleep(0.1)  # transforms of before the reset are past
+    started.wait_until_home()
     started.forget()
     return started
 

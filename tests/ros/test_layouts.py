@@ -51,6 +51,7 @@ def cell(started: Cell) -> Cell:
     wait_until(lambda: started.state("mode", "mujoco_robot") == "holding", "the robot holds")
     started.call("/mujoco_robot/reset")
     started.states.pop("cartesian_controller", None)
+    started.wait_until_home()
     started.forget()
     return started
 
