@@ -128,7 +128,7 @@ class CartesianController:
     def tool_pose(self, arm: str) -> pin.SE3:
         """World pose of an arm's tool at the reference."""
         i = self._arms.index(arm)
-        return pin.SE3(self._tasks.rotation[i].copy(), self._tasks.translation[i].copy())
+        return pin.SE3(self._tasks.rotation[i], self._tasks.translation[i])
 
     def _advance(self, h: float, share: float, summary: _Summary) -> None:
         """One substep, which is a ``share`` of the tick: build, solve, certify and move."""
