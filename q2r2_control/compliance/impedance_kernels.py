@@ -19,6 +19,7 @@ from q2r2_control.compliance.impedance_terms import (
     limit_repulsion,
     task_inertia,
 )
+from q2r2_control.compliance.positive_definite import invert
 from q2r2_control.control.geometry.kinematics import Chain, IntArray, Placements, place
 from q2r2_control.control.jit import Held, kernel, lean_kernel
 from q2r2_control.control.tasks.frame import rotation_vector, tool_jacobian, tool_pose
@@ -64,7 +65,8 @@ class ImpedanceData(NamedTuple):
     wanted_q: Array  # (nv,)
     wanted_v: Array  # (nv,)
     M: Array  # (nv, nv)
-    M_inverse: Array  # (nv, nv)
+    M_inverse: Array  # (nv, nv) scratch
+    M_factor: Array  # (nv, nv) scratch
     stiffness: Array  # (k, 2) in force [N/m, Nm/rad]
     errors: Array  # (k, 6) after clipping [m, rad]
     clipped: IntArray  # (k,) 1 where it was longer
@@ -83,6 +85,7 @@ class ImpedanceData(NamedTuple):
             wanted_v=np.zeros(nv),
             M=np.eye(nv),
             M_inverse=np.eye(nv),
+            M_factor=np.eye(nv),
             stiffness=np.ones((arms, 2)),
             errors=np.zeros((arms, 6)),
             clipped=np.zeros(arms, dtype=np.int64),
@@ -100,6 +103,8 @@ def add_impedance_torque(held_model: Held, held_data: Held) -> None:
     Raises :class:`numpy.linalg.LinAlgError` where the numbers are too large to be computed with.
     """
     model, data = held_model.value, held_data.value
+    if not invert(data.M, data.M_factor, data.M_inverse):
+        raise np.linalg.LinAlgError("the inertia matrix is not positive definite")
     data.repulsion[:] = limit_repulsion(model.limits, data.q, data.v, data.wanted_q)
     data.tau[:] += data.repulsion
     place(model.chain, data.q, data.measured.placements)

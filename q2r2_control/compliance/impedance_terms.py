@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from q2r2_control.compliance.positive_definite import factorise, invert
 from q2r2_control.control.jit import kernel
 from q2r2_control.control.tasks.frame import ROTATION_LENGTH
 from q2r2_control.types import Array
@@ -65,7 +66,15 @@ def task_inertia(J: Array, M_inverse: Array) -> Array:
 
 @kernel
 def _floored_inverse(A: Array, least: float) -> Array:
-    """Inverse of a symmetric positive semidefinite A (6, 6) whose scaled eigenvalues are raised to ``least``."""
+    """Inverse of a symmetric positive semidefinite A (6, 6) whose scaled eigenvalues are raised to ``least``.
+
+    Away from singular postures none has to be raised: A - least is positive definite, and no eigenvalue is needed.
+    """
+    factor, inverse = A * _SCALE, np.empty_like(A)
+    for i in range(A.shape[0]):
+        factor[i, i] -= least
+    if factorise(factor) and invert(A, factor, inverse):
+        return inverse
     values, vectors = np.linalg.eigh(A * _SCALE)
     vectors *= _ROWS
     return (vectors / np.maximum(values, least)) @ vectors.T
