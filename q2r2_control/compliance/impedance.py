@@ -80,7 +80,7 @@ class ImpedanceController:
         self._begin(robot.home, np.zeros(robot.model.nv))
         # Every kernel runs once here, so that none is compiled in mid-motion.
         self._add_torque = bound(add_impedance_torque, self._held_model, self._held_data)
-        bound_torque(self._last, self._last, self._limit, 0.0)
+        self._bound = bound(bound_torque, self._last, self._last, self._limit, 0.0)
 
     def reset(self, state: RobotState) -> None:
         """Start anew at rest at the measured posture: the first torque is that of gravity there, without a bump.
@@ -153,7 +153,7 @@ class ImpedanceController:
             wanted = self._gravity()
         else:
             self._usable_q[:] = state.q
-        bounded = bound_torque(wanted, self._last, self._limit, self.settings.torque_rate_limit * time)
+        bounded = self._bound(wanted, self._last, self._limit, self.settings.torque_rate_limit * time)
         self._last = bounded.tau
         errors, clipped = ({}, ()) if held else self._errors()
         report = ImpedanceReport(
@@ -238,4 +238,4 @@ def _model_of(robot: Robot, settings: ImpedanceSettings) -> ImpedanceModel:
 
 def _finite(*arrays: Array) -> bool:
     """Sums of squares are finite where all numbers are, and none is so large that it means nothing."""
-    return all([math.isfinite(array.dot(array)) for array in arrays])
+    return math.isfinite(sum([array.dot(array) for array in arrays]))

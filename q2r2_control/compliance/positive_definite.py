@@ -1,6 +1,7 @@
 """Small symmetric positive definite matrices, compiled: Cholesky factor and inverse.
 
-For matrices of six or fourteen rows LAPACK takes several times as long as the work itself does. Nothing here raises: a matrix that is not positive definite, or not finite, is said to be none.
+For matrices of six or fourteen rows LAPACK takes several times as long as the work itself does. Nothing here raises: a
+matrix that is not positive definite, or not finite, is said to be none.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ import numpy as np
 
 from q2r2_control.control.jit import lean_kernel
 from q2r2_control.types import Array
+
 
 @lean_kernel
 def factorise(A: Array) -> bool:

@@ -128,10 +128,12 @@ class JointWatch:
         return -math.inf if self.state is None else self.state.stamp
 
     def _unusable(self, state: RobotState) -> str | None:
-        external = state.q if state.tau_external is None else state.tau_external
-        for what, values in (("position", state.q), ("velocity", state.v), ("external torque", external)):
-            # The usual case costs one product; the joint is looked for only where there is something to say.
-            if not math.isfinite(values.dot(values)) and not np.isfinite(values).all():
+        q, v, external = state.q, state.v, state.q if state.tau_external is None else state.tau_external
+        # The usual case costs three products; the joint is looked for only where there is something to say.
+        if math.isfinite(q.dot(q) + v.dot(v) + external.dot(external)):
+            return None
+        for what, values in (("position", q), ("velocity", v), ("external torque", external)):
+            if not np.isfinite(values).all():
                 worst = int(np.flatnonzero(~np.isfinite(values))[0])
                 return f"measured {what} of {self._names[worst]} = {values[worst]}"
         return None

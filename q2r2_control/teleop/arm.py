@@ -95,9 +95,7 @@ class ArmTeleop:
         self._buttons.forget()
         self._presses.clear()
 
-    def act(
-        self, tool: Callable[[], pin.SE3 | None], now: float, chord: bool, obstacle: str | None = None
-    ) -> None:
+    def act(self, tool: Callable[[], pin.SE3 | None], now: float, chord: bool, obstacle: str | None = None) -> None:
         """Change the state by buttons and chords.
 
         ``tool``: gives the pose to anchor to, None if not known, and is only asked where the arm is engaged;

@@ -106,9 +106,7 @@ class OneEuro:
         cutoff = self._min_cutoff + self._beta * math.hypot(x, y, z)
         tau = 1.0 / (2.0 * math.pi * cutoff)
         share, lead = dt / (tau + dt), tau - self.delay
-        return np.array(
-            (share * (error[0] + lead * x), share * (error[1] + lead * y), share * (error[2] + lead * z))
-        )
+        return np.array((share * (error[0] + lead * x), share * (error[1] + lead * y), share * (error[2] + lead * z)))
 
 
 class PoseFilter:

@@ -52,8 +52,13 @@ class Teleop:
 
     def take_events(self) -> list[Event]:
         """State changes and refused presses since the last call, in order of time."""
-        if not any([arm.events for arm in self._arms.values()]):
-            return []
+        # At most ticks there is none.
+        for arm in self._arms.values():
+            if arm.events:
+                return self._sorted_events()
+        return []
+
+    def _sorted_events(self) -> list[Event]:
         events = sorted((event for arm in self._arms.values() for event in arm.events), key=lambda event: event.t)
         for arm in self._arms.values():
             arm.events.clear()
