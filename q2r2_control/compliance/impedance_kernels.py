@@ -19,7 +19,7 @@ from q2r2_control.compliance.impedance_terms import (
     limit_repulsion,
     task_inertia,
 )
-from q2r2_control.compliance.positive_definite import invert
+from q2r2_control.compliance.small_matrices import invert, times
 from q2r2_control.control.geometry.kinematics import Chain, IntArray, Placements, place
 from q2r2_control.control.jit import Held, kernel, lean_kernel
 from q2r2_control.control.tasks.frame import rotation_vector, tool_jacobian, tool_pose
@@ -125,15 +125,15 @@ def _arm_torque(model: ImpedanceModel, data: ImpedanceData, i: int, joints: IntA
     M, M_inverse = data.M[joints][:, joints], data.M_inverse[joints][:, joints]
     error, was_clipped = clip_error(error, model.max_position_error, model.max_rotation_error)
     data.errors[i], data.clipped[i] = error, was_clipped
-    error_rate = wanted_J @ data.wanted_v[joints] - J @ data.v[joints]
+    error_rate = times(wanted_J, data.wanted_v[joints]) - times(J, data.v[joints])
     tool_inertia = task_inertia(J, M_inverse)
     stiffness = np.repeat(data.stiffness[i], 3)
     damping = double_diagonalised_damping(stiffness, tool_inertia, model.damping_ratio)
     posture_stiffness = np.full(len(joints), model.posture_stiffness)
     posture_damping = double_diagonalised_damping(posture_stiffness, M, model.posture_damping_ratio)
-    posture = posture_stiffness * way + posture_damping @ speed
+    posture = posture_stiffness * way + times(posture_damping, speed)
     N = consistent_projector(J, M_inverse, tool_inertia) if model.consistent else kinematic_projector(J)
-    return J.T @ (stiffness * error + damping @ error_rate) + N @ posture
+    return times(J.T, stiffness * error + times(damping, error_rate)) + times(N, posture)
 
 
 @kernel

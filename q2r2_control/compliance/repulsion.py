@@ -79,7 +79,7 @@ class MeasuredSeparation:
 
         Never raises because of a number: where one is not finite nothing can be known, and no torque is given.
         """
-        if not (math.isfinite(q.sum()) and math.isfinite(v.sum())):
+        if not math.isfinite(q.dot(q) + v.dot(v)):
             return WallReport(self._no_torque, (), 0.0, 0.0, ("", ""), math.nan)
         count, closest, distance = self._find(q, v)
         energy = self._press(count) if count else 0.0

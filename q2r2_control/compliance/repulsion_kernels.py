@@ -29,7 +29,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from q2r2_control.compliance.positive_definite import factorise
+from q2r2_control.compliance.small_matrices import factorise
 from q2r2_control.control.geometry.closest_points import clamp
 from q2r2_control.control.geometry.collision import CollisionData, CollisionModel, update_placements
 from q2r2_control.control.geometry.kinematics import IntArray
