@@ -104,7 +104,7 @@ class Pipeline:
         try:
             self.input.start()
             with stop_on_signals(self.stop), few_garbage_collections():
-                return _Run(self, realtime).until(duration)
+                return self._begin(realtime).until(duration)
         finally:
             self._stopping = False
             try:
@@ -121,6 +121,10 @@ class Pipeline:
             self.controller = CartesianController(self.robot, settings)
         self._begin_anew()
 
+    def _begin(self, realtime: bool) -> PipelineRun:
+        """Every run is made here, so that a benchmark can put its clocks into it."""
+        return PipelineRun(self, realtime)
+
     def _begin_anew(self) -> None:
         self.teleop = Teleop(self.config.teleop, tuple(self.robot.arms))
         watch = watch_settings(self.config.supervision, self.drive.yields)
@@ -134,8 +138,8 @@ class Pipeline:
         return self._stopping
 
 
-class _Run:
-    """State of one run: clock, statistics, last connection."""
+class PipelineRun:
+    """One run of a :class:`Pipeline`: its clock, its figures, and what lasts from tick to tick."""
 
     def __init__(self, pipeline: Pipeline, realtime: bool) -> None:
         self._pipeline = pipeline
@@ -166,7 +170,7 @@ class _Run:
         ends = math.inf if duration is None else duration
         try:
             while not (self._clock.after(ends) or self._pipeline.stopping):
-                self._tick()
+                self.tick()
                 self._raise_fault()
         except BaseException:
             # The arms come first, whatever failed. What failed may fail again; the first fault tells more.
@@ -176,7 +180,7 @@ class _Run:
         self._bring_to_rest()
         if fault := self._supervisor.state_fault:
             raise PlantError(fault)
-        return self._recorder.summary(self._clock.wall_time(), self._pacer)
+        return self._recorder.summary(self._clock, self._pacer)
 
     def _bring_to_rest(self) -> None:
         """Tick without input and targets until all stands still; no fault of an input can prevent it."""
@@ -186,11 +190,11 @@ class _Run:
         self._supervisor.stop("the run has ended")
         self._supervisor.events.clear()
         try:
-            velocity = np.abs(self._tick().v)
+            velocity = np.abs(self.tick().v)
             speed = float(velocity.max())
             deadline = self._clock.now + float((velocity / self._acceleration).max()) + _STOP_ALLOWANCE
             while (speed > _REST or not drive.at_rest(self._state)) and self._clock.now < deadline:
-                speed = float(np.abs(self._tick().v).max())
+                speed = float(np.abs(self.tick().v).max())
         finally:
             # From the last state that came: a plant that has lost its sensors still takes commands.
             command = drive.last_command(self._state, self._grippers())
@@ -202,7 +206,7 @@ class _Run:
         if self._supervisor.phase is not Phase.ACTIVE:
             raise PlantError(self._supervisor.fault or "the arms were stopped")
 
-    def _tick(self) -> Reference:
+    def tick(self) -> Reference:
         """One line of the way of the data: sample -> target -> reference -> command -> state."""
         pipeline, drive = self._pipeline, self._pipeline.drive
         gap = self._clock.wait()
@@ -210,7 +214,7 @@ class _Run:
         began = time.perf_counter()
         samples = self._poll() if self._following else []
         state = self._state = pipeline.plant.state()
-        tools = self._tools(state)
+        tools = self.tools(state)
         self._observe(state)
         if self._following:
             commanded = {arm: pipeline.controller.tool_pose(arm) for arm in pipeline.robot.arms}
@@ -224,7 +228,7 @@ class _Run:
         given = min(gap, LONGEST_DT)
         pipeline.plant.advance(given)
         self._unanswered += given
-        self._record(gap, dt, samples, reference, state, tools, compute_time)
+        self.record(gap, dt, samples, reference, state, tools, compute_time)
         return reference
 
     def _observe(self, state: RobotState) -> None:
@@ -234,10 +238,14 @@ class _Run:
         if passed != 0.0:
             self._stamp, self._unanswered = state.stamp, 0.0
         # A plant that hangs repeats its last state, which is as old as the time that it was given since.
-        supervisor.take_joint_state(replace(state, stamp=now - self._unanswered), now, passed)
-        for line in supervisor.events:
-            _logger.warning(line)
-        supervisor.events.clear()
+        stamp = now - self._unanswered
+        # Written out, since dataclasses.replace takes three times as long.
+        seen = RobotState(state.q, state.v, state.tau, state.tau_external, stamp)
+        supervisor.take_joint_state(seen, now, passed)
+        if supervisor.events:
+            for line in supervisor.events:
+                _logger.warning(line)
+            supervisor.events.clear()
 
     def _hand_over(self, tools: dict[str, pin.SE3]) -> None:
         """Targets to supervision. One that is refused pauses the arm, or the operator would think that it follows."""
@@ -267,7 +275,8 @@ class _Run:
             self._pipeline.teleop.connection_lost(self._clock.now)
         return samples
 
-    def _tools(self, state: RobotState) -> dict[str, pin.SE3]:
+    def tools(self, state: RobotState) -> dict[str, pin.SE3]:
+        """Measured tool poses, world frame."""
         robot = self._pipeline.robot
         pin.forwardKinematics(robot.model, self._data, state.q)
         return {
@@ -275,7 +284,7 @@ class _Run:
             for name, arm in robot.arms.items()
         }
 
-    def _record(
+    def record(
         self,
         dt: float,
         step: float,
@@ -285,9 +294,13 @@ class _Run:
         tools: dict[str, pin.SE3],
         compute_time: float,
     ) -> None:
-        teleop, report = self._pipeline.teleop, self._pipeline.drive.report
+        """Add one tick to the summary and tell the listeners; a tick that nobody listens to is not put together."""
+        teleop, report, recorder = self._pipeline.teleop, self._pipeline.drive.report, self._recorder
         engaged = {arm: self._following and value for arm, value in teleop.engaged.items()}
         events = [replace(event, t=event.t - self._clock.start) for event in teleop.take_events()]
+        recorder.add(dt, compute_time, reference, self._targets, tools, engaged, report, events)
+        if not recorder.listened:
+            return
         tick = Tick(
             t=self._clock.now - self._clock.start,
             dt=dt,
@@ -305,4 +318,4 @@ class _Run:
             wall=report.wall,
             admittance=report.admittance,
         )
-        self._recorder.add(tick, events)
+        recorder.tell(tick)

@@ -1,9 +1,9 @@
-"""Figures of a controller and of public peers: times of a tick, work motions, and latencies through the ROS nodes.
+"""Figures of this machine: control ticks beside public peers, work motions, a whole loop, latencies through ROS nodes.
 
 ``tick_times`` times our controller and the ``peers`` in turns, by runs of ``timed_run``. ``work_bench`` asks them for
-two-armed work, one motion and one controller at a time by ``motion_run``, which tests can use alone.
-``command_responses`` finds the commands that answer steps of an input, and ``ros_latency``, which needs ROS, records
-them.
+two-armed work, one motion and one controller at a time by ``motion_run``, which tests can use alone. ``loop_times``
+tells where a tick of the live loop goes. ``command_responses`` finds the commands that answer steps of an input, and
+``ros_latency``, which needs ROS, records them.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from q2r2_control._lazy import lazy_exports
 
 if TYPE_CHECKING:
     from q2r2_control.benchmark.command_responses import LatencyReport, LatencyRow, latency_report
+    from q2r2_control.benchmark.loop_times import LoopReport, LoopRow, run_loop_bench
     from q2r2_control.benchmark.motion_run import MotionFigures, own_controller, run_motion, without_pairs
     from q2r2_control.benchmark.tick_times import BenchReport, BenchRow, run_bench
     from q2r2_control.benchmark.timed_run import RunMetrics, TimedRun
@@ -24,6 +25,8 @@ __all__ = [
     "BenchRow",
     "LatencyReport",
     "LatencyRow",
+    "LoopReport",
+    "LoopRow",
     "MotionFigures",
     "RunMetrics",
     "TimedRun",
@@ -32,6 +35,7 @@ __all__ = [
     "latency_report",
     "own_controller",
     "run_bench",
+    "run_loop_bench",
     "run_motion",
     "run_work_bench",
     "without_pairs",
@@ -45,6 +49,8 @@ __getattr__ = lazy_exports(
         "LatencyReport": "command_responses",
         "LatencyRow": "command_responses",
         "MotionFigures": "motion_run",
+        "LoopReport": "loop_times",
+        "LoopRow": "loop_times",
         "RunMetrics": "timed_run",
         "TimedRun": "timed_run",
         "WorkReport": "work_bench",
@@ -55,5 +61,6 @@ __getattr__ = lazy_exports(
         "run_motion": "motion_run",
         "run_work_bench": "work_bench",
         "without_pairs": "motion_run",
+        "run_loop_bench": "loop_times",
     },
 )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Annotated, NoReturn
 
 import typer
@@ -13,6 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from q2r2_control.benchmark.command_responses import LatencyReport
+from q2r2_control.benchmark.loop_times import PHYSICS, LoopReport, StageTime, run_loop_bench
 from q2r2_control.benchmark.peers.base import PEERS
 from q2r2_control.benchmark.tick_times import BenchReport, BenchRow, run_bench
 from q2r2_control.benchmark.work_bench import WORK_PEERS, run_work_bench
@@ -45,6 +46,7 @@ def bench(
         bool, typer.Option("--soak", help="Check every promise in hostile ticks instead of timing.")
     ] = False,
     seed: Annotated[int, typer.Option(min=0, help="Of the soak.")] = 0,
+    loop: Annotated[bool, typer.Option("--loop", help="Time the whole live loop instead, stage by stage.")] = False,
     ros: Annotated[bool, typer.Option("--ros", help="Time the ROS nodes instead.")] = False,
     duration: Annotated[
         float | None, typer.Option(min=1, max=3600, help=f"Of each input, {_SECONDS:g} by default; with --ros [s].")
@@ -62,11 +64,13 @@ def bench(
     With --soak: random hostile targets, ticks, starts and solver failures; every promise of the controller is checked
     at every tick, and the worst margin of each is printed. Exit 1 if one was broken.
 
+    With --loop: where a tick of q2r2 run goes, from inputs to recording, for three plants and modes.
+
     With --ros: the time from a message on an input topic to the joint command that answers it, through real nodes on
     this machine, in a domain of their own.
     """
-    if sum((work, soak, ros)) > 1:
-        raise ConfigError("--work, --soak and --ros exclude each other")
+    if sum((work, soak, ros, loop)) > 1:
+        raise ConfigError("--work, --soak, --ros and --loop exclude each other")
     if motion and not work:
         raise ConfigError("--motion needs --work")
     if work and ticks is not None:
@@ -88,6 +92,9 @@ def bench(
             _show_soak(run_soak(load_config(DEMO_CONFIG), soak_ticks, seed, _progress(console)), json)
         elif work:
             _show_work(motions, WORK_PEERS if peers else (), console, json)
+        elif loop:
+            loop_ticks = _TICKS if ticks is None else ticks
+            _show_loop(run_loop_bench(load_config(DEMO_CONFIG), loop_ticks, _progress(console)), json)
         else:
             _show_times(_TICKS if ticks is None else ticks, tuple(PEERS) if peers else (), console, json)
 
@@ -108,6 +115,13 @@ def _show_work(motions: Sequence[WorkMotion], peers: tuple[str, ...], console: C
         print(as_json_text(report.as_json()))
     else:
         Console().print(work_table(report))
+
+
+def _show_loop(report: LoopReport, json: bool) -> None:
+    if json:
+        print(as_json_text(report.as_json()))
+    else:
+        Console().print(loop_table(report))
 
 
 def _show_soak(report: SoakReport, json: bool) -> NoReturn:
@@ -208,6 +222,34 @@ def soak_table(report: SoakReport) -> Table:
     table.caption = Text(_soak_notes(report))
     table.caption_justify = "left"
     return table
+
+
+def loop_table(report: LoopReport) -> Table:
+    """Where a tick of the live loop goes: a column for each plant and mode."""
+    first = report.rows[0]
+    table = figure_table(
+        f"{report.cell}: one tick of the live loop at {report.loop_rate_hz:g} Hz, {first.rounds} runs of {first.ticks} "
+        "ticks each [us]",
+        "stage",
+        tuple(text for row in report.rows for text in (f"{row.plant} {row.mode}\nmedian", "\np99")),
+    )
+    for index, stage in enumerate(first.stages):
+        if stage.stage == PHYSICS:
+            table.add_row(Text("without physics", style="bold"), *_times_of(row.without_physics for row in report.rows))
+        table.add_row(stage.stage, *_times_of(row.stages[index] for row in report.rows))
+    added = ", ".join(f"{row.clocks_us:.0f}" for row in report.rows)
+    table.caption = Text(
+        f"without physics: of runs without clocks in the stages, which add {added} us; medians do not add up\n"
+        "drive: impedance and wall in torque mode; physics: of the simulator, where a real robot would move"
+    )
+    table.caption_justify = "left"
+    return table
+
+
+def _times_of(stages: Iterable[StageTime]) -> Iterator[str]:
+    for stage in stages:
+        yield f"{stage.median_us:.0f}"
+        yield f"{stage.p99_us:.0f}"
 
 
 def latency_table(report: LatencyReport) -> Table:

@@ -21,6 +21,7 @@ from q2r2_control.pipeline import Pipeline
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.runtime.recorder import Tick
 from q2r2_control.runtime.run_summary import RunSummary
+from q2r2_control.runtime.scheduling import real_time
 from q2r2_control.supervision.preflight import preflight_faults
 from q2r2_control.viewer.history import History
 from q2r2_control.viewer.live import LiveTable
@@ -46,6 +47,7 @@ class RunOptions:
     window: bool
     report: bool
     force: bool  # run although q2r2 check finds faults
+    real_time: bool  # ask the system for locked memory and SCHED_FIFO
 
 
 def run_cell(config: Config, options: RunOptions, console: Console) -> RunSummary:
@@ -71,6 +73,8 @@ def run_cell(config: Config, options: RunOptions, console: Console) -> RunSummar
             table = LiveTable(f"{options.name}: Ctrl-C brings the arms to rest and ends", config.control.min_distance)
             pipeline.listeners.append(table)
             stack.enter_context(table.shown(console))
+        if options.real_time and (refused := stack.enter_context(real_time())):
+            console.print(refused, style="yellow", soft_wrap=True, highlight=False, markup=False)
         summary = pipeline.run(options.duration, realtime=not options.fast)
     if options.report:
         folder = _write_report(config, options, history, summary)

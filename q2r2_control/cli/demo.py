@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from q2r2_control.cli.cell_run import RunOptions, print_summary, run_cell
-from q2r2_control.cli.options import DEMO_CONFIG, Headless, Human, Json, Viewer, positive, shows_table
+from q2r2_control.cli.options import DEMO_CONFIG, Headless, Human, Json, RealTime, Viewer, positive, shows_table
 from q2r2_control.cli.output import stderr_console
 from q2r2_control.config import load_config
 from q2r2_control.inputs.factory import DEFAULT_TRAJECTORY
@@ -18,6 +18,7 @@ def demo(
     viewer: Viewer = False,
     headless: Headless = False,
     human: Human = False,
+    rt: RealTime = False,
     json: Json = False,
 ) -> None:
     """Two simulated arms follow scripted hands: both pick up a block, meet in the middle, put it back.
@@ -38,5 +39,6 @@ def demo(
         window=viewer,
         report=True,
         force=False,
+        real_time=rt,
     )
     print_summary(run_cell(load_config(DEMO_CONFIG), options, stderr_console()), json)

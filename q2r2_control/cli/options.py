@@ -17,6 +17,10 @@ Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on std
 Headless = Annotated[bool, typer.Option("--headless", help="No live table, no window.")]
 Viewer = Annotated[bool, typer.Option("--viewer", help="Open MuJoCo's window; closing it ends the run.")]
 Human = Annotated[bool, typer.Option("--human", help="Scripted hands tremble, and samples get lost and late.")]
+RealTime = Annotated[
+    bool,
+    typer.Option("--rt", help="Lock memory and run under SCHED_FIFO; says what the system refuses, and runs anyway."),
+]
 
 
 def positive(option: str, value: float) -> float:

@@ -9,7 +9,7 @@ import typer
 
 from q2r2_control.cli.cell_run import RunOptions, print_summary, run_cell
 from q2r2_control.cli.headset_server import Host, Port, with_address
-from q2r2_control.cli.options import ConfigFile, Headless, Human, Json, Viewer, positive, shows_table
+from q2r2_control.cli.options import ConfigFile, Headless, Human, Json, RealTime, Viewer, positive, shows_table
 from q2r2_control.cli.output import stderr_console
 from q2r2_control.config import load_config
 from q2r2_control.errors import ConfigError
@@ -48,6 +48,7 @@ def run(
     port: Port = None,
     viewer: Viewer = False,
     headless: Headless = False,
+    rt: RealTime = False,
     report: Annotated[bool, typer.Option(help="Write plots and a summary to a folder under runs/.")] = False,
     force: Annotated[bool, typer.Option("--force", help="Run even where q2r2 check finds a fault.")] = False,
     json: Json = False,
@@ -65,6 +66,8 @@ def run(
             raise ConfigError(f"{option} cannot be used with --input {input.value}")
     if fast and duration is None:
         raise ConfigError("--fast needs --duration, since simulated time has no end of its own")
+    if fast and rt:
+        raise ConfigError("--rt and --fast exclude each other, since simulated time is never late")
     cell = with_address(load_config(config), host, port)
     options = RunOptions(
         name=cell.name,
@@ -80,5 +83,6 @@ def run(
         window=viewer,
         report=report,
         force=force,
+        real_time=rt,
     )
     print_summary(run_cell(cell, options, stderr_console()), json)

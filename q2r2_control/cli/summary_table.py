@@ -7,7 +7,8 @@ from collections.abc import Sequence
 from rich.markup import escape
 from rich.table import Table
 
-from q2r2_control.runtime.run_summary import Percentiles, RunSummary
+from q2r2_control.runtime.histogram import Percentiles
+from q2r2_control.runtime.run_summary import RunSummary
 from q2r2_control.runtime.torque_summary import TorqueSummary
 from q2r2_control.types import Event
 
@@ -17,6 +18,9 @@ def summary_table(summary: RunSummary) -> Table:
     table = Table(title="summary", title_justify="left", show_header=False)
     table.add_row("duration", f"{summary.duration_s:.2f} s, {summary.ticks} ticks, {summary.loop_rate_hz:.0f} Hz")
     table.add_row("tick", _percentiles(summary.tick_us, "us", 0))
+    if summary.lateness_us.max is not None:
+        late = f"{_percentiles(summary.lateness_us, 'us', 0)}; {summary.overruns} by more than a period"
+        table.add_row("ticks late by", late)
     table.add_row("input to command", _percentiles(summary.input_to_command_ms, "ms", 2))
     for name, arm in summary.arms.items():
         figures = f"engaged {arm.engaged_s:.2f} s"

@@ -30,7 +30,7 @@ from q2r2_control.compliance.impedance_kernels import ImpedanceData, ImpedanceMo
 from q2r2_control.compliance.impedance_terms import BoolArray, PositionLimits, bound_torque
 from q2r2_control.config.control import ImpedanceSettings
 from q2r2_control.control.geometry.kinematics import chain_of
-from q2r2_control.control.jit import hold
+from q2r2_control.control.jit import bound, hold
 from q2r2_control.control.tasks.task_model import tools_of
 from q2r2_control.errors import ConfigError, RobotError
 from q2r2_control.robot.robot import Robot
@@ -79,8 +79,8 @@ class ImpedanceController:
         self._ramping = False
         self._begin(robot.home, np.zeros(robot.model.nv))
         # Every kernel runs once here, so that none is compiled in mid-motion.
-        add_impedance_torque(self._held_model, self._held_data)
-        bound_torque(self._last, self._last, self._limit, 0.0)
+        self._add_torque = bound(add_impedance_torque, self._held_model, self._held_data)
+        self._bound = bound(bound_torque, self._last, self._last, self._limit, 0.0)
 
     def reset(self, state: RobotState) -> None:
         """Start anew at rest at the measured posture: the first torque is that of gravity there, without a bump.
@@ -98,8 +98,12 @@ class ImpedanceController:
     def _begin(self, q: Array, v: Array) -> None:
         self._due_q, self._due_v = q.copy(), v  # of the newest reference, due at the end of its tick
         self._wanted_q, self._wanted_v = self._due_q, self._due_v  # of the one before, due now
-        self._gravity = np.array(pin.computeGeneralizedGravity(self.robot.model, self._data, q))
-        self._last = np.minimum(np.maximum(self._gravity, -self._limit), self._limit)
+        self._usable_q = q.copy()  # the newest measured posture that was of use
+        self._last = np.minimum(np.maximum(self._gravity(), -self._limit), self._limit)
+
+    def _gravity(self) -> Array:
+        """Torque of gravity (nv,) at the newest posture that was of use [Nm]."""
+        return np.array(pin.computeGeneralizedGravity(self.robot.model, self._data, self._usable_q))
 
     def set_stiffness(
         self, translational: float | None = None, rotational: float | None = None, arm: str | None = None
@@ -143,24 +147,21 @@ class ImpedanceController:
         if self._ramping:
             self._ramp(time)
         acceleration = self._exchange(reference)
-        gravity = self._law(state, acceleration) if _finite(state.q, state.v) else None
-        wanted = self._gravity
-        if gravity is not None:
-            wanted = self._kernel_data.tau if extra is None else self._kernel_data.tau + extra
-            if _finite(wanted):
-                self._gravity = gravity
-            else:
-                gravity, wanted = None, self._gravity
-        bounded = bound_torque(wanted, self._last, self._limit, self.settings.torque_rate_limit * time)
+        wanted = self._law(state, acceleration, extra) if _finite(state.q, state.v) else None
+        held = wanted is None
+        if wanted is None:
+            wanted = self._gravity()
+        else:
+            self._usable_q[:] = state.q
+        bounded = self._bound(wanted, self._last, self._limit, self.settings.torque_rate_limit * time)
         self._last = bounded.tau
-        held = gravity is None
-        errors, clipped = self._errors()
+        errors, clipped = ({}, ()) if held else self._errors()
         report = ImpedanceReport(
-            errors={} if held else errors,
-            clipped=() if held else clipped,
+            errors=errors,
+            clipped=clipped,
             saturated=self._names(bounded.saturated),
             rate_limited=self._names(bounded.rate_limited),
-            repelled=() if held else self._names(self._kernel_data.repulsion != 0.0),
+            repelled=() if held else self._names(self._kernel_data.repulsion),
             held=held,
         )
         return TorqueCommand(bounded.tau.copy(), report)
@@ -185,26 +186,26 @@ class ImpedanceController:
         self._due_v = np.zeros_like(self._due_v)
         return self._due_v
 
-    def _law(self, state: RobotState, acceleration: Array) -> Array | None:
-        """The torque of all arms, without bounds, into the kernel's data; returns gravity's.
+    def _law(self, state: RobotState, acceleration: Array, extra: Array | None) -> Array | None:
+        """The torque of all arms and ``extra``, without bounds.
 
         None where the numbers are too large to be computed with.
         """
         model, data, kernel_data = self.robot.model, self._data, self._kernel_data
         kernel_data.q[:], kernel_data.v[:] = state.q, state.v
         kernel_data.wanted_q[:], kernel_data.wanted_v[:] = self._wanted_q, self._wanted_v
-        gravity = np.array(pin.computeGeneralizedGravity(model, data, kernel_data.q))
         kernel_data.tau[:] = pin.rnea(model, data, kernel_data.q, kernel_data.v, acceleration)
         kernel_data.M[:] = pin.crba(model, data, kernel_data.q)
-        kernel_data.M_inverse[:] = pin.computeMinverse(model, data, kernel_data.q)
         try:
-            add_impedance_torque(self._held_model, self._held_data)
+            self._add_torque(self._held_model, self._held_data)
         except np.linalg.LinAlgError:
             return None
-        return gravity
+        wanted = kernel_data.tau if extra is None else kernel_data.tau + extra
+        return wanted if _finite(wanted) else None
 
-    def _names(self, which: BoolArray) -> tuple[str, ...]:
-        if not which.any():
+    def _names(self, which: BoolArray | Array) -> tuple[str, ...]:
+        """Of the joints for which ``which`` is not 0."""
+        if not np.count_nonzero(which):
             return ()
         return tuple(self.robot.joint_names[index] for index in np.flatnonzero(which))
 
@@ -237,4 +238,4 @@ def _model_of(robot: Robot, settings: ImpedanceSettings) -> ImpedanceModel:
 
 def _finite(*arrays: Array) -> bool:
     """Sums of squares are finite where all numbers are, and none is so large that it means nothing."""
-    return all(math.isfinite(np.vdot(array, array)) for array in arrays)
+    return math.isfinite(sum([array.dot(array) for array in arrays]))

@@ -19,6 +19,7 @@ from q2r2_control.compliance.impedance_terms import (
     limit_repulsion,
     task_inertia,
 )
+from q2r2_control.compliance.small_matrices import invert, times
 from q2r2_control.control.geometry.kinematics import Chain, IntArray, Placements, place
 from q2r2_control.control.jit import Held, kernel, lean_kernel
 from q2r2_control.control.tasks.frame import rotation_vector, tool_jacobian, tool_pose
@@ -64,7 +65,8 @@ class ImpedanceData(NamedTuple):
     wanted_q: Array  # (nv,)
     wanted_v: Array  # (nv,)
     M: Array  # (nv, nv)
-    M_inverse: Array  # (nv, nv)
+    M_inverse: Array  # (nv, nv) scratch
+    M_factor: Array  # (nv, nv) scratch
     stiffness: Array  # (k, 2) in force [N/m, Nm/rad]
     errors: Array  # (k, 6) after clipping [m, rad]
     clipped: IntArray  # (k,) 1 where it was longer
@@ -83,6 +85,7 @@ class ImpedanceData(NamedTuple):
             wanted_v=np.zeros(nv),
             M=np.eye(nv),
             M_inverse=np.eye(nv),
+            M_factor=np.eye(nv),
             stiffness=np.ones((arms, 2)),
             errors=np.zeros((arms, 6)),
             clipped=np.zeros(arms, dtype=np.int64),
@@ -100,6 +103,8 @@ def add_impedance_torque(held_model: Held, held_data: Held) -> None:
     Raises :class:`numpy.linalg.LinAlgError` where the numbers are too large to be computed with.
     """
     model, data = held_model.value, held_data.value
+    if not invert(data.M, data.M_factor, data.M_inverse):
+        raise np.linalg.LinAlgError("the inertia matrix is not positive definite")
     data.repulsion[:] = limit_repulsion(model.limits, data.q, data.v, data.wanted_q)
     data.tau[:] += data.repulsion
     place(model.chain, data.q, data.measured.placements)
@@ -120,15 +125,15 @@ def _arm_torque(model: ImpedanceModel, data: ImpedanceData, i: int, joints: IntA
     M, M_inverse = data.M[joints][:, joints], data.M_inverse[joints][:, joints]
     error, was_clipped = clip_error(error, model.max_position_error, model.max_rotation_error)
     data.errors[i], data.clipped[i] = error, was_clipped
-    error_rate = wanted_J @ data.wanted_v[joints] - J @ data.v[joints]
+    error_rate = times(wanted_J, data.wanted_v[joints]) - times(J, data.v[joints])
     tool_inertia = task_inertia(J, M_inverse)
     stiffness = np.repeat(data.stiffness[i], 3)
     damping = double_diagonalised_damping(stiffness, tool_inertia, model.damping_ratio)
     posture_stiffness = np.full(len(joints), model.posture_stiffness)
     posture_damping = double_diagonalised_damping(posture_stiffness, M, model.posture_damping_ratio)
-    posture = posture_stiffness * way + posture_damping @ speed
+    posture = posture_stiffness * way + times(posture_damping, speed)
     N = consistent_projector(J, M_inverse, tool_inertia) if model.consistent else kinematic_projector(J)
-    return J.T @ (stiffness * error + damping @ error_rate) + N @ posture
+    return times(J.T, stiffness * error + times(damping, error_rate)) + times(N, posture)
 
 
 @kernel

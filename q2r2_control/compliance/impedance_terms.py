@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from q2r2_control.compliance.small_matrices import factorise, invert, product, square_root
 from q2r2_control.control.jit import kernel
 from q2r2_control.control.tasks.frame import ROTATION_LENGTH
 from q2r2_control.types import Array
@@ -60,12 +61,20 @@ def task_inertia(J: Array, M_inverse: Array) -> Array:
     are raised to that of 1000 kg. All others stay exact, other than with a damping term on the diagonal, which would
     make the projector that is built with Lambda leak everywhere.
     """
-    return _floored_inverse(J @ M_inverse @ J.T, 1.0 / _HEAVIEST)
+    return _floored_inverse(product(product(J, M_inverse), J.T), 1.0 / _HEAVIEST)
 
 
 @kernel
 def _floored_inverse(A: Array, least: float) -> Array:
-    """Inverse of a symmetric positive semidefinite A (6, 6) whose scaled eigenvalues are raised to ``least``."""
+    """Inverse of a symmetric positive semidefinite A (6, 6) whose scaled eigenvalues are raised to ``least``.
+
+    Away from singular postures none has to be raised: A - least is positive definite, and no eigenvalue is needed.
+    """
+    factor, inverse = A * _SCALE, np.empty_like(A)
+    for i in range(A.shape[0]):
+        factor[i, i] -= least
+    if factorise(factor) and invert(A, factor, inverse):
+        return inverse
     values, vectors = np.linalg.eigh(A * _SCALE)
     vectors *= _ROWS
     return (vectors / np.maximum(values, least)) @ vectors.T
@@ -79,10 +88,17 @@ def double_diagonalised_damping(stiffness: Array, inertia: Array, damping_ratio:
     Frese, Hirzinger: "Cartesian impedance control of redundant robots: recent results with the
     DLR-light-weight-arms", ICRA 2003: K v = lambda Lambda v with V' Lambda V = I, Q = V^-1,
     D = 2 Q' diag(xi sqrt(lambda)) Q. K being diagonal, W and U of  K^-1/2 Lambda K^-1/2 = U W U'  give
-    lambda = 1 / W, Q = W^1/2 U' K^1/2, and D = 2 xi K^1/2 U W^1/2 U' K^1/2, without any matrix to invert.
+    lambda = 1 / W, Q = W^1/2 U' K^1/2, and D = 2 xi K^1/2 U W^1/2 U' K^1/2: between the K^1/2 stands the square root of
+    K^-1/2 Lambda K^-1/2.
     """
     root = np.sqrt(stiffness)
-    W, U = np.linalg.eigh(inertia / np.outer(root, root))
+    both = np.outer(root, root)
+    scaled = inertia / both
+    X, found = square_root(scaled)
+    if found:
+        return 2.0 * damping_ratio * both * X
+    # Of an inertia that is positive definite but for rounding.
+    W, U = np.linalg.eigh(scaled)
     U *= root.reshape((-1, 1))
     return (U * (2.0 * damping_ratio * np.sqrt(np.maximum(W, 0.0)))) @ U.T
 
@@ -90,13 +106,13 @@ def double_diagonalised_damping(stiffness: Array, inertia: Array, damping_ratio:
 @kernel
 def consistent_projector(J: Array, M_inverse: Array, inertia: Array) -> Array:
     """N (n, n): torque N tau accelerates no tool, J M^-1 N = 0: I - J' Lambda J M^-1 (Khatib 1987, eq. 51)."""
-    return np.eye(J.shape[1]) - J.T @ inertia @ J @ M_inverse
+    return np.eye(J.shape[1]) - product(product(product(J.T, inertia), J), M_inverse)
 
 
 @kernel
 def kinematic_projector(J: Array) -> Array:
     """N (n, n): torque N tau balances no static force at the tool, J N = 0: I - J' J'^+; needs no inertia."""
-    return np.eye(J.shape[1]) - J.T @ _floored_inverse(J @ J.T, _LEAST_MOTION**2) @ J
+    return np.eye(J.shape[1]) - product(product(J.T, _floored_inverse(product(J, J.T), _LEAST_MOTION**2)), J)
 
 
 @kernel

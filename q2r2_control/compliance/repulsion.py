@@ -20,7 +20,7 @@ import pinocchio as pin
 from q2r2_control.compliance.repulsion_kernels import RepulsionData, RepulsionModel, find_near, repulsion_torque
 from q2r2_control.config.control import ControllerSettings, WallSettings
 from q2r2_control.control.geometry.collision import collision_model_of
-from q2r2_control.control.jit import hold
+from q2r2_control.control.jit import bound, hold
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 
@@ -69,21 +69,23 @@ class MeasuredSeparation:
         indices = zip(pairs.first.tolist(), pairs.second.tolist(), strict=True)
         self._pair_names = [(names[first], names[second]) for first, second in indices]
         # Every kernel runs once here, so that none is compiled in mid-motion.
-        self._find(robot.home, np.zeros(robot.model.nv))
-        self._press(0)
+        self._find_near = bound(find_near, self._held_model, self._held_data)
+        self._repulsion_torque = bound(repulsion_torque, self._held_model, self._held_data, 0)
+        self._no_torque = np.zeros(robot.model.nv)
+        self._no_torque.flags.writeable = False
 
     def update(self, q: Array, v: Array) -> WallReport:
         """Wall torque at the measured ``q`` [rad] and ``v`` [rad/s], (nv,) each.
 
         Never raises because of a number: where one is not finite nothing can be known, and no torque is given.
         """
-        if not (math.isfinite(q.sum()) and math.isfinite(v.sum())):
-            return WallReport(np.zeros(len(q)), (), 0.0, 0.0, ("", ""), math.nan)
+        if not math.isfinite(q.dot(q) + v.dot(v)):
+            return WallReport(self._no_torque, (), 0.0, 0.0, ("", ""), math.nan)
         count, closest, distance = self._find(q, v)
         energy = self._press(count) if count else 0.0
         pair = self._pair_names[closest] if self._pair_names else ("", "")
         if not energy:
-            return WallReport(np.zeros(len(q)), (), 0.0, 0.0, pair, distance)
+            return WallReport(self._no_torque, (), 0.0, 0.0, pair, distance)
         force = self._kernel_data.force[:count]
         pressing = tuple(self._pair_names[self._kernel_data.near[i]] for i in np.flatnonzero(force > 0.0))
         return WallReport(self._kernel_data.tau.copy(), pressing, float(force.max()), energy, pair, distance)
@@ -91,9 +93,9 @@ class MeasuredSeparation:
     def _find(self, q: Array, v: Array) -> tuple[int, int, float]:
         self._kernel_data.q[:] = q
         self._kernel_data.v[:] = v
-        found: tuple[int, int, float] = find_near(self._held_model, self._held_data)
+        found: tuple[int, int, float] = self._find_near(self._held_model, self._held_data)
         return found
 
     def _press(self, count: int) -> float:
         self._kernel_data.M[:] = pin.crba(self._model, self._data, self._kernel_data.q)
-        return float(repulsion_torque(self._held_model, self._held_data, count))
+        return float(self._repulsion_torque(self._held_model, self._held_data, count))

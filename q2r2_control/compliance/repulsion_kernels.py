@@ -29,6 +29,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from q2r2_control.compliance.small_matrices import factorise
 from q2r2_control.control.geometry.closest_points import clamp
 from q2r2_control.control.geometry.collision import CollisionData, CollisionModel, update_placements
 from q2r2_control.control.geometry.kinematics import IntArray
@@ -121,7 +122,7 @@ def repulsion_torque(held_model: Held, held_data: Held, count: int) -> float:
     """Add up the torques of the ``count`` pairs found near; returns the energy stored in the wall [J]."""
     model, data = held_model.value, held_data.value
     depth, mobility, force = data.depth, data.mobility, data.force
-    _factorise(data.M)
+    factorise(data.M)
     total = 0.0
     for i in range(count):
         mobility[i] = _mobility(data.M, data.rows[i], data.row)
@@ -151,21 +152,6 @@ def repulsion_torque(held_model: Held, held_data: Held, count: int) -> float:
         for j in range(data.v.shape[0]):
             data.tau[j] += force[i] * data.rows[i, j]
     return energy
-
-
-@lean_kernel
-def _factorise(M: Array) -> None:
-    """Cholesky factor of a symmetric M, read from its upper triangle, into the lower one and the diagonal."""
-    for j in range(M.shape[0]):
-        diagonal = M[j, j]
-        for k in range(j):
-            diagonal -= M[j, k] * M[j, k]
-        M[j, j] = np.sqrt(diagonal)
-        for i in range(j + 1, M.shape[0]):
-            value = M[j, i]
-            for k in range(j):
-                value -= M[i, k] * M[j, k]
-            M[i, j] = value / M[j, j]
 
 
 @lean_kernel

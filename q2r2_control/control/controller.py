@@ -9,7 +9,7 @@ import numpy as np
 import pinocchio as pin
 
 from q2r2_control.config.control import ControllerSettings
-from q2r2_control.control.jit import hold
+from q2r2_control.control.jit import bound, hold
 from q2r2_control.control.kernel_data import KernelData
 from q2r2_control.control.kernel_model import kernel_model_of
 from q2r2_control.control.qp import QpProblem, Solver, make_solver
@@ -48,8 +48,8 @@ class CartesianController:
         model = kernel_model_of(robot, self.settings)
         data = KernelData.empty(model)
         self._state, self._rows, self._active = data.safety.state, data.safety.rows, data.safety.active
-        self._stop = data.safety.certified
-        self._wanted, self._tasks = data.safety.wanted, data.tasks
+        self._stop, self._tasks = data.safety.certified, data.tasks
+        self._solution = np.zeros(self._nv)  # of the solver, whatever array it gave
         self._problem = QpProblem(
             H=data.tasks.H,
             g=data.tasks.g,
@@ -70,6 +70,9 @@ class CartesianController:
     def _compile(self) -> None:
         """Run every kernel once, so that none is compiled in mid-motion."""
         self.reset(self.robot.home)
+        model, data, targets = self._held_model, self._held_data, self._targets.held
+        self._assemble = bound(assemble, model, targets, data, self.settings.max_substep)
+        self._move = bound(move_reference, model, data, self._solution, False, self.settings.max_substep, 1.0)
         self.step({arm: self.tool_pose(arm) for arm in self._arms}, self.settings.max_substep)
 
     def reset(self, q: Array, v: Array | None = None) -> None:
@@ -129,7 +132,7 @@ class CartesianController:
     def tool_pose(self, arm: str) -> pin.SE3:
         """World pose of an arm's tool at the reference."""
         i = self._arms.index(arm)
-        return pin.SE3(self._tasks.rotation[i].copy(), self._tasks.translation[i].copy())
+        return pin.SE3(self._tasks.rotation[i], self._tasks.translation[i])
 
     @property
     def stop_deceleration(self) -> Array:
@@ -138,15 +141,16 @@ class CartesianController:
 
     def _advance(self, h: float, share: float, summary: _Summary) -> None:
         """One substep, which is a ``share`` of the tick: build, solve, certify and move."""
-        summary.inside &= assemble(self._held_model, self._targets.held, self._held_data, h)
+        summary.inside &= self._assemble(self._held_model, self._targets.held, self._held_data, h)
         count = int(self._rows.used[0])
         self._problem.rows, self._problem.rows_lower = self._rows.matrix[:count], self._rows.lower[:count]
         solution = self._solver.solve(self._problem)
         limit = self.settings.solve_time_limit
         usable = solution.v is not None and (limit is None or solution.solve_time <= limit)
-        wanted = solution.v if usable else self._wanted
-        outcome, self._closest, self._distance, slack = move_reference(
-            self._held_model, self._held_data, wanted, usable, h, share
+        if usable:
+            self._solution[:] = solution.v
+        outcome, self._closest, self._distance, slack = self._move(
+            self._held_model, self._held_data, self._solution, usable, h, share
         )
         summary.fallback |= outcome != FOLLOWED
         summary.slack = max(summary.slack, slack)

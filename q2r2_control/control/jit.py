@@ -108,3 +108,16 @@ def _compiled(function: Callable[..., Any], **options: Any) -> Callable[..., Any
 def hold(value: Any) -> Held:
     """Put ``value`` behind a pointer."""
     return Held(value)
+
+
+def bound(function: Callable[..., Any], *arguments: Any) -> Callable[..., Any]:
+    """A kernel's machine code for arguments of the types of these, with which it runs once.
+
+    A kernel looks at the type of each argument at each call, which for a :class:`Held` takes longer than a small
+    kernel's work. What is returned does not look: hand it arguments of exactly these types, and arrays of their layout.
+    """
+    function(*arguments)
+    # Set by Numba at run time too.
+    dispatcher: Any = function
+    code: Callable[..., Any] = dispatcher.get_overload(tuple(numba.typeof(argument) for argument in arguments))
+    return code

@@ -8,7 +8,7 @@ import numpy as np
 import pinocchio as pin
 
 from q2r2_control.config.control import ControllerSettings
-from q2r2_control.control.jit import Held, hold, kernel, lean_kernel
+from q2r2_control.control.jit import Held, bound, hold, kernel, lean_kernel
 from q2r2_control.control.tasks.frame import rotation_vector
 from q2r2_control.control.tasks.task_data import PoseScratch, Targets
 from q2r2_control.control.tasks.task_model import TaskModel
@@ -38,6 +38,8 @@ class TargetTracker:
         )
         self._pose, self._offered = self._targets.pose, self._targets.offered
         self.held = hold(self._targets)
+        nv = len(self._home)
+        self._take = bound(take_targets, self.held, np.zeros(nv), np.zeros(nv), 0.0)
 
     def reset(self, q: Array) -> None:
         """Forget all targets; every arm holds where it is, ``q`` (nv,) [rad]."""
@@ -64,7 +66,7 @@ class TargetTracker:
             else:
                 self._offered[i] = _NONE if target is None else _NO_POSE
             known += arm in targets
-        usable = take_targets(self.held, q, v, dt)
+        usable = self._take(self.held, q, v, dt)
         if usable and known == len(targets):
             return ()
         rejected = [arm for arm, offered in zip(self._arms, self._offered, strict=True) if offered == _NO_POSE]

@@ -63,7 +63,7 @@ class Drive(Protocol):
 
 def position_command(reference: Reference, grippers: Openings) -> Command:
     """The reference itself."""
-    return Command(CommandMode.POSITION, reference.q, reference.v, np.zeros_like(reference.q), grippers)
+    return Command(CommandMode.POSITION, reference.q, reference.v, np.zeros(len(reference.q)), grippers)
 
 
 def holding_command(q: Array, grippers: Openings) -> Command:

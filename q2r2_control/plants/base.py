@@ -77,7 +77,8 @@ def check_joints(what: str, values: Array, robot: Robot) -> None:
     shape, count = np.shape(values), len(robot.joint_names)
     if shape != (count,):
         raise PlantError(f"{what} has shape {shape}; expected ({count},), one value for each joint")
-    if not np.isfinite(values).all():
+    # The usual case costs one product; squares of finite numbers may overflow.
+    if not math.isfinite(np.dot(values, values)) and not np.isfinite(values).all():
         joint = int(np.flatnonzero(~np.isfinite(values))[0])
         raise PlantError(f"{what}: {robot.joint_names[joint]} = {values[joint]}: allowed: finite numbers")
 

@@ -67,6 +67,8 @@ class MujocoPlant:
         # Views of MuJoCo's arrays, kept since each access by name makes a new one.
         self._qpos, self._qvel = self.data.qpos, self.data.qvel
         self._bias, self._ctrl = self.data.qfrc_bias, self.data.ctrl
+        self._smooth, self._passive = self.data.qfrc_smooth, self.data.qfrc_passive
+        self._constraint, self._actuator = self.data.qfrc_constraint, self.data.qfrc_actuator
         self._robot = robot
         self._timestep = config.mujoco.timestep
         self._window: Window | None = None
@@ -152,14 +154,14 @@ class MujocoPlant:
 
     def state(self) -> RobotState:
         """See :meth:`Plant.state`. External torque: contacts, pushes, and hard stops at the ends of a joint's range."""
-        data, index = self.data, self._v_index
+        index, actuator = self._v_index, self._actuator
         # What MuJoCo adds up before contacts, less what is not external, leaves pushes from here and from its window.
-        pushed = data.qfrc_smooth - data.qfrc_passive + data.qfrc_bias - data.qfrc_actuator
+        pushed = self._smooth - self._passive + self._bias - actuator
         return RobotState(
-            q=data.qpos[self._q_index],
-            v=data.qvel[index],
-            tau=data.qfrc_actuator[index],
-            tau_external=(data.qfrc_constraint + pushed)[index],
+            q=self._qpos.take(self._q_index),
+            v=self._qvel.take(index),
+            tau=actuator.take(index),
+            tau_external=(self._constraint + pushed).take(index),
             stamp=self._steps * self._timestep,
         )
 

@@ -1,7 +1,8 @@
 """What a control loop needs besides its data: time, signals, garbage collection, and the figures of a run.
 
-``loop_clock`` says when a tick is due, ``process`` stops on signals without interrupting a tick. ``recorder`` gives
-each ``Tick`` to listeners and to ``run_summary`` and ``torque_summary``, which gather a run's figures.
+``loop_clock`` says when a tick is due, ``process`` stops on signals without interrupting a tick, ``scheduling`` asks
+the system for punctuality. ``recorder`` gives each ``Tick`` to listeners and its figures to ``run_summary``, which
+gathers them with ``joint_extremes``, ``histogram`` and ``torque_summary``.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ if TYPE_CHECKING:
     from q2r2_control.runtime.process import few_garbage_collections, stop_on_signals
     from q2r2_control.runtime.recorder import RunRecorder, Tick
     from q2r2_control.runtime.run_summary import RunStatistics, RunSummary
+    from q2r2_control.runtime.scheduling import real_time
     from q2r2_control.runtime.torque_summary import TorqueStatistics, TorqueSummary
 
 __all__ = [
@@ -26,6 +28,7 @@ __all__ = [
     "TorqueStatistics",
     "TorqueSummary",
     "few_garbage_collections",
+    "real_time",
     "stop_on_signals",
 ]
 
@@ -40,6 +43,7 @@ __getattr__ = lazy_exports(
         "TorqueStatistics": "torque_summary",
         "TorqueSummary": "torque_summary",
         "few_garbage_collections": "process",
+        "real_time": "scheduling",
         "stop_on_signals": "process",
     },
 )

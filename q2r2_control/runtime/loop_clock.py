@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import time
 
+from q2r2_control.runtime.histogram import Histogram
+
 _SHORTEST_DT = 1e-6  # [s]
 
 
 class LoopClock:
-    """Ticks on a grid of ``period`` [s], in real time or as fast as they come."""
+    """Ticks on a grid of ``period`` [s], in real time or as fast as they come, which is never late."""
 
     def __init__(self, period: float, realtime: bool) -> None:
         self._period, self._realtime = period, realtime
         self._ticks = 0
         self.start = self.now = self._due = time.monotonic() if realtime else 0.0  # [s]
         self._wall_start = time.perf_counter()
+        self.lateness = Histogram(1e-3)  # of each tick, after it was due
+        self.overruns = 0  # ticks that began more than a period after they were due
 
     def wait(self) -> float:
         """Let the next tick come; returns the time since the last one [s], however long that was."""
@@ -27,6 +31,9 @@ class LoopClock:
         if rest > 0.0:
             time.sleep(rest)
         before, self.now = self.now, time.monotonic()
+        late = self.now - self._due
+        self.lateness.add(late)
+        self.overruns += late > self._period
         # Late wake-ups do not add up, since ticks are due on a grid; ticks that were missed are not made up for.
         self._due = max(self._due, self.now - self._period)
         return max(self.now - before, _SHORTEST_DT)

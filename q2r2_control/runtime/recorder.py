@@ -1,4 +1,4 @@
-"""What a run leaves behind: every tick goes to the listeners and into the summary."""
+"""What a run leaves behind: every tick goes into the summary and, where there are any, to the listeners."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from q2r2_control.compliance.repulsion import WallReport
 from q2r2_control.config import ControllerSettings
 from q2r2_control.drives import DriveReport
 from q2r2_control.robot.robot import Robot
+from q2r2_control.runtime.loop_clock import LoopClock
 from q2r2_control.runtime.run_summary import RunStatistics, RunSummary
 from q2r2_control.supervision.tick_pacer import TickPacer
 from q2r2_control.types import ArmTarget, Event, HandSample, Reference, RobotState
@@ -40,7 +41,7 @@ class Tick:
 
 
 class RunRecorder:
-    """Tells the listeners of every tick and adds it up. A listener that raises ends the run and is not called again."""
+    """Adds up every tick and tells listeners of it. A listener that raises ends the run and is not called again."""
 
     def __init__(
         self,
@@ -57,13 +58,31 @@ class RunRecorder:
         """See :meth:`RunStatistics.add_latency`."""
         self._statistics.add_latency(samples, now)
 
-    def add(self, tick: Tick, events: Iterable[Event]) -> None:
-        """One tick, and what happened to the arms' teleoperation in it."""
+    @property
+    def listened(self) -> bool:
+        """Whether anybody is to be told of ticks."""
+        return bool(self._listeners)
+
+    def add(
+        self,
+        dt: float,
+        compute_time: float,
+        reference: Reference,
+        targets: dict[str, ArmTarget],
+        tools: dict[str, pin.SE3],
+        engaged: dict[str, bool],
+        drive: DriveReport,
+        events: Iterable[Event],
+    ) -> None:
+        """Count one tick: see the fields of :class:`Tick`; ``events`` are those of the arms' teleoperation in it."""
         statistics = self._statistics
-        statistics.tick.add(tick.compute_time)
-        statistics.add(tick.dt, tick.reference, tick.targets, tick.tools, tick.engaged)
-        statistics.add_drive(tick.dt, DriveReport(tick.impedance, tick.wall, tick.admittance))
+        statistics.tick.add(compute_time)
+        statistics.add(dt, reference, targets, tools, engaged)
+        statistics.add_drive(dt, drive)
         statistics.events.extend(events)
+
+    def tell(self, tick: Tick) -> None:
+        """Give one tick to every listener."""
         for listener in list(self._listeners):
             try:
                 listener(tick)
@@ -72,8 +91,10 @@ class RunRecorder:
                 self._failure = self._failure or error
                 self._stop()
 
-    def summary(self, wall_time: float, pacer: TickPacer) -> RunSummary:
-        """The run so far, which took ``wall_time`` [s]. Raises the first exception of a listener."""
+    def summary(self, clock: LoopClock, pacer: TickPacer) -> RunSummary:
+        """The run so far. Raises the first exception of a listener."""
         if self._failure is not None:
             raise self._failure
-        return self._statistics.summary(wall_time, pacer.missed_ticks, pacer.stretched)
+        return self._statistics.summary(
+            clock.wall_time(), pacer.missed_ticks, pacer.stretched, clock.lateness.percentiles(), clock.overruns
+        )

@@ -1,4 +1,4 @@
-"""Summary of a run: figures gathered at every tick, in constant memory."""
+"""Summary of a run: figures gathered at every tick, in constant memory and in a few microseconds."""
 
 from __future__ import annotations
 
@@ -13,20 +13,13 @@ import pinocchio as pin
 from q2r2_control.config.control import ControllerSettings
 from q2r2_control.drives import DriveReport
 from q2r2_control.robot.robot import Robot
+from q2r2_control.runtime.histogram import NOTHING_MEASURED, Histogram, Percentiles
+from q2r2_control.runtime.joint_extremes import JointExtremes
 from q2r2_control.runtime.torque_summary import TorqueStatistics, TorqueSummary
 from q2r2_control.types import ArmTarget, Array, Event, HandSample, Reference
 
 EVENTS_KEPT = 10_000  # the newest ones; a broken button can cause more
 _REST = 1e-3  # [rad/s]
-
-
-@dataclass(frozen=True, slots=True)
-class Percentiles:
-    """Of a duration; p50 and p99 to one part in a thousand of the unit, None where nothing was measured."""
-
-    p50: float | None
-    p99: float | None
-    max: float | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,6 +48,7 @@ class RunSummary:
     duration_s: float
     loop_rate_hz: float
     tick_us: Percentiles  # from polling the input to the command, plant not included
+    lateness_us: Percentiles  # of a tick's begin, after it was due; None in simulated time
     input_to_command_ms: Percentiles  # from a sample's receipt to the command it led to
     arms: dict[str, ArmSummary]
     min_distance_mm: float | None  # None: no monitored pair
@@ -65,6 +59,7 @@ class RunSummary:
     fallback_ticks: int
     uncertified_ticks: int
     rejected_targets: int
+    overruns: int  # ticks that began more than a period after they were due
     missed_ticks: int  # that were due and did not come, since the loop was late
     stretched_s: float  # by how much that made the motion late
     at_rest: bool  # the reference was at rest when the run ended
@@ -79,34 +74,6 @@ class RunSummary:
             for event in self.events
         ]
         return data
-
-
-class Histogram:
-    """Counts of durations in thousandths of ``unit`` [s], up to 100 units: percentiles of any number of values."""
-
-    def __init__(self, unit: float) -> None:
-        self._bin = unit * 1e-3
-        self._unit = unit
-        self._counts = np.zeros(100_000, dtype=np.int64)
-        self._largest = 0.0
-
-    def add(self, duration: float) -> None:
-        """Count one duration [s]; one below zero counts as zero, one that is not finite does not count."""
-        if not math.isfinite(duration):
-            return
-        self._counts[min(max(int(duration / self._bin), 0), len(self._counts) - 1)] += 1
-        self._largest = max(self._largest, duration)
-
-    def percentiles(self) -> Percentiles:
-        """In multiples of the unit."""
-        total = int(self._counts.sum())
-        if total == 0:
-            return Percentiles(None, None, None)
-        cumulative = np.cumsum(self._counts)
-        largest = self._largest / self._unit
-        bins = (int(np.searchsorted(cumulative, share * total)) for share in (0.5, 0.99))
-        middle, high = (largest if i == len(cumulative) - 1 else min((i + 1) * 1e-3, largest) for i in bins)
-        return Percentiles(middle, high, largest)
 
 
 @dataclass(slots=True)
@@ -134,25 +101,20 @@ class RunStatistics:
     events: deque[Event] = field(default_factory=lambda: deque(maxlen=EVENTS_KEPT))
     _arms: dict[str, _ArmFigures] = field(init=False)
     _torque: TorqueStatistics = field(init=False)
-    _velocity_limit: Array = field(init=False)
-    _acceleration_limit: Array = field(init=False)
+    _extremes: JointExtremes = field(init=False)
     _ticks: int = 0
     _duration: float = 0.0
     _distance: float = float("inf")
     _pair: tuple[str, str] | None = None
-    _velocity: float = 0.0
-    _acceleration: float = 0.0
-    _margin: float = float("inf")
     _fallback: int = 0
     _uncertified: int = 0
     _rejected: int = 0
-    _rest: bool = True
+    _newest_v: Array | None = None
 
     def __post_init__(self) -> None:
         self._arms = {name: _ArmFigures() for name in self.robot.arms}
         self._torque = TorqueStatistics.of(tuple(self.robot.arms))
-        self._velocity_limit = self.control.velocity_scale * self.robot.velocity_limit
-        self._acceleration_limit = self.robot.capped_acceleration(self.control.acceleration_limit)
+        self._extremes = JointExtremes(self.robot, self.control)
 
     def add(
         self,
@@ -163,19 +125,16 @@ class RunStatistics:
         engaged: dict[str, bool],
     ) -> None:
         """Count one tick; ``tools`` are the poses measured before the tick's command."""
-        robot, control, report = self.robot, self.control, reference.report
+        report = reference.report
         self._ticks += 1
         self._duration += dt
-        self._velocity = max(self._velocity, float(np.max(np.abs(reference.v) / self._velocity_limit)))
-        self._acceleration = max(self._acceleration, float(np.max(np.abs(reference.a) / self._acceleration_limit)))
-        room: Array = np.minimum(reference.q - robot.position_lower, robot.position_upper - reference.q)
-        self._margin = min(self._margin, float(room.min()) - control.position_margin)
+        self._extremes.add(reference)
+        self._newest_v = reference.v
         if report.closest_distance < self._distance:
             self._distance, self._pair = report.closest_distance, report.closest_pair
         self._fallback += report.fallback
         self._uncertified += not report.certified
         self._rejected += len(report.rejected)
-        self._rest = bool(np.abs(reference.v).max() < _REST)
         for name, target in targets.items():
             figures = self._arms[name]
             if figures.gripper is not None and figures.gripper != target.gripper:
@@ -186,11 +145,14 @@ class RunStatistics:
             if engaged[name] and target.pose is not None:
                 error = tools[name].actInv(target.pose)
                 figures.engaged += dt
-                if not math.isfinite(float(error.translation.sum())):
+                translation = error.translation
+                square = float(translation.dot(translation))
+                if not math.isfinite(square):
                     continue  # nothing was measured
+                x, y, z = pin.log3(error.rotation).tolist()
                 figures.ticks += 1
-                figures.position += float(error.translation @ error.translation)
-                figures.rotation += float(np.sum(pin.log3(error.rotation) ** 2))
+                figures.position += square
+                figures.rotation += x * x + y * y + z * z
 
     def add_latency(self, samples: list[HandSample], now: float) -> None:
         """Count the time from the receipt of a tick's newest sample to its command, sent at ``now`` [s]."""
@@ -207,27 +169,39 @@ class RunStatistics:
                 figures.yielded = max(figures.yielded, math.hypot(*arm.displacement[:3]))
                 figures.yielded_angle = max(figures.yielded_angle, math.hypot(*arm.displacement[3:]))
 
-    def summary(self, wall_time: float, missed_ticks: int = 0, stretched: float = 0.0) -> RunSummary:
-        """The run so far; ``wall_time`` and ``stretched`` [s] are what it took and how late the motion is."""
-        tick = self.tick.percentiles()
+    def summary(
+        self,
+        wall_time: float,
+        missed_ticks: int = 0,
+        stretched: float = 0.0,
+        lateness: Percentiles = NOTHING_MEASURED,
+        overruns: int = 0,
+    ) -> RunSummary:
+        """The run so far.
+
+        ``wall_time`` and ``stretched`` [s] are what it took and how late the motion is; ``lateness`` [ms] and
+        ``overruns``: see :class:`LoopClock`.
+        """
         return RunSummary(
             ticks=self._ticks,
             duration_s=self._duration,
             loop_rate_hz=self._ticks / wall_time if wall_time > 0 else 0.0,
-            tick_us=Percentiles(*(None if x is None else 1e3 * x for x in (tick.p50, tick.p99, tick.max))),
+            tick_us=self.tick.percentiles().scaled(1e3),
+            lateness_us=lateness.scaled(1e3),
             input_to_command_ms=self.latency.percentiles(),
             arms={name: _arm_summary(figures) for name, figures in self._arms.items()},
             min_distance_mm=1e3 * self._distance if self._pair else None,
             closest_pair=self._pair,
-            max_velocity_ratio=self._velocity,
-            max_acceleration_ratio=self._acceleration,
-            min_position_margin_rad=self._margin if self._ticks else 0.0,
+            max_velocity_ratio=self._extremes.velocity_ratio,
+            max_acceleration_ratio=self._extremes.acceleration_ratio,
+            min_position_margin_rad=self._extremes.position_margin if self._ticks else 0.0,
             fallback_ticks=self._fallback,
             uncertified_ticks=self._uncertified,
             rejected_targets=self._rejected,
+            overruns=overruns,
             missed_ticks=missed_ticks,
             stretched_s=stretched,
-            at_rest=self._rest,
+            at_rest=self._newest_v is None or bool(np.abs(self._newest_v).max() < _REST),
             torque=self._torque.summary(),
             events=list(self.events),
         )

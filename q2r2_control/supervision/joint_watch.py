@@ -77,12 +77,9 @@ class JointWatch:
         if last is None or self._still_since == math.inf:
             self._begin(state.q, now)
             return
-        moved = np.abs(state.q - last.q)
-        reach = self._velocity_limit * (max(now - last.stamp, passed, 0.0) + _JUMP_TIME) + _JUMP_ALLOWANCE
-        if (moved > reach).any():
-            worst = int((moved - reach).argmax())
-            self._fail(f"{self._names[worst]} jumped by {moved[worst]:.3f} rad")
-        elif np.abs(state.q - self._still_at).max() > _REST:
+        if fault := self._jump(state.q - last.q, max(now - last.stamp, passed, 0.0)):
+            self._fail(fault)
+        elif not _all_within(state.q - self._still_at, _REST):
             self._begin(state.q, now)
 
     def settled(self, now: float) -> bool:
@@ -103,10 +100,11 @@ class JointWatch:
         """One line where the arms have been too far from ``reference`` for too long, else None."""
         assert self.state is not None
         allowed = self._settings.deviation
-        deviation = np.abs(self.state.q - reference)
-        if self._near_at is None or deviation.max() <= allowed:
+        difference = self.state.q - reference
+        if self._near_at is None or _all_within(difference, allowed):
             self._near_at = now
             return None
+        deviation = np.abs(difference)
         if now - self._near_at <= self._settings.deviation_time:
             return None
         worst = int(deviation.argmax())
@@ -130,13 +128,26 @@ class JointWatch:
         return -math.inf if self.state is None else self.state.stamp
 
     def _unusable(self, state: RobotState) -> str | None:
-        external = state.q if state.tau_external is None else state.tau_external
-        for what, values in (("position", state.q), ("velocity", state.v), ("external torque", external)):
-            # The usual case costs one sum; the joint is looked for only where there is something to say.
-            if not math.isfinite(values.sum()) and not np.isfinite(values).all():
+        q, v, external = state.q, state.v, state.q if state.tau_external is None else state.tau_external
+        # The usual case costs three products; the joint is looked for only where there is something to say.
+        if math.isfinite(q.dot(q) + v.dot(v) + external.dot(external)):
+            return None
+        for what, values in (("position", q), ("velocity", v), ("external torque", external)):
+            if not np.isfinite(values).all():
                 worst = int(np.flatnonzero(~np.isfinite(values))[0])
                 return f"measured {what} of {self._names[worst]} = {values[worst]}"
         return None
+
+    def _jump(self, way: Array, time: float) -> str | None:
+        """What to say of a joint that moved farther than it can in ``time`` [s], else None."""
+        if _all_within(way, _JUMP_ALLOWANCE):
+            return None
+        moved = np.abs(way)
+        reach = self._velocity_limit * (time + _JUMP_TIME) + _JUMP_ALLOWANCE
+        if not (moved > reach).any():
+            return None
+        worst = int((moved - reach).argmax())
+        return f"{self._names[worst]} jumped by {moved[worst]:.3f} rad"
 
     def _begin(self, q: Array, now: float) -> None:
         self._still_since, self._still_at = now, q
@@ -146,3 +157,8 @@ class JointWatch:
         # The first fault tells most; before the first good state the newest does.
         if self.fault is None or self.state is None:
             self.fault = fault
+
+
+def _all_within(values: Array, limit: float) -> bool:
+    """Whether no value is farther from 0 than ``limit``; most are nearer all together, which one product tells."""
+    return values.dot(values) < limit * limit or bool(np.abs(values).max() <= limit)

@@ -129,9 +129,11 @@ class Supervisor:
         ``number`` is the one among its publisher's messages, where the middleware tells; ``measured`` the tool's pose
         at the measured state, which is computed where it is needed and not given.
         """
-        tools = [self._controller.tool_pose(arm)]
-        if not self._targets.follows(arm) and self._external is None and self._watch.state is not None:
-            tools.append(self._robot.tool_pose(self._watch.state.q, arm) if measured is None else measured)
+        tools: list[pin.SE3] = []
+        if not self._targets.follows_on(arm, now):
+            tools.append(self._controller.tool_pose(arm))
+            if self._external is None and self._watch.state is not None:
+                tools.append(self._robot.tool_pose(self._watch.state.q, arm) if measured is None else measured)
         return self._targets.take(arm, pose, tools, now, number, self.no_targets)
 
     def release_target(self, arm: str) -> None:

@@ -79,14 +79,14 @@ class TargetStream:
         """Take a target; returns why it is not followed, or None.
 
         ``tools`` are the poses that count as the tool's: the reference's, and the measured one where it is known. An
-        arm that was pushed away from its reference is engaged where it is.
+        arm that was pushed away from its reference is engaged where it is. An arm that follows a stream needs none.
         """
         self.expire(now)
-        begins, self.stamp = self._begins(pose), now
-        self._last = pose
+        last, self._last, self.stamp = self._last, pose, now
         if self.following:
             self.pose = pose
             return None
+        begins = _begins(pose, last)
         offsets = [apart(pose, tool) for tool in tools]
         # Position and rotation may each be near another one of the poses: an operator's first target has the
         # measured position and the commanded rotation.
@@ -101,11 +101,12 @@ class TargetStream:
             f"anew within {self._settings.engage_distance:g} m and {self._settings.engage_angle:g} rad"
         )
 
-    def _begins(self, pose: pin.SE3) -> bool:
-        if self._last is None:
-            return True
-        distance, angle = apart(pose, self._last)
-        return distance >= _JUMP or angle >= _TURN
+
+def _begins(pose: pin.SE3, last: pin.SE3 | None) -> bool:
+    if last is None:
+        return True
+    distance, angle = apart(pose, last)
+    return distance >= _JUMP or angle >= _TURN
 
 
 def apart(a: pin.SE3, b: pin.SE3) -> tuple[float, float]:

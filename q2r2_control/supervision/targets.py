@@ -33,6 +33,12 @@ class Targets:
         """Whether an arm follows its targets."""
         return self._streams[arm].following
 
+    def follows_on(self, arm: str, now: float) -> bool:
+        """Whether an arm follows its targets, and a target at ``now`` [s] still belongs to them."""
+        stream = self._streams[arm]
+        stream.expire(now)
+        return stream.following
+
     def age(self, arm: str, now: float) -> float:
         """Time since the last target of an arm that was a pose [s]."""
         return now - self._streams[arm].stamp

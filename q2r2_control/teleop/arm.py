@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from enum import StrEnum
 
 import numpy as np
@@ -94,20 +95,21 @@ class ArmTeleop:
         self._buttons.forget()
         self._presses.clear()
 
-    def act(self, tool: pin.SE3 | None, now: float, chord: bool, obstacle: str | None = None) -> None:
+    def act(self, tool: Callable[[], pin.SE3 | None], now: float, chord: bool, obstacle: str | None = None) -> None:
         """Change the state by buttons and chords.
 
-        ``tool``: pose to anchor to, None if not known; ``chord``: whether an alignment chord stops this arm;
-        ``obstacle``: why the arm may not be engaged now, or None.
+        ``tool``: gives the pose to anchor to, None if not known, and is only asked where the arm is engaged;
+        ``chord``: whether an alignment chord stops this arm; ``obstacle``: why the arm may not be engaged now, or None.
         """
         self._obstacle = obstacle
         if chord:
             self._align(now)
         elif self.state is ArmState.ALIGNING and self._gate.pose is not None and self._gate.stamp >= self._aligned_at:
-            self._engage(tool, now, "aligned anew")
-        for press in self._presses + self._buttons.due(now):
-            self._press(press, tool, now)
-        self._presses.clear()
+            self._engage(tool(), now, "aligned anew")
+        if presses := self._presses + self._buttons.due(now):
+            for press in presses:
+                self._press(press, tool, now)
+            self._presses.clear()
 
     def target(self, now: float, commanded: pin.SE3 | None = None) -> pin.SE3 | None:
         """Where the tool should be at ``now`` in the world frame; None: hold.
@@ -133,7 +135,7 @@ class ArmTeleop:
         if self.state is ArmState.ENGAGED or (self.state is ArmState.PAUSING and self.chord):
             self._go(ArmState.ALIGNING, now, "alignment chord")
 
-    def _press(self, press: Press, tool: pin.SE3 | None, now: float) -> None:
+    def _press(self, press: Press, tool: Callable[[], pin.SE3 | None], now: float) -> None:
         if press is Press.UPPER:
             self.gripper = CLOSED if self.gripper == OPEN else OPEN
         elif press is Press.LOWER_DOWN:
@@ -142,7 +144,7 @@ class ArmTeleop:
         elif self.state is ArmState.PAUSING:
             self._go(ArmState.PAUSED, now, "lower button")
         elif self.state is ArmState.PAUSED:
-            self._engage(tool, now, "lower button")
+            self._engage(tool(), now, "lower button")
 
     def _engage(self, tool: pin.SE3 | None, now: float, reason: str) -> None:
         obstacle = self._obstacle or self.watchdog(now)

@@ -5,12 +5,16 @@ sees straight lines instead of 13 ms steps. :class:`OneEuro` then takes the trem
 takes the dt of each tick, so neither the headset's rate nor the loop's changes what the operator feels.
 
 Rotations are filtered as rotations, by their logarithm, so q and -q are the same and nothing is averaged over signs.
+
+All of this runs at every control tick, for vectors of three: sums of three floats cost a tenth of NumPy's calls, and
+``dot`` a third of ``@``.
 """
 
 from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Sequence
 
 import numpy as np
 import pinocchio as pin
@@ -61,9 +65,10 @@ class Interpolator:
 
 def _between(first: pin.SE3, second: pin.SE3, fraction: float) -> pin.SE3:
     """Interpolate linearly in position, and about one fixed axis in rotation."""
-    position = first.translation + fraction * (second.translation - first.translation)
-    turn = pin.log3(second.rotation @ first.rotation.T)
-    return pin.SE3(pin.exp3(fraction * turn) @ first.rotation, position)
+    rotation, start = first.rotation, first.translation
+    position = start + fraction * (second.translation - start)
+    turn = pin.log3(second.rotation.dot(rotation.T))
+    return pin.SE3(pin.exp3(fraction * turn).dot(rotation), position)
 
 
 class OneEuro:
@@ -80,22 +85,28 @@ class OneEuro:
         self._min_cutoff = min_cutoff
         self._beta = beta
         self._derivative_tau = 1.0 / (2.0 * math.pi * derivative_cutoff)
-        self._velocity = np.zeros(3)
+        self.reset()
 
     def reset(self) -> None:
         """Start from rest."""
-        self._velocity = np.zeros(3)
+        self._velocity = (0.0, 0.0, 0.0)
 
-    def correction(self, error: Array, step: Array, dt: float) -> Array:
+    def correction(self, error: Sequence[float], step: Sequence[float], dt: float) -> Array:
         """What to add to the output, (3,), over a tick of ``dt`` > 0 [s].
 
         ``error`` is input minus output before the tick, ``step`` input minus previous input; rotation vectors for
         rotations. Backward Euler: stable for every dt, and the lag at constant velocity is exact for any constant dt.
         """
-        self._velocity = self._velocity + (step - self._velocity * dt) / (self._derivative_tau + dt)
-        cutoff = self._min_cutoff + self._beta * math.hypot(*self._velocity)
+        x, y, z = self._velocity
+        constant = self._derivative_tau + dt
+        x += (step[0] - x * dt) / constant
+        y += (step[1] - y * dt) / constant
+        z += (step[2] - z * dt) / constant
+        self._velocity = x, y, z
+        cutoff = self._min_cutoff + self._beta * math.hypot(x, y, z)
         tau = 1.0 / (2.0 * math.pi * cutoff)
-        return (dt / (tau + dt)) * (error + (tau - self.delay) * self._velocity)
+        share, lead = dt / (tau + dt), tau - self.delay
+        return np.array((share * (error[0] + lead * x), share * (error[1] + lead * y), share * (error[2] + lead * z)))
 
 
 class PoseFilter:
@@ -136,12 +147,14 @@ class PoseFilter:
         if dt <= 0.0:
             return self._output
         played, before, output = self._interpolator.at(now), self._input, self._output
+        position, rotation = played.translation, played.rotation
+        last_position, last_rotation = output.translation, output.rotation
         shift = self._position.correction(
-            played.translation - output.translation, played.translation - before.translation, dt
+            (position - last_position).tolist(), (position - before.translation).tolist(), dt
         )
         turn = self._rotation.correction(
-            pin.log3(played.rotation @ output.rotation.T), pin.log3(played.rotation @ before.rotation.T), dt
+            pin.log3(rotation.dot(last_rotation.T)).tolist(), pin.log3(rotation.dot(before.rotation.T)).tolist(), dt
         )
         self._now, self._input = now, played
-        self._output = pin.SE3(pin.exp3(turn) @ output.rotation, output.translation + shift)
+        self._output = pin.SE3(pin.exp3(turn).dot(last_rotation), last_position + shift)
         return self._output

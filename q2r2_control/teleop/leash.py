@@ -120,7 +120,8 @@ class Leash:
         target, last = motion.target(hand), self._last
         self._last = _Tick(tool, newest, now)
         # The first target is the anchor, which must not move the arm wherever the plant says the tool is.
-        if last is None or not (any(component.taut for component in self._components) or self._ends(tool, target)):
+        position_leash, rotation_leash = self._components
+        if last is None or not (position_leash.taut or rotation_leash.taut or self._ends(tool, target)):
             return target
         position, rotation = self._pull(_ways(tool, target), last, self._last)
         if position is not None:
@@ -133,9 +134,10 @@ class Leash:
 
     def _ends(self, tool: pin.SE3, target: pin.SE3) -> bool:
         """Whether the target is as far as a leash reaches, told with little work: at most ticks it is not."""
+        # Pinocchio's matrices are stored by columns, and vdot would copy what is not stored by rows.
         return (
-            math.dist(target.translation, tool.translation) >= self._distance
-            or np.vdot(target.rotation, tool.rotation) <= self._trace
+            math.dist(target.translation.tolist(), tool.translation.tolist()) >= self._distance
+            or np.vdot(target.rotation.T, tool.rotation.T) <= self._trace
         )
 
     def _pull(self, ways: tuple[Array, Array], last: _Tick, this: _Tick) -> list[Array | None]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from functools import partial
 
 import pinocchio as pin
 
@@ -51,6 +52,13 @@ class Teleop:
 
     def take_events(self) -> list[Event]:
         """State changes and refused presses since the last call, in order of time."""
+        # At most ticks there is none.
+        for arm in self._arms.values():
+            if arm.events:
+                return self._sorted_events()
+        return []
+
+    def _sorted_events(self) -> list[Event]:
         events = sorted((event for arm in self._arms.values() for event in arm.events), key=lambda event: event.t)
         for arm in self._arms.values():
             arm.events.clear()
@@ -87,12 +95,12 @@ class Teleop:
         targets = {}
         for name, arm in self._arms.items():
             arm.act(
-                self._tool(name, tools, commanded),
+                partial(self._tool, name, tools, commanded),
                 now,
                 chord if self._linked else arm.chord,
-                (obstacles or {}).get(name),
+                None if obstacles is None else obstacles.get(name),
             )
-            pose = arm.target(now, (commanded or {}).get(name))
+            pose = arm.target(now, None if commanded is None else commanded.get(name))
             if pose is not None:
                 self._commanded[name] = pose
             targets[name] = ArmTarget(pose, arm.gripper, *arm.slip)

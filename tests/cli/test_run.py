@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -45,3 +47,32 @@ def test_with_force_it_says_what_is_wrong_and_runs(tmp_path: Path) -> None:
     assert result.exit_code == 0
     assert "FAULT home: left_A2 = 2.09" in result.stderr
     assert one_object(result.stdout)["ticks"] > 0
+
+
+def test_rt_says_in_one_line_what_the_system_refuses_and_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    refusal = "real time: no SCHED_FIFO: Operation not permitted; the run goes on without"
+    entered = []
+
+    @contextmanager
+    def refused() -> Iterator[str]:
+        entered.append("in")
+        yield refusal
+        entered.append("out")
+
+    monkeypatch.setattr("q2r2_control.cli.cell_run.real_time", refused)
+    options = ("run", FAST[1], "--plant", "kinematic", "--headless", "--json", "--duration", "0.1")
+    result = q2r2(*options, "--rt")
+    assert result.exit_code == 0
+    assert [line for line in result.stderr.splitlines() if "real time" in line] == [refusal]
+    assert entered == ["in", "out"]
+    figures = one_object(result.stdout)
+    assert set(figures["lateness_us"]) == {"p50", "p99", "max"}
+    assert figures["lateness_us"]["max"] is not None
+    assert figures["overruns"] <= figures["ticks"]
+    assert "real time" not in q2r2(*options).stderr
+
+
+def test_rt_and_simulated_time_exclude_each_other() -> None:
+    result = q2r2(*FAST, "--duration", "0.1", "--rt")
+    assert (result.exit_code, result.stdout) == (2, "")
+    assert result.stderr == "q2r2: --rt and --fast exclude each other, since simulated time is never late\n"

@@ -10,6 +10,7 @@ from rich.console import Console
 
 from q2r2_control import Pipeline, RunSummary
 from q2r2_control.cli.summary_table import summary_table
+from q2r2_control.runtime.histogram import Percentiles
 from q2r2_control.types import Event
 from tests.support.hands_input import HandsInput
 from tests.support.watch import cell
@@ -46,3 +47,9 @@ def test_an_arm_that_was_paused_by_something_else_than_its_button_is_named_with_
 def test_missed_ticks_are_told(summary: RunSummary) -> None:
     text = text_of(replace(summary, missed_ticks=7, stretched_s=0.123))
     assert "7, which made the motion 0.12 s late in all" in text
+
+
+def test_how_late_ticks_were_is_told_where_time_was_real(summary: RunSummary) -> None:
+    assert "ticks late by" not in text_of(summary)
+    text = text_of(replace(summary, lateness_us=Percentiles(60.0, 310.0, 1204.0), overruns=3))
+    assert "median 60 us, p99 310, max 1204; 3 by more than a period" in text

@@ -70,3 +70,23 @@ def test_simulated_time_takes_no_time() -> None:
     assert loop.now == pytest.approx(3 * PERIOD)
     assert loop.after(3 * PERIOD)
     assert not loop.after(4 * PERIOD)
+
+
+def test_lateness_and_overruns_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(loop_clock, "time", LateSleeper([0.001, 0.0, 0.025, 0.0, 0.002, 0.0]))
+    loop = LoopClock(PERIOD, realtime=True)
+    for _ in range(6):
+        loop.wait()
+    late = loop.lateness.percentiles()
+    # The third tick is 25 ms late; the fourth follows at once, and on the grid that begins anew there it is not late.
+    assert loop.overruns == 1
+    assert (late.p50, late.max) == (pytest.approx(0.0, abs=2e-3), pytest.approx(25.0))
+    assert late.p99 == pytest.approx(25.0)
+
+
+def test_simulated_time_is_never_late() -> None:
+    loop = LoopClock(PERIOD, realtime=False)
+    for _ in range(3):
+        loop.wait()
+    assert loop.overruns == 0
+    assert loop.lateness.percentiles().max is None

@@ -1,0 +1,76 @@
+"""What an operating system does for a loop that must not be late: memory stays in RAM, and its thread goes first.
+
+Both need a permission. Without it a run goes on as it would have, so what was refused is a line and no error.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+
+# Below 50, at which Linux with PREEMPT_RT runs the interrupts that the loop itself waits for.
+_PRIORITY = 40
+_CURRENT, _FUTURE = 1, 2  # of mlockall on Linux
+_ADVICE = (
+    "to permit it, give the user 'rtprio 40' and 'memlock unlimited' in /etc/security/limits.conf and log in anew, or "
+    "a container --cap-add SYS_NICE --cap-add IPC_LOCK --ulimit memlock=-1"
+)
+
+
+@contextmanager
+def real_time() -> Iterator[str | None]:
+    """Lock the process's memory and let the calling thread run under SCHED_FIFO, as far as that is permitted.
+
+    Yields None, or one line that says what was refused and how to permit it. Threads and processes that are started
+    meanwhile do not inherit the scheduler: one that draws or listens must not keep the loop waiting.
+    """
+    refused = [line for line in (_lock_memory(), _schedule_first()) if line]
+    try:
+        yield f"real time: {'; '.join(refused)}; the run goes on without; {_ADVICE}" if refused else None
+    finally:
+        _unlock_memory()
+        _schedule_as_others()
+
+
+def _lock_memory() -> str | None:
+    """Why memory cannot be locked, or None."""
+    if sys.platform != "linux":
+        return "memory is not locked: only done on Linux"
+    import resource  # not on every system
+
+    flags = _CURRENT
+    # Under a limit, memory that is asked for later would be refused in mid-run instead of being left unlocked.
+    if os.geteuid() == 0 or resource.getrlimit(resource.RLIMIT_MEMLOCK)[0] == resource.RLIM_INFINITY:
+        flags |= _FUTURE
+    if ctypes.CDLL(None, use_errno=True).mlockall(flags) == 0:
+        return None
+    return f"memory is not locked: {os.strerror(ctypes.get_errno())}"
+
+
+def _unlock_memory() -> None:
+    if sys.platform == "linux":
+        ctypes.CDLL(None).munlockall()
+
+
+def _schedule_first() -> str | None:
+    """Why the calling thread does not get SCHED_FIFO, or None."""
+    if sys.platform != "linux":
+        return "no SCHED_FIFO: only asked for on Linux"
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(_PRIORITY))
+    except OSError as error:
+        return f"no SCHED_FIFO: {error.strerror}"
+    return None
+
+
+def _schedule_as_others() -> None:
+    if sys.platform != "linux":
+        return
+    # Only a privileged process may take the flag back; others keep it, where it does nothing more.
+    with suppress(OSError):
+        os.sched_setscheduler(0, os.SCHED_OTHER | os.SCHED_RESET_ON_FORK, os.sched_param(0))
+    with suppress(OSError):
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))

@@ -1,0 +1,63 @@
+"""Compiled algebra of small matrices is NumPy's, and says so where a matrix is not positive definite."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from q2r2_control.compliance.small_matrices import factorise, invert, product, square_root, times
+from q2r2_control.types import Array
+
+RANDOM = np.random.default_rng(3)
+
+
+def positive_definite(n: int, condition: float) -> Array:
+    """Random, with eigenvalues from 1 to ``condition``."""
+    vectors, _ = np.linalg.qr(RANDOM.normal(size=(n, n)))
+    matrix: Array = (vectors * np.geomspace(1.0, condition, n)) @ vectors.T
+    return 0.5 * (matrix + matrix.T)
+
+
+NOT_POSITIVE_DEFINITE = [
+    pytest.param(np.diag([1.0, -1e-9, 2.0]), id="indefinite"),
+    pytest.param(np.ones((3, 3)), id="singular"),
+    pytest.param(np.full((3, 3), np.nan), id="not finite"),
+]
+
+
+@pytest.mark.parametrize(("n", "k", "m"), [(1, 1, 1), (6, 7, 6), (7, 6, 14)])
+def test_products_are_numpy_s_for_any_order_in_memory(n: int, k: int, m: int) -> None:
+    A, B = RANDOM.normal(size=(n, k)), RANDOM.normal(size=(k, m))
+    np.testing.assert_allclose(product(A, B), A @ B, atol=1e-14)
+    np.testing.assert_allclose(product(np.asfortranarray(A), B.T.copy().T), A @ B, atol=1e-14)
+    np.testing.assert_allclose(times(A, B[:, 0]), A @ B[:, 0], atol=1e-14)
+
+
+@pytest.mark.parametrize("n", [1, 2, 6, 7, 14])
+@pytest.mark.parametrize("condition", [1.0, 30.0, 1e6])
+def test_factor_inverse_and_root_are_exact_to_rounding(n: int, condition: float) -> None:
+    for scale in (1e-3, 1.0, 1e3):
+        A = scale * positive_definite(n, condition)
+        factor, inverse = np.empty_like(A), np.empty_like(A)
+        assert invert(A, factor, inverse)
+        np.testing.assert_allclose(np.tril(factor), np.linalg.cholesky(A), rtol=1e-9, atol=1e-12 * np.sqrt(scale))
+        np.testing.assert_allclose(inverse @ A, np.eye(n), atol=1e-14 * condition * n)
+        root, found = square_root(A)
+        assert found
+        np.testing.assert_array_equal(root, root.T)
+        np.testing.assert_allclose(root @ root, A, atol=1e-13 * np.abs(A).max())
+        assert np.linalg.eigvalsh(root).min() > 0.0
+
+
+def test_the_factor_is_read_from_the_upper_triangle() -> None:
+    A = positive_definite(6, 30.0)
+    spoilt = np.triu(A)
+    assert factorise(spoilt)
+    np.testing.assert_allclose(np.tril(spoilt), np.linalg.cholesky(A), atol=1e-12)
+
+
+@pytest.mark.parametrize("A", NOT_POSITIVE_DEFINITE)
+def test_what_is_not_positive_definite_has_neither_inverse_nor_root(A: Array) -> None:
+    assert not factorise(A.copy())
+    assert not invert(A, np.empty_like(A), np.empty_like(A))
+    assert not square_root(A)[1]

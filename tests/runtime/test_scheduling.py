@@ -1,0 +1,102 @@
+"""Real-time scheduling is asked for as far as the system permits, and given back."""
+
+from __future__ import annotations
+
+import ctypes
+import errno
+import os
+import sys
+import threading
+
+import pytest
+
+from q2r2_control.runtime.scheduling import real_time
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="only asked for on Linux")
+
+
+class FakeSystem:
+    """Stands for Linux: grants what it is told to, and keeps what it was asked for."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, grants_memory: bool, grants_scheduler: bool) -> None:
+        self.calls: list[tuple[object, ...]] = []
+        self._grants_memory, self._grants_scheduler = grants_memory, grants_scheduler
+        monkeypatch.setattr(ctypes, "CDLL", lambda *_, **__: self)
+        monkeypatch.setattr(os, "sched_setscheduler", self._sched_setscheduler)
+
+    def mlockall(self, flags: int) -> int:
+        self.calls.append(("mlockall", flags))
+        ctypes.set_errno(0 if self._grants_memory else errno.ENOMEM)
+        return 0 if self._grants_memory else -1
+
+    def munlockall(self) -> int:
+        self.calls.append(("munlockall",))
+        return 0
+
+    def _sched_setscheduler(self, thread: int, policy: int, parameters: os.sched_param) -> None:
+        self.calls.append(("sched", thread, policy, parameters.sched_priority))
+        if policy & os.SCHED_FIFO and not self._grants_scheduler:
+            raise PermissionError(errno.EPERM, os.strerror(errno.EPERM))
+
+
+def test_where_all_is_permitted_nothing_is_said_and_all_is_given_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    system = FakeSystem(monkeypatch, grants_memory=True, grants_scheduler=True)
+    with real_time() as refused:
+        assert refused is None
+        assert [call[0] for call in system.calls] == ["mlockall", "sched"]
+        assert system.calls[1][1:] == (0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, 40)
+        system.calls.clear()
+    assert system.calls[0] == ("munlockall",)
+    assert system.calls[-1] == ("sched", 0, os.SCHED_OTHER, 0)
+
+
+@pytest.mark.parametrize(
+    ("memory", "scheduler", "said", "not_said"),
+    [
+        pytest.param(False, True, "memory is not locked: Cannot allocate memory", "SCHED_FIFO", id="memory"),
+        pytest.param(True, False, "no SCHED_FIFO: Operation not permitted", "memory is not", id="scheduler"),
+    ],
+)
+def test_what_is_refused_is_one_line_with_what_to_do(
+    monkeypatch: pytest.MonkeyPatch, memory: bool, scheduler: bool, said: str, not_said: str
+) -> None:
+    FakeSystem(monkeypatch, memory, scheduler)
+    with real_time() as refused:
+        assert refused is not None
+    assert refused.startswith("real time: ")
+    assert "\n" not in refused
+    assert said in refused
+    assert not_said not in refused
+    assert "the run goes on without" in refused
+    assert "/etc/security/limits.conf" in refused
+
+
+@pytest.mark.parametrize(
+    ("user", "limit", "flags"),
+    [
+        pytest.param(1000, -1, 3, id="no limit"),
+        pytest.param(1000, 8 << 20, 1, id="a limit"),
+        pytest.param(0, 8 << 20, 3, id="root"),
+    ],
+)
+def test_memory_to_come_is_locked_only_where_no_limit_could_refuse_it_in_mid_run(
+    monkeypatch: pytest.MonkeyPatch, user: int, limit: int, flags: int
+) -> None:
+    system = FakeSystem(monkeypatch, grants_memory=True, grants_scheduler=True)
+    monkeypatch.setattr(os, "geteuid", lambda: user)
+    monkeypatch.setattr("resource.getrlimit", lambda which: (limit, limit))
+    with real_time():
+        assert system.calls[0] == ("mlockall", flags)
+
+
+def test_the_real_system_is_left_as_it_was_and_other_threads_are_not_put_first() -> None:
+    before = os.sched_getscheduler(0)
+    policies = []
+    with real_time() as refused:
+        if refused is None:
+            assert os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK == os.SCHED_FIFO
+        thread = threading.Thread(target=lambda: policies.append(os.sched_getscheduler(0)))
+        thread.start()
+        thread.join()
+    assert policies == [before]
+    assert os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK == before
