@@ -5,16 +5,20 @@ from __future__ import annotations
 import io
 
 import numpy as np
+import pytest
 from rich.console import Console
 
+from q2r2_control.benchmark.loop_times import CASES, PHYSICS, STAGES, LoopReport, LoopRow, StageTime, run_loop_bench
 from q2r2_control.benchmark.motion_run import MotionFigures
 from q2r2_control.benchmark.tick_times import BenchReport, BenchRow
 from q2r2_control.benchmark.timed_run import RunMetrics
 from q2r2_control.benchmark.work_bench import WorkReport, WorkRow
-from q2r2_control.cli.bench import motion_table, soak_table, times_table
+from q2r2_control.cli.bench import loop_table, motion_table, soak_table, times_table
 from q2r2_control.cli.work_table import work_table
+from q2r2_control.config import Config
 from q2r2_control.verification.contract import Margin
 from q2r2_control.verification.soak import SoakReport, Violation
+from tests.cli.test_app import one_object, q2r2
 
 TIMES = ("1234", "18765")
 
@@ -92,3 +96,38 @@ def test_a_broken_promise_is_in_the_table_with_its_tick_and_its_segment() -> Non
     assert "first broken at tick 7: least distance" in " ".join(text.split())
     assert "teleport, dt 1 ms" in " ".join(text.split())
     assert "q2r2 bench --soak --seed 5 --ticks 8" in " ".join(text.split())
+
+
+def test_eighty_columns_hold_every_stage_of_the_loop_for_each_plant_and_mode() -> None:
+    stages = [StageTime(stage, 100.0 + index, 12340.0 + index) for index, stage in enumerate(STAGES)]
+    whole = StageTime("without physics", 237.0, 54321.0)
+    rows = [LoopRow(plant, str(mode), 3000, 3, stages, whole, 6.4) for plant, mode in CASES]
+    text = printed(loop_table(LoopReport("cell", 1000.0, rows)))
+    in_one_line = " ".join(text.split())
+    for word in (*STAGES, "kinematic", "mujoco", "position", "torque", "p99", "[us]", "1000 Hz", "6, 6, 6 us"):
+        assert word in in_one_line
+    lines = text.splitlines()
+    (total,) = (index for index, line in enumerate(lines) if "237" in line)
+    assert lines[total].split() == ["without", "physics", *["237", "54321"] * 3]
+    assert lines[total + 1].split()[0] == PHYSICS, "below the sum, which it is not in"
+    assert "…" not in text
+
+
+def test_the_loop_s_bench_prints_its_figures_as_one_object(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = []
+
+    def short(config: Config, ticks: int, progress: object) -> LoopReport:
+        asked.append(ticks)
+        return run_loop_bench(config, 100, paced=False)
+
+    monkeypatch.setattr("q2r2_control.cli.bench.run_loop_bench", short)
+    found = one_object(q2r2("bench", "--loop", "--ticks", "200", "--json").stdout)
+    assert asked == [200]
+    assert {stage["stage"] for stage in found["rows"][2]["stages"]} == set(STAGES)
+    assert found["rows"][2]["without_physics"]["median_us"] > 0.0
+
+
+@pytest.mark.parametrize("other", ["--soak", "--ros"])
+def test_one_bench_at_a_time(other: str) -> None:
+    refused = q2r2("bench", "--loop", other)
+    assert (refused.exit_code, refused.stderr) == (2, "q2r2: --soak, --ros and --loop exclude each other\n")

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from q2r2_control.control import jit
-from q2r2_control.control.jit import hold, kernel
+from q2r2_control.control.jit import bound, hold, kernel
 from q2r2_control.types import Array
 
 
@@ -134,3 +134,13 @@ def test_what_is_held_stays_the_callers_own_array() -> None:
 @kernel
 def _double_held(held: jit.Held) -> None:
     held.value[0][:] *= 2.0
+
+
+def test_bound_machine_code_is_the_kernel_s_and_has_run_once() -> None:
+    values = np.ones(3)
+    double = bound(_double_held, hold((values,)))
+    np.testing.assert_array_equal(values, [2.0, 2.0, 2.0])
+    others = np.arange(3.0)
+    double(hold((others,)))
+    np.testing.assert_array_equal(others, [0.0, 2.0, 4.0])
+    assert bound(_one_over, 2.0)(4.0) == 0.25
