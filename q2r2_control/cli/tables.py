@@ -41,8 +41,9 @@ def pair_table(check: CellCheck) -> Table:
     title = f"nearest of {check.monitored_pairs} monitored pairs at home, min_distance {1e3 * check.min_distance:g} mm"
     table = _table_of(title, "pair")
     table.add_column(Text("distance [mm]"), justify="right", min_width=8)
+    table.add_column(Text("keeps [mm]"), justify="right", min_width=8)
     for pair in check.nearest:
-        table.add_row(Text(f"{pair.name_a} | {pair.name_b}"), f"{1e3 * pair.distance:.1f}")
+        table.add_row(Text(f"{pair.name_a} | {pair.name_b}"), f"{1e3 * pair.distance:.1f}", f"{1e3 * pair.kept:g}")
     return table
 
 
