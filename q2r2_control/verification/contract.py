@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from q2r2_control.config.control import ControllerSettings
 from q2r2_control.robot.kept_distances import kept_distances
+from q2r2_control.robot.pairs import pair_names
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import LONGEST_DT, Array, Reference, StepReport
 
@@ -133,6 +134,8 @@ class Contract:
         self._lower = robot.position_lower + settings.position_margin
         self._upper = robot.position_upper - settings.position_margin
         self._kept = kept_distances(robot, settings).values
+        pairs = map(frozenset, pair_names(robot.collision_model))
+        self._kept_by_name = dict(zip(pairs, self._kept.tolist(), strict=True))
         self._substep = settings.max_substep
         self.start(robot.home if q is None else q, v)
 
@@ -185,7 +188,7 @@ class Contract:
                 if failed:
                     self._check_stopped(q, v, h, report.fallback)
             self._check_limits(q, v)
-            self._check_distance(report.margin, report.certified)
+            self._check_distance(self._margin_of(report), report.certified)
             stop = self._controller.stop_deceleration
             self._note("deceleration", float(stop.max()) / self._a)
             self._sample(q, v, stop, h, report)
@@ -275,6 +278,11 @@ class Contract:
         end = q + v * np.abs(v) / (2.0 * self._a) + v * self._substep
         inside = (np.minimum(q, end) >= self._lower) & (np.maximum(q, end) <= self._upper)
         return np.asarray(inside, dtype=np.bool_)
+
+    def _margin_of(self, report: StepReport) -> float:
+        """Least margin that a report tells of, the nearest pair judged by what it has to keep here [m]."""
+        nearest = report.closest_distance - self._kept_by_name.get(frozenset(report.closest_pair), 0.0)
+        return min(report.margin, nearest)
 
     def _check_distance(self, least: float, certified: bool) -> None:
         """``least`` is the least margin of a pair [m]."""

@@ -148,7 +148,7 @@ def test_arms_that_come_too_close_are_found_at_ticks_between_them_and_in_stops()
     """The controller keeps 20 mm where 150 mm are asked for."""
     report = soak(lambda reference: reference, 0, 3000, settings=SETTINGS.model_copy(update={"min_distance": 0.15}))
     promises = {found.promise for found in report.broken}
-    assert {f"distance - min_distance, {when}" for when in ("at ticks", "between ticks", "full stops")} <= promises
+    assert {f"distance - kept distance, {when}" for when in ("at ticks", "between ticks", "full stops")} <= promises
 
 
 def test_a_stop_that_is_due_and_not_executed_is_found() -> None:
