@@ -6,6 +6,7 @@ clock that is passed in. An arm or hand is named ``"left"`` or ``"right"``.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from enum import StrEnum
 
@@ -95,7 +96,7 @@ class StepStatus(StrEnum):
     OK = "ok"
     TARGET_REJECTED = "target_rejected"  # a bad target was held
     DT_REJECTED = "dt_rejected"  # dt was not in (0, 0.1] s
-    RECOVERING = "recovering"  # outside a limit or closer than min_distance, on the way back
+    RECOVERING = "recovering"  # outside a limit or closer than a pair may be, on the way back
     FALLBACK = "fallback"  # the stopping motion was executed instead of the QP's solution
 
 
@@ -112,6 +113,8 @@ class StepReport:
     fallback: bool
     slack: float  # largest violation of a separation row of unit norm [rad/s]
     solve_time: float  # solver's own time [s]
+    tightest_pair: tuple[str, str] = ("", "")  # geometry names of the pair with the least margin
+    margin: float = math.inf  # its distance less the one that it keeps [m]
 
 
 @dataclass(frozen=True, slots=True)

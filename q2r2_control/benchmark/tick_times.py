@@ -17,7 +17,7 @@ import pinocchio as pin
 from q2r2_control.benchmark.peers.base import PEERS, BenchController, Setup, build_peers
 from q2r2_control.benchmark.timed_run import OwnController, Poses, RunMetrics, Targets, TimedRun, metrics_of, timed_run
 from q2r2_control.config import Config
-from q2r2_control.config.control import ControllerSettings
+from q2r2_control.config.control import ControllerSettings, DistanceSettings
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.errors import ConfigError
 from q2r2_control.robot.robot import Robot
@@ -73,8 +73,10 @@ def run_bench(
     if ticks < FEWEST_TICKS:
         raise ConfigError(f"bench: ticks = {ticks}: allowed: {FEWEST_TICKS} or more")
     robot = Robot.from_config(config)
-    # Without a time limit, so that a slow machine computes the same motion.
-    settings = config.control.model_copy(update={"solve_time_limit": None})
+    # Without a time limit, so that a slow machine computes the same motion; with one distance for all pairs, since the
+    # peers take no more.
+    only_one = {"distances": DistanceSettings(), "pairs": ()}
+    settings = config.control.model_copy(update={"solve_time_limit": None, **only_one})
     ours = OwnController(CartesianController(robot, settings))
     others, notes = build_peers(peers, Setup(robot, config, _DT))
     bench = _Bench(robot, settings, ours, others, ticks, progress)

@@ -13,9 +13,10 @@ from q2r2_control.config.cell import Config, ObstacleConfig
 from q2r2_control.config.external import describe
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.errors import ConfigError
+from q2r2_control.robot.kept_distances import kept_distances
 from q2r2_control.robot.model_srdf import model_srdfs
 from q2r2_control.robot.reachability import PairReach, Progress, nearest_approaches, srdf_of
-from q2r2_control.robot.robot import PairDistance, Robot
+from q2r2_control.robot.robot import Robot
 from q2r2_control.robot.stop_torque import StopTorque, stop_torques
 from q2r2_control.supervision.preflight import preflight_faults
 
@@ -48,6 +49,16 @@ class ArmCheck:
 
 
 @dataclass(frozen=True, slots=True)
+class KeptPair:
+    """Distance of a monitored pair at home, and the one that it keeps [m]."""
+
+    name_a: str
+    name_b: str
+    distance: float
+    kept: float
+
+
+@dataclass(frozen=True, slots=True)
 class CellCheck:
     """A cell as the controller sees it. Distances in metres, at home; ``faults`` are empty for a good cell."""
 
@@ -58,7 +69,7 @@ class CellCheck:
     monitored_pairs: int
     ignored_pairs: tuple[tuple[str, str], ...]  # overlap by construction
     min_distance: float
-    nearest: tuple[PairDistance, ...]  # nearest first
+    nearest: tuple[KeptPair, ...]  # nearest first
     faults: tuple[str, ...]
     stop_torques: tuple[StopTorque, ...]  # by arm
     driven: dict[str, str]  # by arm: what controllers of others are sent, empty for the built-in one
@@ -84,8 +95,9 @@ def check_cell(config: Config, compiling: AbstractContextManager[None] | None = 
     robot = Robot.from_config(config)
     with compiling or nullcontext():
         controller = CartesianController(robot, config.control)
-    distances = sorted(robot.distances(robot.home), key=lambda pair: pair.distance)
     settings = config.control
+    kept = kept_distances(robot, settings).values.tolist()
+    distances = sorted(zip(robot.distances(robot.home), kept, strict=True), key=lambda found: found[0].distance)
     return CellCheck(
         name=config.name,
         arms=tuple(_arm_check(config, robot, name) for name in robot.arms),
@@ -94,7 +106,7 @@ def check_cell(config: Config, compiling: AbstractContextManager[None] | None = 
         monitored_pairs=len(distances),
         ignored_pairs=robot.ignored_pairs,
         min_distance=settings.min_distance,
-        nearest=tuple(distances[:_NEAREST]),
+        nearest=tuple(KeptPair(pair.name_a, pair.name_b, pair.distance, least) for pair, least in distances[:_NEAREST]),
         faults=preflight_faults(robot, settings, controller),
         stop_torques=stop_torques(robot, robot.capped_acceleration(settings.acceleration_limit)),
         driven={} if config.external is None else describe(config.external),
@@ -117,7 +129,8 @@ def write_pairs(
 ) -> PairsWritten:
     """Sample which pairs of a cell can meet and write those that cannot as an SRDF to ``file``, which is not replaced.
 
-    Raises :class:`ConfigError` for a clearance that is not above ``control.min_distance``, and for a file that exists.
+    Raises :class:`ConfigError` for a clearance that is not above every distance in ``control``, and for a file that
+    exists.
     """
     _check_clearance(config, clearance)
     if file.exists():
@@ -157,9 +170,9 @@ def write_model_pairs(
 
 
 def _check_clearance(config: Config, clearance: float) -> None:
-    least = config.control.min_distance
+    key, least = config.control.largest_distance
     if not least < clearance <= 1.0:
-        raise ConfigError(f"clearance = {clearance:g} m: allowed: above control.min_distance, {least:g}, up to 1")
+        raise ConfigError(f"clearance = {clearance:g} m: allowed: above control.{key}, {least:g}, up to 1")
 
 
 def _write(file: Path, text: str) -> None:

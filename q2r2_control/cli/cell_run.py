@@ -70,7 +70,7 @@ def run_cell(config: Config, options: RunOptions, console: Console) -> RunSummar
             pipeline.plant.launch_viewer()
             pipeline.listeners.append(_WindowListener(pipeline, pipeline.plant))
         if options.table:
-            table = LiveTable(f"{options.name}: Ctrl-C brings the arms to rest and ends", config.control.min_distance)
+            table = LiveTable(f"{options.name}: Ctrl-C brings the arms to rest and ends")
             pipeline.listeners.append(table)
             stack.enter_context(table.shown(console))
         if options.real_time and (refused := stack.enter_context(real_time())):
@@ -127,7 +127,7 @@ def _write_report(config: Config, options: RunOptions, history: History, summary
     (folder / "summary.json").write_text(as_json_text(summary.as_json()) + "\n", encoding="utf-8")
     what = options.trajectory if options.input == "scripted" else options.input
     title = f"{config.name}: {what}, {options.plant} plant"
-    draw_report(history, summary, config.control.min_distance, title, folder / "report.png")
+    draw_report(history, summary, title, folder / "report.png")
     return folder
 
 

@@ -55,9 +55,10 @@ def pair_table(check: CellCheck) -> Table:
     """The nearest pairs at home."""
     title = f"nearest of {check.monitored_pairs} monitored pairs at home, min_distance {1e3 * check.min_distance:g} mm"
     table = _table_of(title, "pair")
-    table.add_column(Text("distance [mm]"), justify="right", min_width=8)
+    table.add_column(Text("distance\n[mm]"), justify="right", min_width=8)
+    table.add_column(Text("kept\n[mm]"), justify="right", min_width=4)
     for pair in check.nearest:
-        table.add_row(Text(f"{pair.name_a} | {pair.name_b}"), f"{1e3 * pair.distance:.1f}")
+        table.add_row(Text(f"{pair.name_a} | {pair.name_b}"), f"{1e3 * pair.distance:.1f}", f"{1e3 * pair.kept:g}")
     return table
 
 

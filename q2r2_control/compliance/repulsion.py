@@ -1,12 +1,12 @@
 """A repulsive, damped wall between the measured links, for torque mode, where they may leave the QP's reference.
 
 In the tick it comes after the QP, beside the impedance:  tau = impedance + gravity and Coriolis + wall,  from the
-measured q and v of the same tick and before torques are saturated. The reference keeps min_distance by itself; an arm
+measured q and v of the same tick and before torques are saturated. The reference keeps its distances by itself; an arm
 that is pushed away from it meets this wall. The law, and why it is stable, stands in repulsion_kernels.py.
 
-**What it can take.** At rest a force of k min_distance or F_max, whichever is less. In motion it takes up at most the
-energy F_max min_distance for each pair, beside what the joints take; bodies that meet with more than that are slowed
-down, but touch.
+**What it can take.** d_min is the distance that a pair keeps. At rest a force of k d_min or F_max, whichever is less.
+In motion it takes up at most the energy F_max d_min for each pair, beside what the joints take; bodies that meet with
+more than that are slowed down, but touch. So fingers that may come within a millimetre touch at a push of 10 N.
 """
 
 from __future__ import annotations
@@ -21,10 +21,11 @@ from q2r2_control.compliance.repulsion_kernels import RepulsionData, RepulsionMo
 from q2r2_control.config.control import ControllerSettings, WallSettings
 from q2r2_control.control.geometry.collision import collision_model_of
 from q2r2_control.control.jit import bound, hold
+from q2r2_control.robot.kept_distances import kept_distances
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 
-# Of the sum of radii and min_distance: the smoothing length of distances, 0.3 mm of error at most.
+# Of the sum of radii and the distance that a pair keeps: the smoothing length of distances, 0.3 mm of error at most.
 _SMOOTHING = 0.07
 # Cores closer than this part of the radii are measured as they are: so deep, the smoothing would weaken the force.
 _DEEP = 0.25
@@ -46,19 +47,20 @@ class MeasuredSeparation:
     """Keeps the measured links apart in torque mode. Holds nothing between ticks but scratch."""
 
     def __init__(self, robot: Robot, settings: ControllerSettings, wall_settings: WallSettings | None = None) -> None:
-        """Uses ``min_distance`` of ``settings``.
+        """Uses the distances that pairs keep of ``settings``.
 
-        Raises :class:`RobotError` for a shape that no kernel measures.
+        Raises :class:`RobotError` for a shape that no kernel measures, :class:`ConfigError` as the controller does.
         """
         law, self._model, self._data = wall_settings or WallSettings(), robot.model, robot.model.createData()
         collision = collision_model_of(robot)
         pairs, radius = collision.pairs, collision.bodies.radius
+        shell = kept_distances(robot, settings).values
         radii = radius[pairs.first] + radius[pairs.second]
         model = RepulsionModel(
             collision=collision,
-            smoothing=(_SMOOTHING * (radii + settings.min_distance)) ** 2,
+            smoothing=(_SMOOTHING * (radii + shell)) ** 2,
             deep=(_DEEP - 1.0) * radii,
-            shell=settings.min_distance,
+            shell=shell,
             stiffness=law.stiffness,
             damping_ratio=law.damping_ratio,
             maximum_force=law.maximum_force,

@@ -1,6 +1,6 @@
 """The law of the wall between measured links, compiled: see :class:`MeasuredSeparation`.
 
-Each monitored pair closer than min_distance by the depth x presses itself apart with the force
+Each monitored pair closer by the depth x than the distance that it keeps presses itself apart with the force
 
     F = min(k x, F_max) - c(x) d',    clipped to [0, F_max],    tau += (dd/dq)' F,
 
@@ -51,7 +51,7 @@ class RepulsionModel(NamedTuple):
     collision: CollisionModel
     smoothing: Array  # (p,) [m^2]
     deep: Array  # (p,) distance from which it is measured as it is [m]
-    shell: float  # min_distance [m]
+    shell: Array  # (p,) distance that the pair keeps [m]
     stiffness: float  # [N/m]
     damping_ratio: float
     maximum_force: float  # [N]
@@ -100,18 +100,18 @@ def find_near(held_model: Held, held_data: Held) -> tuple[int, int, float]:
     update_placements(model.collision, data.collision, data.q)
     count, closest, least = 0, 0, np.inf
     for p in range(model.collision.pairs.first.shape[0]):
-        if at_least(model.collision, data.collision, p) >= max(least, model.shell + _BAND):
+        if at_least(model.collision, data.collision, p) >= max(least, model.shell[p] + _BAND):
             continue
         distance = measure(model.collision, data.collision, p)
         if distance < least:
             least, closest = distance, p
         # The smooth distance is no smaller.
-        if distance >= model.shell + _BAND:
+        if distance >= model.shell[p] + _BAND:
             continue
         if distance > model.deep[p]:
             distance = measure_smooth(model.collision, data.collision, p, model.smoothing[p])
         data.near[count] = p
-        data.depth[count] = model.shell - distance
+        data.depth[count] = model.shell[p] - distance
         distance_row(model.collision, data.collision, p, data.rows[count])
         count += 1
     return count, closest, least

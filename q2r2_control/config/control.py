@@ -3,13 +3,49 @@
 from __future__ import annotations
 
 from collections.abc import Collection
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
 from q2r2_control.errors import ConfigError
 
 EQUAL = "equal"
+
+Distance = Annotated[float, Field(ge=0, le=0.2)]  # [m]
+LinkPattern = Annotated[str, Field(min_length=1)]
+
+
+class DistanceSettings(BaseModel):
+    """How far pairs of bodies stay apart, by what they are; left out: ``min_distance``.
+
+    A finger is what a gripper's joints move, a tool what carries it (the hand), an obstacle what stands in the cell,
+    its floor included. ``arm_self`` is all of one arm against itself and against the robot that it is a part of; the
+    other classes without obstacles are about different arms.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    arm_arm: Distance | None = Field(None, description="links of two arms, bases included [m]")
+    arm_self: Distance | None = Field(None, description="one arm with tool and fingers, among themselves [m]")
+    arm_obstacle: Distance | None = Field(None, description="an arm's links and obstacles [m]")
+    tool_arm: Distance | None = Field(None, description="a hand and the other arm's links [m]")
+    tool_tool: Distance | None = Field(None, description="hand and hand [m]")
+    tool_obstacle: Distance | None = Field(None, description="a hand and obstacles [m]")
+    finger_arm: Distance | None = Field(None, description="fingers and the other arm's links [m]")
+    finger_tool: Distance | None = Field(None, description="fingers and the other hand [m]")
+    finger_finger: Distance | None = Field(None, description="fingers of both hands [m]")
+    finger_obstacle: Distance | None = Field(None, description="fingers and obstacles [m]")
+
+
+class NamedPairDistance(BaseModel):
+    """How far pairs of bodies stay apart, by their names."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    pair: tuple[LinkPattern, LinkPattern] = Field(
+        description="links, * stands for any letters and ? for one; in either order"
+    )
+    distance: Distance = Field(description="[m]")
 
 
 class ControllerSettings(BaseModel):
@@ -28,8 +64,15 @@ class ControllerSettings(BaseModel):
     position_margin: float = Field(0.01, ge=0, le=0.5, description="distance kept from position limits [rad]")
     recovery_velocity: float = Field(0.2, gt=0, le=1, description="inward speed when outside a limit [rad/s]")
 
-    min_distance: float = Field(0.02, ge=0, le=0.2, description="every monitored pair stays this far apart [m]")
-    distance_buffer: float = Field(0.002, gt=0, le=0.05, description="the QP aims to stop this much earlier [m]")
+    min_distance: Distance = Field(0.02, description="monitored pairs stay this far apart unless said below [m]")
+    distances: DistanceSettings = Field(DistanceSettings(), description="the same, by what the bodies are")
+    pairs: tuple[NamedPairDistance, ...] = Field((), description="the same, by name; of several, the last one counts")
+    distance_buffer: float = Field(
+        0.002,
+        gt=0,
+        le=0.05,
+        description="the QP aims to stop this much earlier, but half a pair's distance at most [m]",
+    )
     separation_gain: float = Field(10.0, gt=0, le=50, description="closing speed per metre left after a stop [1/s]")
     separation_recovery_speed: float = Field(0.05, gt=0, le=0.5, description="when too close, moving apart [m/s]")
 
@@ -52,6 +95,13 @@ class ControllerSettings(BaseModel):
     )
     stretch_gain: float = Field(10.0, gt=0, le=200, description="highest gain of a stretched-out arm [1/s]")
 
+    @property
+    def largest_distance(self) -> tuple[str, float]:
+        """Key and value of the largest distance that some pair may have to keep [m]."""
+        by_class = {f"distances.{name}": value for name, value in self.distances if value is not None}
+        by_name = {f"pairs[{i}].distance": named.distance for i, named in enumerate(self.pairs)}
+        return max((("min_distance", self.min_distance), *by_class.items(), *by_name.items()), key=lambda item: item[1])
+
 
 def check_priority(priority: str, arms: Collection[str]) -> None:
     """Raises :class:`ConfigError` unless ``priority`` is ``equal`` or one of ``arms``."""
@@ -60,11 +110,11 @@ def check_priority(priority: str, arms: Collection[str]) -> None:
 
 
 class WallSettings(BaseModel):
-    """The wall between measured links; its depth is the controller's ``min_distance``."""
+    """The wall between measured links; its depth is the distance that each pair keeps."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
-    stiffness: float = Field(10000.0, gt=0, le=100000, description="force per depth below min_distance [N/m]")
+    stiffness: float = Field(10000.0, gt=0, le=100000, description="force per depth below a pair's distance [N/m]")
     damping_ratio: float = Field(1.0, ge=0.2, le=2, description="at each pair's effective mass")
     maximum_force: float = Field(400.0, gt=0, le=2000, description="of each pair of links [N]")
 

@@ -29,9 +29,10 @@ class CartesianController:
     """QP differential inverse kinematics for all arms of a cell at once, with a certified stop at every tick.
 
     The contract, for every sequence of targets and every dt in (0, 0.1] s: finite numbers, no exception; joint
-    position, velocity and acceleration limits; every monitored pair at ``min_distance``, also between ticks and during
-    a stop; rest under a constant target. The reference is the controller's own state: it follows the targets, not the
-    plant's measurement, so that noise never enters it.
+    position, velocity and acceleration limits; every monitored pair at the distance that it keeps (``min_distance``,
+    or what ``distances`` and ``pairs`` say), also between ticks and during a stop; rest under a constant target. The
+    reference is the controller's own state: it follows the targets, not the plant's measurement, so that noise never
+    enters it.
 
     One tick is three calls: :func:`assemble` writes the QP, a solver solves it, :func:`move_reference` takes of the
     solution what can be certified and moves the reference.
@@ -85,8 +86,9 @@ class CartesianController:
         state.q[:] = self._checked("q", q)
         state.v[:] = 0.0 if v is None else self._checked("v", v)
         self._targets.reset(state.q)
-        self._closest, self._distance, proven = start_reference(self._held_model, self._held_data)
-        self._apart = self._distance >= self.settings.min_distance
+        observed = start_reference(self._held_model, self._held_data)
+        self._closest, self._distance, self._tightest, self._margin, proven = observed
+        self._apart = self._margin >= 0.0
         self._certified = proven and self._apart
 
     def _checked(self, name: str, values: Array) -> Array:
@@ -120,12 +122,14 @@ class CartesianController:
             status=self._status(usable and dt <= LONGEST_DT, rejected, summary),
             rejected=rejected,
             binding=self._binding(),
-            closest_pair=self._pair_names[self._closest] if self._pair_names else ("", ""),
+            closest_pair=self._names_of(self._closest),
             closest_distance=self._distance,
             certified=self._certified,
             fallback=summary.fallback,
             slack=summary.slack,
             solve_time=summary.solve_time,
+            tightest_pair=self._names_of(self._tightest),
+            margin=self._margin,
         )
         return Reference(state.q.copy(), state.v.copy(), state.a.copy(), report)
 
@@ -149,13 +153,13 @@ class CartesianController:
         usable = solution.v is not None and (limit is None or solution.solve_time <= limit)
         if usable:
             self._solution[:] = solution.v
-        outcome, self._closest, self._distance, slack = self._move(
+        outcome, self._closest, self._distance, self._tightest, self._margin, slack = self._move(
             self._held_model, self._held_data, self._solution, usable, h, share
         )
         summary.fallback |= outcome != FOLLOWED
         summary.slack = max(summary.slack, slack)
         summary.solve_time += solution.solve_time
-        was_apart, self._apart = self._apart, self._distance >= self.settings.min_distance
+        was_apart, self._apart = self._apart, self._margin >= 0.0
         # A certified stop stays certified. Anything else was proven just now, and if all was apart before, in full.
         self._certified = self._apart and (self._certified if outcome == STOPPED else was_apart)
 
@@ -176,6 +180,9 @@ class CartesianController:
             return ()
         bounds = zip(active.kind[:found].tolist(), active.subject[:found].tolist(), strict=True)
         return tuple(dict.fromkeys(self._bound_name(kind, subject) for kind, subject in bounds))
+
+    def _names_of(self, pair: int) -> tuple[str, str]:
+        return self._pair_names[pair] if self._pair_names else ("", "")
 
     def _bound_name(self, kind: int, subject: int) -> str:
         if kind == SEPARATION:

@@ -14,7 +14,12 @@ from q2r2_control.control.safety.safety_model import Approach, SafetyModel
 from q2r2_control.control.tasks.swivel import nearest_along, swivel_angle
 from q2r2_control.control.tasks.task_data import SwivelScratch
 from q2r2_control.control.tasks.task_model import Motion, Posture, Priority, Swivels, TaskModel, tools_of
+from q2r2_control.robot.kept_distances import kept_distances
 from q2r2_control.robot.robot import Robot
+from q2r2_control.types import Array
+
+# Of pairs that may touch: rows that aim at the very distance would leave the certificate nothing [m].
+_LEAST_BUFFER = 0.00025
 
 
 class KernelModel(NamedTuple):
@@ -27,7 +32,8 @@ class KernelModel(NamedTuple):
 def kernel_model_of(robot: Robot, settings: ControllerSettings) -> KernelModel:
     """Arrays of a robot's joints, tools, pairs and limits.
 
-    Raises :class:`RobotError` for what no kernel handles, :class:`ConfigError` for a priority that is no arm's name.
+    Raises :class:`RobotError` for what no kernel handles, :class:`ConfigError` for a priority that is no arm's name and
+    for names of ``settings.pairs`` that no pair has.
     """
     check_priority(settings.priority, tuple(robot.arms))
     safety = _safety_model(robot, settings)
@@ -36,7 +42,7 @@ def kernel_model_of(robot: Robot, settings: ControllerSettings) -> KernelModel:
 
 def _safety_model(robot: Robot, settings: ControllerSettings) -> SafetyModel:
     collision = collision_model_of(robot)
-    min_distance = np.full(len(collision.pairs.first), settings.min_distance)
+    min_distance = kept_distances(robot, settings).values
     arm = np.full(robot.model.nv, len(robot.arms), dtype=np.int64)
     for i, joints in enumerate(robot.arms.values()):
         arm[joints.joints] = i
@@ -51,13 +57,18 @@ def _safety_model(robot: Robot, settings: ControllerSettings) -> SafetyModel:
             return_speed=settings.recovery_velocity,
         ),
         approach=Approach(
-            stop_distance=min_distance + settings.distance_buffer,
+            stop_distance=min_distance + _buffer(min_distance, settings),
             gain=settings.separation_gain,
             recovery_speed=settings.separation_recovery_speed,
         ),
         min_distance=min_distance,
         arm=arm,
     )
+
+
+def _buffer(min_distance: Array, settings: ControllerSettings) -> Array:
+    """How much farther from each other pairs stop in the QP (p,) [m]."""
+    return np.minimum(settings.distance_buffer, np.maximum(0.5 * min_distance, _LEAST_BUFFER))
 
 
 def _task_model(robot: Robot, settings: ControllerSettings, safety: SafetyModel) -> TaskModel:

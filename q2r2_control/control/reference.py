@@ -5,10 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from q2r2_control.control.geometry.collision import update_placements
+from q2r2_control.control.geometry.pair_distance import measure
 from q2r2_control.control.jit import Held, kernel, lean_kernel
 from q2r2_control.control.kernel_data import KernelData
 from q2r2_control.control.kernel_model import KernelModel
+from q2r2_control.control.safety.safety_data import SafetyData
 from q2r2_control.control.safety.safety_filter import apply_safety_filter, certify_start
+from q2r2_control.control.safety.safety_model import SafetyModel
 from q2r2_control.control.safety.separation_rows import measure_pairs
 from q2r2_control.control.safety.velocity_bounds import update_body_velocities
 from q2r2_control.control.tasks.frame import tool_pose
@@ -16,35 +19,59 @@ from q2r2_control.types import Array
 
 
 @kernel
-def start_reference(held_model: Held, held_data: Held) -> tuple[int, float, bool]:
-    """Observe after a reset: the closest pair, its distance, and whether the stop is known to keep all apart."""
+def start_reference(held_model: Held, held_data: Held) -> tuple[int, float, int, float, bool]:
+    """Observe after a reset: what :func:`_observe` says, and whether the stop is known to keep all apart."""
     model, data = held_model.value, held_data.value
-    closest, distance = _observe(model, data)
-    return closest, distance, certify_start(model.safety, data.safety)
+    closest, distance, tightest, margin = _observe(model, data)
+    return closest, distance, tightest, margin, certify_start(model.safety, data.safety)
 
 
 @kernel
 def move_reference(
     held_model: Held, held_data: Held, solution: Array, usable: bool, h: float, share: float
-) -> tuple[int, int, float, float]:
+) -> tuple[int, int, float, int, float, float]:
     """One step of ``h`` [s] with the solver's next velocities (nv,), as far as :func:`apply_safety_filter` takes them.
 
-    Returns its outcome, the closest pair at the new state, its distance [m] (infinite if there is no pair), and the
-    largest violation of a row [rad/s].
+    Returns its outcome, what :func:`_observe` says of the new state, and the largest violation of a row [rad/s].
     """
     model, data = held_model.value, held_data.value
     outcome, slack = apply_safety_filter(model.safety, data.safety, solution, usable, h, share)
-    closest, distance = _observe(model, data)
-    return outcome, closest, distance, slack
+    closest, distance, tightest, margin = _observe(model, data)
+    return outcome, closest, distance, tightest, margin, slack
 
 
 @lean_kernel
-def _observe(model: KernelModel, data: KernelData) -> tuple[int, float]:
-    """Tool poses and distances at the reference; the closest pair and its distance [m]."""
+def _observe(model: KernelModel, data: KernelData) -> tuple[int, float, int, float]:
+    """Tool poses and distances at the reference.
+
+    Returns the closest pair and its distance, and the pair with the least margin and that, which is its distance less
+    what it keeps [m]; both infinite if there is no pair.
+    """
     collision, safety = model.safety.collision, data.safety
     update_placements(collision, safety.collision, safety.state.q)
     update_body_velocities(collision, safety.collision, safety.state.v, safety.velocities)
     for i in range(model.tasks.tools.joint.shape[0]):
         tool_pose(data.tasks.placements, model.tasks.tools, i, data.tasks.rotation[i], data.tasks.translation[i])
+    if safety.distance.shape[0] == 0:
+        return 0, np.inf, 0, np.inf
     closest = measure_pairs(model.safety, safety)
-    return closest, safety.distance[closest] if safety.distance.shape[0] > 0 else np.inf
+    tightest = _tightest(model.safety, safety)
+    margin = safety.distance[tightest] - model.safety.min_distance[tightest]
+    return closest, safety.distance[closest], tightest, margin
+
+
+@lean_kernel
+def _tightest(model: SafetyModel, data: SafetyData) -> int:
+    """The pair with the least margin. What is a lower bound of a distance is measured until the least one is none."""
+    while True:
+        tightest = 0
+        least = np.inf
+        for p in range(data.distance.shape[0]):
+            margin = data.distance[p] - model.min_distance[p]
+            if margin < least:
+                least = margin
+                tightest = p
+        distance = measure(model.collision, data.collision, tightest)
+        if not distance > data.distance[tightest]:
+            return tightest
+        data.distance[tightest] = distance

@@ -11,6 +11,7 @@ from q2r2_control.errors import ConfigError, Q2R2Error
 from q2r2_control.robot.arm_chain import default_tip, end_of, named_joints
 from q2r2_control.robot.description import Description, LinkTree, joint_end, joint_limits, load_description, parse_srdf
 from q2r2_control.robot.flange import cylinder_flange
+from q2r2_control.robot.link_roles import hand_links
 from q2r2_control.robot.urdf_parts import WORLD, fixed_joint, renamed, renamed_exclusions
 
 
@@ -97,6 +98,12 @@ class Arm:
     def finger_names(self) -> tuple[str, ...]:
         """The joints that the gripper drives, as they are called in the cell."""
         return tuple(map(self.name_in_cell, self.config.gripper.joints))
+
+    def tool_links(self) -> tuple[str, ...]:
+        """The links of the tool, or else of the hand that carries the gripper's joints, as they are in the cell."""
+        has_tool = self.config.tool.model is not None
+        links = self.mounted[-1].model.links if has_tool else hand_links(self.tree, self.config.gripper.joints)
+        return tuple(sorted(map(self.name_in_cell, links)))
 
     def leave_joints_of(self, others: Sequence[Arm]) -> None:
         """Give up joints that carry another arm of the model too, such as a torso's, unless ``joints`` names them."""

@@ -16,8 +16,9 @@ from q2r2_control.config.arms import PoseConfig, RobotConfig, check_models
 from q2r2_control.config.cell import Config
 from q2r2_control.errors import ConfigError
 from q2r2_control.robot.cell_parts import Arm, Model, check_position, load_model
-from q2r2_control.robot.floor import floor_link
+from q2r2_control.robot.floor import FLOOR, floor_link
 from q2r2_control.robot.joint_accelerations import set_acceleration_limit
+from q2r2_control.robot.link_roles import KnownParts
 from q2r2_control.robot.locking import lock_joints, resting_position
 from q2r2_control.robot.pairs import exclusions_of_file
 from q2r2_control.robot.urdf_parts import WORLD, fixed_joint, name_shapes, obstacle_link, renamed_exclusions
@@ -36,10 +37,10 @@ class ComposedCell:
     srdf: str
     tool_frames: dict[str, str]  # link that the operator moves
     arm_joints: dict[str, tuple[str, ...]]  # the arm's own, from the world to the tool frame, in that order
-    finger_joints: dict[str, tuple[str, ...]]  # joints that the gripper drives
     prefixes: dict[str, str]  # of the names of the arm's model
     home: dict[str, float]  # every movable joint's position: arms at home, grippers open
     obstacles: tuple[str, ...]  # link names
+    parts: KnownParts  # what its links are
 
 
 def compose(config: Config) -> ComposedCell:
@@ -85,10 +86,14 @@ def compose(config: Config) -> ComposedCell:
         srdf=ET.tostring(srdf, encoding="unicode"),
         tool_frames={side: arm.name_in_cell(arm.frame) for side, arm in arms.items()},
         arm_joints={side: arm.joint_names() for side, arm in arms.items()},
-        finger_joints={side: arm.finger_names() for side, arm in arms.items()},
         prefixes={side: arm.model.prefix for side, arm in arms.items()},
         home=home,
         obstacles=tuple(config.obstacles),
+        parts=KnownParts(
+            finger_joints={side: arm.finger_names() for side, arm in arms.items()},
+            tool_links={side: arm.tool_links() for side, arm in arms.items()},
+            obstacles=(*config.obstacles, *([] if config.floor is None else [FLOOR])),
+        ),
     )
 
 

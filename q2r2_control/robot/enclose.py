@@ -84,7 +84,7 @@ def _enclosing_shape(shape: coal.CollisionGeometry, name: str, fixed: bool) -> t
         return _around_ellipsoid(np.asarray(shape.radii, dtype=float))
     vertices = _vertices(shape, name)
     radius, start, end = _cached_capsule(vertices.tobytes())
-    return _capsule(radius, start, end)
+    return capsule_between(radius, start, end)
 
 
 def _vertices(shape: coal.CollisionGeometry, name: str) -> Array:
@@ -155,10 +155,10 @@ def _around_ellipsoid(radii: Array) -> tuple[coal.CollisionGeometry, pin.SE3]:
     order = np.argsort(radii)
     axis = np.eye(3)[order[2]]
     length = float(radii[order[2]] - radii[order[1]])
-    return _capsule(float(radii[order[1]]) + _ROUNDING, -length * axis, length * axis)
+    return capsule_between(float(radii[order[1]]) + _ROUNDING, -length * axis, length * axis)
 
 
-def _capsule(radius: float, start: Array, end: Array) -> tuple[coal.CollisionGeometry, pin.SE3]:
+def capsule_between(radius: float, start: Array, end: Array) -> tuple[coal.CollisionGeometry, pin.SE3]:
     """A capsule from ``start`` to ``end``; Coal's lies along z about its middle and takes the segment's length."""
     length = float(np.linalg.norm(end - start))
     along = (end - start) / length if length > 0 else np.array([0.0, 0.0, 1.0])

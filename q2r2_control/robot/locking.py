@@ -10,6 +10,7 @@ import numpy as np
 import pinocchio as pin
 
 from q2r2_control.robot.description import joint_limits
+from q2r2_control.types import Array
 
 
 def joint_origin(joint: ET.Element) -> pin.SE3:
@@ -47,10 +48,15 @@ def resting_position(joint: ET.Element) -> float:
     return min(max(0.0, lower), upper)
 
 
-def _displacement(joint: ET.Element, position: float) -> pin.SE3:
+def joint_axis(joint: ET.Element) -> Array:
+    """Unit vector (3,) that a joint turns about or slides along, in its own frame."""
     element = joint.find("axis")
     axis = np.array([float(part) for part in ("" if element is None else element.get("xyz", "")).split()] or [1, 0, 0])
-    axis = axis / np.linalg.norm(axis)
+    return np.asarray(axis / np.linalg.norm(axis))
+
+
+def _displacement(joint: ET.Element, position: float) -> pin.SE3:
+    axis = joint_axis(joint)
     if joint.get("type") == "prismatic":
         return pin.SE3(np.eye(3), position * axis)
     return pin.SE3(pin.AngleAxis(math.remainder(position, 2 * math.pi), axis).matrix(), np.zeros(3))

@@ -92,7 +92,7 @@ def _disabled(
     """Pairs of links of one arm with its tool that need no watching, in the order of the chain, by reason."""
     cell, prefix = compose(config), f"{_SIDE}_"
     exclusions = [ET.Element("disable_default_collisions", link=prefix + link) for link in hidden]
-    robot = Robot(parse_urdf(cell.urdf, cell.name), exclusions, cell.tool_frames, cell.home, cell.name)
+    robot = Robot(parse_urdf(cell.urdf, cell.name), exclusions, cell.tool_frames, cell.home, cell.name, cell.parts)
     reasons = {frozenset(map(link_of, pair)): "Always" for pair in robot.ignored_pairs}
     for pair in nearest_approaches(robot, samples, seed, progress):
         reasons[frozenset((pair.link_a, pair.link_b))] = "Never" if pair.nearest > clearance else "watched"
@@ -117,5 +117,5 @@ def _enveloped(tool: Description | None) -> tuple[str, ...]:
 def _tool_srdf(tool: Description, disabled: list[Disabled]) -> str:
     comment = "Made by q2r2 check with its option model-pairs."
     if hidden := _enveloped(tool):
-        comment += " The envelope stands for hand and fingers, so that no distance depends on where the fingers are."
+        comment += " The envelopes stand for hand and fingers, so that no distance depends on where the fingers are."
     return srdf_text(tool.name, comment, disabled, hidden)

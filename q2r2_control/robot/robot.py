@@ -17,8 +17,10 @@ from q2r2_control.errors import ConfigError, RobotError
 from q2r2_control.robot.compose import compose
 from q2r2_control.robot.description import LinkTree, joint_limits, parse_srdf, parse_urdf
 from q2r2_control.robot.enclose import enclose_shapes
+from q2r2_control.robot.finger_bodies import sweep_fingers
 from q2r2_control.robot.floor import remove_unreachable_floor_pairs, sink_boxes_into_floor
 from q2r2_control.robot.joint_accelerations import acceleration_limit
+from q2r2_control.robot.link_roles import KnownParts, Role, roles_of
 from q2r2_control.robot.locking import lock_joints
 from q2r2_control.robot.pairs import (
     add_movable_pairs,
@@ -75,8 +77,8 @@ class Robot:
 
     ``collision_model`` holds exactly the monitored pairs: each arm against the other with its base, against its own
     links that can meet, and against what stands in the cell. Every monitored shape is a capsule, a sphere, or a box
-    fixed in the world. ``ignored_pairs`` names pairs of one arm's own shapes that overlap by construction and are not
-    monitored.
+    fixed in the world; a finger that slides is all that it sweeps. ``roles`` says what each link is. ``ignored_pairs``
+    names pairs of one arm's own shapes that overlap by construction and are not monitored.
     """
 
     def __init__(
@@ -86,9 +88,11 @@ class Robot:
         tool_frames: Mapping[str, str],
         home: Mapping[str, float],
         where: str,
+        parts: KnownParts | None = None,
     ) -> None:
         tree = LinkTree(urdf, where)
         chains = {name: _checked_chain(tree, name, frame, where) for name, frame in tool_frames.items()}
+        parts = parts or KnownParts.carried_by(tree, chains)
         self.name: str = urdf.get("name", "robot")
         self.urdf: str = ET.tostring(urdf, encoding="unicode")
         self.model, self.collision_model = _models(urdf, chains, home, where)
@@ -99,6 +103,7 @@ class Robot:
                 tool_frame=frame,
                 frame_id=int(self.model.getFrameId(frame, pin.FrameType.BODY)),
                 joints=np.array([self.model.joints[self.model.getJointId(joint)].idx_v for joint in chains[name]]),
+                finger_joints=parts.finger_joints.get(name, ()),
             )
             for name, frame in tool_frames.items()
         }
@@ -110,7 +115,11 @@ class Robot:
         joints = {joint.get("name", ""): joint for joint in urdf.findall("joint")}
         self.acceleration_limit: Array = np.array([acceleration_limit(joints[name]) for name in self.joint_names])
         _set_rotors(self.model, urdf)
-        self.ignored_pairs = self._monitor(tree, exclusions)
+        own_links = {name: set(tree.path(arm.tool_frame)) | self._moved_links(arm) for name, arm in self.arms.items()}
+        self.roles: dict[str, Role] = roles_of(tree, own_links, parts)
+        enclose_shapes(self.collision_model)
+        sweep_fingers(self.model, self.collision_model, tree, parts, home)
+        self.ignored_pairs = self._monitor(tree, exclusions, list(own_links.values()))
         self._data: pin.Data = self.model.createData()
         self._collision_data: pin.GeometryData = self.collision_model.createData()
 
@@ -119,10 +128,10 @@ class Robot:
         """The robot of a cell. Raises :class:`ConfigError` or :class:`RobotError` with what is wrong and where."""
         cell = compose(config)
         urdf = parse_urdf(cell.urdf, cell.name)
-        robot = cls(urdf, parse_srdf(cell.srdf, cell.name), cell.tool_frames, cell.home, cell.name)
+        robot = cls(urdf, parse_srdf(cell.srdf, cell.name), cell.tool_frames, cell.home, cell.name, cell.parts)
         for name, arm in robot.arms.items():
             swivel = _swivel(config, name, cell.arm_joints[name], cell.prefixes[name])
-            robot.arms[name] = replace(arm, swivel=swivel, finger_joints=cell.finger_joints[name])
+            robot.arms[name] = replace(arm, swivel=swivel)
         return robot
 
     @classmethod
@@ -131,9 +140,11 @@ class Robot:
     ) -> Robot:
         """A robot from any URDF, given as file or text.
 
-        ``arms`` maps an arm's name to its tool frame, a link of the URDF. Home is 0 for each joint, or the middle of
-        its range where 0 is outside. ``srdf`` (file or text) says which pairs need no watching; without one, links of
-        one arm that overlap at home are taken to overlap by construction. Raises :class:`RobotError`.
+        ``arms`` maps an arm's name to its tool frame, a link of the URDF; other joints that an arm carries move its
+        fingers, and the links that these hang on are its tool. No link is known as an obstacle. Home is 0 for each
+        joint, or the middle of its range where 0 is outside. ``srdf`` (file or text) says which pairs need no watching;
+        without one, links of one arm that overlap at home are taken to overlap by construction. Raises
+        :class:`RobotError`.
         """
         text, where, folder = _text_of(path_or_xml, "URDF text")
         urdf = parse_urdf(text, where, folder)
@@ -164,9 +175,10 @@ class Robot:
         pin.computeDistances(self.model, self._data, self.collision_model, self._collision_data, q)
         return np.array([result.min_distance for result in self._collision_data.distanceResults], dtype=np.float64)
 
-    def _monitor(self, tree: LinkTree, exclusions: Iterable[ET.Element] | None) -> tuple[tuple[str, str], ...]:
+    def _monitor(
+        self, tree: LinkTree, exclusions: Iterable[ET.Element] | None, own_links: Sequence[set[str]]
+    ) -> tuple[tuple[str, str], ...]:
         """Choose the pairs; returns those of one arm that overlap by construction and are left out."""
-        enclose_shapes(self.collision_model)
         sink_boxes_into_floor(self.collision_model)
         add_movable_pairs(self.model, self.collision_model, tree)
         remove_unreachable_floor_pairs(self.model, self.collision_model)
@@ -177,7 +189,6 @@ class Robot:
             # Who lists the pairs is believed: only what overlaps everywhere is dropped, since it can never be parted.
             random = np.random.default_rng(0)
             postures += [random.uniform(self.position_lower, self.position_upper) for _ in range(50)]
-        own_links = [set(tree.path(arm.tool_frame)) | self._moved_links(arm) for arm in self.arms.values()]
         return remove_overlapping_own_pairs(self.model, self.collision_model, own_links, postures)
 
     def _moved_links(self, arm: Arm) -> set[str]:

@@ -15,6 +15,8 @@ import pinocchio as pin
 
 from q2r2_control.config import Config
 from q2r2_control.control.controller import CartesianController
+from q2r2_control.robot.kept_distances import kept_distances
+from q2r2_control.robot.pairs import pair_names
 from q2r2_control.robot.robot import Robot
 from q2r2_control.supervision.joint_watch import WatchSettings
 from q2r2_control.supervision.target_stream import StreamSettings, apart
@@ -29,7 +31,7 @@ _FOLLOW = {"posture_gain": 10.0, "posture_speed": 1.5, "manipulability_gain": 0.
 class ExternalSettings:
     """What is allowed of arms that another controller moves; may be changed at run time."""
 
-    tolerance: float = 0.01  # measured pairs may be closer than the least distance by this [m]
+    tolerance: float = 0.01  # measured pairs may be closer by this than they are kept apart [m]
 
 
 def settings_for_external_arms(config: Config) -> Config:
@@ -54,6 +56,7 @@ class ExternalArms:
     ) -> None:
         self._robot, self._controller, self._settings = robot, controller, settings
         self._streams, self._watch = streams, watch
+        self._kept = kept_distances(robot, controller.settings)
         self._near_at: dict[str, float] = {}  # when an arm's tool was last seen near [s]
         self._held: dict[str, pin.SE3] = {}
         self._v: Array = np.zeros_like(robot.home)
@@ -97,12 +100,13 @@ class ExternalArms:
 
     def too_close(self, state: RobotState) -> str | None:
         """One line where a measured pair is closer than allowed, else None."""
-        least = self._controller.settings.min_distance
-        allowed = least - self._settings.tolerance
-        if self._robot.distance_values(state.q).min() >= allowed:
+        distances, kept = self._robot.distance_values(state.q), self._kept
+        if (distances - kept.values).min(initial=np.inf) >= -self._settings.tolerance:
             return None
-        pair = min(self._robot.distances(state.q), key=lambda each: each.distance)
+        tightest = int(np.argmin(distances - kept.values))
+        least, tolerance = kept.values[tightest], self._settings.tolerance
+        names = "|".join(pair_names(self._robot.collision_model)[tightest])
         return (
-            f"measured: {pair.name_a}|{pair.name_b} are {pair.distance:.4f} m apart; allowed: {allowed:.4f}, "
-            f"min_distance {least:g} less distance_tolerance {self._settings.tolerance:g}"
+            f"measured: {names} are {distances[tightest]:.4f} m apart; allowed: {least - tolerance:.4f}, "
+            f"{kept.keys[tightest]} {least:g} less distance_tolerance {tolerance:g}"
         )

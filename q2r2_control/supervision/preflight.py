@@ -5,6 +5,7 @@ from __future__ import annotations
 from q2r2_control.config.control import ControllerSettings
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.robot.floor import FLOOR
+from q2r2_control.robot.kept_distances import KeptDistances, kept_distances
 from q2r2_control.robot.pairs import link_of
 from q2r2_control.robot.robot import PairDistance, Robot
 from q2r2_control.types import Array
@@ -15,11 +16,12 @@ def preflight_faults(
 ) -> tuple[str, ...]:
     """One line for each reason why ``robot`` should not start at home; empty for a cell that may run.
 
-    Looked at are position limits with their margin, every monitored pair against ``min_distance``, and whether the
-    ``controller`` knows a certified stop at home; without one (None: it moves nothing here) only the first two.
+    Looked at are position limits with their margin, every monitored pair against the distance that it keeps, and
+    whether the ``controller`` knows a certified stop at home; without one (None: it moves nothing here) only the first
+    two.
     The controller is left reset at home.
     """
-    too_close = _closer_than_allowed(robot, robot.home, settings.min_distance)
+    too_close = _closer_than_allowed(robot, robot.home, kept_distances(robot, settings))
     faults = [*_outside_limits(robot, robot.home, settings.position_margin), *too_close]
     if controller is not None and not too_close:  # a pair that is too close leaves no certificate, and says more
         faults += _without_certificate(controller)
@@ -35,12 +37,13 @@ def _outside_limits(robot: Robot, home: Array, margin: float) -> list[str]:
     ]
 
 
-def _closer_than_allowed(robot: Robot, home: Array, min_distance: float) -> list[str]:
+def _closer_than_allowed(robot: Robot, home: Array, kept: KeptDistances) -> list[str]:
+    pairs = zip(robot.distances(home), kept.values.tolist(), kept.keys, strict=True)
     return [
         f"home: {pair.name_a} and {pair.name_b} are {1e3 * pair.distance:.1f} mm apart; "
-        f"allowed: at least min_distance, {1e3 * min_distance:.1f} mm{_way_out(pair)}"
-        for pair in sorted(robot.distances(home), key=lambda pair: pair.distance)
-        if pair.distance < min_distance
+        f"allowed: at least {key}, {1e3 * least:.1f} mm{_way_out(pair)}"
+        for pair, least, key in sorted(pairs, key=lambda found: found[0].distance)
+        if pair.distance < least
     ]
 
 
@@ -57,5 +60,5 @@ def _without_certificate(controller: CartesianController) -> list[str]:
     controller.reset(home)
     if report.certified:
         return []
-    nearest = f"{' | '.join(report.closest_pair)} at {1e3 * report.closest_distance:.1f} mm"
-    return [f"home: the controller knows no certified stop from here; nearest pair: {nearest}"]
+    tightest = f"{' | '.join(report.tightest_pair)}, {1e3 * report.margin:.1f} mm farther apart than it has to be"
+    return [f"home: the controller knows no certified stop from here; tightest pair: {tightest}"]

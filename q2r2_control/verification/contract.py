@@ -15,8 +15,10 @@ import numpy as np
 import numpy.typing as npt
 
 from q2r2_control.config.control import ControllerSettings
+from q2r2_control.robot.kept_distances import kept_distances
+from q2r2_control.robot.pairs import pair_names
 from q2r2_control.robot.robot import Robot
-from q2r2_control.types import LONGEST_DT, Array, Reference
+from q2r2_control.types import LONGEST_DT, Array, Reference, StepReport
 
 _NEWEST = 5000  # ticks whose accelerations are kept
 _ROUNDING = 4.0 * np.finfo(np.float64).eps  # of a difference, relative to the numbers
@@ -39,9 +41,9 @@ _PROMISES = {  # key: name, unit, and what its value has to be
     "deceleration": ("deceleration of the stop / limit", "", "<=", 1.0 + _RELATIVE),
     "jump": ("travel in a tick / what v allows", "", "<=", 1.0),
     "parabola": ("off constant acceleration or the stop", "rad", "<=", 1e-11),
-    "distance": ("distance - min_distance, at ticks", "m", ">=", 0.0),
-    "between": ("distance - min_distance, between ticks", "m", ">=", -_COAL),
-    "stop": ("distance - min_distance, full stops", "m", ">=", -_COAL),
+    "distance": ("distance - kept distance, at ticks", "m", ">=", 0.0),
+    "between": ("distance - kept distance, between ticks", "m", ">=", -_COAL),
+    "stop": ("distance - kept distance, full stops", "m", ">=", -_COAL),
     "stop_position": ("room to position limits, full stops", "rad", ">=", -_RELATIVE),
     "coal": ("reported distance off Coal's", "m", "<=", _COAL),
     "bystanders": ("pairs apart while others recover", "m", ">=", -_COAL),
@@ -131,7 +133,9 @@ class Contract:
         self._v_max = robot.velocity_limit * settings.velocity_scale
         self._lower = robot.position_lower + settings.position_margin
         self._upper = robot.position_upper - settings.position_margin
-        self._min_distance = settings.min_distance
+        self._kept = kept_distances(robot, settings).values
+        pairs = map(frozenset, pair_names(robot.collision_model))
+        self._kept_by_name = dict(zip(pairs, self._kept.tolist(), strict=True))
         self._substep = settings.max_substep
         self.start(robot.home if q is None else q, v)
 
@@ -143,12 +147,12 @@ class Contract:
         self._excess = self._excess_of(v)
         self._can_stop = self._stops_inside(q, v)
         self._slow = self._excess == 0.0
-        distances = self._robot.distance_values(q)
+        margins = self._margins(q)
         self._from_rest = not v.any()
-        self._apart = (distances >= self._min_distance) & self._from_rest
+        self._apart = (margins >= 0.0) & self._from_rest
         # Whether a certificate has to be known from now on. A start at rest with all apart is its own.
         self._certain = self._from_rest and bool(self._apart.all())
-        self._least = float(distances.min(initial=np.inf)) if self._certain else -np.inf
+        self._least = float(margins.min(initial=np.inf)) if self._certain else -np.inf
         self._newest: deque[tuple[float, float]] = deque(maxlen=_NEWEST)  # duration [s], duration times |a|^2
 
     def check(
@@ -184,10 +188,10 @@ class Contract:
                 if failed:
                     self._check_stopped(q, v, h, report.fallback)
             self._check_limits(q, v)
-            self._check_distance(report.closest_distance, report.certified)
+            self._check_distance(self._margin_of(report), report.certified)
             stop = self._controller.stop_deceleration
             self._note("deceleration", float((stop / self._a).max()))
-            self._sample(q, v, stop, h, report.closest_distance)
+            self._sample(q, v, stop, h, report)
             self._count(reference, h)
             self._q, self._v, self._stop = q, v, stop
         self.ticks += 1
@@ -275,9 +279,15 @@ class Contract:
         inside = (np.minimum(q, end) >= self._lower) & (np.maximum(q, end) <= self._upper)
         return np.asarray(inside, dtype=np.bool_)
 
+    def _margin_of(self, report: StepReport) -> float:
+        """Least margin that a report tells of, the nearest pair judged by what it has to keep here [m]."""
+        nearest = report.closest_distance - self._kept_by_name.get(frozenset(report.closest_pair), 0.0)
+        return min(report.margin, nearest)
+
     def _check_distance(self, least: float, certified: bool) -> None:
-        if self._certain or (self._from_rest and self._least >= self._min_distance):
-            self._note("distance", least - self._min_distance)
+        """``least`` is the least margin of a pair [m]."""
+        if self._certain or (self._from_rest and self._least >= 0.0):
+            self._note("distance", least)
         elif self._from_rest and self._least > -np.inf:
             self._note("approach", self._least - least)
         if self._certain:
@@ -285,21 +295,23 @@ class Contract:
         self._certain |= certified
         self._least = least
 
-    def _sample(self, q: Array, v: Array, stop: Array, h: float, least: float) -> None:
+    def _sample(self, q: Array, v: Array, stop: Array, h: float, report: StepReport) -> None:
         """Measure distances that the controller did not measure itself."""
         draw = 0.0 if self._sample_all else self._random.random()
         if draw < _BETWEEN_SHARE:
             values = self._robot.distance_values(q)
-            if values.min(initial=np.inf) > 0.0:  # Coal's penetration depth is another quantity
-                self._note("coal", abs(float(values.min()) - least) if len(values) else 0.0)
+            margins = values - self._kept
+            if len(values) and values.min() > 0.0:  # Coal's penetration depth is another quantity
+                self._note("coal", abs(float(values.min()) - report.closest_distance))
+                self._note("coal", abs(float(margins.min()) - report.margin))
             if not self._certain and self._apart.any():
-                self._note("bystanders", float(values[self._apart].min()) - self._min_distance)
+                self._note("bystanders", float(margins[self._apart].min()))
             if self._certain and 0.0 < h <= self._substep:
-                self._note("between", self._least_between(v, h) - self._min_distance)
+                self._note("between", self._least_between(v, h))
         if draw < _STOP_SHARE and self._certain:
             duration = float(np.max(np.abs(v) / stop))
             times = duration * (np.arange(_STOP_SAMPLES) + self._random.random()) / _STOP_SAMPLES
-            self._note("stop", self._least_of(self._braked(q, v, stop, times[:, None])[0]) - self._min_distance)
+            self._note("stop", self._least_of(self._braked(q, v, stop, times[:, None])[0]))
         if draw < _STOP_SHARE and self._can_stop.all():
             end = q + v * np.abs(v) / (2.0 * stop)
             self._note("stop_position", float(np.minimum(end - self._lower, self._upper - end).min()))
@@ -311,4 +323,9 @@ class Contract:
         return self._least_of(self._braked(self._q, self._v, self._stop, times)[0])
 
     def _least_of(self, postures: Array) -> float:
-        return min(float(self._robot.distance_values(q).min(initial=np.inf)) for q in postures)
+        """Least margin of a pair at any of ``postures`` (s, nv) [m]."""
+        return min(float(self._margins(q).min(initial=np.inf)) for q in postures)
+
+    def _margins(self, q: Array) -> Array:
+        """How much farther apart than it has to be every pair is (p,) [m]."""
+        return self._robot.distance_values(q) - self._kept

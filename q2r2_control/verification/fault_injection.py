@@ -29,6 +29,7 @@ _TIMINGS = {  # share of the segments
 _INVALID_DT: tuple[Any, ...] = (0.0, -0.001, math.nan, math.inf, -math.inf, None, "soon", 0.2, 5.0)
 _STARTS = ("home", "apart", "anywhere", "outside", "at limits", "moving", "too fast", "in penetration")
 LATE = 1.0  # [s]
+_DEEPEST = -0.03  # distance of a pair at a start in penetration [m]
 
 
 class FaultySolver:
@@ -92,9 +93,9 @@ class Segment:
         return f"{self.targets}, dt {self.timing}{start}{fault}"
 
 
-def segments(robot: Robot, min_distance: float, random: np.random.Generator) -> Iterator[Segment]:
-    """Endless; the first one starts at home."""
-    adversary, starts = Adversary(robot, random), Starts(robot, min_distance, random)
+def segments(robot: Robot, kept: Array, random: np.random.Generator) -> Iterator[Segment]:
+    """Endless; the first one starts at home. ``kept`` (p,) is how far each pair stays apart [m]."""
+    adversary, starts = Adversary(robot, random), Starts(robot, kept, random)
     start: Start | None = starts.draw("home")
     while True:
         timing = str(random.choice(list(_TIMINGS), p=list(_TIMINGS.values())))
@@ -133,8 +134,8 @@ def _ticks(timing: str, random: np.random.Generator) -> Callable[[], Any]:
 class Starts:
     """Draws what a controller is reset to."""
 
-    def __init__(self, robot: Robot, min_distance: float, random: np.random.Generator) -> None:
-        self._robot, self._min_distance, self._random = robot, min_distance, random
+    def __init__(self, robot: Robot, kept: Array, random: np.random.Generator) -> None:
+        self._robot, self._kept, self._random = robot, kept, random
 
     def draw(self, name: str) -> Start:
         """A start of one of the kinds; at rest but for "moving" and "too fast"."""
@@ -164,14 +165,15 @@ class Starts:
     def _posture(self) -> Array:
         return self._random.uniform(self._robot.position_lower, self._robot.position_upper)
 
-    def _least(self, q: Array) -> float:
-        return float(self._robot.distance_values(q).min(initial=np.inf))
+    def _margin(self, q: Array) -> float:
+        """Least distance beyond what a pair keeps [m]."""
+        return float((self._robot.distance_values(q) - self._kept).min(initial=np.inf))
 
     def _apart(self) -> Array:
         """A random posture with all pairs apart; home where none is found soon."""
         for _ in range(50):
             q = self._posture()
-            if self._least(q) >= self._min_distance:
+            if self._margin(q) >= 0.0:
                 return q
         return self._robot.home.copy()
 
@@ -179,14 +181,15 @@ class Starts:
         """A posture between home and a random one in penetration, where the distance has just become too small."""
         far = self._posture()
         for _ in range(50):
-            if self._least(far) < 0.0:
+            if self._robot.distance_values(far).min(initial=np.inf) < 0.0:
                 break
             far = self._posture()
-        wanted = self._random.uniform(-0.03, self._min_distance)
+        wanted = self._random.uniform(_DEEPEST - self._kept.max(initial=0.0), 0.0)
         low, high = 0.0, 1.0
         for _ in range(12):
             share = 0.5 * (low + high)
-            closer = self._least(self._robot.home + share * (far - self._robot.home)) < wanted
+            distances = self._robot.distance_values(self._robot.home + share * (far - self._robot.home))
+            closer = (distances < np.maximum(self._kept + wanted, _DEEPEST)).any()
             low, high = (low, share) if closer else (share, high)
         q: Array = self._robot.home + high * (far - self._robot.home)
         return q

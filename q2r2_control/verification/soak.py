@@ -16,6 +16,7 @@ from q2r2_control.config import Config
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.control.qp import make_solver
 from q2r2_control.errors import ConfigError
+from q2r2_control.robot.kept_distances import kept_distances
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, Reference
 from q2r2_control.verification.adversary import Request
@@ -135,7 +136,8 @@ class Soak:
         """The segment of each tick and the tick within it; the controller is reset where a segment has a start."""
         left = ticks
         robot, settings = self._controller.robot, self._controller.settings
-        for segment in segments(robot, settings.min_distance, np.random.default_rng([self._seed, 0])):
+        kept = kept_distances(robot, settings).values
+        for segment in segments(robot, kept, np.random.default_rng([self._seed, 0])):
             self._counts["segments"] += 1
             if segment.start is not None:
                 self._reset(segment.start.q, segment.start.v)

@@ -28,7 +28,7 @@ class History:
         self._used = 0
         self._interval = _FIRST_INTERVAL
         self._due = 0.0
-        self._distance: float
+        self._margin: float
         self._velocity: float
         self._acceleration: float
         self._forget_extremes()
@@ -36,7 +36,7 @@ class History:
     def __call__(self, tick: Tick) -> None:
         """Listen to one tick."""
         reference = tick.reference
-        self._distance = min(self._distance, reference.report.closest_distance)
+        self._margin = min(self._margin, reference.report.margin)
         self._velocity = max(self._velocity, float(np.abs(reference.v * self._inverse_velocity_limit).max()))
         self._acceleration = max(
             self._acceleration, float(np.abs(reference.a * self._inverse_acceleration_limit).max())
@@ -47,7 +47,7 @@ class History:
         if self._used == len(self._rows):
             self._thin_out()
         row = self._rows[self._used]
-        row[:4] = tick.t, self._distance, self._velocity, self._acceleration
+        row[:4] = tick.t, self._margin, self._velocity, self._acceleration
         row[4 : 4 + self._nv] = tick.state.q
         for index, arm in enumerate(self.robot.arms):
             row[self._columns(index)] = _arm_figures(tick, arm)
@@ -60,8 +60,8 @@ class History:
         return self._rows[: self._used, 0]
 
     @property
-    def distance(self) -> Array:
-        """(n,) of the nearest pair [m]."""
+    def margin(self) -> Array:
+        """(n,) distance of the tightest pair less the one that it keeps [m]."""
         return self._rows[: self._used, 1]
 
     @property
@@ -111,7 +111,7 @@ class History:
         return slice(first, first + _ARM_COLUMNS)
 
     def _forget_extremes(self) -> None:
-        self._distance, self._velocity, self._acceleration = np.inf, 0.0, 0.0
+        self._margin, self._velocity, self._acceleration = np.inf, 0.0, 0.0
 
     def _thin_out(self) -> None:
         even, odd = self._rows[0::2], self._rows[1::2]

@@ -20,14 +20,14 @@ _REFRESH_RATE = 6.0  # [Hz]
 # The drawing thread gives the interpreter back to the control loop after this long [s].
 _SWITCH_INTERVAL = 2e-4
 _LIMITS_SHOWN = 4
+_NEAR = 0.01  # a pair with less to spare is coloured [m]
 
 
 class LiveTable:
     """Shows the newest tick of a run. A separate thread draws; a tick only stores a reference."""
 
-    def __init__(self, title: str, min_distance: float) -> None:
+    def __init__(self, title: str) -> None:
         self._title = title
-        self._min_distance = min_distance
         self._newest: Tick | None = None
         self._count = 0
         self._binding: dict[str, None] = {}
@@ -66,12 +66,12 @@ class LiveTable:
             table.add_row(name, *values)
         table.add_section()
         report = tick.reference.report
-        distance = 1e3 * report.closest_distance
-        colour = "yellow" if report.closest_distance < self._min_distance + 0.01 else "default"
+        colour = "yellow" if report.margin < _NEAR else "default"
         binding, self._binding = list(self._binding), {}
         rows = {
             "time, loop": (f"{tick.t:.1f} s", f"{rate:.0f} Hz, {1e6 * tick.compute_time:.0f} us a tick"),
-            "nearest pair": (f"[{colour}]{distance:.1f} mm[/]", " | ".join(report.closest_pair)),
+            "nearest pair": (f"{1e3 * report.closest_distance:.1f} mm", " | ".join(report.closest_pair)),
+            "tightest pair": (f"[{colour}]{1e3 * report.margin:.1f} mm to spare[/]", " | ".join(report.tightest_pair)),
             "status": (str(report.status), "a stop is certified" if report.certified else "[red]no certified stop[/]"),
             "limits at work": (str(len(binding)), _some(binding)),
         }

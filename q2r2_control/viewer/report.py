@@ -24,8 +24,8 @@ _CLOSED = 0.95  # a gripper's opening below which it is drawn as closed
 _LABEL_ROOM = 0.09  # between two labels beside the joints' plot, in its units
 
 
-def draw_report(history: History, summary: RunSummary, min_distance: float, title: str, file: Path) -> None:
-    """Write the plots of ``history`` to ``file``; ``min_distance`` [m] is drawn as a limit."""
+def draw_report(history: History, summary: RunSummary, title: str, file: Path) -> None:
+    """Write the plots of ``history`` to ``file``."""
     # Imported here, since it takes longer than all else that a command without a report needs.
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -44,7 +44,7 @@ def draw_report(history: History, summary: RunSummary, min_distance: float, titl
         axes.set_ylim(min(low for low, _ in limits), max(high for _, high in limits))
     _draw_errors(grid[1, 0], history, arms, "position")
     _draw_errors(grid[1, 1], history, arms, "rotation")
-    _draw_distance(grid[2, 0], history, min_distance)
+    _draw_margin(grid[2, 0], history)
     _draw_ratios(grid[2, 1], history)
     for axes in grid.flat:
         axes.grid(alpha=0.3)
@@ -110,15 +110,14 @@ def _draw_errors(axes: Axes, history: History, arms: list[str], kind: str) -> No
     axes.legend(loc="best", fontsize=8)
 
 
-def _draw_distance(axes: Axes, history: History, min_distance: float) -> None:
-    distance = np.where(np.isfinite(history.distance), 1e3 * history.distance, np.nan)
-    lowest = float(np.nanmin(distance, initial=0.0))
-    axes.plot(history.t, distance, color="#3b7d3b", label="nearest monitored pair")
-    axes.axhspan(min(0.0, lowest), 1e3 * min_distance, color=_LIMIT, alpha=0.08, linewidth=0)
-    _draw_limit(axes, 1e3 * min_distance, f"min_distance {1e3 * min_distance:g} mm")
-    axes.set_title("distance of the nearest monitored pair")
-    axes.set_ylabel("distance [mm]")
-    axes.set_ylim(bottom=min(0.0, lowest))
+def _draw_margin(axes: Axes, history: History) -> None:
+    margin = np.where(np.isfinite(history.margin), 1e3 * history.margin, np.nan)
+    lowest = float(np.nanmin(margin, initial=0.0))
+    axes.plot(history.t, margin, color="#3b7d3b", label="tightest monitored pair")
+    _draw_limit(axes, 0.0, "limit")
+    axes.set_title("distance of monitored pairs beyond what they keep")
+    axes.set_ylabel("distance to spare [mm]")
+    axes.set_ylim(bottom=min(-2.0, lowest))
     axes.legend(loc="best", fontsize=8)
 
 

@@ -16,7 +16,7 @@ OPTIONS = (*FAST[2:], "--duration", "0.1")
 @pytest.mark.parametrize(
     ("old", "new", "fault"),
     [
-        pytest.param("home: [0.0204, 0.348,", "home: [0.0204, 1.0,", "left_hand_e_envelope_1 and table_0", id="table"),
+        pytest.param("home: [0.0204, 0.348,", "home: [0.0204, 1.0,", "left_hand_e_envelope_0 and table_0", id="table"),
         pytest.param("0.0204, 0.348,", "0.0204, 2.09,", "left_A2 = 2.09; allowed: -2.0844 .. 2.0844", id="limits"),
     ],
 )

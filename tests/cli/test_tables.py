@@ -7,13 +7,12 @@ from dataclasses import replace
 
 from rich.console import Console
 
-from q2r2_control.cli.cell_report import ArmCheck, JointCheck, PairsWritten, check_cell
+from q2r2_control.cli.cell_report import ArmCheck, JointCheck, KeptPair, PairsWritten, check_cell
 from q2r2_control.cli.summary_table import summary_table
 from q2r2_control.cli.tables import arm_table, pair_reach_table, pair_table
 from q2r2_control.config import load_config
 from q2r2_control.pipeline import Pipeline
 from q2r2_control.robot.reachability import PairReach
-from q2r2_control.robot.robot import PairDistance
 
 
 def printed(table: object, width: int = 120) -> str:
@@ -42,10 +41,11 @@ def test_names_of_joints_and_links_are_whole_in_80_columns() -> None:
     for figure in ("-12.566", "-1.234", "10.472", "320.000"):
         assert figure in text
     check = check_cell(load_config("config/dual_iiwa7.yaml"))
-    pair = PairDistance(f"{side}_link_1_0", f"right_{side}_link_with_a_still_longer_name_0", 0.0416)
+    pair = KeptPair(f"{side}_link_1_0", f"right_{side}_link_with_a_still_longer_name_0", 0.0416, 0.0075)
     text = printed(pair_table(replace(check, nearest=(pair,))), width=80)
     assert joined(text, 0).replace(" ", "") == f"{pair.name_a}|{pair.name_b}"
     assert "41.6" in text
+    assert "7.5" in text
     reach = PairReach(pair.name_a, pair.name_b, 0.123)
     text = printed(pair_reach_table(PairsWritten("a.srdf", 100, 0.05, (reach,), ())), width=80)
     assert joined(text, 0).replace(" ", "") == f"{pair.name_a}|{pair.name_b}"

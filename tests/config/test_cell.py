@@ -29,11 +29,19 @@ from q2r2_control.config.cell import (
     ObstacleConfig,
     load_config,
 )
-from q2r2_control.config.control import AdmittanceSettings, ControllerSettings, ImpedanceSettings, WallSettings
+from q2r2_control.config.control import (
+    AdmittanceSettings,
+    ControllerSettings,
+    DistanceSettings,
+    ImpedanceSettings,
+    NamedPairDistance,
+    WallSettings,
+)
 from q2r2_control.config.external import ExternalArm, ExternalConfig, ExternalGripper, GuardLimits
 from q2r2_control.config.supervision import SupervisionSettings
 from q2r2_control.config.teleop import FilterSettings, GateSettings, LeashSettings, TeleopSettings
 from q2r2_control.errors import ConfigError, Q2R2Error
+from q2r2_control.robot.kept_distances import kept_distances
 from q2r2_control.robot.robot import Robot
 from tests.support.external_cell import external, external_text, robot_text
 
@@ -96,6 +104,7 @@ class TestTheShippedCellShowsAllThereIsToTune:
         ("supervision", SupervisionSettings),
         ("headset", HeadsetConfig),
         ("control", ControllerSettings),
+        ("control.distances", DistanceSettings),
         ("impedance", ImpedanceSettings),
         ("impedance.wall", WallSettings),
         ("admittance", AdmittanceSettings),
@@ -111,12 +120,13 @@ class TestTheShippedCellShowsAllThereIsToTune:
         ("external.arms.left.gripper", ExternalGripper),
     )
     # Not the default, and the file says so.
-    CHOSEN = ("control.solve_time_limit", "mujoco.objects")
+    CHOSEN = ("control.solve_time_limit", "control.distances", "mujoco.objects")
+    IN_A_COMMENT = (NamedPairDistance,)
     # A tool's mount and an obstacle's rpy are placements as an arm's mount is, which shows the keys.
     SHOWN_ELSEWHERE = ("arms.left.tool.mount", "obstacles.table.rpy")
 
     def test_no_model_was_forgotten_here(self) -> None:
-        known = {model for _, model in self.PLACES}
+        known = {model for _, model in self.PLACES} | set(self.IN_A_COMMENT)
         found: set[type[BaseModel]] = set()
 
         def visit(annotation: object) -> None:
@@ -165,6 +175,12 @@ class TestTheShippedCellShowsAllThereIsToTune:
         for key in ("loop_rate_hz", "controller"):
             assert getattr(load_config(CELL), key) == Config.model_fields[key].default
 
+    def test_the_example_of_a_pair_by_name_is_one_that_the_cell_has(self) -> None:
+        (example,) = re.findall(r"pairs: \[\] +# .*such as (\[.*?\}\])", CELL.read_text(encoding="utf-8"))
+        config = Config.model_validate(yaml.safe_load(changed("control.pairs", yaml.safe_load(example))))
+        kept = kept_distances(Robot.from_config(config), config.control)
+        assert "pairs[0]" in kept.keys
+
 
 @pytest.mark.parametrize(
     "path",
@@ -178,6 +194,7 @@ class TestTheShippedCellShowsAllThereIsToTune:
         "obstacles.table.sizes",
         "headset.ports",
         "control.gain",
+        "control.distances.arm_table",
         "impedance.stiffness",
         "impedance.wall.depth",
         "admittance.damping",
@@ -328,6 +345,11 @@ def test_a_misspelt_key_is_named_before_the_one_that_is_missing_for_it(tmp_path:
         ("arms.left.acceleration_limit", [8.65, 5.44], "allowed: limits by joint, such as {A2: 5.4}"),
         ("control.velocity_scale", 100, "less than or equal to 1"),
         ("control.min_distance", 20, "less than or equal to 0.2"),
+        ("control.distances.arm_arm", -0.01, "greater than or equal to 0"),
+        ("control.distances.finger_obstacle", 1, "less than or equal to 0.2"),
+        ("control.pairs", [{"pair": ["a", "b"], "distance": 5}], "less than or equal to 0.2"),
+        ("control.pairs", [{"pair": ["a"], "distance": 0.01}], "missing"),
+        ("control.pairs", [{"pair": ["a", ""], "distance": 0.01}], "at least 1 character"),
         ("impedance.translational_stiffness", -1, "greater than 0"),
         ("impedance.rotational_stiffness", 0, "greater than 0"),
         ("impedance.damping_ratio", 0, "greater than or equal to 0.1"),

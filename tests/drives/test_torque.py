@@ -10,6 +10,7 @@ import pytest
 
 from q2r2_control import CartesianController, Robot, load_config
 from q2r2_control.drives import TorqueDrive
+from q2r2_control.robot.kept_distances import kept_distances
 from q2r2_control.types import CommandMode, Reference, RobotState
 
 DT = 0.004
@@ -61,7 +62,8 @@ def test_the_wall_between_measured_links_is_part_of_the_command(robot: Robot) ->
     # Fold the left arm inwards until a measured pair is closer than allowed.
     q = state.q.copy()
     rng = np.random.default_rng(3)
-    while not 0.0 < robot.distance_values(q).min() < 0.01:
+    kept = kept_distances(robot, load_config("config/dual_iiwa7.yaml").control).values
+    while not (robot.distance_values(q).min() > 0.0 and (robot.distance_values(q) - kept).min() < -0.01):
         q = rng.uniform(robot.position_lower, robot.position_upper)
     near = replace(state, q=q)
     drive.reset(near)

@@ -4,6 +4,7 @@ import xml.etree.ElementTree as ET
 
 import mujoco
 import numpy as np
+import pinocchio as pin
 import pytest
 
 from q2r2_control.config.cell import Config, MujocoConfig, ObjectConfig, ObstacleConfig
@@ -67,7 +68,7 @@ def test_joint_and_torque_limits_are_the_robots(plant: MujocoPlant, robot: Robot
 
 def test_capsules_are_capsules_of_the_urdfs_size(plant: MujocoPlant, urdf: ET.Element) -> None:
     declared = {capsule.get("name") for capsule in urdf.iterfind("link/collision_checking/capsule")}
-    assert len(declared) == 2 * 9
+    assert len(declared) == 2 * (7 + 1 + 2 * 5)
     for collision in urdf.iterfind("link/collision"):
         if collision.get("name") not in declared:
             continue
@@ -82,7 +83,7 @@ def test_capsules_are_capsules_of_the_urdfs_size(plant: MujocoPlant, urdf: ET.El
 
 def test_drawings_and_envelopes_touch_nothing_and_fingers_do(plant: MujocoPlant) -> None:
     names = {plant.model.geom(index).name for index in range(plant.model.ngeom)}
-    assert {"left_link_3_ring", "left_hand_e_fingers_envelope", "right_hand_e_finger_2_contact"} <= names
+    assert {"left_link_3_ring", "left_hand_e_finger_1_tip_1_envelope", "right_hand_e_finger_2_contact"} <= names
     for name in names:
         geom = plant.model.geom(name)
         if name.endswith("_envelope") or ("_link_" in name and not name.endswith(("_capsule", "_sphere"))):
@@ -91,6 +92,38 @@ def test_drawings_and_envelopes_touch_nothing_and_fingers_do(plant: MujocoPlant)
     assert finger.contype[0] == 1
     assert finger.condim[0] >= 4
     assert finger.friction[0] >= 0.8
+
+
+@pytest.mark.parametrize("opening", [0.0, 0.3, 1.0])
+@pytest.mark.parametrize("bend", [-0.3, 0.0, 0.3])
+@pytest.mark.parametrize("turn", [-0.3, 0.0, 0.3])
+def test_what_is_watched_of_the_fingers_reaches_as_low_as_they_do_and_no_2_mm_lower(
+    plant: MujocoPlant, robot: Robot, opening: float, bend: float, turn: float
+) -> None:
+    """Less than half a millimetre where the tool points straight down."""
+    q = robot.home.copy()
+    q[5], q[4] = q[5] + bend, q[4] + turn
+    plant.reset(q)
+    for name in robot.arms["left"].finger_joints:
+        plant.data.joint(name).qpos = 0.025 * opening
+    mujoco.mj_kinematics(plant.model, plant.data)
+    tips = np.inf
+    for number in (1, 2):
+        geom = plant.data.geom(f"left_hand_e_finger_{number}_contact")
+        half = plant.model.geom(f"left_hand_e_finger_{number}_contact").size
+        tips = min(tips, geom.xpos[2] - np.abs(geom.xmat.reshape(3, 3)[2]) @ half)
+    data, geometry_data = robot.model.createData(), robot.collision_model.createData()
+    pin.updateGeometryPlacements(robot.model, data, robot.collision_model, geometry_data, q)
+    watched = min(
+        placement.translation[2] - abs(placement.rotation[2, 2]) * item.geometry.halfLength - item.geometry.radius
+        for item, placement in zip(robot.collision_model.geometryObjects, geometry_data.oMg, strict=True)
+        if item.name.startswith("left_hand_e_finger_1_envelope")
+    )
+    assert watched <= tips
+    if bend == turn == 0.0:
+        assert tips - watched < 0.0005
+    elif opening == 1.0:
+        assert tips - watched < 0.002
 
 
 def test_only_the_blocks_on_the_table_are_in_contact_at_home(plant: MujocoPlant, config: Config) -> None:

@@ -26,7 +26,7 @@ def test_the_cell_names_its_parts_by_side(dual_iiwa7_cell: ComposedCell) -> None
     assert cell.tool_frames == {"left": "left_tool_frame", "right": "right_tool_frame"}
     for side in ("left", "right"):
         assert cell.arm_joints[side] == tuple(f"{side}_A{number}" for number in range(1, 8))
-        assert cell.finger_joints[side] == (f"{side}_finger_joint_1", f"{side}_finger_joint_2")
+        assert cell.parts.finger_joints[side] == (f"{side}_finger_joint_1", f"{side}_finger_joint_2")
         assert cell.home[f"{side}_finger_joint_1"] == 0.025
     assert cell.obstacles == ("table",)
 
@@ -109,7 +109,7 @@ def test_the_tool_frame_is_by_default(arm: dict[str, Any], frame: str) -> None:
 
 def test_joints_that_nobody_drives_are_fixed_as_near_zero_as_they_can() -> None:
     cell = compose(one_arm(model="example-robot-data:panda", home=[0, 0, 0, -1, 0, 1, 0]))
-    assert cell.finger_joints == {"left": ()}
+    assert cell.parts.finger_joints == {"left": ()}
     assert list(cell.home) == list(cell.arm_joints["left"])
     assert list(pin.buildModelFromXML(cell.urdf).names)[1:] == list(cell.arm_joints["left"])
 
@@ -134,7 +134,7 @@ def test_a_joint_that_mimics_a_resting_one_is_fixed_where_that_puts_it(tmp_path:
 def test_a_finger_that_mimics_a_driven_one_moves_with_it() -> None:
     gripper = {"joints": ["panda_finger_joint1"], "open_position": 0.04}
     cell = compose(one_arm(model="example-robot-data:panda", home=[0, 0, 0, -1, 0, 1, 0], gripper=gripper))
-    assert cell.finger_joints == {"left": ("left_panda_finger_joint1",)}
+    assert cell.parts.finger_joints == {"left": ("left_panda_finger_joint1",)}
     assert cell.home["left_panda_finger_joint2"] == 0.04
 
 

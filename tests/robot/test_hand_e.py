@@ -1,4 +1,4 @@
-"""robots/hand_e.urdf: fingers, tool frame, and the envelope that stands for the hand in every distance."""
+"""robots/hand_e.urdf: fingers, tool frame, and the envelopes that stand for the hand in every distance."""
 
 from __future__ import annotations
 
@@ -39,33 +39,46 @@ def _outside(point: Array, capsule: pin.GeometryObject, placement: pin.SE3) -> f
 
 
 @pytest.mark.parametrize("opening", [0.0, 0.005, 0.0125, 0.02, 0.025])
-def test_the_envelope_holds_body_and_fingers_at_every_opening(
+def test_the_envelopes_hold_body_and_fingers_at_every_opening(
     hand: tuple[pin.Model, pin.GeometryModel], opening: float
 ) -> None:
     model, geometry = hand
     data, geometry_data = model.createData(), geometry.createData()
     pin.updateGeometryPlacements(model, data, geometry, geometry_data, np.full(2, opening))
     items = list(zip(geometry.geometryObjects, geometry_data.oMg, strict=True))
-    envelope = [(item, placement) for item, placement in items if "envelope" in item.name]
+    envelopes = [(item, placement) for item, placement in items if "envelope" in item.name]
     contact = [(item, placement) for item, placement in items if "envelope" not in item.name]
-    assert [type(item.geometry) for item, _ in envelope] == [coal.Capsule, coal.Capsule]
+    assert {type(item.geometry) for item, _ in envelopes} == {coal.Capsule}
     assert len(contact) == 3
     for item, placement in contact:
         for point in _points_of(item.geometry):
-            outside = min(_outside(placement.act(point), capsule, where) for capsule, where in envelope)
+            outside = min(_outside(placement.act(point), capsule, where) for capsule, where in envelopes)
             assert outside <= 0, (item.name, placement.act(point))
 
 
-def test_the_envelope_is_tight_at_the_tips(hand: tuple[pin.Model, pin.GeometryModel]) -> None:
-    _, geometry = hand
-    reach = max(
-        item.placement.translation[2]
-        + item.geometry.radius
-        + abs(item.placement.rotation[2, 2]) * item.geometry.halfLength
-        for item in geometry.geometryObjects
-        if "envelope" in item.name
-    )
-    assert FLANGE_TO_TIPS < reach < FLANGE_TO_TIPS + 0.004
+@pytest.mark.parametrize("tilt", [0.0, 0.2, 0.4])
+@pytest.mark.parametrize("axis", ["x", "y"])
+def test_the_envelopes_reach_no_more_than_a_millimetre_beyond_the_tips(
+    hand: tuple[pin.Model, pin.GeometryModel], axis: str, tilt: float
+) -> None:
+    """The lowest point of what is watched and of the fingers themselves, as a hand that points down is tilted."""
+    model, geometry = hand
+    data, geometry_data = model.createData(), geometry.createData()
+    pin.updateGeometryPlacements(model, data, geometry, geometry_data, np.full(2, 0.025))
+    down = pin.utils.rotate(axis, tilt) @ np.array([0.0, 0.0, 1.0])
+    reach = {True: -np.inf, False: -np.inf}  # of envelopes, of the fingers
+    for item, placement in zip(geometry.geometryObjects, geometry_data.oMg, strict=True):
+        is_envelope, shape = "envelope" in item.name, item.geometry
+        along = placement.rotation.T @ down
+        if isinstance(shape, coal.Box):
+            extent = float(np.abs(along) @ shape.halfSide)
+        else:
+            extent = shape.halfLength * abs(along[2]) + (
+                shape.radius if is_envelope else shape.radius * float(np.hypot(*along[:2]))
+            )
+        reach[is_envelope] = max(reach[is_envelope], float(down @ placement.translation) + extent)
+    beyond = reach[True] - reach[False]
+    assert 0.0 <= beyond < (0.0005 if tilt == 0.0 else 0.002)
 
 
 def test_fingers_open_from_closed_to_fifty_millimetres(hand: tuple[pin.Model, pin.GeometryModel]) -> None:

@@ -12,7 +12,8 @@ from q2r2_control.robot.pairs import CLEARANCE, link_of, pair_names
 from q2r2_control.robot.robot import Robot
 from tests.robot.conftest import one_arm
 
-MOVING = [*(f"link_{index}" for index in range(1, 8)), "hand_e_envelope"]
+FINGERS = "hand_e_finger_1_envelope"  # of both: they lie on the same lines
+MOVING = [*(f"link_{index}" for index in range(1, 8)), "hand_e_envelope", FINGERS]
 
 
 def _links(robot: Robot) -> set[frozenset[str]]:
@@ -39,7 +40,8 @@ def test_own_links_that_can_meet_are_watched_and_no_others(dual_iiwa: Robot, sid
     near = [
         ("link_0", "link_2"), ("link_0", "link_3"), ("link_0", "link_4"), ("link_0", "link_5"), ("link_0", "link_6"),
         ("link_0", "link_7"), ("link_0", hand), ("link_1", "link_3"), ("link_1", "link_5"), ("link_1", "link_7"),
-        ("link_1", hand), ("link_2", hand), ("link_3", "link_5"), ("link_5", hand),
+        ("link_1", hand), ("link_2", hand), ("link_3", "link_5"), ("link_5", hand), ("link_0", FINGERS),
+        ("link_1", FINGERS), ("link_2", FINGERS),
     ]  # fmt: skip
     if dual_iiwa.name == "dual_iiwa14":
         near.append(("link_1", "link_6"))
@@ -52,7 +54,7 @@ def test_the_floor_is_watched_against_the_links_that_can_come_near_it_and_no_oth
     dual_iiwa: Robot, side: str
 ) -> None:
     """Link 1 turns about the vertical alone, and link 2 is too short."""
-    reach_it = {f"{side}_link_{index}" for index in range(3, 8)} | {f"{side}_hand_e_envelope"}
+    reach_it = {f"{side}_link_{index}" for index in range(3, 8)} | {f"{side}_hand_e_envelope", f"{side}_{FINGERS}"}
     with_floor = {link for pair in _links(dual_iiwa) if "floor" in pair for link in pair if link.startswith(side)}
     assert with_floor == reach_it
 
@@ -103,9 +105,9 @@ def test_pairs_that_cannot_move_or_are_neighbours_are_not_watched(dual_iiwa: Rob
     assert frozenset((a, b)) not in _links(dual_iiwa)
 
 
-def test_neither_fingers_nor_the_bare_hand_are_watched_because_the_envelope_is(dual_iiwa: Robot) -> None:
-    links = {link for pair in _links(dual_iiwa) for link in pair}
-    assert not {link for link in links if "finger" in link or link.endswith("hand_e_base")}
+def test_neither_bare_fingers_nor_the_bare_hand_are_watched_because_their_envelopes_are(dual_iiwa: Robot) -> None:
+    hands = {link for pair in _links(dual_iiwa) for link in pair if "hand_e" in link}
+    assert hands == {f"{side}_{link}" for side in ("left", "right") for link in ("hand_e_envelope", FINGERS)}
 
 
 @pytest.mark.parametrize("cell", ["dual_iiwa7", "dual_panda"])

@@ -30,8 +30,8 @@ def robot() -> Robot:
 def apart(robot: Robot) -> StepReport:
     """A report that tells of nothing but what is measured at home."""
     nearest = min(robot.distances(robot.home), key=lambda pair: pair.distance)
-    pair = (nearest.name_a, nearest.name_b)
-    return StepReport(StepStatus.OK, (), (), pair, nearest.distance, True, False, 0.0, 0.0)
+    pair, margin = (nearest.name_a, nearest.name_b), nearest.distance - SETTINGS.min_distance
+    return StepReport(StepStatus.OK, (), (), pair, nearest.distance, True, False, 0.0, 0.0, pair, margin)
 
 
 def checked(robot: Robot) -> Any:
@@ -82,7 +82,7 @@ def test_a_broken_promise_is_raised_with_its_name_its_value_and_what_is_allowed(
         ("velocity", {"v": one(10.0)}, {}),
         ("position", {"q": one(4.0)}, {}),
         ("not_finite", {"a": one(np.nan)}, {}),
-        ("distance", {}, {"closest_distance": 0.02 - 1e-12}),
+        ("distance", {}, {"margin": -1e-12}),
         ("uncertified", {}, {"certified": False}),
         ("unreported", {}, {"rejected": ()}),
         ("refused", {}, {"rejected": ("left", "right")}),
@@ -155,7 +155,8 @@ def test_recovering_pairs_never_come_closer_again_and_once_apart_keep_their_dist
     contract = contract_of(robot, q)
 
     def observed(distance: float, certified: bool = False) -> list[str]:
-        report = replace(apart, closest_distance=distance, certified=certified)
+        margin = distance - SETTINGS.min_distance
+        report = replace(apart, closest_distance=distance, margin=margin, certified=certified)
         return list(contract.observe(moved(q, v, 0.0, report), DT))
 
     assert observed(-0.03) == observed(-0.02) == []
@@ -176,9 +177,10 @@ def test_pairs_that_were_apart_stay_apart_while_others_recover(robot: Robot, apa
     assert "bystanders" in broken
 
 
-def test_a_wrong_distance_is_found_by_coal(robot: Robot, apart: StepReport) -> None:
+@pytest.mark.parametrize("reported", ["closest_distance", "margin"])
+def test_a_wrong_distance_is_found_by_coal(robot: Robot, apart: StepReport, reported: str) -> None:
     contract = Contract(checked(robot), sample_all=True)
-    report = replace(apart, closest_distance=apart.closest_distance + 1e-5)
+    report = replace(apart, **{reported: getattr(apart, reported) + 1e-5})
     assert list(contract.observe(moved(robot.home, np.zeros(14), 0.0, report), DT)) == ["coal"]
 
 

@@ -74,7 +74,7 @@ def test_three_thousand_hostile_ticks_break_no_promise(seed: int) -> None:
     assert report.passed
     assert report.resets > 1
     assert report.solver_faults > 0
-    distances = next(margin for margin in report.margins if margin.name == "distance - min_distance, at ticks")
+    distances = next(margin for margin in report.margins if margin.name == "distance - kept distance, at ticks")
     assert distances.checked > 1000
 
 
@@ -125,7 +125,7 @@ def _report(**changes: Any) -> Callable[[Reference], Reference]:
         pytest.param(_raise, "exceptions raised by step", id="an exception"),
         pytest.param(_report(certified=False), "certificates lost", id="a certificate that is lost"),
         pytest.param(
-            _report(closest_distance=0.019), "distance - min_distance, at ticks", id="a distance that is too small"
+            _report(closest_distance=0.019), "distance - kept distance, at ticks", id="a distance that is too small"
         ),
         pytest.param(_report(rejected=("left",)), "usable targets rejected", id="a good target refused"),
     ],
@@ -148,7 +148,7 @@ def test_arms_that_come_too_close_are_found_at_ticks_between_them_and_in_stops()
     """The controller keeps 20 mm where 150 mm are asked for."""
     report = soak(lambda reference: reference, 0, 3000, settings=SETTINGS.model_copy(update={"min_distance": 0.15}))
     promises = {found.promise for found in report.broken}
-    assert {f"distance - min_distance, {when}" for when in ("at ticks", "between ticks", "full stops")} <= promises
+    assert {f"distance - kept distance, {when}" for when in ("at ticks", "between ticks", "full stops")} <= promises
 
 
 def test_a_stop_that_is_due_and_not_executed_is_found() -> None:

@@ -21,9 +21,10 @@ def robot() -> Robot:
 
 
 def tick_at(robot: Robot, t: float, acceleration: float = 0.0, distance: float = 0.1, engaged: bool = True) -> Tick:
-    """A tick whose tools are 3 mm and 0.1 rad from their targets."""
+    """A tick whose tools are 3 mm and 0.1 rad from their targets; the tightest pair keeps 20 mm, the nearest one 0."""
     zero = np.zeros(len(robot.joint_names))
-    report = StepReport(StepStatus.OK, (), (), ("left_link_5_0", "table_0"), distance, True, False, 0.0, 0.0)
+    hand, arms = ("left_hand_0", "table_0"), ("left_link_5_0", "right_link_5_0")
+    report = StepReport(StepStatus.OK, (), (), hand, distance, True, False, 0.0, 0.0, arms, distance - 0.018)
     tools = {arm: robot.tool_pose(robot.home, arm) for arm in robot.arms}
     offset = pin.SE3(pin.exp3(np.array([0.0, 0.1, 0.0])), np.array([0.003, 0.0, 0.0]))
     return Tick(
@@ -56,7 +57,7 @@ def test_peaks_between_rows_are_kept_however_long_the_run_and_rows_stay_bounded(
     for index in (1234, 15_001):
         row = int(np.searchsorted(history.t, 1e-3 * index))
         assert history.acceleration_ratio[row] == pytest.approx(0.7)
-        assert history.distance[row] == pytest.approx(0.021)
+        assert history.margin[row] == pytest.approx(0.003)
     assert (history.acceleration_ratio > 0.0).sum() == 2
 
 

@@ -24,17 +24,19 @@ def drawn(table: LiveTable) -> str:
 
 
 def test_it_shows_states_errors_distances_and_grippers_of_the_newest_tick(robot: Robot) -> None:
-    table = LiveTable("demo", min_distance=0.02)
+    table = LiveTable("demo")
     table(tick_at(robot, 1.0, engaged=False))
     table(tick_at(robot, 2.0, distance=0.0234))
     text = drawn(table)
-    for expected in ("demo", "engaged", "3.0 mm", "5.73 deg", "50 %", "23.4 mm", "left_link_5_0 | table_0", "2.0 s"):
+    for expected in ("demo", "engaged", "3.0 mm", "5.73 deg", "50 %", "23.4 mm", "left_hand_0 | table_0", "2.0 s"):
         assert expected in text
+    assert "5.4 mm to spare" in text
+    assert "left_link_5_0 | right_link_5_0" in text
     assert "paused" not in text
 
 
 def test_it_shows_every_limit_that_was_at_work_since_it_was_drawn_last(robot: Robot) -> None:
-    table = LiveTable("demo", min_distance=0.02)
+    table = LiveTable("demo")
     tick = tick_at(robot, 0.0)
     report = replace(tick.reference.report, binding=("left_A2 velocity",))
     table(replace(tick, reference=replace(tick.reference, report=report)))
@@ -44,7 +46,7 @@ def test_it_shows_every_limit_that_was_at_work_since_it_was_drawn_last(robot: Ro
 
 
 def test_before_the_first_tick_it_says_that_the_run_is_starting() -> None:
-    assert "starting" in drawn(LiveTable("demo", min_distance=0.02))
+    assert "starting" in drawn(LiveTable("demo"))
 
 
 def test_the_interpreters_switch_interval_is_as_before_after_a_fault() -> None:
@@ -52,7 +54,7 @@ def test_the_interpreters_switch_interval_is_as_before_after_a_fault() -> None:
     during = []
 
     def fail() -> None:
-        with LiveTable("demo", 0.02).shown(Console(file=io.StringIO())):
+        with LiveTable("demo").shown(Console(file=io.StringIO())):
             during.append(sys.getswitchinterval())
             raise RuntimeError
 

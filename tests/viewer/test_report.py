@@ -36,7 +36,7 @@ def test_any_run_makes_a_picture(tmp_path: Path, arms: int, engaged: bool, ticks
     for index in range(ticks):
         history(tick_at(robot, 0.01 * index, acceleration=0.1 * index, engaged=engaged, distance=0.5 - 0.003 * index))
     file = tmp_path / "report.png"
-    draw_report(history, summary_of_nothing(robot), 0.02, "a [title] with $signs", file)
+    draw_report(history, summary_of_nothing(robot), "a [title] with $signs", file)
     picture = matplotlib.image.imread(file)
     assert picture.shape[0] > 1000
     assert np.ptp(picture[..., 0]) > 0.9

@@ -1,0 +1,74 @@
+"""How far each monitored pair stays apart: ``control.min_distance``, ``control.distances`` and ``control.pairs``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+
+import numpy as np
+
+from q2r2_control.config.control import ControllerSettings
+from q2r2_control.errors import ConfigError
+from q2r2_control.robot.link_roles import Part, Role
+from q2r2_control.robot.pairs import link_of, pair_names
+from q2r2_control.robot.robot import Robot
+from q2r2_control.types import Array
+
+_OUTERMOST_FIRST = list(Part)
+
+
+@dataclass(frozen=True, slots=True)
+class KeptDistances:
+    """By pair, in the order of ``Robot.distances``."""
+
+    values: Array  # (p,) [m]
+    keys: tuple[str, ...]  # what said so, in the block ``control``: min_distance, distances.arm_arm, pairs[0]
+
+
+def kept_distances(robot: Robot, settings: ControllerSettings) -> KeptDistances:
+    """The distance that every monitored pair of ``robot`` has to keep.
+
+    Raises :class:`ConfigError` for names in ``settings.pairs`` that no monitored pair has.
+    """
+    names = pair_names(robot.collision_model)
+    keys = ["min_distance"] * len(names)
+    values = np.full(len(names), settings.min_distance)
+    for p, (a, b) in enumerate(names):
+        name = pair_class(robot.roles[link_of(a)], robot.roles[link_of(b)])
+        value = getattr(settings.distances, name)
+        if value is not None:
+            values[p], keys[p] = value, f"distances.{name}"
+    for i, named in enumerate(settings.pairs):
+        found = [p for p, pair in enumerate(names) if _are(named.pair, pair)]
+        if not found:
+            raise ConfigError(f"control.pairs[{i}].pair = {list(named.pair)!s:.120}: {_why_none(named.pair, names)}")
+        for p in found:
+            values[p], keys[p] = named.distance, f"pairs[{i}]"
+    return KeptDistances(values, tuple(keys))
+
+
+def pair_class(first: Role, second: Role) -> str:
+    """Key of ``control.distances`` for two links."""
+    parts = sorted((first.part, second.part), key=_OUTERMOST_FIRST.index)
+    same_robot = first.arms & second.arms or not (first.arms and second.arms)
+    if Part.OBSTACLE not in parts and same_robot:
+        return "arm_self"
+    return f"{parts[0]}_{parts[1]}"
+
+
+def _are(patterns: tuple[str, str], pair: tuple[str, str]) -> bool:
+    return any(_is(patterns[0], first) and _is(patterns[1], second) for first, second in (pair, pair[::-1]))
+
+
+def _is(pattern: str, geometry: str) -> bool:
+    """Whether a pattern means a body: its link, or its own name as reports have it."""
+    return fnmatchcase(link_of(geometry), pattern) or fnmatchcase(geometry, pattern)
+
+
+def _why_none(patterns: tuple[str, str], names: tuple[tuple[str, str], ...]) -> str:
+    bodies = {name for pair in names for name in pair}
+    for pattern in patterns:
+        if not any(_is(pattern, name) for name in bodies):
+            links = ", ".join(sorted({link_of(name) for name in bodies}))
+            return f"no monitored body is called {pattern!r:.60}; allowed: names of links, * and ?: {links}"
+    return "these are no monitored pair: neighbours, what an SRDF leaves out, or both fixed; allowed: monitored pairs"

@@ -1,0 +1,116 @@
+"""How near the tools of the shipped cell come: fingers to the table, hand to hand, the contract kept at every tick."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from q2r2_control import CartesianController, Robot, load_config
+from q2r2_control.robot.kept_distances import kept_distances
+from q2r2_control.types import Reference
+from q2r2_control.verification.contract import Contract
+
+CONFIG = load_config("config/dual_iiwa7.yaml")
+SETTINGS = CONFIG.control.model_copy(update={"solve_time_limit": None})  # no outcome hangs on the clock
+TABLE = 0.2  # height of its top [m]
+FRAME_TO_TIPS = 0.013  # [m]
+DOWN = pin.rpy.rpyToMatrix(np.pi, 0.0, np.pi)  # as at home
+DT = 0.002
+
+
+@pytest.fixture(scope="module")
+def controller() -> CartesianController:
+    return CartesianController(Robot.from_config(CONFIG), SETTINGS)
+
+
+def driven(controller: CartesianController, goal: Mapping[str, pin.SE3], seconds: float) -> Reference:
+    """From home towards ``goal``, to rest."""
+    controller.reset(controller.robot.home)
+    contract = Contract(controller, random=np.random.default_rng(1))
+    for _ in range(round(seconds / DT)):
+        reference = controller.step(dict(goal), DT)
+        contract.check(reference, DT)
+    assert contract.tail_acceleration() < 0.1
+    assert contract.fallbacks == contract.uncertified == 0
+    return reference
+
+
+def tips_above_the_table(controller: CartesianController) -> list[float]:
+    tips = pin.SE3(np.eye(3), np.array([0.0, 0.0, FRAME_TO_TIPS]))
+    return [float((controller.tool_pose(arm) * tips).translation[2]) - TABLE for arm in controller.robot.arms]
+
+
+@pytest.mark.parametrize("depth", [0.02, 0.3])
+def test_tools_driven_down_onto_the_table_end_with_their_tips_between_1_and_2_mm_above_it(
+    controller: CartesianController, depth: float
+) -> None:
+    goal = {
+        arm: pin.SE3(DOWN, np.array([0.5, y, TABLE + FRAME_TO_TIPS - depth]))
+        for arm, y in (("left", 0.25), ("right", -0.25))
+    }
+    reference = driven(controller, goal, 3.0)
+    assert all(0.001 < height < 0.002 for height in tips_above_the_table(controller))
+    assert 0.001 <= reference.report.closest_distance < 0.0016
+    assert {name.split("_envelope")[0] for name in reference.report.closest_pair} <= {
+        *(f"{arm}_hand_e_finger_1" for arm in controller.robot.arms),
+        "table_0",
+    }
+
+
+def test_a_tool_goes_to_where_it_holds_a_block_flat_on_the_table(controller: CartesianController) -> None:
+    """Half a centimetre above it, straight: nothing pushes it aside."""
+    pose = pin.SE3(DOWN, np.array([0.5, 0.25, TABLE + FRAME_TO_TIPS + 0.005]))
+    driven(controller, {"left": pose}, 3.0)
+    np.testing.assert_allclose(controller.tool_pose("left").homogeneous, pose.homogeneous, atol=1e-3)
+
+
+def facing(gap: float) -> dict[str, pin.SE3]:
+    """Tools that point at each other, their tips a ``gap`` [m] apart."""
+    return {
+        arm: pin.SE3(pin.rpy.rpyToMatrix(side * np.pi / 2, 0.0, 0.0), np.array([0.55, side * y, 0.5]))
+        for arm, side in (("left", 1.0), ("right", -1.0))
+        for y in [0.5 * gap + FRAME_TO_TIPS]
+    }
+
+
+def test_hands_driven_at_each_other_end_at_the_distance_that_fingers_keep(controller: CartesianController) -> None:
+    reference = driven(controller, facing(-0.05), 6.0)
+    least = SETTINGS.distances.finger_finger
+    assert least is not None
+    assert least <= reference.report.closest_distance <= 1.6 * least
+    assert all("finger" in name for name in reference.report.closest_pair)
+
+
+def test_two_hands_can_hold_a_bar_of_120_mm_at_both_ends(controller: CartesianController) -> None:
+    """Each of them 30 mm of it."""
+    goal = facing(0.06)
+    driven(controller, goal, 6.0)
+    for arm, pose in goal.items():
+        np.testing.assert_allclose(controller.tool_pose(arm).homogeneous, pose.homogeneous, atol=2e-3)
+
+
+def test_the_nearest_pair_and_the_tightest_one_are_told_apart(controller: CartesianController) -> None:
+    """Fingers 12 mm above the table have more to spare than wrists 22 mm from each other."""
+    height = TABLE + FRAME_TO_TIPS + 0.012
+    goal = {arm: pin.SE3(DOWN, np.array([0.5, 0.0, height])) for arm in controller.robot.arms}
+    reference = driven(controller, goal, 6.0)
+    report, robot = reference.report, controller.robot
+    assert "table_0" in report.closest_pair
+    assert all("link_" in name for name in report.tightest_pair)
+    margins = robot.distance_values(reference.q) - kept_distances(robot, SETTINGS).values
+    assert report.margin == pytest.approx(margins.min(), abs=2e-6)
+    assert report.margin < SETTINGS.distance_buffer + 1e-4
+
+
+def test_pairs_that_may_touch_come_to_rest_apart() -> None:
+    named = {"pair": ["*_finger_*", "table"], "distance": 0.0}
+    data = CONFIG.model_dump(mode="json")
+    data["control"] |= {"pairs": [named], "solve_time_limit": None}
+    config = CONFIG.model_validate(data)
+    controller = CartesianController(Robot.from_config(config), config.control)
+    goal = {arm: pin.SE3(DOWN, np.array([0.5, y, 0.1])) for arm, y in (("left", 0.25), ("right", -0.25))}
+    reference = driven(controller, goal, 3.0)
+    assert 0.0 <= reference.report.closest_distance < 0.0005
