@@ -26,10 +26,15 @@ import numpy as np
 import pinocchio as pin
 from pydantic import ValidationError
 
-from q2r2_control.compliance.impedance_kernels import ImpedanceData, ImpedanceModel, add_impedance_torque
-from q2r2_control.compliance.impedance_terms import BoolArray, PositionLimits, bound_torque
+from q2r2_control.compliance.impedance_kernels import (
+    ImpedanceData,
+    ImpedanceModel,
+    add_impedance_torque,
+    bound_torques,
+)
+from q2r2_control.compliance.impedance_terms import BoolArray, PositionLimits
 from q2r2_control.config.control import ImpedanceSettings
-from q2r2_control.control.geometry.kinematics import chain_of
+from q2r2_control.control.geometry.kinematics import IntArray, chain_of
 from q2r2_control.control.jit import bound, hold
 from q2r2_control.control.tasks.task_model import tools_of
 from q2r2_control.errors import ConfigError, RobotError
@@ -68,6 +73,7 @@ class ImpedanceController:
     def __init__(self, robot: Robot, settings: ImpedanceSettings | None = None) -> None:
         self.robot = robot
         self.settings = settings or ImpedanceSettings()
+        self._arms = tuple(robot.arms)
         self._limit = self.settings.torque_scale * robot.torque_limit
         self._data = robot.model.createData()
         model = _model_of(robot, self.settings)
@@ -77,10 +83,10 @@ class ImpedanceController:
         self._wanted_stiffness = self._kernel_data.stiffness.copy()  # at the end of a ramp (k, 2) [N/m, Nm/rad]
         self._ramp_rate = np.zeros_like(self._wanted_stiffness)
         self._ramping = False
-        self._begin(robot.home, np.zeros(robot.model.nv))
         # Every kernel runs once here, so that none is compiled in mid-motion.
         self._add_torque = bound(add_impedance_torque, self._held_model, self._held_data)
-        self._bound = bound(bound_torque, self._last, self._last, self._limit, 0.0)
+        self._bound_torques = bound(bound_torques, self._held_model, self._held_data, 0.0)
+        self._begin(robot.home, np.zeros(robot.model.nv))
 
     def reset(self, state: RobotState) -> None:
         """Start anew at rest at the measured posture: the first torque is that of gravity there, without a bump.
@@ -99,7 +105,7 @@ class ImpedanceController:
         self._due_q, self._due_v = q.copy(), v  # of the newest reference, due at the end of its tick
         self._wanted_q, self._wanted_v = self._due_q, self._due_v  # of the one before, due now
         self._usable_q = q.copy()  # the newest measured posture that was of use
-        self._last = np.minimum(np.maximum(self._gravity(), -self._limit), self._limit)
+        self._kernel_data.bounded[:] = np.minimum(np.maximum(self._gravity(), -self._limit), self._limit)
 
     def _gravity(self) -> Array:
         """Torque of gravity (nv,) at the newest posture that was of use [Nm]."""
@@ -146,31 +152,22 @@ class ImpedanceController:
         time = min(float(dt), LONGEST_DT) if usable else 0.0
         if self._ramping:
             self._ramp(time)
-        acceleration = self._exchange(reference)
-        wanted = self._law(state, acceleration, extra) if _finite(state.q, state.v) else None
-        held = wanted is None
-        if wanted is None:
-            wanted = self._gravity()
+        acceleration, data = self._exchange(reference), self._kernel_data
+        held = not (_finite(state.q, state.v) and self._law(state, acceleration, extra))
+        if held:
+            data.tau[:] = self._gravity()
         else:
             self._usable_q[:] = state.q
-        bounded = self._bound(wanted, self._last, self._limit, self.settings.torque_rate_limit * time)
-        self._last = bounded.tau
-        errors, clipped = ({}, ()) if held else self._errors()
+        limited = self._bound_torques(self._held_model, self._held_data, self.settings.torque_rate_limit * time)
         report = ImpedanceReport(
-            errors=errors,
-            clipped=clipped,
-            saturated=self._names(bounded.saturated),
-            rate_limited=self._names(bounded.rate_limited),
-            repelled=() if held else self._names(self._kernel_data.repulsion),
+            errors={} if held else dict(zip(self._arms, data.errors.copy(), strict=True)),
+            clipped=() if held else _those(self._arms, data.clipped),
+            saturated=_those(self.robot.joint_names, data.saturated) if limited else (),
+            rate_limited=_those(self.robot.joint_names, data.rate_limited) if limited else (),
+            repelled=() if held else _those(self.robot.joint_names, data.repulsion),
             held=held,
         )
-        return TorqueCommand(bounded.tau.copy(), report)
-
-    def _errors(self) -> tuple[dict[str, Array], tuple[str, ...]]:
-        """Of the last law: each arm's clipped error, and the arms whose error was longer."""
-        data, arms = self._kernel_data, self.robot.arms
-        clipped = tuple(name for name, was in zip(arms, data.clipped.tolist(), strict=True) if was)
-        return dict(zip(arms, data.errors.copy(), strict=True)), clipped
+        return TorqueCommand(data.bounded.copy(), report)
 
     def _ramp(self, time: float) -> None:
         reach, stiffness = self._ramp_rate * time, self._kernel_data.stiffness
@@ -186,10 +183,10 @@ class ImpedanceController:
         self._due_v = np.zeros_like(self._due_v)
         return self._due_v
 
-    def _law(self, state: RobotState, acceleration: Array, extra: Array | None) -> Array | None:
-        """The torque of all arms and ``extra``, without bounds.
+    def _law(self, state: RobotState, acceleration: Array, extra: Array | None) -> bool:
+        """The torque of all arms and ``extra``, without bounds, into the kernel's data.
 
-        None where the numbers are too large to be computed with.
+        False where the numbers are too large to be computed with.
         """
         model, data, kernel_data = self.robot.model, self._data, self._kernel_data
         kernel_data.q[:], kernel_data.v[:] = state.q, state.v
@@ -199,15 +196,10 @@ class ImpedanceController:
         try:
             self._add_torque(self._held_model, self._held_data)
         except np.linalg.LinAlgError:
-            return None
-        wanted = kernel_data.tau if extra is None else kernel_data.tau + extra
-        return wanted if _finite(wanted) else None
-
-    def _names(self, which: BoolArray | Array) -> tuple[str, ...]:
-        """Of the joints for which ``which`` is not 0."""
-        if not np.count_nonzero(which):
-            return ()
-        return tuple(self.robot.joint_names[index] for index in np.flatnonzero(which))
+            return False
+        if extra is not None:
+            kernel_data.tau[:] += extra
+        return _finite(kernel_data.tau)
 
 
 def _model_of(robot: Robot, settings: ImpedanceSettings) -> ImpedanceModel:
@@ -220,6 +212,7 @@ def _model_of(robot: Robot, settings: ImpedanceSettings) -> ImpedanceModel:
         tools=tools_of(robot),
         joints=joints,
         dofs=np.array([len(arm.joints) for arm in arms]),
+        torque_limit=settings.torque_scale * robot.torque_limit,
         limits=PositionLimits(
             lower=robot.position_lower,
             upper=robot.position_upper,
@@ -234,6 +227,13 @@ def _model_of(robot: Robot, settings: ImpedanceSettings) -> ImpedanceModel:
         max_rotation_error=settings.max_rotation_error,
         consistent=settings.nullspace_projector == "consistent",
     )
+
+
+def _those(names: tuple[str, ...], which: IntArray | BoolArray | Array) -> tuple[str, ...]:
+    """The names at which ``which`` is not 0."""
+    if not np.count_nonzero(which):
+        return ()
+    return tuple(names[index] for index in np.flatnonzero(which))
 
 
 def _finite(*arrays: Array) -> bool:

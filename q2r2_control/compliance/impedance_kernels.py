@@ -11,7 +11,9 @@ from typing import NamedTuple
 import numpy as np
 
 from q2r2_control.compliance.impedance_terms import (
+    BoolArray,
     PositionLimits,
+    bound_torque,
     clip_error,
     consistent_projector,
     double_diagonalised_damping,
@@ -34,6 +36,7 @@ class ImpedanceModel(NamedTuple):
     tools: Tools
     joints: IntArray  # (k, m) of each arm, the first ``dofs`` of a row
     dofs: IntArray  # (k,)
+    torque_limit: Array  # (nv,) [Nm]
     limits: PositionLimits
     damping_ratio: float
     posture_stiffness: float  # [Nm/rad]
@@ -72,6 +75,9 @@ class ImpedanceData(NamedTuple):
     clipped: IntArray  # (k,) 1 where it was longer
     repulsion: Array  # (nv,) from position limits [Nm]
     tau: Array  # (nv,) in: feed-forward; out: with springs and repulsion [Nm]
+    bounded: Array  # (nv,) in: commanded last; out: what of tau is commanded now [Nm]
+    saturated: BoolArray  # (nv,)
+    rate_limited: BoolArray  # (nv,)
     measured: ToolState  # scratch: of one tool at q
     wanted: ToolState  # scratch: at wanted_q
 
@@ -91,6 +97,9 @@ class ImpedanceData(NamedTuple):
             clipped=np.zeros(arms, dtype=np.int64),
             repulsion=np.zeros(nv),
             tau=np.zeros(nv),
+            bounded=np.zeros(nv),
+            saturated=np.zeros(nv, dtype=np.bool_),
+            rate_limited=np.zeros(nv, dtype=np.bool_),
             measured=ToolState.empty(model.chain),
             wanted=ToolState.empty(model.chain),
         )
@@ -114,6 +123,15 @@ def add_impedance_torque(held_model: Held, held_data: Held) -> None:
         torque = _arm_torque(model, data, i, joints)
         for k in range(joints.shape[0]):
             data.tau[joints[k]] += torque[k]
+
+
+@kernel
+def bound_torques(held_model: Held, held_data: Held, change: float) -> int:
+    """Bring ``tau`` within its limits and ``change`` [Nm] of the last command; how many bounds held it back."""
+    model, data = held_model.value, held_data.value
+    within = bound_torque(data.tau, data.bounded, model.torque_limit, change)
+    data.bounded[:], data.saturated[:], data.rate_limited[:] = within
+    return data.saturated.sum() + data.rate_limited.sum()
 
 
 @kernel
