@@ -331,4 +331,4 @@ def test_separation_holds_between_ticks_and_along_every_stop_where_the_arms_come
         contract.check(controller.step(crossing(0.0, start), settings.max_substep), settings.max_substep)
     for promise in ("distance", "between", "stop"):
         assert contract.margins[promise].checked == 500
-        assert contract.margins[promise].worst < 1e-4, "the arms come near"
+        assert contract.margins[promise].worst < 2e-4, "the arms come near"
