@@ -275,7 +275,7 @@ def unreadable(plant: RecordingPlant) -> Callable[[RobotState], RobotState]:
 @pytest.mark.parametrize(
     ("fault", "message"),
     [
-        (blocked, r"left_A\d is 0\.\d+ rad from its reference for 0\.5 s; allowed: 0\.15 rad for 0\.5 s"),
+        (blocked, r"(left|right)_A\d is 0\.\d+ rad from its reference for 0\.5 s; allowed: 0\.15 rad for 0\.5 s"),
         (teleported, r"left_A4 jumped by 0\.(39|40)\d rad"),
         (frozen, r"no joint states for 0\.10\d s; allowed: 0\.1"),
         (unreadable, r"measured position of left_A4 = nan for more than 50 ms; allowed: finite numbers"),

@@ -191,7 +191,7 @@ def _oscillate(t: float, home: Array) -> Array:
     return places
 
 
-_SLIDING_HEIGHT = 0.226  # 10 mm lower than 20 mm above the table allow [m]
+_SLIDING_HEIGHT = 0.2045  # 10 mm lower than the millimetre that fingers keep from the table allows [m]
 _SLIDE_FROM = (0.50, 0.40)  # x and y [m]
 _SLIDE_WAY, _SLIDE_SPEED, _SLIDE_RAMP = 0.3, 0.2, 0.2  # [m], [m/s], [s]
 _RIGHT_ASIDE = (0.50, -0.25, 0.38)

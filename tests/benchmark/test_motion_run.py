@@ -111,6 +111,6 @@ def test_free_air_follows_what_the_pairs_forbid() -> None:
     figures = run_motion(own_controller(free, CONFIG), Robot.from_config(CONFIG), WORK_MOTIONS["slide"])
     assert figures.rms_error_mm is not None
     assert figures.rms_error_mm < 2.0
-    # The slide asks for 10 mm less than the table's 20.
-    assert figures.min_distance_mm == pytest.approx(10.0, abs=0.5)
-    assert figures.closest_pair == ("left_hand_e_envelope_1", "table_0")
+    # The slide asks for 10 mm less than the millimetre that fingers keep.
+    assert figures.min_distance_mm == pytest.approx(-9.0, abs=0.6)
+    assert figures.closest_pair == ("left_hand_e_finger_1_envelope_3", "table_0")

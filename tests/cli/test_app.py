@@ -405,7 +405,8 @@ def test_bench_measures_the_work_motions_that_are_asked_for() -> None:
     result = q2r2("bench", "--work", "--no-peers", "--motion", "slide", "--motion", "reach", "--json")
     report = one_object(result.stdout)
     assert [row["motion"] for row in report["rows"]] == ["reach-under", "slide"]
-    assert all(figures["min_distance_mm"] >= 20.0 for row in report["rows"] for figures in row["figures"])
+    least = [figures["min_distance_mm"] for row in report["rows"] for figures in row["figures"]]
+    assert min(least) >= 1.0, "what fingers keep from the table"
     table = q2r2("bench", "--work", "--no-peers", "--motion", "slide").stdout
     assert "slide (!)" in table
     assert "q2r2_control" in table

@@ -243,9 +243,9 @@ OUT = {
     "stretched out forwards": Out((1.0, 0.0, 0.0), 1.0),
     "stretched out upwards": Out((-0.3, 0.0, 1.0), 1.2),
     "blocked by the table": Out((0.0, 0.0, -1.0), 0.65),
-    "blocked by the other arm": Out((0.0, -1.0, 0.0), 0.9),
+    "blocked by the other arm": Out((0.0, -1.0, 0.0), 1.2),
 }
-HELD, BACK = 4.0, 0.002  # [s, m]
+HELD, BACK = 6.0, 0.002  # [s, m]
 RATE = 500.0
 
 
