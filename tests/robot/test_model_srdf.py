@@ -32,7 +32,9 @@ def test_every_shipped_file_lists_what_the_program_finds(arm: str) -> None:
 
 @pytest.mark.parametrize("arm", ["iiwa7", "iiwa14"])
 def test_every_shipped_file_about_a_flange_lists_what_the_program_finds(arm: str) -> None:
-    made = model_srdfs(one_arm(model=arm, flange={"model": TOUCH}, tool=HAND), CLEARANCE, SAMPLES)
+    gripper = load_config(f"config/dual_{arm}.yaml").arms["left"].gripper.model_dump()  # whose fingers are one body
+    cell = one_arm(model=arm, flange={"model": TOUCH}, tool=HAND, gripper=gripper)
+    made = model_srdfs(cell, CLEARANCE, SAMPLES)
     assert made.keys() == {f"{arm}.srdf", f"{TOUCH}_on_{arm}.srdf", f"hand_e_on_{TOUCH}_on_{arm}.srdf", "hand_e.srdf"}
     for name, text in made.items():
         assert _disabled(text) == _disabled(find_resource(f"robots/{name}").read_text(encoding="utf-8"))
