@@ -12,6 +12,7 @@ import pinocchio as pin
 
 from q2r2_control.config import Config
 from q2r2_control.robot.compose import compose
+from q2r2_control.robot.kept_distances import kept_distances
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 
@@ -86,6 +87,13 @@ class Setup:
     def upper(self) -> Array:
         """(nv,) [rad]"""
         return self.robot.position_upper - self.config.control.position_margin
+
+    @property
+    def min_distance(self) -> float:
+        """The smallest distance that we keep of any pair [m]: peers know one for all, and none is refused our work."""
+        return float(
+            kept_distances(self.robot, self.config.control).values.min(initial=self.config.control.min_distance)
+        )
 
     def home_of_others(self) -> dict[str, float]:
         """Home positions of joints that move no tool, such as fingers."""

@@ -63,7 +63,7 @@ class Mink:
                 self._model,
                 [([geometry_of[a]], [geometry_of[b]]) for a, b in pair_names(robot.collision_model)],
                 gain=control.separation_gain * setup.dt**2,
-                minimum_distance_from_collisions=control.min_distance,
+                minimum_distance_from_collisions=setup.min_distance,
                 collision_detection_distance=DETECTION_DISTANCE,
             ),
         ]

@@ -50,7 +50,7 @@ class Pink:
             SelfCollisionBarrier(
                 min(NEAREST_ROWS, pairs),
                 gain=control.separation_gain,
-                d_min=control.min_distance,
+                d_min=setup.min_distance,
                 safe_displacement_gain=0.0,
             )
         ]
