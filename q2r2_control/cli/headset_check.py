@@ -12,6 +12,7 @@ from q2r2_control.cli.options import DEMO_CONFIG, Json, positive
 from q2r2_control.cli.output import as_json_text, stderr_console
 from q2r2_control.config import load_config
 from q2r2_control.inputs.headset_check import watch_headset
+from q2r2_control.runtime.process import StopRequest, stop_on_signals
 from q2r2_control.viewer.headset_table import HeadsetDisplay, headset_table
 
 
@@ -33,13 +34,15 @@ def headset_check(
     if duration is not None:
         positive("--duration", duration)
     console = stderr_console()
-    server = AnnouncedHeadset(cell, console)
-    server.start()
-    try:
-        with HeadsetDisplay(console) as display:
-            check = watch_headset(server, cell, duration, display.show)
-    finally:
-        server.close()
+    server, stop = AnnouncedHeadset(cell, console), StopRequest()
+    # From before the announcement on. KeyboardInterrupt would be lost where it comes in the middle of a finaliser.
+    with stop_on_signals(stop.ask):
+        server.start()
+        try:
+            with HeadsetDisplay(console) as display:
+                check = watch_headset(server, cell, duration, display.show, lambda: stop.asked)
+        finally:
+            server.close()
     if json:
         print(as_json_text(check.as_json()))
     else:

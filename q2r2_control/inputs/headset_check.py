@@ -89,14 +89,18 @@ class HeadsetCheck:
 
 
 def watch_headset(
-    server: HeadsetServer, config: Config, duration: float | None, show: Callable[[HeadsetCheck], None]
+    server: HeadsetServer,
+    config: Config,
+    duration: float | None,
+    show: Callable[[HeadsetCheck], None],
+    stopping: Callable[[], bool],
 ) -> HeadsetCheck:
-    """Watch a started server for ``duration`` [s] or until Ctrl-C; ``show`` gets every state. Returns the last."""
+    """Watch a started server for ``duration`` [s] or until ``stopping``; ``show`` gets every state. Returns the last."""
     hands = {hand: HandMovement(config.teleop.axes) for hand in SIDES}
     start = now = last_data = time.monotonic()
     heard = False
     check = HeadsetCheck(server.statistics, dict.fromkeys(hands, "no data"), dict.fromkeys(hands), False, ())
-    while duration is None or now - start < duration:
+    while not stopping() and (duration is None or now - start < duration):
         now = time.monotonic()
         for sample in server.poll(now):
             hands[sample.hand].add(sample)
@@ -110,10 +114,7 @@ def watch_headset(
             advice=advice(statistics) if now - last_data > SILENCE else (),
         )
         show(check)
-        try:
-            time.sleep(_PERIOD)
-        except KeyboardInterrupt:
-            break
+        time.sleep(_PERIOD)
     return check
 
 
