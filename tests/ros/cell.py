@@ -22,11 +22,13 @@ from q2r2_control.ros.bridge.messages import pose_message
 from q2r2_control.types import Array
 from tests.ros import waiting
 from tests.ros.joint_recorder import JointRecorder
-from tests.ros.processes import CONFIG, ROOT, Processes, RosProcess
+from tests.ros.processes import CONFIG, PATIENCE, ROOT, Processes, RosProcess
 from tests.ros.waiting import wait_until
 
 RATE = 100.0  # of targets [Hz]
 NODE_RATE = 125.0  # half of the nodes' default, since many processes share a test machine [Hz]
+_BEGINS = 5.0  # how long a stream of targets may take to be followed [s]
+_GAP = 0.7  # without targets, after which another stream begins: longer than PATIENT's target_timeout [s]
 STILL = 2e-3  # how far joints at rest may move [rad]
 # Longer than by default, so that other load on the machine does not look like a fault.
 PATIENT = ("joint_state_timeout:=0.5", "target_timeout:=0.5", "listener_timeout:=1.0")
@@ -104,18 +106,18 @@ class Cell:
         wait_until(lambda: all(arm.tool_frame in self.tools for arm in self.robot.arms.values()), "tools are on /tf")
 
     def engage(self, *arms: str) -> Stream:
-        """Begin streams of targets at the tools."""
-        stream = Stream(self, {arm: self.tool(arm) for arm in arms})
-        try:
-            wait_until(
-                lambda: all(self.state(f"{arm}_state") == "following" for arm in arms),
-                f"{arms} follow",
-                lambda: (self.states, {arm: (stream.poses[arm], self.tool(arm)) for arm in arms}),
-            )
-        except AssertionError:
+        """Begin streams of targets at the tools, anew where a stall of this machine ended one that had begun."""
+        deadline = time.monotonic() + PATIENCE
+        while True:
+            stream = Stream(self, {arm: self.tool(arm) for arm in arms})
+            patience = time.monotonic() + _BEGINS
+            while time.monotonic() < min(patience, deadline):
+                if all(self.state(f"{arm}_state") == "following" for arm in arms):
+                    return stream
+                time.sleep(0.01)
             stream.end()  # or it would pull at the arms in the tests after this one
-            raise
-        return stream
+            assert time.monotonic() < deadline, f"{arms} do not follow: {self.states}"
+            time.sleep(_GAP)
 
     def wait_until_home(self) -> None:
         """Wait until /tf tells of tools at home: transforms of before a reset may come late."""
