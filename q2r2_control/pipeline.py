@@ -14,7 +14,7 @@ import pinocchio as pin
 
 from q2r2_control.config import Config
 from q2r2_control.control.controller import CartesianController
-from q2r2_control.drives import make_drive
+from q2r2_control.drives import make_drive, permitted
 from q2r2_control.errors import ConfigError, PlantError
 from q2r2_control.inputs.base import Input
 from q2r2_control.inputs.factory import make_input
@@ -65,7 +65,7 @@ class Pipeline:
         self.input = input
         self.plant = plant
         self.drive = make_drive(check_mode(mode, plant), robot, config, CommandMode.POSITION in plant.modes)
-        self.controller = CartesianController(robot, config.control)
+        self.controller = CartesianController(robot, permitted(config.control, self.drive))
         self._begin_anew()
         self.listeners: list[Callable[[Tick], None]] = []
         # A plain flag: unlike the locks of threading.Event, a signal handler can set it in the middle of anything.
@@ -116,7 +116,7 @@ class Pipeline:
         """Nothing of an earlier run may move an arm: every run starts paused and with open grippers, as the plant."""
         # Whether a solution is late depends on the machine; a repeatable run must not.
         changes = {} if realtime else {"solve_time_limit": None}
-        settings = self.config.control.model_copy(update=changes)
+        settings = permitted(self.config.control.model_copy(update=changes), self.drive)
         if settings != self.controller.settings:
             self.controller = CartesianController(self.robot, settings)
         self._begin_anew()

@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from q2r2_control.config.control import ContactPair
 from q2r2_control.errors import ConfigError, InputError
 from q2r2_control.inputs.headset import HeadsetServer
 from q2r2_control.inputs.scripted import ScriptedInput
@@ -179,6 +180,17 @@ def test_runs_by_the_clock_keep_the_solver_s_time_limit_and_simulated_ones_have_
     for realtime, expected in ((False, None), (True, loop.config.control.solve_time_limit), (False, None)):
         loop.run(0.05, realtime=realtime)
         assert loop.controller.settings.solve_time_limit == expected
+
+
+@pytest.mark.parametrize(("mode", "may_touch"), [("position", 0), ("velocity", 0), ("torque", 1)])
+def test_pairs_may_touch_in_torque_mode_only(mode: str, may_touch: int) -> None:
+    contact = (ContactPair(pair=("*_finger_*", "table")),)
+    config = cell()
+    config = config.model_copy(update={"control": config.control.model_copy(update={"contact_allowed": contact})})
+    running = Pipeline.from_config(config, plant="mujoco", mode=mode)
+    assert len(running.controller.settings.contact_allowed) == may_touch
+    running.run(0.05, realtime=False)
+    assert len(running.controller.settings.contact_allowed) == may_touch
 
 
 @pytest.mark.parametrize("rate", [50.0, 333.0, 1000.0])

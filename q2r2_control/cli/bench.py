@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import asdict
 from typing import Annotated, NoReturn
 
 import typer
@@ -15,18 +16,21 @@ from rich.text import Text
 from q2r2_control.benchmark.command_responses import LatencyReport
 from q2r2_control.benchmark.loop_times import PHYSICS, LoopReport, StageTime, run_loop_bench
 from q2r2_control.benchmark.peers.base import PEERS
+from q2r2_control.benchmark.press_run import run_press, with_contact
 from q2r2_control.benchmark.tick_times import BenchReport, BenchRow, run_bench
 from q2r2_control.benchmark.work_bench import WORK_PEERS, run_work_bench
 from q2r2_control.cli.figure_table import figure_table
 from q2r2_control.cli.options import DEMO_CONFIG, Json
 from q2r2_control.cli.output import as_json_text, notice_of_compiling, stderr_console
+from q2r2_control.cli.press_table import press_table
 from q2r2_control.cli.work_table import work_table
-from q2r2_control.config import load_config
+from q2r2_control.config import Config, load_config
 from q2r2_control.errors import ConfigError
 from q2r2_control.verification.soak import MEMORY_ALLOWED, SoakReport, run_soak
 from q2r2_control.verification.work_motions import WORK_MOTIONS, WorkMotion, motions_named
 
 _TICKS, _SOAK_TICKS, _SECONDS = 3000, 1_000_000, 30.0
+_ROTOR_SHARES = (1.0, 0.1)  # all of the rotors' inertia, and what a joint torque loop leaves of it
 _RATE = 250.0  # of the controller's node by default [Hz]
 
 
@@ -47,6 +51,9 @@ def bench(
     ] = False,
     seed: Annotated[int, typer.Option(min=0, help="Of the soak.")] = 0,
     loop: Annotated[bool, typer.Option("--loop", help="Time the whole live loop instead, stage by stage.")] = False,
+    press: Annotated[
+        bool, typer.Option("--press", help="Press a finger on the table in torque mode: forces in MuJoCo.")
+    ] = False,
     ros: Annotated[bool, typer.Option("--ros", help="Time the ROS nodes instead.")] = False,
     duration: Annotated[
         float | None, typer.Option(min=1, max=3600, help=f"Of each input, {_SECONDS:g} by default; with --ros [s].")
@@ -66,15 +73,19 @@ def bench(
 
     With --loop: where a tick of q2r2 run goes, from inputs to recording, for three plants and modes.
 
+    With --press: what the table feels of a finger that is commanded into it, and slides. Exit 1 if a promise is broken.
+
     With --ros: the time from a message on an input topic to the joint command that answers it, through real nodes on
     this machine, in a domain of their own.
     """
-    if sum((work, soak, ros, loop)) > 1:
-        raise ConfigError("--work, --soak, --ros and --loop exclude each other")
+    if sum((work, soak, ros, loop, press)) > 1:
+        raise ConfigError("--work, --soak, --ros, --loop and --press exclude each other")
     if motion and not work:
         raise ConfigError("--motion needs --work")
     if work and ticks is not None:
         raise ConfigError("--ticks cannot be used with --work, whose motions have a length of their own")
+    if press and ticks is not None:
+        raise ConfigError("--ticks cannot be used with --press, which has a length of its own")
     if seed and not soak:
         raise ConfigError("--seed needs --soak, since nothing else draws")
     if ros and ticks is not None:
@@ -92,6 +103,8 @@ def bench(
             _show_soak(run_soak(load_config(DEMO_CONFIG), soak_ticks, seed, _progress(console)), json)
         elif work:
             _show_work(motions, WORK_PEERS if peers else (), console, json)
+        elif press:
+            _show_press(with_contact(load_config(DEMO_CONFIG)), json)
         elif loop:
             loop_ticks = _TICKS if ticks is None else ticks
             _show_loop(run_loop_bench(load_config(DEMO_CONFIG), loop_ticks, _progress(console)), json)
@@ -115,6 +128,15 @@ def _show_work(motions: Sequence[WorkMotion], peers: tuple[str, ...], console: C
         print(as_json_text(report.as_json()))
     else:
         Console().print(work_table(report))
+
+
+def _show_press(config: Config, json: bool) -> NoReturn:
+    figures = [run_press(config, share) for share in _ROTOR_SHARES]
+    if json:
+        print(as_json_text({"cell": config.name, "presses": [asdict(press) for press in figures]}))
+    else:
+        Console().print(press_table(config.name, figures))
+    raise typer.Exit(1 if any(press.violations for press in figures) else 0)
 
 
 def _show_loop(report: LoopReport, json: bool) -> None:

@@ -94,8 +94,10 @@ def check_cell(config: Config, compiling: AbstractContextManager[None] | None = 
     """
     robot = Robot.from_config(config)
     with compiling or nullcontext():
-        controller = CartesianController(robot, config.control)
-    settings = config.control
+        # With what may touch too, so that every name and number is checked; what is kept is that of position mode.
+        CartesianController(robot, config.control)
+        settings = config.control.without_contact()
+        controller = CartesianController(robot, settings)
     kept = kept_distances(robot, settings).values.tolist()
     distances = sorted(zip(robot.distances(robot.home), kept, strict=True), key=lambda found: found[0].distance)
     return CellCheck(

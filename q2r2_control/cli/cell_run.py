@@ -93,7 +93,7 @@ def print_summary(summary: RunSummary, json: bool) -> None:
 def _refuse_faults(pipeline: Pipeline, force: bool, console: Console) -> None:
     """Raises :class:`ConfigError` for a cell in which ``q2r2 check`` finds a fault; with ``force`` only prints them."""
     config = pipeline.config
-    faults = preflight_faults(pipeline.robot, config.control, pipeline.controller)
+    faults = preflight_faults(pipeline.robot, config.control.without_contact(), pipeline.controller)
     if not faults:
         return
     if not force:

@@ -29,6 +29,8 @@ from q2r2_control.types import Array
 _SMOOTHING = 0.07
 # Cores closer than this part of the radii are measured as they are: so deep, the smoothing would weaken the force.
 _DEEP = 0.25
+# Of the radii: how deep two bodies that may touch have to be in each other before the wall pushes.
+_SOFT = 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,8 +56,9 @@ class MeasuredSeparation:
         law, self._model, self._data = wall_settings or WallSettings(), robot.model, robot.model.createData()
         collision = collision_model_of(robot)
         pairs, radius = collision.pairs, collision.bodies.radius
-        shell = kept_distances(robot, settings).values
         radii = radius[pairs.first] + radius[pairs.second]
+        # Pairs that may touch meet the wall only where they are deeper in each other than bodies get that touch.
+        shell = np.maximum(kept_distances(robot, settings).values, -_SOFT * radii)
         model = RepulsionModel(
             collision=collision,
             smoothing=(_SMOOTHING * (radii + shell)) ** 2,

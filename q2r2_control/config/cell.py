@@ -77,6 +77,12 @@ class MujocoConfig(CellModel):
     timestep: float = Field(0.001, gt=0, le=0.001, description="physics step [s]")
     position_stiffness: float = Field(4000.0, gt=0, le=1e6, description="of the position servos [Nm/rad]")
     position_damping_ratio: float = Field(1.0, gt=0, le=5, description="of the position servos")
+    rotor_share: float = Field(
+        1.0,
+        ge=0,
+        le=1,
+        description="of the rotors' inertia that the joints feel; a torque loop on the joint hides most",
+    )
     objects: dict[str, ObjectConfig] = Field(default_factory=dict, description="loose boxes by name")
 
 

@@ -48,6 +48,19 @@ class NamedPairDistance(BaseModel):
     distance: Distance = Field(description="[m]")
 
 
+class ContactPair(BaseModel):
+    """Bodies that may touch in torque mode, by their names. In the other modes they keep their distance.
+
+    The reference may get inside by ``depth``, so that the impedance presses with at most its stiffness times that.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    pair: tuple[LinkPattern, LinkPattern] = Field(description="as in control.pairs")
+    depth: float = Field(0.015, ge=0.001, le=0.03, description="how far the reference may get inside [m]")
+    speed: float = Field(0.03, ge=0.005, le=0.2, description="closing speed before and in contact [m/s]")
+
+
 class ControllerSettings(BaseModel):
     """Settings of :class:`CartesianController`; every range is checked when the object is made."""
 
@@ -67,6 +80,9 @@ class ControllerSettings(BaseModel):
     min_distance: Distance = Field(0.02, description="monitored pairs stay this far apart unless said below [m]")
     distances: DistanceSettings = Field(DistanceSettings(), description="the same, by what the bodies are")
     pairs: tuple[NamedPairDistance, ...] = Field((), description="the same, by name; of several, the last one counts")
+    contact_allowed: tuple[ContactPair, ...] = Field(
+        (), description="pairs that may touch in torque mode; of several, the last one counts"
+    )
     distance_buffer: float = Field(
         0.002,
         gt=0,
@@ -94,6 +110,10 @@ class ControllerSettings(BaseModel):
         0.0, ge=0, le=10, description="posture speed per relative rise of manipulability; 0: off [rad/s]"
     )
     stretch_gain: float = Field(10.0, gt=0, le=200, description="highest gain of a stretched-out arm [1/s]")
+
+    def without_contact(self) -> ControllerSettings:
+        """The same, for modes in which nothing gives way: there no pair may touch."""
+        return self.model_copy(update={"contact_allowed": ()}) if self.contact_allowed else self
 
     @property
     def largest_distance(self) -> tuple[str, float]:

@@ -9,6 +9,7 @@ import numpy as np
 import pinocchio as pin
 
 from q2r2_control.config.control import ControllerSettings
+from q2r2_control.control.geometry.collision import collision_model_of
 from q2r2_control.control.jit import bound, hold
 from q2r2_control.control.kernel_data import KernelData
 from q2r2_control.control.kernel_model import kernel_model_of
@@ -62,7 +63,7 @@ class CartesianController:
         self._targets = TargetTracker(model.tasks, self._arms, self.settings)
         self._held_model, self._held_data = hold(model), hold(data)
         names = [geometry.name for geometry in robot.collision_model.geometryObjects]
-        watched = model.safety.collision.pairs
+        watched = collision_model_of(robot).pairs  # the model's own know boxes that may be touched by other numbers
         pairs = zip(watched.first.tolist(), watched.second.tolist(), strict=True)
         self._pair_names = [(names[first], names[second]) for first, second in pairs]
         self._compile()

@@ -7,19 +7,28 @@ from typing import NamedTuple
 import numpy as np
 
 from q2r2_control.config.control import EQUAL, ControllerSettings, check_priority
-from q2r2_control.control.geometry.collision import collision_model_of
+from q2r2_control.control.geometry.collision import CollisionModel, collision_model_of
 from q2r2_control.control.geometry.kinematics import Chain, Placements, place
+from q2r2_control.control.geometry.rounded_boxes import deepest, with_rounded_boxes
 from q2r2_control.control.safety.joint_limits import JointLimits
 from q2r2_control.control.safety.safety_model import Approach, SafetyModel
 from q2r2_control.control.tasks.swivel import nearest_along, swivel_angle
 from q2r2_control.control.tasks.task_data import SwivelScratch
 from q2r2_control.control.tasks.task_model import Motion, Posture, Priority, Swivels, TaskModel, tools_of
-from q2r2_control.robot.kept_distances import kept_distances
+from q2r2_control.errors import ConfigError
+from q2r2_control.robot.kept_distances import KeptDistances, kept_distances
+from q2r2_control.robot.pairs import pair_names
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 
 # Of pairs that may touch: rows that aim at the very distance would leave the certificate nothing [m].
 _LEAST_BUFFER = 0.00025
+
+
+# How far before contact pairs that may touch are slowed down; bodies are a little larger than what they enclose [m].
+_CONTACT_ZONE = 0.002
+# Of the depth at which the cores of two bodies meet: as far as they may get into each other.
+_DEEPEST = 0.8
 
 
 class KernelModel(NamedTuple):
@@ -41,8 +50,10 @@ def kernel_model_of(robot: Robot, settings: ControllerSettings) -> KernelModel:
 
 
 def _safety_model(robot: Robot, settings: ControllerSettings) -> SafetyModel:
-    collision = collision_model_of(robot)
-    min_distance = kept_distances(robot, settings).values
+    kept = kept_distances(robot, settings)
+    min_distance = kept.values
+    collision = with_rounded_boxes(collision_model_of(robot), -min_distance)
+    _check_depths(robot, collision, kept)
     arm = np.full(robot.model.nv, len(robot.arms), dtype=np.int64)
     for i, joints in enumerate(robot.arms.values()):
         arm[joints.joints] = i
@@ -59,11 +70,23 @@ def _safety_model(robot: Robot, settings: ControllerSettings) -> SafetyModel:
         approach=Approach(
             stop_distance=min_distance + _buffer(min_distance, settings),
             gain=settings.separation_gain,
+            contact_speed=kept.contact_speed,
+            contact_zone=np.where(np.isfinite(kept.contact_speed), _CONTACT_ZONE - min_distance, 0.0),
             recovery_speed=settings.separation_recovery_speed,
         ),
         min_distance=min_distance,
         arm=arm,
     )
+
+
+def _check_depths(robot: Robot, collision: CollisionModel, kept: KeptDistances) -> None:
+    """Raises :class:`ConfigError` where two bodies may get so deep into each other that no direction leads out."""
+    allowed = _DEEPEST * deepest(collision)
+    for p in np.flatnonzero(-kept.values > allowed):
+        names = " and ".join(pair_names(robot.collision_model)[p])
+        raise ConfigError(
+            f"control.{kept.keys[p]}.depth = {-kept.values[p]:g}: allowed for {names}: up to {allowed[p]:.4f} m"
+        )
 
 
 def _buffer(min_distance: Array, settings: ControllerSettings) -> Array:

@@ -8,13 +8,13 @@ but in ``supervision``.
 from __future__ import annotations
 
 from q2r2_control.config import Config
-from q2r2_control.drives.base import Drive, DriveReport
+from q2r2_control.drives.base import Drive, DriveReport, permitted
 from q2r2_control.drives.position import PositionDrive, VelocityDrive
 from q2r2_control.drives.torque import TorqueDrive
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import CommandMode
 
-__all__ = ["Drive", "DriveReport", "PositionDrive", "TorqueDrive", "VelocityDrive", "make_drive"]
+__all__ = ["Drive", "DriveReport", "PositionDrive", "TorqueDrive", "VelocityDrive", "make_drive", "permitted"]
 
 
 def make_drive(mode: CommandMode, robot: Robot, config: Config, has_servos: bool = True) -> Drive:

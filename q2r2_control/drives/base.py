@@ -11,6 +11,7 @@ import pinocchio as pin
 from q2r2_control.compliance.admittance import AdmittanceReport
 from q2r2_control.compliance.impedance import ImpedanceReport
 from q2r2_control.compliance.repulsion import WallReport
+from q2r2_control.config.control import ControllerSettings
 from q2r2_control.types import Array, Command, CommandMode, Reference, RobotState
 
 ToolTargets = dict[str, pin.SE3 | None]
@@ -59,6 +60,11 @@ class Drive(Protocol):
     def last_command(self, state: RobotState, grippers: Openings) -> Command | None:
         """What holds the arms when no more commands come; None: the last one does."""
         ...
+
+
+def permitted(settings: ControllerSettings, drive: Drive) -> ControllerSettings:
+    """What of the controller's settings a drive permits: only where arms yield may bodies touch."""
+    return settings if drive.yields else settings.without_contact()
 
 
 def position_command(reference: Reference, grippers: Openings) -> Command:

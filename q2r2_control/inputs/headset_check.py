@@ -95,7 +95,10 @@ def watch_headset(
     show: Callable[[HeadsetCheck], None],
     stopping: Callable[[], bool],
 ) -> HeadsetCheck:
-    """Watch a started server for ``duration`` [s] or until ``stopping``; ``show`` gets every state. Returns the last."""
+    """Watch a started server for ``duration`` [s] or until ``stopping``; ``show`` gets every state.
+
+    Returns the last one.
+    """
     hands = {hand: HandMovement(config.teleop.axes) for hand in SIDES}
     start = now = last_data = time.monotonic()
     heard = False

@@ -33,6 +33,11 @@ _PAD_FRICTION = (1.0, 0.02, 0.001)
 # them, which is small in a finger, and with its usual 0.02 s the grip would sink millimetres into what it holds.
 _PAD_STIFFNESS = (0.004, 1.0)
 
+# Wood under rubber or plastic, and MuJoCo's usual time constant [s] and damping ratio: the pads' would make a table of
+# millions of N/m of it, with the inertia of a whole arm behind them.
+_OBSTACLE_FRICTION = (0.6, 0.02, 0.001)
+_OBSTACLE_STIFFNESS = (0.02, 1.0)
+
 # A finger servo gives its full force at this part of the stroke.
 _FINGER_SERVO_BAND = 0.05
 
@@ -49,7 +54,8 @@ def build_model(robot: Robot, config: Config) -> mujoco.MjModel:
         _correct_inertias(spec)
         _set_solver(spec, config.mujoco)
         _set_shapes(spec, _capsules(robot.urdf))
-        _set_arm_joints(spec, robot)
+        _set_obstacles(spec, config)
+        _set_arm_joints(spec, robot, config.mujoco)
         _set_grippers(spec, robot, config)
         _exclude_contacts(spec, robot)
         _add_objects(spec, config.mujoco)
@@ -127,10 +133,18 @@ def _set_shapes(spec: mujoco.MjSpec, capsules: set[str]) -> None:
                 geom.group = COLLISION_GROUP
 
 
-def _set_arm_joints(spec: mujoco.MjSpec, robot: Robot) -> None:
+def _set_obstacles(spec: mujoco.MjSpec, config: Config) -> None:
+    """Contacts of what stands in the cell; they count before those of the pads."""
+    for name in config.obstacles:
+        for geom in spec.body(name).geoms:
+            geom.condim, geom.friction, geom.solref = 4, _OBSTACLE_FRICTION, _OBSTACLE_STIFFNESS
+            geom.priority = 2
+
+
+def _set_arm_joints(spec: mujoco.MjSpec, robot: Robot, config: MujocoConfig) -> None:
     for name, armature, torque in zip(robot.joint_names, robot.model.armature, robot.torque_limit, strict=True):
         joint = spec.joint(name)
-        joint.armature = armature
+        joint.armature = config.rotor_share * armature
         joint.damping[0] = max(joint.damping[0], _MIN_DAMPING)
         motor = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
         motor.set_to_motor()

@@ -1,4 +1,4 @@
-"""How far each monitored pair stays apart: ``control.min_distance``, ``control.distances`` and ``control.pairs``."""
+"""How far each monitored pair stays apart: ``min_distance``, ``distances``, ``pairs`` and ``contact_allowed``."""
 
 from __future__ import annotations
 
@@ -21,14 +21,16 @@ _OUTERMOST_FIRST = list(Part)
 class KeptDistances:
     """By pair, in the order of ``Robot.distances``."""
 
-    values: Array  # (p,) [m]
+    values: Array  # (p,) [m]; of pairs that may touch minus the depth that the reference may have
     keys: tuple[str, ...]  # what said so, in the block ``control``: min_distance, distances.arm_arm, pairs[0]
+    contact_speed: Array  # (p,) closing speed near contact of pairs that may touch [m/s]; of the others infinite
 
 
 def kept_distances(robot: Robot, settings: ControllerSettings) -> KeptDistances:
     """The distance that every monitored pair of ``robot`` has to keep.
 
-    Raises :class:`ConfigError` for names in ``settings.pairs`` that no monitored pair has.
+    Raises :class:`ConfigError` for names in ``settings.pairs`` and ``settings.contact_allowed`` that no monitored pair
+    has.
     """
     names = pair_names(robot.collision_model)
     keys = ["min_distance"] * len(names)
@@ -39,12 +41,13 @@ def kept_distances(robot: Robot, settings: ControllerSettings) -> KeptDistances:
         if value is not None:
             values[p], keys[p] = value, f"distances.{name}"
     for i, named in enumerate(settings.pairs):
-        found = [p for p, pair in enumerate(names) if _are(named.pair, pair)]
-        if not found:
-            raise ConfigError(f"control.pairs[{i}].pair = {list(named.pair)!s:.120}: {_why_none(named.pair, names)}")
-        for p in found:
+        for p in _found(f"pairs[{i}]", named.pair, names):
             values[p], keys[p] = named.distance, f"pairs[{i}]"
-    return KeptDistances(values, tuple(keys))
+    speed = np.full(len(names), np.inf)
+    for i, contact in enumerate(settings.contact_allowed):
+        for p in _found(f"contact_allowed[{i}]", contact.pair, names):
+            values[p], keys[p], speed[p] = -contact.depth, f"contact_allowed[{i}]", contact.speed
+    return KeptDistances(values, tuple(keys), speed)
 
 
 def pair_class(first: Role, second: Role) -> str:
@@ -54,6 +57,14 @@ def pair_class(first: Role, second: Role) -> str:
     if Part.OBSTACLE not in parts and same_robot:
         return "arm_self"
     return f"{parts[0]}_{parts[1]}"
+
+
+def _found(key: str, patterns: tuple[str, str], names: tuple[tuple[str, str], ...]) -> list[int]:
+    """Numbers of the pairs that ``patterns`` mean."""
+    found = [p for p, pair in enumerate(names) if _are(patterns, pair)]
+    if not found:
+        raise ConfigError(f"control.{key}.pair = {list(patterns)!s:.120}: {_why_none(patterns, names)}")
+    return found
 
 
 def _are(patterns: tuple[str, str], pair: tuple[str, str]) -> bool:

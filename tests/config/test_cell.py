@@ -31,6 +31,7 @@ from q2r2_control.config.cell import (
 )
 from q2r2_control.config.control import (
     AdmittanceSettings,
+    ContactPair,
     ControllerSettings,
     DistanceSettings,
     ImpedanceSettings,
@@ -121,7 +122,7 @@ class TestTheShippedCellShowsAllThereIsToTune:
     )
     # Not the default, and the file says so.
     CHOSEN = ("control.solve_time_limit", "control.distances", "mujoco.objects")
-    IN_A_COMMENT = (NamedPairDistance,)
+    IN_A_COMMENT = (ContactPair, NamedPairDistance)
     # A tool's mount and an obstacle's rpy are placements as an arm's mount is, which shows the keys.
     SHOWN_ELSEWHERE = ("arms.left.tool.mount", "obstacles.table.rpy")
 

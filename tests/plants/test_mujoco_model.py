@@ -56,6 +56,14 @@ def test_armature_is_rotor_inertia_times_gear_squared(plant: MujocoPlant, urdf: 
         assert plant.model.joint(name).armature[0] == pytest.approx(expected)
 
 
+def test_joints_feel_the_share_of_their_rotors_that_the_cell_says(config: Config, robot: Robot) -> None:
+    share = config.mujoco.model_copy(update={"rotor_share": 0.25})
+    lighter = MujocoPlant(robot, config.model_copy(update={"mujoco": share}))
+    for name, armature in zip(robot.joint_names, robot.model.armature, strict=True):
+        assert lighter.model.joint(name).armature[0] == pytest.approx(0.25 * armature)
+    lighter.close()
+
+
 def test_joint_and_torque_limits_are_the_robots(plant: MujocoPlant, robot: Robot) -> None:
     for index, name in enumerate(robot.joint_names):
         np.testing.assert_allclose(

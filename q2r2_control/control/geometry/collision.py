@@ -26,7 +26,7 @@ class Bodies(NamedTuple):
     box: IntArray  # (g,) 1 for a box
     start: Array  # (g, 3) segment start [m]; box: centre
     end: Array  # (g, 3) segment end [m]
-    radius: Array  # (g,) [m]; box: 0
+    radius: Array  # (g,) [m]; box: 0, or what its edges are rounded with
     half: Array  # (g, 3) half sides of a box [m]
     rotation: Array  # (g, 3, 3) of a box
     size: Array  # (g,) radius of the ball around the middle that holds it all [m]

@@ -29,7 +29,7 @@ def at_least(model: CollisionModel, data: CollisionData, p: int) -> float:
             depth = bodies.half[second, k] - abs(axes[0, k] * x + axes[1, k] * y + axes[2, k] * z)
             inside = min(inside, depth)
             square += min(depth, 0.0) ** 2
-        return (-inside if inside > 0.0 else np.sqrt(square)) - bodies.size[first]
+        return (-inside if inside > 0.0 else np.sqrt(square)) - bodies.size[first] - bodies.radius[second]
     for k in range(3):
         between = posed.start[first, k] + posed.end[first, k] - posed.start[second, k] - posed.end[second, k]
         square += between * between
@@ -77,7 +77,7 @@ def _measure(
                 points[row] = posed.start[second, row] + axes[row, 0] * x + axes[row, 1] * y + axes[row, 2] * z
         for row in range(3):
             contact.normal[row] = axes[row, 0] * normal[0] + axes[row, 1] * normal[1] + axes[row, 2] * normal[2]
-        return distance - bodies.radius[first]
+        return distance - bodies.radius[first] - bodies.radius[second]
     distance = segment_segment(start, end, posed.start[second], posed.end[second], contact.first, contact.second)
     if distance > 1e-9:
         for k in range(3):

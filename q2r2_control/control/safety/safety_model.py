@@ -15,6 +15,8 @@ class Approach(NamedTuple):
 
     stop_distance: Array  # (p,) min_distance + buffer [m]
     gain: float  # [1/s]
+    contact_speed: Array  # (p,) of pairs that may touch, in the contact zone [m/s]; of the others infinite
+    contact_zone: Array  # (p,) free distance from which on that holds [m]; of the others 0
     recovery_speed: float  # [m/s]
 
 

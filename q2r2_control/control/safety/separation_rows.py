@@ -17,8 +17,9 @@ stop until there. With a stop of the same duration after the step,
 
 (That the duration shrinks as the slowest joint brakes is left out: it would make that joint the lever of all rows, and
 the solution change from tick to tick.) For a pair at rest this is the usual row, n'(J_2 - J_1) v+ >= -gain B. Closer
-than the buffer the row asks for opening, as fast as a part of the acceleration limits gives. The rows give comfort
-only: they are soft, so that the QP always has a solution; safety is the certificate's.
+than the buffer the row asks for opening, as fast as a part of the acceleration limits gives. Pairs that may touch have
+a distance below zero, and a zone before and in contact where B is used up no faster than a speed of their own. The rows
+give comfort only: they are soft, so that the QP always has a solution; safety is the certificate's.
 """
 
 from __future__ import annotations
@@ -78,6 +79,7 @@ def measure_pairs(model: SafetyModel, data: SafetyData) -> int:
         # the way of the stop, a row would bind at very low leverage: it would add comfort, and safety needs none.
         closing = fastest_approach(data.velocities, pairs.first[p], pairs.second[p]) + pairs.leverage[p] * surge
         relevant = approach.stop_distance[p] + (2.0 / approach.gain + 0.5 * duration) * closing
+        relevant += approach.contact_zone[p]
         data.near[p] = 0
         if distance[p] > relevant and distance[p] >= least:
             continue
@@ -182,6 +184,10 @@ def _append_row(
         rate += row[j] * v[j]
         change += abs(row[j]) * a[j] * h
     allowed = -model.approach.gain * h * free
+    slow = model.approach.contact_speed[p]
+    if slow < np.inf:
+        beyond = free - model.approach.contact_zone[p]
+        allowed = max(allowed, -h * max(slow, model.approach.gain * beyond))
     if free < 0.0:
         # Asked for more than the joints can do in this step, rows of several pairs would be weighed against each other,
         # and the deeper pair would be opened at the cost of closing another one.

@@ -25,6 +25,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from q2r2_control.config import Config, load_config
 from q2r2_control.control.controller import CartesianController
+from q2r2_control.drives import permitted
 from q2r2_control.errors import ConfigError
 from q2r2_control.robot.robot import Robot
 from q2r2_control.ros.base_node import ERROR, LATCHED_QOS, OK, SENT_COMMAND_QOS, WARN, BaseNode, run_node
@@ -83,7 +84,7 @@ class CartesianControllerNode(BaseNode):
         self._declare(watch, _WATCH_PARAMETERS)
         self._declare(external, _EXTERNAL_PARAMETERS)
         self.add_post_set_parameters_callback(self._on_parameters)
-        self._controller = CartesianController(robot, config.control)
+        self._controller = CartesianController(robot, permitted(config.control, self._output.drive))
         self._supervisor = Supervisor(
             robot,
             self._controller,

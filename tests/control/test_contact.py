@@ -1,0 +1,111 @@
+"""Pairs that may touch: how deep the reference gets, how fast it approaches, and what stays apart as ever."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from q2r2_control import CartesianController, Robot, load_config
+from q2r2_control.config.control import ControllerSettings
+from q2r2_control.errors import ConfigError
+from q2r2_control.robot.pairs import pair_names
+from q2r2_control.types import Array
+from q2r2_control.verification.contract import Contract
+
+CONFIG = load_config("config/dual_iiwa7.yaml")
+ROBOT = Robot.from_config(CONFIG)
+PAIRS = pair_names(ROBOT.collision_model)
+TABLE = 0.2  # height of its top [m]
+FRAME_TO_TIPS = 0.013  # [m]
+DEPTH, SPEED = 0.012, 0.04  # [m], [m/s]
+DOWN = pin.rpy.rpyToMatrix(np.pi, 0.0, np.pi)  # as at home
+DT = 0.002
+
+
+def settings(*allowed: dict[str, Any]) -> ControllerSettings:
+    values = CONFIG.control.model_dump() | {"contact_allowed": allowed, "solve_time_limit": None}
+    return ControllerSettings.model_validate(values)
+
+
+def towards_the_table(controller: CartesianController, speed: float, seconds: float = 4.0) -> tuple[Array, Array]:
+    """Distances of the left fingers from the table [m] and closing speeds [m/s], the target ending 0.3 m inside."""
+    pairs = np.array([set(pair) > {"table_0"} and "left_hand_e_finger" in str(pair) for pair in PAIRS])
+    contract = Contract(controller, random=np.random.default_rng(1))
+    heights = []
+    for i in range(round(seconds / DT)):
+        z = max(0.40 - speed * i * DT, TABLE - 0.3)
+        reference = controller.step({"left": pin.SE3(DOWN, np.array([0.5, 0.25, z]))}, DT)
+        contract.check(reference, DT)
+        heights.append(float(ROBOT.distance_values(reference.q)[pairs].min()))
+    assert contract.fallbacks == contract.uncertified == 0
+    assert contract.tail_acceleration() < 0.1
+    return np.array(heights), -np.diff(heights, prepend=heights[0]) / DT
+
+
+@pytest.mark.parametrize("speed", [0.2, 5.0])
+def test_a_finger_that_may_touch_gets_in_by_the_depth_and_no_faster_than_it_may(speed: float) -> None:
+    allowed = settings({"pair": ["left_*finger*", "table"], "depth": DEPTH, "speed": SPEED})
+    heights, speeds = towards_the_table(CartesianController(ROBOT, allowed), speed)
+    assert heights.min() == pytest.approx(-DEPTH, abs=5e-4)
+    assert heights.min() >= -DEPTH
+    assert speeds[heights < 0.001].max() <= 1.05 * SPEED
+    assert speeds[heights > 0.05].max() > 2.0 * SPEED, "nothing is slowed that is far from contact"
+
+
+def test_without_contact_the_same_finger_stays_above_the_table() -> None:
+    allowed = settings({"pair": ["left_*finger*", "table"], "depth": DEPTH})
+    heights, _ = towards_the_table(CartesianController(ROBOT, allowed.without_contact()), 0.5)
+    assert 0.001 <= heights.min() < 0.0015
+
+
+def test_what_is_not_named_keeps_its_distance_to_the_same_table() -> None:
+    """The right fingers are asked down as the left ones are: the contract knows the distance of every pair."""
+    controller = CartesianController(ROBOT, settings({"pair": ["left_*finger*", "table"], "depth": DEPTH}))
+    contract = Contract(controller, random=np.random.default_rng(2))
+    for _ in range(1500):
+        goal = {arm: pin.SE3(DOWN, np.array([0.5, y, 0.1])) for arm, y in (("left", 0.25), ("right", -0.25))}
+        contract.check(controller.step(goal, DT), DT)
+    tips = {arm: float((controller.tool_pose(arm) * np.array([0.0, 0.0, FRAME_TO_TIPS]))[2]) - TABLE for arm in goal}
+    assert tips["left"] < -0.01
+    assert 0.001 < tips["right"] < 0.002
+
+
+def test_fingers_of_both_hands_may_touch_each_other() -> None:
+    """Hands that face each other: their tools are asked to change sides, and their fingers get in by the depth."""
+    depth = 0.005
+    controller = CartesianController(ROBOT, settings({"pair": ["*finger*", "*finger*"], "depth": depth}))
+    contract = Contract(controller, random=np.random.default_rng(3))
+    # Turned about x until they point at each other.
+    turned = {arm: pin.rpy.rpyToMatrix(sign, 0.0, 0.0) @ DOWN for arm, sign in (("left", -1.0), ("right", 1.0))}
+    for i in range(4000):
+        gap = max(0.25 - 0.1 * i * DT, -0.01)
+        goal = {
+            arm: pin.SE3(turned[arm], np.array([0.5, sign * gap, 0.45])) for arm, sign in (("left", 1), ("right", -1))
+        }
+        reference = controller.step(goal, DT)
+        contract.check(reference, DT)
+    names = [pair for pair in ROBOT.distances(reference.q) if pair.distance < 0.0]
+    assert names, "they touch"
+    assert all("left_hand_e_finger" in pair.name_a and "right_hand_e_finger" in pair.name_b for pair in names)
+    assert -depth <= min(pair.distance for pair in names) < -depth + 1e-3
+
+
+@pytest.mark.parametrize(
+    ("allowed", "says"),
+    [
+        (
+            {"pair": ["*finger*", "tabel"]},
+            r"control\.contact_allowed\[0\]\.pair = .*no monitored body is called 'tabel'",
+        ),
+        (
+            {"pair": ["left_*finger*", "right_*finger*"], "depth": 0.02},
+            r"control\.contact_allowed\[0\]\.depth = 0\.02: allowed for left_hand_e_finger.*: up to 0\.0155 m",
+        ),
+    ],
+)
+def test_names_and_depths_that_cannot_be_are_refused(allowed: dict[str, Any], says: str) -> None:
+    with pytest.raises(ConfigError, match=says):
+        CartesianController(ROBOT, settings(allowed))
