@@ -13,7 +13,8 @@ from q2r2_control.benchmark.motion_run import MotionFigures
 from q2r2_control.benchmark.tick_times import BenchReport, BenchRow
 from q2r2_control.benchmark.timed_run import RunMetrics
 from q2r2_control.benchmark.work_bench import WorkReport, WorkRow
-from q2r2_control.cli.bench import loop_table, motion_table, soak_table, times_table
+from q2r2_control.cli.bench import loop_table, motion_table, times_table
+from q2r2_control.cli.soak_table import soak_table
 from q2r2_control.cli.work_table import work_table
 from q2r2_control.config import Config
 from q2r2_control.verification.contract import Margin
