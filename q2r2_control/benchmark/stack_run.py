@@ -81,8 +81,8 @@ class Stack:
         self._plant, self.mode = plant, CommandMode(mode)
         self._kept = kept_distances(self.robot, self._config.control).values
 
-    def run(self, motion: WorkMotion, seed: int = 0) -> StackFigures:
-        """Run ``motion`` from home; ``seed``: of what samples add to the hands' poses."""
+    def run(self, motion: WorkMotion, seed: int | None = 0) -> StackFigures:
+        """Run ``motion`` from home; ``seed``: of what samples add to the hands' poses, None: nothing."""
         hands = WorkHands(motion, self._start, self._config.teleop, seed)
         pipeline = Pipeline(self._config, self.robot, hands, self._plant, self.mode)
         log = _Log(pipeline, checked=len(self._kept) > 0)
