@@ -21,7 +21,7 @@ from q2r2_control.cli.figure_table import figure_table
 from q2r2_control.cli.options import DEMO_CONFIG, Json
 from q2r2_control.cli.output import as_json_text, notice_of_compiling, stderr_console
 from q2r2_control.cli.soak_table import soak_table
-from q2r2_control.cli.stack_table import stack_table
+from q2r2_control.cli.stack_table import following_table, safety_table
 from q2r2_control.cli.work_table import work_table
 from q2r2_control.config import load_config
 from q2r2_control.errors import ConfigError
@@ -134,7 +134,9 @@ def _show_stack(report: StackReport, json: bool) -> NoReturn:
     if json:
         print(as_json_text(report.as_json()))
     else:
-        Console().print(stack_table(report))
+        out = Console()
+        out.print(following_table(report))
+        out.print(safety_table(report))
     raise typer.Exit(0 if report.passed else 1)
 
 
