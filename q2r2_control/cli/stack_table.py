@@ -30,11 +30,7 @@ def following_table(report: StackReport) -> Table:
     table = figure_table(
         f"{report.cell}: work motions from hand samples to MuJoCo at {report.loop_rate_hz:g} Hz",
         "mode",
-        (
-            *("RMS [mm]", "free [mm]", "max [mm]", "path [mm]", "free [mm]"),
-            *("end [mm]", "there [s]", "slip [mm]"),
-        ),
-        padding=0,
+        ("RMS [mm]", "free [mm]", "max [mm]", "path [mm]", "free [mm]", "end [mm]", "there [s]", "slip [mm]"),
     )
     _fill(table, report, _following_cells)
     about = [f"{row.motion}: {row.about}" for row in report.rows]
