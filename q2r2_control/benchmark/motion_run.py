@@ -57,7 +57,7 @@ def run_motion(
     if ticks <= began + 1:
         return MotionFigures(motion.name, controller.name, ticks / ends)
     errors, to_goal = _errors(run, robot, motion, began)
-    nearest, pair = _nearest(run.q[began:], robot)
+    nearest, pair = nearest_pair(run.q[began:], robot)
     moving = errors[: rests - began]
     stopped = controller.stopped[began:] if isinstance(controller, OwnController) else None
     a = np.diff(run.v, axis=0)[began:] / dt
@@ -70,7 +70,7 @@ def run_motion(
         rms_error_mm=1e3 * float(np.sqrt(np.mean(moving**2, axis=0)).max()),
         max_error_mm=1e3 * float(moving.max()),
         end_error_mm=1e3 * float(errors[-1].max()) if finished else None,
-        arrival_s=_arrival(to_goal, dt) if finished and motion.has_goal else None,
+        arrival_s=arrival_time(to_goal, dt) if finished and motion.has_goal else None,
         fallback_percent=None if stopped is None else 100.0 * sum(stopped) / len(stopped),
         min_distance_mm=nearest,
         closest_pair=pair,
@@ -106,14 +106,14 @@ def _errors(run: TimedRun, robot: Robot, motion: WorkMotion, began: int) -> tupl
     return np.linalg.norm(tools - asked, axis=2), np.linalg.norm(tools - last, axis=2)
 
 
-def _arrival(to_goal: Array, dt: float) -> float | None:
+def arrival_time(to_goal: Array, dt: float) -> float | None:
     """Time [s] from which on both tools stay at the goal; None if they are not there at the end."""
     away = np.flatnonzero((to_goal >= ARRIVED).any(axis=1))
     first = int(away[-1]) + 1 if len(away) else 0
     return first * dt if first < len(to_goal) else None
 
 
-def _nearest(q: Array, robot: Robot) -> tuple[float | None, tuple[str, str] | None]:
+def nearest_pair(q: Array, robot: Robot) -> tuple[float | None, tuple[str, str] | None]:
     """Least distance [mm] over postures (n, nv) and its pair: every few of them first, then all around the nearest."""
     if not len(robot.collision_model.collisionPairs):
         return None, None

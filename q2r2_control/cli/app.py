@@ -26,7 +26,9 @@ app.command(epilog="Example: q2r2 demo --viewer")(demo)
 app.command(epilog="Example: q2r2 run config/dual_iiwa7.yaml --input headset --host 0.0.0.0")(run)
 app.command(epilog="Example: q2r2 check config/dual_iiwa7.yaml --pairs dual_iiwa7.srdf")(check)
 app.command("headset-check", epilog="Example: q2r2 headset-check --host 0.0.0.0")(headset_check)
-app.command(epilog="Example: q2r2 bench --ticks 20000, or q2r2 bench --work --motion meet, or --soak --seed 3")(bench)
+app.command(epilog="Example: q2r2 bench --ticks 20000, or --work --motion meet --through torque, or --soak --seed 3")(
+    bench
+)
 app.add_typer(ros_app, name="ros")
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict
 from typing import Annotated, NoReturn
@@ -17,16 +16,20 @@ from q2r2_control.benchmark.command_responses import LatencyReport
 from q2r2_control.benchmark.loop_times import PHYSICS, LoopReport, StageTime, run_loop_bench
 from q2r2_control.benchmark.peers.base import PEERS
 from q2r2_control.benchmark.press_run import run_press, with_contact
+from q2r2_control.benchmark.stack_bench import StackReport, run_stack_bench
 from q2r2_control.benchmark.tick_times import BenchReport, BenchRow, run_bench
 from q2r2_control.benchmark.work_bench import WORK_PEERS, run_work_bench
 from q2r2_control.cli.figure_table import figure_table
 from q2r2_control.cli.options import DEMO_CONFIG, Json
 from q2r2_control.cli.output import as_json_text, notice_of_compiling, stderr_console
 from q2r2_control.cli.press_table import press_table
+from q2r2_control.cli.soak_table import soak_table
+from q2r2_control.cli.stack_table import following_table, safety_table
 from q2r2_control.cli.work_table import work_table
 from q2r2_control.config import Config, load_config
 from q2r2_control.errors import ConfigError
-from q2r2_control.verification.soak import MEMORY_ALLOWED, SoakReport, run_soak
+from q2r2_control.types import CommandMode
+from q2r2_control.verification.soak import SoakReport, run_soak
 from q2r2_control.verification.work_motions import WORK_MOTIONS, WorkMotion, motions_named
 
 _TICKS, _SOAK_TICKS, _SECONDS = 3000, 1_000_000, 30.0
@@ -46,10 +49,14 @@ def bench(
         list[str] | None,
         typer.Option(help="With --work: only this motion, or those that begin with it, such as carry; repeatable."),
     ] = None,
+    through: Annotated[
+        list[CommandMode] | None,
+        typer.Option(help="With --work: from hand samples through the whole stack to MuJoCo, so driven; repeatable."),
+    ] = None,
     soak: Annotated[
         bool, typer.Option("--soak", help="Check every promise in hostile ticks instead of timing.")
     ] = False,
-    seed: Annotated[int, typer.Option(min=0, help="Of the soak.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Of the soak, or of the hands with --through.")] = 0,
     loop: Annotated[bool, typer.Option("--loop", help="Time the whole live loop instead, stage by stage.")] = False,
     press: Annotated[
         bool, typer.Option("--press", help="Press a finger on the table in torque mode: forces in MuJoCo.")
@@ -66,7 +73,9 @@ def bench(
 ) -> None:
     """Time one tick of the controller with both arms, every pair and the certificate, and public peers beside it.
 
-    With --work: both arms at work near each other and near the table, beside ours in free air, roboplan and mink.
+    With --work: both arms at work near each other and near the table, beside ours in free air, roboplan and mink. With
+    --through as well: ours alone, driven by hand samples, with arms in MuJoCo; every promise of the controller is
+    checked at every tick. Exit 1 if one was broken, or if a motion did not come to its end.
 
     With --soak: random hostile targets, ticks, starts and solver failures; every promise of the controller is checked
     at every tick, and the worst margin of each is printed. Exit 1 if one was broken.
@@ -80,14 +89,15 @@ def bench(
     """
     if sum((work, soak, ros, loop, press)) > 1:
         raise ConfigError("--work, --soak, --ros, --loop and --press exclude each other")
-    if motion and not work:
-        raise ConfigError("--motion needs --work")
+    for option, given in (("--motion", motion), ("--through", through)):
+        if given and not work:
+            raise ConfigError(f"{option} needs --work")
     if work and ticks is not None:
         raise ConfigError("--ticks cannot be used with --work, whose motions have a length of their own")
     if press and ticks is not None:
         raise ConfigError("--ticks cannot be used with --press, which has a length of its own")
-    if seed and not soak:
-        raise ConfigError("--seed needs --soak, since nothing else draws")
+    if seed and not (soak or through):
+        raise ConfigError("--seed needs --soak or --through, since nothing else draws")
     if ros and ticks is not None:
         raise ConfigError("--ticks cannot be used with --ros, which takes --duration")
     if not ros and (duration is not None or rate is not None):
@@ -101,6 +111,9 @@ def bench(
         if soak:
             soak_ticks = _SOAK_TICKS if ticks is None else ticks
             _show_soak(run_soak(load_config(DEMO_CONFIG), soak_ticks, seed, _progress(console)), json)
+        elif through:
+            modes = tuple(dict.fromkeys(through))
+            _show_stack(run_stack_bench(load_config(DEMO_CONFIG), motions, modes, seed, _progress(console)), json)
         elif work:
             _show_work(motions, WORK_PEERS if peers else (), console, json)
         elif press:
@@ -137,6 +150,16 @@ def _show_press(config: Config, json: bool) -> NoReturn:
     else:
         Console().print(press_table(config.name, figures))
     raise typer.Exit(1 if any(press.violations for press in figures) else 0)
+
+
+def _show_stack(report: StackReport, json: bool) -> NoReturn:
+    if json:
+        print(as_json_text(report.as_json()))
+    else:
+        out = Console()
+        out.print(following_table(report))
+        out.print(safety_table(report))
+    raise typer.Exit(0 if report.passed else 1)
 
 
 def _show_loop(report: LoopReport, json: bool) -> None:
@@ -225,27 +248,6 @@ def _by_scenario(report: BenchReport, table: Table) -> Iterator[BenchRow]:
         yield row
 
 
-def soak_table(report: SoakReport) -> Table:
-    """Worst margin of every promise, and how often it was broken."""
-    table = figure_table(
-        f"{report.cell}: {report.ticks} hostile ticks, {report.simulated_s:.0f} s, seed {report.seed}",
-        "promise",
-        ("worst", "allowed", "checked", "broken"),
-    )
-    for margin in report.margins:
-        unit = f" {margin.unit}" if margin.unit else ""
-        worst = "" if math.isinf(margin.worst) and not margin.violations else f"{margin.worst:.2g}{unit}"
-        allowed = f"{margin.sense} {margin.allowed:.2g}"
-        style = "red" if margin.violations else None
-        table.add_row(Text(margin.name), worst, allowed, str(margin.checked), str(margin.violations), style=style)
-    if report.memory_growth_mb is not None:
-        grown, broken = f"{report.memory_growth_mb:.2f} MB", str(int(report.memory_growth_mb > MEMORY_ALLOWED))
-        table.add_row("memory growth after a tenth of it", grown, f"<= {MEMORY_ALLOWED:g}", "1", broken)
-    table.caption = Text(_soak_notes(report))
-    table.caption_justify = "left"
-    return table
-
-
 def loop_table(report: LoopReport) -> Table:
     """Where a tick of the live loop goes: a column for each plant and mode."""
     first = report.rows[0]
@@ -291,21 +293,3 @@ def latency_table(report: LatencyReport) -> Table:
     )
     table.caption_justify = "left"
     return table
-
-
-def _soak_notes(report: SoakReport) -> str:
-    lines = [
-        f"{report.segments} segments, {report.resets} resets, {report.solver_faults} ticks with a failing solver,"
-        f" {report.fallbacks} stops ({report.fallbacks_healthy} with a healthy solver)"
-    ]
-    for found in report.broken:
-        error = f": {found.error}" if found.error else ""
-        lines.append(
-            f"first broken at tick {found.tick}: {found.promise}{error}"
-            f" [tick {found.since_segment} of: {found.segment}; dt {found.dt}]"
-        )
-    if report.broken:
-        lines.append(
-            f"to see the first again: q2r2 bench --soak --seed {report.seed} --ticks {report.broken[0].tick + 1}"
-        )
-    return "\n".join(lines)

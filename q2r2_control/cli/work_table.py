@@ -50,25 +50,25 @@ def _cells(row: WorkRow, figures: MotionFigures, ours: bool) -> tuple[str, ...]:
     held = figures.fallback_percent
     if held is None and figures.ticks:
         held = 100.0 * figures.failures / figures.ticks
-    there = _short(figures.arrival_s)
+    there = short_figure(figures.arrival_s)
     if figures.arrival_s is None and row.free_air.arrival_s is not None:
         there = "no"
     return (
         figures.controller,
-        _short(figures.rms_error_mm),
-        _short(figures.max_error_mm),
-        _short(row.free_air.rms_error_mm) if ours else "",
+        short_figure(figures.rms_error_mm),
+        short_figure(figures.max_error_mm),
+        short_figure(row.free_air.rms_error_mm) if ours else "",
         there,
-        _short(held),
-        _short(figures.min_distance_mm),
-        _short(figures.max_acceleration) + ("" if limited else _UNLIMITED),
-        _short(figures.rest_acceleration),
-        _short(figures.median_us),
-        _short(figures.p99_us),
+        short_figure(held),
+        short_figure(figures.min_distance_mm),
+        short_figure(figures.max_acceleration) + ("" if limited else _UNLIMITED),
+        short_figure(figures.rest_acceleration),
+        short_figure(figures.median_us),
+        short_figure(figures.p99_us),
     )
 
 
-def _short(value: float | None) -> str:
+def short_figure(value: float | None) -> str:
     """Four characters or so: two digits after the point below 10, one below 100, none above."""
     if value is None:
         return "-"

@@ -112,6 +112,23 @@ class RelativeMotion:
             self.anchor_rotation(hand, target)
         return target
 
+    def hand(self, tool: pin.SE3) -> pin.SE3:
+        """The hand pose, in the input's frame, whose :meth:`target` is ``tool``: where an operator has to put the hand.
+
+        Of rotations beyond half a turn from the anchor the shorter one is taken. With a ``rotation_scale`` of 0, with
+        which no hand can turn the tool, the hand keeps its rotation. Raises :class:`Q2R2Error` when nothing has been
+        anchored.
+        """
+        if self._hand_position is None:
+            raise Q2R2Error("RelativeMotion.hand: call anchor(hand, tool) first")
+        way = self._map.T @ (tool.translation - self._tool_position) / self._scale
+        turn = np.eye(3)
+        if self._rotation_scale > 0.0:
+            scaled = self._before.T @ tool.rotation @ self._after.T
+            turn = pin.exp3(pin.log3(scaled) / self._rotation_scale)
+        anchor = self._hand_rotation
+        return pin.SE3(anchor @ turn if self._in_tool_frame else turn @ anchor, self._hand_position + way)
+
     def _scaled(self, rotation: Array) -> Array:
         if self._rotation_scale == 1.0:
             return rotation

@@ -2,7 +2,8 @@
 
 ``contract`` is the one checker, for tests, soaks and live runs. ``adversary`` draws streams of targets,
 ``fault_injection`` uneven ticks, bad starts and failing solvers, and ``soak`` runs a controller through all of them.
-``work_motions`` is the other side: what two arms do at work, for figures of how well they do it.
+``work_motions`` is the other side: what two arms do at work, for figures of how well they do it, and ``work_hands`` the
+operator who makes them do it.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
     from q2r2_control.verification.contract import Contract, Margin
     from q2r2_control.verification.fault_injection import FaultySolver
     from q2r2_control.verification.soak import Soak, SoakReport, run_soak
+    from q2r2_control.verification.work_hands import WorkHands
     from q2r2_control.verification.work_motions import WORK_MOTIONS, WorkMotion, motions_named
 
 __all__ = [
@@ -26,6 +28,7 @@ __all__ = [
     "Margin",
     "Soak",
     "SoakReport",
+    "WorkHands",
     "WorkMotion",
     "motions_named",
     "run_soak",
@@ -41,6 +44,7 @@ __getattr__ = lazy_exports(
         "Soak": "soak",
         "SoakReport": "soak",
         "WORK_MOTIONS": "work_motions",
+        "WorkHands": "work_hands",
         "WorkMotion": "work_motions",
         "motions_named": "work_motions",
         "run_soak": "soak",

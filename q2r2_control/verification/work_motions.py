@@ -23,7 +23,7 @@ from q2r2_control.inputs.trajectories import minimum_jerk
 from q2r2_control.types import Array
 
 ARMS = ("left", "right")
-REST = 2.0  # with still targets at the end [s]
+REST = 2.0  # with still targets at the end, unless a motion says otherwise [s]
 _LEG = 2.0  # of an approach, from place to place [s]
 _SETTLE = 0.5  # between the approach and the motion [s]
 
@@ -44,6 +44,7 @@ class WorkMotion:
     tilt: tuple[float, float] = (0.0, 0.0)  # turn of each tool about the world's x, kept from the approach on [rad]
     has_goal: bool = False  # whether arriving at the last targets is what it is about
     reachable: bool = True  # whether both arms can be at all targets with every distance kept
+    rest: float = REST  # with still targets at the end [s]
 
     @property
     def begins(self) -> float:
@@ -58,7 +59,7 @@ class WorkMotion:
     @property
     def ends(self) -> float:
         """Time in all [s]."""
-        return self.rests + REST
+        return self.rests + self.rest
 
     def targets(self, t: float, start: Mapping[str, pin.SE3]) -> dict[str, pin.SE3]:
         """Tool poses that are asked for at ``t`` [s], by those at the start; both in the world frame."""
@@ -121,10 +122,13 @@ _CARRY_CENTRE, _CARRY_RADIUS, _CARRY_RISE = (0.52, 0.36), 0.08, 0.04  # x and z 
 _CARRY_RAMP, _CARRY_SHORTEST = 0.5, 3.0  # [s]
 
 
-def _carry(gap: float, speed: float) -> WorkMotion:
-    """Both tools go round as if they held one thing, whole laps of at least 3 s in all."""
+def carry(gap: float, speed: float, shortest: float = _CARRY_SHORTEST) -> WorkMotion:
+    """Both tools, ``gap`` [m] apart, go round at ``speed`` [m/s] as if they held one thing.
+
+    In whole laps that take at least the time ``shortest`` [s].
+    """
     rate = speed / _CARRY_RADIUS
-    turn = 2.0 * math.pi * max(1, math.ceil(_CARRY_SHORTEST * rate / (2.0 * math.pi)))
+    turn = 2.0 * math.pi * max(1, math.ceil(shortest * rate / (2.0 * math.pi)))
 
     def path(t: float, home: Array) -> Array:
         phase = _uniform(t, turn, rate, _CARRY_RAMP)
@@ -217,8 +221,8 @@ def _stretch(t: float, home: Array) -> Array:
 
 
 _ALL = (
-    *(_carry(gap, speed) for gap in (0.40, 0.20, 0.16) for speed in (0.15, 0.30, 0.50)),
-    _carry(0.16, 0.04),
+    *(carry(gap, speed) for gap in (0.40, 0.20, 0.16) for speed in (0.15, 0.30, 0.50)),
+    carry(0.16, 0.04),
     WorkMotion(
         name="meet",
         about="the tools meet, asked for 30 mm more than each can, stay 2 s and part",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,14 +11,20 @@ from rich.console import Console
 
 from q2r2_control.benchmark.loop_times import CASES, PHYSICS, STAGES, LoopReport, LoopRow, StageTime, run_loop_bench
 from q2r2_control.benchmark.motion_run import MotionFigures
+from q2r2_control.benchmark.stack_bench import StackReport, StackRow
+from q2r2_control.benchmark.stack_run import StackFigures
 from q2r2_control.benchmark.tick_times import BenchReport, BenchRow
 from q2r2_control.benchmark.timed_run import RunMetrics
 from q2r2_control.benchmark.work_bench import WorkReport, WorkRow
-from q2r2_control.cli.bench import loop_table, motion_table, soak_table, times_table
+from q2r2_control.cli.bench import loop_table, motion_table, times_table
+from q2r2_control.cli.soak_table import soak_table
+from q2r2_control.cli.stack_table import following_table, safety_table
 from q2r2_control.cli.work_table import work_table
 from q2r2_control.config import Config
+from q2r2_control.types import CommandMode
 from q2r2_control.verification.contract import Margin
 from q2r2_control.verification.soak import SoakReport, Violation
+from q2r2_control.verification.work_motions import motions_named
 from tests.cli.test_app import one_object, q2r2
 
 TIMES = ("1234", "18765")
@@ -82,6 +89,101 @@ def test_a_motion_without_a_goal_has_no_time_of_arrival_and_one_that_never_began
     ours, none = printed(work_table(WorkReport("cell", 1, [row], []))).splitlines()[6:8]
     assert ours.split()[1:6] == ["123", "234", "123", "-", "0.00"]
     assert set(none.split()[1:]) == {"-"}
+
+
+def through_the_stack(**changes: object) -> StackFigures:
+    figures = StackFigures(
+        motion="carry-0.20-0.30",
+        mode="position",
+        done=1.0,
+        rms_error_mm=123.4,
+        max_error_mm=234.5,
+        path_error_mm=12.34,
+        arrival_s=1.75,
+        fallback_percent=12.34,
+        measured_distance_mm=-48.3,
+        measured_margin_mm=-68.3,
+        reference_distance_mm=20.01,
+        max_acceleration_ratio=1.0,
+        max_torque_ratio=0.63,
+        rest_acceleration=2.34,
+        end_error_mm=5.67,
+        slip_mm=231.1,
+    )
+    return replace(figures, **changes)  # type: ignore[arg-type]
+
+
+def stack_report(*figures: StackFigures) -> StackReport:
+    free = [through_the_stack(rms_error_mm=8.95, path_error_mm=1.34) for _ in figures]
+    return StackReport("cell", 301, 1000.0, 0, [StackRow("carry-0.20-0.30", "round", False, list(figures), free)])
+
+
+def test_eighty_columns_hold_every_heading_and_figure_of_motions_through_the_stack() -> None:
+    report = stack_report(through_the_stack(), through_the_stack(mode="velocity", arrival_s=None))
+    following, safety = printed(following_table(report)), printed(safety_table(report))
+    for word in ("RMS", "free", "max", "path", "end", "there", "slip", "[mm]", "[s]", "carry-0.20-0.30: round"):
+        assert word in following
+    for word in ("held", "[%]", "near", "ref", "spare", "tau", "/limit", "rest", "[s-2]", "301 pairs"):
+        assert word in safety
+    position, velocity = following.splitlines()[6:8]
+    assert position.split() == ["position", "123", "8.95", "234", "12.3", "1.34", "5.67", "1.75", "231"]
+    assert velocity.split()[7] == "no"
+    figures = ["12.3", "-48.3", "20.0", "-68.3", "1.00", "0.63", "2.34"]
+    assert safety.splitlines()[6].split() == ["position", *figures]
+    assert "2 runs: broken 0 times" in " ".join(safety.split())
+    for table in (following, safety):
+        assert "carry-0.20-0.30 (!)" in table
+        assert "…" not in table
+    assert report.passed
+
+
+def test_what_went_wrong_in_the_stack_stands_below_the_table() -> None:
+    broken = through_the_stack(broken={"acceleration / limit": 3}, pauses=["left: linked to right: no pose"])
+    stopped = StackFigures("carry-0.20-0.30", "torque", 0.58, stopped="left_A2 is 0.160 rad from its reference")
+    report = stack_report(broken, stopped)
+    text = printed(safety_table(report))
+    assert set(text.splitlines()[7].split()[1:]) == {"-"}
+    for fault in (
+        "carry-0.20-0.30, position: paused: left: linked to right: no pose",
+        "carry-0.20-0.30, position: broken 3 times: acceleration / limit",
+        "carry-0.20-0.30, torque: stopped at 58 %: left_A2 is 0.160 rad from its reference",
+        "2 runs: broken 3 times",
+    ):
+        assert fault in " ".join(text.split())
+    assert printed(following_table(report)).splitlines()[7].split()[6:8] == ["-", "no"]
+    assert not report.passed
+
+
+@pytest.mark.parametrize(("broken", "code"), [({}, 0), ({"acceleration / limit": 1}, 1)])
+def test_through_the_stack_every_mode_runs_once_and_a_broken_promise_is_exit_code_1(
+    broken: dict[str, int], code: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = []
+
+    def ran(
+        config: Config, motions: object, modes: tuple[CommandMode, ...], seed: int, progress: object
+    ) -> StackReport:
+        asked.append((motions, modes, seed))
+        return stack_report(through_the_stack(broken=broken))
+
+    monkeypatch.setattr("q2r2_control.cli.bench.run_stack_bench", ran)
+    options = ["--through", "torque", "--through", "position", "--through", "torque", "--motion", "meet", "--seed", "3"]
+    result = q2r2("bench", "--work", *options, "--json")
+    assert result.exit_code == code
+    assert one_object(result.stdout)["passed"] is (code == 0)
+    assert asked == [(motions_named(["meet"]), (CommandMode.TORQUE, CommandMode.POSITION), 3)]
+
+
+@pytest.mark.parametrize(
+    ("options", "line"),
+    [
+        (["--through", "torque"], "--through needs --work"),
+        (["--work", "--seed", "3"], "--seed needs --soak or --through, since nothing else draws"),
+    ],
+)
+def test_options_of_the_stack_that_make_no_sense_are_one_line(options: list[str], line: str) -> None:
+    refused = q2r2("bench", *options)
+    assert (refused.exit_code, refused.stderr) == (2, f"q2r2: {line}\n")
 
 
 def test_a_broken_promise_is_in_the_table_with_its_tick_and_its_segment() -> None:

@@ -44,6 +44,40 @@ def test_the_first_target_is_the_tool_wherever_hand_and_tool_are(
 
 
 @quick
+@given(
+    hand=poses,
+    tool=poses,
+    wanted=poses,
+    stance=st.sampled_from(STANCES),
+    frame=st.sampled_from(FRAMES),
+    scale=st.floats(0.1, 5.0),
+    axes=st.sampled_from([("+x", "+y", "+z"), ("+z", "-x", "+y")]),
+)
+def test_a_hand_can_be_put_where_the_target_is_any_pose_that_is_wanted(
+    hand: pin.SE3, tool: pin.SE3, wanted: pin.SE3, stance: str, frame: str, scale: float, axes: tuple[str, ...]
+) -> None:
+    settings: dict[str, object] = {"stance": stance, "rotation_frame": frame, "scale": scale, "axes": axes}
+    motion = anchored(hand, tool, **settings)
+    assert_same(motion.hand(tool), hand)
+    assert_same(motion.target(motion.hand(wanted)), wanted)
+    motion = anchored(hand, tool, **settings, rotation_scale=1.0 + 0.5 * scale)
+    assert_same(motion.target(motion.hand(wanted)), wanted)
+
+
+def test_where_no_hand_turns_the_tool_it_is_put_in_place_alone() -> None:
+    hand, tool = pose(0.1, 0.2, 0.3, (0.4, 0.0, 0.0)), pose(0.5, 0.0, 0.4, (3.0, 0.0, 0.0))
+    wanted = pose(0.6, 0.1, 0.4, (0.0, 1.0, 0.0))
+    found = anchored(hand, tool, rotation_scale=0.0).hand(wanted)
+    np.testing.assert_allclose(found.rotation, hand.rotation)
+    np.testing.assert_allclose(found.translation - hand.translation, [0.1, 0.1, 0.0], atol=1e-12)
+
+
+def test_before_an_anchor_there_is_no_place_for_the_hand() -> None:
+    with pytest.raises(Q2R2Error, match="call anchor"):
+        RelativeMotion().hand(pose())
+
+
+@quick
 @given(hand=poses, tool=poses, moved=poses)
 def test_in_the_base_frame_the_tool_translates_and_turns_as_the_hand_does(
     hand: pin.SE3, tool: pin.SE3, moved: pin.SE3
