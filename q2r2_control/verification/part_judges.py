@@ -56,17 +56,22 @@ class _Fall:
 
 
 class LiftJudge:
-    """A part is lifted, held up for a second and put back to where it lay, without a fall."""
+    """A part is lifted, held up for a second and put back to where it lay, without a fall.
+
+    Once it has lain there for a second nobody holds it to this any more: other work may go on with it.
+    """
 
     def __init__(self, part: str) -> None:
         self._part = part
         self._start: tuple[float, float, float] | None = None
         self._fall = _Fall()
-        self._held = self._longest = self._height = 0.0
+        self._held = self._longest = self._height = self._lain = 0.0
         self._away = (0.0, 0.0)  # from the start, sideways and in height [m]
 
     def see(self, dt: float, parts: Mapping[str, PartState]) -> None:
         """See :meth:`Judge.see`."""
+        if self._lain >= HELD_TIME:
+            return
         part = parts[self._part]
         if self._start is None:
             self._start = part.place
@@ -76,6 +81,12 @@ class LiftJudge:
         self._held = self._held + dt if up else 0.0
         self._longest = max(self._longest, self._held)
         self._height = max(self._height, self._away[1])
+        back = self._longest >= HELD_TIME and self._is_back and not part.touched & FINGERS
+        self._lain = self._lain + dt if back else 0.0
+
+    @property
+    def _is_back(self) -> bool:
+        return self._away[0] <= _PUT_BACK[0] and abs(self._away[1]) <= _PUT_BACK[1]
 
     def measured(self) -> dict[str, float]:
         """See :meth:`Judge.measured`."""
@@ -91,8 +102,7 @@ class LiftJudge:
         faults = self._fall.faults()
         if self._longest < HELD_TIME:
             faults.append(f"held {1e3 * _LIFT:.0f} mm up for {self._longest:.1f} s, not {HELD_TIME:g} s")
-        sideways, height = _PUT_BACK
-        if self._away[0] > sideways or abs(self._away[1]) > height:
+        if not self._is_back:
             faults.append(f"ended {1e3 * math.hypot(*self._away):.0f} mm from where it lay")
         return [f"{self._part}: {fault}" for fault in faults]
 

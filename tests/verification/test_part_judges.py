@@ -36,6 +36,12 @@ class TestLift:
             {"lifted_mm": 100.0, "held_s": 1.5, "put_back_mm": 0.0, "fall_mm": 0.0}
         )
 
+    def test_a_part_that_lay_back_for_a_second_may_be_taken_elsewhere(self) -> None:
+        lain = [LIES, GRIPPED, HELD, GRIPPED, BACK, BACK]
+        elsewhere = (1.0, 0.3, 0.2, TABLE)
+        assert play(LiftJudge("part"), [*lain, HELD, elsewhere]).faults() == []
+        assert play(LiftJudge("part"), [LIES, GRIPPED, HELD, (0.5, 0.0, 0.2, TABLE), elsewhere]).faults() != []
+
     @pytest.mark.parametrize(
         ("phases", "fault"),
         [
