@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 
@@ -47,7 +46,7 @@ class Gripless(ScriptedInput):
 class Played:
     mode: CommandMode
     pipeline: Pipeline
-    ticks: Sequence[Tick]
+    ticks: list[Tick]
     summary: RunSummary
     results: dict[str, TaskResult]
 
