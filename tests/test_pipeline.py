@@ -78,12 +78,12 @@ def when_moving(action: Callable[[], object]) -> Callable[[Tick], None]:
         ("circle", False, "mujoco", "position", 2.0, 0.3),
         ("line", False, "kinematic", "position", 2.0, 0.3),
         ("rotate", False, "mujoco", "position", 2.0, 0.5),
-        ("reach_grasp_handover", False, "kinematic", "position", 2.0, 0.3),
+        ("meet", False, "kinematic", "position", 2.0, 0.3),
         ("circle", True, "mujoco", "position", 2.0, 0.5),
         ("circle", True, "mujoco", "torque", 2.0, 0.5),
         ("rotate", False, "mujoco", "torque", 2.0, 0.5),
     ],
-    ids=["circle", "line", "rotate", "reach", "a human's circle", "a human's circle by torque", "rotate by torque"],
+    ids=["circle", "line", "rotate", "meet", "a human's circle", "a human's circle by torque", "rotate by torque"],
 )
 def test_both_arms_follow_within_every_limit(
     trajectory: str, human: bool, plant: str, mode: str, millimetres: float, degrees: float

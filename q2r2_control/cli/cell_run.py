@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from datetime import datetime
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 
 from q2r2_control.cli.headset_server import AnnouncedHeadset
 from q2r2_control.cli.output import as_json_text, notice_of_compiling
-from q2r2_control.cli.summary_table import summary_table
+from q2r2_control.cli.summary_table import summary_table, task_line
 from q2r2_control.config import Config
 from q2r2_control.config.external import ControllerKind
 from q2r2_control.errors import ConfigError
@@ -23,6 +24,7 @@ from q2r2_control.runtime.recorder import Tick
 from q2r2_control.runtime.run_summary import RunSummary
 from q2r2_control.runtime.scheduling import real_time
 from q2r2_control.supervision.preflight import preflight_faults
+from q2r2_control.verification.assembly_tasks import AssemblyTask, TaskResult, TaskWatch
 from q2r2_control.viewer.history import History
 from q2r2_control.viewer.live import LiveTable
 from q2r2_control.viewer.report import draw_report
@@ -48,9 +50,22 @@ class RunOptions:
     report: bool
     force: bool  # run although q2r2 check finds faults
     real_time: bool  # ask the system for locked memory and SCHED_FIFO
+    tasks: tuple[AssemblyTask, ...] = ()  # to be judged
 
 
-def run_cell(config: Config, options: RunOptions, console: Console) -> RunSummary:
+@dataclass(frozen=True, slots=True)
+class CellRun:
+    """What a run left behind."""
+
+    summary: RunSummary
+    tasks: tuple[TaskResult, ...] = ()
+
+    def as_json(self) -> dict[str, Any]:
+        """The summary, and where there were tasks their results as ``tasks``."""
+        return {**self.summary.as_json(), **({"tasks": [asdict(task) for task in self.tasks]} if self.tasks else {})}
+
+
+def run_cell(config: Config, options: RunOptions, console: Console) -> CellRun:
     """Run a cell and tell ``console`` about it. Raises :class:`Q2R2Error` where that is not possible as asked."""
     if config.controller is ControllerKind.EXTERNAL:
         raise ConfigError(
@@ -65,6 +80,10 @@ def run_cell(config: Config, options: RunOptions, console: Console) -> RunSummar
     history = History(pipeline.robot, pipeline.robot.capped_acceleration(config.control.acceleration_limit))
     if options.report:
         pipeline.listeners.append(history)
+    watch = None
+    if options.tasks and isinstance(pipeline.plant, MujocoPlant):
+        watch = TaskWatch(options.tasks, pipeline.plant, pipeline.robot, config)
+        pipeline.listeners.append(watch)
     with ExitStack() as stack:
         if options.window and isinstance(pipeline.plant, MujocoPlant):
             pipeline.plant.launch_viewer()
@@ -76,18 +95,22 @@ def run_cell(config: Config, options: RunOptions, console: Console) -> RunSummar
         if options.real_time and (refused := stack.enter_context(real_time())):
             console.print(refused, style="yellow", soft_wrap=True, highlight=False, markup=False)
         summary = pipeline.run(options.duration, realtime=not options.fast)
+    run = CellRun(summary, watch.results() if watch is not None else ())
     if options.report:
-        folder = _write_report(config, options, history, summary)
+        folder = _write_report(config, options, history, run)
         console.print(f"report: {folder / 'report.png'}", soft_wrap=True, highlight=False)
-    return summary
+    return run
 
 
-def print_summary(summary: RunSummary, json: bool) -> None:
+def print_summary(run: CellRun, json: bool) -> None:
     """Print the summary of a run on stdout, as a table or as one JSON object."""
     if json:
-        print(as_json_text(summary.as_json()))
-    else:
-        Console().print(summary_table(summary))
+        print(as_json_text(run.as_json()))
+        return
+    console = Console()
+    console.print(summary_table(run.summary))
+    for task in run.tasks:
+        console.print(task_line(task), soft_wrap=True, highlight=False)
 
 
 def _refuse_faults(pipeline: Pipeline, force: bool, console: Console) -> None:
@@ -122,12 +145,12 @@ class _WindowListener:
                 self._pipeline.stop()
 
 
-def _write_report(config: Config, options: RunOptions, history: History, summary: RunSummary) -> Path:
+def _write_report(config: Config, options: RunOptions, history: History, run: CellRun) -> Path:
     folder = _new_folder(Path("runs"), f"{datetime.now():%Y%m%d-%H%M%S}-{options.name}")
-    (folder / "summary.json").write_text(as_json_text(summary.as_json()) + "\n", encoding="utf-8")
+    (folder / "summary.json").write_text(as_json_text(run.as_json()) + "\n", encoding="utf-8")
     what = options.trajectory if options.input == "scripted" else options.input
     title = f"{config.name}: {what}, {options.plant} plant"
-    draw_report(history, summary, title, folder / "report.png")
+    draw_report(history, run.summary, title, folder / "report.png")
     return folder
 
 

@@ -1,4 +1,4 @@
-"""``q2r2 demo``: two simulated arms follow scripted hands."""
+"""``q2r2 demo``: two simulated arms do small assembly work, led by scripted hands."""
 
 from __future__ import annotations
 
@@ -10,29 +10,48 @@ from q2r2_control.cli.cell_run import RunOptions, print_summary, run_cell
 from q2r2_control.cli.options import DEMO_CONFIG, Headless, Human, Json, RealTime, Viewer, positive, shows_table
 from q2r2_control.cli.output import stderr_console
 from q2r2_control.config import load_config
-from q2r2_control.inputs.factory import DEFAULT_TRAJECTORY
+from q2r2_control.errors import ConfigError
+from q2r2_control.inputs.trajectories import trajectory_named
+from q2r2_control.types import CommandMode
+from q2r2_control.verification.assembly_tasks import ALL_TASKS, TASKS, tasks_named
+
+_DEFAULT = ["handover", "stack"]
+_ABOUT = "; ".join(f"{task.name}: {task.about}" for task in TASKS.values())
 
 
 def demo(
-    duration: Annotated[float, typer.Option(help="[s]")] = 20.0,
+    tasks: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar=f"[{'|'.join((*TASKS, ALL_TASKS))}]...", help=f"By default {' '.join(_DEFAULT)}. {_ABOUT}."
+        ),
+    ] = None,
+    mode: Annotated[CommandMode, typer.Option(help="What the arms get; torque: arms that yield.")] = CommandMode.TORQUE,
+    duration: Annotated[float | None, typer.Option(help="Ends earlier [s].")] = None,
+    fast: Annotated[bool, typer.Option("--fast", help="Simulated time, as fast as it can, repeatable.")] = False,
     viewer: Viewer = False,
     headless: Headless = False,
     human: Human = False,
     rt: RealTime = False,
     json: Json = False,
 ) -> None:
-    """Two simulated arms follow scripted hands: both pick up a block, meet in the middle, put it back.
+    """Two simulated arms hand a bar to each other and stack blocks, led by nothing but the samples of scripted hands.
 
-    The arms are driven in torque mode, by Cartesian impedance. Writes plots and a summary to a folder under runs/.
+    Ends with a line for each task, as the simulation measured it, and exit code 1 where one did not succeed.
+    Writes plots and a summary to a folder under runs/.
     """
+    if fast and rt:
+        raise ConfigError("--rt and --fast exclude each other, since simulated time is never late")
+    chosen = tasks_named(tasks or _DEFAULT)
+    trajectory = "+".join(task.name for task in chosen)
     options = RunOptions(
         name="demo",
         input="scripted",
         plant="mujoco",
-        mode="torque",
-        duration=positive("--duration", duration),
-        fast=False,
-        trajectory=DEFAULT_TRAJECTORY,
+        mode=mode.value,
+        duration=trajectory_named(trajectory).duration if duration is None else positive("--duration", duration),
+        fast=fast,
+        trajectory=trajectory,
         human=human,
         seed=0,
         table=shows_table(headless, viewer),
@@ -40,5 +59,9 @@ def demo(
         report=True,
         force=False,
         real_time=rt,
+        tasks=chosen,
     )
-    print_summary(run_cell(load_config(DEMO_CONFIG), options, stderr_console()), json)
+    run = run_cell(load_config(DEMO_CONFIG), options, stderr_console())
+    print_summary(run, json)
+    if not all(task.succeeded for task in run.tasks):
+        raise typer.Exit(1)

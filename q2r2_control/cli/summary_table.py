@@ -11,6 +11,7 @@ from q2r2_control.runtime.histogram import Percentiles
 from q2r2_control.runtime.run_summary import RunSummary
 from q2r2_control.runtime.torque_summary import TorqueSummary
 from q2r2_control.types import Event
+from q2r2_control.verification.assembly_tasks import TaskResult
 
 
 def summary_table(summary: RunSummary) -> Table:
@@ -52,6 +53,20 @@ def summary_table(summary: RunSummary) -> Table:
         _add_torque(table, summary.torque)
     table.add_row("arms at the end", "at rest" if summary.at_rest else "[red]moving[/]")
     return table
+
+
+def task_line(task: TaskResult) -> str:
+    """One line of markup: whether a task succeeded, and what was measured of it."""
+    figures = ", ".join(
+        f"{what.rpartition('_')[0].replace('_', ' ')} {_figure(what, value)}" for what, value in task.measured.items()
+    )
+    verdict = "[green]succeeded[/]" if task.succeeded else f"[red]failed[/]: {escape(task.reason)}"
+    return f"{task.name} {verdict} ({figures})"
+
+
+def _figure(what: str, value: float) -> str:
+    """With the unit that the figure's name ends with."""
+    return f"{value:.1f} {what.rpartition('_')[2]}"
 
 
 def _last_pauses(events: Sequence[Event]) -> dict[str, Event]:

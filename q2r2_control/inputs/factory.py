@@ -9,7 +9,7 @@ from q2r2_control.inputs.headset import HeadsetServer
 from q2r2_control.inputs.scripted import ScriptedInput
 
 INPUTS = ("scripted", "headset")
-DEFAULT_TRAJECTORY = "reach_grasp_handover"
+DEFAULT_TRAJECTORY = "meet"
 
 
 def make_input(source: Input | str, config: Config) -> Input:

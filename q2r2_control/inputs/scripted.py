@@ -10,7 +10,7 @@ import pinocchio as pin
 from q2r2_control.errors import ConfigError
 from q2r2_control.inputs.played import PlayedInput
 from q2r2_control.inputs.sampling import EvenSampling, HeadsetSampling, Sampling
-from q2r2_control.inputs.trajectories import TRAJECTORIES, Trajectory, mirrored
+from q2r2_control.inputs.trajectories import trajectory_named
 from q2r2_control.types import SIDES
 
 # Where an operator holds the hands; only what follows from here on moves an arm.
@@ -42,15 +42,13 @@ class ScriptedInput(PlayedInput):
         rate_hz: float = 75.0,
         frequency_hz: float = 0.25,
     ) -> None:
-        if trajectory not in TRAJECTORIES:
-            raise ConfigError(f"scripted trajectory {trajectory!r}: allowed are {', '.join(TRAJECTORIES)}")
         for hand in hands:
             if hand not in SIDES:
                 raise ConfigError(f"scripted hand {hand!r}: allowed are {', '.join(SIDES)}")
         for name, value, limit in (("rate_hz", rate_hz, 2000.0), ("frequency_hz", frequency_hz, 2.0)):
             if not 0.0 < value <= limit:
                 raise ConfigError(f"scripted input: {name} = {value!r}: allowed is above 0 and up to {limit:g}")
-        self._trajectory: Trajectory = TRAJECTORIES[trajectory]
+        self._trajectory = trajectory_named(trajectory)
         self._frequency = frequency_hz
 
         def sampling(hand: str) -> Sampling:
@@ -68,8 +66,6 @@ class ScriptedInput(PlayedInput):
         return pin.Motion(linear, pin.log3(after.rotation @ before.rotation.T) / (2.0 * _DIFFERENCE))
 
     def _ideal(self, hand: str, t: float) -> pin.SE3:
-        displacement, turn = self._trajectory.displacement(t, self._frequency)
-        if hand == "right":
-            displacement, turn = mirrored(displacement, turn)
+        displacement, turn = self._trajectory.displacement(hand, t, self._frequency)
         home = HANDS_AT_REST[hand]
         return pin.SE3(pin.exp3(turn) @ home.rotation, home.translation + displacement)

@@ -1,34 +1,52 @@
 """Ideal hand motions with their button presses, to test the robot's response without an operator.
 
-All are written for the left hand, as displacements from wherever the hand starts; the right hand mirrors them left to
-right. Axes: x forwards, y to the left, z up. Only the handover goes below
-the start, to what lies on the table of config/dual_iiwa7.yaml.
+All are displacements from wherever the hands start. Those that are not assembly work are written for the left hand, and
+the right hand mirrors them left to right. Axes: x forwards, y to the left, z up. Only those that pick something up go
+below the start, to what lies on the table of config/dual_iiwa7.yaml.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from q2r2_control.types import Array, HandInputs
+from q2r2_control.errors import ConfigError
+from q2r2_control.inputs.assembly import HOME, WORKS, HandWork
+from q2r2_control.inputs.way_points import WayPoint, WayPoints, later, minimum_jerk
+from q2r2_control.types import SIDES, Array, HandInputs
 
 PRESS_DURATION = 0.15  # [s]
 _FIRST_PRESS = 0.6  # when the lower buttons engage both arms [s]
 _START = 1.2  # of the motion [s]
+_LAST_PRESS, _REST = 0.4, 0.6  # after work: the lower buttons pause both arms, and then the end [s]
 _RAMP = 1.0  # periodic motions gather speed for this long [s]
+
+
+# (t [s], frequency [Hz]) -> displacement (3,) [m] and rotation vector (3,) [rad] of a hand.
+Path = Callable[[float, float], tuple[Array, Array]]
 
 
 @dataclass(frozen=True)
 class Trajectory:
     """What both hands do over time."""
 
-    # (t [s], frequency [Hz]) -> displacement (3,) [m] and rotation vector (3,) [rad] of the left hand
-    displacement: Callable[[float, float], tuple[Array, Array]]
+    left: Path
+    right: Path | None = None  # None: the left hand's, mirrored
     upper_presses: Mapping[str, tuple[float, ...]] = field(default_factory=dict)  # hand -> times [s]
     lower_presses: tuple[float, ...] = (_FIRST_PRESS,)  # of both hands [s]
+    duration: float | None = None  # None: without end [s]
+
+    def displacement(self, hand: str, t: float, frequency: float) -> tuple[Array, Array]:
+        """Displacement (3,) [m] and rotation vector (3,) [rad] of ``hand`` at ``t`` [s]."""
+        if hand == "left":
+            return self.left(t, frequency)
+        if self.right is not None:
+            return self.right(t, frequency)
+        displacement, turn = self.left(t, frequency)
+        return displacement * (1.0, -1.0, 1.0), turn * (-1.0, 1.0, -1.0)
 
     def inputs(self, hand: str, t: float) -> HandInputs:
         """Buttons of ``hand`` at time ``t`` [s]; a closed hand also shows on the index trigger."""
@@ -38,11 +56,6 @@ class Trajectory:
             button_lower=_pressed(self.lower_presses, t),
             press_index=float(sum(press <= t for press in upper) % 2),
         )
-
-
-def mirrored(displacement: Array, turn: Array) -> tuple[Array, Array]:
-    """The same motion of the other hand: reflected in the plane between left and right."""
-    return displacement * (1.0, -1.0, 1.0), turn * (-1.0, 1.0, -1.0)
 
 
 def _pressed(presses: tuple[float, ...], t: float) -> bool:
@@ -78,49 +91,54 @@ def _rotate(t: float, frequency: float) -> tuple[Array, Array]:
     return np.array([0.0, 0.0, lift]), turn
 
 
-# t [s], displacement [m], tilt about x [rad]: wrists outwards, so that the finger tips are what comes nearest.
-_HANDOVER = np.array(
-    [
-        (1.2, 0.00, 0.00, 0.000, 0.00),
-        (2.6, 0.05, 0.00, -0.030, 0.00),  # over the block
-        (4.4, 0.05, 0.00, -0.137, 0.00),  # down around it
-        (5.4, 0.05, 0.00, -0.137, 0.00),  # grasp
-        (7.0, 0.05, 0.00, 0.020, 0.00),  # lift
-        (10.2, 0.05, -0.185, 0.020, -0.25),  # to the middle, where the two grippers nearly touch
-        (11.2, 0.05, -0.185, 0.020, -0.25),
-        (14.0, 0.05, 0.00, 0.020, 0.00),  # back
-        (15.8, 0.05, 0.00, -0.137, 0.00),  # put down
-        (16.8, 0.05, 0.00, -0.137, 0.00),  # let go
-        (18.6, 0.00, 0.00, 0.000, 0.00),  # away
-    ]
-)
+def in_sequence(works: Sequence[HandWork]) -> Trajectory:
+    """Hands that do one work after the other, and then pause."""
+    homes: dict[str, WayPoint] = {hand: (0.0, *HOME[hand], 0.0, 0.0) for hand in SIDES}
+    points = {hand: [home] for hand, home in homes.items()}
+    presses: dict[str, list[float]] = {hand: [] for hand in SIDES}
+    begins = _START
+    for work in works:
+        for hand, home in homes.items():
+            way = [later(point, begins) for point in (home, *work.tools.get(hand, ()))]
+            points[hand] += [point for point in way if point[0] > points[hand][-1][0]]
+            presses[hand] += [begins + t for t in work.presses.get(hand, ())]
+        begins += work.duration
+    return Trajectory(
+        left=_from_home(points["left"], "left"),
+        right=_from_home(points["right"], "right"),
+        upper_presses={hand: tuple(times) for hand, times in presses.items()},
+        lower_presses=(_FIRST_PRESS, begins + _LAST_PRESS),
+        duration=begins + _LAST_PRESS + _REST,
+    )
 
 
-def _reach_grasp_handover(t: float, frequency: float) -> tuple[Array, Array]:
-    """Each hand picks a block up, both meet in the middle, each puts its block back; ``frequency`` means nothing.
+def _from_home(points: Sequence[WayPoint], hand: str) -> Path:
+    way, home = WayPoints(points), np.array(HOME[hand])
 
-    Between rests by minimum-jerk motions (Flash and Hogan, 1985), as people reach.
-    """
-    times = _HANDOVER[:, 0]
-    index = int(np.clip(np.searchsorted(times, t, side="right") - 1, 0, len(times) - 2))
-    fraction = minimum_jerk((t - times[index]) / (times[index + 1] - times[index]))
-    where = (1.0 - fraction) * _HANDOVER[index, 1:] + fraction * _HANDOVER[index + 1, 1:]
-    return where[:3], np.array([where[3], 0.0, 0.0])
+    def displacement(t: float, frequency: float) -> tuple[Array, Array]:
+        place, turn = way.at(t)
+        return place - home, turn
 
-
-def minimum_jerk(fraction: float) -> float:
-    """Share of the way at a ``fraction`` of the time: 0 to 1, at rest at both ends; fractions beyond them are cut."""
-    s = min(max(fraction, 0.0), 1.0)
-    return s**3 * (10.0 - 15.0 * s + 6.0 * s**2)
+    return displacement
 
 
 TRAJECTORIES: Mapping[str, Trajectory] = {
     "circle": Trajectory(_circle),
     "line": Trajectory(_line),
     "rotate": Trajectory(_rotate),
-    "reach_grasp_handover": Trajectory(
-        _reach_grasp_handover,
-        upper_presses={"left": (4.7, 16.1), "right": (4.9, 16.3)},
-        lower_presses=(_FIRST_PRESS, 19.0),
-    ),
+    **{name: in_sequence([work]) for name, work in WORKS.items()},
 }
+
+
+def trajectory_named(name: str) -> Trajectory:
+    """One of :data:`TRAJECTORIES`, or several works one after the other, such as ``handover+stack``.
+
+    Raises :class:`ConfigError` for any other name.
+    """
+    if name in TRAJECTORIES:
+        return TRAJECTORIES[name]
+    works = name.split("+")
+    if not all(work in WORKS for work in works):
+        allowed = f"{', '.join(TRAJECTORIES)}, and {', '.join(WORKS)} joined by +"
+        raise ConfigError(f"scripted trajectory {name!r:.60}: allowed are {allowed}")
+    return in_sequence([WORKS[work] for work in works])

@@ -16,6 +16,7 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from q2r2_control.cli.app import app
+from q2r2_control.config import load_config
 from q2r2_control.config.resources import find_resource
 from q2r2_control.verification.soak import SoakReport, run_soak
 from tests.support.external_cell import external_text
@@ -118,6 +119,8 @@ def test_the_help_lists_every_command(command: str) -> None:
         pytest.param(("run", CELL, "--duration", "nan"), "--duration nan: allowed", id="a duration that is not finite"),
         pytest.param(("run", CELL, "--duration", "-1"), "--duration -1: allowed", id="a negative duration"),
         pytest.param(("demo", "--duration", "0"), "--duration 0: allowed", id="a demo of no duration"),
+        pytest.param(("demo", "juggle"), "task 'juggle': allowed: meet, grasp", id="a task that no demo has"),
+        pytest.param(("demo", "--fast", "--rt"), "exclude each other", id="a demo in simulated real time"),
         pytest.param(("run", CELL, "--fast"), "--fast needs --duration", id="simulated time without an end"),
         pytest.param(
             ("run", CELL, "--input", "headset", "--fast", "--duration", "1"),
@@ -346,11 +349,28 @@ def test_the_demo_leaves_a_picture_and_the_summary_in_a_folder_that_it_names(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     result = q2r2("demo", "--duration", "0.5", "--headless", "--json")
-    assert result.exit_code == 0
+    assert result.exit_code == 1, "no task is done so early"
     path = next(line.removeprefix("report: ") for line in result.stderr.splitlines() if line.startswith("report: "))
     assert Path(path).read_bytes().startswith(b"\x89PNG")
     assert Path(path).parent.parent == Path("runs")
     assert json.loads(Path(path).with_name("summary.json").read_text()) == one_object(result.stdout)
+
+
+def test_the_demo_says_of_each_task_whether_it_succeeded_and_so_does_its_exit_code(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    coarse = load_config(CELL).model_copy(update={"loop_rate_hz": 200.0})
+    monkeypatch.setattr("q2r2_control.cli.demo.load_config", lambda path: coarse)
+    monkeypatch.chdir(tmp_path)
+    demo = ("demo", "grasp", "--fast", "--headless", "--mode", "position")
+    done = q2r2(*demo)
+    assert done.exit_code == 0
+    assert "grasp succeeded (lifted 10" in done.stdout
+    early = q2r2(*demo, "--duration", "4", "--json")
+    assert early.exit_code == 1
+    (task,) = one_object(early.stdout)["tasks"]
+    assert (task["name"], task["succeeded"]) == ("grasp", False)
+    assert task["reason"].startswith("flat_block: held 95 mm up for 0.0 s")
 
 
 def test_headset_check_shows_a_headset_in_a_process_of_its_own() -> None:

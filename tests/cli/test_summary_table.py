@@ -9,9 +9,10 @@ import pytest
 from rich.console import Console
 
 from q2r2_control import Pipeline, RunSummary
-from q2r2_control.cli.summary_table import summary_table
+from q2r2_control.cli.summary_table import summary_table, task_line
 from q2r2_control.runtime.histogram import Percentiles
 from q2r2_control.types import Event
+from q2r2_control.verification.assembly_tasks import TaskResult
 from tests.support.hands_input import HandsInput
 from tests.support.watch import cell
 
@@ -53,3 +54,23 @@ def test_how_late_ticks_were_is_told_where_time_was_real(summary: RunSummary) ->
     assert "ticks late by" not in text_of(summary)
     text = text_of(replace(summary, lateness_us=Percentiles(60.0, 310.0, 1204.0), overruns=3))
     assert "median 60 us, p99 310, max 1204; 3 by more than a period" in text
+
+
+@pytest.mark.parametrize(
+    ("reason", "line"),
+    [
+        pytest.param("", "grasp succeeded (lifted 101.2 mm, put back 0.1 mm, held 1.8 s)", id="success"),
+        pytest.param(
+            "bar: fell 30 mm",
+            "grasp failed: bar: fell 30 mm (lifted 101.2 mm, put back 0.1 mm, held 1.8 s)",
+            id="failure",
+        ),
+    ],
+)
+def test_a_task_is_told_in_one_line_with_what_was_measured_and_what_fell_short(reason: str, line: str) -> None:
+    measured = {"lifted_mm": 101.23, "put_back_mm": 0.1, "held_s": 1.8}
+    console = Console(file=StringIO(), width=300)
+    console.print(task_line(TaskResult("grasp", not reason, measured, reason)), highlight=False)
+    file = console.file
+    assert isinstance(file, StringIO)
+    assert file.getvalue() == f"{line}\n"

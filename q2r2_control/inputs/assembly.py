@@ -1,0 +1,137 @@
+"""Small assembly work of two hands, as way points: what lies on the table of config/dual_iiwa7.yaml is picked up.
+
+Way points are those of the tools that follow, in the world; the hands move alike, from wherever they start. Nothing is
+corrected on the way: where a part lies is known, and where a tool arrives is what the robot makes of it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from q2r2_control.inputs.way_points import WayPoint
+
+# Where the tools are at home [m]: pointing straight down, fingers closing along y.
+HOME: Mapping[str, tuple[float, float, float]] = {"left": (0.50, 0.25, 0.38), "right": (0.50, -0.25, 0.38)}
+_LEFT_HOME, _RIGHT_HOME = (*HOME["left"], 0.0, 0.0), (*HOME["right"], 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class HandWork:
+    """What both hands do, from and to home."""
+
+    duration: float  # [s]
+    tools: Mapping[str, tuple[WayPoint, ...]]  # after home, at rising times since the start; a hand without any rests
+    presses: Mapping[str, tuple[float, ...]] = field(default_factory=dict)  # of the upper buttons, by hand [s]
+
+
+# A block of 60 mm, held 17 mm above its middle.
+_GRIP, _OVER = 0.243, 0.33
+_MEET = (
+    (1.4, 0.55, 0.25, 0.35, 0.0, 0.0),  # over the block
+    (3.2, 0.55, 0.25, _GRIP, 0.0, 0.0),  # down around it
+    (4.2, 0.55, 0.25, _GRIP, 0.0, 0.0),  # grasp
+    (5.8, 0.55, 0.25, 0.40, 0.0, 0.0),  # lift
+    (9.0, 0.55, 0.065, 0.40, -0.25, 0.0),  # to the middle, wrists outwards: the grippers nearly touch
+    (10.0, 0.55, 0.065, 0.40, -0.25, 0.0),
+    (12.8, 0.55, 0.25, 0.40, 0.0, 0.0),  # back
+    (14.6, 0.55, 0.25, _GRIP, 0.0, 0.0),  # put down
+    (15.6, 0.55, 0.25, _GRIP, 0.0, 0.0),  # let go
+    (17.4, *_LEFT_HOME),
+)
+MEET = HandWork(
+    duration=17.4,
+    tools={"left": _MEET, "right": tuple((t, x, -y, z, -tilt, -turn) for t, x, y, z, tilt, turn in _MEET)},
+    presses={"left": (3.5, 14.9), "right": (3.7, 15.1)},
+)
+
+_LOW = 0.216  # tips 3 mm above the table
+GRASP = HandWork(
+    duration=10.6,
+    tools={
+        "right": (
+            (1.4, 0.45, -0.35, 0.30, 0.0, 0.0),  # over the block
+            (2.8, 0.45, -0.35, _LOW, 0.0, 0.0),
+            (3.5, 0.45, -0.35, _LOW, 0.0, 0.0),  # grasp
+            (4.9, 0.45, -0.35, _LOW + 0.101, 0.0, 0.0),  # lift
+            (6.1, 0.45, -0.35, _LOW + 0.101, 0.0, 0.0),
+            (7.5, 0.45, -0.35, _LOW, 0.0, 0.0),  # put down
+            (8.2, 0.45, -0.35, _LOW, 0.0, 0.0),  # let go
+            (9.2, 0.45, -0.35, 0.30, 0.0, 0.0),
+            (10.6, *_RIGHT_HOME),
+        )
+    },
+    presses={"right": (2.9, 7.6)},
+)
+
+STACK = HandWork(
+    duration=14.8,
+    tools={
+        "left": (
+            (0.9, 0.55, 0.25, _OVER, 0.0, 0.0),
+            (2.1, 0.55, 0.25, _GRIP, 0.0, 0.0),
+            (2.8, 0.55, 0.25, _GRIP, 0.0, 0.0),  # grasp
+            (3.8, 0.55, 0.25, 0.36, 0.0, 0.0),
+            (5.6, 0.52, 0.00, 0.36, 0.0, 0.0),  # over the block in the middle
+            (6.6, 0.52, 0.00, _GRIP + 0.06, 0.0, 0.0),
+            (7.3, 0.52, 0.00, _GRIP + 0.06, 0.0, 0.0),  # let go
+            (8.3, 0.52, 0.00, 0.40, 0.0, 0.0),
+            (9.9, *_LEFT_HOME),
+        ),
+        "right": (
+            (4.0, *_RIGHT_HOME),
+            (5.0, 0.55, -0.25, _OVER, 0.0, 0.0),
+            (6.2, 0.55, -0.25, _GRIP, 0.0, 0.0),
+            (6.9, 0.55, -0.25, _GRIP, 0.0, 0.0),  # grasp
+            (8.2, 0.55, -0.25, 0.41, 0.0, 0.0),
+            (8.4, 0.55, -0.25, 0.41, 0.0, 0.0),
+            (10.2, 0.52, 0.00, 0.41, 0.0, 0.0),  # over both, as the other hand leaves
+            (11.2, 0.52, 0.00, _GRIP + 0.12, 0.0, 0.0),
+            (11.9, 0.52, 0.00, _GRIP + 0.12, 0.0, 0.0),  # let go
+            (12.8, 0.52, 0.00, 0.42, 0.0, 0.0),
+            (14.8, *_RIGHT_HOME),
+        ),
+    },
+    presses={"left": (2.2, 6.7), "right": (6.3, 11.3)},
+)
+
+# The hands hold the bar, which lies along y, from both sides, tilted so that their wrists are farther apart than the
+# fingers; straight down, wrists would keep 60 mm more between the tools than the bar leaves.
+_TILT, _TURN = 0.4, 0.5 * math.pi
+_BAR_LOW = 0.2193  # the lower corners of the tilted tips 3 mm above the table
+_OFF = 0.045  # of each tool from the bar's middle, along it
+_BACK_Y, _BACK_Z = 0.09 * math.sin(_TILT), 0.09 * math.cos(_TILT)  # before and after a grasp
+_LEFT, _RIGHT = (-_TILT, -_TURN), (_TILT, _TURN)
+HANDOVER = HandWork(
+    duration=18.4,
+    tools={
+        "left": (
+            (2.2, 0.44, 0.15 + _OFF + _BACK_Y, _BAR_LOW + _BACK_Z, *_LEFT),  # over the bar's left end
+            (3.4, 0.44, 0.15 + _OFF, _BAR_LOW, *_LEFT),
+            (4.1, 0.44, 0.15 + _OFF, _BAR_LOW, *_LEFT),  # grasp
+            (5.2, 0.44, 0.15 + _OFF, 0.34, *_LEFT),  # lift
+            (6.8, 0.46, _OFF, 0.38, *_LEFT),  # to the middle
+            (9.2, 0.46, _OFF, 0.38, *_LEFT),  # let go, once the other hand has it
+            (10.2, 0.46, _OFF + _BACK_Y, 0.38 + _BACK_Z, *_LEFT),
+            (12.4, *_LEFT_HOME),
+        ),
+        "right": (
+            (3.4, *_RIGHT_HOME),
+            (5.8, 0.46, -_OFF - _BACK_Y, 0.38 + _BACK_Z, *_RIGHT),  # where the bar's right end will be
+            (6.8, 0.46, -_OFF - _BACK_Y, 0.38 + _BACK_Z, *_RIGHT),
+            (8.0, 0.46, -_OFF, 0.38, *_RIGHT),
+            (10.2, 0.46, -_OFF, 0.38, *_RIGHT),  # grasp, and wait until the other hand is gone
+            (11.8, 0.46, -_OFF - 0.12, 0.38, *_RIGHT),  # away with it
+            (13.0, 0.46, -_OFF - 0.12, 0.38, *_RIGHT),
+            (14.6, 0.46, -_OFF - 0.12, _BAR_LOW, *_RIGHT),  # put down
+            (15.3, 0.46, -_OFF - 0.12, _BAR_LOW, *_RIGHT),  # let go
+            (16.2, 0.46, -_OFF - 0.12 - _BACK_Y, _BAR_LOW + _BACK_Z, *_RIGHT),
+            (18.4, *_RIGHT_HOME),
+        ),
+    },
+    presses={"left": (3.5, 8.7), "right": (8.1, 14.7)},
+)
+
+# In the order in which they can follow each other.
+WORKS: Mapping[str, HandWork] = {"meet": MEET, "grasp": GRASP, "handover": HANDOVER, "stack": STACK}

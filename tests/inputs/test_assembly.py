@@ -1,0 +1,56 @@
+"""Hand motions of assembly work, and works in sequence."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from q2r2_control import Robot, load_config
+from q2r2_control.errors import ConfigError
+from q2r2_control.inputs.assembly import HOME, WORKS
+from q2r2_control.inputs.trajectories import TRAJECTORIES, trajectory_named
+from q2r2_control.types import SIDES
+
+
+def test_way_points_begin_where_the_shipped_cell_has_its_tools() -> None:
+    robot = Robot.from_config(load_config("config/dual_iiwa7.yaml"))
+    for arm, home in HOME.items():
+        np.testing.assert_allclose(robot.tool_pose(robot.home, arm).translation, home, atol=1e-4)
+
+
+@pytest.mark.parametrize("name", WORKS)
+def test_every_work_has_rising_times_and_ends_at_home_with_open_grippers(name: str) -> None:
+    work = WORKS[name]
+    for hand, points in work.tools.items():
+        times = [point[0] for point in points]
+        assert times == sorted(set(times))
+        assert times[0] > 0.0
+        assert times[-1] <= work.duration
+        assert points[-1][1:] == (*HOME[hand], 0.0, 0.0)
+        assert len(work.presses[hand]) % 2 == 0
+
+
+def test_works_in_sequence_do_what_each_of_them_does_one_after_the_other() -> None:
+    both, first, second = (trajectory_named(name) for name in ("handover+stack", "handover", "stack"))
+    assert first.duration is not None
+    assert second.duration is not None
+    assert both.duration is not None
+    shift = WORKS["handover"].duration
+    assert both.duration == pytest.approx(second.duration + shift)
+    for hand in SIDES:
+        for t in np.linspace(0.0, shift, 40):
+            np.testing.assert_allclose(both.displacement(hand, t, 1.0), first.displacement(hand, t, 1.0), atol=1e-12)
+        for t in np.linspace(2.0, second.duration, 40):
+            expected = second.displacement(hand, t, 1.0)
+            np.testing.assert_allclose(both.displacement(hand, t + shift, 1.0), expected, atol=1e-9)
+        presses = first.upper_presses[hand] + tuple(t + shift for t in second.upper_presses[hand])
+        assert both.upper_presses[hand] == pytest.approx(presses)
+
+
+@pytest.mark.parametrize("name", ["handover+", "circle+stack", "spiral", ""])
+def test_a_name_that_is_no_sequence_of_works_is_refused_with_those_that_are_allowed(name: str) -> None:
+    with pytest.raises(
+        ConfigError, match=r"allowed are circle, .*stack, and meet, grasp, handover, stack joined by \+"
+    ):
+        trajectory_named(name)
+    assert set(WORKS) < set(TRAJECTORIES)
