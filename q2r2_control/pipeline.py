@@ -224,7 +224,7 @@ class PipelineRun:
             commanded = {arm: pipeline.controller.tool_pose(arm) for arm in pipeline.robot.arms}
             self._targets = pipeline.teleop.update(samples, tools, self._clock.now, commanded)
             self._hand_over(tools)
-        self._limit_grippers()
+        self.limit_grippers()
         reference, trusted = self._advance(dt), self._supervisor.state_fault is None
         pipeline.plant.apply(drive.command(reference, state, self._grippers, dt, trusted))
         compute_time = time.perf_counter() - began
@@ -269,7 +269,7 @@ class PipelineRun:
         self._velocity = reference.v
         return reference
 
-    def _limit_grippers(self) -> None:
+    def limit_grippers(self) -> None:
         """What the grippers are commanded to; before the step, which has to be proven with fingers that move in it."""
         pipeline, wanted = self._pipeline, {arm: target.gripper for arm, target in self._targets.items()}
         self._grippers = self._limiter.limit(wanted, pipeline.plant.gripper_openings(), self._clock.now)

@@ -160,9 +160,13 @@ class Contract:
         self._least = float(margins.min(initial=np.inf)) if self._certain else -np.inf
         self._newest: deque[tuple[float, float]] = deque(maxlen=_NEWEST)  # duration [s], duration times |a|^2
 
-    def set_openings(self, openings: Mapping[str, Interval]) -> None:
-        """The controller has accepted ``openings`` since its last reference: its fingers and its stop may be others."""
-        self._stop = self._controller.stop_deceleration
+    def set_openings(self, openings: Mapping[str, Interval], *, before_step: bool = True) -> None:
+        """The controller has accepted ``openings``: its fingers are others, and ``before_step`` its stop may be.
+
+        Who is told of references only, and so is late, leaves the stop as the last reference had it.
+        """
+        if before_step:
+            self._stop = self._controller.stop_deceleration
         model = collision_model_at(self._robot.collision_model, self._robot.finger_bodies, openings)
         self._fingers = model, model.createData()
 

@@ -53,3 +53,11 @@ def test_how_late_ticks_were_is_told_where_time_was_real(summary: RunSummary) ->
     assert "ticks late by" not in text_of(summary)
     text = text_of(replace(summary, lateness_us=Percentiles(60.0, 310.0, 1204.0), overruns=3))
     assert "median 60 us, p99 310, max 1204; 3 by more than a period" in text
+
+
+def test_a_gripper_that_was_held_is_named_with_what_held_it(summary: RunSummary) -> None:
+    assert "gripper held" not in text_of(summary)
+    held = replace(summary.arms["left"], gripper_held_s=1.25, gripper_held_by=("left_finger_0", "block_0"))
+    text = text_of(replace(summary, arms=summary.arms | {"left": held}))
+    (row,) = (line for line in text.splitlines() if "left gripper held for" in line)
+    assert "1.25 s, by left_finger_0 | block_0" in row

@@ -9,6 +9,7 @@ import pytest
 from q2r2_control import CartesianController, Robot
 from q2r2_control.errors import RobotError
 from q2r2_control.robot.finger_openings import collision_model_at
+from q2r2_control.robot.kept_distances import kept_distances
 from q2r2_control.types import ALL_OF_THE_WAY, Array, Reference
 from q2r2_control.verification.contract import Contract
 from tests.support.block_cell import ABOVE, BESIDE, CELL, SETTINGS, at
@@ -35,12 +36,12 @@ def closest_by_coal(controller: CartesianController, q: Array) -> float:
 
 
 class Run:
-    """A controller from home on, its contract checked at every tick."""
+    """A controller at home, or at rest elsewhere, its contract checked at every tick from there."""
 
-    def __init__(self, controller: CartesianController, sample_all: bool = False) -> None:
-        self.controller, self.sample_all = controller, sample_all
-        controller.reset(controller.robot.home)
-        self.contract = Contract(controller, sample_all=sample_all)
+    def __init__(self, controller: CartesianController, q: Array | None = None, sample_all: bool = False) -> None:
+        self.controller, start = controller, controller.robot.home if q is None else q
+        controller.reset(start)
+        self.contract = Contract(controller, start, sample_all=sample_all)
 
     def tell(self, arm: str, least: float, greatest: float) -> tuple[str, str] | None:
         refused = self.controller.set_opening(arm, least, greatest)
@@ -106,21 +107,32 @@ def test_an_opening_that_is_refused_leaves_every_bit_of_the_motion_as_it_was(rob
     assert refused > 100
 
 
-def test_while_the_arm_moves_what_is_accepted_keeps_its_distance_until_it_stands(
-    controller: CartesianController,
-) -> None:
-    """Sideways past the block and into it, the gripper asked to open at every fifth tick."""
-    random = np.random.default_rng(2)
+def test_an_arm_at_speed_may_not_open_where_there_is_room_but_none_to_stop(controller: CartesianController) -> None:
+    """Towards the block with the gripper closed, asked at every tick; Coal looks at stops from what is accepted."""
+    robot = controller.robot
+    kept = kept_distances(robot, SETTINGS).values
+    run = Run(controller)
+    run.tell("left", 0.0, 0.0)
+    run.drive(BESIDE, 1.2)
+    run = Run(controller, run.drive(at(0.05, 0.006), 1.2).q)
+    run.tell("left", 0.0, 0.0)
     answers = []
-    for goal in (at(0.25, 0.03), at(0.4, -0.01)):
-        run = Run(controller, sample_all=True)
+    for _ in range(150):
+        reference = run.drive(at(0.4, 0.006), DT)
+        q, v = reference.q, reference.v
+        room = bool((robot.distance_values(q) >= kept).all())
+        accepted = run.tell("left", *ALL_OF_THE_WAY) is None
+        answers.append((room, accepted))
+        stop = controller.stop_deceleration
+        for time in np.linspace(0.0, float((np.abs(v) / stop).max()), 20) if accepted else ():
+            moving = np.minimum(time, np.abs(v) / stop)
+            braked = q + v * moving - 0.5 * np.sign(v) * stop * moving**2
+            assert (robot.distance_values(braked) >= kept - 2e-6).all()
         run.tell("left", 0.0, 0.0)
-        run.drive(BESIDE, 0.6)
-        for _ in range(30):
-            run.tell("left", 0.0, float(random.random()) * 0.2)
-            answers.append(run.tell("left", 0.0, float(random.random())))
-            run.drive(goal, 5 * DT)
-    assert 10 < sum(answer is not None for answer in answers) < 55
+    assert answers.count((True, True)) > 10
+    assert answers.count((True, False)) > 3
+    assert answers.count((False, False)) > 3
+    assert (False, True) not in answers
 
 
 def test_a_reset_forgets_openings(controller: CartesianController) -> None:
