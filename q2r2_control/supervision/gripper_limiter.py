@@ -56,14 +56,20 @@ class GripperLimiter:
         return granted
 
     def _go_on(self, arm: str, gripper: _Gripper, wanted: float, measured: float, now: float) -> None:
+        if gripper.rests(wanted, measured, now):
+            return
         rolled = gripper.note(wanted, measured, now)
         if now < gripper.asks_at:
             return
-        goal, refused = gripper.goal(), None
-        if goal != gripper.granted or gripper.worth_asking(self._controller.openings[arm], rolled):
+        goal, accepted, refused = gripper.goal(), self._controller.openings[arm], None
+        # Asked one after the other, so that a gripper that is forced wider than can be proven may still be closed.
+        free = _holds(accepted, gripper.around(goal))
+        if not free:
+            refused = self._controller.set_opening(arm, *_hull(accepted, gripper.around(goal)))
+        elif gripper.worth_asking(accepted, rolled):
             refused = self._controller.set_opening(arm, *_hull(gripper.needed(), gripper.around(goal)))
-            gripper.answered(goal, refused is None, now)
-            self.changed |= refused is None
+        gripper.answered(goal, free, refused is None, now)
+        self.changed |= self._controller.openings[arm] != accepted
         if refused is None:
             self.held.pop(arm, None)
         else:
@@ -81,6 +87,13 @@ class _Gripper:
         self._step = 1.0
         self._seen: list[Interval] = []  # in this span of time, and in the one before
         self._since = -math.inf
+
+    def rests(self, wanted: float, measured: float, now: float) -> bool:
+        """Whether this tick's openings tell nothing new; most ticks' do not."""
+        if not wanted == self._wanted == self.granted or now - self._since >= _REMEMBERED:
+            return False
+        least, greatest = self._seen[0]
+        return least <= measured <= greatest
 
     def note(self, wanted: float, measured: float, now: float) -> bool:
         """Take a tick's openings; whether a span of time has ended, so that less may be needed."""
@@ -108,24 +121,29 @@ class _Gripper:
 
     def goal(self) -> float:
         """The next opening on the way to the wanted one."""
-        granted = self._wanted if self.granted is None else self.granted
-        return granted + min(max(self._wanted - granted, -self._step), self._step)
+        if self.granted is None or abs(self._wanted - self.granted) <= self._step:
+            return self._wanted
+        return self.granted + math.copysign(self._step, self._wanted - self.granted)
 
-    def answered(self, goal: float, accepted: bool, now: float) -> None:
-        """Learn from the answer to what was asked."""
-        if accepted:
-            self.granted, self._step = goal, min(2.0 * self._step, 1.0)
-            return
-        if self._step <= self._finest:
+    def answered(self, goal: float, free: bool, accepted: bool, now: float) -> None:
+        """Learn from the answer to what was asked; a ``free`` goal needed none."""
+        if not accepted and (free or self._step <= self._finest):
             self.asks_at = now + _PATIENCE
-        self._step = max(0.5 * self._step, self._finest)
+        if free or accepted:
+            self.granted, self._step = goal, min(2.0 * self._step, 1.0)
+        else:
+            self._step = max(0.5 * self._step, self._finest)
 
     def worth_asking(self, accepted: Interval, rolled: bool) -> bool:
         """Whether the bodies have to grow, or may shrink by as much as is worth the work."""
-        needed, least = self.needed(), self.needed(0.5)
-        if least[0] < accepted[0] or least[1] > accepted[1]:
+        needed = self.needed()
+        if not _holds(accepted, self.needed(0.5)):
             return True
         return rolled and max(needed[0] - accepted[0], accepted[1] - needed[1]) >= self._finest
+
+
+def _holds(outer: Interval, inner: Interval) -> bool:
+    return outer[0] <= inner[0] and inner[1] <= outer[1]
 
 
 def _hull(first: Interval, second: Interval) -> Interval:

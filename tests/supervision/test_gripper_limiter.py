@@ -59,7 +59,8 @@ def test_a_gripper_that_has_closed_takes_up_less_room_and_at_rest_nothing_is_wor
     cell = Cell(controller)
     cell.run(0.0, 0.5)
     assert cell.granted["left"] == cell.motion.openings["left"] == 0.0
-    assert controller.openings["left"] == (0.0, pytest.approx(TOLERANCE / STROKE))
+    assert controller.openings["left"][0] == 0.0
+    assert controller.openings["left"][1] == pytest.approx(TOLERANCE / STROKE)
     asked = cell.asked
     cell.run(0.0, 0.2)
     assert cell.asked == asked < 12
@@ -133,3 +134,17 @@ def test_a_gripper_that_is_forced_wider_than_commanded_counts_as_wide_as_it_is_m
     cell.run(0.0, 0.5)
     cell.tick(0.0, {"left": 0.3, "right": 1.0})
     assert controller.openings["left"][1] >= 0.3 + TOLERANCE / STROKE
+
+
+def test_one_that_is_forced_into_what_is_near_is_named_and_may_close(controller: CartesianController) -> None:
+    cell = Cell(controller)
+    cell.run(0.0, 1.6, BESIDE)
+    openings = controller.openings["left"]
+    for _ in range(20):
+        cell.tick(0.0, {"left": 0.9, "right": 1.0})
+    assert "block_0" in cell.limiter.held["left"]
+    assert controller.openings["left"] == openings
+    cell.run(0.4, 0.2, BESIDE)
+    for wanted in (0.4, 0.1, 0.0):
+        cell.tick(wanted, {"left": 0.9, "right": 1.0})
+        assert cell.granted["left"] == wanted
