@@ -25,6 +25,7 @@ from q2r2_control.runtime.loop_clock import LoopClock
 from q2r2_control.runtime.process import few_garbage_collections, stop_on_signals
 from q2r2_control.runtime.recorder import RunRecorder, Tick
 from q2r2_control.runtime.run_summary import RunSummary
+from q2r2_control.supervision.gripper_limiter import GripperLimiter
 from q2r2_control.supervision.joint_watch import watch_settings
 from q2r2_control.supervision.supervisor import Phase, Supervisor
 from q2r2_control.supervision.target_stream import StreamSettings
@@ -163,6 +164,9 @@ class PipelineRun:
         self._supervisor.activate(replace(state, stamp=self._clock.now), self._clock.now)
         self._supervisor.events.clear()
         pipeline.drive.reset(state)
+        self._limiter = GripperLimiter(pipeline.controller)
+        self._grippers: dict[str, float] = {arm: target.gripper for arm, target in self._targets.items()}
+        pipeline.drive.set_openings(pipeline.controller.openings)
         self._velocity = np.zeros(pipeline.robot.model.nv)
 
     def until(self, duration: float | None) -> RunSummary:
@@ -197,7 +201,7 @@ class PipelineRun:
                 speed = float(np.abs(self.tick().v).max())
         finally:
             # From the last state that came: a plant that has lost its sensors still takes commands.
-            command = drive.last_command(self._state, self._grippers())
+            command = drive.last_command(self._state, self._grippers)
             if command is not None:
                 plant.apply(command)
 
@@ -220,8 +224,9 @@ class PipelineRun:
             commanded = {arm: pipeline.controller.tool_pose(arm) for arm in pipeline.robot.arms}
             self._targets = pipeline.teleop.update(samples, tools, self._clock.now, commanded)
             self._hand_over(tools)
+        self.limit_grippers()
         reference, trusted = self._advance(dt), self._supervisor.state_fault is None
-        pipeline.plant.apply(drive.command(reference, state, self._grippers(), dt, trusted))
+        pipeline.plant.apply(drive.command(reference, state, self._grippers, dt, trusted))
         compute_time = time.perf_counter() - began
         self._recorder.add_latency(samples, self._clock.read())
         # A plant that is simulated lets no more time pass at once, as if the computer had stood still.
@@ -264,8 +269,12 @@ class PipelineRun:
         self._velocity = reference.v
         return reference
 
-    def _grippers(self) -> dict[str, float]:
-        return {arm: target.gripper for arm, target in self._targets.items()}
+    def limit_grippers(self) -> None:
+        """What the grippers are commanded to; before the step, which has to be proven with fingers that move in it."""
+        pipeline, wanted = self._pipeline, {arm: target.gripper for arm, target in self._targets.items()}
+        self._grippers = self._limiter.limit(wanted, pipeline.plant.gripper_openings(), self._clock.now)
+        if self._limiter.changed:
+            pipeline.drive.set_openings(pipeline.controller.openings)
 
     def _poll(self) -> list[HandSample]:
         source, was_connected = self._pipeline.input, self._connected
@@ -298,7 +307,7 @@ class PipelineRun:
         teleop, report, recorder = self._pipeline.teleop, self._pipeline.drive.report, self._recorder
         engaged = {arm: self._following and value for arm, value in teleop.engaged.items()}
         events = [replace(event, t=event.t - self._clock.start) for event in teleop.take_events()]
-        recorder.add(dt, compute_time, reference, self._targets, tools, engaged, report, events)
+        recorder.add(dt, compute_time, reference, self._targets, tools, engaged, report, events, self._limiter.held)
         if not recorder.listened:
             return
         tick = Tick(
@@ -313,6 +322,7 @@ class PipelineRun:
             state=state,
             tools=tools,
             grippers=self._pipeline.plant.gripper_openings(),
+            held_grippers=dict(self._limiter.held),
             compute_time=compute_time,
             impedance=report.impedance,
             wall=report.wall,

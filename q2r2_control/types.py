@@ -17,6 +17,9 @@ import pinocchio as pin
 Array = npt.NDArray[np.float64]
 
 SIDES = ("left", "right")
+Interval = tuple[float, float]  # least and greatest
+ALL_OF_THE_WAY: Interval = (0.0, 1.0)  # of a gripper's opening, 0 closed .. 1 fully open
+
 LONGEST_DT = 0.1  # [s] of a tick; after a longer gap nothing moves further than in this time
 
 

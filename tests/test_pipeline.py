@@ -115,6 +115,27 @@ def test_both_arms_follow_within_every_limit(
         assert_torque_bounds(loop, watch.ticks)
 
 
+@pytest.mark.parametrize("plant", ["kinematic", "mujoco"])
+def test_fingers_count_as_wide_as_the_grippers_are_at_every_tick(plant: str) -> None:
+    loop = Pipeline.from_config(cell(), input=ScriptedInput("reach_grasp_handover"), plant=plant)
+    watch, widest = Watch(loop), list[float]()
+
+    def listener(tick: Tick) -> None:
+        for arm, (least, greatest) in loop.controller.openings.items():
+            assert least <= tick.grippers[arm] <= greatest
+        widest.append(loop.controller.openings["left"][1])
+
+    loop.listeners.append(listener)
+    summary = loop.run(5.6, realtime=False)
+    # In MuJoCo the gripper has closed on a block.
+    assert widest[0] == 1.0
+    assert widest[-1] < 0.9
+    assert widest[-1] == pytest.approx(watch.ticks[-1].grippers["left"] + 0.04, abs=0.02)
+    assert summary.fallback_ticks == summary.uncertified_ticks == 0
+    assert all(not figures.gripper_held_s for figures in summary.arms.values())
+    assert len(watch.ticks) == len(widest)
+
+
 class LeftUpperPresses(ScriptedInput):
     """The left hand presses its upper button at 1.0 and at 1.6 s, and moves in between."""
 

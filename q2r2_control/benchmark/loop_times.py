@@ -171,7 +171,8 @@ class _ClockedPipeline(Pipeline):
         clock.watch(self.teleop, "update", "teleop")
         for name in ("take_joint_state", "take_target", "release_target", "tick"):
             clock.watch(self.supervisor, name, "supervision")
-        for name in ("step", "tool_pose"):
+        clock.watch(run, "limit_grippers", "supervision")
+        for name in ("step", "tool_pose", "set_opening"):
             clock.watch(self.controller, name, "control")
         clock.watch(self.drive, "command", "drive")
         clock.watch(self.plant, "apply", "apply")

@@ -35,7 +35,8 @@ def soak_table(report: SoakReport) -> Table:
 def _soak_notes(report: SoakReport) -> str:
     lines = [
         f"{report.segments} segments, {report.resets} resets, {report.solver_faults} ticks with a failing solver,"
-        f" {report.fallbacks} stops ({report.fallbacks_healthy} with a healthy solver)"
+        f" {report.fallbacks} stops ({report.fallbacks_healthy} with a healthy solver),"
+        f" {report.openings} openings of grippers ({report.openings_refused} refused)"
     ]
     for found in report.broken:
         error = f": {found.error}" if found.error else ""

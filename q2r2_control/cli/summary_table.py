@@ -31,7 +31,11 @@ def summary_table(summary: RunSummary) -> Table:
             figures += f", target slipped {arm.slip_mm_max:.0f} mm, {arm.slip_deg_max:.0f} deg"
         if arm.yielded_mm_max > 0.0 or arm.yielded_deg_max > 0.0:
             figures += f", yielded {arm.yielded_mm_max:.0f} mm, {arm.yielded_deg_max:.0f} deg"
-        table.add_row(f"{name} arm", f"{figures}, gripper changes {arm.gripper_changes}")
+        figures += f", gripper changes {arm.gripper_changes}"
+        table.add_row(f"{name} arm", figures)
+        if arm.gripper_held_by is not None:
+            by = " | ".join(arm.gripper_held_by)
+            table.add_row(f"{name} gripper held for", f"{arm.gripper_held_s:.2f} s, by {by}")
     if summary.min_distance_mm is not None and summary.closest_pair is not None:
         table.add_row("nearest pair", f"{summary.min_distance_mm:.1f} mm, {' | '.join(summary.closest_pair)}")
     table.add_row(

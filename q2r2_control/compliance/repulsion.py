@@ -7,11 +7,17 @@ that is pushed away from it meets this wall. The law, and why it is stable, stan
 **What it can take.** d_min is the distance that a pair keeps. At rest a force of k d_min or F_max, whichever is less.
 In motion it takes up at most the energy F_max d_min for each pair, beside what the joints take; bodies that meet with
 more than that are slowed down, but touch. So fingers that may come within a millimetre touch at a push of 10 N.
+
+**Fingers** are the same bodies here as in the controller, at the openings that it has accepted: a wall around all of
+their way would push the arms out of postures that the reference may take. A body that has grown meets no pair at the
+reference, and what it makes the wall push where the arm is elsewhere comes at the rate of torques that the impedance
+allows.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,10 +26,11 @@ import pinocchio as pin
 from q2r2_control.compliance.repulsion_kernels import RepulsionData, RepulsionModel, find_near, repulsion_torque
 from q2r2_control.config.control import ControllerSettings, WallSettings
 from q2r2_control.control.geometry.collision import collision_model_of
+from q2r2_control.control.geometry.finger_openings import FingerOpenings
 from q2r2_control.control.jit import bound, hold
 from q2r2_control.robot.kept_distances import kept_distances
 from q2r2_control.robot.robot import Robot
-from q2r2_control.types import Array
+from q2r2_control.types import Array, Interval
 
 # Of the sum of radii and the distance that a pair keeps: the smoothing length of distances, 0.3 mm of error at most.
 _SMOOTHING = 0.07
@@ -68,6 +75,7 @@ class MeasuredSeparation:
             damping_ratio=law.damping_ratio,
             maximum_force=law.maximum_force,
         )
+        self._fingers = FingerOpenings(robot, collision.bodies)
         self._kernel_data = RepulsionData.empty(model)
         self._held_model, self._held_data = hold(model), hold(self._kernel_data)
         names = [geometry.name for geometry in robot.collision_model.geometryObjects]
@@ -78,6 +86,10 @@ class MeasuredSeparation:
         self._repulsion_torque = bound(repulsion_torque, self._held_model, self._held_data, 0)
         self._no_torque = np.zeros(robot.model.nv)
         self._no_torque.flags.writeable = False
+
+    def set_openings(self, openings: Mapping[str, Interval]) -> None:
+        """Between which openings each arm's gripper is; of an arm that is not named, all of the way."""
+        self._fingers.set_all(openings)
 
     def update(self, q: Array, v: Array) -> WallReport:
         """Wall torque at the measured ``q`` [rad] and ``v`` [rad/s], (nv,) each.

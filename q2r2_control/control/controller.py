@@ -10,18 +10,20 @@ import pinocchio as pin
 
 from q2r2_control.config.control import ControllerSettings
 from q2r2_control.control.geometry.collision import collision_model_of
+from q2r2_control.control.geometry.finger_openings import FingerOpenings
+from q2r2_control.control.geometry.kinematics import IntArray
 from q2r2_control.control.jit import bound, hold
 from q2r2_control.control.kernel_data import KernelData
 from q2r2_control.control.kernel_model import kernel_model_of
 from q2r2_control.control.qp import QpProblem, Solver, make_solver
 from q2r2_control.control.qp_assembly import assemble
-from q2r2_control.control.reference import move_reference, start_reference
+from q2r2_control.control.reference import move_reference, observe_bodies, start_reference
 from q2r2_control.control.safety.joint_limits import ACCELERATION, POSITION, VELOCITY
 from q2r2_control.control.safety.safety_filter import FOLLOWED, SEPARATION, STOPPED
 from q2r2_control.control.targets import TargetTracker
 from q2r2_control.errors import RobotError
 from q2r2_control.robot.robot import Robot
-from q2r2_control.types import LONGEST_DT, Array, Reference, StepReport, StepStatus
+from q2r2_control.types import LONGEST_DT, Array, Interval, Reference, StepReport, StepStatus
 
 _LIMIT_NAMES = {POSITION: "position", VELOCITY: "velocity", ACCELERATION: "acceleration"}
 
@@ -60,6 +62,8 @@ class CartesianController:
             rows=self._rows.matrix[:0],
             rows_lower=self._rows.lower[:0],
         )
+        self._fingers = FingerOpenings(robot, model.safety.collision.bodies)
+        self._unchanged: IntArray = np.zeros(len(model.safety.collision.bodies.joint), dtype=np.int64)
         self._targets = TargetTracker(model.tasks, self._arms, self.settings)
         self._held_model, self._held_data = hold(model), hold(data)
         names = [geometry.name for geometry in robot.collision_model.geometryObjects]
@@ -74,18 +78,21 @@ class CartesianController:
         self.reset(self.robot.home)
         model, data, targets = self._held_model, self._held_data, self._targets.held
         self._assemble = bound(assemble, model, targets, data, self.settings.max_substep)
+        self._observe_bodies = bound(observe_bodies, model, data, self._unchanged)
         self._move = bound(move_reference, model, data, self._solution, False, self.settings.max_substep, 1.0)
         self.step({arm: self.tool_pose(arm) for arm in self._arms}, self.settings.max_substep)
 
     def reset(self, q: Array, v: Array | None = None) -> None:
         """Start anew at joint positions ``q`` [rad] and velocities ``v`` [rad/s], (nv,) each; targets are forgotten.
 
-        Raises :class:`RobotError` for a wrong shape or a number that is not finite. A start outside the limits or in
-        penetration is allowed: the controller recovers from it.
+        So are openings: fingers are all of their way again, see :meth:`set_opening`. Raises :class:`RobotError` for a
+        wrong shape or a number that is not finite. A start outside the limits or in penetration is allowed: the
+        controller recovers from it.
         """
         state = self._state
         state.q[:] = self._checked("q", q)
         state.v[:] = 0.0 if v is None else self._checked("v", v)
+        self._fingers.set_all({})
         self._targets.reset(state.q)
         observed = start_reference(self._held_model, self._held_data)
         self._closest, self._distance, self._tightest, self._margin, proven = observed
@@ -133,6 +140,40 @@ class CartesianController:
             margin=self._margin,
         )
         return Reference(state.q.copy(), state.v.copy(), state.a.copy(), report)
+
+    def set_opening(self, arm: str, least: float, greatest: float) -> tuple[str, str] | None:
+        """Say that the gripper of ``arm`` is, and stays, between two openings, 0 closed .. 1 fully open.
+
+        Its fingers count as what they sweep between these, from the next step on. Less is always accepted. Where a
+        finger's body grows it is accepted if every pair keeps its distance with it, at the reference and on a certified
+        stop from there; else nothing changes, and the pair that is in the way is returned. So a gripper may be
+        commanded to what was accepted, and to nothing else. An end of the interval at 0 or 1 is that of the joints'
+        travel. Until something is said, and after :meth:`reset`, fingers are all of their way, for which nothing needs
+        to be known; so are those that turn, and those of an arm whose config tells no open and closed position.
+
+        Raises :class:`RobotError` for a name that is no arm's and for numbers that are no interval.
+        """
+        interval, before = self._fingers.checked(arm, least, greatest), self._fingers.intervals[arm]
+        if interval == before:
+            return None
+        blocked = self._look_again(self._fingers.set(arm, interval))
+        if blocked < 0:
+            return None
+        self._fingers.set(arm, before)
+        self._look_again(self._unchanged)
+        return self._names_of(blocked)
+
+    @property
+    def openings(self) -> dict[str, Interval]:
+        """Between which openings each arm's gripper counts as being, as :meth:`set_opening` accepted it."""
+        return dict(self._fingers.intervals)
+
+    def _look_again(self, grown: IntArray) -> int:
+        """Observe with bodies that have changed; returns the pair in the way of those that have ``grown``, or -1."""
+        observed = self._observe_bodies(self._held_model, self._held_data, grown)
+        self._closest, self._distance, self._tightest, self._margin, blocked = observed
+        self._apart = self._margin >= 0.0
+        return int(blocked)
 
     def tool_pose(self, arm: str) -> pin.SE3:
         """World pose of an arm's tool at the reference."""

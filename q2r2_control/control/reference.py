@@ -5,12 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from q2r2_control.control.geometry.collision import update_placements
+from q2r2_control.control.geometry.kinematics import IntArray
 from q2r2_control.control.geometry.pair_distance import measure
 from q2r2_control.control.jit import Held, kernel, lean_kernel
 from q2r2_control.control.kernel_data import KernelData
 from q2r2_control.control.kernel_model import KernelModel
 from q2r2_control.control.safety.safety_data import SafetyData
-from q2r2_control.control.safety.safety_filter import apply_safety_filter, certify_start
+from q2r2_control.control.safety.safety_filter import apply_safety_filter, certify_bodies, certify_start
 from q2r2_control.control.safety.safety_model import SafetyModel
 from q2r2_control.control.safety.separation_rows import measure_pairs
 from q2r2_control.control.safety.velocity_bounds import update_body_velocities
@@ -24,6 +25,17 @@ def start_reference(held_model: Held, held_data: Held) -> tuple[int, float, int,
     model, data = held_model.value, held_data.value
     closest, distance, tightest, margin = _observe(model, data)
     return closest, distance, tightest, margin, certify_start(model.safety, data.safety)
+
+
+@kernel
+def observe_bodies(held_model: Held, held_data: Held, grown: IntArray) -> tuple[int, float, int, float, int]:
+    """Observe with bodies that were changed, some ``grown`` (g,): what :func:`_observe` says, and the pair in the way.
+
+    That is what :func:`certify_bodies` says: -1 where the bodies may be as they are.
+    """
+    model, data = held_model.value, held_data.value
+    closest, distance, tightest, margin = _observe(model, data)
+    return closest, distance, tightest, margin, certify_bodies(model.safety, data.safety, grown)
 
 
 @kernel

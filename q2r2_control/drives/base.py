@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -12,7 +13,7 @@ from q2r2_control.compliance.admittance import AdmittanceReport
 from q2r2_control.compliance.impedance import ImpedanceReport
 from q2r2_control.compliance.repulsion import WallReport
 from q2r2_control.config.control import ControllerSettings
-from q2r2_control.types import Array, Command, CommandMode, Reference, RobotState
+from q2r2_control.types import Array, Command, CommandMode, Interval, Reference, RobotState
 
 ToolTargets = dict[str, pin.SE3 | None]
 Openings = dict[str, float]
@@ -37,6 +38,10 @@ class Drive(Protocol):
 
     def reset(self, state: RobotState) -> None:
         """Start anew, at rest at the measured ``state``. Raises :class:`Q2R2Error` where that cannot be."""
+        ...
+
+    def set_openings(self, openings: Mapping[str, Interval]) -> None:
+        """Between which openings each arm's gripper is, as the controller has accepted it."""
         ...
 
     def displaced(self, targets: ToolTargets, state: RobotState, dt: float) -> ToolTargets:

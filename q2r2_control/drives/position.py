@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -11,7 +12,7 @@ from q2r2_control.config import Config
 from q2r2_control.drives.base import DriveReport, Openings, ToolTargets, position_command
 from q2r2_control.errors import ConfigError
 from q2r2_control.robot.robot import Robot
-from q2r2_control.types import Array, Command, CommandMode, Reference, RobotState
+from q2r2_control.types import Array, Command, CommandMode, Interval, Reference, RobotState
 
 # Velocity mode: how fast the measured position is brought back to the reference [1/s]. A plant that answers with a
 # delay T is stable below about 1 / T; at 10 /s that leaves 100 ms.
@@ -39,6 +40,9 @@ class PositionDrive:
         if state.tau_external is None:
             raise ConfigError("admittance.enabled = true: allowed with a plant that measures external torque only")
         self.admittance.reset()
+
+    def set_openings(self, openings: Mapping[str, Interval]) -> None:
+        """See :meth:`Drive.set_openings`: nothing here has bodies."""
 
     def displaced(self, targets: ToolTargets, state: RobotState, dt: float) -> ToolTargets:
         """See :meth:`Drive.displaced`."""

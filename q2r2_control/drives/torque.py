@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 import pinocchio as pin
 
@@ -10,7 +12,7 @@ from q2r2_control.compliance.repulsion import MeasuredSeparation
 from q2r2_control.config import Config
 from q2r2_control.drives.base import DriveReport, Openings, ToolTargets, holding_command, position_command
 from q2r2_control.robot.robot import Robot
-from q2r2_control.types import Array, Command, CommandMode, Reference, RobotState
+from q2r2_control.types import Array, Command, CommandMode, Interval, Reference, RobotState
 
 _STILL = 1e-2  # of an arm on its spring [rad/s]
 
@@ -41,6 +43,10 @@ class TorqueDrive:
         self.report = DriveReport()
         self._believed = self._reference = state.q
         self.impedance.reset(state)
+
+    def set_openings(self, openings: Mapping[str, Interval]) -> None:
+        """See :meth:`Drive.set_openings`: the wall's fingers are the controller's."""
+        self.wall.set_openings(openings)
 
     def displaced(self, targets: ToolTargets, state: RobotState, dt: float) -> ToolTargets:
         """See :meth:`Drive.displaced`."""

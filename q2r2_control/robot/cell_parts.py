@@ -99,6 +99,10 @@ class Arm:
         """The joints that the gripper drives, as they are called in the cell."""
         return tuple(map(self.name_in_cell, self.config.gripper.joints))
 
+    def stroke(self) -> tuple[float, float]:
+        """Where each of those joints is when the gripper is closed, and when it is open [m or rad]."""
+        return self.config.gripper.closed_position, self.config.gripper.open_position
+
     def tool_links(self) -> tuple[str, ...]:
         """The links of the tool, or else of the hand that carries the gripper's joints, as they are in the cell."""
         has_tool = self.config.tool.model is not None

@@ -91,6 +91,7 @@ def compose(config: Config) -> ComposedCell:
         obstacles=tuple(config.obstacles),
         parts=KnownParts(
             finger_joints={side: arm.finger_names() for side, arm in arms.items()},
+            strokes={side: arm.stroke() for side, arm in arms.items() if arm.config.gripper.joints},
             tool_links={side: arm.tool_links() for side, arm in arms.items()},
             obstacles=(*config.obstacles, *([] if config.floor is None else [FLOOR])),
         ),

@@ -1,13 +1,14 @@
 """The bodies of fingers that slide: each is what it sweeps from one end of its joint's travel to the other.
 
-Distances know arm joints only. A finger may be anywhere on its way while a stop is certified, so its body is all of
-that way. Fingers that turn stay as they are at home, open.
+Distances know arm joints only, so a finger's body is all of its way; what of it counts while the gripper's opening is
+known says finger_openings.py. Fingers that turn stay as they are at home, open.
 """
 
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping
+from dataclasses import dataclass
 from itertools import product
 
 import coal
@@ -16,6 +17,7 @@ import pinocchio as pin
 
 from q2r2_control.robot.description import LinkTree, joint_limits
 from q2r2_control.robot.enclose import capsule_between, enclosing_capsule
+from q2r2_control.robot.finger_openings import FingerBody, Slide
 from q2r2_control.robot.link_roles import KnownParts, links_moved_by
 from q2r2_control.robot.locking import joint_axis
 from q2r2_control.robot.pairs import link_of
@@ -24,28 +26,62 @@ from q2r2_control.types import Array
 _ON_ONE_LINE = 1e-9  # [m]
 
 
+@dataclass(frozen=True, slots=True)
+class _Way:
+    """What one finger joint moves a link by."""
+
+    direction: Array  # (3,) unit vector
+    home: float  # [m]
+    lower: float
+    upper: float
+    stroke: tuple[float, float] | None  # positions of the closed and the open gripper [m], where they are known
+
+    @property
+    def ends(self) -> tuple[Array, Array]:
+        """From home to both ends (3,) [m]."""
+        return (self.lower - self.home) * self.direction, (self.upper - self.home) * self.direction
+
+
+# Both ends of a shape as it was drawn (2, 3) [m] and what moves them.
+_Finger = tuple[Array, list[_Way]]
+
+
 def sweep_fingers(
     model: pin.Model, geometry: pin.GeometryModel, tree: LinkTree, parts: KnownParts, home: Mapping[str, float]
-) -> None:
+) -> tuple[FingerBody, ...]:
     """Replace in place the capsules and spheres of sliding fingers, locked at ``home``, by what they sweep.
 
     Capsules of two fingers of one gripper that lie on one line and are equally thick become one, which keeps the first
-    one's name: what is between the fingers is theirs.
+    one's name: what is between the fingers is theirs. Returns the bodies of which less counts where the gripper's
+    opening is known: those along whose line the fingers move. A finger that moves across its body is all of its way
+    always.
     """
-    for joints in parts.finger_joints.values():
+    bodies = []
+    for arm, joints in parts.finger_joints.items():
         links = links_moved_by(tree, joints)
-        swept = [item for item in geometry.geometryObjects if link_of(item.name) in links]
-        for item in swept:
-            ways = _ways(model, tree, link_of(item.name), links, home)
+        swept: dict[str, list[_Finger] | None] = {}
+        for item in geometry.geometryObjects:
+            link = link_of(item.name)
+            ways = _ways(model, tree, link, links, home, parts.strokes.get(arm)) if link in links else []
             if ways:
-                _sweep(item, ways)
-        _merge(geometry, [item.name for item in swept])
+                drawn = _ends(item)
+                swept[item.name] = [(drawn, ways)] if _sweep(item, ways) else None
+        for name, fingers in _merge(geometry, swept).items():
+            body = fingers and _body(arm, geometry.geometryObjects[geometry.getGeometryId(name)], fingers)
+            if body:
+                bodies.append(body)
+    return tuple(bodies)
 
 
 def _ways(
-    model: pin.Model, tree: LinkTree, link: str, links: set[str], home: Mapping[str, float]
-) -> list[tuple[Array, Array]]:
-    """For each finger joint that carries ``link`` both ends of what it moves it by [m]; none where one turns."""
+    model: pin.Model,
+    tree: LinkTree,
+    link: str,
+    links: set[str],
+    home: Mapping[str, float],
+    stroke: tuple[float, float] | None,
+) -> list[_Way]:
+    """What each finger joint that carries ``link`` moves it by; none where one turns."""
     ways = []
     for joint in tree.chain(link):
         child = next(name for name, carrier in tree.joint_to.items() if carrier is joint)
@@ -53,16 +89,40 @@ def _ways(
             continue
         if joint.get("type") != "prismatic":
             return []
-        ways.append(_way(model, joint, home))
+        ways.append(_way(model, joint, home, stroke))
     return ways
 
 
-def _way(model: pin.Model, joint: ET.Element, home: Mapping[str, float]) -> tuple[Array, Array]:
+def _way(model: pin.Model, joint: ET.Element, home: Mapping[str, float], stroke: tuple[float, float] | None) -> _Way:
     name = joint.get("name", "")
     frame = model.frames[model.getFrameId(name, pin.FrameType.FIXED_JOINT)]
-    direction = frame.placement.rotation @ joint_axis(joint)
-    lower, upper = (limit - home.get(name, 0.0) for limit in joint_limits(joint))
-    return lower * direction, upper * direction
+    mimic = joint.find("mimic")
+    if stroke is not None and mimic is not None:
+        multiplier, offset = float(mimic.get("multiplier", "1")), float(mimic.get("offset", "0"))
+        stroke = multiplier * stroke[0] + offset, multiplier * stroke[1] + offset
+    return _Way(frame.placement.rotation @ joint_axis(joint), home.get(name, 0.0), *joint_limits(joint), stroke)
+
+
+def _body(arm: str, item: pin.GeometryObject, fingers: list[_Finger]) -> FingerBody | None:
+    """A swept body as it depends on the opening; None where no opening tells where its fingers are."""
+    start, end = _ends(item)
+    length = float(np.linalg.norm(end - start))
+    if length <= _ON_ONE_LINE or any(way.stroke is None for _, ways in fingers for way in ways):
+        return None
+    along = (end - start) / length
+    ends = [
+        (
+            float((point - start) @ along),
+            tuple(
+                Slide(float(way.direction @ along), way.home, *way.stroke, way.lower, way.upper)
+                for way in ways
+                if way.stroke is not None
+            ),
+        )
+        for drawn, ways in fingers
+        for point in drawn
+    ]
+    return FingerBody(arm, item.name, length, tuple(ends))
 
 
 def _ends(item: pin.GeometryObject) -> Array:
@@ -72,14 +132,18 @@ def _ends(item: pin.GeometryObject) -> Array:
     return np.array([item.placement.translation - along, item.placement.translation + along])
 
 
-def _sweep(item: pin.GeometryObject, ways: list[tuple[Array, Array]]) -> None:
-    points = np.array([end + np.sum(moved, axis=0) for end in _ends(item) for moved in product(*ways)])
+def _sweep(item: pin.GeometryObject, ways: list[_Way]) -> bool:
+    """Make a shape what it sweeps; whether all of its segment moves along one line."""
+    moves = product(*(way.ends for way in ways))
+    points = np.array([end + moved for moved in [np.sum(move, axis=0) for move in moves] for end in _ends(item)])
     radius, line = float(item.geometry.radius), _line_of(points)
+    on_one_line = line is not None
     if line is None:
         # A capsule is convex: the one around the corners of what the segment sweeps holds all of it.
         thicker, start, end = enclosing_capsule(points)
         radius, line = radius + thicker, np.array([start, end])
     item.geometry, item.placement = capsule_between(radius, line[0], line[1])
+    return on_one_line
 
 
 def _line_of(points: Array) -> Array | None:
@@ -95,15 +159,19 @@ def _line_of(points: Array) -> Array | None:
     return np.array([points[int(np.argmin(along))], points[int(np.argmax(along))]])
 
 
-def _merge(geometry: pin.GeometryModel, names: list[str]) -> None:
-    kept: list[pin.GeometryObject] = []
-    for name in names:
+def _merge(geometry: pin.GeometryModel, swept: dict[str, list[_Finger] | None]) -> dict[str, list[_Finger] | None]:
+    """Join bodies on one line; returns the fingers of those that are left, None where they move across one."""
+    kept: dict[str, list[_Finger] | None] = {}
+    for name, fingers in swept.items():
         item = geometry.geometryObjects[geometry.getGeometryId(name)]
-        for other in kept:
+        for other_name, others in kept.items():
+            other = geometry.geometryObjects[geometry.getGeometryId(other_name)]
             line = _line_of(np.concatenate([_ends(other), _ends(item)]))
             if line is not None and abs(other.geometry.radius - item.geometry.radius) <= _ON_ONE_LINE:
                 other.geometry, other.placement = capsule_between(float(other.geometry.radius), line[0], line[1])
                 geometry.removeGeometryObject(name)
+                kept[other_name] = None if fingers is None or others is None else others + fingers
                 break
         else:
-            kept.append(item)
+            kept[name] = fingers
+    return kept

@@ -26,6 +26,7 @@ class KnownParts:
     finger_joints: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     tool_links: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     obstacles: tuple[str, ...] = ()  # links
+    strokes: Mapping[str, tuple[float, float]] = field(default_factory=dict)  # finger joints closed and open [m or rad]
 
     @classmethod
     def carried_by(cls, tree: LinkTree, chains: Mapping[str, Sequence[str]]) -> KnownParts:

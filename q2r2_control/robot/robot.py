@@ -56,6 +56,7 @@ class Arm:
     joints: np.ndarray  # velocity indices from base to tool; a joint that several arms hang on is in each of them
     swivel: Swivel | None = None  # None: the elbow is free
     finger_joints: tuple[str, ...] = ()  # that its gripper drives
+    stroke: float = 0.0  # of each of them, from closed to open [m or rad]; 0: not known
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +78,8 @@ class Robot:
 
     ``collision_model`` holds exactly the monitored pairs: each arm against the other with its base, against its own
     links that can meet, and against what stands in the cell. Every monitored shape is a capsule, a sphere, or a box
-    fixed in the world; a finger that slides is all that it sweeps. ``roles`` says what each link is. ``ignored_pairs``
+    fixed in the world; a finger that slides is all that it sweeps, and ``finger_bodies`` says what of that counts while
+    its gripper's opening is known. ``roles`` says what each link is. ``ignored_pairs``
     names pairs of one arm's own shapes that overlap by construction and are not monitored.
     """
 
@@ -104,6 +106,7 @@ class Robot:
                 frame_id=int(self.model.getFrameId(frame, pin.FrameType.BODY)),
                 joints=np.array([self.model.joints[self.model.getJointId(joint)].idx_v for joint in chains[name]]),
                 finger_joints=parts.finger_joints.get(name, ()),
+                stroke=_length(parts.strokes.get(name)),
             )
             for name, frame in tool_frames.items()
         }
@@ -118,7 +121,7 @@ class Robot:
         own_links = {name: set(tree.path(arm.tool_frame)) | self._moved_links(arm) for name, arm in self.arms.items()}
         self.roles: dict[str, Role] = roles_of(tree, own_links, parts)
         enclose_shapes(self.collision_model)
-        sweep_fingers(self.model, self.collision_model, tree, parts, home)
+        self.finger_bodies = sweep_fingers(self.model, self.collision_model, tree, parts, home)
         self.ignored_pairs = self._monitor(tree, exclusions, list(own_links.values()))
         self._data: pin.Data = self.model.createData()
         self._collision_data: pin.GeometryData = self.collision_model.createData()
@@ -196,6 +199,10 @@ class Robot:
         joints = {int(index) + 1 for index in arm.joints}
         bodies = (frame for frame in self.model.frames if frame.type == pin.FrameType.BODY)
         return {body.name for body in bodies if body.parentJoint in joints}
+
+
+def _length(stroke: tuple[float, float] | None) -> float:
+    return 0.0 if stroke is None else abs(stroke[1] - stroke[0])
 
 
 def _swivel(config: Config, arm: str, joints: Sequence[str], prefix: str) -> Swivel | None:

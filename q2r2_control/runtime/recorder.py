@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
 
 import pinocchio as pin
 
@@ -38,6 +38,8 @@ class Tick:
     impedance: ImpedanceReport | None = None  # of torque mode
     wall: WallReport | None = None  # of torque mode
     admittance: AdmittanceReport | None = None  # of position mode, where it is enabled
+    # arm -> pair of bodies that keeps its gripper from being commanded as wanted
+    held_grippers: dict[str, tuple[str, str]] = field(default_factory=dict)
 
 
 class RunRecorder:
@@ -73,12 +75,14 @@ class RunRecorder:
         engaged: dict[str, bool],
         drive: DriveReport,
         events: Iterable[Event],
+        held_grippers: Mapping[str, tuple[str, str]],
     ) -> None:
         """Count one tick: see the fields of :class:`Tick`; ``events`` are those of the arms' teleoperation in it."""
         statistics = self._statistics
         statistics.tick.add(compute_time)
         statistics.add(dt, reference, targets, tools, engaged)
         statistics.add_drive(dt, drive)
+        statistics.add_held_grippers(dt, held_grippers)
         statistics.events.extend(events)
 
     def tell(self, tick: Tick) -> None:

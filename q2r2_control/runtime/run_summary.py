@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -34,6 +35,8 @@ class ArmSummary:
     position_error_mm_rms: float | None  # None: never engaged
     rotation_error_deg_rms: float | None
     gripper_changes: int
+    gripper_held_s: float  # for which something near its fingers kept it from opening or closing as wanted
+    gripper_held_by: tuple[str, str] | None  # geometry names of the last pair that did
     slip_mm_max: float  # largest slip of one engagement: how far the leash moved the target
     slip_deg_max: float
     yielded_mm_max: float  # largest displacement of the target by the admittance, in position mode
@@ -84,6 +87,8 @@ class _ArmFigures:
     rotation: float = 0.0  # [rad^2]
     gripper: float | None = None
     gripper_changes: int = 0
+    held: float = 0.0  # [s]
+    held_by: tuple[str, str] | None = None
     slip: float = 0.0  # largest [m]
     slip_angle: float = 0.0  # largest [rad]
     yielded: float = 0.0  # largest [m]
@@ -169,6 +174,12 @@ class RunStatistics:
                 figures.yielded = max(figures.yielded, math.hypot(*arm.displacement[:3]))
                 figures.yielded_angle = max(figures.yielded_angle, math.hypot(*arm.displacement[3:]))
 
+    def add_held_grippers(self, dt: float, held: Mapping[str, tuple[str, str]]) -> None:
+        """Count one tick's grippers that were held, each with the pair of bodies that held it."""
+        for name, pair in held.items():
+            self._arms[name].held += dt
+            self._arms[name].held_by = pair
+
     def summary(
         self,
         wall_time: float,
@@ -216,6 +227,8 @@ def _arm_summary(figures: _ArmFigures) -> ArmSummary:
         position_error_mm_rms=None if rms[0] is None else 1e3 * rms[0],
         rotation_error_deg_rms=None if rms[1] is None else float(np.degrees(rms[1])),
         gripper_changes=figures.gripper_changes,
+        gripper_held_s=figures.held,
+        gripper_held_by=figures.held_by,
         slip_mm_max=1e3 * figures.slip,
         slip_deg_max=math.degrees(figures.slip_angle),
         yielded_mm_max=1e3 * figures.yielded,

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
 
 from q2r2_control.robot.robot import Robot
-from q2r2_control.types import Array
+from q2r2_control.types import ALL_OF_THE_WAY, Array, Interval
 
 
 class Request(NamedTuple):
@@ -207,3 +207,18 @@ class Adversary:
             return Request(self._moved(lambda: by), _NONE)
 
         return stream
+
+
+class HostileGrippers:
+    """Draws what a controller is told of openings: grippers that leap, and want to open at the worst moment."""
+
+    def __init__(self, arms: Iterable[str], random: np.random.Generator) -> None:
+        self._arms, self._random = tuple(arms), random
+
+    def draw(self) -> tuple[str, Interval] | None:
+        """An arm and an interval for this tick, or None; most follow each other closely, so that many are to grow."""
+        if self._random.random() > 0.05:
+            return None
+        arm, kind = str(self._random.choice(self._arms)), int(self._random.integers(4))
+        first, second = np.sort(self._random.random(2)).tolist()
+        return arm, (ALL_OF_THE_WAY, (0.0, 0.0), (first, second), (0.0, second))[kind]

@@ -8,17 +8,20 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
+import pinocchio as pin
 
 from q2r2_control.config.control import ControllerSettings
+from q2r2_control.robot.finger_openings import collision_model_at
 from q2r2_control.robot.kept_distances import kept_distances
 from q2r2_control.robot.pairs import pair_names
 from q2r2_control.robot.robot import Robot
-from q2r2_control.types import LONGEST_DT, Array, Reference, StepReport
+from q2r2_control.types import LONGEST_DT, Array, Interval, Reference, StepReport
 
 _NEWEST = 5000  # ticks whose accelerations are kept
 _ROUNDING = 4.0 * np.finfo(np.float64).eps  # of a difference, relative to the numbers
@@ -128,6 +131,7 @@ class Contract:
         robot, settings = controller.robot, controller.settings
         self._controller = controller
         self._robot, self._random = robot, np.random.default_rng(0) if random is None else random
+        self._data = robot.model.createData()
         self._sample_all = sample_all
         self._a = robot.capped_acceleration(settings.acceleration_limit)
         self._v_max = robot.velocity_limit * settings.velocity_scale
@@ -143,6 +147,7 @@ class Contract:
         """The controller was reset to ``q`` [rad], ``v`` [rad/s], (nv,) each; without ``v`` at rest."""
         v = np.zeros_like(q) if v is None else v
         self._q, self._v, self._stop = q.copy(), v.copy(), self._controller.stop_deceleration
+        self._fingers: tuple[pin.GeometryModel, pin.GeometryData] | None = None  # None: all of their way
         self._outside = np.maximum(np.maximum(self._lower - q, q - self._upper), 0.0)
         self._excess = self._excess_of(v)
         self._can_stop = self._stops_inside(q, v)
@@ -154,6 +159,16 @@ class Contract:
         self._certain = self._from_rest and bool(self._apart.all())
         self._least = float(margins.min(initial=np.inf)) if self._certain else -np.inf
         self._newest: deque[tuple[float, float]] = deque(maxlen=_NEWEST)  # duration [s], duration times |a|^2
+
+    def set_openings(self, openings: Mapping[str, Interval], *, before_step: bool = True) -> None:
+        """The controller has accepted ``openings``: its fingers are others, and ``before_step`` its stop may be.
+
+        Who is told of references only, and so is late, leaves the stop as the last reference had it.
+        """
+        if before_step:
+            self._stop = self._controller.stop_deceleration
+        model = collision_model_at(self._robot.collision_model, self._robot.finger_bodies, openings)
+        self._fingers = model, model.createData()
 
     def check(
         self, reference: Reference, dt: Any, unusable: frozenset[str] | None = None, failed: bool = False
@@ -299,7 +314,7 @@ class Contract:
         """Measure distances that the controller did not measure itself."""
         draw = 0.0 if self._sample_all else self._random.random()
         if draw < _BETWEEN_SHARE:
-            values = self._robot.distance_values(q)
+            values = self._distances(q)
             margins = values - self._kept
             if len(values) and values.min() > 0.0:  # Coal's penetration depth is another quantity
                 self._note("coal", abs(float(values.min()) - report.closest_distance))
@@ -328,4 +343,12 @@ class Contract:
 
     def _margins(self, q: Array) -> Array:
         """How much farther apart than it has to be every pair is (p,) [m]."""
-        return self._robot.distance_values(q) - self._kept
+        return self._distances(q) - self._kept
+
+    def _distances(self, q: Array) -> Array:
+        """As :meth:`Robot.distance_values`, with fingers at the openings that the controller counts with."""
+        if self._fingers is None:
+            return self._robot.distance_values(q)
+        model, data = self._fingers
+        pin.computeDistances(self._robot.model, self._data, model, data, q)
+        return np.array([result.min_distance for result in data.distanceResults], dtype=np.float64)

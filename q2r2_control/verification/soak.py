@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import gc
 import os
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -18,14 +18,23 @@ from q2r2_control.control.qp import make_solver
 from q2r2_control.errors import ConfigError
 from q2r2_control.robot.kept_distances import kept_distances
 from q2r2_control.robot.robot import Robot
-from q2r2_control.types import Array, Reference
-from q2r2_control.verification.adversary import Request
+from q2r2_control.types import Array, Interval, Reference
+from q2r2_control.verification.adversary import HostileGrippers, Request
 from q2r2_control.verification.contract import Checked, Contract, Margin, time_of
 from q2r2_control.verification.fault_injection import STOPPING_FAULTS, FaultySolver, Segment, segments
 
 FEWEST_TICKS = 100
 _SETTLED = 0.1  # share of the ticks after which memory should have stopped growing
 MEMORY_ALLOWED = 5.0  # [MB]
+_COUNTED = (
+    "segments",
+    "resets",
+    "solver_faults",
+    "openings",
+    "openings_refused",
+    "fallbacks",
+    "fallbacks_healthy",
+)
 
 
 class Steppable(Checked, Protocol):
@@ -34,6 +43,11 @@ class Steppable(Checked, Protocol):
     def reset(self, q: Array, v: Array | None = None) -> None: ...
 
     def step(self, targets: Any, dt: Any) -> Reference: ...
+
+    def set_opening(self, arm: str, least: float, greatest: float) -> tuple[str, str] | None: ...
+
+    @property
+    def openings(self) -> Mapping[str, Interval]: ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,6 +76,8 @@ class SoakReport:
     segments: int
     resets: int
     solver_faults: int  # ticks
+    openings: int  # of grippers that were told
+    openings_refused: int
     fallbacks: int  # ticks, of all
     fallbacks_healthy: int  # ticks, of those with a healthy solver
     margins: list[Margin]
@@ -108,8 +124,9 @@ class Soak:
         self._progress = progress
         self._contract = Contract(controller, random=np.random.default_rng([seed, 2]))
         self._broken: dict[str, Violation] = {}
-        self._counts = dict.fromkeys(("segments", "resets", "solver_faults", "fallbacks", "fallbacks_healthy"), 0)
+        self._counts = dict.fromkeys(_COUNTED, 0)
         self._simulated = 0.0
+        self._grippers = HostileGrippers(controller.robot.arms, np.random.default_rng([seed, 3]))
 
     def run(self, ticks: int) -> SoakReport:
         """Run ``ticks`` ticks."""
@@ -157,6 +174,7 @@ class Soak:
         fault, dt = segment.fault_at(since), segment.dt()
         request = segment.stream(since, self._q)
         self._solver.fault = fault
+        self._tell_opening()
         try:
             reference = self._controller.step(request.targets, dt)
         except Exception as error:  # the contract promises none
@@ -175,6 +193,15 @@ class Soak:
         self._counts["solver_faults"] += fault is not None
         self._counts["fallbacks"] += reference.report.fallback
         self._counts["fallbacks_healthy"] += reference.report.fallback and fault is None
+
+    def _tell_opening(self) -> None:
+        told = self._grippers.draw()
+        if told is None:
+            return
+        arm, interval = told
+        self._counts["openings"] += 1
+        self._counts["openings_refused"] += self._controller.set_opening(arm, *interval) is not None
+        self._contract.set_openings(self._controller.openings)
 
     def _keep(
         self, tick: int, segment: Segment, since: int, request: Request, dt: Any, broken: Iterable[str], error: str

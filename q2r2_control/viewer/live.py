@@ -75,6 +75,8 @@ class LiveTable:
             "status": (str(report.status), "a stop is certified" if report.certified else "[red]no certified stop[/]"),
             "limits at work": (str(len(binding)), _some(binding)),
         }
+        for arm, pair in tick.held_grippers.items():
+            rows[f"{arm} gripper"] = ("[yellow]held[/]", " | ".join(pair))
         for name, (first, second) in rows.items():
             table.add_row(name, first, second)
         return table

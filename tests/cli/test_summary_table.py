@@ -74,3 +74,11 @@ def test_a_task_is_told_in_one_line_with_what_was_measured_and_what_fell_short(r
     file = console.file
     assert isinstance(file, StringIO)
     assert file.getvalue() == f"{line}\n"
+
+
+def test_a_gripper_that_was_held_is_named_with_what_held_it(summary: RunSummary) -> None:
+    assert "gripper held" not in text_of(summary)
+    held = replace(summary.arms["left"], gripper_held_s=1.25, gripper_held_by=("left_finger_0", "block_0"))
+    text = text_of(replace(summary, arms=summary.arms | {"left": held}))
+    (row,) = (line for line in text.splitlines() if "left gripper held for" in line)
+    assert "1.25 s, by left_finger_0 | block_0" in row

@@ -14,6 +14,7 @@ from q2r2_control.compliance.repulsion import MeasuredSeparation, WallReport
 from q2r2_control.config import load_config
 from q2r2_control.config.control import ControllerSettings, WallSettings
 from q2r2_control.plants.mujoco import MujocoPlant
+from q2r2_control.robot.finger_openings import collision_model_at
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, Command, CommandMode
 from tests.control.cells import cell, random_posture
@@ -85,6 +86,22 @@ def test_the_report_names_what_presses_and_the_closest_pair() -> None:
         pressing = {frozenset(pair) for pair in report.pressing}
         assert all(distances[pair] < SHELL for pair in pressing)
         assert all(pair in pressing for pair, distance in distances.items() if distance < SHELL - 4e-4)
+
+
+def test_fingers_press_at_the_openings_that_were_set() -> None:
+    random, separation = np.random.default_rng(4), MeasuredSeparation(ROBOT, ControllerSettings(), WallSettings())
+    closed = collision_model_at(ROBOT.collision_model, ROBOT.finger_bodies, {"left": (0.0, 0.1)})
+    data, distances = ROBOT.model.createData(), closed.createData()
+    farther = 0
+    for q, report in [_postures()[i] for i in random.choice(len(_postures()), 60, replace=False)]:
+        separation.set_openings({"left": (0.0, 0.1)})
+        pin.computeDistances(ROBOT.model, data, closed, distances, q)
+        by_coal = min(result.min_distance for result in distances.distanceResults)
+        assert separation.update(q, REST).closest_distance == pytest.approx(by_coal, abs=2e-6)
+        farther += by_coal > report.closest_distance + 1e-4
+        separation.set_openings({})
+        np.testing.assert_array_equal(separation.update(q, REST).tau, report.tau)
+    assert farther > 2
 
 
 def test_there_is_no_torque_outside_the_shell_at_any_speed() -> None:

@@ -47,6 +47,8 @@ ARM_KEYS = {
     "position_error_mm_rms",
     "rotation_error_deg_rms",
     "gripper_changes",
+    "gripper_held_s",
+    "gripper_held_by",
     "slip_mm_max",
     "slip_deg_max",
     "yielded_mm_max",
@@ -85,6 +87,15 @@ def test_the_largest_slip_of_an_engagement_is_told(statistics: RunStatistics) ->
     assert figures["left"].slip_mm_max == pytest.approx(200.0)
     assert figures["left"].slip_deg_max == pytest.approx(60.0)
     assert figures["right"].slip_mm_max == figures["right"].slip_deg_max == 0.0
+
+
+def test_how_long_a_gripper_was_held_is_told_with_the_last_pair_that_did(statistics: RunStatistics) -> None:
+    for pair in (("left_finger", "table"), ("left_finger", "right_link_5")):
+        statistics.add_held_grippers(0.25, {"left": pair})
+    statistics.add_held_grippers(0.25, {})
+    figures = statistics.summary(1.0).arms
+    assert (figures["left"].gripper_held_s, figures["left"].gripper_held_by) == (0.5, ("left_finger", "right_link_5"))
+    assert (figures["right"].gripper_held_s, figures["right"].gripper_held_by) == (0.0, None)
 
 
 def test_a_run_s_json_has_every_key_that_others_read() -> None:

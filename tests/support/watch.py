@@ -28,11 +28,15 @@ class Watch:
         self.ticks: list[Tick] = []
         self._pipeline = pipeline
         self._contract: Contract | None = None
+        self._openings = pipeline.controller.openings
         pipeline.listeners.append(self)
 
     def __call__(self, tick: Tick) -> None:
         if self._contract is None:
             self._contract = Contract(self._pipeline.controller, self._pipeline.robot.home)
+        if (openings := self._pipeline.controller.openings) != self._openings:
+            self._openings = openings
+            self._contract.set_openings(openings, before_step=False)
         self._contract.check(tick.reference, tick.step)
         self.ticks.append(tick)
 

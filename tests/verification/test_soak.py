@@ -16,7 +16,7 @@ from q2r2_control.control.controller import CartesianController
 from q2r2_control.control.qp import make_solver
 from q2r2_control.errors import ConfigError
 from q2r2_control.robot.robot import Robot
-from q2r2_control.types import Array, Reference
+from q2r2_control.types import Array, Interval, Reference
 from q2r2_control.verification.fault_injection import FaultySolver
 from q2r2_control.verification.soak import Soak, SoakReport, run_soak
 
@@ -46,6 +46,13 @@ class Sabotaged:
 
     def reset(self, q: Array, v: Array | None = None) -> None:
         controller_and_solver()[0].reset(q, v)
+
+    def set_opening(self, arm: str, least: float, greatest: float) -> tuple[str, str] | None:
+        return controller_and_solver()[0].set_opening(arm, least, greatest)
+
+    @property
+    def openings(self) -> dict[str, Interval]:
+        return controller_and_solver()[0].openings
 
     @property
     def stop_deceleration(self) -> Array:

@@ -35,6 +35,12 @@ def test_it_shows_states_errors_distances_and_grippers_of_the_newest_tick(robot:
     assert "paused" not in text
 
 
+def test_it_names_what_holds_a_gripper(robot: Robot) -> None:
+    table = LiveTable("demo")
+    table(replace(tick_at(robot, 1.0), held_grippers={"left": ("left_finger_0", "block_0")}))
+    assert "left_finger_0 | block_0" in drawn(table)
+
+
 def test_it_shows_every_limit_that_was_at_work_since_it_was_drawn_last(robot: Robot) -> None:
     table = LiveTable("demo")
     tick = tick_at(robot, 0.0)

@@ -131,6 +131,7 @@ class SafetyData(NamedTuple):
     candidate: Candidate
     rollout: Rollout
     active: ActiveBounds
+    unproven: IntArray  # (1,) pair that the last certificate failed for
 
     @classmethod
     def empty(cls, model: SafetyModel) -> SafetyData:
@@ -149,4 +150,5 @@ class SafetyData(NamedTuple):
             candidate=Candidate.empty(nv),
             rollout=Rollout.empty(model.collision),
             active=ActiveBounds.empty(pairs, nv),
+            unproven=np.zeros(1, dtype=np.int64),
         )

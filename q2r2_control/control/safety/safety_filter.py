@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from q2r2_control.control.geometry.closest_points import clamp
+from q2r2_control.control.geometry.kinematics import IntArray
 from q2r2_control.control.jit import lean_kernel
 from q2r2_control.control.safety.joint_limits import ACCELERATION, NO_LIMIT
 from q2r2_control.control.safety.safety_data import SafetyData
@@ -73,6 +74,39 @@ def certify_start(model: SafetyModel, data: SafetyData) -> bool:
             break
     _keep_stop(data)
     return attempt < SHAPES
+
+
+@lean_kernel
+def certify_bodies(model: SafetyModel, data: SafetyData, grown: IntArray) -> int:
+    """Whether bodies may be as they are now, some of them having ``grown`` (g,) since the reference was certified.
+
+    They may where each of their pairs keeps its distance at the reference, and the stop that is at hand, or else one of
+    some other shape, which becomes the one at hand, keeps all apart. Then the invariant holds with the grown bodies as
+    if they had always been so. Returns the pair that is in the way, or -1.
+
+    Needs the distances measured with the bodies as they are now. A pair that is too close already must not be made
+    closer by growing, so that what is in recovery stays as it is.
+    """
+    pairs = model.collision.pairs
+    any_grown = False
+    for p in range(pairs.first.shape[0]):
+        if grown[pairs.first[p]] == 1 or grown[pairs.second[p]] == 1:
+            any_grown = True
+            if data.distance[p] < model.min_distance[p]:
+                return p
+    if not any_grown:
+        return -1
+    for j in range(data.state.q.shape[0]):
+        data.candidate.q[j] = data.state.q[j]
+        data.candidate.v[j] = data.state.v[j]
+        data.candidate.deceleration[j] = data.certified[j]
+    for attempt in range(SHAPES + 1):
+        if attempt > 0:
+            write_stop(model, data.state.q, data.state.v, attempt - 1, data.candidate.deceleration)
+        if certify(model, data, 0.0):
+            _keep_stop(data)
+            return -1
+    return data.unproven[0]
 
 
 @lean_kernel

@@ -39,7 +39,7 @@ def certify(model: SafetyModel, data: SafetyData, h: float) -> bool:
 
     ``data.distance`` holds distances at the reference, or lower bounds of them; a bound that does not suffice is
     replaced by the distance. A pair that is closer than its distance already must not come closer at the step's end and
-    during the stop.
+    during the stop. Where a pair fails, ``data.unproven`` says which.
     """
     distance = data.distance
     duration = begin_rollout(data)
@@ -50,6 +50,7 @@ def certify(model: SafetyModel, data: SafetyData, h: float) -> bool:
         threshold = model.min_distance[p]
         if distance[p] - step - stop >= threshold:
             continue
+        data.unproven[0] = p
         if distance[p] < threshold:
             if not _comes_no_closer(model, data, p, duration):
                 return False

@@ -1,0 +1,150 @@
+"""How far grippers may be opened and closed: as far as the controller has proven their fingers' bodies.
+
+The controller counts the fingers of an arm as what they sweep between two openings. That interval has to hold where the
+gripper is and where it may go: what was measured and what was commanded a moment ago, with a tolerance. So a gripper
+that has closed takes up less room at no cost, and one that is to open is commanded to the opening that was accepted. It
+is asked for in steps that are halved where the certificate fails and doubled where it holds.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+from q2r2_control.control.controller import CartesianController
+from q2r2_control.types import Interval
+
+# How exactly openings are measured, and how far a finger overshoots, on the way of one finger [m or rad]. Half of it is
+# there always, so that a measurement that trembles does not ask at every tick.
+TOLERANCE = 0.001
+# Least step that is asked for, and least change for which bodies are worked out anew [m or rad].
+_FINEST = 0.0005
+# What was measured or commanded counts for at least this long: the delay of a gripper that is allowed for [s].
+_REMEMBERED = 0.05
+# A gripper that is held at its finest step asks again after this time [s].
+_PATIENCE = 0.005
+_BELIEVABLE = (-0.2, 1.2)  # measured openings; a finger may go a little beyond its calibrated ends
+
+
+class GripperLimiter:
+    """Turns wanted openings into those that may be commanded, for every arm whose opening is measured.
+
+    Others are passed through, and their fingers stay all of their way. Begins as the controller does after
+    :meth:`CartesianController.reset`, with all fingers all of their way, and is made anew with it.
+    """
+
+    def __init__(self, controller: CartesianController) -> None:
+        self._controller = controller
+        self._grippers = {name: _Gripper(arm.stroke) for name, arm in controller.robot.arms.items() if arm.stroke > 0.0}
+        self.held: dict[str, tuple[str, str]] = {}  # arm -> pair of bodies that keeps its gripper from going on
+        self.changed = False  # whether the controller's openings did, in the last tick
+
+    def limit(self, wanted: Mapping[str, float], measured: Mapping[str, float], now: float) -> dict[str, float]:
+        """What may be commanded at ``now`` [s], before the controller's step; openings 0 closed .. 1 fully open.
+
+        Where a measured opening is missing, or is no opening, the gripper stays commanded as it was.
+        """
+        self.changed = False
+        granted = dict(wanted)
+        for arm, gripper in self._grippers.items():
+            # What is no opening is the plant's to refuse.
+            if arm in wanted and 0.0 <= wanted[arm] <= 1.0:
+                if _BELIEVABLE[0] <= measured.get(arm, math.nan) <= _BELIEVABLE[1]:
+                    self._go_on(arm, gripper, wanted[arm], measured[arm], now)
+                if gripper.granted is not None:
+                    granted[arm] = gripper.granted
+        return granted
+
+    def _go_on(self, arm: str, gripper: _Gripper, wanted: float, measured: float, now: float) -> None:
+        if gripper.rests(wanted, measured, now):
+            return
+        rolled = gripper.note(wanted, measured, now)
+        if now < gripper.asks_at:
+            return
+        goal, accepted, refused = gripper.goal(), self._controller.openings[arm], None
+        # Asked one after the other, so that a gripper that is forced wider than can be proven may still be closed.
+        free = _holds(accepted, gripper.around(goal))
+        if not free:
+            refused = self._controller.set_opening(arm, *_hull(accepted, gripper.around(goal)))
+        elif gripper.worth_asking(accepted, rolled):
+            refused = self._controller.set_opening(arm, *_hull(gripper.needed(), gripper.around(goal)))
+        gripper.answered(goal, free, refused is None, now)
+        self.changed |= self._controller.openings[arm] != accepted
+        if refused is None:
+            self.held.pop(arm, None)
+        else:
+            self.held[arm] = refused
+
+
+class _Gripper:
+    """What was measured and commanded of one gripper, and how far it may ask to go."""
+
+    def __init__(self, stroke: float) -> None:
+        self._tolerance, self._finest = TOLERANCE / stroke, min(_FINEST / stroke, 1.0)
+        self.granted: float | None = None  # the opening that is commanded
+        self.asks_at = -math.inf
+        self._wanted = math.nan
+        self._step = 1.0
+        self._seen: list[Interval] = []  # in this span of time, and in the one before
+        self._since = -math.inf
+
+    def rests(self, wanted: float, measured: float, now: float) -> bool:
+        """Whether this tick's openings tell nothing new; most ticks' do not."""
+        if not wanted == self._wanted == self.granted or now - self._since >= _REMEMBERED:
+            return False
+        least, greatest = self._seen[0]
+        return least <= measured <= greatest
+
+    def note(self, wanted: float, measured: float, now: float) -> bool:
+        """Take a tick's openings; whether a span of time has ended, so that less may be needed."""
+        if self.granted is None:
+            self.granted = wanted  # while fingers are all of their way
+        if wanted != self._wanted:
+            self._wanted, self._step, self.asks_at = wanted, 1.0, now
+        spread = min(measured, self.granted), max(measured, self.granted)
+        rolled = now - self._since >= _REMEMBERED
+        if rolled:
+            self._seen, self._since = [spread, *self._seen[:1]], now
+        else:
+            self._seen[0] = _hull(self._seen[0], spread)
+        return rolled and len(self._seen) > 1
+
+    def needed(self, share: float = 1.0) -> Interval:
+        """Where the gripper may be, as openings, with a share of the tolerance."""
+        least, greatest = self._seen[0] if len(self._seen) == 1 else _hull(*self._seen)
+        return _hull(self.around(least, share), self.around(greatest, share))
+
+    def around(self, opening: float, share: float = 1.0) -> Interval:
+        """An opening with a share of the tolerance; beyond the ends of the stroke there is nothing."""
+        tolerance = share * self._tolerance
+        return min(max(opening - tolerance, 0.0), 1.0), min(max(opening + tolerance, 0.0), 1.0)
+
+    def goal(self) -> float:
+        """The next opening on the way to the wanted one."""
+        if self.granted is None or abs(self._wanted - self.granted) <= self._step:
+            return self._wanted
+        return self.granted + math.copysign(self._step, self._wanted - self.granted)
+
+    def answered(self, goal: float, free: bool, accepted: bool, now: float) -> None:
+        """Learn from the answer to what was asked; a ``free`` goal needed none."""
+        if not accepted and (free or self._step <= self._finest):
+            self.asks_at = now + _PATIENCE
+        if free or accepted:
+            self.granted, self._step = goal, min(2.0 * self._step, 1.0)
+        else:
+            self._step = max(0.5 * self._step, self._finest)
+
+    def worth_asking(self, accepted: Interval, rolled: bool) -> bool:
+        """Whether the bodies have to grow, or may shrink by as much as is worth the work."""
+        needed = self.needed()
+        if not _holds(accepted, self.needed(0.5)):
+            return True
+        return rolled and max(needed[0] - accepted[0], accepted[1] - needed[1]) >= self._finest
+
+
+def _holds(outer: Interval, inner: Interval) -> bool:
+    return outer[0] <= inner[0] and inner[1] <= outer[1]
+
+
+def _hull(first: Interval, second: Interval) -> Interval:
+    return min(first[0], second[0]), max(first[1], second[1])

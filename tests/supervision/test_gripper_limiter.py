@@ -1,0 +1,150 @@
+"""A gripper goes no farther than the controller has proven, and the controller always knows where it may be."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import pinocchio as pin
+import pytest
+
+from q2r2_control import CartesianController, Robot
+from q2r2_control.plants.base import GripperMotion
+from q2r2_control.supervision.gripper_limiter import TOLERANCE, GripperLimiter
+from q2r2_control.types import ALL_OF_THE_WAY
+from tests.support.block_cell import ABOVE, BESIDE, CELL, SETTINGS
+
+DT = 0.002
+STROKE = 0.025  # [m]
+
+
+@pytest.fixture(scope="module")
+def controller() -> CartesianController:
+    return CartesianController(Robot.from_config(CELL), SETTINGS)
+
+
+class Cell:
+    """The arms at their reference, and grippers that move at their speed to what is commanded."""
+
+    def __init__(self, controller: CartesianController) -> None:
+        controller.reset(controller.robot.home)
+        self.controller, self.limiter = controller, GripperLimiter(controller)
+        self.motion, self.now, self.asked = GripperMotion(CELL), 0.0, 0
+        self.granted: dict[str, float] = {}
+
+    def run(self, wanted: float, seconds: float, goal: pin.SE3 | None = None) -> None:
+        for _ in range(round(seconds / DT)):
+            before = self.controller.openings
+            self.tick(wanted, self.motion.openings)
+            self.asked += self.controller.openings != before
+            self.controller.step({"left": goal}, DT)
+            self.motion.command(self.granted)
+            self.motion.advance(DT)
+            least, greatest = self.controller.openings["left"]
+            for opening in (self.granted["left"], self.motion.openings["left"]):
+                # A gripper does not leap: half of the tolerance is there always.
+                assert least <= max(opening - 0.5 * TOLERANCE / STROKE, 0.0)
+                assert greatest >= min(opening + 0.5 * TOLERANCE / STROKE, 1.0)
+            assert self.controller.openings["right"][1] == 1.0
+
+    def tick(self, wanted: float, measured: Mapping[str, float]) -> None:
+        self.now += DT
+        self.granted = self.limiter.limit({"left": wanted, "right": 1.0}, measured, self.now)
+        assert self.granted["right"] == 1.0
+
+
+def test_a_gripper_that_has_closed_takes_up_less_room_and_at_rest_nothing_is_worked_out(
+    controller: CartesianController,
+) -> None:
+    cell = Cell(controller)
+    cell.run(0.0, 0.5)
+    assert cell.granted["left"] == cell.motion.openings["left"] == 0.0
+    assert controller.openings["left"][0] == 0.0
+    assert controller.openings["left"][1] == pytest.approx(TOLERANCE / STROKE)
+    asked = cell.asked
+    cell.run(0.0, 0.2)
+    assert cell.asked == asked < 12
+
+
+def test_beside_a_block_it_opens_as_far_as_is_proven_and_by_itself_to_the_end_where_there_is_room(
+    controller: CartesianController,
+) -> None:
+    cell = Cell(controller)
+    cell.run(0.0, 1.6, BESIDE)
+    assert not cell.limiter.held
+    cell.run(1.0, 0.4, BESIDE)
+    assert 0.35 < cell.granted["left"] < 0.5
+    assert cell.motion.openings["left"] == pytest.approx(cell.granted["left"])
+    assert "block_0" in cell.limiter.held["left"]
+    cell.run(1.0, 1.0, ABOVE)
+    assert cell.granted["left"] == cell.motion.openings["left"] == 1.0
+    assert not cell.limiter.held
+
+
+def test_one_that_is_held_asks_once_in_five_milliseconds_and_closes_at_once(
+    controller: CartesianController, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cell = Cell(controller)
+    cell.run(0.0, 1.6, BESIDE)
+    cell.run(1.0, 0.3, BESIDE)
+    calls = 0
+    real = controller.set_opening
+
+    def counted(arm: str, least: float, greatest: float) -> tuple[str, str] | None:
+        nonlocal calls
+        calls += arm == "left"
+        return real(arm, least, greatest)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(controller, "set_opening", counted)
+        cell.run(1.0, 0.1, BESIDE)
+    assert 10 <= calls <= 0.1 / 0.005 + 1
+    cell.run(0.0, DT, BESIDE)
+    assert cell.granted["left"] == 0.0
+    assert not cell.limiter.held
+
+
+def test_what_is_not_measured_is_passed_through_and_its_fingers_stay_all_of_their_way(
+    controller: CartesianController,
+) -> None:
+    cell = Cell(controller)
+    for wanted in (1.0, 0.0, 0.5):
+        cell.tick(wanted, {})
+        assert cell.granted == {"left": wanted, "right": 1.0}
+    assert controller.openings == dict.fromkeys(("left", "right"), ALL_OF_THE_WAY)
+
+
+@pytest.mark.parametrize("measured", [{}, {"left": math.nan}, {"left": 7.0}], ids=["none", "no number", "absurd"])
+def test_without_a_measurement_that_can_be_believed_a_gripper_stays_commanded_as_it_was(
+    controller: CartesianController, measured: dict[str, float]
+) -> None:
+    cell = Cell(controller)
+    cell.run(0.0, 0.5)
+    openings = controller.openings
+    for _ in range(100):
+        cell.tick(1.0, measured)
+        assert cell.granted["left"] == 0.0
+    assert controller.openings == openings
+
+
+def test_a_gripper_that_is_forced_wider_than_commanded_counts_as_wide_as_it_is_measured(
+    controller: CartesianController,
+) -> None:
+    cell = Cell(controller)
+    cell.run(0.0, 0.5)
+    cell.tick(0.0, {"left": 0.3, "right": 1.0})
+    assert controller.openings["left"][1] >= 0.3 + TOLERANCE / STROKE
+
+
+def test_one_that_is_forced_into_what_is_near_is_named_and_may_close(controller: CartesianController) -> None:
+    cell = Cell(controller)
+    cell.run(0.0, 1.6, BESIDE)
+    openings = controller.openings["left"]
+    for _ in range(20):
+        cell.tick(0.0, {"left": 0.9, "right": 1.0})
+    assert "block_0" in cell.limiter.held["left"]
+    assert controller.openings["left"] == openings
+    cell.run(0.4, 0.2, BESIDE)
+    for wanted in (0.4, 0.1, 0.0):
+        cell.tick(wanted, {"left": 0.9, "right": 1.0})
+        assert cell.granted["left"] == wanted
