@@ -22,7 +22,7 @@ from q2r2_control.verification.work_motions import WorkMotion
 
 # When each hand presses: nobody presses with both at once [s].
 _PRESSES = {"left": 0.2, "right": 0.26}
-# From when on the hands move; the longest chord window, in which a press does not count yet, is over then [s].
+# From when on the hands move: half a second after both presses count, however long a chord is waited for [s].
 MOVES = 1.0
 _EVEN_RATE = 75.0  # [Hz]
 _NOISE = 2e-4  # of the sensor, along each axis [m]
