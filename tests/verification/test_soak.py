@@ -81,8 +81,23 @@ def test_three_thousand_hostile_ticks_break_no_promise(seed: int) -> None:
     assert report.passed
     assert report.resets > 1
     assert report.solver_faults > 0
+    assert report.openings > 100
     distances = next(margin for margin in report.margins if margin.name == "distance - kept distance, at ticks")
     assert distances.checked > 1000
+
+
+def test_fingers_that_open_without_a_proof_are_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    real = CartesianController._look_again
+
+    def accepted(self: CartesianController, grown: Any) -> int:
+        real(self, grown)
+        return -1
+
+    monkeypatch.setattr(CartesianController, "_look_again", accepted)
+    report = run_soak(CONFIG, 5000, 1)
+    assert report.openings > 100
+    assert report.openings_refused == 0
+    assert "distance - kept distance, at ticks" in {found.promise for found in report.broken}
 
 
 def test_the_same_seed_gives_the_same_run() -> None:

@@ -20,7 +20,7 @@ from q2r2_control.types import Array
 
 
 class Bodies(NamedTuple):
-    """Collision geometries in their joint's frame."""
+    """Collision geometries in their joint's frame; start and end of fingers change, see :mod:`finger_openings`."""
 
     joint: IntArray  # (g,) 0 is the world
     box: IntArray  # (g,) 1 for a box
