@@ -51,15 +51,17 @@ class Played:
     results: dict[str, TaskResult]
 
 
-def play(names: str, mode: CommandMode, source: type[ScriptedInput] = ScriptedInput) -> Played:
-    """Tasks in simulated time, with the contract checked at every tick."""
+def play(
+    names: str, mode: CommandMode, source: type[ScriptedInput] = ScriptedInput, duration: float | None = None
+) -> Played:
+    """Tasks in simulated time, for as long as they last, with the contract checked at every tick."""
     config = coarse(mode)
     robot = Robot.from_config(config)
     plant = MujocoPlant(robot, config)
     pipeline = Pipeline(config, robot, source(names), plant, mode)
     watch, tasks = Watch(pipeline), TaskWatch(tasks_named(names.split("+")), plant, robot, config)
     pipeline.listeners.append(tasks)
-    summary = pipeline.run(trajectory_named(names).duration, realtime=False)
+    summary = pipeline.run(duration or trajectory_named(names).duration, realtime=False)
     return Played(mode, pipeline, watch.ticks, summary, {result.name: result for result in tasks.results()})
 
 
@@ -101,7 +103,8 @@ def test_fingers_work_within_3_mm_of_the_table_and_tools_within_90_mm_of_each_ot
 
 
 def test_hands_that_never_grip_lift_nothing_and_the_measure_says_so() -> None:
-    result = play("grasp", CommandMode.POSITION, Gripless).results["grasp"]
+    held_up_at = 7.0
+    result = play("grasp", CommandMode.POSITION, Gripless, held_up_at).results["grasp"]
     assert not result.succeeded
     assert result.measured["lifted_mm"] < 1.0
     assert result.reason == "flat_block: held 95 mm up for 0.0 s, not 1 s"
