@@ -18,7 +18,7 @@ from q2r2_control.config.control import ContactPair
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.drives.torque import TorqueDrive
 from q2r2_control.errors import ConfigError
-from q2r2_control.inputs.trajectories import minimum_jerk
+from q2r2_control.inputs.way_points import minimum_jerk
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.plants.mujoco_contacts import pressing_force
 from q2r2_control.robot.kept_distances import kept_distances
