@@ -117,7 +117,7 @@ def test_both_arms_follow_within_every_limit(
 
 @pytest.mark.parametrize("plant", ["kinematic", "mujoco"])
 def test_fingers_count_as_wide_as_the_grippers_are_at_every_tick(plant: str) -> None:
-    loop = Pipeline.from_config(cell(), input=ScriptedInput("reach_grasp_handover"), plant=plant)
+    loop = Pipeline.from_config(cell(), input=ScriptedInput("meet"), plant=plant)
     watch, widest = Watch(loop), list[float]()
 
     def listener(tick: Tick) -> None:
