@@ -15,7 +15,7 @@ from rich.text import Text
 from q2r2_control.benchmark.command_responses import LatencyReport
 from q2r2_control.benchmark.loop_times import PHYSICS, LoopReport, StageTime, run_loop_bench
 from q2r2_control.benchmark.peers.base import PEERS
-from q2r2_control.benchmark.press_run import run_press, with_contact
+from q2r2_control.benchmark.press_run import FINGERS, TABLE_ONLY, run_press, with_contact
 from q2r2_control.benchmark.stack_bench import StackReport, run_stack_bench
 from q2r2_control.benchmark.tick_times import BenchReport, BenchRow, run_bench
 from q2r2_control.benchmark.work_bench import WORK_PEERS, run_work_bench
@@ -55,6 +55,10 @@ def bench(
     ] = None,
     soak: Annotated[
         bool, typer.Option("--soak", help="Check every promise in hostile ticks instead of timing.")
+    ] = False,
+    contact: Annotated[
+        bool,
+        typer.Option("--contact", help="With --soak: fingers may touch table and fingers, as in torque mode."),
     ] = False,
     seed: Annotated[int, typer.Option(min=0, help="Of the soak, or of the hands with --through.")] = 0,
     loop: Annotated[bool, typer.Option("--loop", help="Time the whole live loop instead, stage by stage.")] = False,
@@ -96,6 +100,8 @@ def bench(
         raise ConfigError("--ticks cannot be used with --work, whose motions have a length of their own")
     if press and ticks is not None:
         raise ConfigError("--ticks cannot be used with --press, which has a length of its own")
+    if contact and not soak:
+        raise ConfigError("--contact needs --soak")
     if seed and not (soak or through):
         raise ConfigError("--seed needs --soak or --through, since nothing else draws")
     if ros and ticks is not None:
@@ -110,14 +116,16 @@ def bench(
     with notice_of_compiling(console):
         if soak:
             soak_ticks = _SOAK_TICKS if ticks is None else ticks
-            _show_soak(run_soak(load_config(DEMO_CONFIG), soak_ticks, seed, _progress(console)), json)
+            cell = load_config(DEMO_CONFIG)
+            cell = with_contact(cell, FINGERS) if contact else cell
+            _show_soak(run_soak(cell, soak_ticks, seed, _progress(console)), json)
         elif through:
             modes = tuple(dict.fromkeys(through))
             _show_stack(run_stack_bench(load_config(DEMO_CONFIG), motions, modes, seed, _progress(console)), json)
         elif work:
             _show_work(motions, WORK_PEERS if peers else (), console, json)
         elif press:
-            _show_press(with_contact(load_config(DEMO_CONFIG)), json)
+            _show_press(with_contact(load_config(DEMO_CONFIG), TABLE_ONLY), json)
         elif loop:
             loop_ticks = _TICKS if ticks is None else ticks
             _show_loop(run_loop_bench(load_config(DEMO_CONFIG), loop_ticks, _progress(console)), json)

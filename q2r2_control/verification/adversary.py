@@ -10,6 +10,7 @@ import pinocchio as pin
 
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import ALL_OF_THE_WAY, Array, Interval
+from q2r2_control.verification.work_motions import ARMS, WORK_MOTIONS
 
 
 class Request(NamedTuple):
@@ -22,6 +23,8 @@ class Request(NamedTuple):
 # From the tick within the segment and the last reference's joint positions (nv,) to the request.
 Stream = Callable[[int, Array], Request]
 _NONE: frozenset[str] = frozenset()
+_TABLE = 0.2  # height of the top that is pressed on, as in the shipped cells [m]
+_TICK = 0.001  # that motions at work are played at [s]
 _WORKSPACE = np.array([[-0.6, -1.1, -0.1], [1.1, 1.1, 1.4]])  # [m]
 
 
@@ -43,6 +46,8 @@ class Adversary:
         "chatter",
         "shaking",
         "postures",
+        "work",
+        "pressing",
     )
 
     def __init__(self, robot: Robot, random: np.random.Generator) -> None:
@@ -205,6 +210,29 @@ class Adversary:
         def stream(tick: int, q: Array) -> Request:
             by = size * np.sin(rate * tick) * along
             return Request(self._moved(lambda: by), _NONE)
+
+        return stream
+
+    def _work(self) -> Stream:
+        """What two arms do at work, from anywhere in the motion on, at up to three times its speed."""
+        if self._arms != ARMS:
+            return self._shaking()
+        motion = tuple(WORK_MOTIONS.values())[int(self._random.integers(len(WORK_MOTIONS)))]
+        begins, pace = self._random.uniform(0.0, motion.rests), self._random.uniform(0.3, 3.0) * _TICK
+        return lambda tick, q: Request(dict(motion.targets(begins + pace * tick, self._home)), _NONE)
+
+    def _pressing(self) -> Stream:
+        """Down onto the table, or hand against hand, sliding about meanwhile."""
+        down, rate = self._random.random() < 0.5, self._random.uniform(0.001, 0.02)
+        place, depth = self._random.uniform([0.3, -0.2, 0.3], [0.7, 0.2, 0.6]), self._random.uniform(0.0, 0.1)
+
+        def stream(tick: int, q: Array) -> Request:
+            slide = 0.1 * np.array([np.sin(rate * tick), np.cos(0.7 * rate * tick), 0.0])
+            poses: dict[str, Any] = {}
+            for arm, pose in self._home.items():
+                goal = [*pose.translation[:2], _TABLE - depth] if down else place
+                poses[arm] = pin.SE3(pose.rotation, np.array(goal) + slide)
+            return Request(poses, _NONE)
 
         return stream
 

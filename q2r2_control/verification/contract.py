@@ -317,8 +317,11 @@ class Contract:
             values = self._distances(q)
             margins = values - self._kept
             if len(values) and values.min() > 0.0:  # Coal's penetration depth is another quantity
-                self._note("coal", abs(float(values.min()) - report.closest_distance))
-                self._note("coal", abs(float(margins.min()) - report.margin))
+                # Boxes that may be touched are rounded for the controller.
+                if self._kept[int(values.argmin())] >= 0.0 <= self._kept_by_name[frozenset(report.closest_pair)]:
+                    self._note("coal", abs(float(values.min()) - report.closest_distance))
+                if self._kept[int(margins.argmin())] >= 0.0 <= self._kept_by_name[frozenset(report.tightest_pair)]:
+                    self._note("coal", abs(float(margins.min()) - report.margin))
             if not self._certain and self._apart.any():
                 self._note("bystanders", float(margins[self._apart].min()))
             if self._certain and 0.0 < h <= self._substep:

@@ -178,6 +178,7 @@ def test_through_the_stack_every_mode_runs_once_and_a_broken_promise_is_exit_cod
     ("options", "line"),
     [
         (["--through", "torque"], "--through needs --work"),
+        (["--contact"], "--contact needs --soak"),
         (["--work", "--seed", "3"], "--seed needs --soak or --through, since nothing else draws"),
     ],
 )

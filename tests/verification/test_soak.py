@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from q2r2_control.benchmark.press_run import FINGERS, with_contact
 from q2r2_control.config import load_config
 from q2r2_control.config.control import ControllerSettings
 from q2r2_control.control.controller import CartesianController
@@ -72,6 +73,12 @@ def soak(
     solver: FaultySolver | None = None,
 ) -> SoakReport:
     return Soak("cell", Sabotaged(change, first, settings), solver or controller_and_solver()[1], SEED).run(ticks)
+
+
+def test_hostile_ticks_break_no_promise_where_fingers_may_touch() -> None:
+    report = run_soak(with_contact(CONFIG, FINGERS), 3000, seed=3)
+    assert [found.promise for found in report.broken] == []
+    assert report.passed
 
 
 @pytest.mark.parametrize("seed", [0, 3])
