@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from q2r2_control.benchmark.loop_times import CASES, PHYSICS, STAGES, LoopReport, LoopRow, StageTime, run_loop_bench
+from q2r2_control.benchmark.loop_times import CASES, PHYSICS, STAGES, LoopReport, LoopRow, StageTime
 from q2r2_control.benchmark.motion_run import MotionFigures
 from q2r2_control.benchmark.stack_bench import StackReport, StackRow
 from q2r2_control.benchmark.stack_run import StackFigures
@@ -219,15 +219,19 @@ def test_eighty_columns_hold_every_stage_of_the_loop_for_each_plant_and_mode() -
 def test_the_loop_s_bench_prints_its_figures_as_one_object(monkeypatch: pytest.MonkeyPatch) -> None:
     asked = []
 
-    def short(config: Config, ticks: int, progress: object) -> LoopReport:
+    def made_up(config: Config, ticks: int, progress: object) -> LoopReport:
         asked.append(ticks)
-        return run_loop_bench(config, 100, paced=False)
+        stages = [StageTime(stage, 1.0, 2.0) for stage in STAGES]
+        whole = StageTime("without physics", 9.0, 12.0)
+        return LoopReport(
+            "cell", 1e3, [LoopRow(plant, str(mode), ticks, 3, stages, whole, 0.1) for plant, mode in CASES]
+        )
 
-    monkeypatch.setattr("q2r2_control.cli.bench.run_loop_bench", short)
+    monkeypatch.setattr("q2r2_control.cli.bench.run_loop_bench", made_up)
     found = one_object(q2r2("bench", "--loop", "--ticks", "200", "--json").stdout)
     assert asked == [200]
     assert {stage["stage"] for stage in found["rows"][2]["stages"]} == set(STAGES)
-    assert found["rows"][2]["without_physics"]["median_us"] > 0.0
+    assert found["rows"][2]["without_physics"]["median_us"] == 9.0
 
 
 @pytest.mark.parametrize("other", ["--soak", "--ros"])

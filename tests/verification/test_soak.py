@@ -23,7 +23,7 @@ from q2r2_control.verification.soak import Soak, SoakReport, run_soak
 
 CONFIG = load_config("config/dual_iiwa7.yaml")
 SETTINGS = CONFIG.control
-SEED = 3
+SEED = 5
 
 
 @cache
@@ -81,7 +81,7 @@ def test_hostile_ticks_break_no_promise_where_fingers_may_touch() -> None:
     assert report.passed
 
 
-@pytest.mark.parametrize("seed", [0, 3])
+@pytest.mark.parametrize("seed", [0, 7])
 def test_three_thousand_hostile_ticks_break_no_promise(seed: int) -> None:
     report = run_soak(CONFIG, 3000, seed)
     assert [found.promise for found in report.broken] == []
