@@ -29,8 +29,9 @@ from q2r2_control.config.teleop import LeashSettings
 from q2r2_control.teleop.relative import RelativeMotion
 from q2r2_control.types import Array
 
-# The way back that drops the slack: more than tremor of 0.2 mm and 0.2 degrees to either side, and noise.
-_WAY_BACK = 0.9e-3, 12e-3  # [m, rad]
+# The way back that drops the slack: more than tremor of 0.2 mm and 0.2 degrees to either side, and than the noise of a
+# headset, 0.2 mm and 0.03 degrees, of which seven times lie between the farthest samples of a hand that rests.
+_WAY_BACK = 1.5e-3, 12e-3  # [m, rad]
 # Slower than this a tool counts as blocked. Stopping from there takes a fraction of a millimetre.
 _HELD_UP = 0.05, 0.2  # [m/s, rad/s]
 # A step faster than this is no motion of a target, whatever the controller's settings.
