@@ -15,6 +15,7 @@ import numpy as np
 import pinocchio as pin
 from geometry_msgs.msg import PoseStamped, TransformStamped
 from quest2ros.msg import OVR2ROSHapticFeedback, OVR2ROSInputs
+from rclpy.qos import QoSProfile
 from std_msgs.msg import String
 from tf2_msgs.msg import TFMessage
 
@@ -67,7 +68,7 @@ class ArmRig:
                 OVR2ROSHapticFeedback,
                 f"q2r_{hand}_hand_haptic_feedback",
                 lambda message: self.pulses.append((round(message.frequency, 3), round(message.amplitude, 3))),
-                COMMAND_QOS,
+                QoSProfile(depth=100, reliability=COMMAND_QOS.reliability),  # none lost while this process stalls
             ),
         ]
         self._timer = node.create_timer(PERIOD, self._send)

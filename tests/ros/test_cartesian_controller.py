@@ -293,7 +293,7 @@ def test_it_follows_in_another_layout_and_frame_with_another_output_and_on_simul
 ) -> None:
     cell.call("/cartesian_controller/stop")
     layout = ("left.target_topic:=/left/target_pose", "left.target_frame_id:=left_link_0", "output:=joint_state")
-    arguments = [part for parameter in (*layout, "use_sim_time:=true") for part in ("-p", parameter)]
+    arguments = [part for parameter in (*layout, *PATIENT, "use_sim_time:=true") for part in ("-p", parameter)]
     module = "q2r2_control.ros.nodes.cartesian_controller"
     processes.start_module(module, "--ros-args", *arguments, "-r", "__node:=second")
     states: list[dict[str, Any]] = []
