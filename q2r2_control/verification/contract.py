@@ -17,6 +17,8 @@ import numpy.typing as npt
 import pinocchio as pin
 
 from q2r2_control.config.control import ControllerSettings
+from q2r2_control.control.geometry.collision import collision_model_of
+from q2r2_control.control.geometry.rounded_boxes import deeper_at_corners
 from q2r2_control.robot.finger_openings import collision_model_at
 from q2r2_control.robot.kept_distances import kept_distances
 from q2r2_control.robot.pairs import pair_names
@@ -138,6 +140,7 @@ class Contract:
         self._lower = robot.position_lower + settings.position_margin
         self._upper = robot.position_upper - settings.position_margin
         self._kept = kept_distances(robot, settings).values
+        self._at_corners = deeper_at_corners(collision_model_of(robot), self._kept)
         pairs = map(frozenset, pair_names(robot.collision_model))
         self._kept_by_name = dict(zip(pairs, self._kept.tolist(), strict=True))
         self._substep = settings.max_substep
@@ -315,7 +318,7 @@ class Contract:
         draw = 0.0 if self._sample_all else self._random.random()
         if draw < _BETWEEN_SHARE:
             values = self._distances(q)
-            margins = values - self._kept
+            margins = values - self._kept + self._at_corners
             if len(values) and values.min() > 0.0:  # Coal's penetration depth is another quantity
                 # Boxes that may be touched are rounded for the controller.
                 if self._kept[int(values.argmin())] >= 0.0 <= self._kept_by_name[frozenset(report.closest_pair)]:
@@ -346,7 +349,7 @@ class Contract:
 
     def _margins(self, q: Array) -> Array:
         """How much farther apart than it has to be every pair is (p,) [m]."""
-        return self._distances(q) - self._kept
+        return self._distances(q) - self._kept + self._at_corners
 
     def _distances(self, q: Array) -> Array:
         """As :meth:`Robot.distance_values`, with fingers at the openings that the controller counts with."""

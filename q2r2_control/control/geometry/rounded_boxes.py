@@ -3,7 +3,8 @@
 Directions between two bodies are known as long as their cores, the segments and boxes without their radii, do not meet.
 A finger's core is less than a centimetre below its skin. Where a body may get inside a box by a depth, the box is
 measured as its core, smaller by that depth on all sides, and a radius. On its faces nothing changes; edges and corners
-become round, which is right only for pairs that are allowed to touch.
+become round, which is right only for pairs that are allowed to touch: a body of radius r that comes diagonally gets
+deeper into the real corner than the depth, by r (1 - 1 / sqrt(3)) at most, 4 mm for the fingers of a Hand-E.
 """
 
 from __future__ import annotations
@@ -42,6 +43,12 @@ def with_rounded_boxes(model: CollisionModel, depth: Array) -> CollisionModel:
         name: np.concatenate([array, rounded.get(name, array[sources])]) for name, array in bodies._asdict().items()
     }
     return model._replace(bodies=Bodies(**joined), pairs=pairs._replace(second=second))
+
+
+def deeper_at_corners(model: CollisionModel, kept: Array) -> Array:
+    """How much deeper than -``kept`` (p,) [m] pairs that may touch can get into a real corner (p,) [m]; else 0."""
+    boxed = (kept < 0.0) & (model.bodies.box[model.pairs.second] == 1)
+    return np.where(boxed, (1.0 - 1.0 / np.sqrt(3.0)) * model.bodies.radius[model.pairs.first], 0.0)
 
 
 def deepest(model: CollisionModel) -> Array:
