@@ -79,7 +79,7 @@ class MujocoConfig(CellModel):
     position_damping_ratio: float = Field(1.0, gt=0, le=5, description="of the position servos")
     rotor_share: float = Field(
         1.0,
-        ge=0,
+        ge=0.01,  # light wrist joints without any could not be integrated
         le=1,
         description="of the rotors' inertia that the joints feel; a torque loop on the joint hides most",
     )

@@ -361,6 +361,7 @@ def test_a_misspelt_key_is_named_before_the_one_that_is_missing_for_it(tmp_path:
         ("admittance.enabled", 1, "valid boolean"),
         ("admittance.mass", 0, "greater than or equal to 0.5"),
         ("mujoco.timestep", 0.01, "less than or equal to 0.001"),
+        ("mujoco.rotor_share", 0.0, "greater than or equal to 0.01"),
         ("loop_rate_hz", 1, "greater than or equal to 50"),
         ("loop_rate_hz", 1e300, "less than or equal to 2000"),
         ("loop_rate_hz", 10**400, "finite number"),
