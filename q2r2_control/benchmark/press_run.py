@@ -14,7 +14,6 @@ import numpy as np
 import pinocchio as pin
 
 from q2r2_control.config import Config
-from q2r2_control.config.control import ContactPair
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.drives.torque import TorqueDrive
 from q2r2_control.errors import ConfigError
@@ -34,8 +33,6 @@ _PLACE = (0.50, 0.40)  # x and y [m]
 _HEIGHT, _LOWEST, _RISE = 0.30, 0.10, 0.10  # of the tool before, at least, and after [m]
 _APPROACH_SPEED = 0.5  # asked for, far above what contact allows [m/s]
 _SLIDE = 0.10  # [m]
-TABLE_ONLY = (ContactPair(pair=("*_finger_*", _TABLE)),)
-FINGERS = (*TABLE_ONLY, ContactPair(pair=("left_*_finger_*", "right_*_finger_*"), depth=0.005))
 # Times at which parts of the run begin [s].
 _DOWN, _SLIDING, _LIFT, _END = 2.5, 6.0, 8.5, 10.5
 _APPROACH, _SLIDE_TIME = 2.0, 1.5  # [s]
@@ -58,13 +55,6 @@ class PressFigures:
     slide_error_mm: float  # tool against target along the table at the slide's end [mm]
     slide_force: float  # mean while it slides and after [N]
     violations: int  # of the controller's promises, over all ticks
-
-
-def with_contact(config: Config, pairs: tuple[ContactPair, ...]) -> Config:
-    """The cell as it is where it allows contact, else with ``pairs`` that may touch."""
-    if config.control.contact_allowed:
-        return config
-    return config.model_copy(update={"control": config.control.model_copy(update={"contact_allowed": pairs})})
 
 
 def run_press(config: Config, rotor_share: float) -> PressFigures:

@@ -15,7 +15,7 @@ from rich.text import Text
 from q2r2_control.benchmark.command_responses import LatencyReport
 from q2r2_control.benchmark.loop_times import PHYSICS, LoopReport, StageTime, run_loop_bench
 from q2r2_control.benchmark.peers.base import PEERS
-from q2r2_control.benchmark.press_run import FINGERS, TABLE_ONLY, run_press, with_contact
+from q2r2_control.benchmark.press_run import run_press
 from q2r2_control.benchmark.stack_bench import StackReport, run_stack_bench
 from q2r2_control.benchmark.tick_times import BenchReport, BenchRow, run_bench
 from q2r2_control.benchmark.work_bench import WORK_PEERS, run_work_bench
@@ -29,6 +29,7 @@ from q2r2_control.cli.work_table import work_table
 from q2r2_control.config import Config, load_config
 from q2r2_control.errors import ConfigError
 from q2r2_control.types import CommandMode
+from q2r2_control.verification.contact_cells import FINGERS, TABLE_ONLY, with_contact
 from q2r2_control.verification.soak import SoakReport, run_soak
 from q2r2_control.verification.work_motions import WORK_MOTIONS, WorkMotion, motions_named
 

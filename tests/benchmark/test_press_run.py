@@ -5,8 +5,9 @@ from __future__ import annotations
 import pytest
 
 from q2r2_control import load_config
-from q2r2_control.benchmark.press_run import COMMANDED, TABLE_ONLY, run_press, with_contact
+from q2r2_control.benchmark.press_run import COMMANDED, run_press
 from q2r2_control.errors import ConfigError
+from q2r2_control.verification.contact_cells import TABLE_ONLY, with_contact
 
 CONFIG = load_config("config/dual_iiwa7.yaml")
 STIFFNESS = CONFIG.impedance.translational_stiffness

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from q2r2_control.benchmark.press_run import FINGERS, with_contact
 from q2r2_control.config import load_config
 from q2r2_control.config.control import ControllerSettings
 from q2r2_control.control.controller import CartesianController
@@ -18,6 +17,7 @@ from q2r2_control.control.qp import make_solver
 from q2r2_control.errors import ConfigError
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, Interval, Reference
+from q2r2_control.verification.contact_cells import FINGERS, with_contact
 from q2r2_control.verification.fault_injection import FaultySolver
 from q2r2_control.verification.soak import Soak, SoakReport, run_soak
 
