@@ -109,7 +109,11 @@ class _Probe:
         return recording
 
     def engage_hand(self) -> None:
-        """Press the lower button until the arm's node publishes targets."""
+        """Press the lower button until the arm's node publishes targets, and goes on.
+
+        A press that is answered late may meet the next one, which pauses the arm again: so what follows is asked after
+        the buttons rest, and not of what came while they were pressed.
+        """
         targets: list[PoseStamped] = []
         subscription = self._node.create_subscription(PoseStamped, "/q2r2/left/target_frame", targets.append, 1)
         deadline = time.monotonic() + _START_TIMEOUT
@@ -118,6 +122,8 @@ class _Probe:
                 raise LatencyError(f"left_arm_controller was not engaged within {_START_TIMEOUT:g} s")
             for pressed, period in ((True, _PRESS), (False, _CHORD)):
                 self._send_hand(pressed, period)
+            targets.clear()
+            self._send_hand(False, _CHORD)
         self._node.destroy_subscription(subscription)
 
     def step_hand(self, duration: float) -> Recording:
