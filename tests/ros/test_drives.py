@@ -34,6 +34,7 @@ from tests.ros.waiting import wait_until
 RATE = 125.0  # of the control loop [Hz]
 COMMANDS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE, history=HistoryPolicy.KEEP_LAST)
 ADMITTANCE = {"enabled": True, "stiffness": 500.0, "force_dead_band": 0.0}
+HANGS = 0.13  # longer than commands may go without an acknowledgement, and too short to ask a robot to jump [s]
 SAG = 0.03  # a command that begins anew is no farther from what was measured [rad]
 
 
@@ -87,13 +88,47 @@ def test_a_controller_that_is_stopped_for_a_while_publishes_no_jump(
                 stream = cell.engage("left")
     finally:
         stream.end()
+    assert_no_jump(recorder.commands, robot)
+
+
+def test_no_jump_is_published_while_a_robot_that_hangs_as_a_motion_begins_acknowledges_nothing(
+    robot: Robot, processes: Processes, node: Any
+) -> None:
+    simulation = start_robot(processes)
+    cell = Cell(node, robot, simulation)
+    start_controller(processes, *PATIENT, f"rate:={RATE}")
+    cell.wait_until_active()
+    recorder = Recorder(cell, robot)
+    stream = cell.engage("left")
+    try:
+        for times in range(4):
+            begin = len(recorder.commands)
+            stream.poses["left"] = shifted(stream.poses["left"], 0.0, 0.0, 0.15 if times % 2 == 0 else -0.15)
+            wait_until(partial(moves, recorder, begin), "the reference moves")
+            os.kill(simulation.pid, signal.SIGSTOP)
+            time.sleep(HANGS)
+            os.kill(simulation.pid, signal.SIGCONT)
+            time.sleep(1.5)
+    finally:
+        os.kill(simulation.pid, signal.SIGCONT)
+        stream.end()
+    assert_no_jump(recorder.commands, robot)
+
+
+def assert_no_jump(commands: list[Commanded], robot: Robot) -> None:
+    """No command asks a joint for more than it may do in the periods since the one before."""
     limit = robot.velocity_limit / RATE
-    for before, after in pairwise(recorder.commands):
+    for before, after in pairwise(commands):
         way = np.abs(after.q - before.q)
         periods = after.number - before.number
         # A gap of more than 100 ms, which a busy machine may make of any stall: the controller starts over at the arms.
         anew = np.abs(after.q - after.measured).max() < SAG and after.t - before.t > 0.1
         assert (way <= periods * limit * (1.0 + 1e-6)).all() or anew, (way / limit).max() / periods
+
+
+def moves(recorder: Recorder, begin: int) -> bool:
+    """Whether commands from index ``begin`` on have begun to move."""
+    return fastest(recorder.commands[begin:]) > 0.05
 
 
 def moves_fast(recorder: Recorder, begin: int) -> bool:

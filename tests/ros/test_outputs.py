@@ -51,7 +51,8 @@ class Commands:
         while time.monotonic() < end:
             if (fault := self.output.listener_fault(off_reference)) is not None:
                 return fault
-            self._channel.send(Float64MultiArray())
+            if not self.output.waits():
+                self._publisher.publish(Float64MultiArray())
             time.sleep(0.005)
         return None
 

@@ -33,11 +33,6 @@ class Channel:
     joints: np.ndarray  # velocity indices in the robot's order
     publisher: WatchedPublisher
 
-    def send(self, message: Any) -> None:
-        """Publish a message, or leave it out while the last one's acknowledgement is waited for."""
-        if not self.publisher.waits():
-            self.publisher.publish(message)
-
 
 class JointOutput:
     """Where references go. Without channels, ``output: none``, another controller moves the arms."""
@@ -69,6 +64,13 @@ class JointOutput:
         for channel in self._channels:  # without waiting for an acknowledgement: there is no next one to send instead
             channel.publisher.publish(self._kind.encode(JointCommand(command, state, t), channel.names, channel.joints))
 
+    def waits(self) -> bool:
+        """Whether nothing should be sent now, so that the last command can be acknowledged; to be asked once a tick.
+
+        The reference must not go on meanwhile: it would leave as one jump afterwards.
+        """
+        return any([channel.publisher.waits() for channel in self._channels])
+
     def listener_fault(self, off_reference: bool) -> str | None:
         """One line where what took the commands is gone, or is not alone any more; to be asked before each is sent.
 
@@ -88,7 +90,7 @@ class JointOutput:
 
     def _publish(self, command: JointCommand) -> None:
         for channel in self._channels:
-            channel.send(self._kind.encode(command, channel.names, channel.joints))
+            channel.publisher.publish(self._kind.encode(command, channel.names, channel.joints))
 
 
 def joints_of(robot: Robot, arms: Iterable[str]) -> np.ndarray:

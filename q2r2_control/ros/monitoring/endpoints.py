@@ -108,6 +108,9 @@ class WatchedPublisher:
         now = time.monotonic()
         if not self._streaming or (self._acknowledged is not None and now - self._acknowledged < _CHECK):
             return False
+        if self._publisher.wait_for_all_acked(_NO_WAIT):
+            self._acknowledged = now
+            return False
         if now - self._gap_began >= _CHECK:
             self._gap_began = now
         return now - self._gap_began < _GAP

@@ -149,6 +149,8 @@ class CartesianControllerNode(BaseNode):
         self.create_timer(_LOOK_PERIOD, self._look, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def _tick(self) -> None:
+        if self._output.waits():
+            return  # this tick is a missed one, and the next a late one
         now = self.now
         # A late tick is no jump; a clock that was set back moves nothing.
         gap = now - self._last_tick
