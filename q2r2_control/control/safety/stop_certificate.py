@@ -13,7 +13,9 @@ through in pieces as long as can be proven, each from a sample of its own.
 
 from __future__ import annotations
 
-from q2r2_control.control.geometry.pair_distance import measure
+import numpy as np
+
+from q2r2_control.control.geometry.pair_distance import distance_row, measure
 from q2r2_control.control.jit import lean_kernel
 from q2r2_control.control.safety.safety_data import SafetyData
 from q2r2_control.control.safety.safety_model import SafetyModel
@@ -22,7 +24,8 @@ from q2r2_control.control.safety.stop_rollout import begin_rollout, sample_of, w
 from q2r2_control.types import Array
 
 # A pair that starts closer than its distance may not come closer; this is rounding only.
-_ROUNDING = 1e-12  # [m]
+_ROUNDING = 1e-12  # [m], and relative
+_STILL = 1e-9  # [m/s]
 
 
 @lean_kernel
@@ -152,11 +155,26 @@ def _stop_keeps_apart(model: SafetyModel, data: SafetyData, p: int, duration: fl
 
 @lean_kernel
 def _comes_no_closer(model: SafetyModel, data: SafetyData, p: int, duration: float) -> bool:
-    """For a pair that is too close already: no sample of the stop is closer than the one before."""
+    """For a pair that is too close already: no sample of the stop is closer than the one before, or closing in.
+
+    Distances alone would miss a pair that opens and closes again between two samples. At the last one all joints rest,
+    and the way by which the last of them came counts.
+    """
+    candidate, row = data.candidate, data.rollout.piece.rate
     before = data.distance[p]
-    for i in range(data.rollout.q.shape[0]):
+    last = data.rollout.q.shape[0] - 1
+    for i in range(last + 1):
         now = _distance_at(model, data, p, i, duration)
         if now < before - _ROUNDING:
             return False
         before = now
+        distance_row(model.collision, sample_of(model, data, i, duration), p, row)
+        rate = 0.0
+        for j in range(row.shape[0]):
+            v = data.rollout.v[i, j]
+            if i == last and abs(candidate.v[j]) >= (1.0 - _ROUNDING) * duration * candidate.deceleration[j]:
+                v = np.sign(candidate.v[j]) * candidate.deceleration[j] * duration / last
+            rate += row[j] * v
+        if rate < -_STILL:
+            return False
     return True

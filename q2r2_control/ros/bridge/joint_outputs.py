@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -69,7 +68,8 @@ class JointOutput:
 
         The reference must not go on meanwhile: it would leave as one jump afterwards.
         """
-        return any([channel.publisher.waits() for channel in self._channels])
+        waiting = [channel.publisher.waits() for channel in self._channels]  # asked all: each has a gap of its own
+        return True in waiting
 
     def listener_fault(self, off_reference: bool) -> str | None:
         """One line where what took the commands is gone, or is not alone any more; to be asked before each is sent.

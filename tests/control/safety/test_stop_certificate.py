@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from q2r2_control.control.safety.stop_certificate import certify, step_travel
-from q2r2_control.control.safety.stop_shapes import OWN, SHAPES, write_stop
+from q2r2_control.control.safety.stop_shapes import OWN, SHAPES, TOGETHER, write_stop
 from q2r2_control.types import Array
 from tests.control.cells import NAMES, CellArrays, cell, distances, kernel_data, kernel_model, random_posture
 
@@ -45,8 +45,8 @@ class Motion:
         t = np.linspace(0.0, H, DENSE // 25)[:, None]
         return np.asarray(self.q + self.v * t + 0.5 * (self.v_next - self.v) / H * t**2)
 
-    def stop(self) -> Array:
-        t = np.linspace(0.0, np.max(np.abs(self.v_next) / self.deceleration), DENSE)[:, None]
+    def stop(self, samples: int = DENSE) -> Array:
+        t = np.linspace(0.0, np.max(np.abs(self.v_next) / self.deceleration), samples)[:, None]
         ran = np.minimum(t, np.abs(self.v_next) / self.deceleration)
         return np.asarray(self.q_next + self.v_next * ran - np.sign(self.v_next) * self.deceleration * ran**2 / 2)
 
@@ -192,3 +192,35 @@ def test_a_pair_that_starts_too_close_comes_no_closer_in_a_certified_motion(name
         assert (during[close] >= before[close] - 1e-6).all()
         assert (during[~close] >= MIN_DISTANCE).all()
     assert certified > 3
+
+
+def _turning_at_its_end(name: str, random: np.random.Generator, count: int) -> Iterator[Motion]:
+    """Stops of all joints together out of postures that are too close, the fastest that are certified.
+
+    A faster one brings a pair closer again, at its end.
+    """
+    found = 0
+    for motion in _motions_from(name, _too_close(cell(name), random, 2000), random):
+        low, high = 0.0, 1.0
+        for _ in range(20):
+            share = 0.5 * (low + high)
+            v = share * motion.v
+            low, high = (share, high) if _certified(name, _motion(name, motion.q, v, v, TOGETHER)) else (low, share)
+        if low > 0.05 and high < 1.0:
+            found += 1
+            yield _motion(name, motion.q, low * motion.v, low * motion.v, TOGETHER)
+        if found == count:
+            return
+
+
+def test_a_pair_that_starts_too_close_comes_no_closer_between_the_samples_of_its_stop_either() -> None:
+    name = "dual_iiwa7"
+    arrays, found = cell(name), 0
+    for motion in _turning_at_its_end(name, np.random.default_rng(20), 10):
+        found += 1
+        close = distances(arrays, motion.q[None])[0] < MIN_DISTANCE
+        way = distances(arrays, motion.stop(20 * DENSE), exact_below=MIN_DISTANCE)[:, close]
+        # A pair that has come free may come closer again, as far as its distance.
+        fall = np.where(way[1:] < MIN_DISTANCE, way[:-1] - way[1:], 0.0)
+        assert fall.max() < 1e-9
+    assert found == 10
