@@ -19,8 +19,8 @@ from q2r2_control.inputs.way_points import WayPoint, WayPoints, later, minimum_j
 from q2r2_control.types import SIDES, Array, HandInputs
 
 PRESS_DURATION = 0.15  # [s]
-_FIRST_PRESS = 0.6  # when the lower buttons engage both arms [s]
-_START = 1.2  # of the motion [s]
+FIRST_PRESS = 0.6  # when the lower buttons engage both arms [s]
+START = 1.2  # of the motion [s]
 _LAST_PRESS, _REST = 0.4, 0.6  # after work: the lower buttons pause both arms, and then the end [s]
 _RAMP = 1.0  # periodic motions gather speed for this long [s]
 
@@ -36,7 +36,7 @@ class Trajectory:
     left: Path
     right: Path | None = None  # None: the left hand's, mirrored
     upper_presses: Mapping[str, tuple[float, ...]] = field(default_factory=dict)  # hand -> times [s]
-    lower_presses: tuple[float, ...] = (_FIRST_PRESS,)  # of both hands [s]
+    lower_presses: tuple[float, ...] = (FIRST_PRESS,)  # of both hands [s]
     duration: float | None = None  # None: without end [s]
 
     def displacement(self, hand: str, t: float, frequency: float) -> tuple[Array, Array]:
@@ -64,7 +64,7 @@ def _pressed(presses: tuple[float, ...], t: float) -> bool:
 
 def _phase(t: float, frequency: float) -> float:
     """Angle of a periodic motion that gathers speed without a jerk [rad]."""
-    elapsed = max(t - _START, 0.0)
+    elapsed = max(t - START, 0.0)
     if elapsed < _RAMP:
         return math.pi * frequency * (elapsed - _RAMP / math.pi * math.sin(math.pi * elapsed / _RAMP))
     return 2.0 * math.pi * frequency * (elapsed - _RAMP / 2.0)
@@ -87,7 +87,7 @@ def _rotate(t: float, frequency: float) -> tuple[Array, Array]:
     phase = _phase(t, frequency)
     turn = np.zeros(3)
     turn[int(phase / (2.0 * math.pi)) % 3] = math.radians(30.0) * (1.0 - math.cos(phase)) / 2.0
-    lift = 0.05 * minimum_jerk((t - _START) / _RAMP)
+    lift = 0.05 * minimum_jerk((t - START) / _RAMP)
     return np.array([0.0, 0.0, lift]), turn
 
 
@@ -96,7 +96,7 @@ def in_sequence(works: Sequence[HandWork]) -> Trajectory:
     homes: dict[str, WayPoint] = {hand: (0.0, *HOME[hand], 0.0, 0.0) for hand in SIDES}
     points = {hand: [home] for hand, home in homes.items()}
     presses: dict[str, list[float]] = {hand: [] for hand in SIDES}
-    begins = _START
+    begins = START
     for work in works:
         for hand, home in homes.items():
             way = [later(point, begins) for point in (home, *work.tools.get(hand, ()))]
@@ -107,7 +107,7 @@ def in_sequence(works: Sequence[HandWork]) -> Trajectory:
         left=_from_home(points["left"], "left"),
         right=_from_home(points["right"], "right"),
         upper_presses={hand: tuple(times) for hand, times in presses.items()},
-        lower_presses=(_FIRST_PRESS, begins + _LAST_PRESS),
+        lower_presses=(FIRST_PRESS, begins + _LAST_PRESS),
         duration=begins + _LAST_PRESS + _REST,
     )
 

@@ -55,6 +55,9 @@ Record = Callable[[str, object], None]
 ATTEMPTS = 5  # to catch both arms in motion, and to measure while the machine is not overloaded
 LONGEST_STARVED = 0.1  # time without joint states that is allowed for; a longer one makes a measurement void [s]
 
+CONTROLLER = "/cartesian_controller"
+STOPPED = f"{CONTROLLER} is stopped: stopped by {CONTROLLER}/stop; {CONTROLLER}/reset activates again"
+
 
 class Teleoperation:
     """The nodes and the operator."""
@@ -98,7 +101,7 @@ class Teleoperation:
         self.move()
 
     def play(self) -> None:
-        """Start the script, which presses once, until both arms follow; again if that press had no effect."""
+        """Start the script until both arms follow; again if a fault stopped them early."""
         for _ in range(ATTEMPTS):
             self.nodes.reset_if_stopped()
             self.nodes.start("simulation_input")
@@ -248,6 +251,25 @@ def test_a_killed_script_stops_both_arms_and_its_restart_waits_for_a_request(
         nodes.kill("simulation_input")
         teleop.operator.rest()
         teleop.operator.online = True
+
+
+def test_a_press_against_a_stopped_controller_says_why_nothing_follows_and_what_helps(moving: Teleoperation) -> None:
+    nodes = moving.nodes
+    since = time.monotonic()
+    assert call(nodes.node, "/cartesian_controller/stop").success
+    nodes.wait_for_diagnosis(since, STOPPED)
+    wait_until(lambda: not any(map(nodes.engaged, ARMS)), "both arms are paused")
+    moving.operator.rest()
+    pressed = time.monotonic()
+    moving.operator.press(*ARMS)
+    time.sleep(AWHILE)
+    for arm in ARMS:
+        lines = [one.line for one in nodes.diagnoses if one.t > pressed and one.node.startswith(f"/{arm}")]
+        assert lines
+        assert all(line == STOPPED for line in lines)
+    assert not any(map(nodes.engaged, ARMS))
+    assert call(nodes.node, "/cartesian_controller/reset").success
+    moving.move()
 
 
 @pytest.mark.parametrize("name", FROZEN)

@@ -1,4 +1,4 @@
-"""The README's port of another robot works as it stands there."""
+"""The README's commands for ROS and its port of another robot work as they stand there."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
+from q2r2_control import Robot
+from q2r2_control.types import Array
 from tests.ros.conftest import NEEDS_ROS
 from tests.ros.processes import PATIENCE, ROOT, Processes
 
@@ -21,6 +23,11 @@ pytestmark = pytest.mark.usefixtures("interfaces")
 from q2r2_control.ros.base_node import LATCHED_QOS  # noqa: E402
 from q2r2_control.ros.bridge.messages import pose_of  # noqa: E402
 from tests.ros.arm_rig import PATIENT, TOOL, ArmRig, assert_same, first, offset, stamped_transform  # noqa: E402
+from tests.ros.joint_recorder import JointRecorder  # noqa: E402
+from tests.ros.waiting import wait_until  # noqa: E402
+
+STARTS = 3
+MOVED = 0.05  # [rad]
 
 
 def test_the_subclass_in_the_readme_teleoperates_its_arm_in_its_robots_frame(
@@ -58,3 +65,20 @@ def test_the_subclass_in_the_readme_teleoperates_its_arm_in_its_robots_frame(
     rig.wait(lambda: shown["right_engaged"].color.a < 1.0, "the marker fades")
     assert_same(pose_of(shown["right_engaged"].pose), pin.SE3.Identity(), 1e-9)
     assert process.interrupt(PATIENCE) == 0
+
+
+@pytest.mark.parametrize("start", range(STARTS))
+def test_the_command_in_the_readme_moves_both_arms(start: int, node: Any, robot: Robot, processes: Processes) -> None:
+    command = re.search(r"`q2r2 (ros up \S+ --input scripted)`", (ROOT / "README.md").read_text())
+    assert command is not None
+    joints = JointRecorder(robot)
+    joints.subscribe(node)
+    up = processes.start_module("q2r2_control", *command[1].split())
+    wait_until(lambda: all(farthest(joints, arm.joints) > MOVED for arm in robot.arms.values()), "both arms move")
+    assert up.interrupt(PATIENCE) == 0
+
+
+def farthest(recorder: JointRecorder, joints: Array) -> float:
+    """How far some of the joints have been from where they were first [rad]."""
+    states = recorder.states
+    return float(np.abs(states[-1].q - states[0].q)[joints].max()) if states else 0.0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 from queue import Queue
 from typing import Any
@@ -17,6 +18,8 @@ from tests.ros.waiting import States, drained, wait_until
 
 pytest.importorskip("rclpy", reason=NEEDS_ROS)
 pytestmark = pytest.mark.usefixtures("interfaces")
+
+from std_msgs.msg import String  # noqa: E402
 
 MODULE = "q2r2_control.ros.nodes.simulation_input"
 RATE = 50.0  # [Hz]
@@ -103,6 +106,40 @@ def test_the_script_waits_until_both_hands_are_listened_to(node: Any, processes:
     state = states.wait_for("circle of left and right")
     assert state["level"] == "ok"
     assert process.interrupt() == 0
+
+
+def test_the_script_waits_for_an_arm_that_is_not_ready_and_presses_until_it_follows(
+    node: Any, processes: Processes
+) -> None:
+    arm = {"hand": "left", "engaged": False, "level": "warn", "message": "no tool yet"}
+    said = node.create_publisher(String, f"{node.get_fully_qualified_name()}/state", 10)
+    node.create_timer(0.1, lambda: said.publish(String(data=json.dumps(arm))))
+    states, left = States(node, "simulation_input"), subscribe(node, "left")
+    start(processes, side="left", trajectory="line")
+    states.wait_for("no tool yet")
+    time.sleep(2.0)
+    held = drained(left["pose"])
+    assert not any(message.button_lower for message in drained(left["inputs"])), "nothing is pressed meanwhile"
+    assert len({message.pose.position.x for message in held}) == 1, "the hand rests, and is there"
+
+    arm |= {"level": "ok", "message": "ready to engage"}
+    for _ in range(2):
+        wait_until(lambda: left["inputs"].get(timeout=PATIENCE).button_lower, "the button is pressed")
+        wait_until(lambda: not left["inputs"].get(timeout=PATIENCE).button_lower, "the button is let go")
+    assert len({message.pose.position.x for message in drained(left["pose"])}) == 1
+    arm["engaged"] = True
+    rest = left["pose"].get(timeout=PATIENCE).pose.position.x
+    wait_until(lambda: left["pose"].get(timeout=PATIENCE).pose.position.x > rest + 0.02, "the hand moves")
+    arm["engaged"] = False  # stopped by a fault at once
+    wait_until(lambda: left["pose"].get(timeout=PATIENCE).pose.position.x == rest, "the hand is where it was")
+    wait_until(lambda: left["inputs"].get(timeout=PATIENCE).button_lower, "the button is pressed")
+    arm["engaged"] = True
+    time.sleep(5.0)
+    arm["engaged"] = False  # later it takes a person
+    time.sleep(0.5)
+    drained(left["inputs"])
+    time.sleep(2.0)
+    assert not any(message.button_lower for message in drained(left["inputs"]))
 
 
 def test_a_bad_parameter_is_one_line(processes: Processes) -> None:

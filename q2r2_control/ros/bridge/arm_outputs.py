@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import math
 from importlib import import_module
 from typing import Any
 
 import pinocchio as pin
 from rclpy.node import Node
-from std_msgs.msg import Bool
+from std_msgs.msg import Bool, String
 
 from q2r2_control.config.presets import BUILTIN, Mode
 from q2r2_control.ros.base_node import LATCHED_QOS, BaseNode
@@ -19,6 +20,10 @@ from q2r2_control.ros.bridge.target_output import TargetOutput, near
 # A commanded pose may be this far from the measured one, because the arm sags under its load.
 SAG = 0.05, 0.1  # [m, rad]
 _POSE = 2  # of moveit_msgs/srv/ServoCommandType
+# What the built-in controller says of an arm that takes a stream of targets, and what helps where it takes none.
+_READY = ("holding", "following")
+_NO_FAULT = ("active", "paused")
+_CURES = {"stopped": "reset", "paused": "pause with data: false"}
 _RETRY = 1.0  # the service is called again if it has not answered for this long [s]
 
 
@@ -64,7 +69,8 @@ class ArmOutputs:
         self._follows: FollowWatch | None = None
         if self.first.preset is BUILTIN:
             # Twice the usual timeout: the targets have to arrive first, and then the answer.
-            self._follows = FollowWatch(node, values.following_topic, 2.0 * values.listener_timeout)
+            arm = values.following_topic.rpartition("/")[2]
+            self._follows = FollowWatch(node, values.following_topic, arm, 2.0 * values.listener_timeout)
         self._all = [self.first] if self._last is None else [self.first, self._last]
         self._command_type: CommandType | None = None
         if preset.command_type is not None:
@@ -84,6 +90,8 @@ class ArmOutputs:
             return unready
         if self._last is not None and not self._has_safe_target:
             return self._safe_target.problem
+        if self._follows is not None and (unready := self._follows.unready):
+            return unready
         return None if self._command_type is None else self._command_type.unready
 
     @property
@@ -136,11 +144,14 @@ class FollowWatch:
     new stream. A controller that publishes nothing here is taken to follow.
     """
 
-    def __init__(self, node: Node, topic: str, timeout: float) -> None:
+    def __init__(self, node: Node, topic: str, arm: str, timeout: float) -> None:
         self._topic, self._timeout = topic, timeout
+        self._controller, self._arm = topic.partition("/following/")[0], arm
         self._follows: bool | None = None
         self._since = math.inf  # targets have been sent and not followed [s]
+        self.unready: str | None = None  # why the controller would follow no stream of targets now
         node.create_subscription(Bool, topic, self._on_following, LATCHED_QOS)
+        node.create_subscription(String, f"{self._controller}/state", self._on_state, 1)
 
     def refusal(self, sending: bool, now: float) -> str | None:
         """One line if targets are ``sending`` and have not been followed for longer than the timeout."""
@@ -152,6 +163,19 @@ class FollowWatch:
 
     def _on_following(self, message: Bool) -> None:
         self._follows = bool(message.data)
+
+    def _on_state(self, message: String) -> None:
+        """What the controller says of this arm, twice a second and at every change."""
+        try:
+            said = json.loads(message.data)
+            state, why = said[f"{self._arm}_state"], said["message"]
+        except (ValueError, TypeError, KeyError):
+            return  # some other node's
+        self.unready = None
+        if state not in _READY:
+            line = state if why in _NO_FAULT else f"{state}: {why}".replace("~", self._controller)
+            cure = f"{self._controller}/{_CURES[state]}" if state in _CURES else ""
+            self.unready = f"{self._controller} is {line}" + ("" if cure in line else f"; call {cure}")
 
 
 class CommandType:

@@ -91,7 +91,7 @@ class BaseArmController(BaseNode):
         self._pose: tuple[PoseStamped, float] | None = None
         self._inputs: tuple[OVR2ROSInputs | None, float] = (None, float("-inf"))
         self._target = ArmTarget(None, OPEN)
-        self._last_event = "paused: not engaged yet"
+        self._last_event = self._paused = "paused: not engaged yet"
         self._refusal: tuple[bytes, str] | None = None
         self._shown = 0.0
         self._ticked = self.now
@@ -193,6 +193,8 @@ class BaseArmController(BaseNode):
         for problem in (self.gripper.problem, self._outputs.advice):
             if problem is not None:
                 return WARN, problem, values
+        if self.state is ArmState.PAUSED:
+            return OK, f"ready to engage ({self._paused})", values  # whatever refused an earlier press is over
         return OK, self._last_event, values
 
     def close(self) -> None:
@@ -241,6 +243,8 @@ class BaseArmController(BaseNode):
         """Report changes of the state: to the log, to the hand as vibrations, and to the other arm."""
         for event in self.teleop.take_events():
             self._last_event = f"{event.destination}: {event.reason}"
+            if event.destination is ArmState.PAUSED is not event.source:
+                self._paused = self._last_event
             self.get_logger().info(self._last_event)
             self.haptics.tell(event)
             if event.destination is ArmState.ENGAGED:

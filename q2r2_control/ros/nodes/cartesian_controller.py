@@ -143,7 +143,7 @@ class CartesianControllerNode(BaseNode):
             "stop": self._stop,
         }
         for name, act in services.items():
-            self.create_service(Trigger, f"~/{name}", partial(_serve, act))
+            self.create_service(Trigger, f"~/{name}", partial(self._serve, act))
         self.create_timer(self._period, self._tick)
         # Looks even while /clock stands still.
         self.create_timer(_LOOK_PERIOD, self._look, clock=Clock(clock_type=ClockType.STEADY_TIME))
@@ -214,7 +214,13 @@ class CartesianControllerNode(BaseNode):
 
     def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         self._supervisor.pause(request.data)
+        self.report_health()  # arms that listen must not wait for the next time
         return _answer(response, None)
+
+    def _serve(self, act: Callable[[], str | None], request: Any, response: Any) -> Any:
+        refusal = act()
+        self.report_health()
+        return _answer(response, refusal)
 
     def _stop(self) -> str | None:
         self._supervisor.stop("stopped by ~/stop; ~/reset activates again")
@@ -268,10 +274,6 @@ class CartesianControllerNode(BaseNode):
         finally:
             if self._commanding and self._joints.state is not None:
                 self._output.end(self._joints.state, self.now)
-
-
-def _serve(act: Callable[[], str | None], request: Any, response: Any) -> Any:
-    return _answer(response, act())
 
 
 def _answer(response: Any, refusal: str | None) -> Any:

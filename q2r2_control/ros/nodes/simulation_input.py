@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 from std_srvs.srv import Trigger
@@ -11,12 +12,16 @@ from std_srvs.srv import Trigger
 from q2r2_control.inputs.messages import HandMessage, HandPose, HandTwist, MessageType
 from q2r2_control.inputs.scripted import ScriptedInput
 from q2r2_control.inputs.session import HAND_TOPICS
-from q2r2_control.inputs.trajectories import TRAJECTORIES
+from q2r2_control.inputs.trajectories import FIRST_PRESS, START, TRAJECTORIES
 from q2r2_control.ros.base_node import OK, WARN, BaseNode, run_node
 from q2r2_control.ros.bridge.hand_topics import HandPublishers
+from q2r2_control.ros.monitoring.hand_listeners import HandListeners
 from q2r2_control.types import SIDES, HandSample
 
 _PERIOD = 0.002  # samples that came due are published this often [s]
+# Of the script, when it is decided whether the buttons are pressed, and whether the hands move [s].
+_BEFORE_PRESS, _BEFORE_MOTION = FIRST_PRESS - 0.1, START - 0.05
+_STARTED = START + 3.0  # [s]
 _MODES = {
     "all": (MessageType.POSE, MessageType.INPUTS, MessageType.TWIST),
     "teleop": (MessageType.POSE, MessageType.INPUTS),
@@ -25,9 +30,12 @@ _MODES = {
 
 
 class SimulationInput(BaseNode):
-    """Plays a scripted trajectory. It presses and releases the lower buttons once, early on, to engage the arms.
+    """Plays a scripted trajectory. It presses and releases the lower buttons, early on, to engage the arms.
 
     So the script starts only when every hand that it plays has a subscriber, unless ``wait_for_subscribers`` is false.
+    The hands rest until the arms' nodes that listen say that they can be engaged. Then the buttons are pressed, and
+    again where an arm is not engaged by the time the hands would move, or stops within the first three seconds of the
+    motion. From then on nothing is pressed again: it takes a person to go on after a fault.
 
     A user who starts the node asks for the motion, as an operator does with a button. A launch file that restarts the
     node after a crash does not, and the arms that the crash has stopped must not move then. Use ``start_on_request``
@@ -58,8 +66,14 @@ class SimulationInput(BaseNode):
         }
         self._publishers_of_hands = HandPublishers(self, self._topics.values())
         self._samples = 0
-        self._script = ScriptedInput(trajectory, self._hands, rate_hz=rate)
-        self._script.start()
+        self._trajectory, self._rate = trajectory, rate
+        self._listeners = HandListeners(
+            self, {hand: topic for (hand, kind), topic in self._topics.items() if kind is MessageType.INPUTS}
+        )
+        self._starts = True  # until nothing is pressed again to engage the arms
+        self._moves = False  # whether the hands do
+        self._not_to_press: set[str] | None = None  # hands; None: that is not decided yet
+        self._rewind(self.now)
         self.create_service(Trigger, "~/start", self._on_start)
         self.create_timer(_PERIOD, self._play)
 
@@ -70,6 +84,8 @@ class SimulationInput(BaseNode):
             return WARN, "waits for a call of ~/start", values
         if self._waits_for_subscribers:
             return WARN, f"waits for a subscriber of {' and '.join(self._missing())}", values
+        if self._starts and (unready := self._listeners.unready()) is not None:
+            return WARN, f"waits: {unready}", values
         return OK, self._title, values
 
     def _missing(self) -> list[str]:
@@ -91,14 +107,45 @@ class SimulationInput(BaseNode):
                 return
             self._waits_for_subscribers = False
             self.get_logger().info(f"plays {self._title}")
-        for sample in self._script.poll(self.now):
+        now = self.now
+        if self._starts:
+            self._engage(now)
+        for sample in self._script.poll(now):
             self._publish(sample)
+
+    def _engage(self, now: float) -> None:
+        """Begin the script anew, where its hands still rest, until the arms are ready, and then until they follow."""
+        self._listeners.look()
+        t = now - self._began
+        if t < _BEFORE_PRESS or (self._not_to_press is not None and t < _BEFORE_MOTION):
+            return
+        if self._not_to_press is None:
+            if self._listeners.unready() is not None:
+                self._rewind(now)
+            else:
+                # A press would pause those that are engaged already.
+                self._not_to_press = {hand for hand in self._hands if self._listeners.engaged(hand)}
+            return
+        follow = [self._listeners.engaged(hand) is not False for hand in self._hands]
+        # Once the hands move they do not go back while an arm follows, which would be a jump.
+        if not (any(follow) if self._moves else all(follow)):
+            self._rewind(now)
+        else:
+            self._moves, self._starts = True, t < _STARTED
+
+    def _rewind(self, now: float) -> None:
+        self._script = ScriptedInput(self._trajectory, self._hands, rate_hz=self._rate)
+        self._script.start()
+        self._began, self._not_to_press, self._moves = now, None, False
 
     def _publish(self, sample: HandSample) -> None:
         twist = self._script.hand_twist(sample.hand, sample.pose_stamp)
+        inputs = sample.inputs
+        if not self._moves and sample.hand in (self._not_to_press or ()):
+            inputs = replace(inputs, button_lower=False)
         messages: dict[MessageType, HandMessage] = {
             MessageType.POSE: HandPose(sample.position, sample.quaternion, sample.pose_stamp, self._frame),
-            MessageType.INPUTS: sample.inputs,
+            MessageType.INPUTS: inputs,
             MessageType.TWIST: HandTwist(twist.linear, twist.angular),
         }
         for kind, message in messages.items():
