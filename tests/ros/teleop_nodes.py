@@ -43,6 +43,7 @@ class TeleopNodes:
         self.commands: list[tuple[float, Array]] = []  # receipt [s] and commanded joint positions [rad]
         self.diagnoses: list[Diagnosis] = []
         self._states: dict[str, tuple[float, dict[str, Any]]] = {}
+        self._engaged: list[tuple[float, str, bool]] = []  # receipt [s], arm, and whether it was engaged
         self._processes = processes
         self._running: dict[str, RosProcess] = {}
         node.create_subscription(JointTrajectory, "/joint_trajectory", self._on_command, COMMAND_QOS)
@@ -83,6 +84,17 @@ class TeleopNodes:
     def engaged(self, arm: str) -> bool:
         """Whether an arm followed its hand when it last reported, which it does at every change."""
         return bool(self._state(f"{arm}_q2r2_arm_controller", 0.0).get("engaged"))
+
+    def alone(self, since: float) -> float:
+        """How long one arm was engaged and the other was not, from ``since`` [s] until now, by their reports [s]."""
+        engaged = dict.fromkeys(ARMS, False)
+        total, before = 0.0, since
+        for t, arm, now in [*self._engaged, (time.monotonic(), ARMS[0], None)]:
+            if t > since:
+                total += (t - before) * (len(set(engaged.values())) > 1)
+                before = t
+            engaged[arm] = engaged[arm] if now is None else now
+        return total
 
     def controller_is(self, phase: str, since: float) -> bool:
         """Whether the controller has reported that after ``since`` [s]."""
@@ -128,7 +140,10 @@ class TeleopNodes:
         self.diagnoses += [Diagnosis(time.monotonic(), status.name, status.message) for status in message.status]
 
     def _on_state(self, name: str, message: String) -> None:
-        self._states[name] = time.monotonic(), json.loads(message.data)
+        now, state = time.monotonic(), json.loads(message.data)
+        self._states[name] = now, state
+        if "arm" in state:
+            self._engaged.append((now, state["arm"], state["engaged"]))
 
 
 def address_of(endpoint: RosProcess) -> tuple[str, int]:

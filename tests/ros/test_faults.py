@@ -55,6 +55,9 @@ Record = Callable[[str, object], None]
 ATTEMPTS = 5  # to catch both arms in motion, and to measure while the machine is not overloaded
 LONGEST_STARVED = 0.1  # time without joint states that is allowed for; a longer one makes a measurement void [s]
 
+# Most of them just below the timeouts, where one node notices and the other does not [s].
+STALLS = (0.05, *3 * (0.11, 0.12, 0.13), 0.16, 0.4)
+ALONE = 0.15  # one arm may be engaged without the other, after both run again [s]
 CONTROLLER = "/cartesian_controller"
 STOPPED = f"{CONTROLLER} is stopped: stopped by {CONTROLLER}/stop; {CONTROLLER}/reset activates again"
 
@@ -270,6 +273,22 @@ def test_a_press_against_a_stopped_controller_says_why_nothing_follows_and_what_
     assert not any(map(nodes.engaged, ARMS))
     assert call(nodes.node, "/cartesian_controller/reset").success
     moving.move()
+
+
+@pytest.mark.parametrize("name", [f"{arm}_arm_controller" for arm in ARMS])
+def test_however_short_an_arm_s_node_stops_either_both_arms_go_on_or_none(name: str, moving: Teleoperation) -> None:
+    nodes = moving.nodes
+    for stall in STALLS:
+        moving.move()
+        nodes.signal(name, signal.SIGSTOP)
+        time.sleep(stall)
+        woken = nodes.signal(name, signal.SIGCONT)
+        time.sleep(AWHILE)
+        alone = nodes.alone(woken)
+        if alone > ALONE:
+            skip_if_overloaded(f"one arm was engaged alone for {alone:.2f} s")
+        assert alone <= ALONE, f"stopped for {stall} s"
+        moving.operator.rest()
 
 
 @pytest.mark.parametrize("name", FROZEN)

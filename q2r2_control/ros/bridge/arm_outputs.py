@@ -24,6 +24,7 @@ _POSE = 2  # of moveit_msgs/srv/ServoCommandType
 _READY = ("holding", "following")
 _NO_FAULT = ("active", "paused")
 _CURES = {"stopped": "reset", "paused": "pause with data: false"}
+_ANSWER = 0.2  # the controller has told of all earlier streams by then [s]
 _RETRY = 1.0  # the service is called again if it has not answered for this long [s]
 
 
@@ -149,17 +150,24 @@ class FollowWatch:
         self._controller, self._arm = topic.partition("/following/")[0], arm
         self._follows: bool | None = None
         self._since = math.inf  # targets have been sent and not followed [s]
+        self._followed_since = math.inf  # targets have been sent and followed [s]
         self.unready: str | None = None  # why the controller would follow no stream of targets now
         node.create_subscription(Bool, topic, self._on_following, LATCHED_QOS)
         node.create_subscription(String, f"{self._controller}/state", self._on_state, 1)
 
     def refusal(self, sending: bool, now: float) -> str | None:
-        """One line if targets are ``sending`` and have not been followed for longer than the timeout."""
-        if not sending or self._follows is not False:
+        """One line if targets are ``sending`` and are followed no more, or not yet after the timeout."""
+        followed = sending and self._follows is True
+        if followed or not sending:
             self._since = math.inf
+            self._followed_since = min(self._followed_since, now) if followed else math.inf
             return None
-        self._since = min(self._since, now)
-        return f"{self._topic} says that targets are not followed" if now - self._since > self._timeout else None
+        # The end of a stream before this one may be told late, when this one has not been answered yet.
+        dropped = now - self._followed_since > _ANSWER
+        self._since, self._followed_since = min(self._since, now), math.inf
+        if self._follows is None or not (dropped or now - self._since > self._timeout):
+            return None
+        return f"{self._topic} says that targets are not followed" + (" any more" if dropped else "")
 
     def _on_following(self, message: Bool) -> None:
         self._follows = bool(message.data)

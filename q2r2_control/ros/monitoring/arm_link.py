@@ -47,8 +47,10 @@ class ArmLink:
       younger than it is, which can only cause a pause too many, never one too few.
     - One fault pauses an arm only once. Its number is remembered together with the run of the node that it belongs to,
       so jitter of the ages does not matter, and a node that is restarted counts from 1 again.
-    - A pause because of the other arm is no fault of this arm and is not sent back. Where both arms are at fault each
-      sends its own, and each is engaged by its own press, whether the other one is engaged or not.
+    - A pause because of a fault that the other arm has sent is not sent back. Where both arms are at fault each sends
+      its own, and each is engaged by its own press, whether the other one is engaged or not.
+    - Silence of the other arm is a fault that this arm has found, and is sent: a node that was stopped for less than
+      its own timeout goes on as if nothing had happened, and its arm would move alone.
 
     No heartbeat for ``timeout`` [s] is a fault too, and so is a heartbeat of another run of the node where the first
     one has not announced its end. Time here is the machine's steady clock: a node may hang or die whatever simulated
@@ -64,6 +66,7 @@ class ArmLink:
         self._newest: _Heartbeat | None = None  # of the other node; None: none yet, timed out, or ended in order
         self._received_at = -math.inf  # of the newest heartbeat [s]
         self._acted_on: tuple[str, int] = ("", 0)  # run of the node and number of its last fault
+        self._told = ""  # the last fault of the other arm that was taken
         self._pending: str | None = None  # a fault of the other arm that was not taken yet
         self._stances = node.create_publisher(String, f"/{robot}/{arm}/stance", LATCHED_QOS)
         self._heartbeats = node.create_publisher(String, f"/{robot}/{arm}/link", 10)
@@ -96,11 +99,17 @@ class ArmLink:
     def take_fault(self) -> str | None:
         """Why this arm has to pause because of the other one; each reason is returned once."""
         fault, self._pending = self._pending, None
+        if fault is not None:
+            self._told = f"linked to {self.other}: {fault}"
         silence = time.monotonic() - self._received_at
         if fault is None and self._newest is not None and silence > self._timeout:
             fault = f"{self._newest.node} is silent for {silence:.2f} s"
             self._newest = None
         return fault and f"linked to {self.other}: {fault}"
+
+    def told(self, reason: str) -> bool:
+        """Whether ``reason`` is the last fault that the other arm has told, and knows."""
+        return reason == self._told
 
     def close(self) -> None:
         """Announce the end of this node, so that the other one does not wait for its heartbeat."""

@@ -250,7 +250,7 @@ class BaseArmController(BaseNode):
             if event.destination is ArmState.ENGAGED:
                 self._link.engaged()
             stopped = event.source != ArmState.PAUSED and event.destination in (ArmState.PAUSED, ArmState.ALIGNING)
-            if stopped and event.reason != "lower button" and not event.reason.startswith("linked to"):
+            if stopped and event.reason != "lower button" and not self._link.told(event.reason):
                 self._link.report(event.reason)
             self.report_health()
 
