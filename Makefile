@@ -30,8 +30,8 @@ test: setup
 
 # Real processes with real timeouts of 150 ms: on their own, since a machine that is busy otherwise would fail them.
 test-ros: setup
-	$(BIN)/python -m pytest tests/ros -n 2 --dist loadfile -m 'not alone'
-	$(BIN)/python -m pytest tests/ros -m alone
+	$(BIN)/python -m pytest tests/ros -n 2 --dist loadfile -m 'not alone'; failed=$$?; \
+		$(BIN)/python -m pytest tests/ros -m alone && exit $$failed
 
 lint: setup
 	$(BIN)/ruff check .

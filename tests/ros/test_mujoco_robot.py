@@ -169,6 +169,19 @@ def test_commands_that_cannot_be_followed_move_nothing_and_are_reported_once(cel
     assert cell.processes[0].output.count("joint_trajectory: refused") == 1
 
 
+def test_good_and_bad_commands_in_turns_are_a_line_a_second_at_most(cell: Cell, robot: Robot) -> None:
+    publisher = cell.node.create_publisher(JointTrajectory, "joint_trajectory", COMMAND_QOS)
+    began, before = time.monotonic(), cell.processes[0].output.count("joint_trajectory: refused")
+    for _ in range(100):
+        publisher.publish(trajectory(robot, robot.home))
+        time.sleep(0.01)
+        publisher.publish(trajectory(robot, robot.home + 0.5))
+        time.sleep(0.01)
+    wait_until(lambda: cell.state("refused_commands", "mujoco_robot") > 20, "many are refused")
+    lines = cell.processes[0].output.count("joint_trajectory: refused") - before
+    assert 1 <= lines <= 2.0 + (time.monotonic() - began)
+
+
 def test_without_further_torques_position_servos_take_over(cell: Cell, robot: Robot) -> None:
     publisher = cell.node.create_publisher(Float64MultiArray, "torque_commands", COMMAND_QOS)
     # With less than gravity's torque the arms begin to fall, slowly enough not to meet the table.

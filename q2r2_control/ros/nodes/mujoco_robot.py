@@ -8,6 +8,7 @@ the arms brake, and after ``hold_after`` they stand on their position servos, wh
 
 from __future__ import annotations
 
+import math
 import sys
 import time
 from collections.abc import Mapping
@@ -34,6 +35,8 @@ from q2r2_control.ros.bridge.grippers import GripperServer, Stroke
 from q2r2_control.ros.bridge.messages import joint_state_message, seconds, transform_message
 from q2r2_control.types import RobotState
 
+_LOG_PERIOD = 1.0  # of lines about one topic [s]
+
 
 class MujocoRobot(BaseNode):
     """Runs a :class:`SimulatedCell` in real time between its topics, services and actions."""
@@ -54,6 +57,7 @@ class MujocoRobot(BaseNode):
         self._robot = Robot.from_config(config)
         self._cell = SimulatedCell(self._robot, config, hold_after, max_jump)
         self._refused: dict[str, str] = {}
+        self._logged: dict[str, float] = {}  # when a topic's refusal last was [s]
         self._refusals = 0
         self._ticks, self._reported_at = 0, time.monotonic()
         self._make_publishers()
@@ -126,14 +130,18 @@ class MujocoRobot(BaseNode):
         self._note(topic, self._cell.command_positions(setpoint, time.monotonic()))
 
     def _note(self, topic: str, fault: str | None) -> None:
-        """Say what was refused: once, until the topic brings something good again."""
+        """Say what was refused: once, until the topic brings something good again, and not more than once a second."""
         if fault is None:
             self._refused.pop(topic, None)
             return
         self._refusals += 1
-        if topic not in self._refused:
-            self.get_logger().warning(f"{topic}: refused: {fault}")
-            self._refused[topic] = fault
+        if topic in self._refused:
+            return
+        self._refused[topic] = fault
+        now = time.monotonic()
+        if now - self._logged.get(topic, -math.inf) >= _LOG_PERIOD:
+            self._logged[topic] = now
+            self.get_logger().warning(f"{topic}: refused: {fault} ({self._refusals} refused so far)")
             self.report_health()
 
     def _tick(self) -> None:
