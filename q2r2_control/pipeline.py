@@ -305,7 +305,7 @@ class PipelineRun:
     ) -> None:
         """Add one tick to the summary and tell the listeners; a tick that nobody listens to is not put together."""
         teleop, report, recorder = self._pipeline.teleop, self._pipeline.drive.report, self._recorder
-        engaged = {arm: self._following and value for arm, value in teleop.engaged.items()}
+        engaged = teleop.engaged if self._following else dict.fromkeys(self._targets, False)
         events = [replace(event, t=event.t - self._clock.start) for event in teleop.take_events()]
         recorder.add(dt, compute_time, reference, self._targets, tools, engaged, report, events, self._limiter.held)
         if not recorder.listened:

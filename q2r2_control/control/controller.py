@@ -23,7 +23,7 @@ from q2r2_control.control.safety.safety_filter import FOLLOWED, SEPARATION, STOP
 from q2r2_control.control.targets import TargetTracker
 from q2r2_control.errors import RobotError
 from q2r2_control.robot.robot import Robot
-from q2r2_control.types import LONGEST_DT, Array, Interval, Reference, StepReport, StepStatus
+from q2r2_control.types import LONGEST_DT, Array, Interval, Reference, StepReport, StepStatus, pose_of
 
 _LIMIT_NAMES = {POSITION: "position", VELOCITY: "velocity", ACCELERATION: "acceleration"}
 
@@ -178,7 +178,7 @@ class CartesianController:
     def tool_pose(self, arm: str) -> pin.SE3:
         """World pose of an arm's tool at the reference."""
         i = self._arms.index(arm)
-        return pin.SE3(self._tasks.rotation[i], self._tasks.translation[i])
+        return pose_of(self._tasks.rotation[i], self._tasks.translation[i])
 
     @property
     def stop_deceleration(self) -> Array:

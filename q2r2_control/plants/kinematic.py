@@ -44,14 +44,14 @@ class KinematicPlant:
         if dt == 0:
             return
         self._q = self._q + dt * self._due_v if self._due_q is None else self._due_q
-        self._due_q, self._v, self._due_v = self._q, self._due_v, np.zeros_like(self._q)
+        self._due_q, self._v, self._due_v = self._q, self._due_v, np.zeros(len(self._q))
         self._time += dt
         self._grippers.advance(dt)
 
     def state(self) -> RobotState:
         """See :meth:`Plant.state`. Torques are zero; external torque cannot be told."""
         return RobotState(
-            q=self._q.copy(), v=self._v.copy(), tau=np.zeros_like(self._q), tau_external=None, stamp=self._time
+            q=self._q.copy(), v=self._v.copy(), tau=np.zeros(len(self._q)), tau_external=None, stamp=self._time
         )
 
     def gripper_openings(self) -> dict[str, float]:

@@ -149,7 +149,7 @@ class MujocoPlant:
         while self._steps < due:
             # A step may begin before the tick that it ends in.
             self._step(max(self._steps * self._timestep - start, 0.0) / dt)
-        if not math.isfinite(np.dot(self._qvel, self._qvel)):
+        if not math.isfinite(self._qvel.dot(self._qvel)):
             raise PlantError(f"the simulation diverged at {self._clock:.3f} s; reset it")
 
     def state(self) -> RobotState:

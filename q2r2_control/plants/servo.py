@@ -56,7 +56,7 @@ class ReferenceLine:
         """Turn to the newest command, or to rest."""
         self._start_q = self._end_q
         if self._next is None:
-            self._start_v = self._end_v = np.zeros_like(self._end_v)
+            self._start_v = self._end_v = np.zeros(len(self._end_v))
         else:
             self._start_v = self._end_v
             self._end_q, self._end_v = self._next

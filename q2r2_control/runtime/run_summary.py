@@ -148,16 +148,15 @@ class RunStatistics:
             figures.slip = max(figures.slip, target.slip)
             figures.slip_angle = max(figures.slip_angle, target.slip_angle)
             if engaged[name] and target.pose is not None:
-                error = tools[name].actInv(target.pose)
                 figures.engaged += dt
-                translation = error.translation
-                square = float(translation.dot(translation))
+                x, y, z, a, b, c, w = pin.SE3ToXYZQUATtuple(tools[name].actInv(target.pose))
+                square = x * x + y * y + z * z
                 if not math.isfinite(square):
                     continue  # nothing was measured
-                x, y, z = pin.log3(error.rotation).tolist()
+                angle = 2.0 * math.atan2(math.hypot(a, b, c), abs(w))
                 figures.ticks += 1
                 figures.position += square
-                figures.rotation += x * x + y * y + z * z
+                figures.rotation += angle * angle
 
     def add_latency(self, samples: list[HandSample], now: float) -> None:
         """Count the time from the receipt of a tick's newest sample to its command, sent at ``now`` [s]."""

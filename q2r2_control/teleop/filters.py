@@ -6,8 +6,9 @@ takes the dt of each tick, so neither the headset's rate nor the loop's changes 
 
 Rotations are filtered as rotations, by their logarithm, so q and -q are the same and nothing is averaged over signs.
 
-All of this runs at every control tick, for vectors of three: sums of three floats cost a tenth of NumPy's calls, and
-``dot`` a third of ``@``.
+All of this runs at every control tick, for vectors of three: sums of three floats cost a tenth of NumPy's calls,
+``dot`` a third of ``@``, and each look into an SE3, or a new one, as much as the product of two rotations. So positions
+are three floats in here and rotations (3, 3) arrays.
 """
 
 from __future__ import annotations
@@ -20,10 +21,12 @@ import numpy as np
 import pinocchio as pin
 
 from q2r2_control.config.teleop import FilterSettings
-from q2r2_control.types import Array
+from q2r2_control.types import Array, pose_of
 
 # Closer samples are merged: over so short a time receipt jitter would look like speed [s].
 _MIN_SPACING = 0.005
+
+Vector = tuple[float, float, float]
 
 
 class Interpolator:
@@ -35,40 +38,37 @@ class Interpolator:
 
     def __init__(self, delay: float) -> None:
         self.delay = delay
-        self._knots: deque[tuple[float, pin.SE3]] = deque()
+        self._knots: deque[tuple[float, Vector, Array]] = deque()
 
-    def reset(self, pose: pin.SE3, now: float) -> None:
-        """Rest at ``pose``."""
-        self._knots = deque([(now - self.delay, pose)])
+    def reset(self, position: Vector, rotation: Array, now: float) -> None:
+        """Rest at a pose; ``rotation`` is (3, 3)."""
+        self._knots = deque([(now - self.delay, position, rotation)])
 
-    def add(self, pose: pin.SE3, stamp: float, now: float) -> None:
+    def add(self, position: Vector, rotation: Array, stamp: float, now: float) -> None:
         """Append a sample received at ``stamp`` <= ``now`` [s]; ``reset`` has to come first."""
         while len(self._knots) > 1 and stamp - self._knots[-1][0] < _MIN_SPACING:
             self._knots.pop()
         # A sample in time is reached after the whole delay; so is a late one, without a faster motion.
         earliest = self._knots[0][0] + max(self.delay / 2.0, _MIN_SPACING)
-        self._knots.append((max(stamp, earliest), pose))
+        self._knots.append((max(stamp, earliest), position, rotation))
 
-    def at(self, now: float) -> pin.SE3:
-        """The pose played back at ``now`` [s], which never goes back."""
-        playhead = now - self.delay
-        while len(self._knots) > 1 and self._knots[1][0] <= playhead:
-            self._knots.popleft()
-        start, first = self._knots[0]
-        if len(self._knots) > 1:
-            end, second = self._knots[1]
-            first = _between(first, second, (playhead - start) / (end - start))
+    def at(self, now: float) -> tuple[Vector, Array]:
+        """The position and rotation played back at ``now`` [s], which never goes back."""
+        playhead, knots = now - self.delay, self._knots
+        while len(knots) > 1 and knots[1][0] <= playhead:
+            knots.popleft()
+        start, position, rotation = knots[0]
+        if len(knots) > 1:
+            end, next_position, next_rotation = knots[1]
+            share = (playhead - start) / (end - start)
+            x, y, z = position
+            to_x, to_y, to_z = next_position
+            position = x + share * (to_x - x), y + share * (to_y - y), z + share * (to_z - z)
+            # About one fixed axis.
+            rotation = pin.exp3(share * pin.log3(next_rotation.dot(rotation.T))).dot(rotation)
         # What was played is where the next line starts, so a sample that replaces another cannot make the output step.
-        self._knots[0] = (playhead, first)
-        return first
-
-
-def _between(first: pin.SE3, second: pin.SE3, fraction: float) -> pin.SE3:
-    """Interpolate linearly in position, and about one fixed axis in rotation."""
-    rotation, start = first.rotation, first.translation
-    position = start + fraction * (second.translation - start)
-    turn = pin.log3(second.rotation.dot(rotation.T))
-    return pin.SE3(pin.exp3(fraction * turn).dot(rotation), position)
+        knots[0] = playhead, position, rotation
+        return position, rotation
 
 
 class OneEuro:
@@ -91,8 +91,8 @@ class OneEuro:
         """Start from rest."""
         self._velocity = (0.0, 0.0, 0.0)
 
-    def correction(self, error: Sequence[float], step: Sequence[float], dt: float) -> Array:
-        """What to add to the output, (3,), over a tick of ``dt`` > 0 [s].
+    def correction(self, error: Sequence[float], step: Sequence[float], dt: float) -> Vector:
+        """What to add to the output over a tick of ``dt`` > 0 [s].
 
         ``error`` is input minus output before the tick, ``step`` input minus previous input; rotation vectors for
         rotations. Backward Euler: stable for every dt, and the lag at constant velocity is exact for any constant dt.
@@ -106,7 +106,7 @@ class OneEuro:
         cutoff = self._min_cutoff + self._beta * math.hypot(x, y, z)
         tau = 1.0 / (2.0 * math.pi * cutoff)
         share, lead = dt / (tau + dt), tau - self.delay
-        return np.array((share * (error[0] + lead * x), share * (error[1] + lead * y), share * (error[2] + lead * z)))
+        return share * (error[0] + lead * x), share * (error[1] + lead * y), share * (error[2] + lead * z)
 
 
 class PoseFilter:
@@ -121,8 +121,7 @@ class PoseFilter:
         self._interpolator = Interpolator(settings.interpolation_delay)
         self._position = OneEuro(settings.min_cutoff, settings.beta, *smoothing)
         self._rotation = OneEuro(settings.min_cutoff, settings.rotation_beta, *smoothing)
-        self._input = self._output = pin.SE3.Identity()
-        self._now = 0.0
+        self.reset(pin.SE3.Identity(), 0.0)
 
     @property
     def delay(self) -> float:
@@ -131,30 +130,38 @@ class PoseFilter:
 
     def reset(self, pose: pin.SE3, now: float) -> None:
         """Rest at ``pose``; earlier samples are forgotten."""
-        self._interpolator.reset(pose, now)
+        self._in = self._out = _parts(pose)
+        self._interpolator.reset(*self._in, now)
         self._position.reset()
         self._rotation.reset()
-        self._input = self._output = pose
+        self._output = pose
         self._now = now
 
     def add(self, pose: pin.SE3, stamp: float, now: float) -> None:
         """Add a sample received at ``stamp`` [s]."""
-        self._interpolator.add(pose, stamp, now)
+        self._interpolator.add(*_parts(pose), stamp, now)
 
     def at(self, now: float) -> pin.SE3:
         """The filtered pose at ``now`` [s]; a time that does not advance returns the same pose again."""
         dt = now - self._now
         if dt <= 0.0:
             return self._output
-        played, before, output = self._interpolator.at(now), self._input, self._output
-        position, rotation = played.translation, played.rotation
-        last_position, last_rotation = output.translation, output.rotation
+        (before_x, before_y, before_z), before = self._in
+        (last_x, last_y, last_z), last = self._out
+        self._now, self._in = now, self._interpolator.at(now)
+        (x, y, z), rotation = self._in
         shift = self._position.correction(
-            (position - last_position).tolist(), (position - before.translation).tolist(), dt
+            (x - last_x, y - last_y, z - last_z), (x - before_x, y - before_y, z - before_z), dt
         )
         turn = self._rotation.correction(
-            pin.log3(rotation.dot(last_rotation.T)).tolist(), pin.log3(rotation.dot(before.rotation.T)).tolist(), dt
+            pin.log3(rotation.dot(last.T)).tolist(), pin.log3(rotation.dot(before.T)).tolist(), dt
         )
-        self._now, self._input = now, played
-        self._output = pin.SE3(pin.exp3(turn).dot(last_rotation), last_position + shift)
+        position = last_x + shift[0], last_y + shift[1], last_z + shift[2]
+        rotation = pin.exp3(np.array(turn)).dot(last)
+        self._out, self._output = (position, rotation), pose_of(rotation, np.array(position))
         return self._output
+
+
+def _parts(pose: pin.SE3) -> tuple[Vector, Array]:
+    x, y, z = pose.translation.tolist()
+    return (x, y, z), np.array(pose.rotation)

@@ -36,6 +36,7 @@ _WAY_BACK = 1.5e-3, 12e-3  # [m, rad]
 _HELD_UP = 0.05, 0.2  # [m/s, rad/s]
 # A step faster than this is no motion of a target, whatever the controller's settings.
 _NO_MOTION = 10.0, 35.0  # [m/s, rad/s]
+_ROUNDING = 1e-9  # [m], and of a cosine
 
 
 class ComponentLeash:
@@ -91,9 +92,9 @@ class Leash:
     def __init__(self, settings: LeashSettings) -> None:
         limits = list(zip(_WAY_BACK, _HELD_UP, _NO_MOTION, strict=True))
         self._components = ComponentLeash(settings.distance, *limits[0]), ComponentLeash(settings.angle, *limits[1])
-        self._distance = math.inf if settings.distance is None else settings.distance
-        # Of a trace, 1 + 2 cos(angle); a little more than the leash's, so that it is looked at in time.
-        self._trace = -math.inf if settings.angle is None else 1.0 + 2.0 * math.cos(settings.angle) + 1e-9
+        # A little less than the leash's, so that it is looked at in time; of the angle, the quaternion's w.
+        self._distance = math.inf if settings.distance is None else settings.distance - _ROUNDING
+        self._cosine = -math.inf if settings.angle is None else math.cos(0.5 * settings.angle) + _ROUNDING
         self._last: _Tick | None = None
 
     @property
@@ -135,11 +136,8 @@ class Leash:
 
     def _ends(self, tool: pin.SE3, target: pin.SE3) -> bool:
         """Whether the target is as far as a leash reaches, told with little work: at most ticks it is not."""
-        # Pinocchio's matrices are stored by columns, and vdot would copy what is not stored by rows.
-        return (
-            math.dist(target.translation.tolist(), tool.translation.tolist()) >= self._distance
-            or np.vdot(target.rotation.T, tool.rotation.T) <= self._trace
-        )
+        x, y, z, _, _, _, w = pin.SE3ToXYZQUATtuple(tool.actInv(target))
+        return math.hypot(x, y, z) >= self._distance or abs(w) <= self._cosine
 
     def _pull(self, ways: tuple[Array, Array], last: _Tick, this: _Tick) -> list[Array | None]:
         """Ways from the tool to the target's new position and rotation, None for what the leash leaves alone."""

@@ -12,7 +12,7 @@ from pydantic import ValidationError
 from q2r2_control.config.axes import axes_matrix
 from q2r2_control.config.teleop import RotationFrame, Stance, TeleopSettings
 from q2r2_control.errors import ConfigError, Q2R2Error
-from q2r2_control.types import Array
+from q2r2_control.types import Array, pose_of
 
 # Left and right change sign, forward and up do not.
 _REFLECTION = np.diag([1.0, -1.0, 1.0])
@@ -68,9 +68,12 @@ class RelativeMotion:
         self._map = axes_matrix(settings.axes)
         if settings.stance is Stance.MIRROR_REFLECTED:
             self._map = _REFLECTION @ self._map
-        self._hand_position: Array | None = None
+        # A signed permutation: each axis of the tool goes along one of the hand's, by so much of it.
+        sources = np.abs(self._map).argmax(axis=1)
+        self._axes = [(int(j), self._scale * float(row[j])) for row, j in zip(self._map, sources, strict=True)]
+        self._hand_position: list[float] | None = None
         self._hand_rotation = np.eye(3)
-        self._tool_position = np.zeros(3)
+        self._tool_position = [0.0, 0.0, 0.0]
         # The tool's rotation is before * (the hand's own rotation since the anchor) * after.
         self._before = self._after = np.eye(3)
         self._vector = np.zeros(3)
@@ -82,8 +85,8 @@ class RelativeMotion:
 
     def anchor_position(self, hand: pin.SE3, tool: pin.SE3) -> None:
         """Make only the positions of ``hand`` and ``tool`` correspond from now on; rotations go on as they were."""
-        self._hand_position = np.array(hand.translation)
-        self._tool_position = np.array(tool.translation)
+        self._hand_position = hand.translation.tolist()
+        self._tool_position = tool.translation.tolist()
 
     def anchor_rotation(self, hand: pin.SE3, tool: pin.SE3) -> None:
         """Make only the rotations of ``hand`` and ``tool`` correspond from now on; positions go on as they were."""
@@ -103,11 +106,14 @@ class RelativeMotion:
         """
         if self._hand_position is None:
             raise Q2R2Error("RelativeMotion.target: call anchor(hand, tool) first")
-        # At every tick: dot costs a third of @.
-        way = self._scale * self._map.dot(hand.translation - self._hand_position)
-        before, now = self._hand_rotation.T, hand.rotation
-        turn = before.dot(now) if self._in_tool_frame else now.dot(before)
-        target = pin.SE3(self._before.dot(self._scaled(turn)).dot(self._after), self._tool_position + way)
+        # At every tick: sums of floats cost a third of NumPy's of vectors of three, and dot a third of @.
+        now, before, tool = hand.translation.tolist(), self._hand_position, self._tool_position
+        (i, a), (j, b), (k, c) = self._axes
+        x, y, z = a * (now[i] - before[i]), b * (now[j] - before[j]), c * (now[k] - before[k])
+        anchored, turned = self._hand_rotation.T, hand.rotation
+        turn = anchored.dot(turned) if self._in_tool_frame else turned.dot(anchored)
+        rotation = self._before.dot(self._scaled(turn)).dot(self._after)
+        target = pose_of(rotation, np.array((tool[0] + x, tool[1] + y, tool[2] + z)))
         if self._rotation_scale != 1.0 and np.linalg.norm(self._vector) > _REANCHOR_ANGLE:
             self.anchor_rotation(hand, target)
         return target

@@ -19,6 +19,7 @@ _FALL = 0.005  # without a finger on it, deeper than a part that is put down [m]
 _PUT_BACK = (0.01, 0.001)  # from where it was, sideways and in height [m]
 _STACKED = (0.01, 0.001)  # from the middle of the part below, sideways and in height [m]
 _UPRIGHT = math.radians(2.0)
+_FINGERS = int(FINGERS)  # an IntFlag takes ten times as long for an "and", and several judges ask at every tick
 
 
 class Judge(Protocol):
@@ -46,7 +47,7 @@ class _Fall:
 
     def see(self, part: PartState) -> None:
         height = part.place[2]
-        if part.touched & FINGERS:
+        if part.touched & _FINGERS:
             self._held_at = height
         elif self._held_at is not None:
             self.depth = max(self.depth, self._held_at - height)
@@ -77,11 +78,11 @@ class LiftJudge:
             self._start = part.place
         self._away = math.dist(part.place[:2], self._start[:2]), part.place[2] - self._start[2]
         self._fall.see(part)
-        up = part.touched and not part.touched & ~FINGERS and self._away[1] >= _LIFT
+        up = part.touched and not part.touched & ~_FINGERS and self._away[1] >= _LIFT
         self._held = self._held + dt if up else 0.0
         self._longest = max(self._longest, self._held)
         self._height = max(self._height, self._away[1])
-        back = self._longest >= HELD_TIME and self._is_back and not part.touched & FINGERS
+        back = self._longest >= HELD_TIME and self._is_back and not part.touched & _FINGERS
         self._lain = self._lain + dt if back else 0.0
 
     @property
@@ -127,7 +128,7 @@ class StackJudge:
         gaps = [upper.place[2] - lower.place[2] for lower, upper in pairwise(tower)]
         off = max(abs(gap - rest) for gap, rest in zip(gaps, self._rest, strict=True))
         stands = self._sideways <= _STACKED[0] and off <= _STACKED[1] and self._tilt <= _UPRIGHT
-        untouched = not any(part.touched & FINGERS for part in tower)
+        untouched = not any(part.touched & _FINGERS for part in tower)
         self._stood = self._stood + dt if stands and untouched else 0.0
 
     def measured(self) -> dict[str, float]:
