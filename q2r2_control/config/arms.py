@@ -99,11 +99,12 @@ class ToolConfig(CellModel):
 
 
 class HeldObjectConfig(CellModel):
-    """What a gripper holds when it holds something: a box along the tool frame's axes, or a ball. Fixed to the tool."""
+    """What a gripper holds when it holds something: a box or a ball, fixed to the tool."""
 
     box: tuple[ObjectSize, ObjectSize, ObjectSize] | None = Field(None, description="x y z [m]")
     sphere: float | None = Field(None, gt=0, le=0.5, description="radius; with neither, 0.03 [m]")
     at: Metres3 = Field((0.0, 0.0, 0.0), description="centre in the tool frame [m]")
+    rpy: Radians3 = Field((0.0, 0.0, 0.0), description="of the box in the tool frame [rad]")
     mass: float = Field(0.0, ge=0, le=50, description="that torque mode bears [kg]")
 
     @model_validator(mode="after")

@@ -85,9 +85,9 @@ class CartesianController:
     def reset(self, q: Array, v: Array | None = None) -> None:
         """Start anew at joint positions ``q`` [rad] and velocities ``v`` [rad/s], (nv,) each; targets are forgotten.
 
-        So are openings: fingers are all of their way again, see :meth:`set_opening`. Nothing is held, see
-        :meth:`set_holding`. Raises :class:`RobotError` for a wrong shape or a number that is not finite. A start outside the limits or in penetration is allowed: the
-        controller recovers from it.
+        So are openings: fingers are all of their way again, see :meth:`set_opening`; and nothing is held, see
+        :meth:`set_holding`. Raises :class:`RobotError` for a wrong shape or a number that is not finite. A start
+        outside the limits or in penetration is allowed: the controller recovers from it.
         """
         state = self._state
         state.q[:] = self._checked("q", q)

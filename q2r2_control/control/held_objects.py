@@ -164,9 +164,7 @@ class ObjectLoads:
 
     def _make_room(self, pairs: int, nv: int) -> None:
         """Rows for all pairs."""
-        safety = self.data.safety._replace(
-            rows=SeparationRows.empty(pairs, nv), active=ActiveBounds.empty(pairs, nv)
-        )
+        safety = self.data.safety._replace(rows=SeparationRows.empty(pairs, nv), active=ActiveBounds.empty(pairs, nv))
         self.data = self.data._replace(safety=safety)
 
     def _load(self, counting: _Counting) -> Load:

@@ -38,9 +38,9 @@ class HeldObject:
     placement: pin.SE3  # of its centre, in that joint's frame
     config: HeldObjectConfig
 
-    def inertia(self) -> pin.Inertia:
-        """In the joint's frame: of a uniform box or ball."""
-        mass, box = self.config.mass, self.config.box
+    def inertia(self, share: float = 1.0) -> pin.Inertia:
+        """Of a uniform box or ball with a share of its mass, in the joint's frame."""
+        mass, box = share * self.config.mass, self.config.box
         own = pin.Inertia.FromSphere(mass, self.config.radius) if box is None else pin.Inertia.FromBox(mass, *box)
         return own.se3Action(self.placement)
 
@@ -74,7 +74,7 @@ def held_objects(
     by_arm: dict[str, HeldObject] = {}
     for arm, config in configs.items():
         frame = model.frames[tool_frames[arm]]
-        placement = frame.placement * pin.SE3(np.eye(3), np.array(config.at))
+        placement = frame.placement * pin.SE3(pin.rpy.rpyToMatrix(*config.rpy), np.array(config.at))
         by_arm[arm] = HeldObject(arm, f"{arm}_object", frame.parentJoint, placement, config)
     if not by_arm:
         return HeldObjects(geometry, {}, ())

@@ -81,7 +81,8 @@ class Robot:
     links that can meet, and against what stands in the cell. Every monitored shape is a capsule, a sphere, or a box
     fixed in the world; a finger that slides is all that it sweeps, and ``finger_bodies`` says what of that counts while
     its gripper's opening is known. ``objects`` are what grippers hold, of which the collision model knows nothing.
-    ``roles`` says what each link is. ``ignored_pairs`` names pairs of one arm's own shapes that overlap by construction and are not monitored.
+    ``roles`` says what each link is. ``ignored_pairs`` names pairs of one arm's own shapes that overlap by construction
+    and are not monitored.
     """
 
     def __init__(

@@ -55,6 +55,13 @@ class Sabotaged:
     def openings(self) -> dict[str, Interval]:
         return controller_and_solver()[0].openings
 
+    def set_holding(self, arm: str, holds: bool) -> None:
+        controller_and_solver()[0].set_holding(arm, holds)
+
+    @property
+    def object_distances(self) -> Array:
+        return controller_and_solver()[0].object_distances
+
     @property
     def stop_deceleration(self) -> Array:
         return controller_and_solver()[0].stop_deceleration
