@@ -78,7 +78,11 @@ class CellCheck:
     @property
     def notes(self) -> tuple[str, ...]:
         """One line for each thing that a user should know of and that is no fault."""
-        held = (f"{arm.name} arm: while its gripper holds, {arm.object}, is part of the tool" for arm in self.arms if arm.object)
+        held = (
+            f"{arm.name} arm: while its gripper holds, {arm.object}, is part of the tool"
+            for arm in self.arms
+            if arm.object
+        )
         return (*held, *(_stop_note(stop) for stop in self.stop_torques if stop.stop.ratio > 1.0))
 
     def as_json(self) -> dict[str, Any]:
