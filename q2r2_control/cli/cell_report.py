@@ -46,7 +46,7 @@ class ArmCheck:
     tool_frame: str
     tool_position: tuple[float, ...]
     joints: tuple[JointCheck, ...]
-    object: str | None  # what its gripper is to hold, which is part of the tool then
+    object: str | None = None  # what its gripper is to hold, which is part of the tool then
 
 
 @dataclass(frozen=True, slots=True)

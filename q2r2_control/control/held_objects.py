@@ -16,8 +16,10 @@ that both hands hold: then they are not watched against each other, until one le
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from q2r2_control.config.control import ControllerSettings
 from q2r2_control.control.geometry.collision import Bodies, Pairs, Posed, bodies_of, pairs_of
@@ -36,6 +38,7 @@ from q2r2_control.types import Array
 
 _PERIOD = 0.01  # after which kept distances are looked at again, while they grow [s]
 
+AnyArray = npt.NDArray[Any]
 # Which pairs of objects count: a pair does where all arms that have to hold are in one of these sets.
 _Counting = frozenset[frozenset[str]]
 
@@ -67,7 +70,7 @@ class ObjectLoads:
         if self._arms:
             bodies, self._pairs = _with_objects(robot, model.safety)
             count = len(model.safety.collision.bodies.joint)
-            model = _with_bodies(model, Bodies(*(array[:count] for array in bodies)))
+            model = _with_bodies(model, Bodies._make(array[:count] for array in bodies))
         self.model, self.data = model, KernelData.empty(model)
         self.bodies = model.safety.collision.bodies
         self._loads: dict[_Counting, Load] = {}
@@ -171,7 +174,7 @@ class ObjectLoads:
         numbers = [pair for pair, holders in enumerate(self._holders) if holders in counting]
         objects: IntArray = np.array(numbers, dtype=np.int64)
         base, goal = self.model.safety, self._goal
-        pairs = Pairs(*(array[objects] for array in self._pairs))
+        pairs = Pairs._make(array[objects] for array in self._pairs)
         approach = base.approach._replace(
             stop_distance=_joined(base.approach.stop_distance, (goal.values + self._buffer)[objects]),
             contact_speed=_joined(base.approach.contact_speed, goal.contact_speed[objects]),
@@ -207,13 +210,13 @@ def _with_objects(robot: Robot, safety: SafetyModel) -> tuple[Bodies, Pairs]:
     bodies = bodies_of(robot.objects.geometry)
     travel = np.maximum(np.abs(robot.position_lower), np.abs(robot.position_upper))
     every = pairs_of(robot.objects.geometry, known.chain, bodies, travel)
-    pairs = Pairs(*(array[len(every.first) - len(robot.objects.holders) :] for array in every))
+    pairs = Pairs._make(array[len(every.first) - len(robot.objects.holders) :] for array in every)
     # The model's own bodies may end with boxes that it has rounded.
     shift = len(known.bodies.joint) - first_body
     for numbers in (pairs.first, pairs.second):
         numbers[numbers >= first_body] += shift
     joined = (_joined(old, new[first_body:]) for old, new in zip(known.bodies, bodies, strict=True))
-    return Bodies(*joined), pairs
+    return Bodies._make(joined), pairs
 
 
 def _with_bodies(model: KernelModel, bodies: Bodies) -> KernelModel:
@@ -223,13 +226,13 @@ def _with_bodies(model: KernelModel, bodies: Bodies) -> KernelModel:
 
 def _joined_pairs(first: Pairs, second: Pairs) -> Pairs:
     width = max(first.joint.shape[1], second.joint.shape[1])
-    return Pairs(*(_joined(_widened(a, width), _widened(b, width)) for a, b in zip(first, second, strict=True)))
+    return Pairs._make(_joined(_widened(a, width), _widened(b, width)) for a, b in zip(first, second, strict=True))
 
 
-def _widened(array: Array, width: int) -> Array:
+def _widened(array: AnyArray, width: int) -> AnyArray:
     """Rows with zeros at their ends."""
     return array if array.ndim == 1 else np.pad(array, ((0, 0), (0, width - array.shape[1])))
 
 
-def _joined(first: Array, second: Array) -> Array:
+def _joined(first: AnyArray, second: AnyArray) -> AnyArray:
     return np.concatenate([first, second])

@@ -13,6 +13,7 @@ import numpy as np
 import pinocchio as pin
 
 from q2r2_control.config import Config
+from q2r2_control.config.arms import HeldObjectConfig
 from q2r2_control.errors import ConfigError, RobotError
 from q2r2_control.robot.compose import compose
 from q2r2_control.robot.description import LinkTree, joint_limits, parse_srdf, parse_urdf
@@ -199,7 +200,9 @@ class Robot:
         return remove_overlapping_own_pairs(self.model, self.collision_model, own_links, postures)
 
     def _add_objects(self, config: Config) -> None:
-        configs = {side: arm.gripper.object for side, arm in config.arms.items() if arm.gripper.object is not None}
+        configs: dict[str, HeldObjectConfig] = {
+            side: arm.gripper.object for side, arm in config.arms.items() if arm.gripper.object is not None
+        }
         tools = {name: arm.frame_id for name, arm in self.arms.items()}
         self.objects = held_objects(self.model, self.collision_model, self.roles, tools, configs)
         for link, role in self.objects.roles().items():
