@@ -16,6 +16,7 @@ from q2r2_control.config.arms import (
     ArmConfig,
     FlangeConfig,
     GripperConfig,
+    HeldObjectConfig,
     PoseConfig,
     RobotConfig,
     SwivelConfig,
@@ -122,7 +123,7 @@ class TestTheShippedCellShowsAllThereIsToTune:
     )
     # Not the default, and the file says so.
     CHOSEN = ("control.solve_time_limit", "control.distances", "mujoco.objects")
-    IN_A_COMMENT = (ContactPair, NamedPairDistance)
+    IN_A_COMMENT = (ContactPair, HeldObjectConfig, NamedPairDistance)
     # A tool's mount and an obstacle's rpy are placements as an arm's mount is, which shows the keys.
     SHOWN_ELSEWHERE = ("arms.left.tool.mount", "obstacles.table.rpy")
 
