@@ -79,7 +79,7 @@ class CellCheck:
     def notes(self) -> tuple[str, ...]:
         """One line for each thing that a user should know of and that is no fault."""
         held = (
-            f"{arm.name} arm: while its gripper holds, {arm.object}, is part of the tool"
+            f"{arm.name} arm: while its gripper holds, its tool includes {arm.object}"
             for arm in self.arms
             if arm.object
         )
