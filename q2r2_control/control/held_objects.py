@@ -26,8 +26,7 @@ from q2r2_control.control.geometry.collision import Bodies, Pairs, Posed, bodies
 from q2r2_control.control.geometry.kinematics import IntArray
 from q2r2_control.control.jit import Held, hold
 from q2r2_control.control.kernel_data import KernelData
-from q2r2_control.control.kernel_model import KernelModel
-from q2r2_control.control.kernel_model import _buffer as stop_buffer
+from q2r2_control.control.kernel_model import KernelModel, stop_buffer
 from q2r2_control.control.safety.safety_data import ActiveBounds, Rollout, SafetyData, SeparationRows
 from q2r2_control.control.safety.safety_model import SafetyModel
 from q2r2_control.control.safety.velocity_bounds import BodyVelocities
