@@ -25,6 +25,7 @@ from q2r2_control.runtime.loop_clock import LoopClock
 from q2r2_control.runtime.process import few_garbage_collections, stop_on_signals
 from q2r2_control.runtime.recorder import RunRecorder, Tick
 from q2r2_control.runtime.run_summary import RunSummary
+from q2r2_control.supervision.grasp_watch import GraspWatch
 from q2r2_control.supervision.gripper_limiter import GripperLimiter
 from q2r2_control.supervision.joint_watch import watch_settings
 from q2r2_control.supervision.supervisor import Phase, Supervisor
@@ -164,9 +165,11 @@ class PipelineRun:
         self._supervisor.activate(replace(state, stamp=self._clock.now), self._clock.now)
         self._supervisor.events.clear()
         pipeline.drive.reset(state)
-        self._limiter = GripperLimiter(pipeline.controller)
+        self._limiter, self._grasps = GripperLimiter(pipeline.controller), GraspWatch(pipeline.controller)
         self._grippers: dict[str, float] = {arm: target.gripper for arm, target in self._targets.items()}
         pipeline.drive.set_openings(pipeline.controller.openings)
+        self._holding = pipeline.controller.holding
+        pipeline.drive.set_holding(self._holding)
         self._velocity = np.zeros(pipeline.robot.model.nv)
 
     def until(self, duration: float | None) -> RunSummary:
@@ -270,11 +273,18 @@ class PipelineRun:
         return reference
 
     def limit_grippers(self) -> None:
-        """What the grippers are commanded to; before the step, which has to be proven with fingers that move in it."""
+        """What the grippers are commanded to, and whether they hold something.
+
+        Before the step, which has to be proven with fingers that move in it and with objects that are held.
+        """
         pipeline, wanted = self._pipeline, {arm: target.gripper for arm, target in self._targets.items()}
-        self._grippers = self._limiter.limit(wanted, pipeline.plant.gripper_openings(), self._clock.now)
+        measured = pipeline.plant.gripper_openings()
+        self._grippers = self._limiter.limit(wanted, measured, self._clock.now)
         if self._limiter.changed:
             pipeline.drive.set_openings(pipeline.controller.openings)
+        if self._grasps.update(wanted, measured, self._clock.now):
+            self._holding = pipeline.controller.holding
+            pipeline.drive.set_holding(self._holding)
 
     def _poll(self) -> list[HandSample]:
         source, was_connected = self._pipeline.input, self._connected
@@ -308,6 +318,7 @@ class PipelineRun:
         engaged = teleop.engaged if self._following else dict.fromkeys(self._targets, False)
         events = [replace(event, t=event.t - self._clock.start) for event in teleop.take_events()]
         recorder.add(dt, compute_time, reference, self._targets, tools, engaged, report, events, self._limiter.held)
+        recorder.add_holding(dt, self._holding)
         if not recorder.listened:
             return
         tick = Tick(
@@ -323,6 +334,7 @@ class PipelineRun:
             tools=tools,
             grippers=self._pipeline.plant.gripper_openings(),
             held_grippers=dict(self._limiter.held),
+            holding=self._holding,
             compute_time=compute_time,
             impedance=report.impedance,
             wall=report.wall,

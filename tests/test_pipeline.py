@@ -28,6 +28,7 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.runtime.recorder import Tick
 from q2r2_control.runtime.run_summary import RunSummary
 from q2r2_control.types import SIDES, Command, HandSample
+from tests.support.object_cell import cell as object_cell
 from tests.support.watch import Watch, assert_torque_bounds, cell, changes, speed
 
 CHECKOUT = Path(__file__).resolve().parents[1]
@@ -134,6 +135,24 @@ def test_fingers_count_as_wide_as_the_grippers_are_at_every_tick(plant: str) -> 
     assert summary.fallback_ticks == summary.uncertified_ticks == 0
     assert all(not figures.gripper_held_s for figures in summary.arms.values())
     assert len(watch.ticks) == len(widest)
+
+
+def test_what_is_gripped_is_part_of_the_tool_until_it_is_put_down() -> None:
+    """The flat block of the demo; the contract, objects included, is checked at every tick."""
+    flat = {"box": (0.06, 0.04, 0.015), "at": (0.0, 0.0, 0.0085), "mass": 0.1}
+    config = object_cell(None, flat)
+    loop = Pipeline.from_config(config, input=ScriptedInput("grasp"), plant="mujoco")
+    watch = Watch(loop)
+    summary = loop.run(10.0, realtime=False)
+    held = [tick.t for tick in watch.ticks if tick.holding["right"]]
+    assert 4.0 < held[0] < 5.0
+    assert 8.5 < held[-1] < 9.5
+    assert summary.arms["right"].object_held_s == pytest.approx(held[-1] - held[0], abs=0.01)
+    assert summary.arms["left"].object_held_s is None
+    assert summary.fallback_ticks == summary.uncertified_ticks == 0
+    jumps = [np.abs(second.reference.v - first.reference.v).max() for first, second in pairwise(watch.ticks)]
+    gripped = next(i for i, tick in enumerate(watch.ticks) if tick.holding["right"])
+    assert max(jumps[gripped - 1 : gripped + 20]) < 1.05 * jumps[gripped - 2] + 1e-9
 
 
 class LeftUpperPresses(ScriptedInput):

@@ -172,7 +172,7 @@ class _ClockedPipeline(Pipeline):
         for name in ("take_joint_state", "take_target", "release_target", "tick"):
             clock.watch(self.supervisor, name, "supervision")
         clock.watch(run, "limit_grippers", "supervision")
-        for name in ("step", "tool_pose", "set_opening"):
+        for name in ("step", "tool_pose", "set_opening", "set_holding"):
             clock.watch(self.controller, name, "control")
         clock.watch(self.drive, "command", "drive")
         clock.watch(self.plant, "apply", "apply")

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from q2r2_control.config.arms import FlangeConfig
+from q2r2_control.config.arms import FlangeConfig, HeldObjectConfig
 from q2r2_control.config.cell import Config, ObstacleConfig
 from q2r2_control.config.external import describe
 from q2r2_control.control.controller import CartesianController
@@ -46,6 +46,7 @@ class ArmCheck:
     tool_frame: str
     tool_position: tuple[float, ...]
     joints: tuple[JointCheck, ...]
+    object: str | None = None  # what its gripper is to hold, which is part of the tool then
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +78,12 @@ class CellCheck:
     @property
     def notes(self) -> tuple[str, ...]:
         """One line for each thing that a user should know of and that is no fault."""
-        return tuple(_stop_note(stop) for stop in self.stop_torques if stop.stop.ratio > 1.0)
+        held = (
+            f"{arm.name} arm: while its gripper holds, its tool includes {arm.object}"
+            for arm in self.arms
+            if arm.object
+        )
+        return (*held, *(_stop_note(stop) for stop in self.stop_torques if stop.stop.ratio > 1.0))
 
     def as_json(self) -> dict[str, Any]:
         """Plain data and dataclasses for the JSON writer."""
@@ -213,6 +219,16 @@ def _flange_of(config: FlangeConfig) -> str | None:
     return f"{1e3 * config.thickness:g} mm thick, radius {1e3 * config.radius:g} mm"
 
 
+def _object_of(config: HeldObjectConfig | None) -> str | None:
+    if config is None:
+        return None
+    shape = f"a ball of radius {1e3 * config.radius:g} mm"
+    if config.box is not None:
+        shape = f"a box of {' x '.join(f'{1e3 * side:g}' for side in config.box)} mm"
+    place = " ".join(f"{1e3 * value:g}" for value in config.at)
+    return f"{shape}, {config.mass:g} kg, at {place} mm in the tool frame"
+
+
 def _arm_check(config: Config, robot: Robot, name: str) -> ArmCheck:
     arm = robot.arms[name]
     settings = next(settings for side, settings in config.arms.items() if side == name)
@@ -234,4 +250,5 @@ def _arm_check(config: Config, robot: Robot, name: str) -> ArmCheck:
             )
             for index in arm.joints
         ),
+        object=_object_of(settings.gripper.object),
     )

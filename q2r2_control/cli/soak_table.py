@@ -37,6 +37,7 @@ def _soak_notes(report: SoakReport) -> str:
         f"{report.segments} segments, {report.resets} resets, {report.solver_faults} ticks with a failing solver,"
         f" {report.fallbacks} stops ({report.fallbacks_healthy} with a healthy solver),"
         f" {report.openings} openings of grippers ({report.openings_refused} refused)"
+        + (f", {report.grasps} grasps and releases" if report.grasps else "")
     ]
     for found in report.broken:
         error = f": {found.error}" if found.error else ""

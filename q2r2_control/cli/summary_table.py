@@ -36,6 +36,8 @@ def summary_table(summary: RunSummary) -> Table:
         if arm.gripper_held_by is not None:
             by = " | ".join(arm.gripper_held_by)
             table.add_row(f"{name} gripper held for", f"{arm.gripper_held_s:.2f} s, by {by}")
+        if arm.object_held_s is not None:
+            table.add_row(f"{name} object part of the tool for", f"{arm.object_held_s:.2f} s")
     if summary.min_distance_mm is not None and summary.closest_pair is not None:
         table.add_row("nearest pair", f"{summary.min_distance_mm:.1f} mm, {' | '.join(summary.closest_pair)}")
     table.add_row(

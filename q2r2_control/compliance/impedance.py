@@ -13,6 +13,9 @@ reference's acceleration, so that it does nothing to the stiffness that a push a
 **Torque rate.** A full stop at 10 rad/s^2 takes 70 Nm more in a joint that moves the whole arm. As long as the torque
 rises to that the tool leaves the reference, and with it the distances that the reference keeps.
 
+**Payload.** What grippers hold is part of M, C and g while they do. Its mass comes and goes on a straight line over
+0.3 s, so that no torque jumps.
+
 **Time.** A reference is due at the end of its tick, the state is measured at its start. So the spring is about the
 reference of the tick before, which is due now, while the acceleration is the one that leads to the newest.
 """
@@ -20,6 +23,7 @@ reference of the tick before, which is due now, while the acceleration is the on
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -40,6 +44,8 @@ from q2r2_control.control.tasks.task_model import tools_of
 from q2r2_control.errors import ConfigError, RobotError
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import LONGEST_DT, Array, Reference, RobotState
+
+_PAYLOAD_TIME = 0.3  # over which a payload's mass comes or goes [s]
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +81,11 @@ class ImpedanceController:
         self.settings = settings or ImpedanceSettings()
         self._arms = tuple(robot.arms)
         self._limit = self.settings.torque_scale * robot.torque_limit
-        self._data = robot.model.createData()
+        self._payloads = {arm: held for arm, held in robot.objects.by_arm.items() if held.config.mass > 0.0}
+        self._borne = dict.fromkeys(self._payloads, 0.0)  # share of each payload's mass
+        self._wanted_borne = dict(self._borne)
+        self._model = robot.model.copy() if self._payloads else robot.model  # with what is held
+        self._data = self._model.createData()
         model = _model_of(robot, self.settings)
         self._kernel_data = ImpedanceData.empty(model)
         self._held_model, self._held_data = hold(model), hold(self._kernel_data)
@@ -91,25 +101,43 @@ class ImpedanceController:
     def reset(self, state: RobotState) -> None:
         """Start anew at rest at the measured posture: the first torque is that of gravity there, without a bump.
 
-        A stiffness that is being changed is reached at once. Raises :class:`RobotError` for a posture that is not nv
-        finite numbers.
+        A stiffness or a payload that is being changed is reached at once. Raises :class:`RobotError` for a posture that
+        is not nv finite numbers.
         """
         q = np.array(state.q, dtype=np.float64)
         if q.shape != self._limit.shape or not np.isfinite(q).all():
             raise RobotError(f"impedance reset: q = {q!s:.80}: expected {len(self._limit)} finite numbers")
         self._kernel_data.stiffness[:] = self._wanted_stiffness
         self._ramping = False
+        if self._borne != self._wanted_borne:
+            self._bear(1.0)
         self._begin(q, np.zeros_like(q))
 
     def _begin(self, q: Array, v: Array) -> None:
         self._due_q, self._due_v = q.copy(), v  # of the newest reference, due at the end of its tick
         self._wanted_q, self._wanted_v = self._due_q, self._due_v  # of the one before, due now
         self._usable_q = q.copy()  # the newest measured posture that was of use
-        self._kernel_data.bounded[:] = np.minimum(np.maximum(self._gravity(), -self._limit), self._limit)
+        self._kernel_data.bounded[:] = np.minimum(np.maximum(self.gravity(q), -self._limit), self._limit)
 
-    def _gravity(self) -> Array:
-        """Torque of gravity (nv,) at the newest posture that was of use [Nm]."""
-        return np.array(pin.computeGeneralizedGravity(self.robot.model, self._data, self._usable_q))
+    def gravity(self, q: Array) -> Array:
+        """Torque (nv,) that bears the arms, with what they hold, at a posture ``q`` (nv,) [rad], [Nm]."""
+        return np.array(pin.computeGeneralizedGravity(self._model, self._data, q))
+
+    def set_holding(self, holding: Mapping[str, bool]) -> None:
+        """Of each arm whose gripper has an object, whether it is held and its mass to be borne."""
+        for arm in self._payloads:
+            self._wanted_borne[arm] = float(holding.get(arm, False))
+
+    def _bear(self, change: float) -> None:
+        """Let the borne share of each payload come nearer to the wanted one by ``change``."""
+        inertias = {held.joint: self.robot.model.inertias[held.joint] for held in self._payloads.values()}
+        for arm, held in self._payloads.items():
+            way = self._wanted_borne[arm] - self._borne[arm]
+            self._borne[arm] += min(max(way, -change), change)
+            if self._borne[arm] > 0.0:
+                inertias[held.joint] = inertias[held.joint] + held.inertia(self._borne[arm])
+        for joint, inertia in inertias.items():
+            self._model.inertias[joint] = inertia
 
     def set_stiffness(
         self, translational: float | None = None, rotational: float | None = None, arm: str | None = None
@@ -152,10 +180,12 @@ class ImpedanceController:
         time = min(float(dt), LONGEST_DT) if usable else 0.0
         if self._ramping:
             self._ramp(time)
+        if self._borne != self._wanted_borne:
+            self._bear(time / _PAYLOAD_TIME)
         acceleration, data = self._exchange(reference), self._kernel_data
         held = not (_finite(state.q, state.v) and self._law(state, acceleration, extra))
         if held:
-            data.tau[:] = self._gravity()
+            data.tau[:] = self.gravity(self._usable_q)
         else:
             self._usable_q[:] = state.q
         limited = self._bound_torques(self._held_model, self._held_data, self.settings.torque_rate_limit * time)
@@ -188,7 +218,7 @@ class ImpedanceController:
 
         False where the numbers are too large to be computed with.
         """
-        model, data, kernel_data = self.robot.model, self._data, self._kernel_data
+        model, data, kernel_data = self._model, self._data, self._kernel_data
         kernel_data.q[:], kernel_data.v[:] = state.q, state.v
         kernel_data.wanted_q[:], kernel_data.wanted_v[:] = self._wanted_q, self._wanted_v
         kernel_data.tau[:] = pin.rnea(model, data, kernel_data.q, kernel_data.v, acceleration)

@@ -15,11 +15,13 @@ Side = Literal["left", "right"]
 Coordinate = Annotated[float, Field(ge=-20, le=20)]  # [m]
 Extent = Annotated[float, Field(gt=0, le=20)]  # [m]
 Angle = Annotated[float, Field(ge=-6.2832, le=6.2832)]  # [rad]
+ObjectSize = Annotated[float, Field(ge=0.001, le=1)]  # [m]
 Acceleration = Annotated[float, Field(gt=0, le=100)]  # [rad/s^2]
 Share = Annotated[float, Field(ge=0, le=1)]
 Metres3 = Annotated[tuple[Coordinate, Coordinate, Coordinate], Field(description="x, y, z [m]")]
 Radians3 = Annotated[tuple[Angle, Angle, Angle], Field(description="roll, pitch, yaw [rad]")]
 Colour = tuple[Share, Share, Share, Share]
+_USUAL_RADIUS = 0.03  # of an object of which nothing is said: more than most grippers open by half [m]
 
 
 def _beside_the_file(value: str, info: ValidationInfo) -> str:
@@ -96,6 +98,27 @@ class ToolConfig(CellModel):
     frame: str | None = Field(None, description="link of the tool that the operator moves; default: the last link")
 
 
+class HeldObjectConfig(CellModel):
+    """What a gripper holds when it holds something: a box or a ball, fixed to the tool."""
+
+    box: tuple[ObjectSize, ObjectSize, ObjectSize] | None = Field(None, description="x y z [m]")
+    sphere: float | None = Field(None, gt=0, le=0.5, description="radius; with neither, 0.03 [m]")
+    at: Metres3 = Field((0.0, 0.0, 0.0), description="centre in the tool frame [m]")
+    rpy: Radians3 = Field((0.0, 0.0, 0.0), description="of the box in the tool frame [rad]")
+    mass: float = Field(0.0, ge=0, le=50, description="that torque mode bears [kg]")
+
+    @model_validator(mode="after")
+    def _is_one_shape(self) -> HeldObjectConfig:
+        if self.box is not None and self.sphere is not None:
+            raise ValueError("box and sphere are two shapes: give one")
+        return self
+
+    @property
+    def radius(self) -> float:
+        """Of the ball that stands for it where it is no box [m]."""
+        return _USUAL_RADIUS if self.sphere is None else self.sphere
+
+
 class GripperConfig(CellModel):
     """How an opening of 0..1 becomes finger joint positions."""
 
@@ -104,6 +127,7 @@ class GripperConfig(CellModel):
     closed_position: float = Field(0.0, ge=-3.15, le=3.15, description="of each finger joint, closed [m or rad]")
     speed: float = Field(0.1, gt=0, le=5, description="of each finger joint [m/s or rad/s]")
     force: float = Field(60.0, gt=0, le=500, description="of each finger joint [N or Nm]")
+    object: HeldObjectConfig | None = Field(None, description="what counts as part of the tool while it is held")
 
     @model_validator(mode="after")
     def _opens(self) -> GripperConfig:

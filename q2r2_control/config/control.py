@@ -12,6 +12,9 @@ from q2r2_control.errors import ConfigError
 EQUAL = "equal"
 
 Distance = Annotated[float, Field(ge=0, le=0.2)]  # [m]
+ObjectDistance = Annotated[
+    float, Field(ge=-0.05, le=0.2)
+]  # below 0: how far a box that is known roughly may overlap [m]
 LinkPattern = Annotated[str, Field(min_length=1)]
 
 
@@ -19,8 +22,9 @@ class DistanceSettings(BaseModel):
     """How far pairs of bodies stay apart, by what they are; left out: ``min_distance``.
 
     A finger is what a gripper's joints move, a tool what carries it (the hand), an obstacle what stands in the cell,
-    its floor included. ``arm_self`` is all of one arm against itself and against the robot that it is a part of; the
-    other classes without obstacles are about different arms.
+    its floor included, an object what ``gripper.object`` describes, while it is held. ``arm_self`` is all of one arm
+    against itself and against the robot that it is a part of, its own object included; the other classes without
+    obstacles are about different arms.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
@@ -35,6 +39,10 @@ class DistanceSettings(BaseModel):
     finger_tool: Distance | None = Field(None, description="fingers and the other hand [m]")
     finger_finger: Distance | None = Field(None, description="fingers of both hands [m]")
     finger_obstacle: Distance | None = Field(None, description="fingers and obstacles [m]")
+    object_arm: ObjectDistance | None = Field(None, description="a held object and the other arm's links [m]")
+    object_tool: ObjectDistance | None = Field(0.005, description="a held object and the other hand [m]")
+    object_object: ObjectDistance | None = Field(0.0, description="two objects that are held [m]")
+    object_obstacle: ObjectDistance | None = Field(0.0, description="a held object and obstacles [m]")
 
 
 class NamedPairDistance(BaseModel):

@@ -12,8 +12,8 @@ from q2r2_control.config.control import ControllerSettings
 from q2r2_control.control.geometry.collision import collision_model_of
 from q2r2_control.control.geometry.finger_openings import FingerOpenings
 from q2r2_control.control.geometry.kinematics import IntArray
-from q2r2_control.control.jit import bound, hold
-from q2r2_control.control.kernel_data import KernelData
+from q2r2_control.control.held_objects import ObjectLoads
+from q2r2_control.control.jit import bound
 from q2r2_control.control.kernel_model import kernel_model_of
 from q2r2_control.control.qp import QpProblem, Solver, make_solver
 from q2r2_control.control.qp_assembly import assemble
@@ -49,8 +49,8 @@ class CartesianController:
         self._nv = robot.model.nv
         self._arms = tuple(robot.arms)
         self._solver = solver or make_solver(self.settings.solver, self._nv, self.settings.solve_time_limit)
-        model = kernel_model_of(robot, self.settings)
-        data = KernelData.empty(model)
+        self._objects = ObjectLoads(robot, self.settings, kernel_model_of(robot, self.settings))
+        model, data = self._objects.model, self._objects.data
         self._state, self._rows, self._active = data.safety.state, data.safety.rows, data.safety.active
         self._stop, self._tasks = data.safety.certified, data.tasks
         self._solution = np.zeros(self._nv)  # of the solver, whatever array it gave
@@ -62,14 +62,14 @@ class CartesianController:
             rows=self._rows.matrix[:0],
             rows_lower=self._rows.lower[:0],
         )
-        self._fingers = FingerOpenings(robot, model.safety.collision.bodies)
-        self._unchanged: IntArray = np.zeros(len(model.safety.collision.bodies.joint), dtype=np.int64)
+        self._fingers = FingerOpenings(robot, self._objects.bodies)
+        self._unchanged: IntArray = np.zeros(len(self._objects.bodies.joint), dtype=np.int64)
         self._targets = TargetTracker(model.tasks, self._arms, self.settings)
-        self._held_model, self._held_data = hold(model), hold(data)
         names = [geometry.name for geometry in robot.collision_model.geometryObjects]
         watched = collision_model_of(robot).pairs  # the model's own know boxes that may be touched by other numbers
         pairs = zip(watched.first.tolist(), watched.second.tolist(), strict=True)
-        self._pair_names = [(names[first], names[second]) for first, second in pairs]
+        self._names = [(names[first], names[second]) for first, second in pairs]
+        self._take_load()
         self._compile()
         self.reset(robot.home)
 
@@ -85,14 +85,16 @@ class CartesianController:
     def reset(self, q: Array, v: Array | None = None) -> None:
         """Start anew at joint positions ``q`` [rad] and velocities ``v`` [rad/s], (nv,) each; targets are forgotten.
 
-        So are openings: fingers are all of their way again, see :meth:`set_opening`. Raises :class:`RobotError` for a
-        wrong shape or a number that is not finite. A start outside the limits or in penetration is allowed: the
-        controller recovers from it.
+        So are openings: fingers are all of their way again, see :meth:`set_opening`; and nothing is held, see
+        :meth:`set_holding`. Raises :class:`RobotError` for a wrong shape or a number that is not finite. A start
+        outside the limits or in penetration is allowed: the controller recovers from it.
         """
         state = self._state
         state.q[:] = self._checked("q", q)
         state.v[:] = 0.0 if v is None else self._checked("v", v)
         self._fingers.set_all({})
+        self._objects.clear()
+        self._take_load()
         self._targets.reset(state.q)
         observed = start_reference(self._held_model, self._held_data)
         self._closest, self._distance, self._tightest, self._margin, proven = observed
@@ -168,6 +170,40 @@ class CartesianController:
         """Between which openings each arm's gripper counts as being, as :meth:`set_opening` accepted it."""
         return dict(self._fingers.intervals)
 
+    def set_holding(self, arm: str, holds: bool) -> None:
+        """Say that the gripper of ``arm`` holds its object from the next step on, or that it does not.
+
+        The object of the cell's YAML then is part of the tool. It may touch, or overlap, what is near when it is
+        gripped: each of its pairs begins with the distance that there is and keeps more as it gets more, until it keeps
+        its own (:attr:`object_distances`). So it is always accepted, and proven with the stop that is known; nothing
+        moves for it. Until something is said, and after :meth:`reset`, nothing is held.
+
+        Raises :class:`RobotError` for an arm that has no object.
+        """
+        if not self._objects.change(arm, holds):
+            return
+        self._take_load()
+        self._look_again(self._unchanged)
+        self._objects.begin()
+        self._take_load()
+        self._look_again(self._unchanged)
+
+    @property
+    def holding(self) -> dict[str, bool]:
+        """Of each arm that has an object, whether its gripper holds it, as :meth:`set_holding` was told."""
+        return {arm: arm in self._objects.holding for arm in self.robot.objects.by_arm}
+
+    @property
+    def object_distances(self) -> Array:
+        """What every pair of ``Robot.objects`` keeps now (pairs,) [m]; minus infinity while it does not count."""
+        return self._objects.kept()
+
+    def _take_load(self) -> None:
+        """Go on with the kernels' model and data of what is held now."""
+        load = self._objects.load
+        self._held_model, self._held_data = load.model, load.data
+        self._pair_names = self._names + [self._objects.pair_names[pair] for pair in load.objects]
+
     def _look_again(self, grown: IntArray) -> int:
         """Observe with bodies that have changed; returns the pair in the way of those that have ``grown``, or -1."""
         observed = self._observe_bodies(self._held_model, self._held_data, grown)
@@ -201,6 +237,8 @@ class CartesianController:
         summary.fallback |= outcome != FOLLOWED
         summary.slack = max(summary.slack, slack)
         summary.solve_time += solution.solve_time
+        if self._objects.growing:
+            self._objects.grow(h)
         was_apart, self._apart = self._apart, self._margin >= 0.0
         # A certified stop stays certified. Anything else was proven just now, and if all was apart before, in full.
         self._certified = self._apart and (self._certified if outcome == STOPPED else was_apart)

@@ -68,7 +68,7 @@ def _safety_model(robot: Robot, settings: ControllerSettings) -> SafetyModel:
             return_speed=settings.recovery_velocity,
         ),
         approach=Approach(
-            stop_distance=min_distance + _buffer(min_distance, settings),
+            stop_distance=min_distance + stop_buffer(min_distance, settings),
             gain=settings.separation_gain,
             contact_speed=kept.contact_speed,
             contact_zone=np.where(np.isfinite(kept.contact_speed), _CONTACT_ZONE - min_distance, 0.0),
@@ -89,7 +89,7 @@ def _check_depths(robot: Robot, collision: CollisionModel, kept: KeptDistances) 
         )
 
 
-def _buffer(min_distance: Array, settings: ControllerSettings) -> Array:
+def stop_buffer(min_distance: Array, settings: ControllerSettings) -> Array:
     """How much farther from each other pairs stop in the QP (p,) [m]."""
     return np.minimum(settings.distance_buffer, np.maximum(0.5 * min_distance, _LEAST_BUFFER))
 

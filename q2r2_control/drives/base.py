@@ -44,6 +44,10 @@ class Drive(Protocol):
         """Between which openings each arm's gripper is, as the controller has accepted it."""
         ...
 
+    def set_holding(self, holding: Mapping[str, bool]) -> None:
+        """Of each arm whose gripper has an object, whether it is held."""
+        ...
+
     def displaced(self, targets: ToolTargets, state: RobotState, dt: float) -> ToolTargets:
         """The tool targets that the controller is to follow in a tick of ``dt`` [s]."""
         ...

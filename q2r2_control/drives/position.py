@@ -44,6 +44,9 @@ class PositionDrive:
     def set_openings(self, openings: Mapping[str, Interval]) -> None:
         """See :meth:`Drive.set_openings`: nothing here has bodies."""
 
+    def set_holding(self, holding: Mapping[str, bool]) -> None:
+        """See :meth:`Drive.set_holding`: the plant's own servos bear it."""
+
     def displaced(self, targets: ToolTargets, state: RobotState, dt: float) -> ToolTargets:
         """See :meth:`Drive.displaced`."""
         if self.admittance is None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-import pinocchio as pin
 
 from q2r2_control.compliance.impedance import ImpedanceController
 from q2r2_control.compliance.repulsion import MeasuredSeparation
@@ -34,7 +33,6 @@ class TorqueDrive:
         self.impedance = ImpedanceController(robot, config.impedance)
         self.wall = MeasuredSeparation(robot, config.control, config.impedance.wall)
         self.report = DriveReport()
-        self._model, self._data = robot.model, robot.model.createData()
         self._has_servos = has_servos
         self._believed = self._reference = robot.home  # the last posture and reference (nv,) [rad]
 
@@ -47,6 +45,10 @@ class TorqueDrive:
     def set_openings(self, openings: Mapping[str, Interval]) -> None:
         """See :meth:`Drive.set_openings`: the wall's fingers are the controller's."""
         self.wall.set_openings(openings)
+
+    def set_holding(self, holding: Mapping[str, bool]) -> None:
+        """See :meth:`Drive.set_holding`: the impedance bears it. The wall knows no objects: they may touch."""
+        self.impedance.set_holding(holding)
 
     def displaced(self, targets: ToolTargets, state: RobotState, dt: float) -> ToolTargets:
         """See :meth:`Drive.displaced`."""
@@ -71,7 +73,7 @@ class TorqueDrive:
 
     def gravity(self, q: Array) -> Array:
         """What bears the arms at a posture ``q`` (nv,) [rad]: torques (nv,) [Nm]."""
-        return np.array(pin.computeGeneralizedGravity(self._model, self._data, q))
+        return self.impedance.gravity(q)
 
     def at_rest(self, state: RobotState) -> bool:
         """See :meth:`Drive.at_rest`. What cannot be seen is not waited for."""

@@ -32,7 +32,23 @@ def kept_distances(robot: Robot, settings: ControllerSettings) -> KeptDistances:
     Raises :class:`ConfigError` for names in ``settings.pairs`` and ``settings.contact_allowed`` that no monitored pair
     has.
     """
-    names = pair_names(robot.collision_model)
+    kept = _of_all_pairs(robot, settings)
+    return _part(kept, slice(0, len(kept.keys) - len(robot.objects.holders)))
+
+
+def kept_by_objects(robot: Robot, settings: ControllerSettings) -> KeptDistances:
+    """The same of the pairs of ``robot.objects``; raises as :func:`kept_distances` does."""
+    kept = _of_all_pairs(robot, settings)
+    return _part(kept, slice(len(kept.keys) - len(robot.objects.holders), None))
+
+
+def _part(kept: KeptDistances, pairs: slice) -> KeptDistances:
+    return KeptDistances(kept.values[pairs], kept.keys[pairs], kept.contact_speed[pairs])
+
+
+def _of_all_pairs(robot: Robot, settings: ControllerSettings) -> KeptDistances:
+    """Of the monitored pairs, then of those of objects."""
+    names = pair_names(robot.objects.geometry)
     keys = ["min_distance"] * len(names)
     values = np.full(len(names), settings.min_distance)
     for p, (a, b) in enumerate(names):

@@ -13,6 +13,7 @@ from q2r2_control.robot.description import LinkTree, joint_end
 class Part(StrEnum):
     """What a link is, in the words of ``control.distances``, the outermost first."""
 
+    OBJECT = "object"
     FINGER = "finger"
     TOOL = "tool"
     ARM = "arm"

@@ -13,12 +13,14 @@ import numpy as np
 import pinocchio as pin
 
 from q2r2_control.config import Config
+from q2r2_control.config.arms import HeldObjectConfig
 from q2r2_control.errors import ConfigError, RobotError
 from q2r2_control.robot.compose import compose
 from q2r2_control.robot.description import LinkTree, joint_limits, parse_srdf, parse_urdf
 from q2r2_control.robot.enclose import enclose_shapes
 from q2r2_control.robot.finger_bodies import sweep_fingers
 from q2r2_control.robot.floor import remove_unreachable_floor_pairs, sink_boxes_into_floor
+from q2r2_control.robot.held_objects import HeldObjects, held_objects
 from q2r2_control.robot.joint_accelerations import acceleration_limit
 from q2r2_control.robot.link_roles import KnownParts, Role, roles_of
 from q2r2_control.robot.locking import lock_joints
@@ -79,8 +81,9 @@ class Robot:
     ``collision_model`` holds exactly the monitored pairs: each arm against the other with its base, against its own
     links that can meet, and against what stands in the cell. Every monitored shape is a capsule, a sphere, or a box
     fixed in the world; a finger that slides is all that it sweeps, and ``finger_bodies`` says what of that counts while
-    its gripper's opening is known. ``roles`` says what each link is. ``ignored_pairs``
-    names pairs of one arm's own shapes that overlap by construction and are not monitored.
+    its gripper's opening is known. ``objects`` are what grippers hold, of which the collision model knows nothing.
+    ``roles`` says what each link is. ``ignored_pairs`` names pairs of one arm's own shapes that overlap by construction
+    and are not monitored.
     """
 
     def __init__(
@@ -123,6 +126,7 @@ class Robot:
         enclose_shapes(self.collision_model)
         self.finger_bodies = sweep_fingers(self.model, self.collision_model, tree, parts, home)
         self.ignored_pairs = self._monitor(tree, exclusions, list(own_links.values()))
+        self.objects = HeldObjects(self.collision_model, {}, ())
         self._data: pin.Data = self.model.createData()
         self._collision_data: pin.GeometryData = self.collision_model.createData()
 
@@ -135,6 +139,7 @@ class Robot:
         for name, arm in robot.arms.items():
             swivel = _swivel(config, name, cell.arm_joints[name], cell.prefixes[name])
             robot.arms[name] = replace(arm, swivel=swivel)
+        robot._add_objects(config)
         return robot
 
     @classmethod
@@ -193,6 +198,18 @@ class Robot:
             random = np.random.default_rng(0)
             postures += [random.uniform(self.position_lower, self.position_upper) for _ in range(50)]
         return remove_overlapping_own_pairs(self.model, self.collision_model, own_links, postures)
+
+    def _add_objects(self, config: Config) -> None:
+        configs: dict[str, HeldObjectConfig] = {
+            side: arm.gripper.object for side, arm in config.arms.items() if arm.gripper.object is not None
+        }
+        tools = {name: arm.frame_id for name, arm in self.arms.items()}
+        self.objects = held_objects(self.model, self.collision_model, self.roles, tools, configs)
+        for link, role in self.objects.roles().items():
+            if link in self.roles:
+                arm = next(iter(role.arms))
+                raise ConfigError(f"arms.{arm}.gripper.object: the cell has a link {link}; allowed: none of that name")
+            self.roles[link] = role
 
     def _moved_links(self, arm: Arm) -> set[str]:
         """Links that an arm's joints carry, of branches beside the way to the tool too, such as fingers."""

@@ -40,6 +40,9 @@ class Tick:
     admittance: AdmittanceReport | None = None  # of position mode, where it is enabled
     # arm -> pair of bodies that keeps its gripper from being commanded as wanted
     held_grippers: dict[str, tuple[str, str]] = field(default_factory=dict)
+    holding: dict[str, bool] = field(
+        default_factory=dict
+    )  # of arms whose grippers have an object, whether they hold it
 
 
 class RunRecorder:
@@ -84,6 +87,10 @@ class RunRecorder:
         statistics.add_drive(dt, drive)
         statistics.add_held_grippers(dt, held_grippers)
         statistics.events.extend(events)
+
+    def add_holding(self, dt: float, holding: Mapping[str, bool]) -> None:
+        """See :meth:`RunStatistics.add_holding`."""
+        self._statistics.add_holding(dt, holding)
 
     def tell(self, tick: Tick) -> None:
         """Give one tick to every listener."""

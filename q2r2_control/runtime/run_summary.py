@@ -37,6 +37,7 @@ class ArmSummary:
     gripper_changes: int
     gripper_held_s: float  # for which something near its fingers kept it from opening or closing as wanted
     gripper_held_by: tuple[str, str] | None  # geometry names of the last pair that did
+    object_held_s: float | None  # for which its gripper held its object; None: the cell's YAML has none for it
     slip_mm_max: float  # largest slip of one engagement: how far the leash moved the target
     slip_deg_max: float
     yielded_mm_max: float  # largest displacement of the target by the admittance, in position mode
@@ -89,6 +90,7 @@ class _ArmFigures:
     gripper_changes: int = 0
     held: float = 0.0  # [s]
     held_by: tuple[str, str] | None = None
+    object_held: float | None = None  # [s]
     slip: float = 0.0  # largest [m]
     slip_angle: float = 0.0  # largest [rad]
     yielded: float = 0.0  # largest [m]
@@ -179,6 +181,12 @@ class RunStatistics:
             self._arms[name].held += dt
             self._arms[name].held_by = pair
 
+    def add_holding(self, dt: float, holding: Mapping[str, bool]) -> None:
+        """Count one tick's grippers that have an object, and hold it or not."""
+        for name, holds in holding.items():
+            figures = self._arms[name]
+            figures.object_held = (figures.object_held or 0.0) + (dt if holds else 0.0)
+
     def summary(
         self,
         wall_time: float,
@@ -228,6 +236,7 @@ def _arm_summary(figures: _ArmFigures) -> ArmSummary:
         gripper_changes=figures.gripper_changes,
         gripper_held_s=figures.held,
         gripper_held_by=figures.held_by,
+        object_held_s=figures.object_held,
         slip_mm_max=1e3 * figures.slip,
         slip_deg_max=math.degrees(figures.slip_angle),
         yielded_mm_max=1e3 * figures.yielded,

@@ -250,3 +250,17 @@ class HostileGrippers:
         arm, kind = str(self._random.choice(self._arms)), int(self._random.integers(4))
         first, second = np.sort(self._random.random(2)).tolist()
         return arm, (ALL_OF_THE_WAY, (0.0, 0.0), (first, second), (0.0, second))[kind]
+
+
+class HostileGrasps:
+    """Draws when objects are gripped and let go: at any speed, anywhere, some for a moment and some for long."""
+
+    def __init__(self, arms: Iterable[str], random: np.random.Generator) -> None:
+        """``arms`` are those whose grippers have an object."""
+        self._arms, self._random = tuple(arms), random
+
+    def draw(self) -> tuple[str, bool] | None:
+        """An arm and whether it holds from this tick on, or None."""
+        if not self._arms or self._random.random() > 0.02:
+            return None
+        return str(self._random.choice(self._arms)), bool(self._random.random() < 0.7)

@@ -53,6 +53,7 @@ _PROMISES = {  # key: name, unit, and what its value has to be
     "coal": ("reported distance off Coal's", "m", "<=", _COAL),
     "bystanders": ("pairs apart while others recover", "m", ">=", -_COAL),
     "uncertified": ("certificates lost", "", "<=", 0.0),
+    "loosened": ("held objects: kept distance falls by", "m", "<=", 0.0),
     "approach": ("recovery: closer by, in a tick", "m", "<=", 1e-9),
     "not_stopped": ("solver failed: off the stop", "rad", "<=", 1e-11),
     "unsaid": ("solver failed: stop not reported", "", "<=", 0.0),
@@ -101,6 +102,9 @@ class Checked(Protocol):
     @property
     def stop_deceleration(self) -> Array: ...
 
+    @property
+    def object_distances(self) -> Array: ...
+
 
 def time_of(dt: Any) -> float:
     """Seconds that a tick of ``dt`` moves the reference by: 0 for what is no time, 0.1 s at most."""
@@ -143,6 +147,9 @@ class Contract:
         self._at_corners = deeper_at_corners(collision_model_of(robot), self._kept)
         pairs = map(frozenset, pair_names(robot.collision_model))
         self._kept_by_name = dict(zip(pairs, self._kept.tolist(), strict=True))
+        self._objects = [frozenset(pair) for pair in robot.objects.pair_names()]
+        self._held_model = robot.objects.geometry
+        self._held_data: pin.GeometryData = self._held_model.createData()
         self._substep = settings.max_substep
         self.start(robot.home if q is None else q, v)
 
@@ -155,6 +162,7 @@ class Contract:
         self._excess = self._excess_of(v)
         self._can_stop = self._stops_inside(q, v)
         self._slow = self._excess == 0.0
+        self._held = np.full(len(self._objects), -np.inf)  # what pairs of objects keep [m]
         margins = self._margins(q)
         self._from_rest = not v.any()
         self._apart = (margins >= 0.0) & self._from_rest
@@ -172,6 +180,14 @@ class Contract:
             self._stop = self._controller.stop_deceleration
         model = collision_model_at(self._robot.collision_model, self._robot.finger_bodies, openings)
         self._fingers = model, model.createData()
+
+    def _note_objects(self) -> None:
+        """Take over what pairs of objects keep, which never falls while they count."""
+        held = self._controller.object_distances
+        counted = np.isfinite(self._held) & np.isfinite(held)
+        if counted.any():
+            self._note("loosened", float((self._held[counted] - held[counted]).max()))
+        self._held = held
 
     def check(
         self, reference: Reference, dt: Any, unusable: frozenset[str] | None = None, failed: bool = False
@@ -209,6 +225,7 @@ class Contract:
             self._check_distance(self._margin_of(report), report.certified)
             stop = self._controller.stop_deceleration
             self._note("deceleration", float((stop / self._a).max()))
+            self._note_objects()
             self._sample(q, v, stop, h, report)
             self._count(reference, h)
             self._q, self._v, self._stop = q, v, stop
@@ -299,7 +316,10 @@ class Contract:
 
     def _margin_of(self, report: StepReport) -> float:
         """Least margin that a report tells of, the nearest pair judged by what it has to keep here [m]."""
-        nearest = report.closest_distance - self._kept_by_name.get(frozenset(report.closest_pair), 0.0)
+        closest = frozenset(report.closest_pair)
+        if closest in self._objects:
+            return report.margin
+        nearest = report.closest_distance - self._kept_by_name.get(closest, 0.0)
         return min(report.margin, nearest)
 
     def _check_distance(self, least: float, certified: bool) -> None:
@@ -319,7 +339,8 @@ class Contract:
         if draw < _BETWEEN_SHARE:
             values = self._distances(q)
             margins = values - self._kept + self._at_corners
-            if len(values) and values.min() > 0.0:  # Coal's penetration depth is another quantity
+            of_object = {frozenset(report.closest_pair), frozenset(report.tightest_pair)} & set(self._objects)
+            if len(values) and values.min() > 0.0 and not of_object:  # Coal's penetration depth is another quantity
                 # Boxes that may be touched are rounded for the controller.
                 if self._kept[int(values.argmin())] >= 0.0 <= self._kept_by_name[frozenset(report.closest_pair)]:
                     self._note("coal", abs(float(values.min()) - report.closest_distance))
@@ -345,11 +366,25 @@ class Contract:
 
     def _least_of(self, postures: Array) -> float:
         """Least margin of a pair at any of ``postures`` (s, nv) [m]."""
-        return min(float(self._margins(q).min(initial=np.inf)) for q in postures)
+        return min(
+            min(float(self._margins(q).min(initial=np.inf)), float(self._object_margins(q).min(initial=np.inf)))
+            for q in postures
+        )
 
     def _margins(self, q: Array) -> Array:
         """How much farther apart than it has to be every pair is (p,) [m]."""
         return self._distances(q) - self._kept + self._at_corners
+
+    def _object_margins(self, q: Array) -> Array:
+        """The same of the pairs of held objects that are apart, or have to be [m]."""
+        count = len(self._held)
+        if not count or not np.isfinite(self._held).any():
+            return np.zeros(0)
+        pin.computeDistances(self._robot.model, self._data, self._held_model, self._held_data, q)
+        results = list(self._held_data.distanceResults)[-count:]
+        values = np.array([result.min_distance for result in results], dtype=np.float64)
+        seen = np.isfinite(self._held) & ((values > 0.0) | (self._held >= 0.0))  # Coal's depth is another quantity
+        return (values - self._held)[seen]
 
     def _distances(self, q: Array) -> Array:
         """As :meth:`Robot.distance_values`, with fingers at the openings that the controller counts with."""

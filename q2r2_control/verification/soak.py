@@ -19,7 +19,7 @@ from q2r2_control.errors import ConfigError
 from q2r2_control.robot.kept_distances import kept_distances
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, Interval, Reference
-from q2r2_control.verification.adversary import HostileGrippers, Request
+from q2r2_control.verification.adversary import HostileGrasps, HostileGrippers, Request
 from q2r2_control.verification.contract import Checked, Contract, Margin, time_of
 from q2r2_control.verification.fault_injection import STOPPING_FAULTS, FaultySolver, Segment, segments
 
@@ -32,6 +32,7 @@ _COUNTED = (
     "solver_faults",
     "openings",
     "openings_refused",
+    "grasps",
     "fallbacks",
     "fallbacks_healthy",
 )
@@ -48,6 +49,8 @@ class Steppable(Checked, Protocol):
 
     @property
     def openings(self) -> Mapping[str, Interval]: ...
+
+    def set_holding(self, arm: str, holds: bool) -> None: ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,6 +81,7 @@ class SoakReport:
     solver_faults: int  # ticks
     openings: int  # of grippers that were told
     openings_refused: int
+    grasps: int  # of objects, and releases
     fallbacks: int  # ticks, of all
     fallbacks_healthy: int  # ticks, of those with a healthy solver
     margins: list[Margin]
@@ -127,6 +131,7 @@ class Soak:
         self._counts = dict.fromkeys(_COUNTED, 0)
         self._simulated = 0.0
         self._grippers = HostileGrippers(controller.robot.arms, np.random.default_rng([seed, 3]))
+        self._objects = HostileGrasps(controller.robot.objects.by_arm, np.random.default_rng([seed, 4]))
 
     def run(self, ticks: int) -> SoakReport:
         """Run ``ticks`` ticks."""
@@ -175,6 +180,7 @@ class Soak:
         request = segment.stream(since, self._q)
         self._solver.fault = fault
         self._tell_opening()
+        self._tell_holding()
         try:
             reference = self._controller.step(request.targets, dt)
         except Exception as error:  # the contract promises none
@@ -202,6 +208,13 @@ class Soak:
         self._counts["openings"] += 1
         self._counts["openings_refused"] += self._controller.set_opening(arm, *interval) is not None
         self._contract.set_openings(self._controller.openings)
+
+    def _tell_holding(self) -> None:
+        told = self._objects.draw()
+        if told is None:
+            return
+        self._counts["grasps"] += 1
+        self._controller.set_holding(*told)
 
     def _keep(
         self, tick: int, segment: Segment, since: int, request: Request, dt: Any, broken: Iterable[str], error: str

@@ -193,7 +193,7 @@ def test_a_broken_promise_is_in_the_table_with_its_tick_and_its_segment() -> Non
     margin.note(-0.25, 7)
     q = np.zeros(14)
     found = Violation("least distance", 7, "teleport, dt 1 ms", 3, q, q, {}, "0.001", "")
-    text = printed(soak_table(SoakReport("cell", 5, 9, 0.1, 1, 1, 0, 0, 0, 0, 0, [margin], 0.5, [found])))
+    text = printed(soak_table(SoakReport("cell", 5, 9, 0.1, 1, 1, 0, 0, 0, 0, 0, 0, [margin], 0.5, [found])))
     assert "seed 5" in text
     assert "-0.25 m" in text
     assert "first broken at tick 7: least distance" in " ".join(text.split())

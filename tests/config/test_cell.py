@@ -16,6 +16,7 @@ from q2r2_control.config.arms import (
     ArmConfig,
     FlangeConfig,
     GripperConfig,
+    HeldObjectConfig,
     PoseConfig,
     RobotConfig,
     SwivelConfig,
@@ -122,7 +123,7 @@ class TestTheShippedCellShowsAllThereIsToTune:
     )
     # Not the default, and the file says so.
     CHOSEN = ("control.solve_time_limit", "control.distances", "mujoco.objects")
-    IN_A_COMMENT = (ContactPair, NamedPairDistance)
+    IN_A_COMMENT = (ContactPair, HeldObjectConfig, NamedPairDistance)
     # A tool's mount and an obstacle's rpy are placements as an arm's mount is, which shows the keys.
     SHOWN_ELSEWHERE = ("arms.left.tool.mount", "obstacles.table.rpy")
 
@@ -348,6 +349,13 @@ def test_a_misspelt_key_is_named_before_the_one_that_is_missing_for_it(tmp_path:
         ("control.min_distance", 20, "less than or equal to 0.2"),
         ("control.distances.arm_arm", -0.01, "greater than or equal to 0"),
         ("control.distances.finger_obstacle", 1, "less than or equal to 0.2"),
+        ("control.distances.object_obstacle", -20, "greater than or equal to -0.05"),
+        ("arms.left.gripper.object", True, "object"),
+        ("arms.left.gripper.object", {"box": [0.04, 0.04]}, "missing"),
+        ("arms.left.gripper.object", {"box": [40, 40, 60]}, "less than or equal to 1"),
+        ("arms.left.gripper.object", {"box": [0.04, 0.04, 0.06], "sphere": 0.03}, "two shapes: give one"),
+        ("arms.left.gripper.object", {"sphere": 0}, "greater than 0"),
+        ("arms.left.gripper.object", {"mass": -1}, "greater than or equal to 0"),
         ("control.pairs", [{"pair": ["a", "b"], "distance": 5}], "less than or equal to 0.2"),
         ("control.pairs", [{"pair": ["a"], "distance": 0.01}], "missing"),
         ("control.pairs", [{"pair": ["a", ""], "distance": 0.01}], "at least 1 character"),

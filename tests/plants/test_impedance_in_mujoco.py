@@ -335,3 +335,27 @@ def test_thrown_by_a_blow_it_keeps_every_bound_and_comes_back(bare: MujocoPlant,
     assert clipped == {"left"}
     loop.settle()
     assert np.linalg.norm(loop.displacement()[:3]) < 2e-3
+
+
+def test_what_a_gripper_holds_hangs_on_no_spring_and_makes_no_torque_jump(bare_config: Config) -> None:
+    """2 kg at the tool's point, by 2000 N/m: 9.8 mm of sag while nobody knows of them."""
+    data = bare_config.model_dump()
+    data["arms"]["left"]["gripper"]["object"] = {"mass": 2.0}
+    config = Config.model_validate(data)
+    robot = Robot.from_config(config)
+    plant = MujocoPlant(robot, config)
+    tool = plant.model.body(robot.arms["left"].tool_frame)
+    tool.mass[0], tool.inertia[:] = 2.0, 0.4 * 2.0 * 0.03**2
+    mujoco.mj_setConst(plant.model, plant.data)
+    loop = TorqueLoop(plant, robot, SETTINGS, robot.home, SLOW)
+    loop.run(1.5)
+    assert loop.displacement()[2] == pytest.approx(-2.0 * 9.81 / SETTINGS.translational_stiffness, rel=0.1)
+    before = loop.controller.gravity(robot.home)
+    loop.controller.set_holding({"left": True, "right": False})
+    torques = np.array([command.tau for command in loop.ticks(1.5)])
+    assert np.abs(loop.displacement()[:3]).max() < 1e-4
+    assert np.abs(loop.controller.gravity(robot.home) - before).max() > 5.0
+    assert np.abs(np.diff(torques, axis=0)).max() < 0.5
+    loop.controller.set_holding({"left": False})
+    loop.run(0.5)
+    np.testing.assert_allclose(loop.controller.gravity(robot.home), before, atol=1e-9)

@@ -20,6 +20,7 @@ from q2r2_control.types import Array, Interval, Reference
 from q2r2_control.verification.contact_cells import FINGERS, with_contact
 from q2r2_control.verification.fault_injection import FaultySolver
 from q2r2_control.verification.soak import Soak, SoakReport, run_soak
+from tests.support.object_cell import cell
 
 CONFIG = load_config("config/dual_iiwa7.yaml")
 SETTINGS = CONFIG.control
@@ -54,6 +55,13 @@ class Sabotaged:
     @property
     def openings(self) -> dict[str, Interval]:
         return controller_and_solver()[0].openings
+
+    def set_holding(self, arm: str, holds: bool) -> None:
+        controller_and_solver()[0].set_holding(arm, holds)
+
+    @property
+    def object_distances(self) -> Array:
+        return controller_and_solver()[0].object_distances
 
     @property
     def stop_deceleration(self) -> Array:
@@ -91,6 +99,15 @@ def test_three_thousand_hostile_ticks_break_no_promise(seed: int) -> None:
     assert report.openings > 100
     distances = next(margin for margin in report.margins if margin.name == "distance - kept distance, at ticks")
     assert distances.checked > 1000
+
+
+def test_objects_gripped_and_let_go_at_any_moment_break_no_promise() -> None:
+    report = run_soak(cell({"box": (0.1, 0.2, 0.06), "at": (0.0, 0.0, 0.02)}, {}), 3000, seed=1)
+    assert [found.promise for found in report.broken] == []
+    assert report.passed
+    assert report.grasps > 40
+    fallen = next(margin for margin in report.margins if margin.name == "held objects: kept distance falls by")
+    assert fallen.checked > 1000
 
 
 def test_fingers_that_open_without_a_proof_are_found(monkeypatch: pytest.MonkeyPatch) -> None:

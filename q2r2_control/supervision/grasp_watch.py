@@ -1,0 +1,66 @@
+"""Whether grippers hold something: they are to close farther, and do not.
+
+A gripper that holds is open by more than it is asked to be and stays so. Where no opening is measured nothing can be
+seen, and one that is to be closed counts as holding: an object that is not there costs room, one that is not counted
+could hit something.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+from q2r2_control.control.controller import CartesianController
+
+# How much farther open than asked each finger is that holds something, and that does not any more [m or rad].
+_SQUEEZES, _SLIPPED = 0.002, 0.001
+# A finger that moves by less than this in that time is held up [m or rad], [s]. A gripper may take a while to begin.
+_STILL, _STALL = 0.0005, 0.2
+_CLOSED = 0.5  # a gripper that is not measured is taken as closed below this opening
+
+
+class GraspWatch:
+    """Tells the controller which grippers hold their objects, of those that have one in the cell's YAML."""
+
+    def __init__(self, controller: CartesianController) -> None:
+        self._controller = controller
+        arms = controller.robot.arms
+        self._grips = {arm: _Grip(arms[arm].stroke) for arm in controller.robot.objects.by_arm}
+
+    def update(self, wanted: Mapping[str, float], measured: Mapping[str, float], now: float) -> bool:
+        """Look at wanted and measured openings at ``now`` [s], before the controller's step; whether something changed.
+
+        Openings are 0 closed .. 1 fully open. While a measurement fails, what was known stays.
+        """
+        changed = False
+        for arm, grip in self._grips.items():
+            if arm in wanted:
+                holds = grip.look(wanted[arm], measured.get(arm), now)
+                if holds != self._controller.holding[arm]:
+                    self._controller.set_holding(arm, holds)
+                    changed = True
+        return changed
+
+
+class _Grip:
+    """What was seen of one gripper."""
+
+    def __init__(self, stroke: float) -> None:
+        self._stroke = stroke
+        self._holds = False
+        self._seen, self._since = math.nan, -math.inf  # opening, and since when it has been about that [s]
+
+    def look(self, wanted: float, measured: float | None, now: float) -> bool:
+        if self._stroke <= 0.0 and measured is None:
+            self._holds = wanted < _CLOSED
+        elif measured is not None and math.isfinite(measured):
+            self._judge((measured - wanted) * self._stroke, measured * self._stroke, now)
+        return self._holds
+
+    def _judge(self, squeezed: float, opening: float, now: float) -> None:
+        if squeezed <= _SLIPPED:
+            self._holds = False
+        if squeezed <= _SQUEEZES or not abs(opening - self._seen) <= _STILL:
+            self._seen, self._since = opening, now
+        elif now - self._since >= _STALL:
+            self._holds = True

@@ -1,0 +1,102 @@
+"""A gripper holds that is to close farther and does not, until it is opened or has closed after all."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from q2r2_control import CartesianController, Robot
+from q2r2_control.supervision.grasp_watch import GraspWatch
+from tests.support.object_cell import BLOCK, cell
+
+DT = 0.004
+CELL = cell(BLOCK)
+
+
+@pytest.fixture(scope="module")
+def built() -> CartesianController:
+    return CartesianController(Robot.from_config(CELL), CELL.control)
+
+
+@pytest.fixture
+def controller(built: CartesianController) -> CartesianController:
+    built.reset(built.robot.home)
+    return built
+
+
+class Hand:
+    """A left gripper that closes at its speed, but no farther than to what is between its fingers."""
+
+    def __init__(self, controller: CartesianController) -> None:
+        self.controller, self.watch = controller, GraspWatch(controller)
+        self.opening, self.now, self.changes = 1.0, 0.0, 0
+
+    def run(self, wanted: float, seconds: float, least: float = 0.0, measured: float | None = None) -> bool:
+        for _ in range(round(seconds / DT)):
+            self.now += DT
+            goal = max(wanted, least)
+            self.opening += min(max(goal - self.opening, -4.0 * DT), 4.0 * DT)
+            seen = {"left": self.opening if measured is None else measured, "right": 1.0}
+            self.changes += self.watch.update({"left": wanted, "right": 0.0}, seen, self.now)
+        return self.controller.holding["left"]
+
+
+def test_closed_on_a_block_it_holds_once_its_fingers_stand_still(controller: CartesianController) -> None:
+    hand = Hand(controller)
+    assert not hand.run(0.0, 0.2, least=0.8)
+    assert hand.run(0.0, 0.2, least=0.8)
+    assert hand.run(0.0, 1.0, least=0.8)
+    assert hand.changes == 1
+
+
+def test_it_lets_go_as_soon_as_it_is_to_open(controller: CartesianController) -> None:
+    hand = Hand(controller)
+    hand.run(0.0, 0.5, least=0.8)
+    assert not hand.run(1.0, DT, least=0.8)
+
+
+def test_what_slips_out_is_held_no_more(controller: CartesianController) -> None:
+    hand = Hand(controller)
+    assert hand.run(0.0, 0.5, least=0.8)
+    assert not hand.run(0.0, 0.5)
+
+
+@pytest.mark.parametrize("least", [0.0, 0.06], ids=["nothing", "1.5 mm"])
+def test_a_gripper_that_closes_fully_or_nearly_holds_nothing(controller: CartesianController, least: float) -> None:
+    assert not Hand(controller).run(0.0, 1.5, least=least)
+
+
+def test_one_that_closes_slowly_holds_nothing_on_the_way(controller: CartesianController) -> None:
+    hand = Hand(controller)
+    for step in range(100):
+        assert not hand.run(0.0, DT, least=1.0 - 0.01 * step)
+
+
+def test_while_nothing_is_measured_what_was_known_stays(controller: CartesianController) -> None:
+    hand = Hand(controller)
+    assert not hand.run(0.0, 0.5, measured=math.nan)
+    hand.run(0.0, 0.5, least=0.8)
+    assert hand.run(0.0, 0.5, measured=math.nan)
+    assert hand.run(1.0, 0.5, measured=math.nan)
+
+
+def test_after_a_reset_of_the_controller_it_is_told_again(controller: CartesianController) -> None:
+    hand = Hand(controller)
+    hand.run(0.0, 0.5, least=0.8)
+    controller.reset(controller.robot.home)
+    assert hand.run(0.0, DT, least=0.8)
+
+
+def test_where_no_opening_is_measured_a_closed_gripper_holds() -> None:
+    """A gripper of which the cell has no joints."""
+    data = CELL.model_dump()
+    data["arms"]["left"]["gripper"]["joints"] = ()
+    bare = type(CELL).model_validate(data)
+    controller = CartesianController(Robot.from_config(bare), bare.control)
+    watch = GraspWatch(controller)
+    held = []
+    for wanted in (1.0, 0.0, 0.0, 1.0):
+        watch.update({"left": wanted, "right": wanted}, {}, 0.0)
+        held.append(controller.holding["left"])
+    assert held == [False, True, True, False]
