@@ -16,6 +16,7 @@ from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescri
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.duration import Duration
+from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
@@ -76,6 +77,19 @@ class BaseNode(Node):
         )  # the newest ROS time, and the steady time at which it was first seen [s]
         # Steady time, since the diagnostics have to say it when ROS time stands still.
         self.create_timer(_DIAGNOSTICS_PERIOD, self.report_health, clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+    # rclpy looks at every endpoint's events each time that it waits, which took a sixth of an arm's node. They warn of
+    # settings that do not match: a publisher's subscribers warn too, and best effort matches every publisher.
+    def create_publisher(self, *args: Any, **kwargs: Any) -> Any:
+        """See :class:`rclpy.node.Node`."""
+        kwargs.setdefault("event_callbacks", PublisherEventCallbacks(use_default_callbacks=False))
+        return super().create_publisher(*args, **kwargs)
+
+    def create_subscription(self, msg_type: Any, topic: str, callback: Any, qos_profile: Any, **kwargs: Any) -> Any:
+        """See :class:`rclpy.node.Node`."""
+        if isinstance(qos_profile, QoSProfile) and qos_profile.reliability is ReliabilityPolicy.BEST_EFFORT:
+            kwargs.setdefault("event_callbacks", SubscriptionEventCallbacks(use_default_callbacks=False))
+        return super().create_subscription(msg_type, topic, callback, qos_profile, **kwargs)
 
     def parameter(
         self,

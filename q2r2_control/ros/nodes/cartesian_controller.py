@@ -42,6 +42,7 @@ from q2r2_control.types import LONGEST_DT, Reference
 _LONGEST_STOP = 3.0  # [s]
 _LOOK_PERIOD = 0.5  # between two looks at the graph [s]
 
+_SAFE_TARGET_PERIOD = 0.008  # [s]
 # Parameters that may change while the node runs: name, unit or meaning, least and greatest value.
 _Table = tuple[tuple[str, str, str, float, float], ...]
 _STREAM_PARAMETERS: _Table = (
@@ -101,6 +102,8 @@ class CartesianControllerNode(BaseNode):
         self._reference: Reference | None = None
         self._commanding = False
         self._advances = 0
+        # Another controller follows every one; arms that listen take a hundred a second.
+        self._safe_target_ticks = 1 if output == NONE else max(round(_SAFE_TARGET_PERIOD * rate), 1)
         self._ticks, self._reported_at, self._last_tick = 0, time.monotonic(), self.now
         self._connect()
         self.get_logger().info(f"{config.name}: {', '.join(robot.arms)}; waits for joint states")
@@ -178,7 +181,8 @@ class CartesianControllerNode(BaseNode):
         if reference is not None and state is not None:
             self._output.send(reference, state, dt, now, self._supervisor.trusted)
             self._reference, self._velocity = reference, reference.v
-            self._publish_safe_targets(now)
+            if self._advances % self._safe_target_ticks == 0:
+                self._publish_safe_targets(now)
         elif self._commanding and state is not None:
             self._output.end(state, now)
         self._commanding = reference is not None

@@ -32,7 +32,7 @@ from q2r2_control.robot.compose import WORLD
 from q2r2_control.robot.robot import Robot
 from q2r2_control.ros.base_node import LATCHED_QOS, OK, WARN, BaseNode, run_node
 from q2r2_control.ros.bridge.grippers import GripperServer, Stroke
-from q2r2_control.ros.bridge.messages import joint_state_message, seconds, transform_message
+from q2r2_control.ros.bridge.messages import joint_state_message, seconds, write_transform
 from q2r2_control.types import RobotState
 
 _LOG_PERIOD = 1.0  # of lines about one topic [s]
@@ -173,9 +173,10 @@ class MujocoRobot(BaseNode):
     def _placed(self, transforms: Mapping[int, TransformStamped]) -> TFMessage:
         """The transforms of MuJoCo's bodies, each straight from the world."""
         data, stamp = self._cell.plant.data, self.get_clock().now().to_msg()
+        quaternions = data.xquat[:, [1, 2, 3, 0]]  # from w first
         for index, message in transforms.items():
             message.header.stamp = stamp
-            message.transform = transform_message(data.xpos[index], data.xquat[index][[1, 2, 3, 0]])  # from w first
+            write_transform(data.xpos[index], quaternions[index], message.transform)
         return TFMessage(transforms=list(transforms.values()))
 
     def _reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
