@@ -10,6 +10,7 @@ from typing import Any
 
 from q2r2_control.config.arms import FlangeConfig, HeldObjectConfig
 from q2r2_control.config.cell import Config, ObstacleConfig
+from q2r2_control.config.control import ContactPair
 from q2r2_control.config.external import describe
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.errors import ConfigError
@@ -70,6 +71,7 @@ class CellCheck:
     monitored_pairs: int
     ignored_pairs: tuple[tuple[str, str], ...]  # overlap by construction
     min_distance: float
+    contacts: tuple[ContactPair, ...]  # that may touch, in torque mode
     nearest: tuple[KeptPair, ...]  # nearest first
     faults: tuple[str, ...]
     stop_torques: tuple[StopTorque, ...]  # by arm
@@ -83,13 +85,19 @@ class CellCheck:
             for arm in self.arms
             if arm.object
         )
-        return (*held, *(_stop_note(stop) for stop in self.stop_torques if stop.stop.ratio > 1.0))
+        touch = (
+            f"{' and '.join(allowed.pair)} may touch in torque mode: the reference gets inside by up to "
+            f"{1e3 * allowed.depth:g} mm, and closes in at {1e3 * allowed.speed:g} mm/s"
+            for allowed in self.contacts
+        )
+        return (*held, *touch, *(_stop_note(stop) for stop in self.stop_torques if stop.stop.ratio > 1.0))
 
     def as_json(self) -> dict[str, Any]:
         """Plain data and dataclasses for the JSON writer."""
         data = {name: getattr(self, name) for name in self.__slots__}
         data["notes"] = self.notes
         data["obstacles"] = {name: obstacle.model_dump(mode="json") for name, obstacle in self.obstacles.items()}
+        data["contacts"] = [allowed.model_dump(mode="json") for allowed in self.contacts]
         return data
 
 
@@ -114,6 +122,7 @@ def check_cell(config: Config, compiling: AbstractContextManager[None] | None = 
         monitored_pairs=len(distances),
         ignored_pairs=robot.ignored_pairs,
         min_distance=settings.min_distance,
+        contacts=tuple(config.control.contact_allowed),
         nearest=tuple(KeptPair(pair.name_a, pair.name_b, pair.distance, least) for pair, least in distances[:_NEAREST]),
         faults=preflight_faults(robot, settings, controller),
         stop_torques=stop_torques(robot, robot.capped_acceleration(settings.acceleration_limit)),

@@ -8,8 +8,10 @@ from pathlib import Path
 import pytest
 
 from q2r2_control.cli.cell_report import check_cell, write_model_pairs
+from q2r2_control.config import load_config
 from q2r2_control.config.resources import find_resource
 from q2r2_control.errors import ConfigError
+from q2r2_control.verification.contact_cells import FINGERS, with_contact
 from tests.robot.conftest import one_arm
 
 ARM = one_arm()
@@ -46,3 +48,13 @@ def test_where_gravity_alone_is_too_much_the_note_says_so_and_promises_nothing_o
         r"No acceleration limit changes the former",
         note,
     )
+
+
+def test_what_may_touch_is_said() -> None:
+    cell = with_contact(load_config("config/dual_iiwa7.yaml"), FINGERS)
+    report = check_cell(cell)
+    notes = [note for note in report.notes if "may touch in torque mode" in note]
+    assert len(notes) == len(cell.control.contact_allowed) == len(report.as_json()["contacts"])
+    for note, allowed in zip(notes, cell.control.contact_allowed, strict=True):
+        assert all(name in note for name in allowed.pair)
+        assert f"inside by up to {1e3 * allowed.depth:g} mm" in note

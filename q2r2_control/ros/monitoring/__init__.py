@@ -1,7 +1,8 @@
 """What a node knows about other nodes, so that it can stop in time and name the one that is missing.
 
 ``endpoints`` says which nodes publish on a topic and whether listeners still acknowledge; ``arm_link`` connects the
-nodes of the two arms, so that a fault of one pauses the other. They are imported when first used.
+nodes of the two arms, so that a fault of one pauses the other; ``hand_listeners`` says of a hand's topics which arms
+follow them. They are imported when first used.
 """
 
 from __future__ import annotations
@@ -13,13 +14,15 @@ from q2r2_control._lazy import lazy_exports
 if TYPE_CHECKING:
     from q2r2_control.ros.monitoring.arm_link import ArmLink
     from q2r2_control.ros.monitoring.endpoints import Publishers, WatchedPublisher
+    from q2r2_control.ros.monitoring.hand_listeners import HandListeners
 
-__all__ = ["ArmLink", "Publishers", "WatchedPublisher"]
+__all__ = ["ArmLink", "HandListeners", "Publishers", "WatchedPublisher"]
 
 __getattr__ = lazy_exports(
     __name__,
     {
         "ArmLink": "arm_link",
+        "HandListeners": "hand_listeners",
         "Publishers": "endpoints",
         "WatchedPublisher": "endpoints",
     },
