@@ -28,7 +28,7 @@ demo: setup
 test: setup
 	$(BIN)/python -m pytest -n auto --ignore tests/ros
 
-# Real processes with real timeouts of 150 ms: on their own, since a machine that is busy otherwise would fail them.
+# Real processes with real timeouts of 150 ms. Those with a whole set of nodes run on their own, since it keeps two cores busy.
 test-ros: setup
 	$(BIN)/python -m pytest tests/ros -n 2 --dist loadfile -m 'not alone'; failed=$$?; \
 		$(BIN)/python -m pytest tests/ros -m alone && exit $$failed

@@ -36,6 +36,8 @@ from q2r2_control.ros.bridge.messages import pose_message, stamped_pose, time_me
 from tests.ros.cell import PATIENT, STILL, Cell, Stream, shifted, start_controller, start_robot
 from tests.ros.waiting import wait_until
 
+pytestmark = pytest.mark.alone
+
 # How far the simulated arms lag behind their reference at the speeds of these tests, between two arms.
 TRACKING = 0.01  # [m]
 

@@ -31,6 +31,8 @@ from trajectory_msgs.msg import JointTrajectory
 from tests.ros.cell import PATIENT, Cell, changed_cell, shifted, start_controller, start_robot
 from tests.ros.waiting import wait_until
 
+pytestmark = pytest.mark.alone
+
 RATE = 125.0  # of the control loop [Hz]
 COMMANDS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE, history=HistoryPolicy.KEEP_LAST)
 ADMITTANCE = {"enabled": True, "stiffness": 500.0, "force_dead_band": 0.0}

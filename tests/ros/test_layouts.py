@@ -31,6 +31,8 @@ from q2r2_control.types import Array
 from tests.ros.cell import PATIENT, SOFT, STILL, Cell, Stream, changed_cell, start_controller, start_robot
 from tests.ros.waiting import wait_until
 
+pytestmark = pytest.mark.alone
+
 Engage = Callable[..., Stream]
 TARGETS = "/{arm}/target_pose"
 TARGET_TOPICS = [f"{arm}.target_topic:=/{arm}/target_pose" for arm in ("left", "right")]

@@ -26,7 +26,7 @@ from tests.ros.processes import CONFIG, PATIENCE, Processes, skip_if_overloaded
 
 pytest.importorskip("rclpy", reason=NEEDS_ROS)
 pytest.importorskip("quest2ros", reason="needs q2r2 ros build-interfaces")
-pytestmark = pytest.mark.usefixtures("interfaces")
+pytestmark = [pytest.mark.usefixtures("interfaces"), pytest.mark.alone]
 
 from geometry_msgs.msg import PoseStamped  # noqa: E402
 

@@ -22,7 +22,7 @@ from tests.ros.processes import CONFIG, ROOT, Processes, RosProcess
 from tests.support.external_cell import external
 
 pytest.importorskip("rclpy", reason=NEEDS_ROS)
-pytestmark = pytest.mark.usefixtures("interfaces")
+pytestmark = [pytest.mark.usefixtures("interfaces"), pytest.mark.alone]
 
 # The robot and the controller alone, through the same functions as the command.
 PAIR = f"""

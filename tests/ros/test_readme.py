@@ -18,7 +18,7 @@ from tests.ros.processes import PATIENCE, ROOT, Processes
 
 pytest.importorskip("rclpy", reason=NEEDS_ROS)
 pytest.importorskip("quest2ros", reason="needs q2r2 ros build-interfaces")
-pytestmark = pytest.mark.usefixtures("interfaces")
+pytestmark = [pytest.mark.usefixtures("interfaces"), pytest.mark.alone]
 
 from q2r2_control.ros.base_node import LATCHED_QOS  # noqa: E402
 from q2r2_control.ros.bridge.messages import pose_of  # noqa: E402
