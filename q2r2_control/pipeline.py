@@ -164,12 +164,12 @@ class PipelineRun:
         self._supervisor = pipeline.supervisor
         self._supervisor.activate(replace(state, stamp=self._clock.now), self._clock.now)
         self._supervisor.events.clear()
+        self._holding = pipeline.controller.holding
+        pipeline.drive.set_holding(self._holding)  # before the reset, which begins with the weight of what is held
         pipeline.drive.reset(state)
         self._limiter, self._grasps = GripperLimiter(pipeline.controller), GraspWatch(pipeline.controller)
         self._grippers: dict[str, float] = {arm: target.gripper for arm, target in self._targets.items()}
         pipeline.drive.set_openings(pipeline.controller.openings)
-        self._holding = pipeline.controller.holding
-        pipeline.drive.set_holding(self._holding)
         self._velocity = np.zeros(pipeline.robot.model.nv)
 
     def until(self, duration: float | None) -> RunSummary:
@@ -282,7 +282,7 @@ class PipelineRun:
         self._grippers = self._limiter.limit(wanted, measured, self._clock.now)
         if self._limiter.changed:
             pipeline.drive.set_openings(pipeline.controller.openings)
-        if self._grasps.update(wanted, measured, self._clock.now):
+        if self._grasps.update(self._grippers, measured, self._clock.now):
             self._holding = pipeline.controller.holding
             pipeline.drive.set_holding(self._holding)
 

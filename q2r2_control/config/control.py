@@ -120,7 +120,7 @@ class ControllerSettings(BaseModel):
     stretch_gain: float = Field(10.0, gt=0, le=200, description="highest gain of a stretched-out arm [1/s]")
 
     def without_contact(self) -> ControllerSettings:
-        """The same, for modes in which nothing gives way: there no pair may touch."""
+        """The same, for modes in which nothing gives way: there ``contact_allowed`` allows nothing."""
         return self.model_copy(update={"contact_allowed": ()}) if self.contact_allowed else self
 
     @property

@@ -203,6 +203,7 @@ class CartesianController:
         load = self._objects.load
         self._held_model, self._held_data = load.model, load.data
         self._pair_names = self._names + [self._objects.pair_names[pair] for pair in load.objects]
+        self._active.used[0] = 0  # pairs are numbered anew
 
     def _look_again(self, grown: IntArray) -> int:
         """Observe with bodies that have changed; returns the pair in the way of those that have ``grown``, or -1."""

@@ -110,7 +110,8 @@ class ObjectLoads:
         now, pairs = self._within_reach(), self.load.objects
         both = np.array([len(self._holders[pair]) > 1 for pair in pairs], dtype=np.bool_)
         self._kept[pairs[self._new]] = np.minimum(self._goal.values[pairs], now)[self._new]
-        is_one = bool((self._distances()[both & self._new] < 0.0).any())
+        allowed = np.minimum(self._goal.values[pairs], 0.0)
+        is_one = bool((self._distances() < allowed)[both & self._new].any())
         if is_one:
             self._count(frozenset(frozenset({held}) for held in self.holding))
         else:

@@ -32,7 +32,7 @@ _DEEPEST = 0.8
 
 
 class KernelModel(NamedTuple):
-    """What does not change between ticks, by the rooms that read it."""
+    """What does not change in a tick, by the rooms that read it."""
 
     safety: SafetyModel
     tasks: TaskModel

@@ -153,7 +153,8 @@ def _edge(placement: pin.SE3, start: Array, end: Array) -> tuple[coal.CollisionG
 def _watched(geometry: pin.GeometryModel, roles: Mapping[str, Role], held: HeldObject) -> list[str]:
     """Bodies that those on the object's link are watched against, but for hands that hold, or take, the object."""
     items = geometry.geometryObjects
-    found: dict[str, None] = {}
+    # Obstacles all, also those that the hand itself cannot reach: an object reaches farther.
+    found = dict.fromkeys(item.name for item in items if roles[link_of(item.name)].part is Part.OBSTACLE)
     for pair in geometry.collisionPairs:
         first, second = items[pair.first], items[pair.second]
         for one, other in ((first, second), (second, first)):

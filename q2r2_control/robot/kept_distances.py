@@ -60,8 +60,9 @@ def _of_all_pairs(robot: Robot, settings: ControllerSettings) -> KeptDistances:
         for p in _found(f"pairs[{i}]", named.pair, names):
             values[p], keys[p] = named.distance, f"pairs[{i}]"
     speed = np.full(len(names), np.inf)
-    for i, contact in enumerate(settings.contact_allowed):
-        for p in _found(f"contact_allowed[{i}]", contact.pair, names):
+    monitored = names[: len(names) - len(robot.objects.holders)]
+    for i, contact in enumerate(settings.contact_allowed):  # which objects need none of: their classes allow contact
+        for p in _found(f"contact_allowed[{i}]", contact.pair, monitored):
             values[p], keys[p], speed[p] = -contact.depth, f"contact_allowed[{i}]", contact.speed
     return KeptDistances(values, tuple(keys), speed)
 

@@ -79,7 +79,7 @@ class BaseNode(Node):
         self.create_timer(_DIAGNOSTICS_PERIOD, self.report_health, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     # rclpy looks at every endpoint's events each time that it waits, which took a sixth of an arm's node. They warn of
-    # settings that do not match: a publisher's subscribers warn too, and best effort matches every publisher.
+    # settings or types that do not match: a publisher's subscribers warn too, and best effort matches every publisher.
     def create_publisher(self, *args: Any, **kwargs: Any) -> Any:
         """See :class:`rclpy.node.Node`."""
         kwargs.setdefault("event_callbacks", PublisherEventCallbacks(use_default_callbacks=False))

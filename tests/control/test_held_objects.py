@@ -217,6 +217,30 @@ def test_a_reset_forgets_what_is_held(controller: CartesianController) -> None:
     assert not counting(controller).size
 
 
+@pytest.mark.parametrize("forget", ["let go", "reset"])
+def test_once_it_is_let_go_no_report_names_a_pair_of_it_even_if_no_time_passes(
+    forget: str, controller: CartesianController, at_grip: Array
+) -> None:
+    run = Run(controller, at_grip)
+    controller.set_holding("left", True)
+    run.drive(0.5, at(GRIP + 0.02))
+    binding = run.drive(1.5, at(GRIP - 0.03)).report.binding
+    assert any("left_object" in name for name in binding), "the block is held back by the table"
+    if forget == "reset":
+        controller.reset(at_grip)
+    else:
+        controller.set_holding("left", False)
+    assert controller.step({}, 0.0).report.binding == ()
+
+
+def test_it_is_watched_against_obstacles_that_its_hand_alone_cannot_reach() -> None:
+    config = CELL.model_copy(update={"floor": -0.9})
+    robot = Robot.from_config(config)
+    monitored = [(pair.name_a, pair.name_b) for pair in robot.distances(robot.home)]
+    assert not any("floor" in "".join(pair) and "hand" in "".join(pair) for pair in monitored)
+    assert any("floor" in "".join(pair) for pair in robot.objects.pair_names())
+
+
 def test_the_kernels_see_the_same_types_whatever_is_held(controller: CartesianController) -> None:
     loads: dict[Any, Any] = controller._objects._loads
     kinds = {(numba.typeof(load.model), numba.typeof(load.data)) for load in loads.values()}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -15,8 +16,13 @@ pytest.importorskip("tf2_msgs", reason="needs q2r2 ros build-interfaces")
 pytest.importorskip("quest2ros", reason="needs q2r2 ros build-interfaces")
 
 
-from q2r2_control.ros.bridge.frames import FrameTree
+from rclpy.serialization import serialize_message
+from tf2_msgs.msg import TFMessage
+
+from q2r2_control.ros.base_node import LATCHED_QOS
+from q2r2_control.ros.bridge.frames import FrameListener, FrameTree
 from tests.ros.arm_rig import stamped_transform
+from tests.ros.waiting import wait_until
 
 A = pin.SE3(pin.exp3(np.array([0.3, -1.0, 0.2])), np.array([1.0, 2.0, -0.5]))
 B = pin.SE3(pin.exp3(np.array([-0.7, 0.1, 2.0])), np.array([0.2, -0.4, 0.9]))
@@ -65,3 +71,13 @@ def test_a_transform_that_is_none_is_passed_over(bad: float, tree: FrameTree) ->
     placement = tree.find("tool", "mount")
     assert placement is not None
     np.testing.assert_allclose(placement.pose.homogeneous, B.homogeneous, atol=1e-12)
+
+
+def test_a_name_that_is_no_text_is_another_node_s_fault_and_ends_nothing(node: Any) -> None:
+    listener = FrameListener(node)
+    publisher = node.create_publisher(TFMessage, "/tf_static", LATCHED_QOS)
+    good = serialize_message(TFMessage(transforms=[stamped_transform("mount", "tool", C)]))
+    wait_until(lambda: publisher.get_subscription_count() > 0, "the listener is found")
+    publisher.publish(good.replace(b"tool", b"\xe9ool"))
+    publisher.publish(good)
+    wait_until(lambda: listener.tree.find("tool", "mount") is not None, "the good one is heard")

@@ -51,10 +51,11 @@ def assert_a_part_of(received: Array, script: Array, tolerance: float = 0.0) -> 
 def test_poses_inputs_and_twists_are_the_scripts_own(node: Any, processes: Processes) -> None:
     queues = subscribe(node, "right")
     start(processes, side="right", trajectory="rotate", rate=RATE)
-    wait_until(lambda: queues["pose"].qsize() >= 150, "three seconds of poses")
-    wait_until(lambda: queues["inputs"].qsize() >= 150, "three seconds of inputs")
-    wait_until(lambda: queues["twist"].qsize() >= 150, "three seconds of twists")
-    poses, inputs, twists = (drained(queues[suffix])[:150] for suffix in ("pose", "inputs", "twist"))
+    wait_until(lambda: all(queue.qsize() >= 300 for queue in queues.values()), "six seconds of each topic")
+    poses, inputs, twists = (drained(queues[suffix])[:300] for suffix in ("pose", "inputs", "twist"))
+    # At first the hand rests, while nobody has said yet whether there is an arm that listens.
+    press = next(i for i, message in enumerate(inputs) if message.button_lower)
+    poses, inputs, twists = (messages[press - 20 : press + 130] for messages in (poses, inputs, twists))
 
     script = ScriptedInput("rotate", ["right"], rate_hz=RATE)
     script.start()
@@ -111,7 +112,7 @@ def test_the_script_waits_until_both_hands_are_listened_to(node: Any, processes:
 def test_the_script_waits_for_an_arm_that_is_not_ready_and_presses_until_it_follows(
     node: Any, processes: Processes
 ) -> None:
-    arm = {"hand": "left", "engaged": False, "level": "warn", "message": "no tool yet"}
+    arm = {"hand": "left", "engaged": False, "ready": False, "message": "no tool yet", "last_event": ""}
     said = node.create_publisher(String, f"{node.get_fully_qualified_name()}/state", 10)
     node.create_timer(0.1, lambda: said.publish(String(data=json.dumps(arm))))
     states, left = States(node, "simulation_input"), subscribe(node, "left")
@@ -122,7 +123,7 @@ def test_the_script_waits_for_an_arm_that_is_not_ready_and_presses_until_it_foll
     assert not any(message.button_lower for message in drained(left["inputs"])), "nothing is pressed meanwhile"
     assert len({message.pose.position.x for message in held}) == 1, "the hand rests, and is there"
 
-    arm |= {"level": "ok", "message": "ready to engage"}
+    arm |= {"ready": True, "message": "ready to engage"}
     for _ in range(2):
         wait_until(lambda: left["inputs"].get(timeout=PATIENCE).button_lower, "the button is pressed")
         wait_until(lambda: not left["inputs"].get(timeout=PATIENCE).button_lower, "the button is let go")
@@ -139,6 +140,23 @@ def test_the_script_waits_for_an_arm_that_is_not_ready_and_presses_until_it_foll
     time.sleep(0.5)
     drained(left["inputs"])
     time.sleep(2.0)
+    assert not any(message.button_lower for message in drained(left["inputs"]))
+
+
+def test_an_arm_that_a_person_pauses_is_not_engaged_again(node: Any, processes: Processes) -> None:
+    arm = {"hand": "left", "engaged": False, "ready": True, "message": "ready to engage", "last_event": ""}
+    said = node.create_publisher(String, f"{node.get_fully_qualified_name()}/state", 10)
+    node.create_timer(0.1, lambda: said.publish(String(data=json.dumps(arm))))
+    left = subscribe(node, "left")
+    start(processes, side="left", trajectory="line")
+    wait_until(lambda: left["inputs"].get(timeout=PATIENCE).button_lower, "the button is pressed")
+    arm["engaged"] = True
+    rest = left["pose"].get(timeout=PATIENCE).pose.position.x
+    wait_until(lambda: left["pose"].get(timeout=PATIENCE).pose.position.x > rest + 0.01, "the hand moves")
+    arm |= {"engaged": False, "last_event": "paused: the pause service"}
+    time.sleep(0.5)
+    drained(left["inputs"])
+    time.sleep(2.5)
     assert not any(message.button_lower for message in drained(left["inputs"]))
 
 

@@ -21,7 +21,7 @@ class Approach(NamedTuple):
 
 
 class SafetyModel(NamedTuple):
-    """What does not change in a tick, and between ticks but for the bodies of fingers."""
+    """What does not change in a tick, and between ticks but for bodies of fingers and what objects keep."""
 
     collision: CollisionModel
     limits: JointLimits

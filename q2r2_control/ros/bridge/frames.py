@@ -12,6 +12,7 @@ import pinocchio as pin
 from geometry_msgs.msg import PoseStamped
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.serialization import serialize_message
+from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, get_typestore
 from tf2_msgs.msg import TFMessage
 
@@ -102,7 +103,11 @@ class FrameListener:
 
     def _take(self, node: Any, received: float | None, message: bytes) -> None:
         received = node.now if received is None else received
-        for transform in self._read(message, _TF).transforms:
+        try:
+            transforms = self._read(message, _TF).transforms
+        except (SerdeError, ValueError):
+            return  # such as a name that is no UTF-8, which is some other node's fault
+        for transform in transforms:
             self.tree.set(transform, received)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import time
 from collections.abc import Mapping
 from functools import partial
@@ -16,6 +17,7 @@ from q2r2_control.ros.monitoring.endpoints import node_of
 _PERIOD = 0.1  # of asking the graph [s]
 _DISCOVERY = 1.0  # the graph knows one endpoint of a node before another, by less than this [s]
 _SILENT = 2.0  # nodes say what they do twice a second [s]
+PAUSED_BY_SERVICE = "the pause service"  # the reason that arms give
 _STARTING = "has not said yet what it does"
 
 
@@ -26,6 +28,7 @@ class HandListeners:
         """``topics``: hand -> the topic of its buttons."""
         self._node, self._topics = node, topics
         self._asked_at = 0.0
+        self._unnamed_since = math.inf  # the graph knows a listener and not its node yet [s]
         self._found: dict[str, float] = {}  # full name of a node -> when it was found [s]
         self._subscriptions: dict[str, Any] = {}
         self._states: dict[str, tuple[dict[str, Any], float]] = {}  # full name -> what it said last, and when [s]
@@ -36,12 +39,13 @@ class HandListeners:
         if now - self._asked_at < _PERIOD:
             return
         self._asked_at = now
-        listeners = {
-            name
+        names = {
+            node_of(endpoint)
             for topic in self._topics.values()
             for endpoint in self._node.get_subscriptions_info_by_topic(topic)
-            if (name := node_of(endpoint)) is not None
         }
+        self._unnamed_since = min(self._unnamed_since, now) if None in names else math.inf
+        listeners = {name for name in names if name is not None}
         for name in self._found.keys() - listeners:
             del self._found[name]
             self._states.pop(name, None)
@@ -56,6 +60,8 @@ class HandListeners:
     def unready(self) -> str | None:
         """One line if some arm cannot be engaged yet, or may be one that has not said so; else None."""
         now = time.monotonic()
+        if 0.0 <= now - self._unnamed_since < _SILENT:
+            return f"a listener {_STARTING}"
         for name, found in self._found.items():
             state, said = self._states.get(name, ({}, found))
             if not state and now - found < (_SILENT if name in self._subscriptions else _DISCOVERY):
@@ -63,7 +69,7 @@ class HandListeners:
             if _is_arm(state) and not state["engaged"]:
                 if now - said > _SILENT:
                     return f"{name} is silent for {now - said:.0f} s"
-                if state["level"] != "ok":
+                if not state["ready"]:
                     return f"{name}: {state['message']}"
         return None
 
@@ -71,6 +77,10 @@ class HandListeners:
         """Whether all arms that follow a hand are engaged; None if no arm follows it."""
         arms = [state for state, _ in self._states.values() if _is_arm(state) and state["hand"] == hand]
         return all(state["engaged"] for state in arms) if arms else None
+
+    def paused_by_a_person(self) -> bool:
+        """Whether some arm's ``~/pause`` was called."""
+        return any(_is_arm(state) and PAUSED_BY_SERVICE in state["last_event"] for state, _ in self._states.values())
 
     def _on_state(self, name: str, message: String) -> None:
         try:
@@ -82,4 +92,4 @@ class HandListeners:
 
 
 def _is_arm(state: Mapping[str, Any]) -> bool:
-    return {"engaged", "hand", "level", "message"} <= state.keys()
+    return {"engaged", "ready", "hand", "message", "last_event"} <= state.keys()

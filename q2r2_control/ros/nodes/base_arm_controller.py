@@ -24,6 +24,7 @@ from q2r2_control.ros.bridge.messages import hand_sample
 from q2r2_control.ros.bridge.parameters import ArmDefaults, ArmParameters, arm_parameters
 from q2r2_control.ros.bridge.target_output import near
 from q2r2_control.ros.monitoring.arm_link import ArmLink
+from q2r2_control.ros.monitoring.hand_listeners import PAUSED_BY_SERVICE
 from q2r2_control.teleop.arm import OPEN, ArmState
 from q2r2_control.teleop.haptics import HapticPulses
 from q2r2_control.teleop.teleop import Teleop
@@ -174,6 +175,7 @@ class BaseArmController(BaseNode):
             "arm": self.arm_name,
             "state": str(self.state),
             "engaged": self.state is ArmState.ENGAGED,
+            "ready": self._refusal is None,  # to be engaged
             "hand": self.hand,
             "hand_age": round(self.now - self._pose[1], 3) if self._pose else None,
             "inputs_age": round(self.now - self._inputs[1], 3) if self._inputs[0] else None,
@@ -243,7 +245,7 @@ class BaseArmController(BaseNode):
         """Report changes of the state: to the log, to the hand as vibrations, and to the other arm."""
         for event in self.teleop.take_events():
             self._last_event = f"{event.destination}: {event.reason}"
-            if event.destination is ArmState.PAUSED is not event.source:
+            if event.destination is ArmState.PAUSED and event.source is not ArmState.PAUSED:
                 self._paused = self._last_event
             self.get_logger().info(self._last_event)
             self.haptics.tell(event)
@@ -269,7 +271,7 @@ class BaseArmController(BaseNode):
             self._samples.put(hand_sample(self.hand, *self._pose, *self._inputs))
 
     def _on_pause(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        self.teleop.pause(self.now, "the pause service")
+        self.teleop.pause(self.now, PAUSED_BY_SERVICE)
         response.success, response.message = True, f"{self.arm_name} is paused"
         return response
 

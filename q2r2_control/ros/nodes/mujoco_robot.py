@@ -57,6 +57,7 @@ class MujocoRobot(BaseNode):
         self._robot = Robot.from_config(config)
         self._cell = SimulatedCell(self._robot, config, hold_after, max_jump)
         self._refused: dict[str, str] = {}
+        self._said: set[str] = set()  # topics whose refusal is in the log
         self._logged: dict[str, float] = {}  # when a topic's refusal last was [s]
         self._refusals = 0
         self._ticks, self._reported_at = 0, time.monotonic()
@@ -133,14 +134,14 @@ class MujocoRobot(BaseNode):
         """Say what was refused: once, until the topic brings something good again, and not more than once a second."""
         if fault is None:
             self._refused.pop(topic, None)
+            self._said.discard(topic)
             return
         self._refusals += 1
-        if topic in self._refused:
-            return
-        self._refused[topic] = fault
+        self._refused.setdefault(topic, fault)
         now = time.monotonic()
-        if now - self._logged.get(topic, -math.inf) >= _LOG_PERIOD:
+        if topic not in self._said and now - self._logged.get(topic, -math.inf) >= _LOG_PERIOD:
             self._logged[topic] = now
+            self._said.add(topic)
             self.get_logger().warning(f"{topic}: refused: {fault} ({self._refusals} refused so far)")
             self.report_health()
 

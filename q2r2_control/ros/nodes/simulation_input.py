@@ -21,7 +21,7 @@ from q2r2_control.types import SIDES, HandSample
 _PERIOD = 0.002  # samples that came due are published this often [s]
 # Of the script, when it is decided whether the buttons are pressed, and whether the hands move [s].
 _BEFORE_PRESS, _BEFORE_MOTION = FIRST_PRESS - 0.1, START - 0.05
-_STARTED = START + 3.0  # [s]
+_SETTLES = 3.0  # an arm that stops within this time of the motion's begin is engaged again [s]
 _MODES = {
     "all": (MessageType.POSE, MessageType.INPUTS, MessageType.TWIST),
     "teleop": (MessageType.POSE, MessageType.INPUTS),
@@ -35,7 +35,7 @@ class SimulationInput(BaseNode):
     So the script starts only when every hand that it plays has a subscriber, unless ``wait_for_subscribers`` is false.
     The hands rest until the arms' nodes that listen say that they can be engaged. Then the buttons are pressed, and
     again where an arm is not engaged by the time the hands would move, or stops within the first three seconds of the
-    motion. From then on nothing is pressed again: it takes a person to go on after a fault.
+    motion. From then on, and after an arm's ``~/pause``, nothing is pressed again: it takes a person to go on.
 
     A user who starts the node asks for the motion, as an operator does with a button. A launch file that restarts the
     node after a crash does not, and the arms that the crash has stopped must not move then. Use ``start_on_request``
@@ -72,6 +72,7 @@ class SimulationInput(BaseNode):
         )
         self._starts = True  # until nothing is pressed again to engage the arms
         self._moves = False  # whether the hands do
+        self._moved_at: float | None = None  # when they first did [s]
         self._not_to_press: set[str] | None = None  # hands; None: that is not decided yet
         self._rewind(self.now)
         self.create_service(Trigger, "~/start", self._on_start)
@@ -97,6 +98,7 @@ class SimulationInput(BaseNode):
             "starts" if self._waits_for_request else "has started before",
         )
         self._waits_for_request = False
+        self._rewind(self.now)
         return response
 
     def _play(self) -> None:
@@ -106,6 +108,7 @@ class SimulationInput(BaseNode):
             if self._missing():
                 return
             self._waits_for_subscribers = False
+            self._rewind(self.now)  # the listeners are looked at from now on
             self.get_logger().info(f"plays {self._title}")
         now = self.now
         if self._starts:
@@ -120,18 +123,27 @@ class SimulationInput(BaseNode):
         if t < _BEFORE_PRESS or (self._not_to_press is not None and t < _BEFORE_MOTION):
             return
         if self._not_to_press is None:
-            if self._listeners.unready() is not None:
-                self._rewind(now)
-            else:
+            if self._listeners.unready() is None:
                 # A press would pause those that are engaged already.
                 self._not_to_press = {hand for hand in self._hands if self._listeners.engaged(hand)}
+            elif self._moved_at is None:
+                self._rewind(now)
+            else:
+                self._give_up()
             return
         follow = [self._listeners.engaged(hand) is not False for hand in self._hands]
         # Once the hands move they do not go back while an arm follows, which would be a jump.
-        if not (any(follow) if self._moves else all(follow)):
-            self._rewind(now)
+        if any(follow) if self._moves else all(follow):
+            self._moves, self._moved_at = True, now if self._moved_at is None else self._moved_at
+            self._starts = now - self._moved_at < _SETTLES
+        elif self._listeners.paused_by_a_person():
+            self._give_up()
         else:
-            self._moves, self._starts = True, t < _STARTED
+            self._rewind(now)
+
+    def _give_up(self) -> None:
+        """From here on a person engages arms, or nobody does."""
+        self._starts, self._not_to_press = False, set(self._hands)
 
     def _rewind(self, now: float) -> None:
         self._script = ScriptedInput(self._trajectory, self._hands, rate_hz=self._rate)
