@@ -53,6 +53,7 @@ def test_the_subclass_in_the_readme_teleoperates_its_arm_in_its_robots_frame(
     rig.wait_until_connected()
     rig.engage()
     rig.wait(lambda: rig.targets, "targets come")
+    assert rig.state["preset"] == "kuka_lbr_clik", "not the terms of another controller"
     assert rig.targets[0].header.frame_id == "bh_robot_base"
     assert_same(base * first(rig), TOOL, 1e-9)
     rig.move((0.0, 0.1, 0.0))

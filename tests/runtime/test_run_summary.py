@@ -48,6 +48,7 @@ ARM_KEYS = {
     "rotation_error_deg_rms",
     "gripper_changes",
     "gripper_held_s",
+    "object_held_s",
     "gripper_held_by",
     "slip_mm_max",
     "slip_deg_max",

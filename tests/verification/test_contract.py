@@ -37,7 +37,7 @@ def apart(robot: Robot) -> StepReport:
 def checked(robot: Robot) -> Any:
     """A controller as a contract sees it, whose stop takes every joint's limit."""
     limit = robot.capped_acceleration(SETTINGS.acceleration_limit)
-    return SimpleNamespace(robot=robot, settings=SETTINGS, stop_deceleration=limit)
+    return SimpleNamespace(robot=robot, settings=SETTINGS, stop_deceleration=limit, object_distances=np.zeros(0))
 
 
 def contract_of(robot: Robot, q: Array | None = None, v: Array | None = None) -> Contract:

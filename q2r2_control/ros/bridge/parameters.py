@@ -34,6 +34,7 @@ class ArmDefaults:
     ctrl_prefix: str
     gripper_action_topic: str
     filter_window_size: int | None = None
+    preset: str = BUILTIN.name
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,6 +145,7 @@ def _of_subclass(subclass: ArmDefaults) -> _Defaults:
         subclass.end_effector_link_name,
         subclass.gripper_action_topic,
         teleop,
+        preset=subclass.preset,
     )
 
 

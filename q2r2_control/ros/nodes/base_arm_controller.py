@@ -11,6 +11,7 @@ from quest2ros.msg import OVR2ROSHapticFeedback, OVR2ROSInputs
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import Marker
 
+from q2r2_control.config.presets import BUILTIN
 from q2r2_control.errors import ConfigError
 from q2r2_control.inputs.samples import SampleQueue
 from q2r2_control.inputs.session import HAPTIC_TOPICS
@@ -37,7 +38,7 @@ class BaseArmController(BaseNode):
     """One arm follows one hand: hand topics in, target pose, gripper goals, markers and vibrations out.
 
     The node is ``<arm_name>_<robot_name>_arm_controller``; the other arguments are the defaults of parameters of that
-    name.
+    name. ``preset`` names the terms of the controller that is driven: topic, rate, speeds, what it needs in pauses.
     ``filter_window_size``, in samples of a 75 Hz headset, sets ``teleop.filter.smoothing_delay``.
 
     Steps to override: :meth:`setup_parameters`, :meth:`setup_state`, :meth:`setup_interfaces`, :meth:`current_pose`,
@@ -54,6 +55,7 @@ class BaseArmController(BaseNode):
         end_effector_link_name: str = "",
         ctrl_prefix: str = "",
         gripper_action_topic: str = "",
+        preset: str = BUILTIN.name,
         **kwargs: Any,
     ) -> None:
         if arm_name not in SIDES:
@@ -69,6 +71,7 @@ class BaseArmController(BaseNode):
             ctrl_prefix=ctrl_prefix or f"/{robot_name}/{arm_name}",
             gripper_action_topic=gripper_action_topic or f"/{robot_name}/{arm_name}_gripper/gripper_cmd",
             filter_window_size=filter_window_size,
+            preset=preset,
         )
         try:
             self.parameters = self.setup_parameters()
