@@ -14,8 +14,10 @@ from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pinocchio as pin
 import pytest
 
 from q2r2_control.config.control import ContactPair
@@ -27,6 +29,7 @@ from q2r2_control.plants.kinematic import KinematicPlant
 from q2r2_control.robot.robot import Robot
 from q2r2_control.runtime.recorder import Tick
 from q2r2_control.runtime.run_summary import RunSummary
+from q2r2_control.supervision.gripper_limiter import GripperLimiter
 from q2r2_control.types import SIDES, Command, HandSample
 from tests.support.object_cell import cell as object_cell
 from tests.support.watch import Watch, assert_torque_bounds, cell, changes, speed
@@ -155,6 +158,19 @@ def test_what_is_gripped_is_part_of_the_tool_until_it_is_put_down() -> None:
     assert max(jumps[gripped - 1 : gripped + 20]) < 1.05 * jumps[gripped - 2] + 1e-9
 
 
+def test_a_run_after_one_that_ended_while_something_was_held_bears_no_weight_that_is_not_there() -> None:
+    config = object_cell({"mass": 2.0})
+    loop = Pipeline.from_config(config, input=ScriptedInput("circle"), plant="mujoco", mode="torque")
+    drive: Any = loop.drive
+    drive.set_holding({"left": True})
+    drive.reset(loop.plant.state())
+    home, model = loop.robot.home, loop.robot.model
+    bare = pin.computeGeneralizedGravity(model, model.createData(), home)
+    assert np.abs(drive.impedance.gravity(home) - bare).max() > 1.0
+    loop.run(0.01, realtime=False)
+    np.testing.assert_allclose(drive.impedance.gravity(home), bare, atol=1e-9)
+
+
 class LeftUpperPresses(ScriptedInput):
     """The left hand presses its upper button at 1.0 and at 1.6 s, and moves in between."""
 
@@ -164,6 +180,16 @@ class LeftUpperPresses(ScriptedInput):
             replace(sample, inputs=replace(sample.inputs, button_upper=held)) if sample.hand == "left" else sample
             for sample in super().poll(now)
         ]
+
+
+def test_a_gripper_that_something_keeps_from_closing_holds_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(GripperLimiter, "limit", lambda *_: {"left": 0.5, "right": 1.0})
+    loop = Pipeline.from_config(object_cell({}), input=LeftUpperPresses("circle"), plant="mujoco")
+    watch = Watch(loop)
+    loop.run(1.55, realtime=False)
+    assert watch.ticks[-1].targets["left"].gripper == 0.0
+    assert loop.plant.gripper_openings()["left"] == pytest.approx(0.5, abs=0.05)
+    assert not any(tick.holding["left"] for tick in watch.ticks)
 
 
 def test_a_gripper_closes_and_opens_with_the_upper_button_of_its_hand() -> None:

@@ -78,8 +78,8 @@ class BaseNode(Node):
         # Steady time, since the diagnostics have to say it when ROS time stands still.
         self.create_timer(_DIAGNOSTICS_PERIOD, self.report_health, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
-    # rclpy looks at every endpoint's events each time that it waits, which took a sixth of an arm's node. They warn of
-    # settings or types that do not match: a publisher's subscribers warn too, and best effort matches every publisher.
+    # rclpy looks at every endpoint's events each time that it waits, which costs processor time. They warn of settings
+    # or types that do not match: a publisher's subscribers warn too, and best effort matches every publisher.
     def create_publisher(self, *args: Any, **kwargs: Any) -> Any:
         """See :class:`rclpy.node.Node`."""
         kwargs.setdefault("event_callbacks", PublisherEventCallbacks(use_default_callbacks=False))

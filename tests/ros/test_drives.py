@@ -17,7 +17,7 @@ import pytest
 from q2r2_control import Robot
 from q2r2_control.types import Array
 from tests.ros.conftest import NEEDS_ROS
-from tests.ros.processes import Processes
+from tests.ros.processes import Processes, RosProcess
 
 pytest.importorskip("rclpy", reason=NEEDS_ROS)
 pytest.importorskip("control_msgs", reason="needs control_msgs: q2r2 ros build-interfaces")
@@ -28,7 +28,7 @@ from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory
 
-from tests.ros.cell import PATIENT, Cell, changed_cell, shifted, start_controller, start_robot
+from tests.ros.cell import PATIENT, Cell, Stream, changed_cell, shifted, start_controller, start_robot
 from tests.ros.waiting import wait_until
 
 pytestmark = pytest.mark.alone
@@ -68,11 +68,7 @@ class Recorder:
 def test_a_controller_that_is_stopped_for_a_while_publishes_no_jump(
     stall: float, robot: Robot, processes: Processes, node: Any
 ) -> None:
-    cell = Cell(node, robot, start_robot(processes))
-    controller = start_controller(processes, *PATIENT, f"rate:={RATE}")
-    cell.wait_until_active()
-    recorder = Recorder(cell, robot)
-    stream = cell.engage("left")
+    cell, controller, recorder, stream = recorded(robot, processes, node)
     try:
         for times in range(4):
             begin = len(recorder.commands)
@@ -96,12 +92,8 @@ def test_a_controller_that_is_stopped_for_a_while_publishes_no_jump(
 def test_no_jump_is_published_while_a_robot_that_hangs_as_a_motion_begins_acknowledges_nothing(
     robot: Robot, processes: Processes, node: Any
 ) -> None:
-    simulation = start_robot(processes)
-    cell = Cell(node, robot, simulation)
-    start_controller(processes, *PATIENT, f"rate:={RATE}")
-    cell.wait_until_active()
-    recorder = Recorder(cell, robot)
-    stream = cell.engage("left")
+    cell, _, recorder, stream = recorded(robot, processes, node)
+    simulation = cell.processes[0]
     try:
         for times in range(4):
             begin = len(recorder.commands)
@@ -115,6 +107,14 @@ def test_no_jump_is_published_while_a_robot_that_hangs_as_a_motion_begins_acknow
         os.kill(simulation.pid, signal.SIGCONT)
         stream.end()
     assert_no_jump(recorder.commands, robot)
+
+
+def recorded(robot: Robot, processes: Processes, node: Any) -> tuple[Cell, RosProcess, Recorder, Stream]:
+    """A cell whose left arm follows a stream, its controller, and what records every command."""
+    cell = Cell(node, robot, start_robot(processes))
+    controller = start_controller(processes, *PATIENT, f"rate:={RATE}")
+    cell.wait_until_active()
+    return cell, controller, Recorder(cell, robot), cell.engage("left")
 
 
 def assert_no_jump(commands: list[Commanded], robot: Robot) -> None:

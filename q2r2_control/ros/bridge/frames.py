@@ -88,8 +88,8 @@ class FrameTree:
 class FrameListener:
     """Keeps a :class:`FrameTree` up to date for a node.
 
-    A robot's message has dozens of transforms, fifty times a second, of which an arm needs a few. rosbags reads them in
-    a quarter of the time that rclpy takes, which was a third of what an arm's node does.
+    A robot's message has dozens of transforms, fifty times a second, of which an arm needs a few. So rosbags reads
+    them, which makes no checked message object of each as rclpy does.
     """
 
     def __init__(self, node: Any) -> None:
