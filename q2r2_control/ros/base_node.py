@@ -25,6 +25,7 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 from std_msgs.msg import String
 
 from q2r2_control.errors import ConfigError, Q2R2Error
+from q2r2_control.ros.executor import TickExecutor
 from q2r2_control.ros.launch.middleware import set_up_middleware
 from q2r2_control.runtime.process import StopRequest
 
@@ -66,6 +67,7 @@ class BaseNode(Node):
     """
 
     exit_code: int | None = None
+    ticks = False  # whether its messages wait for its timers, see TickExecutor
 
     def __init__(self, name: str, **kwargs: Any) -> None:
         super().__init__(name, **kwargs)
@@ -181,7 +183,7 @@ def run_node(make: Callable[[], Node], args: Sequence[str] | None = None) -> int
     node: Any = None
     try:
         node = make()
-        executor = SingleThreadedExecutor()
+        executor = TickExecutor() if getattr(node, "ticks", False) else SingleThreadedExecutor()
         executor.add_node(node)
         while rclpy.ok() and not stop.asked and getattr(node, "exit_code", None) is None:
             executor.spin_once(timeout_sec=0.1)

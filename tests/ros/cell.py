@@ -17,7 +17,9 @@ from std_msgs.msg import String
 from tf2_msgs.msg import TFMessage
 
 from q2r2_control import Robot
-from q2r2_control.ros.base_node import COMMAND_QOS
+from q2r2_control.robot.compose import WORLD
+from q2r2_control.ros.base_node import COMMAND_QOS, LATCHED_QOS, STREAM_QOS
+from q2r2_control.ros.bridge.frames import FrameTree
 from q2r2_control.ros.bridge.messages import pose_message
 from q2r2_control.types import Array
 from tests.ros import waiting
@@ -42,22 +44,22 @@ class Cell:
     ) -> None:
         self.node, self.robot, self.processes = node, robot, processes
         self.joints = JointRecorder(robot)
-        self.tools: dict[str, pin.SE3] = {}
+        self.frames = FrameTree()
+        self.parents: dict[str, str] = {}  # of each frame on /tf and /tf_static
         self.states: dict[str, dict[str, Any]] = {}
         self._publishers = {
             arm: node.create_publisher(PoseStamped, targets.format(arm=arm), COMMAND_QOS) for arm in robot.arms
         }
         self.joints.subscribe(node)
-        node.create_subscription(TFMessage, "/tf", self._on_transforms, 100)
+        for topic, qos in (("/tf", STREAM_QOS), ("/tf_static", LATCHED_QOS)):
+            node.create_subscription(TFMessage, topic, self._on_transforms, qos)
         for name in ("mujoco_robot", "cartesian_controller"):
             node.create_subscription(String, f"/{name}/state", partial(self._on_state, name), 10)
 
     def _on_transforms(self, message: TFMessage) -> None:
         for transform in message.transforms:
-            p, r = transform.transform.translation, transform.transform.rotation
-            self.tools[transform.child_frame_id] = pin.SE3(
-                pin.Quaternion(r.w, r.x, r.y, r.z).toRotationMatrix(), np.array([p.x, p.y, p.z])
-            )
+            self.parents[transform.child_frame_id] = transform.header.frame_id
+            self.frames.set(transform, time.monotonic())
 
     def _on_state(self, name: str, message: String) -> None:
         self.states[name] = json.loads(message.data)
@@ -79,7 +81,14 @@ class Cell:
 
     def tool(self, arm: str) -> pin.SE3:
         """An arm's tool, from /tf."""
-        return self.tools[self.robot.arms[arm].tool_frame]
+        tool = self.find_tool(arm)
+        assert tool is not None
+        return tool
+
+    def find_tool(self, arm: str) -> pin.SE3 | None:
+        """The same; None as long as it is not known."""
+        placement = self.frames.find(self.robot.arms[arm].tool_frame, WORLD)
+        return None if placement is None else placement.pose
 
     def state(self, key: str, name: str = "cartesian_controller") -> Any:
         """The newest value in a node's state."""
@@ -103,7 +112,7 @@ class Cell:
         """Wait until the arms can be moved."""
         wait_until(lambda: self.state("phase") == "active", "the controller is active", lambda: self.states)
         wait_until(lambda: all(p.get_subscription_count() for p in self._publishers.values()), "targets have listeners")
-        wait_until(lambda: all(arm.tool_frame in self.tools for arm in self.robot.arms.values()), "tools are on /tf")
+        wait_until(lambda: all(self.find_tool(arm) is not None for arm in self.robot.arms), "tools are on /tf")
 
     def engage(self, *arms: str) -> Stream:
         """Begin streams of targets at the tools, anew where a stall of this machine ended one that had begun."""
@@ -124,7 +133,7 @@ class Cell:
 
         def at_home(arm: str) -> bool:
             home = self.robot.tool_pose(self.robot.home, arm).translation
-            there = self.tools.get(self.robot.arms[arm].tool_frame)
+            there = self.find_tool(arm)
             return there is not None and float(np.linalg.norm(there.translation - home)) < 2e-3
 
         wait_until(lambda: all(map(at_home, self.robot.arms)), "the tools are at home")

@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from functools import partial
 from queue import Queue
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 import pinocchio as pin
@@ -27,7 +28,6 @@ from control_msgs.action import GripperCommand
 from rclpy.action import ActionClient
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, String
-from tf2_msgs.msg import TFMessage
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from q2r2_control.ros.base_node import COMMAND_QOS, LATCHED_QOS
@@ -90,24 +90,41 @@ def trajectory(robot: Robot, q: np.ndarray, names: tuple[str, ...] | None = None
     )
 
 
-def test_it_publishes_joints_by_name_all_links_and_the_description(cell: Cell, robot: Robot) -> None:
+def test_it_publishes_joints_by_name_and_the_description(cell: Cell, robot: Robot) -> None:
     names: Queue[list[str]] = Queue()
-    fixed: Queue[list[str]] = Queue()
     description: Queue[str] = Queue()
-    node = cell.node
-    node.create_subscription(JointState, "/joint_states", lambda m: names.put(list(m.name)), 10)
-    node.create_subscription(
-        TFMessage, "/tf_static", lambda m: fixed.put([t.child_frame_id for t in m.transforms]), LATCHED_QOS
-    )
-    node.create_subscription(String, "/robot_description", lambda m: description.put(m.data), LATCHED_QOS)
+    cell.node.create_subscription(JointState, "/joint_states", lambda m: names.put(list(m.name)), 10)
+    cell.node.create_subscription(String, "/robot_description", lambda m: description.put(m.data), LATCHED_QOS)
     assert names.get(timeout=PATIENCE) == [*robot.joint_names, *FINGERS]
-    urdf = description.get(timeout=PATIENCE)
-    assert urdf == robot.urdf
-    wait_until(lambda: cell.tools, "transforms come")
-    links = {line.split('"')[1] for line in urdf.splitlines() if line.strip().startswith("<link ")}
-    assert set(fixed.get(timeout=PATIENCE)) | set(cell.tools) == links - {"world"}
-    for arm in robot.arms:
-        assert np.allclose(cell.tool(arm).homogeneous, robot.tool_pose(robot.home, arm).homogeneous, atol=2e-3)
+    assert description.get(timeout=PATIENCE) == robot.urdf
+
+
+def test_links_are_where_robot_state_publisher_puts_them_each_in_its_parent_s_frame(cell: Cell, robot: Robot) -> None:
+    joints = [joint for joint in ElementTree.fromstring(robot.urdf) if joint.tag == "joint"]
+    parents = {link_of(joint, "child"): link_of(joint, "parent") for joint in joints}
+    wait_until(lambda: cell.parents.keys() >= parents.keys(), "all links are on /tf or /tf_static")
+    assert cell.parents == parents
+
+    states: Queue[JointState] = Queue()
+    cell.node.create_subscription(JointState, "/joint_states", states.put, 10)
+    state = states.get(timeout=PATIENCE)
+    model = pin.buildModelFromXML(robot.urdf)
+    data, q = model.createData(), pin.neutral(model)
+    for name, position in zip(state.name, state.position, strict=True):
+        q[model.joints[model.getJointId(name)].idx_q] = position
+    pin.framesForwardKinematics(model, data, q)
+    placements = {frame.name: data.oMf[number] for number, frame in enumerate(model.frames) if frame.type == pin.BODY}
+    for child, parent in parents.items():
+        found = cell.frames.find(child, parent)
+        assert found is not None
+        expected = placements[parent].actInv(placements[child])
+        assert np.allclose(found.pose.homogeneous, expected.homogeneous, atol=1e-3), child
+
+
+def link_of(joint: ElementTree.Element, role: str) -> str:
+    element = joint.find(role)
+    assert element is not None
+    return element.get("link", "")
 
 
 @pytest.mark.parametrize("kind", ["joint_trajectory", "joint_commands", "position_commands"])

@@ -7,7 +7,9 @@ inside are receipt times on the node's own clock, given in seconds.
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -20,11 +22,17 @@ from q2r2_control.inputs.messages import HandPose, HandTwist
 from q2r2_control.types import Array, HandInputs, HandSample, RobotState
 
 _UNIT = 1e-3  # a quaternion's norm may be off by this
+_OLDEST = 0.1  # a message waits for the next tick, and no longer: more is a clock that was set [s]
 
 
 def seconds(stamp: Time) -> float:
     """A message's stamp in seconds of its sender's clock."""
     return float(stamp.sec) + 1e-9 * float(stamp.nanosec)
+
+
+def age(info: Mapping[str, Any]) -> float:
+    """How long ago the middleware received a message [s], by the information that a subscription passes with it."""
+    return min(max((time.time_ns() - int(info["received_timestamp"])) * 1e-9, 0.0), _OLDEST)
 
 
 def time_message(t: float) -> Time:

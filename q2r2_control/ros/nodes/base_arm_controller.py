@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 import pinocchio as pin
@@ -21,7 +22,7 @@ from q2r2_control.ros.bridge.frames import FrameListener, PoseTopic, ToolFrame
 from q2r2_control.ros.bridge.grippers import GripperClient
 from q2r2_control.ros.bridge.hand_topics import HandWatch
 from q2r2_control.ros.bridge.markers import TargetMarkers
-from q2r2_control.ros.bridge.messages import hand_sample
+from q2r2_control.ros.bridge.messages import age, hand_sample
 from q2r2_control.ros.bridge.parameters import ArmDefaults, ArmParameters, arm_parameters
 from q2r2_control.ros.bridge.target_output import near
 from q2r2_control.ros.monitoring.arm_link import ArmLink
@@ -44,6 +45,8 @@ class BaseArmController(BaseNode):
     Steps to override: :meth:`setup_parameters`, :meth:`setup_state`, :meth:`setup_interfaces`, :meth:`current_pose`,
     :meth:`pose_callback`, :meth:`inputs_callback`, :meth:`toggle_gripper`.
     """
+
+    ticks = True
 
     def __init__(
         self,
@@ -98,7 +101,7 @@ class BaseArmController(BaseNode):
         self._last_event = self._paused = "paused: not engaged yet"
         self._refusal: tuple[bytes, str] | None = None
         self._shown = 0.0
-        self._ticked = self.now
+        self._received = self._ticked = self.now  # the message of the hand that is being taken was
 
     def setup_interfaces(self) -> None:
         """Make publishers, subscriptions, services, the action client and the timer."""
@@ -115,8 +118,11 @@ class BaseArmController(BaseNode):
         self.gripper = GripperClient(self, values.gripper_topic, values.gripper)
         self._markers = self.create_publisher(Marker, "/visualization_marker", 10)
         self._haptics = self.create_publisher(OVR2ROSHapticFeedback, HAPTIC_TOPICS[hand], COMMAND_QOS)
-        self.create_subscription(PoseStamped, f"q2r_{hand}_hand_pose", self.pose_callback, STREAM_QOS)
-        self.create_subscription(OVR2ROSInputs, f"q2r_{hand}_hand_inputs", self.inputs_callback, STREAM_QOS)
+        for kind, topic, callback in (
+            (PoseStamped, f"q2r_{hand}_hand_pose", self.pose_callback),
+            (OVR2ROSInputs, f"q2r_{hand}_hand_inputs", self.inputs_callback),
+        ):
+            self.create_subscription(kind, topic, partial(self._take, callback), STREAM_QOS)
         self.create_service(Trigger, "~/pause", self._on_pause)
         self.create_service(Trigger, "~/reset", self._on_reset)
         self.create_timer(1.0 / values.rate, self.tick)
@@ -127,12 +133,12 @@ class BaseArmController(BaseNode):
 
     def pose_callback(self, message: PoseStamped) -> None:
         """Take a pose of the hand."""
-        self._pose = message, self.now
+        self._pose = message, self._received
         self._put_sample()
 
     def inputs_callback(self, message: OVR2ROSInputs) -> None:
         """Take buttons, triggers and stick of the hand."""
-        self._inputs = message, self.now
+        self._inputs = message, self._received
         self._put_sample()
 
     def toggle_gripper(self) -> None:
@@ -268,6 +274,10 @@ class BaseArmController(BaseNode):
             self._shown = now
             for marker in self.markers.at(sent, tool, self.state is ArmState.ENGAGED, now):
                 self._markers.publish(marker)
+
+    def _take(self, callback: Callable[[Any], None], message: Any, info: Mapping[str, Any]) -> None:
+        self._received = self.now - age(info)
+        callback(message)
 
     def _put_sample(self) -> None:
         if self._pose is not None:

@@ -64,6 +64,8 @@ _EXTERNAL_PARAMETERS: _Table = (
 class CartesianControllerNode(BaseNode):
     """Feeds a :class:`Supervisor` from its topics and publishes the reference that comes of it."""
 
+    ticks = True
+
     def __init__(self) -> None:
         super().__init__("cartesian_controller")
         config = load_config(self.parameter("config", "config/dual_iiwa7.yaml", "YAML of the cell"))

@@ -11,11 +11,11 @@ from __future__ import annotations
 import math
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
-from geometry_msgs.msg import TransformStamped
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.qos import QoSProfile, ReliabilityPolicy
@@ -28,11 +28,11 @@ from trajectory_msgs.msg import JointTrajectory
 from q2r2_control.config import load_config
 from q2r2_control.errors import ConfigError
 from q2r2_control.plants.simulated_cell import JointSetpoint, SimulatedCell
-from q2r2_control.robot.compose import WORLD
 from q2r2_control.robot.robot import Robot
 from q2r2_control.ros.base_node import LATCHED_QOS, OK, WARN, BaseNode, run_node
 from q2r2_control.ros.bridge.grippers import GripperServer, Stroke
-from q2r2_control.ros.bridge.messages import joint_state_message, seconds, write_transform
+from q2r2_control.ros.bridge.link_frames import LinkFrames
+from q2r2_control.ros.bridge.messages import age, joint_state_message, seconds
 from q2r2_control.types import RobotState
 
 _LOG_PERIOD = 1.0  # of lines about one topic [s]
@@ -40,6 +40,8 @@ _LOG_PERIOD = 1.0  # of lines about one topic [s]
 
 class MujocoRobot(BaseNode):
     """Runs a :class:`SimulatedCell` in real time between its topics, services and actions."""
+
+    ticks = True
 
     def __init__(self) -> None:
         super().__init__("mujoco_robot")
@@ -56,6 +58,8 @@ class MujocoRobot(BaseNode):
             raise ConfigError("gripper_open_position, gripper_closed_position: allowed: two different numbers")
         self._robot = Robot.from_config(config)
         self._cell = SimulatedCell(self._robot, config, hold_after, max_jump)
+        self._period = 1.0 / rate
+        self._received = 0.0  # when the command that is being taken was [s]
         self._refused: dict[str, str] = {}
         self._said: set[str] = set()  # topics whose refusal is in the log
         self._logged: dict[str, float] = {}  # when a topic's refusal last was [s]
@@ -66,7 +70,7 @@ class MujocoRobot(BaseNode):
         self._grippers = {arm: self._gripper(arm, stroke) for arm in self._cell.plant.gripper_openings()}
         self.create_service(Trigger, "~/reset", self._reset)
         steady = Clock(clock_type=ClockType.STEADY_TIME)  # the simulation makes its own time, whatever /clock says
-        self.create_timer(1.0 / rate, self._tick, clock=steady)
+        self.create_timer(self._period, self._tick, clock=steady)
         self.create_timer(1.0 / tf_rate, self._publish_transforms, clock=steady)
         self.get_logger().info(f"{config.name}: {', '.join(self._robot.joint_names)}")
 
@@ -77,12 +81,8 @@ class MujocoRobot(BaseNode):
         self._tf_static = self.create_publisher(TFMessage, "/tf_static", LATCHED_QOS)
         self._description = self.create_publisher(String, "robot_description", LATCHED_QOS)
         self._description.publish(String(data=self._robot.urdf))
-        model = self._cell.plant.model
-        links = [index for index in range(1, model.nbody) if model.body(index).name not in self._cell.loose_objects]
-        moving = [index for index in links if model.body_weldid[index] != 0]
-        self._moving = {index: _transform(model.body(index).name) for index in moving}
-        fixed = {index: _transform(model.body(index).name) for index in links if index not in self._moving}
-        self._tf_static.publish(self._placed(fixed))
+        self._frames = LinkFrames(self._cell.plant.model, self._cell.loose_objects)
+        self._tf_static.publish(self._frames.fixed.at(self._cell.plant.data, self.get_clock().now().to_msg()))
 
     def _make_subscriptions(self) -> None:
         # Each arm may have a sender of its own, and the one's message is not to take the place of the other's.
@@ -94,7 +94,7 @@ class MujocoRobot(BaseNode):
             (Float64MultiArray, "velocity_commands", self._on_velocities),
             (Float64MultiArray, "torque_commands", self._on_torques),
         ):
-            self.create_subscription(kind, topic, callback, commands)
+            self.create_subscription(kind, topic, partial(self._take, callback), commands)
 
     def _gripper(self, arm: str, stroke: Stroke) -> GripperServer:
         return GripperServer(
@@ -104,6 +104,11 @@ class MujocoRobot(BaseNode):
             lambda opening: self._cell.command_gripper(arm, opening),
             lambda fault: self._note(f"{arm}_gripper", fault),
         )
+
+    def _take(self, callback: Callable[[Any], None], message: Any, info: Mapping[str, Any]) -> None:
+        # What came while this process stood still is as new as what came since the last tick.
+        self._received = time.monotonic() - min(age(info), self._period)
+        callback(message)
 
     def _on_trajectory(self, message: JointTrajectory) -> None:
         if len(message.points) != 1:
@@ -119,16 +124,16 @@ class MujocoRobot(BaseNode):
         self._follow("position_commands", self._robot.joint_names, message.data, ())
 
     def _on_velocities(self, message: Float64MultiArray) -> None:
-        fault = self._cell.command_velocities(np.array(message.data, float), time.monotonic())
+        fault = self._cell.command_velocities(np.array(message.data, float), self._received)
         self._note("velocity_commands", fault)
 
     def _on_torques(self, message: Float64MultiArray) -> None:
-        self._note("torque_commands", self._cell.command_torques(np.array(message.data, float), time.monotonic()))
+        self._note("torque_commands", self._cell.command_torques(np.array(message.data, float), self._received))
 
     def _follow(self, topic: str, names: Any, positions: Any, velocities: Any, delay: Any = None) -> None:
         v = np.array(velocities, float) if len(velocities) else None
         setpoint = JointSetpoint(names, np.array(positions, float), v, 0.0 if delay is None else seconds(delay))
-        self._note(topic, self._cell.command_positions(setpoint, time.monotonic()))
+        self._note(topic, self._cell.command_positions(setpoint, self._received))
 
     def _note(self, topic: str, fault: str | None) -> None:
         """Say what was refused: once, until the topic brings something good again, and not more than once a second."""
@@ -169,16 +174,7 @@ class MujocoRobot(BaseNode):
         )
 
     def _publish_transforms(self) -> None:
-        self._tf.publish(self._placed(self._moving))
-
-    def _placed(self, transforms: Mapping[int, TransformStamped]) -> TFMessage:
-        """The transforms of MuJoCo's bodies, each straight from the world."""
-        data, stamp = self._cell.plant.data, self.get_clock().now().to_msg()
-        quaternions = data.xquat[:, [1, 2, 3, 0]]  # from w first
-        for index, message in transforms.items():
-            message.header.stamp = stamp
-            write_transform(data.xpos[index], quaternions[index], message.transform)
-        return TFMessage(transforms=list(transforms.values()))
+        self._tf.publish(self._frames.moving.at(self._cell.plant.data, self.get_clock().now().to_msg()))
 
     def _reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self._cell.reset()
@@ -202,12 +198,6 @@ class MujocoRobot(BaseNode):
     def close(self) -> None:
         """Give the plant back."""
         self._cell.plant.close()
-
-
-def _transform(link: str) -> TransformStamped:
-    message = TransformStamped(child_frame_id=link)
-    message.header.frame_id = WORLD
-    return message
 
 
 def main() -> int:

@@ -12,7 +12,9 @@ from control_msgs.action import GripperCommand
 from rclpy.action import ActionServer, CancelResponse
 from rclpy.action.server import ServerGoalHandle
 from rclpy.callback_groups import ReentrantCallbackGroup
-from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor
+from rclpy.executors import MultiThreadedExecutor
+
+from tests.ros.programs import until_interrupted
 
 OPEN, HELD, STEP = 0.05, 0.02, 0.01  # [m]
 
@@ -41,10 +43,8 @@ def main() -> None:
     executor = MultiThreadedExecutor(num_threads=2)
     executor.add_node(node)
     print("ready")
-    try:
+    with until_interrupted():
         executor.spin()
-    except (KeyboardInterrupt, ExternalShutdownException):
-        node.destroy_node()
 
 
 if __name__ == "__main__":

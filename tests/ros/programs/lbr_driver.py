@@ -8,15 +8,15 @@ from __future__ import annotations
 
 import json
 import sys
-from contextlib import suppress
 from functools import partial
 from importlib import import_module
 from typing import Any
 
 import rclpy
-from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
+
+from tests.ros.programs import until_interrupted
 
 TOPICS = {"LBRJointPositionCommand": "joint_position", "LBRTorqueCommand": "torque"}
 
@@ -47,7 +47,7 @@ class Listener(Node):
 
 def main() -> None:
     rclpy.init()
-    with suppress(KeyboardInterrupt, ExternalShutdownException):
+    with until_interrupted():
         rclpy.spin(Listener(sys.argv[1], sys.argv[2:]))
 
 

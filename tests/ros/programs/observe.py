@@ -12,11 +12,11 @@ from functools import partial
 from typing import Any
 
 import rclpy
-from rclpy.executors import ExternalShutdownException
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 
 from q2r2_control.ros.base_node import STREAM_QOS
+from tests.ros.programs import until_interrupted
 
 
 def main() -> None:
@@ -37,10 +37,8 @@ def main() -> None:
 
     for name in sys.argv[1:]:
         node.create_subscription(String, f"/{name}/state", partial(on_state, name), 10)
-    try:
+    with until_interrupted():
         rclpy.spin(node)
-    except (KeyboardInterrupt, ExternalShutdownException):
-        node.destroy_node()
 
 
 if __name__ == "__main__":

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import json
 import sys
-from contextlib import suppress
 from importlib import import_module
 from typing import Any
 
 import rclpy
-from rclpy.executors import ExternalShutdownException
 
 from q2r2_control.ros.base_node import COMMAND_QOS
+from tests.ros.programs import until_interrupted
 
 PERIOD = 0.01  # [s]
 
@@ -30,7 +29,7 @@ def main() -> None:
     node = rclpy.create_node("sender")
     publisher = node.create_publisher(type(message), sys.argv[2], COMMAND_QOS)
     node.create_timer(PERIOD, lambda: publisher.publish(message))
-    with suppress(KeyboardInterrupt, ExternalShutdownException):
+    with until_interrupted():
         rclpy.spin(node)
 
 

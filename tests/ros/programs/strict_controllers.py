@@ -20,13 +20,14 @@ import numpy as np
 import pinocchio as pin
 import rclpy
 from geometry_msgs.msg import PoseStamped, WrenchStamped
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, String
 from trajectory_msgs.msg import JointTrajectory
 
+from tests.ros.programs import until_interrupted
 from tests.ros.programs.impedance_model import ImpedanceModel
 
 ARMS = ("left", "right")
@@ -212,7 +213,7 @@ def main() -> None:
     rclpy.init()
     executor, driver = SingleThreadedExecutor(), Driver()
     executor.add_node(driver)
-    try:
+    with until_interrupted():
         while not driver.driving:
             executor.spin_once()
         assert driver.model is not None
@@ -220,8 +221,6 @@ def main() -> None:
             executor.add_node(Controller(arm, terms, driver.model))
         print("ready", flush=True)
         executor.spin()
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
 
 
 if __name__ == "__main__":
