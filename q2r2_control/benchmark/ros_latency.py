@@ -7,15 +7,10 @@ commands that answer.
 
 from __future__ import annotations
 
-import os
-import signal
-import subprocess
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from typing import Any
 
-import domain_coordinator
 import numpy as np
 import rclpy
 from geometry_msgs.msg import PoseStamped
@@ -24,11 +19,11 @@ from rclpy.executors import SingleThreadedExecutor
 from trajectory_msgs.msg import JointTrajectory
 
 from q2r2_control.benchmark.command_responses import LatencyReport, Recording, latency_report
+from q2r2_control.benchmark.ros_processes import private_domain, started
 from q2r2_control.config import load_config
 from q2r2_control.errors import Q2R2Error
 from q2r2_control.robot.robot import Robot
 from q2r2_control.ros.base_node import COMMAND_QOS, STREAM_QOS
-from q2r2_control.ros.launch.middleware import set_up_middleware
 from q2r2_control.ros.launch.processes import NodeProcess
 
 _START_TIMEOUT = 300.0  # kernels may have to be compiled [s]
@@ -57,12 +52,12 @@ def measure_latency(config: str, duration: float, rate: float, progress: Callabl
         ),
     ]
     arm = NodeProcess("left_arm_controller", "q2r2_control.ros.nodes.left_arm_controller", filters)
-    with _private_domain(), _started(nodes), _Probe() as probe:
+    with private_domain(), started(nodes), _Probe() as probe:
         progress("waiting for the controller")
         probe.wait_for_tool()
         progress(f"target topic to joint command: {duration:g} s")
         target = probe.step_targets(duration)
-        with _started([arm]):
+        with started([arm]):
             progress("waiting for the arm's teleoperation")
             probe.engage_hand()
             progress(f"hand topic to joint command: {duration:g} s")
@@ -178,36 +173,3 @@ def _pose() -> PoseStamped:
     message = PoseStamped()
     message.pose.orientation.w = 1.0
     return message
-
-
-@contextmanager
-def _private_domain() -> Iterator[None]:
-    """A ROS domain of its own, on this host only: no message reaches a robot on the network, or comes from one."""
-    with domain_coordinator.domain_id() as number:
-        private = {"ROS_DOMAIN_ID": str(number), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
-        before = dict(os.environ)
-        os.environ.update(private)
-        set_up_middleware(os.environ)
-        try:
-            yield
-        finally:
-            os.environ.clear()
-            os.environ.update(before)
-
-
-@contextmanager
-def _started(nodes: list[NodeProcess]) -> Iterator[None]:
-    """Run the nodes as processes; at the end they are interrupted in reverse order."""
-    processes = [
-        subprocess.Popen(node.command(), stdin=subprocess.DEVNULL, stderr=subprocess.DEVNULL) for node in nodes
-    ]
-    try:
-        yield
-    finally:
-        for process in reversed(processes):
-            process.send_signal(signal.SIGINT)
-        for process in reversed(processes):
-            try:
-                process.wait(10.0)
-            except subprocess.TimeoutExpired:
-                process.kill()

@@ -12,7 +12,6 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from q2r2_control.benchmark.command_responses import LatencyReport
 from q2r2_control.benchmark.loop_times import PHYSICS, LoopReport, StageTime, run_loop_bench
 from q2r2_control.benchmark.peers.base import PEERS
 from q2r2_control.benchmark.press_run import run_press
@@ -23,6 +22,7 @@ from q2r2_control.cli.figure_table import figure_table
 from q2r2_control.cli.options import DEMO_CONFIG, Json
 from q2r2_control.cli.output import as_json_text, notice_of_compiling, stderr_console
 from q2r2_control.cli.press_table import press_table
+from q2r2_control.cli.ros_table import latency_table, load_table
 from q2r2_control.cli.soak_table import soak_table
 from q2r2_control.cli.stack_table import following_table, safety_table
 from q2r2_control.cli.work_table import work_table
@@ -89,8 +89,8 @@ def bench(
 
     With --press: what the table feels of a finger that is commanded into it, and slides. Exit 1 if a promise is broken.
 
-    With --ros: the time from a message on an input topic to the joint command that answers it, through real nodes on
-    this machine, in a domain of their own.
+    With --ros: the time from a message on an input topic to the joint command that answers it, what each node takes of
+    the processors, and how evenly the commands move; through real nodes on this machine, in a domain of their own.
     """
     if sum((work, soak, ros, loop, press)) > 1:
         raise ConfigError("--work, --soak, --ros, --loop and --press exclude each other")
@@ -112,7 +112,7 @@ def bench(
     motions = motions_named(WORK_MOTIONS if motion is None else motion)
     console = stderr_console()
     if ros:
-        _show_latency(_SECONDS if duration is None else duration, rate or _RATE, console, json)
+        _show_ros(_SECONDS if duration is None else duration, rate or _RATE, console, json)
         return
     with notice_of_compiling(console):
         if soak:
@@ -186,20 +186,25 @@ def _show_soak(report: SoakReport, json: bool) -> NoReturn:
     raise typer.Exit(0 if report.passed else 1)
 
 
-def _show_latency(duration: float, rate: float, console: Console, json: bool) -> None:
+def _show_ros(duration: float, rate: float, console: Console, json: bool) -> None:
     missing = [name for name in ("rclpy", "quest2ros", "domain_coordinator") if importlib.util.find_spec(name) is None]
     if missing:
         raise ConfigError(
             f"--ros: {', '.join(missing)} cannot be imported: pip install 'q2r2_control[ros]' and "
             "q2r2 ros build-interfaces, or source a ROS 2 Jazzy"
         )
-    from q2r2_control.benchmark.ros_latency import measure_latency  # all else works without ROS
+    # All else works without ROS.
+    from q2r2_control.benchmark.ros_latency import measure_latency
+    from q2r2_control.benchmark.ros_load import measure_load
 
-    report = measure_latency(DEMO_CONFIG, duration, rate, _progress(console))
+    latency = measure_latency(DEMO_CONFIG, duration, rate, _progress(console))
+    load = measure_load(DEMO_CONFIG, duration, _progress(console))
     if json:
-        print(as_json_text(report.as_json()))
+        print(as_json_text(latency.as_json() | {"load": load.as_json()}))
     else:
-        Console().print(latency_table(report))
+        out = Console()
+        out.print(latency_table(latency))
+        out.print(load_table(load))
 
 
 def _progress(console: Console) -> Callable[[str], None]:
@@ -283,22 +288,3 @@ def _times_of(stages: Iterable[StageTime]) -> Iterator[str]:
     for stage in stages:
         yield f"{stage.median_us:.0f}"
         yield f"{stage.p99_us:.0f}"
-
-
-def latency_table(report: LatencyReport) -> Table:
-    """Latencies through the ROS nodes."""
-    table = figure_table(
-        f"from an input topic to the joint command that answers it, controller at {report.loop_rate_hz:g} Hz",
-        "path",
-        ("p50 [ms]", "p99 [ms]", "max [ms]", "steps", "missed"),
-    )
-    for row in report.rows:
-        times = ("" if time is None else f"{time:.1f}" for time in (row.p50_ms, row.p99_ms, row.max_ms))
-        table.add_row(row.path, *times, str(row.steps), str(row.missed))
-    table.caption = Text(
-        f"one joint command between two processes: p50 {report.transport_p50_ms:.2f} ms, p99 "
-        f"{report.transport_p99_ms:.2f} ms\n"
-        "the hand's latency includes an interpolation of 5 ms, the shortest; its filters are off"
-    )
-    table.caption_justify = "left"
-    return table

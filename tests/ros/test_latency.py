@@ -14,10 +14,10 @@ pytest.importorskip("rclpy", reason=NEEDS_ROS)
 pytestmark = [pytest.mark.usefixtures("interfaces"), pytest.mark.alone]
 
 
-def test_the_bench_measures_both_ways_in_through_real_nodes(processes: Processes) -> None:
+def test_the_bench_measures_both_ways_in_and_the_load_of_real_nodes(processes: Processes) -> None:
     command = ("-m", "q2r2_control", "bench", "--ros", "--duration", "2", "--json")
     process = processes.start(sys.executable, *command, name="bench")
-    assert process.wait(4.0 * PATIENCE) == 0
+    assert process.wait(6.0 * PATIENCE) == 0
     report = json.loads(process.output)
     assert [row["path"] for row in report["rows"]] == ["target to joint command", "hand to joint command"]
     for row in report["rows"]:
@@ -26,3 +26,16 @@ def test_the_bench_measures_both_ways_in_through_real_nodes(processes: Processes
             skip_if_overloaded(f"{row['missed']} of {row['steps']} steps were not answered in time")
         assert row["missed"] <= row["steps"] / 2
         assert 0.0 < report["transport_p50_ms"] < row["p50_ms"] <= row["p99_ms"] <= row["max_ms"]
+    load = report["load"]
+    nodes = [row["node"] for row in load["rows"]]
+    assert nodes == [
+        "mujoco_robot",
+        "cartesian_controller",
+        "left_arm_controller",
+        "right_arm_controller",
+        "SimulationInput",
+    ]
+    assert all(row["moving"] > 0.0 for row in load["rows"])
+    assert load["total"]["moving"] == pytest.approx(sum(row["moving"] for row in load["rows"]))
+    assert load["commands_hz"] > 10.0
+    assert load["speed_ripple"] > 0.0

@@ -1,0 +1,113 @@
+"""``q2r2 bench --ros``: processor time of the set that ``q2r2 ros up`` starts, idle and moving, and its smoothness."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any
+
+import numpy as np
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from std_msgs.msg import String
+from trajectory_msgs.msg import JointTrajectory
+
+from q2r2_control.benchmark.node_load import LoadReport, NodeLoad, speed_ripple
+from q2r2_control.benchmark.ros_processes import private_domain, processor_time, started
+from q2r2_control.errors import Q2R2Error
+from q2r2_control.ros.base_node import STREAM_QOS
+from q2r2_control.ros.launch.processes import NodeProcess, nodes_of
+
+_START_TIMEOUT = 300.0  # kernels may have to be compiled [s]
+_SETTLE = 3.0  # after the nodes have begun, and after the hands have [s]
+_SCRIPT = NodeProcess("SimulationInput", "q2r2_control.ros.nodes.simulation_input")
+
+
+class LoadError(Q2R2Error):
+    """The nodes did not begin in time; the message says what was waited for."""
+
+
+def measure_load(config: str, duration: float, progress: Callable[[str], None]) -> LoadReport:
+    """Measure for ``duration`` [s] at rest, and as long with both arms moving. Raises :class:`LoadError`."""
+    nodes = nodes_of(config, "none")
+    with private_domain(), _Watcher() as watcher, started(nodes) as processes:
+        progress("waiting for all nodes")
+        watcher.wait(lambda: watcher.active and len(watcher.engaged) == _arms(nodes), "the nodes")
+        watcher.spin(_SETTLE)
+        progress(f"idle: {duration:g} s")
+        idle = watcher.shares(processes, duration)
+        with started([_SCRIPT]) as script:
+            progress("waiting for the arms to follow")
+            watcher.wait(lambda: all(watcher.engaged.values()), "the arms to follow")
+            watcher.spin(_SETTLE)
+            progress(f"moving: {duration:g} s")
+            watcher.commands.clear()
+            moving = watcher.shares(processes | script, duration)
+    if not all(watcher.engaged.values()):
+        raise LoadError(f"an arm was paused within {duration:g} s; engaged: {watcher.engaged}")
+    times, q = np.array([at for at, _ in watcher.commands]), np.array([q for _, q in watcher.commands])
+    rows = tuple(NodeLoad(name, idle.get(name, 0.0), moving[name]) for name in moving)
+    return LoadReport(duration, rows, len(times) / duration, speed_ripple(times, q))
+
+
+def _arms(nodes: list[NodeProcess]) -> int:
+    return sum(node.name.endswith("_arm_controller") for node in nodes)
+
+
+class _Watcher:
+    """Listens to the nodes' states and to the joint commands, whose times are the middleware's at the sender."""
+
+    def __init__(self) -> None:
+        self.active = False  # the controller
+        self.engaged: dict[str, bool] = {}  # by arm
+        self.commands: list[tuple[float, list[float]]] = []  # time [s] and positions [rad]
+        self._context = rclpy.Context()
+        rclpy.init(context=self._context)
+        self._node = rclpy.create_node("load_watcher", context=self._context)
+        listen: Any = self._on_command  # rclpy's types know callbacks without the message's stamps only
+        self._node.create_subscription(JointTrajectory, "/joint_trajectory", listen, STREAM_QOS)
+        for name in ("cartesian_controller", "left_q2r2_arm_controller", "right_q2r2_arm_controller"):
+            self._node.create_subscription(String, f"/{name}/state", partial(self._on_state, name), 10)
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self._node)
+
+    def __enter__(self) -> _Watcher:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._executor.shutdown()
+        self._node.destroy_node()
+        self._context.try_shutdown()
+
+    def wait(self, condition: Callable[[], object], what: str) -> None:
+        """Listen until ``condition`` holds."""
+        deadline = time.monotonic() + _START_TIMEOUT
+        while not condition():
+            if time.monotonic() > deadline:
+                raise LoadError(f"waited {_START_TIMEOUT:g} s for {what}")
+            self._executor.spin_once(0.05)
+
+    def spin(self, period: float) -> None:
+        """Listen for ``period`` [s]."""
+        end = time.monotonic() + period
+        while (left := end - time.monotonic()) > 0.0:
+            self._executor.spin_once(left)
+
+    def shares(self, processes: Mapping[str, int], duration: float) -> dict[str, float]:
+        """What each process takes of one core for ``duration`` [s], in percent."""
+        began, before = time.monotonic(), {name: processor_time(pid) for name, pid in processes.items()}
+        self.spin(duration)
+        passed = time.monotonic() - began
+        return {name: 100.0 * (processor_time(pid) - before[name]) / passed for name, pid in processes.items()}
+
+    def _on_command(self, message: JointTrajectory, info: dict[str, int]) -> None:
+        self.commands.append((1e-9 * info["source_timestamp"], list(message.points[0].positions)))
+
+    def _on_state(self, name: str, message: String) -> None:
+        state = json.loads(message.data)
+        if name == "cartesian_controller":
+            self.active = state["phase"] == "active"
+        else:
+            self.engaged[state["arm"]] = state["engaged"]
