@@ -21,7 +21,8 @@ from q2r2_control.types import SIDES, HandSample
 _PERIOD = 0.002  # samples that came due are published this often [s]
 # Of the script, when it is decided whether the buttons are pressed, and whether the hands move [s].
 _BEFORE_PRESS, _BEFORE_MOTION = FIRST_PRESS - 0.1, START - 0.05
-_SETTLES = 3.0  # an arm that stops within this time of the motion's begin is engaged again [s]
+# An arm that stops within this time of the motion's begin is engaged again, if it is ready within the same time [s].
+_SETTLES = 3.0
 _MODES = {
     "all": (MessageType.POSE, MessageType.INPUTS, MessageType.TWIST),
     "teleop": (MessageType.POSE, MessageType.INPUTS),
@@ -73,6 +74,7 @@ class SimulationInput(BaseNode):
         self._starts = True  # until nothing is pressed again to engage the arms
         self._moves = False  # whether the hands do
         self._moved_at: float | None = None  # when they first did [s]
+        self._stopped_at: float | None = None  # when no arm followed any more, soon after that [s]
         self._not_to_press: set[str] | None = None  # hands; None: that is not decided yet
         self._rewind(self.now)
         self.create_service(Trigger, "~/start", self._on_start)
@@ -126,10 +128,12 @@ class SimulationInput(BaseNode):
             if self._listeners.unready() is None:
                 # A press would pause those that are engaged already.
                 self._not_to_press = {hand for hand in self._hands if self._listeners.engaged(hand)}
-            elif self._moved_at is None:
-                self._rewind(now)
-            else:
+            elif self._stopped_at is not None and (
+                now - self._stopped_at > _SETTLES or self._listeners.paused_by_a_person()
+            ):
                 self._give_up()
+            else:
+                self._rewind(now)
             return
         follow = [self._listeners.engaged(hand) is not False for hand in self._hands]
         # Once the hands move they do not go back while an arm follows, which would be a jump.
@@ -139,6 +143,8 @@ class SimulationInput(BaseNode):
         elif self._listeners.paused_by_a_person():
             self._give_up()
         else:
+            if self._moves:
+                self._stopped_at = now
             self._rewind(now)
 
     def _give_up(self) -> None:

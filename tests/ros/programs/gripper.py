@@ -45,6 +45,8 @@ def main() -> None:
     print("ready")
     with until_interrupted():
         executor.spin()
+    executor.shutdown()
+    node.destroy_node()
 
 
 if __name__ == "__main__":

@@ -39,6 +39,7 @@ def main() -> None:
         node.create_subscription(String, f"/{name}/state", partial(on_state, name), 10)
     with until_interrupted():
         rclpy.spin(node)
+    node.destroy_node()
 
 
 if __name__ == "__main__":
