@@ -1,9 +1,13 @@
-"""Whatever order tests run in, what they draw from Pinocchio's random numbers is the same."""
+"""Whatever order tests run in and however busy the machine is, what they draw at random is the same."""
 
 from __future__ import annotations
 
 import pinocchio as pin
 import pytest
+from hypothesis import settings
+
+settings.register_profile("repeatable", derandomize=True, deadline=None)
+settings.load_profile("repeatable")
 
 
 @pytest.fixture(autouse=True)

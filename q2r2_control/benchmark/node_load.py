@@ -29,7 +29,7 @@ class LoadReport:
     seconds: float  # of each of both
     rows: tuple[NodeLoad, ...]
     commands_hz: float
-    speed_ripple: float  # RMS of the joints' commanded speed about its trend, as a share of its RMS
+    speed_ripple: float  # RMS of the joints' commanded speed about its trend, as a share of its RMS, to a robot
 
     @property
     def total(self) -> NodeLoad:
@@ -38,6 +38,18 @@ class LoadReport:
 
     def as_json(self) -> dict[str, Any]:
         return asdict(self) | {"total": asdict(self.total)}
+
+
+def times_of_a_robot(times: Array) -> Array:
+    """When a robot follows commands that were sent at ``times`` (n,) [s]: one of its own periods after the other.
+
+    It takes the newest command once a period, so a command that is a little early or late makes no difference. Where
+    one is missing it waits for two.
+    """
+    gaps = np.diff(times)
+    period = float(np.median(gaps))
+    periods = np.maximum(np.round(gaps / period), 1.0)
+    return np.concatenate([[0.0], period * np.cumsum(periods)])
 
 
 def speed_ripple(times: Array, q: Array) -> float:

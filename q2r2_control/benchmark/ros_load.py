@@ -14,7 +14,7 @@ from rclpy.executors import SingleThreadedExecutor
 from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory
 
-from q2r2_control.benchmark.node_load import LoadReport, NodeLoad, speed_ripple
+from q2r2_control.benchmark.node_load import LoadReport, NodeLoad, speed_ripple, times_of_a_robot
 from q2r2_control.benchmark.ros_processes import private_domain, processor_time, started
 from q2r2_control.errors import Q2R2Error
 from q2r2_control.ros.base_node import STREAM_QOS
@@ -49,7 +49,7 @@ def measure_load(config: str, duration: float, progress: Callable[[str], None]) 
         raise LoadError(f"an arm was paused within {duration:g} s; engaged: {watcher.engaged}")
     times, q = np.array([at for at, _ in watcher.commands]), np.array([q for _, q in watcher.commands])
     rows = tuple(NodeLoad(name, idle.get(name, 0.0), moving[name]) for name in moving)
-    return LoadReport(duration, rows, len(times) / duration, speed_ripple(times, q))
+    return LoadReport(duration, rows, len(times) / duration, speed_ripple(times_of_a_robot(times), q))
 
 
 def _arms(nodes: list[NodeProcess]) -> int:

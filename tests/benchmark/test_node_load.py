@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from q2r2_control.benchmark.node_load import LoadReport, NodeLoad, speed_ripple
+from q2r2_control.benchmark.node_load import LoadReport, NodeLoad, speed_ripple, times_of_a_robot
 from q2r2_control.types import Array
 
 TIMES: Array = 0.004 * np.arange(2000.0)  # [s]
@@ -28,6 +28,11 @@ def test_ripple_is_what_is_added_to_the_speed(share: float) -> None:
     w = 2.0 * np.pi * 40.0
     along = TIMES - share * np.sqrt(2.0) * np.cos(w * TIMES) / w
     assert speed_ripple(TIMES, circle(along)) == pytest.approx(share, rel=0.1)
+
+
+def test_a_robot_takes_commands_once_a_period_and_waits_for_one_that_is_missing() -> None:
+    sent = np.array([0.0, 0.0041, 0.0079, 0.016, 0.0201])
+    np.testing.assert_allclose(times_of_a_robot(sent), np.median(np.diff(sent)) * np.array([0.0, 1.0, 2.0, 4.0, 5.0]))
 
 
 def test_all_nodes_together_are_in_the_report() -> None:
