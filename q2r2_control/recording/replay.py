@@ -171,7 +171,7 @@ def replay(path: Path, config: Config | None = None) -> Replay:
         ended_by = _end_of(ticks)
     except PlantError as error:
         ended_by = str(error)
-    comparison.finish()
+    comparison.finish(whole=not ticks.missing)
     return Replay(ticks.count, summary, ended_by, comparison.difference, notes)
 
 

@@ -160,7 +160,9 @@ def test_a_folder_that_cannot_be_written_is_one_line_and_the_run_goes_on(
 FULL_DISK = """
 import resource, sys
 from pathlib import Path
+from q2r2_control.recording import recorder
 from tests.recording.runs import pipeline, record
+recorder._CHUNK_TIME = 0.02
 resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, 300_000))
 summary = record(Path(sys.argv[1]), pipeline(), 1.0)
 print(summary.fault, summary.ticks, summary.lost_ticks, summary.file, sep="\\n")
@@ -261,9 +263,9 @@ def test_memory_is_flat_however_long_a_run_is(tmp_path: Path, recorded: tuple[Pa
     held: list[int] = []
     tracemalloc.start()
     with recorder:
-        for number in range(12_000):
+        for number in range(4000):
             recorder(changed(tick, now=tick.start.now + 1e-3 * number))
-            if number % 3000 == 2999:
+            if number % 1000 == 999:
                 while len(recorder._queue):
                     time.sleep(1e-3)
                 held.append(tracemalloc.get_traced_memory()[0])

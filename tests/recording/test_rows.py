@@ -33,7 +33,7 @@ def test_a_row_is_the_message_that_rosbags_writes(topic: Topic) -> None:
     store = message_types(Dialect.ROS2)
     rows = filled(topic.row, topic.channel)
     payload = rows.tobytes()[HEAD.size :]
-    message = store.deserialize_cdr(payload, topic.type)
+    message: Any = store.deserialize_cdr(payload, topic.type)
     assert bytes(store.serialize_cdr(message, topic.type)) == payload
     if topic.type.endswith("JointState"):
         assert message.name == list(JOINTS)
