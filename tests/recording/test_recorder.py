@@ -163,7 +163,7 @@ from pathlib import Path
 from q2r2_control.recording import recorder
 from tests.recording.runs import pipeline, record
 recorder._CHUNK_TIME = 0.02
-resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, 300_000))
+resource.setrlimit(resource.RLIMIT_FSIZE, (110_000, 110_000))
 summary = record(Path(sys.argv[1]), pipeline(), 1.0)
 print(summary.fault, summary.ticks, summary.lost_ticks, summary.file, sep="\\n")
 """
