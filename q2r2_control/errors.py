@@ -23,3 +23,7 @@ class InputError(Q2R2Error):
 
 class PlantError(Q2R2Error):
     """A plant cannot be built or driven as asked; the message says what was wrong and what is allowed."""
+
+
+class RecordingError(Q2R2Error):
+    """A recording cannot be read or replayed; the message names the file, what is wrong and what is allowed."""

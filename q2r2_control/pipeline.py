@@ -23,7 +23,7 @@ from q2r2_control.plants.factory import check_mode, make_plant
 from q2r2_control.robot.robot import Robot
 from q2r2_control.runtime.loop_clock import LoopClock
 from q2r2_control.runtime.process import few_garbage_collections, stop_on_signals
-from q2r2_control.runtime.recorder import RunRecorder, Tick
+from q2r2_control.runtime.recorder import RunRecorder, RunStart, Tick
 from q2r2_control.runtime.run_summary import RunSummary
 from q2r2_control.supervision.grasp_watch import GraspWatch
 from q2r2_control.supervision.gripper_limiter import GripperLimiter
@@ -33,7 +33,7 @@ from q2r2_control.supervision.target_stream import StreamSettings
 from q2r2_control.supervision.tick_pacer import TickPacer
 from q2r2_control.teleop.arm import OPEN
 from q2r2_control.teleop.teleop import Teleop
-from q2r2_control.types import LONGEST_DT, ArmTarget, CommandMode, HandSample, Reference, RobotState
+from q2r2_control.types import LONGEST_DT, ArmTarget, Command, CommandMode, HandSample, Reference, RobotState
 
 STOPPING = "stopping"  # state of every arm while the run ends
 # Added to the time that full braking takes; an arm that still recovers into its limits is not waited for longer.
@@ -127,6 +127,10 @@ class Pipeline:
         """Every run is made here, so that a benchmark can put its clocks into it."""
         return PipelineRun(self, realtime)
 
+    def make_clock(self, realtime: bool) -> LoopClock:
+        """The clock of a run, which begins now; a replay has one of its own."""
+        return LoopClock(1.0 / self.config.loop_rate_hz, realtime)
+
     def _begin_anew(self) -> None:
         self.teleop = Teleop(self.config.teleop, tuple(self.robot.arms))
         watch = watch_settings(self.config.supervision, self.drive.yields)
@@ -152,12 +156,12 @@ class PipelineRun:
         self._connected = False
         pipeline.plant.reset()
         state = pipeline.plant.state()
-        period = 1.0 / pipeline.config.loop_rate_hz
-        self._clock = LoopClock(period, realtime)
+        self._clock = pipeline.make_clock(realtime)
+        self._start = RunStart(self._clock.now, state)
         control = pipeline.config.control
         limit = pipeline.robot.velocity_limit * control.velocity_scale
         self._acceleration = pipeline.robot.capped_acceleration(control.acceleration_limit)
-        self._pacer = TickPacer(period, limit, self._acceleration, pipeline.drive.coasts)
+        self._pacer = TickPacer(1.0 / pipeline.config.loop_rate_hz, limit, self._acceleration, pipeline.drive.coasts)
         self._stamp = state.stamp  # of the newest state, by the plant's clock [s]
         self._unanswered = 0.0  # time that the plant was given since without a newer one [s]
         self._state = state  # the newest that the plant gave
@@ -170,6 +174,7 @@ class PipelineRun:
         self._limiter, self._grasps = GripperLimiter(pipeline.controller), GraspWatch(pipeline.controller)
         self._grippers: dict[str, float] = {arm: target.gripper for arm, target in self._targets.items()}
         pipeline.drive.set_openings(pipeline.controller.openings)
+        self._openings: dict[str, float] = {}  # measured, that the tick went by
         self._velocity = np.zeros(pipeline.robot.model.nv)
 
     def until(self, duration: float | None) -> RunSummary:
@@ -229,14 +234,15 @@ class PipelineRun:
             self._hand_over(tools)
         self.limit_grippers()
         reference, trusted = self._advance(dt), self._supervisor.state_fault is None
-        pipeline.plant.apply(drive.command(reference, state, self._grippers, dt, trusted))
+        command = drive.command(reference, state, self._grippers, dt, trusted)
+        pipeline.plant.apply(command)
         compute_time = time.perf_counter() - began
         self._recorder.add_latency(samples, self._clock.read())
         # A plant that is simulated lets no more time pass at once, as if the computer had stood still.
         given = min(gap, LONGEST_DT)
         pipeline.plant.advance(given)
         self._unanswered += given
-        self.record(gap, dt, samples, reference, state, tools, compute_time)
+        self.record(gap, dt, samples, reference, state, tools, command, compute_time)
         return reference
 
     def _observe(self, state: RobotState) -> None:
@@ -278,7 +284,7 @@ class PipelineRun:
         Before the step, which has to be proven with fingers that move in it and with objects that are held.
         """
         pipeline, wanted = self._pipeline, {arm: target.gripper for arm, target in self._targets.items()}
-        measured = pipeline.plant.gripper_openings()
+        measured = self._openings = pipeline.plant.gripper_openings()
         self._grippers = self._limiter.limit(wanted, measured, self._clock.now)
         if self._limiter.changed:
             pipeline.drive.set_openings(pipeline.controller.openings)
@@ -311,6 +317,7 @@ class PipelineRun:
         reference: Reference,
         state: RobotState,
         tools: dict[str, pin.SE3],
+        command: Command,
         compute_time: float,
     ) -> None:
         """Add one tick to the summary and tell the listeners; a tick that nobody listens to is not put together."""
@@ -323,15 +330,22 @@ class PipelineRun:
             return
         tick = Tick(
             t=self._clock.now - self._clock.start,
+            start=self._start,
+            now=self._clock.now,
             dt=dt,
             step=step,
+            following=self._following,
+            connected=self._connected,
             samples=samples,
             targets=self._targets,
             engaged=engaged,
             states={arm: str(value) if self._following else STOPPING for arm, value in teleop.states.items()},
             reference=reference,
             state=state,
+            openings=self._openings,
             tools=tools,
+            command=command,
+            events=events,
             grippers=self._pipeline.plant.gripper_openings(),
             held_grippers=dict(self._limiter.held),
             holding=self._holding,

@@ -127,6 +127,7 @@ class StepReport:
     solve_time: float  # solver's own time [s]
     tightest_pair: tuple[str, str] = ("", "")  # geometry names of the pair with the least margin
     margin: float = math.inf  # its distance less the one that it keeps [m]
+    unsolved: int = 0  # bit i: the QP of substep i had no solution, or too late, and the stop went on
 
 
 @dataclass(frozen=True, slots=True)

@@ -28,7 +28,7 @@ LEVELS = (
     {"drives", "supervision"},
     {"runtime"},
     {"pipeline"},
-    {"viewer", "verification"},
+    {"viewer", "verification", "recording"},
     {"ros"},
     {"benchmark"},
     {"cli"},

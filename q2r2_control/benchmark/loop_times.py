@@ -10,6 +10,8 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -20,6 +22,8 @@ from q2r2_control.errors import ConfigError
 from q2r2_control.inputs.scripted import ScriptedInput
 from q2r2_control.pipeline import Pipeline, PipelineRun
 from q2r2_control.plants.factory import make_plant
+from q2r2_control.recording.about import About
+from q2r2_control.recording.recorder import Recorder
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, CommandMode
 
@@ -55,6 +59,7 @@ class LoopRow:
     stages: list[StageTime]
     without_physics: StageTime  # of rounds without clocks in the stages
     clocks_us: float  # that the clocks in the stages add to a tick
+    recorded: StageTime | None = None  # without physics, of rounds that were recorded to a file
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,16 +76,22 @@ class LoopReport:
 
 
 def run_loop_bench(
-    config: Config, ticks: int, progress: Callable[[str], None] = lambda what: None, *, paced: bool = True
+    config: Config,
+    ticks: int,
+    progress: Callable[[str], None] = lambda what: None,
+    *,
+    paced: bool = True,
+    record: bool = False,
 ) -> LoopReport:
     """Time ``ticks`` ticks of each case and round, with both arms engaged.
 
-    ``paced``: ticks begin a period apart; otherwise each right after the last, which is faster and tells less. Raises
+    ``record``: time them also while they are recorded. ``paced``: ticks begin a period apart; otherwise each right
+    after the last, which is faster and tells less. Raises
     :class:`ConfigError` for fewer than 100 ticks, and for a cell that cannot be built.
     """
     if ticks < FEWEST_TICKS:
         raise ConfigError(f"bench: ticks = {ticks}: allowed: {FEWEST_TICKS} or more")
-    cases = [_Case(config, plant, mode, ticks, paced) for plant, mode in CASES]
+    cases = [_Case(config, plant, mode, ticks, paced, record) for plant, mode in CASES]
     for turn in range(_ROUNDS):
         for case in cases:
             progress(f"{case.plant}, {case.mode}, round {turn + 1} of {_ROUNDS}")
@@ -183,8 +194,8 @@ class _ClockedPipeline(Pipeline):
 class _Case:
     """One plant and mode, and the times of its rounds so far."""
 
-    def __init__(self, config: Config, plant: str, mode: CommandMode, ticks: int, paced: bool) -> None:
-        self.plant, self.mode = plant, str(mode)
+    def __init__(self, config: Config, plant: str, mode: CommandMode, ticks: int, paced: bool, record: bool) -> None:
+        self.plant, self.mode, self._record = plant, str(mode), record
         self._config, self._ticks = config, ticks
         self._period = 1.0 / config.loop_rate_hz if paced else 0.0
         robot = Robot.from_config(config)
@@ -193,11 +204,14 @@ class _Case:
         )
         self._stages: list[Array] = []
         self._whole: list[Array] = []
+        self._recorded: list[Array] = []
 
     def run_round(self) -> None:
-        """One run with clocks in every stage, and one without."""
+        """One run with clocks in every stage, one without, and where asked for one that is recorded."""
         self._stages.append(self._run(clocks_in_stages=True))
         self._whole.append(self._run(clocks_in_stages=False))
+        if self._record:
+            self._recorded.append(self._run_recorded())
 
     def row(self) -> LoopRow:
         """The figures of all rounds."""
@@ -210,7 +224,20 @@ class _Case:
             stages=[_time_of(stage, stages[:, index]) for index, stage in enumerate(STAGES)],
             without_physics=_time_of("without physics", whole),
             clocks_us=1e6 * float(np.median(_without_physics(stages)) - np.median(whole)),
+            recorded=_time_of("recorded", _without_physics(np.concatenate(self._recorded))) if self._record else None,
         )
+
+    def _run_recorded(self) -> Array:
+        """As when a robot moves: a full queue loses ticks, so that it cannot hold up the loop."""
+        pipeline = self._pipeline
+        with TemporaryDirectory() as folder:
+            recorder = Recorder(Path(folder), "bench", About.of(pipeline, True, {}), pipeline.robot)
+            pipeline.listeners.append(recorder)
+            try:
+                with recorder:
+                    return self._run(clocks_in_stages=False)
+            finally:
+                pipeline.listeners.remove(recorder)
 
     def _run(self, clocks_in_stages: bool) -> Array:
         pipeline, engaged = self._pipeline, round(_ENGAGED_AFTER * self._config.loop_rate_hz)

@@ -63,6 +63,7 @@ def bench(
     ] = False,
     seed: Annotated[int, typer.Option(min=0, help="Of the soak, or of the hands with --through.")] = 0,
     loop: Annotated[bool, typer.Option("--loop", help="Time the whole live loop instead, stage by stage.")] = False,
+    record: Annotated[bool, typer.Option("--record", help="With --loop: also while the run is recorded.")] = False,
     press: Annotated[
         bool, typer.Option("--press", help="Press a finger on the table in torque mode: forces in MuJoCo.")
     ] = False,
@@ -101,6 +102,8 @@ def bench(
         raise ConfigError("--ticks cannot be used with --work, whose motions have a length of their own")
     if press and ticks is not None:
         raise ConfigError("--ticks cannot be used with --press, which has a length of its own")
+    if record and not loop:
+        raise ConfigError("--record needs --loop")
     if contact and not soak:
         raise ConfigError("--contact needs --soak")
     if seed and not (soak or through):
@@ -129,7 +132,7 @@ def bench(
             _show_press(with_contact(load_config(DEMO_CONFIG), TABLE_ONLY), json)
         elif loop:
             loop_ticks = _TICKS if ticks is None else ticks
-            _show_loop(run_loop_bench(load_config(DEMO_CONFIG), loop_ticks, _progress(console)), json)
+            _show_loop(run_loop_bench(load_config(DEMO_CONFIG), loop_ticks, _progress(console), record=record), json)
         else:
             _show_times(_TICKS if ticks is None else ticks, tuple(PEERS) if peers else (), console, json)
 
@@ -274,6 +277,8 @@ def loop_table(report: LoopReport) -> Table:
     for index, stage in enumerate(first.stages):
         if stage.stage == PHYSICS:
             table.add_row(Text("without physics", style="bold"), *_times_of(row.without_physics for row in report.rows))
+            if recorded := [row.recorded for row in report.rows if row.recorded is not None]:
+                table.add_row("the same, recorded", *_times_of(recorded))
         table.add_row(stage.stage, *_times_of(row.stages[index] for row in report.rows))
     added = ", ".join(f"{row.clocks_us:.0f}" for row in report.rows)
     table.caption = Text(

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ from rich.console import Console
 
 from q2r2_control.cli.headset_server import AnnouncedHeadset
 from q2r2_control.cli.output import as_json_text, notice_of_compiling
-from q2r2_control.cli.summary_table import summary_table, task_line
+from q2r2_control.cli.summary_table import recording_line, summary_table, task_line
 from q2r2_control.config import Config
 from q2r2_control.config.external import ControllerKind
 from q2r2_control.errors import ConfigError
@@ -20,6 +21,9 @@ from q2r2_control.inputs.base import Input
 from q2r2_control.inputs.scripted import ScriptedInput
 from q2r2_control.pipeline import Pipeline
 from q2r2_control.plants.mujoco import MujocoPlant
+from q2r2_control.recording.about import About
+from q2r2_control.recording.recorder import Recorder, RecordingSummary
+from q2r2_control.runtime.folders import new_folder
 from q2r2_control.runtime.recorder import Tick
 from q2r2_control.runtime.run_summary import RunSummary
 from q2r2_control.runtime.scheduling import real_time
@@ -51,6 +55,8 @@ class RunOptions:
     force: bool  # run although q2r2 check finds faults
     real_time: bool  # ask the system for locked memory and SCHED_FIFO
     tasks: tuple[AssemblyTask, ...] = ()  # to be judged
+    record: Path | None = None  # folder of recordings
+    notes: Mapping[str, str] = field(default_factory=dict)  # by name, for the recording
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,10 +65,16 @@ class CellRun:
 
     summary: RunSummary
     tasks: tuple[TaskResult, ...] = ()
+    recording: RecordingSummary | None = None
 
     def as_json(self) -> dict[str, Any]:
-        """The summary, and where there were tasks their results as ``tasks``."""
-        return {**self.summary.as_json(), **({"tasks": [asdict(task) for task in self.tasks]} if self.tasks else {})}
+        """The summary, and where there were tasks or a recording what became of them."""
+        data = self.summary.as_json()
+        if self.tasks:
+            data["tasks"] = [asdict(task) for task in self.tasks]
+        if self.recording is not None:
+            data["recording"] = asdict(self.recording)
+        return data
 
 
 def run_cell(config: Config, options: RunOptions, console: Console) -> CellRun:
@@ -94,8 +106,11 @@ def run_cell(config: Config, options: RunOptions, console: Console) -> CellRun:
             stack.enter_context(table.shown(console))
         if options.real_time and (refused := stack.enter_context(real_time())):
             console.print(refused, style="yellow", soft_wrap=True, highlight=False, markup=False)
+        # Last, so that it ends first and the table's last picture is of arms at rest.
+        recorder = stack.enter_context(_recorder(pipeline, options)) if options.record is not None else None
         summary = pipeline.run(options.duration, realtime=not options.fast)
-    run = CellRun(summary, watch.results() if watch is not None else ())
+    recording = None if recorder is None else recorder.summary
+    run = CellRun(summary, watch.results() if watch is not None else (), recording)
     if options.report:
         folder = _write_report(config, options, history, run)
         console.print(f"report: {folder / 'report.png'}", soft_wrap=True, highlight=False)
@@ -111,6 +126,8 @@ def print_summary(run: CellRun, json: bool) -> None:
     console.print(summary_table(run.summary))
     for task in run.tasks:
         console.print(task_line(task), soft_wrap=True, highlight=False)
+    if run.recording is not None:
+        console.print(recording_line(run.recording), soft_wrap=True, highlight=False)
 
 
 def _refuse_faults(pipeline: Pipeline, force: bool, console: Console) -> None:
@@ -131,6 +148,18 @@ def _input_of(config: Config, options: RunOptions, console: Console) -> Input:
     return ScriptedInput(options.trajectory, human=options.human, seed=options.seed)
 
 
+def _recorder(pipeline: Pipeline, options: RunOptions) -> Recorder:
+    """A recorder that listens to the pipeline."""
+    assert options.record is not None
+    notes = {"cell": pipeline.config.name, "input": options.input, **options.notes}
+    if options.input == "scripted":
+        notes |= {"trajectory": options.trajectory, "human": str(options.human).lower(), "seed": str(options.seed)}
+    about = About.of(pipeline, not options.fast, notes)
+    recorder = Recorder(options.record, options.name, about, pipeline.robot, waits=options.fast)
+    pipeline.listeners.append(recorder)
+    return recorder
+
+
 class _WindowListener:
     """Shows MuJoCo's window some thirty times a second; closing it ends the run."""
 
@@ -146,23 +175,9 @@ class _WindowListener:
 
 
 def _write_report(config: Config, options: RunOptions, history: History, run: CellRun) -> Path:
-    folder = _new_folder(Path("runs"), f"{datetime.now():%Y%m%d-%H%M%S}-{options.name}")
+    folder = new_folder(Path("runs"), f"{datetime.now():%Y%m%d-%H%M%S}-{options.name}", "report folder")
     (folder / "summary.json").write_text(as_json_text(run.as_json()) + "\n", encoding="utf-8")
     what = options.trajectory if options.input == "scripted" else options.input
     title = f"{config.name}: {what}, {options.plant} plant"
     draw_report(history, run.summary, title, folder / "report.png")
     return folder
-
-
-def _new_folder(parent: Path, name: str) -> Path:
-    """A folder that did not exist before; runs may end within one second."""
-    for suffix in ("", *(f"-{number}" for number in range(2, 100))):
-        folder = parent / (name + suffix)
-        try:
-            folder.mkdir(parents=True)
-        except FileExistsError:
-            continue
-        except OSError as error:
-            raise ConfigError(f"report folder {folder}: {error}") from error
-        return folder
-    raise ConfigError(f"report folder {parent / name}: exists, and so do 98 numbered ones")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from enum import StrEnum
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -50,6 +51,9 @@ def run(
     headless: Headless = False,
     rt: RealTime = False,
     report: Annotated[bool, typer.Option(help="Write plots and a summary to a folder under runs/.")] = False,
+    record: Annotated[str | None, typer.Option(metavar="DIR", help="Record the run to a new folder in DIR.")] = None,
+    task: Annotated[str | None, typer.Option(help="With --record: what is done, noted in the recording.")] = None,
+    operator: Annotated[str | None, typer.Option(help="With --record: whose hands, noted as well.")] = None,
     force: Annotated[bool, typer.Option("--force", help="Run even where q2r2 check finds a fault.")] = False,
     json: Json = False,
 ) -> None:
@@ -68,6 +72,9 @@ def run(
         raise ConfigError("--fast needs --duration, since simulated time has no end of its own")
     if fast and rt:
         raise ConfigError("--rt and --fast exclude each other, since simulated time is never late")
+    for option, text in (("--task", task), ("--operator", operator)):
+        if text is not None and record is None:
+            raise ConfigError(f"{option} needs --record")
     cell = with_address(load_config(config), host, port)
     options = RunOptions(
         name=cell.name,
@@ -84,5 +91,7 @@ def run(
         report=report,
         force=force,
         real_time=rt,
+        record=None if record is None else Path(record),
+        notes={name: text for name, text in (("task", task), ("operator", operator)) if text is not None},
     )
     print_summary(run_cell(cell, options, stderr_console()), json)

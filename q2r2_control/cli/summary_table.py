@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from rich.markup import escape
 from rich.table import Table
 
+from q2r2_control.recording.recorder import RecordingSummary
 from q2r2_control.runtime.histogram import Percentiles
 from q2r2_control.runtime.run_summary import RunSummary
 from q2r2_control.runtime.torque_summary import TorqueSummary
@@ -68,6 +69,15 @@ def task_line(task: TaskResult) -> str:
     )
     verdict = "[green]succeeded[/]" if task.succeeded else f"[red]failed[/]: {escape(task.reason)}"
     return f"{task.name} {verdict} ({figures})"
+
+
+def recording_line(recording: RecordingSummary) -> str:
+    """One line of markup: where a run was recorded, and what is missing of it."""
+    if recording.fault is not None:
+        ended = f"[red]recording ended[/]: {escape(recording.fault)}"
+        return f"{ended}; {recording.ticks} ticks recorded, {recording.lost_ticks} not"
+    lost = f", [red]{recording.lost_ticks} lost[/]: the queue was full" if recording.lost_ticks else ""
+    return f"recording: {escape(str(recording.file))} ({recording.ticks} ticks{lost})"
 
 
 def _figure(what: str, value: float) -> str:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import os
 import re
+from pathlib import Path
 from typing import Any, Literal
 
 import yaml
@@ -136,9 +137,19 @@ def load_config(path: str | os.PathLike[str]) -> Config:
     """
     file = find_resource(path)
     try:
-        data = yaml.load(file.read_text(encoding="utf-8"), Loader=_Loader)
+        text = file.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: cannot be read: {_line(error)}") from error
+    return parse_config(text, path, file.absolute().parent)
+
+
+def parse_config(text: str, path: str | os.PathLike[str], folder: Path | None = None) -> Config:
+    """Check the YAML of a cell that was read from ``path``; paths in it are looked up from a ``folder`` first.
+
+    Raises :class:`ConfigError` as :func:`load_config` does.
+    """
+    try:
+        data = yaml.load(text, Loader=_Loader)
     # Values such as dates and huge integers, and nesting without end, raise Python's own exceptions.
     except (yaml.YAMLError, ValueError, TypeError, RecursionError) as error:
         raise ConfigError(f"{path}: not YAML: {_line(error)}") from error
@@ -146,8 +157,8 @@ def load_config(path: str | os.PathLike[str]) -> Config:
         raise ConfigError(f"{path}: expected a mapping of keys such as name, arms, obstacles; got {data!r:.60}")
     try:
         # Strict, or `off` would pass for 0.0; by way of JSON, where sequences are tuples and names are enums.
-        text = json.dumps(data, default=str)
-        config = Config.model_validate_json(text, strict=True, context={"folder": file.absolute().parent})
+        content = json.dumps(data, default=str)
+        config = Config.model_validate_json(content, strict=True, context={"folder": folder})
         check_models(config.robot, config.arms)
         check_priority(config.control.priority, config.arms)
         check_external(config.controller, config.external, config.arms)

@@ -126,8 +126,9 @@ class CartesianController:
         summary = _Summary()
         if time > 0.0:
             substeps = max(math.ceil(time / self.settings.max_substep - 1e-9), 1)
-            for _ in range(substeps):
-                self._advance(time / substeps, 1.0 / substeps, summary)
+            for index in range(substeps):
+                if not self._advance(time / substeps, 1.0 / substeps, summary):
+                    summary.unsolved |= 1 << index
         report = StepReport(
             status=self._status(usable and dt <= LONGEST_DT, rejected, summary),
             rejected=rejected,
@@ -140,6 +141,7 @@ class CartesianController:
             solve_time=summary.solve_time,
             tightest_pair=self._names_of(self._tightest),
             margin=self._margin,
+            unsolved=summary.unsolved,
         )
         return Reference(state.q.copy(), state.v.copy(), state.a.copy(), report)
 
@@ -222,8 +224,8 @@ class CartesianController:
         """Of each joint in the full stop from the reference that is known, (nv,) [rad/s^2]."""
         return self._stop.copy()
 
-    def _advance(self, h: float, share: float, summary: _Summary) -> None:
-        """One substep, which is a ``share`` of the tick: build, solve, certify and move."""
+    def _advance(self, h: float, share: float, summary: _Summary) -> bool:
+        """One substep, which is a ``share`` of the tick: build, solve, certify and move; whether it was solved."""
         summary.inside &= self._assemble(self._held_model, self._targets.held, self._held_data, h)
         count = int(self._rows.used[0])
         self._problem.rows, self._problem.rows_lower = self._rows.matrix[:count], self._rows.lower[:count]
@@ -243,6 +245,7 @@ class CartesianController:
         was_apart, self._apart = self._apart, self._margin >= 0.0
         # A certified stop stays certified. Anything else was proven just now, and if all was apart before, in full.
         self._certified = self._apart and (self._certified if outcome == STOPPED else was_apart)
+        return usable
 
     def _status(self, dt_usable: bool, rejected: tuple[str, ...], summary: _Summary) -> StepStatus:
         if summary.fallback:
@@ -277,5 +280,6 @@ class _Summary:
     def __init__(self) -> None:
         self.fallback = False
         self.inside = True
+        self.unsolved = 0
         self.slack = 0.0
         self.solve_time = 0.0

@@ -107,7 +107,7 @@ def decode(kind: MessageType, payload: bytes, dialect: Dialect) -> HandMessage:
     does not have in ``dialect`` raises :class:`ProtocolError`.
     """
     _check_bytes(kind, payload, dialect)
-    store = _store(dialect)
+    store = message_types(dialect)
     read = store.deserialize_ros1 if dialect is Dialect.ROS1 else store.deserialize_cdr
     try:
         message: Any = read(payload, kind.full_name)
@@ -140,7 +140,7 @@ def fits(kind: MessageType, payload: bytes, dialect: Dialect) -> bool:
 
 def encode(message: AppMessage, dialect: Dialect) -> bytes:
     """Serialise a vibration as two float32, frequency and amplitude, or a twist as six float64, linear first."""
-    store = _store(dialect)
+    store = message_types(dialect)
     if isinstance(message, HapticFeedback):
         kind = MessageType.HAPTIC
         content: Any = store.types[kind.full_name](frequency=message.frequency, amplitude=message.amplitude)
@@ -157,11 +157,12 @@ def warm_up() -> None:
     """Compile every (de)serialiser now, about 0.5 s once a process, so that no first message waits for it."""
     for dialect in Dialect:
         for kind in MessageType:
-            _store(dialect).get_msgdef(kind.full_name)
+            message_types(dialect).get_msgdef(kind.full_name)
 
 
 @cache
-def _store(dialect: Dialect) -> Typestore:
+def message_types(dialect: Dialect) -> Typestore:
+    """The message types of ROS 1 Noetic or ROS 2 Jazzy, and those of quest2ros."""
     store = get_typestore(Stores.ROS1_NOETIC if dialect is Dialect.ROS1 else Stores.ROS2_JAZZY)
     for kind, fields in ((MessageType.INPUTS, _INPUTS_FIELDS), (MessageType.HAPTIC, _HAPTIC_FIELDS)):
         store.register(get_types_from_msg(fields, kind.full_name))

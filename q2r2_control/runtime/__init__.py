@@ -14,7 +14,7 @@ from q2r2_control._lazy import lazy_exports
 if TYPE_CHECKING:
     from q2r2_control.runtime.loop_clock import LoopClock
     from q2r2_control.runtime.process import few_garbage_collections, stop_on_signals
-    from q2r2_control.runtime.recorder import RunRecorder, Tick
+    from q2r2_control.runtime.recorder import RunRecorder, RunStart, Tick
     from q2r2_control.runtime.run_summary import RunStatistics, RunSummary
     from q2r2_control.runtime.scheduling import real_time
     from q2r2_control.runtime.torque_summary import TorqueStatistics, TorqueSummary
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 __all__ = [
     "LoopClock",
     "RunRecorder",
+    "RunStart",
     "RunStatistics",
     "RunSummary",
     "Tick",
@@ -37,6 +38,7 @@ __getattr__ = lazy_exports(
     {
         "LoopClock": "loop_clock",
         "RunRecorder": "recorder",
+        "RunStart": "recorder",
         "RunStatistics": "run_summary",
         "RunSummary": "run_summary",
         "Tick": "recorder",

@@ -219,8 +219,8 @@ def test_eighty_columns_hold_every_stage_of_the_loop_for_each_plant_and_mode() -
 def test_the_loop_s_bench_prints_its_figures_as_one_object(monkeypatch: pytest.MonkeyPatch) -> None:
     asked = []
 
-    def made_up(config: Config, ticks: int, progress: object) -> LoopReport:
-        asked.append(ticks)
+    def made_up(config: Config, ticks: int, progress: object, *, record: bool) -> LoopReport:
+        asked.append((ticks, record))
         stages = [StageTime(stage, 1.0, 2.0) for stage in STAGES]
         whole = StageTime("without physics", 9.0, 12.0)
         return LoopReport(
@@ -228,8 +228,8 @@ def test_the_loop_s_bench_prints_its_figures_as_one_object(monkeypatch: pytest.M
         )
 
     monkeypatch.setattr("q2r2_control.cli.bench.run_loop_bench", made_up)
-    found = one_object(q2r2("bench", "--loop", "--ticks", "200", "--json").stdout)
-    assert asked == [200]
+    found = one_object(q2r2("bench", "--loop", "--record", "--ticks", "200", "--json").stdout)
+    assert asked == [(200, True)]
     assert {stage["stage"] for stage in found["rows"][2]["stages"]} == set(STAGES)
     assert found["rows"][2]["without_physics"]["median_us"] == 9.0
 

@@ -9,8 +9,9 @@ import pinocchio as pin
 import pytest
 
 from q2r2_control.config import load_config
+from q2r2_control.drives.base import position_command
 from q2r2_control.robot.robot import Robot
-from q2r2_control.runtime.recorder import Tick
+from q2r2_control.runtime.recorder import RunStart, Tick
 from q2r2_control.types import ArmTarget, Reference, RobotState, StepReport, StepStatus
 from q2r2_control.viewer.history import History, tracking_error
 
@@ -27,17 +28,25 @@ def tick_at(robot: Robot, t: float, acceleration: float = 0.0, distance: float =
     report = StepReport(StepStatus.OK, (), (), hand, distance, True, False, 0.0, 0.0, arms, distance - 0.018)
     tools = {arm: robot.tool_pose(robot.home, arm) for arm in robot.arms}
     offset = pin.SE3(pin.exp3(np.array([0.0, 0.1, 0.0])), np.array([0.003, 0.0, 0.0]))
+    state = RobotState(robot.home, zero, zero, None, t)
     return Tick(
         t=t,
+        start=RunStart(0.0, state),
+        now=t,
         dt=0.001,
         step=0.001,
+        following=True,
+        connected=True,
         samples=[],
         targets={arm: ArmTarget(pose * offset if engaged else None, 1.0) for arm, pose in tools.items()},
         engaged=dict.fromkeys(robot.arms, engaged),
         states=dict.fromkeys(robot.arms, "engaged" if engaged else "paused"),
         reference=Reference(robot.home, zero, zero + acceleration, report),
-        state=RobotState(robot.home, zero, zero, None, t),
+        state=state,
+        openings=dict.fromkeys(robot.arms, 0.5),
         tools=tools,
+        command=position_command(Reference(robot.home, zero, zero, report), {}),
+        events=[],
         grippers=dict.fromkeys(robot.arms, 0.5),
         compute_time=1e-4,
     )

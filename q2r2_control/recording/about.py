@@ -1,0 +1,115 @@
+"""What is said once in a recording: the cell, the robot, the program, the machine, and how the run was asked for."""
+
+from __future__ import annotations
+
+import json
+import platform
+import subprocess
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+import yaml
+
+from q2r2_control.config import Config
+from q2r2_control.pipeline import Pipeline
+
+FORMAT = "1"  # of topics and fields; another one cannot be replayed
+ABOUT, CELL, ROBOT, FIELDS = "q2r2_control", "cell.yaml", "robot.urdf", "fields.json"
+_GIT_TIME = 2.0  # [s]
+
+
+@dataclass(frozen=True)
+class About:
+    """Read from, and written to, a metadata record of texts."""
+
+    arms: tuple[str, ...]
+    joints: tuple[str, ...]
+    mode: str  # of driving
+    plant_modes: tuple[str, ...]  # that the plant follows
+    epoch: int  # time of day at which the run began [ns]
+    realtime: bool
+    cell: str  # the YAML of the cell with all its defaults
+    robot: str  # URDF
+    notes: dict[str, str] = field(default_factory=dict)  # program, machine, task and the like, for people
+
+    @classmethod
+    def of(cls, pipeline: Pipeline, realtime: bool, notes: Mapping[str, str]) -> About:
+        """Of a run that is about to begin; ``notes`` are added to those on program and machine."""
+        return cls(
+            arms=tuple(pipeline.robot.arms),
+            joints=tuple(pipeline.robot.joint_names),
+            mode=str(pipeline.drive.mode),
+            plant_modes=tuple(map(str, pipeline.plant.modes)),
+            epoch=time.time_ns(),
+            realtime=realtime,
+            cell=as_yaml(pipeline.config),
+            robot=pipeline.robot.urdf,
+            notes={**program(), "plant": type(pipeline.plant).__name__, **notes},
+        )
+
+    def texts(self) -> dict[str, str]:
+        """For the metadata record; cell and robot are attachments."""
+        return {
+            "format": FORMAT,
+            "arms": json.dumps(self.arms),
+            "joints": json.dumps(self.joints),
+            "mode": self.mode,
+            "plant_modes": json.dumps(self.plant_modes),
+            "epoch_ns": str(self.epoch),
+            "realtime": json.dumps(self.realtime),
+            **self.notes,
+        }
+
+    @classmethod
+    def from_texts(cls, texts: Mapping[str, str], cell: str, robot: str) -> About:
+        """Raises :class:`KeyError` and :class:`ValueError` for what is not one."""
+        rest = dict(texts)
+        if rest.pop("format") != FORMAT:
+            raise ValueError(f"its format is {texts['format']}, this version reads {FORMAT}")
+        return cls(
+            arms=tuple(json.loads(rest.pop("arms"))),
+            joints=tuple(json.loads(rest.pop("joints"))),
+            mode=rest.pop("mode"),
+            plant_modes=tuple(json.loads(rest.pop("plant_modes"))),
+            epoch=int(rest.pop("epoch_ns")),
+            realtime=bool(json.loads(rest.pop("realtime"))),
+            cell=cell,
+            robot=robot,
+            notes=rest,
+        )
+
+
+def as_yaml(config: Config) -> str:
+    """The cell with all its defaults, so that a later version's defaults change nothing."""
+    return str(yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False))
+
+
+def program() -> dict[str, str]:
+    """Version, git revision where there is one, and machine."""
+    notes = {"version": _version("q2r2_control"), "machine": f"{platform.node()}, {platform.platform()}"}
+    notes["libraries"] = ", ".join(f"{name} {_version(name)}" for name in ("numpy", "pin", "numba", "daqp", "mujoco"))
+    if revision := _revision():
+        notes["revision"] = revision
+    return notes
+
+
+def _version(package: str) -> str:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "unknown"
+
+
+def _revision() -> str:
+    """Of the checkout that this module is in, with a mark where it was changed; empty for an installed package."""
+    checkout = Path(__file__).resolve().parents[2]
+    if not (checkout / ".git").exists():
+        return ""
+    command = ["git", "-C", str(checkout), "describe", "--always", "--dirty", "--abbrev=40"]
+    try:
+        return subprocess.run(command, capture_output=True, text=True, timeout=_GIT_TIME, check=True).stdout.strip()
+    except (OSError, subprocess.SubprocessError):
+        return ""

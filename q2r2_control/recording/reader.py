@@ -1,0 +1,137 @@
+"""Reads recordings, chunk by chunk: those that were ended, and what a killed process left."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from mcap.exceptions import EndOfFile, McapError
+from mcap.records import Attachment, Channel, Chunk, DataEnd, McapRecord, Metadata
+from mcap.stream_reader import StreamReader, get_chunk_data_stream
+from zstandard import ZstdError
+
+from q2r2_control.errors import RecordingError
+from q2r2_control.recording.about import ABOUT, CELL, ROBOT, About
+from q2r2_control.recording.rows import HEAD, MESSAGE, Rows
+from q2r2_control.recording.topics import Topic, Topics
+
+_LARGEST = 1 << 30  # of a record [bytes]
+_OPCODE_AND_LENGTH = 9
+_BROKEN = (McapError, ZstdError, ValueError, KeyError, IndexError, struct.error, OverflowError, MemoryError)
+
+
+@dataclass(frozen=True)
+class RecordedChunk:
+    """Messages of some ticks: rows of each topic, and the records of those that are texts."""
+
+    rows: dict[str, Rows]
+    texts: dict[str, list[bytes]]
+
+
+class Recording:
+    """A file that ``q2r2 run --record`` wrote. Raises :class:`RecordingError`, one line, for any other."""
+
+    def __init__(self, path: Path) -> None:
+        """``path``: the file, or the folder that it is alone in."""
+        self.file = _file_of(path)
+        self.about = self._read_about()
+        self.topics = Topics(self.about.arms, self.about.joints)
+
+    def chunks(self) -> Iterator[RecordedChunk]:
+        """All messages, some half a second at a time."""
+        try:
+            for record in self._records():
+                if isinstance(record, Channel):
+                    self._check(record)
+                elif isinstance(record, Chunk):
+                    stream, size = get_chunk_data_stream(record, validate_crc=True)
+                    yield self._split(stream.read(size))
+                elif isinstance(record, DataEnd):
+                    return
+        except EndOfFile:
+            return  # cut off in the middle of a record, by a machine that lost its power
+        except _BROKEN as error:
+            raise RecordingError(f"{self.file}: damaged: {_line(error)}") from error
+
+    def _records(self) -> Iterator[McapRecord]:
+        try:
+            with self.file.open("rb") as stream:
+                # Not wrapped, so that a file that changes meanwhile is not read twice.
+                yield from StreamReader(stream, emit_chunks=True, record_size_limit=_LARGEST).records
+        except OSError as error:
+            raise RecordingError(f"{self.file}: cannot be read: {error.strerror}") from error
+
+    def _read_about(self) -> About:
+        texts: dict[str, str] = {}
+        attachments: dict[str, str] = {}
+        try:
+            for record in self._records():
+                if isinstance(record, Metadata) and record.name == ABOUT:
+                    texts = record.metadata
+                elif isinstance(record, Attachment):
+                    attachments[record.name] = record.data.decode()
+                elif isinstance(record, Chunk):
+                    break
+        except EndOfFile:
+            pass
+        except _BROKEN as error:
+            raise RecordingError(f"{self.file}: not an MCAP file, or damaged: {_line(error)}") from error
+        if not texts:
+            raise RecordingError(f"{self.file}: not a recording of q2r2 run --record: no metadata {ABOUT}")
+        try:
+            return About.from_texts(texts, attachments[CELL], attachments[ROBOT])
+        except KeyError as error:
+            raise RecordingError(f"{self.file}: damaged: no {error.args[0]}") from error
+        except ValueError as error:
+            raise RecordingError(f"{self.file}: {_line(error)}") from error
+
+    def _check(self, channel: Channel) -> None:
+        known = self.topics.by_channel.get(channel.id)
+        if known is None or known.name != channel.topic:
+            raise ValueError(f"unknown topic {channel.topic}")
+
+    def _split(self, data: bytes) -> RecordedChunk:
+        """The messages of a chunk by topic."""
+        records: dict[int, list[bytes]] = {}
+        at = 0
+        while at < len(data):
+            opcode, length, channel, *_ = HEAD.unpack_from(data, at)
+            end = at + _OPCODE_AND_LENGTH + length
+            if opcode != MESSAGE or end > len(data):
+                raise ValueError("a chunk that does not end with a message")
+            records.setdefault(channel, []).append(data[at:end])
+            at = end
+        rows, texts = {}, {}
+        for channel, found in records.items():
+            topic = self.topics.by_channel[channel]
+            if topic.row is None:
+                texts[topic.name] = found
+            else:
+                rows[topic.name] = _as_rows(topic, found)
+        return RecordedChunk(rows, texts)
+
+
+def _as_rows(topic: Topic, records: list[bytes]) -> Rows:
+    assert topic.row is not None
+    dtype = topic.row.dtype
+    if any(len(record) != dtype.itemsize for record in records):
+        raise ValueError(f"a message of {topic.name} has a size that it cannot have")
+    return np.frombuffer(b"".join(records), dtype=dtype)
+
+
+def _file_of(path: Path) -> Path:
+    if not path.is_dir():
+        if not path.exists():
+            raise RecordingError(f"{path}: no such file or folder")
+        return path
+    files = sorted(path.glob("*.mcap"))
+    if len(files) != 1:
+        raise RecordingError(f"{path}: has {len(files)} files .mcap; allowed: a folder with one, or a file")
+    return files[0]
+
+
+def _line(error: Exception) -> str:
+    return " ".join((str(error) or repr(error)).split())[:200]

@@ -1,0 +1,219 @@
+"""A replay does what was done, to the bit; and says what is different where something is."""
+
+from __future__ import annotations
+
+from dataclasses import replace as changed
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from q2r2_control.config import Config
+from q2r2_control.control.qp import DaqpSolver, QpProblem, QpSolution
+from q2r2_control.errors import PlantError, RecordingError
+from q2r2_control.inputs.scripted import ScriptedInput
+from q2r2_control.plants.kinematic import KinematicPlant
+from q2r2_control.recording.reader import Recording
+from q2r2_control.recording.recorder import Recorder
+from q2r2_control.recording.replay import replay
+from q2r2_control.recording.rows import HEAD
+from q2r2_control.robot.robot import Robot
+from q2r2_control.types import HandSample, RobotState
+from tests.recording.runs import RATE, file_of, pipeline, record, rewrite
+from tests.support.object_cell import cell as object_cell
+from tests.support.watch import cell
+
+
+@pytest.fixture(scope="module")
+def circle(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Both arms on a circle for half a second, after they were engaged."""
+    return file_of(record(tmp_path_factory.mktemp("recordings"), pipeline(), 1.2))
+
+
+@pytest.mark.parametrize(
+    ("trajectory", "plant", "mode", "human", "duration"),
+    [
+        ("line", "kinematic", "velocity", False, 1.2),
+        ("rotate", "mujoco", "position", True, 1.2),
+        ("meet", "mujoco", "torque", False, 2.0),
+    ],
+    ids=["velocities", "a human's hands in MuJoCo", "torques, grippers that close"],
+)
+def test_a_replay_of_a_run_in_simulated_time_is_identical(
+    tmp_path: Path, trajectory: str, plant: str, mode: str, human: bool, duration: float
+) -> None:
+    file = file_of(record(tmp_path, pipeline(trajectory, plant, mode, human), duration))
+    result = replay(file)
+    assert (result.difference, result.ended_by, result.notes) == (None, None, [])
+    assert result.ticks >= duration * RATE
+    assert result.summary is not None
+    assert result.summary.arms["left"].engaged_s > 0.3
+    assert result.summary.at_rest
+
+
+def test_a_replay_of_a_run_by_the_computers_clock_is_identical(tmp_path: Path) -> None:
+    loop = pipeline("circle", "mujoco", "torque", human=True)
+    result = replay(file_of(record(tmp_path, loop, 1.2, realtime=True)))
+    # Whether the arms were engaged depends on the machine: a loop that stalls pauses them.
+    assert (result.difference, result.ended_by) == (None, None)
+    assert result.ticks > 10
+
+
+def test_what_a_gripper_holds_is_replayed(tmp_path: Path) -> None:
+    flat = {"box": (0.06, 0.04, 0.015), "at": (0.0, 0.0, 0.0085), "mass": 0.1}
+    config = object_cell(None, flat).model_copy(update={"loop_rate_hz": RATE})
+    changes = {name: getattr(config, name) for name in ("arms", "mujoco")}
+    loop = pipeline("grasp", "mujoco", source=ScriptedInput("grasp"), **changes)
+    result = replay(file_of(record(tmp_path, loop, 5.5)))
+    assert result.difference is None
+    assert result.summary is not None
+    assert result.summary.arms["right"].object_held_s
+
+
+class FaultyHands(ScriptedInput):
+    """Loses its connection for a moment, and sends what is no pose, and hands that nobody has."""
+
+    @property
+    def connected(self) -> bool:
+        return super().connected and not 1.0 <= self._now < 1.02
+
+    def poll(self, now: float) -> list[HandSample]:
+        self._now = now
+        samples = super().poll(now)
+        if 0.9 <= now < 0.95:
+            samples = [changed(sample, position=np.array([np.nan, np.inf, -0.0])) for sample in samples]
+        return samples + [changed(sample, hand="third") for sample in samples]
+
+    _now = 0.0
+
+
+def test_lost_connections_and_numbers_that_are_none_are_replayed(tmp_path: Path) -> None:
+    result = replay(file_of(record(tmp_path, pipeline(source=FaultyHands("circle")), 1.2)))
+    assert result.difference is None
+    assert result.summary is not None
+    reasons = [event.reason for event in result.summary.events if event.destination == "paused"]
+    assert any("not finite" in reason for reason in reasons)
+
+
+class LosesItsSensors(KinematicPlant):
+    """Measures nothing any more after 1 s."""
+
+    def state(self) -> RobotState:
+        state = super().state()
+        return changed(state, q=np.full_like(state.q, np.nan)) if state.stamp > 1.0 else state
+
+
+def test_a_run_that_a_fault_ended_ends_by_the_same_fault(tmp_path: Path) -> None:
+    plant = LosesItsSensors(Robot.from_config(cell()), cell())
+    recorders: list[Recorder] = []
+    with pytest.raises(PlantError) as fault:
+        record(tmp_path, pipeline(plant=plant), 1.5, during=recorders.append)
+    result = replay(file_of(recorders[0].summary))
+    assert result.difference is None
+    assert result.ended_by == str(fault.value)
+
+
+class SometimesLate(DaqpSolver):
+    """Has no solution at every seventh problem, as if it had taken too long."""
+
+    count = 0
+
+    def solve(self, problem: QpProblem) -> QpSolution:
+        self.count += 1
+        solution = super().solve(problem)
+        return QpSolution(None, 1.0) if self.count % 7 == 0 else solution
+
+
+def test_solutions_that_came_too_late_are_too_late_again(tmp_path: Path) -> None:
+    loop = pipeline(control=cell().control.model_copy(update={"solve_time_limit": None}))
+    loop.controller._solver = SometimesLate(loop.robot.model.nv, None)
+    file = file_of(record(tmp_path, loop, 1.2))
+    result = replay(file)
+    assert result.difference is None
+    assert result.summary is not None
+    assert result.summary.fallback_ticks > 50
+
+
+def flip(file: Path, target: Path, topic: str, label: str) -> Path:
+    """A copy in which a low bit of one number is flipped, in the first message of a topic after one second."""
+    row = Recording(file).topics.by_name[topic]
+    assert row.row is not None
+    assert row.row.dtype.fields is not None
+    begin = row.row.dtype.fields["data"][1] + 8 * row.labels["data"].index(label)
+    flipped: list[int] = []
+
+    def change(chunk: bytearray) -> None:
+        at = 0
+        while at < len(chunk) and not flipped:
+            _, length, channel, number, *_ = HEAD.unpack_from(chunk, at)
+            if channel == row.channel and number >= 1.0 * RATE:
+                chunk[at + begin + 1] ^= 1
+                flipped.append(number)
+            at += 9 + length
+
+    copy = rewrite(file, target, change)
+    assert flipped
+    return copy
+
+
+def test_a_flipped_bit_in_a_sample_is_the_first_difference(tmp_path: Path, circle: Path) -> None:
+    result = replay(flip(circle, tmp_path / "flipped.mcap", "/q2r2/hand_samples", "x"))
+    assert result.difference is not None
+    time, _, rest = result.difference.partition(" s: ")
+    assert float(time) == pytest.approx(1.0, abs=0.02)
+    assert rest.startswith("/q2r_left_hand_pose: position[x]: recorded ")
+    assert "replayed" in rest
+
+
+def test_a_flipped_bit_in_the_time_of_a_tick_is_the_first_difference(tmp_path: Path, circle: Path) -> None:
+    result = replay(flip(circle, tmp_path / "flipped.mcap", "/q2r2/tick", "dt"))
+    assert result.difference is not None
+    assert result.difference.startswith("1.002000 s: /q2r2/tick: data[step]: recorded 0.002, replayed 0.00199")
+
+
+def changed_filter(config: Config) -> Config:
+    teleop: Any = config.teleop
+    smoother = teleop.filter.model_copy(update={"smoothing_delay": teleop.filter.smoothing_delay + 0.02})
+    return config.model_copy(update={"teleop": teleop.model_copy(update={"filter": smoother})})
+
+
+def test_another_filter_is_named_and_so_is_the_first_difference(circle: Path) -> None:
+    config = changed_filter(cell().model_copy(update={"loop_rate_hz": RATE}))
+    result = replay(circle, config)
+    assert [note.split(" ")[1] for note in result.notes] == ["teleop.filter.smoothing_delay:"]
+    assert result.difference is not None
+    time, _, rest = result.difference.partition(" s: ")
+    assert 0.6 < float(time) < 0.9
+    assert rest.startswith("/q2r2/left/target_frame: ")
+
+
+def test_a_file_that_is_no_recording_is_one_line(tmp_path: Path, circle: Path) -> None:
+    damaged = tmp_path / "damaged.mcap"
+    data = bytearray(circle.read_bytes())
+    data[data.rindex(b"zstd", 0, len(data) // 2) + 50] ^= 1  # in what a chunk packs, not in an index
+    damaged.write_bytes(data)
+    text = tmp_path / "text.mcap"
+    text.write_text("nothing of the kind")
+    empty = tmp_path / "empty.mcap"
+    empty.write_bytes(b"")
+    other = tmp_path / "other.mcap"
+    other.write_bytes(circle.read_bytes().replace(b"q2r2_control", b"q9r9_control"))
+    for file, what in (
+        (damaged, "damaged: "),
+        (text, "not an MCAP file"),
+        (empty, "not a recording"),
+        (other, "not a recording of q2r2 run --record"),
+        (tmp_path / "none.mcap", "no such file"),
+        (tmp_path, "has 4 files .mcap"),
+    ):
+        with pytest.raises(RecordingError, match=what) as error:
+            pytest.fail(f"{file} was replayed: {replay(file)}")
+        assert "\n" not in str(error.value)
+        assert str(file) in str(error.value)
+
+
+def test_a_cell_with_other_joints_cannot_replay(circle: Path) -> None:
+    one_arm = cell().model_copy(update={"arms": {"left": cell().arms["left"]}})
+    with pytest.raises(RecordingError, match="other arms or joints"):
+        replay(circle, one_arm)
