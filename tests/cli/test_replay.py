@@ -1,0 +1,62 @@
+"""A run that is recorded and replayed from the command line, as a user does it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from tests.cli.test_app import FAST, changed_cell, one_object, q2r2
+
+OPTIONS = (*FAST[2:], "--duration", "1.5")
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a recorded run, in which both arms are engaged and move."""
+    parent = tmp_path_factory.mktemp("recordings")
+    cell = changed_cell(parent, "", "")
+    given = ("--record", str(parent / "here"), "--task", "a circle", "--operator", "Ada")
+    result = q2r2("run", cell, *OPTIONS, *given)
+    assert result.exit_code == 0
+    recording = one_object(result.stdout)["recording"]
+    assert recording["ticks"] == one_object(result.stdout)["ticks"]
+    assert (recording["lost_ticks"], recording["fault"]) == (0, None)
+    return Path(recording["file"]).parent
+
+
+def test_it_says_identical_and_exits_0(recorded: Path) -> None:
+    for file in (recorded, *recorded.glob("*.mcap")):
+        result = q2r2("replay", str(file), "--compare")
+        assert (result.exit_code, result.stdout, result.stderr) == (0, "identical\n", "")
+
+
+def test_with_another_cell_it_says_what_differs_then_and_now_and_exits_1(recorded: Path, tmp_path: Path) -> None:
+    other = changed_cell(tmp_path, "position_scale: 1.0 ", "position_scale: 1.5 ")
+    result = q2r2("replay", str(recorded), "--compare", "--config", other)
+    assert result.exit_code == 1
+    assert result.stdout.startswith("first difference at ")
+    assert "target_frame: position[" in result.stdout
+    assert "teleop.position_scale: 1.0 when recorded, now 1.5" in result.stderr
+
+
+def test_without_compare_it_prints_the_summary_of_the_replayed_run(recorded: Path) -> None:
+    data = one_object(q2r2("replay", str(recorded), "--json").stdout)
+    assert data["ticks"] == data["summary"]["ticks"] > 1000
+    assert "difference" not in data
+
+
+def test_a_file_that_is_no_recording_is_one_line_and_exit_code_2(tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").write_text("no recording\n")
+    for file in (tmp_path / "notes.txt", tmp_path / "missing.mcap"):
+        result = q2r2("replay", str(file))
+        assert (result.exit_code, result.stdout) == (2, "")
+        assert result.stderr.count("\n") == 1
+        assert file.name in result.stderr
+
+
+@pytest.mark.parametrize("option", ["--task", "--operator"])
+def test_notes_need_a_recording(option: str, tmp_path: Path) -> None:
+    result = q2r2("run", changed_cell(tmp_path, "", ""), *OPTIONS, option, "something")
+    assert result.exit_code == 2
+    assert f"{option} needs --record" in result.stderr
