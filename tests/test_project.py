@@ -74,7 +74,7 @@ def modules_outside_ros() -> set[Path]:
 
 def modules_of_nodes() -> set[Path]:
     """What needs rclpy: the nodes, and the benchmark that runs them."""
-    return {*ROS.rglob("*.py"), ROOT / "q2r2_control" / "benchmark" / "ros_latency.py"}
+    return {*ROS.rglob("*.py"), *(ROOT / "q2r2_control" / "benchmark").glob("ros_*.py")}
 
 
 @pytest.mark.parametrize("dependency", dependencies())
