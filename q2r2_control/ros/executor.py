@@ -1,8 +1,8 @@
 """An executor for nodes that tick: at each tick it takes what has arrived, and then lets the timers work with it.
 
 rclpy's own executor wakes for each message, and for each callback it collects all entities, builds a wait set and
-makes a task, twice. In a node that ticks at 250 Hz that takes several times the processor time of its callbacks, for
-messages that wait for the next tick anyway.
+makes a task, twice. In a node that ticks that takes much processor time, for messages that wait for the next tick
+anyway.
 """
 
 from __future__ import annotations
