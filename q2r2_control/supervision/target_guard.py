@@ -9,7 +9,7 @@ import pinocchio as pin
 
 from q2r2_control.config.teleop import GuardSettings
 from q2r2_control.supervision.tick_pacer import TickPacer
-from q2r2_control.types import Array
+from q2r2_control.types import LONGEST_DT, Array
 
 _REST = 1e-9  # slower than this is at rest [m/s, rad/s]
 
@@ -26,7 +26,8 @@ class TargetGuard:
     A step of the target faster than the limit is no motion of it; then u = 0. Rotations are limited the same way by
     the rotation vector from pose to target. Poses are in one frame, whichever; quaternions stay of unit length over any
     number of steps. Nothing but :meth:`reset` makes the pose jump, and a step that comes late moves it no farther than
-    the velocity limits allow in one period, see :mod:`tick_pacer`.
+    the velocity limits allow in one period, see :mod:`tick_pacer`. After a gap of more than 0.1 s it begins from rest:
+    whatever followed it stands at the last pose, and the way that was left to brake on would move it once more.
     """
 
     def __init__(self, settings: GuardSettings, period: float) -> None:
@@ -63,6 +64,9 @@ class TargetGuard:
         gap = now - self._now
         if self.pose is None or not gap > 0.0:
             return self.pose
+        if gap > LONGEST_DT:  # whatever follows has come to rest meanwhile, or is about to
+            self._linear.stop()
+            self._angular.stop()
         dt = self._pacer.step(gap, np.array([self._linear.speed, self._angular.speed]))
         self._now = now
         if target is None or not np.isfinite(target.homogeneous).all():

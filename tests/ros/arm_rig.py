@@ -31,6 +31,14 @@ TOOL = pin.SE3(pin.exp3(np.array([3.0, 0.2, 0.1])), np.array([0.5, 0.25, 0.38]))
 PATIENT = {"teleop.gate.timeout": 1.0, "tool_timeout": 1.0, "link_timeout": 3.0, "listener_timeout": 1.0}
 
 
+def patient(parameters: dict[str, Any]) -> list[str]:
+    """Arguments of an arm's node: parameters, with timeouts that an overloaded machine keeps to."""
+    return [
+        "--ros-args",
+        *(part for name, value in (PATIENT | parameters).items() for part in ("-p", f"{name}:={value}")),
+    ]
+
+
 class ArmRig:
     """The hand ``hand`` and the robot of the arm ``arm``, on a node that a thread spins.
 
@@ -75,8 +83,8 @@ class ArmRig:
 
     def start(self, processes: Processes, parameters: dict[str, Any] | None = None) -> RosProcess:
         """Start the arm's controller; returns when it receives the hand."""
-        given = (f"{name}:={value}" for name, value in (PATIENT | (parameters or {})).items())
-        process = processes.start_node(f"{self.arm}_arm_controller", *given)
+        module = f"q2r2_control.ros.nodes.{self.arm}_arm_controller"
+        process = processes.start_module(module, *patient(parameters or {}))
         self.wait_until_connected()
         return process
 

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import re
+import signal
+import threading
 import time
 from queue import Queue
 from typing import Any
@@ -19,7 +22,8 @@ pytest.importorskip("quest2ros", reason="needs q2r2 ros build-interfaces")
 pytestmark = pytest.mark.usefixtures("interfaces")
 
 from q2r2_control.errors import ConfigError  # noqa: E402
-from tests.ros.arm_rig import TOOL, ArmRig, assert_same, first, offset, steps  # noqa: E402
+from tests.ros.arm_rig import TOOL, ArmRig, assert_same, first, offset, patient, steps  # noqa: E402
+from tests.ros.programs.stalling_arm import STALL  # noqa: E402
 
 
 @pytest.fixture
@@ -84,6 +88,28 @@ def test_a_silent_hand_pauses_the_arm_and_its_return_moves_nothing(rig: ArmRig, 
     rig.engage()
     rig.wait_for_rest()
     assert_same(rig.newest(), held, 1e-6)
+
+
+def test_a_node_that_stood_still_in_the_middle_of_a_tick_sends_no_target_of_the_past(
+    rig: ArmRig, processes: Processes
+) -> None:
+    """Neither the one that it had decided on, nor the way that its last motion had left to brake on."""
+    process = processes.start_module("tests.ros.programs.stalling_arm", *patient({}))
+    rig.wait_until_connected()
+    rig.engage()
+    mover = threading.Thread(target=rig.move, args=((0.6, 0.0, 0.0), 2.0))
+    mover.start()
+    time.sleep(0.5)
+    os.kill(process.pid, signal.SIGUSR1)
+    time.sleep(0.5 * STALL)
+    before, held = len(rig.targets), rig.newest()
+    assert held.translation[0] > TOOL.translation[0] + 0.05  # it was moving
+    rig.wait(lambda: rig.state["last_event"].startswith("paused: this node stood still for 1."), "it has gone on")
+    mover.join()
+    assert len(rig.targets) == before
+    rig.engage()
+    rig.move((0.0, 0.05, 0.0))
+    assert_same(rig.wait_for_rest(), offset(held, (0.0, 0.05, 0.0)), 1e-3)
 
 
 def test_without_its_tools_pose_an_arm_is_not_engaged_nor_a_gripper_closed_without_server(

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from q2r2_control.config.teleop import GuardSettings
 from q2r2_control.supervision.target_guard import TargetGuard
 from q2r2_control.supervision.tick_pacer import TickPacer
-from q2r2_control.types import Array
+from q2r2_control.types import LONGEST_DT, Array
 from tests.teleop.hands import pose
 
 DT = 0.01
@@ -35,6 +35,8 @@ class Watched:
         return self.guard.pose
 
     def step(self, target: pin.SE3 | None, dt: float = DT) -> pin.SE3:
+        if self.now + dt - self.now > LONGEST_DT:  # what follows it has come to rest
+            self.velocity = np.zeros(3), np.zeros(3)
         before, last = self.pose, self.velocity
         self.now += dt
         after = self.guard.step(target, self.now)
@@ -75,6 +77,17 @@ def circle(t: float, radius: float, period: float) -> pin.SE3:
     """A circle through the origin that sets off within half a second, turning on its way."""
     phase = 2 * math.pi / period * (t * t if t < 0.5 else t - 0.25)
     return pose(radius * (math.cos(phase) - 1), radius * math.sin(phase), 0.0, (0.0, 0.0, 0.5 * math.sin(phase)))
+
+
+def test_what_was_left_to_brake_on_is_not_moved_after_a_gap_in_which_all_came_to_rest() -> None:
+    watched = Watched()
+    for step in range(1, 101):
+        watched.step(pose(0.4 * DT * step))
+    assert watched.velocity[0][0] == pytest.approx(0.4, abs=0.01)
+    held = watched.pose
+    assert watched.step(None, 1.01 * LONGEST_DT).isApprox(held, 1e-12)
+    assert watched.guard.at_rest
+    assert watched.step(None).isApprox(held, 1e-12)
 
 
 def test_without_a_reset_there_is_no_pose() -> None:

@@ -111,11 +111,15 @@ class ArmOutputs:
             faults += [self._safe_target.take_silence(now), self._follows.refusal(self.first.following, now)]
         return next((fault for fault in faults if fault), None)
 
-    def step(self, target: pin.SE3 | None, tool: pin.SE3 | None, base: pin.SE3 | None, now: float) -> pin.SE3 | None:
+    def step(
+        self, target: pin.SE3 | None, tool: pin.SE3 | None, base: pin.SE3 | None, now: float, decided: float
+    ) -> pin.SE3 | None:
         """Send the hand's target, see :meth:`TargetOutput.step`."""
-        return self.first.step(target, tool, pin.SE3.Identity() if self._filtered else base, now)
+        return self.first.step(target, tool, pin.SE3.Identity() if self._filtered else base, now, decided)
 
-    def relay(self, engaged: bool, tool: pin.SE3 | None, base: pin.SE3 | None, now: float) -> str | None:
+    def relay(
+        self, engaged: bool, tool: pin.SE3 | None, base: pin.SE3 | None, now: float, decided: float
+    ) -> str | None:
         """Pass on the safe target of the built-in controller; returns why the arm has to pause."""
         if self._last is None:
             return None
@@ -127,7 +131,7 @@ class ArmOutputs:
                 fault = self._safe_target.problem or f"{self._safe_topic} is not where the tool is"
         self._relaying = self._relaying and safe is not None
         # A stream starts at the measured tool: the safe target may differ from it by the arm's sag.
-        self._last.step(safe if self._relaying else None, tool, base, now, start=tool)
+        self._last.step(safe if self._relaying else None, tool, base, now, decided, start=tool)
         return fault
 
     def forget(self, now: float) -> None:

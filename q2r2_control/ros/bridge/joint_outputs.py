@@ -6,6 +6,7 @@ its commands become. Whether anything still takes them is found out while they a
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -46,22 +47,21 @@ class JointOutput:
         if self._channels:
             self.drive.reset(state)
 
-    def send(self, reference: Reference, state: RobotState, dt: float, t: float, trusted: bool) -> None:
+    def send(self, reference: Reference, state: RobotState, dt: float, t: float, trusted: bool, decided: float) -> None:
         """Command the reference that is due ``dt`` [s] from now, at ``t`` [s] of the node's clock.
 
-        ``trusted``: see :meth:`Drive.command`.
+        ``trusted``: see :meth:`Drive.command`; ``decided``: see :func:`publish_in_time`.
         """
         if self._channels:
             command = self.drive.command(reference, state, {}, dt, trusted)
-            self._publish(JointCommand(command, state, t))
+            self._publish(JointCommand(command, state, t), decided)
 
     def end(self, state: RobotState, t: float) -> None:
         """What holds the arms where no more commands come, for drives that need it."""
         command = self.drive.last_command(state, {})
         if command is None or command.mode is not self.drive.mode:
             return
-        for channel in self._channels:  # without waiting for an acknowledgement: there is no next one to send instead
-            channel.publisher.publish(self._kind.encode(JointCommand(command, state, t), channel.names, channel.joints))
+        self._publish(JointCommand(command, state, t), time.monotonic())
 
     def waits(self) -> bool:
         """Whether nothing should be sent now, so that the last command can be acknowledged; to be asked once a tick.
@@ -88,9 +88,9 @@ class JointOutput:
             return "a new receiver takes the commands, and the arms are not where these are"
         return next((line for publisher in publishers if (line := publisher.silence())), None)
 
-    def _publish(self, command: JointCommand) -> None:
+    def _publish(self, command: JointCommand, decided: float) -> None:
         for channel in self._channels:
-            channel.publisher.publish(self._kind.encode(command, channel.names, channel.joints))
+            channel.publisher.publish(self._kind.encode(command, channel.names, channel.joints), decided)
 
 
 def joints_of(robot: Robot, arms: Iterable[str]) -> np.ndarray:

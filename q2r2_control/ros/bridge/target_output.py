@@ -114,13 +114,14 @@ class TargetOutput:
         tool: pin.SE3 | None,
         base: pin.SE3 | None,
         now: float,
+        decided: float,
         start: pin.SE3 | None = None,
     ) -> pin.SE3 | None:
         """Publish for ``now`` [s]; returns what was published, in the world frame.
 
         ``target``: where the tool should be, None while paused; ``tool``: where it is; ``base``: the frame in which
         the controller reads its targets. All are in the world frame; the latter two are None while not known.
-        ``start``: where a stream begins, by default at its first target.
+        ``decided``: see :func:`publish_in_time`; ``start``: where a stream begins, by default at its first target.
         """
         if self._unknown or self._present > self._listeners:
             return None
@@ -134,7 +135,7 @@ class TargetOutput:
         if pose is None or base is None or not (self.following or not self.guard.at_rest or self._holds(tool, now)):
             return None
         if not (self.following and self._publisher.waits()):
-            self._publisher.publish(stamped_pose(base.actInv(pose), self._frame, now))
+            self._publisher.publish(stamped_pose(base.actInv(pose), self._frame, now), decided)
             self.sent += 1
         return pose
 

@@ -20,6 +20,7 @@ _NO_WAIT = Duration(nanoseconds=0)
 # A subscriber may take 5 ms to acknowledge, longer than the period of a fast stream. So messages are left out every
 # _CHECK seconds, until the one before has been acknowledged, or for at most _GAP seconds.
 _CHECK, _GAP = 0.05, 0.015
+_LIFESPAN = SENT_COMMAND_QOS.lifespan.nanoseconds * 1e-9  # [s]
 
 
 def node_of(endpoint: Any) -> str | None:
@@ -68,6 +69,16 @@ class Publishers:
             self._names[topic] = " and ".join(known)
 
 
+def publish_in_time(publisher: Any, message: Any, decided: float) -> None:
+    """Publish what was decided on at ``decided`` [s] of the steady clock, unless its lifespan is over since then.
+
+    The middleware counts the lifespan from the publishing. A process that is frozen between the two would send, when it
+    continues, one command of the past: a jump for a robot that has come to rest meanwhile.
+    """
+    if time.monotonic() - decided <= _LIFESPAN:
+        publisher.publish(message)
+
+
 class WatchedPublisher:
     """A publisher of targets or commands that notices when a subscriber was killed or hangs: it acknowledges no more.
 
@@ -98,9 +109,9 @@ class WatchedPublisher:
         self._streaming, self._gap_began = False, -math.inf
         self._acknowledged = time.monotonic() if acknowledged else None
 
-    def publish(self, message: Any) -> None:
-        """Publish a message of the stream."""
-        self._publisher.publish(message)
+    def publish(self, message: Any, decided: float) -> None:
+        """Publish a message of the stream; ``decided``: see :func:`publish_in_time`."""
+        publish_in_time(self._publisher, message, decided)
         self._streaming = True
 
     def waits(self) -> bool:

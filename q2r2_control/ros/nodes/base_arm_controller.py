@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
@@ -147,7 +148,7 @@ class BaseArmController(BaseNode):
 
     def tick(self) -> None:
         """Process what arrived, and publish where the tool should go."""
-        now, tool = self.now, self.current_pose()
+        decided, now, tool = time.monotonic(), self.now, self.current_pose()
         base = self._base()
         self._refusal = self._refuse(tool, base, now)
         obstacle = None if self._refusal is None else self._refusal[1]
@@ -161,10 +162,9 @@ class BaseArmController(BaseNode):
         target = self.teleop.update(samples, tools, now, commanded or None, obstacles)[arm]
         toggled = target.gripper != self._target.gripper
         self._target = target
-        if self.now - now > self.parameters.teleop.gate.timeout:
-            return  # this process was frozen meanwhile: the target is out of date, and the next tick pauses the arm
-        sent = self._outputs.step(target.pose, tool, base, now)
-        if (fault := self._outputs.relay(self.state is ArmState.ENGAGED, tool, base, now)) is not None:
+        # If this process was frozen meanwhile, the target is out of date: it is not sent, and the next tick pauses.
+        sent = self._outputs.step(target.pose, tool, base, now, decided)
+        if (fault := self._outputs.relay(self.state is ArmState.ENGAGED, tool, base, now, decided)) is not None:
             self.teleop.pause(now, fault)
         if toggled:
             self.toggle_gripper()

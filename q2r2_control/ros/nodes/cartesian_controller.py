@@ -32,6 +32,7 @@ from q2r2_control.ros.base_node import ERROR, LATCHED_QOS, OK, SENT_COMMAND_QOS,
 from q2r2_control.ros.bridge.intakes import JointIntake, TargetIntake
 from q2r2_control.ros.bridge.joint_outputs import NONE, make_output, output_name
 from q2r2_control.ros.bridge.messages import stamped_pose
+from q2r2_control.ros.monitoring.endpoints import publish_in_time
 from q2r2_control.supervision.external_arms import ExternalArms, ExternalSettings, settings_for_external_arms
 from q2r2_control.supervision.joint_watch import watch_settings
 from q2r2_control.supervision.supervisor import Displace, Phase, Supervisor
@@ -154,6 +155,7 @@ class CartesianControllerNode(BaseNode):
         self.create_timer(_LOOK_PERIOD, self._look, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def _tick(self) -> None:
+        decided = time.monotonic()
         if self._output.waits():
             return  # this tick is a missed one, and the next a late one
         now = self.now
@@ -165,12 +167,11 @@ class CartesianControllerNode(BaseNode):
         self._last_tick = now
         self._ticks += 1
         if dt > 0.0:
-            self._advance(now, dt)
+            self._advance(now, dt, decided)
         self._tell_followed()
 
-    def _advance(self, now: float, dt: float) -> None:
+    def _advance(self, now: float, dt: float, decided: float) -> None:
         self._advances += 1
-        began = time.monotonic()
         # Commands that the arms do not follow are not for a receiver that has just come.
         if fault := self._output.listener_fault(self._supervisor.off_reference):
             self._supervisor.let_go(fault, now)
@@ -178,24 +179,22 @@ class CartesianControllerNode(BaseNode):
         reference, state = self._supervisor.tick(now, dt), self._joints.state
         if not was_active and self._supervisor.phase is Phase.ACTIVE and state is not None:
             self._output.activate(state)
-        if time.monotonic() - began > LONGEST_DT:
-            return  # frozen in between: what was to be sent is of the past, and the next tick finds out
         if reference is not None and state is not None:
-            self._output.send(reference, state, dt, now, self._supervisor.trusted)
+            self._output.send(reference, state, dt, now, self._supervisor.trusted, decided)
             self._reference, self._velocity = reference, reference.v
             if self._advances % self._safe_target_ticks == 0:
-                self._publish_safe_targets(now)
+                self._publish_safe_targets(now, decided)
         elif self._commanding and state is not None:
             self._output.end(state, now)
         self._commanding = reference is not None
         self._tell_events()
 
-    def _publish_safe_targets(self, now: float) -> None:
+    def _publish_safe_targets(self, now: float, decided: float) -> None:
         for arm, publisher in self._safe_targets.items():
             if publisher.get_subscription_count():
                 frame = self._targets.frames[arm]
                 tool = frame.pose.actInv(self._controller.tool_pose(arm))
-                publisher.publish(stamped_pose(tool, frame.name, now))
+                publish_in_time(publisher, stamped_pose(tool, frame.name, now), decided)
 
     def _tell_followed(self) -> None:
         """Say of each arm whether its targets are followed, when that changes."""
@@ -276,7 +275,7 @@ class CartesianControllerNode(BaseNode):
                 if self._advances != advances:
                     advances, last = self._advances, now
                 elif now - last > 2.0 * self._period:
-                    self._advance(self.now, self._period)
+                    self._advance(self.now, self._period, now)
         finally:
             if self._commanding and self._joints.state is not None:
                 self._output.end(self._joints.state, self.now)
