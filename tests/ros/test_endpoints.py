@@ -47,7 +47,7 @@ class Stream:
             if self._publisher.waits():
                 self.left_out += 1
             else:
-                self._publisher.publish(PoseStamped())
+                self._publisher.publish(PoseStamped(), time.monotonic())
                 self.published += 1
             time.sleep(self._period)
         return None

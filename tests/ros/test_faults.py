@@ -296,13 +296,7 @@ def test_a_frozen_node_stops_both_arms_and_moves_none_when_it_continues(
     name: str, moving: Teleoperation, record_property: Record
 ) -> None:
     nodes = moving.nodes
-
-    def freeze() -> float:
-        # Between two commands: one that was being published at this moment would be sent later, at the wake-up.
-        count = len(nodes.commands)
-        wait_until(lambda: len(nodes.commands) > count, "a command comes")
-        return nodes.signal(name, signal.SIGSTOP)
-
+    freeze = partial(nodes.signal, name, signal.SIGSTOP)
     stop = moving.measure_stop(f"{name} frozen", freeze, partial(moving.move_again, name), record_property)
     time.sleep(max(stop.fault + 1.0 - time.monotonic(), 0.0))
     woken = nodes.signal(name, signal.SIGCONT)

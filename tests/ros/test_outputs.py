@@ -52,7 +52,7 @@ class Commands:
             if (fault := self.output.listener_fault(off_reference)) is not None:
                 return fault
             if not self.output.waits():
-                self._publisher.publish(Float64MultiArray())
+                self._publisher.publish(Float64MultiArray(), time.monotonic())
             time.sleep(0.005)
         return None
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -18,8 +19,9 @@ from q2r2_control.robot.compose import WORLD
 from q2r2_control.robot.robot import Robot
 from q2r2_control.ros.base_node import COMMAND_QOS, STREAM_QOS, BaseNode
 from q2r2_control.ros.bridge.joint_outputs import joints_of
-from q2r2_control.ros.bridge.messages import pose_of, robot_state
+from q2r2_control.ros.bridge.messages import delay, pose_of, robot_state
 from q2r2_control.ros.monitoring.endpoints import Publishers
+from q2r2_control.supervision.delay_watch import DelayWatch
 from q2r2_control.supervision.target_stream import Refusal
 from q2r2_control.types import Array, RobotState
 
@@ -49,6 +51,7 @@ class TargetIntake:
                 raise ConfigError(f"{arm}.target_topic = {topic!r:.80}: another arm has it; allowed: one of its own")
             self.topics[arm] = topic
         self._publishers = Publishers(node, self.topics.values())
+        self._delays = {arm: DelayWatch(STREAM_TIMEOUT) for arm in robot.arms}
         self._refused: dict[str, tuple[Refusal, float]] = {}  # why an arm's last target was not used, and when [s]
         self.rejected = dict.fromkeys(robot.arms, 0)
 
@@ -78,9 +81,13 @@ class TargetIntake:
     def _on_target(self, take: Take, arm: str, message: PoseStamped, info: Mapping[str, int | None]) -> None:
         frame, now = self.frames[arm], self._node.now
         pose = pose_of(message.pose) if message.header.frame_id == frame.name else None
-        refusal = take(arm, None if pose is None else frame.pose * pose, now, info["publication_sequence_number"])
+        late = self._delays[arm].take(delay(info), time.monotonic())
+        wanted = None if pose is None or late else frame.pose * pose
+        refusal = take(arm, wanted, now, info["publication_sequence_number"])
         if refusal is not None:
             self._refuse(arm, refusal)
+        elif late:
+            self._refuse(arm, Refusal("late", f"{late:.2f} s late; its sender or this node stood still"))
         elif message.header.frame_id != frame.name:
             fault = f"frame_id {message.header.frame_id!r:.40}; allowed: {frame.name!r}"
             self._refuse(arm, Refusal("frame", fault))

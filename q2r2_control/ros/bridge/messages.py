@@ -35,6 +35,15 @@ def age(info: Mapping[str, Any]) -> float:
     return min(max((time.time_ns() - int(info["received_timestamp"])) * 1e-9, 0.0), _OLDEST)
 
 
+def delay(info: Mapping[str, Any]) -> float:
+    """How long a message took from being sent to being received [s], by the clocks of the two hosts.
+
+    Not finite where the middleware does not know.
+    """
+    sent, received = int(info["source_timestamp"]), int(info["received_timestamp"])
+    return (received - sent) * 1e-9 if sent and received else math.nan
+
+
 def time_message(t: float) -> Time:
     """``t`` [s] as a stamp; not negative."""
     whole = math.floor(max(t, 0.0))

@@ -26,13 +26,15 @@ from tf2_msgs.msg import TFMessage
 from trajectory_msgs.msg import JointTrajectory
 
 from q2r2_control.config import load_config
+from q2r2_control.config.timeouts import STREAM_TIMEOUT
 from q2r2_control.errors import ConfigError
 from q2r2_control.plants.simulated_cell import JointSetpoint, SimulatedCell
 from q2r2_control.robot.robot import Robot
 from q2r2_control.ros.base_node import LATCHED_QOS, OK, WARN, BaseNode, run_node
 from q2r2_control.ros.bridge.grippers import GripperServer, Stroke
 from q2r2_control.ros.bridge.link_frames import LinkFrames
-from q2r2_control.ros.bridge.messages import age, joint_state_message, seconds
+from q2r2_control.ros.bridge.messages import age, delay, joint_state_message, seconds
+from q2r2_control.supervision.delay_watch import DelayWatch
 from q2r2_control.types import RobotState
 
 _LOG_PERIOD = 1.0  # of lines about one topic [s]
@@ -64,6 +66,7 @@ class MujocoRobot(BaseNode):
         self._said: set[str] = set()  # topics whose refusal is in the log
         self._logged: dict[str, float] = {}  # when a topic's refusal last was [s]
         self._refusals = 0
+        self._delays: dict[tuple[str, ...], DelayWatch] = {}  # by topic and first joint
         self._ticks, self._reported_at = 0, time.monotonic()
         self._make_publishers()
         self._make_subscriptions()
@@ -94,7 +97,7 @@ class MujocoRobot(BaseNode):
             (Float64MultiArray, "velocity_commands", self._on_velocities),
             (Float64MultiArray, "torque_commands", self._on_torques),
         ):
-            self.create_subscription(kind, topic, partial(self._take, callback), commands)
+            self.create_subscription(kind, topic, partial(self._take, topic, callback), commands)
 
     def _gripper(self, arm: str, stroke: Stroke) -> GripperServer:
         return GripperServer(
@@ -105,7 +108,13 @@ class MujocoRobot(BaseNode):
             lambda fault: self._note(f"{arm}_gripper", fault),
         )
 
-    def _take(self, callback: Callable[[Any], None], message: Any, info: Mapping[str, Any]) -> None:
+    def _take(self, topic: str, callback: Callable[[Any], None], message: Any, info: Mapping[str, Any]) -> None:
+        # Two controllers of an arm each may send on one topic, from hosts with clocks of their own.
+        names = getattr(message, "joint_names", ()) or getattr(message, "name", ())
+        delays = self._delays.setdefault((topic, *names[:1]), DelayWatch(STREAM_TIMEOUT))
+        if late := delays.take(delay(info), time.monotonic()):
+            self._note(topic, f"{late:.2f} s late; its sender or this node stood still")
+            return
         # What came while this process stood still is as new as what came since the last tick.
         self._received = time.monotonic() - min(age(info), self._period)
         callback(message)

@@ -20,7 +20,8 @@ class StallingArm(LeftArmController):
         super().setup_interfaces()
         self._stalls = False
         signal.signal(signal.SIGUSR1, self._on_signal)
-        step = self._outputs.step
+        outputs: Any = self._outputs
+        step = outputs.step
 
         def late(*values: Any) -> Any:
             if self._stalls:
@@ -28,7 +29,7 @@ class StallingArm(LeftArmController):
                 time.sleep(STALL)
             return step(*values)
 
-        self._outputs.step = late  # type: ignore[method-assign]
+        outputs.step = late
 
     def _on_signal(self, *_: Any) -> None:
         self._stalls = True

@@ -1,0 +1,43 @@
+"""Whether a message took much longer than its kind does: then it tells of the past, and must not move an arm.
+
+A sender that is frozen in the middle of sending finishes when it goes on: one target or command of long ago leaves, and
+whoever receives it takes it for the begin of something new. The delay is the time of receipt less that of sending,
+read from clocks that may be of two hosts. So only differences between delays count: the least one of the past is the
+usual one.
+"""
+
+from __future__ import annotations
+
+import math
+
+# The usual delay may grow this fast: clocks of two hosts drift apart by less, and a frozen sender's delay by far more.
+_DRIFT = 1e-3
+# Messages that are late for as long as this show a clock that was set [s].
+_CLOCK_WAS_SET = 1.0
+
+
+class DelayWatch:
+    """The delays of one topic's messages. Times are receipt times [s]."""
+
+    def __init__(self, allowed: float) -> None:
+        """``allowed``: how much longer than usual a message may take [s]."""
+        self._allowed = allowed
+        self._usual, self._stamp = math.inf, 0.0
+        self._late_since: float | None = None
+
+    def take(self, delay: float, now: float) -> float:
+        """How much too late [s] a message is that came at ``now`` [s] with ``delay`` [s]; 0 if it may be used.
+
+        A delay that is not finite is not known, and such a message may be used.
+        """
+        if not math.isfinite(delay):
+            return 0.0
+        usual = self._usual + _DRIFT * max(now - self._stamp, 0.0)
+        if self._late_since is not None and now - self._late_since > _CLOCK_WAS_SET:
+            usual = math.inf
+        if delay - usual <= self._allowed:
+            self._usual, self._stamp = min(delay, usual), now
+            self._late_since = None
+            return 0.0
+        self._late_since = now if self._late_since is None else self._late_since
+        return delay - usual

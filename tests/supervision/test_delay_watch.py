@@ -1,0 +1,76 @@
+"""A message of a frozen sender is found by its delay, whatever the clocks of two hosts say."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from q2r2_control.supervision.delay_watch import DelayWatch
+
+ALLOWED, PERIOD, USUAL = 0.15, 0.01, 0.0004  # [s]
+
+
+class Stream:
+    """Messages of a sender whose clock is ahead by ``offset`` [s] and gains ``drift`` seconds a second."""
+
+    def __init__(self, offset: float, drift: float = 0.0) -> None:
+        self._watch, self._offset, self._drift = DelayWatch(ALLOWED), offset, drift
+        self.now = 100.0
+
+    def take(self, extra: float = 0.0, after: float = PERIOD) -> float:
+        self.now += after
+        ahead = self._offset + self._drift * (self.now - 100.0)
+        return self._watch.take(USUAL + extra - ahead, self.now)
+
+    def set_clock(self, by: float) -> None:
+        self._offset += by
+
+
+@pytest.mark.parametrize("offset", [0.0, 3600.0, -3600.0])
+def test_only_the_message_that_a_frozen_sender_finishes_is_late(offset: float) -> None:
+    stream = Stream(offset)
+    assert not any(stream.take() for _ in range(100))
+    assert stream.take(extra=1.0, after=1.0) == pytest.approx(1.0, abs=2e-3)
+    assert not any(stream.take() for _ in range(100))
+
+
+def test_a_message_that_waits_on_the_network_for_less_than_is_allowed_is_used() -> None:
+    stream, random = Stream(0.0), np.random.default_rng(3)
+    assert not any(stream.take(extra=extra) for extra in random.uniform(0.0, 0.9 * ALLOWED, 1000))
+
+
+@pytest.mark.parametrize("drift", [1e-4, -1e-4])
+def test_clocks_that_drift_apart_for_a_day_make_no_message_late(drift: float) -> None:
+    stream = Stream(0.0, drift)
+    assert not any(stream.take(after=60.0) for _ in range(24 * 60))
+
+
+def test_a_sender_that_was_frozen_for_an_hour_is_found_too() -> None:
+    stream = Stream(0.0)
+    stream.take()
+    assert stream.take(extra=3600.0, after=3600.0) > 3500.0
+
+
+@pytest.mark.parametrize("by", [-5.0, 5.0])
+def test_after_a_clock_was_set_messages_are_used_again_within_little_more_than_a_second(by: float) -> None:
+    stream = Stream(0.0)
+    assert not any(stream.take() for _ in range(100))
+    stream.set_clock(by)
+    late = [stream.take() > 0.0 for _ in range(200)]
+    assert any(late) == (by < 0.0)
+    assert not any(late[105:])
+
+
+def test_where_the_middleware_knows_no_delay_no_message_is_late_and_none_that_is_known_becomes_so() -> None:
+    watch = DelayWatch(ALLOWED)
+    assert [watch.take(delay, now) for now, delay in enumerate((-math.inf, USUAL, math.nan, USUAL))] == [0.0] * 4
+
+
+def test_two_messages_of_a_sender_that_is_frozen_twice_are_both_late() -> None:
+    stream = Stream(0.0)
+    stream.take()
+    assert stream.take(extra=0.5, after=0.5) > 0.0
+    stream.take()
+    assert stream.take(extra=3.0, after=3.0) > 0.0
