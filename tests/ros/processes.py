@@ -7,12 +7,13 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 
 import pytest
 
 from q2r2_control.ros.launch.middleware import set_up_middleware
+from tests.ros.warm_start import WarmProcess
 
 ROOT = Path(__file__).resolve().parents[2]
 CONFIG = "config/dual_iiwa7.yaml"
@@ -32,13 +33,8 @@ def skip_if_overloaded(what: str) -> None:
 class RosProcess:
     """One running program, with stdout and stderr in one file."""
 
-    def __init__(self, name: str, command: Sequence[str], log: Path, environment: Mapping[str, str]) -> None:
-        self.name = name
-        self.log = log
-        with log.open("w") as output:
-            self._process = subprocess.Popen(
-                command, cwd=ROOT, env=environment, stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT
-            )
+    def __init__(self, name: str, process: subprocess.Popen[bytes] | WarmProcess, log: Path) -> None:
+        self.name, self.log, self._process = name, log, process
 
     @property
     def pid(self) -> int:
@@ -98,15 +94,26 @@ class Processes:
 
     def start(self, *command: str, name: str = "", **environment: str) -> RosProcess:
         """Start a program; ``environment`` is added to the private domain's."""
-        name = name or Path(command[0]).name
-        log = self._folder / f"{len(self.started)}-{name}.log"
-        process = RosProcess(name, command, log, self._environment | environment)
-        self.started.append(process)
-        return process
+        log = self._new_log(name := name or Path(command[0]).name)
+        with log.open("w") as output:
+            process = subprocess.Popen(
+                command,
+                cwd=ROOT,
+                env=self._environment | environment,
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+            )
+        return self._started(name, process, log)
 
     def start_module(self, module: str, *arguments: str, **environment: str) -> RosProcess:
         """Start ``python -m module``, unbuffered."""
-        return self.start(sys.executable, "-u", "-m", module, *arguments, name=module.split(".")[-1], **environment)
+        name = module.split(".")[-1]
+        if "LD_LIBRARY_PATH" in environment or "PYTHONPATH" in environment:  # which an interpreter reads at its start
+            return self.start(sys.executable, "-u", "-m", module, *arguments, name=name, **environment)
+        (log := self._new_log(name)).touch()
+        process = WarmProcess([module, *arguments], ROOT, self._environment | environment, log)
+        return self._started(name, process, log)
 
     def start_node(self, name: str, *parameters: str, **environment: str) -> RosProcess:
         """Start one of the package's nodes with ``parameters``, each as ``name:=value``."""
@@ -117,6 +124,13 @@ class Processes:
         """Last started, first ended."""
         for process in reversed(self.started):
             process.end()
+
+    def _new_log(self, name: str) -> Path:
+        return self._folder / f"{len(self.started)}-{name}.log"
+
+    def _started(self, name: str, process: subprocess.Popen[bytes] | WarmProcess, log: Path) -> RosProcess:
+        self.started.append(RosProcess(name, process, log))
+        return self.started[-1]
 
 
 def environment_of(domain: int, folder: Path) -> dict[str, str]:

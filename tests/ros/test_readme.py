@@ -22,7 +22,7 @@ pytestmark = [pytest.mark.usefixtures("interfaces"), pytest.mark.alone]
 
 from q2r2_control.ros.base_node import LATCHED_QOS  # noqa: E402
 from q2r2_control.ros.bridge.messages import pose_of  # noqa: E402
-from tests.ros.arm_rig import PATIENT, TOOL, ArmRig, assert_same, first, offset, stamped_transform  # noqa: E402
+from tests.ros.arm_rig import TOOL, ArmRig, assert_same, first, offset, patient, stamped_transform  # noqa: E402
 from tests.ros.joint_recorder import JointRecorder  # noqa: E402
 from tests.ros.waiting import wait_until  # noqa: E402
 
@@ -47,9 +47,8 @@ def test_the_subclass_in_the_readme_teleoperates_its_arm_in_its_robots_frame(
     rig.follows = False
     code, _ = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
     (file := tmp_path / "right_arm.py").write_text(code)
-    parameters = PATIENT | {"world_frame_id": "world", "teleop.leash.distance": 0.0}
-    arguments = [part for name, value in parameters.items() for part in ("-p", f"{name}:={value}")]
-    process = processes.start(sys.executable, str(file), "--ros-args", *arguments, name="right_arm")
+    arguments = patient({"world_frame_id": "world", "teleop.leash.distance": 0.0})
+    process = processes.start(sys.executable, str(file), *arguments, name="right_arm")
     rig.wait_until_connected()
     rig.engage()
     rig.wait(lambda: rig.targets, "targets come")
@@ -74,7 +73,7 @@ def test_the_command_in_the_readme_moves_both_arms(start: int, node: Any, robot:
     assert command is not None
     joints = JointRecorder(robot)
     joints.subscribe(node)
-    up = processes.start_module("q2r2_control", *command[1].split())
+    up = processes.start(sys.executable, "-u", "-m", "q2r2_control", *command[1].split(), name="up")
     wait_until(lambda: all(farthest(joints, arm.joints) > MOVED for arm in robot.arms.values()), "both arms move")
     assert up.interrupt(PATIENCE) == 0
 
