@@ -11,6 +11,7 @@ from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.duration import Duration
 from rclpy.node import Node
+from rclpy.serialization import serialize_message
 
 from q2r2_control.ros.base_node import SENT_COMMAND_QOS
 
@@ -73,10 +74,12 @@ def publish_in_time(publisher: Any, message: Any, decided: float) -> None:
     """Publish what was decided on at ``decided`` [s] of the steady clock, unless its lifespan is over since then.
 
     The middleware counts the lifespan from the publishing. A process that is frozen between the two would send, when it
-    continues, one command of the past: a jump for a robot that has come to rest meanwhile.
+    continues, one command of the past: a jump for a robot that has come to rest meanwhile. Serializing comes first: it
+    takes most of the time until the middleware notes when the message was sent; :mod:`delay_watch` covers the rest.
     """
+    data = serialize_message(message)
     if time.monotonic() - decided <= _LIFESPAN:
-        publisher.publish(message)
+        publisher.publish(data)
 
 
 class WatchedPublisher:
