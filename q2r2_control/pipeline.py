@@ -22,6 +22,7 @@ from q2r2_control.plants.base import Plant
 from q2r2_control.plants.factory import check_mode, make_plant
 from q2r2_control.robot.robot import Robot
 from q2r2_control.runtime.loop_clock import LoopClock
+from q2r2_control.runtime.operator_feedback import OperatorFeedback
 from q2r2_control.runtime.process import few_garbage_collections, stop_on_signals
 from q2r2_control.runtime.recorder import RunRecorder, RunStart, Tick
 from q2r2_control.runtime.run_summary import RunSummary
@@ -31,7 +32,7 @@ from q2r2_control.supervision.joint_watch import watch_settings
 from q2r2_control.supervision.supervisor import Phase, Supervisor
 from q2r2_control.supervision.target_stream import StreamSettings
 from q2r2_control.supervision.tick_pacer import TickPacer
-from q2r2_control.teleop.arm import OPEN
+from q2r2_control.teleop.arm import OPEN, is_fault
 from q2r2_control.teleop.teleop import Teleop
 from q2r2_control.types import LONGEST_DT, ArmTarget, Command, CommandMode, HandSample, Reference, RobotState
 
@@ -176,6 +177,10 @@ class PipelineRun:
         pipeline.drive.set_openings(pipeline.controller.openings)
         self._openings: dict[str, float] = {}  # measured, that the tick went by
         self._velocity = np.zeros(pipeline.robot.model.nv)
+        hands = {arm: pipeline.teleop.hand_of(arm) for arm in pipeline.robot.arms}
+        self._feedback = OperatorFeedback(
+            pipeline.controller, hands, pipeline.config.teleop.haptics, pipeline.input.send_haptic
+        )
 
     def until(self, duration: float | None) -> RunSummary:
         """Tick until ``duration`` is over or a stop is asked for, then until the arms are at rest."""
@@ -324,8 +329,13 @@ class PipelineRun:
         teleop, report, recorder = self._pipeline.teleop, self._pipeline.drive.report, self._recorder
         engaged = teleop.engaged if self._following else dict.fromkeys(self._targets, False)
         events = [replace(event, t=event.t - self._clock.start) for event in teleop.take_events()]
+        for event in filter(is_fault, events):
+            _logger.warning("%s arm: %s", event.arm, event.reason)
         recorder.add(dt, compute_time, reference, self._targets, tools, engaged, report, events, self._limiter.held)
         recorder.add_holding(dt, self._holding)
+        if self._following:
+            now, openings = self._clock.now, self._openings
+            self._feedback.update(now, events, self._targets, reference.report, state, self._grippers, openings)
         if not recorder.listened:
             return
         tick = Tick(

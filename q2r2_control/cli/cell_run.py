@@ -101,7 +101,9 @@ def run_cell(config: Config, options: RunOptions, console: Console) -> CellRun:
             pipeline.plant.launch_viewer()
             pipeline.listeners.append(_WindowListener(pipeline, pipeline.plant))
         if options.table:
-            table = LiveTable(f"{options.name}: Ctrl-C brings the arms to rest and ends")
+            robot = pipeline.robot
+            joints = {arm: [robot.joint_names[joint] for joint in its.joints] for arm, its in robot.arms.items()}
+            table = LiveTable(f"{options.name}: Ctrl-C brings the arms to rest and ends", joints)
             pipeline.listeners.append(table)
             stack.enter_context(table.shown(console))
         if options.real_time and (refused := stack.enter_context(real_time())):

@@ -11,6 +11,7 @@ from q2r2_control.recording.recorder import RecordingSummary
 from q2r2_control.runtime.histogram import Percentiles
 from q2r2_control.runtime.run_summary import RunSummary
 from q2r2_control.runtime.torque_summary import TorqueSummary
+from q2r2_control.teleop.arm import is_fault
 from q2r2_control.types import Event
 from q2r2_control.verification.assembly_tasks import TaskResult
 
@@ -55,7 +56,8 @@ def summary_table(summary: RunSummary) -> Table:
         "ticks missed", f"{summary.missed_ticks}, which made the motion {summary.stretched_s:.2f} s late in all"
     )
     for name, event in _last_pauses(summary.events).items():
-        table.add_row(f"{name} arm paused by", f"[yellow]{escape(event.reason)}[/], at {event.t:.2f} s")
+        label = f"{name} arm" if event.reason.startswith("not engaged") else f"{name} arm paused by"
+        table.add_row(label, f"[yellow]{escape(event.reason)}[/], at {event.t:.2f} s")
     if summary.torque is not None:
         _add_torque(table, summary.torque)
     table.add_row("arms at the end", "at rest" if summary.at_rest else "[red]moving[/]")
@@ -86,13 +88,9 @@ def _figure(what: str, value: float) -> str:
 
 
 def _last_pauses(events: Sequence[Event]) -> dict[str, Event]:
-    """The last event of each arm that was paused by something else than its button."""
+    """The last event of each arm that something else than its button paused, or kept from being engaged."""
     last = {event.arm: event for event in events if event.destination in ("paused", "engaged")}
-    return {
-        arm: event
-        for arm, event in last.items()
-        if event.destination == "paused" and event.source == "engaged" and event.reason != "lower button"
-    }
+    return {arm: event for arm, event in last.items() if is_fault(event)}
 
 
 def _add_torque(table: Table, torque: TorqueSummary) -> None:

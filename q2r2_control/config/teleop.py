@@ -60,6 +60,14 @@ class LeashSettings(BaseModel):
     angle: float | None = Field(0.5, ge=0.1, le=2, description="of rotations [rad]; none: no leash")
 
 
+class HapticSettings(BaseModel):
+    """What the hands feel of their arms."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    strength: float = Field(1.0, ge=0, le=1, description="of all vibrations; 0: none")
+
+
 class TeleopSettings(BaseModel):
     """Settings of the teleop layer; every range is checked when the object is made."""
 
@@ -79,6 +87,7 @@ class TeleopSettings(BaseModel):
     linked: bool = Field(True, description="a fault of one hand disengages both arms")
     filter: FilterSettings = Field(default_factory=FilterSettings)
     leash: LeashSettings = Field(default_factory=LeashSettings)
+    haptics: HapticSettings = Field(default_factory=HapticSettings)
     gate: GateSettings = Field(default_factory=GateSettings)
 
     @field_validator("axes")

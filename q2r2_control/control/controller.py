@@ -17,11 +17,12 @@ from q2r2_control.control.jit import bound
 from q2r2_control.control.kernel_model import kernel_model_of
 from q2r2_control.control.qp import QpProblem, Solver, make_solver
 from q2r2_control.control.qp_assembly import assemble
-from q2r2_control.control.reference import move_reference, observe_bodies, start_reference
+from q2r2_control.control.reference import move_reference, observe_bodies, spare_distance, start_reference
 from q2r2_control.control.safety.joint_limits import ACCELERATION, POSITION, VELOCITY
 from q2r2_control.control.safety.safety_filter import FOLLOWED, SEPARATION, STOPPED
 from q2r2_control.control.targets import TargetTracker
 from q2r2_control.errors import RobotError
+from q2r2_control.robot.pairs import pairs_with_others
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import LONGEST_DT, Array, Interval, Reference, StepReport, StepStatus, pose_of
 
@@ -79,6 +80,7 @@ class CartesianController:
         model, data, targets = self._held_model, self._held_data, self._targets.held
         self._assemble = bound(assemble, model, targets, data, self.settings.max_substep)
         self._observe_bodies = bound(observe_bodies, model, data, self._unchanged)
+        self._spare = bound(spare_distance, model, data, self._with_others[self._arms[0]])
         self._move = bound(move_reference, model, data, self._solution, False, self.settings.max_substep, 1.0)
         self.step({arm: self.tool_pose(arm) for arm in self._arms}, self.settings.max_substep)
 
@@ -206,6 +208,7 @@ class CartesianController:
         self._held_model, self._held_data = load.model, load.data
         self._pair_names = self._names + [self._objects.pair_names[pair] for pair in load.objects]
         self._active.used[0] = 0  # pairs are numbered anew
+        self._with_others = {arm: pairs_with_others(self._pair_names, self.robot.roles, arm) for arm in self._arms}
 
     def _look_again(self, grown: IntArray) -> int:
         """Observe with bodies that have changed; returns the pair in the way of those that have ``grown``, or -1."""
@@ -218,6 +221,13 @@ class CartesianController:
         """World pose of an arm's tool at the reference."""
         i = self._arms.index(arm)
         return pose_of(self._tasks.rotation[i], self._tasks.translation[i])
+
+    def spare_distance(self, arm: str) -> float:
+        """How much nearer ``arm`` may come to what is no part of it [m]: the least of its pairs, inf if there is none.
+
+        At the reference, and less what each pair keeps.
+        """
+        return float(self._spare(self._held_model, self._held_data, self._with_others[arm]))
 
     @property
     def stop_deceleration(self) -> Array:

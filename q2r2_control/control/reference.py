@@ -6,7 +6,7 @@ import numpy as np
 
 from q2r2_control.control.geometry.collision import update_placements
 from q2r2_control.control.geometry.kinematics import IntArray
-from q2r2_control.control.geometry.pair_distance import measure
+from q2r2_control.control.geometry.pair_distance import at_least, measure
 from q2r2_control.control.jit import Held, kernel, lean_kernel
 from q2r2_control.control.kernel_data import KernelData
 from q2r2_control.control.kernel_model import KernelModel
@@ -50,6 +50,17 @@ def move_reference(
     outcome, slack = apply_safety_filter(model.safety, data.safety, solution, usable, h, share)
     closest, distance, tightest, margin = _observe(model, data)
     return outcome, closest, distance, tightest, margin, slack
+
+
+@kernel
+def spare_distance(held_model: Held, held_data: Held, pairs: IntArray) -> float:
+    """The least that some ``pairs`` (p,) have to spare at the reference [m]: their distance less what they keep."""
+    model, data = held_model.value.safety, held_data.value.safety
+    least = np.inf
+    for p in pairs:
+        if at_least(model.collision, data.collision, p) - model.min_distance[p] < least:
+            least = min(least, measure(model.collision, data.collision, p) - model.min_distance[p])
+    return least
 
 
 @lean_kernel

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import combinations
 
 import numpy as np
@@ -12,6 +12,7 @@ import pinocchio as pin
 from q2r2_control.config.resources import find_resource
 from q2r2_control.errors import ConfigError, RobotError
 from q2r2_control.robot.description import LinkTree, joint_end, parse_srdf
+from q2r2_control.robot.link_roles import Role
 from q2r2_control.types import Array
 
 # Links that always stay farther apart than this need no watching: more than twice what is usually kept [m].
@@ -21,6 +22,16 @@ CLEARANCE = 0.05
 def link_of(geometry_name: str) -> str:
     """Link of a geometry object: Pinocchio names the objects of a link LINK_0, LINK_1, ..."""
     return geometry_name.rsplit("_", 1)[0]
+
+
+def pairs_with_others(pairs: Iterable[tuple[str, str]], roles: Mapping[str, Role], arm: str) -> np.ndarray:
+    """Numbers (p,) of those ``pairs`` of geometry names that are of a part of ``arm`` and of something else."""
+    numbers = [
+        number
+        for number, names in enumerate(pairs)
+        if [arm in roles[link_of(name)].arms for name in names].count(True) == 1
+    ]
+    return np.array(numbers, dtype=np.int64)
 
 
 def add_movable_pairs(model: pin.Model, geometry: pin.GeometryModel, tree: LinkTree) -> None:

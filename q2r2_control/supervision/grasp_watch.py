@@ -25,7 +25,7 @@ class GraspWatch:
     def __init__(self, controller: CartesianController) -> None:
         self._controller = controller
         arms = controller.robot.arms
-        self._grips = {arm: _Grip(arms[arm].stroke) for arm in controller.robot.objects.by_arm}
+        self._grips = {arm: Grip(arms[arm].stroke) for arm in controller.robot.objects.by_arm}
 
     def update(self, wanted: Mapping[str, float], measured: Mapping[str, float], now: float) -> bool:
         """Look at wanted and measured openings at ``now`` [s], before the controller's step; whether something changed.
@@ -42,7 +42,7 @@ class GraspWatch:
         return changed
 
 
-class _Grip:
+class Grip:
     """What was seen of one gripper."""
 
     def __init__(self, stroke: float) -> None:

@@ -28,6 +28,11 @@ class ArmState(StrEnum):
     ALIGNING = "aligning"  # stopped by the alignment chord; anchored when the buttons are released
 
 
+def is_fault(event: Event) -> bool:
+    """Whether an arm was paused, or stays so, for another reason than what its operator pressed."""
+    return event.destination == ArmState.PAUSED and event.source != ArmState.PAUSING
+
+
 class ArmTeleop:
     """Teleoperation of one arm by one hand.
 

@@ -1,10 +1,12 @@
-"""Short vibrations that tell a hand about the state of its arm."""
+"""Short vibrations that tell a hand about its arm: what they are, and when."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import NamedTuple
 
-from q2r2_control.teleop.arm import ArmState
+from q2r2_control.config.teleop import HapticSettings
+from q2r2_control.teleop.arm import ArmState, is_fault
 from q2r2_control.types import Event, HapticFeedback
 
 
@@ -16,55 +18,133 @@ class Pulse(NamedTuple):
     duration: float  # [s]
 
 
+class Word(NamedTuple):
+    """What a vibration tells."""
+
+    meaning: str
+    pulse: Pulse
+    strongest: float | None = None  # amplitude that it grows to
+
+
 ENGAGED = Pulse(0.5, 0.4, 0.08)
 PAUSED = Pulse(0.3, 0.3, 0.08)
 FAULT = Pulse(1.0, 1.0, 0.3)
 SLIP = Pulse(0.2, 0.2, 0.05)
+LIMIT = Pulse(0.8, 0.25, 0.05)
+NEAR = Pulse(0.6, 0.1, 0.04)
+CONTACT = Pulse(0.1, 0.2, 0.06)
+GRASP = Pulse(0.7, 0.5, 0.12)
+_NEAREST, _HARDEST = 0.6, 0.8  # amplitudes that NEAR and CONTACT grow to
+# The weakest first: where two are due at once, the stronger one is felt. The docs' table is this one.
+VOCABULARY = (
+    Word("another 5 mm nearer to what the arm has to keep away from, from 50 mm to spare on", NEAR, _NEAREST),
+    Word("the target has slipped along by another 20 mm or 0.1 rad", SLIP),
+    Word("the tool's contact force has grown by another 5 N", CONTACT, _HARDEST),
+    Word("a joint has come to its position limit", LIMIT),
+    Word("paused, by the button or the alignment chord", PAUSED),
+    Word("engaged", ENGAGED),
+    Word("the gripper has closed on something", GRASP),
+    Word("paused by a fault (lost data, a jump, a stop), or a press that was refused", FAULT),
+)
+
 _SLIP_STEP = 0.02  # the target slips by this between two pulses [m]
 _SLIP_ANGLE_STEP = 0.1  # or by this [rad]
+_NEAR_STEP, _NEAR_FROM = 0.005, 0.05  # [m]
+_FORCE_STEP, _FORCE_TO = 5.0, 50.0  # [N]
+_PAUSE = 0.05  # between two vibrations, so that they are felt as two [s]
 
 
 class HapticPulses:
-    """Vibrations of one hand: on engaging, on pausing, longer on a fault, and whenever a target slips by a step.
+    """Vibrations of one hand: see :data:`VOCABULARY`. What lasts is told once for each step that it grows by.
 
     The app vibrates until the next message, so the end of a pulse is a message as well.
     """
 
-    def __init__(self, hand: str) -> None:
-        self._hand = hand
+    def __init__(self, hand: str, settings: HapticSettings | None = None) -> None:
+        self._hand, self._strength_of_all = hand, (settings or HapticSettings()).strength
         self._ends: float | None = None
+        self._next = 0.0  # no vibration begins before [s]
         self._strength = 0.0
-        self._felt = (0.0, 0.0)
+        self._slipped = _Steps(_SLIP_STEP), _Steps(_SLIP_ANGLE_STEP)
+        self._nearness, self._force = _Steps(_NEAR_STEP), _Steps(_FORCE_STEP)
+        self._limits: frozenset[str] = frozenset()
+        self._grasps = False
         self._waiting: Pulse | None = None
 
     def tell(self, event: Event) -> None:
         """Start the pulse for a change of the arm's state; that of a refused press is that of a fault."""
         if event.destination == ArmState.ENGAGED:
             self._want(ENGAGED)
-        elif event.source == ArmState.ENGAGED:
-            self._want(PAUSED if event.destination != ArmState.PAUSED else FAULT)
-        elif event.destination == ArmState.PAUSED and event.source in (ArmState.PAUSED, ArmState.ALIGNING):
+        elif is_fault(event):
             self._want(FAULT)
+        elif event.source == ArmState.ENGAGED:
+            self._want(PAUSED)
 
     def slip(self, slip: float, slip_angle: float) -> None:
-        """Start a pulse where the target has slipped by another step since engaging [m, rad]."""
-        if slip < self._felt[0] or slip_angle < self._felt[1]:
-            self._felt = (slip, slip_angle)
-        elif slip >= self._felt[0] + _SLIP_STEP or slip_angle >= self._felt[1] + _SLIP_ANGLE_STEP:
-            self._felt = (slip, slip_angle)
+        """How far the target has slipped since engaging [m, rad]."""
+        position, rotation = self._slipped
+        if position.grew(slip) | rotation.grew(slip_angle):  # both count
             self._want(SLIP)
+
+    def near(self, spare: float) -> None:
+        """How much nearer the arm may come to what it has to keep away from [m]."""
+        nearness = max(_NEAR_FROM - spare, 0.0)
+        if self._nearness.grew(nearness):
+            self._want(_grown(NEAR, _NEAREST, nearness / _NEAR_FROM))
+
+    def contact(self, force: float) -> None:
+        """The contact force at the tool [N]."""
+        if self._force.grew(force):
+            self._want(_grown(CONTACT, _HARDEST, force / _FORCE_TO))
+
+    def limits(self, joints: Iterable[str]) -> None:
+        """The joints of the arm that are at a position limit."""
+        held = frozenset(joints)
+        if held - self._limits:
+            self._want(LIMIT)
+        self._limits = held
+
+    def grasps(self, holds: bool) -> None:
+        """Whether the gripper is closed on something."""
+        if holds and not self._grasps:
+            self._want(GRASP)
+        self._grasps = holds
 
     def at(self, now: float) -> HapticFeedback | None:
         """What to send at ``now`` [s], or None."""
-        pulse, self._waiting = self._waiting, None
-        if pulse is not None and (self._ends is None or pulse.amplitude >= self._strength):
-            self._ends, self._strength = now + pulse.duration, pulse.amplitude
-            return HapticFeedback(self._hand, pulse.frequency, pulse.amplitude)
         if self._ends is not None and now >= self._ends:
-            self._ends = None
+            self._ends, self._next = None, now + _PAUSE
             return HapticFeedback(self._hand, 0.0, 0.0)
-        return None
+        pulse = self._waiting
+        if pulse is None or (self._ends is None and now < self._next and pulse is not FAULT):
+            return None
+        self._waiting = None
+        if self._ends is not None and pulse.amplitude < self._strength:
+            return None
+        self._ends, self._strength = now + pulse.duration, pulse.amplitude
+        return HapticFeedback(self._hand, pulse.frequency, pulse.amplitude * self._strength_of_all)
 
     def _want(self, pulse: Pulse) -> None:
-        if self._waiting is None or pulse.amplitude >= self._waiting.amplitude:
+        if self._strength_of_all > 0.0 and (self._waiting is None or pulse.amplitude >= self._waiting.amplitude):
             self._waiting = pulse
+
+
+class _Steps:
+    """Counts steps that a quantity has grown by; it may shrink by two before they count anew."""
+
+    def __init__(self, step: float) -> None:
+        self._step, self._counted = step, 0
+
+    def grew(self, value: float) -> bool:
+        """Whether ``value`` is a step beyond what was counted."""
+        steps = int(value / self._step + 1e-9)
+        if steps > self._counted:
+            self._counted = steps
+            return True
+        if value <= max((self._counted - 2) * self._step, 0.0):
+            self._counted = steps
+        return False
+
+
+def _grown(pulse: Pulse, strongest: float, share: float) -> Pulse:
+    return pulse._replace(amplitude=pulse.amplitude + (strongest - pulse.amplitude) * min(share, 1.0))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 
 import numpy as np
@@ -14,6 +14,8 @@ from rich.markup import escape
 from rich.table import Table
 
 from q2r2_control.runtime.recorder import Tick
+from q2r2_control.types import Event
+from q2r2_control.viewer.arm_words import next_press, why
 from q2r2_control.viewer.history import tracking_error
 
 _REFRESH_RATE = 6.0  # [Hz]
@@ -26,8 +28,10 @@ _NEAR = 0.01  # a pair with less to spare is coloured [m]
 class LiveTable:
     """Shows the newest tick of a run. A separate thread draws; a tick only stores a reference."""
 
-    def __init__(self, title: str) -> None:
-        self._title = title
+    def __init__(self, title: str, joints: Mapping[str, Collection[str]]) -> None:
+        """``joints``: names of those that move each arm."""
+        self._title, self._joints = title, joints
+        self._last: dict[str, Event] = {}  # of each arm
         self._newest: Tick | None = None
         self._count = 0
         self._binding: dict[str, None] = {}
@@ -39,6 +43,8 @@ class LiveTable:
         self._count += 1
         if tick.reference.report.binding:
             self._binding.update(dict.fromkeys(tick.reference.report.binding))
+        for event in tick.events:
+            self._last[event.arm] = event
 
     @contextmanager
     def shown(self, console: Console) -> Iterator[None]:
@@ -62,12 +68,15 @@ class LiveTable:
         arms = list(tick.tools)
         for arm in arms:
             table.add_column(arm, justify="right", min_width=18)
+        binding, self._binding = list(self._binding), {}
         for name, values in _arm_rows(tick, arms):
             table.add_row(name, *values)
+        words = [why(tick, arm, self._joints[arm], binding, self._last.get(arm)) for arm in arms]
+        table.add_row("why", *map(escape, words))
+        table.add_row("next press", *(next_press(tick, arm) for arm in arms))
         table.add_section()
         report = tick.reference.report
         colour = "yellow" if report.margin < _NEAR else "default"
-        binding, self._binding = list(self._binding), {}
         rows = {
             "time, loop": (f"{tick.t:.1f} s", f"{rate:.0f} Hz, {1e6 * tick.compute_time:.0f} us a tick"),
             "nearest pair": (f"{1e3 * report.closest_distance:.1f} mm", " | ".join(report.closest_pair)),

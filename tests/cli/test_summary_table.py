@@ -36,13 +36,16 @@ def test_an_arm_that_was_paused_by_something_else_than_its_button_is_named_with_
 ) -> None:
     reason = "the control loop stood still for 0.40 s"
     paused = Event(4.07, "left", "engaged", "paused", reason)
-    pressed = Event(4.5, "right", "engaged", "paused", "lower button")
+    pressed = Event(4.5, "right", "pausing", "paused", "lower button")
     text = text_of(replace(summary, events=[*summary.events, paused, pressed]))
     (row,) = (line for line in text.splitlines() if "left arm paused by" in line)
     assert f"{reason}, at 4.07 s" in row
     assert "right arm paused by" not in text
     again = Event(5.0, "left", "paused", "engaged", "lower button")
     assert "paused by" not in text_of(replace(summary, events=[paused, again]))
+    refused = Event(6.0, "left", "paused", "paused", "not engaged: no pose for 0.15 s")
+    text = text_of(replace(summary, events=[again, refused]))
+    assert "not engaged: no pose for 0.15 s, at 6.00 s" in text
 
 
 def test_missed_ticks_are_told(summary: RunSummary) -> None:

@@ -41,7 +41,7 @@ from q2r2_control.config.control import (
 )
 from q2r2_control.config.external import ExternalArm, ExternalConfig, ExternalGripper, GuardLimits
 from q2r2_control.config.supervision import SupervisionSettings
-from q2r2_control.config.teleop import FilterSettings, GateSettings, LeashSettings, TeleopSettings
+from q2r2_control.config.teleop import FilterSettings, GateSettings, HapticSettings, LeashSettings, TeleopSettings
 from q2r2_control.errors import ConfigError, Q2R2Error
 from q2r2_control.robot.kept_distances import kept_distances
 from q2r2_control.robot.robot import Robot
@@ -113,6 +113,7 @@ class TestTheShippedCellShowsAllThereIsToTune:
         ("teleop", TeleopSettings),
         ("teleop.filter", FilterSettings),
         ("teleop.leash", LeashSettings),
+        ("teleop.haptics", HapticSettings),
         ("teleop.gate", GateSettings),
         ("mujoco", MujocoConfig),
         ("mujoco.objects.blue_block", ObjectConfig),

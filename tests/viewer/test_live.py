@@ -15,6 +15,8 @@ from tests.viewer.test_history import robot, tick_at
 
 __all__ = ["robot"]
 
+JOINTS = {side: [f"{side}_A{number}" for number in range(1, 8)] for side in ("left", "right")}
+
 
 def drawn(table: LiveTable) -> str:
     console = Console(file=io.StringIO(), width=120)
@@ -24,7 +26,7 @@ def drawn(table: LiveTable) -> str:
 
 
 def test_it_shows_states_errors_distances_and_grippers_of_the_newest_tick(robot: Robot) -> None:
-    table = LiveTable("demo")
+    table = LiveTable("demo", JOINTS)
     table(tick_at(robot, 1.0, engaged=False))
     table(tick_at(robot, 2.0, distance=0.0234))
     text = drawn(table)
@@ -36,13 +38,13 @@ def test_it_shows_states_errors_distances_and_grippers_of_the_newest_tick(robot:
 
 
 def test_it_names_what_holds_a_gripper(robot: Robot) -> None:
-    table = LiveTable("demo")
+    table = LiveTable("demo", JOINTS)
     table(replace(tick_at(robot, 1.0), held_grippers={"left": ("left_finger_0", "block_0")}))
     assert "left_finger_0 | block_0" in drawn(table)
 
 
 def test_it_shows_every_limit_that_was_at_work_since_it_was_drawn_last(robot: Robot) -> None:
-    table = LiveTable("demo")
+    table = LiveTable("demo", JOINTS)
     tick = tick_at(robot, 0.0)
     report = replace(tick.reference.report, binding=("left_A2 velocity",))
     table(replace(tick, reference=replace(tick.reference, report=report)))
@@ -52,7 +54,7 @@ def test_it_shows_every_limit_that_was_at_work_since_it_was_drawn_last(robot: Ro
 
 
 def test_before_the_first_tick_it_says_that_the_run_is_starting() -> None:
-    assert "starting" in drawn(LiveTable("demo"))
+    assert "starting" in drawn(LiveTable("demo", JOINTS))
 
 
 def test_the_interpreters_switch_interval_is_as_before_after_a_fault() -> None:
@@ -60,7 +62,7 @@ def test_the_interpreters_switch_interval_is_as_before_after_a_fault() -> None:
     during = []
 
     def fail() -> None:
-        with LiveTable("demo").shown(Console(file=io.StringIO())):
+        with LiveTable("demo", JOINTS).shown(Console(file=io.StringIO())):
             during.append(sys.getswitchinterval())
             raise RuntimeError
 

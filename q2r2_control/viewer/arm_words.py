@@ -1,0 +1,61 @@
+"""In words why an arm moves or does not, and what its operator's next press does."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+
+import numpy as np
+
+from q2r2_control.runtime.recorder import Tick
+from q2r2_control.teleop.arm import ArmState
+from q2r2_control.types import Event
+from q2r2_control.viewer.history import tracking_error
+
+# A tool nearer to its target than this follows; what holds it back beyond that is said [m], [rad].
+_FOLLOWS, _TURNED = 0.005, 0.05
+_POSITION, _VELOCITY = " position", " velocity"
+
+
+def why(tick: Tick, arm: str, joints: Collection[str], binding: Collection[str], last: Event | None) -> str:
+    """Why ``arm``, whose joints have these names, is where it is.
+
+    ``binding``: limits and pairs that held the last steps back, as in a report; ``last``: its last event.
+    """
+    if tick.states[arm] == ArmState.ALIGNING:
+        return "aligning"
+    if not tick.engaged[arm]:
+        if last is None:
+            return "not engaged yet"
+        return last.reason if last.reason.startswith("not engaged") else f"{tick.states[arm]}: {last.reason}"
+    distance, angle = tracking_error(tick, arm)
+    if not (distance > _FOLLOWS or angle > _TURNED):
+        return "follows the hand"
+    return _held_by(tick, arm, joints, binding) or ("catches up" if np.isfinite(distance) else "holds")
+
+
+def next_press(tick: Tick, arm: str) -> str:
+    """What the buttons of the arm's hand do next."""
+    state = tick.states[arm]
+    if not tick.connected:
+        return "nothing: no input is connected"
+    if state == ArmState.ALIGNING:
+        return "release both buttons to go on"
+    gripper = "opens" if tick.targets[arm].gripper < 0.5 else "closes"
+    lower = "pauses" if state in (ArmState.ENGAGED, ArmState.PAUSING) else "engages"
+    return f"lower {lower}, upper {gripper} the gripper"
+
+
+def _held_by(tick: Tick, arm: str, joints: Collection[str], binding: Collection[str]) -> str | None:
+    """The pair or limit of an arm that is nearest to what moves the tool, if any is at work."""
+    report = tick.reference.report
+    pairs = [name for name in binding if "|" in name and any(part.startswith(f"{arm}_") for part in name.split("|"))]
+    tightest = "|".join(report.tightest_pair)
+    if tightest in pairs:
+        return f"held by {' | '.join(report.tightest_pair)}, {1e3 * report.margin:.0f} mm to spare"
+    if pairs:
+        return f"held by {' | '.join(pairs[0].split('|'))}"
+    for kind, words in ((_POSITION, "at its limit"), (_VELOCITY, "as fast as it may turn")):
+        limited = [name.removesuffix(kind) for name in binding if name.endswith(kind)]
+        if mine := [name for name in limited if name in joints]:
+            return f"{mine[0]} {words}"
+    return None

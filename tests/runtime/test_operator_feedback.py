@@ -1,0 +1,186 @@
+"""What an operator's hands feel of a run: in the simulated loop, and as bytes on the headset's connection."""
+
+from __future__ import annotations
+
+import struct
+import threading
+from collections.abc import Callable
+from itertools import pairwise
+from typing import ClassVar
+
+import numpy as np
+import pytest
+
+from q2r2_control.inputs.headset import HeadsetServer
+from q2r2_control.inputs.scripted import ScriptedInput
+from q2r2_control.pipeline import Pipeline
+from q2r2_control.plants.mujoco import MujocoPlant
+from q2r2_control.runtime.recorder import Tick
+from q2r2_control.teleop.haptics import CONTACT, ENGAGED, FAULT, GRASP, LIMIT, NEAR, PAUSED, SLIP, Pulse
+from q2r2_control.types import Array, HapticFeedback
+from tests.support.fake_headset import RATE_HZ, FakeHeadset
+from tests.support.hands_input import ENGAGED as BEGIN
+from tests.support.hands_input import HandsInput, Path
+from tests.support.operator_script import HANDS, START
+from tests.support.watch import cell
+
+UP = np.array([0.0, 0.0, 1.0])
+
+
+class FeltHands(HandsInput):
+    """Keeps what the hands feel, with the time of the tick."""
+
+    def __init__(self, **paths: Path) -> None:
+        super().__init__(**paths)
+        self.now = 0.0
+        self.felt: list[tuple[float, HapticFeedback]] = []
+
+    def poll(self, now: float) -> list:
+        self.now = now
+        return super().poll(now)
+
+    def send_haptic(self, feedback: HapticFeedback) -> None:
+        self.felt.append((self.now, feedback))
+
+    def by(self, hand: str, pulse: Pulse) -> list[float]:
+        """Amplitudes of the vibrations of a hand that have this frequency."""
+        of = [one for _, one in self.felt if one.hand == hand and one.amplitude > 0.0]
+        return [one.amplitude for one in of if one.frequency == pulse.frequency]
+
+
+def straight(way: Array, duration: float = 1.5) -> Path:
+    """From rest to rest along ``way`` [m], after both arms were engaged."""
+
+    def path(t: float) -> Array:
+        share = np.clip((t - BEGIN - 0.1) / duration, 0.0, 1.0)
+        return np.append(share * share * (3.0 - 2.0 * share) * way, np.zeros(3))
+
+    return path
+
+
+def run(hands: FeltHands, duration: float, plant: str = "kinematic", listener: Callable | None = None) -> None:
+    loop = Pipeline.from_config(cell().model_copy(update={"loop_rate_hz": 500.0}), input=hands, plant=plant)
+    if listener is not None:
+        loop.listeners.append(lambda tick: listener(loop, tick))
+    loop.run(duration, realtime=False)
+
+
+def test_engaging_is_felt_by_both_hands_and_every_vibration_ends_before_the_next_one_begins() -> None:
+    hands = FeltHands(left=straight(0.25 * -np.eye(3)[1]))
+    run(hands, 2.5)
+    for hand in HANDS:
+        assert hands.by(hand, ENGAGED) == [ENGAGED.amplitude]
+        sent = [(t, one.amplitude > 0.0) for t, one in hands.felt if one.hand == hand]
+        assert [on for _, on in sent] == [True, False] * (len(sent) // 2)
+        assert all(0.03 < after - before < 0.4 for (before, on), (after, _) in pairwise(sent) if on)
+        assert all(after - before > 0.04 for (before, on), (after, _) in pairwise(sent) if not on)
+
+
+def test_an_arm_that_is_driven_at_the_other_is_felt_by_both_hands_stronger_and_stronger_and_then_no_more() -> None:
+    hands = FeltHands(left=straight(0.5 * -np.eye(3)[1]))
+    run(hands, 5.0)
+    for hand in HANDS:
+        amplitudes = hands.by(hand, NEAR)
+        assert len(amplitudes) >= 4
+        assert amplitudes == sorted(amplitudes)
+    assert max(t for t, _ in hands.felt) < 4.0
+
+
+def test_a_hand_that_goes_out_of_reach_feels_its_target_slip_and_one_that_turns_too_far_a_joint_at_its_limit() -> None:
+    def turn(t: float) -> Array:
+        return np.append(np.zeros(3), 40.0 * straight(0.1 * UP, 4.0)(t)[:3])
+
+    hands = FeltHands(left=straight(1.2 * UP, 3.0), right=turn)
+    run(hands, 6.0)
+    assert len(hands.by("left", SLIP)) >= 5
+    assert 1 <= len(hands.by("right", LIMIT)) <= 3
+    assert not hands.by("left", LIMIT)
+
+
+def test_a_push_at_the_tool_is_felt_by_its_hand_only() -> None:
+    hands, pushed = FeltHands(), False
+
+    def push(loop: Pipeline, tick: Tick) -> None:
+        nonlocal pushed
+        if tick.t > 1.0 and not pushed:
+            pushed = True
+            assert isinstance(loop.plant, MujocoPlant)
+            loop.plant.push("right", np.array([0.0, 0.0, 22.0, 0.0, 0.0, 0.0]), 0.5)
+
+    run(hands, 2.0, "mujoco", push)
+    assert len(hands.by("right", CONTACT)) >= 1
+    assert CONTACT.amplitude < max(hands.by("right", CONTACT)) < 0.6
+    assert not hands.by("left", CONTACT)
+
+
+def test_a_gripper_that_closes_on_a_block_is_felt_once_and_an_empty_one_is_not() -> None:
+    class FeltScript(ScriptedInput):
+        grasps: ClassVar[dict[str, int]] = {}
+
+        def send_haptic(self, feedback: HapticFeedback) -> None:
+            if feedback.frequency == GRASP.frequency and feedback.amplitude > 0.0:
+                self.grasps[feedback.hand] = self.grasps.get(feedback.hand, 0) + 1
+
+    script = FeltScript("grasp")
+    config = cell().model_copy(update={"loop_rate_hz": 500.0})
+    Pipeline.from_config(config, input=script, plant="mujoco").run(14.0, realtime=False)
+    assert script.grasps == {"right": 1}
+
+
+@pytest.mark.parametrize("dialect", ["ros1", "ros2"])
+def test_a_headset_gets_the_vibrations_over_its_connection(dialect: str) -> None:
+    server = HeadsetServer(port=0)
+    config = cell()
+    patient = config.teleop.gate.model_copy(update={"timeout": 2.0})  # a busy machine is no fault
+    config = config.model_copy(update={"teleop": config.teleop.model_copy(update={"gate": patient})})
+    loop = Pipeline.from_config(config, input=server, plant="kinematic")
+    listening, ended = threading.Event(), threading.Event()
+    loop.listeners.append(lambda _: listening.set())
+    runs = threading.Thread(target=loop.run)
+    runs.start()
+    try:
+        assert listening.wait(60.0)
+        with FakeHeadset(server.address, dialect) as headset:
+            headset.send(headset.registrations())
+            lower = threading.Event()
+
+            def stream() -> None:
+                while not ended.wait(1.0 / RATE_HZ):
+                    for hand in HANDS:
+                        headset.send(headset.pose(hand, START[hand], (0.0, 0.0, 0.0, 1.0)))
+                        headset.send(headset.inputs(hand, lower=lower.is_set()))
+
+            streams = threading.Thread(target=stream)
+            streams.start()
+
+            def next_pulse() -> tuple[float, float]:
+                payload = headset.read_until("q2r_left_hand_haptic_feedback", 30.0)
+                frequency, amplitude = struct.unpack("<ff", payload[-8:])
+                return round(frequency, 3), round(amplitude, 3)
+
+            try:
+                threading.Event().wait(0.3)
+                lower.set()
+                assert next_pulse() == ENGAGED[:2]
+                assert next_pulse() == (0.0, 0.0)
+                lower.clear()
+                threading.Event().wait(0.3)
+                lower.set()
+                assert next_pulse() == PAUSED[:2]
+                assert next_pulse() == (0.0, 0.0)
+            finally:
+                ended.set()
+                streams.join()
+    finally:
+        loop.stop()
+        runs.join()
+
+
+def test_a_refused_press_is_felt_as_a_fault_is() -> None:
+    hands = FeltHands()
+    loop = Pipeline.from_config(cell(), input=hands, plant="kinematic")
+    loop.listeners.append(
+        lambda tick: loop.teleop.pause(tick.now, "as if something had failed") if tick.t > 0.5 else None
+    )
+    loop.run(0.6, realtime=False)
+    assert hands.by("left", FAULT) == [1.0]

@@ -1,0 +1,79 @@
+"""What an operator reads of an arm: why it does not follow, and what the next press does."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from q2r2_control.robot.robot import Robot
+from q2r2_control.runtime.recorder import Tick
+from q2r2_control.types import ArmTarget, Event
+from q2r2_control.viewer.arm_words import next_press, why
+from tests.viewer.test_history import robot, tick_at
+
+__all__ = ["robot"]
+
+JOINTS = ("left_A2", "left_A4")
+
+
+def words(tick: Tick, *binding: str, last: Event | None = None) -> str:
+    return why(tick, "left", JOINTS, binding, last)
+
+
+@pytest.mark.parametrize(
+    ("binding", "expected"),
+    [
+        ((), "catches up"),
+        (("right_A4 position", "right_link_1_0|right_link_5_0"), "catches up"),
+        (("left_A4 acceleration",), "catches up"),
+        (("left_A4 position", "left_A2 velocity"), "left_A4 at its limit"),
+        (("left_A2 velocity",), "left_A2 as fast as it may turn"),
+        (("left_A2 velocity", "left_hand_0|table_0"), "held by left_hand_0 | table_0"),
+        (
+            ("left_hand_0|table_0", "left_link_5_0|right_link_5_0"),
+            "held by left_link_5_0 | right_link_5_0, 82 mm to spare",
+        ),
+    ],
+)
+def test_an_arm_that_is_away_from_its_target_is_held_by_what_is_at_work_on_it(
+    robot: Robot, binding: tuple[str, ...], expected: str
+) -> None:
+    assert words(tick_at(robot, 1.0), *binding) == expected
+
+
+def test_an_arm_that_is_at_its_target_follows_whatever_is_at_work(robot: Robot) -> None:
+    tick = tick_at(robot, 1.0)
+    targets = {arm: ArmTarget(pose, 1.0) for arm, pose in tick.tools.items()}
+    assert words(replace(tick, targets=targets), "left_A2 velocity") == "follows the hand"
+
+
+@pytest.mark.parametrize(
+    ("source", "destination", "reason", "expected"),
+    [
+        ("engaged", "paused", "no pose for 0.15 s", "paused: no pose for 0.15 s"),
+        ("pausing", "paused", "lower button", "paused: lower button"),
+        ("paused", "paused", "not engaged: no pose for 0.15 s", "not engaged: no pose for 0.15 s"),
+    ],
+)
+def test_an_arm_that_is_not_engaged_says_what_stopped_it(
+    robot: Robot, source: str, destination: str, reason: str, expected: str
+) -> None:
+    paused = tick_at(robot, 1.0, engaged=False)
+    assert words(paused, last=Event(0.5, "left", source, destination, reason)) == expected
+
+
+def test_before_its_first_event_and_while_aligning_it_says_so_too(robot: Robot) -> None:
+    paused = tick_at(robot, 1.0, engaged=False)
+    assert words(paused) == "not engaged yet"
+    aligning = replace(paused, states={"left": "aligning", "right": "aligning"})
+    assert words(aligning, last=Event(0.5, "left", "engaged", "aligning", "alignment chord")) == "aligning"
+    assert next_press(aligning, "left") == "release both buttons to go on"
+
+
+def test_the_next_press_is_told_by_state_and_gripper(robot: Robot) -> None:
+    engaged, paused = tick_at(robot, 1.0), tick_at(robot, 1.0, engaged=False)
+    assert next_press(engaged, "left") == "lower pauses, upper closes the gripper"
+    closed = {arm: ArmTarget(None, 0.0) for arm in paused.targets}
+    assert next_press(replace(paused, targets=closed), "left") == "lower engages, upper opens the gripper"
+    assert next_press(replace(paused, connected=False), "left") == "nothing: no input is connected"
