@@ -139,11 +139,12 @@ def moves_fast(recorder: Recorder, begin: int) -> bool:
 
 
 def fastest(commands: list[Commanded]) -> float:
-    """Largest speed of a joint between the newest commands [rad/s]."""
-    if len(commands) < 2:
-        return 0.0
-    before, after = commands[-2:]
-    return float(np.abs(after.q - before.q).max() / max(after.number - before.number, 1) * RATE)
+    """Largest speed of a joint between two commands [rad/s]."""
+    speeds = (
+        float(np.abs(after.q - before.q).max() / max(after.number - before.number, 1) * RATE)
+        for before, after in pairwise(commands)
+    )
+    return max(speeds, default=0.0)
 
 
 def test_in_velocity_mode_the_arm_follows_and_stays_where_it_was_left(

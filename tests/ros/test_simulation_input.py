@@ -131,18 +131,39 @@ def test_the_script_waits_for_an_arm_that_is_not_ready_and_presses_until_it_foll
     arm["engaged"] = True
     rest = left["pose"].get(timeout=PATIENCE).pose.position.x
     wait_until(lambda: left["pose"].get(timeout=PATIENCE).pose.position.x > rest + 0.02, "the hand moves")
-    arm |= {"engaged": False, "ready": False}  # stopped by a fault at once, and not ready for a moment
-    wait_until(lambda: left["pose"].get(timeout=PATIENCE).pose.position.x == rest, "the hand is where it was")
-    time.sleep(1.0)
-    assert not any(message.button_lower for message in drained(left["inputs"]))
-    arm["ready"] = True
-    wait_until(lambda: left["inputs"].get(timeout=PATIENCE).button_lower, "the button is pressed")
-    arm["engaged"] = True
-    time.sleep(5.0)
+    for _ in range(2):
+        arm |= {"engaged": False, "ready": False}  # stopped by a fault at once, and not ready for a moment
+        wait_until(lambda: left["pose"].get(timeout=PATIENCE).pose.position.x == rest, "the hand is where it was")
+        drained(left["inputs"])
+        time.sleep(1.0)
+        assert not any(message.button_lower for message in drained(left["inputs"]))
+        arm["ready"] = True
+        wait_until(lambda: left["inputs"].get(timeout=PATIENCE).button_lower, "the button is pressed")
+        arm["engaged"] = True
+        time.sleep(2.0)
+    time.sleep(3.0)
     arm["engaged"] = False  # later it takes a person
     time.sleep(0.5)
     drained(left["inputs"])
     time.sleep(2.0)
+    assert not any(message.button_lower for message in drained(left["inputs"]))
+
+
+def test_an_arm_that_stops_early_again_and_again_is_not_engaged_for_ever(node: Any, processes: Processes) -> None:
+    arm = {"hand": "left", "engaged": False, "ready": True, "message": "ready to engage", "last_event": ""}
+    said = node.create_publisher(String, f"{node.get_fully_qualified_name()}/state", 10)
+    node.create_timer(0.1, lambda: said.publish(String(data=json.dumps(arm))))
+    left = subscribe(node, "left")
+    start(processes, side="left", trajectory="line")
+    rest = left["pose"].get(timeout=PATIENCE).pose.position.x
+    for _ in range(6):
+        wait_until(lambda: left["inputs"].get(timeout=PATIENCE).button_lower, "the button is pressed")
+        arm["engaged"] = True
+        wait_until(lambda: left["pose"].get(timeout=PATIENCE).pose.position.x > rest + 0.005, "the hand moves")
+        arm["engaged"] = False
+        time.sleep(0.3)
+        drained(left["inputs"]), drained(left["pose"])
+    time.sleep(2.5)
     assert not any(message.button_lower for message in drained(left["inputs"]))
 
 

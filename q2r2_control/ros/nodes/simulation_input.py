@@ -21,8 +21,10 @@ from q2r2_control.types import SIDES, HandSample
 _PERIOD = 0.002  # samples that came due are published this often [s]
 # Of the script, when it is decided whether the buttons are pressed, and whether the hands move [s].
 _BEFORE_PRESS, _BEFORE_MOTION = FIRST_PRESS - 0.1, START - 0.05
-# An arm that stops within this time of the motion's begin is engaged again, if it is ready within the same time [s].
+# An arm that stops within this time of a motion's begin is engaged again, if it is ready within the same time [s], and
+# if that has not happened too often: then something else than a busy machine stops it.
 _SETTLES = 3.0
+_EARLY_STOPS = 5
 _MODES = {
     "all": (MessageType.POSE, MessageType.INPUTS, MessageType.TWIST),
     "teleop": (MessageType.POSE, MessageType.INPUTS),
@@ -73,8 +75,9 @@ class SimulationInput(BaseNode):
         )
         self._starts = True  # until nothing is pressed again to engage the arms
         self._moves = False  # whether the hands do
-        self._moved_at: float | None = None  # when they first did [s]
+        self._moved_at: float | None = None  # since when they do [s]
         self._stopped_at: float | None = None  # when no arm followed any more, soon after that [s]
+        self._early_stops = 0
         self._not_to_press: set[str] | None = None  # hands; None: that is not decided yet
         self._rewind(self.now)
         self.create_service(Trigger, "~/start", self._on_start)
@@ -140,11 +143,12 @@ class SimulationInput(BaseNode):
         if any(follow) if self._moves else all(follow):
             self._moves, self._moved_at = True, now if self._moved_at is None else self._moved_at
             self._starts = now - self._moved_at < _SETTLES
-        elif self._listeners.paused_by_a_person():
+        elif self._listeners.paused_by_a_person() or self._early_stops >= _EARLY_STOPS:
             self._give_up()
         else:
             if self._moves:
                 self._stopped_at = now
+                self._early_stops += 1
             self._rewind(now)
 
     def _give_up(self) -> None:
@@ -154,7 +158,7 @@ class SimulationInput(BaseNode):
     def _rewind(self, now: float) -> None:
         self._script = ScriptedInput(self._trajectory, self._hands, rate_hz=self._rate)
         self._script.start()
-        self._began, self._not_to_press, self._moves = now, None, False
+        self._began, self._not_to_press, self._moves, self._moved_at = now, None, False, None
 
     def _publish(self, sample: HandSample) -> None:
         twist = self._script.hand_twist(sample.hand, sample.pose_stamp)
