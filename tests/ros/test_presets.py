@@ -69,10 +69,11 @@ def test_targets_keep_the_rules_of_a_controller_in_both_modes_and_its_arm_moves_
     name: str, bench: PresetBench, processes: Processes, other_interfaces: dict[str, str]
 ) -> None:
     bench.reset("output:=none")
-    controllers = StrictControllers(processes, POSES[name], other_interfaces)
+    environment = other_interfaces if POSES[name].command_type else {}
+    controllers = StrictControllers(processes, POSES[name], environment)
     controllers.start()
     modes = {"left": "raw", "right": "raw" if name == "builtin" else "filtered"}
-    with arm_controllers(bench, processes, name, modes, other_interfaces) as rigs:
+    with arm_controllers(bench, processes, name, modes, environment) as rigs:
         run_through(bench, rigs, controllers, PRESETS[name].guard)
         stamps = [target.header.stamp.sec + 1e-9 * target.header.stamp.nanosec for target in rigs.rigs[0].targets]
     # Half of it, since other programs take their part; that the preset asks for enough is tested below.
@@ -88,10 +89,11 @@ def test_joint_commands_of_the_built_in_controller_keep_the_rules_of_a_controlle
 ) -> None:
     terms, preset = JOINTS[name], PRESETS[name]
     topic = f"right.output_topic:=/robot/right_ctrl/{terms.topic}"
-    bench.reset(f"output:={preset.output}", topic, f"rate:={preset.rate}", **other_interfaces)
-    controllers = StrictControllers(processes, terms, other_interfaces)
+    environment = other_interfaces if terms.message == "lbr" else {}
+    bench.reset(f"output:={preset.output}", topic, f"rate:={preset.rate}", **environment)
+    controllers = StrictControllers(processes, terms, environment)
     controllers.start()
-    with arm_controllers(bench, processes, name, {"right": "filtered"}, other_interfaces) as rigs:
+    with arm_controllers(bench, processes, name, {"right": "filtered"}, environment) as rigs:
         run_through(bench, rigs, controllers, BUILTIN.guard)
 
 
