@@ -76,6 +76,7 @@ class CellCheck:
     faults: tuple[str, ...]
     stop_torques: tuple[StopTorque, ...]  # by arm
     driven: dict[str, str]  # by arm: what controllers of others are sent, empty for the built-in one
+    controls: dict[str, str]  # what those of each hand do
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -127,6 +128,7 @@ def check_cell(config: Config, compiling: AbstractContextManager[None] | None = 
         faults=preflight_faults(robot, settings, controller),
         stop_torques=stop_torques(robot, robot.capped_acceleration(settings.acceleration_limit)),
         driven={} if config.external is None else describe(config.external),
+        controls=config.teleop.bindings.meanings(),
     )
 
 

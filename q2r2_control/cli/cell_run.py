@@ -103,7 +103,8 @@ def run_cell(config: Config, options: RunOptions, console: Console) -> CellRun:
         if options.table:
             robot = pipeline.robot
             joints = {arm: [robot.joint_names[joint] for joint in its.joints] for arm, its in robot.arms.items()}
-            table = LiveTable(f"{options.name}: Ctrl-C brings the arms to rest and ends", joints)
+            title = f"{options.name}: Ctrl-C brings the arms to rest and ends"
+            table = LiveTable(title, joints, config.teleop.bindings)
             pipeline.listeners.append(table)
             stack.enter_context(table.shown(console))
         if options.real_time and (refused := stack.enter_context(real_time())):

@@ -16,6 +16,7 @@ from q2r2_control.cli.output import as_json_text, notice_of_compiling, stderr_co
 from q2r2_control.cli.progress_lines import ProgressLines
 from q2r2_control.cli.tables import (
     arm_table,
+    control_table,
     model_pairs_table,
     obstacle_table,
     pair_reach_table,
@@ -71,6 +72,7 @@ def _print_cell(result: CellCheck) -> None:
         *map(stop_table, result.stop_torques),
         obstacle_table(result),
         pair_table(result),
+        control_table(result),
     ):
         console.print(table)
     for arm, line in (result.driven or {"arms": "the built-in controller"}).items():

@@ -62,6 +62,15 @@ def pair_table(check: CellCheck) -> Table:
     return table
 
 
+def control_table(check: CellCheck) -> Table:
+    """What the controls of each hand do."""
+    table = _table_of("controls of each hand", "control")
+    table.add_column("does")
+    for control, meaning in check.controls.items():
+        table.add_row(control, meaning)
+    return table
+
+
 def pair_reach_table(pairs: PairsWritten) -> Table:
     """Which pairs of links cannot meet."""
     title = (

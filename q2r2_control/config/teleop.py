@@ -7,6 +7,7 @@ from enum import StrEnum
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from q2r2_control.config.axes import axes_matrix
+from q2r2_control.config.bindings import BindingSettings
 from q2r2_control.config.timeouts import STREAM_TIMEOUT
 
 
@@ -85,6 +86,8 @@ class TeleopSettings(BaseModel):
         0.08, ge=0, le=0.5, description="a button waits this long for the other, which makes it a chord [s]"
     )
     linked: bool = Field(True, description="a fault of one hand disengages both arms")
+    precision_scale: float = Field(0.25, gt=0, le=1, description="of all motion while precision is held")
+    bindings: BindingSettings = Field(default_factory=BindingSettings)
     filter: FilterSettings = Field(default_factory=FilterSettings)
     leash: LeashSettings = Field(default_factory=LeashSettings)
     haptics: HapticSettings = Field(default_factory=HapticSettings)

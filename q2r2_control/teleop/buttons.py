@@ -13,6 +13,7 @@ class Press(Enum):
     """What a hand's buttons ask for."""
 
     LOWER_DOWN = auto()  # the lower button went down; it may still become a chord
+    UPPER_DOWN = auto()  # the same of the upper one
     LOWER = auto()  # the lower button was pressed, and alone
     UPPER = auto()  # the upper button was pressed, and alone
 
@@ -31,8 +32,8 @@ class ButtonArbiter:
 
     The two buttons of a chord never go down in the same sample, so a press is delayed by ``chord_window`` [s] (or until
     release, if that is earlier): when the other button follows, it was a chord and neither press is reported. Only
-    stopping must not wait: ``LOWER_DOWN`` reports the lower button at once, and may only be used to stop motion, which
-    a chord does as well. A button that goes down while the other one is held makes a chord at any time.
+    stopping must not wait: ``LOWER_DOWN`` and ``UPPER_DOWN`` report a button at once, and may only be used to stop
+    motion, which a chord does as well. A button that goes down while the other one is held makes a chord at any time.
 
     After a chord both buttons have to be released before either counts again.
     """
@@ -73,6 +74,7 @@ class ButtonArbiter:
             self.cancel()
         elif rose_upper:
             self._upper.pressed_at = stamp
+            presses.append(Press.UPPER_DOWN)
         elif rose_lower:
             self._lower.pressed_at = stamp
             presses.append(Press.LOWER_DOWN)

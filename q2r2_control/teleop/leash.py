@@ -113,6 +113,10 @@ class Leash:
             component.reset()
         self._last = None
 
+    def anchor_anew(self) -> None:
+        """The hand was anchored anew where it is: its way since the last tick is not known; what has slipped stays."""
+        self._last = None
+
     def target(self, motion: RelativeMotion, hand: pin.SE3, newest: pin.SE3, tool: pin.SE3, now: float) -> pin.SE3:
         """The target of ``hand`` at ``now`` [s], no farther from ``tool`` (world frame) than the leash reaches.
 

@@ -62,15 +62,12 @@ class RelativeMotion:
             fault = error.errors()[0]
             key = ".".join(str(part) for part in fault["loc"])
             raise ConfigError(f"RelativeMotion: {key} = {fault['input']!r:.60}: {fault['msg']}") from error
-        self._scale = settings.position_scale
-        self._rotation_scale = settings.rotation_scale
+        self._scale, self._rotation_scale = self._full = settings.position_scale, settings.rotation_scale
         self._in_tool_frame = settings.rotation_frame is RotationFrame.TOOL
         self._map = axes_matrix(settings.axes)
         if settings.stance is Stance.MIRROR_REFLECTED:
             self._map = _REFLECTION @ self._map
-        # A signed permutation: each axis of the tool goes along one of the hand's, by so much of it.
-        sources = np.abs(self._map).argmax(axis=1)
-        self._axes = [(int(j), self._scale * float(row[j])) for row, j in zip(self._map, sources, strict=True)]
+        self._axes = self._scaled_axes()
         self._hand_position: list[float] | None = None
         self._hand_rotation = np.eye(3)
         self._tool_position = [0.0, 0.0, 0.0]
@@ -82,6 +79,15 @@ class RelativeMotion:
         """Make ``hand`` (finite, input's frame) and ``tool`` (world frame) correspond from now on."""
         self.anchor_position(hand, tool)
         self.anchor_rotation(hand, tool)
+
+    def rescale(self, position: float, rotation: float, hand: pin.SE3, tool: pin.SE3) -> None:
+        """From now on scale by these shares of the scales; ``hand`` and ``tool`` are anchored, so nothing jumps.
+
+        A share of 0 keeps the tool's position, or its rotation, where it is.
+        """
+        self._scale, self._rotation_scale = position * self._full[0], rotation * self._full[1]
+        self._axes = self._scaled_axes()
+        self.anchor(hand, tool)
 
     def anchor_position(self, hand: pin.SE3, tool: pin.SE3) -> None:
         """Make only the positions of ``hand`` and ``tool`` correspond from now on; rotations go on as they were."""
@@ -121,19 +127,24 @@ class RelativeMotion:
     def hand(self, tool: pin.SE3) -> pin.SE3:
         """The hand pose, in the input's frame, whose :meth:`target` is ``tool``: where an operator has to put the hand.
 
-        Of rotations beyond half a turn from the anchor the shorter one is taken. With a ``rotation_scale`` of 0, with
-        which no hand can turn the tool, the hand keeps its rotation. Raises :class:`Q2R2Error` when nothing has been
-        anchored.
+        Of rotations beyond half a turn from the anchor the shorter one is taken. With a scale of 0, with which no hand
+        can move or turn the tool, the hand keeps its position or rotation. Raises :class:`Q2R2Error` when nothing has
+        been anchored.
         """
         if self._hand_position is None:
             raise Q2R2Error("RelativeMotion.hand: call anchor(hand, tool) first")
-        way = self._map.T @ (tool.translation - self._tool_position) / self._scale
+        way = self._map.T @ (tool.translation - self._tool_position) / self._scale if self._scale else np.zeros(3)
         turn = np.eye(3)
         if self._rotation_scale > 0.0:
             scaled = self._before.T @ tool.rotation @ self._after.T
             turn = pin.exp3(pin.log3(scaled) / self._rotation_scale)
         anchor = self._hand_rotation
         return pin.SE3(anchor @ turn if self._in_tool_frame else turn @ anchor, self._hand_position + way)
+
+    def _scaled_axes(self) -> list[tuple[int, float]]:
+        """A signed permutation: each axis of the tool goes along one of the hand's, by so much of it."""
+        sources = np.abs(self._map).argmax(axis=1)
+        return [(int(j), self._scale * float(row[j])) for row, j in zip(self._map, sources, strict=True)]
 
     def _scaled(self, rotation: Array) -> Array:
         if self._rotation_scale == 1.0:

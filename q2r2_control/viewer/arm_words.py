@@ -6,6 +6,7 @@ from collections.abc import Collection
 
 import numpy as np
 
+from q2r2_control.config.bindings import BindingSettings, ButtonAction, HeldAction
 from q2r2_control.runtime.recorder import Tick
 from q2r2_control.teleop.arm import ArmState
 from q2r2_control.types import Event
@@ -33,16 +34,21 @@ def why(tick: Tick, arm: str, joints: Collection[str], binding: Collection[str],
     return _held_by(tick, arm, joints, binding) or ("catches up" if np.isfinite(distance) else "holds")
 
 
-def next_press(tick: Tick, arm: str) -> str:
-    """What the buttons of the arm's hand do next."""
+def next_press(tick: Tick, arm: str, bindings: BindingSettings) -> str:
+    """What the buttons of the arm's hand do next, and its dead man."""
     state = tick.states[arm]
     if not tick.connected:
         return "nothing: no input is connected"
     if state == ArmState.ALIGNING:
         return "release both buttons to go on"
-    gripper = "opens" if tick.targets[arm].gripper < 0.5 else "closes"
-    lower = "pauses" if state in (ArmState.ENGAGED, ArmState.PAUSING) else "engages"
-    return f"lower {lower}, upper {gripper} the gripper"
+    moves = state in (ArmState.ENGAGED, ArmState.PAUSING)
+    words = {
+        ButtonAction.PAUSE_TOGGLE: "pauses" if moves else "engages",
+        ButtonAction.GRIPPER_TOGGLE: "opens the gripper" if tick.targets[arm].gripper < 0.5 else "closes the gripper",
+        HeldAction.DEAD_MAN: "let go pauses" if moves else "held engages",
+    }
+    bound = ((bindings.control_of(action), what) for action, what in words.items())
+    return ", ".join(f"{control} {what}" for control, what in bound if control is not None)
 
 
 def _held_by(tick: Tick, arm: str, joints: Collection[str], binding: Collection[str]) -> str | None:

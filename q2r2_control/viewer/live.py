@@ -13,6 +13,7 @@ from rich.live import Live
 from rich.markup import escape
 from rich.table import Table
 
+from q2r2_control.config.bindings import BindingSettings
 from q2r2_control.runtime.recorder import Tick
 from q2r2_control.types import Event
 from q2r2_control.viewer.arm_words import next_press, why
@@ -28,9 +29,9 @@ _NEAR = 0.01  # a pair with less to spare is coloured [m]
 class LiveTable:
     """Shows the newest tick of a run. A separate thread draws; a tick only stores a reference."""
 
-    def __init__(self, title: str, joints: Mapping[str, Collection[str]]) -> None:
-        """``joints``: names of those that move each arm."""
-        self._title, self._joints = title, joints
+    def __init__(self, title: str, joints: Mapping[str, Collection[str]], bindings: BindingSettings) -> None:
+        """``joints``: names of those that move each arm; ``bindings``: what the hands' controls do."""
+        self._title, self._joints, self._bindings = title, joints, bindings
         self._last: dict[str, Event] = {}  # of each arm
         self._newest: Tick | None = None
         self._count = 0
@@ -73,7 +74,7 @@ class LiveTable:
             table.add_row(name, *values)
         words = [why(tick, arm, self._joints[arm], binding, self._last.get(arm)) for arm in arms]
         table.add_row("why", *map(escape, words))
-        table.add_row("next press", *(next_press(tick, arm) for arm in arms))
+        table.add_row("next press", *(next_press(tick, arm, self._bindings) for arm in arms))
         table.add_section()
         report = tick.reference.report
         colour = "yellow" if report.margin < _NEAR else "default"

@@ -22,6 +22,7 @@ from q2r2_control.config.arms import (
     SwivelConfig,
     ToolConfig,
 )
+from q2r2_control.config.bindings import BindingSettings
 from q2r2_control.config.cell import (
     Config,
     HeadsetConfig,
@@ -114,6 +115,7 @@ class TestTheShippedCellShowsAllThereIsToTune:
         ("teleop.filter", FilterSettings),
         ("teleop.leash", LeashSettings),
         ("teleop.haptics", HapticSettings),
+        ("teleop.bindings", BindingSettings),
         ("teleop.gate", GateSettings),
         ("mujoco", MujocoConfig),
         ("mujoco.objects.blue_block", ObjectConfig),

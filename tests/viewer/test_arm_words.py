@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import pytest
 
+from q2r2_control.config.bindings import BindingSettings
 from q2r2_control.robot.robot import Robot
 from q2r2_control.runtime.recorder import Tick
 from q2r2_control.types import ArmTarget, Event
@@ -68,12 +69,24 @@ def test_before_its_first_event_and_while_aligning_it_says_so_too(robot: Robot) 
     assert words(paused) == "not engaged yet"
     aligning = replace(paused, states={"left": "aligning", "right": "aligning"})
     assert words(aligning, last=Event(0.5, "left", "engaged", "aligning", "alignment chord")) == "aligning"
-    assert next_press(aligning, "left") == "release both buttons to go on"
+    assert press(aligning) == "release both buttons to go on"
+
+
+def press(tick: Tick, **bindings: str) -> str:
+    return next_press(tick, "left", BindingSettings.model_validate(bindings))
 
 
 def test_the_next_press_is_told_by_state_and_gripper(robot: Robot) -> None:
     engaged, paused = tick_at(robot, 1.0), tick_at(robot, 1.0, engaged=False)
-    assert next_press(engaged, "left") == "lower pauses, upper closes the gripper"
+    assert press(engaged) == "lower pauses, upper closes the gripper"
     closed = {arm: ArmTarget(None, 0.0) for arm in paused.targets}
-    assert next_press(replace(paused, targets=closed), "left") == "lower engages, upper opens the gripper"
-    assert next_press(replace(paused, connected=False), "left") == "nothing: no input is connected"
+    assert press(replace(paused, targets=closed)) == "lower engages, upper opens the gripper"
+    assert press(replace(paused, connected=False)) == "nothing: no input is connected"
+
+
+def test_the_next_press_is_that_of_the_control_that_is_bound(robot: Robot) -> None:
+    engaged, paused = tick_at(robot, 1.0), tick_at(robot, 1.0, engaged=False)
+    assert press(paused, lower="gripper_toggle", upper="pause_toggle") == "upper engages, lower closes the gripper"
+    dead_man = {"lower": "none", "upper": "none", "grip": "dead_man", "trigger": "precision"}
+    assert press(paused, **dead_man) == "grip held engages"
+    assert press(engaged, **dead_man) == "grip let go pauses"

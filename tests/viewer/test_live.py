@@ -9,6 +9,7 @@ from dataclasses import replace
 import pytest
 from rich.console import Console
 
+from q2r2_control.config.bindings import BindingSettings
 from q2r2_control.robot.robot import Robot
 from q2r2_control.viewer.live import LiveTable
 from tests.viewer.test_history import robot, tick_at
@@ -26,7 +27,7 @@ def drawn(table: LiveTable) -> str:
 
 
 def test_it_shows_states_errors_distances_and_grippers_of_the_newest_tick(robot: Robot) -> None:
-    table = LiveTable("demo", JOINTS)
+    table = LiveTable("demo", JOINTS, BindingSettings())
     table(tick_at(robot, 1.0, engaged=False))
     table(tick_at(robot, 2.0, distance=0.0234))
     text = drawn(table)
@@ -38,13 +39,13 @@ def test_it_shows_states_errors_distances_and_grippers_of_the_newest_tick(robot:
 
 
 def test_it_names_what_holds_a_gripper(robot: Robot) -> None:
-    table = LiveTable("demo", JOINTS)
+    table = LiveTable("demo", JOINTS, BindingSettings())
     table(replace(tick_at(robot, 1.0), held_grippers={"left": ("left_finger_0", "block_0")}))
     assert "left_finger_0 | block_0" in drawn(table)
 
 
 def test_it_shows_every_limit_that_was_at_work_since_it_was_drawn_last(robot: Robot) -> None:
-    table = LiveTable("demo", JOINTS)
+    table = LiveTable("demo", JOINTS, BindingSettings())
     tick = tick_at(robot, 0.0)
     report = replace(tick.reference.report, binding=("left_A2 velocity",))
     table(replace(tick, reference=replace(tick.reference, report=report)))
@@ -54,7 +55,7 @@ def test_it_shows_every_limit_that_was_at_work_since_it_was_drawn_last(robot: Ro
 
 
 def test_before_the_first_tick_it_says_that_the_run_is_starting() -> None:
-    assert "starting" in drawn(LiveTable("demo", JOINTS))
+    assert "starting" in drawn(LiveTable("demo", JOINTS, BindingSettings()))
 
 
 def test_the_interpreters_switch_interval_is_as_before_after_a_fault() -> None:
@@ -62,7 +63,7 @@ def test_the_interpreters_switch_interval_is_as_before_after_a_fault() -> None:
     during = []
 
     def fail() -> None:
-        with LiveTable("demo", JOINTS).shown(Console(file=io.StringIO())):
+        with LiveTable("demo", JOINTS, BindingSettings()).shown(Console(file=io.StringIO())):
             during.append(sys.getswitchinterval())
             raise RuntimeError
 

@@ -28,7 +28,7 @@ from q2r2_control.ros.bridge.parameters import ArmDefaults, ArmParameters, arm_p
 from q2r2_control.ros.bridge.target_output import near
 from q2r2_control.ros.monitoring.arm_link import ArmLink
 from q2r2_control.ros.monitoring.hand_listeners import PAUSED_BY_SERVICE
-from q2r2_control.teleop.arm import OPEN, ArmState
+from q2r2_control.teleop.arm import BY_OPERATOR, OPEN, ArmState
 from q2r2_control.teleop.haptics import HapticPulses
 from q2r2_control.teleop.teleop import Teleop
 from q2r2_control.types import SIDES, ArmTarget
@@ -261,7 +261,7 @@ class BaseArmController(BaseNode):
             if event.destination is ArmState.ENGAGED:
                 self._link.engaged()
             stopped = event.source != ArmState.PAUSED and event.destination in (ArmState.PAUSED, ArmState.ALIGNING)
-            if stopped and event.reason != "lower button" and not self._link.told(event.reason):
+            if stopped and event.reason not in BY_OPERATOR and not self._link.told(event.reason):
                 self._link.report(event.reason)
             self.report_health()
 

@@ -1,0 +1,301 @@
+"""What triggers, sticks and buttons may be bound to, and that nothing they do makes a target jump."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from pydantic import ValidationError
+
+from q2r2_control.config import load_config
+from q2r2_control.config.bindings import HELD, BindingSettings, HeldAction
+from q2r2_control.errors import ConfigError
+from q2r2_control.teleop.arm import LET_GO, is_fault
+from q2r2_control.teleop.held_controls import HeldControls, travel
+from q2r2_control.types import SIDES, HandInputs, HandSample
+from tests.teleop.hands import ENGAGED, PAUSED, Operator, assert_smooth, operator, spoilt, waving
+
+PUSHED: dict[str, dict[str, Any]] = {
+    "trigger": {"press_index": 1.0},
+    "grip": {"press_middle": 1.0},
+    "stick_up": {"thumb_stick_vertical": 1.0},
+    "stick_down": {"thumb_stick_vertical": -1.0},
+    "stick_left": {"thumb_stick_horizontal": -1.0},
+    "stick_right": {"thumb_stick_horizontal": 1.0},
+}
+
+
+class Squeezing(Operator):
+    """Holds controls of both hands, by the names of the bindings."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.held: dict[str, float] = {}
+        self.only: str | None = None  # the hand that holds them; None: both
+        self.alter = self._squeeze
+
+    def _squeeze(self, received: HandSample) -> HandSample:
+        if received.hand != (self.only or received.hand):
+            return received
+        values: dict[str, Any] = {
+            field: value * share for control, share in self.held.items() for field, value in PUSHED[control].items()
+        }
+        return replace(received, inputs=replace(received.inputs, **values))
+
+
+def squeezing(**changes: object) -> Squeezing:
+    return Squeezing(operator(**changes).settings)
+
+
+def engaged(**bindings: str) -> Squeezing:
+    driver = squeezing(bindings=bindings)
+    driver.engage()
+    assert driver.states == ENGAGED
+    return driver
+
+
+def place(driver: Operator, arm: str = "left") -> pin.SE3:
+    target = driver.targets[arm].pose
+    assert target is not None
+    return target
+
+
+def shift(driver: Operator, way: np.ndarray, turn: np.ndarray, duration: float = 1.0) -> list:
+    """Both hands by ``way`` [m] and ``turn`` [rad], and then at rest."""
+    start = dict(driver.hands)
+
+    def move(t: float) -> dict[str, pin.SE3]:
+        share = min(t / duration, 1.0)
+        return {
+            hand: pin.SE3(pin.exp3(share * turn) @ at.rotation, at.translation + share * way)
+            for hand, at in start.items()
+        }
+
+    return driver.run(duration + 0.8, move)
+
+
+def later(wave: Any, by: float, t: float) -> dict[str, pin.SE3]:
+    """A motion of the hands that has gone on for so long [s]."""
+    hands: dict[str, pin.SE3] = wave(t + by)
+    return hands
+
+
+WAY, TURN = np.array([0.1, -0.05, 0.08]), np.array([0.1, 0.3, -0.2])
+
+
+@pytest.mark.parametrize(
+    ("action", "position", "rotation"),
+    [("precision", 0.25, 0.25), ("rotation_lock", 1.0, 0.0), ("translation_lock", 0.0, 1.0)],
+)
+@pytest.mark.parametrize("control", HELD)
+def test_what_is_held_scales_the_motion_for_as_long_as_it_is_held_and_nothing_jumps(
+    control: str, action: str, position: float, rotation: float
+) -> None:
+    driver = engaged(**{control: action})
+    history = shift(driver, WAY, TURN)
+    for held, shares in ((1.0, (position, rotation)), (0.0, (1.0, 1.0))):
+        driver.held = {control: held}
+        history += driver.run(0.1)
+        before = place(driver)
+        history += shift(driver, WAY, TURN)
+        after = place(driver)
+        np.testing.assert_allclose(after.translation - before.translation, shares[0] * WAY, atol=2e-4)
+        np.testing.assert_allclose(pin.log3(after.rotation @ before.rotation.T), shares[1] * TURN, atol=1e-3)
+    assert_smooth(history)
+
+
+def test_pressing_and_letting_go_in_mid_motion_does_not_jump_either() -> None:
+    driver = engaged(grip="precision", trigger="rotation_lock", stick_up="translation_lock")
+    wave = waving(driver, 0.2)
+    history, began, random = [], driver.now, np.random.default_rng(2)
+    for _ in range(40):
+        driver.held = {control: float(random.random() < 0.5) for control in ("grip", "trigger", "stick_up")}
+        history += driver.run(0.05, partial(later, wave, driver.now - began))
+    assert_smooth(history)
+    assert driver.states == ENGAGED
+
+
+def test_the_scale_of_precision_is_a_setting() -> None:
+    driver = squeezing(precision_scale=0.5, bindings={"grip": "precision"})
+    driver.engage()
+    driver.held = {"grip": 1.0}
+    driver.run(0.1)
+    before = place(driver)
+    shift(driver, WAY, np.zeros(3))
+    np.testing.assert_allclose(place(driver).translation - before.translation, 0.5 * WAY, atol=2e-4)
+
+
+def test_an_arm_that_is_engaged_while_precision_is_held_begins_with_it() -> None:
+    driver = squeezing(bindings={"grip": "precision"})
+    driver.run(0.1)
+    driver.held = {"grip": 1.0}
+    driver.engage()
+    before = place(driver)
+    shift(driver, WAY, np.zeros(3))
+    np.testing.assert_allclose(place(driver).translation - before.translation, 0.25 * WAY, atol=2e-4)
+
+
+class TestADeadMan:
+    BINDINGS: ClassVar[dict[str, str]] = {"lower": "none", "grip": "dead_man"}
+
+    def driver(self) -> Squeezing:
+        driver = squeezing(bindings=self.BINDINGS)
+        driver.run(0.1)
+        assert driver.states == PAUSED
+        return driver
+
+    def test_engages_while_it_is_held_and_pauses_at_once_when_it_is_let_go(self) -> None:
+        driver = self.driver()
+        driver.held = {"grip": 1.0}
+        driver.run(0.05)
+        assert driver.states == ENGAGED
+        shift(driver, WAY, TURN)
+        driver.held = {}
+        driver.tick(driver.samples())
+        assert driver.states == PAUSED
+        assert all(target.pose is None for target in driver.targets.values())
+        assert {event.reason for event in driver.events} == {"dead man held", LET_GO}
+        assert not any(map(is_fault, driver.events))
+
+    def test_of_one_hand_is_no_fault_of_the_other(self) -> None:
+        driver = self.driver()
+        driver.held = {"grip": 1.0}
+        driver.run(0.05)
+        driver.only = "right"
+        driver.run(0.05)
+        assert driver.states == {"left": "paused", "right": "engaged"}
+
+    def test_that_stays_held_through_a_fault_has_to_be_let_go_first(self) -> None:
+        driver = self.driver()
+        driver.held = {"grip": 1.0}
+        driver.run(0.05)
+        driver.silent = set(SIDES)
+        driver.run(0.3)
+        assert driver.states == PAUSED
+        driver.silent = set()
+        driver.run(0.5)
+        assert driver.states == PAUSED
+        driver.held = {}
+        driver.run(0.1)
+        driver.held = {"grip": 1.0}
+        driver.run(0.1)
+        assert driver.states == ENGAGED
+
+    @pytest.mark.parametrize("lost", [False, True])
+    def test_that_is_held_while_the_connection_comes_up_does_nothing(self, lost: bool) -> None:
+        driver = squeezing(bindings=self.BINDINGS)
+        driver.held = {"grip": 1.0}
+        driver.run(0.2)
+        assert driver.states == PAUSED
+        if lost:
+            driver.held = {}
+            driver.run(0.1)
+            driver.held = {"grip": 1.0}
+            driver.run(0.1)
+            assert driver.states == ENGAGED
+            driver.teleop.connection_lost(driver.now)
+            driver.run(0.3)
+            assert driver.states == PAUSED
+
+    @pytest.mark.parametrize("let_go", [False, True])
+    def test_is_aligned_anew_only_if_it_is_still_held(self, let_go: bool) -> None:
+        driver = self.driver()
+        driver.held = {"grip": 1.0}
+        driver.run(0.05)
+        driver.lower, driver.upper = set(SIDES), set(SIDES)
+        driver.run(0.2)
+        assert driver.states == {"left": "aligning", "right": "aligning"}
+        driver.held = {} if let_go else driver.held
+        driver.run(0.1)
+        driver.lower, driver.upper = set(), set()
+        driver.run(0.2)
+        assert driver.states == (PAUSED if let_go else ENGAGED)
+
+    def test_is_not_engaged_by_a_press_of_a_button(self) -> None:
+        driver = self.driver()
+        driver.press(*SIDES)
+        assert driver.states == PAUSED
+
+    def test_is_let_go_by_a_reading_that_is_no_number(self) -> None:
+        driver = self.driver()
+        driver.held = {"grip": 1.0}
+        driver.run(0.05)
+        driver.alter = lambda received: spoilt(received, inputs=HandInputs(press_middle=float("nan")))
+        driver.run(0.05)
+        assert driver.states == PAUSED
+
+
+def test_a_control_that_trembles_about_its_threshold_is_held_and_let_go_once() -> None:
+    controls = HeldControls(BindingSettings(grip=HeldAction.PRECISION))
+    seen = []
+    for step, value in enumerate((0.0, 0.55, 0.61, 0.45, 0.59, 0.41, 0.39, 0.55, 0.5, 0.59, 0.7)):
+        controls.receive(HandInputs(press_middle=value), step, step)
+        seen.append(bool(controls.actions))
+    assert seen == [False, False, True, True, True, True, False, False, False, False, True]
+
+
+def test_readings_that_come_late_or_from_the_future_hold_nothing() -> None:
+    controls = HeldControls(BindingSettings(grip=HeldAction.PRECISION))
+    controls.receive(HandInputs(), 1.0, 1.0)
+    controls.receive(HandInputs(press_middle=1.0), 0.9, 1.1)
+    controls.receive(HandInputs(press_middle=1.0), float("nan"), 1.1)
+    assert not controls.actions
+    controls.receive(HandInputs(press_middle=1.0), 99.0, 1.2)  # counts as received now
+    assert controls.actions
+    controls.receive(HandInputs(), 1.3, 1.3)
+    assert not controls.actions
+
+
+@pytest.mark.parametrize("control", HELD)
+def test_every_control_moves_from_0_to_1_and_no_other_with_it(control: str) -> None:
+    inputs = HandInputs(**PUSHED[control])
+    assert travel(control, inputs) == 1.0
+    assert all(travel(other, inputs) <= 0.0 for other in HELD if other != control)
+
+
+def test_the_buttons_can_change_places() -> None:
+    driver = squeezing(bindings={"lower": "gripper_toggle", "upper": "pause_toggle"})
+    driver.run(0.05)
+    driver.press(*SIDES, button="upper")
+    assert driver.states == ENGAGED
+    driver.press("left")
+    assert [driver.targets[arm].gripper for arm in SIDES] == [0.0, 1.0]
+    assert driver.states == ENGAGED
+    driver.upper = {"left"}
+    driver.tick(driver.samples())
+    assert driver.states["left"] == "pausing"
+    driver.run(0.2)
+    assert driver.states["left"] == "paused"
+    assert not any(map(is_fault, driver.events))
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({"upper": "pause_toggle"}, "lower and upper are both pause_toggle; allowed: one of them"),
+        ({"grip": "precision", "stick_up": "precision"}, "grip and stick_up are both precision; allowed: one of them"),
+        ({"grip": "dead_man"}, "lower is pause_toggle and grip is dead_man; allowed: one way to engage"),
+        ({"lower": "none"}, "no control engages the arm; allowed: a button that is pause_toggle, or dead_man"),
+        ({"grip": "pause_toggle"}, "Input should be 'none', 'dead_man', 'precision', 'rotation_lock' or"),
+        ({"thumb": "precision"}, "Extra inputs are not permitted"),
+    ],
+)
+def test_bindings_that_mean_two_things_or_nothing_are_refused(given: dict[str, str], said: str) -> None:
+    with pytest.raises(ValidationError) as error:
+        BindingSettings.model_validate(given)
+    assert said in str(error.value)
+
+
+def test_in_a_cells_yaml_the_line_names_the_key_and_both_controls(tmp_path: Path) -> None:
+    text = Path("config/dual_iiwa7.yaml").read_text().replace("    grip: none", "    grip: dead_man")
+    (file := tmp_path / "cell.yaml").write_text(text)
+    with pytest.raises(ConfigError) as error:
+        load_config(file)
+    assert "teleop.bindings" in str(error.value)
+    assert "lower is pause_toggle and grip is dead_man; allowed: one way to engage" in str(error.value)
+    assert len(str(error.value).splitlines()) == 1
