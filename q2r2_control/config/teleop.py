@@ -40,6 +40,7 @@ class FilterSettings(BaseModel):
     beta: float = Field(10.0, ge=0, le=1000, description="cutoff added per speed [Hz s/m]")
     rotation_beta: float = Field(3.0, ge=0, le=1000, description="cutoff added per speed [Hz s/rad]")
     derivative_cutoff: float = Field(2.0, gt=0, le=100, description="cutoff of the speed estimate [Hz]")
+    average_at_rest: bool = Field(True, description="a hand that rests is where its samples are on average")
 
 
 class GateSettings(BaseModel):

@@ -16,6 +16,7 @@ from q2r2_control.teleop.gate import PoseGate
 from q2r2_control.teleop.held_controls import HeldControls
 from q2r2_control.teleop.leash import Leash
 from q2r2_control.teleop.relative import RelativeMotion
+from q2r2_control.teleop.rest import RestingPose
 from q2r2_control.types import Event, HandSample
 
 OPEN, CLOSED = 1.0, 0.0
@@ -57,6 +58,7 @@ class ArmTeleop:
         self._gate = PoseGate(settings.gate)
         self._buttons = ButtonArbiter(settings.chord_window)
         self._filter = PoseFilter(settings.filter)
+        self._rest = RestingPose(settings.filter.average_at_rest)
         self._motion, self._unslipped = (
             RelativeMotion(
                 settings.stance,
@@ -92,8 +94,10 @@ class ArmTeleop:
         if HeldAction.DEAD_MAN in held ^ self.held:
             self._gripped = HeldAction.DEAD_MAN in self.held
         usable, fault = self._gate.receive(sample, now)
-        if usable and fault is None and self.state is ArmState.ENGAGED and self._gate.pose is not None:
-            self._filter.add(self._gate.pose, self._gate.stamp, now)
+        if usable and fault is None and self._gate.pose is not None:
+            self._rest.add(self._gate.pose)
+            if self.state is ArmState.ENGAGED:
+                self._filter.add(self._gate.pose, self._gate.stamp, now)
         if usable and self.state is ArmState.ALIGNING:
             return None  # realigning makes the pose jump, and the arm is not following
         return fault
@@ -116,6 +120,7 @@ class ArmTeleop:
     def forget(self) -> None:
         """Drop everything received: poses are forgotten, buttons count as held until they are seen released."""
         self._gate.reset()
+        self._rest.forget()
         self._buttons.forget()
         self._held.forget()
         self._presses.clear()
@@ -149,7 +154,7 @@ class ArmTeleop:
         """
         if self.state is not ArmState.ENGAGED:
             return None
-        hand = self._filter.at(now)
+        hand = self._rest.draw(self._filter.at(now), now)
         if commanded is None or self._gate.pose is None:
             target = self._motion.target(hand)
         else:
@@ -202,6 +207,7 @@ class ArmTeleop:
             self.state = ArmState.PAUSED
 
     def _anchor(self, hand: pin.SE3, tool: pin.SE3, now: float) -> None:
+        hand = self._rest.begin(hand, now)
         self._filter.reset(hand, now)
         self._rescale(hand, tool)
         self._leash.reset()

@@ -1,0 +1,105 @@
+"""Where a hand rests, known better than any one sample of it says.
+
+A third of a headset's noise, about 0.2 mm a sample, passes the filter, since a filter that follows a hand within 25 ms
+cannot average for long. A hand that rests needs no such haste: here the samples since it came to rest are averaged,
+over two seconds at most. Without that each engagement and each pause leaves the tool where the noise was at that
+moment, and a hundred of them are a random walk of millimetres.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+
+import numpy as np
+import pinocchio as pin
+
+from q2r2_control.types import Array, pose_of
+
+# A hand rests while the mean of its newest samples is this near to that of all since it came to rest, and no sample is
+# farther from it than a headset's noise makes one in thousands [m], [rad].
+_NEWEST, _DRIFTED, _FAR = 8, (0.35e-3, 2e-3), (1.0e-3, 5e-3)
+_LONGEST = 150  # samples of the mean: two seconds of a 75 Hz headset
+_TRUSTED = 10, 50  # the mean begins to count from so many samples on, and is all that counts from so many
+_LEAVING = 0.05  # the mean of a hand that moves again counts for so long, less and less [s]
+
+
+class RestingPose:
+    """Draws a filtered pose towards the mean of a hand that rests; not ``enabled``, it leaves every pose as it is."""
+
+    def __init__(self, enabled: bool = True) -> None:
+        self._enabled = enabled
+        self.forget()
+
+    def forget(self) -> None:
+        """Nothing is known."""
+        self._restart([pin.SE3.Identity()])
+        self._count = 0
+        self._share = 0.0
+        self._held = pin.SE3.Identity()  # the mean that is drawn to
+        self._of = self._episode = 0  # the rest that it is of, and the one that is going on
+        self._now = 0.0
+
+    def add(self, pose: pin.SE3) -> None:
+        """A sample of the hand."""
+        if not self._enabled:
+            return
+        sample = np.concatenate((pose.translation, pin.log3(pose.rotation.dot(self._origin.T))))
+        self._newest.append((sample, pose))
+        if self._count == 0 or self._away(sample, _FAR):
+            self._leave([pose])
+            return
+        self._count += 1
+        self._mean += (sample - self._mean) / min(self._count, _LONGEST)
+        if self._count > _NEWEST:
+            newest = np.mean([one for one, _ in self._newest], axis=0)
+            if self._away(newest, _DRIFTED):
+                self._leave([pose for _, pose in self._newest])
+
+    def begin(self, newest: pin.SE3, now: float) -> pin.SE3:
+        """Where the hand is at ``now`` [s]: at the mean if it rests, else at its ``newest`` pose."""
+        self._now, self._of = now, self._episode
+        self._share = min(max(self._trusted, 0.0), 1.0)
+        self._held = self._mean_pose() if self._share > 0.0 else newest
+        return self._held
+
+    def draw(self, pose: pin.SE3, now: float) -> pin.SE3:
+        """The filtered ``pose`` at ``now`` [s], drawn towards the mean as far as that is to be trusted."""
+        passed, self._now = max(now - self._now, 0.0) / _LEAVING, now
+        if self._of != self._episode and self._share == 0.0:
+            self._of = self._episode
+        if self._of == self._episode:
+            self._share = min(max(self._trusted, 0.0), 1.0, self._share + passed)
+        else:
+            self._share = max(self._share - passed, 0.0)
+        if self._share == 0.0:
+            return pose
+        if self._of == self._episode:
+            self._held = self._mean_pose()
+        position = pose.translation + self._share * (self._held.translation - pose.translation)
+        turn = pin.exp3(self._share * pin.log3(self._held.rotation.dot(pose.rotation.T)))
+        return pose_of(turn.dot(pose.rotation), position)
+
+    @property
+    def _trusted(self) -> float:
+        """The share that the mean may count for, if positive."""
+        least, most = _TRUSTED
+        return (self._count - least) / (most - least)
+
+    def _mean_pose(self) -> pin.SE3:
+        return pose_of(pin.exp3(self._mean[3:]).dot(self._origin), self._mean[:3].copy())
+
+    def _away(self, sample: Array, bounds: tuple[float, float]) -> bool:
+        way = sample - self._mean
+        return math.hypot(*way[:3]) > bounds[0] or math.hypot(*way[3:]) > bounds[1]
+
+    def _leave(self, samples: list[pin.SE3]) -> None:
+        self._episode += 1
+        self._restart(samples)
+
+    def _restart(self, samples: list[pin.SE3]) -> None:
+        """A rest that begins with these samples."""
+        self._origin = np.array(samples[-1].rotation)  # rotations are told as vectors from here
+        rows = [np.concatenate((one.translation, pin.log3(one.rotation.dot(self._origin.T)))) for one in samples]
+        self._newest = deque(zip(rows, samples, strict=True), maxlen=_NEWEST)
+        self._mean, self._count = np.mean(rows, axis=0), len(rows)
