@@ -17,7 +17,7 @@ from q2r2_control.errors import InputError, ProtocolError
 from q2r2_control.inputs.client import Client
 from q2r2_control.inputs.messages import PROP_TOPICS, AppMessage, PropTwist, warm_up
 from q2r2_control.inputs.samples import SampleQueue
-from q2r2_control.inputs.session import Reception, log_frame, topic_of
+from q2r2_control.inputs.session import HANDSHAKE, Reception, log_frame, topic_of
 from q2r2_control.inputs.statistics import HeadsetStatistics
 from q2r2_control.types import SIDES, HandSample, HapticFeedback
 
@@ -194,7 +194,7 @@ class HeadsetServer:
             if address[0] not in driving.refused_hosts and len(driving.refused_hosts) < MAX_HOSTS_NAMED:
                 driving.refused_hosts.add(address[0])
                 _LOG.warning("headset %s refused: %s drives", peer, driving.peer)
-            _close_with_text(connection, f"refused: {driving.peer} drives")
+            _close_with(connection, HANDSHAKE + log_frame("error", f"refused: {driving.peer} drives"))
             return
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         client = Client(connection, peer, self._clock())
@@ -285,12 +285,11 @@ class HeadsetServer:
             self._client = None
             self._last_disconnect = reason
         self._selector.unregister(client.socket)
-        # Behind half a frame the text could not be read.
-        _close_with_text(client.socket, None if client.session.outgoing else f"dropped: {reason}")
+        # Behind what was left unsent, which may be the end of a frame.
+        _close_with(client.socket, bytes(client.session.outgoing) + log_frame("error", f"dropped: {reason}"))
 
 
-def _close_with_text(connection: socket.socket, text: str | None) -> None:
-    """Close, after a line for the app's console if it can be sent at once."""
+def _close_with(connection: socket.socket, last_words: bytes) -> None:
+    """Close, after ``last_words`` if they can be sent at once."""
     with connection, suppress(OSError):
-        if text is not None:
-            connection.send(log_frame("error", text))
+        connection.send(last_words)

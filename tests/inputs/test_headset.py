@@ -9,6 +9,7 @@ import socket
 import struct
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from itertools import pairwise
@@ -182,6 +183,21 @@ def test_after_a_second_without_words_the_server_sends_a_keepalive(server: Heads
     with connect(server) as headset:
         clock.now += 1.1
         assert headset.socket.recv(100) == KEEPALIVE
+
+
+@every_dialect
+def test_a_blank_topic_or_a_missing_type_is_told_to_the_app_which_stays_connected(
+    server: HeadsetServer, dialect: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    with connect(server, dialect) as headset:
+        headset.send(headset.command("__publish", topic="", message_name="geometry_msgs/PoseStamped"))
+        assert b"topic is empty" in headset.read_until("__error")
+        headset.send(headset.command("__subscribe", topic="dice_twist"))
+        assert b"message_name of dice_twist is empty" in headset.read_until("__error")
+        headset.send(headset.command("__topic_list") + headset.pose("left", (1.0, 2.0, 3.0), IDENTITY))
+        assert b'"/q2r_left_hand_pose"' in headset.read_until("__topic_list")
+        collect(server, 1)
+    assert warnings(caplog) == []
 
 
 def test_a_headset_that_only_keeps_alive_stays(server: HeadsetServer, clock: HandClock) -> None:
@@ -381,7 +397,9 @@ def test_a_second_headset_is_refused_with_a_reason_and_one_line_while_one_drives
         for _ in range(3):
             with FakeHeadset(server.address) as second:
                 second.send(second.registrations())
-                assert b"refused" in second.read_until("__error")
+                frames = [second.read_frame(), second.read_frame()]
+                assert [frame and frame[0] for frame in frames] == ["__handshake", "__error"], "or the app misreads it"
+                assert b"refused" in cast(tuple[str, bytes], frames[1])[1]
                 assert second.read_frame() is None
         first.send(first.pose("left", (1.0, 2.0, 3.0), IDENTITY))
         collect(server, 1)
@@ -451,8 +469,14 @@ FAULTS: dict[str, tuple[Callable[[FakeHeadset], bytes], str]] = {
     "destination that is not UTF-8": (lambda _: b"\x02\0\0\0\xff\xfe\0\0\0\0", "not UTF-8"),
     "unknown system command": (lambda headset: headset.command("__ping"), "unknown system command"),
     "destination that is no topic": (lambda headset: headset.frame("no topic", b""), "not a topic name"),
+    "one NUL too many": (lambda headset: headset.frame("__topic_list\0", b"{}"), "'__topic_list"),
     "log forgery in a destination": (lambda headset: headset.frame("a\nINFO all is well", b""), "not a topic name"),
     "registration that is not JSON": (lambda headset: headset.frame("__publish", b"{"), "not JSON"),
+    "flood of blank topics": (lambda headset: headset.command("__publish", topic="") * 65, "registrations without"),
+    "command of 16 kB": (
+        lambda headset: headset.frame("__publish", b'{"topic":"a","message_name":"a/B"}'.ljust((1 << 14) + 1)),
+        "16385 bytes, at most 16384",
+    ),
     "payload without destination": (lambda _: b"\0\0\0\0\x01\0\0\0x", "without a destination"),
     "short pose": (lambda headset: headset.frame("q2r_left_hand_pose", bytes(20)), "bytes"),
     "pose with spare bytes": (
@@ -487,7 +511,10 @@ def test_a_fault_drops_that_client_with_one_line_and_the_next_is_served(
         headset.read_until("__topic_list")
         headset.send(make_bytes(headset))
         eventually(lambda: not server.connected)
-        assert reason.encode() in headset.read_until("__error"), "the operator's app is told why"
+        last = deque(iter(headset.read_frame, None), maxlen=1).pop()
+        assert last is not None
+        assert last[0] == "__error"
+        assert reason.encode() in last[1], "the operator's app is told why"
     eventually(lambda: warnings(caplog))
     (line,) = warnings(caplog)
     assert reason in line
