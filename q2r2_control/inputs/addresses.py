@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import socket
+from collections.abc import Sequence
+
+from q2r2_control.config.networks import Network
 
 EVERY_NETWORK = ("", "0.0.0.0", "::")  # as hosts to listen on
 ONLY_THIS_MACHINE = ("127.0.0.1", "::1", "localhost")
@@ -16,6 +19,20 @@ def written(host: str, port: int) -> str:
 def app_settings(host: str, port: int) -> str:
     """What to enter in the app, for a server that listens on ``host``."""
     return f"address {_reachable(host)}, port {port}, protocol ROS2"
+
+
+def access_lines(host: str, port: int, allow: Sequence[Network] | None) -> tuple[str, ...]:
+    """What to enter in the app, and who can drive now, for a server that listens on ``host``."""
+    if host in ONLY_THIS_MACHINE:
+        return (f"{host} can be reached from this machine only; --host 0.0.0.0 admits the network",)
+    if allow is None:
+        drivers = (
+            "whoever reaches this port can drive the arms; headset.allow in the cell's YAML restricts it, such as to "
+            "[192.168.1.0/24]"
+        )
+    else:
+        drivers = f"only {', '.join(map(str, allow))} can drive the arms (headset.allow in the cell's YAML)"
+    return (f"enter in the app: {app_settings(host, port)}", drivers)
 
 
 def _reachable(host: str) -> str:

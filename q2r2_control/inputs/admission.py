@@ -21,10 +21,10 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from enum import Enum
-from ipaddress import IPv4Network, IPv6Network, ip_address
+from ipaddress import ip_address
 from typing import NamedTuple, Protocol
 
-Network = IPv4Network | IPv6Network
+from q2r2_control.config.networks import Network
 
 QUIET_ALLOWED = 0.5  # without a frame, against the same peer on a new connection [s]
 POSES_ALLOWED = 5.0  # without a hand pose, against a client that sends them [s]

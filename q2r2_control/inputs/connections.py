@@ -10,8 +10,9 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 
+from q2r2_control.config.networks import Network
 from q2r2_control.errors import ProtocolError
-from q2r2_control.inputs.admission import Network, Verdict, decide, is_allowed
+from q2r2_control.inputs.admission import Verdict, decide, is_allowed
 from q2r2_control.inputs.client import Client
 from q2r2_control.inputs.door import Door
 from q2r2_control.inputs.framing import Frame

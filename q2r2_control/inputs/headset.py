@@ -11,9 +11,9 @@ from contextlib import suppress
 
 import numpy as np
 
+from q2r2_control.config.networks import Network
 from q2r2_control.errors import InputError
 from q2r2_control.inputs.addresses import written
-from q2r2_control.inputs.admission import Network
 from q2r2_control.inputs.client import Client
 from q2r2_control.inputs.connections import TURN, Connections, Handlers
 from q2r2_control.inputs.door import Door
