@@ -28,7 +28,7 @@ def headset_check(
     """Show what a headset sends: connection, rates, ages, last values, and which way each hand moves.
 
     Move a hand forwards, to the left, up: where the words do not agree, change teleop.axes in the config.
-    Exit 1 when no hand data came at all.
+    Exit 1 unless poses and inputs came of every hand that leads an arm; without both, run has nothing to engage.
     """
     cell = with_address(load_config(config), host, port)
     if duration is not None:
@@ -47,4 +47,4 @@ def headset_check(
         print(as_json_text(check.as_json()))
     else:
         Console().print(headset_table(check))
-    raise typer.Exit(0 if check.heard else 1)
+    raise typer.Exit(1 if check.missing else 0)

@@ -8,28 +8,31 @@ import typer
 from rich.console import Console
 
 from q2r2_control.config.cell import Config, HeadsetConfig
+from q2r2_control.inputs.addresses import access_lines, written
 from q2r2_control.inputs.headset import HeadsetServer
 
-Host = Annotated[str | None, typer.Option(help="Address to bind, instead of the config's; 0.0.0.0: every network.")]
+Host = Annotated[
+    str | None, typer.Option(help="Address to bind, instead of the config's; 0.0.0.0: every network, :: IPv6 too.")
+]
 Port = Annotated[int | None, typer.Option(min=0, max=65535, help="Port, instead of the config's; 0: any free one.")]
 
 
 class AnnouncedHeadset(HeadsetServer):
-    """A headset server that says where it listens, for people and for scripts that asked for port 0."""
+    """A headset server that says where it listens, for scripts that asked for port 0, and who can drive, for people."""
 
     def __init__(self, config: Config, console: Console) -> None:
-        super().__init__(config.headset.host, config.headset.port)
-        self._console = console
+        headset = config.headset
+        super().__init__(headset.host, headset.port, allow=headset.networks)
+        self._headset, self._console = headset, console
 
     def start(self) -> None:
         """See :meth:`HeadsetServer.start`."""
         super().start()
-        self._console.print(f"headset: listening on {self.address[0]}:{self.address[1]}", highlight=False)
+        for line in (f"listening on {written(*self.address)}", *access_lines(*self.address, self._headset.networks)):
+            self._console.print(f"headset: {line}", soft_wrap=True, highlight=False, markup=False)
 
 
 def with_address(config: Config, host: str | None, port: int | None) -> Config:
     """The config with another address for the headset to connect to."""
-    address = HeadsetConfig(
-        host=config.headset.host if host is None else host, port=config.headset.port if port is None else port
-    )
-    return config.model_copy(update={"headset": address})
+    given = {name: value for name, value in (("host", host), ("port", port)) if value is not None}
+    return config.model_copy(update={"headset": HeadsetConfig(**(config.headset.model_dump() | given))})

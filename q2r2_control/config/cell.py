@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import yaml
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, ValidationError, field_validator, model_validator
 
 from q2r2_control.config.arms import (
     ArmConfig,
@@ -29,6 +29,7 @@ from q2r2_control.config.arms import (
 )
 from q2r2_control.config.control import AdmittanceSettings, ControllerSettings, ImpedanceSettings, check_priority
 from q2r2_control.config.external import ControllerKind, ExternalConfig, check_external
+from q2r2_control.config.networks import Network, network_of
 from q2r2_control.config.resources import find_resource
 from q2r2_control.config.supervision import SupervisionSettings
 from q2r2_control.config.teleop import TeleopSettings
@@ -59,8 +60,23 @@ class ObstacleConfig(CellModel):
 class HeadsetConfig(CellModel):
     """The TCP server that the Quest2ROS app connects to."""
 
-    host: str = Field("127.0.0.1", description="address to bind; 0.0.0.0 admits the network")
+    host: str = Field("127.0.0.1", description="address to bind; 0.0.0.0 admits the network, :: that of IPv6 too")
     port: int = Field(10000, ge=0, le=65535, description="0 takes any free port")
+    allow: tuple[str, ...] | None = Field(
+        None, min_length=1, description="addresses and networks that may connect; none: all that reach the port"
+    )
+
+    @field_validator("allow")
+    @classmethod
+    def _are_networks(cls, allow: tuple[str, ...] | None) -> tuple[str, ...] | None:
+        for text in allow or ():
+            network_of(text)
+        return allow
+
+    @property
+    def networks(self) -> tuple[Network, ...] | None:
+        """What ``allow`` names."""
+        return None if self.allow is None else tuple(map(network_of, self.allow))
 
 
 class ObjectConfig(CellModel):

@@ -1,11 +1,15 @@
-"""The state of the connected headset in the server."""
+"""The state of a connected client in the server."""
 
 from __future__ import annotations
 
+import math
 import socket
+from collections.abc import Mapping
 
 from q2r2_control.errors import ProtocolError
-from q2r2_control.inputs.framing import FrameDecoder
+from q2r2_control.inputs.framing import Frame, FrameDecoder
+from q2r2_control.inputs.messages import HandPose
+from q2r2_control.inputs.rate_limits import RateLimit
 from q2r2_control.inputs.samples import HandTracker
 from q2r2_control.inputs.session import HeadsetSession, Reception
 from q2r2_control.inputs.statistics import TopicRecorder
@@ -14,29 +18,42 @@ MAX_FRAMES_PER_SECOND = 2000  # the app sends about 450; more would take process
 
 
 class Client:
-    """The connected headset."""
+    """A connected client. Implements :class:`~q2r2_control.inputs.admission.Peer`."""
 
-    def __init__(self, connection: socket.socket, peer: str, now: float) -> None:
+    def __init__(self, connection: socket.socket, host: str, peer: str, now: float) -> None:
         self.socket = connection
+        self.host = host
         self.peer = peer
         self.session = HeadsetSession()
         self.decoder = FrameDecoder()
         self.tracker = HandTracker()
         self.recorders: dict[str, TopicRecorder] = {}
         self.refused_hosts: set[str] = set()
+        self.announced = False  # in the log
+        self.since = now
         self.last_frame = now
+        self.last_pose = -math.inf
         self.last_sent = now
-        self._window_start = now
-        self._window_frames = 0
+        self._frames = RateLimit(MAX_FRAMES_PER_SECOND)
 
-    def count_frame(self, now: float) -> None:
-        """Raises :class:`ProtocolError` when the client floods."""
+    @property
+    def registrations(self) -> tuple[Mapping[str, str], Mapping[str, str]]:
+        """Topics with types that it publishes, and topics that it listens to."""
+        return self.session.published, self.session.subscribed
+
+    def receive(self, frame: Frame, now: float) -> Reception | None:
+        """Take one frame; the hand's message if it was one.
+
+        Raises :class:`ProtocolError` when the client breaks the protocol or floods.
+        """
         self.last_frame = now
-        if now - self._window_start >= 1.0:
-            self._window_start, self._window_frames = now, 0
-        self._window_frames += 1
-        if self._window_frames > MAX_FRAMES_PER_SECOND:
+        if not self._frames.take(now):
             raise ProtocolError(f"more than {MAX_FRAMES_PER_SECOND} frames in a second")
+        reception = self.session.receive(frame)
+        if reception is not None and isinstance(reception.message, HandPose):
+            self.last_pose = now
+        return reception
 
     def record(self, reception: Reception, now: float) -> None:
+        """Count a message for people to see."""
         self.recorders.setdefault(reception.topic, TopicRecorder()).record(reception.message, now)

@@ -17,7 +17,8 @@ def make_input(source: Input | str, config: Config) -> Input:
     if source == "scripted":
         return ScriptedInput(DEFAULT_TRAJECTORY)
     if source == "headset":
-        return HeadsetServer(config.headset.host, config.headset.port)
+        headset = config.headset
+        return HeadsetServer(headset.host, headset.port, allow=headset.networks)
     if isinstance(source, str):
         raise ConfigError(f"input {source!r}: allowed are {', '.join(INPUTS)}")
     return source

@@ -4,28 +4,26 @@ from __future__ import annotations
 
 import logging
 import math
-import selectors
-import socket
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 
 import numpy as np
 
-from q2r2_control.errors import InputError, ProtocolError
+from q2r2_control.config.networks import Network
+from q2r2_control.errors import InputError
+from q2r2_control.inputs.addresses import written
 from q2r2_control.inputs.client import Client
+from q2r2_control.inputs.connections import TURN, Connections, Handlers
+from q2r2_control.inputs.door import Door
+from q2r2_control.inputs.framing import Frame
 from q2r2_control.inputs.messages import PROP_TOPICS, AppMessage, PropTwist, warm_up
+from q2r2_control.inputs.rate_limits import HostLog, log_writer
 from q2r2_control.inputs.samples import SampleQueue
-from q2r2_control.inputs.session import Reception, log_frame, topic_of
+from q2r2_control.inputs.session import Reception, topic_of
 from q2r2_control.inputs.statistics import HeadsetStatistics
 from q2r2_control.types import SIDES, HandSample, HapticFeedback
-
-KEEPALIVE_AFTER = 1.0  # of own silence [s]
-SILENCE_ALLOWED = 2.0  # without a whole frame [s]; the app sends a keepalive after 1 s
-MAX_HOSTS_NAMED = 8  # in the log as refused while one headset drives
-_TURN = 0.05  # longest wait for the network; timeouts are looked at this often [s]
-_RECEIVE_BYTES = 1 << 12  # some 40 messages: the control loop gets the interpreter between two such portions
 
 _LOG = logging.getLogger(__name__)
 
@@ -34,8 +32,9 @@ class HeadsetServer:
     """Hand samples from, and vibrations to, the Quest2ROS app. Implements :class:`~q2r2_control.inputs.base.Input`.
 
     Samples are stamped with ``clock`` when their bytes are received. The loop's thread never waits for the network
-    or for decoding. A client that breaks the protocol, floods, or is silent for ``SILENCE_ALLOWED`` is dropped with one
-    logged line, and another one may connect; while one is connected, others are refused.
+    or for decoding. A client that breaks the protocol, floods, or is silent for 2 s is dropped with one logged line,
+    and another one may connect. ``allow`` names the networks whose hosts may connect, None all of them; who of those
+    drives is decided in :mod:`~q2r2_control.inputs.admission`.
 
     Where a ``listener`` is given, each message goes only to it, at once and in the receiving thread, and :meth:`poll`
     returns nothing: this is for forwarding messages one by one.
@@ -47,8 +46,10 @@ class HeadsetServer:
         port: int = 10000,
         clock: Callable[[], float] = time.monotonic,
         listener: Callable[[Reception], None] | None = None,
+        allow: Sequence[Network] | None = None,
     ) -> None:
         self._address = (host, port)
+        self._allow = allow
         self._clock = clock
         self._tell = listener
         self._thread: threading.Thread | None = None
@@ -59,29 +60,25 @@ class HeadsetServer:
         self._statistics_lock = threading.Lock()  # never taken by poll or what sends
         self._client: Client | None = None
         self._last_client: Client | None = None
-        self._connections = 0
+        self._connections_made = 0
         self._last_disconnect: str | None = None
 
     def start(self) -> None:
         """Listen. Raises :class:`InputError` when host and port cannot be bound, or when already started."""
         if self._thread is not None:
-            raise InputError(f"headset: already listening on {self._address[0]}:{self._address[1]}")
+            raise InputError(f"headset: already listening on {written(*self._address)}")
         warm_up()
         host, port = self._address
+        log = HostLog(log_writer(_LOG))
         try:
-            self._listener = socket.create_server(self._address)  # with SO_REUSEADDR
+            door = Door(host, port, log)
         except (OSError, OverflowError, ValueError) as error:
-            raise InputError(f"headset: cannot listen on {host}:{port}: {error}") from error
-        self._listener.setblocking(False)
-        self._address = (host, self._listener.getsockname()[1])
-        self._waker, self._waiter = socket.socketpair()
-        self._waker.setblocking(False)
-        self._waiter.setblocking(False)
-        self._selector = selectors.DefaultSelector()
-        self._selector.register(self._listener, selectors.EVENT_READ, self._accept)
-        self._selector.register(self._waiter, selectors.EVENT_READ, self._drain_waiter)
+            raise InputError(f"headset: cannot listen on {written(host, port)}: {error}") from error
+        self._address = (host, door.port)
+        handlers = Handlers(admitted=self._admit, lost=self._lose, receive=self._receive, due=self._take_owed)
+        self._connections = Connections(door, self._allow, self._clock, handlers, log)
         self._stop.clear()
-        self._thread = threading.Thread(target=self._run, name="headset", daemon=True)
+        self._thread = threading.Thread(target=self._run, args=(self._connections,), name="headset", daemon=True)
         self._thread.start()
 
     @property
@@ -125,7 +122,7 @@ class HeadsetServer:
                 unknown_topics=dict(session.unknown_topics) if session else {},
                 published=tuple(session.published) if session else (),
                 subscribed=tuple(session.subscribed) if session else (),
-                connections=self._connections,
+                connections=self._connections_made,
                 last_disconnect=self._last_disconnect,
             )
 
@@ -134,7 +131,7 @@ class HeadsetServer:
         if self._thread is None:
             return
         self._stop.set()
-        self._wake()
+        self._connections.wake()
         self._thread.join()
         self._thread = None
 
@@ -142,155 +139,47 @@ class HeadsetServer:
         if self._client is not None:
             with self._owed_lock:
                 self._owed[topic_of(message)] = message
-            self._wake()
+            self._connections.wake()
 
-    def _wake(self) -> None:
-        # A full pipe wakes the thread as well; with a closed one there is no thread.
-        with suppress(OSError):
-            self._waker.send(b"\0")
-
-    def _run(self) -> None:
-        last_fault = ""
+    def _run(self, connections: Connections) -> None:
         while not self._stop.is_set():
             try:
-                self._serve_once()
+                connections.serve()
             except Exception as error:
-                # After any exception this thread has to go on for the next headset; the client is dropped.
-                if repr(error) != last_fault:
-                    _LOG.exception("headset server: unexpected fault, dropping the headset")
-                last_fault = repr(error)
+                # After any exception this thread has to go on for the next headset.
+                connections.report(error)
                 with suppress(Exception):
-                    self._disconnect("unexpected fault of the server")
-                time.sleep(_TURN)
-        self._disconnect("server closed")
-        for open_socket in (self._listener, self._waker, self._waiter):
-            open_socket.close()
-        self._selector.close()
+                    connections.end_all("unexpected fault of the server")
+                time.sleep(TURN)
+        connections.close()
 
-    def _serve_once(self) -> None:
-        """Wait for the network once and handle what there is."""
-        for key, _ in self._selector.select(_TURN):
-            key.data()
-        now = self._clock()
-        if self._client is not None:
-            self._send_due(self._client, now)
-
-    def _drain_waiter(self) -> None:
-        self._waiter.recv(_RECEIVE_BYTES)
-
-    def _accept(self) -> None:
-        try:
-            connection, address = self._listener.accept()
-        except OSError as error:
-            # Out of file descriptors, or the peer has gone again. The listener stays readable: do not spin.
-            _LOG.debug("headset server: accept: %s", error)
-            time.sleep(0.01)
-            return
-        connection.setblocking(False)
-        peer = f"{address[0]}:{address[1]}"
-        driving = self._client
-        if driving is not None:
-            # The app tries again every second: one line for each host is enough.
-            if address[0] not in driving.refused_hosts and len(driving.refused_hosts) < MAX_HOSTS_NAMED:
-                driving.refused_hosts.add(address[0])
-                _LOG.warning("headset %s refused: %s drives", peer, driving.peer)
-            _close_with_text(connection, f"refused: {driving.peer} drives")
-            return
-        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        client = Client(connection, peer, self._clock())
-        self._selector.register(connection, selectors.EVENT_READ, lambda: self._receive(client))
+    def _admit(self, client: Client) -> None:
         with self._owed_lock:
             self._owed.clear()
         with self._statistics_lock:
             self._client = self._last_client = client
-            self._connections += 1
-        _LOG.info("headset %s connected", peer)
+            self._connections_made += 1
 
-    def _receive(self, client: Client) -> None:
-        if client is not self._client:
-            return
-        try:
-            data = client.socket.recv(_RECEIVE_BYTES)
-            if data:
-                self._handle(client, data, self._clock())
-                return
-            client.decoder.finish()
-        except BlockingIOError:
-            return
-        except OSError as error:
-            self._drop(f"connection lost: {error.strerror}")
-        except ProtocolError as error:
-            self._drop(str(error))
-        else:
-            _LOG.info("headset %s closed the connection", client.peer)
-            self._disconnect("closed by the headset")
-
-    def _handle(self, client: Client, data: bytes, now: float) -> None:
-        client.decoder.feed(data)
-        while (frame := client.decoder.next_frame()) is not None:
-            client.count_frame(now)
-            # Locked for each frame, so that a snapshot never waits for a whole burst.
-            with self._statistics_lock:
-                reception = client.session.receive(frame)
-                if reception is not None:
-                    client.record(reception, now)
-            if reception is None:
-                continue
-            if self._tell is not None:
-                self._tell(reception)
-            elif (sample := client.tracker.update(reception.hand, reception.message, now)) is not None:
-                self._samples.put(sample)
-
-    def _send_due(self, client: Client, now: float) -> None:
-        """Send what is due, and drop a silent client: its half-open connection would keep others out."""
-        if now - client.last_frame > SILENCE_ALLOWED:
-            self._drop(f"no frame for {SILENCE_ALLOWED:g} s")
-            return
-        outgoing = client.session.outgoing
-        if not outgoing:
-            # Encoded only now, so that a client that does not read gets the newest vibration and not all of them.
-            with self._owed_lock:
-                owed, self._owed = self._owed, {}
-            for message in owed.values():
-                client.session.queue_message(message)
-            if not outgoing and now - client.last_sent > KEEPALIVE_AFTER:
-                client.session.queue_keepalive()
-        try:
-            if outgoing:
-                del outgoing[: client.socket.send(outgoing)]
-                client.last_sent = now
-        except BlockingIOError:
-            pass
-        except OSError as error:
-            self._drop(f"connection lost: {error.strerror}")
-            return
-        events = selectors.EVENT_READ | (selectors.EVENT_WRITE if outgoing else 0)
-        key = self._selector.get_key(client.socket)
-        if key.events != events:
-            self._selector.modify(client.socket, events, key.data)
-
-    def _drop(self, reason: str) -> None:
-        """End the connection from this side, with one logged line that says why."""
-        if self._client is not None:
-            reason = " ".join(reason.split())
-            _LOG.warning("headset %s dropped: %s", self._client.peer, reason)
-            self._disconnect(reason)
-
-    def _disconnect(self, reason: str) -> None:
-        client = self._client
-        if client is None:
-            return
+    def _lose(self, reason: str) -> None:
         self._samples.cut()  # before _client, so that `connected` cannot be true of the next one too early
         with self._statistics_lock:
             self._client = None
             self._last_disconnect = reason
-        self._selector.unregister(client.socket)
-        # Behind half a frame the text could not be read.
-        _close_with_text(client.socket, None if client.session.outgoing else f"dropped: {reason}")
 
+    def _receive(self, client: Client, frame: Frame, now: float) -> None:
+        # Locked for each frame, so that a snapshot never waits for a whole burst.
+        with self._statistics_lock:
+            reception = client.receive(frame, now)
+            if reception is not None:
+                client.record(reception, now)
+        if reception is None:
+            return
+        if self._tell is not None:
+            self._tell(reception)
+        elif (sample := client.tracker.update(reception.hand, reception.message, now)) is not None:
+            self._samples.put(sample)
 
-def _close_with_text(connection: socket.socket, text: str | None) -> None:
-    """Close, after a line for the app's console if it can be sent at once."""
-    with connection, suppress(OSError):
-        if text is not None:
-            connection.send(log_frame("error", text))
+    def _take_owed(self) -> Iterable[AppMessage]:
+        with self._owed_lock:
+            owed, self._owed = self._owed, {}
+        return owed.values()

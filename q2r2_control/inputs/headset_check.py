@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import socket
 import time
 from collections import deque
 from collections.abc import Callable
@@ -13,7 +12,11 @@ import numpy as np
 
 from q2r2_control.config import Config
 from q2r2_control.config.axes import axes_matrix
+from q2r2_control.config.teleop import Stance
+from q2r2_control.inputs.addresses import ONLY_THIS_MACHINE, app_settings, written
 from q2r2_control.inputs.headset import HeadsetServer
+from q2r2_control.inputs.messages import MessageType
+from q2r2_control.inputs.session import HAND_TOPICS
 from q2r2_control.inputs.statistics import HeadsetStatistics
 from q2r2_control.types import SIDES, Array, HandSample
 
@@ -21,6 +24,8 @@ SILENCE = 2.0  # without data before advice is given [s]
 _PERIOD = 0.05  # [s]
 _WINDOW = 0.5  # of the movement that is put in words [s]
 _STILL = 0.02  # a hand that moved less in the window is still [m]
+_NEEDED = (MessageType.POSE, MessageType.INPUTS)
+_OTHER = {"left": "right", "right": "left"}
 _DIRECTIONS = (("back -x", "forward +x"), ("right -y", "left +y"), ("down -z", "up +z"))
 
 
@@ -63,7 +68,8 @@ class HeadsetCheck:
     directions: dict[str, str]  # hand -> where it moves
     positions: dict[str, Array | None]  # hand -> world position [m]
     heard: bool  # data came at some time
-    advice: tuple[str, ...]  # lines; empty while data comes
+    missing: tuple[str, ...]  # topics that a run needs and that never came
+    advice: tuple[str, ...]  # lines; empty while all comes that a run needs
 
     def as_json(self) -> dict[str, Any]:
         """Data for the JSON writer."""
@@ -84,6 +90,7 @@ class HeadsetCheck:
             "subscribed": statistics.subscribed,
             "hands": {hand: {"direction": self.directions[hand], "position_m": self.positions[hand]} for hand in SIDES},
             "heard": self.heard,
+            "missing": self.missing,
             "advice": self.advice,
         }
 
@@ -100,31 +107,66 @@ def watch_headset(
     Returns the last one.
     """
     hands = {hand: HandMovement(config.teleop.axes) for hand in SIDES}
-    start = now = last_data = time.monotonic()
+    start = time.monotonic()
+    last_data = dict.fromkeys(needed_topics(config), start)
+    missing = tuple(last_data)
     heard = False
-    check = HeadsetCheck(server.statistics, dict.fromkeys(hands, "no data"), dict.fromkeys(hands), False, ())
-    while not stopping() and (duration is None or now - start < duration):
+    while True:
         now = time.monotonic()
+        ends = stopping() or (duration is not None and now - start >= duration)  # before the last look
         for sample in server.poll(now):
             hands[sample.hand].add(sample)
-            last_data, heard = now, True
+            heard = True
         statistics = server.statistics
+        for name in statistics.topics.keys() & last_data.keys():
+            last_data[name] = max(last_data[name], now - statistics.topics[name].age)
+        missing = tuple(name for name in missing if name not in statistics.topics)
+        silent = tuple(name for name, last in last_data.items() if now - last > SILENCE)
+        if ends and not silent:
+            silent = missing  # there is no time left to wait for it
+        nothing_comes = len(silent) == len(last_data)
         check = HeadsetCheck(
             statistics=statistics,
             directions={hand: movement.in_words(now) for hand, movement in hands.items()},
             positions={hand: movement.position for hand, movement in hands.items()},
             heard=heard,
-            advice=advice(statistics) if now - last_data > SILENCE else (),
+            missing=missing,
+            advice=advice(statistics) if nothing_comes else advice_on_some(silent),
         )
         show(check)
+        if ends:
+            return check
         time.sleep(_PERIOD)
-    return check
+
+
+def needed_topics(config: Config) -> tuple[str, ...]:
+    """What a run needs: poses and inputs, which have the button that engages, of each hand that leads an arm."""
+    hands = set(config.arms) if config.teleop.stance is Stance.SIDE_BY_SIDE else {_OTHER[arm] for arm in config.arms}
+    return tuple(name for name, topic in HAND_TOPICS.items() if topic.hand in hands and topic.kind in _NEEDED)
+
+
+def advice_on_some(silent: tuple[str, ...]) -> tuple[str, ...]:
+    """What is missing where other topics come, a line a hand."""
+    lines = []
+    for hand in SIDES:
+        kinds = {HAND_TOPICS[name].kind: name for name in silent if HAND_TOPICS[name].hand == hand}
+        match list(kinds):
+            case []:
+                continue
+            case [MessageType.INPUTS]:
+                what = f"no inputs ({kinds[MessageType.INPUTS]}): without its buttons a run cannot engage an arm"
+            case [MessageType.POSE]:
+                what = f"no poses ({kinds[MessageType.POSE]}): a run has nothing to follow"
+            case _:
+                what = "nothing arrives: switch its controller on and keep it in the headset's view"
+        lines.append(f"{hand} hand: {what}")
+    return tuple(lines)
 
 
 def advice(statistics: HeadsetStatistics) -> tuple[str, ...]:
     """What to check when no data comes, the most likely cause first."""
     host, port = statistics.address
-    lines = [f"nothing arrives for {SILENCE:g} s on {host}:{port}"]
+    lines = [f"nothing arrives for {SILENCE:g} s on {written(host, port)}"]
     if statistics.peer is not None:
         return (
             *lines,
@@ -133,23 +175,11 @@ def advice(statistics: HeadsetStatistics) -> tuple[str, ...]:
         )
     if statistics.last_disconnect is not None:
         lines.append(f"the last connection ended: {statistics.last_disconnect}")
-    if host in ("127.0.0.1", "::1", "localhost"):
+    if host in ONLY_THIS_MACHINE:
         lines.append(f"{host} can be reached from this machine only: start again with --host 0.0.0.0")
     return (
         *lines,
-        f"what the app has to have: address {_own_address(host)}, port {port}, protocol ROS2",
+        f"what the app has to have: {app_settings(host, port)}",
         "headset and this machine have to be in the same network, one that lets its members talk to each other",
         f"a firewall on this machine must let TCP port {port} in (ufw allow {port}/tcp)",
     )
-
-
-def _own_address(host: str) -> str:
-    """What to type in the app. Connecting a UDP socket sends nothing; it only picks the way out."""
-    if host not in ("", "0.0.0.0", "::"):
-        return host
-    try:
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-            probe.connect(("192.0.2.1", 9))  # of a range that is for documentation only
-            return str(probe.getsockname()[0])
-    except OSError:
-        return "of this machine (it has no network now)"

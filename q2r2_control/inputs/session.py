@@ -25,6 +25,7 @@ from q2r2_control.types import SIDES, HapticFeedback
 MAX_OUTGOING_BYTES = 1 << 16  # answers a client may leave unread
 MAX_COMMAND_BYTES = 1 << 14  # JSON of a system command; the app's have under 200
 MAX_TOPICS = 64  # a client may name; the app names about ten
+MAX_INCOMPLETE = 64  # registrations without topic or type that are answered in one session
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,6 +69,17 @@ def log_frame(level: str, text: str) -> bytes:
     return encode_frame(f"__{level}", json.dumps({"text": text}).encode())
 
 
+# The app takes any other first frame for an endpoint of another version, and throws it away.
+HANDSHAKE = encode_frame(
+    "__handshake",
+    json.dumps({"version": "v0.7.0", "metadata": json.dumps({"protocol": Dialect.ROS2.value})}).encode(),
+)
+
+
+class _IncompleteRegistrationError(Exception):
+    """A command names no topic or no type: the app's user has left a field empty."""
+
+
 class HeadsetSession:
     """Protocol state of one client: frames in through :meth:`receive`, bytes out through :attr:`outgoing`.
 
@@ -78,8 +90,10 @@ class HeadsetSession:
     it. Contradictory evidence ends the session: no message is read by guessing.
 
     Data on topics outside ``HAND_TOPICS`` is counted and ignored, because an app that publishes more than we know
-    still has hands to follow. An unknown system command, a name that no topic can have, or a payload that its topic
-    cannot have shows that the two sides do not speak the same protocol: :class:`ProtocolError`.
+    still has hands to follow. A registration with an empty topic or type is a field that the app's user has left empty:
+    as from Unity's own endpoint, the answer is an error for the app's console, ``MAX_INCOMPLETE`` times. An unknown
+    system command, a name that no topic can have, or a payload that its topic cannot have shows that the two sides do
+    not speak the same protocol: :class:`ProtocolError`.
     """
 
     def __init__(self) -> None:
@@ -89,8 +103,8 @@ class HeadsetSession:
         self.unknown_topics: Counter[str] = Counter()
         self.outgoing = bytearray()
         self._skip_body = False
-        handshake = {"version": "v0.7.0", "metadata": json.dumps({"protocol": Dialect.ROS2.value})}
-        self._answer("__handshake", handshake)
+        self._incomplete = 0
+        self.outgoing += HANDSHAKE
 
     def receive(self, frame: Frame) -> Reception | None:
         """Take one frame; the hand's message if it was one. Raises :class:`ProtocolError`: drop the client."""
@@ -101,7 +115,13 @@ class HeadsetSession:
             self._skip_body = False
             return None
         if frame.destination.startswith("__"):
-            self._command(frame)
+            try:
+                self._command(frame)
+            except _IncompleteRegistrationError as error:
+                self._incomplete += 1
+                if self._incomplete > MAX_INCOMPLETE:
+                    raise ProtocolError(f"more than {MAX_INCOMPLETE} registrations without topic or type") from error
+                self._answer("__error", {"text": str(error)})
             return None
         return self._data(frame)
 
@@ -158,7 +178,8 @@ class HeadsetSession:
                 self.subscribed.pop(_topic(command, parameters), None)
             case "__topic_list":
                 types = _TOPIC_TYPES | self.published
-                self._answer("__topic_list", {"topics": list(types), "types": list(types.values())})
+                names = [f"/{name}" for name in types]  # as in the ROS graph
+                self._answer("__topic_list", {"topics": names, "types": list(types.values())})
             case "__ros_service" | "__unity_service":
                 self._answer("__warn", {"text": f"{command} {_topic(command, parameters)}: q2r2 offers no services"})
             case "__remove_ros_service" | "__remove_unity_service":
@@ -191,17 +212,21 @@ def _parameters(command: str, payload: bytes) -> dict[str, Any]:
 
 
 def _topic(command: str, parameters: dict[str, Any]) -> str:
-    topic = parameters.get("topic")
-    if not isinstance(topic, str):
-        raise ProtocolError(f"{command}: the topic is a string, got a {type(topic).__name__}")
-    return _topic_name(topic)
+    return _topic_name(_text(command, parameters, "topic"))
 
 
 def _topic_and_type(command: str, parameters: dict[str, Any]) -> tuple[str, str]:
-    kind = parameters.get("message_name")
-    if not isinstance(kind, str):
-        raise ProtocolError(f"{command}: the message_name is a string, got a {type(kind).__name__}")
-    return _topic(command, parameters), kind
+    topic = _topic(command, parameters)
+    return topic, _text(command, parameters, "message_name", f" of {topic}")
+
+
+def _text(command: str, parameters: dict[str, Any], key: str, whose: str = "") -> str:
+    value = parameters.get(key, "")
+    if value is None or value == "" or (isinstance(value, str) and value.isspace()):
+        raise _IncompleteRegistrationError(f"{command}: {key}{whose} is empty; this registration is left out")
+    if not isinstance(value, str):
+        raise ProtocolError(f"{command}: {key} is a string, got a {type(value).__name__}")
+    return value
 
 
 def _topic_name(name: str) -> str:

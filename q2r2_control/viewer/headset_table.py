@@ -10,6 +10,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
+from q2r2_control.inputs.addresses import written
 from q2r2_control.inputs.headset_check import HeadsetCheck
 from q2r2_control.viewer.topic_table import topic_table
 
@@ -21,8 +22,9 @@ def headset_table(check: HeadsetCheck) -> Table:
     statistics = check.statistics
     state = f"{statistics.peer} connected" if statistics.peer else "not connected"
     dialect = f", dialect {statistics.dialect}" if statistics.dialect else ""
-    address = "{}:{}".format(*statistics.address)
-    table = topic_table(f"headset on {address}: {state}{dialect}", dict(sorted(statistics.topics.items())))
+    table = topic_table(
+        f"headset on {written(*statistics.address)}: {state}{dialect}", dict(sorted(statistics.topics.items()))
+    )
     for name, count in statistics.unknown_topics.items():
         table.add_row(Text(name), str(count), "", "", "not read")
     table.add_section()
@@ -37,13 +39,13 @@ def headset_table(check: HeadsetCheck) -> Table:
 
 
 class HeadsetDisplay:
-    """Shows the state of a headset: as a live table on a terminal; elsewhere only advice, when it begins."""
+    """Shows the state of a headset: as a live table on a terminal; elsewhere only advice, when it changes."""
 
     def __init__(self, console: Console) -> None:
         self._console = console
         self._live = Live(console=console, auto_refresh=False, transient=True) if console.is_terminal else None
         self._drawn = -np.inf
-        self._advised = False
+        self._advised: tuple[str, ...] = ()
 
     def __enter__(self) -> HeadsetDisplay:
         if self._live is not None:
@@ -57,10 +59,10 @@ class HeadsetDisplay:
     def show(self, check: HeadsetCheck) -> None:
         """Show the newest state."""
         if self._live is None:
-            if check.advice and not self._advised:
+            if check.advice != self._advised:
                 for line in check.advice:
                     self._console.print(line, soft_wrap=True, highlight=False, markup=False)
-            self._advised = bool(check.advice)
+            self._advised = check.advice
         elif time.monotonic() - self._drawn >= 1.0 / _REFRESH_RATE:
             self._drawn = time.monotonic()
             self._live.update(headset_table(check), refresh=True)

@@ -20,6 +20,7 @@ from q2r2_control.config import load_config
 from q2r2_control.config.resources import find_resource
 from q2r2_control.verification.soak import SoakReport, run_soak
 from tests.support.external_cell import external_text
+from tests.support.fake_headset import FakeHeadset
 
 CELL = "config/dual_iiwa7.yaml"
 COMMANDS = ("demo", "run", "check", "headset-check", "bench")
@@ -387,6 +388,41 @@ def test_headset_check_shows_a_headset_in_a_process_of_its_own() -> None:
         f"q2r_{hand}_hand_{kind}" for hand in ("left", "right") for kind in ("pose", "inputs")
     }
     assert check["topics"]["q2r_left_hand_pose"]["count"] == 112
+
+
+def test_headset_check_of_a_headset_without_buttons_says_so_and_fails() -> None:
+    with (
+        process("headset-check", "--port", "0", "--json") as running,
+        FakeHeadset(("127.0.0.1", bound_port(running))) as headset,
+    ):
+        headset.send(headset.pose("left", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, -1.0)) + headset.registrations())
+        headset.read_until("__topic_list")
+        running.send_signal(signal.SIGINT)
+        stdout, _ = running.communicate(timeout=30)
+    assert running.returncode == 1
+    check = one_object(stdout)
+    assert "q2r_left_hand_inputs" in check["missing"]
+    assert "left hand: no inputs" in "\n".join(check["advice"])
+
+
+def test_a_headset_server_on_every_network_says_what_to_enter_in_the_app_and_who_can_drive() -> None:
+    result = q2r2("headset-check", "--host", "0.0.0.0", "--port", "0", "--duration", "0.1", "--json")
+    port = one_object(result.stdout)["address"][1]
+    listening, enter, drivers = result.stderr.splitlines()[:3]
+    assert listening == f"headset: listening on 0.0.0.0:{port}"
+    assert re.fullmatch(rf"headset: enter in the app: address .+, port {port}, protocol ROS2", enter)
+    assert drivers.startswith("headset: whoever reaches this port can drive the arms; headset.allow")
+
+
+def test_a_host_outside_the_cells_headset_allow_is_refused(tmp_path: Path) -> None:
+    cell = tmp_path / "cell.yaml"
+    cell.write_text(Path(CELL).read_text(encoding="utf-8").replace("allow: null", "allow: [10.0.0.0/8]"), "utf-8")
+    with process("headset-check", str(cell), "--host", "0.0.0.0", "--port", "0", "--json") as running:
+        with FakeHeadset(("127.0.0.1", bound_port(running))) as headset:
+            assert b"127.0.0.1 is not in headset.allow" in headset.read_until("__error")
+        running.send_signal(signal.SIGINT)
+        _, stderr = running.communicate(timeout=30)
+    assert "only 10.0.0.0/8 can drive the arms" in stderr
 
 
 def test_headset_check_says_what_to_look_at_when_nothing_comes() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable
+from ipaddress import ip_network
 from pathlib import Path
 from typing import Any, get_args
 
@@ -378,6 +379,10 @@ def test_a_misspelt_key_is_named_before_the_one_that_is_missing_for_it(tmp_path:
         ("loop_rate_hz", 10**400, "finite number"),
         ("headset.port", 70000, "less than or equal to 65535"),
         ("headset.port", 10.5, "valid integer"),
+        ("headset.allow", ["192.168.1.7/24"], "write 192.168.1.0/24, or 192.168.1.7 alone"),
+        ("headset.allow", ["10.0.0.7", "the lab"], "'the lab' is neither an address nor a network such as"),
+        ("headset.allow", [10], "valid string"),
+        ("headset.allow", [], "at least 1"),
         ("arms.left.gripper.closed_position", 0.025, "have to differ"),
         # not numbers, or not the ones meant
         ("control.acceleration_limit", math.nan, "finite number"),
@@ -598,3 +603,9 @@ def test_two_different_links_for_the_end_of_one_arm_are_refused(tmp_path: Path, 
     arm = {"model": "iiwa7", "home": [0] * 7, "tip": "link_ee", "tool": tool}
     message = fault(tmp_path, changed("arms.left", arm))
     assert f"tip = 'link_ee' and {key} = 'link_7' mean the same link: give one" in message
+
+
+def test_networks_that_may_connect_are_read_as_such(tmp_path: Path) -> None:
+    headset = loaded(tmp_path, changed("headset.allow", ["192.168.1.0/24", "10.0.0.7", "fd00::/64"])).headset
+    assert headset.networks == tuple(map(ip_network, ("192.168.1.0/24", "10.0.0.7/32", "fd00::/64")))
+    assert loaded(tmp_path, changed("headset.allow", None)).headset.networks is None

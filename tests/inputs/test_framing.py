@@ -33,6 +33,10 @@ def test_the_nul_of_a_ros2_destination_is_told_and_taken_off() -> None:
     assert frames(ABC_NUL) == [Frame("/abc", b"xyz", terminated=True)]
 
 
+def test_only_one_nul_is_taken_off() -> None:
+    assert frames(b"\x05\x00\x00\x00abc\x00\x00\x00\x00\x00\x00") == [Frame("abc\0", b"", terminated=True)]
+
+
 def test_eight_zero_bytes_are_a_keepalive() -> None:
     (frame,) = frames(KEEPALIVE)
     assert frame.is_keepalive

@@ -7,9 +7,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from q2r2_control.inputs.headset_check import HandMovement, advice
+from q2r2_control.config import load_config
+from q2r2_control.config.cell import Config
+from q2r2_control.config.teleop import Stance
+from q2r2_control.inputs.headset import HeadsetServer
+from q2r2_control.inputs.headset_check import HandMovement, HeadsetCheck, advice, needed_topics, watch_headset
 from q2r2_control.inputs.statistics import HeadsetStatistics
 from q2r2_control.types import HandSample
+from tests.support.fake_headset import FakeHeadset
+from tests.support.headset_server import IDENTITY
 
 WORLD = ("+x", "+y", "+z")
 UNITY = ("+z", "-x", "+y")
@@ -80,3 +86,64 @@ def test_advice_for_a_headset_that_is_connected_but_silent_is_about_the_headset(
 
 def test_advice_after_a_lost_connection_says_why_it_was_lost() -> None:
     assert "no frame for 2 s" in "\n".join(advice(replace(NOBODY, last_disconnect="no frame for 2 s")))
+
+
+# What a run needs -----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def cell() -> Config:
+    return load_config("config/dual_iiwa7.yaml")
+
+
+def with_one_arm(cell: Config, arm: str, stance: Stance) -> Config:
+    teleop = cell.teleop.model_copy(update={"stance": stance})
+    return cell.model_copy(update={"arms": {arm: cell.arms[arm]}, "teleop": teleop})  # type: ignore[index]
+
+
+def test_a_run_needs_poses_and_inputs_of_each_hand_that_leads_an_arm(cell: Config) -> None:
+    def of(hand: str) -> set[str]:
+        return {f"q2r_{hand}_hand_pose", f"q2r_{hand}_hand_inputs"}
+
+    assert set(needed_topics(cell)) == of("left") | of("right")
+    assert set(needed_topics(with_one_arm(cell, "left", Stance.SIDE_BY_SIDE))) == of("left")
+    assert set(needed_topics(with_one_arm(cell, "left", Stance.MIRROR))) == of("right")
+    assert set(needed_topics(with_one_arm(cell, "right", Stance.MIRROR_REFLECTED))) == of("left")
+
+
+def check_of(server: HeadsetServer, cell: Config, sent: str) -> HeadsetCheck:
+    """The last state once the server has what a headset ``sent``, such as "left pose, right inputs"."""
+    with FakeHeadset(server.address) as headset:
+        for hand, kind in (words.split() for words in sent.split(", ")):
+            headset.send(headset.pose(hand, (0.0, 0.0, 0.0), IDENTITY) if kind == "pose" else headset.inputs(hand))
+        topics = {f"q2r_{hand}_hand_{kind}" for hand, kind in (words.split() for words in sent.split(", "))}
+
+        states: list[HeadsetCheck] = []
+
+        def enough() -> bool:
+            return bool(states) and states[-1].statistics.topics.keys() == topics
+
+        return watch_headset(server, cell, None, states.append, enough)
+
+
+EVERYTHING = "left pose, left inputs, right pose, right inputs"
+
+
+@pytest.mark.parametrize(
+    ("sent", "missing", "says"),
+    [
+        (EVERYTHING, (), ""),
+        ("left pose", ("left_hand_inputs", "right_hand_pose", "right_hand_inputs"), "left hand: no inputs (q2r_left_"),
+        ("left pose", ("left_hand_inputs", "right_hand_pose", "right_hand_inputs"), "right hand: nothing arrives"),
+        ("left pose, left inputs, right pose", ("right_hand_inputs",), "right hand: no inputs"),
+        ("left pose, left inputs, right inputs", ("right_hand_pose",), "right hand: no poses"),
+    ],
+)
+def test_what_a_run_needs_and_does_not_get_is_named(
+    server: HeadsetServer, cell: Config, sent: str, missing: tuple[str, ...], says: str
+) -> None:
+    check = check_of(server, cell, sent)
+    assert check.missing == tuple(f"q2r_{name}" for name in missing)
+    assert says in "\n".join(check.advice)
+    assert bool(check.advice) == bool(missing)
+    assert "firewall" not in "\n".join(check.advice)

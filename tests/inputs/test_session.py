@@ -11,7 +11,14 @@ import pytest
 from q2r2_control.errors import ProtocolError
 from q2r2_control.inputs.framing import KEEPALIVE, Frame, FrameDecoder
 from q2r2_control.inputs.messages import PROP_TOPICS, Dialect, PropTwist
-from q2r2_control.inputs.session import MAX_COMMAND_BYTES, MAX_OUTGOING_BYTES, MAX_TOPICS, HeadsetSession, Reception
+from q2r2_control.inputs.session import (
+    MAX_COMMAND_BYTES,
+    MAX_INCOMPLETE,
+    MAX_OUTGOING_BYTES,
+    MAX_TOPICS,
+    HeadsetSession,
+    Reception,
+)
 from q2r2_control.types import HapticFeedback
 from tests.support.fake_headset import pack_inputs, pack_pose, pack_twist
 
@@ -144,17 +151,19 @@ def test_removing_takes_a_registration_away_and_may_come_without_one(session: He
     assert (session.published, session.subscribed) == ({}, {})
 
 
-def test_the_topic_list_has_a_type_of_two_parts_for_each_topic(session: HeadsetSession) -> None:
-    session.receive(command(Dialect.ROS2, "__publish", topic="dice", message_name="geometry_msgs/Twist"))
+@pytest.mark.parametrize("slash", ["", "/"])
+def test_the_topic_list_has_a_type_of_two_parts_for_each_topic(session: HeadsetSession, slash: str) -> None:
+    session.receive(command(Dialect.ROS2, "__publish", topic=slash + "dice", message_name="geometry_msgs/Twist"))
     session.receive(command(Dialect.ROS2, "__topic_list"))
     ((name, payload),) = answers(session)
     topics = json.loads(payload)
     assert name == "__topic_list"
     types = dict(zip(topics["topics"], topics["types"], strict=True))
-    assert types["q2r_left_hand_pose"] == "geometry_msgs/PoseStamped"
-    assert types["q2r_right_hand_inputs"] == "quest2ros/OVR2ROSInputs"
-    assert types[HAPTIC] == "quest2ros/OVR2ROSHapticFeedback"
-    assert types["dice"] == types["dice_twist"] == types["q2r_twist"] == "geometry_msgs/Twist"
+    assert types["/q2r_left_hand_pose"] == "geometry_msgs/PoseStamped"
+    assert types["/q2r_right_hand_inputs"] == "quest2ros/OVR2ROSInputs"
+    assert types["/" + HAPTIC] == "quest2ros/OVR2ROSHapticFeedback"
+    assert types["/dice"] == types["/dice_twist"] == types["/q2r_twist"] == "geometry_msgs/Twist"
+    assert all(re.fullmatch(r"/\w+", topic) for topic in types), "as in the ROS graph: one slash before each"
     assert all(re.fullmatch(r"\w+/\w+", kind) for kind in types.values())
 
 
@@ -193,23 +202,66 @@ def test_an_unknown_system_command_ends_the_session(session: HeadsetSession, dia
         pytest.param(b"{", id="half an object"),
         pytest.param(b"[]", id="a list"),
         pytest.param(b"null", id="null"),
-        pytest.param(b"{}", id="no topic"),
         pytest.param(b'{"topic":3,"message_name":"a/B"}', id="a topic that is a number"),
-        pytest.param(b'{"topic":"a"}', id="no type"),
+        pytest.param(b'{"topic":"a","message_name":3}', id="a type that is a number"),
         pytest.param(b'{"topic":"a b","message_name":"a/B"}', id="a topic with a space"),
-        pytest.param(b'{"topic":"","message_name":"a/B"}', id="an empty topic"),
         pytest.param(b'{"topic":"\\ud800","message_name":"a/B"}', id="half a surrogate"),
         pytest.param(b'{"topic":"a","message_name":"a/B"}\0\0', id="two NULs"),
         pytest.param(b"\xff\xfe", id="not UTF-8"),
         pytest.param(b"[" * MAX_COMMAND_BYTES, id="nested without end"),
         pytest.param(b'{"topic":' + b"[" * 900 + b"]" * 900 + b"}", id="a nested topic"),
         pytest.param(b"9" * 10000, id="a number of ten thousand digits"),
-        pytest.param(b" " * (MAX_COMMAND_BYTES + 1), id="too long"),
     ],
 )
 def test_a_registration_that_cannot_be_read_ends_the_session(session: HeadsetSession, payload: bytes) -> None:
     with pytest.raises(ProtocolError, match=r"__publish|topic name"):
         session.receive(frame(Dialect.ROS1, "__publish", payload))
+
+
+@pytest.mark.parametrize("excess", [0, 1])
+def test_a_command_may_have_16_kilobytes_and_no_more(session: HeadsetSession, excess: int) -> None:
+    payload = b'{"topic":"a","message_name":"a/B"}'.ljust((1 << 14) + excess)
+    if excess:
+        with pytest.raises(ProtocolError, match="16385 bytes, at most 16384 are allowed"):
+            session.receive(frame(Dialect.ROS1, "__publish", payload))
+    else:
+        session.receive(frame(Dialect.ROS1, "__publish", payload))
+    assert len(session.published) == 1 - excess
+
+
+@every_dialect
+@pytest.mark.parametrize("name", ["__publish", "__subscribe", "__remove_publisher", "__remove_subscriber"])
+@pytest.mark.parametrize("topic", [{}, {"topic": ""}, {"topic": " "}, {"topic": None}], ids=str)
+def test_a_blank_topic_is_answered_with_an_error_and_the_session_goes_on(
+    session: HeadsetSession, dialect: Dialect, name: str, topic: dict[str, object]
+) -> None:
+    session.receive(command(dialect, name, message_name="std_msgs/Empty", **topic))
+    ((answer, payload),) = answers(session)
+    assert answer == "__error"
+    assert json.loads(payload)["text"] == f"{name}: topic is empty; this registration is left out"
+    assert (session.published, session.subscribed) == ({}, {})
+    assert session.receive(pose(dialect)) is not None
+
+
+@pytest.mark.parametrize("name", ["__publish", "__subscribe"])
+@pytest.mark.parametrize("kind", [{}, {"message_name": ""}], ids=str)
+def test_a_missing_type_is_answered_with_an_error_and_the_session_goes_on(
+    session: HeadsetSession, name: str, kind: dict[str, object]
+) -> None:
+    session.receive(command(Dialect.ROS2, name, topic="dice", **kind))
+    ((answer, payload),) = answers(session)
+    assert answer == "__error"
+    assert "message_name of dice is empty" in json.loads(payload)["text"]
+    assert (session.published, session.subscribed) == ({}, {})
+    assert session.receive(pose(Dialect.ROS2)) is not None
+
+
+def test_a_flood_of_blank_topics_ends_the_session_though_every_answer_is_read(session: HeadsetSession) -> None:
+    for _ in range(MAX_INCOMPLETE):
+        session.receive(command(Dialect.ROS2, "__publish", topic=""))
+        session.outgoing.clear()
+    with pytest.raises(ProtocolError, match=f"more than {MAX_INCOMPLETE} registrations without"):
+        session.receive(command(Dialect.ROS2, "__publish", topic=""))
 
 
 def test_data_on_an_unknown_topic_is_counted_and_ignored(session: HeadsetSession) -> None:

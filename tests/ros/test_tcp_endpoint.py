@@ -7,6 +7,7 @@ import socket
 import struct
 import time
 from contextlib import suppress
+from pathlib import Path
 from queue import Empty, Queue
 from threading import Event, Lock, Thread
 from typing import Any
@@ -25,6 +26,7 @@ pytestmark = pytest.mark.usefixtures("interfaces")
 
 MODULE = "q2r2_control.ros.nodes.tcp_endpoint"
 IDENTITY = (0.0, 0.0, 0.0, -1.0)
+ROOT = Path(__file__).resolve().parents[2]
 CDR = b"\0\1\0\0"
 
 every_dialect = pytest.mark.parametrize("dialect", DIALECTS)
@@ -174,6 +176,22 @@ def test_best_effort_subscribers_hear_too_and_a_configured_frame_replaces_the_he
                 for message in drained(queue):
                     frames[hand] = message.header.frame_id
     assert frames == {"left": "base", "right": "room"}
+
+
+def test_only_networks_that_the_cell_or_a_parameter_allows_are_served(processes: Processes, tmp_path: Path) -> None:
+    cell = tmp_path / "cell.yaml"
+    shipped = (ROOT / "config" / "dual_iiwa7.yaml").read_text(encoding="utf-8")
+    cell.write_text(shipped.replace("allow: null", "allow: [127.0.0.2, 10.0.0.0/8]"), encoding="utf-8")
+    process, address = start_endpoint(processes, f"config:={cell}")
+    with FakeHeadset(address) as headset:
+        assert b"127.0.0.1 is not in headset.allow" in headset.read_until("__error")
+    with FakeHeadset(address, source="127.0.0.2") as headset:
+        headset.send(headset.registrations())
+        headset.read_until("__topic_list")
+    assert process.interrupt() == 0
+    refused = processes.start_module(MODULE, "--ros-args", "-p", "port:=0", "-p", "allow:='the lab'")
+    assert refused.wait() == 2
+    assert "parameter allow: 'the lab' is neither an address nor a network" in refused.output
 
 
 def send_until_received(publisher: Any, message: Any, headset: FakeHeadset) -> bytes:

@@ -25,15 +25,20 @@ KEEPALIVE = b"\0\0\0\0\0\0\0\0"
 
 
 class FakeHeadset:
-    """One connection of a headset. ``slash`` writes topics with a leading slash."""
+    """One connection of a headset. ``slash`` writes topics with a leading slash; ``source`` is its own address."""
 
     def __init__(
-        self, address: tuple[str, int], dialect: str = "ros2", slash: bool = False, connect_timeout: float = 5.0
+        self,
+        address: tuple[str, int],
+        dialect: str = "ros2",
+        slash: bool = False,
+        connect_timeout: float = 5.0,
+        source: str = "",
     ) -> None:
         self.dialect = dialect
         self._slash = "/" if slash else ""
         self._received = bytearray()
-        self.socket = _connect(address, connect_timeout)
+        self.socket = _connect(address, connect_timeout, source)
         self.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
     def frame(self, destination: str, payload: bytes) -> bytes:
@@ -169,12 +174,12 @@ def pack_inputs(dialect: str, upper: bool, lower: bool, analog: tuple[float, ...
     return b"\0\1\0\0" + struct.pack("<??2x4f", upper, lower, *analog)
 
 
-def _connect(address: tuple[str, int], timeout: float) -> socket.socket:
+def _connect(address: tuple[str, int], timeout: float, source: str) -> socket.socket:
     """Connect, trying again while nobody listens, as the app does."""
     deadline = time.monotonic() + timeout
     while True:
         try:
-            return socket.create_connection(address, timeout=None)
+            return socket.create_connection(address, timeout=None, source_address=(source, 0) if source else None)
         except ConnectionRefusedError:
             if time.monotonic() > deadline:
                 raise

@@ -14,6 +14,11 @@ from typing import Any
 from geometry_msgs.msg import Twist
 from quest2ros.msg import OVR2ROSHapticFeedback
 
+from q2r2_control.config import load_config
+from q2r2_control.config.cell import HeadsetConfig
+from q2r2_control.config.networks import Network, network_of
+from q2r2_control.errors import ConfigError
+from q2r2_control.inputs.addresses import access_lines, written
 from q2r2_control.inputs.headset import HeadsetServer
 from q2r2_control.inputs.headset_check import SILENCE
 from q2r2_control.inputs.messages import PROP_TOPICS, HandPose, PropTwist
@@ -33,19 +38,25 @@ class TcpEndpoint(BaseNode):
     are passed on unchanged, and so is the frame unless one is configured. Only what was received is published: after a
     disconnect the topics are silent. What is sent to the app while none is connected is lost.
 
-    Raises :class:`InputError` when host and port cannot be bound.
+    Raises :class:`InputError` when host and port cannot be bound, :class:`ConfigError` for what ``allow`` cannot be.
     """
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("tcp_endpoint", **kwargs)
-        host = self.parameter("host", "127.0.0.1", "Address to listen on; 0.0.0.0 admits the network.")
-        port = self.parameter("port", 10000, "TCP port; 0 takes any free one.", at_least=0, at_most=65535)
+        config = self.parameter("config", "", 'YAML of the cell, whose block headset are defaults of these; "": none')
+        headset = load_config(config).headset if config else HeadsetConfig()
+        host = self.parameter("host", headset.host, "Address to listen on; 0.0.0.0 admits the network.")
+        port = self.parameter("port", headset.port, "TCP port; 0 takes any free one.", at_least=0, at_most=65535)
+        allow = self.parameter(
+            "allow", ",".join(headset.allow or ()), "Addresses and networks that may connect, by commas; empty: all."
+        )
+        networks = _networks(allow)
         self._frames = {
             hand: self.parameter(f"{hand}_frame_id", "", f"Frame of {hand} poses; empty: what the headset says.")
             for hand in SIDES
         }
         self._publishers_of_hands = HandPublishers(self, HAND_TOPICS)
-        self._server = HeadsetServer(host, port, listener=self._publish)
+        self._server = HeadsetServer(host, port, listener=self._publish, allow=networks)
         for hand, topic in HAPTIC_TOPICS.items():
             self.create_subscription(OVR2ROSHapticFeedback, topic, self._vibrate(hand), STREAM_QOS)
         for topic in PROP_TOPICS:
@@ -54,12 +65,14 @@ class TcpEndpoint(BaseNode):
         _SERVER_LOG.addHandler(self._log)
         _SERVER_LOG.setLevel(logging.INFO)
         self._server.start()
-        self.get_logger().info("listening on {}:{}".format(*self._server.address))
+        self.get_logger().info(f"listening on {written(*self._server.address)}")
+        for line in access_lines(*self._server.address, networks):
+            self.get_logger().info(line)
 
     def health(self) -> tuple[bytes, str, Mapping[str, Any]]:
         """Which headset is connected, and the rate of each topic."""
         statistics = self._server.statistics
-        address = "{}:{}".format(*statistics.address)
+        address = written(*statistics.address)
         values = {
             "address": address,
             "peer": statistics.peer,
@@ -94,6 +107,13 @@ class TcpEndpoint(BaseNode):
             self._server.send_twist(PropTwist(topic, twist.linear, twist.angular))
 
         return send
+
+
+def _networks(allow: str) -> tuple[Network, ...] | None:
+    try:
+        return tuple(network_of(text.strip()) for text in allow.split(",")) if allow.strip() else None
+    except ValueError as error:
+        raise ConfigError(f"parameter allow: {error}") from None
 
 
 class _ToRosLog(logging.Handler):

@@ -1,0 +1,105 @@
+"""Who may drive: of all clients one, whose hand poses are followed. No sockets, no clocks.
+
+What decides, in this order:
+
+1. A host outside ``headset.allow`` is not served.
+2. The place belongs to who sends hand poses. A driver without one for ``POSES_ALLOWED``, keepalives or not, gives way
+   to the first other client that sends one.
+3. A peer that comes back takes its own place: a connection from the driver's address that registers what the driver
+   registered, while no frame has come from the driver for ``QUIET_ALLOWED``. After a silently lost link the old
+   connection looks alive for seconds.
+4. Everybody else is refused while somebody drives.
+
+All headsets register alike, so that in rule 3 the address is what tells them apart. Behind one address (a router that
+translates addresses, two apps on one PC) a second headset could take the place of one that is quiet, but never of one
+that drives: ``QUIET_ALLOWED`` is 37 periods of the app's poses, and three times as long as what pauses the arms
+(``STREAM_TIMEOUT``). Whoever takes the place finds all arms paused, since the loop is told of a lost connection.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from enum import Enum
+from ipaddress import ip_address
+from typing import NamedTuple, Protocol
+
+from q2r2_control.config.networks import Network
+
+QUIET_ALLOWED = 0.5  # without a frame, against the same peer on a new connection [s]
+POSES_ALLOWED = 5.0  # without a hand pose, against a client that sends them [s]
+WAIT_ALLOWED = 2.0  # for a newcomer to show what gives it the place [s]
+
+
+class Peer(Protocol):
+    """What is known of a connected client."""
+
+    @property
+    def peer(self) -> str:
+        """Its address and port, for people."""
+        ...
+
+    @property
+    def host(self) -> str:
+        """Its address."""
+        ...
+
+    @property
+    def since(self) -> float:
+        """When it connected [s]."""
+        ...
+
+    @property
+    def last_frame(self) -> float:
+        """When its last whole frame was received [s]."""
+        ...
+
+    @property
+    def last_pose(self) -> float:
+        """When its last hand pose was received, -inf before the first [s]."""
+        ...
+
+    @property
+    def registrations(self) -> Sequence[Mapping[str, str]]:
+        """What it has registered."""
+        ...
+
+
+class Verdict(Enum):
+    """What becomes of a newcomer."""
+
+    ADMIT = "drives from now on, instead of the driver if there is one"
+    WAIT = "may stay, unheard, until more is known"
+    REFUSE = "is sent away"
+
+
+class Decision(NamedTuple):
+    """A verdict, and why: for ``ADMIT`` why the driver lost its place, for ``REFUSE`` why the newcomer gets none."""
+
+    verdict: Verdict
+    reason: str = ""
+
+
+def decide(driver: Peer | None, newcomer: Peer, now: float) -> Decision:
+    """What becomes of ``newcomer`` at ``now`` [s], by rules 2 to 4."""
+    if driver is None:
+        return Decision(Verdict.ADMIT)
+    if now - driver.last_pose > POSES_ALLOWED:
+        if newcomer.last_pose > -math.inf:
+            return Decision(Verdict.ADMIT, f"no hand pose for {POSES_ALLOWED:g} s, and {newcomer.peer} sends them")
+    elif newcomer.host == driver.host and now - driver.last_frame > QUIET_ALLOWED:
+        if any(newcomer.registrations) and newcomer.registrations == driver.registrations:
+            return Decision(Verdict.ADMIT, f"no frame for {QUIET_ALLOWED:g} s, and it came back as {newcomer.peer}")
+    else:
+        return Decision(Verdict.REFUSE, f"{driver.peer} drives")
+    if now - newcomer.since > WAIT_ALLOWED:
+        return Decision(Verdict.REFUSE, f"{driver.peer} is connected")
+    return Decision(Verdict.WAIT)
+
+
+def is_allowed(host: str, networks: Sequence[Network] | None) -> bool:
+    """Whether the address ``host`` lies in one of ``networks``; None admits all (rule 1)."""
+    if networks is None:
+        return True
+    address = ip_address(host)
+    return any(address in network for network in networks)

@@ -1,0 +1,233 @@
+"""The network's side of the headset server, for its thread alone: who drives, who waits, bytes in and out."""
+
+from __future__ import annotations
+
+import logging
+import selectors
+import socket
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import partial
+
+from q2r2_control.config.networks import Network
+from q2r2_control.errors import ProtocolError
+from q2r2_control.inputs.admission import Verdict, decide, is_allowed
+from q2r2_control.inputs.client import Client
+from q2r2_control.inputs.door import Door
+from q2r2_control.inputs.framing import Frame
+from q2r2_control.inputs.messages import AppMessage
+from q2r2_control.inputs.rate_limits import MAX_HOSTS_NAMED, HostLog
+from q2r2_control.inputs.session import log_frame
+
+KEEPALIVE_AFTER = 1.0  # of own silence [s]
+SILENCE_ALLOWED = 2.0  # without a whole frame [s]; the app sends a keepalive after 1 s
+MAX_WAITING = 4  # newcomers of which it is not yet known whether they may drive, one of each host
+TURN = 0.05  # longest wait for the network; timeouts are looked at this often [s]
+_RECEIVE_BYTES = 1 << 12  # some 40 messages: the control loop gets the interpreter between two such portions
+
+_LOG = logging.getLogger("q2r2_control.inputs.headset")
+
+
+@dataclass(frozen=True, slots=True)
+class Handlers:
+    """What is called in the server's thread."""
+
+    admitted: Callable[[Client], None]  # a client drives from now on
+    lost: Callable[[str], None]  # the driver is gone, for a reason
+    receive: Callable[[Client, Frame, float], None]  # a frame of the driver, at a time [s]; may raise ProtocolError
+    due: Callable[[], Iterable[AppMessage]]  # what to send to the driver
+
+
+class Connections:
+    """Serves the driver, and newcomers until :func:`~q2r2_control.inputs.admission.decide` has decided on them."""
+
+    def __init__(
+        self,
+        door: Door,
+        allow: Sequence[Network] | None,
+        clock: Callable[[], float],
+        handlers: Handlers,
+        log: HostLog,
+    ) -> None:
+        self._door, self._allow, self._clock, self._handlers, self._log = door, allow, clock, handlers, log
+        self._driver: Client | None = None
+        self._waiting: list[Client] = []  # in the order of their arrival
+        self._unwelcome: set[str] = set()  # hosts outside ``allow`` that the log has named
+        self._last_fault = ""
+        self._waker, self._waiter = socket.socketpair()
+        self._waker.setblocking(False)
+        self._waiter.setblocking(False)
+        self._selector = selectors.DefaultSelector()
+        self._selector.register(self._waiter, selectors.EVENT_READ, self._drain_waiter)
+        self._door_watched = False
+
+    def wake(self) -> None:
+        """Make :meth:`serve` return soon; from any thread, at any time."""
+        # A full pipe wakes the thread as well; with a closed one there is no thread.
+        with suppress(OSError):
+            self._waker.send(b"\0")
+
+    def serve(self) -> None:
+        """Wait for the network once, ``TURN`` at most, and handle what there is."""
+        # What was sent before this time is read before anybody is judged by it, so that no client is taken for silent
+        # because this thread, or the whole process, stood still.
+        asked = self._clock()
+        self._watch_door(asked)
+        # A connection ends in its own event or behind this loop, so that none of these events is of one that has ended.
+        for key, _ in self._selector.select(TURN):
+            key.data()
+        self._settle(asked)
+        now = self._clock()
+        for client in (*self._waiting, *filter(None, (self._driver,))):
+            self._send(client, now)
+        self._log.flush(now)
+
+    def report(self, error: Exception) -> None:
+        """Log a fault of the server itself, once in a row."""
+        if repr(error) != self._last_fault:
+            _LOG.error("headset server: unexpected fault, dropping the headset", exc_info=error)
+        self._last_fault = repr(error)
+
+    def end_all(self, reason: str) -> None:
+        """Close every connection."""
+        for client in (*self._waiting, *filter(None, (self._driver,))):
+            self._end(client, reason)
+
+    def close(self) -> None:
+        """Close every connection and stop listening."""
+        self.end_all("server closed")
+        self._log.close()
+        for open_one in (self._door, self._waker, self._waiter, self._selector):
+            open_one.close()
+
+    def _drain_waiter(self) -> None:
+        self._waiter.recv(_RECEIVE_BYTES)
+
+    def _watch_door(self, now: float) -> None:
+        """Connections beyond the rate wait in the kernel, which costs this process nothing."""
+        watched = self._door.is_open(now)
+        if watched and not self._door_watched:
+            self._selector.register(self._door, selectors.EVENT_READ, self._accept)
+        elif self._door_watched and not watched:
+            self._selector.unregister(self._door)
+        self._door_watched = watched
+
+    def _accept(self) -> None:
+        now = self._clock()
+        for connection, host, peer in self._door.arrivals(now):
+            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            client = Client(connection, host, peer, now)
+            self._selector.register(connection, selectors.EVENT_READ, partial(self._receive, client))
+            self._waiting.append(client)
+
+    def _settle(self, now: float) -> None:
+        """Decide who drives, with all read that was sent before ``now``."""
+        driver = self._driver
+        if driver is not None and now - driver.last_frame > SILENCE_ALLOWED:
+            self._drop(driver, f"no frame for {SILENCE_ALLOWED:g} s")  # half-open: it would keep others out
+        newest = {client.host: client for client in self._waiting}
+        still_waiting = 0
+        for client in tuple(self._waiting):
+            if not is_allowed(client.host, self._allow):
+                self._refuse(client, f"{client.host} is not in headset.allow", self._unwelcome)
+                continue
+            driver = self._driver
+            verdict, reason = decide(driver, client, now)
+            if verdict is Verdict.ADMIT:
+                self._admit(client, reason)
+            elif verdict is Verdict.REFUSE or newest[client.host] is not client or still_waiting == MAX_WAITING:
+                assert driver is not None  # without one, everybody is admitted
+                self._refuse(client, reason or f"{driver.peer} is connected", driver.refused_hosts)
+            else:
+                still_waiting += 1
+
+    def _admit(self, client: Client, reason: str) -> None:
+        if self._driver is not None:
+            self._drop(self._driver, reason)
+        self._waiting.remove(client)
+        self._driver = client
+        self._handlers.admitted(client)
+
+    def _refuse(self, client: Client, reason: str, named: set[str]) -> None:
+        """Send a newcomer away. The app tries again every second: one line for each host is enough."""
+        if client.host not in named and len(named) < MAX_HOSTS_NAMED:
+            named.add(client.host)
+            self._write(client, logging.WARNING, f"refused: {reason}")
+        self._end(client, f"refused: {reason}")
+
+    def _receive(self, client: Client) -> None:
+        try:
+            data = client.socket.recv(_RECEIVE_BYTES)
+            if data:
+                self._handle(client, data, self._clock())
+                return
+            client.decoder.finish()
+        except BlockingIOError:
+            return
+        except OSError as error:
+            self._drop(client, f"connection lost: {error.strerror}")
+        except ProtocolError as error:
+            self._drop(client, str(error))
+        except Exception as error:
+            # After any exception this thread has to go on, and a newcomer must not cost the driver its place.
+            self.report(error)
+            self._drop(client, "unexpected fault of the server")
+        else:
+            if client.announced:
+                self._write(client, logging.INFO, "closed the connection")
+            self._end(client, "closed by the headset")
+
+    def _handle(self, client: Client, data: bytes, now: float) -> None:
+        client.decoder.feed(data)
+        while (frame := client.decoder.next_frame()) is not None:
+            if client is not self._driver:
+                client.receive(frame, now)
+                continue
+            self._handlers.receive(client, frame, now)
+            if not client.announced and client.session.dialect is not None:
+                client.announced = True
+                self._write(client, logging.INFO, f"connected, dialect {client.session.dialect}")
+
+    def _send(self, client: Client, now: float) -> None:
+        """Send what is due."""
+        outgoing = client.session.outgoing
+        if not outgoing and client is self._driver:
+            # Encoded only now, so that a client that does not read gets the newest vibration and not all of them.
+            for message in self._handlers.due():
+                client.session.queue_message(message)
+            if not outgoing and now - client.last_sent > KEEPALIVE_AFTER:
+                client.session.queue_keepalive()
+        try:
+            if outgoing:
+                del outgoing[: client.socket.send(outgoing)]
+                client.last_sent = now
+        except BlockingIOError:
+            pass
+        except OSError as error:
+            self._drop(client, f"connection lost: {error.strerror}")
+            return
+        events = selectors.EVENT_READ | (selectors.EVENT_WRITE if outgoing else 0)
+        key = self._selector.get_key(client.socket)
+        if key.events != events:
+            self._selector.modify(client.socket, events, key.data)
+
+    def _drop(self, client: Client, reason: str) -> None:
+        """End a connection from this side, with one line in the log that says why."""
+        reason = " ".join(reason.split())
+        self._write(client, logging.WARNING, f"dropped: {reason}")
+        self._end(client, reason, f"dropped: {reason}")
+
+    def _end(self, client: Client, reason: str, last_words: str = "") -> None:
+        if client is self._driver:
+            self._driver = None
+            self._handlers.lost(reason)
+        else:
+            self._waiting.remove(client)
+        self._selector.unregister(client.socket)
+        with client.socket, suppress(OSError):
+            # Behind what was left unsent, which may be the end of a frame.
+            client.socket.send(bytes(client.session.outgoing) + log_frame("error", last_words or reason))
+
+    def _write(self, client: Client, level: int, what: str) -> None:
+        self._log.write(client.host, level, f"headset {client.peer} {what}", self._clock())

@@ -1,0 +1,100 @@
+"""The listening socket: connections come in at a bounded rate, however many there are."""
+
+from __future__ import annotations
+
+import logging
+import socket
+import struct
+from collections.abc import Iterator
+from contextlib import suppress
+from ipaddress import IPv6Address, ip_address
+from typing import NamedTuple
+
+from q2r2_control.inputs.addresses import written
+from q2r2_control.inputs.rate_limits import HostLog, RateLimit
+
+# Taking a connection costs the interpreter, and so the control loop, some 0.1 ms. Who waits in the kernel's queue of
+# 128 is taken within 0.35 s; when that is full, the kernel drops what comes, and the client tries again after 1 s.
+ACCEPTS, ACCEPTS_PERIOD = 20, 0.05  # [s]
+ANSWERS_PER_SECOND = 10  # to one host; the app connects once a second
+
+_RESET = struct.pack("ii", 1, 0)  # SO_LINGER: close with a reset, which leaves nothing behind in the kernel
+
+
+class Arrival(NamedTuple):
+    """A new connection."""
+
+    connection: socket.socket  # not blocking
+    host: str  # an IPv4 address that came in through IPv6 is written as IPv4
+    peer: str  # with its port
+
+
+class Door:
+    """Listens on ``host`` and ``port``. Raises OSError, OverflowError or ValueError where that is not possible.
+
+    A host that connects more than ``ANSWERS_PER_SECOND`` is closed without a word, which costs least.
+    """
+
+    def __init__(self, host: str, port: int, log: HostLog) -> None:
+        family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        both = family == socket.AF_INET6 and socket.has_dualstack_ipv6()
+        self._socket = socket.create_server((host, port), family=family, dualstack_ipv6=both)  # with SO_REUSEADDR
+        self._socket.setblocking(False)
+        self._log = log
+        self._accepts = RateLimit(ACCEPTS, ACCEPTS_PERIOD)
+        self._answers: dict[str, RateLimit] = {}
+        self._answers_since = -float("inf")
+
+    @property
+    def port(self) -> int:
+        """The port that was bound."""
+        return int(self._socket.getsockname()[1])
+
+    def fileno(self) -> int:
+        """For a selector."""
+        return self._socket.fileno()
+
+    def is_open(self, now: float) -> bool:
+        """Whether there is any use in waiting for connections at ``now`` [s]."""
+        return self._accepts.is_open(now)
+
+    def arrivals(self, now: float) -> Iterator[Arrival]:
+        """Connections that wait, as many as the rate allows."""
+        while self._accepts.take(now):
+            try:
+                connection, address = self._socket.accept()
+            except BlockingIOError:
+                return
+            except OSError as error:  # out of file descriptors, or the peer has gone again
+                logging.getLogger(__name__).debug("accept: %s", error)
+                continue
+            host = _plain(address[0])
+            if self._answers_to(host, now).take(now):
+                connection.setblocking(False)
+                yield Arrival(connection, host, written(host, address[1]))
+                continue
+            with connection, suppress(OSError):
+                connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _RESET)
+            self._log.write(
+                host,
+                logging.WARNING,
+                f"headset {host} connects more than {ANSWERS_PER_SECOND} times a second: not answered",
+                now,
+            )
+
+    def close(self) -> None:
+        """Stop listening."""
+        self._socket.close()
+
+    def _answers_to(self, host: str, now: float) -> RateLimit:
+        if now - self._answers_since >= 1.0:
+            self._answers_since = now
+            self._answers.clear()
+        return self._answers.setdefault(host, RateLimit(ANSWERS_PER_SECOND))
+
+
+def _plain(host: str) -> str:
+    if not host.startswith("::ffff:"):
+        return host
+    address = ip_address(host)
+    return str((isinstance(address, IPv6Address) and address.ipv4_mapped) or address)

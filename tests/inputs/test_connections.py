@@ -1,0 +1,396 @@
+"""Who is served and who is refused over real TCP, and what strangers cannot do to the headset that drives."""
+
+from __future__ import annotations
+
+import logging
+import socket
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
+from ipaddress import ip_network
+from typing import Any
+
+import pytest
+
+from q2r2_control.config.networks import Network
+from q2r2_control.inputs import connections
+from q2r2_control.inputs.headset import HeadsetServer
+from q2r2_control.inputs.session import HeadsetSession
+from tests.support.fake_headset import KEEPALIVE, FakeHeadset
+from tests.support.headset_server import (
+    A_LINE_LATER,
+    IDENTITY,
+    HandClock,
+    collect,
+    connect,
+    eventually,
+    warnings,
+)
+
+HERE, ELSEWHERE = "127.0.0.1", "127.0.0.2"  # two hosts, as a server sees them
+
+
+@contextmanager
+def driving(server: HeadsetServer, source: str = HERE) -> Iterator[FakeHeadset]:
+    """A headset that has registered and sent a pose."""
+    with connect(server, source=source) as headset:
+        headset.send(headset.registrations())
+        headset.read_until("__topic_list")
+        move(headset, server)
+        yield headset
+
+
+def move(headset: FakeHeadset, server: HeadsetServer, x: float = 0.0) -> None:
+    """A pose of the headset arrives where poses are used."""
+    headset.send(headset.pose("left", (x, 0.0, 0.0), IDENTITY))
+    assert collect(server, 1)[-1].position[0] == x
+
+
+def assert_refused(headset: FakeHeadset, because: bytes) -> None:
+    """Greeted first, or the app takes the refusal for an endpoint of another version."""
+    greeting = headset.read_frame()
+    assert greeting is not None
+    assert greeting[0] == "__handshake"
+    assert_ended(headset, because)
+
+
+def assert_ended(headset: FakeHeadset, because: bytes) -> None:
+    """The last that the app hears of the server is the reason."""
+    last = ("", b"")
+    while (frame := headset.read_frame()) is not None:
+        last = frame
+    assert last[0] == "__error"
+    assert because in last[1]
+
+
+def drives(server: HeadsetServer, headset: FakeHeadset) -> bool:
+    return server.statistics.peer == "{}:{}".format(*headset.socket.getsockname())
+
+
+# A second headset ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("source", [HERE, ELSEWHERE])
+def test_a_second_headset_is_refused_with_a_reason_and_one_line_while_one_drives(
+    server: HeadsetServer, clock: HandClock, caplog: pytest.LogCaptureFixture, source: str
+) -> None:
+    with driving(server) as first:
+        for _ in range(4):
+            with FakeHeadset(server.address, source=source) as second:
+                second.send(second.registrations())
+                assert_refused(second, b"drives")
+            clock.advance(0.4)
+            move(first, server)
+        assert server.connected
+        clock.advance(0.4)
+    (line,) = warnings(caplog)
+    assert f"headset {source}:" in line
+    assert "refused: 127.0.0.1:" in line
+
+
+@pytest.mark.parametrize("source", [HERE, ELSEWHERE])
+def test_a_second_headset_that_registers_the_same_cannot_push_out_one_that_is_alive(
+    server: HeadsetServer, clock: HandClock, source: str
+) -> None:
+    with driving(server) as first:
+        clock.advance(0.4)
+        with FakeHeadset(server.address, source=source) as second:
+            second.send(second.registrations() + second.pose("right", (7.0, 7.0, 7.0), IDENTITY))
+            assert_refused(second, b"drives")
+        move(first, server, 1.0)
+        assert server.statistics.connections == 1
+
+
+def test_a_peer_that_comes_back_after_a_silently_lost_link_takes_its_place_at_once_and_as_a_new_connection(
+    server: HeadsetServer, clock: HandClock, caplog: pytest.LogCaptureFixture
+) -> None:
+    with driving(server) as lost:
+        eventually(lambda: server.connected)
+        clock.advance(0.6)
+        with connect(server) as back:
+            back.send(back.registrations())
+            eventually(lambda: drives(server, back))
+            assert not server.connected, "the loop has to see that a connection was lost"
+            assert server.poll(0.0) == []
+            back.send(back.pose("left", (5.0, 0.0, 0.0), IDENTITY))
+            (sample,) = collect(server, 1)
+            eventually(lambda: server.connected)
+            assert_ended(lost, b"it came back as 127.0.0.1:")
+    assert sample.position[0] == 5.0
+    assert server.statistics.connections == 2
+    assert not any("refused" in line for line in warnings(caplog))
+
+
+def test_another_host_does_not_take_the_place_of_a_quiet_headset(server: HeadsetServer, clock: HandClock) -> None:
+    with driving(server) as first:
+        clock.advance(0.6)
+        with FakeHeadset(server.address, source=ELSEWHERE) as second:
+            second.send(second.registrations())
+            assert_refused(second, b"drives")
+        move(first, server)
+
+
+def test_a_quiet_headset_that_is_heard_again_keeps_its_place(server: HeadsetServer, clock: HandClock) -> None:
+    with driving(server) as first:
+        clock.advance(0.6)
+        with connect(server) as second:
+            second.send(KEEPALIVE)
+            move(first, server)
+            assert_ended(second, b"drives")
+        move(first, server)
+
+
+def test_other_registrations_from_the_same_host_wait_until_the_quiet_headset_is_given_up(
+    server: HeadsetServer, clock: HandClock
+) -> None:
+    with driving(server) as first:
+        clock.advance(0.6)
+        with connect(server) as second:
+            second.send(second.command("__publish", topic="dice", message_name="geometry_msgs/Twist"))
+            second.send(second.command("__topic_list"))
+            second.read_until("__topic_list")
+            clock.advance(0.6)
+            assert drives(server, first)
+            clock.advance(0.9)
+            eventually(lambda: drives(server, second), "no frame of the first for 2 s")
+
+
+# The place belongs to who sends poses --------------------------------------------------------------------------------
+
+
+def test_a_peer_that_only_keeps_alive_gives_way_to_a_headset_that_sends_poses(
+    server: HeadsetServer, clock: HandClock
+) -> None:
+    with driving(server) as idle:
+        for _ in range(6):
+            clock.advance(1.0)
+            keep_alive(idle, server, clock)
+        with connect(server, source=ELSEWHERE) as second:
+            second.send(second.registrations())
+            second.read_until("__topic_list")
+            assert drives(server, idle), "nothing is taken by who sends no poses either"
+            second.send(second.pose("left", (5.0, 0.0, 0.0), IDENTITY))
+            eventually(lambda: drives(server, second))
+            second.send(second.pose("left", (6.0, 0.0, 0.0), IDENTITY))
+            assert collect(server, 1)[-1].position[0] == 6.0
+
+
+def keep_alive(headset: FakeHeadset, server: HeadsetServer, clock: HandClock) -> None:
+    headset.send(KEEPALIVE)
+    eventually(lambda: server._client is not None and server._client.last_frame == clock.now)
+
+
+def test_poses_in_the_last_five_seconds_hold_the_place(server: HeadsetServer, clock: HandClock) -> None:
+    with driving(server) as idle:
+        for _ in range(4):
+            clock.advance(1.0)
+            keep_alive(idle, server, clock)
+        with FakeHeadset(server.address, source=ELSEWHERE) as second:
+            second.send(second.registrations() + second.pose("left", (5.0, 0.0, 0.0), IDENTITY))
+            assert_refused(second, b"drives")
+
+
+def test_a_peer_that_never_sent_a_pose_holds_nothing(server: HeadsetServer) -> None:
+    with connect(server) as idle, connect(server, source=ELSEWHERE) as second:
+        assert drives(server, idle)
+        second.send(second.pose("left", (5.0, 0.0, 0.0), IDENTITY))
+        eventually(lambda: drives(server, second))
+
+
+def test_a_newcomer_that_shows_nothing_is_refused_after_two_seconds(server: HeadsetServer, clock: HandClock) -> None:
+    with connect(server) as idle, connect(server, source=ELSEWHERE) as second:
+        clock.advance(1.5)
+        keep_alive(idle, server, clock)
+        clock.advance(0.6)
+        assert_ended(second, b"is connected")
+        assert drives(server, idle)
+
+
+def test_at_most_four_hosts_wait_each_with_its_newest_connection(server: HeadsetServer) -> None:
+    hosts = [f"127.0.0.{number}" for number in range(2, 7)]
+    with connect(server):
+        waiting = [connect(server, source=host) for host in (*hosts[:4], hosts[0])]
+        assert_ended(waiting[0], b"is connected")
+        with FakeHeadset(server.address, source=hosts[4]) as fifth:
+            assert_refused(fifth, b"is connected")
+        waiting[-1].send(waiting[-1].pose("left", (5.0, 0.0, 0.0), IDENTITY))
+        eventually(lambda: drives(server, waiting[-1]))
+    for headset in waiting:
+        headset.close()
+
+
+# What newcomers cannot do --------------------------------------------------------------------------------------------
+
+
+def test_what_a_waiting_newcomer_sends_reaches_nobody_and_its_faults_cost_only_itself(
+    server: HeadsetServer, clock: HandClock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with driving(server) as first:
+        clock.advance(0.6)
+        with connect(server) as second:
+            second.send(second.pose("left", (5.0, 0.0, 0.0), IDENTITY) + second.command("__ping"))
+            assert_ended(second, b"unknown system command")
+        with connect(server) as third, monkeypatch.context() as patch:
+            patch.setattr(HeadsetSession, "receive", lambda *_: 1 // 0)
+            third.send(KEEPALIVE)
+            assert_ended(third, b"unexpected fault")
+        assert drives(server, first)
+        assert server.statistics.topics["q2r_left_hand_pose"].count == 1
+        move(first, server, 1.0)
+
+
+def test_a_server_that_stood_still_does_not_take_a_live_headset_for_silent(
+    server: HeadsetServer, clock: HandClock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    selector = server._connections._selector
+    look = selector.select
+    frozen: list[bool] = []
+
+    def look_and_stand_still(timeout: float) -> list[Any]:
+        """The process freezes when it has seen the second headset's bytes; the first one's come meanwhile."""
+        found = look(timeout)
+        if found and not frozen:
+            frozen.append(True)
+            clock.now += 2.5
+            first.send(first.pose("left", (1.0, 0.0, 0.0), IDENTITY))
+        return found
+
+    with driving(server) as first:
+        monkeypatch.setattr(selector, "select", look_and_stand_still)
+        clock.advance(0.0)
+        with FakeHeadset(server.address) as second:
+            second.send(second.registrations())
+            assert_refused(second, b"drives")
+        assert frozen
+        assert collect(server, 1)[0].position[0] == 1.0
+        assert server.statistics.connections == 1
+        assert server.statistics.last_disconnect is None
+
+
+# Floods --------------------------------------------------------------------------------------------------------------
+
+
+def test_a_flood_of_connections_is_taken_at_a_bounded_rate_and_another_host_is_served_behind_it(
+    server: HeadsetServer, clock: HandClock
+) -> None:
+    flood = [socket.create_connection(server.address, source_address=(ELSEWHERE, 0)) for _ in range(100)]
+    with FakeHeadset(server.address) as headset:
+        headset.send(headset.registrations() + headset.pose("left", (1.0, 2.0, 3.0), IDENTITY))
+        for _ in range(4):
+            clock.advance(0.0501)
+        assert not drives(server, headset), "no more than 20 in 0.05 s"
+        clock.advance(0.0501)
+        eventually(lambda: drives(server, headset), "the headset is served when its turn comes")
+    assert sum(was_greeted(connection) for connection in flood) == 10, "answers to one host in a second"
+
+
+def was_greeted(connection: socket.socket) -> bool:
+    with connection:
+        try:
+            return bool(connection.recv(1))
+        except ConnectionResetError:
+            return False
+
+
+def test_garbage_again_and_again_is_one_line_a_second_with_a_count_of_what_was_left_out(
+    server: HeadsetServer, clock: HandClock, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO)
+    for count in range(1, 9):
+        with connect(server) as headset:
+            headset.send(b"GET / HTTP/1.1\r\n\r\n")
+        eventually(partial(has_connected, server, count))
+        eventually(lambda: server.statistics.peer is None)
+    assert len(caplog.messages) == 1
+    clock.advance(A_LINE_LATER)
+    eventually(lambda: len(caplog.messages) == 2)
+    assert caplog.messages[1].endswith("(6 more left out)")
+    assert all("bytes announced" in line for line in caplog.messages)
+
+
+def has_connected(server: HeadsetServer, count: int) -> bool:
+    return server.statistics.connections == count
+
+
+def test_only_the_first_eight_hosts_that_are_refused_are_named(
+    server: HeadsetServer, clock: HandClock, caplog: pytest.LogCaptureFixture
+) -> None:
+    with driving(server) as first:
+        for number in range(2, 14):
+            with FakeHeadset(server.address, source=f"127.0.0.{number}") as second:
+                assert_refused(second, b"drives")
+            clock.advance(A_LINE_LATER)
+            move(first, server)
+    assert len(warnings(caplog)) == 8
+
+
+# Who may connect -----------------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def listening(clock: HandClock, host: str, allow: tuple[Network, ...] | None = None) -> Iterator[HeadsetServer]:
+    server = HeadsetServer(host, 0, clock=clock, allow=allow)
+    server.start()
+    try:
+        yield server
+    finally:
+        server.close()
+
+
+def test_only_hosts_of_allowed_networks_are_served(clock: HandClock, caplog: pytest.LogCaptureFixture) -> None:
+    with listening(clock, HERE, (ip_network("127.0.0.2"), ip_network("10.0.0.0/8"))) as server:
+        for _ in range(3):
+            with FakeHeadset(server.address) as headset:
+                headset.send(headset.registrations())
+                assert_refused(headset, b"127.0.0.1 is not in headset.allow")
+        with driving(server, ELSEWHERE) as headset:
+            assert drives(server, headset)
+        clock.advance(A_LINE_LATER)
+    (line,) = warnings(caplog)
+    assert "127.0.0.1 is not in headset.allow" in line
+
+
+needs_ipv6 = pytest.mark.skipif(not socket.has_dualstack_ipv6(), reason="this machine has no IPv6")
+
+
+@needs_ipv6
+def test_every_network_of_ipv6_is_every_network_of_ipv4_too(clock: HandClock) -> None:
+    with listening(clock, "::") as server:
+        for host, written in (("::1", "[::1]:"), (HERE, "127.0.0.1:")):
+            with FakeHeadset((host, server.address[1])) as headset:
+                headset.read_until("__handshake")
+                eventually(lambda: server.statistics.peer)
+                assert str(server.statistics.peer).startswith(written)
+            eventually(lambda: server.statistics.peer is None)
+
+
+@needs_ipv6
+def test_an_ipv4_network_is_allowed_through_ipv6_too(clock: HandClock) -> None:
+    with listening(clock, "::", (ip_network("127.0.0.0/8"),)) as server:
+        with FakeHeadset(("::1", server.address[1])) as headset:
+            assert_refused(headset, b"::1 is not in headset.allow")
+        with FakeHeadset((HERE, server.address[1])) as headset:
+            headset.read_until("__handshake")
+            eventually(lambda: drives(server, headset))
+
+
+# Sending -------------------------------------------------------------------------------------------------------------
+
+
+def test_a_headset_that_reads_again_is_sent_the_rest_at_once(
+    server: HeadsetServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nothing but the network's readiness wakes the server here: it would wait for an hour."""
+    monkeypatch.setattr(connections, "TURN", 3600.0)
+    with connect(server) as headset:
+        client = server._client
+        assert client is not None
+        for number in range(50):  # so that answers are long
+            headset.send(headset.command("__publish", topic=f"{number:_>200}", message_name="std_msgs/Empty"))
+        asked = 0
+        while len(client.session.outgoing) < 30000:  # two answers and more are left: the network is full
+            headset.send(headset.command("__topic_list"))
+            move(headset, server)
+            asked += 1
+        for _ in range(asked):
+            headset.read_until("__topic_list")

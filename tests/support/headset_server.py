@@ -1,0 +1,84 @@
+"""A headset server under test, whose time only the test moves, and what tests do with it from outside."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+
+import pytest
+
+from q2r2_control.inputs.headset import HeadsetServer
+from q2r2_control.types import HandSample
+from tests.support.fake_headset import FakeHeadset
+
+IDENTITY = (0.0, 0.0, 0.0, -1.0)
+A_LINE_LATER = 1.0  # [s]: a host gets one line a second in the log
+
+
+class HandClock:
+    """A clock that only the test moves."""
+
+    def __init__(self) -> None:
+        self.now = 100.0
+        self._readings = 0
+
+    def __call__(self) -> float:
+        self._readings += 1
+        return self.now
+
+    def advance(self, seconds: float) -> None:
+        """Move on, and return when the server's thread has begun to wait for the network at the new time.
+
+        It reads the clock before it waits and behind that, so that one of three readings is the first of these.
+        """
+        self.now += seconds
+        read = self._readings
+        eventually(lambda: self._readings >= read + 3, "the server looks at its clock")
+
+
+def eventually(condition: Callable[[], object], what: str = "") -> None:
+    """Wait for the other thread, far longer than it needs."""
+    deadline = time.monotonic() + 10.0
+    while not condition():
+        assert time.monotonic() < deadline, f"never happened: {what or condition}"
+        time.sleep(0.001)
+
+
+def collect(server: HeadsetServer, count: int) -> list[HandSample]:
+    """Poll as the loop does until ``count`` samples have come."""
+    samples: list[HandSample] = []
+
+    def enough() -> bool:
+        samples.extend(server.poll(0.0))
+        return len(samples) >= count
+
+    eventually(enough, f"{count} samples")
+    return samples
+
+
+def assert_serves(server: HeadsetServer, dialect: str = "ros2") -> None:
+    """A new headset is accepted and its motion arrives."""
+    with connect(server, dialect) as headset:
+        headset.send(headset.registrations() + headset.pose("right", (7.0, 8.0, 9.0), IDENTITY))
+        headset.read_until("__topic_list")
+        (sample,) = collect(server, 1)
+        assert (sample.hand, sample.position.tolist()) == ("right", [7.0, 8.0, 9.0])
+    eventually(lambda: server.statistics.peer is None)
+
+
+def connect(server: HeadsetServer, dialect: str = "ros2", source: str = "") -> FakeHeadset:
+    """Connect and wait until the server has the connection, so that tests can go on in order."""
+    headset = FakeHeadset(server.address, dialect, source=source)
+    headset.read_until("__handshake")
+    return headset
+
+
+def warnings(caplog: pytest.LogCaptureFixture) -> list[str]:
+    return [record.getMessage() for record in caplog.records if record.levelno >= logging.WARNING]
+
+
+def wait_until_dropped(server: HeadsetServer, headset: FakeHeadset) -> None:
+    eventually(lambda: server.statistics.peer is None, "the client is dropped")
+    while headset.read_frame() is not None:
+        pass
