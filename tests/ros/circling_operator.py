@@ -51,7 +51,7 @@ class Operator:
         """Put both hands at rest where they were at that time [s], or at the start; no arm may follow meanwhile."""
         self.moves = False
         self._rate = 0.0
-        self._angle = next((angle for t, angle in reversed(self._angles) if t <= (at or -1.0)), 0.0)
+        self._angle = next((angle for t, angle in reversed(list(self._angles)) if t <= (at or -1.0)), 0.0)
 
     def _run(self) -> None:
         while not self._ended.wait(0.1):
