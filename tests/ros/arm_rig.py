@@ -57,7 +57,7 @@ class ArmRig:
         hand = hand or arm
         self.arm, self.node = arm, node
         self.hand, self.tool = HAND, TOOL
-        self.lower = self.upper = False
+        self.lower = self.upper = self.grip = False
         self.sends_hand = self.sends_tool = self.follows = True
         self.targets: list[PoseStamped] = []
         self.state: dict[str, Any] = {}
@@ -145,7 +145,9 @@ class ArmRig:
         pose, inputs, tf = self._made
         if self.sends_hand:
             pose.publish(stamped_pose(self.hand, "", now))
-            inputs.publish(OVR2ROSInputs(button_upper=self.upper, button_lower=self.lower))
+            inputs.publish(
+                OVR2ROSInputs(button_upper=self.upper, button_lower=self.lower, press_middle=float(self.grip))
+            )
         if self.sends_tool:
             tf.publish(TFMessage(transforms=[stamped_transform("world", self._frame, self.tool)]))
 

@@ -247,6 +247,8 @@ BAD_PARAMETERS = {
     "teleop.gate.timeout:=9.0": "parameter teleop.gate.timeout: ",
     "teleop.axes:=[+x,+x,+z]": "parameter teleop.axes = ",
     "guard.max_velocity:=0.0": "parameter guard.max_velocity = 0.0",
+    "teleop.bindings.grip:=dead_man": "lower is pause_toggle and grip is dead_man; allowed: one way to engage",
+    "teleop.bindings.grip:=wave": "parameter teleop.bindings.grip = 'wave'",
 }
 
 
