@@ -79,7 +79,7 @@ class OperatorFeedback:
                 pulses.grasps(self._grips[arm].look(grippers[arm], openings[arm], now))
 
     def _feel_contact(self, state: RobotState) -> None:
-        if state.tau_external is None or not np.isfinite(state.tau_external).all():
+        if state.tau_external is None or not np.isfinite((state.tau_external, state.q)).all():
             return
         for arm, pulses in self._pulses.items():
             members = self._robot.arms[arm]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from typing import NamedTuple
 
@@ -136,7 +137,9 @@ class _Steps:
         self._step, self._counted = step, 0
 
     def grew(self, value: float) -> bool:
-        """Whether ``value`` is a step beyond what was counted."""
+        """Whether ``value`` is a step beyond what was counted; one that is no number is not."""
+        if not math.isfinite(value):
+            return False
         steps = int(value / self._step + 1e-9)
         if steps > self._counted:
             self._counted = steps
