@@ -106,7 +106,7 @@ class CartesianController:
     def _checked(self, name: str, values: Array) -> Array:
         array = np.array(values, dtype=np.float64)
         if array.shape != (self._nv,) or not np.isfinite(array).all():
-            raise RobotError(f"reset: {name} = {values!r:.80}: expected {self._nv} finite numbers")
+            raise RobotError(f"{name} = {values!r:.80}: expected {self._nv} finite numbers")
         return array
 
     def step(self, targets: Mapping[str, pin.SE3 | None], dt: float, posture: Array | None = None) -> Reference:
@@ -146,6 +146,14 @@ class CartesianController:
             unsolved=summary.unsolved,
         )
         return Reference(state.q.copy(), state.v.copy(), state.a.copy(), report)
+
+    def hold_at(self, q: Array | None) -> None:
+        """Let arms without a target go to joint positions ``q`` (nv,) [rad] and hold there, within every promise.
+
+        As fast as a gain of 4 /s of the way that is left, so ``q`` should move as the arms should. None: they hold
+        where they come to rest, as they do anyhow after a target. Raises :class:`RobotError` as :meth:`reset` does.
+        """
+        self._targets.hold_at(None if q is None else self._checked("q", q))
 
     def set_opening(self, arm: str, least: float, greatest: float) -> tuple[str, str] | None:
         """Say that the gripper of ``arm`` is, and stays, between two openings, 0 closed .. 1 fully open.

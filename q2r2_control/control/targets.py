@@ -48,6 +48,14 @@ class TargetTracker:
         self._targets.hold[:] = q
         self._targets.posture[:] = self._home
 
+    def hold_at(self, q: Array | None) -> None:
+        """Arms that follow no target go to ``q`` (nv,) [rad] and hold there; None: where they come to rest."""
+        if q is None:
+            self._targets.latched[:] = 0
+        else:
+            self._targets.hold[:] = q
+            self._targets.latched[:] = 1
+
     def aim_posture(self, posture: Array | None) -> None:
         """Let the free joints go to ``posture`` (nv,) [rad], home where there is none; a bad one changes nothing."""
         if posture is None:

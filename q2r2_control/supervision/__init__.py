@@ -2,8 +2,8 @@
 
 ``supervisor`` decides at every tick what the controller is asked for and whether the arms may move; ``joint_watch``
 judges measured states, ``targets`` and ``target_stream`` who is followed, ``tick_pacer`` what a late tick may move,
-``delay_watch`` and ``sequence_watch`` whether a message is of the past, or of another sender,
-``homing`` and ``external_arms`` two special ways to be led. ``preflight`` looks at a cell before it runs, and
+``delay_watch`` and ``sequence_watch`` whether a message is of the past, or of another sender; ``joint_homing``,
+``homing`` and ``external_arms`` are special ways to be led. ``preflight`` looks at a cell before it runs, and
 ``target_guard`` limits targets for controllers that have no limits of their own. No ROS and no clock in here.
 """
 

@@ -1,4 +1,4 @@
-"""A slow way home for all tools."""
+"""A slow way home for the tools alone, of arms whose joints another controller moves."""
 
 from __future__ import annotations
 

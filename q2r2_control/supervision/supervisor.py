@@ -18,9 +18,11 @@ import numpy as np
 import pinocchio as pin
 
 from q2r2_control.control.controller import CartesianController
+from q2r2_control.robot.kept_distances import kept_distances
 from q2r2_control.robot.robot import Robot
 from q2r2_control.supervision.external_arms import ExternalArms
 from q2r2_control.supervision.homing import Homing
+from q2r2_control.supervision.joint_homing import JointHoming
 from q2r2_control.supervision.joint_watch import NONE_YET, JointWatch, WatchSettings
 from q2r2_control.supervision.target_stream import Origins, Refusal, StreamSettings
 from q2r2_control.supervision.targets import Targets
@@ -65,7 +67,7 @@ class Supervisor:
         self._home = {arm: robot.tool_pose(robot.home, arm) for arm in robot.arms}
         self._targets = Targets(robot.arms, streams, self._origins)
         self._watch = JointWatch(robot.joint_names, robot.velocity_limit, watch, self._origins.joint_states)
-        self._homing: Homing | None = None
+        self._homing: Homing | JointHoming | None = None
         self._stopped: str | None = None  # why it takes a reset
         self._last: Reference | None = None
         self.phase = Phase.INACTIVE
@@ -249,7 +251,7 @@ class Supervisor:
             return "the arms are braking"
         self._stopped, self.paused = None, False
         self._targets.reset()
-        self._homing = None
+        self._end_homing()
         if self.phase is Phase.STOPPED:
             self.phase = Phase.INACTIVE
         return None
@@ -259,7 +261,11 @@ class Supervisor:
         if self.phase is not Phase.ACTIVE or self.paused:
             return "the controller is paused" if self.paused else f"the controller is {self.phase}"
         self._forget_targets()
-        self._homing = Homing(self._tools(), self._home)
+        if self._external is not None:
+            self._homing = Homing(self._tools(), self._home)  # the joints are another controller's
+        else:
+            kept = kept_distances(self._robot, self._controller.settings).values
+            self._homing = JointHoming(self._robot, kept)
         return None
 
     def activate(self, state: RobotState, now: float) -> None:
@@ -288,16 +294,34 @@ class Supervisor:
             self.phase = Phase.BRAKING
 
     def _forget_targets(self) -> None:
-        self._homing = None
+        self._end_homing()
         self._targets.drop()
+
+    def _end_homing(self) -> None:
+        """The arms hold where they come to rest."""
+        if isinstance(self._homing, JointHoming):
+            self._controller.hold_at(None)
+        self._homing = None
 
     def _wanted(self, now: float, dt: float) -> dict[str, pin.SE3 | None]:
         self.events += self._targets.expire(now)
-        return self._targets.poses if self._homing is None else self._homing.targets(dt)
+        if isinstance(self._homing, Homing):
+            return self._homing.targets(dt)
+        if self._homing is None:
+            return self._targets.poses
+        if self._last is not None:
+            self._controller.hold_at(self._homing.step(self._last.q, self._last.v, dt))
+        return dict.fromkeys(self._targets.arms)
 
     def _look_home(self) -> None:
-        if self._homing is not None and (outcome := self._homing.outcome(self._tools())):
-            self._homing = None
+        homing = self._homing
+        if homing is None or self._last is None:
+            return
+        outcome = homing.outcome if isinstance(homing, JointHoming) else homing.outcome(self._tools())
+        if outcome == "held up" and isinstance(homing, JointHoming):
+            outcome = f"held up by {' | '.join(self._last.report.tightest_pair)}"
+        if outcome:
+            self._end_homing()
             self.events.append(f"homing ended: {outcome}")
 
     def _tools(self) -> dict[str, pin.SE3]:

@@ -1,0 +1,184 @@
+"""Home from anywhere: all joints; every promise kept at every tick; interruptible; and it says why it ends."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from q2r2_control import CartesianController, Robot, load_config
+from q2r2_control.robot.kept_distances import kept_distances
+from q2r2_control.supervision.joint_homing import JointHoming
+from q2r2_control.supervision.joint_watch import WatchSettings
+from q2r2_control.supervision.supervisor import Supervisor
+from q2r2_control.supervision.target_stream import StreamSettings
+from q2r2_control.types import Array, Reference, RobotState
+from q2r2_control.verification.contract import Contract
+
+CONFIG = "config/dual_iiwa7.yaml"
+DT = 0.004  # [s]
+POSTURES, REACHED = 50, 48
+LONGEST = 60.0  # [s]
+
+
+@pytest.fixture(scope="module")
+def robot() -> Robot:
+    return Robot.from_config(load_config(CONFIG))
+
+
+@pytest.fixture(scope="module")
+def controller(robot: Robot) -> CartesianController:
+    return CartesianController(robot, load_config(CONFIG).control)
+
+
+class World:
+    """A supervisor whose arms are where its references are; its contract is checked at every tick that is asked for."""
+
+    def __init__(self, robot: Robot, controller: CartesianController, q: Array, checked: bool = False) -> None:
+        self.controller = controller
+        self.supervisor = Supervisor(robot, controller, StreamSettings(), WatchSettings())
+        self.state = RobotState(q.copy(), np.zeros_like(q), np.zeros_like(q), None, 0.0)
+        self.supervisor.activate(self.state, 0.0)
+        self.contract = Contract(controller, q) if checked else None
+        self.now = 0.0
+        self.fastest = 0.0  # of any joint [rad/s]
+
+    def tick(self) -> Reference:
+        self.now += DT
+        self.supervisor.take_joint_state(self.state, self.now)
+        reference = self.supervisor.tick(self.now, DT)
+        assert reference is not None
+        if self.contract is not None:
+            self.contract.check(reference, DT)
+        assert reference.report.certified
+        assert reference.report.margin > -1e-9
+        self.fastest = max(self.fastest, float(np.abs(reference.v).max()))
+        self.state = RobotState(reference.q, reference.v, self.state.tau, None, self.now)
+        return reference
+
+    def run(self, seconds: float) -> None:
+        for _ in range(round(seconds / DT)):
+            self.tick()
+
+    def go_home(self) -> str:
+        """How it ended."""
+        assert self.supervisor.go_home() is None
+        while self.now < LONGEST and self.supervisor.homing:
+            self.tick()
+        return next((line for line in self.supervisor.events if line.startswith("homing ended")), "it goes on")
+
+
+def postures(robot: Robot, controller: CartesianController, count: int, seed: int) -> list[Array]:
+    """Random ones at which a stop is certified and every pair has 5 mm to spare."""
+    random = np.random.default_rng(seed)
+    found: list[Array] = []
+    while len(found) < count:
+        q = random.uniform(robot.position_lower + 0.1, robot.position_upper - 0.1)
+        controller.reset(q)
+        report = controller.step({}, DT).report
+        if report.certified and report.margin > 0.005:
+            found.append(q)
+    return found
+
+
+def test_from_fifty_random_postures_all_joints_come_home_from_all_but_two_at_most(
+    robot: Robot, controller: CartesianController
+) -> None:
+    ends = []
+    for q in postures(robot, controller, POSTURES, seed=0):
+        world = World(robot, controller, q)
+        ends.append(world.go_home())
+        if ends[-1] == "homing ended: at home":
+            assert np.abs(world.state.q - robot.home).max() < 0.004
+        assert world.fastest < 0.45
+    assert ends.count("homing ended: at home") >= REACHED, ends
+
+
+def test_the_contract_holds_at_every_tick_of_the_way(robot: Robot, controller: CartesianController) -> None:
+    for q in postures(robot, controller, 4, seed=3):
+        World(robot, controller, q, checked=True).go_home()
+
+
+def test_a_motion_is_braked_before_the_way_home_begins_and_the_arms_stay_there(
+    robot: Robot, controller: CartesianController
+) -> None:
+    world = World(robot, controller, robot.home, checked=True)
+    tool = controller.tool_pose("left")
+    for step in range(100):
+        raised = tool.copy()
+        raised.translation += np.array([0.0, 0.0, 0.3 * DT * step])
+        world.supervisor.take_target("left", raised, world.now)
+        world.tick()
+    assert world.fastest > 0.3
+    assert world.go_home() == "homing ended: at home"
+    world.run(1.0)
+    assert np.abs(world.state.q - robot.home).max() < 0.01
+    assert np.abs(world.state.v).max() < 1e-3
+
+
+@pytest.mark.parametrize("how", ["pause", "stop", "reset"])
+def test_it_can_be_interrupted_and_the_arms_come_to_rest_where_they_are(
+    robot: Robot, controller: CartesianController, how: str
+) -> None:
+    (q,) = postures(robot, controller, 1, seed=6)
+    world = World(robot, controller, q, checked=True)
+    assert world.supervisor.go_home() is None
+    world.run(3.0)
+    at = world.state.q
+    assert np.abs(world.state.v).max() > 0.1
+    if how == "pause":
+        world.supervisor.pause(True)
+    elif how == "stop":
+        world.supervisor.stop("as asked")
+    else:
+        world.supervisor.reset()
+    for _ in range(round(1.5 / DT)):
+        if how == "stop" and np.abs(world.state.v).max() < 1e-4:
+            break
+        world.tick()
+    assert not world.supervisor.homing
+    assert np.abs(world.state.v).max() < 1e-2
+    assert np.abs(world.state.q - at).max() < 0.1
+
+
+def test_while_no_way_is_known_the_arms_stand_still_and_a_tick_looks_at_two_samples_at_most(robot: Robot) -> None:
+    class Counting:
+        """The robot, with what is asked of its distances counted."""
+
+        def __init__(self) -> None:
+            self.asked = 0
+            self.home, self.arms = robot.home, robot.arms
+            self.position_lower, self.position_upper = robot.position_lower, robot.position_upper
+
+        def distance_values(self, q: Array) -> Array:
+            self.asked += 1
+            return np.ones(3) if self.asked == 1 else np.zeros(3)  # only the start is free
+
+    counting = Counting()
+    homing = JointHoming(counting, np.full(3, 0.02))  # type: ignore[arg-type]
+    q = robot.home + 0.5
+    ticks = 0
+    while homing.outcome is None:
+        before = counting.asked
+        at = homing.step(q, np.zeros_like(q), DT)
+        assert at is not None
+        assert np.array_equal(at, q)
+        assert counting.asked - before <= 3  # with the room where the way begins, once
+        ticks += 1
+    assert homing.outcome == "no way home was found"
+    assert ticks > 100
+
+
+def test_an_arm_that_is_held_up_is_waited_for_and_then_it_says_so(robot: Robot) -> None:
+    settings = load_config(CONFIG).control
+    homing = JointHoming(robot, kept_distances(robot, settings).values)
+    q = robot.home.copy()
+    q[0] += 0.8
+    farthest = 0.0
+    for _ in range(round(10.0 / DT)):
+        at = homing.step(q, np.zeros_like(q), DT)  # the reference does not move
+        assert at is not None
+        farthest = max(farthest, float(np.abs(at - q).max()))
+        if homing.outcome is not None:
+            break
+    assert homing.outcome == "held up"
+    assert 0.2 < farthest < 0.45
