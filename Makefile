@@ -37,7 +37,7 @@ test-ros: setup
 LEROBOT := .venv-lerobot
 
 test-lerobot: $(LEROBOT)/.installed
-	$(LEROBOT)/bin/python -m pytest tests/lerobot
+	HF_HUB_OFFLINE=1 HF_HOME=$(LEROBOT)/huggingface $(LEROBOT)/bin/python -m pytest tests/lerobot
 
 $(LEROBOT)/.installed: pyproject.toml setup.py
 	$(PYTHON) -m venv $(LEROBOT)

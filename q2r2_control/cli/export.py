@@ -76,16 +76,19 @@ def _export(
     output = Output(path)
     files = recordings_in(recordings)
     writer = writer_for(len(files))
-    with Progress(console=console, disable=not console.is_terminal, transient=True) as progress:
-        bar = progress.add_task("recordings", total=len(files))
-        made = make_episodes(
-            files,
-            sampling,
-            output.episodes(),
-            workers=workers,
-            skip_bad=skip_bad,
-            progress=lambda done: progress.update(bar, completed=done),
-        )
+    try:
+        with Progress(console=console, disable=not console.is_terminal, transient=True) as progress:
+            bar = progress.add_task("recordings", total=len(files))
+            made = make_episodes(
+                files,
+                sampling,
+                output.episodes(),
+                workers=workers,
+                skip_bad=skip_bad,
+                progress=lambda done: progress.update(bar, completed=done),
+            )
+    finally:
+        output.tidy()
     for fault in made.skipped:
         console.print(f"skipped: {fault}", style="yellow", soft_wrap=True, highlight=False, markup=False)
     if not made.kept:

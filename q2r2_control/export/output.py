@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 from q2r2_control.errors import ConfigError
@@ -29,6 +30,12 @@ class Output:
         except OSError as error:
             raise ConfigError(f"--output {self._path}: {error.strerror}: {error.filename}") from error
         return folder
+
+    def tidy(self) -> None:
+        """Remove what is kept for the next export, if that is nothing."""
+        with suppress(OSError):
+            (self._partial / "episodes").rmdir()
+            self._partial.rmdir()
 
     def write(self, write: Callable[[Path], None]) -> None:
         """Let ``write`` make the file or folder, and put it into its place."""

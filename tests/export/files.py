@@ -86,12 +86,13 @@ def write_recording(
         block.rows["log_time"] = block.rows["publish_time"] = EPOCH + np.array(times, dtype=np.int64)[places]
         block.rows["sequence"] = np.array(at if numbers is None else numbers)[places]
     for begin in range(0, count, CHUNK):
-        inside = [
-            Block(block.topic, [place for place in block.at if begin <= place < begin + CHUNK], part)
-            for block in blocks
-            if block.rows is not None
-            and len(part := block.rows[[begin <= place < begin + CHUNK for place in block.at]].copy())
-        ]
+        inside = []
+        for block in blocks:
+            assert block.rows is not None
+            # A slice, since numpy copies of rows have not the bytes between their fields.
+            first, last = np.searchsorted(block.at, (begin, begin + CHUNK))
+            if first < last:
+                inside.append(Block(block.topic, block.at[first:last], block.rows[first:last]))
         file.add(in_order(inside))
         file.flush()
     file.close()
