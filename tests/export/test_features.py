@@ -33,7 +33,7 @@ def frames(seed: int = 0) -> dict[str, Array]:
 
     def motion() -> Array:
         ends = random.uniform(robot().position_lower, robot().position_upper, (2, len(robot().joint_names)))
-        return np.linspace(*ends, COUNT)
+        return np.linspace(ends[0], ends[1], COUNT)
 
     position, reference = motion(), motion()
     return {
