@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV   := .venv
 BIN    := $(VENV)/bin
 
-.PHONY: setup demo test test-ros lint bench soak clean
+.PHONY: setup demo test test-ros test-lerobot lint bench soak clean
 .DEFAULT_GOAL := setup
 
 setup: $(VENV)/.installed
@@ -26,12 +26,24 @@ demo: setup
 	$(BIN)/q2r2 demo
 
 test: setup
-	$(BIN)/python -m pytest -n auto --ignore tests/ros
+	$(BIN)/python -m pytest -n auto --ignore tests/ros --ignore tests/lerobot
 
 # Real processes with real timeouts of 150 ms. Those with a whole set of nodes run on their own, since it keeps two cores busy.
 test-ros: setup
 	$(BIN)/python -m pytest tests/ros -n 2 --dist loadfile -m 'not alone'; failed=$$?; \
 		$(BIN)/python -m pytest tests/ros -m alone && exit $$failed
+
+# The real package, whose loader reads what q2r2 export lerobot writes. It takes some gigabytes, so it has an environment of its own.
+LEROBOT := .venv-lerobot
+
+test-lerobot: $(LEROBOT)/.installed
+	HF_HUB_OFFLINE=1 HF_HOME=$(LEROBOT)/huggingface $(LEROBOT)/bin/python -m pytest tests/lerobot
+
+$(LEROBOT)/.installed: pyproject.toml setup.py
+	$(PYTHON) -m venv $(LEROBOT)
+	$(LEROBOT)/bin/python -m pip install --quiet --upgrade pip
+	$(LEROBOT)/bin/python -m pip install --quiet --editable '.[export]' lerobot==0.4.4 'pytest>=8' 'hypothesis>=6.100'
+	touch $@
 
 lint: setup
 	$(BIN)/ruff check .
@@ -50,4 +62,4 @@ soak: setup
 	$(BIN)/q2r2 bench --soak
 
 clean:
-	rm -rf $(VENV) build install log *.egg-info .mypy_cache .ruff_cache .pytest_cache
+	rm -rf $(VENV) $(LEROBOT) build install log *.egg-info .mypy_cache .ruff_cache .pytest_cache

@@ -29,7 +29,7 @@ LEVELS = (
     {"runtime"},
     {"pipeline"},
     {"viewer", "verification", "recording"},
-    {"ros"},
+    {"ros", "export"},
     {"benchmark"},
     {"cli"},
     {"__main__"},

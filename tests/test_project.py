@@ -45,8 +45,9 @@ def modules_of_dependencies() -> set[str]:
 
 
 def modules_of_formats() -> set[str]:
-    """What is imported only where a model has another format than URDF."""
-    return set(map(distribution, project()["optional-dependencies"]["xacro"]))
+    """What is imported only where a model has another format than URDF, or a dataset is written."""
+    extras = project()["optional-dependencies"]
+    return set(map(distribution, extras["xacro"] + extras["export"]))
 
 
 def modules_of_ros() -> set[str]:

@@ -11,6 +11,7 @@ from q2r2_control.cli.bench import bench
 from q2r2_control.cli.check import check
 from q2r2_control.cli.demo import demo
 from q2r2_control.cli.error_handling import ErrorHandlingGroup
+from q2r2_control.cli.export import app as export_app
 from q2r2_control.cli.headset_check import headset_check
 from q2r2_control.cli.replay import replay
 from q2r2_control.cli.ros import app as ros_app
@@ -31,6 +32,7 @@ app.command("headset-check", epilog="Example: q2r2 headset-check --host 0.0.0.0"
 app.command(epilog="Example: q2r2 bench --ticks 20000, or --work --motion meet --through torque, or --soak --seed 3")(
     bench
 )
+app.add_typer(export_app, name="export")
 app.add_typer(ros_app, name="ros")
 
 

@@ -137,7 +137,7 @@ def test_it_can_be_interrupted_and_the_arms_come_to_rest_where_they_are(
         world.tick()
     assert not world.supervisor.homing
     assert np.abs(world.state.v).max() < 1e-2
-    assert np.abs(world.state.q - at).max() < 0.1
+    assert np.abs(world.state.q - at).max() < 0.04
 
 
 def test_while_no_way_is_known_the_arms_stand_still_and_a_tick_looks_at_two_samples_at_most(robot: Robot) -> None:

@@ -1,0 +1,97 @@
+"""``q2r2 export``: recordings as datasets to train on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.progress import Progress
+
+from q2r2_control.cli.output import stderr_console
+from q2r2_control.errors import ConfigError, RecordingError
+from q2r2_control.export.csv_tables import write_table, write_tables
+from q2r2_control.export.episodes import FASTEST, Sampling, make_episodes, recordings_in
+from q2r2_control.export.lerobot import require_pyarrow, write_dataset
+from q2r2_control.export.output import Output
+
+app = typer.Typer(rich_markup_mode=None, help="Recordings of q2r2 run --record as datasets to train on.")
+
+Recordings = Annotated[
+    list[Path], typer.Argument(metavar="DIR_OR_FILES...", help="Recordings, or folders of them, in this order.")
+]
+Fps = Annotated[int, typer.Option(help=f"Frames per second: 1 .. {FASTEST}.")]
+Trim = Annotated[bool, typer.Option("--trim", help="Leave out what is before and after any arm is engaged or moving.")]
+Workers = Annotated[int, typer.Option(min=1, help="Processes; the result is the same for any number.")]
+SkipBad = Annotated[bool, typer.Option("--skip-bad", help="Say which recordings are bad, and go on without them.")]
+
+
+@app.command(epilog="Example: q2r2 export lerobot recordings --output datasets/circle --fps 30")
+def lerobot(
+    recordings: Recordings,
+    output: Annotated[Path, typer.Option(metavar="OUT", help="A folder that does not exist yet.")],
+    fps: Fps = 30,
+    trim: Trim = False,
+    workers: Workers = 1,
+    skip_bad: SkipBad = False,
+) -> None:
+    """Make a LeRobotDataset v3.0 of recordings: an episode each. Needs pyarrow, the extra `export`."""
+    require_pyarrow()
+    _export(recordings, Sampling(fps, trim), output, workers, skip_bad, lambda count: write_dataset)
+
+
+@app.command(epilog="Example: q2r2 export csv recordings/20260101-120000-dual_iiwa7 --output circle.csv")
+def csv(
+    recordings: Recordings,
+    output: Annotated[
+        Path, typer.Option(metavar="OUT", help="A file .csv for one recording; else a folder, a file in it for each.")
+    ],
+    fps: Fps = 30,
+    trim: Trim = False,
+    workers: Workers = 1,
+    skip_bad: SkipBad = False,
+) -> None:
+    """Make tables of recordings: a line a frame, the columns of the dataset of q2r2 export lerobot."""
+
+    def writer(count: int) -> Callable[[Sequence[Path], Path], None]:
+        if output.suffix != ".csv":
+            return write_tables
+        if count > 1:
+            raise ConfigError(f"--output {output}: for {count} recordings; allowed: a folder, or one recording")
+        return write_table
+
+    _export(recordings, Sampling(fps, trim), output, workers, skip_bad, writer)
+
+
+def _export(
+    recordings: Sequence[Path],
+    sampling: Sampling,
+    path: Path,
+    workers: int,
+    skip_bad: bool,
+    writer_for: Callable[[int], Callable[[Sequence[Path], Path], None]],
+) -> None:
+    console = stderr_console()
+    output = Output(path)
+    files = recordings_in(recordings)
+    writer = writer_for(len(files))
+    try:
+        with Progress(console=console, disable=not console.is_terminal, transient=True) as progress:
+            bar = progress.add_task("recordings", total=len(files))
+            made = make_episodes(
+                files,
+                sampling,
+                output.episodes(),
+                workers=workers,
+                skip_bad=skip_bad,
+                progress=lambda done: progress.update(bar, completed=done),
+            )
+    finally:
+        output.tidy()
+    for fault in made.skipped:
+        console.print(f"skipped: {fault}", style="yellow", soft_wrap=True, highlight=False, markup=False)
+    if not made.kept:
+        raise RecordingError("none of the recordings can be exported")
+    output.write(lambda target: writer(made.kept, target))
+    print(f"{path}: {len(made.kept)} of {len(files)} recordings at {sampling.fps} frames per second")

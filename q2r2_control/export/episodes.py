@@ -1,0 +1,228 @@
+"""Episodes: recordings as vectors at a fixed rate, made in several processes and kept until all are through."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import signal
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from functools import lru_cache
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+from zipfile import BadZipFile
+
+import numpy as np
+import numpy.typing as npt
+
+from q2r2_control.config.cell import parse_config
+from q2r2_control.errors import ConfigError, Q2R2Error, RecordingError
+from q2r2_control.export.features import Names, features
+from q2r2_control.export.sampling import sample
+from q2r2_control.recording.reader import Recording
+from q2r2_control.robot.robot import Robot
+
+FASTEST = 1000  # [frames/s]
+_FORMAT = 1  # of kept episodes; another one is made again
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """What becomes frames, and how many."""
+
+    fps: int = 30
+    trim: bool = False  # to the time in which arms are engaged or moving
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.fps <= FASTEST:
+            raise ConfigError(f"--fps {self.fps}: allowed: 1 .. {FASTEST}")
+
+
+@dataclass(frozen=True)
+class Episode:
+    """One recording as vectors, (n, size) float32 by feature."""
+
+    recording: str  # name of its file
+    cell: str
+    task: str
+    fps: int
+    names: Names  # of the numbers of each feature
+    notes: dict[str, str]  # program, machine, operator and the like, as recorded
+    vectors: dict[str, npt.NDArray[np.float32]]
+
+    @property
+    def frames(self) -> int:
+        """Their number."""
+        return len(next(iter(self.vectors.values())))
+
+    def columns(self, index: int, first_frame: int, task: int) -> dict[str, npt.NDArray[Any]]:
+        """All columns of a dataset in which this is episode ``index`` and ``first_frame`` frames are before it.
+
+        Vectors are (n, size), the numbers of LeRobot's datasets behind them (n,).
+        """
+        frames = np.arange(self.frames)
+        return {
+            **self.vectors,
+            "next.done": frames == self.frames - 1,
+            "timestamp": (frames / self.fps).astype(np.float32),
+            "frame_index": frames,
+            "episode_index": np.full(self.frames, index),
+            "index": first_frame + frames,
+            "task_index": np.full(self.frames, task),
+        }
+
+    def save(self, file: Path) -> None:
+        """Keep it; a file of this name is always a whole one."""
+        about = {name: value for name, value in self.__dict__.items() if name != "vectors"}
+        unfinished = file.with_suffix(".unfinished")
+        with unfinished.open("wb") as stream:
+            np.savez(stream, about=np.array(json.dumps(about)), **self.vectors)  # type: ignore[arg-type]
+        unfinished.replace(file)
+
+    @classmethod
+    def load(cls, file: Path) -> Episode:
+        """One that was kept."""
+        with np.load(file) as kept:
+            about = json.loads(str(kept["about"]))
+            vectors = {name: kept[name] for name in about["names"]}
+        about["names"] = {name: tuple(labels) for name, labels in about["names"].items()}
+        return cls(**about, vectors=vectors)
+
+
+def make_episode(file: Path, sampling: Sampling) -> Episode:
+    """An episode of a recording. Raises :class:`RecordingError` that names the file and what is wrong."""
+    recording = Recording(file)
+    about = recording.about
+    frames = sample(recording, sampling.fps, sampling.trim)
+    try:
+        cell, robot = _cell(about.cell)
+        if tuple(robot.arms) != about.arms or tuple(robot.joint_names) != about.joints:
+            raise RecordingError("recorded with other arms or joints than its cell has")
+        vectors, labels = features(frames, robot)
+    except Q2R2Error as error:
+        raise RecordingError(f"{recording.file}: {error}") from error
+    notes = dict(about.notes)
+    task = notes.pop("task", "")
+    return Episode(recording.file.name, cell, task, sampling.fps, labels, notes, vectors)
+
+
+@lru_cache(maxsize=4)
+def _cell(text: str) -> tuple[str, Robot]:
+    """Name and robot of a cell; recordings of a day have the same one."""
+    config = parse_config(text, "its cell")
+    return config.name, Robot.from_config(config)
+
+
+def recordings_in(paths: Sequence[Path]) -> list[Path]:
+    """Files of recordings: those given, and all in folders given, by name; each once.
+
+    Raises :class:`RecordingError` for a path without any.
+    """
+    files: dict[Path, Path] = {}
+    for path in paths:
+        if path.is_dir():
+            found = sorted(path.rglob("*.mcap"))
+            if not found:
+                raise RecordingError(f"{path}: no file .mcap in it; allowed: recordings of q2r2 run --record")
+        elif path.exists():
+            found = [path]
+        else:
+            raise RecordingError(f"{path}: no such file or folder")
+        for file in found:
+            files.setdefault(file.resolve(), file)
+    return list(files.values())
+
+
+@dataclass(frozen=True)
+class Exported:
+    """What became of recordings."""
+
+    kept: list[Path]  # episodes, in the order of their recordings
+    skipped: list[str]  # what was wrong with the others, a line each
+
+
+def make_episodes(
+    files: Sequence[Path],
+    sampling: Sampling,
+    folder: Path,
+    *,
+    workers: int = 1,
+    skip_bad: bool = False,
+    progress: Callable[[int], None] = lambda done: None,
+) -> Exported:
+    """Make an episode of each recording, and keep it in ``folder``; those that are there already are not made again.
+
+    The same comes out for any number of ``workers``. ``progress`` is told how many are through. Raises the
+    :class:`RecordingError` of the first bad recording unless ``skip_bad``, and :class:`ConfigError` where nothing can
+    be written.
+    """
+    targets = [folder / f"{_key(file, sampling)}.npz" for file in files]
+    jobs = [(file, sampling, target) for file, target in zip(files, targets, strict=True)]
+    exported = Exported([], [])
+    with _mapping(min(workers, len(jobs))) as run:
+        for done, (target, fault) in enumerate(zip(targets, run(jobs), strict=True), start=1):
+            if fault is not None and not skip_bad:
+                raise RecordingError(fault)
+            if fault is None:
+                exported.kept.append(target)
+            else:
+                exported.skipped.append(fault)
+            progress(done)
+    return exported
+
+
+@contextmanager
+def _mapping(workers: int) -> Iterator[Callable[[list[Any]], Iterator[str | None]]]:
+    """Faults of jobs in their order, done here or by processes."""
+    if workers <= 1:
+        yield lambda jobs: map(_work, jobs)
+        return
+    # Spawned, not forked: this process may have threads.
+    pool = ProcessPoolExecutor(workers, get_context("spawn"), initializer=signal.signal, initargs=_IGNORED)
+    try:
+        yield lambda jobs: pool.map(_work, jobs)
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+_IGNORED = (
+    signal.SIGINT,
+    signal.SIG_IGN,
+)  # Ctrl-C goes to all of a terminal's processes; the first one ends the others
+
+
+def _work(job: tuple[Path, Sampling, Path]) -> str | None:
+    """Make one episode unless it is there; returns what was wrong."""
+    file, sampling, target = job
+    if _is_kept(target):
+        return None
+    try:
+        episode = make_episode(file, sampling)
+    except RecordingError as error:
+        return str(error)
+    try:
+        episode.save(target)
+    except OSError as error:
+        raise ConfigError(f"--output {target.parent}: {error.strerror}") from error
+    return None
+
+
+def _is_kept(target: Path) -> bool:
+    try:
+        Episode.load(target)
+    except (OSError, ValueError, KeyError, TypeError, EOFError, BadZipFile):
+        return False
+    return True
+
+
+def _key(file: Path, sampling: Sampling) -> str:
+    """Another one after any change of the recording or of what is asked for."""
+    try:
+        status = file.stat()
+    except OSError as error:
+        raise RecordingError(f"{file}: cannot be read: {error.strerror}") from error
+    identity = [str(file.resolve()), status.st_size, status.st_mtime_ns, asdict(sampling), _FORMAT]
+    return hashlib.sha256(json.dumps(identity).encode()).hexdigest()[:24]

@@ -1,0 +1,157 @@
+"""Frames at a fixed rate, out of the ticks of a recording.
+
+Frame k is at t_k = t_0 + k / fps, to the nanosecond, where t_0 is the time of the first tick. What is observed at it is
+that of the newest tick at or before t_k, what is commanded that of the first tick at or after t_k: so an observation
+never knows the future, and a command was decided on no earlier than what was observed. A tick at t_k gives both.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from q2r2_control.errors import RecordingError
+from q2r2_control.recording import topics as names
+from q2r2_control.recording.reader import RecordedChunk, Recording
+from q2r2_control.types import Array
+
+Columns = dict[str, npt.NDArray[Any]]
+
+OBSERVED = ("position", "velocity", "effort", "opening")
+COMMANDED = ("reference", "gripper", "target", "reference_tool")
+_NANOSECONDS = 1_000_000_000
+_MOVING = 0.01  # fastest joint of a reference that moves [rad/s]
+
+
+def sample(recording: Recording, fps: int, trim: bool = False) -> dict[str, Array]:
+    """What is observed and commanded at each of n frames.
+
+    ``position``, ``velocity``, ``effort`` (n, joints) are measured [rad, rad/s, Nm], ``opening`` (n, arms) too, 0
+    closed .. 1 open, -inf where it is not measured. ``reference`` (n, joints) and ``gripper`` (n, arms) are commanded.
+    ``target`` (n, arms, 7), x y z qx qy qz qw in the world, is what the operator asks for, and the tool at the
+    reference (``reference_tool``) while that is nothing. ``time`` (n,) [s] is since t_0.
+
+    ``trim``: from the first to the last tick at which an arm is engaged or the reference moves. Raises
+    :class:`RecordingError` for a damaged file, one without a tick to take, and one in which ticks were lost for longer
+    than a frame.
+    """
+    picked: dict[str, list[npt.NDArray[Any]]] = {name: [] for name in ("time", *OBSERVED, *COMMANDED)}
+    start, end, count = None, 0, 0
+    previous: Columns | None = None
+    for columns in _ticks(recording, fps):
+        known = columns
+        if previous is not None:
+            known = {name: np.concatenate((previous[name], columns[name])) for name in columns}
+        previous = {name: values[-1:] for name, values in columns.items()}
+        counting = np.flatnonzero(columns["active"]) if trim else np.arange(len(columns["time"]))
+        if len(counting):
+            start = int(columns["time"][counting[0]]) if start is None else start
+            end = int(columns["time"][counting[-1]])
+        if start is None:
+            continue
+        times = known["time"]
+        due = _times_until(int(times[-1]), start, fps, count)
+        count += len(due)
+        observed = np.searchsorted(times, due, side="right") - 1
+        commanded = np.searchsorted(times, due, side="left")
+        picked["time"].append(due)
+        for name in OBSERVED:
+            picked[name].append(known[name][observed])
+        for name in COMMANDED:
+            picked[name].append(known[name][commanded])
+    if previous is None:
+        raise RecordingError(f"{recording.file}: no tick was recorded")
+    if start is None:
+        raise RecordingError(f"{recording.file}: no arm was ever engaged or moved, so --trim leaves nothing")
+    frames = {name: np.concatenate(values) for name, values in picked.items()}
+    kept = frames["time"] <= end
+    frames = {name: values[kept] for name, values in frames.items()}
+    frames["time"] = (frames["time"] - start) / _NANOSECONDS
+    return frames
+
+
+def _times_until(last: int, start: int, fps: int, first_frame: int) -> npt.NDArray[np.int64]:
+    """Times [ns] of the frames from ``first_frame`` on that are not after ``last``, rounded."""
+    beyond = max((last - start) * fps // _NANOSECONDS + 2, first_frame)
+    frames = np.arange(first_frame, beyond, dtype=np.int64)
+    times = start + (frames * _NANOSECONDS + fps // 2) // fps
+    return times[times <= last]
+
+
+def _ticks(recording: Recording, fps: int) -> Iterator[Columns]:
+    """Columns of the ticks, some half a second at a time; checks that they follow each other."""
+    last_number, last_time = -1, 0
+    for chunk in recording.chunks():
+        if names.TICK not in chunk.rows:
+            continue
+        try:
+            columns = _columns(chunk, recording)
+        except (KeyError, ValueError, IndexError) as error:
+            raise RecordingError(f"{recording.file}: damaged: a tick without all of its messages") from error
+        numbers = np.concatenate(([last_number], columns["number"]))
+        times = np.concatenate(([last_time], columns["time"]))
+        if (np.diff(times) < 0).any() or (np.diff(numbers) < 1).any():
+            raise RecordingError(f"{recording.file}: damaged: ticks are not in the order of time")
+        lost = (np.diff(numbers) > 1) & (np.diff(times) * fps > _NANOSECONDS)
+        lost[0] &= last_number >= 0
+        if lost.any():
+            gap = int(np.argmax(lost))
+            when = (int(times[gap]) - recording.about.epoch) / _NANOSECONDS
+            raise RecordingError(
+                f"{recording.file}: {int(numbers[gap + 1] - numbers[gap]) - 1} ticks were lost after {when:.3f} s when "
+                f"it was recorded; allowed: none for longer than a frame, 1/{fps} s"
+            )
+        last_number, last_time = int(numbers[-1]), int(times[-1])
+        yield columns
+
+
+def _columns(chunk: RecordedChunk, recording: Recording) -> Columns:
+    """One row of each for every tick of a chunk."""
+    arms, topics, rows = recording.about.arms, recording.topics, chunk.rows
+
+    def numbers(topic: str, label: str) -> npt.NDArray[Any]:
+        return np.asarray(rows[topic]["data"][:, topics.by_name[topic].labels["data"].index(label)])
+
+    def of_arms(topic: str, what: str) -> npt.NDArray[Any]:
+        return np.stack([numbers(topic, f"{what}_{arm}") for arm in arms], axis=1)
+
+    states, reference = rows[names.JOINT_STATES], rows[names.REFERENCE]
+    engaged = of_arms(names.FLAGS, "engaged").any(axis=1)
+    reference_tool = np.stack([_poses(rows[names.safe_target(arm)]) for arm in arms], axis=1)
+    columns: Columns = {
+        "number": rows[names.TICK]["sequence"].astype(np.int64),
+        "time": rows[names.TICK]["log_time"].astype(np.int64),
+        "active": engaged | (np.abs(reference["velocities"]).max(axis=1) > _MOVING),
+        "position": states["position"],
+        "velocity": states["velocity"],
+        "effort": states["effort"],
+        "opening": of_arms(names.TICK, "opening"),
+        "reference": reference["positions"],
+        "gripper": of_arms(names.GRIPPERS, "commanded"),
+        "target": _targets(rows, arms, reference_tool),
+        "reference_tool": reference_tool,
+    }
+    if len({len(values) for values in columns.values()}) != 1:
+        raise ValueError("a message is missing")
+    return columns
+
+
+def _targets(rows: Mapping[str, npt.NDArray[np.void]], arms: tuple[str, ...], otherwise: Array) -> Array:
+    """What the operator asks for, where there is such a message."""
+    targets = otherwise.copy()
+    ticks = rows[names.TICK]["sequence"]
+    for index, arm in enumerate(arms):
+        asked = rows.get(names.target(arm))
+        if asked is not None:
+            at = np.searchsorted(ticks, asked["sequence"])
+            if (ticks[at] != asked["sequence"]).any():
+                raise ValueError("a target without a tick")
+            targets[at, index] = _poses(asked)
+    return targets
+
+
+def _poses(rows: npt.NDArray[np.void]) -> Array:
+    return np.concatenate((rows["position"], rows["quaternion"]), axis=1)

@@ -1,0 +1,118 @@
+"""Recordings become datasets from the command line, as a user does it."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from q2r2_control.cli import export as command
+from tests.cli.test_app import q2r2
+from tests.export.runs import DURATION, contents, record_two
+
+
+@pytest.fixture(scope="module")
+def recordings(tmp_path_factory: pytest.TempPathFactory) -> Sequence[Path]:
+    """Files of two runs, each in a folder of its own."""
+    return record_two(tmp_path_factory.mktemp("recordings"))
+
+
+def test_a_dataset_is_the_same_for_any_number_of_workers(recordings: Sequence[Path], tmp_path: Path) -> None:
+    pytest.importorskip("pyarrow", reason="the extra export is not installed")
+    folder = recordings[0].parent.parent
+    for workers in ("1", "2"):
+        out = tmp_path / workers
+        result = q2r2("export", "lerobot", str(folder), "--output", str(out), "--workers", workers)
+        assert (result.exit_code, result.stderr) == (0, "")
+        assert result.stdout == f"{out}: 2 of 2 recordings at 30 frames per second\n"
+    assert contents(tmp_path / "1") == contents(tmp_path / "2")
+    assert set(contents(tmp_path / "1")) == {
+        "data/chunk-000/file-000.parquet",
+        "meta/episodes/chunk-000/file-000.parquet",
+        "meta/info.json",
+        "meta/recordings.json",
+        "meta/stats.json",
+        "meta/tasks.parquet",
+    }
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["1", "2"]
+
+
+def test_one_recording_is_one_table_and_a_folder_of_them_a_folder(recordings: Sequence[Path], tmp_path: Path) -> None:
+    assert q2r2("export", "csv", str(recordings[0]), "--output", str(tmp_path / "a.csv"), "--fps", "50").exit_code == 0
+    with (tmp_path / "a.csv").open(newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    # The arms come to rest after the end.
+    assert len(rows) >= DURATION * 50
+    assert {row["task"] for row in rows} == {"a test"}
+    folder = str(recordings[0].parent.parent)
+    assert q2r2("export", "csv", folder, "--output", str(tmp_path / "all")).exit_code == 0
+    assert set(contents(tmp_path / "all")) == {f"{file.stem}.csv" for file in recordings}
+    result = q2r2("export", "csv", folder, "--output", str(tmp_path / "b.csv"))
+    assert result.exit_code == 2
+    assert "for 2 recordings; allowed: a folder, or one recording" in result.stderr
+
+
+def test_trim_leaves_out_what_is_before_the_first_engagement(recordings: Sequence[Path], tmp_path: Path) -> None:
+    lengths = []
+    for name, options in (("whole", ()), ("trimmed", ("--trim",))):
+        out = tmp_path / f"{name}.csv"
+        assert q2r2("export", "csv", str(recordings[0]), "--output", str(out), "--fps", "100", *options).exit_code == 0
+        lengths.append(out.read_text().count("\n") - 1)
+    # The press comes 0.1 s after the beginning.
+    assert lengths[0] - lengths[1] >= 10
+
+
+def test_a_bad_recording_ends_the_export_with_one_line_or_is_skipped(
+    recordings: Sequence[Path], tmp_path: Path
+) -> None:
+    (tmp_path / "notes.mcap").write_text("no recording\n")
+    arguments = ("export", "csv", str(tmp_path / "notes.mcap"), str(recordings[1]), "--output", str(tmp_path / "out"))
+    result = q2r2(*arguments)
+    assert (result.exit_code, result.stdout) == (2, "")
+    assert result.stderr.count("\n") == 1
+    assert "notes.mcap: not an MCAP file" in result.stderr
+    assert [path.name for path in tmp_path.iterdir()] == ["notes.mcap"]
+    result = q2r2(*arguments, "--skip-bad")
+    assert result.exit_code == 0
+    assert result.stderr.startswith("skipped: ")
+    assert "notes.mcap: not an MCAP file" in result.stderr
+    assert result.stdout == f"{tmp_path / 'out'}: 1 of 2 recordings at 30 frames per second\n"
+    result = q2r2("export", "csv", str(tmp_path / "notes.mcap"), "--output", str(tmp_path / "none"), "--skip-bad")
+    assert result.exit_code == 2
+    assert "none of the recordings can be exported" in result.stderr
+
+
+def test_an_interrupted_export_leaves_nothing_half_and_the_next_one_ends_it(
+    recordings: Sequence[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(*given: Any) -> None:
+        raise KeyboardInterrupt
+
+    arguments = ("export", "csv", *map(str, recordings), "--output")
+    with monkeypatch.context() as patch:
+        patch.setattr(command, "write_tables", interrupted)
+        assert q2r2(*arguments, str(tmp_path / "out")).exit_code == 130
+    assert [path.name for path in tmp_path.iterdir()] == ["out.partial"]
+    for name in ("out", "at_once"):
+        assert q2r2(*arguments, str(tmp_path / name)).exit_code == 0
+    assert contents(tmp_path / "out") == contents(tmp_path / "at_once")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["at_once", "out"]
+
+
+def test_an_output_that_exists_is_left_alone(recordings: Sequence[Path], tmp_path: Path) -> None:
+    (tmp_path / "out.csv").write_text("mine")
+    result = q2r2("export", "csv", str(recordings[0]), "--output", str(tmp_path / "out.csv"))
+    assert result.exit_code == 2
+    assert "out.csv: exists; allowed: a name that does not exist yet" in result.stderr
+    assert (tmp_path / "out.csv").read_text() == "mine"
+    assert not (tmp_path / "out.csv.partial").exists()
+
+
+@pytest.mark.parametrize("arguments", [("lerobot",), ("csv",)])
+def test_the_help_has_an_example(arguments: tuple[str, ...]) -> None:
+    result = q2r2("export", *arguments, "--help")
+    assert result.exit_code == 0
+    assert f"Example: q2r2 export {arguments[0]}" in result.stdout
