@@ -22,6 +22,8 @@ def why(tick: Tick, arm: str, joints: Collection[str], binding: Collection[str],
 
     ``binding``: limits and pairs that held the last steps back, as in a report; ``last``: its last event.
     """
+    if not tick.following:
+        return "the run ends"
     if tick.states[arm] == ArmState.ALIGNING:
         return "aligning"
     if not tick.engaged[arm]:

@@ -69,6 +69,7 @@ def test_before_its_first_event_and_while_aligning_it_says_so_too(robot: Robot) 
     assert words(paused) == "not engaged yet"
     aligning = replace(paused, states={"left": "aligning", "right": "aligning"})
     assert words(aligning, last=Event(0.5, "left", "engaged", "aligning", "alignment chord")) == "aligning"
+    assert words(replace(paused, following=False)) == "the run ends"
     assert press(aligning) == "release both buttons to go on"
 
 
