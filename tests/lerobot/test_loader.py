@@ -75,7 +75,12 @@ def test_files_have_the_same_names_columns_and_types(ours: Path, theirs: Path) -
     for name in sorted(files_in(theirs)):
         if name.endswith(".parquet"):
             found, expected = (pyarrow.parquet.read_schema(folder / name) for folder in (ours, theirs))
-            assert found.remove_metadata().equals(expected.remove_metadata()), name
+            assert columns(found) == columns(expected), name
+
+
+def columns(schema: pyarrow.Schema) -> list[tuple[str, str]]:
+    """Names and types; which of the two kinds of strings pandas writes depends on its version."""
+    return [(field.name, str(field.type).replace("large_string", "string")) for field in schema]
 
 
 def test_frames_and_tasks_are_the_same_to_the_bit(ours: Path, theirs: Path) -> None:
