@@ -1,9 +1,9 @@
 """The way home of all arms in joint space: straight, or by way points where something is in between.
 
 Straight in the space of the joints every posture ends at home, elbows and turns of the wrist too, which a line of the
-tools does not: from 50 random postures that reached home with 22 tools and no elbow. What is sent is not the way itself
-but joint positions for the controller to hold, which keeps every promise on the way there. The way is stretched in time
-where the arms lag behind, so an arm that is held up is waited for.
+tools does not. What is sent is not the way itself but joint positions for the controller to hold, which keeps every
+promise on the way there. The way is stretched in time where the arms lag behind, so an arm that is held up is waited
+for, and when it is free again it sets off little faster than it was.
 
 Which way is free is looked for by samples of the distances, a few at a tick, while the arms stand still: straight; one
 arm first; by a random posture. Nobody's safety rests on what is found, because the controller is what keeps the arms
@@ -21,7 +21,7 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 
 _SPEED = 0.3  # of the fastest joint [rad/s]
-_SLOWED, _WAITED = 0.2, 0.4  # by how much the arms lag behind where the way is slowed, and where it waits [rad]
+_SLOWED, _WAITED = 0.09, 0.12  # by how much the arms lag behind where the way is slowed, and where it waits [rad]
 _PASSED, _ARRIVED = 0.1, 0.003  # how near the arms come to a way point, and to home [rad]
 _PATIENCE, _PROGRESS = 3.0, 1e-3  # without progress of so much [s], [rad]
 _AT_REST = 0.02  # [rad/s]
