@@ -109,12 +109,18 @@ def test_the_script_waits_until_both_hands_are_listened_to(node: Any, processes:
     assert process.interrupt() == 0
 
 
+def speaking_arm(node: Any, ready: bool, message: str) -> dict[str, Any]:
+    """What an arm of the left hand says ten times a second, from this node; tests change it."""
+    arm = {"hand": "left", "engaged": False, "ready": ready, "message": message, "last_event": ""}
+    said = node.create_publisher(String, f"{node.get_fully_qualified_name()}/state", 10)
+    node.create_timer(0.1, lambda: said.publish(String(data=json.dumps(arm))))
+    return arm
+
+
 def test_the_script_waits_for_an_arm_that_is_not_ready_and_presses_until_it_follows(
     node: Any, processes: Processes
 ) -> None:
-    arm = {"hand": "left", "engaged": False, "ready": False, "message": "no tool yet", "last_event": ""}
-    said = node.create_publisher(String, f"{node.get_fully_qualified_name()}/state", 10)
-    node.create_timer(0.1, lambda: said.publish(String(data=json.dumps(arm))))
+    arm = speaking_arm(node, ready=False, message="no tool yet")
     states, left = States(node, "simulation_input"), subscribe(node, "left")
     start(processes, side="left", trajectory="line")
     states.wait_for("no tool yet")
@@ -150,9 +156,7 @@ def test_the_script_waits_for_an_arm_that_is_not_ready_and_presses_until_it_foll
 
 
 def test_an_arm_that_stops_early_again_and_again_is_not_engaged_for_ever(node: Any, processes: Processes) -> None:
-    arm = {"hand": "left", "engaged": False, "ready": True, "message": "ready to engage", "last_event": ""}
-    said = node.create_publisher(String, f"{node.get_fully_qualified_name()}/state", 10)
-    node.create_timer(0.1, lambda: said.publish(String(data=json.dumps(arm))))
+    arm = speaking_arm(node, ready=True, message="ready to engage")
     left = subscribe(node, "left")
     start(processes, side="left", trajectory="line")
     rest = left["pose"].get(timeout=PATIENCE).pose.position.x
@@ -168,9 +172,7 @@ def test_an_arm_that_stops_early_again_and_again_is_not_engaged_for_ever(node: A
 
 
 def test_an_arm_that_a_person_pauses_is_not_engaged_again(node: Any, processes: Processes) -> None:
-    arm = {"hand": "left", "engaged": False, "ready": True, "message": "ready to engage", "last_event": ""}
-    said = node.create_publisher(String, f"{node.get_fully_qualified_name()}/state", 10)
-    node.create_timer(0.1, lambda: said.publish(String(data=json.dumps(arm))))
+    arm = speaking_arm(node, ready=True, message="ready to engage")
     left = subscribe(node, "left")
     start(processes, side="left", trajectory="line")
     wait_until(lambda: left["inputs"].get(timeout=PATIENCE).button_lower, "the button is pressed")
