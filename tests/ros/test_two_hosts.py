@@ -32,7 +32,7 @@ NETWORK = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET"}
 set_up_middleware(NETWORK)
 BRAKING = 5.44  # lowest acceleration limit of a joint of the cell [rad/s^2]
 DELIVERY = 0.15  # allowance for messages and for a paused arm, which brakes at 2 m/s^2 of its tool [s]
-STILL, FAST = 0.005, 1.5  # [rad], [rad/s]
+STILL, FAST = 0.005, 1.7  # [rad], [rad/s]; see test_faults
 
 
 class Hosts:
