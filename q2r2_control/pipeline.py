@@ -26,13 +26,15 @@ from q2r2_control.runtime.operator_feedback import OperatorFeedback
 from q2r2_control.runtime.process import few_garbage_collections, stop_on_signals
 from q2r2_control.runtime.recorder import RunRecorder, RunStart, Tick
 from q2r2_control.runtime.run_summary import RunSummary
+from q2r2_control.runtime.way_home import WayHome
 from q2r2_control.supervision.grasp_watch import GraspWatch
 from q2r2_control.supervision.gripper_limiter import GripperLimiter
 from q2r2_control.supervision.joint_watch import watch_settings
 from q2r2_control.supervision.supervisor import Phase, Supervisor
 from q2r2_control.supervision.target_stream import StreamSettings
 from q2r2_control.supervision.tick_pacer import TickPacer
-from q2r2_control.teleop.arm import OPEN, is_fault
+from q2r2_control.teleop.arm import OPEN
+from q2r2_control.teleop.arm_states import is_fault
 from q2r2_control.teleop.teleop import Teleop
 from q2r2_control.types import LONGEST_DT, ArmTarget, Command, CommandMode, HandSample, Reference, RobotState
 
@@ -72,7 +74,7 @@ class Pipeline:
         self._begin_anew()
         self.listeners: list[Callable[[Tick], None]] = []
         # A plain flag: unlike the locks of threading.Event, a signal handler can set it in the middle of anything.
-        self._stopping = False
+        self._stopping = self._wants_home = False
 
     @classmethod
     def from_config(
@@ -96,6 +98,13 @@ class Pipeline:
         """Bring the arms to rest and end the run, or the next one if none runs; from any thread or signal handler."""
         self._stopping = True
 
+    def go_home(self) -> None:
+        """Bring both arms home, as an operator may; from any thread. Without effect while the arms stop or are stopped.
+
+        Any press of an operator's ends it. How it went is in the events of the run.
+        """
+        self._wants_home = True
+
     def run(self, duration: float | None = None, realtime: bool = True) -> RunSummary:
         """Run for ``duration`` [s], or until :meth:`stop`, Ctrl-C or SIGTERM; the arms are brought to rest first.
 
@@ -109,7 +118,7 @@ class Pipeline:
             with stop_on_signals(self.stop), few_garbage_collections():
                 return self._begin(realtime).until(duration)
         finally:
-            self._stopping = False
+            self._stopping = self._wants_home = False
             try:
                 self.input.close()
             finally:
@@ -138,6 +147,11 @@ class Pipeline:
         self.supervisor = Supervisor(
             self.robot, self.controller, StreamSettings(), watch, displace=self.drive.displaced
         )
+
+    def take_wish_for_home(self) -> bool:
+        """Whether :meth:`go_home` was called since the last call of this."""
+        wanted, self._wants_home = self._wants_home, False
+        return wanted
 
     @property
     def stopping(self) -> bool:
@@ -177,9 +191,9 @@ class PipelineRun:
         pipeline.drive.set_openings(pipeline.controller.openings)
         self._openings: dict[str, float] = {}  # measured, that the tick went by
         self._velocity = np.zeros(pipeline.robot.model.nv)
-        hands = {arm: pipeline.teleop.hand_of(arm) for arm in pipeline.robot.arms}
+        self._way_home = WayHome(pipeline.teleop, self._supervisor)
         self._feedback = OperatorFeedback(
-            pipeline.controller, hands, pipeline.config.teleop.haptics, pipeline.input.send_haptic
+            pipeline.controller, pipeline.teleop.hand_of, pipeline.config.teleop.haptics, pipeline.input.send_haptic
         )
 
     def until(self, duration: float | None) -> RunSummary:
@@ -234,9 +248,12 @@ class PipelineRun:
         tools = self.tools(state)
         self._observe(state)
         if self._following:
+            if pipeline.take_wish_for_home():
+                pipeline.teleop.home(self._clock.now)
             commanded = {arm: pipeline.controller.tool_pose(arm) for arm in pipeline.robot.arms}
             self._targets = pipeline.teleop.update(samples, tools, self._clock.now, commanded)
             self._hand_over(tools)
+            self._way_home.update(self._clock.now)
         self.limit_grippers()
         reference, trusted = self._advance(dt), self._supervisor.state_fault is None
         command = drive.command(reference, state, self._grippers, dt, trusted)

@@ -138,7 +138,7 @@ class TestSession:
     def test_the_buttons_engage_pause_and_resume_and_nothing_else_does(self, session: Live, arm: str) -> None:
         assert session.summary is not None
         assert changes(session.summary.events, arm)[:4] == [
-            ("paused", "engaged", "lower button"),
+            ("idle", "engaged", "lower button"),
             ("engaged", "pausing", "lower button"),
             ("pausing", "paused", "lower button"),
             ("paused", "engaged", "lower button"),
@@ -311,5 +311,5 @@ class TestConnectionEndsInMidMotion:
         )
         for arm in SIDES:
             event = next(event for event in run.summary.events if event.arm == arm and event.t >= begin)
-            assert (str(event.source), str(event.destination)) == ("engaged", "paused")
+            assert (str(event.source), str(event.destination)) == ("engaged", "lost")
             assert any(reason in event.reason for reason in expected), event.reason

@@ -1,8 +1,9 @@
-"""Held controls in the whole loop: the contract at every tick, and the tool follows what they make of the hand."""
+"""What the hands' controls do in the whole loop: the contract at every tick, and the arms do what was asked for."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 from itertools import pairwise
 from typing import Any
 
@@ -11,6 +12,8 @@ import pytest
 
 from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.pipeline import Pipeline
+from q2r2_control.robot.robot import Robot
+from q2r2_control.runtime.recorder import Tick
 from q2r2_control.types import Array, HandInputs, HandSample
 from tests.support.hands_input import ENGAGED, HandsInput
 from tests.support.watch import Watch, cell
@@ -37,14 +40,47 @@ class SqueezingHands(HandsInput):
         return super()._sample(hand, replace(inputs, **changed), now)
 
 
+class PlayingHands(HandsInput):
+    """Engages at first; its left hand circles; then the left hand pushes controls at given times, for 0.1 s each."""
+
+    def __init__(self, *pushed: tuple[float, str]) -> None:
+        super().__init__(left=circle)
+        self._pushed = pushed
+
+    def _sample(self, hand: str, inputs: HandInputs, now: float) -> HandSample:
+        for at, field in self._pushed:
+            if hand == "left" and at <= now < at + 0.1:
+                pushed: dict[str, Any] = {field: True if field.startswith("button") else 1.0}
+                inputs = replace(inputs, **pushed)
+        return super()._sample(hand, inputs, now)
+
+
 def run(**bindings: str) -> Watch:
     teleop = TeleopSettings.model_validate({"bindings": bindings})
+    return watched(SqueezingHands(presses=bindings["grip"] != "dead_man"), teleop, 5.0)
+
+
+def watched(hands: HandsInput, teleop: TeleopSettings, duration: float) -> Watch:
     config = cell().model_copy(update={"loop_rate_hz": 500.0, "teleop": teleop})
-    hands = SqueezingHands(presses=bindings["grip"] != "dead_man")
     loop = Pipeline.from_config(config, input=hands, plant="kinematic")
     watch = Watch(loop)
-    loop.run(5.0, realtime=False)
+    loop.run(duration, realtime=False)
     return watch
+
+
+def played(*pushed: tuple[float, str], duration: float = 6.0) -> Watch:
+    """With stop on the trigger and the way home on the grip."""
+    bindings = {"bindings": {"trigger": "stop", "grip": "home"}}
+    return watched(PlayingHands(*pushed), TeleopSettings.model_validate(bindings), duration)
+
+
+def farthest_from_home(tick: Tick) -> float:
+    return float(np.abs(tick.reference.q - cell_robot().home).max())
+
+
+@cache
+def cell_robot() -> Robot:
+    return Robot.from_config(cell())
 
 
 @pytest.mark.parametrize("action", ["precision", "rotation_lock", "translation_lock"])
@@ -78,3 +114,45 @@ def test_with_a_dead_man_the_arm_is_engaged_while_it_is_held_and_at_rest_soon_af
         pose = tick.targets["left"].pose
         assert pose is not None
         assert np.linalg.norm(pose.translation - tick.tools["left"].translation) < 1e-6
+
+
+def test_the_way_home_is_gone_within_every_promise_and_ends_paused_at_home() -> None:
+    ticks = played((1.5, "press_middle")).ticks
+    away = next(tick for tick in ticks if tick.t > 1.5)
+    assert farthest_from_home(away) > 0.1
+    homing = [tick for tick in ticks if set(tick.states.values()) == {"homing"}]
+    assert homing[0].t == pytest.approx(1.5, abs=0.02)
+    assert homing[-1].t < 5.0
+    last = next(tick for tick in ticks if tick.t > homing[-1].t)
+    assert set(last.states.values()) == {"paused"}
+    assert {event.reason for event in last.events} == {"at home"}
+    assert farthest_from_home(ticks[-1]) < 0.005
+
+
+def test_a_press_on_the_way_home_ends_it_where_the_arms_come_to_rest() -> None:
+    ticks = played((1.5, "press_middle"), (1.9, "button_lower")).ticks
+    assert {event.reason for tick in ticks if tick.t > 1.6 for event in tick.events} == {"the way home was interrupted"}
+    after = [tick for tick in ticks if 2.4 < tick.t < 6.0]
+    assert set(after[0].states.values()) == {"paused"}
+    assert farthest_from_home(after[-1]) > 0.05
+    assert max(float(np.abs(tick.reference.v).max()) for tick in after) < 0.02
+
+
+def test_a_stop_brings_both_arms_to_rest_and_only_taking_it_back_and_a_press_move_them() -> None:
+    ticks = played((1.5, "press_index"), (2.0, "button_lower"), (2.3, "press_middle"), (3.0, "press_index")).ticks
+    stopped = [tick for tick in ticks if set(tick.states.values()) == {"stopped"}]
+    assert (stopped[0].t, stopped[-1].t) == (pytest.approx(1.5, abs=0.02), pytest.approx(3.0, abs=0.02))
+    resting = [tick for tick in ticks if 1.9 < tick.t < 6.0]
+    assert max(float(np.abs(tick.reference.v).max()) for tick in resting) < 0.02
+    assert all(tick.targets[arm].pose is None for tick in resting for arm in tick.targets)
+
+
+def test_a_program_may_send_the_arms_home_too() -> None:
+    config = cell().model_copy(update={"loop_rate_hz": 500.0})
+    loop = Pipeline.from_config(config, input=PlayingHands(), plant="kinematic")
+    watch = Watch(loop)
+    loop.listeners.append(lambda tick: loop.go_home() if 1.5 <= tick.t < 1.502 else None)
+    loop.run(6.0, realtime=False)
+    events = [event.reason for tick in watch.ticks for event in tick.events if event.arm == "left"]
+    assert events == ["lower button", "way home", "at home"]
+    assert farthest_from_home(watch.ticks[-1]) < 0.005

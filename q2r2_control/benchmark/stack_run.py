@@ -21,7 +21,7 @@ from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.robot.kept_distances import kept_distances
 from q2r2_control.robot.robot import Robot
 from q2r2_control.runtime.recorder import Tick
-from q2r2_control.teleop.arm import ArmState
+from q2r2_control.teleop.arm_states import AT_REST
 from q2r2_control.types import Array, CommandMode, Event
 from q2r2_control.verification.contract import Contract
 from q2r2_control.verification.work_hands import MOVES, WorkHands
@@ -199,4 +199,4 @@ def _rms_mm(errors: Array) -> float:
 
 
 def _pauses(event: Event) -> bool:
-    return event.destination is ArmState.PAUSED and event.source is not ArmState.PAUSED
+    return event.destination in AT_REST and event.source not in AT_REST

@@ -11,7 +11,7 @@ from q2r2_control.recording.recorder import RecordingSummary
 from q2r2_control.runtime.histogram import Percentiles
 from q2r2_control.runtime.run_summary import RunSummary
 from q2r2_control.runtime.torque_summary import TorqueSummary
-from q2r2_control.teleop.arm import is_fault
+from q2r2_control.teleop.arm_states import ArmState, is_fault
 from q2r2_control.types import Event
 from q2r2_control.verification.assembly_tasks import TaskResult
 
@@ -87,9 +87,12 @@ def _figure(what: str, value: float) -> str:
     return f"{value:.1f} {what.rpartition('_')[2]}"
 
 
+_IN_BETWEEN = (ArmState.PAUSING, ArmState.ALIGNING)
+
+
 def _last_pauses(events: Sequence[Event]) -> dict[str, Event]:
     """The last event of each arm that something else than its button paused, or kept from being engaged."""
-    last = {event.arm: event for event in events if event.destination in ("paused", "engaged")}
+    last = {event.arm: event for event in events if event.destination not in _IN_BETWEEN}
     return {arm: event for arm, event in last.items() if is_fault(event)}
 
 

@@ -1,84 +1,182 @@
-"""What each control of a hand does: one thing, or nothing."""
+"""What each control of a hand does: one thing for each gesture, or nothing."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from enum import StrEnum
+from typing import NamedTuple
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 
-class ButtonAction(StrEnum):
-    """What a press of the upper or lower button does."""
+class Action(StrEnum):
+    """What a hand can do with its controls."""
 
     NONE = "none"
+    # Once, when a control was tapped, held for a while or tapped twice.
     PAUSE_TOGGLE = "pause_toggle"  # engage, or pause
     GRIPPER_TOGGLE = "gripper_toggle"
-
-
-class HeldAction(StrEnum):
-    """What lasts for as long as a trigger or stick is held."""
-
-    NONE = "none"
+    HOME = "home"  # both arms
+    STOP = "stop"  # both arms, until it is done once more
+    SWAP_HANDS = "swap_hands"  # each hand drives the other arm
+    # For as long as a trigger or stick is held.
     DEAD_MAN = "dead_man"  # engaged while held
     PRECISION = "precision"  # motion is scaled down
     ROTATION_LOCK = "rotation_lock"  # the tool keeps its orientation
     TRANSLATION_LOCK = "translation_lock"  # the tool keeps its position
+    GRIPPER_ANALOG = "gripper_analog"  # the gripper closes as far as the trigger is pressed
+
+
+LASTING = frozenset(
+    {Action.DEAD_MAN, Action.PRECISION, Action.ROTATION_LOCK, Action.TRANSLATION_LOCK, Action.GRIPPER_ANALOG}
+)
+
+
+class Gesture(StrEnum):
+    """How a control is used. ``DOWN`` is its beginning, which only stops an arm that the control pauses."""
+
+    DOWN = "down"
+    TAP = "tap"
+    HOLD = "hold"
+    DOUBLE = "double"
 
 
 # What an operator reads of each action.
 MEANINGS: dict[str, str] = {
-    ButtonAction.PAUSE_TOGGLE: "engages the arm where it is, or pauses it",
-    ButtonAction.GRIPPER_TOGGLE: "closes the gripper, or opens it",
-    HeldAction.DEAD_MAN: "held: the arm follows; let go: it pauses",
-    HeldAction.PRECISION: "held: motion is scaled by precision_scale",
-    HeldAction.ROTATION_LOCK: "held: the tool keeps its orientation",
-    HeldAction.TRANSLATION_LOCK: "held: the tool keeps its position",
+    Action.PAUSE_TOGGLE: "engages the arm where it is, or pauses it",
+    Action.GRIPPER_TOGGLE: "closes the gripper, or opens it",
+    Action.HOME: "brings both arms home; any press on the way stops them",
+    Action.STOP: "stops both arms until it is done once more",
+    Action.SWAP_HANDS: "lets each hand drive the other arm, while both are paused",
+    Action.DEAD_MAN: "held: the arm follows; let go: it pauses",
+    Action.PRECISION: "held: motion is scaled by precision_scale",
+    Action.ROTATION_LOCK: "held: the tool keeps its orientation",
+    Action.TRANSLATION_LOCK: "held: the tool keeps its position",
+    Action.GRIPPER_ANALOG: "closes the gripper as far as it is pressed",
 }
 # Fields of the settings, which name the controls as an operator does.
 BUTTONS = ("lower", "upper")
-HELD = ("trigger", "grip", "stick_up", "stick_down", "stick_left", "stick_right")
+TRIGGERS = ("trigger", "grip")
+HELD = (*TRIGGERS, "stick_up", "stick_down", "stick_left", "stick_right")
+CONTROLS = (*BUTTONS, *HELD)
+_WORDS = {Gesture.TAP: "", Gesture.HOLD: " held", Gesture.DOUBLE: " tapped twice"}
+_SUFFIXES = {Gesture.TAP: "", Gesture.HOLD: "_hold", Gesture.DOUBLE: "_double"}
+
+_HOLD = "held for hold_time: home, stop, swap_hands, gripper_toggle or none"
+_DOUBLE = "tapped twice within double_tap_window, the same"
+
+
+class Binding(NamedTuple):
+    """One gesture of one control, and what it does."""
+
+    control: str
+    gesture: Gesture
+    action: Action
+
+    @property
+    def field(self) -> str:
+        """The setting's name."""
+        return self.control + _SUFFIXES[self.gesture]
+
+    @property
+    def words(self) -> str:
+        """As an operator calls it."""
+        return self.control + _WORDS[self.gesture]
 
 
 class BindingSettings(BaseModel):
-    """The controls of each hand. An action is bound to one control at most, and something has to engage the arm."""
+    """The controls of each hand. An action is bound to one gesture at most, and something has to engage the arm."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    lower: ButtonAction = Field(ButtonAction.PAUSE_TOGGLE, description="A or X: pause_toggle, gripper_toggle or none")
-    upper: ButtonAction = Field(ButtonAction.GRIPPER_TOGGLE, description="B or Y: the same")
-    trigger: HeldAction = Field(
-        HeldAction.NONE,
-        description="index finger, while held: dead_man, precision, rotation_lock, translation_lock or none",
+    lower: Action = Field(
+        Action.PAUSE_TOGGLE, description="A or X, tapped: pause_toggle, gripper_toggle, home, swap_hands or none"
     )
-    grip: HeldAction = Field(HeldAction.NONE, description="middle finger, the same")
-    stick_up: HeldAction = Field(HeldAction.NONE, description="thumb stick forward, the same")
-    stick_down: HeldAction = Field(HeldAction.NONE, description="the same")
-    stick_left: HeldAction = Field(HeldAction.NONE, description="the same")
-    stick_right: HeldAction = Field(HeldAction.NONE, description="the same")
+    lower_hold: Action = Field(Action.NONE, description=_HOLD)
+    lower_double: Action = Field(Action.NONE, description=_DOUBLE)
+    upper: Action = Field(Action.GRIPPER_TOGGLE, description="B or Y, as lower")
+    upper_hold: Action = Field(Action.NONE, description="as lower_hold")
+    upper_double: Action = Field(Action.NONE, description="as lower_double")
+    trigger: Action = Field(
+        Action.NONE,
+        description="index finger; while held: dead_man, precision, rotation_lock, translation_lock, gripper_analog; "
+        "tapped: pause_toggle, gripper_toggle, home, stop, swap_hands; or none",
+    )
+    trigger_hold: Action = Field(Action.NONE, description="as lower_hold, where trigger is not for what lasts")
+    trigger_double: Action = Field(Action.NONE, description="as lower_double, likewise")
+    grip: Action = Field(Action.NONE, description="middle finger, as trigger")
+    grip_hold: Action = Field(Action.NONE, description="as trigger_hold")
+    grip_double: Action = Field(Action.NONE, description="as trigger_double")
+    stick_up: Action = Field(Action.NONE, description="thumb stick forward, as trigger, but no gripper_analog")
+    stick_up_hold: Action = Field(Action.NONE, description="as trigger_hold")
+    stick_up_double: Action = Field(Action.NONE, description="as trigger_double")
+    stick_down: Action = Field(Action.NONE, description="as stick_up")
+    stick_down_hold: Action = Field(Action.NONE, description="as trigger_hold")
+    stick_down_double: Action = Field(Action.NONE, description="as trigger_double")
+    stick_left: Action = Field(Action.NONE, description="as stick_up")
+    stick_left_hold: Action = Field(Action.NONE, description="as trigger_hold")
+    stick_left_double: Action = Field(Action.NONE, description="as trigger_double")
+    stick_right: Action = Field(Action.NONE, description="as stick_up")
+    stick_right_hold: Action = Field(Action.NONE, description="as trigger_hold")
+    stick_right_double: Action = Field(Action.NONE, description="as trigger_double")
 
     @model_validator(mode="after")
     def _mean_one_thing(self) -> BindingSettings:
-        bound: dict[str, str] = {}
-        for control in (*BUTTONS, *HELD):
-            action = str(getattr(self, control))
-            if action == ButtonAction.NONE:
-                continue
-            if action in bound:
-                raise ValueError(f"{bound[action]} and {control} are both {action}; allowed: one of them")
-            bound[action] = control
-        toggle, dead_man = bound.get(ButtonAction.PAUSE_TOGGLE), bound.get(HeldAction.DEAD_MAN)
+        bound: dict[str, Binding] = {}
+        for binding in self.bound():
+            if other := bound.get(binding.action):
+                raise ValueError(f"{other.field} and {binding.field} are both {binding.action}; allowed: one of them")
+            bound[binding.action] = binding
+            self._allow(binding)
+        toggle, dead_man = bound.get(Action.PAUSE_TOGGLE), bound.get(Action.DEAD_MAN)
         if toggle and dead_man:
-            raise ValueError(f"{toggle} is pause_toggle and {dead_man} is dead_man; allowed: one way to engage")
+            raise ValueError(
+                f"{toggle.field} is pause_toggle and {dead_man.field} is dead_man; allowed: one way to engage"
+            )
         if not (toggle or dead_man):
-            raise ValueError("no control engages the arm; allowed: a button that is pause_toggle, or dead_man")
+            raise ValueError("no control engages the arm; allowed: a control that is pause_toggle, or dead_man")
+        analog = bound.get(Action.GRIPPER_ANALOG)
+        if analog and (other := bound.get(Action.GRIPPER_TOGGLE)):
+            raise ValueError(
+                f"{other.field} is gripper_toggle and {analog.field} is gripper_analog; allowed: one of them"
+            )
         return self
+
+    def _allow(self, binding: Binding) -> None:
+        """Raises ValueError for an action that its gesture is too slow, too coarse or too ambiguous for."""
+        control, gesture, action = binding
+        if action is Action.PAUSE_TOGGLE and gesture is not Gesture.TAP:
+            raise ValueError(f"{binding.field} is pause_toggle, which must not wait; allowed: {control}")
+        if action is Action.STOP and control in BUTTONS and gesture is Gesture.TAP:
+            raise ValueError(
+                f"{control} is stop, and the headset's alignment presses it too; allowed: {control}_hold, "
+                f"{control}_double, or another control"
+            )
+        if action in LASTING and (gesture is not Gesture.TAP or control in BUTTONS):
+            raise ValueError(f"{binding.field} is {action}, which lasts; allowed: {', '.join(HELD)}")
+        if action is Action.GRIPPER_ANALOG and control not in TRIGGERS:
+            raise ValueError(f"{control} is gripper_analog; allowed: trigger or grip")
+        if action in LASTING:
+            for other in self.bound():
+                if other.control == control and other.gesture is not Gesture.TAP:
+                    raise ValueError(f"{control} is {action} and {other.field} is {other.action}; allowed: one of them")
+
+    def bound(self) -> Iterator[Binding]:
+        """All that is bound, control by control."""
+        for control in CONTROLS:
+            for gesture, suffix in _SUFFIXES.items():
+                if (action := getattr(self, control + suffix)) is not Action.NONE:
+                    yield Binding(control, gesture, action)
 
     def meanings(self) -> dict[str, str]:
         """In words what each control of a hand does that does something."""
-        bound = {control: str(getattr(self, control)) for control in (*BUTTONS, *HELD)}
-        words = {control: MEANINGS[action] for control, action in bound.items() if action != ButtonAction.NONE}
+        words = {binding.words: MEANINGS[binding.action] for binding in self.bound()}
         return words | {"lower and upper together": "the headset's alignment: stops both arms until they are let go"}
 
-    def control_of(self, action: str) -> str | None:
-        """The control that an action is bound to."""
-        return next((control for control in (*BUTTONS, *HELD) if getattr(self, control) == action), None)
+    def action_of(self, control: str, gesture: Gesture) -> Action:
+        """What a gesture of a control does; the beginning of one nothing by itself."""
+        return Action.NONE if gesture is Gesture.DOWN else getattr(self, control + _SUFFIXES[gesture])
+
+    def words_of(self, action: str) -> str | None:
+        """The gesture that an action is bound to, as an operator calls it."""
+        return next((binding.words for binding in self.bound() if binding.action == action), None)

@@ -86,8 +86,17 @@ class TeleopSettings(BaseModel):
     chord_window: float = Field(
         0.08, ge=0, le=0.5, description="a button waits this long for the other, which makes it a chord [s]"
     )
+    hold_time: float = Field(
+        0.6, ge=0.2, le=3, description="after which a control counts as held, where that is bound [s]"
+    )
+    double_tap_window: float = Field(
+        0.3, ge=0.1, le=1, description="a tap waits this long for another, where two are bound [s]"
+    )
     linked: bool = Field(True, description="a fault of one hand disengages both arms")
     precision_scale: float = Field(0.25, gt=0, le=1, description="of all motion while precision is held")
+    gripper_speed: float = Field(
+        4.0, gt=0, le=50, description="of a gripper that is gripper_analog, in full openings a second [1/s]"
+    )
     bindings: BindingSettings = Field(default_factory=BindingSettings)
     filter: FilterSettings = Field(default_factory=FilterSettings)
     leash: LeashSettings = Field(default_factory=LeashSettings)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
 
 import numpy as np
 import pinocchio as pin
@@ -25,17 +26,19 @@ class OperatorFeedback:
     def __init__(
         self,
         controller: CartesianController,
-        hands: Mapping[str, str],
+        hand_of: Callable[[str], str],
         settings: HapticSettings,
         send: Callable[[HapticFeedback], None],
     ) -> None:
-        """``hands``: the one that drives each arm; ``send``: takes what a hand shall feel, and never waits."""
+        """``hand_of``: tells which hand drives an arm, which may change; ``send``: takes what a hand shall feel,
+        and never waits.
+        """
         robot = controller.robot
-        self._controller, self._robot, self._send = controller, robot, send
+        self._controller, self._robot, self._send, self._hand_of = controller, robot, send, hand_of
         self._data = robot.model.createData()
-        self._pulses = {arm: HapticPulses(hand, settings) for arm, hand in hands.items()}
-        self._joints = {arm: {robot.joint_names[j] for j in robot.arms[arm].joints} for arm in hands}
-        self._grips = {arm: Grip(robot.arms[arm].stroke) for arm in hands}
+        self._pulses = {arm: HapticPulses(hand_of(arm), settings) for arm in robot.arms}
+        self._joints = {arm: {robot.joint_names[j] for j in robot.arms[arm].joints} for arm in robot.arms}
+        self._grips = {arm: Grip(robot.arms[arm].stroke) for arm in robot.arms}
         self._limited: dict[str, float] = {}  # when a joint last was at its position limit [s]
         self._due = -np.inf
 
@@ -60,9 +63,9 @@ class OperatorFeedback:
             self._limited = {name: t for name, t in self._limited.items() if now - t <= _LIMIT_LASTS}
             self._look(now, targets, grippers, openings)
             self._feel_contact(state)
-        for pulses in self._pulses.values():
+        for arm, pulses in self._pulses.items():
             if (feedback := pulses.at(now)) is not None:
-                self._send(feedback)
+                self._send(replace(feedback, hand=self._hand_of(arm)))
 
     def _look(
         self,

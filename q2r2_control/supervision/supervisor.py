@@ -72,6 +72,7 @@ class Supervisor:
         self._last: Reference | None = None
         self.phase = Phase.INACTIVE
         self.paused = False
+        self.homing_outcome: str | None = None  # how the last way home ended, where it did by itself
         self.events: list[str] = []  # what happened, for the log; its writer clears them
 
     @property
@@ -251,7 +252,7 @@ class Supervisor:
             return "the arms are braking"
         self._stopped, self.paused = None, False
         self._targets.reset()
-        self._end_homing()
+        self.end_homing()
         if self.phase is Phase.STOPPED:
             self.phase = Phase.INACTIVE
         return None
@@ -261,11 +262,19 @@ class Supervisor:
         if self.phase is not Phase.ACTIVE or self.paused:
             return "the controller is paused" if self.paused else f"the controller is {self.phase}"
         self._forget_targets()
+        self.homing_outcome = None
         if self._external is not None:
             self._homing = Homing(self._tools(), self._home)  # the joints are another controller's
         else:
             kept = kept_distances(self._robot, self._controller.settings).values
             self._homing = JointHoming(self._robot, kept)
+        return None
+
+    def hold(self) -> str | None:
+        """End the way home: the arms hold where they come to rest. Returns why that is not possible: never, so None."""
+        if self.homing:
+            self.end_homing()
+            self.homing_outcome = "the way home was interrupted"
         return None
 
     def activate(self, state: RobotState, now: float) -> None:
@@ -294,10 +303,10 @@ class Supervisor:
             self.phase = Phase.BRAKING
 
     def _forget_targets(self) -> None:
-        self._end_homing()
+        self.end_homing()
         self._targets.drop()
 
-    def _end_homing(self) -> None:
+    def end_homing(self) -> None:
         """The arms hold where they come to rest."""
         if isinstance(self._homing, JointHoming):
             self._controller.hold_at(None)
@@ -321,7 +330,8 @@ class Supervisor:
         if outcome == "held up" and isinstance(homing, JointHoming):
             outcome = f"held up by {' | '.join(self._last.report.tightest_pair)}"
         if outcome:
-            self._end_homing()
+            self.end_homing()
+            self.homing_outcome = outcome
             self.events.append(f"homing ended: {outcome}")
 
     def _tools(self) -> dict[str, pin.SE3]:

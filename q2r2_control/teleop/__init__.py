@@ -1,11 +1,12 @@
 """From hand samples to tool targets: what one operator's hands ask the arms to do.
 
-``teleop`` drives all arms and ``arm`` is the state machine of one; ``relative`` maps hand motion to tool motion, and
-``leash`` keeps a target near its tool. ``gate``, ``buttons`` and ``filters`` turn samples into poses and presses;
-``haptics`` tells the operator.
+``teleop`` drives all arms and ``arm`` one, by the table of ``arm_states``; ``relative`` maps hand motion to tool
+motion, and ``leash`` keeps a target near its tool. ``gate``, ``gestures`` and ``filters`` turn samples into poses and
+presses; ``haptics`` tells the operator.
 """
 
-from q2r2_control.teleop.arm import ArmState, ArmTeleop
+from q2r2_control.teleop.arm import ArmTeleop
+from q2r2_control.teleop.arm_states import ArmState
 from q2r2_control.teleop.haptics import HapticPulses
 from q2r2_control.teleop.relative import RelativeMotion
 from q2r2_control.teleop.teleop import Teleop

@@ -1,18 +1,19 @@
-"""The state machine of one arm: its hand, its buttons, and the faults of both."""
+"""Teleoperation of one arm: its hand, its controls, and the faults of both."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from enum import StrEnum
+from collections.abc import Callable, Iterable
 
 import numpy as np
 import pinocchio as pin
 
-from q2r2_control.config.bindings import ButtonAction, HeldAction
+from q2r2_control.config.bindings import BUTTONS, Action, Gesture
 from q2r2_control.config.teleop import TeleopSettings
-from q2r2_control.teleop.buttons import ButtonArbiter, Press
+from q2r2_control.teleop.analog_gripper import AnalogGripper
+from q2r2_control.teleop.arm_states import ArmState, Cause, next_state
 from q2r2_control.teleop.filters import PoseFilter
 from q2r2_control.teleop.gate import PoseGate
+from q2r2_control.teleop.gestures import GestureRecognizer, Press
 from q2r2_control.teleop.held_controls import HeldControls
 from q2r2_control.teleop.leash import Leash
 from q2r2_control.teleop.relative import RelativeMotion
@@ -20,22 +21,6 @@ from q2r2_control.teleop.rest import RestingPose
 from q2r2_control.types import Event, HandSample
 
 OPEN, CLOSED = 1.0, 0.0
-LET_GO = "dead man let go"
-BY_OPERATOR = frozenset({"lower button", "upper button", LET_GO})  # reasons of a pause that are no fault
-
-
-class ArmState(StrEnum):
-    """Only an engaged arm follows its hand; in every other state it holds."""
-
-    PAUSED = "paused"
-    ENGAGED = "engaged"
-    PAUSING = "pausing"  # stopped by a button, which may still turn out to be half a chord
-    ALIGNING = "aligning"  # stopped by the alignment chord; anchored when the buttons are released
-
-
-def is_fault(event: Event) -> bool:
-    """Whether an arm was paused, or stays so, for another reason than what its operator pressed."""
-    return event.destination == ArmState.PAUSED and event.reason not in BY_OPERATOR
 
 
 class ArmTeleop:
@@ -47,16 +32,17 @@ class ArmTeleop:
 
     def __init__(self, arm: str, settings: TeleopSettings) -> None:
         self.arm = arm
-        self.state = ArmState.PAUSED
+        self.state = ArmState.IDLE
         self.gripper = OPEN
         self.events: list[Event] = []
         self._bindings, self._precision = settings.bindings, settings.precision_scale
         self._held = HeldControls(settings.bindings)
-        self._has_dead_man = settings.bindings.control_of(HeldAction.DEAD_MAN) is not None
+        self._has_dead_man = settings.bindings.words_of(Action.DEAD_MAN) is not None
+        self._analog = AnalogGripper(settings.bindings, settings.gripper_speed)
         self._shares = 1.0, 1.0  # of the scales of positions and rotations
         self._timeout = settings.gate.timeout
         self._gate = PoseGate(settings.gate)
-        self._buttons = ButtonArbiter(settings.chord_window)
+        self._gestures = GestureRecognizer(settings)
         self._filter = PoseFilter(settings.filter)
         self._rest = RestingPose(settings.filter.average_at_rest)
         self._motion, self._unslipped = (
@@ -79,20 +65,21 @@ class ArmTeleop:
     @property
     def chord(self) -> bool:
         """Whether this hand's alignment chord is held."""
-        return self._buttons.chord
+        return self._gestures.chord
 
     @property
-    def held(self) -> frozenset[HeldAction]:
+    def held(self) -> frozenset[Action]:
         """What the hand's triggers and stick are held for."""
         return self._held.actions
 
     def receive(self, sample: HandSample, now: float) -> str | None:
         """Process one sample of this arm's hand; returns the fault that forbids to follow it any longer, or None."""
-        self._presses += self._buttons.receive(sample.inputs, sample.inputs_stamp, now)
+        self._presses += self._gestures.receive(sample.inputs, sample.inputs_stamp, now)
         held = self.held
         self._held.receive(sample.inputs, sample.inputs_stamp, now)
-        if HeldAction.DEAD_MAN in held ^ self.held:
-            self._gripped = HeldAction.DEAD_MAN in self.held
+        self._analog.receive(sample.inputs, sample.inputs_stamp, now, self.gripper)
+        if Action.DEAD_MAN in held ^ self.held:
+            self._gripped = Action.DEAD_MAN in self.held
         usable, fault = self._gate.receive(sample, now)
         if usable and fault is None and self._gate.pose is not None:
             self._rest.add(self._gate.pose)
@@ -106,46 +93,76 @@ class ArmTeleop:
         """The fault of a stream that has stopped, or None."""
         if self._gate.stale(now):
             return f"no pose for {self._timeout:g} s"
-        if self._buttons.stale(now, self._timeout):
+        if self._gestures.stale(now, self._timeout):
             return f"no button data for {self._timeout:g} s"
         return None
 
-    def disengage(self, now: float, reason: str) -> None:
-        """Hold until a new press; one that began before does not count."""
-        self._buttons.cancel()
+    def change(self, cause: Cause, now: float, reason: str) -> bool:
+        """Follow a cause from outside of this arm; whether it changed the state.
+
+        Presses that began before do not count. ``cause``: any but those that engage, which need the tool.
+        """
+        self._gestures.cancel()
         self._presses.clear()
         self._gripped = None
-        self._go(ArmState.PAUSED, now, reason)
+        before = self.state
+        self._go(cause, now, reason)
+        if self.state is ArmState.STOPPED:
+            self._analog.forget()
+        return self.state is not before
+
+    def tell(self, now: float, reason: str) -> None:
+        """What the operator should know while the state stays; what was not done begins with "not"."""
+        self.events.append(Event(now, self.arm, self.state, self.state, reason))
+
+    def take_presses(self, now: float) -> list[Press]:
+        """Gestures since the last call; those that nobody gives to :meth:`act` are lost."""
+        presses = self._presses + self._gestures.due(now)
+        self._presses = []
+        return presses
+
+    @property
+    def grips(self) -> bool:
+        """Whether the dead man was just taken hold of."""
+        return bool(self._gripped)
 
     def forget(self) -> None:
         """Drop everything received: poses are forgotten, buttons count as held until they are seen released."""
         self._gate.reset()
         self._rest.forget()
-        self._buttons.forget()
+        self._gestures.forget()
         self._held.forget()
+        self._analog.forget()
         self._presses.clear()
         self._gripped = None
 
-    def act(self, tool: Callable[[], pin.SE3 | None], now: float, chord: bool, obstacle: str | None = None) -> None:
-        """Change the state by buttons and chords.
+    def act(
+        self,
+        presses: Iterable[Press],
+        tool: Callable[[], pin.SE3 | None],
+        now: float,
+        chord: bool,
+        obstacle: str | None = None,
+    ) -> None:
+        """Change the state by this hand's gestures, and by chords.
 
         ``tool``: gives the pose to anchor to, None if not known, and is only asked where the arm is engaged;
         ``chord``: whether an alignment chord stops this arm; ``obstacle``: why the arm may not be engaged now, or None.
         """
         self._obstacle = obstacle
-        if self._gripped is False and self.state in (ArmState.ENGAGED, ArmState.ALIGNING):
-            self._go(ArmState.PAUSED, now, LET_GO)
+        if self._gripped is False:
+            self._go(Cause.LET_GO, now, "dead man let go")
         if chord:
             self._align(now)
         elif self.state is ArmState.ALIGNING and self._gate.pose is not None and self._gate.stamp >= self._aligned_at:
-            self._engage(tool(), now, "aligned anew")
-        elif self._gripped and self.state is ArmState.PAUSED:
-            self._engage(tool(), now, "dead man held")
+            self._engage(Cause.ALIGNED, tool(), now, "aligned anew")
+        elif self._gripped:
+            self._engage(Cause.ENGAGE, tool(), now, "dead man held")
         self._gripped = None
-        if presses := self._presses + self._buttons.due(now):
-            for press in presses:
-                self._press(press, tool, now)
-            self._presses.clear()
+        for press in presses:
+            self._press(press, tool, now)
+        if self.state is not ArmState.STOPPED:
+            self.gripper = self._analog.opening(self.gripper, now)
 
     def target(self, now: float, commanded: pin.SE3 | None = None) -> pin.SE3 | None:
         """Where the tool should be at ``now`` in the world frame; None: hold.
@@ -173,26 +190,30 @@ class ArmTeleop:
 
     def _align(self, now: float) -> None:
         self._aligned_at = now
-        if self.state is ArmState.ENGAGED or (self.state is ArmState.PAUSING and self.chord):
-            self._go(ArmState.ALIGNING, now, "alignment chord")
+        if self.state is not ArmState.PAUSING or self.chord:  # the other hand's chord does not say what this press is
+            self._go(Cause.CHORD, now, "alignment chord")
 
     def _press(self, press: Press, tool: Callable[[], pin.SE3 | None], now: float) -> None:
-        is_upper = press in (Press.UPPER, Press.UPPER_DOWN)
-        action = self._bindings.upper if is_upper else self._bindings.lower
-        button = "upper button" if is_upper else "lower button"
-        if press in (Press.UPPER_DOWN, Press.LOWER_DOWN):
-            if action is ButtonAction.PAUSE_TOGGLE and self.state is ArmState.ENGAGED:
-                self._go(ArmState.PAUSING, now, button)
-        elif action is ButtonAction.GRIPPER_TOGGLE:
+        control, gesture = press
+        action = self._bindings.action_of(control, gesture)
+        pauses = self._bindings.action_of(control, Gesture.TAP) is Action.PAUSE_TOGGLE
+        reason = f"{control} button" if control in BUTTONS else control
+        if gesture is Gesture.DOWN:
+            if pauses:
+                self._go(Cause.PAUSE_BEGINS, now, reason)
+        elif pauses and self.state is ArmState.PAUSING:
+            self._go(Cause.PAUSE, now, reason)
+        elif action is Action.GRIPPER_TOGGLE:
             self.gripper = CLOSED if self.gripper == OPEN else OPEN
-        elif action is ButtonAction.PAUSE_TOGGLE and self.state is ArmState.PAUSING:
-            self._go(ArmState.PAUSED, now, button)
-        elif action is ButtonAction.PAUSE_TOGGLE and self.state is ArmState.PAUSED:
-            self._engage(tool(), now, button)
+        elif action is Action.PAUSE_TOGGLE:
+            self._engage(Cause.ENGAGE, tool(), now, reason)
 
-    def _engage(self, tool: pin.SE3 | None, now: float, reason: str) -> None:
+    def _engage(self, cause: Cause, tool: pin.SE3 | None, now: float, reason: str) -> None:
+        """Engage where ``cause`` would, if nothing is in the way; else say what is."""
+        if next_state(self.state, cause) is self.state:
+            return
         obstacle = self._obstacle or self.watchdog(now)
-        if self._has_dead_man and HeldAction.DEAD_MAN not in self.held:
+        if self._has_dead_man and Action.DEAD_MAN not in self.held:
             obstacle = obstacle or "the dead man is not held"
         if self._gate.pose is None:
             obstacle = obstacle or "the newest pose is not usable"
@@ -201,10 +222,11 @@ class ArmTeleop:
         else:
             self._anchor(self._gate.pose, tool, now)
         if obstacle is None:
-            self._go(ArmState.ENGAGED, now, reason)
+            self._go(cause, now, reason)
+        elif self.state is ArmState.ALIGNING:
+            self._go(Cause.NOT_ALIGNED, now, f"not engaged: {obstacle}")
         else:
-            self.events.append(Event(now, self.arm, self.state, ArmState.PAUSED, f"not engaged: {obstacle}"))
-            self.state = ArmState.PAUSED
+            self.tell(now, f"not engaged: {obstacle}")
 
     def _anchor(self, hand: pin.SE3, tool: pin.SE3, now: float) -> None:
         hand = self._rest.begin(hand, now)
@@ -214,10 +236,10 @@ class ArmTeleop:
 
     def _held_shares(self) -> tuple[float, float]:
         """Of the scales, by what is held."""
-        share = self._precision if HeldAction.PRECISION in self.held else 1.0
+        share = self._precision if Action.PRECISION in self.held else 1.0
         return (
-            0.0 if HeldAction.TRANSLATION_LOCK in self.held else share,
-            0.0 if HeldAction.ROTATION_LOCK in self.held else share,
+            0.0 if Action.TRANSLATION_LOCK in self.held else share,
+            0.0 if Action.ROTATION_LOCK in self.held else share,
         )
 
     def _rescale(self, hand: pin.SE3, tool: pin.SE3) -> None:
@@ -226,7 +248,8 @@ class ArmTeleop:
         self._motion.rescale(*self._shares, hand, tool)
         self._unslipped.rescale(*self._shares, hand, tool)
 
-    def _go(self, state: ArmState, now: float, reason: str) -> None:
+    def _go(self, cause: Cause, now: float, reason: str) -> None:
+        state = next_state(self.state, cause)
         if state is not self.state:
             self.events.append(Event(now, self.arm, self.state, state, reason))
             self.state = state

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from typing import NamedTuple
 
 from q2r2_control.config.teleop import HapticSettings
-from q2r2_control.teleop.arm import ArmState, is_fault
+from q2r2_control.teleop.arm_states import ArmState, is_fault
 from q2r2_control.types import Event, HapticFeedback
 
 
@@ -35,6 +35,8 @@ LIMIT = Pulse(0.8, 0.25, 0.05)
 NEAR = Pulse(0.6, 0.1, 0.04)
 CONTACT = Pulse(0.1, 0.2, 0.06)
 GRASP = Pulse(0.7, 0.5, 0.12)
+HOMING = Pulse(0.4, 0.55, 0.2)
+STOPPED = Pulse(0.9, 0.9, 0.25)
 _NEAREST, _HARDEST = 0.6, 0.8  # amplitudes that NEAR and CONTACT grow to
 # The weakest first: where two are due at once, the stronger one is felt. The docs' table is this one.
 VOCABULARY = (
@@ -42,10 +44,12 @@ VOCABULARY = (
     Word("the target has slipped along by another 20 mm or 0.1 rad", SLIP),
     Word("the tool's contact force has grown by another 5 N", CONTACT, _HARDEST),
     Word("a joint has come to its position limit", LIMIT),
-    Word("paused, by the button or the alignment chord", PAUSED),
+    Word("paused, by its control or the alignment chord; home, or interrupted on the way", PAUSED),
     Word("engaged", ENGAGED),
     Word("the gripper has closed on something", GRASP),
-    Word("paused by a fault (lost data, a jump, a stop), or a press that was refused", FAULT),
+    Word("on the way home", HOMING),
+    Word("stopped, by the control that stops", STOPPED),
+    Word("lost: stopped by a fault (lost data, a jump, a stop), or a press that was refused", FAULT),
 )
 
 _SLIP_STEP = 0.02  # the target slips by this between two pulses [m]
@@ -78,7 +82,11 @@ class HapticPulses:
             self._want(ENGAGED)
         elif is_fault(event):
             self._want(FAULT)
-        elif event.source == ArmState.ENGAGED:
+        elif event.destination == ArmState.HOMING:
+            self._want(HOMING)
+        elif event.destination == ArmState.STOPPED:
+            self._want(STOPPED)
+        elif event.source in (ArmState.ENGAGED, ArmState.HOMING):
             self._want(PAUSED)
 
     def slip(self, slip: float, slip_angle: float) -> None:

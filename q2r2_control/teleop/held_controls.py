@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from q2r2_control.config.bindings import HELD, BindingSettings, HeldAction
+from q2r2_control.config.bindings import LASTING, Action, BindingSettings
 from q2r2_control.types import HandInputs
 
 # A control is held from the first of these on and let go below the second, so that noise in between changes nothing.
@@ -27,6 +27,16 @@ def travel(control: str, inputs: HandInputs) -> float:
     return -inputs.thumb_stick_horizontal
 
 
+def is_held(control: str, inputs: HandInputs, was_held: bool) -> bool:
+    """Whether a button is down, or a trigger or stick far enough from rest; what is not a number is let go."""
+    match control:
+        case "lower":
+            return bool(inputs.button_lower)
+        case "upper":
+            return bool(inputs.button_upper)
+    return travel(control, inputs) >= (_LET_GO if was_held else _HELD)
+
+
 class HeldControls:
     """The actions of one hand that are held.
 
@@ -36,11 +46,11 @@ class HeldControls:
 
     def __init__(self, bindings: BindingSettings) -> None:
         self._controls = [
-            (control, HeldAction(getattr(bindings, control)))
-            for control in HELD
-            if getattr(bindings, control) is not HeldAction.NONE
+            (binding.control, binding.action)
+            for binding in bindings.bound()
+            if binding.action in LASTING and binding.action is not Action.GRIPPER_ANALOG
         ]
-        self.actions: frozenset[HeldAction] = frozenset()
+        self.actions: frozenset[Action] = frozenset()
         self.forget()
 
     def forget(self) -> None:
@@ -57,8 +67,7 @@ class HeldControls:
         self._stamp = stamp
         held = set()
         for control, action in self._controls:
-            value = travel(control, inputs)
-            if not value >= (_LET_GO if action in self.actions else _HELD):
+            if not is_held(control, inputs, action in self.actions):
                 self._seen_let_go.add(control)
             elif control in self._seen_let_go:
                 held.add(action)

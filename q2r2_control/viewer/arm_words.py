@@ -6,9 +6,9 @@ from collections.abc import Collection
 
 import numpy as np
 
-from q2r2_control.config.bindings import BindingSettings, ButtonAction, HeldAction
+from q2r2_control.config.bindings import Action, BindingSettings
 from q2r2_control.runtime.recorder import Tick
-from q2r2_control.teleop.arm import ArmState
+from q2r2_control.teleop.arm_states import ArmState
 from q2r2_control.types import Event
 from q2r2_control.viewer.history import tracking_error
 
@@ -24,12 +24,12 @@ def why(tick: Tick, arm: str, joints: Collection[str], binding: Collection[str],
     """
     if not tick.following:
         return "the run ends"
-    if tick.states[arm] == ArmState.ALIGNING:
-        return "aligning"
+    if tick.states[arm] in (ArmState.ALIGNING, ArmState.HOMING):
+        return tick.states[arm]
     if not tick.engaged[arm]:
         if last is None:
             return "not engaged yet"
-        return last.reason if last.reason.startswith("not engaged") else f"{tick.states[arm]}: {last.reason}"
+        return last.reason if last.reason.startswith("not ") else f"{tick.states[arm]}: {last.reason}"
     distance, angle = tracking_error(tick, arm)
     if not (distance > _FOLLOWS or angle > _TURNED):
         return "follows the hand"
@@ -43,13 +43,17 @@ def next_press(tick: Tick, arm: str, bindings: BindingSettings) -> str:
         return "nothing: no input is connected"
     if state == ArmState.ALIGNING:
         return "release both buttons to go on"
+    if state == ArmState.HOMING:
+        return "any press stops the way home"
+    if state == ArmState.STOPPED:
+        return f"{bindings.words_of(Action.STOP)} goes on"
     moves = state in (ArmState.ENGAGED, ArmState.PAUSING)
     words = {
-        ButtonAction.PAUSE_TOGGLE: "pauses" if moves else "engages",
-        ButtonAction.GRIPPER_TOGGLE: "opens the gripper" if tick.targets[arm].gripper < 0.5 else "closes the gripper",
-        HeldAction.DEAD_MAN: "let go pauses" if moves else "held engages",
+        Action.PAUSE_TOGGLE: "pauses" if moves else "engages",
+        Action.GRIPPER_TOGGLE: "opens the gripper" if tick.targets[arm].gripper < 0.5 else "closes the gripper",
+        Action.DEAD_MAN: "let go pauses" if moves else "held engages",
     }
-    bound = ((bindings.control_of(action), what) for action, what in words.items())
+    bound = ((bindings.words_of(action), what) for action, what in words.items())
     return ", ".join(f"{control} {what}" for control, what in bound if control is not None)
 
 

@@ -35,7 +35,7 @@ def test_an_arm_that_was_paused_by_something_else_than_its_button_is_named_with_
     summary: RunSummary,
 ) -> None:
     reason = "the control loop stood still for 0.40 s"
-    paused = Event(4.07, "left", "engaged", "paused", reason)
+    paused = Event(4.07, "left", "engaged", "lost", reason)
     pressed = Event(4.5, "right", "pausing", "paused", "lower button")
     text = text_of(replace(summary, events=[*summary.events, paused, pressed]))
     (row,) = (line for line in text.splitlines() if "left arm paused by" in line)

@@ -92,7 +92,7 @@ def test_lost_connections_and_numbers_that_are_none_are_replayed(tmp_path: Path)
     result = replay(file_of(record(tmp_path, pipeline(source=FaultyHands("circle")), 1.2)))
     assert result.difference is None
     assert result.summary is not None
-    reasons = [event.reason for event in result.summary.events if event.destination == "paused"]
+    reasons = [event.reason for event in result.summary.events if event.destination == "lost"]
     assert any("not finite" in reason for reason in reasons)
 
 

@@ -39,6 +39,9 @@ def patient(parameters: dict[str, Any]) -> list[str]:
     ]
 
 
+HOLDING = ("paused", "lost")  # states of an arm that was engaged
+
+
 class ArmRig:
     """The hand ``hand`` and the robot of the arm ``arm``, on a node that a thread spins.
 
@@ -57,7 +60,8 @@ class ArmRig:
         hand = hand or arm
         self.arm, self.node = arm, node
         self.hand, self.tool = HAND, TOOL
-        self.lower = self.upper = self.grip = False
+        self.lower = self.upper = False
+        self.grip = 0.0
         self.sends_hand = self.sends_tool = self.follows = True
         self.targets: list[PoseStamped] = []
         self.state: dict[str, Any] = {}
@@ -145,9 +149,7 @@ class ArmRig:
         pose, inputs, tf = self._made
         if self.sends_hand:
             pose.publish(stamped_pose(self.hand, "", now))
-            inputs.publish(
-                OVR2ROSInputs(button_upper=self.upper, button_lower=self.lower, press_middle=float(self.grip))
-            )
+            inputs.publish(OVR2ROSInputs(button_upper=self.upper, button_lower=self.lower, press_middle=self.grip))
         if self.sends_tool:
             tf.publish(TFMessage(transforms=[stamped_transform("world", self._frame, self.tool)]))
 
@@ -179,10 +181,10 @@ class ArmRigs:
 
     def pause(self) -> None:
         """Press until all are paused."""
-        self._press_until(lambda rig: rig.state.get("state") == "paused", "the arm is paused")
+        self._press_until(lambda rig: rig.state.get("state") in HOLDING, "the arm is paused")
 
     def wait_for_pause(self) -> None:
-        self.wait(lambda rig: rig.state.get("state") == "paused", "the arm is paused")
+        self.wait(lambda rig: rig.state.get("state") in HOLDING, "the arm is paused")
 
     def move(self, by: tuple[float, float, float], duration: float, turn: float = 0.0) -> None:
         """See :meth:`ArmRig.move`."""

@@ -61,13 +61,13 @@ def test_triggers_and_stick_are_bound_by_parameters_and_a_dead_man_is_no_fault_w
     rig.start(processes, {f"teleop.bindings.{control}": action for control, action in bindings.items()})
     rig.wait(lambda: rig.state.get("level") == "ok", "nothing keeps the arm from being engaged")
     rig.press()
-    assert rig.state["state"] == "paused"
-    rig.grip = True
+    assert rig.state["state"] == "idle"
+    rig.grip = 1.0
     rig.wait(lambda: rig.state["engaged"], "the arm is engaged")
     rig.move((0.0, 0.05, 0.0))
     assert_same(rig.wait_for_rest(), offset(TOOL, (0.0, 0.05, 0.0)), 1e-3)
     rig.pulses.clear()
-    rig.grip = False
+    rig.grip = 0.0
     rig.wait(lambda: rig.state["state"] == "paused", "the arm is paused")
     assert rig.state["last_event"] == "paused: dead man let go"
     rig.wait(lambda: len(rig.pulses) == 2, "it is felt")
@@ -130,7 +130,7 @@ def test_a_tool_on_a_topic_is_engaged_where_it_is_and_paused_when_the_topic_ends
     rig.move((0.05, 0.0, 0.0))
     assert_same(rig.wait_for_rest(), offset(TOOL, (0.05, 0.0, 0.0)), 1e-3)
     node.destroy_timer(timer)
-    rig.wait(lambda: rig.state["state"] == "paused", "an arm without tool poses is paused")
+    rig.wait(lambda: rig.state["state"] == "lost", "an arm without tool poses is paused")
     rig.wait(lambda: "/left/current_pose from /test is silent" in rig.state["message"], "the reason is reported")
 
 

@@ -72,8 +72,8 @@ def test_a_silent_hand_pauses_the_arm_and_its_return_moves_nothing(rig: ArmRig, 
     rig.engage()
     rig.move((0.1, 0.0, 0.0), 0.2)
     rig.sends_hand = False
-    rig.wait(lambda: rig.state["state"] == "paused", "the watchdog pauses the arm")
-    assert re.match(r"paused: no (data|pose) of the left hand from /test for 0\.5", rig.state["last_event"])
+    rig.wait(lambda: rig.state["state"] == "lost", "the watchdog pauses the arm")
+    assert re.match(r"lost: no (data|pose) of the left hand from /test for 0\.5", rig.state["last_event"])
     rig.wait(
         lambda: "of the left hand from /test for" in rig.state["message"],
         "diagnostics name the node",
@@ -83,7 +83,7 @@ def test_a_silent_hand_pauses_the_arm_and_its_return_moves_nothing(rig: ArmRig, 
     rig.hand = offset(rig.hand, (0.3, 0.3, 0.0))
     rig.sends_hand = True
     time.sleep(0.5)
-    assert rig.state["state"] == "paused"
+    assert rig.state["state"] == "lost"
     assert_same(rig.newest(), held, 1e-12)
     rig.engage()
     rig.wait_for_rest()
@@ -104,7 +104,7 @@ def test_a_node_that_stood_still_in_the_middle_of_a_tick_sends_no_target_of_the_
     time.sleep(0.5 * STALL)
     before, held = len(rig.targets), rig.newest()
     assert held.translation[0] > TOOL.translation[0] + 0.05  # it was moving
-    rig.wait(lambda: rig.state["last_event"].startswith("paused: this node stood still for 1."), "it has gone on")
+    rig.wait(lambda: rig.state["last_event"].startswith("lost: this node stood still for 1."), "it has gone on")
     mover.join()
     assert len(rig.targets) == before
     rig.engage()
@@ -125,7 +125,7 @@ def test_without_its_tools_pose_an_arm_is_not_engaged_nor_a_gripper_closed_witho
     rig.engage()
     rig.wait(lambda: rig.targets, "targets come")
     rig.sends_tool = False
-    rig.wait(lambda: rig.state["state"] == "paused", "an arm whose tool is not seen any more is paused")
+    rig.wait(lambda: rig.state["state"] == "lost", "an arm whose tool is not seen any more is paused")
     assert "left_tool_frame on /tf from /test is 1.0" in rig.state["last_event"]
 
     rig.sends_tool = True
@@ -150,16 +150,16 @@ def test_services_and_a_second_publisher_of_targets_pause_the_arm(rig: ArmRig, n
     for service in ("pause", "reset"):
         rig.engage()
         assert call(node, f"/left_q2r2_arm_controller/{service}").success
-        rig.wait(lambda: rig.state["state"] == "paused", "the service pauses the arm")
+        rig.wait(lambda: rig.state["state"] == "lost", "the service pauses the arm")
 
     rig.engage()
     second = node.create_publisher(PoseStamped, "/q2r2/left/target_frame", 1)
     rig.wait(lambda: rig.state["level"] == "error", "the second publisher is reported")
     assert "2 publishers of /q2r2/left/target_frame" in rig.state["message"]
-    assert rig.state["state"] == "paused"
+    assert rig.state["state"] == "lost"
     assert "/left_q2r2_arm_controller: 2 publishers" in errors.get(timeout=PATIENCE)
     rig.press()
-    assert rig.state["state"] == "paused"
+    assert rig.state["state"] == "lost"
     node.destroy_publisher(second)
     rig.engage()
 
@@ -183,9 +183,9 @@ def test_arms_with_different_mirror_settings_refuse_to_engage_and_a_fault_of_one
     left.engage()
     assert right.state["engaged"]
     left.hand = offset(left.hand, (1.0, 0.0, 0.0))  # a jump, which is a fault of the left hand
-    left.wait(lambda: left.state["state"] == "paused", "the fault pauses its own arm")
-    right.wait(lambda: right.state["state"] == "paused", "and the other")
-    assert right.state["last_event"].startswith("paused: linked to left: the hand jumped")
+    left.wait(lambda: left.state["state"] == "lost", "the fault pauses its own arm")
+    right.wait(lambda: right.state["state"] == "lost", "and the other")
+    assert right.state["last_event"].startswith("lost: linked to left: the hand jumped")
 
 
 def start_mirrored(rig: ArmRig, processes: Processes) -> RosProcess:
@@ -234,6 +234,30 @@ def test_a_gripper_is_closed_when_its_result_says_so_even_stalled(
         answers.put({"stalled": False})
         rig.wait(lambda: "neither stalled nor at its goal" in rig.state["message"], "the failure is reported")
         assert rig.state["gripper"] == "closed"
+        server.destroy()
+
+
+def test_a_gripper_follows_a_trigger_with_a_few_goals_a_second(rig: ArmRig, processes: Processes, domain: int) -> None:
+    from control_msgs.action import GripperCommand
+    from rclpy.action import ActionServer
+
+    goals: Queue[float] = Queue()
+
+    def execute(goal: Any) -> Any:
+        goals.put(goal.request.command.position)
+        goal.succeed()
+        return GripperCommand.Result(reached_goal=True)
+
+    with spun_node(domain, "gripper") as other:
+        server = ActionServer(other, GripperCommand, "/q2r2/left_gripper/gripper_cmd", execute)
+        rig.start(processes, {"teleop.bindings.upper": "none", "teleop.bindings.grip": "gripper_analog"})
+        while goals.empty():  # a goal before the server is discovered is dropped
+            rig.grip = 0.5 - rig.grip
+            time.sleep(0.3)
+        for grip, position in ((0.725, 0.0375), (0.0, 0.0), (1.0, 0.05)):
+            rig.grip = grip
+            while (found := goals.get(timeout=PATIENCE)) != pytest.approx(position, abs=5e-4):
+                assert 0.0 <= found <= 0.05
         server.destroy()
 
 

@@ -122,7 +122,7 @@ def test_arms_follow_across_hosts_stop_when_the_cable_is_pulled_and_wait_for_a_p
 ) -> None:
     hosts = Hosts(network, processes, robot)
     wait_until(lambda: hosts.joints.states, "joint states come")
-    hosts.wait_until_arms(state="paused")
+    hosts.wait_until_arms(state="idle")
     script = hosts.play()
     time.sleep(0.5)
 
@@ -140,10 +140,10 @@ def test_arms_follow_across_hosts_stop_when_the_cable_is_pulled_and_wait_for_a_p
     if stop.slow > allowed:
         skip_if_overloaded(line)
     assert stop.slow <= allowed
-    hosts.wait_until_arms(state="paused", level="warn")
+    hosts.wait_until_arms(state="lost", level="warn")
 
     network.plug_cable()
-    hosts.wait_until_arms(state="paused", level="ok")
+    hosts.wait_until_arms(state="lost", level="ok")
     time.sleep(1.0)
     assert hosts.joints.farthest_from(stop.posture, stop.t) < STILL, "the script went on and no arm followed it"
     script.end()

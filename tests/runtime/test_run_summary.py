@@ -110,8 +110,8 @@ def test_a_run_s_json_has_every_key_that_others_read() -> None:
             assert isinstance(data[key], expected), key
     assert all(set(figures) == ARM_KEYS for figures in data["arms"].values())
     assert [(event["arm"], event["from"], event["to"], event["reason"]) for event in data["events"]] == [
-        ("left", "paused", "engaged", "lower button"),
-        ("right", "paused", "engaged", "lower button"),
+        ("left", "idle", "engaged", "lower button"),
+        ("right", "idle", "engaged", "lower button"),
     ]
     assert data["events"][0]["t"] == pytest.approx(0.68, abs=0.05)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -110,7 +111,9 @@ def spoilt(received: HandSample, **changes: object) -> HandSample:
 
 
 History = list[dict[str, ArmTarget]]
-PAUSED = {"left": "paused", "right": "paused"}
+IDLE, LOST, PAUSED, HOMING, STOPPED = (
+    dict.fromkeys(SIDES, state) for state in ("idle", "lost", "paused", "homing", "stopped")
+)
 ENGAGED = {"left": "engaged", "right": "engaged"}
 
 
@@ -157,3 +160,35 @@ def assert_holds(driver: Operator, duration: float = 0.4) -> None:
     for targets in driver.run(duration, waving(driver)):
         assert targets["left"].pose is None
         assert targets["right"].pose is None
+
+
+PUSHED: dict[str, dict[str, Any]] = {
+    "trigger": {"press_index": 1.0},
+    "grip": {"press_middle": 1.0},
+    "stick_up": {"thumb_stick_vertical": 1.0},
+    "stick_down": {"thumb_stick_vertical": -1.0},
+    "stick_left": {"thumb_stick_horizontal": -1.0},
+    "stick_right": {"thumb_stick_horizontal": 1.0},
+}
+
+
+class Squeezing(Operator):
+    """Holds controls of both hands, by the names of the bindings."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.held: dict[str, float] = {}
+        self.only: str | None = None  # the hand that holds them; None: both
+        self.alter = self._squeeze
+
+    def _squeeze(self, received: HandSample) -> HandSample:
+        if received.hand != (self.only or received.hand):
+            return received
+        values: dict[str, Any] = {
+            field: value * share for control, share in self.held.items() for field, value in PUSHED[control].items()
+        }
+        return replace(received, inputs=replace(received.inputs, **values))
+
+
+def squeezing(**changes: object) -> Squeezing:
+    return Squeezing(operator(**changes).settings)

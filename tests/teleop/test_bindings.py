@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
@@ -13,43 +12,24 @@ import pytest
 from pydantic import ValidationError
 
 from q2r2_control.config import load_config
-from q2r2_control.config.bindings import HELD, BindingSettings, HeldAction
+from q2r2_control.config.bindings import HELD, Action, BindingSettings
 from q2r2_control.errors import ConfigError
-from q2r2_control.teleop.arm import LET_GO, is_fault
+from q2r2_control.teleop.arm_states import is_fault
 from q2r2_control.teleop.held_controls import HeldControls, travel
-from q2r2_control.types import SIDES, HandInputs, HandSample
-from tests.teleop.hands import ENGAGED, PAUSED, Operator, assert_smooth, operator, spoilt, waving
-
-PUSHED: dict[str, dict[str, Any]] = {
-    "trigger": {"press_index": 1.0},
-    "grip": {"press_middle": 1.0},
-    "stick_up": {"thumb_stick_vertical": 1.0},
-    "stick_down": {"thumb_stick_vertical": -1.0},
-    "stick_left": {"thumb_stick_horizontal": -1.0},
-    "stick_right": {"thumb_stick_horizontal": 1.0},
-}
-
-
-class Squeezing(Operator):
-    """Holds controls of both hands, by the names of the bindings."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self.held: dict[str, float] = {}
-        self.only: str | None = None  # the hand that holds them; None: both
-        self.alter = self._squeeze
-
-    def _squeeze(self, received: HandSample) -> HandSample:
-        if received.hand != (self.only or received.hand):
-            return received
-        values: dict[str, Any] = {
-            field: value * share for control, share in self.held.items() for field, value in PUSHED[control].items()
-        }
-        return replace(received, inputs=replace(received.inputs, **values))
-
-
-def squeezing(**changes: object) -> Squeezing:
-    return Squeezing(operator(**changes).settings)
+from q2r2_control.types import SIDES, HandInputs
+from tests.teleop.hands import (
+    ENGAGED,
+    IDLE,
+    LOST,
+    PAUSED,
+    PUSHED,
+    Operator,
+    Squeezing,
+    assert_smooth,
+    spoilt,
+    squeezing,
+    waving,
+)
 
 
 def engaged(**bindings: str) -> Squeezing:
@@ -146,7 +126,7 @@ class TestADeadMan:
     def driver(self) -> Squeezing:
         driver = squeezing(bindings=self.BINDINGS)
         driver.run(0.1)
-        assert driver.states == PAUSED
+        assert driver.states == IDLE
         return driver
 
     def test_engages_while_it_is_held_and_pauses_at_once_when_it_is_let_go(self) -> None:
@@ -159,7 +139,7 @@ class TestADeadMan:
         driver.tick(driver.samples())
         assert driver.states == PAUSED
         assert all(target.pose is None for target in driver.targets.values())
-        assert {event.reason for event in driver.events} == {"dead man held", LET_GO}
+        assert {event.reason for event in driver.events} == {"dead man held", "dead man let go"}
         assert not any(map(is_fault, driver.events))
 
     def test_of_one_hand_is_no_fault_of_the_other(self) -> None:
@@ -176,10 +156,10 @@ class TestADeadMan:
         driver.run(0.05)
         driver.silent = set(SIDES)
         driver.run(0.3)
-        assert driver.states == PAUSED
+        assert driver.states == LOST
         driver.silent = set()
         driver.run(0.5)
-        assert driver.states == PAUSED
+        assert driver.states == LOST
         driver.held = {}
         driver.run(0.1)
         driver.held = {"grip": 1.0}
@@ -191,7 +171,7 @@ class TestADeadMan:
         driver = squeezing(bindings=self.BINDINGS)
         driver.held = {"grip": 1.0}
         driver.run(0.2)
-        assert driver.states == PAUSED
+        assert driver.states == IDLE
         if lost:
             driver.held = {}
             driver.run(0.1)
@@ -200,7 +180,7 @@ class TestADeadMan:
             assert driver.states == ENGAGED
             driver.teleop.connection_lost(driver.now)
             driver.run(0.3)
-            assert driver.states == PAUSED
+            assert driver.states == LOST
 
     @pytest.mark.parametrize("let_go", [False, True])
     def test_is_aligned_anew_only_if_it_is_still_held(self, let_go: bool) -> None:
@@ -219,7 +199,7 @@ class TestADeadMan:
     def test_is_not_engaged_by_a_press_of_a_button(self) -> None:
         driver = self.driver()
         driver.press(*SIDES)
-        assert driver.states == PAUSED
+        assert driver.states == IDLE
 
     def test_is_let_go_by_a_reading_that_is_no_number(self) -> None:
         driver = self.driver()
@@ -231,7 +211,7 @@ class TestADeadMan:
 
 
 def test_a_control_that_trembles_about_its_threshold_is_held_and_let_go_once() -> None:
-    controls = HeldControls(BindingSettings(grip=HeldAction.PRECISION))
+    controls = HeldControls(BindingSettings(grip=Action.PRECISION))
     seen = []
     for step, value in enumerate((0.0, 0.55, 0.61, 0.45, 0.59, 0.41, 0.39, 0.55, 0.5, 0.59, 0.7)):
         controls.receive(HandInputs(press_middle=value), step, step)
@@ -240,7 +220,7 @@ def test_a_control_that_trembles_about_its_threshold_is_held_and_let_go_once() -
 
 
 def test_readings_that_come_late_or_from_the_future_hold_nothing() -> None:
-    controls = HeldControls(BindingSettings(grip=HeldAction.PRECISION))
+    controls = HeldControls(BindingSettings(grip=Action.PRECISION))
     controls.receive(HandInputs(), 1.0, 1.0)
     controls.receive(HandInputs(press_middle=1.0), 0.9, 1.1)
     controls.receive(HandInputs(press_middle=1.0), float("nan"), 1.1)
@@ -280,8 +260,16 @@ def test_the_buttons_can_change_places() -> None:
         ({"upper": "pause_toggle"}, "lower and upper are both pause_toggle; allowed: one of them"),
         ({"grip": "precision", "stick_up": "precision"}, "grip and stick_up are both precision; allowed: one of them"),
         ({"grip": "dead_man"}, "lower is pause_toggle and grip is dead_man; allowed: one way to engage"),
-        ({"lower": "none"}, "no control engages the arm; allowed: a button that is pause_toggle, or dead_man"),
-        ({"grip": "pause_toggle"}, "Input should be 'none', 'dead_man', 'precision', 'rotation_lock' or"),
+        ({"lower": "none"}, "no control engages the arm; allowed: a control that is pause_toggle, or dead_man"),
+        ({"grip": "wave"}, "Input should be 'none', 'pause_toggle', 'gripper_toggle', 'home', 'stop',"),
+        ({"grip": "pause_toggle"}, "lower and grip are both pause_toggle; allowed: one of them"),
+        ({"lower": "none", "lower_hold": "pause_toggle"}, "pause_toggle, which must not wait; allowed: lower"),
+        ({"upper": "stop"}, "upper is stop, and the headset's alignment presses it too; allowed: upper_hold,"),
+        ({"upper": "precision"}, "upper is precision, which lasts; allowed: trigger, grip, stick_up,"),
+        ({"grip_hold": "precision"}, "grip_hold is precision, which lasts; allowed: trigger, grip, stick_up,"),
+        ({"stick_up": "gripper_analog"}, "stick_up is gripper_analog; allowed: trigger or grip"),
+        ({"grip": "precision", "grip_hold": "home"}, "grip is precision and grip_hold is home; allowed: one of them"),
+        ({"grip": "gripper_analog"}, "upper is gripper_toggle and grip is gripper_analog; allowed: one of them"),
         ({"thumb": "precision"}, "Extra inputs are not permitted"),
     ],
 )

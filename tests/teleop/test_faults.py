@@ -15,7 +15,8 @@ from hypothesis import strategies as st
 from q2r2_control.types import SIDES, HandSample
 from tests.teleop.hands import (
     ENGAGED,
-    PAUSED,
+    IDLE,
+    LOST,
     assert_holds,
     assert_smooth,
     engaged,
@@ -46,8 +47,8 @@ def test_a_fault_of_the_left_hand_disengages(reason: str, linked: bool) -> None:
     driver.alter = lambda s: FAULTS[reason](s) if s.hand == "left" else s
     history = driver.run(0.3, waving(driver))
     assert_smooth(history)
-    assert driver.states == (PAUSED if linked else {"left": "paused", "right": "engaged"})
-    last = [event for event in driver.events if event.destination == "paused"]
+    assert driver.states == (LOST if linked else {"left": "lost", "right": "engaged"})
+    last = [event for event in driver.events if event.destination == "lost"]
     assert reason in last[0].reason
     assert [event.arm for event in last] == (["left", "right"] if linked else ["left"])
     driver.alter = lambda s: s
@@ -109,7 +110,7 @@ def test_a_lost_connection_pauses_every_arm_and_wants_fresh_poses_and_a_new_pres
     driver = engaged()
     driver.run(0.2, waving(driver))
     driver.teleop.connection_lost(driver.now)
-    assert driver.states == PAUSED
+    assert driver.states == LOST
     assert {event.reason for event in driver.teleop.take_events()} == {"connection lost"}
     driver.lower = set(SIDES)
     assert_holds(driver)
@@ -133,7 +134,7 @@ def test_engaging_is_refused_when_poses_are(alter: Callable[[HandSample], HandSa
     driver.alter = alter
     driver.run(0.3)
     driver.press(*SIDES)
-    assert driver.states == PAUSED
+    assert driver.states == IDLE
     assert [event.reason for event in driver.events] == [f"not engaged: {reason}"] * 2
 
 
@@ -142,7 +143,7 @@ def test_engaging_is_refused_when_the_tools_pose_is(tools: dict[str, pin.SE3]) -
     driver = operator()
     driver.tools = tools
     driver.engage()
-    assert driver.states == PAUSED
+    assert driver.states == IDLE
     assert {event.reason for event in driver.events} == {"not engaged: the tool's pose is not known"}
 
 

@@ -13,10 +13,12 @@ from q2r2_control.teleop.haptics import (
     ENGAGED,
     FAULT,
     GRASP,
+    HOMING,
     LIMIT,
     NEAR,
     PAUSED,
     SLIP,
+    STOPPED,
     VOCABULARY,
     HapticPulses,
     Pulse,
@@ -27,9 +29,12 @@ EVENTS = {
     "engaging": (("paused", "engaged", "lower button"), ENGAGED),
     "pausing": (("engaged", "pausing", "lower button"), PAUSED),
     "the alignment chord": (("engaged", "aligning", "alignment chord"), PAUSED),
-    "a fault": (("engaged", "paused", "no pose for 0.15 s"), FAULT),
+    "a fault": (("engaged", "lost", "no pose for 0.15 s"), FAULT),
     "a refused press": (("paused", "paused", "not engaged: the tool's pose is not known"), FAULT),
-    "an alignment that ends unengaged": (("aligning", "paused", "not engaged: the newest pose is not usable"), FAULT),
+    "an alignment that ends unengaged": (("aligning", "lost", "not engaged: the newest pose is not usable"), FAULT),
+    "the way home": (("paused", "homing", "home (grip)"), HOMING),
+    "the end of the way home": (("homing", "paused", "at home"), PAUSED),
+    "a stop": (("engaged", "stopped", "stop (grip)"), STOPPED),
 }
 
 
@@ -67,7 +72,7 @@ def test_slipping_is_felt_at_every_stretch_of_it_and_anew_after_engaging() -> No
 
 def test_a_weaker_vibration_does_not_cut_a_stronger_one_short() -> None:
     haptics = HapticPulses("left")
-    haptics.tell(Event(1.0, "left", "engaged", "paused", "the hand jumped"))
+    haptics.tell(Event(1.0, "left", "engaged", "lost", "the hand jumped"))
     assert haptics.at(1.0) == feedback(FAULT)
     haptics.slip(1.0, 0.0)
     assert haptics.at(1.1) is None
@@ -134,14 +139,14 @@ def test_two_vibrations_are_felt_as_two_and_a_fault_waits_for_none() -> None:
     haptics.limits(["left_A4"])
     assert felt(haptics, 1.09, 1.12) == []
     assert felt(haptics, 1.12, 1.2)[0] == feedback(LIMIT)
-    haptics.tell(Event(1.2, "left", "engaged", "paused", "the hand jumped"))
+    haptics.tell(Event(1.2, "left", "engaged", "lost", "the hand jumped"))
     assert haptics.at(1.21) == feedback(FAULT)
 
 
 @pytest.mark.parametrize(("strength", "expected"), [(0.5, [0.5 * FAULT.amplitude, 0.0]), (0.0, [])])
 def test_the_strength_of_all_is_a_setting_and_0_sends_nothing(strength: float, expected: list[float]) -> None:
     haptics = HapticPulses("left", HapticSettings(strength=strength))
-    haptics.tell(Event(1.0, "left", "engaged", "paused", "the hand jumped"))
+    haptics.tell(Event(1.0, "left", "engaged", "lost", "the hand jumped"))
     assert [sent.amplitude for sent in felt(haptics, 1.0, 2.0)] == expected
 
 

@@ -26,14 +26,14 @@ from tests.teleop.hands import (
 )
 
 
-def test_it_starts_paused_and_the_first_press_of_the_lower_button_engages_that_arm_alone() -> None:
+def test_it_starts_idle_and_the_first_press_of_the_lower_button_engages_that_arm_alone() -> None:
     driver = operator()
     assert_holds(driver)
     driver.engage("left")
-    assert driver.states == {"left": "engaged", "right": "paused"}
+    assert driver.states == {"left": "engaged", "right": "idle"}
     assert driver.teleop.engaged == {"left": True, "right": False}
     assert [(e.arm, e.source, e.destination, e.reason) for e in driver.events] == [
-        ("left", "paused", "engaged", "lower button")
+        ("left", "idle", "engaged", "lower button")
     ]
 
 

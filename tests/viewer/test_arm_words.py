@@ -52,7 +52,7 @@ def test_an_arm_that_is_at_its_target_follows_whatever_is_at_work(robot: Robot) 
 @pytest.mark.parametrize(
     ("source", "destination", "reason", "expected"),
     [
-        ("engaged", "paused", "no pose for 0.15 s", "paused: no pose for 0.15 s"),
+        ("engaged", "lost", "no pose for 0.15 s", "lost: no pose for 0.15 s"),
         ("pausing", "paused", "lower button", "paused: lower button"),
         ("paused", "paused", "not engaged: no pose for 0.15 s", "not engaged: no pose for 0.15 s"),
     ],
@@ -60,7 +60,7 @@ def test_an_arm_that_is_at_its_target_follows_whatever_is_at_work(robot: Robot) 
 def test_an_arm_that_is_not_engaged_says_what_stopped_it(
     robot: Robot, source: str, destination: str, reason: str, expected: str
 ) -> None:
-    paused = tick_at(robot, 1.0, engaged=False)
+    paused = replace(tick_at(robot, 1.0, engaged=False), states={"left": destination, "right": "idle"})
     assert words(paused, last=Event(0.5, "left", source, destination, reason)) == expected
 
 

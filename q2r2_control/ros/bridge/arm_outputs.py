@@ -22,6 +22,7 @@ SAG = 0.05, 0.1  # [m, rad]
 _POSE = 2  # of moveit_msgs/srv/ServoCommandType
 # What the built-in controller says of an arm that takes a stream of targets, and what helps where it takes none.
 _READY = ("holding", "following")
+_HOMING = "homing"
 _NO_FAULT = ("active", "paused")
 _CURES = {"stopped": "reset", "paused": "pause with data: false"}
 _ANSWER = 0.2  # the controller has told of all earlier streams by then [s]
@@ -96,6 +97,16 @@ class ArmOutputs:
         return None if self._command_type is None else self._command_type.unready
 
     @property
+    def home_controller(self) -> str | None:
+        """The name of the built-in controller, which knows a way home, where it moves the arm."""
+        return None if self._follows is None or self._filtered else self._follows.controller
+
+    @property
+    def homing(self) -> tuple[bool, str]:
+        """Whether the built-in controller says that it goes home, and how the last way ended."""
+        return (False, "") if self._follows is None else (self._follows.homing, self._follows.homing_ended)
+
+    @property
     def advice(self) -> str | None:
         """What the user has to do by hand."""
         return None if self._command_type is None else self._command_type.advice
@@ -151,16 +162,19 @@ class FollowWatch:
 
     def __init__(self, node: Node, topic: str, arm: str, timeout: float) -> None:
         self._topic, self._timeout = topic, timeout
-        self._controller, self._arm = topic.partition("/following/")[0], arm
+        self.controller, self._arm = topic.partition("/following/")[0], arm
         self._follows: bool | None = None
         self._since = math.inf  # targets have been sent and not followed [s]
         self._followed_since = math.inf  # targets have been sent and followed [s]
         self.unready: str | None = None  # why the controller would follow no stream of targets now
+        self.homing, self.homing_ended = False, ""  # whether it says that it goes home; how the last way ended
         node.create_subscription(Bool, topic, self._on_following, LATCHED_QOS)
-        node.create_subscription(String, f"{self._controller}/state", self._on_state, 1)
+        node.create_subscription(String, f"{self.controller}/state", self._on_state, 1)
 
     def refusal(self, sending: bool, now: float) -> str | None:
         """One line if targets are ``sending`` and are followed no more, or not yet after the timeout."""
+        if self.homing:
+            return None
         followed = sending and self._follows is True
         if followed or not sending:
             self._since = math.inf
@@ -184,10 +198,11 @@ class FollowWatch:
         except (ValueError, TypeError, KeyError):
             return  # some other node's
         self.unready = None
-        if state not in _READY:
-            line = state if why in _NO_FAULT else f"{state}: {why}".replace("~", self._controller)
-            cure = f"{self._controller}/{_CURES[state]}" if state in _CURES else ""
-            self.unready = f"{self._controller} is {line}" + ("" if cure in line else f"; call {cure}")
+        self.homing, self.homing_ended = state == _HOMING, str(said.get("homing_ended", ""))
+        if state not in (*_READY, _HOMING):
+            line = state if why in _NO_FAULT else f"{state}: {why}".replace("~", self.controller)
+            cure = f"{self.controller}/{_CURES[state]}" if state in _CURES else ""
+            self.unready = f"{self.controller} is {line}" + ("" if cure in line else f"; call {cure}")
 
 
 class CommandType:

@@ -19,6 +19,7 @@ from q2r2_control.ros.base_node import COMMAND_QOS
 
 # The client.
 _RESULT_TIMEOUT = 10.0  # of a goal [s]
+_MOVE_PERIOD, _MOVE_STEP = 0.1, 0.01  # between two goals of a gripper that follows a trigger [s], of the stroke
 # The server.
 _REACHED = 0.02  # of the stroke
 _STALLED_AFTER = 0.3  # without moving by the following [s]
@@ -39,7 +40,7 @@ class GripperClient:
         self.problem: str | None = None
         self._node, self._name, self._settings = node, name, settings
         self._goal_closed: bool | None = None  # closed or not, while a goal is under way
-        self._sent = 0.0  # [s]
+        self._sent, self._asked = -math.inf, 1.0  # the last goal: when [s], and its opening
         self._goals = 0
         kind = settings.action_type
         self._publisher = self._client = None
@@ -61,12 +62,23 @@ class GripperClient:
         self.command(not (self.closed if self._goal_closed is None else self._goal_closed), now)
 
     def command(self, close: bool, now: float) -> None:
-        """Ask to close or open. If there is no server, ``problem`` says so and the request is dropped.
+        """Ask to close or open, see :meth:`move`."""
+        self._ask(0.0 if close else 1.0, now)
+
+    def move(self, opening: float, now: float) -> None:
+        """Ask for an opening, 0 closed .. 1 open, as often as a trigger moves: ten times a second at most."""
+        moved = abs(opening - self._asked) >= _MOVE_STEP or (opening in (0.0, 1.0) and opening != self._asked)
+        if moved and not 0.0 <= now - self._sent < _MOVE_PERIOD:
+            self._ask(opening, now)
+
+    def _ask(self, opening: float, now: float) -> None:
+        """Ask for an opening. If there is no server, ``problem`` says so and the request is dropped.
 
         It is not kept for later: a gripper that moves when its server starts would be a surprise.
         """
-        position = self._settings.closed_position if close else self._settings.open_position
-        self.problem = None
+        settings, close = self._settings, opening < 0.5
+        position = settings.closed_position + opening * (settings.open_position - settings.closed_position)
+        self.problem, self._asked, self._sent = None, opening, now
         if self._publisher is not None:
             self._publisher.publish(Float64MultiArray(data=[position]))
             self.closed = close
@@ -76,7 +88,7 @@ class GripperClient:
             self.problem = f"no gripper server at {self._name}"
             return
         self._goals += 1
-        self._goal_closed, self._sent = close, now
+        self._goal_closed = close
         number = self._goals
         answer = self._client.send_goal_async(self._goal(position))
         answer.add_done_callback(lambda future: self._answered(future.result(), number))

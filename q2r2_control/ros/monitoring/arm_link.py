@@ -29,6 +29,8 @@ class _Heartbeat(BaseModel):
     reason: str = ""
     age: float = Field(0.0, ge=0.0)  # of that fault [s]
     ended: bool = False
+    stopped: bool = False  # both arms, by their operator
+    change: int = Field(0, ge=0)  # number of the change that made it so
 
 
 class ArmLink:
@@ -51,6 +53,10 @@ class ArmLink:
       its own, and each is engaged by its own press, whether the other one is engaged or not.
     - Silence of the other arm is a fault that this arm has found, and is sent: a node that was stopped for less than
       its own timeout goes on as if nothing had happened, and its arm would move alone.
+
+    Whether an operator has stopped both arms is one value for the pair, of which the change with the greater number
+    counts; a stop, where two numbers are the same. So both nodes end with the same value whatever crosses on the way,
+    and a node that is restarted learns it from the other one.
 
     No heartbeat for ``timeout`` [s] is a fault too, and so is a heartbeat of another run of the node where the first
     one has not announced its end. Time here is the machine's steady clock: a node may hang or die whatever simulated
@@ -96,6 +102,17 @@ class ArmLink:
         self._own = self._own.model_copy(update={"fault": self._own.fault + 1, "reason": fault})
         self._send_heartbeat()
 
+    @property
+    def stopped(self) -> bool:
+        """Whether both arms are stopped by their operator, as far as this node knows."""
+        return self._own.stopped
+
+    def set_stopped(self, stopped: bool) -> None:
+        """This arm's operator stopped both arms, or took that back."""
+        if stopped != self._own.stopped:
+            self._own = self._own.model_copy(update={"stopped": stopped, "change": self._own.change + 1})
+            self._send_heartbeat()
+
     def take_fault(self) -> str | None:
         """Why this arm has to pause because of the other one; each reason is returned once."""
         fault, self._pending = self._pending, None
@@ -136,5 +153,7 @@ class ArmLink:
             self._acted_on = theirs.id, theirs.fault
             if now - theirs.age >= self._engaged_at:
                 self._pending = theirs.reason
+        if (theirs.change, theirs.stopped) > (self._own.change, self._own.stopped):
+            self._own = self._own.model_copy(update={"stopped": theirs.stopped, "change": theirs.change})
         if theirs.ended:
             self._newest, self._pending = None, f"{theirs.node} has ended"

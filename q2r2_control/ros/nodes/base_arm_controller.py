@@ -13,6 +13,7 @@ from quest2ros.msg import OVR2ROSHapticFeedback, OVR2ROSInputs
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import Marker
 
+from q2r2_control.config.bindings import Action
 from q2r2_control.config.presets import BUILTIN
 from q2r2_control.errors import ConfigError
 from q2r2_control.inputs.samples import SampleQueue
@@ -22,13 +23,15 @@ from q2r2_control.ros.bridge.arm_outputs import SAG, ArmOutputs
 from q2r2_control.ros.bridge.frames import FrameListener, PoseTopic, ToolFrame
 from q2r2_control.ros.bridge.grippers import GripperClient
 from q2r2_control.ros.bridge.hand_topics import HandWatch
+from q2r2_control.ros.bridge.home_client import HomeClient
 from q2r2_control.ros.bridge.markers import TargetMarkers
 from q2r2_control.ros.bridge.messages import age, hand_sample
 from q2r2_control.ros.bridge.parameters import ArmDefaults, ArmParameters, arm_parameters
 from q2r2_control.ros.bridge.target_output import near
 from q2r2_control.ros.monitoring.arm_link import ArmLink
 from q2r2_control.ros.monitoring.hand_listeners import PAUSED_BY_SERVICE
-from q2r2_control.teleop.arm import BY_OPERATOR, OPEN, ArmState
+from q2r2_control.teleop.arm import OPEN
+from q2r2_control.teleop.arm_states import AT_REST, HOLDING, ArmState, is_refusal
 from q2r2_control.teleop.haptics import HapticPulses
 from q2r2_control.teleop.teleop import Teleop
 from q2r2_control.types import SIDES, ArmTarget
@@ -95,11 +98,12 @@ class BaseArmController(BaseNode):
         self.hand = self.teleop.hand_of(self.arm_name)
         self.haptics = HapticPulses(self.hand)
         self.markers = TargetMarkers(self.arm_name, self.parameters.tool_frame, self.parameters.world_frame)
+        self._has_analog_gripper = self.parameters.teleop.bindings.words_of(Action.GRIPPER_ANALOG) is not None
         self._samples = SampleQueue()
         self._pose: tuple[PoseStamped, float] | None = None
         self._inputs: tuple[OVR2ROSInputs | None, float] = (None, float("-inf"))
         self._target = ArmTarget(None, OPEN)
-        self._last_event = self._paused = "paused: not engaged yet"
+        self._last_event = self._paused = "not engaged yet"
         self._refusal: tuple[bytes, str] | None = None
         self._shown = 0.0
         self._received = self._ticked = self.now  # the message of the hand that is being taken was
@@ -116,6 +120,7 @@ class BaseArmController(BaseNode):
         self._link = ArmLink(self, self.robot_name, self.arm_name, values.teleop.stance, values.link_timeout)
         self._hand_watch = HandWatch(self, hand, values.teleop.gate.timeout)
         self._outputs = ArmOutputs(self, values, self._safe_target)
+        self._home = HomeClient(self, self._outputs.home_controller)
         self.gripper = GripperClient(self, values.gripper_topic, values.gripper)
         self._markers = self.create_publisher(Marker, "/visualization_marker", 10)
         self._haptics = self.create_publisher(OVR2ROSHapticFeedback, HAPTIC_TOPICS[hand], COMMAND_QOS)
@@ -153,20 +158,26 @@ class BaseArmController(BaseNode):
         self._refusal = self._refuse(tool, base, now)
         obstacle = None if self._refusal is None else self._refusal[1]
         fault = self._faults(now) or obstacle
-        if fault is not None and self.state is not ArmState.PAUSED:
+        if fault is not None and self.state not in HOLDING:
             self.teleop.pause(now, fault)
+        if self._link.stopped != self.teleop.stopped:
+            self.teleop.set_stopped(self._link.stopped, now, f"the {self._link.other} arm's operator")
         samples, arm = self._samples.take(), self.arm_name
         tools = {} if tool is None else {arm: tool}
         commanded = {} if tool is None else {arm: self._commanded(tool, now)}
         obstacles = {} if obstacle is None else {arm: obstacle}
         target = self.teleop.update(samples, tools, now, commanded or None, obstacles)[arm]
+        self._link.set_stopped(self.teleop.stopped)
+        self._home.update(self.teleop, *self._outputs.homing, now)
         toggled = target.gripper != self._target.gripper
         self._target = target
         # If this process was frozen meanwhile, the target is out of date: it is not sent, and the next tick pauses.
         sent = self._outputs.step(target.pose, tool, base, now, decided)
         if (fault := self._outputs.relay(self.state is ArmState.ENGAGED, tool, base, now, decided)) is not None:
             self.teleop.pause(now, fault)
-        if toggled:
+        if self._has_analog_gripper:
+            self.gripper.move(target.gripper, now)
+        elif toggled:
             self.toggle_gripper()
         self.gripper.check(now)
         self._publish_events(now)
@@ -184,7 +195,7 @@ class BaseArmController(BaseNode):
             "arm": self.arm_name,
             "state": str(self.state),
             "engaged": self.state is ArmState.ENGAGED,
-            "ready": self._refusal is None,  # to be engaged
+            "ready": self._refusal is None and self.state not in (ArmState.STOPPED, ArmState.HOMING),  # to be engaged
             "hand": self.hand,
             "hand_age": round(self.now - self._pose[1], 3) if self._pose else None,
             "inputs_age": round(self.now - self._inputs[1], 3) if self._inputs[0] else None,
@@ -204,7 +215,7 @@ class BaseArmController(BaseNode):
         for problem in (self.gripper.problem, self._outputs.advice):
             if problem is not None:
                 return WARN, problem, values
-        if self.state is ArmState.PAUSED:
+        if self.state in AT_REST:
             return OK, f"ready to engage ({self._paused})", values  # whatever refused an earlier press is over
         return OK, self._last_event, values
 
@@ -254,14 +265,14 @@ class BaseArmController(BaseNode):
         """Report changes of the state: to the log, to the hand as vibrations, and to the other arm."""
         for event in self.teleop.take_events():
             self._last_event = f"{event.destination}: {event.reason}"
-            if event.destination is ArmState.PAUSED and event.source is not ArmState.PAUSED:
+            if event.destination in AT_REST and not is_refusal(event):
                 self._paused = self._last_event
             self.get_logger().info(self._last_event)
             self.haptics.tell(event)
             if event.destination is ArmState.ENGAGED:
                 self._link.engaged()
-            stopped = event.source != ArmState.PAUSED and event.destination in (ArmState.PAUSED, ArmState.ALIGNING)
-            if stopped and event.reason not in BY_OPERATOR and not self._link.told(event.reason):
+            stopped = event.source not in AT_REST and event.destination in (ArmState.LOST, ArmState.ALIGNING)
+            if stopped and not self._link.told(event.reason):
                 self._link.report(event.reason)
             self.report_health()
 
@@ -289,9 +300,10 @@ class BaseArmController(BaseNode):
         return response
 
     def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        """Drop all that was received and the held target; a press engages again."""
+        """Drop all that was received, the held target and a stop of the operator's; a press engages again."""
         now = self.now
         self.teleop.connection_lost(now)
+        self.teleop.set_stopped(False, now, "the reset service")
         self._outputs.forget(now)
         response.success, response.message = True, f"{self.arm_name} is reset"
         return response

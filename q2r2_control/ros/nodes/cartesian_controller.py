@@ -145,6 +145,7 @@ class CartesianControllerNode(BaseNode):
         self.create_service(SetBool, "~/pause", self._on_pause)
         services: dict[str, Callable[[], str | None]] = {
             "home": self._supervisor.go_home,
+            "hold": self._supervisor.hold,
             "reset": self._supervisor.reset,
             "stop": self._stop,
         }
@@ -235,6 +236,7 @@ class CartesianControllerNode(BaseNode):
         supervisor, now, wall = self._supervisor, self.now, time.monotonic()
         values: dict[str, Any] = {
             "phase": supervisor.phase,
+            "homing_ended": supervisor.homing_outcome or "",
             "loop_rate_hz": round(self._ticks / max(wall - self._reported_at, 1e-9), 1),
             "missed_ticks": self._pacer.missed_ticks,
         }

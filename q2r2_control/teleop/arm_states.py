@@ -1,0 +1,94 @@
+"""The states of an arm, and what leads from one to another: the table of the code, and of the docs."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from typing import NamedTuple
+
+from q2r2_control.types import Event
+
+
+class ArmState(StrEnum):
+    """Only an engaged arm follows its hand, and one that goes home moves by itself; in every other state it holds."""
+
+    IDLE = "idle"  # was never engaged
+    ENGAGED = "engaged"
+    PAUSING = "pausing"  # stopped by a control, which may still turn out to be half a chord, or another gesture
+    PAUSED = "paused"
+    ALIGNING = "aligning"  # stopped by the alignment chord; anchored when the buttons are released
+    HOMING = "homing"
+    LOST = "lost"  # stopped by what its operator did not press
+    STOPPED = "stopped"  # by its operator, until that is taken back
+
+
+class Cause(StrEnum):
+    """What changes an arm's state, in the words of the docs."""
+
+    PAUSE_BEGINS = "the control that pauses goes down"
+    PAUSE = "it was that control's gesture, and no chord"
+    ENGAGE = "the control that engages, with nothing in the way"
+    LET_GO = "the dead man is let go"
+    CHORD = "the headset's alignment: both buttons of a hand"
+    ALIGNED = "both buttons are released, and a new pose has come"
+    NOT_ALIGNED = "the same, with something in the way"
+    HOME = "the control that brings the arms home, with nothing in the way"
+    HOMED = "home, or held up on the way"
+    PRESS = "any press"
+    STOP = "the control that stops"
+    GO_ON = "the control that stops, once more"
+    FAULT = "data lost or not usable, a jump, a stall, what moves the arm has stopped"
+
+
+class Who(StrEnum):
+    """Whose state changes."""
+
+    ARM = "the arm"
+    LINKED = "both arms; with `linked: false` the arm"
+    BOTH = "both arms"
+
+
+class Transition(NamedTuple):
+    """One line of the table."""
+
+    sources: frozenset[ArmState]
+    cause: Cause
+    destination: ArmState
+    who: Who = Who.ARM
+
+
+_S = ArmState
+AT_REST = frozenset({_S.IDLE, _S.PAUSED, _S.LOST})  # may be engaged
+HOLDING = AT_REST | {_S.STOPPED}
+FOLLOWING = frozenset({_S.ENGAGED, _S.PAUSING, _S.ALIGNING})
+TRANSITIONS = (
+    Transition(AT_REST, Cause.ENGAGE, _S.ENGAGED),
+    Transition(frozenset({_S.ENGAGED}), Cause.PAUSE_BEGINS, _S.PAUSING),
+    Transition(frozenset({_S.PAUSING}), Cause.PAUSE, _S.PAUSED),
+    Transition(frozenset({_S.ENGAGED, _S.ALIGNING}), Cause.LET_GO, _S.PAUSED),
+    Transition(frozenset({_S.ENGAGED, _S.PAUSING}), Cause.CHORD, _S.ALIGNING, Who.LINKED),
+    Transition(frozenset({_S.ALIGNING}), Cause.ALIGNED, _S.ENGAGED),
+    Transition(frozenset({_S.ALIGNING}), Cause.NOT_ALIGNED, _S.LOST),
+    Transition(FOLLOWING, Cause.FAULT, _S.LOST, Who.LINKED),
+    Transition(AT_REST | {_S.ENGAGED, _S.PAUSING}, Cause.HOME, _S.HOMING, Who.BOTH),
+    Transition(frozenset({_S.HOMING}), Cause.HOMED, _S.PAUSED, Who.BOTH),
+    Transition(frozenset({_S.HOMING}), Cause.PRESS, _S.PAUSED, Who.BOTH),
+    Transition(frozenset({_S.HOMING}), Cause.FAULT, _S.LOST, Who.BOTH),
+    Transition(frozenset(_S) - {_S.STOPPED}, Cause.STOP, _S.STOPPED, Who.BOTH),
+    Transition(frozenset({_S.STOPPED}), Cause.GO_ON, _S.PAUSED, Who.BOTH),
+)
+_NEXT = {(source, line.cause): line.destination for line in TRANSITIONS for source in line.sources}
+
+
+def next_state(state: ArmState, cause: Cause) -> ArmState:
+    """Where ``cause`` leads from ``state``; where it does not change anything, ``state``."""
+    return _NEXT.get((state, cause), state)
+
+
+def is_refusal(event: Event) -> bool:
+    """Whether an operator wanted something that was not done: nothing changed."""
+    return event.source == event.destination and event.reason.startswith("not ")
+
+
+def is_fault(event: Event) -> bool:
+    """Whether an arm stopped for another reason than what its operator pressed, or did not do what was pressed."""
+    return event.destination == ArmState.LOST or is_refusal(event)

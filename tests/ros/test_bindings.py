@@ -1,0 +1,136 @@
+"""What is for both arms, in nodes: the way home and a stop, asked for by either hand; the simulated arms do it."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from q2r2_control import Robot
+from tests.ros.conftest import NEEDS_ROS, spun_node
+from tests.ros.processes import Processes
+
+pytest.importorskip("rclpy", reason=NEEDS_ROS)
+pytest.importorskip("control_msgs", reason="needs control_msgs: q2r2 ros build-interfaces")
+pytest.importorskip("tf2_msgs", reason="needs tf2_msgs: q2r2 ros build-interfaces")
+
+from tests.ros.arm_rig import ArmRig, ArmRigs
+from tests.ros.cell import PATIENT, Cell, start_controller, start_robot
+from tests.ros.waiting import call, wait_until
+
+pytestmark = pytest.mark.alone
+
+BINDINGS = {"teleop.bindings.grip": "home", "teleop.bindings.lower_hold": "stop"}
+HOME, STILL = 0.01, 0.005  # [rad]
+
+
+class Cockpit:
+    """Two hands that drive the simulated arms through their nodes."""
+
+    def __init__(self, node: object, robot: Robot, processes: Processes) -> None:
+        self.cell = Cell(node, robot, start_robot(processes), start_controller(processes, *PATIENT))
+        self.left, self.right = ArmRig(node, "left"), ArmRig(node, "right")
+        self.rigs = ArmRigs([self.left, self.right])
+        for rig in self.rigs.rigs:
+            rig.sends_tool = rig.follows = False
+            rig.start(processes, BINDINGS)
+        self.cell.wait_until_active()
+
+    def go_away(self) -> None:
+        """Both arms are moved a way from home by their hands."""
+        self.rigs.engage()
+        self.rigs.move((0.1, 0.0, 0.08), 1.0)
+        wait_until(lambda: self.from_home > 0.1, "the arms are away from home")
+
+    @property
+    def from_home(self) -> float:
+        return float(np.abs(self.cell.q - self.cell.robot.home).max())
+
+    def ask_for_home(self) -> None:
+        """By the left hand."""
+        self.left.grip = 1.0
+        self.rigs.wait(lambda rig: rig.state["state"] == "homing", "both arms are on their way home")
+        self.left.grip = 0.0
+
+    def hold_lower(self, rig: ArmRig) -> None:
+        rig.lower = True
+        time.sleep(1.0)
+        rig.lower = False
+
+
+@pytest.fixture(scope="module")
+def started(domain: int, robot: Robot, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cockpit]:
+    processes = Processes(tmp_path_factory.mktemp("cockpit"), os.environ)
+    with spun_node(domain) as node:
+        yield Cockpit(node, robot, processes)
+        processes.end_all()
+
+
+@pytest.fixture
+def cockpit(started: Cockpit) -> Iterator[Cockpit]:
+    started.go_away()
+    yield started
+    for arm in ("left", "right"):
+        assert call(started.cell.node, f"/{arm}_q2r2_arm_controller/reset").success
+
+
+def test_the_way_home_that_one_hand_asks_for_brings_both_arms_home_and_a_press_engages_them_there(
+    cockpit: Cockpit,
+) -> None:
+    cockpit.ask_for_home()
+    cockpit.rigs.wait(lambda rig: rig.state["state"] == "paused", "both arms are paused")
+    cockpit.rigs.wait(lambda rig: rig.state["last_event"] == "paused: at home", "and say why")
+    assert cockpit.from_home < HOME
+    cockpit.rigs.engage()
+    assert cockpit.from_home < HOME
+
+
+def test_a_press_of_the_other_hand_ends_the_way_home_where_the_arms_are(cockpit: Cockpit) -> None:
+    cockpit.ask_for_home()
+    cockpit.right.press("upper")
+    cockpit.rigs.wait(lambda rig: rig.state["state"] == "paused", "both arms are paused")
+    rest = cockpit.cell.joints.wait_for_rest()
+    assert cockpit.from_home > 2.0 * HOME
+    time.sleep(1.0)
+    assert np.abs(cockpit.cell.q - rest).max() < STILL
+    cockpit.rigs.wait(lambda rig: rig.state["ready"], "they can be engaged")
+
+
+def test_the_way_home_that_somebody_else_asks_for_is_told_to_both_hands(cockpit: Cockpit) -> None:
+    assert call(cockpit.cell.node, "/cartesian_controller/home").success
+    cockpit.rigs.wait(lambda rig: rig.state["state"] == "homing", "both arms are on their way home")
+    cockpit.left.press("upper")
+    cockpit.rigs.wait(lambda rig: rig.state["state"] == "paused", "a press ends it")
+
+
+def test_a_stop_of_one_hand_stops_both_arms_until_either_takes_it_back(cockpit: Cockpit) -> None:
+    cockpit.hold_lower(cockpit.left)
+    cockpit.rigs.wait(lambda rig: rig.state["state"] == "stopped", "both arms are stopped")
+    rest = cockpit.cell.joints.wait_for_rest()
+    cockpit.right.press()
+    cockpit.right.wait(
+        lambda: cockpit.right.state["last_event"] == "stopped: not engaged: stopped, lower held goes on",
+        "a press is refused",
+    )
+    cockpit.rigs.move((0.1, 0.0, 0.0), 0.5)
+    assert np.abs(cockpit.cell.q - rest).max() < STILL
+    cockpit.hold_lower(cockpit.right)
+    cockpit.rigs.wait(lambda rig: rig.state["state"] == "paused", "it is taken back for both")
+    assert np.abs(cockpit.cell.q - rest).max() < STILL
+    cockpit.rigs.engage()
+
+
+def test_an_arms_node_that_is_restarted_learns_of_a_stop(cockpit: Cockpit) -> None:
+    from q2r2_control.ros.monitoring.arm_link import ArmLink
+
+    cockpit.hold_lower(cockpit.left)
+    cockpit.rigs.wait(lambda rig: rig.state["state"] == "stopped", "both arms are stopped")
+    link = ArmLink(cockpit.cell.node, "q2r2", "right", "side_by_side", 1.0)  # as the restarted one's
+    assert not link.stopped
+    wait_until(lambda: link.stopped, "it is told")
+    link.set_stopped(False)
+    cockpit.left.wait(lambda: cockpit.left.state["state"] == "paused", "what it says counts")
+    link.close()

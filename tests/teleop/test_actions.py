@@ -1,0 +1,277 @@
+"""What is for both arms: stop, the way home, hands that are swapped; and a gripper that follows a trigger."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from q2r2_control.teleop.arm_states import is_fault, is_refusal
+from q2r2_control.types import SIDES, HandInputs
+from tests.teleop.hands import (
+    ENGAGED,
+    HOMING,
+    IDLE,
+    LOST,
+    PAUSED,
+    STOPPED,
+    Squeezing,
+    assert_holds,
+    assert_smooth,
+    pose,
+    spoilt,
+    squeezing,
+    waving,
+)
+
+BINDINGS = {"grip": "stop", "stick_down": "home", "stick_left": "swap_hands"}
+
+
+def engaged(**bindings: str) -> Squeezing:
+    driver = squeezing(bindings=bindings or BINDINGS)
+    driver.engage()
+    assert driver.states == ENGAGED
+    return driver
+
+
+def push(driver: Squeezing, control: str, hand: str = "left", duration: float = 0.1) -> None:
+    driver.only, driver.held = hand, {control: 1.0}
+    driver.run(duration)
+    driver.held = {}
+    driver.run(0.1)
+
+
+class TestAStop:
+    def test_stops_both_arms_in_the_sample_that_it_comes_with(self) -> None:
+        driver = engaged()
+        driver.run(0.3, waving(driver))
+        driver.only, driver.held = "right", {"grip": 1.0}
+        driver.tick(driver.samples())
+        assert driver.states == STOPPED
+        assert all(target.pose is None for target in driver.targets.values())
+        assert not any(map(is_fault, driver.events))
+
+    def test_lets_nothing_move_until_it_is_taken_back_and_then_a_press_engages(self) -> None:
+        driver = engaged()
+        push(driver, "grip")
+        for control in ("stick_down", "stick_left"):
+            push(driver, control)
+            assert driver.states == STOPPED
+        driver.press(*SIDES)
+        driver.press(*SIDES, button="upper")
+        assert driver.states == STOPPED
+        assert {event.reason for event in driver.events if is_refusal(event)} == {"not engaged: stopped, grip goes on"}
+        assert [driver.targets[arm].gripper for arm in SIDES] == [1.0, 1.0]
+        assert_holds(driver)
+        push(driver, "grip", hand="right")
+        assert driver.states == PAUSED
+        assert_holds(driver)
+        driver.press(*SIDES)
+        assert driver.states == ENGAGED
+
+    def test_comes_before_all_else_that_is_pressed_at_once(self) -> None:
+        driver = engaged()
+        driver.lower, driver.upper = {"left"}, {"left"}
+        driver.held, driver.only = {"grip": 1.0, "stick_down": 1.0}, "right"
+        driver.tick(driver.samples())
+        assert driver.states == STOPPED
+        driver.run(0.3)
+        driver.lower, driver.upper, driver.held = set(), set(), {}
+        driver.run(0.3)
+        assert driver.states == STOPPED
+
+    def test_stays_through_a_lost_connection_and_faults(self) -> None:
+        driver = engaged()
+        push(driver, "grip")
+        driver.silent = set(SIDES)
+        driver.run(0.3)
+        driver.teleop.connection_lost(driver.now)
+        driver.silent = set()
+        driver.run(0.3)
+        assert driver.states == STOPPED
+        driver.press(*SIDES)
+        assert driver.states == STOPPED
+
+    def test_that_a_button_is_held_for_is_not_lost_by_a_fault_in_between(self) -> None:
+        driver = engaged(upper_hold="stop")
+        driver.upper = {"left"}
+        driver.run(0.3)
+        driver.teleop.pause(driver.now, "linked to right: something")
+        assert driver.states == LOST
+        driver.run(0.5)
+        assert driver.states == STOPPED
+        assert driver.targets["left"].gripper == 1.0
+
+
+class TestTheWayHome:
+    def test_of_both_arms_is_asked_for_by_either_hand_and_ends_where_the_caller_says(self) -> None:
+        driver = engaged()
+        push(driver, "stick_down", hand="right")
+        assert driver.states == HOMING
+        assert driver.teleop.homing
+        assert_holds(driver)  # the hands lead nothing
+        driver.teleop.end_homing(driver.now, "at home")
+        driver.run(0.1)
+        assert driver.states == PAUSED
+        assert {event.reason for event in driver.events[-2:]} == {"at home"}
+        assert not any(map(is_fault, driver.events))
+        driver.press(*SIDES)
+        assert driver.states == ENGAGED
+
+    def test_may_be_asked_for_by_arms_that_were_never_engaged(self) -> None:
+        driver = squeezing(bindings=BINDINGS)
+        driver.run(0.1)
+        push(driver, "stick_down")
+        assert driver.states == HOMING
+
+    @pytest.mark.parametrize("hand", SIDES)
+    @pytest.mark.parametrize("control", ["lower", "upper", "stick_down", "stick_left"])
+    def test_is_ended_by_any_press_which_does_nothing_else(self, control: str, hand: str) -> None:
+        driver = engaged()
+        push(driver, "stick_down")
+        if control in ("lower", "upper"):
+            driver.press(hand, button=control)
+        else:
+            push(driver, control, hand=hand)
+        assert driver.states == PAUSED
+        assert [driver.targets[arm].gripper for arm in SIDES] == [1.0, 1.0]
+        assert driver.teleop.hand_of("left") == "left"
+
+    def test_is_ended_by_the_alignment_chord(self) -> None:
+        driver = engaged()
+        push(driver, "stick_down")
+        driver.lower, driver.upper = {"right"}, {"right"}
+        driver.run(0.1)
+        driver.lower, driver.upper = set(), set()
+        driver.run(0.3)
+        assert driver.states == PAUSED
+
+    def test_ends_as_a_fault_when_the_hand_that_asked_is_lost_and_not_for_the_other(self) -> None:
+        driver = engaged()
+        push(driver, "stick_down")
+        driver.silent = {"right"}
+        driver.run(0.4)
+        assert driver.states == HOMING
+        driver.silent = set(SIDES)
+        driver.run(0.2)
+        assert driver.states == LOST
+        assert {event.reason for event in driver.events[-2:]} == {"on the way home: no pose for 0.15 s"}
+
+    def test_that_no_hand_asked_for_needs_none(self) -> None:
+        driver = squeezing(bindings=BINDINGS)
+        driver.silent = set(SIDES)
+        driver.run(0.3)
+        driver.teleop.home(driver.now)
+        driver.run(0.3)
+        driver.teleop.connection_lost(driver.now)
+        driver.run(0.3)
+        assert driver.states == HOMING
+        driver.silent = set()
+        driver.run(0.3)
+        driver.press("left")
+        assert driver.states == PAUSED
+
+    def test_is_refused_while_something_is_in_the_way(self) -> None:
+        driver = squeezing(bindings=BINDINGS)
+        driver.run(0.1)
+        driver.alter = lambda received: spoilt(received, pose_stamp=-math.inf, inputs=HandInputs())
+        driver.run(0.3)
+        driver.alter = lambda received: spoilt(
+            received, pose_stamp=-math.inf, inputs=HandInputs(thumb_stick_vertical=-1.0)
+        )
+        driver.run(0.1)
+        assert driver.states == IDLE
+        assert {event.reason for event in driver.events} == {"not homing: no pose for 0.15 s"}
+
+
+class TestSwappedHands:
+    def test_drive_the_other_arm_after_a_new_press_and_swap_back(self) -> None:
+        driver = engaged()
+        driver.press(*SIDES)
+        for left in ("right", "left"):
+            push(driver, "stick_left")
+            assert (driver.teleop.hand_of("left"), driver.states) == (left, PAUSED)
+            assert_holds(driver)
+            driver.press(left)
+            assert driver.states == {"left": "engaged", "right": "paused"}
+            driver.press(left)
+        assert {event.reason for event in driver.events if event.source == event.destination} == {
+            f"driven by the {hand} hand" for hand in SIDES
+        }
+
+    def test_do_not_jump(self) -> None:
+        driver = engaged()
+        driver.hands["right"] = pose(1.0, -1.0, 1.0, (1.0, 0.0, 0.0))
+        driver.teleop.pause(driver.now, "test")
+        push(driver, "stick_left")
+        driver.press(*SIDES)
+        assert driver.states == ENGAGED
+        first = driver.targets["left"].pose
+        assert first is not None
+        np.testing.assert_allclose(first.translation, driver.tools["left"].translation, atol=1e-9)
+        assert_smooth(driver.run(0.5, waving(driver)))
+
+    def test_are_refused_while_an_arm_is_engaged(self) -> None:
+        driver = engaged()
+        push(driver, "stick_left")
+        assert driver.states == ENGAGED
+        assert driver.teleop.hand_of("left") == "left"
+        assert {event.reason for event in driver.events if is_refusal(event)} == {"not swapped: pause both arms first"}
+
+
+class TestAGripperThatFollowsATrigger:
+    def driver(self, **changes: object) -> Squeezing:
+        driver = squeezing(bindings={"upper": "none", "trigger": "gripper_analog"}, **changes)
+        driver.only = "left"
+        driver.run(0.1)
+        return driver
+
+    def test_closes_as_far_as_it_is_pressed_and_opens_again(self) -> None:
+        driver = self.driver()
+        for pressed, opening in ((0.5, 0.5), (1.0, 0.0), (0.275, 0.75), (0.0, 1.0)):
+            driver.held = {"trigger": pressed}
+            driver.run(0.4)
+            assert driver.targets["left"].gripper == pytest.approx(opening, abs=1e-9)
+            assert driver.targets["right"].gripper == 1.0
+
+    def test_is_no_faster_than_the_setting(self) -> None:
+        driver = self.driver(gripper_speed=2.0)
+        driver.held = {"trigger": 1.0}
+        openings = [targets["left"].gripper for targets in driver.run(0.6)]
+        assert np.abs(np.diff(openings)).max() <= 2.0 * 0.001 + 1e-9
+        assert openings[-1] == 0.0
+
+    def test_does_not_tremble_with_the_trigger(self) -> None:
+        driver = self.driver()
+        random, seen = np.random.default_rng(0), set()
+        driver.held = {"trigger": 0.5}
+        driver.run(0.4)
+        for _ in range(50):
+            driver.held = {"trigger": 0.5 + random.uniform(-0.008, 0.008)}
+            driver.run(0.02)
+            seen.add(driver.targets["left"].gripper)
+        assert len(seen) == 1
+
+    def test_keeps_what_it_holds_when_the_connection_comes_back_until_the_trigger_has_reached_it(self) -> None:
+        driver = self.driver()
+        driver.held = {"trigger": 0.725}
+        driver.run(0.4)
+        assert driver.targets["left"].gripper == pytest.approx(0.25)
+        driver.teleop.connection_lost(driver.now)
+        driver.held = {}
+        driver.run(0.4)
+        driver.held = {"trigger": 0.5}
+        driver.run(0.4)
+        assert driver.targets["left"].gripper == pytest.approx(0.25)
+        driver.held = {"trigger": 0.9}
+        driver.run(0.4)
+        assert driver.targets["left"].gripper == pytest.approx(1.0 - 0.85 / 0.9)
+
+    def test_is_left_as_it_is_by_a_reading_that_is_no_number(self) -> None:
+        driver = self.driver()
+        driver.held = {"trigger": 0.5}
+        driver.run(0.4)
+        driver.alter = lambda received: spoilt(received, inputs=HandInputs(press_index=math.nan))
+        driver.run(0.2)
+        assert driver.targets["left"].gripper == pytest.approx(0.5)

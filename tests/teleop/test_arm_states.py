@@ -1,0 +1,52 @@
+"""The table of states: what the docs say, and that nothing but an engagement lets an arm follow its hand."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from q2r2_control.teleop.arm_states import TRANSITIONS, ArmState, Cause, Transition, Who, next_state
+
+RESTS = set(ArmState) - {ArmState.ENGAGED, ArmState.HOMING}
+
+
+def row(line: Transition) -> str:
+    """A line of the table in the docs."""
+    sources = ", ".join(f"`{state}`" for state in ArmState if state in line.sources)
+    if len(line.sources) == len(ArmState) - 1:
+        sources = f"any but `{line.destination}`"
+    return f"| {sources} | {line.cause} | `{line.destination}` | {line.who} |"
+
+
+def test_the_table_in_the_docs_is_the_one_of_the_code() -> None:
+    table = (Path(__file__).resolve().parents[2] / "docs" / "operator.md").read_text()
+    assert [line for line in table.splitlines() if "| the arm |" in line or "| both arms" in line] == [
+        row(line) for line in TRANSITIONS
+    ]
+
+
+def test_no_state_has_two_ways_for_one_cause() -> None:
+    ways = [(source, line.cause) for line in TRANSITIONS for source in line.sources]
+    assert len(ways) == len(set(ways))
+    assert {line.cause for line in TRANSITIONS} == set(Cause)
+    assert {line.destination for line in TRANSITIONS} | {ArmState.IDLE} == set(ArmState)
+
+
+def test_an_arm_is_set_in_motion_by_its_operator_alone() -> None:
+    begins = {line.cause for line in TRANSITIONS if line.destination not in RESTS and line.sources & RESTS}
+    assert begins == {Cause.ENGAGE, Cause.ALIGNED, Cause.HOME}
+
+
+@pytest.mark.parametrize("state", ArmState)
+def test_a_stop_stops_in_every_state_and_ends_by_itself_alone(state: ArmState) -> None:
+    assert next_state(state, Cause.STOP) is ArmState.STOPPED
+    ends = [cause for cause in Cause if next_state(ArmState.STOPPED, cause) is not ArmState.STOPPED]
+    assert ends == [Cause.GO_ON]
+
+
+@pytest.mark.parametrize("state", set(ArmState) - RESTS)
+@pytest.mark.parametrize("cause", [Cause.FAULT, Cause.STOP])
+def test_what_moves_is_stopped_by_a_fault_and_by_a_stop(state: ArmState, cause: Cause) -> None:
+    assert next_state(state, cause) in RESTS
+    assert next(line.who for line in TRANSITIONS if state in line.sources and line.cause is cause) is not Who.ARM
