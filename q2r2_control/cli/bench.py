@@ -12,12 +12,14 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from q2r2_control.benchmark.feel_run import run_feel
 from q2r2_control.benchmark.loop_times import PHYSICS, LoopReport, StageTime, run_loop_bench
 from q2r2_control.benchmark.peers.base import PEERS
 from q2r2_control.benchmark.press_run import run_press
 from q2r2_control.benchmark.stack_bench import StackReport, run_stack_bench
 from q2r2_control.benchmark.tick_times import BenchReport, BenchRow, run_bench
 from q2r2_control.benchmark.work_bench import WORK_PEERS, run_work_bench
+from q2r2_control.cli.feel_table import show_feel
 from q2r2_control.cli.figure_table import figure_table
 from q2r2_control.cli.options import DEMO_CONFIG, Json
 from q2r2_control.cli.output import as_json_text, notice_of_compiling, stderr_console
@@ -67,6 +69,9 @@ def bench(
     press: Annotated[
         bool, typer.Option("--press", help="Press a finger on the table in torque mode: forces in MuJoCo.")
     ] = False,
+    feel: Annotated[
+        bool, typer.Option("--feel", help="Measure delay, tremor, noise and stops from the hand to the tool.")
+    ] = False,
     ros: Annotated[bool, typer.Option("--ros", help="Time the ROS nodes instead.")] = False,
     duration: Annotated[
         float | None, typer.Option(min=1, max=3600, help=f"Of each input, {_SECONDS:g} by default; with --ros [s].")
@@ -90,18 +95,21 @@ def bench(
 
     With --press: what the table feels of a finger that is commanded into it, and slides. Exit 1 if a promise is broken.
 
+    With --feel: a hand moves in tones, trembles, rests and stops; for the cell's filter, one for precision and one for
+    speed. Delays and gains from the hand to the measured tool.
+
     With --ros: the time from a message on an input topic to the joint command that answers it, what each node takes of
     the processors, and how evenly the commands move; through real nodes on this machine, in a domain of their own.
     """
-    if sum((work, soak, ros, loop, press)) > 1:
-        raise ConfigError("--work, --soak, --ros, --loop and --press exclude each other")
+    if sum((work, soak, ros, loop, press, feel)) > 1:
+        raise ConfigError("--work, --soak, --ros, --loop, --press and --feel exclude each other")
     for option, given in (("--motion", motion), ("--through", through)):
         if given and not work:
             raise ConfigError(f"{option} needs --work")
     if work and ticks is not None:
         raise ConfigError("--ticks cannot be used with --work, whose motions have a length of their own")
-    if press and ticks is not None:
-        raise ConfigError("--ticks cannot be used with --press, which has a length of its own")
+    if (press or feel) and ticks is not None:
+        raise ConfigError("--ticks cannot be used with --press and --feel, which have a length of their own")
     if record and not loop:
         raise ConfigError("--record needs --loop")
     if contact and not soak:
@@ -130,6 +138,9 @@ def bench(
             _show_work(motions, WORK_PEERS if peers else (), console, json)
         elif press:
             _show_press(with_contact(load_config(DEMO_CONFIG), TABLE_ONLY), json)
+        elif feel:
+            cell = load_config(DEMO_CONFIG)
+            show_feel(cell.name, run_feel(cell, _progress(console)), json)
         elif loop:
             loop_ticks = _TICKS if ticks is None else ticks
             _show_loop(run_loop_bench(load_config(DEMO_CONFIG), loop_ticks, _progress(console), record=record), json)

@@ -237,5 +237,5 @@ def test_the_loop_s_bench_prints_its_figures_as_one_object(monkeypatch: pytest.M
 @pytest.mark.parametrize("other", ["--soak", "--ros"])
 def test_one_bench_at_a_time(other: str) -> None:
     refused = q2r2("bench", "--loop", other)
-    line = "q2r2: --work, --soak, --ros, --loop and --press exclude each other\n"
+    line = "q2r2: --work, --soak, --ros, --loop, --press and --feel exclude each other\n"
     assert (refused.exit_code, refused.stderr) == (2, line)

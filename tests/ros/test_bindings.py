@@ -31,13 +31,14 @@ class Cockpit:
     """Two hands that drive the simulated arms through their nodes."""
 
     def __init__(self, node: object, robot: Robot, processes: Processes) -> None:
-        self.cell = Cell(node, robot, start_robot(processes), start_controller(processes, *PATIENT))
+        nodes = start_robot(processes), start_controller(processes, *PATIENT)
+        self.cell = Cell(node, robot, *nodes, targets="/not_used/{arm}")  # the arms' nodes publish targets
         self.left, self.right = ArmRig(node, "left"), ArmRig(node, "right")
         self.rigs = ArmRigs([self.left, self.right])
         for rig in self.rigs.rigs:
             rig.sends_tool = rig.follows = False
             rig.start(processes, BINDINGS)
-        self.cell.wait_until_active()
+        wait_until(lambda: self.cell.state("phase") == "active", "the controller is active")
 
     def go_away(self) -> None:
         """Both arms are moved a way from home by their hands."""

@@ -77,7 +77,7 @@ class GripperClient:
         It is not kept for later: a gripper that moves when its server starts would be a surprise.
         """
         settings, close = self._settings, opening < 0.5
-        position = settings.closed_position + opening * (settings.open_position - settings.closed_position)
+        position = (1.0 - opening) * settings.closed_position + opening * settings.open_position
         self.problem, self._asked, self._sent = None, opening, now
         if self._publisher is not None:
             self._publisher.publish(Float64MultiArray(data=[position]))

@@ -1,0 +1,43 @@
+"""What a filter feels like: the figures are those of the hand and the tool, whatever the settings say of themselves."""
+
+from __future__ import annotations
+
+import pytest
+
+from q2r2_control.benchmark import feel_run
+from q2r2_control.benchmark.feel_run import SPEED, FeelFigures, run_feel
+from tests.support.watch import cell
+
+
+@pytest.fixture(scope="module")
+def measured() -> tuple[FeelFigures, FeelFigures]:
+    """The cell's filter and a fast one, with fewer tones than in the benchmark."""
+    told: list[str] = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(feel_run, "MOTIONS", ((1.0, 0.04),))
+        patch.setattr(feel_run, "TREMORS", (10.0,))
+        usual, fast = run_feel(cell(), told.append, {"speed": SPEED})
+    assert told == ["this cell", "speed"]
+    return usual, fast
+
+
+def test_the_tool_is_later_than_the_filter_alone_and_by_little(measured: tuple[FeelFigures, FeelFigures]) -> None:
+    for figures in measured:
+        assert 0.0 < figures.delays_ms[0] - figures.filter_delay_ms < 40.0
+        assert -1.0 < figures.gains_db[0] < 2.0
+
+
+def test_a_filter_for_speed_is_less_late_and_lets_more_tremor_through(
+    measured: tuple[FeelFigures, FeelFigures],
+) -> None:
+    usual, fast = measured
+    assert fast.delays_ms[0] < usual.delays_ms[0] - 15.0
+    assert fast.stop_delay_ms < usual.stop_delay_ms
+    assert usual.tremors_db[0] < -12.0
+    assert fast.tremors_db[0] > usual.tremors_db[0] + 3.0
+
+
+def test_a_hand_that_rests_is_hardly_heard(measured: tuple[FeelFigures, FeelFigures]) -> None:
+    for figures in measured:
+        assert figures.tremor_at_rest_db < -12.0
+        assert figures.noise_um < 50.0
