@@ -97,19 +97,17 @@ class ArmTeleop:
             return f"no button data for {self._timeout:g} s"
         return None
 
-    def change(self, cause: Cause, now: float, reason: str) -> bool:
-        """Follow a cause from outside of this arm; whether it changed the state.
+    def change(self, cause: Cause, now: float, reason: str) -> None:
+        """Follow a cause from outside of this arm: any but those that engage, which need the tool.
 
-        Presses that began before do not count. ``cause``: any but those that engage, which need the tool.
+        Presses that began before do not count.
         """
         self._gestures.cancel()
         self._presses.clear()
         self._gripped = None
-        before = self.state
         self._go(cause, now, reason)
         if self.state is ArmState.STOPPED:
             self._analog.forget()
-        return self.state is not before
 
     def tell(self, now: float, reason: str) -> None:
         """What the operator should know while the state stays; what was not done begins with "not"."""

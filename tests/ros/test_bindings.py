@@ -124,6 +124,13 @@ def test_a_stop_of_one_hand_stops_both_arms_until_either_takes_it_back(cockpit: 
     cockpit.rigs.engage()
 
 
+def test_a_stop_is_taken_back_by_the_reset_of_an_arms_node_too(cockpit: Cockpit) -> None:
+    cockpit.hold_lower(cockpit.right)
+    cockpit.rigs.wait(lambda rig: rig.state["state"] == "stopped", "both arms are stopped")
+    assert call(cockpit.cell.node, "/left_q2r2_arm_controller/reset").success
+    cockpit.rigs.wait(lambda rig: rig.state["state"] == "paused", "it is taken back for both")
+
+
 def test_an_arms_node_that_is_restarted_learns_of_a_stop(cockpit: Cockpit) -> None:
     from q2r2_control.ros.monitoring.arm_link import ArmLink
 

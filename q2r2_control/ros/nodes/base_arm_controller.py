@@ -304,6 +304,7 @@ class BaseArmController(BaseNode):
         now = self.now
         self.teleop.connection_lost(now)
         self.teleop.set_stopped(False, now, "the reset service")
+        self._link.set_stopped(False)
         self._outputs.forget(now)
         response.success, response.message = True, f"{self.arm_name} is reset"
         return response
