@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from enum import StrEnum
+from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from q2r2_control.config.axes import axes_matrix
 from q2r2_control.config.bindings import BindingSettings
 from q2r2_control.config.timeouts import STREAM_TIMEOUT
+from q2r2_control.types import Interval
+
+_Scale = Annotated[float, Field(ge=0, le=10)]
 
 
 class Stance(StrEnum):
@@ -70,6 +74,27 @@ class HapticSettings(BaseModel):
     strength: float = Field(1.0, ge=0, le=1, description="of all vibrations; 0: none")
 
 
+class WorkspaceSettings(BaseModel):
+    """A box in the world that one arm's targets stay in."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    x: Interval = Field(description="least and greatest of the target's position [m]")
+    y: Interval = Field(description="the same [m]")
+    z: Interval = Field(description="the same [m]")
+    soft_edge: float = Field(0.05, gt=0, le=0.5, description="this near to a side the target slows down [m]")
+
+    @model_validator(mode="after")
+    def _have_room(self) -> WorkspaceSettings:
+        for name, (least, greatest) in (("x", self.x), ("y", self.y), ("z", self.z)):
+            if not greatest - least >= 2.0 * self.soft_edge:
+                raise ValueError(
+                    f"{name} = [{least:g}, {greatest:g}]: allowed: least first, and twice soft_edge in between, "
+                    f"{2.0 * self.soft_edge:g} m"
+                )
+        return self
+
+
 class TeleopSettings(BaseModel):
     """Settings of the teleop layer; every range is checked when the object is made."""
 
@@ -78,6 +103,9 @@ class TeleopSettings(BaseModel):
     stance: Stance = Field(Stance.SIDE_BY_SIDE, description="side_by_side, mirror or mirror_reflected")
     position_scale: float = Field(1.0, gt=0, le=10, description="tool metres per hand metre")
     rotation_scale: float = Field(1.0, ge=0, le=5, description="tool radians per hand radian")
+    axis_scales: tuple[_Scale, _Scale, _Scale] = Field(
+        (1.0, 1.0, 1.0), description="of motion along the world's x, y and z, on top of position_scale"
+    )
     rotation_frame: RotationFrame = Field(RotationFrame.BASE, description="base or tool")
     axes: tuple[str, str, str] = Field(
         ("+x", "+y", "+z"),
@@ -96,6 +124,9 @@ class TeleopSettings(BaseModel):
     precision_scale: float = Field(0.25, gt=0, le=1, description="of all motion while precision is held")
     gripper_speed: float = Field(
         4.0, gt=0, le=50, description="of a gripper that is gripper_analog, in full openings a second [1/s]"
+    )
+    workspace: dict[Literal["left", "right"], WorkspaceSettings] = Field(
+        default_factory=dict, description="arm -> box that its targets stay in"
     )
     bindings: BindingSettings = Field(default_factory=BindingSettings)
     filter: FilterSettings = Field(default_factory=FilterSettings)

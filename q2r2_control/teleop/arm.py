@@ -18,7 +18,8 @@ from q2r2_control.teleop.held_controls import HeldControls
 from q2r2_control.teleop.leash import Leash
 from q2r2_control.teleop.relative import RelativeMotion
 from q2r2_control.teleop.rest import RestingPose
-from q2r2_control.types import Event, HandSample
+from q2r2_control.teleop.workspace import Workspace
+from q2r2_control.types import Event, HandSample, pose_of
 
 OPEN, CLOSED = 1.0, 0.0
 
@@ -52,11 +53,13 @@ class ArmTeleop:
                 settings.rotation_frame,
                 settings.rotation_scale,
                 settings.axes,
+                settings.axis_scales,
             )
             for _ in range(2)
         )
         self._newest: tuple[pin.SE3, pin.SE3] | None = None  # the newest hand pose and where it would have the tool
         self._leash = Leash(settings.leash)
+        self._workspace = Workspace(settings.workspace.get(arm))  # type: ignore[call-overload]
         self._presses: list[Press] = []
         self._gripped: bool | None = None  # the dead man was just held, or let go
         self._aligned_at = 0.0
@@ -176,6 +179,9 @@ class ArmTeleop:
             if self._newest is None or self._newest[0] is not self._gate.pose:
                 self._newest = self._gate.pose, self._unslipped.target(self._gate.pose)
             target = self._leash.target(self._motion, hand, self._newest[1], commanded, now)
+        if (held := self._workspace.hold(target.translation)) is not None:
+            target = pose_of(target.rotation, np.array(held))
+            self._motion.anchor_position(hand, target)
         if self._shares != self._held_shares():
             self._rescale(hand, target)  # from here on, so the target does not jump
             self._leash.anchor_anew()
@@ -183,8 +189,8 @@ class ArmTeleop:
 
     @property
     def slip(self) -> tuple[float, float]:
-        """How far the target has slipped along with the tool since engaging [m, rad]."""
-        return self._leash.slip, self._leash.slip_angle
+        """How far the target has slipped along since engaging, with the tool or along its workspace [m, rad]."""
+        return self._leash.slip + self._workspace.slip, self._leash.slip_angle
 
     def _align(self, now: float) -> None:
         self._aligned_at = now
@@ -231,6 +237,7 @@ class ArmTeleop:
         self._filter.reset(hand, now)
         self._rescale(hand, tool)
         self._leash.reset()
+        self._workspace.reset()
 
     def _held_shares(self) -> tuple[float, float]:
         """Of the scales, by what is held."""

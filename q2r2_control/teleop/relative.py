@@ -28,7 +28,7 @@ class RelativeMotion:
     With M the signed permutation ``axes``, preceded by S = diag(1, -1, 1) in the stance ``mirror_reflected``, a hand
     pose (p, R) counts in the world as (M p, M R M'). With anchors hand0 and tool0, ``target`` is
 
-        position  tool0 + scale (hand - hand0)
+        position  tool0 + scale diag(axis_scales) (hand - hand0)
         rotation  base frame:  exp(rotation_scale log(R R0')) Rtool0
                   tool frame:  Rtool0 exp(rotation_scale log(R0' R))
 
@@ -47,6 +47,7 @@ class RelativeMotion:
         rotation_frame: str = "base",
         rotation_scale: float = 1.0,
         axes: Sequence[str] = ("+x", "+y", "+z"),
+        axis_scales: Sequence[float] = (1.0, 1.0, 1.0),
     ) -> None:
         try:
             settings = TeleopSettings.model_validate(
@@ -56,6 +57,7 @@ class RelativeMotion:
                     "rotation_frame": rotation_frame,
                     "rotation_scale": rotation_scale,
                     "axes": axes,
+                    "axis_scales": axis_scales,
                 }
             )
         except ValidationError as error:
@@ -64,6 +66,7 @@ class RelativeMotion:
             raise ConfigError(f"RelativeMotion: {key} = {fault['input']!r:.60}: {fault['msg']}") from error
         self._scale, self._rotation_scale = self._full = settings.position_scale, settings.rotation_scale
         self._in_tool_frame = settings.rotation_frame is RotationFrame.TOOL
+        self._axis_scales = np.array(settings.axis_scales)
         self._map = axes_matrix(settings.axes)
         if settings.stance is Stance.MIRROR_REFLECTED:
             self._map = _REFLECTION @ self._map
@@ -133,7 +136,9 @@ class RelativeMotion:
         """
         if self._hand_position is None:
             raise Q2R2Error("RelativeMotion.hand: call anchor(hand, tool) first")
-        way = self._map.T @ (tool.translation - self._tool_position) / self._scale if self._scale else np.zeros(3)
+        scales = self._scale * self._axis_scales
+        moved = tool.translation - self._tool_position
+        way = self._map.T @ np.divide(moved, scales, out=np.zeros(3), where=scales > 0.0)
         turn = np.eye(3)
         if self._rotation_scale > 0.0:
             scaled = self._before.T @ tool.rotation @ self._after.T
@@ -144,7 +149,8 @@ class RelativeMotion:
     def _scaled_axes(self) -> list[tuple[int, float]]:
         """A signed permutation: each axis of the tool goes along one of the hand's, by so much of it."""
         sources = np.abs(self._map).argmax(axis=1)
-        return [(int(j), self._scale * float(row[j])) for row, j in zip(self._map, sources, strict=True)]
+        rows = zip(self._map, sources, self._axis_scales.tolist(), strict=True)
+        return [(int(j), self._scale * scale * float(row[j])) for row, j, scale in rows]
 
     def _scaled(self, rotation: Array) -> Array:
         if self._rotation_scale == 1.0:

@@ -43,7 +43,14 @@ from q2r2_control.config.control import (
 )
 from q2r2_control.config.external import ExternalArm, ExternalConfig, ExternalGripper, GuardLimits
 from q2r2_control.config.supervision import SupervisionSettings
-from q2r2_control.config.teleop import FilterSettings, GateSettings, HapticSettings, LeashSettings, TeleopSettings
+from q2r2_control.config.teleop import (
+    FilterSettings,
+    GateSettings,
+    HapticSettings,
+    LeashSettings,
+    TeleopSettings,
+    WorkspaceSettings,
+)
 from q2r2_control.errors import ConfigError, Q2R2Error
 from q2r2_control.robot.kept_distances import kept_distances
 from q2r2_control.robot.robot import Robot
@@ -127,7 +134,7 @@ class TestTheShippedCellShowsAllThereIsToTune:
     )
     # Not the default, and the file says so.
     CHOSEN = ("control.solve_time_limit", "control.distances", "mujoco.objects")
-    IN_A_COMMENT = (ContactPair, HeldObjectConfig, NamedPairDistance)
+    IN_A_COMMENT = (ContactPair, HeldObjectConfig, NamedPairDistance, WorkspaceSettings)
     # A tool's mount and an obstacle's rpy are placements as an arm's mount is, which shows the keys.
     SHOWN_ELSEWHERE = ("arms.left.tool.mount", "obstacles.table.rpy")
 

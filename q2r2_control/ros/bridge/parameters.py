@@ -200,7 +200,7 @@ def _teleop_settings(node: BaseNode, default: TeleopSettings) -> TeleopSettings:
         raise ConfigError("parameter mirror_reflected = True: allowed with mirror = True only")
     stance = Stance.SIDE_BY_SIDE if not mirror else Stance.MIRROR_REFLECTED if reflected else Stance.MIRROR
     default = default.model_copy(update={"stance": stance})
-    return settings_from_parameters(node, "teleop", default, frozenset({"stance"}))
+    return settings_from_parameters(node, "teleop", default, frozenset({"stance", "workspace"}))
 
 
 def settings_from_parameters(node: BaseNode, prefix: str, default: Model, leave_out: frozenset[str]) -> Model:

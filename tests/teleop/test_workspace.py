@@ -1,0 +1,112 @@
+"""The box that targets stay in: never left, slower towards its sides, left inwards at once; and scales of axes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from q2r2_control.config.teleop import WorkspaceSettings
+from q2r2_control.teleop.workspace import Workspace
+from q2r2_control.types import SIDES
+from tests.teleop.hands import ENGAGED, TICK, Operator, assert_smooth, operator
+
+EDGE = 0.05
+# About the left tool of the operator's tests, at (0.5, 0.4, 0.4).
+BOX = {"x": [0.4, 0.65], "y": [0.3, 0.6], "z": [0.3, 0.5], "soft_edge": EDGE}
+
+
+def engaged(**changes: object) -> Operator:
+    driver = operator(**changes)
+    driver.engage()
+    assert driver.states == ENGAGED
+    return driver
+
+
+def shift(driver: Operator, way: tuple[float, float, float], duration: float) -> list[np.ndarray]:
+    """The left target's positions while both hands move evenly by ``way`` and then rest a while."""
+    start = dict(driver.hands)
+
+    def move(t: float) -> dict[str, pin.SE3]:
+        share = min(t / duration, 1.0)
+        return {hand: pin.SE3(at.rotation, at.translation + share * np.array(way)) for hand, at in start.items()}
+
+    history = driver.run(duration + 0.5, move)
+    assert_smooth(history)
+    return [targets["left"].pose.translation for targets in history if targets["left"].pose is not None]
+
+
+def test_a_target_never_leaves_its_box_and_comes_back_with_the_hand_at_once() -> None:
+    driver = engaged(workspace={"left": BOX})
+    out = shift(driver, (0.3, 0.0, 0.0), 1.0)
+    assert max(position[0] for position in out) < 0.65
+    assert out[-1][0] > 0.65 - EDGE
+    assert driver.targets["left"].slip > 0.1
+    assert driver.targets["right"].slip == 0.0
+    back = shift(driver, (-0.1, 0.0, 0.0), 0.5)
+    np.testing.assert_allclose(back[-1] - out[-1], (-0.1, 0.0, 0.0), atol=1e-3)
+
+
+def test_the_way_along_a_side_is_made_whole() -> None:
+    driver = engaged(workspace={"left": BOX})
+    out = shift(driver, (0.3, 0.0, 0.0), 1.0)
+    along = shift(driver, (0.1, 0.05, -0.05), 0.5)
+    np.testing.assert_allclose((along[-1] - out[-1])[1:], (0.05, -0.05), atol=1e-3)
+
+
+def test_the_target_slows_down_towards_the_side_by_the_share_of_the_edge_that_is_left() -> None:
+    driver = engaged(workspace={"left": BOX})
+    positions = np.array(shift(driver, (0.3, 0.0, 0.0), 3.0))[:, 0]
+    speeds, room = np.diff(positions) / TICK, 0.65 - positions[:-1]
+    steady = slice(500, 2900)
+    expected = 0.1 * np.clip(room / EDGE, 0.0, 1.0)
+    np.testing.assert_allclose(speeds[steady], expected[steady], atol=0.004)
+
+
+def test_an_arm_that_is_engaged_outside_does_not_jump_and_may_only_come_in() -> None:
+    driver = operator(workspace={"left": BOX | {"x": [0.6, 0.8]}})
+    driver.engage()
+    assert driver.targets["left"].pose is not None
+    np.testing.assert_allclose(driver.targets["left"].pose.translation, driver.tools["left"].translation, atol=1e-6)
+    out = shift(driver, (-0.1, 0.0, 0.0), 0.5)
+    assert min(position[0] for position in out) > 0.5 - 1e-6
+    assert out[-1][0] < 0.504  # what the filter swings back when the hand stops
+    assert shift(driver, (0.2, 0.0, 0.0), 0.5)[-1][0] == pytest.approx(0.7, abs=5e-3)
+
+
+@pytest.mark.parametrize("at", [0.62, 0.6499, 0.66])
+def test_a_hand_that_trembles_at_a_side_does_not_creep_away_from_it(at: float) -> None:
+    workspace = Workspace(WorkspaceSettings.model_validate(BOX))
+    position, way = np.array([at, 0.4, 0.4]), 0.0
+    assert workspace.hold(position) is None
+    random = np.random.default_rng(0)
+    for tick in range(5000):
+        wanted = 0.5e-3 * np.sin(2.0 * np.pi * 10.0 * tick * TICK) + random.normal(0.0, 2e-5)
+        asked = position + np.array([wanted - way, 0.0, 0.0])
+        way, held = wanted, workspace.hold(asked)
+        position = asked if held is None else np.array(held)
+        assert abs(position[0] - at) < 1.5e-3
+
+
+@settings(derandomize=True, max_examples=50, deadline=None)
+@given(st.lists(st.tuples(*[st.floats(-0.2, 0.2)] * 3), min_size=1, max_size=40))
+def test_no_steps_of_any_size_lead_outside(steps: list[tuple[float, float, float]]) -> None:
+    workspace = Workspace(WorkspaceSettings.model_validate(BOX))
+    position = np.array([0.5, 0.4, 0.4])
+    assert workspace.hold(position) is None
+    for step in steps:
+        asked = position + np.array(step)
+        held = workspace.hold(asked)
+        position = asked if held is None else np.array(held)
+        for value, side in zip(position, (BOX["x"], BOX["y"], BOX["z"]), strict=True):
+            assert side[0] - 1e-12 <= value <= side[1] + 1e-12  # type: ignore[index]
+
+
+def test_axes_have_scales_of_their_own_and_a_scale_of_0_locks_one() -> None:
+    driver = engaged(position_scale=0.5, axis_scales=(1.0, 2.0, 0.0))
+    before = driver.tools["left"].translation
+    after = shift(driver, (0.1, -0.05, 0.08), 1.0)[-1]
+    np.testing.assert_allclose(after - before, (0.05, -0.05, 0.0), atol=1e-3)
+    assert all(driver.targets[arm].slip == 0.0 for arm in SIDES)
