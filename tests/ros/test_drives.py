@@ -34,6 +34,7 @@ from tests.ros.waiting import wait_until
 pytestmark = pytest.mark.alone
 
 RATE = 125.0  # of the control loop [Hz]
+PLACES = (-0.05, 0.2)  # above home, between which the arm becomes fast [m]
 COMMANDS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE, history=HistoryPolicy.KEEP_LAST)
 ADMITTANCE = {"enabled": True, "stiffness": 500.0, "force_dead_band": 0.0}
 HANGS = 0.13  # longer than commands may go without an acknowledgement, and too short to ask a robot to jump [s]
@@ -69,12 +70,15 @@ def test_a_controller_that_is_stopped_for_a_while_publishes_no_jump(
     stall: float, robot: Robot, processes: Processes, node: Any
 ) -> None:
     cell, controller, recorder, stream = recorded(robot, processes, node)
+    home = stream.poses["left"]
     try:
-        for times in range(4):
+        for _ in range(4):
             begin = len(recorder.commands)
-            home = stream.poses["left"]
-            stream.poses["left"] = shifted(home, 0.0, 0.0, 0.15 if times % 2 == 0 else -0.15)
-            wait_until(partial(moves_fast, recorder, begin), "the arm moves fast")
+            # The farther one, since a stall that starts over leaves the arm anywhere in between.
+            height = cell.tool("left").translation[2]
+            goal = max(PLACES, key=lambda place: abs(home.translation[2] + place - height))
+            stream.poses["left"] = shifted(home, 0.0, 0.0, goal)
+            wait_until(partial(moves_fast, recorder, begin), "the arm moves fast", lambda: cell.states)
             os.kill(controller.pid, signal.SIGSTOP)
             time.sleep(stall)
             os.kill(controller.pid, signal.SIGCONT)
