@@ -42,6 +42,7 @@ from q2r2_control.config.control import (
     WallSettings,
 )
 from q2r2_control.config.external import ExternalArm, ExternalConfig, ExternalGripper, GuardLimits
+from q2r2_control.config.judge import JudgeSettings
 from q2r2_control.config.supervision import SupervisionSettings
 from q2r2_control.config.teleop import FilterSettings, GateSettings, HapticSettings, LeashSettings, TeleopSettings
 from q2r2_control.errors import ConfigError, Q2R2Error
@@ -120,6 +121,7 @@ class TestTheShippedCellShowsAllThereIsToTune:
         ("teleop.gate", GateSettings),
         ("mujoco", MujocoConfig),
         ("mujoco.objects.blue_block", ObjectConfig),
+        ("judge", JudgeSettings),
         ("external", ExternalConfig),
         ("external.limits", GuardLimits),
         ("external.arms.left", ExternalArm),
@@ -171,6 +173,7 @@ class TestTheShippedCellShowsAllThereIsToTune:
             ("admittance", AdmittanceSettings),
             ("teleop", TeleopSettings),
             ("mujoco", MujocoConfig),
+            ("judge", JudgeSettings),
         ],
     )
     def test_what_is_written_is_the_default(self, place: str, model: type[BaseModel]) -> None:
