@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import Progress
 from rich.table import Table
+from rich.text import Text
 
 from q2r2_control.cli.figure_table import figure_table
 from q2r2_control.cli.options import Json
@@ -22,6 +23,8 @@ from q2r2_control.errors import ConfigError
 from q2r2_control.judging.judge import Judged, judge_all
 from q2r2_control.judging.page import COLUMNS, page_of
 from q2r2_control.recording.files import recordings_in
+
+_SHOWN = ("time", "idle", "gap", "delay", "error", "LDLJ")  # what a terminal has room for; the page has all
 
 Recordings = Annotated[list[Path], typer.Argument(metavar="DIR_OR_FILES...", help="Recordings, or folders of them.")]
 Thresholds = Annotated[
@@ -41,7 +44,8 @@ def judge(recordings: Recordings, config: Thresholds = None, json: Json = False)
     console = Console()
     console.print(_table(judged))
     for one in judged:
-        console.print(f"{escape(one.figures.file)}: {verdict_markup(one.verdict)}", soft_wrap=True, highlight=False)
+        if not one.verdict.keep:
+            console.print(f"{escape(one.figures.file)}: {verdict_markup(one.verdict)}", soft_wrap=True, highlight=False)
 
 
 def report(
@@ -77,10 +81,10 @@ def _judged(recordings: Sequence[Path], config: str | None) -> list[Judged]:
 def _table(judged: Sequence[Judged]) -> Table:
     """A row for each episode; of several hands or arms the worst number."""
     kept = sum(one.verdict.keep for one in judged)
-    title = f"{len(judged)} episodes: {kept} kept, {len(judged) - kept} discarded"
-    headings = tuple(f"{column.name} {column.unit and f'[{column.unit}]'}".strip() for column in COLUMNS)
-    table = figure_table(title, "episode", ("verdict", *headings))
+    columns = [column for column in COLUMNS if column.name in _SHOWN]
+    headings = tuple(column.heading for column in columns)
+    table = figure_table(f"episodes: {kept} kept, {len(judged) - kept} discarded", "episode", ("verdict", *headings))
     for one in judged:
-        name = Path(one.figures.file).stem
-        table.add_row(name, one.verdict.word, *(column.text(one.figures) for column in COLUMNS))
+        name = Text(Path(one.figures.file).stem)
+        table.add_row(name, one.verdict.word, *(column.text(one.figures) for column in columns))
     return table

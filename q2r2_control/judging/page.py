@@ -50,7 +50,7 @@ COLUMNS = (
     FigureColumn("poses", "Hz", 0, lambda of: _worst([hand.pose_rate_hz for hand in of.hands.values()], min)),
     FigureColumn("gap", "s", 3, lambda of: _worst([hand.longest_gap_s for hand in of.hands.values()])),
     FigureColumn("delay", "ms", 0, lambda of: _worst([arm.hand_to_tool_ms for arm in of.arms.values()])),
-    FigureColumn("error RMS", "mm", 1, lambda of: _worst([arm.position_error_mm_rms for arm in of.arms.values()])),
+    FigureColumn("error", "mm RMS", 1, lambda of: _worst([arm.position_error_mm_rms for arm in of.arms.values()])),
     FigureColumn("leashed", "%", 0, lambda of: _percent(_worst([arm.leashed_share for arm in of.arms.values()]))),
     FigureColumn("SPARC", "", 2, lambda of: _worst([arm.sparc for arm in of.arms.values()], min)),
     FigureColumn("LDLJ", "", 1, lambda of: _worst([arm.ldlj for arm in of.arms.values()], min)),
@@ -69,7 +69,7 @@ def page_of(episodes: Sequence[Judged], title: str, progress: Callable[[int], No
         sections.append(_section(judged, number))
         progress(number)
     kept = sum(judged.verdict.keep for judged in episodes)
-    headings = "".join(f"<th>{escape(column.heading)}</th>" for column in COLUMNS)
+    headings = "".join(f'<th class="number">{escape(column.heading)}</th>' for column in COLUMNS)
     return _PAGE.format(
         title=escape(title),
         count=f"episodes: {len(episodes)}, of which {kept} kept and {len(episodes) - kept} discarded",
@@ -132,7 +132,7 @@ table { border-collapse: collapse; width: 100%; font-size: 13px; }
 th, td { padding: .35rem .55rem; text-align: left; border-bottom: 1px solid #eee; white-space: nowrap; }
 th { background: #f0f2f5; cursor: pointer; white-space: normal; vertical-align: bottom; user-select: none; }
 th[data-order="1"]::after { content: " \\25b2"; } th[data-order="-1"]::after { content: " \\25bc"; }
-td.number { text-align: right; font-variant-numeric: tabular-nums; }
+.number { text-align: right; font-variant-numeric: tabular-nums; }
 .keep, .discard { font-weight: 600; white-space: nowrap; } .keep { color: #1f6fb2; } .discard { color: #b04a00; }
 section { background: white; border: 1px solid #ddd; border-radius: 6px; margin: 1.2rem 0; padding: .9rem 1.1rem; }
 section ul { margin: .3rem 0; color: #b04a00; } section img { width: 100%; height: auto; }

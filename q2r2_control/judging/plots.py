@@ -135,15 +135,16 @@ def _draw_leash(axes: Axes, judged: Judged) -> None:
             axes.plot(t, some, linestyle="none", marker="|", markersize=6, color=colour, label=label)
     axes.set_title("limits: how far the leash has dragged the targets")
     axes.set_ylabel("slip [mm]")
-    axes.set_ylim(0.0, highest)
+    axes.set_ylim(-0.03 * highest, highest)
 
 
 def _draw_timing(axes: Axes, judged: Judged) -> None:
     """Time between ticks, and where some are not in the file a red ground."""
     ticks = judged.episode.ticks
     axes.plot(*thinned(ticks.t, 1e3 * ticks.dt, np.fmax), color="#555555", linewidth=1.0, label="between ticks")
-    compute = thinned(ticks.t, 1e3 * ticks.compute_time, np.fmax)
-    axes.plot(*compute, color=COLOURS["left"], linewidth=0.8, alpha=0.7, label="computing")
+    if judged.episode.recording.about.realtime:  # in simulated time it is nobody's matter
+        compute = thinned(ticks.t, 1e3 * ticks.compute_time, np.fmax)
+        axes.plot(*compute, color=COLOURS["left"], linewidth=0.8, alpha=0.7, label="computing")
     label: str | None = "lost ticks"
     for at in np.flatnonzero(np.diff(ticks.number) > 1)[:_POINTS]:
         axes.axvspan(ticks.t[at], ticks.t[at + 1], color="#b3202c", alpha=0.4, linewidth=0.0, label=label)

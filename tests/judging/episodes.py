@@ -23,7 +23,7 @@ ARMS = ("left", "right")
 
 def recording() -> Recording:
     """What is asked of a recording once it is read."""
-    about = SimpleNamespace(arms=ARMS, notes={"task": "to <stack>"})
+    about = SimpleNamespace(arms=ARMS, realtime=True, notes={"task": "to <stack>"})
     return cast(Recording, SimpleNamespace(about=about, closed=True, file=Path("some/where/run.mcap")))
 
 
@@ -46,7 +46,7 @@ def episode(
     (k,), which ticks get ``delay`` [s] later. ``ticks`` replaces columns of :class:`Ticks`.
     """
     count = round(seconds / DT)
-    t = DT * np.arange(1, count + 1)
+    t: Array = DT * np.arange(1, count + 1, dtype=np.float64)
     flags = np.zeros((count, 2), dtype=bool)
     rows = Ticks(
         number=np.arange(count),
