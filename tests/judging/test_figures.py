@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -63,6 +64,14 @@ class TestHands:
         found = hand_figures(episode(hand_path=places), "left", DROPOUT)
         assert found.unusable_poses == 20
         assert found.longest_gap_s == pytest.approx(0.21)
+
+    def test_a_gap_in_which_ticks_were_lost_is_none(self) -> None:
+        number = np.concatenate((np.arange(500), np.arange(600, 2100)))
+        of = episode(4.2, received=without(1.0, 1.2))
+        keep = {name: values[number] for name, values in vars(of.ticks).items()}
+        lossy = replace(of, ticks=replace(of.ticks, **keep), frames=replace(of.frames, at=of.frames.at[:1]))
+        assert hand_figures(of, "left", DROPOUT).dropouts == 2
+        assert hand_figures(lossy, "left", DROPOUT).dropouts == 1  # the one at the end
 
     def test_ages_are_from_the_receipt_to_the_tick(self) -> None:
         found = hand_figures(episode(delay=0.03), "left", DROPOUT)

@@ -174,6 +174,7 @@ def test_every_threshold_is_tried_here() -> None:
 def test_a_number_that_is_none_is_not_judged_and_one_that_is_no_number_is_discarded() -> None:
     assert verdict_of(arm(sparc=None, hand_to_tool_ms=None), JudgeSettings()).keep
     assert not verdict_of(arm(sparc=float("nan")), JudgeSettings()).keep
+    assert not verdict_of(arm(position_error_mm_rms=float("nan")), JudgeSettings()).keep
 
 
 def test_damage_and_a_missing_end_are_named_before_all_else() -> None:
