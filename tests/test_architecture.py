@@ -29,7 +29,7 @@ LEVELS = (
     {"runtime"},
     {"pipeline"},
     {"viewer", "verification", "recording"},
-    {"ros", "export"},
+    {"ros", "export", "judging"},
     {"benchmark"},
     {"cli"},
     {"__main__"},

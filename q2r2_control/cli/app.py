@@ -13,6 +13,7 @@ from q2r2_control.cli.demo import demo
 from q2r2_control.cli.error_handling import ErrorHandlingGroup
 from q2r2_control.cli.export import app as export_app
 from q2r2_control.cli.headset_check import headset_check
+from q2r2_control.cli.judge import judge, report
 from q2r2_control.cli.replay import replay
 from q2r2_control.cli.ros import app as ros_app
 from q2r2_control.cli.run import run
@@ -27,6 +28,8 @@ app = typer.Typer(
 app.command(epilog="Example: q2r2 demo --viewer")(demo)
 app.command(epilog="Example: q2r2 run config/dual_iiwa7.yaml --input headset --host 0.0.0.0")(run)
 app.command(epilog="Example: q2r2 replay recordings/20260101-120000-dual_iiwa7 --compare")(replay)
+app.command(epilog="Example: q2r2 judge recordings --json")(judge)
+app.command(epilog="Example: q2r2 report recordings --output report.html")(report)
 app.command(epilog="Example: q2r2 check config/dual_iiwa7.yaml --pairs dual_iiwa7.srdf")(check)
 app.command("headset-check", epilog="Example: q2r2 headset-check --host 0.0.0.0")(headset_check)
 app.command(epilog="Example: q2r2 bench --ticks 20000, or --work --motion meet --through torque, or --soak --seed 3")(

@@ -12,16 +12,18 @@ from typing import Any
 from rich.console import Console
 
 from q2r2_control.cli.headset_server import AnnouncedHeadset
-from q2r2_control.cli.output import as_json_text, notice_of_compiling
-from q2r2_control.cli.summary_table import recording_line, summary_table, task_line
+from q2r2_control.cli.output import as_json_text, notice_of_compiling, stderr_console
+from q2r2_control.cli.summary_table import recording_line, summary_table, task_line, verdict_markup
 from q2r2_control.config import Config
 from q2r2_control.config.external import ControllerKind
-from q2r2_control.errors import ConfigError
+from q2r2_control.errors import ConfigError, RecordingError
 from q2r2_control.inputs.base import Input
 from q2r2_control.inputs.scripted import ScriptedInput
+from q2r2_control.judging.judge import Judged, judge, keep_verdict
 from q2r2_control.pipeline import Pipeline
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.recording.about import About
+from q2r2_control.recording.reader import Recording
 from q2r2_control.recording.recorder import Recorder, RecordingSummary
 from q2r2_control.runtime.folders import new_folder
 from q2r2_control.runtime.recorder import Tick
@@ -121,9 +123,11 @@ def run_cell(config: Config, options: RunOptions, console: Console) -> CellRun:
 
 
 def print_summary(run: CellRun, json: bool) -> None:
-    """Print the summary of a run on stdout, as a table or as one JSON object."""
+    """Print the summary of a run on stdout, as a table or as one JSON object, and the verdict on its recording."""
     if json:
-        print(as_json_text(run.as_json()))
+        judged = _judge_recording(run.recording)
+        verdict = {} if judged is None else {"judge": judged.as_json()}
+        print(as_json_text({**run.as_json(), **verdict}))
         return
     console = Console()
     console.print(summary_table(run.summary))
@@ -131,6 +135,21 @@ def print_summary(run: CellRun, json: bool) -> None:
         console.print(task_line(task), soft_wrap=True, highlight=False)
     if run.recording is not None:
         console.print(recording_line(run.recording), soft_wrap=True, highlight=False)
+        if judged := _judge_recording(run.recording):
+            console.print(f"verdict: {verdict_markup(judged.verdict)}", soft_wrap=True, highlight=False)
+
+
+def _judge_recording(recording: RecordingSummary | None) -> Judged | None:
+    """Judge the file as it was written, and keep the verdict beside it. Whatever fails is one line on stderr."""
+    if recording is None or recording.file is None or not Path(recording.file).exists():
+        return None
+    try:
+        judged = judge(Recording(Path(recording.file)))
+        keep_verdict(judged)
+    except RecordingError as error:
+        stderr_console().print(f"not judged: {error}", soft_wrap=True, highlight=False, markup=False)
+        return None
+    return judged
 
 
 def _refuse_faults(pipeline: Pipeline, force: bool, console: Console) -> None:

@@ -12,9 +12,10 @@ from rich.progress import Progress
 from q2r2_control.cli.output import stderr_console
 from q2r2_control.errors import ConfigError, RecordingError
 from q2r2_control.export.csv_tables import write_table, write_tables
-from q2r2_control.export.episodes import FASTEST, Sampling, make_episodes, recordings_in
+from q2r2_control.export.episodes import FASTEST, Sampling, make_episodes
 from q2r2_control.export.lerobot import require_pyarrow, write_dataset
 from q2r2_control.export.output import Output
+from q2r2_control.recording.files import recordings_in
 
 app = typer.Typer(rich_markup_mode=None, help="Recordings of q2r2 run --record as datasets to train on.")
 

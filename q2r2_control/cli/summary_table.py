@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from rich.markup import escape
 from rich.table import Table
 
+from q2r2_control.judging.verdict import Verdict
 from q2r2_control.recording.recorder import RecordingSummary
 from q2r2_control.runtime.histogram import Percentiles
 from q2r2_control.runtime.run_summary import RunSummary
@@ -80,6 +81,12 @@ def recording_line(recording: RecordingSummary) -> str:
         return f"{ended}; {recording.ticks} ticks recorded, {recording.lost_ticks} not"
     lost = f", [red]{recording.lost_ticks} lost[/]: the queue was full" if recording.lost_ticks else ""
     return f"recording: {escape(str(recording.file))} ({recording.ticks} ticks{lost})"
+
+
+def verdict_markup(verdict: Verdict) -> str:
+    """One line of markup: whether an episode is kept, and why not."""
+    colour = "green" if verdict.keep else "red"
+    return f"[{colour}]{verdict.word}[/]{escape(verdict.line.removeprefix(verdict.word))}"
 
 
 def _figure(what: str, value: float) -> str:

@@ -29,6 +29,7 @@ from q2r2_control.config.arms import (
 )
 from q2r2_control.config.control import AdmittanceSettings, ControllerSettings, ImpedanceSettings, check_priority
 from q2r2_control.config.external import ControllerKind, ExternalConfig, check_external
+from q2r2_control.config.judge import JudgeSettings
 from q2r2_control.config.networks import Network, network_of
 from q2r2_control.config.resources import find_resource
 from q2r2_control.config.supervision import SupervisionSettings
@@ -127,6 +128,7 @@ class Config(CellModel):
     teleop: TeleopSettings = TeleopSettings()
     headset: HeadsetConfig = HeadsetConfig()
     mujoco: MujocoConfig = MujocoConfig()
+    judge: JudgeSettings = JudgeSettings()
 
     def model_of(self, arm: str) -> str:
         """The model that an arm is, or is part of."""

@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
-from functools import lru_cache
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -18,12 +17,11 @@ from zipfile import BadZipFile
 import numpy as np
 import numpy.typing as npt
 
-from q2r2_control.config.cell import parse_config
-from q2r2_control.errors import ConfigError, Q2R2Error, RecordingError
+from q2r2_control.errors import ConfigError, RecordingError
 from q2r2_control.export.features import Names, features
 from q2r2_control.export.sampling import sample
 from q2r2_control.recording.reader import Recording
-from q2r2_control.robot.robot import Robot
+from q2r2_control.recording.recorded_robot import cell_and_robot_of
 
 FASTEST = 1000  # [frames/s]
 _FORMAT = 1  # of kept episodes; another one is made again
@@ -95,45 +93,15 @@ class Episode:
 def make_episode(file: Path, sampling: Sampling) -> Episode:
     """An episode of a recording. Raises :class:`RecordingError` that names the file and what is wrong."""
     recording = Recording(file)
-    about = recording.about
     frames = sample(recording, sampling.fps, sampling.trim)
+    cell, robot = cell_and_robot_of(recording)
     try:
-        cell, robot = _cell(about.cell)
-        if tuple(robot.arms) != about.arms or tuple(robot.joint_names) != about.joints:
-            raise RecordingError("recorded with other arms or joints than its cell has")
         vectors, labels = features(frames, robot)
-    except Q2R2Error as error:
+    except RecordingError as error:
         raise RecordingError(f"{recording.file}: {error}") from error
-    notes = dict(about.notes)
+    notes = dict(recording.about.notes)
     task = notes.pop("task", "")
-    return Episode(recording.file.name, cell, task, sampling.fps, labels, notes, vectors)
-
-
-@lru_cache(maxsize=4)
-def _cell(text: str) -> tuple[str, Robot]:
-    """Name and robot of a cell; recordings of a day have the same one."""
-    config = parse_config(text, "its cell")
-    return config.name, Robot.from_config(config)
-
-
-def recordings_in(paths: Sequence[Path]) -> list[Path]:
-    """Files of recordings: those given, and all in folders given, by name; each once.
-
-    Raises :class:`RecordingError` for a path without any.
-    """
-    files: dict[Path, Path] = {}
-    for path in paths:
-        if path.is_dir():
-            found = sorted(path.rglob("*.mcap"))
-            if not found:
-                raise RecordingError(f"{path}: no file .mcap in it; allowed: recordings of q2r2 run --record")
-        elif path.exists():
-            found = [path]
-        else:
-            raise RecordingError(f"{path}: no such file or folder")
-        for file in found:
-            files.setdefault(file.resolve(), file)
-    return list(files.values())
+    return Episode(recording.file.name, cell.name, task, sampling.fps, labels, notes, vectors)
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ import pinocchio as pin
 
 from q2r2_control.errors import RecordingError
 from q2r2_control.recording.encoder import NOT_MEASURED
+from q2r2_control.recording.recorded_robot import check_tools, tool_poses
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 
@@ -19,7 +20,6 @@ Names = dict[str, tuple[str, ...]]
 
 POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
 MOTION = ("x", "y", "z", "rx", "ry", "rz")
-_SAME_POSE = 1e-6  # [m], and of a quaternion
 
 
 def features(frames: Mapping[str, Array], robot: Robot) -> tuple[Vectors, Names]:
@@ -30,10 +30,10 @@ def features(frames: Mapping[str, Array], robot: Robot) -> tuple[Vectors, Names]
     not the one that was recorded.
     """
     arms, joints = tuple(robot.arms), robot.joint_names
-    _check_robot(frames, robot)
+    check_tools(frames["reference"][0], frames["reference_tool"][0], robot)
     measured = _known(frames, "opening", arms)
     commanded = _known(frames, "gripper", arms)
-    tools = _continuous(_tools(frames["position"], robot))
+    tools = _continuous(tool_poses(frames["position"], robot))
     targets = _continuous(frames["target"], tools[0])
     poses = tuple(f"{arm}_{number}" for arm in arms for number in POSE)
     count = len(tools)
@@ -71,25 +71,6 @@ def _known(frames: Mapping[str, Array], what: str, arms: tuple[str, ...]) -> lis
         if unknown[:, index].any() and not unknown[:, index].all():
             raise RecordingError(f"the {what} of arm {arm} is not known at frame {np.argmax(unknown[:, index])}")
     return [index for index in range(len(arms)) if not unknown[:, index].any()]
-
-
-def _tools(positions: Array, robot: Robot) -> Array:
-    """Tool poses (n, arms, 7) at joint positions (n, joints)."""
-    model, data = robot.model, robot.model.createData()
-    poses = np.empty((len(positions), len(robot.arms), 7))
-    for q, pose in zip(positions, poses, strict=True):
-        pin.forwardKinematics(model, data, q)
-        for index, arm in enumerate(robot.arms.values()):
-            pose[index] = pin.SE3ToXYZQUAT(pin.updateFramePlacement(model, data, arm.frame_id))
-    return poses
-
-
-def _check_robot(frames: Mapping[str, Array], robot: Robot) -> None:
-    """The tool at the reference was recorded too, so another robot, whose files have changed since, shows."""
-    found = _continuous(_tools(frames["reference"][:1], robot))
-    recorded = _continuous(frames["reference_tool"][:1], found[0])
-    if not np.allclose(found, recorded, rtol=0.0, atol=_SAME_POSE):
-        raise RecordingError("the robot that its cell names now is not the recorded one: tools are elsewhere")
 
 
 def _continuous(poses: Array, first: Array | None = None) -> Array:

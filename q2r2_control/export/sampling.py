@@ -7,18 +7,18 @@ never knows the future, and a command was decided on no earlier than what was ob
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from typing import Any
+from collections.abc import Iterator
 
 import numpy as np
 import numpy.typing as npt
 
 from q2r2_control.errors import RecordingError
 from q2r2_control.recording import topics as names
-from q2r2_control.recording.reader import RecordedChunk, Recording
+from q2r2_control.recording.reader import Recording
+from q2r2_control.recording.ticks import ChunkTicks, Column, ticks_of
 from q2r2_control.types import Array
 
-Columns = dict[str, npt.NDArray[Any]]
+Columns = dict[str, Column]
 
 OBSERVED = ("position", "velocity", "effort", "opening")
 COMMANDED = ("reference", "gripper", "target", "reference_tool")
@@ -38,7 +38,7 @@ def sample(recording: Recording, fps: int, trim: bool = False) -> dict[str, Arra
     :class:`RecordingError` for a damaged file, one without a tick to take, and one in which ticks were lost for longer
     than a frame.
     """
-    picked: dict[str, list[npt.NDArray[Any]]] = {name: [] for name in ("time", *OBSERVED, *COMMANDED)}
+    picked: dict[str, list[Column]] = {name: [] for name in ("time", *OBSERVED, *COMMANDED)}
     start, end, count = None, 0, 0
     previous: Columns | None = None
     for columns in _ticks(recording, fps):
@@ -82,21 +82,13 @@ def _times_until(last: int, start: int, fps: int, first_frame: int) -> npt.NDArr
 
 
 def _ticks(recording: Recording, fps: int) -> Iterator[Columns]:
-    """Columns of the ticks, some half a second at a time; checks that they follow each other."""
-    last_number, last_time = -1, 0
-    for chunk in recording.chunks():
-        if names.TICK not in chunk.rows:
-            continue
-        try:
-            columns = _columns(chunk, recording)
-        except (KeyError, ValueError, IndexError) as error:
-            raise RecordingError(f"{recording.file}: damaged: a tick without all of its messages") from error
-        numbers = np.concatenate(([last_number], columns["number"]))
-        times = np.concatenate(([last_time], columns["time"]))
-        if (np.diff(times) < 0).any() or (np.diff(numbers) < 1).any():
-            raise RecordingError(f"{recording.file}: damaged: ticks are not in the order of time")
+    """Columns of the ticks, some half a second at a time; checks that none are missing for longer than a frame."""
+    last: ChunkTicks | None = None
+    for ticks in ticks_of(recording):
+        numbers, times = ticks.numbers, ticks.times
+        if last is not None:
+            numbers, times = np.append(last.numbers[-1], numbers), np.append(last.times[-1], times)
         lost = (np.diff(numbers) > 1) & (np.diff(times) * fps > _NANOSECONDS)
-        lost[0] &= last_number >= 0
         if lost.any():
             gap = int(np.argmax(lost))
             when = (int(times[gap]) - recording.about.epoch) / _NANOSECONDS
@@ -104,54 +96,27 @@ def _ticks(recording: Recording, fps: int) -> Iterator[Columns]:
                 f"{recording.file}: {int(numbers[gap + 1] - numbers[gap]) - 1} ticks were lost after {when:.3f} s when "
                 f"it was recorded; allowed: none for longer than a frame, 1/{fps} s"
             )
-        last_number, last_time = int(numbers[-1]), int(times[-1])
-        yield columns
+        last = ticks
+        try:
+            yield _columns(ticks)
+        except ValueError as error:
+            raise RecordingError(f"{recording.file}: damaged: {error}") from error
 
 
-def _columns(chunk: RecordedChunk, recording: Recording) -> Columns:
+def _columns(ticks: ChunkTicks) -> Columns:
     """One row of each for every tick of a chunk."""
-    arms, topics, rows = recording.about.arms, recording.topics, chunk.rows
-
-    def numbers(topic: str, label: str) -> npt.NDArray[Any]:
-        return np.asarray(rows[topic]["data"][:, topics.by_name[topic].labels["data"].index(label)])
-
-    def of_arms(topic: str, what: str) -> npt.NDArray[Any]:
-        return np.stack([numbers(topic, f"{what}_{arm}") for arm in arms], axis=1)
-
-    states, reference = rows[names.JOINT_STATES], rows[names.REFERENCE]
-    engaged = of_arms(names.FLAGS, "engaged").any(axis=1)
-    reference_tool = np.stack([_poses(rows[names.safe_target(arm)]) for arm in arms], axis=1)
-    columns: Columns = {
-        "number": rows[names.TICK]["sequence"].astype(np.int64),
-        "time": rows[names.TICK]["log_time"].astype(np.int64),
+    states, reference = ticks.rows(names.JOINT_STATES), ticks.rows(names.REFERENCE)
+    engaged = ticks.of_arms(names.FLAGS, "engaged").any(axis=1)
+    reference_tool = ticks.reference_tools()
+    return {
+        "time": ticks.times,
         "active": engaged | (np.abs(reference["velocities"]).max(axis=1) > _MOVING),
         "position": states["position"],
         "velocity": states["velocity"],
         "effort": states["effort"],
-        "opening": of_arms(names.TICK, "opening"),
+        "opening": ticks.of_arms(names.TICK, "opening"),
         "reference": reference["positions"],
-        "gripper": of_arms(names.GRIPPERS, "commanded"),
-        "target": _targets(rows, arms, reference_tool),
+        "gripper": ticks.of_arms(names.GRIPPERS, "commanded"),
+        "target": ticks.targets(otherwise=reference_tool),
         "reference_tool": reference_tool,
     }
-    if len({len(values) for values in columns.values()}) != 1:
-        raise ValueError("a message is missing")
-    return columns
-
-
-def _targets(rows: Mapping[str, npt.NDArray[np.void]], arms: tuple[str, ...], otherwise: Array) -> Array:
-    """What the operator asks for, where there is such a message."""
-    targets = otherwise.copy()
-    ticks = rows[names.TICK]["sequence"]
-    for index, arm in enumerate(arms):
-        asked = rows.get(names.target(arm))
-        if asked is not None:
-            at = np.searchsorted(ticks, asked["sequence"])
-            if (ticks[at] != asked["sequence"]).any():
-                raise ValueError("a target without a tick")
-            targets[at, index] = _poses(asked)
-    return targets
-
-
-def _poses(rows: npt.NDArray[np.void]) -> Array:
-    return np.concatenate((rows["position"], rows["quaternion"]), axis=1)

@@ -9,17 +9,21 @@ from pathlib import Path
 
 import numpy as np
 from mcap.exceptions import EndOfFile, McapError
+from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Chunk, DataEnd, McapRecord, Metadata
 from mcap.stream_reader import StreamReader, get_chunk_data_stream
 from zstandard import ZstdError
 
 from q2r2_control.errors import RecordingError
 from q2r2_control.recording.about import ABOUT, CELL, ROBOT, About
+from q2r2_control.recording.mcap_file import MAGIC
 from q2r2_control.recording.rows import HEAD, MESSAGE, Rows
 from q2r2_control.recording.topics import Topic, Topics
 
 _LARGEST = 1 << 30  # of a record [bytes]
 _OPCODE_AND_LENGTH = 9
+_FOOTER_LENGTH = 20
+_FOOTER = struct.Struct("<BQQQI8s")  # opcode, length, starts of summary and its offsets, checksum; then the magic
 _BROKEN = (McapError, ZstdError, ValueError, KeyError, IndexError, struct.error, OverflowError, MemoryError)
 
 
@@ -55,6 +59,20 @@ class Recording:
             return  # cut off in the middle of a record, by a machine that lost its power
         except _BROKEN as error:
             raise RecordingError(f"{self.file}: damaged: {_line(error)}") from error
+
+    @property
+    def closed(self) -> bool:
+        """Whether the file has an index, which is written last: not where its process was killed or the disk full."""
+        try:
+            with self.file.open("rb") as stream:
+                stream.seek(max(self.file.stat().st_size - _FOOTER.size, 0))
+                end = stream.read()
+        except OSError as error:
+            raise RecordingError(f"{self.file}: cannot be read: {error.strerror}") from error
+        if len(end) != _FOOTER.size:
+            return False
+        opcode, length, summary, _, _, magic = _FOOTER.unpack(end)
+        return bool(opcode == Opcode.FOOTER and length == _FOOTER_LENGTH and summary and magic == MAGIC)
 
     def _records(self) -> Iterator[McapRecord]:
         try:

@@ -11,14 +11,12 @@ import numpy as np
 from q2r2_control.runtime.run_summary import RunSummary
 from q2r2_control.types import Array
 from q2r2_control.viewer.history import History
+from q2r2_control.viewer.plot_style import COLOURS, LINE_STYLES, MARGIN_COLOUR, draw_limit
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-_COLOURS = {"left": "#1f6fb2", "right": "#d9722b"}
-_LIMIT = "#b3202c"
 _AXES_STYLE = (("x", 1.0), ("y", 0.7), ("z", 0.45))  # name, opacity
-_LINE_STYLES = {"left": "-", "right": (0, (4, 3))}  # where both share a plot, the right lies on top
 _TARGET_STYLE: dict[str, Any] = {"color": "black", "linestyle": (0, (2, 4)), "linewidth": 1.0}
 _CLOSED = 0.95  # a gripper's opening below which it is drawn as closed
 _LABEL_ROOM = 0.09  # between two labels beside the joints' plot, in its units
@@ -69,7 +67,7 @@ def _headline(summary: RunSummary) -> str:
 
 def _draw_path(axes: Axes, history: History, arm: str) -> None:
     """Displacement from where the tool started, and while the gripper is closed."""
-    colour, start = _COLOURS[arm], history.tool(arm)[:1]
+    colour, start = COLOURS[arm], history.tool(arm)[:1]
     measured, target = 1e3 * (history.tool(arm) - start), 1e3 * (history.target(arm) - start)
     for index, (name, opacity) in enumerate(_AXES_STYLE):
         axes.plot(history.t, measured[:, index], color=colour, alpha=opacity, linewidth=2.0, label=f"{name} measured")
@@ -103,7 +101,7 @@ def _draw_errors(axes: Axes, history: History, arms: list[str], kind: str) -> No
     """Measured tool against the target, where engaged."""
     for arm in arms:
         error = 1e3 * history.position_error(arm) if kind == "position" else np.degrees(history.rotation_error(arm))
-        axes.plot(history.t, error, color=_COLOURS[arm], linestyle=_LINE_STYLES[arm], label=arm)
+        axes.plot(history.t, error, color=COLOURS[arm], linestyle=LINE_STYLES[arm], label=arm)
     axes.set_title(f"{kind} error of the measured tool, while engaged")
     axes.set_ylabel("error [mm]" if kind == "position" else "error [deg]")
     axes.set_ylim(bottom=0.0)
@@ -113,8 +111,8 @@ def _draw_errors(axes: Axes, history: History, arms: list[str], kind: str) -> No
 def _draw_margin(axes: Axes, history: History) -> None:
     margin = np.where(np.isfinite(history.margin), 1e3 * history.margin, np.nan)
     lowest = float(np.nanmin(margin, initial=0.0))
-    axes.plot(history.t, margin, color="#3b7d3b", label="tightest monitored pair")
-    _draw_limit(axes, 0.0, "limit")
+    axes.plot(history.t, margin, color=MARGIN_COLOUR, label="tightest monitored pair")
+    draw_limit(axes, 0.0, "limit")
     axes.set_title("distance of monitored pairs beyond what they keep")
     axes.set_ylabel("distance to spare [mm]")
     axes.set_ylim(bottom=min(-2.0, lowest))
@@ -124,7 +122,7 @@ def _draw_margin(axes: Axes, history: History) -> None:
 def _draw_ratios(axes: Axes, history: History) -> None:
     axes.plot(history.t, history.velocity_ratio, color="#6a4c93", label="velocity, worst joint")
     axes.plot(history.t, history.acceleration_ratio, color="#8d8d8d", linewidth=1.0, label="acceleration, worst joint")
-    _draw_limit(axes, 1.0, "limit")
+    draw_limit(axes, 1.0, "limit")
     axes.set_title("reference velocity and acceleration, as part of their limits")
     axes.set_ylabel("ratio [1]")
     axes.set_ylim(0.0, 1.1)
@@ -138,14 +136,14 @@ def _draw_joints(axes: Axes, history: History, arm: str) -> None:
     place: Array = (2.0 * history.q[:, joints] - lower - upper) / (upper - lower)
     for number in range(len(joints)):
         opacity = 1.0 - 0.75 * number / max(len(joints) - 1, 1)
-        axes.plot(history.t, place[:, number], color=_COLOURS[arm], alpha=opacity)
+        axes.plot(history.t, place[:, number], color=COLOURS[arm], alpha=opacity)
     for number, height in enumerate(_spread(place[-1])):
         name = robot.joint_names[joints[number]].removeprefix(f"{arm}_")
         axes.annotate(
-            name, (1.01, height), xycoords=("axes fraction", "data"), va="center", fontsize=8, color=_COLOURS[arm]
+            name, (1.01, height), xycoords=("axes fraction", "data"), va="center", fontsize=8, color=COLOURS[arm]
         )
-    _draw_limit(axes, 1.0, "limits")
-    _draw_limit(axes, -1.0, None)
+    draw_limit(axes, 1.0, "limits")
+    draw_limit(axes, -1.0, None)
     axes.set_title(f"{arm} joints between their limits")
     axes.set_ylabel("position: -1 lower, +1 upper limit")
     axes.set_ylim(-1.1, 1.1)
@@ -158,7 +156,3 @@ def _spread(heights: Array) -> Array:
     for below, above in itertools.pairwise(order):
         spread[above] = max(spread[above], spread[below] + _LABEL_ROOM)
     return spread
-
-
-def _draw_limit(axes: Axes, value: float, label: str | None) -> None:
-    axes.axhline(value, color=_LIMIT, linestyle="--", linewidth=1.2, label=label)

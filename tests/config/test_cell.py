@@ -42,6 +42,7 @@ from q2r2_control.config.control import (
     WallSettings,
 )
 from q2r2_control.config.external import ExternalArm, ExternalConfig, ExternalGripper, GuardLimits
+from q2r2_control.config.judge import JudgeSettings
 from q2r2_control.config.supervision import SupervisionSettings
 from q2r2_control.config.teleop import (
     FilterSettings,
@@ -127,6 +128,7 @@ class TestTheShippedCellShowsAllThereIsToTune:
         ("teleop.gate", GateSettings),
         ("mujoco", MujocoConfig),
         ("mujoco.objects.blue_block", ObjectConfig),
+        ("judge", JudgeSettings),
         ("external", ExternalConfig),
         ("external.limits", GuardLimits),
         ("external.arms.left", ExternalArm),
@@ -178,6 +180,7 @@ class TestTheShippedCellShowsAllThereIsToTune:
             ("admittance", AdmittanceSettings),
             ("teleop", TeleopSettings),
             ("mujoco", MujocoConfig),
+            ("judge", JudgeSettings),
         ],
     )
     def test_what_is_written_is_the_default(self, place: str, model: type[BaseModel]) -> None:

@@ -1,0 +1,90 @@
+"""``q2r2 judge`` and ``q2r2 report``: which recorded episodes are fit to be learned from, and why others are not."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import Progress
+from rich.table import Table
+from rich.text import Text
+
+from q2r2_control.cli.figure_table import figure_table
+from q2r2_control.cli.options import Json
+from q2r2_control.cli.output import as_json_text, stderr_console
+from q2r2_control.cli.summary_table import verdict_markup
+from q2r2_control.config import load_config
+from q2r2_control.config.judge import JudgeSettings
+from q2r2_control.errors import ConfigError
+from q2r2_control.judging.judge import Judged, judge_all
+from q2r2_control.judging.page import COLUMNS, page_of
+from q2r2_control.recording.files import recordings_in
+
+_SHOWN = ("time", "idle", "gap", "delay", "error", "LDLJ")  # what a terminal has room for; the page has all
+
+Recordings = Annotated[list[Path], typer.Argument(metavar="DIR_OR_FILES...", help="Recordings, or folders of them.")]
+Thresholds = Annotated[
+    str | None, typer.Option(metavar="CONFIG", help="A cell's YAML whose thresholds to use, not the recorded cell's.")
+]
+
+
+def judge(recordings: Recordings, config: Thresholds = None, json: Json = False) -> None:
+    """Say of each recorded episode whether to keep or to discard it, why, and by which numbers.
+
+    Thresholds are those of the recorded cell, its block `judge`. Exit code 2 for a file that is no recording.
+    """
+    judged = list(_judged(recordings, config))
+    if json:
+        print(as_json_text({"episodes": [one.as_json() for one in judged]}))
+        return
+    console = Console()
+    console.print(_table(judged))
+    for one in judged:
+        if not one.verdict.keep:
+            console.print(f"{escape(one.figures.file)}: {verdict_markup(one.verdict)}", soft_wrap=True, highlight=False)
+
+
+def report(
+    recordings: Recordings,
+    output: Annotated[Path, typer.Option(metavar="HTML", help="The page to write; one that exists is replaced.")],
+    config: Thresholds = None,
+) -> None:
+    """Write one HTML page of recorded episodes: verdicts, numbers and plots. It needs no network to be looked at."""
+    if output.is_dir() or not output.parent.is_dir():
+        raise ConfigError(f"--output {output}: allowed: a file in a folder that exists")
+    judged = list(_judged(recordings, config))
+    console = stderr_console()
+    with Progress(console=console, disable=not console.is_terminal, transient=True) as progress:
+        bar = progress.add_task("plots", total=len(judged))
+        names = ", ".join(map(str, recordings))
+        page = page_of(judged, f"Recordings: {names}", lambda done: progress.update(bar, completed=done))
+    try:
+        output.write_text(page, encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(f"--output {output}: {error.strerror}") from error
+    kept = sum(one.verdict.keep for one in judged)
+    print(f"{output}: {len(judged)} episodes, {kept} kept, {len(judged) - kept} discarded")
+
+
+def _judged(recordings: Sequence[Path], config: str | None) -> list[Judged]:
+    settings: JudgeSettings | None = None if config is None else load_config(config).judge
+    files = recordings_in(recordings)
+    console = stderr_console()
+    with Progress(console=console, disable=not console.is_terminal, transient=True) as progress:
+        return list(progress.track(judge_all(files, settings), total=len(files), description="recordings"))
+
+
+def _table(judged: Sequence[Judged]) -> Table:
+    """A row for each episode; of several hands or arms the worst number."""
+    kept = sum(one.verdict.keep for one in judged)
+    columns = [column for column in COLUMNS if column.name in _SHOWN]
+    headings = tuple(column.heading for column in columns)
+    table = figure_table(f"episodes: {kept} kept, {len(judged) - kept} discarded", "episode", ("verdict", *headings))
+    for one in judged:
+        name = Text(Path(one.figures.file).stem)
+        table.add_row(name, one.verdict.word, *(column.text(one.figures) for column in columns))
+    return table

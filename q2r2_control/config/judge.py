@@ -1,0 +1,57 @@
+"""What makes a recorded episode unfit to be learned from, with units and ranges."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import BaseModel, ConfigDict, Field
+
+Share = Annotated[float, Field(ge=0, le=1)]
+Seconds = Annotated[float, Field(ge=0, le=10)]
+Metres = Annotated[float, Field(ge=0, le=2)]
+Radians = Annotated[float, Field(ge=0, le=3.15)]
+
+
+class JudgeSettings(BaseModel):
+    """Thresholds of ``q2r2 judge``: an episode beyond any of them is discarded. None: that number is not judged.
+
+    Shares are of the time for which an arm is engaged, unless said otherwise, so that no threshold is a matter of how
+    long an episode is. The numbers are those of ``q2r2_control.judging``.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    min_pose_rate: Annotated[float, Field(ge=0, le=1000)] | None = Field(
+        30.0, description="poses received of a hand that leads an engaged arm [Hz]"
+    )
+    dropout: float = Field(0.06, ge=0.005, le=1, description="a longer time between two poses is a dropout [s]")
+    max_dropout_share: Share | None = Field(0.05, description="within dropouts")
+    max_pose_gap: Seconds | None = Field(0.12, description="longest time without a pose [s]")
+    max_sample_age: Seconds | None = Field(0.04, description="p99 of receipt to tick, of poses [s]")
+    max_delay: Seconds | None = Field(0.12, description="from the motion of a hand to that of its tool [s]")
+    max_faults: Annotated[int, Field(ge=0, le=1000)] | None = Field(
+        0, description="pauses that no operator asked for: jumps, lost hands, refused targets"
+    )
+    max_rejected_share: Share | None = Field(0.01, description="targets that the controller could not use")
+    max_leashed_share: Share | None = Field(0.05, description="the leash drags the target along with the tool")
+    max_position_error_rms: Metres | None = Field(0.025, description="target to measured tool [m]")
+    max_position_error_p99: Metres | None = Field(0.07, description="target to measured tool [m]")
+    max_rotation_error_rms: Radians | None = Field(0.15, description="target to measured tool [rad]")
+    max_rotation_error_p99: Radians | None = Field(0.4, description="target to measured tool [rad]")
+    max_idle_share: Share | None = Field(0.5, description="of the whole run: no arm engaged, or none of those moves")
+    min_sparc: Annotated[float, Field(ge=-100, le=-1)] | None = Field(
+        -3.0, description="smoothness of the tool: spectral arc length, the nearer to -1 the smoother"
+    )
+    min_ldlj: Annotated[float, Field(ge=-100, le=0)] | None = Field(
+        -14.0, description="smoothness of the tool: log dimensionless jerk, the nearer to 0 the smoother"
+    )
+    max_fallback_share: Share | None = Field(0.05, description="of the ticks: the certified stop was executed")
+    max_uncertified_share: Share | None = Field(0.0, description="of the ticks: no certified stop was known")
+    min_margin: Annotated[float, Field(ge=-1, le=1)] | None = Field(
+        -0.001, description="least distance of a pair less the one that it keeps [m]"
+    )
+    max_lost_share: Share | None = Field(0.01, description="of the ticks: not in the file")
+    max_lost_gap: Seconds | None = Field(0.03, description="longest time of which no tick is in the file [s]")
+    max_missed_share: Share | None = Field(0.1, description="of the ticks that were due: the loop was late")
+    max_tick_gap: Seconds | None = Field(0.1, description="longest time between two ticks of the loop [s]")
+    needs_end: bool = Field(True, description="a file that was not ended, by a killed process say, is discarded")

@@ -1,0 +1,86 @@
+"""All numbers of an episode."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from q2r2_control.judging.episode import Episode
+from q2r2_control.judging.hands import HandFigures, hand_figures
+from q2r2_control.judging.motion import ArmFigures, arm_figures, idle_share
+from q2r2_control.judging.timing import TimingFigures, timing_figures
+from q2r2_control.teleop.arm import ArmState, is_fault
+
+_LINKED = "linked to "  # begins the reason of an arm that was paused by the other one's fault
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """A pause that no operator asked for."""
+
+    t: float  # since the run began [s]
+    arm: str
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class EpisodeFigures:
+    """The numbers of one episode. Shares are from 0 to 1; None: there is nothing to tell it by."""
+
+    file: str
+    task: str
+    duration_s: float  # until the run begins to end
+    engaged_s: float  # of any arm
+    idle_share: float | None
+    hands: dict[str, HandFigures]
+    arms: dict[str, ArmFigures]
+    faults: list[Fault]
+    fallback_ticks: int
+    fallback_share: float | None
+    uncertified_ticks: int
+    uncertified_share: float | None
+    min_distance_mm: float | None  # of the nearest monitored pair, by the controller's reference
+    min_margin_mm: float | None  # of the tightest one, less the distance that it keeps
+    timing: TimingFigures
+    damage: str | None  # why the file could be read no farther
+
+
+def figures_of(episode: Episode, dropout: float) -> EpisodeFigures:
+    """The numbers of an episode; ``dropout`` [s] is the longest time between a hand's poses that is none."""
+    ticks = episode.ticks
+    following = ticks.following
+    engaged = ticks.engaged.any(axis=1) & following
+    count = len(ticks.t)
+    return EpisodeFigures(
+        file=str(episode.recording.file),
+        task=episode.recording.about.notes.get("task", ""),
+        duration_s=float(ticks.t[following][-1]) if following.any() else 0.0,
+        engaged_s=float(ticks.dt[engaged].sum()),
+        idle_share=idle_share(episode),
+        hands={hand: hand_figures(episode, hand, dropout) for hand in episode.hands},
+        arms={arm: arm_figures(episode, arm) for arm in episode.arms},
+        faults=_faults(episode),
+        fallback_ticks=int(ticks.fallback.sum()),
+        fallback_share=float(ticks.fallback.mean()) if count else None,
+        uncertified_ticks=int((~ticks.certified).sum()),
+        uncertified_share=float((~ticks.certified).mean()) if count else None,
+        min_distance_mm=_least_mm(ticks.distance),
+        min_margin_mm=_least_mm(ticks.margin),
+        timing=timing_figures(episode),
+        damage=episode.damage,
+    )
+
+
+def _faults(episode: Episode) -> list[Fault]:
+    """Refused presses are none, since nothing moved; nor is the pause of the other arm that follows from a fault."""
+    return [
+        Fault(event.t, event.arm, event.reason)
+        for event in episode.events
+        if is_fault(event) and event.source != ArmState.PAUSED and not event.reason.startswith(_LINKED)
+    ]
+
+
+def _least_mm(distances: np.ndarray) -> float | None:
+    known = distances[np.isfinite(distances)]
+    return 1e3 * float(known.min()) if len(known) else None

@@ -1,0 +1,121 @@
+"""Recordings are judged from the command line, as a user does it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from rosbags.highlevel import AnyReader
+
+from tests.cli.test_app import FAST, changed_cell, one_object, q2r2
+from tests.judging.runs import hands, record_episode
+
+IDLE = "max_idle_share: 0.5 "
+
+
+@pytest.fixture(scope="module")
+def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a recording that is kept, and one that ends before anything moves."""
+    folder = tmp_path_factory.mktemp("recordings")
+    for name, duration in (("a", 3.0), ("b", 0.5)):
+        file = record_episode(folder / name, hands(2), duration)
+        file.rename(file.with_name(f"{name}.mcap"))
+    return folder
+
+
+def test_each_episode_has_a_row_and_a_line_with_the_reasons(recordings: Path) -> None:
+    result = q2r2("judge", str(recordings))
+    assert (result.exit_code, result.stderr) == (0, "")
+    assert "episodes: 1 kept, 1 discarded" in result.stdout
+    kept, discarded = sorted(recordings.rglob("*.mcap"))
+    lines = [line.split() for line in result.stdout.splitlines()]
+    assert [line[1] for line in lines if line and line[0] in (kept.stem, discarded.stem)] == ["keep", "discard"]
+    assert result.stdout.splitlines()[-1].startswith(f"{discarded}: discard: idle: no engaged arm moves ")
+
+
+def test_json_has_every_number_and_every_reason(recordings: Path) -> None:
+    episodes = one_object(q2r2("judge", str(recordings), "--json").stdout)["episodes"]
+    assert [episode["verdict"] for episode in episodes] == ["keep", "discard"]
+    assert [reason["name"] for reason in episodes[1]["reasons"]] == ["max_idle_share"]
+    figures = episodes[0]["figures"]
+    assert figures["task"] == "a test"
+    assert figures["arms"]["left"]["position_error_mm_rms"] < 5.0
+    assert figures["hands"]["right"]["pose_rate_hz"] > 60.0
+    assert figures["timing"]["ended"] is True
+
+
+def test_another_cells_thresholds_can_be_used(recordings: Path, tmp_path: Path) -> None:
+    lenient = changed_cell(tmp_path, IDLE, "max_idle_share: null ")
+    episodes = one_object(q2r2("judge", str(recordings), "--config", lenient, "--json").stdout)["episodes"]
+    assert [episode["verdict"] for episode in episodes] == ["keep", "keep"]
+
+
+@pytest.mark.parametrize("value", [".nan", "-0.1", "1.5", "yes", "[]"])
+def test_thresholds_that_are_none_end_in_one_line(value: str, recordings: Path, tmp_path: Path) -> None:
+    bad = changed_cell(tmp_path, IDLE, f"max_idle_share: {value} ")
+    result = q2r2("judge", str(recordings), "--config", bad)
+    assert (result.exit_code, result.stdout) == (2, "")
+    assert result.stderr.count("\n") == 1
+    assert "judge.max_idle_share" in result.stderr
+
+
+@pytest.mark.parametrize("command", [("judge",), ("report", "--output", "page.html")])
+def test_what_is_no_recording_is_one_line_and_exit_code_2(command: tuple[str, ...], tmp_path: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "notes.mcap").write_text("no recording")
+    for name, says in (
+        ("empty", "no file .mcap in it"),
+        ("missing", "no such file or folder"),
+        ("notes.mcap", "not an MCAP file"),
+    ):
+        result = q2r2(command[0], str(tmp_path / name), *command[1:])
+        assert (result.exit_code, result.stdout) == (2, "")
+        assert result.stderr.count("\n") == 1
+        assert f"{name}: {says}" in result.stderr
+
+
+def test_a_report_is_one_page_of_all_of_them(recordings: Path, tmp_path: Path) -> None:
+    page = tmp_path / "report.html"
+    result = q2r2("report", str(recordings), "--output", str(page))
+    assert (result.exit_code, result.stderr) == (0, "")
+    assert result.stdout == f"{page}: 2 episodes, 1 kept, 1 discarded\n"
+    assert page.read_text().count("<section ") == 2
+    for output in (tmp_path, tmp_path / "missing" / "report.html"):
+        refused = q2r2("report", str(recordings), "--output", str(output))
+        assert refused.exit_code == 2
+        assert f"--output {output}: allowed: a file in a folder that exists" in refused.stderr
+
+
+class TestARunThatIsRecorded:
+    OPTIONS = ("--trajectory", "line", "--human", "--seed", "5", "--duration", "3")
+
+    def test_prints_its_verdict_and_keeps_it_beside_the_file(self, tmp_path: Path) -> None:
+        result = q2r2(*FAST, *self.OPTIONS, "--record", str(tmp_path))
+        assert result.exit_code == 0
+        judge = one_object(result.stdout)["judge"]
+        assert judge["verdict"] == "keep"
+        (kept,) = tmp_path.rglob("verdict.json")
+        written = json.loads(kept.read_text())
+        assert {name: written[name] for name in judge} == judge
+        again = one_object(q2r2("judge", str(tmp_path), "--json").stdout)["episodes"]
+        assert again == [judge]
+        with AnyReader([kept.parent]) as bag:  # is one still
+            assert bag.message_count > 0
+
+    def test_says_it_in_one_line_after_the_summary(self, tmp_path: Path) -> None:
+        options = [option for option in (*FAST, *self.OPTIONS) if option != "--json"]
+        cell = changed_cell(tmp_path, IDLE, "max_idle_share: 0.01 ")
+        result = q2r2(options[0], cell, *options[2:], "--record", str(tmp_path / "here"))
+        assert result.exit_code == 0
+        *_, recording, verdict = result.stdout.splitlines()
+        assert recording.startswith("recording: ")
+        assert verdict.startswith("verdict: discard: idle: no engaged arm moves ")
+
+    def test_ends_well_where_the_verdict_cannot_be_kept(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr("q2r2_control.judging.judge.VERDICT_FILE", "x" * 300)
+        result = q2r2(*FAST, "--duration", "0.3", "--record", str(tmp_path))
+        assert result.exit_code == 0
+        assert "judge" not in one_object(result.stdout)
+        assert "not judged: " in result.stderr
+        assert "File name too long" in result.stderr
