@@ -25,7 +25,8 @@ from q2r2_control.recording.ring import Ring
 from q2r2_control.recording.topics import Topics
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # for the run, which says when it has ended
-_PERIOD = 0.02  # between two looks at the ring [s]
+# Between two looks at the ring [s]; a few ticks take nearly as long to encode as many.
+_PERIOD = 0.1
 _BATCH = 256  # ticks
 _CHUNK_TIME = 0.5  # what is lost at most where this process is killed too, with what is being written [s]
 _CHUNK_SIZE = 4 << 20  # [bytes]

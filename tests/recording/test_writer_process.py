@@ -9,7 +9,7 @@ import resource
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -182,11 +182,14 @@ record(Path(sys.argv[1]), loop, 600.0, realtime=True, during=lambda recorder: lo
 """
 
 
+PATH = {**os.environ, "PYTHONPATH": str(ROOT)}
+
+
 @contextmanager
-def started(*command: str, cwd: Path = ROOT) -> Iterator[subprocess.Popen[str]]:
+def started(*command: str, cwd: Path = ROOT, env: Mapping[str, str] = PATH) -> Iterator[subprocess.Popen[str]]:
     """A run in a process group of its own."""
     running = subprocess.Popen(
-        [sys.executable, *command], cwd=cwd, env={**os.environ, "PYTHONPATH": str(ROOT)}, process_group=0,
+        [sys.executable, *command], cwd=cwd, env=env, process_group=0,
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
     )  # fmt: skip
     try:
@@ -234,7 +237,43 @@ def test_what_a_killed_run_leaves_opens_and_is_replayed(tmp_path: Path, both: bo
     assert "its process was killed" in result.ended_by
 
 
-COMMAND = "from q2r2_control.cli.app import app\napp()\n"
+# Of a program that uses os.fork, whose children have all that it has open.
+FORKING = """
+import os, sys, time
+from pathlib import Path
+from tests.recording.runs import pipeline, record
+def fork(recorder):
+    child = os.fork()
+    if child == 0:
+        os.closerange(0, 3)
+        time.sleep(600.0)
+        os._exit(0)
+    print(child, flush=True)
+record(Path(sys.argv[1]), pipeline(), 600.0, realtime=True, during=fork)
+"""
+
+
+def test_the_writer_ends_with_a_killed_run_that_has_children_which_do_not(tmp_path: Path) -> None:
+    with started("-c", FORKING, str(tmp_path)) as running:
+        assert running.stdout is not None
+        child = int(running.stdout.readline())
+        try:
+            wait_until(lambda: has_ticks(tmp_path))
+            (writer,) = (pid for pid in children(running.pid) if pid != child)
+            running.kill()
+            wait_until(lambda: not alive(writer))
+            assert alive(child)
+        finally:
+            os.kill(child, signal.SIGKILL)
+    assert replay(file_in(tmp_path)).difference is None
+
+
+COMMAND = f"""
+import sys
+sys.path.append({str(ROOT)!r})
+from q2r2_control.cli.app import app
+app()
+"""
 
 
 @pytest.mark.parametrize("how", ["python -m", "a script, somewhere else"])
@@ -255,7 +294,8 @@ def test_ctrl_c_ends_the_run_and_the_recording_is_whole(tmp_path: Path, how: str
     script.parent.mkdir()
     script.write_text(COMMAND)
     command = ("-m", "q2r2_control") if how == "python -m" else (str(script),)
-    with started(*command, *options, cwd=ROOT if how == "python -m" else folder) as running:
+    where = ROOT if how == "python -m" else folder
+    with started(*command, *options, cwd=where, env=os.environ) as running:
         recordings = tmp_path / "recordings"
         wait_until(lambda: has_ticks(recordings))
         (writer,) = children(running.pid)
