@@ -150,6 +150,7 @@ HEAVY = (f"{PACKAGE}.control.controller", "mujoco", "numba", "matplotlib")
         pytest.param("inputs", HEAVY, id="inputs"),
         pytest.param("viewer.topic_table", HEAVY, id="a table of topics"),
         pytest.param("plants", ("mujoco", "numba", "matplotlib"), id="plants"),
+        pytest.param("recording.writer", (*HEAVY, f"{PACKAGE}.pipeline"), id="the process that writes recordings"),
         pytest.param("cli.app", ("matplotlib", "rclpy"), id="the command line"),
     ],
 )

@@ -228,14 +228,13 @@ class _Case:
         )
 
     def _run_recorded(self) -> Array:
-        """As when a robot moves: a full queue loses ticks, so that it cannot hold up the loop."""
+        """As when a robot moves: where there is no room ticks are lost, so that nothing can hold up the loop."""
         pipeline = self._pipeline
-        with TemporaryDirectory() as folder:
-            recorder = Recorder(Path(folder), "bench", About.of(pipeline, True, {}), pipeline.robot)
+        with TemporaryDirectory() as folder, Recorder(Path(folder), "bench") as recorder:
+            recorder.begin(About.of(pipeline, True, {}), pipeline.robot)
             pipeline.listeners.append(recorder)
             try:
-                with recorder:
-                    return self._run(clocks_in_stages=False)
+                return self._run(clocks_in_stages=False)
             finally:
                 pipeline.listeners.remove(recorder)
 

@@ -87,33 +87,23 @@ def run_cell(config: Config, options: RunOptions, console: Console) -> CellRun:
         )
     if options.window and options.plant != "mujoco":
         raise ConfigError(f"--viewer: the {options.plant} plant has no window; allowed: --plant mujoco")
-    with notice_of_compiling(console):
-        source = _input_of(config, options, console)
-        pipeline = Pipeline.from_config(config, input=source, plant=options.plant, mode=options.mode)
-        _refuse_faults(pipeline, options.force, console)
-    history = History(pipeline.robot, pipeline.robot.capped_acceleration(config.control.acceleration_limit))
-    if options.report:
-        pipeline.listeners.append(history)
-    watch = None
-    if options.tasks and isinstance(pipeline.plant, MujocoPlant):
-        watch = TaskWatch(options.tasks, pipeline.plant, pipeline.robot, config)
-        pipeline.listeners.append(watch)
     with ExitStack() as stack:
-        if options.window and isinstance(pipeline.plant, MujocoPlant):
-            pipeline.plant.launch_viewer()
-            pipeline.listeners.append(_WindowListener(pipeline, pipeline.plant))
-        if options.table:
-            robot = pipeline.robot
-            joints = {arm: [robot.joint_names[joint] for joint in its.joints] for arm, its in robot.arms.items()}
-            title = f"{options.name}: Ctrl-C brings the arms to rest and ends"
-            table = LiveTable(title, joints, config.teleop.bindings)
-            pipeline.listeners.append(table)
-            stack.enter_context(table.shown(console))
-        if options.real_time and (refused := stack.enter_context(real_time())):
-            console.print(refused, style="yellow", soft_wrap=True, highlight=False, markup=False)
-        # Last, so that it ends first and the table's last picture is of arms at rest.
-        recorder = stack.enter_context(_recorder(pipeline, options)) if options.record is not None else None
-        summary = pipeline.run(options.duration, realtime=not options.fast)
+        recorder = None
+        if options.record is not None:
+            # Before the pipeline, which takes longer to build than the recorder's process to start.
+            recorder = stack.enter_context(Recorder(options.record, options.name, waits=options.fast))
+        with notice_of_compiling(console):
+            source = _input_of(config, options, console)
+            pipeline = Pipeline.from_config(config, input=source, plant=options.plant, mode=options.mode)
+            _refuse_faults(pipeline, options.force, console)
+        history = History(pipeline.robot, pipeline.robot.capped_acceleration(config.control.acceleration_limit))
+        if options.report:
+            pipeline.listeners.append(history)
+        watch = None
+        if options.tasks and isinstance(pipeline.plant, MujocoPlant):
+            watch = TaskWatch(options.tasks, pipeline.plant, pipeline.robot, config)
+            pipeline.listeners.append(watch)
+        summary = _run(pipeline, options, recorder, console)
     recording = None if recorder is None else recorder.summary
     run = CellRun(summary, watch.results() if watch is not None else (), recording)
     if options.report:
@@ -170,16 +160,33 @@ def _input_of(config: Config, options: RunOptions, console: Console) -> Input:
     return ScriptedInput(options.trajectory, human=options.human, seed=options.seed)
 
 
-def _recorder(pipeline: Pipeline, options: RunOptions) -> Recorder:
-    """A recorder that listens to the pipeline."""
-    assert options.record is not None
+def _run(pipeline: Pipeline, options: RunOptions, recorder: Recorder | None, console: Console) -> RunSummary:
+    """Run with what is to be shown and recorded of it."""
+    with ExitStack() as stack:
+        if options.window and isinstance(pipeline.plant, MujocoPlant):
+            pipeline.plant.launch_viewer()
+            pipeline.listeners.append(_WindowListener(pipeline, pipeline.plant))
+        if options.table:
+            robot = pipeline.robot
+            joints = {arm: [robot.joint_names[joint] for joint in its.joints] for arm, its in robot.arms.items()}
+            title = f"{options.name}: Ctrl-C brings the arms to rest and ends"
+            table = LiveTable(title, joints, pipeline.config.teleop.bindings)
+            pipeline.listeners.append(table)
+            stack.enter_context(table.shown(console))
+        if options.real_time and (refused := stack.enter_context(real_time())):
+            console.print(refused, style="yellow", soft_wrap=True, highlight=False, markup=False)
+        if recorder is not None:
+            recorder.begin(_about(pipeline, options), pipeline.robot)
+            pipeline.listeners.append(recorder)
+        return pipeline.run(options.duration, realtime=not options.fast)
+
+
+def _about(pipeline: Pipeline, options: RunOptions) -> About:
+    """What a recording says once, of a run that begins now."""
     notes = {"cell": pipeline.config.name, "input": options.input, **options.notes}
     if options.input == "scripted":
         notes |= {"trajectory": options.trajectory, "human": str(options.human).lower(), "seed": str(options.seed)}
-    about = About.of(pipeline, not options.fast, notes)
-    recorder = Recorder(options.record, options.name, about, pipeline.robot, waits=options.fast)
-    pipeline.listeners.append(recorder)
-    return recorder
+    return About.of(pipeline, not options.fast, notes)
 
 
 class _WindowListener:

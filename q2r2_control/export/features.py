@@ -10,7 +10,7 @@ import numpy.typing as npt
 import pinocchio as pin
 
 from q2r2_control.errors import RecordingError
-from q2r2_control.recording.encoder import NOT_MEASURED
+from q2r2_control.recording.packing import NOT_MEASURED
 from q2r2_control.recording.recorded_robot import check_tools, tool_poses
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array

@@ -1,7 +1,8 @@
 """Runs kept in MCAP files that ROS 2 tools open, and replayed to the bit. None of it needs ROS.
 
-``recorder`` listens to a run and writes it from a thread of its own: ``encoder`` makes messages of ticks, ``topics``
-and ``rows`` say where each number stands in them, ``mcap_file`` is the file, ``bag`` what rosbag2 wants beside it,
+``recorder`` listens to a run: ``packing`` makes bytes of a tick, and ``ring`` takes them to the process that
+``writer_process`` starts. There ``writer`` does the rest: ``encoder`` makes messages of packed ticks, ``topics`` and
+``rows`` say where each number stands in them, ``mcap_file`` is the file, ``bag`` what rosbag2 wants beside it,
 ``about`` what is said once. ``reader`` reads it again, ``replay`` gives it to the pipeline's own loop, and
 ``comparison`` holds what comes out to what was recorded.
 """

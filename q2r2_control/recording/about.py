@@ -10,11 +10,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import yaml
 
-from q2r2_control.config import Config
-from q2r2_control.pipeline import Pipeline
+if TYPE_CHECKING:  # the writer's process does without them
+    from q2r2_control.config import Config
+    from q2r2_control.pipeline import Pipeline
 
 FORMAT = "1"  # of topics and fields; another one cannot be replayed
 ABOUT, CELL, ROBOT, FIELDS = "q2r2_control", "cell.yaml", "robot.urdf", "fields.json"

@@ -12,7 +12,8 @@ import yaml
 from q2r2_control.config import Config
 from q2r2_control.recording import topics as names
 from q2r2_control.recording.about import About, as_yaml, program
-from q2r2_control.recording.encoder import NumberedTick, TickEncoder
+from q2r2_control.recording.encoder import RecordedRobot, TickEncoder
+from q2r2_control.recording.packing import TickPacker
 from q2r2_control.recording.reader import RecordedChunk
 from q2r2_control.recording.rows import Rows, log_time, text_of
 from q2r2_control.recording.topics import Topic, Topics
@@ -28,10 +29,11 @@ class Comparison:
 
     def __init__(self, robot: Robot, topics: Topics, epoch: int) -> None:
         self._topics, self._epoch = topics, epoch
-        self._encoder = TickEncoder(robot, topics, epoch)
+        self._packer = TickPacker(topics)
+        self._encoder = TickEncoder(RecordedRobot.of(robot), topics, epoch)
         self._pairs = {topic.name: _Pair() for topic in topics.all}
         self._differences: dict[str, tuple[int, str]] = {}  # the first of each topic: time [ns] and what
-        self._batch: list[NumberedTick] = []
+        self._batch: list[bytes] = []
         self._count = 0
         labels = topics.by_name[names.TICK].labels["data"]
         self._timings = [labels.index(name) for name in names.TIMINGS]
@@ -45,7 +47,7 @@ class Comparison:
 
     def __call__(self, tick: Tick) -> None:
         """Take one tick of the replay."""
-        self._batch.append((self._count, tick))
+        self._batch.append(self._packer.pack(self._count, tick))
         self._count += 1
         if len(self._batch) == _BATCH:
             self._compare()

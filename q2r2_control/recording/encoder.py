@@ -1,30 +1,43 @@
-"""From ticks to messages, some dozens of ticks at a time: the same for a recording and for what a replay is held to."""
+"""From packed ticks to messages, some dozens at a time: the same for a recording and for what a replay is held to."""
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
+import numpy.typing as npt
 import pinocchio as pin
 
 from q2r2_control.recording import topics as names
+from q2r2_control.recording.packing import POSE, Extras, row_type, unpack
 from q2r2_control.recording.rows import Rows, text_record
-from q2r2_control.recording.topics import Topic, Topics
-from q2r2_control.robot.robot import Robot
-from q2r2_control.runtime.recorder import Tick
-from q2r2_control.types import SIDES, Array, CommandMode, HandInputs, HandSample, RobotState, StepStatus
+from q2r2_control.recording.topics import SAMPLE_FIELDS, Topic, Topics
+from q2r2_control.types import SIDES, Array, HandInputs
 
-NOT_MEASURED = -math.inf  # in place of the opening of a gripper that the plant does not measure
-COMMAND_MODES, STATUSES = tuple(CommandMode), tuple(StepStatus)
-UNSOLVED_MAX = 2**53  # more substeps than a float64 has bits for cannot be told apart
+if TYPE_CHECKING:
+    from q2r2_control.robot.robot import Robot
+
 _NANOSECONDS = 1_000_000_000
 _LAST_TIME = 2**62
+_HAND, _POSE_STAMP, _INPUTS_STAMP, _X = (
+    SAMPLE_FIELDS.index(name) for name in ("hand", "pose_stamp", "inputs_stamp", "x")
+)
 
-NumberedTick = tuple[int, Tick]  # with its number, from 0 on
+
+@dataclass(frozen=True)
+class RecordedRobot:
+    """What messages need of a robot; unlike the robot itself it can be sent to another process."""
+
+    model: pin.Model
+    tools: tuple[int, ...]  # frames, arm by arm
+    urdf: str
+
+    @classmethod
+    def of(cls, robot: Robot) -> RecordedRobot:
+        return cls(robot.model, tuple(arm.frame_id for arm in robot.arms.values()), robot.urdf)
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,224 +60,129 @@ class Block:
 class TickEncoder:
     """Makes messages of ticks, in their order. ``epoch`` [ns] is the time of day at which the run began."""
 
-    def __init__(self, robot: Robot, topics: Topics, epoch: int) -> None:
+    def __init__(self, robot: RecordedRobot, topics: Topics, epoch: int) -> None:
         self.topics = topics
-        self._robot, self._arms, self._joints = robot, tuple(robot.arms), len(robot.joint_names)
-        self._model_data = robot.model.createData()
-        self._epoch = epoch
-        self._started = False
-        self._state = ""  # the last text
-        self._stamps = dict.fromkeys(SIDES, (math.nan, math.nan))  # of the last pose and inputs written
+        self._robot, self._model_data = robot, robot.model.createData()
+        self._epoch, self._start = epoch, 0.0
+        self._row = row_type(topics)
+        self._stamps: dict[tuple[str, int], float] = {}  # the last of each hand's poses and inputs
 
-    def encode(self, batch: Sequence[NumberedTick]) -> list[Block]:
-        """Messages of a batch that follows the last one, topic by topic."""
-        ticks = [tick for _, tick in batch]
-        numbers = [number for number, _ in batch]
-        every = range(len(batch))
-        start = ticks[0].start.now
-        times = self._times((tick.now for tick in ticks), start)
-        blocks = self._beginning(ticks[0]) if not self._started else []
-        self._started = True
+    def encode(self, batch: Sequence[bytes]) -> list[Block]:
+        """Messages of packed ticks that follow the last ones, topic by topic."""
+        unpacked = [unpack(record, self._row.itemsize) for record in batch]
+        extras = [extra for _, extra in unpacked]
+        ticks = np.frombuffer(b"".join(row for row, _ in unpacked), dtype=self._row)
+        blocks = self._beginning(extras[0].start) if extras[0].start else []
+        numbers = self._column(ticks, "index").astype(np.int64)
+        times = self._times(self._column(ticks, "now"))
 
-        def add(topic: str, at: Sequence[int], stamps: Any = None, **columns: Any) -> None:
+        def add(topic: str, at: npt.NDArray[np.intp], stamps: Array | None = None, **columns: Array) -> None:
             if len(at):
-                place = np.array(at)
-                row = self.topics.by_name[topic]
-                assert row.row is not None
-                rows = row.row.rows(row.channel, len(at))
-                rows["log_time"] = rows["publish_time"] = times[place]
-                rows["sequence"] = np.array(numbers)[place]
+                named = self.topics.by_name[topic]
+                assert named.row is not None
+                rows = named.row.rows(named.channel, len(at))
+                rows["log_time"] = rows["publish_time"] = times[at]
+                rows["sequence"] = numbers[at]
                 if rows.dtype.names and "sec" in rows.dtype.names:
-                    stamped = times[place] if stamps is None else stamps
+                    stamped = times[at] if stamps is None else self._times(stamps)
                     rows["sec"], rows["nanosec"] = stamped // _NANOSECONDS, stamped % _NANOSECONDS
                 for column, values in columns.items():
                     rows[column] = values
-                blocks.append(Block(row, at, rows))
+                blocks.append(Block(named, at.tolist(), rows))
 
-        add(names.TICK, every, data=[self._tick(number, tick) for number, tick in batch])
-        self._add_samples(add, batch, start)
-        states = [tick.state for tick in ticks]
-        add(
-            names.JOINT_STATES,
-            every,
-            position=[state.q for state in states],
-            velocity=[state.v for state in states],
-            effort=[state.tau for state in states],
-        )
-        felt = [i for i in every if states[i].tau_external is not None]
-        add(names.EXTERNAL_TORQUE, felt, effort=[states[i].tau_external for i in felt])
-        tools = [self._tools(tick.reference.q) for tick in ticks]
-        for index, arm in enumerate(self._arms):
-            led = [i for i in every if ticks[i].targets[arm].pose is not None]
-            poses = [pin.SE3ToXYZQUATtuple(ticks[i].targets[arm].pose) for i in led]
-            add(names.target(arm), led, **_pose_columns(poses))
-            add(names.safe_target(arm), every, **_pose_columns([tool[index] for tool in tools]))
-        references = [tick.reference for tick in ticks]
+        every = np.arange(len(ticks))
+        add(names.TICK, every, data=ticks[names.TICK])
+        self._add_samples(add, extras)
+        add(names.JOINT_STATES, every, position=ticks["q"], velocity=ticks["v"], effort=ticks["tau"])
+        felt = np.flatnonzero(self._column(ticks, "external"))
+        add(names.EXTERNAL_TORQUE, felt, effort=ticks["tau_external"][felt])
+        tools = self._tools(ticks["reference_q"])
+        for index, arm in enumerate(self.topics.arms):
+            led = np.flatnonzero(ticks["led"][:, index])
+            add(names.target(arm), led, **_pose_columns(ticks["targets"][led, index]))
+            add(names.safe_target(arm), every, **_pose_columns(tools[:, index]))
         add(
             names.REFERENCE,
             every,
-            positions=[reference.q for reference in references],
-            velocities=[reference.v for reference in references],
-            accelerations=[reference.a for reference in references],
+            positions=ticks["reference_q"],
+            velocities=ticks["reference_v"],
+            accelerations=ticks["reference_a"],
         )
-        commands = [tick.command for tick in ticks]
         add(
             names.JOINT_COMMANDS,
             every,
-            position=[command.q for command in commands],
-            velocity=[command.v for command in commands],
-            effort=[command.tau for command in commands],
+            position=ticks["command_q"],
+            velocity=ticks["command_v"],
+            effort=ticks["command_tau"],
         )
-        add(names.GRIPPERS, every, data=[self._grippers(tick) for tick in ticks])
-        add(names.FLAGS, every, data=[self._flags(tick) for tick in ticks])
-        self._add_states(blocks, batch, times)
+        add(names.GRIPPERS, every, data=ticks[names.GRIPPERS])
+        add(names.FLAGS, every, data=ticks[names.FLAGS])
+        state = self.topics.by_name[names.STATE]
+        told = [at for at, extra in enumerate(extras) if extra.state]
+        if told:
+            texts = [text_record(state.channel, int(numbers[at]), int(times[at]), extras[at].state) for at in told]
+            blocks.append(Block(state, told, None, texts))
         return blocks
 
-    def _times(self, seconds: Iterable[float], start: float) -> Any:
+    def _column(self, ticks: Rows, name: str) -> Array:
+        """One number of the topic tick, of every tick."""
+        return ticks[names.TICK][:, self.topics.by_name[names.TICK].labels["data"].index(name)]
+
+    def _times(self, seconds: Array) -> Array:
         """Times of the loop's clock [s] as times of day [ns]; any number of a sender gives some time."""
-        passed = np.nan_to_num(np.array(list(seconds), dtype=np.float64) - start) * 1e9
+        passed = np.nan_to_num(seconds - self._start) * 1e9
         return np.clip(np.rint(np.clip(passed, -_LAST_TIME, _LAST_TIME)).astype(np.int64) + self._epoch, 0, _LAST_TIME)
 
-    def _beginning(self, tick: Tick) -> list[Block]:
+    def _beginning(self, start: bytes) -> list[Block]:
         """What is written once: where the run began, and the robot for viewers."""
-        start = tick.start
-        topic = self.topics.by_name[names.START]
+        topic, description = self.topics.by_name[names.START], self.topics.by_name[names.DESCRIPTION]
         assert topic.row is not None
         rows = topic.row.rows(topic.channel, 1)
         rows["log_time"] = rows["publish_time"] = self._epoch
-        rows["data"] = [start.now, start.state.stamp, start.state.tau_external is not None, *_joints(start.state)]
-        description = self.topics.by_name[names.DESCRIPTION]
+        rows["data"] = np.frombuffer(start)
+        self._start = float(rows["data"][0, 0])
         text = text_record(description.channel, 0, self._epoch, self._robot.urdf)
         return [Block(description, [0], None, [text]), Block(topic, [0], rows)]
 
-    def _tick(self, number: int, tick: Tick) -> list[float]:
-        report = tick.reference.report
-        return [
-            number,
-            tick.now,
-            tick.dt,
-            tick.step,
-            tick.state.stamp,
-            tick.following,
-            tick.connected,
-            sum(sample.hand in SIDES for sample in tick.samples),
-            tick.state.tau_external is not None,
-            min(report.unsolved, UNSOLVED_MAX),
-            COMMAND_MODES.index(tick.command.mode),
-            *(tick.openings.get(arm, NOT_MEASURED) for arm in self._arms),
-            tick.compute_time,
-            report.solve_time,
-        ]
-
-    def _add_samples(self, add: Callable[..., None], batch: Sequence[NumberedTick], start: float) -> None:
+    def _add_samples(self, add: Callable[..., None], extras: Sequence[Extras]) -> None:
         """Samples as the loop got them, and those poses and inputs that are new, as messages of the nodes."""
-        samples = [
-            (at, number, sample)
-            for at, (number, tick) in enumerate(batch)
-            for sample in tick.samples
-            if sample.hand in SIDES
-        ]
-        add(
-            names.SAMPLES,
-            [at for at, _, _ in samples],
-            data=[_sample_row(number, sample) for _, number, sample in samples],
-        )
-        for hand in SIDES:
-            poses, inputs = [], []
-            for at, _, sample in samples:
-                if sample.hand == hand:
-                    pose_stamp, inputs_stamp = self._stamps[hand]
-                    if sample.pose_stamp != pose_stamp:
-                        poses.append((at, sample))
-                    if sample.inputs_stamp != inputs_stamp:
-                        inputs.append((at, sample))
-                    self._stamps[hand] = sample.pose_stamp, sample.inputs_stamp
+        samples = np.frombuffer(b"".join(extra.samples for extra in extras)).reshape(-1, len(SAMPLE_FIELDS))
+        size = 8 * len(SAMPLE_FIELDS)
+        at = np.repeat(np.arange(len(extras)), [len(extra.samples) // size for extra in extras])
+        add(names.SAMPLES, at, data=samples)
+        for number, hand in enumerate(SIDES):
+            of_hand = np.flatnonzero(samples[:, _HAND] == number)
+            poses = of_hand[self._changes(hand, _POSE_STAMP, samples[of_hand])]
             add(
                 names.hand_pose(hand),
-                [at for at, _ in poses],
-                stamps=self._times((sample.pose_stamp for _, sample in poses), start),
-                position=[sample.position for _, sample in poses],
-                quaternion=[sample.quaternion for _, sample in poses],
+                at[poses],
+                stamps=samples[poses, _POSE_STAMP],
+                **_pose_columns(samples[poses, _X : _X + POSE]),
             )
-            values = {name: [getattr(sample.inputs, name) for _, sample in inputs] for name in HandInputs.__slots__}
-            add(names.hand_buttons(hand), [at for at, _ in inputs], **values)
+            inputs = of_hand[self._changes(hand, _INPUTS_STAMP, samples[of_hand])]
+            columns = {name: samples[inputs, SAMPLE_FIELDS.index(name)] for name in HandInputs.__slots__}
+            add(names.hand_buttons(hand), at[inputs], **columns)
 
-    def _tools(self, q: Array) -> list[tuple[float, ...]]:
-        model, data = self._robot.model, self._model_data
-        pin.forwardKinematics(model, data, q)
-        return [
-            pin.SE3ToXYZQUATtuple(pin.updateFramePlacement(model, data, arm.frame_id))
-            for arm in self._robot.arms.values()
-        ]
+    def _changes(self, hand: str, stamp: int, samples: Array) -> Array:
+        """Which samples of a hand have another stamp than the one before."""
+        stamps = samples[:, stamp]
+        before = np.concatenate(([self._stamps.get((hand, stamp), math.nan)], stamps))
+        self._stamps[hand, stamp] = before[-1]
+        return stamps != before[:-1]
 
-    def _grippers(self, tick: Tick) -> list[float]:
-        commanded, measured = tick.command.grippers, tick.openings
-        return [
-            value
-            for arm in self._arms
-            for value in (
-                tick.targets[arm].gripper,
-                commanded.get(arm, NOT_MEASURED),
-                measured.get(arm, NOT_MEASURED),
-            )
-        ]
-
-    def _flags(self, tick: Tick) -> list[float]:
-        report = tick.reference.report
-        flags = [
-            STATUSES.index(report.status),
-            report.certified,
-            report.fallback,
-            report.closest_distance,
-            report.margin,
-            report.slack,
-        ]
-        for arm in self._arms:
-            wanted = tick.targets[arm]
-            held, holding = arm in tick.held_grippers, tick.holding.get(arm, False)
-            flags += [tick.engaged[arm], arm in report.rejected, wanted.slip, wanted.slip_angle, held, holding]
-        return flags
-
-    def _add_states(self, blocks: list[Block], batch: Sequence[NumberedTick], times: Any) -> None:
-        """What has names, as JSON, at the ticks at which it changed."""
-        topic, at, texts = self.topics.by_name[names.STATE], [], []
-        for index, (number, tick) in enumerate(batch):
-            report = tick.reference.report
-            state: dict[str, Any] = {
-                "states": tick.states,
-                "connected": tick.connected,
-                "status": report.status,
-                "closest_pair": report.closest_pair,
-                "tightest_pair": report.tightest_pair,
-                "held_grippers": tick.held_grippers,
-                "holding": tick.holding,
-            }
-            text = json.dumps(state)
-            if text == self._state and not tick.events:
-                continue
-            self._state = text
-            if tick.events:
-                text = json.dumps({**state, "events": [asdict(event) for event in tick.events]})
-            at.append(index)
-            texts.append(text_record(topic.channel, number, int(times[index]), text))
-        if texts:
-            blocks.append(Block(topic, at, None, texts))
+    def _tools(self, postures: Array) -> Array:
+        """Tool poses (ticks, arms, 7)."""
+        robot, data = self._robot, self._model_data
+        poses = np.empty((len(postures), len(robot.tools), POSE))
+        for row, q in zip(poses, postures, strict=True):
+            pin.forwardKinematics(robot.model, data, q)
+            for pose, frame in zip(row, robot.tools, strict=True):
+                pose[:] = pin.SE3ToXYZQUATtuple(pin.updateFramePlacement(robot.model, data, frame))
+        return poses
 
 
-def _joints(state: RobotState) -> list[float]:
-    """Positions, velocities, torques and external torques, zero where the plant cannot tell those."""
-    external = np.zeros(len(state.q)) if state.tau_external is None else state.tau_external
-    return [*state.q, *state.v, *state.tau, *external]
-
-
-def _sample_row(number: int, sample: HandSample) -> list[float]:
-    inputs = (getattr(sample.inputs, name) for name in HandInputs.__slots__)
-    stamps = (sample.pose_stamp, sample.inputs_stamp)
-    return [number, SIDES.index(sample.hand), *stamps, *sample.position, *sample.quaternion, *inputs]
-
-
-def _pose_columns(poses: Sequence[tuple[float, ...]]) -> dict[str, Any]:
-    return {"position": [pose[:3] for pose in poses], "quaternion": [pose[3:] for pose in poses]}
+def _pose_columns(poses: Array) -> dict[str, Array]:
+    return {"position": poses[:, :3], "quaternion": poses[:, 3:]}
 
 
 def in_order(blocks: Iterable[Block]) -> list[tuple[Topic, bytes]]:

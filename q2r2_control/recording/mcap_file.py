@@ -2,8 +2,8 @@
 
 So what a killed process leaves behind is a file without an index, which every reader opens; the index and statistics
 are written when it is closed. The writers of the packages ``mcap`` and ``rosbags`` keep up to a megabyte to themselves,
-write the footer at the end only, and take each message by itself, 5 to 10 us of Python each, while the loop waits for
-the interpreter. Here a message is a row of bytes already; the records around chunks are those of ``mcap``.
+write the footer at the end only, and take each message by itself, which would keep a processor busy that the loop may
+need. Here a message is a row of bytes already; the records around chunks are those of ``mcap``.
 """
 
 from __future__ import annotations

@@ -18,7 +18,7 @@ from q2r2_control.errors import PlantError, RecordingError
 from q2r2_control.pipeline import Pipeline
 from q2r2_control.recording import topics as names
 from q2r2_control.recording.comparison import Comparison, changes
-from q2r2_control.recording.encoder import NOT_MEASURED
+from q2r2_control.recording.packing import NOT_MEASURED
 from q2r2_control.recording.reader import RecordedChunk, Recording
 from q2r2_control.robot.robot import Robot
 from q2r2_control.runtime.loop_clock import LoopClock

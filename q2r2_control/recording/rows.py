@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Sequence
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -66,9 +67,12 @@ class RowType:
         """A std_msgs/Header with fields ``sec`` and ``nanosec``."""
         return self.field("sec", "<i4").field("nanosec", "<u4").text(frame)
 
-    @property
+    @cached_property
     def dtype(self) -> np.dtype[np.void]:
-        """Of one record; beside the fields it has ``channel``, ``sequence``, ``log_time`` and ``publish_time`` [ns]."""
+        """Of one record, once all fields are known.
+
+        Beside them it has ``channel``, ``sequence``, ``log_time`` and ``publish_time`` [ns].
+        """
         head = {"channel": ("<u2", 9), "sequence": ("<u4", 11), "log_time": ("<u8", 15), "publish_time": ("<u8", 23)}
         names = [*head, *self._fields]
         formats: list[Any] = [kind for kind, _ in head.values()]
@@ -78,12 +82,18 @@ class RowType:
 
     def rows(self, channel: int, count: int) -> Rows:
         """``count`` messages of a ``channel``, all fields zero."""
+        rows = np.frombuffer(bytearray(self._template * count), dtype=self.dtype)
+        rows["channel"] = channel
+        return rows
+
+    @cached_property
+    def _template(self) -> bytes:
+        """A message of channel 0, all fields zero."""
         template = bytearray(self._end)
-        length = self._end - _OPCODE_AND_LENGTH
-        template[: HEAD.size] = HEAD.pack(MESSAGE, length, channel, 0, 0, 0)
+        template[: HEAD.size] = HEAD.pack(MESSAGE, self._end - _OPCODE_AND_LENGTH, 0, 0, 0, 0)
         for offset, data in self._constants:
             template[offset : offset + len(data)] = data
-        return np.frombuffer(bytearray(template * count), dtype=self.dtype)
+        return bytes(template)
 
     def _take(self, size: int, count: int) -> int:
         """Offset of ``count`` values of a ``size``, aligned."""

@@ -53,6 +53,7 @@ class Topics:
     """All topics for arms and joints of these names, in the order in which a tick's messages are written."""
 
     def __init__(self, arms: Sequence[str], joints: Sequence[str]) -> None:
+        self.arms, self.joints = tuple(arms), tuple(joints)
         self.all: list[Topic] = []
         measured = tuple(f"{what}_{name}" for what in ("q", "v", "tau", "tau_external") for name in joints)
         joint_lists = {"position": joints, "velocity": joints, "effort": joints}

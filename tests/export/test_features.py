@@ -10,7 +10,7 @@ import pytest
 
 from q2r2_control.errors import RecordingError
 from q2r2_control.export.features import MOTION, POSE, features
-from q2r2_control.recording.encoder import NOT_MEASURED
+from q2r2_control.recording.packing import NOT_MEASURED
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 from tests.support.watch import cell

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import json
+import subprocess
+import sys
 import zlib
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import zstandard
 from mcap.data_stream import RecordBuilder
@@ -17,10 +21,44 @@ from q2r2_control.pipeline import Pipeline
 from q2r2_control.plants.base import Plant
 from q2r2_control.recording.about import About
 from q2r2_control.recording.mcap_file import MAGIC
-from q2r2_control.recording.recorder import CAPACITY, Recorder, RecordingSummary
+from q2r2_control.recording.recorder import Recorder, RecordingSummary
+from q2r2_control.recording.writer_process import ROOM, WriterProcess
 from tests.support.watch import cell
 
+ROOT = Path(__file__).resolve().parents[2]
 RATE = 500.0  # [Hz], the lowest with one substep a tick, since most of a test's time goes by ticks
+
+
+# Reads a bag with rosbags alone, in a process that has nothing of this package.
+READER = """
+import json, sys
+from pathlib import Path
+from rosbags.highlevel import AnyReader
+from rosbags.typesys import Stores, get_typestore
+assert not any(name.startswith("q2r2") for name in sys.modules)
+found = {}
+with AnyReader([Path(sys.argv[1])], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
+    for connection, stamp, data in reader.messages():
+        message = reader.deserialize(data, connection.msgtype)
+        entry = found.setdefault(connection.topic, {"type": connection.msgtype, "count": 0, "first": stamp})
+        entry["count"] += 1
+        assert stamp >= entry.get("last", 0)
+        entry["last"] = stamp
+        if connection.topic == "/joint_commands":
+            entry["names"], entry["position"] = message.name, message.position.tolist()
+        if connection.topic == "/q2r2/state":
+            entry.setdefault("texts", []).append(message.data)
+print(json.dumps(found))
+"""
+
+
+def read_elsewhere(path: Path, folder: Path) -> dict[str, Any]:
+    result = subprocess.run(
+        [sys.executable, "-c", READER, str(path)], cwd=folder, capture_output=True, text=True, timeout=120
+    )
+    assert result.returncode == 0, result.stderr
+    found: dict[str, Any] = json.loads(result.stdout)
+    return found
 
 
 def pipeline(
@@ -43,19 +81,23 @@ def record(
     duration: float,
     *,
     realtime: bool = False,
-    capacity: int = CAPACITY,
+    room: int = ROOM,
     waits: bool = True,
     during: Callable[[Recorder], None] = lambda recorder: None,
 ) -> RecordingSummary:
     """Record a run; ``during`` gets the recorder when it has begun."""
-    about = About.of(loop, realtime, {"task": "a test"})
-    recorder = Recorder(folder, "test", about, loop.robot, waits=waits and not realtime, capacity=capacity)
-    loop.listeners.append(recorder)
-    with recorder:
+    with Recorder(folder, "test", waits=waits and not realtime, room=room) as recorder:
+        recorder.begin(About.of(loop, realtime, {"task": "a test"}), loop.robot)
+        loop.listeners.append(recorder)
         during(recorder)
         loop.run(duration, realtime=realtime)
     loop.listeners.remove(recorder)
     return recorder.summary
+
+
+def writer_of(recorder: Recorder) -> WriterProcess:
+    assert recorder.writer is not None
+    return recorder.writer
 
 
 def file_of(summary: RecordingSummary) -> Path:

@@ -5,61 +5,30 @@ from __future__ import annotations
 import json
 import logging
 import os
-import signal
 import subprocess
 import sys
 import textwrap
 import time
 import tracemalloc
 from dataclasses import replace as changed
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 import pytest
 import yaml
 
 from q2r2_control.config.cell import parse_config
 from q2r2_control.recording.about import About
-from q2r2_control.recording.mcap_file import McapFile
+from q2r2_control.recording.packing import TickPacker
 from q2r2_control.recording.reader import Recording
 from q2r2_control.recording.recorder import Recorder
 from q2r2_control.recording.replay import replay
 from q2r2_control.recording.topics import Topics
 from q2r2_control.runtime.recorder import Tick
-from tests.recording.runs import RATE, file_of, pipeline, record
+from tests.recording.runs import RATE, file_of, pipeline, read_elsewhere, record, writer_of
+from tests.support.processes import wait_until
 
 ROOT = Path(__file__).resolve().parents[2]
-
-# Reads a bag with rosbags alone, in a process that has nothing of this package.
-READER = """
-import json, sys
-from pathlib import Path
-from rosbags.highlevel import AnyReader
-from rosbags.typesys import Stores, get_typestore
-assert not any(name.startswith("q2r2") for name in sys.modules)
-found = {}
-with AnyReader([Path(sys.argv[1])], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
-    for connection, stamp, data in reader.messages():
-        message = reader.deserialize(data, connection.msgtype)
-        entry = found.setdefault(connection.topic, {"type": connection.msgtype, "count": 0, "first": stamp})
-        entry["count"] += 1
-        assert stamp >= entry.get("last", 0)
-        entry["last"] = stamp
-        if connection.topic == "/joint_commands":
-            entry["names"], entry["position"] = message.name, message.position.tolist()
-        if connection.topic == "/q2r2/state":
-            entry.setdefault("texts", []).append(message.data)
-print(json.dumps(found))
-"""
-
-
-def read_elsewhere(path: Path, folder: Path) -> dict[str, Any]:
-    result = subprocess.run(
-        [sys.executable, "-c", READER, str(path)], cwd=folder, capture_output=True, text=True, timeout=120
-    )
-    assert result.returncode == 0, result.stderr
-    found: dict[str, Any] = json.loads(result.stdout)
-    return found
 
 
 @pytest.fixture(scope="module")
@@ -114,34 +83,6 @@ def test_the_file_says_what_was_run(recorded: tuple[Path, list[Tick]]) -> None:
     assert not about.realtime
 
 
-def test_a_full_queue_loses_ticks_and_says_how_many(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    flush, slow = McapFile.flush, [True]
-
-    def flush_slowly(file: McapFile) -> None:
-        while slow[0]:
-            time.sleep(1e-3)
-        flush(file)
-
-    monkeypatch.setattr(McapFile, "flush", flush_slowly)
-    loop = pipeline()
-
-    def until_some_were_lost(tick: Tick) -> None:
-        slow[0] = tick.t < 0.9
-
-    loop.listeners.append(until_some_were_lost)
-    monkeypatch.setattr("q2r2_control.recording.recorder._CHUNK_SIZE", 1)
-    summary = record(tmp_path, loop, 1.0, capacity=100, waits=False)
-    assert summary.fault is None
-    assert summary.lost_ticks > 100
-    assert summary.ticks > 0
-    assert summary.ticks + summary.lost_ticks >= 1.0 * RATE
-    assert summary.file is not None
-    result = replay(Path(summary.file))
-    assert result.difference is None
-    assert result.ended_by is not None
-    assert "ticks were lost here" in result.ended_by
-
-
 def test_a_folder_that_cannot_be_written_is_one_line_and_the_run_goes_on(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -157,18 +98,6 @@ def test_a_folder_that_cannot_be_written_is_one_line_and_the_run_goes_on(
     assert summary.lost_ticks >= 0.2 * RATE
 
 
-FULL_DISK = """
-import resource, sys
-from pathlib import Path
-from q2r2_control.recording import recorder
-from tests.recording.runs import pipeline, record
-recorder._CHUNK_TIME = 0.02
-resource.setrlimit(resource.RLIMIT_FSIZE, (110_000, 110_000))
-summary = record(Path(sys.argv[1]), pipeline(), 1.0)
-print(summary.fault, summary.ticks, summary.lost_ticks, summary.file, sep="\\n")
-"""
-
-
 def run_program(program: str, *arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
         [sys.executable, "-c", textwrap.dedent(program), *arguments],
@@ -176,59 +105,12 @@ def run_program(program: str, *arguments: str) -> subprocess.CompletedProcess[st
     )  # fmt: skip
 
 
-def test_a_full_disk_ends_the_recording_and_not_the_run_and_leaves_what_fits(tmp_path: Path) -> None:
-    result = run_program(FULL_DISK, str(tmp_path))
-    assert result.returncode == 0, result.stderr
-    fault, written, lost, file = result.stdout.split("\n")[:4]
-    assert fault.endswith("File too large")
-    assert int(written) > 0
-    assert int(written) + int(lost) >= 1.0 * RATE
-    found = read_elsewhere(Path(file), tmp_path)
-    assert found["/q2r2/tick"]["count"] == int(written)
-
-
-KILLED = """
-import sys, time
-from pathlib import Path
-from tests.recording.runs import pipeline, record
-loop = pipeline()
-loop.listeners.append(lambda tick: print(tick.t, flush=True))
-record(Path(sys.argv[1]), loop, 30.0, realtime=True)
-"""
-
-
-def test_what_a_killed_process_leaves_opens_and_misses_a_second_at_most(tmp_path: Path) -> None:
-    process = subprocess.Popen(
-        [sys.executable, "-c", KILLED, str(tmp_path)],
-        cwd=ROOT, env={**os.environ, "PYTHONPATH": str(ROOT)}, stdout=subprocess.PIPE, text=True,
-    )  # fmt: skip
-    assert process.stdout is not None
-    reached = 0.0
-    for line in process.stdout:
-        reached = float(line)
-        if reached > 2.5:
-            break
-    process.send_signal(signal.SIGKILL)
-    rest = process.stdout.read().split("\n")
-    reached = max([reached, *(float(line) for line in rest[:-1] if line)])
-    process.wait()
-    (file,) = tmp_path.glob("*/*.mcap")
-    found = read_elsewhere(file.parent, tmp_path)["/q2r2/tick"]
-    recorded_time = 1e-9 * (found["last"] - found["first"])
-    assert reached - 1.0 < recorded_time <= reached
-    assert set(read_elsewhere(file, tmp_path)) >= {"/joint_states", "/robot_description", "/q2r2/left/target_frame"}
-    result = replay(file)
-    assert result.difference is None
-    assert result.ticks == found["count"]
-    assert result.ended_by is not None
-    assert "its process was killed" in result.ended_by
-
-
 def test_two_processes_that_record_at_once_get_a_folder_each(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     program = """
         import sys, time
         time.time_ns = lambda: 1_700_000_000_000_000_000
-        from pathlib import Path
+        from functools import partial
+from pathlib import Path
         from tests.recording.runs import pipeline, record
         print(record(Path(sys.argv[1]), pipeline(), 0.2).file)
     """
@@ -242,34 +124,56 @@ def test_two_processes_that_record_at_once_get_a_folder_each(tmp_path: Path, mon
         assert replay(file).difference is None
 
 
-def test_a_recorder_that_fails_inside_does_not_end_the_run(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    def spoil(recorder: Recorder) -> None:
-        def fail(batch: object) -> None:
-            raise ZeroDivisionError("in the encoder")
+class Broken(TickPacker):
+    def __init__(self) -> None:
+        pass
 
-        recorder._encoder.encode = fail  # type: ignore[assignment, method-assign]
+    def pack(self, number: int, tick: Tick) -> bytes:
+        raise ZeroDivisionError("of the packer")
+
+
+@pytest.mark.parametrize("side", ["the loop's", "the writer's"])
+def test_a_recorder_that_fails_inside_does_not_end_the_run(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, side: str
+) -> None:
+    def spoil(recorder: Recorder) -> None:
+        if side == "the writer's":
+            writer_of(recorder).ring.put(b"no tick")
+        else:
+            recorder._packer = Broken()
 
     with caplog.at_level(logging.WARNING):
         summary = record(tmp_path, pipeline(), 0.3, during=spoil)
     assert summary.fault is not None
-    assert "in the encoder" in summary.fault
-    assert len(caplog.records) == 1
+    assert ("buffer size" if side == "the writer's" else "of the packer") in summary.fault
+    assert summary.ticks == 0
+    assert summary.lost_ticks >= 0.3 * RATE
+    (line,) = [entry.getMessage() for entry in caplog.records]
+    assert line == f"recording ended, the run goes on: {summary.fault}"
 
 
 def test_memory_is_flat_however_long_a_run_is(tmp_path: Path, recorded: tuple[Path, list[Tick]]) -> None:
     loop = pipeline("circle", "mujoco")
     (tick,) = recorded[1][200:201]
-    recorder = Recorder(tmp_path, "long", About.of(loop, False, {}), loop.robot, waits=True, capacity=100)
-    held: list[int] = []
-    tracemalloc.start()
-    with recorder:
-        for number in range(4000):
+    held: list[tuple[int, int]] = []
+    with Recorder(tmp_path, "long", waits=True) as recorder:
+        writer = writer_of(recorder)
+        recorder.begin(About.of(loop, False, {}), loop.robot)
+        tracemalloc.start()
+        for number in range(12000):
             recorder(changed(tick, now=tick.start.now + 1e-3 * number))
-            if number % 1000 == 999:
-                while len(recorder._queue):
-                    time.sleep(1e-3)
-                held.append(tracemalloc.get_traced_memory()[0])
-    tracemalloc.stop()
+            if number % 3000 == 2999:
+                behind = number - 1000
+                wait_until(partial(lambda least: writer.ring.written > least, behind))
+                held.append((tracemalloc.get_traced_memory()[0], resident(writer.pid)))
+        tracemalloc.stop()
     assert recorder.summary.lost_ticks == 0
-    # What waits for the next chunk is some megabytes at any time.
-    assert max(held[1:]) - held[0] < 8e6
+    for now, then in zip(held[-1], held[0], strict=True):
+        # What waits for the next chunk is some megabytes at any time.
+        assert now - then < 8e6
+
+
+def resident(pid: int) -> int:
+    """What a process has in RAM [bytes]."""
+    (line,) = [line for line in Path(f"/proc/{pid}/status").read_text().splitlines() if line.startswith("VmRSS")]
+    return 1024 * int(line.split()[1])

@@ -20,6 +20,7 @@ from q2r2_control.ros.launch.processes import SOURCES, NodeProcess, nodes_of
 from tests.ros.conftest import NEEDS_ROS
 from tests.ros.processes import CONFIG, ROOT, Processes, RosProcess
 from tests.support.external_cell import external
+from tests.support.processes import alive, children
 
 pytest.importorskip("rclpy", reason=NEEDS_ROS)
 pytestmark = [pytest.mark.usefixtures("interfaces"), pytest.mark.alone]
@@ -38,20 +39,6 @@ def pair(processes: Processes) -> RosProcess:
     process.wait_for("[cartesian_controller] ")
     process.wait_for("active: ")
     return process
-
-
-def children(pid: int) -> list[int]:
-    with open(f"/proc/{pid}/task/{pid}/children") as file:
-        return [int(child) for child in file.read().split()]
-
-
-def alive(pid: int) -> bool:
-    """Whether it runs; a process that has ended may remain as a zombie."""
-    try:
-        with open(f"/proc/{pid}/stat") as file:
-            return file.read().rpartition(")")[2].split()[0] != "Z"
-    except FileNotFoundError:
-        return False
 
 
 def test_ctrl_c_ends_every_process(pair: RosProcess) -> None:

@@ -1,0 +1,326 @@
+"""Whatever becomes of run, writer and disk: the others go on, and nothing is left but a whole file."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import resource
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from q2r2_control.errors import RecordingError
+from q2r2_control.pipeline import Pipeline
+from q2r2_control.recording.reader import Recording
+from q2r2_control.recording.recorder import Recorder
+from q2r2_control.recording.replay import replay
+from q2r2_control.runtime.recorder import Tick
+from tests.recording.runs import ROOT, file_of, pipeline, read_elsewhere, record, writer_of
+from tests.support.processes import alive, children, wait_until
+
+WRITTEN_LATER = 60.0  # [s] of simulated time, which a listener ends
+
+
+class Script:
+    """A listener that does one step after the other, and then ends the run. Simulated time waits for it."""
+
+    def __init__(self, loop: Pipeline, steps: Callable[[Recorder], Iterator[None]]) -> None:
+        self._loop, self._steps = loop, steps
+
+    def __call__(self, recorder: Recorder) -> None:
+        """When recording has begun."""
+        self._left = self._steps(recorder)
+        self._loop.listeners.append(self._step)
+
+    def _step(self, tick: Tick) -> None:
+        """A step lasts until its generator yields; it is resumed at each tick."""
+        if next(self._left, self) is self:
+            self._loop.stop()
+
+
+def written(recorder: Recorder) -> int:
+    return writer_of(recorder).ring.written
+
+
+def test_while_the_writer_is_stopped_the_loop_goes_on_and_what_is_lost_is_counted(tmp_path: Path) -> None:
+    pids: list[int] = []
+
+    def stopped_for_a_while(recorder: Recorder) -> Iterator[None]:
+        pids.append(writer_of(recorder).pid)
+        for _ in range(20):
+            yield
+        os.kill(pids[0], signal.SIGSTOP)
+        while recorder.overflows < 100:
+            yield
+        os.kill(pids[0], signal.SIGCONT)
+        wait_until(lambda: written(recorder))
+        for _ in range(50):
+            yield
+
+    loop = pipeline()
+    summary = record(tmp_path, loop, WRITTEN_LATER, waits=False, room=400_000, during=Script(loop, stopped_for_a_while))
+    assert summary.fault is None
+    assert summary.lost_ticks == 100
+    assert summary.ticks > 100
+    assert summary.file is not None
+    file = Path(summary.file)
+    found = read_elsewhere(file, tmp_path)
+    assert found["/q2r2/tick"]["count"] == summary.ticks
+    states = found["/q2r2/state"]["texts"]
+    assert states.count(states[0]) == 2, "told again behind the gap"
+    result = replay(file)
+    assert result.difference is None
+    assert result.ended_by is not None
+    assert "ticks were lost here" in result.ended_by
+    assert not alive(pids[0])
+
+
+def test_a_writer_that_is_killed_is_one_line_and_leaves_what_it_wrote(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    ticks: list[int] = []
+    pids: list[int] = []
+
+    def killed(recorder: Recorder) -> Iterator[None]:
+        pids.append(writer_of(recorder).pid)
+        for _ in range(50):
+            yield
+        wait_until(lambda: written(recorder))
+        os.kill(pids[0], signal.SIGKILL)
+        wait_until(lambda: not alive(pids[0]))
+        ticks.append(written(recorder))
+        while not caplog.records:
+            yield
+        for _ in range(100):
+            yield
+
+    loop = pipeline()
+    with caplog.at_level(logging.WARNING):
+        summary = record(tmp_path, loop, WRITTEN_LATER, during=Script(loop, killed))
+    (line,) = [entry.getMessage() for entry in caplog.records]
+    assert line == f"recording ended, the run goes on: {summary.fault}"
+    assert summary.fault == f"{summary.file}: the process that writes it was ended by SIGKILL"
+    assert summary.ticks == ticks[0] > 0
+    assert summary.lost_ticks > 100
+    assert summary.file is not None
+    assert read_elsewhere(Path(summary.file), tmp_path)["/q2r2/tick"]["count"] == summary.ticks
+    assert replay(Path(summary.file)).difference is None
+    assert not alive(pids[0])
+
+
+def test_a_full_disk_ends_the_recording_and_not_the_run_and_leaves_what_fits(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    pids: list[int] = []
+
+    def full_disk(recorder: Recorder) -> Iterator[None]:
+        pids.append(writer_of(recorder).pid)
+        for _ in range(50):
+            yield
+        wait_until(lambda: written(recorder))
+        size = file_in(tmp_path).stat().st_size
+        resource.prlimit(pids[0], resource.RLIMIT_FSIZE, (size + 100, size + 100))
+        while not caplog.records:
+            yield
+
+    loop = pipeline()
+    with caplog.at_level(logging.WARNING):
+        summary = record(tmp_path, loop, WRITTEN_LATER, during=Script(loop, full_disk))
+    assert summary.fault == f"{summary.file}: File too large"
+    assert len(caplog.records) == 1
+    assert summary.ticks > 0
+    assert summary.lost_ticks > 0
+    assert read_elsewhere(file_in(tmp_path), tmp_path)["/q2r2/tick"]["count"] == summary.ticks
+    assert not alive(pids[0])
+
+
+def test_a_writer_that_hangs_at_the_end_is_not_waited_for_longer_than_that(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("q2r2_control.recording.recorder._PATIENCE", 0.1)
+    pids: list[int] = []
+
+    def hang(recorder: Recorder) -> None:
+        pids.append(writer_of(recorder).pid)
+        os.kill(pids[0], signal.SIGSTOP)
+
+    summary = record(tmp_path, pipeline(), 0.1, during=hang)
+    assert summary.fault == f"{summary.file}: the disk took no data for 0.1 s"
+    assert not alive(pids[0])
+
+
+def test_a_writer_that_is_not_needed_ends(tmp_path: Path) -> None:
+    with Recorder(tmp_path, "test") as recorder:
+        pid = writer_of(recorder).pid
+    assert not alive(pid)
+    assert list(tmp_path.iterdir()) == []
+    assert recorder.summary.fault is None
+
+
+def file_in(folder: Path) -> Path:
+    (file,) = folder.glob("*/*.mcap")
+    return file
+
+
+RUN = """
+import sys
+from pathlib import Path
+from tests.recording.runs import pipeline, record
+loop = pipeline()
+count = 0
+def tell(tick):
+    global count
+    count += 1
+    print(count, flush=True)
+record(Path(sys.argv[1]), loop, 600.0, realtime=True, during=lambda recorder: loop.listeners.append(tell))
+"""
+
+
+PATH = {**os.environ, "PYTHONPATH": str(ROOT)}
+
+
+@contextmanager
+def started(*command: str, cwd: Path = ROOT, env: Mapping[str, str] = PATH) -> Iterator[subprocess.Popen[str]]:
+    """A run in a process group of its own."""
+    running = subprocess.Popen(
+        [sys.executable, *command], cwd=cwd, env=env, process_group=0,
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    try:
+        yield running
+    finally:
+        running.kill()
+        running.communicate()
+
+
+def has_ticks(folder: Path) -> bool:
+    """Whether a chunk of the recording in it is there already."""
+    try:
+        return any(chunk.rows for file in folder.glob("*/*.mcap") for chunk in Recording(file).chunks())
+    except RecordingError:
+        return False
+
+
+@pytest.mark.parametrize("both", [False, True], ids=["the run alone", "the writer too"])
+def test_what_a_killed_run_leaves_opens_and_is_replayed(tmp_path: Path, both: bool) -> None:
+    with started("-c", RUN, str(tmp_path)) as running:
+        assert running.stdout is not None
+        while int(running.stdout.readline()) < 100:
+            pass
+        wait_until(lambda: has_ticks(tmp_path))
+        (writer,) = children(running.pid)
+        memory = Path(f"/proc/{writer}/maps").read_text()
+        assert "memfd:q2r2-recording (deleted)" in memory
+        assert "/dev/shm" not in memory
+        running.kill()
+        if both:
+            os.kill(writer, signal.SIGKILL)
+        told = int(running.stdout.read().split()[-1])
+        running.wait()
+        wait_until(lambda: not alive(writer))
+    file = file_in(tmp_path)
+    found = read_elsewhere(file.parent if not both else file, tmp_path)
+    assert set(found) >= {"/joint_states", "/robot_description", "/q2r2/run_start"}
+    count = found["/q2r2/tick"]["count"]
+    if not both:
+        # All but the newest: the last one in the ring comes with the next.
+        assert told - 1 <= count <= told + 1
+    result = replay(file)
+    assert (result.difference, result.ticks) == (None, count)
+    assert result.ended_by is not None
+    assert "its process was killed" in result.ended_by
+
+
+# Of a program that uses os.fork, whose children have all that it has open.
+FORKING = """
+import os, sys, time
+from pathlib import Path
+from tests.recording.runs import pipeline, record
+def fork(recorder):
+    child = os.fork()
+    if child == 0:
+        os.closerange(0, 3)
+        time.sleep(600.0)
+        os._exit(0)
+    print(child, flush=True)
+record(Path(sys.argv[1]), pipeline(), 600.0, realtime=True, during=fork)
+"""
+
+
+def test_the_writer_ends_with_a_killed_run_that_has_children_which_do_not(tmp_path: Path) -> None:
+    with started("-c", FORKING, str(tmp_path)) as running:
+        assert running.stdout is not None
+        child = int(running.stdout.readline())
+        try:
+            wait_until(lambda: has_ticks(tmp_path))
+            (writer,) = (pid for pid in children(running.pid) if pid != child)
+            running.kill()
+            wait_until(lambda: not alive(writer))
+            assert alive(child)
+        finally:
+            os.kill(child, signal.SIGKILL)
+    assert replay(file_in(tmp_path)).difference is None
+
+
+COMMAND = f"""
+import sys
+sys.path.append({str(ROOT)!r})
+from q2r2_control.cli.app import app
+app()
+"""
+
+
+@pytest.mark.parametrize("how", ["python -m", "a script, somewhere else"])
+def test_ctrl_c_ends_the_run_and_the_recording_is_whole(tmp_path: Path, how: str) -> None:
+    options: tuple[str, ...] = (
+        "run",
+        str(ROOT / "config/dual_iiwa7.yaml"),
+        "--plant",
+        "kinematic",
+        "--headless",
+        "--json",
+    )
+    options += ("--record", str(tmp_path / "recordings"))
+    script, folder = tmp_path / "bin" / "q2r2", tmp_path / "folder"
+    for trap in ("q2r2_control", "json"):
+        (folder / trap).mkdir(parents=True)
+        (folder / trap / "__init__.py").write_text("raise ImportError('not this one')")
+    script.parent.mkdir()
+    script.write_text(COMMAND)
+    command = ("-m", "q2r2_control") if how == "python -m" else (str(script),)
+    where = ROOT if how == "python -m" else folder
+    with started(*command, *options, cwd=where, env=os.environ) as running:
+        recordings = tmp_path / "recordings"
+        wait_until(lambda: has_ticks(recordings))
+        (writer,) = children(running.pid)
+        os.kill(writer, signal.SIGINT)
+        os.kill(writer, signal.SIGTERM)
+        os.killpg(running.pid, signal.SIGINT)
+        stdout, stderr = running.communicate()
+    assert running.returncode == 0, stderr
+    summary = json.loads(stdout)
+    assert summary["recording"]["fault"] is None
+    assert summary["recording"]["ticks"] == summary["ticks"]
+    assert not alive(writer)
+    assert replay(Path(summary["recording"]["file"])).ended_by is None
+
+
+def test_the_file_of_a_run_that_raises_is_whole(tmp_path: Path) -> None:
+    recorders: list[Recorder] = []
+
+    def fail(recorder: Recorder) -> Iterator[None]:
+        recorders.append(recorder)
+        for _ in range(50):
+            yield
+        raise ZeroDivisionError("of another listener")
+
+    loop = pipeline()
+    with pytest.raises(ZeroDivisionError):
+        record(tmp_path, loop, 1.0, during=Script(loop, fail))
+    assert replay(file_of(recorders[0].summary)).difference is None
