@@ -10,7 +10,7 @@ from q2r2_control.judging.episode import Episode
 from q2r2_control.judging.hands import HandFigures, hand_figures
 from q2r2_control.judging.motion import ArmFigures, arm_figures, idle_share
 from q2r2_control.judging.timing import TimingFigures, timing_figures
-from q2r2_control.teleop.arm import ArmState, is_fault
+from q2r2_control.teleop.arm_states import is_fault, is_refusal
 
 _LINKED = "linked to "  # begins the reason of an arm that was paused by the other one's fault
 
@@ -77,7 +77,7 @@ def _faults(episode: Episode) -> list[Fault]:
     return [
         Fault(event.t, event.arm, event.reason)
         for event in episode.events
-        if is_fault(event) and event.source != ArmState.PAUSED and not event.reason.startswith(_LINKED)
+        if is_fault(event) and not is_refusal(event) and not event.reason.startswith(_LINKED)
     ]
 
 

@@ -158,9 +158,9 @@ def loop_of(source: object, **changes: object) -> Pipeline:
 def record_episode(folder: Path, source: object, duration: float = DURATION) -> Path:
     """The file of a recorded run."""
     loop = loop_of(source)
-    recorder = Recorder(folder, "test", About.of(loop, False, {"task": "a test"}), loop.robot, waits=True)
-    loop.listeners.append(recorder)
-    with recorder:
+    with Recorder(folder, "test", waits=True) as recorder:
+        recorder.begin(About.of(loop, False, {"task": "a test"}), loop.robot)
+        loop.listeners.append(recorder)
         loop.run(duration, realtime=False)
     return file_of(recorder.summary)
 

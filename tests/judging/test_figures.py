@@ -229,8 +229,8 @@ class TestTiming:
 def test_faults_are_pauses_that_no_operator_asked_for_each_once() -> None:
     events = [
         Event(0.5, "left", "paused", "engaged", "lower button"),
-        Event(1.0, "left", "engaged", "paused", "the hand jumped 0.300 m"),
-        Event(1.0, "right", "engaged", "paused", "linked to left: the hand jumped 0.300 m"),
+        Event(1.0, "left", "engaged", "lost", "the hand jumped 0.300 m"),
+        Event(1.0, "right", "engaged", "lost", "linked to left: the hand jumped 0.300 m"),
         Event(2.0, "left", "paused", "paused", "not engaged: no pose for 0.15 s"),
         Event(3.0, "right", "pausing", "paused", "lower button"),
     ]
