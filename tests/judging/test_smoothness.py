@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.integrate import trapezoid
 
 from q2r2_control.inputs.way_points import minimum_jerk
 from q2r2_control.judging.smoothness import ldlj, smoothness, sparc
@@ -34,7 +35,7 @@ def test_a_reach_of_minimum_jerk_has_the_values_of_the_definitions() -> None:
     t = np.linspace(0.0, 1.0, 2001)
     speed = 30.0 * t**2 - 60.0 * t**3 + 30.0 * t**4
     frequencies = np.arange(0.0, 10.0, 0.01)
-    spectrum = np.abs(np.trapezoid(speed * np.exp(-2.0j * np.pi * frequencies[:, None] * t), t, axis=1))
+    spectrum = np.abs(trapezoid(speed * np.exp(-2.0j * np.pi * frequencies[:, None] * t), t, axis=1))
     highest = int(np.flatnonzero(spectrum >= 0.05)[-1])
     arc = np.hypot(0.01 / frequencies[highest], np.diff(spectrum[: highest + 1])).sum()
     assert sparc(reach(), DT) == pytest.approx(-arc, abs=0.02)
