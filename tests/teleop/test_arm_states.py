@@ -45,7 +45,7 @@ def test_a_stop_stops_in_every_state_and_ends_by_itself_alone(state: ArmState) -
     assert ends == [Cause.GO_ON]
 
 
-@pytest.mark.parametrize("state", set(ArmState) - RESTS)
+@pytest.mark.parametrize("state", sorted(set(ArmState) - RESTS))
 @pytest.mark.parametrize("cause", [Cause.FAULT, Cause.STOP])
 def test_what_moves_is_stopped_by_a_fault_and_by_a_stop(state: ArmState, cause: Cause) -> None:
     assert next_state(state, cause) in RESTS
