@@ -80,7 +80,7 @@ def _draw_speed(axes: Axes, judged: Judged) -> None:
         label = None
     axes.set_title("speed of the measured tools")
     axes.set_ylabel("speed [mm/s]")
-    axes.set_ylim(bottom=0.0)
+    axes.set_ylim(0.0, max(10.0, axes.get_ylim()[1]))  # of arms at rest not the rounding
 
 
 def _draw_errors(axes: Axes, judged: Judged) -> None:
