@@ -109,8 +109,7 @@ def test_two_processes_that_record_at_once_get_a_folder_each(tmp_path: Path, mon
     program = """
         import sys, time
         time.time_ns = lambda: 1_700_000_000_000_000_000
-        from functools import partial
-from pathlib import Path
+        from pathlib import Path
         from tests.recording.runs import pipeline, record
         print(record(Path(sys.argv[1]), pipeline(), 0.2).file)
     """
@@ -169,8 +168,8 @@ def test_memory_is_flat_however_long_a_run_is(tmp_path: Path, recorded: tuple[Pa
         tracemalloc.stop()
     assert recorder.summary.lost_ticks == 0
     for now, then in zip(held[-1], held[0], strict=True):
-        # What waits for the next chunk is some megabytes at any time.
-        assert now - then < 8e6
+        # What waits for the next chunk is some megabytes at any time; 9000 ticks that are kept would be 14.
+        assert now - then < 12e6
 
 
 def resident(pid: int) -> int:
