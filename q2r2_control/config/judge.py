@@ -43,7 +43,7 @@ class JudgeSettings(BaseModel):
         -3.0, description="smoothness of the tool: spectral arc length, the nearer to -1 the smoother"
     )
     min_ldlj: Annotated[float, Field(ge=-100, le=0)] | None = Field(
-        -14.0, description="smoothness of the tool: log dimensionless jerk, the nearer to 0 the smoother"
+        -11.0, description="smoothness of the tool: log dimensionless jerk, the nearer to 0 the smoother"
     )
     max_fallback_share: Share | None = Field(0.05, description="of the ticks: the certified stop was executed")
     max_uncertified_share: Share | None = Field(0.0, description="of the ticks: no certified stop was known")
@@ -52,6 +52,6 @@ class JudgeSettings(BaseModel):
     )
     max_lost_share: Share | None = Field(0.01, description="of the ticks: not in the file")
     max_lost_gap: Seconds | None = Field(0.03, description="longest time of which no tick is in the file [s]")
-    max_missed_share: Share | None = Field(0.1, description="of the ticks that were due: the loop was late")
+    max_missed_share: Share | None = Field(0.5, description="of the ticks that were due: the loop was late")
     max_tick_gap: Seconds | None = Field(0.1, description="longest time between two ticks of the loop [s]")
     needs_end: bool = Field(True, description="a file that was not ended, by a killed process say, is discarded")
