@@ -12,7 +12,7 @@ import numpy.typing as npt
 import pinocchio as pin
 
 from q2r2_control.recording import topics as names
-from q2r2_control.recording.packing import POSE, Extras, row_type, unpack
+from q2r2_control.recording.packing import POSE, unpack
 from q2r2_control.recording.rows import Rows, text_record
 from q2r2_control.recording.topics import SAMPLE_FIELDS, Topic, Topics
 from q2r2_control.types import SIDES, Array, HandInputs
@@ -64,15 +64,12 @@ class TickEncoder:
         self.topics = topics
         self._robot, self._model_data = robot, robot.model.createData()
         self._epoch, self._start = epoch, 0.0
-        self._row = row_type(topics)
         self._stamps: dict[tuple[str, int], float] = {}  # the last of each hand's poses and inputs
 
     def encode(self, batch: Sequence[bytes]) -> list[Block]:
         """Messages of packed ticks that follow the last ones, topic by topic."""
-        unpacked = [unpack(record, self._row.itemsize) for record in batch]
-        extras = [extra for _, extra in unpacked]
-        ticks = np.frombuffer(b"".join(row for row, _ in unpacked), dtype=self._row)
-        blocks = self._beginning(extras[0].start) if extras[0].start else []
+        ticks, samples, start, states = unpack(batch, self.topics)
+        blocks = self._beginning(start) if start else []
         numbers = self._column(ticks, "index").astype(np.int64)
         times = self._times(self._column(ticks, "now"))
 
@@ -92,7 +89,7 @@ class TickEncoder:
 
         every = np.arange(len(ticks))
         add(names.TICK, every, data=ticks[names.TICK])
-        self._add_samples(add, extras)
+        self._add_samples(add, samples, self._column(ticks, "samples").astype(np.int64))
         add(names.JOINT_STATES, every, position=ticks["q"], velocity=ticks["v"], effort=ticks["tau"])
         felt = np.flatnonzero(self._column(ticks, "external"))
         add(names.EXTERNAL_TORQUE, felt, effort=ticks["tau_external"][felt])
@@ -118,9 +115,9 @@ class TickEncoder:
         add(names.GRIPPERS, every, data=ticks[names.GRIPPERS])
         add(names.FLAGS, every, data=ticks[names.FLAGS])
         state = self.topics.by_name[names.STATE]
-        told = [at for at, extra in enumerate(extras) if extra.state]
+        told = [at for at, text in enumerate(states) if text]
         if told:
-            texts = [text_record(state.channel, int(numbers[at]), int(times[at]), extras[at].state) for at in told]
+            texts = [text_record(state.channel, int(numbers[at]), int(times[at]), states[at]) for at in told]
             blocks.append(Block(state, told, None, texts))
         return blocks
 
@@ -144,11 +141,12 @@ class TickEncoder:
         text = text_record(description.channel, 0, self._epoch, self._robot.urdf)
         return [Block(description, [0], None, [text]), Block(topic, [0], rows)]
 
-    def _add_samples(self, add: Callable[..., None], extras: Sequence[Extras]) -> None:
-        """Samples as the loop got them, and those poses and inputs that are new, as messages of the nodes."""
-        samples = np.frombuffer(b"".join(extra.samples for extra in extras)).reshape(-1, len(SAMPLE_FIELDS))
-        size = 8 * len(SAMPLE_FIELDS)
-        at = np.repeat(np.arange(len(extras)), [len(extra.samples) // size for extra in extras])
+    def _add_samples(self, add: Callable[..., None], samples: Array, counts: npt.NDArray[np.int64]) -> None:
+        """Samples as the loop got them, and those poses and inputs that are new, as messages of the nodes.
+
+        ``counts``: how many of them each tick has.
+        """
+        at = np.repeat(np.arange(len(counts)), counts)
         add(names.SAMPLES, at, data=samples)
         for number, hand in enumerate(SIDES):
             of_hand = np.flatnonzero(samples[:, _HAND] == number)

@@ -1,14 +1,14 @@
 """A tick as bytes: what the loop's own thread does for a recording, some microseconds of work.
 
 A row of float64 has all that every tick has, in the order in which messages want it. What only some have goes behind
-it: hand samples, the state in words where it changed, and at first where the run began.
+it: hand samples, at first where the run began, and the state in words where it changed. Between two ticks other
+programs and other code fill the processor's caches, so that little code here counts for more than little arithmetic.
 """
 
 from __future__ import annotations
 
 import json
 import math
-import pickle
 import struct
 from array import array
 from collections.abc import Sequence
@@ -18,8 +18,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import pinocchio as pin
 
-from q2r2_control.recording.topics import FLAGS, GRIPPERS, TICK, Topics
-from q2r2_control.types import SIDES, CommandMode, HandInputs, HandSample, RobotState, StepStatus
+from q2r2_control.recording.rows import Rows
+from q2r2_control.recording.topics import FLAGS, GRIPPERS, SAMPLE_FIELDS, START, TICK, Topics
+from q2r2_control.types import SIDES, Array, CommandMode, HandInputs, HandSample, RobotState, StepStatus
 
 if TYPE_CHECKING:  # the writer's process does without the loop's modules
     from q2r2_control.runtime.recorder import Tick
@@ -35,18 +36,17 @@ POSE = 7  # numbers of a pose: x y z qx qy qz qw
 
 _MODE_NUMBERS = {mode: number for number, mode in enumerate(COMMAND_MODES)}
 _STATUS_NUMBERS = {status: number for number, status in enumerate(STATUSES)}
-_INPUTS = HandInputs.__slots__
+_SAMPLE = struct.Struct(f"<{len(SAMPLE_FIELDS)}d")
+_NO_POSE = (0.0,) * POSE
 
 
-class Extras(NamedTuple):
-    """What only some ticks have; arrays are bytes of float64."""
+class PackedTicks(NamedTuple):
+    """Some ticks in a row, unpacked."""
 
-    samples: bytes = b""  # rows of SAMPLE_FIELDS
-    state: str = ""  # JSON
-    start: bytes = b""  # of the topic run_start
-
-
-_NOTHING = Extras()
+    rows: Rows  # of row_type
+    samples: Array  # (samples, numbers of SAMPLE_FIELDS), of all of them
+    start: bytes  # the numbers of the topic run_start, where the first tick of a run is among them
+    states: list[str]  # of each: JSON where it changed, else empty
 
 
 def row_type(topics: Topics) -> np.dtype[np.void]:
@@ -54,14 +54,25 @@ def row_type(topics: Topics) -> np.dtype[np.void]:
     arms, joints = len(topics.arms), len(topics.joints)
     counts = {name: len(topics.by_name[name].labels["data"]) for name in (TICK, GRIPPERS, FLAGS)}
     fields: list[tuple[str, str, tuple[int, ...]]] = [(name, "<f8", (count,)) for name, count in counts.items()]
-    fields += [("led", "<f8", (arms,)), ("targets", "<f8", (arms, POSE))]
+    fields += [("led", "<f8", (arms,)), ("targets", "<f8", (arms, POSE)), ("begins", "<f8", ())]
     fields += [(name, "<f8", (joints,)) for name in JOINT_FIELDS]
     return np.dtype(fields)
 
 
-def unpack(record: bytes, size: int) -> tuple[bytes, Extras]:
-    """The row, of ``size`` bytes, and what is behind it."""
-    return record[:size], Extras(*pickle.loads(record[size:])) if len(record) > size else _NOTHING
+def unpack(batch: Sequence[bytes], topics: Topics) -> PackedTicks:
+    """The ticks that :class:`TickPacker` packed."""
+    kind, labels = row_type(topics), topics.by_name[TICK].labels["data"]
+    rows = np.frombuffer(b"".join([record[: kind.itemsize] for record in batch]), dtype=kind)
+    counts = rows[TICK][:, labels.index("samples")].astype(int).tolist()
+    samples, start, states = [], b"", []
+    for record, count, begins in zip(batch, counts, rows["begins"].tolist(), strict=True):
+        end = kind.itemsize + count * _SAMPLE.size
+        samples.append(record[kind.itemsize : end])
+        if begins:
+            start = record[end : end + 8 * len(topics.by_name[START].labels["data"])]
+            end += len(start)
+        states.append(record[end:].decode())
+    return PackedTicks(rows, np.frombuffer(b"".join(samples)).reshape(-1, len(SAMPLE_FIELDS)), start, states)
 
 
 class TickPacker:
@@ -76,8 +87,8 @@ class TickPacker:
         self._joints = [joints[name] for name in JOINT_FIELDS]  # views of the row
         # Most of the numbers are by themselves, and numpy takes one as long as a whole list.
         self._numbers = struct.Struct(f"<{kind.fields['q'][1] // 8}d")
-        self._state: tuple[Any, ...] | None = None  # as it was written last
-        self._started = False
+        self._state: tuple[Any, ...] | None = None  # in names, as it was told last
+        self._begun = False
 
     def repeat_state(self) -> None:
         """Tell the state again with the next tick: the last one was lost."""
@@ -85,10 +96,26 @@ class TickPacker:
 
     def pack(self, number: int, tick: Tick) -> bytes:
         """One tick, the ``number``-th from 0 on."""
-        report, state, command, reference = tick.reference.report, tick.state, tick.command, tick.reference
-        openings, commanded = tick.openings, command.grippers
-        samples = [sample for sample in tick.samples if sample.hand in SIDES] if tick.samples else ()
-        numbers: list[float] = [
+        reference, state, command, holding = tick.reference, tick.state, tick.command, tick.holding
+        report = reference.report
+        samples = [sample for sample in tick.samples if sample.hand in SIDES] if tick.samples else []
+        # Of all arms, one after the other.
+        openings: list[float] = []
+        grippers: list[float] = []
+        flags: list[float] = []
+        led: list[float] = []
+        targets: list[float] = []
+        for arm in self._arms:
+            target, opening = tick.targets[arm], tick.openings.get(arm, NOT_MEASURED)
+            held, holds = arm in tick.held_grippers, holding.get(arm, False)
+            openings.append(opening)
+            grippers += (target.gripper, command.grippers.get(arm, NOT_MEASURED), opening)
+            flags += (tick.engaged[arm], arm in report.rejected, target.slip, target.slip_angle, held, holds)
+            led.append(target.pose is not None)
+            targets += _NO_POSE if target.pose is None else pin.SE3ToXYZQUATtuple(target.pose)
+        self._numbers.pack_into(
+            self._row,
+            0,
             number,
             tick.now,
             tick.dt,
@@ -100,88 +127,64 @@ class TickPacker:
             state.tau_external is not None,
             min(report.unsolved, UNSOLVED_MAX),
             _MODE_NUMBERS[command.mode],
-            *(openings.get(arm, NOT_MEASURED) for arm in self._arms),
+            *openings,
             tick.compute_time,
             report.solve_time,
-        ]
-        for arm in self._arms:
-            gripper = tick.targets[arm].gripper
-            numbers += (gripper, commanded.get(arm, NOT_MEASURED), openings.get(arm, NOT_MEASURED))
-        numbers += (
+            *grippers,
             _STATUS_NUMBERS[report.status],
             report.certified,
             report.fallback,
             report.closest_distance,
             report.margin,
             report.slack,
+            *flags,
+            *led,
+            *targets,
+            not self._begun,
         )
-        for arm in self._arms:
-            wanted = tick.targets[arm]
-            held, holding = arm in tick.held_grippers, tick.holding.get(arm, False)
-            numbers += (tick.engaged[arm], arm in report.rejected, wanted.slip, wanted.slip_angle, held, holding)
-        poses = [tick.targets[arm].pose for arm in self._arms]
-        numbers += [pose is not None for pose in poses]
-        for pose in poses:
-            numbers += _NO_POSE if pose is None else pin.SE3ToXYZQUATtuple(pose)
-        self._numbers.pack_into(self._row, 0, *numbers)
         external = 0.0 if state.tau_external is None else state.tau_external
         measured, moved = (state.q, state.v, state.tau, external), (reference.q, reference.v, reference.a)
         for view, values in zip(self._joints, (*measured, *moved, command.q, command.v, command.tau), strict=True):
             view[:] = values
-        return bytes(self._row) + self._extras(number, tick, samples)
-
-    def _extras(self, number: int, tick: Tick, samples: Sequence[HandSample]) -> bytes:
-        state, start = self._state_text(tick), b""
-        if not self._started:
-            self._started, begun = True, tick.start
-            known = begun.state.tau_external is not None
-            start = array("d", [begun.now, begun.state.stamp, known, *_joints(begun.state)]).tobytes()
-        if not (samples or state or start):
-            return b""
-        rows = array("d", [value for sample in samples for value in _sample_row(number, sample)])
-        return pickle.dumps(tuple(Extras(rows.tobytes(), state, start)))
-
-    def _state_text(self, tick: Tick) -> str:
-        """What has names, as JSON; empty where it is as it was."""
-        report = tick.reference.report
-        state = (
-            tick.connected,
-            report.status,
-            report.closest_pair,
-            report.tightest_pair,
-            # Copies, since these change in place.
-            tuple(tick.states.items()),
-            tuple(tick.held_grippers.items()),
-            tuple(tick.holding.items()),
-        )
-        if state == self._state and not tick.events:
-            return ""
-        self._state = state
-        words: dict[str, Any] = {
-            "states": tick.states,
-            "connected": tick.connected,
-            "status": report.status,
-            "closest_pair": report.closest_pair,
-            "tightest_pair": report.tightest_pair,
-            "held_grippers": tick.held_grippers,
-            "holding": tick.holding,
-        }
-        if tick.events:
-            words["events"] = [asdict(event) for event in tick.events]
-        return json.dumps(words)
+        record = bytes(self._row)
+        for sample in samples:
+            record += _packed_sample(number, sample)
+        if not self._begun:
+            self._begun = True
+            record += _packed_start(tick.start.now, tick.start.state)
+        words = (tick.connected, report.status, report.closest_pair, report.tightest_pair)
+        named = (*words, tick.states, tick.held_grippers, holding)
+        if named != self._state or tick.events:
+            self._state = named
+            record += _state_text(tick).encode()
+        return record
 
 
-_NO_POSE = (0.0,) * POSE
+def _state_text(tick: Tick) -> str:
+    """What has names, as JSON."""
+    report = tick.reference.report
+    words: dict[str, Any] = {
+        "states": tick.states,
+        "connected": tick.connected,
+        "status": report.status,
+        "closest_pair": report.closest_pair,
+        "tightest_pair": report.tightest_pair,
+        "held_grippers": tick.held_grippers,
+        "holding": tick.holding,
+    }
+    if tick.events:
+        words["events"] = [asdict(event) for event in tick.events]
+    return json.dumps(words)
 
 
-def _joints(state: RobotState) -> list[float]:
-    """Positions, velocities, torques and external torques, zero where the plant cannot tell those."""
+def _packed_start(now: float, state: RobotState) -> bytes:
+    """Where a run began; external torques are zero where the plant cannot tell them."""
     external = np.zeros(len(state.q)) if state.tau_external is None else state.tau_external
-    return [*state.q, *state.v, *state.tau, *external]
+    known = state.tau_external is not None
+    return array("d", [now, state.stamp, known, *state.q, *state.v, *state.tau, *external]).tobytes()
 
 
-def _sample_row(number: int, sample: HandSample) -> list[float]:
-    inputs = [getattr(sample.inputs, name) for name in _INPUTS]
-    stamps = (sample.pose_stamp, sample.inputs_stamp)
-    pose = (*sample.position.tolist(), *sample.quaternion.tolist())
-    return [number, SIDES.index(sample.hand), *stamps, *pose, *inputs]
+def _packed_sample(number: int, sample: HandSample) -> bytes:
+    inputs = [getattr(sample.inputs, name) for name in HandInputs.__slots__]
+    side, stamps = SIDES.index(sample.hand), (sample.pose_stamp, sample.inputs_stamp)
+    return _SAMPLE.pack(number, side, *stamps, *sample.position.tolist(), *sample.quaternion.tolist(), *inputs)

@@ -56,6 +56,11 @@ class Ring:
     def written(self, count: int) -> None:
         self._counters[_WRITTEN] = count
 
+    @property
+    def progress(self) -> tuple[int, int]:
+        """What changes while the writer gets on: bytes taken and ticks written."""
+        return self._counters[_TAKEN], self._counters[_WRITTEN]
+
     def put(self, record: bytes) -> bool:
         """Add a record; False where there is no room now. Raises :class:`ValueError` for one that never fits."""
         length = len(record)

@@ -19,6 +19,7 @@ from q2r2_control.recording.ring import Ring, new_memory
 from q2r2_control.recording.writer import LONGEST_REASON, Setup
 
 ROOM = 8 << 20  # for ticks that wait to be written [bytes]; one of two arms with seven joints each takes 1.6 kB
+_STARTING = 6.0  # times as long a patience with a writer that has not taken anything yet
 # Signals first, since a Ctrl-C may come at once; modules are looked for where this process looks.
 _PROGRAM = """\
 import signal
@@ -82,7 +83,7 @@ class WriterProcess:
     def finish(self, patience: float) -> str | None:
         """Let it write what there is, and end. Returns why it did not, or None.
 
-        One that has not ended within ``patience`` [s] is killed, and one that was told of no run at once.
+        One that gets nowhere for ``patience`` [s] is killed, and one that was told of no run at once.
         """
         fault = None
         if self._begun:
@@ -100,8 +101,12 @@ class WriterProcess:
         late = f"the disk took no data for {patience:g} s"
         answer = select.poll()
         answer.register(self._output, select.POLLIN)
-        if not answer.poll(1000.0 * patience):
-            return late
+        reached = self.ring.progress
+        # On a machine that is busy with other work its imports alone may take that long.
+        while not answer.poll(1000.0 * (patience if any(reached) else _STARTING * patience)):
+            if self.ring.progress == reached:
+                return late
+            reached = self.ring.progress
         said = self._output.read(LONGEST_REASON)
         try:
             code = self._process.wait(patience)
