@@ -43,8 +43,8 @@ def smoothness(t: Array, position: Array, engaged: Flags) -> tuple[float | None,
 def _smoothed(position: Array) -> Array:
     """A piece without what its ends make of the smoothing.
 
-    A tick that comes a millisecond late measures a tool at 0.3 m/s 0.3 mm off, and of three derivatives of that is more
-    than of the motion: without this a hand's smooth circle is at -8 in simulated time and at -16 in real time.
+    A tick that comes a millisecond late measures a tool at 0.3 m/s 0.3 mm off, and in real time there are many: three
+    derivatives of that would be more than those of the motion.
     """
     cut = round(2.0 * _SMOOTHING / FRAME)
     return np.asarray(gaussian_filter1d(position, _SMOOTHING / FRAME, axis=0))[cut:-cut]

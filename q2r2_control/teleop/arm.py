@@ -46,17 +46,7 @@ class ArmTeleop:
         self._gestures = GestureRecognizer(settings)
         self._filter = PoseFilter(settings.filter)
         self._rest = RestingPose(settings.filter.average_at_rest)
-        self._motion, self._unslipped = (
-            RelativeMotion(
-                settings.stance,
-                settings.position_scale,
-                settings.rotation_frame,
-                settings.rotation_scale,
-                settings.axes,
-                settings.axis_scales,
-            )
-            for _ in range(2)
-        )
+        self._motion, self._unslipped = (RelativeMotion.of(settings) for _ in range(2))
         self._newest: tuple[pin.SE3, pin.SE3] | None = None  # the newest hand pose and where it would have the tool
         self._leash = Leash(settings.leash)
         self._workspace = Workspace(settings.workspace.get(arm))  # type: ignore[call-overload]

@@ -78,6 +78,12 @@ class RelativeMotion:
         self._before = self._after = np.eye(3)
         self._vector = np.zeros(3)
 
+    @classmethod
+    def of(cls, settings: TeleopSettings) -> RelativeMotion:
+        """As an operator's settings say."""
+        scales = settings.rotation_scale, settings.axes, settings.axis_scales
+        return cls(settings.stance, settings.position_scale, settings.rotation_frame, *scales)
+
     def anchor(self, hand: pin.SE3, tool: pin.SE3) -> None:
         """Make ``hand`` (finite, input's frame) and ``tool`` (world frame) correspond from now on."""
         self.anchor_position(hand, tool)

@@ -53,14 +53,7 @@ class WorkHands(PlayedInput):
 
 
 def _anchored(settings: TeleopSettings, hand: pin.SE3, tool: pin.SE3) -> RelativeMotion:
-    motion = RelativeMotion(
-        settings.stance,
-        settings.position_scale,
-        settings.rotation_frame,
-        settings.rotation_scale,
-        settings.axes,
-        settings.axis_scales,
-    )
+    motion = RelativeMotion.of(settings)
     motion.anchor(hand, tool)
     return motion
 

@@ -34,7 +34,7 @@ BRAKING = 5.44  # lowest acceleration limit of a joint of the cell [rad/s^2]
 DELIVERY = 0.15
 STILL = 0.005  # a joint that stands moves no farther [rad]
 ANCHORED = 0.005  # a tool whose hand rests moves no farther [m]
-# When hands move at 0.3 m/s the fastest joint turns at 0.95. Arms whose messages were late by the 0.15 s that pauses
+# When hands move at 0.3 m/s the fastest joint turns at 0.9. Arms whose messages were late by the 0.15 s that pauses
 # them catch up by that within the 0.2 s that speeds are means of [rad/s].
 FAST = 1.7
 AWHILE = 0.5  # in which something would have moved if anything did [s]
