@@ -34,6 +34,7 @@ from q2r2_control.verification.assembly_tasks import AssemblyTask, TaskResult, T
 from q2r2_control.viewer.history import History
 from q2r2_control.viewer.live import LiveTable
 from q2r2_control.viewer.report import draw_report
+from q2r2_control.viewer.sound import SoundKind, sounding
 
 _WINDOW_PERIOD = 1.0 / 30.0  # [s]
 
@@ -57,6 +58,7 @@ class RunOptions:
     force: bool  # run although q2r2 check finds faults
     real_time: bool  # ask the system for locked memory and SCHED_FIFO
     tasks: tuple[AssemblyTask, ...] = ()  # to be judged
+    sound: SoundKind | None = None  # None: silent
     record: Path | None = None  # folder of recordings
     notes: Mapping[str, str] = field(default_factory=dict)  # by name, for the recording
 
@@ -175,6 +177,8 @@ def _run(pipeline: Pipeline, options: RunOptions, recorder: Recorder | None, con
             stack.enter_context(table.shown(console))
         if options.real_time and (refused := stack.enter_context(real_time())):
             console.print(refused, style="yellow", soft_wrap=True, highlight=False, markup=False)
+        if options.sound is not None:
+            pipeline.listeners.append(stack.enter_context(sounding(options.sound)))
         if recorder is not None:
             recorder.begin(_about(pipeline, options), pipeline.robot)
             pipeline.listeners.append(recorder)

@@ -17,6 +17,7 @@ from q2r2_control.errors import ConfigError
 from q2r2_control.inputs.factory import DEFAULT_TRAJECTORY
 from q2r2_control.inputs.trajectories import TRAJECTORIES
 from q2r2_control.types import CommandMode
+from q2r2_control.viewer.sound import SoundKind
 
 
 class InputName(StrEnum):
@@ -51,6 +52,7 @@ def run(
     headless: Headless = False,
     rt: RealTime = False,
     report: Annotated[bool, typer.Option(help="Write plots and a summary to a folder under runs/.")] = False,
+    sound: Annotated[SoundKind | None, typer.Option(help="When engaged, at faults and episodes: how.")] = None,
     record: Annotated[str | None, typer.Option(metavar="DIR", help="Record the run to a new folder in DIR.")] = None,
     task: Annotated[str | None, typer.Option(help="With --record: what is done, noted in the recording.")] = None,
     operator: Annotated[str | None, typer.Option(help="With --record: whose hands, noted as well.")] = None,
@@ -91,6 +93,7 @@ def run(
         report=report,
         force=force,
         real_time=rt,
+        sound=sound,
         record=None if record is None else Path(record),
         notes={name: text for name, text in (("task", task), ("operator", operator)) if text is not None},
     )
