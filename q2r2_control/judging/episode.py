@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Iterator
 from dataclasses import dataclass, fields
 from typing import Any, TypeVar
 
@@ -14,9 +12,9 @@ from q2r2_control.config import Config
 from q2r2_control.config.teleop import Stance
 from q2r2_control.errors import RecordingError
 from q2r2_control.recording import topics as names
+from q2r2_control.recording.episode_spans import events_of
 from q2r2_control.recording.reader import Recording
 from q2r2_control.recording.recorded_robot import cell_and_robot_of, check_tools, tool_poses
-from q2r2_control.recording.rows import text_of
 from q2r2_control.recording.ticks import ChunkTicks, Column, ticks_of
 from q2r2_control.types import SIDES, Array, Event
 
@@ -169,7 +167,7 @@ class _Reader:
         slots = np.floor(ticks.t / FRAME).astype(np.int64)
         at = np.flatnonzero(np.diff(slots, prepend=self._slot) > 0)
         frames = _frames(chunk, at, self._count)
-        events = list(_events(chunk))
+        events = list(events_of(chunk.chunk))
         if names.SAMPLES in chunk.chunk.rows:
             self._samples.append(chunk.chunk.rows[names.SAMPLES]["data"])
         self._ticks.append(ticks)
@@ -208,12 +206,6 @@ def _frames(chunk: ChunkTicks, at: npt.NDArray[np.int64], before: int) -> Frames
         target=chunk.targets(otherwise=reference)[at],
         reference=reference[at],
     )
-
-
-def _events(chunk: ChunkTicks) -> Iterator[Event]:
-    for record in chunk.chunk.texts.get(names.STATE, ()):
-        for event in json.loads(text_of(record)).get("events", ()):
-            yield Event(**event)
 
 
 def _no_ticks(arms: int) -> Ticks:

@@ -27,6 +27,8 @@ _AXES = ("x", "y", "z", "w")
 class Comparison:
     """A listener of a replay that holds its messages to the recorded ones. How long a tick took is left out."""
 
+    keeps_episodes = True  # as when it was recorded
+
     def __init__(self, robot: Robot, topics: Topics, epoch: int) -> None:
         self._topics, self._epoch = topics, epoch
         self._packer = TickPacker(topics)

@@ -47,6 +47,8 @@ class Recorder:
     ``waits``: a tick waits for room, as it may in simulated time; otherwise it is lost, and counted.
     """
 
+    keeps_episodes = True  # its operator can tell where one begins and ends
+
     def __init__(self, parent: Path, name: str, *, waits: bool = False, room: int = ROOM) -> None:
         """``room`` [bytes] for ticks that wait to be written."""
         self._parent, self._name, self._waits = parent, name, waits

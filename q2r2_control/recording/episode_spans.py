@@ -1,0 +1,67 @@
+"""Where episodes begin and end in a recording: at its operator's controls, or else it is one as a whole."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+
+from q2r2_control.errors import RecordingError
+from q2r2_control.recording import topics as names
+from q2r2_control.recording.reader import RecordedChunk, Recording
+from q2r2_control.recording.rows import text_of
+from q2r2_control.teleop.episode_marks import BEGINS, DISCARDED, ENDS, MARK
+from q2r2_control.types import Event
+
+
+@dataclass(frozen=True)
+class EpisodeSpan:
+    """An episode within a run; times are since the run began [s]."""
+
+    start: float = -math.inf
+    end: float = math.inf  # inf: the run's
+    discarded: bool = False  # by its operator
+    marks: tuple[float, ...] = ()
+
+    @property
+    def whole(self) -> bool:
+        """Whether it is the whole run."""
+        return self.start == -math.inf
+
+
+def spans_of(events: Iterable[Event]) -> list[EpisodeSpan]:
+    """The episodes that an operator has told; the whole run where that are none.
+
+    A discard is for the episode that goes on, or else for the last one.
+    """
+    spans: list[EpisodeSpan] = []
+    marks: list[float] = []  # outside of episodes too, since a run without any is one
+    for event in events:
+        is_open = bool(spans) and spans[-1].end == math.inf
+        if event.reason == BEGINS and not is_open:
+            spans.append(EpisodeSpan(event.t))
+        elif event.reason == ENDS and is_open:
+            spans[-1] = replace(spans[-1], end=event.t)
+        elif event.reason == DISCARDED and spans:
+            spans[-1] = replace(spans[-1], end=min(spans[-1].end, event.t), discarded=True)
+        elif event.reason == MARK:
+            marks.append(event.t)
+    return [
+        replace(span, marks=tuple(t for t in marks if span.start <= t <= span.end)) for span in spans or [EpisodeSpan()]
+    ]
+
+
+def events_of(chunk: RecordedChunk) -> Iterator[Event]:
+    """What happened to the arms' states. Raises :class:`ValueError`, :class:`KeyError` and :class:`TypeError`."""
+    for record in chunk.texts.get(names.STATE, ()):
+        for event in json.loads(text_of(record)).get("events", ()):
+            yield Event(**event)
+
+
+def read_spans(recording: Recording) -> list[EpisodeSpan]:
+    """The episodes of a recording. Raises :class:`RecordingError` for a damaged one."""
+    try:
+        return spans_of(event for chunk in recording.chunks() for event in events_of(chunk))
+    except (ValueError, KeyError, TypeError) as error:
+        raise RecordingError(f"{recording.file}: damaged: {error!r:.200}") from error

@@ -1,0 +1,44 @@
+"""Episodes that an operator tells of in a recording: where they begin and end, and which are worth keeping."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from q2r2_control.recording.episode_spans import EpisodeSpan, spans_of
+from q2r2_control.types import Event
+
+BEGINS, ENDS, DISCARDED, MARK = "episode begins", "episode ends", "episode discarded", "mark"
+
+CASES = {
+    "none at all: the whole run": ([], [(-math.inf, math.inf, False)]),
+    "two, one after the other": (
+        [(1.0, BEGINS), (2.0, ENDS), (3.0, BEGINS), (4.0, ENDS)],
+        [(1.0, 2.0, False), (3.0, 4.0, False)],
+    ),
+    "one that the run ends": ([(1.0, BEGINS)], [(1.0, math.inf, False)]),
+    "one that is discarded while it goes on": ([(1.0, BEGINS), (2.0, DISCARDED)], [(1.0, 2.0, True)]),
+    "one that is discarded after it has ended": (
+        [(1.0, BEGINS), (2.0, ENDS), (2.5, DISCARDED), (3.0, BEGINS), (4.0, ENDS)],
+        [(1.0, 2.0, True), (3.0, 4.0, False)],
+    ),
+    "other events": ([(0.5, "lower button"), (1.0, BEGINS), (1.5, "no pose for 0.15 s")], [(1.0, math.inf, False)]),
+}
+
+
+def events(*told: tuple[float, str]) -> list[Event]:
+    return [Event(t, "left", "engaged", "engaged", reason) for t, reason in told]
+
+
+@pytest.mark.parametrize(("told", "expected"), CASES.values(), ids=CASES)
+def test_episodes_are_where_the_operator_says(
+    told: list[tuple[float, str]], expected: list[tuple[float, float, bool]]
+) -> None:
+    assert spans_of(events(*told)) == [EpisodeSpan(*values) for values in expected]
+
+
+def test_marks_are_those_of_the_episode_that_they_are_in() -> None:
+    told = events((0.5, MARK), (1.0, BEGINS), (1.2, MARK), (1.4, MARK), (2.0, ENDS), (3.0, MARK))
+    assert [span.marks for span in spans_of(told)] == [(1.2, 1.4)]
+    assert [span.marks for span in spans_of(events((0.5, MARK)))] == [(0.5,)]
