@@ -3,8 +3,8 @@
 ``messages`` and ``joint_messages`` convert; ``frames`` says where a tool is, ``link_frames`` where links are;
 ``intakes`` takes targets and joint states; ``joint_outputs`` sends joint commands; ``target_output`` and
 ``arm_outputs`` send tool poses to a controller, which ``home_client`` asks for the way home; ``grippers``,
-``hand_topics`` and ``markers`` do one kind of topic each; ``parameters`` reads parameters. The modules are imported
-when their names are first used.
+``hand_topics`` and ``markers`` do one kind of topic each; ``parameters`` reads parameters, and ``live_parameters``
+takes those that change. The modules are imported when their names are first used.
 """
 
 from __future__ import annotations

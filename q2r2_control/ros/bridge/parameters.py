@@ -200,17 +200,20 @@ def _teleop_settings(node: BaseNode, default: TeleopSettings) -> TeleopSettings:
         raise ConfigError("parameter mirror_reflected = True: allowed with mirror = True only")
     stance = Stance.SIDE_BY_SIDE if not mirror else Stance.MIRROR_REFLECTED if reflected else Stance.MIRROR
     default = default.model_copy(update={"stance": stance})
-    return settings_from_parameters(node, "teleop", default, frozenset({"stance", "workspace"}))
+    left_out = frozenset({"stance", "workspace", "speed_limit"})
+    return settings_from_parameters(node, "teleop", default, left_out, read_only=False)
 
 
-def settings_from_parameters(node: BaseNode, prefix: str, default: Model, leave_out: frozenset[str]) -> Model:
+def settings_from_parameters(
+    node: BaseNode, prefix: str, default: Model, leave_out: frozenset[str], *, read_only: bool = True
+) -> Model:
     """Declare ``prefix.field`` for every field of ``default`` but those left out; returns the settings they make.
 
     Nested models become nested names; a number that may be none is none where the parameter is 0.
     Raises :class:`ConfigError` that names the parameter.
     """
     try:
-        return type(default).model_validate(_values(node, prefix, default, leave_out))
+        return type(default).model_validate(_values(node, prefix, default, leave_out, read_only))
     except ValidationError as error:
         fault = error.errors()[0]
         name = ".".join([prefix, *map(str, fault["loc"])])
@@ -219,30 +222,41 @@ def settings_from_parameters(node: BaseNode, prefix: str, default: Model, leave_
         ) from error
 
 
-def _values(node: BaseNode, prefix: str, default: BaseModel, leave_out: frozenset[str]) -> dict[str, Any]:
+def _values(
+    node: BaseNode, prefix: str, default: BaseModel, leave_out: frozenset[str], read_only: bool
+) -> dict[str, Any]:
     values: dict[str, Any] = {}
     for key, info in type(default).model_fields.items():
         value = getattr(default, key)
         if key in leave_out:
             values[key] = value
         elif isinstance(value, BaseModel):
-            values[key] = _values(node, f"{prefix}.{key}", value, leave_out)
+            values[key] = _values(node, f"{prefix}.{key}", value, leave_out, read_only)
         else:
-            values[key] = _value(node, f"{prefix}.{key}", value, info)
+            values[key] = _value(node, f"{prefix}.{key}", value, info, read_only)
     return values
 
 
-def _value(node: BaseNode, name: str, default: Any, field: FieldInfo) -> Any:
+def _value(node: BaseNode, name: str, default: Any, field: FieldInfo, read_only: bool) -> Any:
     description = field.description or name
-    may_be_none = type(None) in getattr(field.annotation, "__args__", ())
-    if may_be_none:
-        given = node.parameter(name, _NONE if default is None else default, f"{description}; here 0")
-        return None if given == _NONE else given
+    if may_be_none(field):
+        given = _NONE if default is None else default
+        return none_of_zero(node.parameter(name, given, f"{description}; here 0", read_only=read_only))
     if isinstance(default, Enum):
-        return node.parameter(name, str(default.value), description)
+        return node.parameter(name, str(default.value), description, read_only=read_only)
     if isinstance(default, tuple):
-        return tuple(node.parameter(name, list(default), description))
-    return node.parameter(name, default, description, **_range(field))
+        return tuple(node.parameter(name, list(default), description, read_only=read_only))
+    return node.parameter(name, default, description, read_only=read_only, **_range(field))
+
+
+def may_be_none(field: FieldInfo) -> bool:
+    """Whether a setting may be none, for which its parameter is 0."""
+    return type(None) in getattr(field.annotation, "__args__", ())
+
+
+def none_of_zero(value: Any) -> Any:
+    """A setting that may be none, of its parameter."""
+    return None if value == _NONE else value
 
 
 def _range(field: FieldInfo) -> dict[str, Any]:

@@ -1,0 +1,95 @@
+"""Parameters that are set while an arm moves: no jump, what counts from then on, what is refused as a whole and why."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.ros.conftest import NEEDS_ROS, spun_node
+from tests.ros.processes import Processes
+from tests.ros.waiting import wait_until
+
+pytest.importorskip("rclpy", reason=NEEDS_ROS)
+pytest.importorskip("quest2ros", reason="needs q2r2 ros build-interfaces")
+pytestmark = pytest.mark.usefixtures("interfaces")
+
+from rclpy.parameter import Parameter  # noqa: E402
+from rclpy.parameter_client import AsyncParameterClient  # noqa: E402
+
+from tests.ros.arm_rig import ArmRig, assert_same, offset, steps  # noqa: E402
+
+NODE = "left_q2r2_arm_controller"
+
+
+class Settable(ArmRig):
+    """An arm whose node's parameters can be set and read."""
+
+    def __init__(self, node: Any) -> None:
+        super().__init__(node)
+        self._client = AsyncParameterClient(node, NODE)
+
+    def set(self, **values: Any) -> Any:
+        """All together, ``__`` stands for a dot; the result, with ``successful`` and ``reason``."""
+        parameters = [Parameter("teleop." + name.replace("__", "."), value=value) for name, value in values.items()]
+        future = self._client.set_parameters_atomically(parameters)
+        wait_until(future.done, "the parameters are answered")
+        return future.result().result
+
+    def get(self, name: str) -> float:
+        future = self._client.get_parameters([f"teleop.{name}"])
+        wait_until(future.done, "the parameters are answered")
+        return float(future.result().values[0].double_value)
+
+
+@pytest.fixture
+def rig(domain: int, processes: Processes) -> Iterator[Settable]:
+    with spun_node(domain) as node:
+        rig = Settable(node)
+        rig.start(processes)
+        rig.engage()
+        yield rig
+
+
+def test_a_scale_that_is_set_in_motion_counts_from_then_on_and_nothing_jumps(rig: Settable) -> None:
+    before = rig.wait_for_rest()
+    assert rig.set(position_scale=0.5, filter__smoothing_delay=0.05).successful
+    rig.move((0.1, 0.0, 0.0))
+    assert_same(rig.wait_for_rest(), offset(before, (0.05, 0.0, 0.0)), 1e-3)
+    assert rig.state["engaged"]
+    assert max(steps(rig.targets)) < 0.01
+    assert rig.get("position_scale") == 0.5
+
+
+@pytest.mark.parametrize(
+    ("values", "reason"),
+    [
+        ({"position_scale": 0.5, "chord_window": 0.2}, "may be changed while both arms hold"),
+        ({"position_scale": 0.5, "precision_scale": 7.0}, "precision_scale"),
+        ({"position_scale": 0.5, "axis_scales": [1.0, 2.0]}, "teleop.axis_scales"),
+        ({"position_scale": 0.5, "rotation_frame": "elsewhere"}, "teleop.rotation_frame"),
+    ],
+    ids=["not now", "out of range", "of another length", "no such choice"],
+)
+def test_what_cannot_be_set_is_refused_with_the_reason_and_changes_nothing(
+    rig: Settable, values: dict[str, Any], reason: str
+) -> None:
+    before = rig.wait_for_rest()
+    result = rig.set(**values)
+    assert not result.successful
+    assert reason in result.reason
+    assert rig.get("position_scale") == 1.0
+    rig.move((0.05, 0.0, 0.0))
+    assert_same(rig.wait_for_rest(), offset(before, (0.05, 0.0, 0.0)), 1e-3)
+
+
+def test_controls_are_bound_anew_while_the_arm_is_paused(rig: Settable) -> None:
+    rig.pause()
+    assert rig.set(bindings__lower="none", bindings__grip="dead_man").successful
+    rig.press()
+    assert not rig.state["engaged"]
+    rig.grip = 1.0
+    rig.wait(lambda: rig.state["engaged"], "the arm is engaged")
+    assert np.isfinite(rig.newest().homogeneous).all()
