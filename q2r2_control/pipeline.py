@@ -13,6 +13,7 @@ import numpy as np
 import pinocchio as pin
 
 from q2r2_control.config import Config
+from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.drives import make_drive, permitted
 from q2r2_control.errors import ConfigError, PlantError
@@ -22,11 +23,10 @@ from q2r2_control.plants.base import Plant
 from q2r2_control.plants.factory import check_mode, make_plant
 from q2r2_control.robot.robot import Robot
 from q2r2_control.runtime.loop_clock import LoopClock
-from q2r2_control.runtime.operator_feedback import OperatorFeedback
+from q2r2_control.runtime.operator_side import OperatorSide, Wishes
 from q2r2_control.runtime.process import few_garbage_collections, stop_on_signals
 from q2r2_control.runtime.recorder import RunRecorder, RunStart, Tick
 from q2r2_control.runtime.run_summary import RunSummary
-from q2r2_control.runtime.way_home import WayHome
 from q2r2_control.supervision.grasp_watch import GraspWatch
 from q2r2_control.supervision.gripper_limiter import GripperLimiter
 from q2r2_control.supervision.joint_watch import watch_settings
@@ -34,7 +34,6 @@ from q2r2_control.supervision.supervisor import Phase, Supervisor
 from q2r2_control.supervision.target_stream import StreamSettings
 from q2r2_control.supervision.tick_pacer import TickPacer
 from q2r2_control.teleop.arm import OPEN
-from q2r2_control.teleop.arm_states import is_fault
 from q2r2_control.teleop.teleop import Teleop
 from q2r2_control.types import LONGEST_DT, ArmTarget, Command, CommandMode, HandSample, Reference, RobotState
 
@@ -74,7 +73,8 @@ class Pipeline:
         self._begin_anew()
         self.listeners: list[Callable[[Tick], None]] = []
         # A plain flag: unlike the locks of threading.Event, a signal handler can set it in the middle of anything.
-        self._stopping = self._wants_home = False
+        self._stopping = False
+        self.wishes = Wishes()
 
     @classmethod
     def from_config(
@@ -103,7 +103,15 @@ class Pipeline:
 
         Any press of an operator's ends it. How it went is in the events of the run.
         """
-        self._wants_home = True
+        self.wishes.home = True
+
+    def change_teleop(self, settings: TeleopSettings) -> None:
+        """Other settings of the operator's from the next tick on, without a jump; from any thread.
+
+        What can be changed when: see :meth:`Teleop.change`. Whether it was is in the events of the run; the next run
+        begins with the settings of the cell.
+        """
+        self.wishes.settings = settings
 
     def run(self, duration: float | None = None, realtime: bool = True) -> RunSummary:
         """Run for ``duration`` [s], or until :meth:`stop`, Ctrl-C or SIGTERM; the arms are brought to rest first.
@@ -118,7 +126,8 @@ class Pipeline:
             with stop_on_signals(self.stop), few_garbage_collections():
                 return self._begin(realtime).until(duration)
         finally:
-            self._stopping = self._wants_home = False
+            self._stopping = False
+            self.wishes.clear()
             try:
                 self.input.close()
             finally:
@@ -148,11 +157,6 @@ class Pipeline:
             self.robot, self.controller, StreamSettings(), watch, displace=self.drive.displaced
         )
 
-    def take_wish_for_home(self) -> bool:
-        """Whether :meth:`go_home` was called since the last call of this."""
-        wanted, self._wants_home = self._wants_home, False
-        return wanted
-
     @property
     def stopping(self) -> bool:
         """Whether :meth:`stop` was called, until the run has ended."""
@@ -168,7 +172,6 @@ class PipelineRun:
         self._data = pipeline.robot.model.createData()
         self._targets = {arm: ArmTarget(None, OPEN) for arm in pipeline.robot.arms}
         self._following = True
-        self._connected = False
         pipeline.plant.reset()
         state = pipeline.plant.state()
         self._clock = pipeline.make_clock(realtime)
@@ -191,10 +194,10 @@ class PipelineRun:
         pipeline.drive.set_openings(pipeline.controller.openings)
         self._openings: dict[str, float] = {}  # measured, that the tick went by
         self._velocity = np.zeros(pipeline.robot.model.nv)
-        self._way_home = WayHome(pipeline.teleop, self._supervisor)
-        self._feedback = OperatorFeedback(
-            pipeline.controller, pipeline.teleop.hand_of, pipeline.config.teleop.haptics, pipeline.input.send_haptic
+        self._operator = OperatorSide(
+            pipeline.teleop, pipeline.input, self._supervisor, pipeline.controller, pipeline.wishes
         )
+        pipeline.teleop.marks.recorded = self._recorder.keeps_episodes
 
     def until(self, duration: float | None) -> RunSummary:
         """Tick until ``duration`` is over or a stop is asked for, then until the arms are at rest."""
@@ -243,17 +246,13 @@ class PipelineRun:
         gap = self._clock.wait()
         dt = self._pacer.step(gap, self._velocity)
         began = time.perf_counter()
-        samples = self._poll() if self._following else []
+        samples = self._operator.poll(self._clock.now) if self._following else []
         state = self._state = pipeline.plant.state()
         tools = self.tools(state)
         self._observe(state)
         if self._following:
-            if pipeline.take_wish_for_home():
-                pipeline.teleop.home(self._clock.now)
             commanded = {arm: pipeline.controller.tool_pose(arm) for arm in pipeline.robot.arms}
-            self._targets = pipeline.teleop.update(samples, tools, self._clock.now, commanded)
-            self._hand_over(tools)
-            self._way_home.update(self._clock.now)
+            self._targets = self._operator.targets(samples, tools, self._clock.now, commanded)
         self.limit_grippers()
         reference, trusted = self._advance(dt), self._supervisor.state_fault is None
         command = drive.command(reference, state, self._grippers, dt, trusted)
@@ -283,15 +282,6 @@ class PipelineRun:
                 _logger.warning(line)
             supervisor.events.clear()
 
-    def _hand_over(self, tools: dict[str, pin.SE3]) -> None:
-        """Targets to supervision. One that is refused pauses the arm, or the operator would think that it follows."""
-        now = self._clock.now
-        for arm, target in self._targets.items():
-            if target.pose is None:
-                self._supervisor.release_target(arm)
-            elif refusal := self._supervisor.take_target(arm, target.pose, now, measured=tools[arm]):
-                self._pipeline.teleop.pause(now, refusal.line)
-
     def _advance(self, dt: float) -> Reference:
         """The reference of this tick; once the arms were stopped, what is left of their motion."""
         reference = self._supervisor.tick(self._clock.now, dt)
@@ -313,14 +303,6 @@ class PipelineRun:
         if self._grasps.update(self._grippers, measured, self._clock.now):
             self._holding = pipeline.controller.holding
             pipeline.drive.set_holding(self._holding)
-
-    def _poll(self) -> list[HandSample]:
-        source, was_connected = self._pipeline.input, self._connected
-        samples = source.poll(self._clock.now)
-        self._connected = source.connected
-        if was_connected and not self._connected:
-            self._pipeline.teleop.connection_lost(self._clock.now)
-        return samples
 
     def tools(self, state: RobotState) -> dict[str, pin.SE3]:
         """Measured tool poses, world frame."""
@@ -345,14 +327,12 @@ class PipelineRun:
         """Add one tick to the summary and tell the listeners; a tick that nobody listens to is not put together."""
         teleop, report, recorder = self._pipeline.teleop, self._pipeline.drive.report, self._recorder
         engaged = teleop.engaged if self._following else dict.fromkeys(self._targets, False)
-        events = [replace(event, t=event.t - self._clock.start) for event in teleop.take_events()]
-        for event in filter(is_fault, events):
-            _logger.warning("%s arm: %s", event.arm, event.reason)
+        events = self._operator.take_events(self._clock.start)
         recorder.add(dt, compute_time, reference, self._targets, tools, engaged, report, events, self._limiter.held)
         recorder.add_holding(dt, self._holding)
         if self._following:
             now, openings = self._clock.now, self._openings
-            self._feedback.update(now, events, self._targets, reference.report, state, self._grippers, openings)
+            self._operator.feel(now, events, self._targets, reference, state, self._grippers, openings)
         if not recorder.listened:
             return
         tick = Tick(
@@ -362,7 +342,7 @@ class PipelineRun:
             dt=dt,
             step=step,
             following=self._following,
-            connected=self._connected,
+            connected=self._operator.connected,
             samples=samples,
             targets=self._targets,
             engaged=engaged,

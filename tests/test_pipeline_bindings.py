@@ -8,6 +8,7 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
+import pinocchio as pin
 import pytest
 
 from q2r2_control.config.teleop import TeleopSettings
@@ -15,7 +16,7 @@ from q2r2_control.pipeline import Pipeline
 from q2r2_control.robot.robot import Robot
 from q2r2_control.runtime.recorder import Tick
 from q2r2_control.types import Array, HandInputs, HandSample
-from tests.support.hands_input import ENGAGED, HandsInput
+from tests.support.hands_input import ENGAGED, HandsInput, Path
 from tests.support.watch import Watch, cell
 
 SPEED, RADIUS = 0.25, 0.08  # of the left hand's circle [m/s], [m]
@@ -43,8 +44,8 @@ class SqueezingHands(HandsInput):
 class PlayingHands(HandsInput):
     """Engages at first; its left hand circles; then the left hand pushes controls at given times, for 0.1 s each."""
 
-    def __init__(self, *pushed: tuple[float, str]) -> None:
-        super().__init__(left=circle)
+    def __init__(self, *pushed: tuple[float, str], left: Path = circle) -> None:
+        super().__init__(left=left)
         self._pushed = pushed
 
     def _sample(self, hand: str, inputs: HandInputs, now: float) -> HandSample:
@@ -60,9 +61,9 @@ def run(**bindings: str) -> Watch:
     return watched(SqueezingHands(presses=bindings["grip"] != "dead_man"), teleop, 5.0)
 
 
-def watched(hands: HandsInput, teleop: TeleopSettings, duration: float) -> Watch:
+def watched(hands: HandsInput, teleop: TeleopSettings, duration: float, plant: str = "kinematic") -> Watch:
     config = cell().model_copy(update={"loop_rate_hz": 500.0, "teleop": teleop})
-    loop = Pipeline.from_config(config, input=hands, plant="kinematic")
+    loop = Pipeline.from_config(config, input=hands, plant=plant)
     watch = Watch(loop)
     loop.run(duration, realtime=False)
     return watch
@@ -156,3 +157,53 @@ def test_a_program_may_send_the_arms_home_too() -> None:
     events = [event.reason for tick in watch.ticks for event in tick.events if event.arm == "left"]
     assert events == ["lower button", "way home", "at home"]
     assert farthest_from_home(watch.ticks[-1]) < 0.005
+
+
+def wandering(t: float) -> Array:
+    """Begins softly, goes along and turns about all axes, where no limit of a joint and no pair is near."""
+    since = max(t - ENGAGED - 0.3, 0.0)
+    soft = min(since, 1.0) ** 2 * (3.0 - 2.0 * min(since, 1.0))
+    x, y, z, about_x, about_y, about_z = np.sin(np.pi * since * np.array([1.0, 0.7, 0.5, 0.8, 1.0, 0.6]))
+    return soft * np.array([0.05 * x - 0.02, 0.04 * y, -0.08 * z * z, 0.08 * about_x, 0.08 * about_y, 0.25 * about_z])
+
+
+@pytest.mark.parametrize("plant", ["kinematic", "mujoco"])
+def test_two_tools_that_carry_keep_their_relation_while_one_hand_moves_and_turns_both(plant: str) -> None:
+    teleop = TeleopSettings.model_validate({"bindings": {"grip": "carry"}})
+    hands = PlayingHands((0.35, "press_middle"), left=wandering)
+    ticks = watched(hands, teleop, 5.0, plant).ticks
+    carried = [tick for tick in ticks if tick.states["right"] == "carried"]
+    assert carried[0].t == pytest.approx(0.35, abs=0.02)
+    assert carried[-1].t > 4.9
+    wanted = carried[0].tools["left"].actInv(carried[0].tools["right"])
+    for tick in carried:
+        assert not tick.reference.report.binding  # free motion
+        relation = tick.tools["left"].actInv(tick.tools["right"])
+        assert np.linalg.norm(relation.translation - wanted.translation) < 0.001
+        assert np.degrees(np.linalg.norm(pin.log3(relation.rotation.T @ wanted.rotation))) < 0.5
+    for arm in ("left", "right"):
+        assert np.ptp([tick.tools[arm].translation for tick in carried], axis=0).max() > 0.08
+        turns = [pin.log3(tick.tools[arm].rotation @ carried[0].tools[arm].rotation.T) for tick in carried]
+        assert np.degrees(max(map(np.linalg.norm, turns))) > 12.0
+
+
+def test_what_a_program_changes_counts_from_the_next_tick_on_without_a_jump() -> None:
+    config = cell().model_copy(update={"loop_rate_hz": 500.0})
+    loop = Pipeline.from_config(config, input=PlayingHands(), plant="kinematic")
+    watch = Watch(loop)
+    half = config.teleop.model_copy(update={"position_scale": 0.5})
+    loop.listeners.append(lambda tick: loop.change_teleop(half) if 1.5 <= tick.t < 1.502 else None)
+    loop.run(4.0, realtime=False)
+    events = [event for tick in watch.ticks for event in tick.events if event.arm == "left"]
+    assert [event.reason for event in events] == ["lower button", "settings changed"]
+    following = [tick for tick in watch.ticks if tick.targets["left"].pose is not None]
+    ways = [
+        float(np.linalg.norm(after.targets["left"].pose.translation - before.targets["left"].pose.translation))  # type: ignore[union-attr]
+        for before, after in pairwise(following)
+    ]
+    assert max(ways) < 2.0 * SPEED / 500.0
+    speeds = [
+        500.0 * np.mean([way for way, tick in zip(ways, following, strict=False) if since < tick.t < since + 1.0])
+        for since in (0.5, 2.5)
+    ]
+    assert speeds[1] == pytest.approx(0.5 * speeds[0], rel=0.05)

@@ -19,6 +19,10 @@ class Action(StrEnum):
     HOME = "home"  # both arms
     STOP = "stop"  # both arms, until it is done once more
     SWAP_HANDS = "swap_hands"  # each hand drives the other arm
+    CARRY = "carry"  # this hand moves both tools as one body
+    RECORD_TOGGLE = "record_toggle"  # an episode begins, or ends
+    RECORD_DISCARD = "record_discard"  # the episode is not worth keeping
+    RECORD_MARK = "record_mark"  # something happened now
     # For as long as a trigger or stick is held.
     DEAD_MAN = "dead_man"  # engaged while held
     PRECISION = "precision"  # motion is scaled down
@@ -48,6 +52,10 @@ MEANINGS: dict[str, str] = {
     Action.HOME: "brings both arms home; any press on the way stops them",
     Action.STOP: "stops both arms until it is done once more",
     Action.SWAP_HANDS: "lets each hand drive the other arm, while both are paused",
+    Action.CARRY: "lets this hand move both tools as one body, or ends that",
+    Action.RECORD_TOGGLE: "begins an episode of the recording, or ends it",
+    Action.RECORD_DISCARD: "throws away the episode, or the last one if it has ended",
+    Action.RECORD_MARK: "marks this moment in the recording",
     Action.DEAD_MAN: "held: the arm follows; let go: it pauses",
     Action.PRECISION: "held: motion is scaled by precision_scale",
     Action.ROTATION_LOCK: "held: the tool keeps its orientation",
@@ -62,7 +70,7 @@ CONTROLS = (*BUTTONS, *HELD)
 _WORDS = {Gesture.TAP: "", Gesture.HOLD: " held", Gesture.DOUBLE: " tapped twice"}
 _SUFFIXES = {Gesture.TAP: "", Gesture.HOLD: "_hold", Gesture.DOUBLE: "_double"}
 
-_HOLD = "held for hold_time: home, stop, swap_hands, gripper_toggle or none"
+_HOLD = "held for hold_time: what is done once, but pause_toggle; or none"
 _DOUBLE = "tapped twice within double_tap_window, the same"
 
 
@@ -89,9 +97,7 @@ class BindingSettings(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    lower: Action = Field(
-        Action.PAUSE_TOGGLE, description="A or X, tapped: pause_toggle, gripper_toggle, home, swap_hands or none"
-    )
+    lower: Action = Field(Action.PAUSE_TOGGLE, description="A or X, tapped: what is done once, but stop; or none")
     lower_hold: Action = Field(Action.NONE, description=_HOLD)
     lower_double: Action = Field(Action.NONE, description=_DOUBLE)
     upper: Action = Field(Action.GRIPPER_TOGGLE, description="B or Y, as lower")
@@ -100,7 +106,7 @@ class BindingSettings(BaseModel):
     trigger: Action = Field(
         Action.NONE,
         description="index finger; while held: dead_man, precision, rotation_lock, translation_lock, gripper_analog; "
-        "tapped: pause_toggle, gripper_toggle, home, stop, swap_hands; or none",
+        "tapped: what is done once; or none",
     )
     trigger_hold: Action = Field(Action.NONE, description="as lower_hold, where trigger is not for what lasts")
     trigger_double: Action = Field(Action.NONE, description="as lower_double, likewise")

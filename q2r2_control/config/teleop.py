@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from enum import StrEnum
 from typing import Annotated, Literal
 
@@ -64,6 +65,14 @@ class LeashSettings(BaseModel):
 
     distance: float | None = Field(0.1, ge=0.02, le=2, description="of positions [m]; none: no leash")
     angle: float | None = Field(0.5, ge=0.1, le=2, description="of rotations [rad]; none: no leash")
+    carried_distance: float = Field(0.03, ge=0.01, le=2, description="of the frame between two tools that carry [m]")
+    carried_angle: float = Field(0.1, ge=0.03, le=2, description="of that frame's rotation [rad]")
+
+    def carried(self) -> LeashSettings:
+        """The leash of the frame between two tools, which is no longer than that of a tool."""
+        distance, angle = (math.inf if length is None else length for length in (self.distance, self.angle))
+        shorter = {"distance": min(distance, self.carried_distance), "angle": min(angle, self.carried_angle)}
+        return self.model_copy(update=shorter)
 
 
 class HapticSettings(BaseModel):
@@ -93,6 +102,15 @@ class WorkspaceSettings(BaseModel):
                     f"{2.0 * self.soft_edge:g} m"
                 )
         return self
+
+
+class SpeedLimitSettings(BaseModel):
+    """How fast one arm's target may move, however fast the hand does. None: as fast as the hand."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    linear: float | None = Field(None, ge=0.01, le=5, description="of the target's position [m/s]")
+    angular: float | None = Field(None, ge=0.05, le=20, description="of the target's rotation [rad/s]")
 
 
 class TeleopSettings(BaseModel):
@@ -127,6 +145,9 @@ class TeleopSettings(BaseModel):
     )
     workspace: dict[Literal["left", "right"], WorkspaceSettings] = Field(
         default_factory=dict, description="arm -> box that its targets stay in"
+    )
+    speed_limit: dict[Literal["left", "right"], SpeedLimitSettings] = Field(
+        default_factory=dict, description="arm -> how fast its targets may move"
     )
     bindings: BindingSettings = Field(default_factory=BindingSettings)
     filter: FilterSettings = Field(default_factory=FilterSettings)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import replace
 
 import numpy as np
 import pinocchio as pin
@@ -36,11 +35,16 @@ class OperatorFeedback:
         robot = controller.robot
         self._controller, self._robot, self._send, self._hand_of = controller, robot, send, hand_of
         self._data = robot.model.createData()
-        self._pulses = {arm: HapticPulses(hand_of(arm), settings) for arm in robot.arms}
+        self._pulses = {arm: HapticPulses(settings) for arm in robot.arms}
         self._joints = {arm: {robot.joint_names[j] for j in robot.arms[arm].joints} for arm in robot.arms}
         self._grips = {arm: Grip(robot.arms[arm].stroke) for arm in robot.arms}
         self._limited: dict[str, float] = {}  # when a joint last was at its position limit [s]
         self._due = -np.inf
+
+    def scale(self, strength: float) -> None:
+        """Make all vibrations this strong from now on, 0..1."""
+        for pulses in self._pulses.values():
+            pulses.strength = strength
 
     def update(
         self,
@@ -64,8 +68,8 @@ class OperatorFeedback:
             self._look(now, targets, grippers, openings)
             self._feel_contact(state)
         for arm, pulses in self._pulses.items():
-            if (feedback := pulses.at(now)) is not None:
-                self._send(replace(feedback, hand=self._hand_of(arm)))
+            if (feedback := pulses.at(now, self._hand_of(arm))) is not None:
+                self._send(feedback)
 
     def _look(
         self,

@@ -79,6 +79,11 @@ class RunRecorder:
         self._statistics.add_latency(samples, now)
 
     @property
+    def keeps_episodes(self) -> bool:
+        """Whether a listener records the run to where episodes of it can be found."""
+        return any(getattr(listener, "keeps_episodes", False) for listener in self._listeners)
+
+    @property
     def listened(self) -> bool:
         """Whether anybody is to be told of ticks."""
         return bool(self._listeners)

@@ -11,15 +11,13 @@ from q2r2_control.config.bindings import BUTTONS, Action, Gesture
 from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.teleop.analog_gripper import AnalogGripper
 from q2r2_control.teleop.arm_states import ArmState, Cause, next_state
-from q2r2_control.teleop.filters import PoseFilter
+from q2r2_control.teleop.carry import CarriedTools
 from q2r2_control.teleop.gate import PoseGate
 from q2r2_control.teleop.gestures import GestureRecognizer, Press
+from q2r2_control.teleop.hand_motion import HandMotion, Shares
 from q2r2_control.teleop.held_controls import HeldControls
-from q2r2_control.teleop.leash import Leash
-from q2r2_control.teleop.relative import RelativeMotion
-from q2r2_control.teleop.rest import RestingPose
 from q2r2_control.teleop.workspace import Workspace
-from q2r2_control.types import Event, HandSample, pose_of
+from q2r2_control.types import Event, HandSample
 
 OPEN, CLOSED = 1.0, 0.0
 
@@ -27,8 +25,7 @@ OPEN, CLOSED = 1.0, 0.0
 class ArmTeleop:
     """Teleoperation of one arm by one hand.
 
-    Every transition to ENGAGED calls :meth:`_anchor`, which anchors hand and tool at their current poses and starts the
-    filter at rest there. So there is no catch-up motion: no state holds what the hand did before.
+    Every transition to ENGAGED anchors hand and tool at their current poses, see :class:`HandMotion`.
     """
 
     def __init__(self, arm: str, settings: TeleopSettings) -> None:
@@ -36,24 +33,36 @@ class ArmTeleop:
         self.state = ArmState.IDLE
         self.gripper = OPEN
         self.events: list[Event] = []
-        self._bindings, self._precision = settings.bindings, settings.precision_scale
-        self._held = HeldControls(settings.bindings)
-        self._has_dead_man = settings.bindings.words_of(Action.DEAD_MAN) is not None
-        self._analog = AnalogGripper(settings.bindings, settings.gripper_speed)
-        self._shares = 1.0, 1.0  # of the scales of positions and rotations
+        self._settings, self._precision = settings, settings.precision_scale
         self._timeout = settings.gate.timeout
         self._gate = PoseGate(settings.gate)
-        self._gestures = GestureRecognizer(settings)
-        self._filter = PoseFilter(settings.filter)
-        self._rest = RestingPose(settings.filter.average_at_rest)
-        self._motion, self._unslipped = (RelativeMotion.of(settings) for _ in range(2))
-        self._newest: tuple[pin.SE3, pin.SE3] | None = None  # the newest hand pose and where it would have the tool
-        self._leash = Leash(settings.leash)
-        self._workspace = Workspace(settings.workspace.get(arm))  # type: ignore[call-overload]
+        self._motion = HandMotion(arm, settings)
+        self._use(settings)
         self._presses: list[Press] = []
         self._gripped: bool | None = None  # the dead man was just held, or let go
         self._aligned_at = 0.0
         self._obstacle: str | None = None
+
+    def _use(self, settings: TeleopSettings) -> None:
+        self._bindings = settings.bindings
+        self._has_dead_man = settings.bindings.words_of(Action.DEAD_MAN) is not None
+        self._held = HeldControls(settings.bindings)
+        self._analog = AnalogGripper(settings.bindings, settings.gripper_speed)
+        self._gestures = GestureRecognizer(settings)
+
+    def configure(self, settings: TeleopSettings, last: pin.SE3 | None, now: float) -> None:
+        """Other settings from now on; an engaged arm goes on from its ``last`` target, so it does not jump.
+
+        Those of the controls may be changed while the arm holds only: what is pressed now is forgotten.
+        """
+        if of_controls(settings) != of_controls(self._settings):
+            self._use(settings)
+        self._settings, self._precision = settings, settings.precision_scale
+        self._timeout = settings.gate.timeout
+        self._gate.settings = settings.gate
+        self._motion.change(settings)
+        if self.state is ArmState.ENGAGED and self._gate.pose is not None and last is not None:
+            self._motion.anchor(self._gate.pose, last, self._shares(), now)
 
     @property
     def chord(self) -> bool:
@@ -75,9 +84,9 @@ class ArmTeleop:
             self._gripped = Action.DEAD_MAN in self.held
         usable, fault = self._gate.receive(sample, now)
         if usable and fault is None and self._gate.pose is not None:
-            self._rest.add(self._gate.pose)
+            self._motion.note(self._gate.pose)
             if self.state is ArmState.ENGAGED:
-                self._filter.add(self._gate.pose, self._gate.stamp, now)
+                self._motion.add(self._gate.pose, self._gate.stamp, now)
         if usable and self.state is ArmState.ALIGNING:
             return None  # realigning makes the pose jump, and the arm is not following
         return fault
@@ -120,7 +129,7 @@ class ArmTeleop:
     def forget(self) -> None:
         """Drop everything received: poses are forgotten, buttons count as held until they are seen released."""
         self._gate.reset()
-        self._rest.forget()
+        self._motion.forget()
         self._gestures.forget()
         self._held.forget()
         self._analog.forget()
@@ -156,31 +165,26 @@ class ArmTeleop:
             self.gripper = self._analog.opening(self.gripper, now)
 
     def target(self, now: float, commanded: pin.SE3 | None = None) -> pin.SE3 | None:
-        """Where the tool should be at ``now`` in the world frame; None: hold.
+        """Where the tool should be at ``now`` in the world frame, or the frame that it carries; None: hold.
 
-        ``commanded``: the tool's pose at the controller's reference, from which no target is farther than the leash.
+        ``commanded``: where the controller's reference has it, from which no target is farther than the leash.
         """
         if self.state is not ArmState.ENGAGED:
             return None
-        hand = self._rest.draw(self._filter.at(now), now)
-        if commanded is None or self._gate.pose is None:
-            target = self._motion.target(hand)
-        else:
-            if self._newest is None or self._newest[0] is not self._gate.pose:
-                self._newest = self._gate.pose, self._unslipped.target(self._gate.pose)
-            target = self._leash.target(self._motion, hand, self._newest[1], commanded, now)
-        if (held := self._workspace.hold(target.translation)) is not None:
-            target = pose_of(target.rotation, np.array(held))
-            self._motion.anchor_position(hand, target)
-        if self._shares != self._held_shares():
-            self._rescale(hand, target)  # from here on, so the target does not jump
-            self._leash.anchor_anew()
-        return target
+        return self._motion.target(self._gate.pose, commanded, self._shares(), now)
 
     @property
     def slip(self) -> tuple[float, float]:
-        """How far the target has slipped along since engaging, with the tool or along its workspace [m, rad]."""
-        return self._leash.slip + self._workspace.slip, self._leash.slip_angle
+        """See :attr:`HandMotion.slip`."""
+        return self._motion.slip
+
+    def workspace(self) -> Workspace:
+        """The box of its targets."""
+        return self._motion.workspace()
+
+    def lead(self, tools: CarriedTools, other: ArmTeleop, now: float) -> None:
+        """Move the frame of ``tools``, of this arm and the ``other``, until this one is engaged anew."""
+        self._motion.carry(tools, other._motion, now)
 
     def _align(self, now: float) -> None:
         self._aligned_at = now
@@ -214,7 +218,7 @@ class ArmTeleop:
         elif tool is None or not np.isfinite(tool.homogeneous).all():
             obstacle = obstacle or "the tool's pose is not known"
         else:
-            self._anchor(self._gate.pose, tool, now)
+            self._motion.anchor(self._gate.pose, tool, self._shares(), now)
         if obstacle is None:
             self._go(cause, now, reason)
         elif self.state is ArmState.ALIGNING:
@@ -222,14 +226,7 @@ class ArmTeleop:
         else:
             self.tell(now, f"not engaged: {obstacle}")
 
-    def _anchor(self, hand: pin.SE3, tool: pin.SE3, now: float) -> None:
-        hand = self._rest.begin(hand, now)
-        self._filter.reset(hand, now)
-        self._rescale(hand, tool)
-        self._leash.reset()
-        self._workspace.reset()
-
-    def _held_shares(self) -> tuple[float, float]:
+    def _shares(self) -> Shares:
         """Of the scales, by what is held."""
         share = self._precision if Action.PRECISION in self.held else 1.0
         return (
@@ -237,14 +234,14 @@ class ArmTeleop:
             0.0 if Action.ROTATION_LOCK in self.held else share,
         )
 
-    def _rescale(self, hand: pin.SE3, tool: pin.SE3) -> None:
-        """Anchor hand and tool, with the scales that hold from now on."""
-        self._shares, self._newest = self._held_shares(), None
-        self._motion.rescale(*self._shares, hand, tool)
-        self._unslipped.rescale(*self._shares, hand, tool)
-
     def _go(self, cause: Cause, now: float, reason: str) -> None:
         state = next_state(self.state, cause)
         if state is not self.state:
             self.events.append(Event(now, self.arm, self.state, state, reason))
             self.state = state
+
+
+def of_controls(settings: TeleopSettings) -> tuple[object, ...]:
+    """What the hands' controls mean."""
+    times = settings.chord_window, settings.hold_time, settings.double_tap_window, settings.gripper_speed
+    return settings.bindings, *times

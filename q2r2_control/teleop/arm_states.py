@@ -9,13 +9,16 @@ from q2r2_control.types import Event
 
 
 class ArmState(StrEnum):
-    """Only an engaged arm follows its hand, and one that goes home moves by itself; in every other state it holds."""
+    """Only an engaged arm follows its hand, a carried one that of the other arm, and one that goes home moves by
+    itself; in every other state it holds.
+    """
 
     IDLE = "idle"  # was never engaged
     ENGAGED = "engaged"
     PAUSING = "pausing"  # stopped by a control, which may still turn out to be half a chord, or another gesture
     PAUSED = "paused"
     ALIGNING = "aligning"  # stopped by the alignment chord; anchored when the buttons are released
+    CARRIED = "carried"  # goes with the other arm, which is engaged: one hand moves both
     HOMING = "homing"
     LOST = "lost"  # stopped by what its operator did not press
     STOPPED = "stopped"  # by its operator, until that is taken back
@@ -31,6 +34,8 @@ class Cause(StrEnum):
     CHORD = "the headset's alignment: both buttons of a hand"
     ALIGNED = "both buttons are released, and a new pose has come"
     NOT_ALIGNED = "the same, with something in the way"
+    CARRY = "the control that carries, by the hand of the other arm, which is engaged"
+    CARRY_ENDS = "that control, one that pauses or an alignment, by either hand"
     HOME = "the control that brings the arms home, with nothing in the way"
     HOMED = "home, or held up on the way"
     PRESS = "any press"
@@ -59,7 +64,7 @@ class Transition(NamedTuple):
 _S = ArmState
 AT_REST = frozenset({_S.IDLE, _S.PAUSED, _S.LOST})  # may be engaged
 HOLDING = AT_REST | {_S.STOPPED}
-FOLLOWING = frozenset({_S.ENGAGED, _S.PAUSING, _S.ALIGNING})
+FOLLOWING = frozenset({_S.ENGAGED, _S.PAUSING, _S.ALIGNING, _S.CARRIED})
 TRANSITIONS = (
     Transition(AT_REST, Cause.ENGAGE, _S.ENGAGED),
     Transition(frozenset({_S.ENGAGED}), Cause.PAUSE_BEGINS, _S.PAUSING),
@@ -68,6 +73,8 @@ TRANSITIONS = (
     Transition(frozenset({_S.ENGAGED, _S.PAUSING}), Cause.CHORD, _S.ALIGNING, Who.LINKED),
     Transition(frozenset({_S.ALIGNING}), Cause.ALIGNED, _S.ENGAGED),
     Transition(frozenset({_S.ALIGNING}), Cause.NOT_ALIGNED, _S.LOST),
+    Transition(AT_REST | {_S.ENGAGED}, Cause.CARRY, _S.CARRIED),
+    Transition(frozenset({_S.ENGAGED, _S.CARRIED}), Cause.CARRY_ENDS, _S.PAUSED, Who.BOTH),
     Transition(FOLLOWING, Cause.FAULT, _S.LOST, Who.LINKED),
     Transition(AT_REST | {_S.ENGAGED, _S.PAUSING}, Cause.HOME, _S.HOMING, Who.BOTH),
     Transition(frozenset({_S.HOMING}), Cause.HOMED, _S.PAUSED, Who.BOTH),

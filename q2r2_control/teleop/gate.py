@@ -24,7 +24,7 @@ class PoseGate:
     """
 
     def __init__(self, settings: GateSettings) -> None:
-        self._settings = settings
+        self.settings = settings
         self._pose: pin.SE3 | None = None
         self._stamp = -math.inf
 
@@ -45,7 +45,7 @@ class PoseGate:
 
     def stale(self, now: float) -> bool:
         """Whether no pose was received for ``timeout``."""
-        return now - self._stamp > self._settings.timeout
+        return now - self._stamp > self.settings.timeout
 
     def receive(self, sample: HandSample, now: float) -> tuple[bool, str | None]:
         """Process one sample; returns whether its pose is new and usable, and what forbids to follow it, or None.
@@ -67,7 +67,7 @@ class PoseGate:
         return True, self._jump(previous, pose, gap)
 
     def _jump(self, previous: pin.SE3, pose: pin.SE3, gap: float) -> str | None:
-        limits = self._settings
+        limits = self.settings
         if gap > limits.timeout:
             return f"no pose for {gap:.3f} s"
         distance = math.dist(pose.translation, previous.translation)

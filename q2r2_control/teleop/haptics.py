@@ -8,6 +8,8 @@ from typing import NamedTuple
 
 from q2r2_control.config.teleop import HapticSettings
 from q2r2_control.teleop.arm_states import ArmState, is_fault
+from q2r2_control.teleop.carry_mode import CARRIES
+from q2r2_control.teleop.episode_marks import BEGINS, DISCARDED, ENDS, MARK
 from q2r2_control.types import Event, HapticFeedback
 
 
@@ -37,6 +39,8 @@ CONTACT = Pulse(0.1, 0.2, 0.06)
 GRASP = Pulse(0.7, 0.5, 0.12)
 HOMING = Pulse(0.4, 0.55, 0.2)
 STOPPED = Pulse(0.9, 0.9, 0.25)
+EPISODE_BEGINS, EPISODE_ENDS = Pulse(0.6, 0.45, 0.15), Pulse(0.35, 0.35, 0.15)
+EPISODE_DISCARDED = Pulse(0.2, 0.65, 0.25)
 _NEAREST, _HARDEST = 0.6, 0.8  # amplitudes that NEAR and CONTACT grow to
 # The weakest first: where two are due at once, the stronger one is felt. The docs' table is this one.
 VOCABULARY = (
@@ -45,12 +49,29 @@ VOCABULARY = (
     Word("the tool's contact force has grown by another 5 N", CONTACT, _HARDEST),
     Word("a joint has come to its position limit", LIMIT),
     Word("paused, by its control or the alignment chord; home, or interrupted on the way", PAUSED),
-    Word("engaged", ENGAGED),
+    Word("an episode of the recording ends", EPISODE_ENDS),
+    Word("engaged; both arms carry", ENGAGED),
+    Word("an episode of the recording begins; a mark", EPISODE_BEGINS),
     Word("the gripper has closed on something", GRASP),
     Word("on the way home", HOMING),
+    Word("an episode is discarded", EPISODE_DISCARDED),
     Word("stopped, by the control that stops", STOPPED),
     Word("lost: stopped by a fault (lost data, a jump, a stop), or a press that was refused", FAULT),
 )
+
+_BEGINS = {
+    ArmState.ENGAGED: ENGAGED,
+    ArmState.CARRIED: ENGAGED,
+    ArmState.HOMING: HOMING,
+    ArmState.STOPPED: STOPPED,
+}
+_TOLD = {
+    CARRIES: ENGAGED,
+    BEGINS: EPISODE_BEGINS,
+    MARK: EPISODE_BEGINS,
+    ENDS: EPISODE_ENDS,
+    DISCARDED: EPISODE_DISCARDED,
+}
 
 _SLIP_STEP = 0.02  # the target slips by this between two pulses [m]
 _SLIP_ANGLE_STEP = 0.1  # or by this [rad]
@@ -60,16 +81,16 @@ _PAUSE = 0.05  # between two vibrations, so that they are felt as two [s]
 
 
 class HapticPulses:
-    """Vibrations of one hand: see :data:`VOCABULARY`. What lasts is told once for each step that it grows by.
+    """Vibrations of one arm's hand: see :data:`VOCABULARY`. What lasts is told once for each step that it grows by.
 
     The app vibrates until the next message, so the end of a pulse is a message as well.
     """
 
-    def __init__(self, hand: str, settings: HapticSettings | None = None) -> None:
-        self._hand, self._strength_of_all = hand, (settings or HapticSettings()).strength
+    def __init__(self, settings: HapticSettings | None = None) -> None:
+        self.strength = (settings or HapticSettings()).strength  # of all vibrations, 0: none
         self._ends: float | None = None
         self._next = 0.0  # no vibration begins before [s]
-        self._strength = 0.0
+        self._amplitude = 0.0
         self._slipped = _Steps(_SLIP_STEP), _Steps(_SLIP_ANGLE_STEP)
         self._nearness, self._force = _Steps(_NEAR_STEP), _Steps(_FORCE_STEP)
         self._limits: frozenset[str] = frozenset()
@@ -78,15 +99,14 @@ class HapticPulses:
 
     def tell(self, event: Event) -> None:
         """Start the pulse for a change of the arm's state; that of a refused press is that of a fault."""
-        if event.destination == ArmState.ENGAGED:
-            self._want(ENGAGED)
-        elif is_fault(event):
+        if is_fault(event):
             self._want(FAULT)
-        elif event.destination == ArmState.HOMING:
-            self._want(HOMING)
-        elif event.destination == ArmState.STOPPED:
-            self._want(STOPPED)
-        elif event.source in (ArmState.ENGAGED, ArmState.HOMING):
+        elif event.source == event.destination:
+            if (pulse := _TOLD.get(event.reason)) is not None:
+                self._want(pulse)
+        elif event.destination in _BEGINS:
+            self._want(_BEGINS[ArmState(event.destination)])
+        elif event.source in (ArmState.ENGAGED, ArmState.CARRIED, ArmState.HOMING):
             self._want(PAUSED)
 
     def slip(self, slip: float, slip_angle: float) -> None:
@@ -119,22 +139,22 @@ class HapticPulses:
             self._want(GRASP)
         self._grasps = holds
 
-    def at(self, now: float) -> HapticFeedback | None:
-        """What to send at ``now`` [s], or None."""
+    def at(self, now: float, hand: str) -> HapticFeedback | None:
+        """What to send to ``hand``, which drives the arm at ``now`` [s], or None."""
         if self._ends is not None and now >= self._ends:
             self._ends, self._next = None, now + _PAUSE
-            return HapticFeedback(self._hand, 0.0, 0.0)
+            return HapticFeedback(hand, 0.0, 0.0)
         pulse = self._waiting
         if pulse is None or (self._ends is None and now < self._next and pulse is not FAULT):
             return None
         self._waiting = None
-        if self._ends is not None and pulse.amplitude < self._strength:
+        if self._ends is not None and pulse.amplitude < self._amplitude:
             return None
-        self._ends, self._strength = now + pulse.duration, pulse.amplitude
-        return HapticFeedback(self._hand, pulse.frequency, pulse.amplitude * self._strength_of_all)
+        self._ends, self._amplitude = now + pulse.duration, pulse.amplitude
+        return HapticFeedback(hand, pulse.frequency, pulse.amplitude * self.strength)
 
     def _want(self, pulse: Pulse) -> None:
-        if self._strength_of_all > 0.0 and (self._waiting is None or pulse.amplitude >= self._waiting.amplitude):
+        if self.strength > 0.0 and (self._waiting is None or pulse.amplitude >= self._waiting.amplitude):
             self._waiting = pulse
 
 

@@ -8,11 +8,11 @@ from functools import partial
 
 import pinocchio as pin
 
-from q2r2_control.config.bindings import Action, Gesture
-from q2r2_control.config.teleop import Stance, TeleopSettings
-from q2r2_control.teleop.arm import ArmTeleop
-from q2r2_control.teleop.arm_states import AT_REST, FOLLOWING, ArmState, Cause
-from q2r2_control.teleop.gestures import Press
+from q2r2_control.config.teleop import TeleopSettings
+from q2r2_control.teleop.arm import of_controls
+from q2r2_control.teleop.arm_states import FOLLOWING, HOLDING, ArmState, Cause
+from q2r2_control.teleop.both_arms import BothArms, Surroundings
+from q2r2_control.teleop.episode_marks import EpisodeMarks
 from q2r2_control.types import ArmTarget, Event, HandSample
 
 
@@ -30,15 +30,37 @@ class Teleop:
     """
 
     def __init__(self, settings: TeleopSettings, arms: Sequence[str]) -> None:
-        self._linked, self._bindings = settings.linked, settings.bindings
-        self._stall = settings.gate.timeout
-        swapped = settings.stance is not Stance.SIDE_BY_SIDE
-        self._arms = {arm: ArmTeleop(arm, settings) for arm in arms}
-        self._arm_of_hand = {_other(arm) if swapped else arm: arm for arm in arms}
+        self._pair = BothArms(settings, arms)
+        self._arms = self._pair.arms
+        self._use(settings)
         self._commanded: dict[str, pin.SE3] = {}
         self._now: float | None = None
-        self._asks_home: str | None = None  # the arm whose hand asked for the way home; None: no hand did
+
+    def _use(self, settings: TeleopSettings) -> None:
+        self.settings = settings
+        self._linked, self._stall = settings.linked, settings.gate.timeout
         self.delay = settings.filter.interpolation_delay + settings.filter.smoothing_delay
+
+    def change(self, settings: TeleopSettings, now: float) -> str | None:
+        """Other settings from now on, without a jump; returns why that is not possible now, or None.
+
+        Which hand drives an arm, which way its axes go and what its controls mean may change only while the arms hold.
+        """
+        before = self.settings
+        turned = (before.stance, before.axes) != (settings.stance, settings.axes)
+        if self._pair.carry is not None:
+            return "two arms carry"
+        if (turned or of_controls(before) != of_controls(settings)) and not self._pair.all_in(HOLDING):
+            return "stance, axes and controls may be changed while both arms hold"
+        self._use(settings)
+        self._pair.use(settings)
+        for name, arm in self._arms.items():
+            arm.configure(settings, self._commanded.get(name), now)
+            if turned:
+                arm.forget()
+        if before.stance is not settings.stance:
+            self._pair.assign_hands(settings.stance)
+        return None
 
     @property
     def states(self) -> dict[str, ArmState]:
@@ -47,17 +69,22 @@ class Teleop:
 
     @property
     def engaged(self) -> dict[str, bool]:
-        """Whether each arm follows its hand now."""
-        return {name: arm.state is ArmState.ENGAGED for name, arm in self._arms.items()}
+        """Whether each arm follows a hand now."""
+        return {name: arm.state in (ArmState.ENGAGED, ArmState.CARRIED) for name, arm in self._arms.items()}
 
     @property
     def homing(self) -> bool:
         """Whether both arms are to be brought home, until :meth:`end_homing` or what stops them."""
-        return any(arm.state is ArmState.HOMING for arm in self._arms.values())
+        return self._pair.any_in(ArmState.HOMING)
+
+    @property
+    def marks(self) -> EpisodeMarks:
+        """What the operator says of the recording."""
+        return self._pair.marks
 
     def hand_of(self, arm: str) -> str:
         """The hand that drives ``arm``."""
-        return next(hand for hand, name in self._arm_of_hand.items() if name == arm)
+        return self._pair.hand_of(arm)
 
     def take_events(self) -> list[Event]:
         """State changes and refused presses since the last call, in order of time."""
@@ -94,125 +121,77 @@ class Teleop:
         now = self._now if self._now is not None else 0.0
         faults: dict[str, str | None] = {}
         for sample in samples:
-            name = self._arm_of_hand.get(sample.hand)
+            name = self._pair.arm_of_hand.get(sample.hand)
             if name is not None:
                 faults[name] = self._arms[name].receive(sample, now) or faults.get(name)
         for name, arm in self._arms.items():
             faults[name] = faults.get(name) or arm.watchdog(now) or clock_fault
         self._disengage(faults, now)
-        presses = self._act_together(obstacles or {}, now)
+        around = Surroundings(tools, self._commanded, commanded, obstacles or {})
+        presses = self._pair.act(around, now)
         chord = any(arm.chord for arm in self._arms.values())
-        targets = {}
         for name, arm in self._arms.items():
             arm.act(
                 presses[name],
-                partial(self._tool, name, tools, commanded),
+                partial(around.anchor, name),
                 now,
                 chord if self._linked else arm.chord,
-                None if obstacles is None else obstacles.get(name),
+                around.obstacles.get(name),
             )
-            pose = arm.target(now, None if commanded is None else commanded.get(name))
-            if pose is not None:
-                self._commanded[name] = pose
-            targets[name] = ArmTarget(pose, arm.gripper, *arm.slip)
-        if any(presses.values()) and self._asked(presses, Action.SWAP_HANDS) is not None:
-            self._swap_hands(now)
+        targets = self._targets(now, commanded)
+        self._pair.swap_hands(presses, now)
         return targets
 
-    def _act_together(self, obstacles: Mapping[str, str], now: float) -> dict[str, list[Press]]:
-        """Do what is for both arms; returns the presses that are left for each."""
-        presses = {name: arm.take_presses(now) for name, arm in self._arms.items()}
-        if not any(presses.values()) and not any(arm.grips or arm.chord for arm in self._arms.values()):
-            return presses  # as at most ticks
-        states = {arm.state for arm in self._arms.values()}
-        if self._asked(presses, Action.STOP) is not None:
-            go_on = states == {ArmState.STOPPED}
-            self._change(Cause.GO_ON if go_on else Cause.STOP, now, self._reason(Action.STOP))
-        elif ArmState.STOPPED in states:
-            for name, listed in presses.items():
-                if any(press.gesture is not Gesture.DOWN for press in listed):
-                    self._arms[name].tell(now, f"not engaged: stopped, {self._bindings.words_of(Action.STOP)} goes on")
-        elif ArmState.HOMING in states:
-            begun = any(press.gesture is Gesture.DOWN for listed in presses.values() for press in listed)
-            if begun or any(arm.grips or arm.chord for arm in self._arms.values()):
-                self._change(Cause.PRESS, now, "the way home was interrupted")
-        elif (asked_by := self._asked(presses, Action.HOME)) is not None:
-            self.home(now, asked_by, obstacles)
-        else:
-            return presses
-        return {name: [] for name in self._arms}
-
-    def home(self, now: float, asked_by: str | None = None, obstacles: Mapping[str, str] | None = None) -> None:
-        """Both arms shall go home; the hand of the arm ``asked_by`` has to be there on the way, None: no hand.
-
-        ``obstacles``: see :meth:`update`. What is in the way is told as an event.
-        """
-        problem = next(iter((obstacles or {}).values()), None)
-        if any(arm.state is ArmState.ALIGNING for arm in self._arms.values()):
-            problem = problem or "an alignment is not over"
-        if any(arm.state is ArmState.STOPPED for arm in self._arms.values()):
-            problem = problem or "stopped"
-        if problem is None and asked_by is not None:
-            problem = self._arms[asked_by].watchdog(now)
-        self._asks_home = asked_by
-        for arm in self._arms.values():
-            if problem is not None:
-                arm.tell(now, f"not homing: {problem}")
+    def _targets(self, now: float, commanded: Mapping[str, pin.SE3] | None) -> dict[str, ArmTarget]:
+        """Of every arm, by its state."""
+        if self._pair.carry is not None and not self._pair.carry.lasts:
+            self._pair.end_carry(now, "the other arm was stopped")
+        carry, targets = self._pair.carry, {}
+        carried = {} if carry is None else carry.targets(now, commanded)
+        for name, arm in self._arms.items():
+            if carry is not None:
+                pose, slip = carried.get(name), carry.slip
             else:
-                arm.change(Cause.HOME, now, "way home" if asked_by is None else self._reason(Action.HOME))
+                pose, slip = arm.target(now, None if commanded is None else commanded.get(name)), arm.slip
+            if pose is not None:
+                self._commanded[name] = pose
+            targets[name] = ArmTarget(pose, arm.gripper, *slip)
+        return targets
+
+    def home(self, now: float) -> None:
+        """Both arms shall go home, because a program says so. What is in the way is told as an event."""
+        self._pair.home(now, None, {})
+
+    def end_homing(self, now: float, outcome: str, arrived: bool = True) -> None:
+        """The way home is over, with this ``outcome``; not ``arrived``: because of a fault."""
+        self._pair.change(Cause.HOMED if arrived else Cause.FAULT, now, outcome)
 
     @property
     def stopped(self) -> bool:
         """Whether the operator has stopped the arms."""
-        return any(arm.state is ArmState.STOPPED for arm in self._arms.values())
+        return self._pair.any_in(ArmState.STOPPED)
 
     def set_stopped(self, stopped: bool, now: float, reason: str) -> None:
         """Stop all arms, or take that back, because their operator did so elsewhere."""
-        self._change(Cause.STOP if stopped else Cause.GO_ON, now, reason)
+        self._pair.change(Cause.STOP if stopped else Cause.GO_ON, now, reason)
 
-    def end_homing(self, now: float, outcome: str, arrived: bool = True) -> None:
-        """The way home is over, with this ``outcome``; not ``arrived``: because of a fault."""
-        self._change(Cause.HOMED if arrived else Cause.FAULT, now, outcome)
-
-    def _swap_hands(self, now: float) -> None:
-        """Each hand drives the other arm, and has to be seen anew before it does."""
-        alone = len(self._arms) < 2 and "not swapped: this program drives one arm only"
-        busy = any(arm.state not in AT_REST for arm in self._arms.values()) and "not swapped: pause both arms first"
-        if problem := alone or busy:
-            for arm in self._arms.values():
-                arm.tell(now, problem)
-            return
-        self._arm_of_hand = {_other(hand): name for hand, name in self._arm_of_hand.items()}
+    def tell(self, now: float, reason: str) -> None:
+        """What the operator should know of both arms; what was not done begins with "not"."""
         for arm in self._arms.values():
-            arm.forget()
-            arm.tell(now, f"driven by the {self.hand_of(arm.arm)} hand")
-
-    def _asked(self, presses: Mapping[str, Sequence[Press]], action: Action) -> str | None:
-        """The arm whose hand asked for ``action``, or None."""
-        for name, listed in presses.items():
-            if any(self._bindings.action_of(*press) is action for press in listed):
-                return name
-        return None
-
-    def _reason(self, action: Action) -> str:
-        return f"{action} ({self._bindings.words_of(action)})"
-
-    def _change(self, cause: Cause, now: float, reason: str) -> None:
-        for arm in self._arms.values():
-            arm.change(cause, now, reason)
+            arm.tell(now, reason)
 
     def connection_lost(self, now: float) -> None:
         """The input is lost: every arm that a hand drives stops, and everything received is forgotten."""
         self._clock(now)
-        if not self.homing or self._asks_home is not None:
-            self._change(Cause.FAULT, self._now if self._now is not None else 0.0, "connection lost")
+        if not self.homing or self._pair.asks_home is not None:
+            self._pair.change(Cause.FAULT, self._now if self._now is not None else 0.0, "connection lost")
         for arm in self._arms.values():
             arm.forget()
 
     def pause(self, now: float, reason: str) -> None:
         """Every arm holds until a new press, for a reason outside of this layer."""
         self._clock(now)
-        self._change(Cause.FAULT, self._now if self._now is not None else 0.0, reason)
+        self._pair.change(Cause.FAULT, self._now if self._now is not None else 0.0, reason)
 
     def _clock(self, now: float) -> str | None:
         """Advance the time; returns the fault of a clock that cannot be followed, or None."""
@@ -233,11 +212,13 @@ class Teleop:
     def _disengage(self, faults: Mapping[str, str | None], now: float) -> None:
         """Stop the arms whose hand has a fault; that of a hand whose arm holds anyway has no effect."""
         if self.homing:
-            fault = faults.get(self._asks_home) if self._asks_home is not None else None
+            fault = faults.get(self._pair.asks_home) if self._pair.asks_home is not None else None
             if fault:
-                self._change(Cause.FAULT, now, f"on the way home: {fault}")
+                self._pair.change(Cause.FAULT, now, f"on the way home: {fault}")
             return
-        active = {name: fault for name, fault in faults.items() if fault and self._arms[name].state in FOLLOWING}
+        # A carried arm's own hand does not move it.
+        led = FOLLOWING - {ArmState.CARRIED}
+        active = {name: fault for name, fault in faults.items() if fault and self._arms[name].state in led}
         for name, fault in active.items():
             self._arms[name].change(Cause.FAULT, now, fault)
         if active and self._linked:
@@ -245,15 +226,3 @@ class Teleop:
             for name, arm in self._arms.items():
                 if name not in active:
                     arm.change(Cause.FAULT, now, f"linked to {first}: {fault}")
-
-    def _tool(self, name: str, tools: Mapping[str, pin.SE3], commanded: Mapping[str, pin.SE3] | None) -> pin.SE3 | None:
-        """The tool's pose for an anchor: measured position, commanded orientation."""
-        measured = tools.get(name)
-        if measured is None:
-            return None
-        reference = (commanded or self._commanded).get(name, measured)
-        return pin.SE3(reference.rotation, measured.translation)
-
-
-def _other(side: str) -> str:
-    return "right" if side == "left" else "left"

@@ -13,6 +13,9 @@ from __future__ import annotations
 
 from itertools import starmap
 
+import numpy as np
+import pinocchio as pin
+
 from q2r2_control.config.teleop import WorkspaceSettings
 from q2r2_control.types import Array
 
@@ -36,14 +39,14 @@ class Workspace:
         """For a new anchor: the next target is where the tool is, wherever that may be."""
         self._last, self.slip = None, 0.0
 
-    def hold(self, position: Array) -> list[float] | None:
-        """Where a target that is asked to be at ``position`` (3,), world frame, may be; None: there.
+    def hold(self, target: pin.SE3) -> list[float] | None:
+        """Where a target that is asked to be at ``target``, world frame, may be; None: there.
 
         Asked at every tick; what it returns the hand has to be anchored to.
         """
         if not self._axes:
             return None
-        asked = position.tolist()
+        asked = target.translation.tolist()
         last, self._last = self._last, asked
         if last is None:
             for axis, value in zip(self._axes, asked, strict=True):
@@ -56,6 +59,17 @@ class Workspace:
         self._last = allowed
         return allowed
 
+    def clip(self, position: Array) -> Array:
+        """The nearest position (3,) within the sides, world frame."""
+        if not self._axes:
+            return position
+        return np.array([axis.clip(value) for axis, value in zip(self._axes, position.tolist(), strict=True)])
+
+    def move_to(self, position: Array) -> None:
+        """The target is at ``position`` (3,) instead of what :meth:`hold` returned last."""
+        if self._last is not None:
+            self._last = position.tolist()
+
 
 class _Axis:
     """One axis of the box, between two sides."""
@@ -67,6 +81,9 @@ class _Axis:
 
     def begin(self, value: float) -> None:
         self._free, self._turned = self._least <= value <= self._greatest, 0.0
+
+    def clip(self, value: float) -> float:
+        return min(max(value, self._least), self._greatest)
 
     def step(self, start: float, end: float) -> float:
         """Where a step of the hand from ``start`` towards ``end`` leads."""
@@ -83,4 +100,4 @@ class _Axis:
         if made == out and (room < 0.0 or made <= room) and self._least <= end <= self._greatest:
             return end
         reached = start + (made if upper else -made)
-        return reached if room < 0.0 else min(max(reached, self._least), self._greatest)
+        return reached if room < 0.0 else self.clip(reached)

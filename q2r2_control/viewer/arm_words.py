@@ -32,7 +32,7 @@ def why(tick: Tick, arm: str, joints: Collection[str], binding: Collection[str],
         return last.reason if last.reason.startswith("not ") else f"{tick.states[arm]}: {last.reason}"
     distance, angle = tracking_error(tick, arm)
     if not (distance > _FOLLOWS or angle > _TURNED):
-        return "follows the hand"
+        return "goes with the other arm" if tick.states[arm] == ArmState.CARRIED else "follows the hand"
     return _held_by(tick, arm, joints, binding) or ("catches up" if np.isfinite(distance) else "holds")
 
 
@@ -45,6 +45,8 @@ def next_press(tick: Tick, arm: str, bindings: BindingSettings) -> str:
         return "release both buttons to go on"
     if state == ArmState.HOMING:
         return "any press stops the way home"
+    if state == ArmState.CARRIED:
+        return f"{bindings.words_of(Action.CARRY)} of either hand ends it, or a pause"
     if state == ArmState.STOPPED:
         return f"{bindings.words_of(Action.STOP)} goes on"
     moves = state in (ArmState.ENGAGED, ArmState.PAUSING)

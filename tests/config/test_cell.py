@@ -49,6 +49,7 @@ from q2r2_control.config.teleop import (
     GateSettings,
     HapticSettings,
     LeashSettings,
+    SpeedLimitSettings,
     TeleopSettings,
     WorkspaceSettings,
 )
@@ -136,7 +137,7 @@ class TestTheShippedCellShowsAllThereIsToTune:
     )
     # Not the default, and the file says so.
     CHOSEN = ("control.solve_time_limit", "control.distances", "mujoco.objects")
-    IN_A_COMMENT = (ContactPair, HeldObjectConfig, NamedPairDistance, WorkspaceSettings)
+    IN_A_COMMENT = (ContactPair, HeldObjectConfig, NamedPairDistance, SpeedLimitSettings, WorkspaceSettings)
     # A tool's mount and an obstacle's rpy are placements as an arm's mount is, which shows the keys.
     SHOWN_ELSEWHERE = ("arms.left.tool.mount", "obstacles.table.rpy")
 

@@ -11,6 +11,9 @@ from q2r2_control.config.teleop import HapticSettings
 from q2r2_control.teleop.haptics import (
     CONTACT,
     ENGAGED,
+    EPISODE_BEGINS,
+    EPISODE_DISCARDED,
+    EPISODE_ENDS,
     FAULT,
     GRASP,
     HOMING,
@@ -34,6 +37,13 @@ EVENTS = {
     "an alignment that ends unengaged": (("aligning", "lost", "not engaged: the newest pose is not usable"), FAULT),
     "the way home": (("paused", "homing", "home (grip)"), HOMING),
     "the end of the way home": (("homing", "paused", "at home"), PAUSED),
+    "both arms carry, for the one that leads": (("engaged", "engaged", "carries both tools"), ENGAGED),
+    "both arms carry, for the other one": (("paused", "carried", "carries with the left arm"), ENGAGED),
+    "the end of carrying": (("carried", "paused", "grip"), PAUSED),
+    "an episode that begins": (("engaged", "engaged", "episode begins"), EPISODE_BEGINS),
+    "an episode that ends": (("engaged", "engaged", "episode ends"), EPISODE_ENDS),
+    "an episode that is discarded": (("paused", "paused", "episode discarded"), EPISODE_DISCARDED),
+    "what an engaged arm refuses": (("engaged", "engaged", "not carried: stopped"), FAULT),
     "a stop": (("engaged", "stopped", "stop (grip)"), STOPPED),
 }
 
@@ -44,49 +54,49 @@ def feedback(pulse: Pulse) -> HapticFeedback:
 
 @pytest.mark.parametrize(("event", "pulse"), EVENTS.values(), ids=EVENTS)
 def test_an_event_is_felt_once_and_ends(event: tuple[str, str, str], pulse: Pulse) -> None:
-    haptics = HapticPulses("left")
+    haptics = HapticPulses()
     haptics.tell(Event(1.0, "left", *event))
-    assert haptics.at(1.0) == feedback(pulse)
-    assert haptics.at(1.0 + 0.9 * pulse.duration) is None
-    assert haptics.at(1.01 + pulse.duration) == HapticFeedback("left", 0.0, 0.0)
-    assert haptics.at(9.0) is None
+    assert haptics.at(1.0, "left") == feedback(pulse)
+    assert haptics.at(1.0 + 0.9 * pulse.duration, "left") is None
+    assert haptics.at(1.01 + pulse.duration, "left") == HapticFeedback("left", 0.0, 0.0)
+    assert haptics.at(9.0, "left") is None
 
 
 def test_a_pause_that_is_complete_is_not_felt_again() -> None:
-    haptics = HapticPulses("left")
+    haptics = HapticPulses()
     haptics.tell(Event(1.0, "left", "pausing", "paused", "lower button"))
-    assert haptics.at(1.0) is None
+    assert haptics.at(1.0, "left") is None
 
 
 def test_slipping_is_felt_at_every_stretch_of_it_and_anew_after_engaging() -> None:
-    haptics = HapticPulses("left")
+    haptics = HapticPulses()
     felt = []
     for tick in range(100):
         haptics.slip(0.001 * tick, 0.0)
-        felt.append(haptics.at(tick * 0.1))
+        felt.append(haptics.at(tick * 0.1, "left"))
     assert felt.count(feedback(SLIP)) == 4
     haptics.slip(0.0, 0.0)
     haptics.slip(0.0, 0.11)
-    assert haptics.at(20.0) == feedback(SLIP)
+    assert haptics.at(20.0, "left") == feedback(SLIP)
 
 
 def test_a_weaker_vibration_does_not_cut_a_stronger_one_short() -> None:
-    haptics = HapticPulses("left")
+    haptics = HapticPulses()
     haptics.tell(Event(1.0, "left", "engaged", "lost", "the hand jumped"))
-    assert haptics.at(1.0) == feedback(FAULT)
+    assert haptics.at(1.0, "left") == feedback(FAULT)
     haptics.slip(1.0, 0.0)
-    assert haptics.at(1.1) is None
-    assert haptics.at(1.0 + FAULT.duration) == HapticFeedback("left", 0.0, 0.0)
+    assert haptics.at(1.1, "left") is None
+    assert haptics.at(1.0 + FAULT.duration, "left") == HapticFeedback("left", 0.0, 0.0)
 
 
 def felt(haptics: HapticPulses, since: float, until: float) -> list[HapticFeedback]:
     """All that is sent in that time [s], at 1000 ticks a second."""
     ticks = range(round((until - since) * 1000))
-    return [sent for tick in ticks if (sent := haptics.at(since + 0.001 * tick)) is not None]
+    return [sent for tick in ticks if (sent := haptics.at(since + 0.001 * tick, "left")) is not None]
 
 
 def test_coming_near_is_felt_at_every_5_mm_and_stronger_the_nearer_and_leaving_is_not() -> None:
-    haptics = HapticPulses("left")
+    haptics = HapticPulses()
     pulses: list[float] = []
     for tick in range(200):  # from 60 mm to spare to 0, and back
         spare = abs(0.06 - 0.0006 * tick)
@@ -100,7 +110,7 @@ def test_coming_near_is_felt_at_every_5_mm_and_stronger_the_nearer_and_leaving_i
 
 
 def test_an_arm_that_stays_near_is_silent_though_the_distance_trembles() -> None:
-    haptics = HapticPulses("left")
+    haptics = HapticPulses()
     haptics.near(0.0174)
     assert len(felt(haptics, 0.0, 1.0)) == 2
     for tick in range(100):
@@ -109,7 +119,7 @@ def test_an_arm_that_stays_near_is_silent_though_the_distance_trembles() -> None
 
 
 def test_a_contact_is_felt_at_every_5_newtons_and_stronger_the_harder() -> None:
-    haptics = HapticPulses("left")
+    haptics = HapticPulses()
     pulses = []
     for tick in range(80):
         haptics.contact(float(tick))
@@ -119,7 +129,7 @@ def test_a_contact_is_felt_at_every_5_newtons_and_stronger_the_harder() -> None:
 
 
 def test_a_joint_at_its_limit_and_a_grasp_are_each_felt_once_for_as_long_as_they_last() -> None:
-    haptics = HapticPulses("left")
+    haptics = HapticPulses()
     sent = []
     for tick in range(10):
         haptics.limits(["left_A2", "left_A4"] if tick > 4 else ["left_A4"])
@@ -132,7 +142,7 @@ def test_a_joint_at_its_limit_and_a_grasp_are_each_felt_once_for_as_long_as_they
 
 
 def test_two_vibrations_are_felt_as_two_and_a_fault_waits_for_none() -> None:
-    haptics = HapticPulses("left")
+    haptics = HapticPulses()
     haptics.tell(Event(1.0, "left", "paused", "engaged", "lower button"))
     first = felt(haptics, 1.0, 1.0 + ENGAGED.duration + 0.002)
     assert [one.amplitude for one in first] == [ENGAGED.amplitude, 0.0]
@@ -140,12 +150,12 @@ def test_two_vibrations_are_felt_as_two_and_a_fault_waits_for_none() -> None:
     assert felt(haptics, 1.09, 1.12) == []
     assert felt(haptics, 1.12, 1.2)[0] == feedback(LIMIT)
     haptics.tell(Event(1.2, "left", "engaged", "lost", "the hand jumped"))
-    assert haptics.at(1.21) == feedback(FAULT)
+    assert haptics.at(1.21, "left") == feedback(FAULT)
 
 
 @pytest.mark.parametrize(("strength", "expected"), [(0.5, [0.5 * FAULT.amplitude, 0.0]), (0.0, [])])
 def test_the_strength_of_all_is_a_setting_and_0_sends_nothing(strength: float, expected: list[float]) -> None:
-    haptics = HapticPulses("left", HapticSettings(strength=strength))
+    haptics = HapticPulses(HapticSettings(strength=strength))
     haptics.tell(Event(1.0, "left", "engaged", "lost", "the hand jumped"))
     assert [sent.amplitude for sent in felt(haptics, 1.0, 2.0)] == expected
 
@@ -153,10 +163,10 @@ def test_the_strength_of_all_is_a_setting_and_0_sends_nothing(strength: float, e
 def test_of_two_at_once_the_one_that_stands_later_in_the_vocabulary_is_felt() -> None:
     amplitudes = [word.pulse.amplitude for word in VOCABULARY]
     assert amplitudes == sorted(amplitudes)
-    haptics = HapticPulses("left")
+    haptics = HapticPulses()
     haptics.grasps(True)
     haptics.limits(["left_A4"])
-    assert haptics.at(0.0) == feedback(GRASP)
+    assert haptics.at(0.0, "left") == feedback(GRASP)
 
 
 def test_the_table_in_the_docs_is_the_vocabulary() -> None:

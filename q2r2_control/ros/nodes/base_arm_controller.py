@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -15,6 +16,7 @@ from visualization_msgs.msg import Marker
 
 from q2r2_control.config.bindings import Action
 from q2r2_control.config.presets import BUILTIN
+from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.errors import ConfigError
 from q2r2_control.inputs.samples import SampleQueue
 from q2r2_control.inputs.session import HAPTIC_TOPICS
@@ -24,6 +26,7 @@ from q2r2_control.ros.bridge.frames import FrameListener, PoseTopic, ToolFrame
 from q2r2_control.ros.bridge.grippers import GripperClient
 from q2r2_control.ros.bridge.hand_topics import HandWatch
 from q2r2_control.ros.bridge.home_client import HomeClient
+from q2r2_control.ros.bridge.live_parameters import LiveTeleopParameters
 from q2r2_control.ros.bridge.markers import TargetMarkers
 from q2r2_control.ros.bridge.messages import age, hand_sample
 from q2r2_control.ros.bridge.parameters import ArmDefaults, ArmParameters, arm_parameters
@@ -96,7 +99,7 @@ class BaseArmController(BaseNode):
         """Make the objects that keep the node's state."""
         self.teleop = Teleop(self.parameters.teleop, (self.arm_name,))
         self.hand = self.teleop.hand_of(self.arm_name)
-        self.haptics = HapticPulses(self.hand)
+        self.haptics = HapticPulses(self.parameters.teleop.haptics)
         self.markers = TargetMarkers(self.arm_name, self.parameters.tool_frame, self.parameters.world_frame)
         self._has_analog_gripper = self.parameters.teleop.bindings.words_of(Action.GRIPPER_ANALOG) is not None
         self._samples = SampleQueue()
@@ -129,6 +132,7 @@ class BaseArmController(BaseNode):
             (OVR2ROSInputs, f"q2r_{hand}_hand_inputs", self.inputs_callback),
         ):
             self.create_subscription(kind, topic, partial(self._take, callback), STREAM_QOS)
+        self._live = LiveTeleopParameters(self, values.teleop, self._change_teleop)
         self.create_service(Trigger, "~/pause", self._on_pause)
         self.create_service(Trigger, "~/reset", self._on_reset)
         self.create_timer(1.0 / values.rate, self.tick)
@@ -279,7 +283,7 @@ class BaseArmController(BaseNode):
     def _publish_feedback(self, sent: pin.SE3 | None, tool: pin.SE3 | None, now: float) -> None:
         """Publish markers and vibrations."""
         self.haptics.slip(self._target.slip, self._target.slip_angle)
-        if (pulse := self.haptics.at(now)) is not None:
+        if (pulse := self.haptics.at(now, self.hand)) is not None:
             self._haptics.publish(OVR2ROSHapticFeedback(frequency=pulse.frequency, amplitude=pulse.amplitude))
         if not 0.0 <= now - self._shown < _MARKER_PERIOD:
             self._shown = now
@@ -293,6 +297,13 @@ class BaseArmController(BaseNode):
     def _put_sample(self) -> None:
         if self._pose is not None:
             self._samples.put(hand_sample(self.hand, *self._pose, *self._inputs))
+
+    def _change_teleop(self, settings: TeleopSettings) -> str | None:
+        problem = self.teleop.change(settings, self.now)
+        if problem is None:
+            self.parameters = replace(self.parameters, teleop=settings)
+            self.haptics.strength = settings.haptics.strength
+        return problem
 
     def _on_pause(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self.teleop.pause(self.now, PAUSED_BY_SERVICE)

@@ -1,0 +1,121 @@
+"""The operator's side of one run: the input, the teleop layer, the way home, and what is told to hands and log."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import pinocchio as pin
+
+from q2r2_control.config.teleop import TeleopSettings
+from q2r2_control.control.controller import CartesianController
+from q2r2_control.inputs.base import Input
+from q2r2_control.runtime.operator_feedback import OperatorFeedback
+from q2r2_control.supervision.supervisor import Supervisor
+from q2r2_control.teleop.arm_states import is_fault
+from q2r2_control.teleop.teleop import Teleop
+from q2r2_control.types import ArmTarget, Event, HandSample, Reference, RobotState
+
+_logger = logging.getLogger(__name__)
+
+
+@dataclass(slots=True)
+class Wishes:
+    """What a program asks of a run that goes on, from any thread; each is done once, at the next tick."""
+
+    home: bool = False
+    settings: TeleopSettings | None = None
+
+    def clear(self) -> None:
+        """Ask for nothing any more."""
+        self.home, self.settings = False, None
+
+
+class OperatorSide:
+    """Once a tick: :meth:`poll`, :meth:`targets`, and at its end :meth:`take_events` and :meth:`feel`."""
+
+    def __init__(
+        self, teleop: Teleop, source: Input, supervisor: Supervisor, controller: CartesianController, wishes: Wishes
+    ) -> None:
+        self._teleop, self._input, self._supervisor, self._wishes = teleop, source, supervisor, wishes
+        self._homing = False  # supervision is on the way home
+        self._feedback = OperatorFeedback(controller, teleop.hand_of, teleop.settings.haptics, source.send_haptic)
+        self.connected = False
+
+    def poll(self, now: float) -> list[HandSample]:
+        """Samples of the hands; a connection that is lost stops the arms that hands drive."""
+        was_connected = self.connected
+        samples = self._input.poll(now)
+        self.connected = self._input.connected
+        if was_connected and not self.connected:
+            self._teleop.connection_lost(now)
+        return samples
+
+    def targets(
+        self,
+        samples: list[HandSample],
+        tools: Mapping[str, pin.SE3],
+        now: float,
+        commanded: Mapping[str, pin.SE3],
+    ) -> dict[str, ArmTarget]:
+        """What the operator asks of the arms, handed over to supervision; see :meth:`Teleop.update`."""
+        if self._wishes.home or self._wishes.settings is not None:
+            self._fulfil(now)
+        targets = self._teleop.update(samples, tools, now, commanded)
+        for arm, target in targets.items():
+            if target.pose is None:
+                self._supervisor.release_target(arm)
+            elif refusal := self._supervisor.take_target(arm, target.pose, now, measured=tools[arm]):
+                self._teleop.pause(now, refusal.line)  # or the operator would think that the arm follows
+        self._go_home(now)
+        return targets
+
+    def take_events(self, start: float) -> list[Event]:
+        """What happened to the arms' states since the last call, by the time since ``start`` [s]; it is logged."""
+        events = [replace(event, t=event.t - start) for event in self._teleop.take_events()]
+        for event in events:
+            if is_fault(event):
+                _logger.warning("%s arm: %s", event.arm, event.reason)
+            else:
+                _logger.debug("%s arm: %s -> %s: %s", event.arm, event.source, event.destination, event.reason)
+        return events
+
+    def feel(
+        self,
+        now: float,
+        events: list[Event],
+        targets: Mapping[str, ArmTarget],
+        reference: Reference,
+        state: RobotState,
+        grippers: Mapping[str, float],
+        openings: Mapping[str, float],
+    ) -> None:
+        """Send the hands what they shall feel; see :meth:`OperatorFeedback.update`."""
+        self._feedback.update(now, events, targets, reference.report, state, grippers, openings)
+
+    def _fulfil(self, now: float) -> None:
+        home, settings = self._wishes.home, self._wishes.settings
+        self._wishes.clear()
+        if home:
+            self._teleop.home(now)
+        if settings is not None:
+            problem = self._teleop.change(settings, now)
+            self._teleop.tell(now, "settings changed" if problem is None else f"not changed: {problem}")
+            if problem is None:
+                self._feedback.scale(settings.haptics.strength)
+
+    def _go_home(self, now: float) -> None:
+        """Begin and end the way home as the operator asks, and tell the operator how it ended."""
+        asked, supervisor = self._teleop.homing, self._supervisor
+        if asked and not self._homing:
+            if refusal := supervisor.go_home():
+                self._teleop.end_homing(now, f"not homing: {refusal}", arrived=False)
+            else:
+                self._homing = True
+        elif self._homing and not asked:
+            self._homing = False
+            supervisor.end_homing()
+        elif self._homing and not supervisor.homing:
+            self._homing = False
+            self._teleop.end_homing(now, supervisor.homing_outcome or "the way home was ended")

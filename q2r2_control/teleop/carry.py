@@ -1,0 +1,119 @@
+"""Two tools that one hand moves as one body, about the point between them: two arms that carry one box.
+
+The hand is anchored to a frame in the middle between both tools, turned as the world, and both tools keep the pose in
+it that they had when the carrying began. So nothing jumps when it begins, and the targets' relation is exact while it
+lasts. That of the tools is as good as both arms follow: where one is held up, the frame waits for it on a leash that is
+shorter than that of one arm, so that what is carried is neither torn nor crushed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import pinocchio as pin
+
+from q2r2_control.teleop.workspace import Workspace
+from q2r2_control.types import LONGEST_DT, Array, pose_of
+
+_GAIN = 20.0  # of keeping the relation [1/s]
+_MOST = 0.01, 0.05  # that it shifts a target by [m], [rad]
+
+
+class CarriedTools:
+    """The tools of both arms, as parts of one frame that moves."""
+
+    def __init__(self, tools: Mapping[str, pin.SE3]) -> None:
+        """``tools``: where both are now, or are asked to be; world frame."""
+        middle = np.mean([tool.translation for tool in tools.values()], axis=0)
+        self.frame = pose_of(np.eye(3), middle)  # where it is asked to be
+        self._in_frame = {arm: self.frame.actInv(tool) for arm, tool in tools.items()}
+
+    @property
+    def lever(self) -> float:
+        """From the frame to the tools [m]."""
+        return max(float(np.linalg.norm(tool.translation)) for tool in self._in_frame.values())
+
+    def frames_of(self, tools: Mapping[str, pin.SE3]) -> dict[str, pin.SE3]:
+        """Where each of ``tools`` has the frame."""
+        return {arm: tools[arm] * placed.inverse() for arm, placed in self._in_frame.items() if arm in tools}
+
+    def slowest(self, frames: Mapping[str, pin.SE3]) -> pin.SE3 | None:
+        """Of frames that disagree the one that is farther from where it is asked to be."""
+        return max(frames.values(), key=self._away, default=None)
+
+    def tool_at(self, arm: str, frame: pin.SE3) -> pin.SE3:
+        """One tool, with the frame at ``frame``."""
+        return frame * self._in_frame[arm]
+
+    def at(self, frame: pin.SE3) -> dict[str, pin.SE3]:
+        """Both tools, with the frame at ``frame``."""
+        return {arm: self.tool_at(arm, frame) for arm in self._in_frame}
+
+    def _away(self, frame: pin.SE3) -> float:
+        """How far a frame is, as a tool feels it [m]."""
+        turn = float(np.linalg.norm(pin.log3(frame.rotation @ self.frame.rotation.T)))
+        return float(np.linalg.norm(frame.translation - self.frame.translation)) + self.lever * turn
+
+
+class RelationKeeper:
+    """Moves the frame of the tool that is carried so that both tools keep their relation, not only their targets.
+
+    Both arms follow a target some millimetres late, and each in its own way. What they have in common bends nothing;
+    by what the carried one is behind the leading one, or ahead, its frame is shifted, as an integral:
+
+        dc/dt = g (frame of the leading tool - frame of the carried tool),  |c| bounded.
+
+    A target's own velocity is fed forward, so the tool goes where the shift goes, and the loop is of first order.
+    """
+
+    def __init__(self) -> None:
+        self._shift, self._turn = np.zeros(3), np.eye(3)
+        self._now: float | None = None
+
+    def frame(self, asked: pin.SE3, leading: pin.SE3, carried: pin.SE3, now: float) -> pin.SE3:
+        """The frame for the carried tool at ``now`` [s], where ``asked`` is that of the leading one.
+
+        ``leading``, ``carried``: where the controller's reference has the frame of either, world frame.
+        """
+        dt = 0.0 if self._now is None else min(max(now - self._now, 0.0), LONGEST_DT)
+        self._now = now
+        gain = min(_GAIN * dt, 1.0)
+        self._shift = _at_most(self._shift + gain * (leading.translation - carried.translation), _MOST[0])
+        turn = pin.log3(pin.exp3(gain * pin.log3(leading.rotation @ carried.rotation.T)) @ self._turn)
+        self._turn = pin.exp3(_at_most(turn, _MOST[1]))
+        return pose_of(self._turn @ asked.rotation, asked.translation + self._shift)
+
+
+def _at_most(vector: Array, length: float) -> Array:
+    norm = float(np.linalg.norm(vector))
+    return vector if norm <= length else vector * (length / norm)
+
+
+class CarriedWorkspace:
+    """Keeps both tools in the boxes of their arms, by moving the frame."""
+
+    def __init__(self, tools: CarriedTools, boxes: Mapping[str, Workspace]) -> None:
+        self._tools, self._boxes = tools, boxes
+        self.reset()
+
+    def reset(self) -> None:
+        """See :meth:`Workspace.reset`."""
+        self.slip = 0.0  # how much of the hand's way was not made [m]
+        for box in self._boxes.values():
+            box.reset()
+
+    def hold(self, frame: pin.SE3) -> list[float] | None:
+        """Where the frame that is asked to be at ``frame`` may be; None: there. See :meth:`Workspace.hold`."""
+        shift = np.zeros(3)
+        tools = self._tools.at(frame)
+        for arm, box in self._boxes.items():
+            if (held := box.hold(tools[arm])) is not None:
+                back = np.array(held) - tools[arm].translation
+                shift = np.where(np.abs(back) > np.abs(shift), back, shift)
+        if not shift.any():
+            return None
+        for arm, box in self._boxes.items():
+            box.move_to(tools[arm].translation + shift)
+        self.slip += float(np.linalg.norm(shift))
+        return [float(value) for value in frame.translation + shift]

@@ -1,0 +1,123 @@
+"""From the usable poses of one hand to targets: what lies between an anchor and the controller."""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+
+from q2r2_control.config.teleop import TeleopSettings
+from q2r2_control.teleop.carry import CarriedTools, CarriedWorkspace
+from q2r2_control.teleop.filters import PoseFilter
+from q2r2_control.teleop.leash import Leash
+from q2r2_control.teleop.relative import RelativeMotion
+from q2r2_control.teleop.rest import RestingPose
+from q2r2_control.teleop.speed_limit import SpeedLimit
+from q2r2_control.teleop.workspace import Workspace
+from q2r2_control.types import pose_of
+
+Shares = tuple[float, float]  # of the scales of positions and rotations
+
+
+class HandMotion:
+    """One hand's motion as that of a tool, or of the frame between two tools that carry.
+
+    :meth:`anchor` anchors hand and tool at their current poses and starts the filter at rest there. So there is no
+    catch-up motion: no state holds what the hand did before.
+    """
+
+    def __init__(self, arm: str, settings: TeleopSettings) -> None:
+        self._arm = arm
+        self._carried: CarriedTools | None = None
+        self._use(settings)
+
+    def _use(self, settings: TeleopSettings) -> None:
+        self._settings = settings
+        self._filter = PoseFilter(settings.filter)
+        self._rest = RestingPose(settings.filter.average_at_rest)
+        self._motion, self._unslipped = (RelativeMotion.of(settings) for _ in range(2))
+        self._shares: Shares = (1.0, 1.0)
+        # The newest hand pose, and where it would have the tool if nothing had slipped.
+        self._newest: tuple[pin.SE3, pin.SE3] | None = None
+        self._bound_one_tool()
+
+    def _bound_one_tool(self) -> None:
+        settings, arm = self._settings, self._arm
+        self._leash = Leash(settings.leash)
+        self._workspace: Workspace | CarriedWorkspace = self.workspace()
+        self._speed = SpeedLimit([settings.speed_limit.get(arm)])  # type: ignore[call-overload]
+
+    def workspace(self) -> Workspace:
+        """The box of this arm's targets."""
+        return Workspace(self._settings.workspace.get(self._arm))  # type: ignore[call-overload]
+
+    @property
+    def slip(self) -> tuple[float, float]:
+        """How far the target has slipped along since the anchor, with the tool or along its workspace [m, rad]."""
+        return self._leash.slip + self._workspace.slip, self._leash.slip_angle
+
+    def note(self, hand: pin.SE3) -> None:
+        """A usable pose of the hand, whether its arm is engaged or not."""
+        self._rest.add(hand)
+
+    def add(self, hand: pin.SE3, stamp: float, now: float) -> None:
+        """A pose that may be followed, received at ``stamp`` [s]; an anchor has to come first."""
+        self._filter.add(hand, stamp, now)
+
+    def forget(self) -> None:
+        """Forget how the hand rested."""
+        self._rest.forget()
+
+    def change(self, settings: TeleopSettings) -> None:
+        """Other settings from now on. Before the next target there has to be an anchor."""
+        self._use(settings)
+
+    def anchor(self, hand: pin.SE3, tool: pin.SE3, shares: Shares, now: float) -> None:
+        """The newest pose of the ``hand`` and ``tool``, in the world, correspond from now on."""
+        if self._carried is not None:
+            self._carried = None
+            self._bound_one_tool()
+        hand = self._rest.begin(hand, now)
+        self._filter.reset(hand, now)
+        self._rescale(hand, tool, shares)
+        self._leash.reset()
+        self._workspace.reset()
+        self._speed.reset()
+
+    def carry(self, tools: CarriedTools, other: HandMotion, now: float) -> None:
+        """Move the frame of ``tools`` from now on, until the next anchor; ``other``: that of the other arm."""
+        self._carried = tools
+        self._leash = Leash(self._settings.leash.carried())
+        self._workspace = CarriedWorkspace(tools, {self._arm: self.workspace(), other._arm: other.workspace()})
+        limits = self._settings.speed_limit
+        self._speed = SpeedLimit(limits.values(), tools.lever)
+        self._rescale(self._hand(now), tools.frame, self._shares)
+
+    def target(self, newest: pin.SE3 | None, commanded: pin.SE3 | None, shares: Shares, now: float) -> pin.SE3:
+        """Where the tool, or the frame, should be at ``now`` [s] in the world.
+
+        ``newest``: the hand's newest pose, or None; ``commanded``: where the controller's reference has the tool or
+        the frame, from which no target is farther than the leash, or None: then there is none.
+        """
+        hand = self._hand(now)
+        if commanded is None or newest is None:
+            target = self._motion.target(hand)
+        else:
+            if self._newest is None or self._newest[0] is not newest:
+                self._newest = newest, self._unslipped.target(newest)
+            target = self._leash.target(self._motion, hand, self._newest[1], commanded, now)
+        if (held := self._workspace.hold(target)) is not None:
+            target = pose_of(target.rotation, np.array(held))
+            self._motion.anchor_position(hand, target)
+        if self._shares != shares:
+            self._rescale(hand, target, shares)  # from here on, so the target does not jump
+            self._leash.anchor_anew()
+        return self._speed.limit(target, now)
+
+    def _hand(self, now: float) -> pin.SE3:
+        return self._rest.draw(self._filter.at(now), now)
+
+    def _rescale(self, hand: pin.SE3, tool: pin.SE3, shares: Shares) -> None:
+        """Anchor hand and tool, with the scales that hold from now on."""
+        self._shares, self._newest = shares, None
+        self._motion.rescale(*shares, hand, tool)
+        self._unslipped.rescale(*shares, hand, tool)

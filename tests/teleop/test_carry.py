@@ -1,0 +1,218 @@
+"""Two tools that one hand moves as one body: their relation, what begins and ends it, and that nothing jumps."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from q2r2_control.teleop.arm_states import is_fault, is_refusal
+from q2r2_control.types import SIDES, ArmTarget
+from tests.teleop.hands import ENGAGED, PAUSED, Squeezing, assert_holds, assert_smooth, squeezing
+
+BINDINGS = {"grip": "carry", "stick_down": "home", "stick_left": "stop"}
+CARRYING = {"left": "engaged", "right": "carried"}
+LIMITS = {"left": {"linear": 0.1, "angular": 0.2}, "right": {"linear": 0.05}}
+
+
+def push(driver: Squeezing, control: str, hand: str = "left") -> None:
+    driver.only, driver.held = hand, {control: 1.0}
+    driver.run(0.1)
+    driver.held = {}
+    driver.run(0.1)
+
+
+def carrying(*hands: str, **changes: object) -> Squeezing:
+    """The left hand carries, after ``hands`` were engaged."""
+    driver = squeezing(bindings=BINDINGS, **changes)
+    driver.engage(*(hands or SIDES))
+    push(driver, "grip")
+    assert driver.states == CARRYING
+    return driver
+
+
+def relation(targets: dict[str, ArmTarget]) -> pin.SE3:
+    left, right = targets["left"].pose, targets["right"].pose
+    assert left is not None
+    assert right is not None
+    return left.actInv(right)
+
+
+def turning(driver: Squeezing, way: float = 0.2, angle: float = 0.6) -> Callable[[float], dict[str, pin.SE3]]:
+    """The left hand goes along and turns within a second; the right one wanders about as it likes."""
+    left, right = (driver.hands[hand] for hand in SIDES)
+
+    def move(t: float) -> dict[str, pin.SE3]:
+        share = min(t, 1.0)
+        turn = pin.exp3(np.array([0.0, 0.3 * angle * share, angle * share]))
+        elsewhere = right.translation + 0.05 * np.sin([3.0 * t, 5.0 * t, 7.0 * t])
+        return {
+            "left": pin.SE3(turn @ left.rotation, left.translation + share * np.array([way, 0.1, -0.1])),
+            "right": pin.SE3(pin.exp3(np.array([0.4 * np.sin(4.0 * t), 0.0, 0.0])) @ right.rotation, elsewhere),
+        }
+
+    return move
+
+
+class TestBothTools:
+    def test_keep_their_relation_at_every_tick_and_turn_about_the_point_between_them(self) -> None:
+        driver = carrying()
+        before = {arm: driver.targets[arm].pose for arm in SIDES}
+        history = driver.run(1.5, turning(driver))
+        for targets in history:
+            assert relation(targets).isApprox(relation({arm: ArmTarget(before[arm], 1.0) for arm in SIDES}), 1e-9)
+        middles = [np.mean([t[arm].pose.translation for arm in SIDES], axis=0) for t in history]  # type: ignore[union-attr]
+        np.testing.assert_allclose(middles[-1] - middles[0], (0.2, 0.1, -0.1), atol=1e-3)
+        turned = history[-1]["right"].pose.rotation @ before["right"].rotation.T  # type: ignore[union-attr]
+        np.testing.assert_allclose(pin.log3(turned), (0.0, 0.18, 0.6), atol=5e-3)
+
+    def test_do_not_jump_when_it_begins_in_mid_motion(self) -> None:
+        driver = squeezing(bindings=BINDINGS)
+        driver.engage()
+        move = turning(driver)
+        history = driver.run(0.4, move)
+        driver.only, driver.held = "left", {"grip": 1.0}
+        history += driver.run(0.6, lambda t: move(0.4 + t))
+        assert driver.states == CARRYING
+        assert_smooth(history)
+
+    @pytest.mark.parametrize("hand", SIDES)
+    def test_are_led_by_the_hand_that_asked(self, hand: str) -> None:
+        driver = squeezing(bindings=BINDINGS)
+        driver.engage()
+        push(driver, "grip", hand)
+        assert driver.states == {hand: "engaged", ("right" if hand == "left" else "left"): "carried"}
+
+    def test_need_only_the_arm_of_that_hand_engaged_and_the_other_one_does_not_move_when_it_begins(self) -> None:
+        driver = carrying("left")
+        held = driver.targets["right"].pose
+        assert held is not None
+        assert held.isApprox(driver.tools["right"], 1e-6)
+
+    def test_are_held_back_together_where_one_arm_cannot_follow(self) -> None:
+        driver = carrying()
+        poses: dict[str, Any] = {arm: driver.targets[arm].pose for arm in SIDES}
+        move = turning(driver, angle=0.0)
+        for tick in range(1500):
+            driver.hands |= move(0.001 * tick)
+            left = driver.targets["left"].pose
+            assert left is not None
+            driver.commanded = {"left": left, "right": poses["right"]}  # which is stuck
+            driver.tick()
+            for arm in SIDES:
+                away = driver.targets[arm].pose.translation - poses[arm].translation  # type: ignore[union-attr]
+                assert np.linalg.norm(away) < 0.03 + (0.01 if arm == "right" else 0.0) + 1e-6
+        assert driver.targets["left"].slip > 0.15
+
+    def test_both_stay_in_their_boxes(self) -> None:
+        box = {"x": [0.4, 0.6], "y": [-0.7, 0.7], "z": [0.35, 0.6], "soft_edge": 0.02}
+        driver = carrying(workspace={"right": box})
+        history = driver.run(2.0, turning(driver))
+        assert_smooth(history)
+        for targets in history:
+            right = targets["right"].pose
+            assert right is not None
+            assert right.translation[0] < 0.6 + 1e-9
+            assert right.translation[2] > 0.35 - 1e-9
+        assert relation(history[-1]).isApprox(relation(history[0]), 1e-9)
+
+    def test_neither_goes_faster_than_its_arm_may(self) -> None:
+        driver = carrying(speed_limit=LIMITS)
+        history = driver.run(2.0, turning(driver))
+        for before, after in pairwise(history):
+            for arm in SIDES:
+                a, b = before[arm].pose, after[arm].pose
+                assert a is not None
+                assert b is not None
+                assert np.linalg.norm(b.translation - a.translation) < 0.05 * 0.001 + 1e-9
+                assert np.linalg.norm(pin.log3(a.rotation.T @ b.rotation)) < 0.2 * 0.001 + 1e-9
+
+
+class TestItEnds:
+    @pytest.mark.parametrize(
+        "end",
+        [
+            pytest.param(lambda driver: push(driver, "grip"), id="by the same control"),
+            pytest.param(lambda driver: push(driver, "grip", "right"), id="by the same control of the other hand"),
+            pytest.param(lambda driver: driver.press("left"), id="by a pause"),
+            pytest.param(lambda driver: driver.press("right"), id="by a pause of the other hand"),
+        ],
+    )
+    def test_for_both_arms_which_hold_until_they_are_engaged_anew(self, end: Callable[[Squeezing], Any]) -> None:
+        driver = carrying()
+        end(driver)
+        assert driver.states == PAUSED
+        assert not any(map(is_fault, driver.events))
+        assert_holds(driver)
+        driver.press(*SIDES)
+        assert driver.states == ENGAGED
+
+    @pytest.mark.parametrize("hand", SIDES)
+    def test_with_an_alignment_after_which_neither_goes_on_by_itself(self, hand: str) -> None:
+        driver = carrying()
+        driver.lower, driver.upper = {hand}, {hand}
+        driver.run(0.3)
+        driver.lower, driver.upper = set(), set()
+        driver.run(0.3)
+        assert driver.states == PAUSED
+        assert_holds(driver)
+
+    @pytest.mark.parametrize("linked", [True, False])
+    def test_with_a_fault_of_the_hand_that_leads(self, linked: bool) -> None:
+        driver = carrying(linked=linked)
+        driver.silent = {"left"}
+        driver.run(0.3)
+        assert driver.states == {"left": "lost", "right": "lost" if linked else "paused"}
+        assert_holds(driver)
+
+    def test_not_with_a_fault_of_the_other_hand_which_may_be_put_down(self) -> None:
+        driver = carrying()
+        driver.silent = {"right"}
+        history = driver.run(1.0, turning(driver))
+        assert driver.states == CARRYING
+        assert all(targets["right"].pose is not None for targets in history)
+
+    def test_with_a_stop_and_with_a_lost_connection(self) -> None:
+        driver = carrying()
+        push(driver, "stick_left", "right")
+        assert driver.states == {"left": "stopped", "right": "stopped"}
+        driver = carrying()
+        driver.teleop.connection_lost(driver.now)
+        driver.run(0.01)
+        assert driver.states == {"left": "lost", "right": "lost"}
+
+
+class TestItDoesNotBegin:
+    @pytest.mark.parametrize(
+        ("engaged", "expected"),
+        [((), "not carried: engage the arm first"), (("right",), "not carried: engage the arm first")],
+    )
+    def test_for_an_arm_that_is_not_engaged(self, engaged: tuple[str, ...], expected: str) -> None:
+        driver = squeezing(bindings=BINDINGS)
+        driver.run(0.1)
+        if engaged:
+            driver.engage(*engaged)
+        push(driver, "grip")
+        assert "carried" not in driver.states.values()
+        assert [event.reason for event in driver.events if is_refusal(event)] == [expected]
+
+    def test_where_a_tool_is_held_up(self) -> None:
+        driver = squeezing(bindings=BINDINGS)
+        driver.engage()
+        driver.commanded = {arm: driver.targets[arm].pose for arm in SIDES}
+        driver.run(1.0, turning(driver))
+        push(driver, "grip")
+        assert driver.states == ENGAGED
+        assert {event.reason for event in driver.events if is_refusal(event)} == {
+            "not carried: a tool is held up on the way to its target"
+        }
+
+    def test_and_while_it_lasts_the_arms_do_not_go_home(self) -> None:
+        driver = carrying()
+        push(driver, "stick_down")
+        assert driver.states == CARRYING
+        assert {event.reason for event in driver.events if is_refusal(event)} == {"not homing: two arms carry"}

@@ -1,0 +1,77 @@
+"""Settings that change while the arms move: no jump, what counts from then on, and what is refused."""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from q2r2_control.config.teleop import TeleopSettings
+from q2r2_control.types import SIDES
+from tests.teleop.hands import ENGAGED, Operator, assert_smooth, engaged, waving
+
+BOX = {"x": [0.3, 0.7], "y": [0.2, 0.6], "z": [0.2, 0.6]}
+CHANGES = {
+    "scales": {"position_scale": 0.3, "rotation_scale": 0.5, "axis_scales": (1.0, 0.5, 2.0)},
+    "precision": {"precision_scale": 0.1},
+    "rotation frame": {"rotation_frame": "tool"},
+    "filter": {"filter": {"smoothing_delay": 0.1, "interpolation_delay": 0.05}},
+    "leash": {"leash": {"distance": 0.05}},
+    "workspace": {"workspace": {"left": BOX}},
+    "speed limit": {"speed_limit": {"left": {"linear": 0.05}}},
+    "gate": {"gate": {"max_jump": 0.05}},
+}
+
+
+def settings(driver: Operator, **changes: object) -> TeleopSettings:
+    return TeleopSettings.model_validate(driver.settings.model_dump() | changes)
+
+
+@pytest.mark.parametrize("changes", CHANGES.values(), ids=CHANGES)
+def test_an_arm_that_moves_goes_on_without_a_jump(changes: dict[str, object]) -> None:
+    driver = engaged()
+    move = waving(driver)
+    history = driver.run(0.4, move)
+    assert driver.teleop.change(settings(driver, **changes), driver.now) is None
+    history += driver.run(0.6, lambda t: move(0.4 + t))
+    assert driver.states == ENGAGED
+    assert_smooth(history)
+
+
+def test_what_was_changed_counts_from_then_on() -> None:
+    driver = engaged()
+    assert driver.teleop.change(settings(driver, position_scale=0.5), driver.now) is None
+    start = dict(driver.hands)
+    moved = {hand: pin.SE3(at.rotation, at.translation + np.array([0.1, 0.0, 0.0])) for hand, at in start.items()}
+    driver.run(1.0, lambda t: {hand: pin.SE3.Interpolate(start[hand], moved[hand], min(t, 1.0)) for hand in SIDES})
+    driver.run(0.5)
+    for arm in SIDES:
+        way = driver.targets[arm].pose.translation - driver.tools[arm].translation  # type: ignore[union-attr]
+        np.testing.assert_allclose(way, (0.05, 0.0, 0.0), atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{"stance": "mirror"}, {"axes": ("+y", "-x", "+z")}, {"bindings": {"grip": "home"}}, {"hold_time": 1.0}],
+    ids=["stance", "axes", "bindings", "hold_time"],
+)
+def test_what_turns_the_hands_or_their_controls_round_waits_until_both_arms_hold(changes: dict[str, object]) -> None:
+    driver = engaged()
+    refusal = driver.teleop.change(settings(driver, **changes), driver.now)
+    assert refusal == "stance, axes and controls may be changed while both arms hold"
+    assert driver.teleop.settings == driver.settings
+    driver.press(*SIDES)
+    assert driver.teleop.change(settings(driver, **changes), driver.now) is None
+    driver.run(0.3)
+    driver.press(*SIDES)
+    assert driver.states == ENGAGED
+
+
+def test_a_stance_that_is_changed_gives_each_hand_the_other_arm() -> None:
+    driver = engaged()
+    driver.press(*SIDES)
+    assert driver.teleop.change(settings(driver, stance="mirror"), driver.now) is None
+    assert [driver.teleop.hand_of(arm) for arm in SIDES] == ["right", "left"]
+    driver.run(0.2)
+    driver.press("left")
+    assert driver.states == {"left": "paused", "right": "engaged"}
