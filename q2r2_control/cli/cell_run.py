@@ -19,7 +19,7 @@ from q2r2_control.config.external import ControllerKind
 from q2r2_control.errors import ConfigError, RecordingError
 from q2r2_control.inputs.base import Input
 from q2r2_control.inputs.scripted import ScriptedInput
-from q2r2_control.judging.judge import Judged, judge, keep_verdict
+from q2r2_control.judging.judge import Judged, judge, keep_verdicts
 from q2r2_control.pipeline import Pipeline
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.recording.about import About
@@ -118,7 +118,7 @@ def print_summary(run: CellRun, json: bool) -> None:
     """Print the summary of a run on stdout, as a table or as one JSON object, and the verdict on its recording."""
     if json:
         judged = _judge_recording(run.recording)
-        verdict = {} if judged is None else {"judge": judged.as_json()}
+        verdict = {"judge": [one.as_json() for one in judged]} if judged else {}
         print(as_json_text({**run.as_json(), **verdict}))
         return
     console = Console()
@@ -127,20 +127,21 @@ def print_summary(run: CellRun, json: bool) -> None:
         console.print(task_line(task), soft_wrap=True, highlight=False)
     if run.recording is not None:
         console.print(recording_line(run.recording), soft_wrap=True, highlight=False)
-        if judged := _judge_recording(run.recording):
-            console.print(f"verdict: {verdict_markup(judged.verdict)}", soft_wrap=True, highlight=False)
+        for one in _judge_recording(run.recording):
+            which = "" if one.figures.part is None else f" on episode {one.figures.part}"
+            console.print(f"verdict{which}: {verdict_markup(one.verdict)}", soft_wrap=True, highlight=False)
 
 
-def _judge_recording(recording: RecordingSummary | None) -> Judged | None:
-    """Judge the file as it was written, and keep the verdict beside it. Whatever fails is one line on stderr."""
+def _judge_recording(recording: RecordingSummary | None) -> list[Judged]:
+    """Judge the file as it was written, and keep the verdicts beside it. Whatever fails is one line on stderr."""
     if recording is None or recording.file is None or not Path(recording.file).exists():
-        return None
+        return []
     try:
         judged = judge(Recording(Path(recording.file)))
-        keep_verdict(judged)
+        keep_verdicts(judged)
     except RecordingError as error:
         stderr_console().print(f"not judged: {error}", soft_wrap=True, highlight=False, markup=False)
-        return None
+        return []
     return judged
 
 

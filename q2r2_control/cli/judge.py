@@ -45,7 +45,8 @@ def judge(recordings: Recordings, config: Thresholds = None, json: Json = False)
     console.print(_table(judged))
     for one in judged:
         if not one.verdict.keep:
-            console.print(f"{escape(one.figures.file)}: {verdict_markup(one.verdict)}", soft_wrap=True, highlight=False)
+            name = one.figures.file + ("" if one.figures.part is None else f" #{one.figures.part}")
+            console.print(f"{escape(name)}: {verdict_markup(one.verdict)}", soft_wrap=True, highlight=False)
 
 
 def report(
@@ -85,6 +86,6 @@ def _table(judged: Sequence[Judged]) -> Table:
     headings = tuple(column.heading for column in columns)
     table = figure_table(f"episodes: {kept} kept, {len(judged) - kept} discarded", "episode", ("verdict", *headings))
     for one in judged:
-        name = Text(Path(one.figures.file).stem)
+        name = Text(one.figures.name)
         table.add_row(name, one.verdict.word, *(column.text(one.figures) for column in columns))
     return table

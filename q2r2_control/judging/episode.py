@@ -66,7 +66,7 @@ class Hand:
 
 @dataclass(frozen=True)
 class Episode:
-    """One recording. Times are since its run began."""
+    """One recording, or an episode in it. Times are since it began."""
 
     recording: Recording
     config: Config
@@ -76,6 +76,9 @@ class Episode:
     hands: dict[str, Hand]  # those that lead an arm
     events: list[Event]
     damage: str | None  # why the file could be read no farther
+    part: int | None = None  # of the recording's episodes, from 1 on; None: the whole
+    discarded: bool = False  # by its operator
+    ended_by_operator: bool = False  # while the run went on
 
     @property
     def arms(self) -> tuple[str, ...]:
@@ -95,7 +98,9 @@ class Episode:
 
     @property
     def ended(self) -> bool:
-        """Whether the run came to its end and the file was closed."""
+        """Whether the run came to its end and the file was closed, or the operator ended the episode before."""
+        if self.ended_by_operator:
+            return True
         return self.recording.closed and bool(len(self.ticks.t)) and not self.ticks.following[-1]
 
 

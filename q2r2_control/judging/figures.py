@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -29,6 +30,7 @@ class EpisodeFigures:
     """The numbers of one episode. Shares are from 0 to 1; None: there is nothing to tell it by."""
 
     file: str
+    part: int | None  # which episode of the file, from 1 on; None: the whole
     task: str
     duration_s: float  # until the run begins to end
     engaged_s: float  # of any arm
@@ -44,6 +46,12 @@ class EpisodeFigures:
     min_margin_mm: float | None  # of the tightest one, less the distance that it keeps
     timing: TimingFigures
     damage: str | None  # why the file could be read no farther
+    discarded: bool  # by the operator
+
+    @property
+    def name(self) -> str:
+        """Of the file, and which of its episodes."""
+        return Path(self.file).stem + ("" if self.part is None else f" #{self.part}")
 
 
 def figures_of(episode: Episode, dropout: float) -> EpisodeFigures:
@@ -54,6 +62,7 @@ def figures_of(episode: Episode, dropout: float) -> EpisodeFigures:
     count = len(ticks.t)
     return EpisodeFigures(
         file=str(episode.recording.file),
+        part=episode.part,
         task=episode.recording.about.notes.get("task", ""),
         duration_s=float(ticks.t[following][-1]) if following.any() else 0.0,
         engaged_s=float(ticks.dt[engaged].sum()),
@@ -69,6 +78,7 @@ def figures_of(episode: Episode, dropout: float) -> EpisodeFigures:
         min_margin_mm=_least_mm(ticks.margin),
         timing=timing_figures(episode),
         damage=episode.damage,
+        discarded=episode.discarded,
     )
 
 

@@ -14,16 +14,17 @@ from q2r2_control.config.judge import JudgeSettings
 from q2r2_control.errors import RecordingError
 from q2r2_control.judging.episode import Episode, read_episode
 from q2r2_control.judging.figures import EpisodeFigures, figures_of
+from q2r2_control.judging.parts import parts_of
 from q2r2_control.judging.verdict import Verdict, verdict_of
 from q2r2_control.recording.reader import Recording
 
 VERDICT_FILE = "verdict.json"
-_FORMAT = 1
+_FORMAT = 2
 
 
 @dataclass(frozen=True)
 class Judged:
-    """One recording, its numbers, and what became of them."""
+    """One episode, its numbers, and what became of them."""
 
     episode: Episode
     figures: EpisodeFigures
@@ -38,15 +39,17 @@ class Judged:
         return found
 
 
-def judge(recording: Recording, settings: JudgeSettings | None = None) -> Judged:
-    """Judge a recording by these thresholds, or by those of the cell that it was recorded with.
+def judge(recording: Recording, settings: JudgeSettings | None = None) -> list[Judged]:
+    """Judge the episodes of a recording by these thresholds, or by those of the cell that it was recorded with.
 
     Raises :class:`RecordingError` where that cell cannot be built.
     """
-    episode = read_episode(recording)
-    chosen = settings or episode.config.judge
-    figures = figures_of(episode, chosen.dropout)
-    return Judged(episode, figures, verdict_of(figures, chosen), chosen)
+    return [_judge(episode, settings or episode.config.judge) for episode in parts_of(read_episode(recording))]
+
+
+def _judge(episode: Episode, settings: JudgeSettings) -> Judged:
+    figures = figures_of(episode, settings.dropout)
+    return Judged(episode, figures, verdict_of(figures, settings), settings)
 
 
 def judge_all(files: Sequence[Path], settings: JudgeSettings | None = None) -> Iterator[Judged]:
@@ -55,16 +58,17 @@ def judge_all(files: Sequence[Path], settings: JudgeSettings | None = None) -> I
     Raises :class:`RecordingError` for a file that is none, before the first is judged.
     """
     for recording in [Recording(file) for file in files]:
-        yield judge(recording, settings)
+        yield from judge(recording, settings)
 
 
-def keep_verdict(judged: Judged) -> Path:
-    """Write a verdict beside its recording, whole or not at all. Raises :class:`RecordingError`."""
-    recording = judged.episode.recording
+def keep_verdicts(judged: Sequence[Judged]) -> Path:
+    """Write the verdicts on a recording's episodes beside it, whole or not at all. Raises :class:`RecordingError`."""
+    recording = judged[0].episode.recording
     target = recording.file.with_name(VERDICT_FILE)
     part = target.with_suffix(".part")
-    thresholds = judged.settings.model_dump(mode="json")
-    data = {"format": _FORMAT, "recording": recording.file.name, **judged.as_json(), "thresholds": thresholds}
+    thresholds = judged[0].settings.model_dump(mode="json")
+    episodes = [one.as_json() for one in judged]
+    data = {"format": _FORMAT, "recording": recording.file.name, "episodes": episodes, "thresholds": thresholds}
     try:
         part.write_text(json.dumps(data, indent=1, allow_nan=False) + "\n", encoding="utf-8")
         os.replace(part, target)

@@ -7,7 +7,6 @@ from base64 import b64encode
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from html import escape
-from pathlib import Path
 
 from q2r2_control.judging.figures import EpisodeFigures
 from q2r2_control.judging.judge import Judged
@@ -89,7 +88,7 @@ def _row(judged: Judged, number: int) -> str:
     )
     return (
         f'<tr data-verdict="{word}"><td class="number" data-value="{number}">{number}</td>'
-        f'<td><a href="#episode-{number}">{escape(_name(judged))}</a></td><td>{_badge(word)}</td>{cells}</tr>'
+        f'<td><a href="#episode-{number}">{escape(judged.figures.name)}</a></td><td>{_badge(word)}</td>{cells}</tr>'
     )
 
 
@@ -100,19 +99,15 @@ def _section(judged: Judged, number: int) -> str:
     why = f"<ul>{reasons}</ul>" if reasons else ""
     return (
         f'<section id="episode-{number}" data-verdict="{word}">'
-        f"<h2>{number}. {escape(_name(judged))} {_badge(word)}</h2>{task}{why}{_picture(judged)}</section>"
+        f"<h2>{number}. {escape(judged.figures.name)} {_badge(word)}</h2>{task}{why}{_picture(judged)}</section>"
     )
 
 
 def _picture(judged: Judged) -> str:
     """As an image of its own, since names of elements are the same in all of them."""
     data = b64encode(draw_episode(judged).encode()).decode()
-    alt = escape(f"plots of {_name(judged)}")
+    alt = escape(f"plots of {judged.figures.name}")
     return f'<img alt="{alt}" width="1248" height="806" src="data:image/svg+xml;base64,{data}">'
-
-
-def _name(judged: Judged) -> str:
-    return Path(judged.figures.file).stem
 
 
 def _badge(word: str) -> str:

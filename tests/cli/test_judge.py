@@ -93,11 +93,11 @@ class TestARunThatIsRecorded:
     def test_prints_its_verdict_and_keeps_it_beside_the_file(self, tmp_path: Path) -> None:
         result = q2r2(*FAST, *self.OPTIONS, "--record", str(tmp_path))
         assert result.exit_code == 0
-        judge = one_object(result.stdout)["judge"]
+        (judge,) = one_object(result.stdout)["judge"]
         assert judge["verdict"] == "keep"
         (kept,) = tmp_path.rglob("verdict.json")
         written = json.loads(kept.read_text())
-        assert {name: written[name] for name in judge} == judge
+        assert written["episodes"] == [judge]
         again = one_object(q2r2("judge", str(tmp_path), "--json").stdout)["episodes"]
         assert again == [judge]
         with AnyReader([kept.parent]) as bag:  # is one still

@@ -155,9 +155,9 @@ def loop_of(source: object, **changes: object) -> Pipeline:
     return Pipeline.from_config(config, input=source, plant="kinematic")  # type: ignore[arg-type]
 
 
-def record_episode(folder: Path, source: object, duration: float = DURATION) -> Path:
+def record_episode(folder: Path, source: object, duration: float = DURATION, **changes: object) -> Path:
     """The file of a recorded run."""
-    loop = loop_of(source)
+    loop = loop_of(source, **changes)
     with Recorder(folder, "test", waits=True) as recorder:
         recorder.begin(About.of(loop, False, {"task": "a test"}), loop.robot)
         loop.listeners.append(recorder)

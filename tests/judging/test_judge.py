@@ -14,7 +14,7 @@ import pytest
 from q2r2_control.config.judge import JudgeSettings
 from q2r2_control.errors import RecordingError
 from q2r2_control.inputs.base import Input
-from q2r2_control.judging.judge import VERDICT_FILE, Judged, judge, judge_all, keep_verdict
+from q2r2_control.judging.judge import VERDICT_FILE, Judged, judge, judge_all, keep_verdicts
 from q2r2_control.recording.reader import Recording
 from q2r2_control.types import HandInputs
 from tests.judging.runs import (
@@ -37,7 +37,8 @@ SEED = 0
 
 
 def judged(file: Path) -> Judged:
-    return judge(Recording(file))
+    (whole,) = judge(Recording(file))
+    return whole
 
 
 @pytest.fixture(scope="module")
@@ -159,7 +160,7 @@ def test_a_recording_whose_process_was_killed_says_so_alone(clean: Path, tmp_pat
     found = judged(killed(clean, tmp_path / "killed.mcap", 800))
     assert [reason.name for reason in found.verdict.reasons] == ["needs_end"]
     assert found.figures.timing.ticks == 800
-    kept = judge(Recording(tmp_path / "killed.mcap"), JudgeSettings(needs_end=False))
+    (kept,) = judge(Recording(tmp_path / "killed.mcap"), JudgeSettings(needs_end=False))
     assert kept.verdict.keep
 
 
@@ -205,13 +206,15 @@ def test_where_the_operator_rests_changes_nothing(folder: Path) -> None:
 
 def test_a_verdict_is_kept_beside_the_file_with_all_that_it_was_made_of(clean: Path, tmp_path: Path) -> None:
     file = Path(shutil.copy(clean, tmp_path))
-    written = keep_verdict(judged(file))
+    written = keep_verdicts([judged(file)])
     assert written == tmp_path / VERDICT_FILE
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted([file.name, VERDICT_FILE])
     kept = json.loads(written.read_text())
-    assert (kept["format"], kept["recording"], kept["verdict"], kept["reasons"]) == (1, file.name, "keep", [])
+    assert (kept["format"], kept["recording"]) == (2, file.name)
+    (episode,) = kept["episodes"]
+    assert (episode["verdict"], episode["reasons"]) == ("keep", [])
     assert JudgeSettings.model_validate(kept["thresholds"]) == JudgeSettings()
-    assert kept["figures"]["arms"]["left"]["gripper_changes"] == 1
+    assert episode["figures"]["arms"]["left"]["gripper_changes"] == 1
 
 
 def test_a_file_that_is_no_recording_is_told_before_any_is_judged(clean: Path, tmp_path: Path) -> None:

@@ -1,0 +1,100 @@
+"""Episodes that an operator tells of while a run is recorded: judged one by one, replayed as a whole."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from q2r2_control.config.teleop import TeleopSettings
+from q2r2_control.judging.episode import read_episode
+from q2r2_control.judging.judge import Judged, judge
+from q2r2_control.judging.page import page_of
+from q2r2_control.recording.reader import Recording
+from q2r2_control.recording.replay import replay
+from q2r2_control.types import HandInputs
+from tests.judging.runs import hands, loop_of, press, record_episode
+
+BINDINGS = {"trigger": "record_toggle", "grip": "record_discard", "stick_up": "record_mark"}
+# Three episodes, 1 to 2.5, 3 to 4.5 and from 5 s on, of which the second is discarded after it has ended.
+TOGGLED, DISCARDED, MARKED = (1.0, 2.5, 3.0, 4.5, 5.0), 4.7, 1.7
+DURATION = 7.0
+
+
+def controls(hand: str, t: float) -> HandInputs:
+    def held(*begin: float) -> float:
+        return float(hand == "left" and any(at <= t < at + 0.1 for at in begin))
+
+    return replace(
+        press(hand, t),
+        press_index=held(*TOGGLED),
+        press_middle=held(DISCARDED),
+        thumb_stick_vertical=held(MARKED),
+    )
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    teleop = TeleopSettings.model_validate({"bindings": BINDINGS})
+    return record_episode(tmp_path_factory.mktemp("parts"), hands(5, inputs=controls), DURATION, teleop=teleop)
+
+
+@pytest.fixture(scope="module")
+def judged(file: Path) -> list[Judged]:
+    return judge(Recording(file))
+
+
+def test_each_is_judged_by_what_is_in_it_alone(judged: list[Judged]) -> None:
+    assert [one.figures.part for one in judged] == [1, 2, 3]
+    assert [one.verdict.line for one in judged] == ["keep", "discard: its operator discarded it", "keep"]
+    durations = [one.figures.duration_s for one in judged]
+    assert durations == [pytest.approx(seconds, abs=0.05) for seconds in (1.5, 1.5, 2.0)]
+    assert [one.figures.timing.lost_ticks for one in judged] == [0, 0, 0]
+    for one in judged:
+        hand = one.figures.hands["left"]
+        assert hand.pose_rate_hz == pytest.approx(75.0, rel=0.05)
+        assert one.figures.idle_share is not None
+        assert one.figures.idle_share < 0.5
+    # The gripper closes at 2 s, which is in the first one.
+    assert [one.figures.arms["left"].gripper_changes for one in judged] == [1, 0, 0]
+
+
+def test_its_events_are_by_its_own_time(judged: list[Judged]) -> None:
+    marks = [(event.t, event.reason) for event in judged[0].episode.events]
+    assert marks == [
+        (pytest.approx(0.0, abs=0.02), "episode begins"),
+        (pytest.approx(MARKED - TOGGLED[0], abs=0.03), "mark"),
+        (pytest.approx(1.5, abs=0.03), "episode ends"),
+    ]
+
+
+def test_they_have_names_of_their_own_on_the_page(file: Path, judged: list[Judged]) -> None:
+    page = page_of(judged, "Recordings")
+    for number in (1, 2, 3):
+        assert f">{file.stem} #{number}</a>" in page
+
+
+def test_the_run_is_replayed_to_the_bit(file: Path) -> None:
+    found = replay(file)
+    assert found.difference is None
+    assert found.ended_by is None
+
+
+def test_frames_are_of_the_ticks_that_they_were_of(file: Path, judged: list[Judged]) -> None:
+    whole = read_episode(Recording(file))
+    for one, began in zip(judged, (1.0, 3.0, 5.0), strict=True):
+        episode = one.episode
+        np.testing.assert_allclose(np.diff(episode.frame_t), 0.012, atol=0.0045)
+        at = np.searchsorted(whole.frame_t, began + episode.frame_t[10], side="left")
+        near = whole.tools[max(at - 3, 0) : at + 3, 0, :3]
+        assert np.abs(near - episode.tools[10, 0, :3]).max(axis=1).min() < 1e-9
+
+
+def test_where_nothing_is_recorded_the_controls_say_so() -> None:
+    teleop = TeleopSettings.model_validate({"bindings": BINDINGS})
+    loop = loop_of(hands(3, inputs=controls), teleop=teleop)
+    summary = loop.run(1.5, realtime=False)
+    told = [event.reason for event in summary.events if "record" in event.reason]
+    assert told == ["not recorded: this run has no recording"]
