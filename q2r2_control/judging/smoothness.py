@@ -17,6 +17,7 @@ from q2r2_control.types import Array
 
 PIECE = 1.0  # [s]
 _HOP = 0.25  # from one piece to the next [s]
+_FEWEST = 8  # pieces
 _SLOWEST = 0.02  # mean speed of a piece that counts [m/s]
 _LONGEST_GAP = 0.05  # between two frames [s]
 _HIGHEST = 10.0  # frequency that counts [Hz]
@@ -28,12 +29,13 @@ _PADDING = 16  # of the spectrum, times the length of a piece
 def smoothness(t: Array, position: Array, engaged: Flags) -> tuple[float | None, float | None]:
     """Medians of :func:`sparc` and, of smoothed positions, :func:`ldlj` over the pieces of a tool's motion.
 
-    ``position`` (n, 3) [m] is at the times ``t`` (n,) [s]. None: no piece moves at 20 mm/s on average.
+    ``position`` (n, 3) [m] is at the times ``t`` (n,) [s]. None: fewer than eight pieces, 2.75 s in
+    all, move at 20 mm/s on average; the median of so few says little.
     """
     moving = []
     for begin, end in stretches(engaged & np.isfinite(position).all(axis=1)):
         moving += _pieces(t[begin:end], position[begin:end])
-    if not moving:
+    if len(moving) < _FEWEST:
         return None, None
     return float(np.median([sparc(piece, FRAME) for piece in moving])), float(
         np.median([ldlj(_smoothed(piece), FRAME) for piece in moving])
