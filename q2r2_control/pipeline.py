@@ -23,10 +23,11 @@ from q2r2_control.plants.base import Plant
 from q2r2_control.plants.factory import check_mode, make_plant
 from q2r2_control.robot.robot import Robot
 from q2r2_control.runtime.loop_clock import LoopClock
-from q2r2_control.runtime.operator_side import OperatorSide, Wishes
+from q2r2_control.runtime.operator_side import OperatorSide
 from q2r2_control.runtime.process import few_garbage_collections, stop_on_signals
 from q2r2_control.runtime.recorder import RunRecorder, RunStart, Tick
 from q2r2_control.runtime.run_summary import RunSummary
+from q2r2_control.runtime.wishes import Wishes
 from q2r2_control.supervision.grasp_watch import GraspWatch
 from q2r2_control.supervision.gripper_limiter import GripperLimiter
 from q2r2_control.supervision.joint_watch import watch_settings

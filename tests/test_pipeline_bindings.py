@@ -155,7 +155,7 @@ def test_a_program_may_send_the_arms_home_too() -> None:
     loop.listeners.append(lambda tick: loop.go_home() if 1.5 <= tick.t < 1.502 else None)
     loop.run(6.0, realtime=False)
     events = [event.reason for tick in watch.ticks for event in tick.events if event.arm == "left"]
-    assert events == ["lower button", "way home", "at home"]
+    assert events == ["lower button", "a program asks for the way home", "way home", "at home"]
     assert farthest_from_home(watch.ticks[-1]) < 0.005
 
 
@@ -195,7 +195,8 @@ def test_what_a_program_changes_counts_from_the_next_tick_on_without_a_jump() ->
     loop.listeners.append(lambda tick: loop.change_teleop(half) if 1.5 <= tick.t < 1.502 else None)
     loop.run(4.0, realtime=False)
     events = [event for tick in watch.ticks for event in tick.events if event.arm == "left"]
-    assert [event.reason for event in events] == ["lower button", "settings changed"]
+    change = 'a program changes settings: {"position_scale": 0.5}'
+    assert [event.reason for event in events] == ["lower button", change, "settings changed"]
     following = [tick for tick in watch.ticks if tick.targets["left"].pose is not None]
     ways = [
         float(np.linalg.norm(after.targets["left"].pose.translation - before.targets["left"].pose.translation))  # type: ignore[union-attr]

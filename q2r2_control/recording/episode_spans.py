@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from q2r2_control.errors import RecordingError
 from q2r2_control.recording import topics as names
 from q2r2_control.recording.reader import RecordedChunk, Recording
-from q2r2_control.recording.rows import text_of
+from q2r2_control.recording.rows import sequence_of, text_of
 from q2r2_control.teleop.episode_marks import BEGINS, DISCARDED, ENDS, MARK
 from q2r2_control.types import Event
 
@@ -52,11 +52,21 @@ def spans_of(events: Iterable[Event]) -> list[EpisodeSpan]:
     ]
 
 
+def events_of_ticks(chunk: RecordedChunk) -> dict[int, list[Event]]:
+    """What happened to the arms' states, by the number of the tick.
+
+    Raises :class:`ValueError`, :class:`KeyError` and :class:`TypeError` for what is no such thing.
+    """
+    return {
+        sequence_of(record): [Event(**event) for event in json.loads(text_of(record)).get("events", ())]
+        for record in chunk.texts.get(names.STATE, ())
+    }
+
+
 def events_of(chunk: RecordedChunk) -> Iterator[Event]:
-    """What happened to the arms' states. Raises :class:`ValueError`, :class:`KeyError` and :class:`TypeError`."""
-    for record in chunk.texts.get(names.STATE, ()):
-        for event in json.loads(text_of(record)).get("events", ()):
-            yield Event(**event)
+    """The same in the order of time."""
+    for events in events_of_ticks(chunk).values():
+        yield from events
 
 
 def read_spans(recording: Recording) -> list[EpisodeSpan]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,13 +18,24 @@ from q2r2_control.errors import PlantError, RecordingError
 from q2r2_control.pipeline import Pipeline
 from q2r2_control.recording import topics as names
 from q2r2_control.recording.comparison import Comparison, changes
+from q2r2_control.recording.episode_spans import events_of_ticks
 from q2r2_control.recording.packing import NOT_MEASURED
 from q2r2_control.recording.reader import RecordedChunk, Recording
 from q2r2_control.robot.robot import Robot
 from q2r2_control.runtime.loop_clock import LoopClock
 from q2r2_control.runtime.recorder import RunStart
 from q2r2_control.runtime.run_summary import RunSummary
-from q2r2_control.types import SIDES, Array, Command, CommandMode, HandInputs, HandSample, HapticFeedback, RobotState
+from q2r2_control.types import (
+    SIDES,
+    Array,
+    Command,
+    CommandMode,
+    Event,
+    HandInputs,
+    HandSample,
+    HapticFeedback,
+    RobotState,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,6 +51,7 @@ class RecordedTick:
     state: RobotState
     openings: dict[str, float]
     unsolved: int
+    events: list[Event]
 
 
 class RecordedTicks:
@@ -92,6 +104,7 @@ class RecordedTicks:
         states = chunk.rows[names.JOINT_STATES]
         felt = deque(chunk.rows[names.EXTERNAL_TORQUE]["effort"]) if names.EXTERNAL_TORQUE in chunk.rows else deque()
         samples = deque(chunk.rows[names.SAMPLES]["data"]) if names.SAMPLES in chunk.rows else deque()
+        events = events_of_ticks(chunk)
         for numbers, state in zip(chunk.rows[names.TICK]["data"], states, strict=True):
             tick = dict(zip(self._labels, numbers.tolist(), strict=True))
             openings = {arm: tick[f"opening_{arm}"] for arm in self._arms}
@@ -111,6 +124,7 @@ class RecordedTicks:
                 ),
                 openings={arm: opening for arm, opening in openings.items() if opening != NOT_MEASURED},
                 unsolved=int(tick["unsolved"]),
+                events=events.get(int(tick["index"]), []),
             )
 
 
@@ -122,12 +136,17 @@ class ReplayPipeline(Pipeline):
     """Runs the loop with the clock, input and plant of a recording, and its solver as late as it was then."""
 
     def __init__(self, config: Config, robot: Robot, ticks: RecordedTicks, mode: str, modes: tuple[str, ...]) -> None:
-        super().__init__(config, robot, _Input(ticks), _Plant(ticks, modes), mode)
+        super().__init__(config, robot, _Input(ticks, self._wish_again), _Plant(ticks, modes), mode)
         self._recorded = ticks
 
     def make_clock(self, realtime: bool) -> LoopClock:
         """See :meth:`Pipeline.make_clock`."""
         return _Clock(1.0 / self.config.loop_rate_hz, self._recorded)
+
+    def _wish_again(self, events: list[Event]) -> None:
+        """What a program asked of the run at this tick; both arms were told of it, so it is asked twice."""
+        for event in events:
+            self.wishes.take(event.reason, self.teleop.settings)
 
     def _prepare(self, realtime: bool) -> None:
         settings = permitted(self.config.control.model_copy(update={"solve_time_limit": None}), self.drive)
@@ -206,8 +225,8 @@ class _Clock(LoopClock):
 class _Input:
     """The samples of the recorded tick. Implements :class:`Input`."""
 
-    def __init__(self, ticks: RecordedTicks) -> None:
-        self._ticks = ticks
+    def __init__(self, ticks: RecordedTicks, tell: Callable[[list[Event]], None]) -> None:
+        self._ticks, self._tell = ticks, tell
 
     @property
     def connected(self) -> bool:
@@ -217,7 +236,10 @@ class _Input:
         pass
 
     def poll(self, now: float) -> list[HandSample]:
-        return [] if self._ticks.current is None else self._ticks.current.samples
+        if self._ticks.current is None:
+            return []
+        self._tell(self._ticks.current.events)
+        return self._ticks.current.samples
 
     def send_haptic(self, feedback: HapticFeedback) -> None:
         pass

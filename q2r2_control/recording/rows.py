@@ -152,3 +152,8 @@ def hand_inputs() -> RowType:
 def log_time(record: bytes) -> int:
     """Of a message's record [ns]."""
     return int(HEAD.unpack_from(record)[4])
+
+
+def sequence_of(record: bytes) -> int:
+    """The number of a message's record."""
+    return int(HEAD.unpack_from(record)[3])

@@ -4,32 +4,20 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import pinocchio as pin
 
-from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.inputs.base import Input
 from q2r2_control.runtime.operator_feedback import OperatorFeedback
+from q2r2_control.runtime.wishes import Wishes
 from q2r2_control.supervision.supervisor import Supervisor
 from q2r2_control.teleop.arm_states import is_fault
 from q2r2_control.teleop.teleop import Teleop
 from q2r2_control.types import ArmTarget, Event, HandSample, Reference, RobotState
 
 _logger = logging.getLogger(__name__)
-
-
-@dataclass(slots=True)
-class Wishes:
-    """What a program asks of a run that goes on, from any thread; each is done once, at the next tick."""
-
-    home: bool = False
-    settings: TeleopSettings | None = None
-
-    def clear(self) -> None:
-        """Ask for nothing any more."""
-        self.home, self.settings = False, None
 
 
 class OperatorSide:
@@ -96,6 +84,8 @@ class OperatorSide:
 
     def _fulfil(self, now: float) -> None:
         home, settings = self._wishes.home, self._wishes.settings
+        for line in self._wishes.told(self._teleop.settings):
+            self._teleop.tell(now, line)
         self._wishes.clear()
         if home:
             self._teleop.home(now)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from q2r2_control.config import Config
+from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.control.qp import DaqpSolver, QpProblem, QpSolution
 from q2r2_control.errors import PlantError, RecordingError
 from q2r2_control.inputs.scripted import ScriptedInput
@@ -19,10 +20,14 @@ from q2r2_control.recording.recorder import Recorder
 from q2r2_control.recording.replay import replay
 from q2r2_control.recording.rows import HEAD
 from q2r2_control.robot.robot import Robot
+from q2r2_control.runtime.recorder import Tick
 from q2r2_control.types import HandSample, RobotState
 from tests.recording.runs import RATE, file_of, pipeline, record, rewrite
 from tests.support.object_cell import cell as object_cell
 from tests.support.watch import cell
+
+
+BOX = {"x": [0.3, 0.8], "y": [0.0, 0.6], "z": [0.1, 0.7]}
 
 
 @pytest.fixture(scope="module")
@@ -50,6 +55,28 @@ def test_a_replay_of_a_run_in_simulated_time_is_identical(
     assert result.summary is not None
     assert result.summary.arms["left"].engaged_s > 0.3
     assert result.summary.at_rest
+
+
+def test_what_a_program_asked_of_the_run_is_asked_again(tmp_path: Path) -> None:
+    loop = pipeline("circle", "kinematic")
+    teleop = loop.config.teleop
+    other = TeleopSettings.model_validate(
+        teleop.model_dump() | {"position_scale": 0.3, "workspace": {"left": BOX}, "filter": {"smoothing_delay": 0.05}}
+    )
+
+    def ask(tick: Tick) -> None:
+        if 0.8 <= tick.t < 0.8 + 0.9 / RATE:
+            loop.change_teleop(other)
+        if 1.2 <= tick.t < 1.2 + 0.9 / RATE:
+            loop.go_home()
+
+    loop.listeners.append(ask)
+    result = replay(file_of(record(tmp_path, loop, 1.6)))
+    assert result.summary is not None
+    told = [event.reason for event in result.summary.events if event.arm == "left"]
+    assert told[1].startswith('a program changes settings: {"position_scale": 0.3')
+    assert told[2:5] == ["settings changed", "a program asks for the way home", "way home"]
+    assert (result.difference, result.ended_by, result.notes) == (None, None, [])
 
 
 def test_a_replay_of_a_run_by_the_computers_clock_is_identical(tmp_path: Path) -> None:
