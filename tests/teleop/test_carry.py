@@ -151,6 +151,19 @@ class TestItEnds:
         driver.press(*SIDES)
         assert driver.states == ENGAGED
 
+    def test_and_then_each_arm_is_on_its_own_leash_and_in_its_own_box(self) -> None:
+        box = {"x": [0.3, 0.9], "y": [-0.7, 0.7], "z": [0.1, 0.8]}
+        driver = carrying(workspace={"left": box, "right": box | {"x": [0.3, 0.51]}})
+        driver.press("left")
+        driver.press("left")
+        assert driver.states == {"left": "engaged", "right": "paused"}
+        held = driver.targets["left"].pose
+        assert held is not None
+        driver.commanded = {"left": held}  # which is stuck
+        driver.run(1.5, turning(driver, angle=0.0))
+        away = driver.targets["left"].pose.translation - held.translation  # type: ignore[union-attr]
+        assert np.linalg.norm(away) == pytest.approx(0.1, abs=1e-6)
+
     @pytest.mark.parametrize("hand", SIDES)
     def test_with_an_alignment_after_which_neither_goes_on_by_itself(self, hand: str) -> None:
         driver = carrying()

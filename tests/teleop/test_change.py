@@ -75,3 +75,14 @@ def test_a_stance_that_is_changed_gives_each_hand_the_other_arm() -> None:
     driver.run(0.2)
     driver.press("left")
     assert driver.states == {"left": "paused", "right": "engaged"}
+
+
+def test_a_press_that_began_before_the_hands_were_turned_round_engages_nothing() -> None:
+    driver = engaged()
+    driver.press(*SIDES)
+    driver.lower = {"left"}
+    driver.run(0.03)
+    assert driver.teleop.change(settings(driver, stance="mirror"), driver.now) is None
+    driver.lower = set()
+    driver.run(0.3)
+    assert driver.states == {"left": "paused", "right": "paused"}
