@@ -18,7 +18,7 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = "q2r2_control"
 
 # From the bottom to the top. A room imports only from rooms below it; those that share a line are independent of each
-# other, except for drives and supervision.
+# other.
 LEVELS = (
     {"_lazy", "errors", "types"},
     {"config"},
@@ -34,7 +34,6 @@ LEVELS = (
     {"cli"},
     {"__main__"},
 )
-MAY_SHARE = {"drives", "supervision"}
 ROS_PACKAGES = {
     *("rclpy", "launch", "launch_ros", "ament_index_python", "domain_coordinator", "quest2ros"),
     *("rcl_interfaces", "rosgraph_msgs", "builtin_interfaces", "action_msgs", "std_srvs", "tf2_msgs"),
@@ -106,8 +105,6 @@ def test_every_room_has_a_level() -> None:
 def test_a_room_imports_only_from_rooms_below_it(room: str) -> None:
     level = next(index for index, rooms in enumerate(LEVELS) if room in rooms)
     allowed = {room}.union(*LEVELS[:level])
-    if room in MAY_SHARE:
-        allowed |= MAY_SHARE
     for module in MODULES:
         if room_of(module) == room:
             against = {name for name in inner_imports(module) if room_of(name) not in allowed}

@@ -101,7 +101,7 @@ def _errors(run: TimedRun, robot: Robot, motion: WorkMotion, began: int) -> tupl
     start = {arm: robot.tool_pose(robot.home, arm) for arm in robot.arms}
     goal = motion.targets(motion.ends, start)
     tools = np.array([[robot.tool_pose(q, arm).translation for arm in goal] for q in run.q[began:]])
-    asked = np.array([[pose.translation for pose in targets.values()] for targets in run.goals[began:]])
+    asked = np.array([[pose.translation for pose in targets.values()] for targets in run.asked[began:]])
     last = np.array([pose.translation for pose in goal.values()])
     return np.linalg.norm(tools - asked, axis=2), np.linalg.norm(tools - last, axis=2)
 

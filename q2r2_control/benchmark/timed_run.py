@@ -45,7 +45,7 @@ class TimedRun:
     times_us: Array  # (ticks,)
     q: Array  # (n, nv) [rad]
     v: Array  # (n, nv) [rad/s]
-    goals: list[Poses]  # n
+    asked: list[Poses]  # n
     failed: Array  # (n,) bool
     dt: float  # [s]
 
@@ -103,18 +103,18 @@ def timed_run(
     """
     untimed = int(WARM_UP * ticks) if warm_up is None else warm_up
     start = {arm: robot.tool_pose(robot.home, arm) for arm in robot.arms}
-    goals = [targets(tick * dt, start) for tick in range(untimed + ticks)]
-    times, failed = np.empty(len(goals)), np.zeros(len(goals), dtype=bool)
-    q, v = np.empty((len(goals), robot.model.nv)), np.empty((len(goals), robot.model.nv))
+    asked = [targets(tick * dt, start) for tick in range(untimed + ticks)]
+    times, failed = np.empty(len(asked)), np.zeros(len(asked), dtype=bool)
+    q, v = np.empty((len(asked), robot.model.nv)), np.empty((len(asked), robot.model.nv))
     done, deadline = 0, time.process_time() + patience
     controller.reset(robot.home)
     gc.collect()
     gc.disable()
     try:
-        while done < len(goals) and time.process_time() <= deadline:
+        while done < len(asked) and time.process_time() <= deadline:
             began = time.perf_counter()
             try:
-                q[done], v[done] = controller.step(goals[done], dt)
+                q[done], v[done] = controller.step(asked[done], dt)
                 solved = True
             except Exception:  # each peer has exceptions of its own
                 solved = False
@@ -125,7 +125,7 @@ def timed_run(
             done += 1
     finally:
         gc.enable()
-    return TimedRun(1e6 * times[untimed:done], q[:done], v[:done], goals[:done], failed[:done], dt)
+    return TimedRun(1e6 * times[untimed:done], q[:done], v[:done], asked[:done], failed[:done], dt)
 
 
 def rest_acceleration(v: Array, dt: float) -> float:
@@ -141,7 +141,7 @@ def metrics_of(run: TimedRun, robot: Robot, settings: ControllerSettings) -> Run
     room = np.minimum(q - robot.position_lower, robot.position_upper - q) - settings.position_margin
     errors = [
         np.linalg.norm(robot.tool_pose(q[-1], arm).translation - pose.translation)
-        for arm, pose in run.goals[-1].items()
+        for arm, pose in run.asked[-1].items()
     ]
     return RunMetrics(
         max_acceleration_ratio=float((np.abs(a) / robot.capped_acceleration(settings.acceleration_limit)).max()),

@@ -18,6 +18,7 @@ from q2r2_control.config import Config
 from q2r2_control.config.external import ControllerKind
 from q2r2_control.errors import ConfigError, RecordingError
 from q2r2_control.inputs.base import Input
+from q2r2_control.inputs.factory import make_input
 from q2r2_control.inputs.scripted import ScriptedInput
 from q2r2_control.judging.judge import Judged, judge, keep_verdicts
 from q2r2_control.pipeline import Pipeline
@@ -160,7 +161,9 @@ def _refuse_faults(pipeline: Pipeline, force: bool, console: Console) -> None:
 def _input_of(config: Config, options: RunOptions, console: Console) -> Input:
     if options.input == "headset":
         return AnnouncedHeadset(config, console)
-    return ScriptedInput(options.trajectory, human=options.human, seed=options.seed)
+    if options.input == "scripted":
+        return ScriptedInput(options.trajectory, human=options.human, seed=options.seed)
+    return make_input(options.input, config)
 
 
 def _run(pipeline: Pipeline, options: RunOptions, recorder: Recorder | None, console: Console) -> RunSummary:

@@ -202,4 +202,5 @@ def describe(external: ExternalConfig) -> dict[str, str]:
         message = preset.message.rpartition("/")[2] + (f" in {made.base_frame}" if preset.takes_poses else "")
         rate = external.rate or preset.rate
         lines[arm] = f"{preset.name}: {message} on {external.topic(arm)} at {rate:g} Hz, {source}"
+        lines[arm] += f"; it takes: {preset.activation.format(ctrl=made.ctrl_prefix)}"
     return lines

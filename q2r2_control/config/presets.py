@@ -46,7 +46,6 @@ class Preset:
     output: str = "none"  # of cartesian_controller in mode filtered: what joints it commands itself, if any
     zero_wrench: str | None = None  # topic where a zero wrench is sent, without which it may push
     command_type: str | None = None  # service that has to be told that targets are poses, at each of its starts
-    longest_age: float | None = None  # of a target's stamp, older ones are dropped [s]
 
     @property
     def takes_poses(self) -> bool:
@@ -132,7 +131,6 @@ _ALL = (
         guard=_CAREFUL,
         activation="{ctrl}/switch_command_type called with 2, which is pose",
         command_type="{ctrl}/switch_command_type",
-        longest_age=0.1,
     ),
     Preset(
         name="lbr_position",

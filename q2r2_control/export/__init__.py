@@ -2,5 +2,31 @@
 
 ``sampling`` takes frames at a fixed rate out of a recording, ``features`` makes named vectors of them, ``episodes``
 does so for many recordings, in several processes and once only; ``lerobot`` and ``csv_tables`` write what comes out,
-with ``statistics`` and ``tasks`` for the first, and ``output`` sees to it that nothing half is left.
+with ``statistics`` for the first, and ``output`` sees to it that nothing half is left.
 """
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from q2r2_control._lazy import lazy_exports
+
+if TYPE_CHECKING:
+    from q2r2_control.export.episodes import Episode, Sampling, make_episode, make_episodes
+
+__all__ = [
+    "Episode",
+    "Sampling",
+    "make_episode",
+    "make_episodes",
+]
+
+__getattr__ = lazy_exports(
+    __name__,
+    {
+        "Episode": "episodes",
+        "Sampling": "episodes",
+        "make_episode": "episodes",
+        "make_episodes": "episodes",
+    },
+)

@@ -4,7 +4,8 @@
 judges measured states, ``targets`` and ``target_stream`` who is followed, ``tick_pacer`` what a late tick may move,
 ``delay_watch`` and ``sequence_watch`` whether a message is of the past, or of another sender; ``joint_homing``,
 ``homing`` and ``external_arms`` are special ways to be led. ``preflight`` looks at a cell before it runs, and
-``target_guard`` limits targets for controllers that have no limits of their own. No ROS and no clock in here.
+``target_guard`` limits targets for controllers that have no limits of their own. For loops that drive grippers, as the
+pipeline does, there are ``gripper_limiter`` and ``grasp_watch``. No ROS and no clock in here.
 """
 
 from __future__ import annotations
@@ -14,20 +15,32 @@ from typing import TYPE_CHECKING
 from q2r2_control._lazy import lazy_exports
 
 if TYPE_CHECKING:
+    from q2r2_control.supervision.delay_watch import DelayWatch
+    from q2r2_control.supervision.external_arms import ExternalArms
+    from q2r2_control.supervision.grasp_watch import GraspWatch
+    from q2r2_control.supervision.gripper_limiter import GripperLimiter
     from q2r2_control.supervision.homing import Homing
+    from q2r2_control.supervision.joint_homing import JointHoming
     from q2r2_control.supervision.joint_watch import JointWatch, WatchSettings, watch_settings
     from q2r2_control.supervision.preflight import preflight_faults
+    from q2r2_control.supervision.sequence_watch import SequenceWatch
     from q2r2_control.supervision.supervisor import Phase, Supervisor
     from q2r2_control.supervision.target_guard import TargetGuard
     from q2r2_control.supervision.target_stream import Origins, Refusal, StreamSettings, TargetStream
     from q2r2_control.supervision.tick_pacer import TickPacer
 
 __all__ = [
+    "DelayWatch",
+    "ExternalArms",
+    "GraspWatch",
+    "GripperLimiter",
     "Homing",
+    "JointHoming",
     "JointWatch",
     "Origins",
     "Phase",
     "Refusal",
+    "SequenceWatch",
     "StreamSettings",
     "Supervisor",
     "TargetGuard",
@@ -42,11 +55,17 @@ __all__ = [
 __getattr__ = lazy_exports(
     __name__,
     {
+        "DelayWatch": "delay_watch",
+        "ExternalArms": "external_arms",
+        "GraspWatch": "grasp_watch",
+        "GripperLimiter": "gripper_limiter",
         "Homing": "homing",
+        "JointHoming": "joint_homing",
         "JointWatch": "joint_watch",
         "Origins": "target_stream",
         "Phase": "supervisor",
         "Refusal": "target_stream",
+        "SequenceWatch": "sequence_watch",
         "StreamSettings": "target_stream",
         "Supervisor": "supervisor",
         "TargetGuard": "target_guard",

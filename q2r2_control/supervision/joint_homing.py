@@ -81,8 +81,8 @@ class JointHoming:
         goal, last = self._points[0], len(self._points) == 1
         way = goal - self._leg
         lag = float(np.abs(self._at - q).max())
-        pace = min(max((_WAITED - lag) / (_WAITED - _SLOWED), 0.0), 1.0)
-        self._share = min(self._share + pace * dt * _SPEED / max(float(np.abs(way).max()), 1e-6), 1.0)
+        rate = min(max((_WAITED - lag) / (_WAITED - _SLOWED), 0.0), 1.0)
+        self._share = min(self._share + rate * dt * _SPEED / max(float(np.abs(way).max()), 1e-6), 1.0)
         self._at = self._leg + self._share * way
         left = float(np.abs(goal - q).max())
         if left < self._least_left - _PROGRESS:

@@ -20,14 +20,14 @@ NONE_YET = "no joint states yet"
 
 @dataclass(slots=True)
 class WatchSettings:
-    """What measured states have to be; may be changed at run time."""
+    """What measured states have to be; may be changed at run time. See :func:`watch_settings`."""
 
-    timeout: float = 0.1  # without a state for this long is a fault [s]
+    timeout: float  # without a state for this long is a fault [s]
     # States that are not finite are bridged for this long [s]; 0: the first one is a fault.
-    unusable_time: float = 0.0
-    settle_time: float = 0.1  # that states have to be good and at rest before the arms are activated [s]
-    deviation: float = 0.15  # of a joint from the reference [rad]
-    deviation_time: float = 0.5  # [s]
+    unusable_time: float
+    settle_time: float  # that states have to be good and at rest before the arms are activated [s]
+    deviation: float  # of a joint from the reference [rad]
+    deviation_time: float  # [s]
 
 
 def watch_settings(settings: SupervisionSettings, yields: bool) -> WatchSettings:

@@ -218,8 +218,8 @@ class Adversary:
         if self._arms != ARMS:
             return self._shaking()
         motion = tuple(WORK_MOTIONS.values())[int(self._random.integers(len(WORK_MOTIONS)))]
-        begins, pace = self._random.uniform(0.0, motion.rests), self._random.uniform(0.3, 3.0) * _TICK
-        return lambda tick, q: Request(dict(motion.targets(begins + pace * tick, self._home)), _NONE)
+        begins, speed = self._random.uniform(0.0, motion.rests), self._random.uniform(0.3, 3.0) * _TICK
+        return lambda tick, q: Request(dict(motion.targets(begins + speed * tick, self._home)), _NONE)
 
     def _pressing(self) -> Stream:
         """Down onto the table, or hand against hand, sliding about meanwhile."""

@@ -44,6 +44,8 @@ class LiveTable:
         self._count += 1
         if tick.reference.report.binding:
             self._binding.update(dict.fromkeys(tick.reference.report.binding))
+        if tick.impedance is not None and tick.impedance.repelled:
+            self._binding.update(dict.fromkeys(f"{joint} pushed off its limit" for joint in tick.impedance.repelled))
         for event in tick.events:
             self._last[event.arm] = event
 

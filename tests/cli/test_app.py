@@ -204,7 +204,8 @@ def test_check_says_what_drives_the_arms_and_how(tmp_path: Path, mode: str, sour
     assert "arms driven by the built-in controller\n" in q2r2("check", CELL).stdout
     file = external_cell(tmp_path, new=f"mode: {mode}")
     topic = "/bh_robot/right_arm_clik_controller/target_frame"
-    line = f"kuka_lbr_clik: PoseStamped in bh_robot_base on {topic} at 100 Hz, {source}"
+    takes = "it takes: active; keeps the last target for ever"
+    line = f"kuka_lbr_clik: PoseStamped in bh_robot_base on {topic} at 100 Hz, {source}; {takes}"
     assert f"right driven by {line}\n" in q2r2("check", file).stdout
     assert one_object(q2r2("check", file, "--json").stdout)["driven"]["right"] == line
 

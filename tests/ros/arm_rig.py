@@ -20,7 +20,7 @@ from std_msgs.msg import String
 from tf2_msgs.msg import TFMessage
 
 from q2r2_control.ros.base_node import COMMAND_QOS, STREAM_QOS
-from q2r2_control.ros.bridge.messages import pose_of, stamped_pose, transform_message
+from q2r2_control.ros.bridge.messages import pose_of, stamped_pose, write_transform
 from tests.ros.processes import PATIENCE, Processes, RosProcess
 from tests.ros.waiting import wait_until
 
@@ -220,8 +220,8 @@ class ArmRigs:
 
 def stamped_transform(parent: str, child: str, pose: pin.SE3) -> TransformStamped:
     """Where a frame is in another, as on /tf; the stamp is not set."""
-    transform = transform_message(pose.translation, pin.Quaternion(pose.rotation).coeffs())
-    message = TransformStamped(child_frame_id=child, transform=transform)
+    message = TransformStamped(child_frame_id=child)
+    write_transform(pose.translation, pin.Quaternion(pose.rotation).coeffs(), message.transform)
     message.header.frame_id = parent
     return message
 

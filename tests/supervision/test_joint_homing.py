@@ -6,13 +6,16 @@ import numpy as np
 import pytest
 
 from q2r2_control import CartesianController, Robot, load_config
+from q2r2_control.config.supervision import SupervisionSettings
 from q2r2_control.robot.kept_distances import kept_distances
 from q2r2_control.supervision.joint_homing import JointHoming
-from q2r2_control.supervision.joint_watch import WatchSettings
+from q2r2_control.supervision.joint_watch import watch_settings
 from q2r2_control.supervision.supervisor import Supervisor
 from q2r2_control.supervision.target_stream import StreamSettings
 from q2r2_control.types import Array, Reference, RobotState
 from q2r2_control.verification.contract import Contract
+
+STRICT = SupervisionSettings(unusable_time=0.0)  # a state that is not finite is a fault at once
 
 CONFIG = "config/dual_iiwa7.yaml"
 DT = 0.004  # [s]
@@ -35,7 +38,7 @@ class World:
 
     def __init__(self, robot: Robot, controller: CartesianController, q: Array, checked: bool = False) -> None:
         self.controller = controller
-        self.supervisor = Supervisor(robot, controller, StreamSettings(), WatchSettings())
+        self.supervisor = Supervisor(robot, controller, StreamSettings(), watch_settings(STRICT, yields=False))
         self.state = RobotState(q.copy(), np.zeros_like(q), np.zeros_like(q), None, 0.0)
         self.supervisor.activate(self.state, 0.0)
         self.contract = Contract(controller, q) if checked else None

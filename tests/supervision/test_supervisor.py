@@ -7,10 +7,13 @@ import pinocchio as pin
 import pytest
 
 from q2r2_control import CartesianController, Robot, load_config
-from q2r2_control.supervision.joint_watch import WatchSettings
+from q2r2_control.config.supervision import SupervisionSettings
+from q2r2_control.supervision.joint_watch import watch_settings
 from q2r2_control.supervision.supervisor import Phase, Supervisor
 from q2r2_control.supervision.target_stream import StreamSettings, TargetStream
 from q2r2_control.types import Array, RobotState
+
+STRICT = SupervisionSettings(unusable_time=0.0)  # a state that is not finite is a fault at once
 
 DT = 0.004
 TOOL = pin.SE3(np.eye(3), np.array([0.5, 0.2, 0.4]))
@@ -30,7 +33,7 @@ class World:
     """A supervisor and arms that are where its references are, as long as they are not blocked."""
 
     def __init__(self, robot: Robot, controller: CartesianController) -> None:
-        self.supervisor = Supervisor(robot, controller, StreamSettings(), WatchSettings())
+        self.supervisor = Supervisor(robot, controller, StreamSettings(), watch_settings(STRICT, yields=False))
         self.q, self.now, self.blocked = robot.home.copy(), 0.0, False
         self.v, self.lag = np.zeros_like(self.q), DT  # [s]
         self.commanded: list[Array | None] = []

@@ -162,7 +162,7 @@ class TestItEnds:
         driver.commanded = {"left": held}  # which is stuck
         driver.run(1.5, turning(driver, angle=0.0))
         away = driver.targets["left"].pose.translation - held.translation  # type: ignore[union-attr]
-        assert np.linalg.norm(away) == pytest.approx(0.1, abs=1e-6)
+        assert 0.09 < np.linalg.norm(away) < 0.1 + 1e-6  # of which less where the hand has come back a little
 
     @pytest.mark.parametrize("hand", SIDES)
     def test_with_an_alignment_after_which_neither_goes_on_by_itself(self, hand: str) -> None:

@@ -1,8 +1,8 @@
 """What the arms should do, as costs of the QP: kernels that add to H and g of  1/2 v' H v + g' v.
 
 ``frame`` follows a tool target; ``posture`` holds joints and uses those that no tool needs; ``swivel`` turns elbows and
-``manipulability`` betters postures in the tools' nullspace; ``priority`` says which arm gives way and how fast tools
-move near each other. Each takes a ``TaskModel`` (fixed) and ``TaskData`` (rewritten at each tick).
+``manipulability`` betters postures in the tools' nullspace. Which arm gives way is a matter of their weights. Each
+takes a ``TaskModel`` (fixed) and ``TaskData`` (rewritten at each tick).
 """
 
 from q2r2_control.control.tasks.frame import add_stretch_damping, add_tool_task, tool_jacobian, tool_pose, wanted_twist

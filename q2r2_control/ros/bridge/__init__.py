@@ -1,4 +1,4 @@
-"""Between ROS and the package's own data: messages in, messages out, nothing decided.
+"""Between ROS and the package's own data: messages in and out, and whether those on the other side can be relied on.
 
 ``messages`` and ``joint_messages`` convert; ``frames`` says where a tool is, ``link_frames`` where links are;
 ``intakes`` takes targets and joint states; ``joint_outputs`` sends joint commands; ``target_output`` and

@@ -57,15 +57,8 @@ def pose_message(pose: pin.SE3) -> Pose:
     return message
 
 
-def transform_message(position: Array, quaternion: Array) -> Transform:
-    """A position (3,) and a unit quaternion x y z w as a transform."""
-    message = Transform()
-    write_transform(position, quaternion, message)
-    return message
-
-
 def write_transform(position: Array, quaternion: Array, message: Transform) -> None:
-    """The same into a message that is sent again and again."""
+    """A position (3,) and a unit quaternion x y z w into a message that is sent again and again."""
     _write(position, quaternion, message.translation, message.rotation)
 
 

@@ -246,7 +246,7 @@ def _value(node: BaseNode, name: str, default: Any, field: FieldInfo, read_only:
         return node.parameter(name, str(default.value), description, read_only=read_only)
     if isinstance(default, tuple):
         return tuple(node.parameter(name, list(default), description, read_only=read_only))
-    return node.parameter(name, default, description, read_only=read_only, **_range(field))
+    return node.parameter(name, default, description, read_only=read_only, **bounds_of(field))
 
 
 def may_be_none(field: FieldInfo) -> bool:
@@ -259,7 +259,7 @@ def none_of_zero(value: Any) -> Any:
     return None if value == _NONE else value
 
 
-def _range(field: FieldInfo) -> dict[str, Any]:
+def bounds_of(field: FieldInfo) -> dict[str, Any]:
     """The closed range of a field; whether the ends are allowed is checked by the model."""
     bounds: dict[str, Any] = {}
     for entry in field.metadata:

@@ -25,12 +25,13 @@ from std_srvs.srv import SetBool, Trigger
 
 from q2r2_control.config import Config, load_config
 from q2r2_control.control.controller import CartesianController
-from q2r2_control.drives import permitted
+from q2r2_control.drives import TorqueDrive, permitted
 from q2r2_control.errors import ConfigError
 from q2r2_control.robot.robot import Robot
 from q2r2_control.ros.base_node import ERROR, LATCHED_QOS, OK, SENT_COMMAND_QOS, WARN, BaseNode, run_node
 from q2r2_control.ros.bridge.intakes import JointIntake, TargetIntake
 from q2r2_control.ros.bridge.joint_outputs import NONE, make_output, output_name
+from q2r2_control.ros.bridge.live_parameters import LiveStiffness
 from q2r2_control.ros.bridge.messages import stamped_pose
 from q2r2_control.ros.monitoring.endpoints import publish_in_time
 from q2r2_control.supervision.external_arms import ExternalArms, ExternalSettings, settings_for_external_arms
@@ -88,6 +89,8 @@ class CartesianControllerNode(BaseNode):
         self._declare(watch, _WATCH_PARAMETERS)
         self._declare(external, _EXTERNAL_PARAMETERS)
         self.add_post_set_parameters_callback(self._on_parameters)
+        if isinstance(self._output.drive, TorqueDrive):
+            self._stiffness = LiveStiffness(self, self._output.drive.impedance)
         self._controller = CartesianController(robot, permitted(config.control, self._output.drive))
         self._supervisor = Supervisor(
             robot,

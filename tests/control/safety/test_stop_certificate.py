@@ -101,7 +101,7 @@ def _starts_apart(name: str, random: np.random.Generator, near: bool, count: int
 @pytest.mark.parametrize("shape", range(SHAPES), ids=["together", "arm by arm", "own"])
 @pytest.mark.parametrize("near", [False, True], ids=["anywhere", "just before contact"])
 @pytest.mark.parametrize("name", NAMES)
-def test_nothing_comes_too_close_in_a_certified_motion_and_most_safe_motions_are_certified(
+def test_nothing_comes_too_close_in_a_certified_motion_and_what_is_safe_by_far_is_certified(
     name: str, near: bool, shape: int
 ) -> None:
     random = np.random.default_rng(15)
@@ -115,7 +115,8 @@ def test_nothing_comes_too_close_in_a_certified_motion_and_most_safe_motions_are
             refused += 1
         clearly_safe += bool(least >= MIN_DISTANCE + 0.02)
     assert certified > 5
-    assert refused <= 0.2 * clearly_safe, "safe by 20 mm"
+    assert refused == 0, "safe by 20 mm"
+    assert near or clearly_safe > 5
 
 
 def _aimed_at_the_threshold(name: str, random: np.random.Generator, count: int, shape: int) -> Iterator[Motion]:
