@@ -9,6 +9,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from q2r2_control.cli.app import app
+from q2r2_control.cli.progress_lines import ProgressLines
 from q2r2_control.config import load_config
 from q2r2_control.config.resources import find_resource
 from q2r2_control.verification.soak import SoakReport, run_soak
@@ -491,3 +493,14 @@ def test_a_soak_that_finds_something_ends_in_1(monkeypatch: pytest.MonkeyPatch) 
     result = q2r2("bench", "--soak", "--ticks", "100", "--json")
     assert result.exit_code == 1
     assert not one_object(result.stdout)["passed"]
+
+
+@pytest.mark.parametrize("option", ["--pairs", "--model-pairs"])
+def test_a_search_for_pairs_says_how_far_it_has_got(
+    tmp_path: Path, option: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("q2r2_control.cli.check.ProgressLines", partial(ProgressLines, period=0.0))
+    target = tmp_path if option == "--model-pairs" else tmp_path / "cell.srdf"
+    result = q2r2("check", CELL, option, str(target), "--samples", "300")
+    assert result.exit_code == 0
+    assert " of 300\n" in result.stderr

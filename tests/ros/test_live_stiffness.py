@@ -13,14 +13,14 @@ from tests.ros.waiting import wait_until
 
 pytest.importorskip("rclpy", reason=NEEDS_ROS)
 
-from rclpy.parameter import Parameter  # noqa: E402
-from rclpy.parameter_client import AsyncParameterClient  # noqa: E402
+from rclpy.parameter import Parameter
+from rclpy.parameter_client import AsyncParameterClient
 
-from q2r2_control.compliance.impedance import ImpedanceController  # noqa: E402
-from q2r2_control.config import ImpedanceSettings  # noqa: E402
-from q2r2_control.ros.base_node import BaseNode  # noqa: E402
-from q2r2_control.ros.bridge.live_parameters import LiveStiffness  # noqa: E402
-from q2r2_control.types import RobotState  # noqa: E402
+from q2r2_control.compliance.impedance import ImpedanceController
+from q2r2_control.config import ImpedanceSettings
+from q2r2_control.ros.base_node import BaseNode
+from q2r2_control.ros.bridge.live_parameters import LiveStiffness
+from q2r2_control.types import RobotState
 
 
 def test_what_is_set_counts_for_both_arms_without_a_jump_and_what_is_not_allowed_changes_nothing(
