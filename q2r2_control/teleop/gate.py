@@ -32,7 +32,7 @@ class PoseGate:
         self._pose: pin.SE3 | None = None
         self._stamp = -math.inf
         self._problem = ""
-        self._way: deque[tuple[float, pin.SE3]] = deque()  # without jumps; the first is _SPEED_WINDOW old, or the oldest
+        self._way: deque[tuple[float, pin.SE3]] = deque()  # the first is _SPEED_WINDOW old, or the oldest
 
     @property
     def pose(self) -> pin.SE3 | None:

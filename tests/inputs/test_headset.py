@@ -20,9 +20,10 @@ import pytest
 from q2r2_control.errors import InputError
 from q2r2_control.inputs.base import Input
 from q2r2_control.inputs.client import MAX_FRAMES_PER_SECOND
+from q2r2_control.inputs.hands_watch import Watched
 from q2r2_control.inputs.headset import HeadsetServer
 from q2r2_control.inputs.messages import Dialect, HandPose, PropTwist
-from q2r2_control.inputs.session import HeadsetSession, Reception
+from q2r2_control.inputs.session import HeadsetSession
 from q2r2_control.types import HapticFeedback
 from tests.support.fake_headset import DIALECTS, KEEPALIVE, FakeHeadset, pack_inputs, pack_pose, pack_twist
 from tests.support.headset_server import (
@@ -306,7 +307,7 @@ def test_twists_arrive_at_a_headset_that_listens_and_only_whole_ones(server: Hea
 
 @every_dialect
 def test_a_listener_gets_every_message_in_order_and_poll_none(clock: HandClock, dialect: str) -> None:
-    heard: list[Reception] = []
+    heard: list[Watched] = []
     server = HeadsetServer(port=0, clock=clock, listener=heard.append)
     server.start()
     try:
@@ -317,8 +318,8 @@ def test_a_listener_gets_every_message_in_order_and_poll_none(clock: HandClock, 
                 headset.send(headset.inputs("right", lower=index % 2 == 0))
             eventually(lambda: len(heard) == 300)
             topics = ("q2r_left_hand_pose", "q2r_left_hand_twist", "q2r_right_hand_inputs")
-            assert [reception.topic for reception in heard] == [*topics] * 100
-            poses = [reception.message for reception in heard[::3]]
+            assert [watched.reception.topic for watched in heard] == [*topics] * 100
+            poses = [watched.reception.message for watched in heard[::3]]
             assert [pose.position[0] for pose in poses if isinstance(pose, HandPose)] == list(range(100))
             assert server.poll(0.0) == []
     finally:
