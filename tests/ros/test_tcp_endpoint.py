@@ -7,6 +7,7 @@ import socket
 import struct
 import time
 from contextlib import suppress
+from itertools import count as attempts
 from pathlib import Path
 from queue import Empty, Queue
 from threading import Event, Lock, Thread
@@ -19,7 +20,7 @@ from q2r2_control.inputs.messages import PROP_TOPICS
 from tests.ros.conftest import NEEDS_ROS
 from tests.ros.processes import PATIENCE, Processes, RosProcess
 from tests.ros.waiting import States, drained
-from tests.support.fake_headset import DIALECTS, KEEPALIVE, FakeHeadset, pack_twist
+from tests.support.fake_headset import DIALECTS, KEEPALIVE, FakeHeadset, Sensor, pack_twist
 
 pytest.importorskip("rclpy", reason=NEEDS_ROS)
 pytestmark = pytest.mark.usefixtures("interfaces")
@@ -81,13 +82,13 @@ class Hand:
     def meet(self, headset: FakeHeadset) -> None:
         """Until publisher and subscriber know each other a message may be lost: send until each topic has come."""
         for suffix, queue in self.queues.items():
-            probe = {
-                "pose": headset.pose(self.name, (0.0, 0.0, 0.0), IDENTITY),
-                "twist": headset.twist(self.name, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)),
-                "inputs": headset.inputs(self.name),
-            }[suffix]
             deadline = time.monotonic() + PATIENCE
-            while True:
+            for attempt in attempts(1):
+                probe = {
+                    "pose": headset.pose(self.name, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, float(attempt))),  # not frozen
+                    "twist": headset.twist(self.name, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)),
+                    "inputs": headset.inputs(self.name),
+                }[suffix]
                 headset.send(probe)
                 try:
                     queue.get(timeout=0.1)
@@ -165,12 +166,13 @@ def test_best_effort_subscribers_hear_too_and_a_configured_frame_replaces_the_he
         received[hand] = Queue()
         node.create_subscription(PoseStamped, f"q2r_{hand}_hand_pose", received[hand].put, STREAM_QOS)
     frames: dict[str, str] = {}
+    sensor = Sensor()
     with KeepaliveHeadset(address) as headset:
         deadline = time.monotonic() + PATIENCE
         while len(frames) < 2:
             assert time.monotonic() < deadline
             for hand in ("left", "right"):
-                headset.send(headset.pose(hand, (1.0, 2.0, 3.0), IDENTITY, frame_id="room"))
+                headset.send(headset.pose(hand, sensor.measured((1.0, 2.0, 3.0)), IDENTITY, frame_id="room"))
             time.sleep(0.05)
             for hand, queue in received.items():
                 for message in drained(queue):
