@@ -48,7 +48,7 @@ class HandsWatch:
         """What to hand on after ``reception`` came at ``now`` [s], in this order."""
         hand, message = reception.hand, reception.message
         if isinstance(message, HandInputs) and self._frame is not None:
-            self._frame.take_inputs(hand, message)
+            self._frame.take_inputs(hand, message, now)
         if not isinstance(message, HandPose):
             return [Watched(reception, now)]
         frozen = self._frozen[hand].receive(message, now)

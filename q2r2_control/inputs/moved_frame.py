@@ -33,6 +33,7 @@ _ALIVE = 0.05  # a hand without a pose for longer is not waited for [s]
 _LONGEST_GAP = 0.15  # what a hand did across a longer one is not judged [s]
 # The buttons of an alignment may come after the poses that it moves; so long nobody is told [s].
 _CHORD_TIME = 0.04
+_CHORD_SEEN = 0.01  # before a pose that they moved, whoever follows it shall have seen those buttons [s]
 
 
 class Verdict(Enum):
@@ -50,7 +51,7 @@ class MovedFrame:
     def __init__(self, fault_time: float) -> None:
         """``fault_time``: after the frame has moved, no pose is good for this long [s]."""
         self._fault_time = fault_time
-        self._chords: set[str] = set()
+        self._chords: dict[str, float] = {}  # hands that align, since when
         self.reset()
 
     def reset(self) -> None:
@@ -60,20 +61,21 @@ class MovedFrame:
         self._suspected: float | None = None
         self._bad_until = -math.inf
 
-    def take_inputs(self, hand: str, inputs: HandInputs) -> None:
+    def take_inputs(self, hand: str, inputs: HandInputs, now: float) -> None:
         """With both buttons the operator aligns the frame: whatever moves as one then is meant to."""
         if inputs.button_upper and inputs.button_lower:
-            self._chords.add(hand)
+            self._chords.setdefault(hand, now)
             self.reset()
         else:
-            self._chords.discard(hand)
+            self._chords.pop(hand, None)
 
     def receive(self, hand: str, pose: HandPose, now: float) -> Verdict:
         """Judge a pose."""
         place = Place.of(pose)
         if self._chords or place is None:
             self._ways[hand] = _Way()
-            return Verdict.FOLLOW
+            just_now = now - min(self._chords.values(), default=-math.inf) < _CHORD_SEEN
+            return Verdict.DROP if just_now else Verdict.FOLLOW
         way, other = self._ways[hand], self._ways[_other(hand)]
         if not way.add(place, now):
             self._pairs.clear()

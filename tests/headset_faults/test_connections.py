@@ -89,9 +89,9 @@ def late_by(duration: float) -> Callable[[Operator], Iterator[float]]:
         for _ in range(2):
             yield from op.move((0.0, 0.06, 0.06), seconds=0.3)
             op.held_up = True
-            yield from op.move((0.0, 0.03, 0.03), seconds=duration)
+            yield from op.move((0.0, 0.1 * duration, 0.1 * duration), seconds=duration)
             op.held_up = False
-            yield from op.move((0.0, -0.09, -0.09), seconds=0.4)
+            yield from op.move((0.0, -0.06, -0.06), seconds=0.4)
 
     return script
 

@@ -111,13 +111,15 @@ class Operator:
     def move(
         self, way: Iterable[float], turn: Iterable[float] = (0.0, 0.0, 0.0), seconds: float = 0.6
     ) -> Iterator[float]:
-        """Both hands, evenly; the right one goes by 0.9 of the way, as human hands never move as one."""
-        steps = max(round(seconds / PERIOD), 1)
-        step, angle = np.array(list(way)) / steps, np.array(list(turn)) / steps
-        for _ in range(steps):
-            for hand, share in (("left", 1.0), ("right", 0.9)):
-                at = self.hands[hand]
-                self.hands[hand] = pin.SE3(pin.exp3(share * angle) @ at.rotation, at.translation + share * step)
+        """Both hands, as people reach; the right one goes by 0.9 of the way, as human hands never move as one."""
+        steps, starts = max(round(seconds / PERIOD), 1), dict(self.hands)
+        whole = pin.Motion(np.array(list(way)), np.array(list(turn)))
+        for index in range(1, steps + 1):
+            s = index / steps
+            done = s**3 * (10.0 - 15.0 * s + 6.0 * s**2)  # least jerk (Flash and Hogan 1985)
+            for hand, share in (("left", done), ("right", 0.9 * done)):
+                rotation = pin.exp3(share * whole.angular) @ starts[hand].rotation
+                self.hands[hand] = pin.SE3(rotation, starts[hand].translation + share * whole.linear)
             yield PERIOD
 
 
