@@ -273,6 +273,30 @@ def test_topics_are_silent_without_a_headset_and_a_headset_of_the_other_dialect_
     assert process.interrupt() == 0
 
 
+def test_frozen_poses_are_left_out_with_one_line_and_those_that_change_again_are_published(
+    node: Any, processes: Processes
+) -> None:
+    process, address = start_endpoint(processes, "frozen_time:=0.3")
+    hand = Hand(node, "left")
+    with KeepaliveHeadset(address) as headset:
+        headset.send(headset.registrations())
+        hand.meet(headset)
+        sent, deadline = 0, time.monotonic() + PATIENCE
+        while "the hand's pose is frozen; its poses are left out" not in process.output:
+            assert time.monotonic() < deadline
+            headset.send(headset.pose("left", (1.0, 2.0, 3.0), IDENTITY))
+            sent += 1
+            time.sleep(0.01)
+        for _ in range(20):
+            headset.send(headset.pose("left", (1.0, 2.0, 3.0), IDENTITY))
+        headset.send(headset.pose("left", (4.0, 5.0, 6.0), IDENTITY))
+        published = hand.next("pose", 1)
+        while numbers(published[-1]) != [4.0, 5.0, 6.0]:
+            published += hand.next("pose", 1)
+    assert 1 < len(published) <= sent + 1
+    assert process.output.count("frozen") == 1
+
+
 def test_an_address_that_cannot_be_bound_and_a_port_out_of_range_are_one_line(processes: Processes) -> None:
     with socket.create_server(("127.0.0.1", 0)) as other:
         taken = other.getsockname()[1]
