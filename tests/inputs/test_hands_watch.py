@@ -16,7 +16,7 @@ from q2r2_control.inputs.messages import HandPose
 from q2r2_control.inputs.rigid_motion import Tolerance
 from q2r2_control.inputs.session import Reception
 from q2r2_control.types import SIDES, HandFault, HandInputs
-from tests.support.two_hands import PERIOD, TwoHands, carry, hand_pose, rest
+from tests.support.two_hands import PERIOD, START, TwoHands, carry, hand_pose, rest
 
 Message = tuple[float, str, HandPose | HandInputs]
 STEP_AT = 30 * PERIOD  # [s]
@@ -108,6 +108,13 @@ def test_a_step_of_one_hand_is_handed_on_in_order_for_the_gate_to_judge() -> Non
             assert stamps == sorted(stamps)
 
 
+def test_a_step_of_each_hand_another_way_is_no_frame_but_for_the_gate_to_judge() -> None:
+    ways = {"left": stepped(0.3, 0.0), "right": stepped(-0.3, 0.0)}
+    watched = handed_on(moved(resting(), lambda t, hand: ways[hand](t, hand)))
+    assert faults(watched) == set()
+    assert len(watched) == len(resting())
+
+
 def test_a_hand_whose_other_one_is_not_there_does_not_wait_for_it() -> None:
     alone = [message for message in moved(resting(), stepped(0.1, 0.0)) if message[1] == "right"]
     watch = HandsWatch()
@@ -185,3 +192,24 @@ def test_hands_that_start_as_fast_as_hands_can_with_samples_lost_and_held_up_are
     watched = handed_on(samples)
     assert faults(watched) == set()
     assert len(watched) >= len(samples) - 1
+
+
+def test_hands_that_start_together_while_samples_are_lost_are_no_frame() -> None:
+    """At 16 m/s^2, for 60 ms, and without anything that tells them from one rigid body."""
+
+    def reach(t: float) -> pin.SE3:
+        return pin.SE3(np.eye(3), np.array([0.0, 8.0 * min(max(t - STEP_AT, 0.0), 0.06) ** 2, 0.0]))
+
+    rigid = TwoHands(reach, 0, (0.0, 0.0), tremor=False).samples(1.0)
+    assert faults(handed_on(one for one in rigid if not STEP_AT < one[0] < STEP_AT + 0.06)) == set()
+
+
+def test_hands_that_go_and_turn_alike_each_about_itself_are_no_frame() -> None:
+    still = TwoHands(rest, 0, (0.0, 0.0), tremor=False).samples(1.5)
+
+    def alike(t: float, hand: str) -> pin.SE3:
+        about = pin.SE3(np.eye(3), START[hand])
+        turn = pin.SE3(pin.exp3(np.array([0.0, 0.0, 0.3 * t])), np.zeros(3))
+        return pin.SE3(np.eye(3), np.array([0.3 * t, 0.0, 0.0])) * about * turn * about.inverse()
+
+    assert faults(handed_on(moved(still, alike))) == set()
