@@ -26,6 +26,7 @@ _STEP_GAP = 0.032
 # A frame that is carried along.
 _WINDOW = 1.5  # [s]
 _CARRIED = 0.15  # of both hands [m]
+_NEAR = 0.4 * _CARRIED
 _CARRIED_TOLERANCE = Tolerance(0.001, math.radians(0.5))
 
 _SAME_TIME = 0.01  # the two hands' messages of one time come within this [s]
@@ -58,6 +59,7 @@ class MovedFrame:
         """Forget everything received but who holds the buttons of an alignment."""
         self._ways = {hand: _Way() for hand in SIDES}
         self._pairs: deque[HandPair] = deque()
+        self._near: HandPair  # since when the left hand is within _NEAR of it; where there are pairs
         self._suspected: float | None = None
         self._bad_until = -math.inf
 
@@ -109,10 +111,15 @@ class MovedFrame:
         if steps and moved_as_one(pairs[-1], pair, _STEP_TOLERANCE):
             self._suspected = now if self._suspected is None else self._suspected
             pairs.clear()
+        if not pairs:
+            self._near = pair
         pairs.append(pair)
         while pairs[0].t < now - _WINDOW:
             pairs.popleft()
-        if _carried(pairs):
+        if math.dist(pair.left.position, self._near.left.position) > _NEAR:
+            self._near = pair
+        # Where the left hand stayed near one place for all of the window, nothing was carried: spares a hand at rest.
+        if self._near.t > pairs[0].t and _carried(pairs):
             self._bad_until = now + self._fault_time
             pairs.clear()
 
