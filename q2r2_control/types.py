@@ -47,6 +47,13 @@ class HandInputs:
     press_middle: float = 0.0
 
 
+class HandFault(StrEnum):
+    """What an input finds wrong with a hand whose pose, by itself, is a pose."""
+
+    FROZEN = "the hand's pose is frozen"
+    FRAME_MOVED = "both hands moved as one, as when their frame moves: align"
+
+
 @dataclass(frozen=True, slots=True)
 class HandSample:
     """One reading of one hand. Numbers are as received: nothing has been checked or normalised yet.
@@ -61,6 +68,7 @@ class HandSample:
     pose_stamp: float  # receipt time of the pose [s]
     inputs: HandInputs = field(default_factory=HandInputs)
     inputs_stamp: float = float("-inf")  # receipt time of the inputs [s]; -inf: none received yet
+    fault: HandFault | None = None  # why no arm may follow this pose, nor be engaged at it
 
 
 @dataclass(frozen=True, slots=True)

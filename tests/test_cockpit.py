@@ -13,7 +13,7 @@ import pytest
 from q2r2_control.inputs.headset import HeadsetServer
 from q2r2_control.pipeline import Pipeline
 from q2r2_control.runtime.recorder import Tick
-from tests.support.fake_headset import RATE_HZ, FakeHeadset
+from tests.support.fake_headset import RATE_HZ, FakeHeadset, Sensor
 from tests.support.operator_script import HANDS, START
 from tests.support.watch import Watch, cell
 
@@ -116,13 +116,14 @@ class Cockpit:
             self.failure = failure
 
     def _stream(self) -> None:
+        sensor = Sensor()
         with FakeHeadset(self.server.address) as headset:
             headset.send(headset.registrations())
             while not self._ended.wait(1.0 / RATE_HZ):
                 headset.discard_received()
                 for hand in HANDS:
                     x, y, z = START[hand] + self.shift
-                    headset.send(headset.pose(hand, (x, y, z), (0.0, 0.0, 0.0, 1.0)))
+                    headset.send(headset.pose(hand, sensor.measured((x, y, z)), (0.0, 0.0, 0.0, 1.0)))
                     analog = self.analog.get(hand, (0.0,) * 4)
                     headset.send(headset.inputs(hand, lower=hand in self.lower, analog=analog))
 

@@ -9,6 +9,7 @@ from rich.console import Console
 
 from q2r2_control.config.cell import Config, HeadsetConfig
 from q2r2_control.inputs.addresses import access_lines, written
+from q2r2_control.inputs.factory import hands_watch
 from q2r2_control.inputs.headset import HeadsetServer
 
 Host = Annotated[
@@ -22,7 +23,7 @@ class AnnouncedHeadset(HeadsetServer):
 
     def __init__(self, config: Config, console: Console) -> None:
         headset = config.headset
-        super().__init__(headset.host, headset.port, allow=headset.networks)
+        super().__init__(headset.host, headset.port, allow=headset.networks, watch=hands_watch(config))
         self._headset, self._console = headset, console
 
     def start(self) -> None:

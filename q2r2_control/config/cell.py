@@ -67,6 +67,11 @@ class HeadsetConfig(CellModel):
         None, min_length=1, description="addresses and networks that may connect; none: all that reach the port"
     )
 
+    frozen_time: float | None = Field(
+        0.5, ge=0.1, le=10, description="poses that stay the same to the last bit for this long are lost [s]; none: not"
+    )
+    watch_frame: bool = Field(True, description="both hands that move as one are a frame that moved: a fault")
+
     @field_validator("allow")
     @classmethod
     def _are_networks(cls, allow: tuple[str, ...] | None) -> tuple[str, ...] | None:

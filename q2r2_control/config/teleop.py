@@ -56,6 +56,8 @@ class GateSettings(BaseModel):
     timeout: float = Field(STREAM_TIMEOUT, gt=0, le=2, description="no pose for this long disengages [s]")
     max_jump: float = Field(0.15, gt=0, le=2, description="position change between two samples [m]")
     max_rotation_jump: float = Field(1.0, gt=0, le=3.14, description="rotation between two samples [rad]")
+    max_speed: float = Field(5.0, gt=0, le=100, description="of a hand, over at least 50 ms [m/s]")
+    max_angular_speed: float = Field(30.0, gt=0, le=100, description="of a hand, over at least 50 ms [rad/s]")
 
 
 class LeashSettings(BaseModel):

@@ -4,8 +4,9 @@
 ``assembly``, as ``way_points``: ``played`` makes samples of hands whose poses are functions of time, ``sampling`` says
 when, and what the measurement adds. ``headset`` is the TCP server for the Quest2ROS app: ``framing``, ``messages``,
 ``session`` and ``client`` are its protocol without sockets, ``admission`` says who may drive, ``door`` takes
-connections in, ``connections`` serves them, ``rate_limits`` bounds what strangers can make it do, ``samples`` is the
-queue between its thread and the loop, ``statistics``, ``addresses`` and ``headset_check`` are what people see of it.
+connections in, ``connections`` serves them, ``rate_limits`` bounds what strangers can make it do, ``hands_watch`` finds
+poses that must not be followed (``frozen_pose``; ``moved_frame`` by ``rigid_motion``), ``samples`` is the queue between
+its thread and the loop, ``statistics``, ``addresses`` and ``headset_check`` are what people see of it.
 """
 
 from q2r2_control.inputs.base import Input

@@ -18,10 +18,11 @@ from q2r2_control.inputs.client import Client
 from q2r2_control.inputs.connections import TURN, Connections, Handlers
 from q2r2_control.inputs.door import Door
 from q2r2_control.inputs.framing import Frame
+from q2r2_control.inputs.hands_watch import HandsWatch, Watched
 from q2r2_control.inputs.messages import PROP_TOPICS, AppMessage, PropTwist, warm_up
 from q2r2_control.inputs.rate_limits import HostLog, log_writer
 from q2r2_control.inputs.samples import SampleQueue
-from q2r2_control.inputs.session import Reception, topic_of
+from q2r2_control.inputs.session import topic_of
 from q2r2_control.inputs.statistics import HeadsetStatistics
 from q2r2_control.types import SIDES, HandSample, HapticFeedback
 
@@ -34,10 +35,10 @@ class HeadsetServer:
     Samples are stamped with ``clock`` when their bytes are received. The loop's thread never waits for the network
     or for decoding. A client that breaks the protocol, floods, or is silent for 2 s is dropped with one logged line,
     and another one may connect. ``allow`` names the networks whose hosts may connect, None all of them; who of those
-    drives is decided in :mod:`~q2r2_control.inputs.admission`.
+    drives is decided in :mod:`~q2r2_control.inputs.admission`. ``watch`` finds poses that must not be followed.
 
     Where a ``listener`` is given, each message goes only to it, at once and in the receiving thread, and :meth:`poll`
-    returns nothing: this is for forwarding messages one by one.
+    returns nothing: this is for forwarding messages one by one, but for those with a fault.
     """
 
     def __init__(
@@ -45,13 +46,15 @@ class HeadsetServer:
         host: str = "127.0.0.1",
         port: int = 10000,
         clock: Callable[[], float] = time.monotonic,
-        listener: Callable[[Reception], None] | None = None,
+        listener: Callable[[Watched], None] | None = None,
         allow: Sequence[Network] | None = None,
+        watch: HandsWatch | None = None,
     ) -> None:
         self._address = (host, port)
         self._allow = allow
         self._clock = clock
         self._tell = listener
+        self._watch = watch or HandsWatch()
         self._thread: threading.Thread | None = None
         self._stop = threading.Event()
         self._samples = SampleQueue()
@@ -156,6 +159,7 @@ class HeadsetServer:
     def _admit(self, client: Client) -> None:
         with self._owed_lock:
             self._owed.clear()
+        self._watch.reset()
         with self._statistics_lock:
             self._client = self._last_client = client
             self._connections_made += 1
@@ -174,9 +178,14 @@ class HeadsetServer:
                 client.record(reception, now)
         if reception is None:
             return
+        for watched in self._watch.receive(reception, now):
+            self._hand_on(client, watched)
+
+    def _hand_on(self, client: Client, watched: Watched) -> None:
+        hand, message = watched.reception.hand, watched.reception.message
         if self._tell is not None:
-            self._tell(reception)
-        elif (sample := client.tracker.update(reception.hand, reception.message, now)) is not None:
+            self._tell(watched)
+        elif (sample := client.tracker.update(hand, message, watched.stamp, watched.fault)) is not None:
             self._samples.put(sample)
 
     def _take_owed(self) -> Iterable[AppMessage]:

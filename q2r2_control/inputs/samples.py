@@ -6,7 +6,7 @@ import threading
 from itertools import pairwise
 
 from q2r2_control.inputs.messages import HandMessage, HandPose
-from q2r2_control.types import SIDES, HandInputs, HandSample
+from q2r2_control.types import SIDES, HandFault, HandInputs, HandSample
 
 SAMPLES_KEPT = 64  # of each hand between two polls: over 0.4 s of pose and inputs at 75 Hz each
 
@@ -18,22 +18,25 @@ class HandTracker:
     """
 
     def __init__(self) -> None:
-        self._poses: dict[str, tuple[HandPose, float]] = {}
+        self._poses: dict[str, tuple[HandPose, float, HandFault | None]] = {}
         self._inputs: dict[str, tuple[HandInputs, float]] = dict.fromkeys(SIDES, (HandInputs(), float("-inf")))
 
-    def update(self, hand: str, message: HandMessage, now: float) -> HandSample | None:
-        """The sample after ``message`` came in at ``now`` [s]; None for a twist, or before the hand's first pose."""
+    def update(self, hand: str, message: HandMessage, now: float, fault: HandFault | None = None) -> HandSample | None:
+        """The sample after ``message`` came in at ``now`` [s]; None for a twist, or before the hand's first pose.
+
+        ``fault``: why a pose must not be followed.
+        """
         if isinstance(message, HandPose):
-            self._poses[hand] = (message, now)
+            self._poses[hand] = (message, now, fault)
         elif isinstance(message, HandInputs):
             self._inputs[hand] = (message, now)
         else:
             return None
         if hand not in self._poses:
             return None
-        pose, pose_stamp = self._poses[hand]
+        pose, pose_stamp, pose_fault = self._poses[hand]
         inputs, inputs_stamp = self._inputs[hand]
-        return HandSample(hand, pose.position, pose.quaternion, pose_stamp, inputs, inputs_stamp)
+        return HandSample(hand, pose.position, pose.quaternion, pose_stamp, inputs, inputs_stamp, pose_fault)
 
 
 class SampleQueue:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:  # the writer's process does without them
     from q2r2_control.config import Config
     from q2r2_control.pipeline import Pipeline
 
-FORMAT = "1"  # of topics and fields; another one cannot be replayed
+FORMAT = "2"  # of topics and fields; another one cannot be replayed
 ABOUT, CELL, ROBOT, FIELDS = "q2r2_control", "cell.yaml", "robot.urdf", "fields.json"
 _GIT_TIME = 2.0  # [s]
 

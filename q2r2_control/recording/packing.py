@@ -20,13 +20,14 @@ import pinocchio as pin
 
 from q2r2_control.recording.rows import Rows
 from q2r2_control.recording.topics import FLAGS, GRIPPERS, SAMPLE_FIELDS, START, TICK, Topics
-from q2r2_control.types import SIDES, Array, CommandMode, HandInputs, HandSample, RobotState, StepStatus
+from q2r2_control.types import SIDES, Array, CommandMode, HandFault, HandInputs, HandSample, RobotState, StepStatus
 
 if TYPE_CHECKING:  # the writer's process does without the loop's modules
     from q2r2_control.runtime.recorder import Tick
 
 NOT_MEASURED = -math.inf  # in place of the opening of a gripper that the plant does not measure
 COMMAND_MODES, STATUSES = tuple(CommandMode), tuple(StepStatus)
+HAND_FAULTS = (None, *HandFault)
 UNSOLVED_MAX = 2**53  # more substeps than a float64 has bits for cannot be told apart
 JOINT_FIELDS = (
     *("q", "v", "tau", "tau_external", "reference_q", "reference_v", "reference_a"),
@@ -187,4 +188,5 @@ def _packed_start(now: float, state: RobotState) -> bytes:
 def _packed_sample(number: int, sample: HandSample) -> bytes:
     inputs = [getattr(sample.inputs, name) for name in HandInputs.__slots__]
     side, stamps = SIDES.index(sample.hand), (sample.pose_stamp, sample.inputs_stamp)
-    return _SAMPLE.pack(number, side, *stamps, *sample.position.tolist(), *sample.quaternion.tolist(), *inputs)
+    fault = HAND_FAULTS.index(sample.fault)
+    return _SAMPLE.pack(number, side, *stamps, *sample.position.tolist(), *sample.quaternion.tolist(), *inputs, fault)

@@ -19,7 +19,7 @@ from q2r2_control.pipeline import Pipeline
 from q2r2_control.recording import topics as names
 from q2r2_control.recording.comparison import Comparison, changes
 from q2r2_control.recording.episode_spans import events_of_ticks
-from q2r2_control.recording.packing import NOT_MEASURED
+from q2r2_control.recording.packing import HAND_FAULTS, NOT_MEASURED
 from q2r2_control.recording.reader import RecordedChunk, Recording
 from q2r2_control.robot.robot import Robot
 from q2r2_control.runtime.loop_clock import LoopClock
@@ -303,4 +303,5 @@ def _sample(numbers: Array) -> HandSample:
         pose_stamp=values["pose_stamp"],
         inputs=HandInputs(**inputs),
         inputs_stamp=values["inputs_stamp"],
+        fault=HAND_FAULTS[int(values["fault"])],
     )

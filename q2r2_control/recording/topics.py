@@ -25,6 +25,7 @@ _POSE, _JOINTS = "geometry_msgs/msg/PoseStamped", "sensor_msgs/msg/JointState"
 SAMPLE_FIELDS = (
     *("tick", "hand", "pose_stamp", "inputs_stamp", "x", "y", "z", "qx", "qy", "qz", "qw", "button_upper"),
     *("button_lower", "thumb_stick_horizontal", "thumb_stick_vertical", "press_index", "press_middle"),
+    "fault",
 )
 # Of the tick topic. Those behind `opening_<arm>`, as measured: how long it took, which no replay repeats.
 _TICK_FIELDS = (

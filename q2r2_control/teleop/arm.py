@@ -214,7 +214,7 @@ class ArmTeleop:
         if self._has_dead_man and Action.DEAD_MAN not in self.held:
             obstacle = obstacle or "the dead man is not held"
         if self._gate.pose is None:
-            obstacle = obstacle or "the newest pose is not usable"
+            obstacle = obstacle or self._gate.problem
         elif tool is None or not np.isfinite(tool.homogeneous).all():
             obstacle = obstacle or "the tool's pose is not known"
         else:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 
 import numpy as np
 import pinocchio as pin
@@ -14,6 +15,9 @@ from q2r2_control.types import Array, HandSample
 _MAX_COORDINATE = 1e6
 # A quaternion with a norm outside this range is not a rotation with rounding errors.
 _QUATERNION_LENGTHS = (1e-6, 1e6)
+# Speeds are taken over at least this time. Messages that a network held up come within a millisecond of each other, and
+# then say nothing about a speed [s].
+_SPEED_WINDOW = 0.05
 
 
 class PoseGate:
@@ -27,6 +31,8 @@ class PoseGate:
         self.settings = settings
         self._pose: pin.SE3 | None = None
         self._stamp = -math.inf
+        self._problem = ""
+        self._way: deque[tuple[float, pin.SE3]] = deque()  # the first is _SPEED_WINDOW old, or the oldest
 
     @property
     def pose(self) -> pin.SE3 | None:
@@ -38,10 +44,17 @@ class PoseGate:
         """Receipt time of the newest pose [s], usable or not; -inf before the first."""
         return self._stamp
 
+    @property
+    def problem(self) -> str | None:
+        """Why no arm may be anchored to the newest pose, None where it may."""
+        return None if self._pose is not None else self._problem or "the newest pose is not usable"
+
     def reset(self) -> None:
         """Forget everything received."""
         self._pose = None
         self._stamp = -math.inf
+        self._problem = ""
+        self._way.clear()
 
     def stale(self, now: float) -> bool:
         """Whether no pose was received for ``timeout``."""
@@ -57,14 +70,16 @@ class PoseGate:
             return False, "a pose without a receipt time"
         if stamp < self._stamp or stamp == -math.inf:
             return False, None
-        pose = _pose_of(sample)
+        pose, self._problem = (None, str(sample.fault)) if sample.fault else (_pose_of(sample), "")
         previous, gap = self._pose, stamp - self._stamp
         self._pose, self._stamp = pose, stamp
         if pose is None:
-            return False, "a pose that is not finite or not a rotation"
-        if previous is None:
-            return True, None
-        return True, self._jump(previous, pose, gap)
+            self._way.clear()
+            return False, self._problem or "a pose that is not finite or not a rotation"
+        jump = None if previous is None else self._jump(previous, pose, gap)
+        if jump is not None:
+            self._way.clear()  # no speed is taken across it
+        return True, jump or self._speed(pose, stamp)
 
     def _jump(self, previous: pin.SE3, pose: pin.SE3, gap: float) -> str | None:
         limits = self.settings
@@ -76,6 +91,24 @@ class PoseGate:
         angle = math.hypot(*pin.log3(previous.rotation.T @ pose.rotation))
         if angle > limits.max_rotation_jump:
             return f"the hand's rotation jumped {angle:.2f} rad"
+        return None
+
+    def _speed(self, pose: pin.SE3, stamp: float) -> str | None:
+        """What is wrong with the hand's mean speed over the last ``_SPEED_WINDOW`` or a little more, or None."""
+        way = self._way
+        way.append((stamp, pose))
+        while len(way) > 1 and stamp - way[1][0] >= _SPEED_WINDOW:
+            way.popleft()
+        since, start = way[0]
+        time = stamp - since
+        if time < _SPEED_WINDOW:
+            return None
+        speed = math.dist(pose.translation, start.translation) / time
+        if speed > self.settings.max_speed:
+            return f"the hand moved at {speed:.1f} m/s"
+        angular_speed = math.hypot(*pin.log3(start.rotation.T @ pose.rotation)) / time
+        if angular_speed > self.settings.max_angular_speed:
+            return f"the hand turned at {angular_speed:.0f} rad/s"
         return None
 
 

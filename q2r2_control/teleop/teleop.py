@@ -20,8 +20,9 @@ class Teleop:
     """Hands drive arms relative to anchors; faults stop them. What leads where is the table of :mod:`arm_states`.
 
     An engaged arm is stopped by: no pose or no button data for ``gate.timeout`` of receipt time, a pose that is not
-    finite or not a rotation, a jump past the gate, a lost connection, a loop that stalled or a clock that went back by
-    more than ``gate.timeout``; with ``linked`` the other arm too. Only a new press engages again.
+    finite or not a rotation, a jump or a speed past the gate, a fault that the input found, a lost connection, a loop
+    that stalled or a clock that went back by more than ``gate.timeout``; with ``linked`` the other arm too. Only a new
+    press engages again.
 
     Of what is pressed at once, a stop comes first, then the alignment chord, then a pause, then the rest. What is
     for both arms either hand may ask for. The way home is the caller's to go while :attr:`homing`.

@@ -393,6 +393,9 @@ def test_a_misspelt_key_is_named_before_the_one_that_is_missing_for_it(tmp_path:
         ("headset.allow", ["192.168.1.7/24"], "write 192.168.1.0/24, or 192.168.1.7 alone"),
         ("headset.allow", ["10.0.0.7", "the lab"], "'the lab' is neither an address nor a network such as"),
         ("headset.allow", [10], "valid string"),
+        ("headset.frozen_time", 0.01, "greater than or equal to 0.1"),
+        ("headset.watch_frame", "no", "valid boolean"),
+        ("teleop.gate.max_speed", 0.0, "greater than 0"),
         ("headset.allow", [], "at least 1"),
         ("arms.left.gripper.closed_position", 0.025, "have to differ"),
         # not numbers, or not the ones meant

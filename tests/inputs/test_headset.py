@@ -17,13 +17,16 @@ from typing import cast
 import numpy as np
 import pytest
 
+from q2r2_control.config import load_config
 from q2r2_control.errors import InputError
 from q2r2_control.inputs.base import Input
 from q2r2_control.inputs.client import MAX_FRAMES_PER_SECOND
+from q2r2_control.inputs.factory import make_input
+from q2r2_control.inputs.hands_watch import Watched
 from q2r2_control.inputs.headset import HeadsetServer
 from q2r2_control.inputs.messages import Dialect, HandPose, PropTwist
-from q2r2_control.inputs.session import HeadsetSession, Reception
-from q2r2_control.types import HapticFeedback
+from q2r2_control.inputs.session import HeadsetSession
+from q2r2_control.types import HandFault, HapticFeedback
 from tests.support.fake_headset import DIALECTS, KEEPALIVE, FakeHeadset, pack_inputs, pack_pose, pack_twist
 from tests.support.headset_server import (
     A_LINE_LATER,
@@ -306,7 +309,7 @@ def test_twists_arrive_at_a_headset_that_listens_and_only_whole_ones(server: Hea
 
 @every_dialect
 def test_a_listener_gets_every_message_in_order_and_poll_none(clock: HandClock, dialect: str) -> None:
-    heard: list[Reception] = []
+    heard: list[Watched] = []
     server = HeadsetServer(port=0, clock=clock, listener=heard.append)
     server.start()
     try:
@@ -317,10 +320,50 @@ def test_a_listener_gets_every_message_in_order_and_poll_none(clock: HandClock, 
                 headset.send(headset.inputs("right", lower=index % 2 == 0))
             eventually(lambda: len(heard) == 300)
             topics = ("q2r_left_hand_pose", "q2r_left_hand_twist", "q2r_right_hand_inputs")
-            assert [reception.topic for reception in heard] == [*topics] * 100
-            poses = [reception.message for reception in heard[::3]]
+            assert [watched.reception.topic for watched in heard] == [*topics] * 100
+            poses = [watched.reception.message for watched in heard[::3]]
             assert [pose.position[0] for pose in poses if isinstance(pose, HandPose)] == list(range(100))
             assert server.poll(0.0) == []
+    finally:
+        server.close()
+
+
+# Poses that must not be followed -------------------------------------------------------------------------------------
+
+
+def test_a_frozen_pose_arrives_with_its_fault_and_a_new_connection_begins_anew(
+    server: HeadsetServer, clock: HandClock
+) -> None:
+    def faults(headset: FakeHeadset, count: int) -> list[HandFault | None]:
+        found = []
+        for _ in range(count):
+            headset.send(headset.pose("left", (1.0, 2.0, 3.0), IDENTITY))
+            found += [sample.fault for sample in collect(server, 1)]
+            clock.now += 0.3
+        return found
+
+    with connect(server) as headset:
+        assert faults(headset, 3) == [None, None, HandFault.FROZEN]
+        headset.close()
+        eventually(lambda: server.statistics.peer is None)
+    with connect(server) as headset:
+        assert faults(headset, 2) == [None, None]
+
+
+def test_a_cells_settings_reach_the_server() -> None:
+    cell = load_config("config/dual_iiwa7.yaml")
+    quick = cell.headset.model_copy(update={"port": 0, "frozen_time": 0.1})
+    server = make_input("headset", cell.model_copy(update={"headset": quick}))
+    assert isinstance(server, HeadsetServer)
+    server.start()
+    try:
+        with connect(server) as headset:
+            faults = []
+            for _ in range(2):
+                headset.send(headset.pose("left", (1.0, 2.0, 3.0), IDENTITY))
+                faults += [sample.fault for sample in collect(server, 1)]
+                time.sleep(0.15)
+            assert faults == [None, HandFault.FROZEN]
     finally:
         server.close()
 

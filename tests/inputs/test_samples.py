@@ -8,7 +8,7 @@ import numpy as np
 
 from q2r2_control.inputs.messages import HandPose, HandTwist
 from q2r2_control.inputs.samples import SAMPLES_KEPT, HandTracker, SampleQueue
-from q2r2_control.types import HandInputs, HandSample
+from q2r2_control.types import HandFault, HandInputs, HandSample
 
 PRESSED = HandInputs(button_lower=True)
 
@@ -125,3 +125,13 @@ def test_a_cut_shows_at_one_look_per_tick_whether_before_or_after_the_take() -> 
         assert seen[0], "the loss was never seen"
         assert not seen[-1], "the new connection was never seen"
         assert stamps == [5.0], "the new connection's samples wait until the loss was seen"
+
+
+def test_the_fault_of_a_pose_stays_with_it_until_the_next_pose() -> None:
+    tracker = HandTracker()
+    made = [
+        tracker.update("left", pose(0.0), 1.0, HandFault.FROZEN),
+        tracker.update("left", PRESSED, 1.01),
+        tracker.update("left", pose(0.1), 1.02),
+    ]
+    assert [one.fault for one in made if one] == [HandFault.FROZEN, HandFault.FROZEN, None]

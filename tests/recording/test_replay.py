@@ -21,7 +21,7 @@ from q2r2_control.recording.replay import replay
 from q2r2_control.recording.rows import HEAD
 from q2r2_control.robot.robot import Robot
 from q2r2_control.runtime.recorder import Tick
-from q2r2_control.types import HandSample, RobotState
+from q2r2_control.types import HandFault, HandSample, RobotState
 from tests.recording.runs import RATE, file_of, pipeline, record, rewrite
 from tests.support.object_cell import cell as object_cell
 from tests.support.watch import cell
@@ -120,6 +120,22 @@ def test_lost_connections_and_numbers_that_are_none_are_replayed(tmp_path: Path)
     assert result.summary is not None
     reasons = [event.reason for event in result.summary.events if event.destination == "lost"]
     assert any("not finite" in reason for reason in reasons)
+
+
+class FrozenHands(ScriptedInput):
+    """Finds a fault in its own left hand."""
+
+    def poll(self, now: float) -> list[HandSample]:
+        faults = {"left": HandFault.FROZEN if now > 0.9 else None}
+        return [changed(sample, fault=faults.get(sample.hand)) for sample in super().poll(now)]
+
+
+def test_a_fault_that_the_input_found_is_replayed(tmp_path: Path) -> None:
+    result = replay(file_of(record(tmp_path, pipeline(source=FrozenHands("circle")), 1.2)))
+    assert result.difference is None
+    assert result.summary is not None
+    lost = [event.reason for event in result.summary.events if event.destination == "lost"]
+    assert lost == [HandFault.FROZEN, f"linked to left: {HandFault.FROZEN}"]
 
 
 class LosesItsSensors(KinematicPlant):

@@ -9,10 +9,11 @@ from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 
-from tests.support.fake_headset import RATE_HZ, FakeHeadset
+from tests.support.fake_headset import RATE_HZ, FakeHeadset, Sensor
 from tests.support.operator_script import HANDS, START, Vector
 
 RADIUS, SPEED = 0.08, 0.3  # of the hands' circles [m], [m/s]
+RIGHT_SHARE = 0.9  # of the right hand's circle, since human hands never move as one
 RAMP = 0.3  # from rest to that speed [s]
 PRESS = 0.2  # longer than a chord's window [s]
 
@@ -28,6 +29,7 @@ class Operator:
         self._angle = self._rate = 0.0
         self._angles: deque[tuple[float, float]] = deque(maxlen=int(60.0 * RATE_HZ))  # when [s], and the angle
         self._ended = threading.Event()
+        self._sensor = Sensor()
 
     @contextmanager
     def streaming(self) -> Iterator[Operator]:
@@ -79,4 +81,6 @@ class Operator:
 
     def _position(self, hand: str) -> Vector:
         x, y, z = START[hand]
-        return x, y + RADIUS * math.sin(self._angle), z + RADIUS * (1.0 - math.cos(self._angle))
+        radius = RADIUS if hand == "left" else RIGHT_SHARE * RADIUS
+        position = x, y + radius * math.sin(self._angle), z + radius * (1.0 - math.cos(self._angle))
+        return self._sensor.measured(position)

@@ -7,6 +7,7 @@ import socket
 import struct
 import time
 from contextlib import suppress
+from itertools import count as attempts
 from pathlib import Path
 from queue import Empty, Queue
 from threading import Event, Lock, Thread
@@ -19,7 +20,7 @@ from q2r2_control.inputs.messages import PROP_TOPICS
 from tests.ros.conftest import NEEDS_ROS
 from tests.ros.processes import PATIENCE, Processes, RosProcess
 from tests.ros.waiting import States, drained
-from tests.support.fake_headset import DIALECTS, KEEPALIVE, FakeHeadset, pack_twist
+from tests.support.fake_headset import DIALECTS, KEEPALIVE, FakeHeadset, Sensor, pack_twist
 
 pytest.importorskip("rclpy", reason=NEEDS_ROS)
 pytestmark = pytest.mark.usefixtures("interfaces")
@@ -81,13 +82,13 @@ class Hand:
     def meet(self, headset: FakeHeadset) -> None:
         """Until publisher and subscriber know each other a message may be lost: send until each topic has come."""
         for suffix, queue in self.queues.items():
-            probe = {
-                "pose": headset.pose(self.name, (0.0, 0.0, 0.0), IDENTITY),
-                "twist": headset.twist(self.name, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)),
-                "inputs": headset.inputs(self.name),
-            }[suffix]
             deadline = time.monotonic() + PATIENCE
-            while True:
+            for attempt in attempts(1):
+                probe = {
+                    "pose": headset.pose(self.name, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, float(attempt))),  # not frozen
+                    "twist": headset.twist(self.name, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)),
+                    "inputs": headset.inputs(self.name),
+                }[suffix]
                 headset.send(probe)
                 try:
                     queue.get(timeout=0.1)
@@ -165,12 +166,13 @@ def test_best_effort_subscribers_hear_too_and_a_configured_frame_replaces_the_he
         received[hand] = Queue()
         node.create_subscription(PoseStamped, f"q2r_{hand}_hand_pose", received[hand].put, STREAM_QOS)
     frames: dict[str, str] = {}
+    sensor = Sensor()
     with KeepaliveHeadset(address) as headset:
         deadline = time.monotonic() + PATIENCE
         while len(frames) < 2:
             assert time.monotonic() < deadline
             for hand in ("left", "right"):
-                headset.send(headset.pose(hand, (1.0, 2.0, 3.0), IDENTITY, frame_id="room"))
+                headset.send(headset.pose(hand, sensor.measured((1.0, 2.0, 3.0)), IDENTITY, frame_id="room"))
             time.sleep(0.05)
             for hand, queue in received.items():
                 for message in drained(queue):
@@ -269,6 +271,30 @@ def test_topics_are_silent_without_a_headset_and_a_headset_of_the_other_dialect_
         headset.send(b"\xff" * 64)  # no protocol at all
         process.wait_for("dropped: frame of")
     assert process.interrupt() == 0
+
+
+def test_frozen_poses_are_left_out_with_one_line_and_those_that_change_again_are_published(
+    node: Any, processes: Processes
+) -> None:
+    process, address = start_endpoint(processes, "frozen_time:=0.3")
+    hand = Hand(node, "left")
+    with KeepaliveHeadset(address) as headset:
+        headset.send(headset.registrations())
+        hand.meet(headset)
+        sent, deadline = 0, time.monotonic() + PATIENCE
+        while "the hand's pose is frozen; its poses are left out" not in process.output:
+            assert time.monotonic() < deadline
+            headset.send(headset.pose("left", (1.0, 2.0, 3.0), IDENTITY))
+            sent += 1
+            time.sleep(0.01)
+        for _ in range(20):
+            headset.send(headset.pose("left", (1.0, 2.0, 3.0), IDENTITY))
+        headset.send(headset.pose("left", (4.0, 5.0, 6.0), IDENTITY))
+        published = hand.next("pose", 1)
+        while numbers(published[-1]) != [4.0, 5.0, 6.0]:
+            published += hand.next("pose", 1)
+    assert 1 < len(published) <= sent + 1
+    assert process.output.count("frozen") == 1
 
 
 def test_an_address_that_cannot_be_bound_and_a_port_out_of_range_are_one_line(processes: Processes) -> None:

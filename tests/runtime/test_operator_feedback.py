@@ -18,7 +18,7 @@ from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.runtime.recorder import Tick
 from q2r2_control.teleop.haptics import CONTACT, ENGAGED, FAULT, GRASP, LIMIT, NEAR, PAUSED, SLIP, Pulse
 from q2r2_control.types import Array, HapticFeedback
-from tests.support.fake_headset import RATE_HZ, FakeHeadset
+from tests.support.fake_headset import RATE_HZ, FakeHeadset, Sensor
 from tests.support.hands_input import ENGAGED as BEGIN
 from tests.support.hands_input import HandsInput, Path
 from tests.support.operator_script import HANDS, START
@@ -145,9 +145,10 @@ def test_a_headset_gets_the_vibrations_over_its_connection(dialect: str) -> None
             lower = threading.Event()
 
             def stream() -> None:
+                sensor = Sensor()
                 while not ended.wait(1.0 / RATE_HZ):
                     for hand in HANDS:
-                        headset.send(headset.pose(hand, START[hand], (0.0, 0.0, 0.0, 1.0)))
+                        headset.send(headset.pose(hand, sensor.measured(START[hand]), (0.0, 0.0, 0.0, 1.0)))
                         headset.send(headset.inputs(hand, lower=lower.is_set()))
 
             streams = threading.Thread(target=stream)

@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import argparse
 import json
+import random
 import socket
 import struct
 import sys
 import time
 from collections.abc import Iterator
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 from tests.support.operator_script import HANDS, SCRIPTS, START, Quaternion, Reading, Script, Vector
@@ -22,6 +23,7 @@ from tests.support.operator_script import HANDS, SCRIPTS, START, Quaternion, Rea
 RATE_HZ = 75.0
 DIALECTS = ("ros1", "ros2")
 KEEPALIVE = b"\0\0\0\0\0\0\0\0"
+NOISE = 1e-6  # of a position, too little for anything but telling a hand at rest from a frozen pose [m]
 
 
 class FakeHeadset:
@@ -74,8 +76,16 @@ class FakeHeadset:
             )
         return b"".join([*parts, self.command("__topic_list")])
 
-    def pose(self, hand: str, position: Vector, quaternion: Quaternion, frame_id: str = "") -> bytes:
-        return self.frame(self.topic(hand, "pose"), pack_pose(self.dialect, position, quaternion, frame_id))
+    def pose(
+        self,
+        hand: str,
+        position: Vector,
+        quaternion: Quaternion,
+        frame_id: str = "",
+        stamp: tuple[int, int] = (12, 500),
+    ) -> bytes:
+        """``stamp``: of the headset's own clock [s], [ns]."""
+        return self.frame(self.topic(hand, "pose"), pack_pose(self.dialect, position, quaternion, frame_id, stamp))
 
     def twist(self, hand: str, linear: Vector, angular: Vector) -> bytes:
         return self.frame(self.topic(hand, "twist"), pack_twist(self.dialect, linear, angular))
@@ -155,12 +165,25 @@ class FakeHeadset:
         return frame
 
 
-def pack_pose(dialect: str, position: Vector, quaternion: Quaternion, frame_id: str = "") -> bytes:
+class Sensor:
+    """Measures positions: never twice the same, as of a real hand at rest."""
+
+    def __init__(self, seed: int = 0) -> None:
+        self._random = random.Random(seed)
+
+    def measured(self, position: Vector) -> Vector:
+        x, y, z = (value + self._random.gauss(0.0, NOISE) for value in position)
+        return x, y, z
+
+
+def pack_pose(
+    dialect: str, position: Vector, quaternion: Quaternion, frame_id: str = "", stamp: tuple[int, int] = (12, 500)
+) -> bytes:
     numbers = struct.pack("<7d", *position, *quaternion)
     name = frame_id.encode()
     if dialect == "ros1":
-        return struct.pack("<IIII", 7, 12, 500, len(name)) + name + numbers
-    text = struct.pack("<iII", 12, 500, len(name) + 1) + name + b"\0"
+        return struct.pack("<IiII", 7, *stamp, len(name)) + name + numbers
+    text = struct.pack("<iII", *stamp, len(name) + 1) + name + b"\0"
     return b"\0\1\0\0" + text + b"\0" * (-len(text) % 8) + numbers
 
 
@@ -188,11 +211,12 @@ def _connect(address: tuple[str, int], timeout: float, source: str) -> socket.so
 
 def play(headset: FakeHeadset, script: Script, duration: float) -> Iterator[tuple[float, Reading]]:
     """Send the script at RATE_HZ in real time; yields what was sent with its time on ``time.monotonic``."""
-    start = time.monotonic()
+    start, sensor = time.monotonic(), Sensor()
     for index in range(int(duration * RATE_HZ)):
         due = start + index / RATE_HZ
         time.sleep(max(due - time.monotonic(), 0.0))
-        readings = [script.reading(hand, index / RATE_HZ) for hand in HANDS]
+        ideal = [script.reading(hand, index / RATE_HZ) for hand in HANDS]
+        readings = [replace(reading, position=sensor.measured(reading.position)) for reading in ideal]
         headset.discard_received()
         for reading in readings:
             headset.send(headset.pose(reading.hand, reading.position, reading.quaternion))

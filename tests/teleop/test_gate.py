@@ -10,6 +10,7 @@ import pytest
 
 from q2r2_control.config.teleop import GateSettings
 from q2r2_control.teleop.gate import PoseGate
+from q2r2_control.types import HandFault
 from tests.teleop.hands import pose, sample
 
 GOOD = sample("left", pose(0.1, 0.2, 0.3, (0.1, 0.2, 0.3)), 1.0)
@@ -104,3 +105,63 @@ def test_before_any_pose_inputs_alone_are_no_fault_and_a_stamp_that_is_no_number
     assert fresh.receive(replace(GOOD, pose_stamp=math.nan), 1.0)[1] is not None
     assert fresh.pose is None
     assert fresh.stale(1.0)
+
+
+# Speed ---------------------------------------------------------------------------------------------------------------
+
+
+def faults_of_a_motion(speed: float, receipts: list[float], turning: bool = False) -> list[str | None]:
+    """Faults of a hand at a constant speed [m/s or rad/s], sampled at 75 Hz and received at these times [s]."""
+    passed = PoseGate(GateSettings())
+    found = []
+    for index, stamp in enumerate(receipts):
+        way = speed * index / 75.0
+        moved = pose(turn=(0.0, 0.0, way)) if turning else pose(way)
+        found.append(passed.receive(sample("left", moved, stamp), stamp)[1])
+    return found
+
+
+EVEN = [index / 75.0 for index in range(60)]
+
+
+@pytest.mark.parametrize(
+    ("speed", "turning", "words"),
+    [(4.9, False, None), (5.1, False, "moved at 5.1 m/s"), (29.0, True, None), (31.0, True, "turned at 31 rad/s")],
+    ids=["as fast as allowed", "faster", "turning as fast as allowed", "turning faster"],
+)
+def test_a_hand_that_moves_faster_than_any_operator_is_a_fault(speed: float, turning: bool, words: str | None) -> None:
+    found = [fault for fault in faults_of_a_motion(speed, EVEN, turning) if fault]
+    assert (found == []) if words is None else (words in found[0])
+
+
+@pytest.mark.parametrize("stall", [0.04, 0.08, 0.13])
+def test_samples_that_a_network_held_up_and_delivers_at_once_are_no_speed(stall: float) -> None:
+    """A hand at 2 m/s whose samples of ``stall`` come within a millisecond: 26 mm in 0.1 ms."""
+    end = EVEN[20] + stall
+    receipts = [max(t, end + 1e-4 * (index - 20)) if t > EVEN[20] else t for index, t in enumerate(EVEN)]
+    assert faults_of_a_motion(2.0, sorted(receipts)) == [None] * len(EVEN)
+
+
+def test_no_speed_is_taken_across_a_jump_which_is_a_fault_of_its_own() -> None:
+    passed = PoseGate(GateSettings(max_speed=1.0))
+    for index in range(10):
+        passed.receive(sample("left", pose(), EVEN[index]), EVEN[index])
+    found = []
+    for index in range(10, 20):
+        found.append(passed.receive(sample("left", pose(0.5), EVEN[index]), EVEN[index])[1])
+    assert "jumped" in str(found[0])
+    assert found[1:] == [None] * 9
+
+
+# A fault that the input found ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("fault", sorted(HandFault))
+def test_a_fault_that_the_input_found_is_handed_on_and_leaves_no_pose(fault: HandFault) -> None:
+    passed = gate()
+    assert passed.problem is None
+    assert passed.receive(replace(GOOD, pose_stamp=1.01, fault=fault), 1.01) == (False, str(fault))
+    assert (passed.pose, passed.problem) == (None, str(fault))
+    assert not passed.stale(1.1)
+    assert passed.receive(replace(GOOD, pose_stamp=1.02), 1.02) == (True, None)
+    assert passed.problem is None

@@ -17,16 +17,18 @@ from quest2ros.msg import OVR2ROSHapticFeedback
 from q2r2_control.config import load_config
 from q2r2_control.config.cell import HeadsetConfig
 from q2r2_control.config.networks import Network, network_of
+from q2r2_control.config.teleop import GateSettings
 from q2r2_control.errors import ConfigError
 from q2r2_control.inputs.addresses import access_lines, written
+from q2r2_control.inputs.hands_watch import HandsWatch, Watched
 from q2r2_control.inputs.headset import HeadsetServer
 from q2r2_control.inputs.headset_check import SILENCE
 from q2r2_control.inputs.messages import PROP_TOPICS, HandPose, PropTwist
-from q2r2_control.inputs.session import HAND_TOPICS, HAPTIC_TOPICS, Reception
+from q2r2_control.inputs.session import HAND_TOPICS, HAPTIC_TOPICS
 from q2r2_control.ros.base_node import OK, STREAM_QOS, WARN, BaseNode, run_node
 from q2r2_control.ros.bridge.hand_topics import HandPublishers
 from q2r2_control.ros.bridge.messages import hand_twist
-from q2r2_control.types import SIDES, HapticFeedback
+from q2r2_control.types import SIDES, HandFault, HapticFeedback
 
 _SERVER_LOG = logging.getLogger("q2r2_control.inputs.headset")
 
@@ -38,13 +40,17 @@ class TcpEndpoint(BaseNode):
     are passed on unchanged, and so is the frame unless one is configured. Only what was received is published: after a
     disconnect the topics are silent. What is sent to the app while none is connected is lost.
 
+    Poses that no arm may follow, frozen ones and those of a frame that moved, are left out, so that arms pause for
+    missing data; the log has a line where that begins.
+
     Raises :class:`InputError` when host and port cannot be bound, :class:`ConfigError` for what ``allow`` cannot be.
     """
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("tcp_endpoint", **kwargs)
         config = self.parameter("config", "", 'YAML of the cell, whose block headset are defaults of these; "": none')
-        headset = load_config(config).headset if config else HeadsetConfig()
+        cell = load_config(config) if config else None
+        headset, gate = (cell.headset, cell.teleop.gate) if cell else (HeadsetConfig(), GateSettings())
         host = self.parameter("host", headset.host, "Address to listen on; 0.0.0.0 admits the network.")
         port = self.parameter("port", headset.port, "TCP port; 0 takes any free one.", at_least=0, at_most=65535)
         allow = self.parameter(
@@ -56,7 +62,17 @@ class TcpEndpoint(BaseNode):
             for hand in SIDES
         }
         self._publishers_of_hands = HandPublishers(self, HAND_TOPICS)
-        self._server = HeadsetServer(host, port, listener=self._publish, allow=networks)
+        frozen_time = self.parameter(
+            "frozen_time",
+            headset.frozen_time or 0.0,
+            "Poses the same to the last bit for this long are left out [s]; 0: never.",
+            at_least=0.0,
+            at_most=10.0,
+        )
+        frame = self.parameter("watch_frame", headset.watch_frame, "Leave out poses of a frame that moved.")
+        watch = HandsWatch(frozen_time or None, frame, gate.timeout)
+        self._faults: dict[str, HandFault | None] = dict.fromkeys(SIDES)
+        self._server = HeadsetServer(host, port, listener=self._publish, allow=networks, watch=watch)
         for hand, topic in HAPTIC_TOPICS.items():
             self.create_subscription(OVR2ROSHapticFeedback, topic, self._vibrate(hand), STREAM_QOS)
         for topic in PROP_TOPICS:
@@ -93,8 +109,14 @@ class TcpEndpoint(BaseNode):
         self._server.close()
         _SERVER_LOG.removeHandler(self._log)
 
-    def _publish(self, reception: Reception) -> None:
-        message = reception.message
+    def _publish(self, watched: Watched) -> None:
+        reception, message = watched.reception, watched.reception.message
+        if isinstance(message, HandPose):
+            before, self._faults[reception.hand] = self._faults[reception.hand], watched.fault
+            if watched.fault is not None:
+                if before is not watched.fault:
+                    self.get_logger().warning(f"{reception.hand} hand: {watched.fault}; its poses are left out")
+                return
         frame = self._frames[reception.hand] or (message.frame_id if isinstance(message, HandPose) else "")
         self._publishers_of_hands.publish(reception.topic, message, frame, self.now)
 

@@ -1,0 +1,170 @@
+"""Notices when not the hands moved but the frame that they are measured in: then both move as one.
+
+A frame moves at once, when the headset is recentred, or for as long as something carries it along, such as the
+operator's head. Either looks like a motion of both hands, and no arm may follow it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from enum import Enum
+
+from q2r2_control.inputs.messages import HandPose
+from q2r2_control.inputs.rigid_motion import HandPair, Move, Place, Tolerance, moved_as_one
+from q2r2_control.types import SIDES, HandInputs
+
+# A step: from one sample to the next by more than this, and by more than _STANDS_OUT times any of the _BEFORE samples
+# before. From rest that is 0.7 m/s within one sample, more than 30 m/s^2.
+_STEP = Move(0.010, math.radians(2.0))
+_STANDS_OUT, _BEFORE = 3.0, 4
+_PERIOD = 1.0 / 72.0  # of samples; closer ones were held up on the way [s]
+_STEP_TOLERANCE = Tolerance(0.002, math.radians(0.75))
+# Over a longer gap hands get farther by themselves, from rest with its square: at 20 m/s^2 and 70 rad/s^2 by _STEP [s].
+_STEP_GAP = 0.032
+
+# A frame that is carried along.
+_WINDOW = 1.5  # [s]
+_CARRIED = 0.15  # of both hands [m]
+_NEAR = 0.4 * _CARRIED
+_CARRIED_TOLERANCE = Tolerance(0.001, math.radians(0.5))
+
+_SAME_TIME = 0.01  # the two hands' messages of one time come within this [s]
+_ALIVE = 0.05  # a hand without a pose for longer is not waited for [s]
+_LONGEST_GAP = 0.15  # what a hand did across a longer one is not judged [s]
+# The buttons of an alignment may come after the poses that it moves; so long nobody is told [s].
+_CHORD_TIME = 0.04
+_CHORD_SEEN = 0.01  # before a pose that they moved, whoever follows it shall have seen those buttons [s]
+
+
+class Verdict(Enum):
+    """What becomes of a pose."""
+
+    FOLLOW = "as it is"
+    WAIT = "not before the other hand's next pose has come"
+    DROP = "nobody needs to see it: what it means is told soon"
+    FAULT = "not to be followed"
+
+
+class MovedFrame:
+    """Judges the poses of both hands as they come. Times are receipt times [s]."""
+
+    def __init__(self, fault_time: float) -> None:
+        """``fault_time``: after the frame has moved, no pose is good for this long [s]."""
+        self._fault_time = fault_time
+        self._chords: dict[str, float] = {}  # hands that align, since when
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything received but who holds the buttons of an alignment."""
+        self._ways = {hand: _Way() for hand in SIDES}
+        self._pairs: deque[HandPair] = deque()
+        self._near: HandPair  # since when the left hand is within _NEAR of it; where there are pairs
+        self._suspected: float | None = None
+        self._bad_until = -math.inf
+
+    def take_inputs(self, hand: str, inputs: HandInputs, now: float) -> None:
+        """With both buttons the operator aligns the frame: whatever moves as one then is meant to."""
+        if inputs.button_upper and inputs.button_lower:
+            self._chords.setdefault(hand, now)
+            self.reset()
+        else:
+            self._chords.pop(hand, None)
+
+    def receive(self, hand: str, pose: HandPose, now: float) -> Verdict:
+        """Judge a pose."""
+        place = Place.of(pose)
+        if self._chords or place is None:
+            self._ways[hand] = _Way()
+            just_now = now - min(self._chords.values(), default=-math.inf) < _CHORD_SEEN
+            return Verdict.DROP if just_now else Verdict.FOLLOW
+        way, other = self._ways[hand], self._ways[_other(hand)]
+        if not way.add(place, now):
+            self._pairs.clear()
+        pair = self._pair(way, other, now)
+        if pair is not None:
+            self._judge(pair, now)
+        if self._suspected is not None:
+            if now - self._suspected < _CHORD_TIME:
+                return Verdict.DROP
+            self._suspected, self._bad_until = None, now + self._fault_time
+        if now < self._bad_until:
+            return Verdict.FAULT
+        waits = way.stands_out and way.is_new and now - other.stamp < _ALIVE
+        return Verdict.WAIT if waits else Verdict.FOLLOW
+
+    def _pair(self, way: _Way, other: _Way, now: float) -> HandPair | None:
+        """Both hands, where the one that just came has its counterpart."""
+        if now - other.stamp > _SAME_TIME:
+            other.is_new = False
+        if not other.is_new:
+            return None
+        way.is_new = other.is_new = False
+        places = [self._ways[hand].place for hand in SIDES]
+        assert places[0] is not None
+        assert places[1] is not None
+        return HandPair.of(now, places[0], places[1])
+
+    def _judge(self, pair: HandPair, now: float) -> None:
+        pairs = self._pairs
+        steps = pairs and all(way.stands_out for way in self._ways.values())
+        if steps and moved_as_one(pairs[-1], pair, _STEP_TOLERANCE):
+            self._suspected = now if self._suspected is None else self._suspected
+            pairs.clear()
+        if not pairs:
+            self._near = pair
+        pairs.append(pair)
+        while pairs[0].t < now - _WINDOW:
+            pairs.popleft()
+        if math.dist(pair.left.position, self._near.left.position) > _NEAR:
+            self._near = pair
+        # Where the left hand stayed near one place for all of the window, nothing was carried: spares a hand at rest.
+        if self._near.t > pairs[0].t and _carried(pairs):
+            self._bad_until = now + self._fault_time
+            pairs.clear()
+
+
+class _Way:
+    """What one hand did of late."""
+
+    def __init__(self) -> None:
+        self.place: Place | None = None
+        self.stamp = -math.inf
+        self.is_new = False  # and has no counterpart of the other hand yet
+        self.stands_out = False  # among the moves before
+        self._moves: deque[Move] = deque(maxlen=_BEFORE)
+
+    def add(self, place: Place, now: float) -> bool:
+        """The newest place; returns whether it goes on from the last one."""
+        last, gap = self.place, now - self.stamp
+        self.place, self.stamp, self.is_new = place, now, True
+        if last is None or gap > _LONGEST_GAP:
+            self._moves.clear()
+            self.stands_out = False
+            return False
+        move = place.move_from(last)
+        self.stands_out = len(self._moves) == _BEFORE and self._is_step(move, gap)
+        self._moves.append(move)
+        return True
+
+    def _is_step(self, move: Move, gap: float) -> bool:
+        scale, usual = max(gap / _STEP_GAP, 1.0) ** 2, _STANDS_OUT * max(gap / _PERIOD, 1.0)
+        distance = max(scale * _STEP.distance, usual * max(before.distance for before in self._moves))
+        angle = max(scale * _STEP.angle, usual * max(before.angle for before in self._moves))
+        return move.distance > distance or move.angle > angle
+
+
+def _carried(pairs: deque[HandPair]) -> bool:
+    """Whether the newest of ``pairs`` is far from an earlier one, and all in between differ by rigid motions only."""
+    newest = pairs[-1]
+    for index in range(len(pairs) - 2, -1, -1):
+        if not moved_as_one(pairs[index], newest, _CARRIED_TOLERANCE):
+            return False
+        hands = ((pairs[index].left, newest.left), (pairs[index].right, newest.right))
+        if all(math.dist(before.position, after.position) > _CARRIED for before, after in hands):
+            return True
+    return False
+
+
+def _other(hand: str) -> str:
+    return "right" if hand == "left" else "left"

@@ -1,0 +1,109 @@
+"""Connections that end, fall silent, or deliver late: both arms pause, and only a new press engages."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from q2r2_control.config.timeouts import STREAM_TIMEOUT
+from q2r2_control.types import SIDES, Array
+from tests.support.fake_headset import KEEPALIVE, FakeHeadset
+from tests.support.headset_in_step import PERIOD, InStepRun, Operator
+
+AWAY = pin.SE3(pin.exp3(np.array([0.2, 1.0, 0.3])), np.array([0.2, -0.1, 0.3]))
+A_TICK = 0.002  # [s]
+
+
+def displace(op: Operator) -> None:
+    """The hands go elsewhere while nobody follows them."""
+    op.hands = {hand: place * AWAY for hand, place in op.hands.items()}
+
+
+def engaged_anew(op: Operator) -> Iterator[float]:
+    yield 0.6  # in which nothing may move
+    yield from op.press(*SIDES)
+    yield from op.move((0.0, 0.0, 0.05), seconds=0.3)
+
+
+def assert_engaged_twice(run: InStepRun) -> None:
+    assert [len(run.watch.engagements(arm)) for arm in SIDES] == [2, 2]
+    assert run.states == {"engaged"}
+
+
+@pytest.mark.parametrize("end", [FakeHeadset.reset, FakeHeadset.close], ids=["by a reset", "by a close"])
+def test_a_connection_that_ends_in_mid_motion_pauses_both_arms(end: Callable[[FakeHeadset], None]) -> None:
+    def script(op: Operator) -> Iterator[float]:
+        yield from op.engage()
+        yield from op.move((0.05, 0.05, 0.0), seconds=0.3)
+        op.lose(end)
+        displace(op)
+        yield 0.3
+        op.connect()
+        yield from engaged_anew(op)
+
+    run = InStepRun(script)
+    assert run.reasons("lost") == ["connection lost"] * 2
+    assert_engaged_twice(run)
+
+
+@pytest.mark.parametrize("alive", [False, True], ids=["silent", "silent but for keepalives and buttons"])
+def test_a_headset_that_sends_no_poses_in_mid_motion_pauses_both_arms_in_time(alive: bool) -> None:
+    stopped = []
+
+    def nothing(hand: str, position: Array, quaternion: Array) -> bytes:
+        return KEEPALIVE
+
+    def script(op: Operator) -> Iterator[float]:
+        yield from op.engage()
+        yield from op.move((0.05, 0.05, 0.0), seconds=0.3)
+        stopped.append(op.now)
+        if alive:
+            op.send_pose = nothing
+        op.silent = not alive
+        displace(op)
+        yield 0.4
+        op.silent, op.send_pose = False, op.pose
+        yield from engaged_anew(op)
+
+    run = InStepRun(script)
+    assert "no pose for 0.15 s" in run.reasons("lost")
+    assert max(event.t for event in run.events if event.destination == "lost") <= stopped[0] + STREAM_TIMEOUT + A_TICK
+    assert_engaged_twice(run)
+
+
+def late_by(duration: float) -> Callable[[Operator], Iterator[float]]:
+    """A headset at uneven 30 .. 72 Hz, of whose samples 5 % are lost, on a network that stands still twice."""
+
+    def script(op: Operator) -> Iterator[float]:
+        random = np.random.default_rng(7)
+
+        def sent(hand: str, position: Array, quaternion: Array) -> bytes | None:
+            op.period = float(random.uniform(PERIOD, 1.0 / 30.0))
+            return None if random.random() < 0.05 else op.pose(hand, position, quaternion)
+
+        op.send_pose = sent
+        yield from op.engage()
+        for _ in range(2):
+            yield from op.move((0.0, 0.06, 0.06), seconds=0.3)
+            op.held_up = True
+            yield from op.move((0.0, 0.1 * duration, 0.1 * duration), seconds=duration)
+            op.held_up = False
+            yield from op.move((0.0, -0.06, -0.06), seconds=0.4)
+
+    return script
+
+
+def test_bursts_that_come_within_the_timeout_are_followed_without_a_jump() -> None:
+    run = InStepRun(late_by(0.08))
+    assert run.reasons("lost") == []
+    assert run.states == {"engaged"}
+
+
+def test_bursts_of_200_ms_pause_both_arms_and_what_comes_late_moves_nothing() -> None:
+    run = InStepRun(late_by(0.2))
+    assert "no pose for 0.15 s" in run.reasons("lost")
+    assert [len(run.watch.engagements(arm)) for arm in SIDES] == [1, 1]
+    assert run.states == {"lost"}

@@ -1,0 +1,184 @@
+"""Poses that are no motion of a hand: signs, jumps, frames that move, frozen numbers, clocks, and what is no pose."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from q2r2_control.types import SIDES, Array, HandFault
+from tests.support.headset_in_step import InStepRun, Operator, Sender
+
+AWAY = pin.SE3(pin.exp3(np.array([0.0, 0.0, 0.5 * math.pi])), np.array([0.3, -0.4, 0.0]))  # 0.5 m and 90 degrees
+STILL = 5e-4  # of a tool, whose hand trembles by the noise of its sensor [m]
+
+
+def assert_still(run: InStepRun) -> None:
+    for arm in SIDES:
+        tool = run.tool(arm)
+        assert np.linalg.norm(tool - tool[0], axis=1).max() < STILL
+
+
+def test_quaternions_of_alternating_sign_are_one_rotation() -> None:
+    def script(op: Operator) -> Iterator[float]:
+        signs = dict.fromkeys(SIDES, 1.0)
+
+        def flipped(hand: str, position: Array, quaternion: Array) -> bytes:
+            signs[hand] *= -1.0
+            return op.pose(hand, position, signs[hand] * quaternion)
+
+        op.send_pose = flipped
+        yield from op.engage()
+        yield from op.move((0.0, 0.05, 0.0), (0.0, 0.0, 0.4), seconds=0.5)
+        yield 0.2
+
+    run = InStepRun(script)
+    assert run.reasons("lost") == []
+    first, last = (run.ticks[index].tools["left"].rotation for index in (0, -1))
+    np.testing.assert_allclose(pin.log3(last @ first.T), [0.0, 0.0, 0.4], atol=0.02)
+
+
+def jumping(op: Operator, hands: tuple[str, ...], count: float) -> Sender:
+    """The next ``count`` samples of these hands are measured in a frame 0.5 m and 90 degrees away."""
+    left = dict.fromkeys(hands, count)
+
+    def sent(hand: str, position: Array, quaternion: Array) -> bytes:
+        seen = pin.SE3(pin.Quaternion(quaternion).matrix(), position)
+        if left.get(hand, 0) > 0:
+            left[hand] -= 1
+            seen = AWAY * seen
+        return op.pose(hand, seen.translation, pin.Quaternion(seen.rotation).coeffs())
+
+    return sent
+
+
+@pytest.mark.parametrize("count", [1, math.inf], ids=["for one sample", "for good"])
+@pytest.mark.parametrize("hands", [("left",), ("right",), SIDES], ids=["left", "right", "both, as a frame does"])
+def test_a_jump_moves_no_arm_and_pauses_both(hands: tuple[str, ...], count: float) -> None:
+    def script(op: Operator) -> Iterator[float]:
+        yield from op.engage()
+        yield 0.2
+        op.send_pose = jumping(op, hands, count)
+        yield 0.8
+        yield from op.press(*SIDES)
+        yield 0.2
+
+    run = InStepRun(script)
+    lost = run.reasons("lost")
+    assert len(lost) == 2
+    assert all((HandFault.FRAME_MOVED if hands == SIDES else "the hand jumped") in reason for reason in lost)
+    assert_still(run)
+    assert run.states == {"engaged"}
+
+
+@pytest.mark.parametrize("shift", [0.02, 0.1])
+def test_a_frame_that_steps_by_less_than_any_gate_moves_no_arm(shift: float) -> None:
+    def script(op: Operator) -> Iterator[float]:
+        yield from op.engage()
+        yield 0.2
+        op.frame = pin.SE3(np.eye(3), np.array([0.0, 0.6 * shift, 0.8 * shift]))
+        yield 0.5
+
+    run = InStepRun(script)
+    assert run.reasons("lost") == [HandFault.FRAME_MOVED] * 2
+    assert_still(run)
+
+
+def test_poses_that_freeze_while_buttons_go_on_pause_both_arms_and_engage_none() -> None:
+    def script(op: Operator) -> Iterator[float]:
+        yield from op.engage()
+        yield from op.move((0.0, 0.05, 0.0), seconds=0.3)
+        frozen: dict[str, bytes] = {}
+        op.send_pose = lambda hand, position, quaternion: frozen.setdefault(hand, op.pose(hand, position, quaternion))
+        yield 0.6
+        yield from op.press(*SIDES)
+        op.send_pose = op.pose
+        yield 0.1
+        yield from op.press(*SIDES)
+
+    run = InStepRun(script)
+    assert run.reasons("lost")[:2] == [HandFault.FROZEN] * 2
+    assert run.reasons("lost")[2:] == [f"not engaged: {HandFault.FROZEN}"] * 2
+    assert run.states == {"engaged"}
+
+
+# Clocks --------------------------------------------------------------------------------------------------------------
+
+HOUR = 3600
+STAMPS: dict[str, Callable[[int], tuple[int, int]]] = {
+    "repeated": lambda index: (12, 500),
+    "out of order": lambda index: (100 - 3 * (index % 2), 13_000_000 * (index % 70)),
+    "an hour early, then an hour late": lambda index: (10 * HOUR + (HOUR if index < 60 else -HOUR), 0),
+    "in the farthest future": lambda index: (2**31 - 1, 999_999_999),
+    "before 1970": lambda index: (-1, 0),
+}
+
+
+def stamped(stamp: Callable[[int], tuple[int, int]]) -> InStepRun:
+    def script(op: Operator) -> Iterator[float]:
+        counts = dict.fromkeys(SIDES, 0)
+
+        def sent(hand: str, position: Array, quaternion: Array) -> bytes:
+            counts[hand] += 1
+            return op.pose(hand, position, quaternion, stamp=stamp(counts[hand]))
+
+        op.send_pose = sent
+        yield from op.engage()
+        yield from op.move((0.05, 0.05, 0.0), (0.0, 0.2, 0.0), seconds=0.5)
+
+    return InStepRun(script)
+
+
+@pytest.fixture(scope="module")
+def in_order() -> Array:
+    run = stamped(lambda index: (100 + index // 72, 13_000_000 * (index % 72)))
+    assert run.states == {"engaged"}
+    return run.tool("left")
+
+
+@pytest.mark.parametrize("name", sorted(STAMPS))
+def test_an_arm_goes_by_when_poses_are_received_whatever_the_headsets_clock_says(name: str, in_order: Array) -> None:
+    np.testing.assert_array_equal(stamped(STAMPS[name]).tool("left"), in_order)
+
+
+# What is no pose -----------------------------------------------------------------------------------------------------
+
+HOSTILE: dict[str, tuple[Array, Array]] = {
+    "not a number": (np.array([np.nan, 0.0, 0.0]), np.array([0.0, 0.0, 0.0, 1.0])),
+    "infinite": (np.array([0.0, -np.inf, 0.0]), np.array([0.0, 0.0, 0.0, 1.0])),
+    "beyond the solar system": (np.array([0.0, 0.0, 1e300]), np.array([0.0, 0.0, 0.0, 1.0])),
+    "no rotation": (np.zeros(3), np.zeros(4)),
+    "a rotation that is not a number": (np.zeros(3), np.array([np.nan, 0.0, 0.0, 1.0])),
+    "a rotation of no length": (np.zeros(3), np.array([0.0, 0.0, 0.0, 5e-324])),
+}
+
+
+@pytest.mark.parametrize("name", sorted(HOSTILE))
+def test_a_hand_that_sends_what_is_no_pose_stops_its_arm_while_the_other_one_works_on(name: str) -> None:
+    def script(op: Operator) -> Iterator[float]:
+        yield from op.engage()
+        op.send_pose = lambda hand, position, quaternion: (
+            op.pose(hand, *HOSTILE[name]) if hand == "left" else op.pose(hand, position, quaternion)
+        )
+        yield from op.move((0.0, 0.1, 0.0), seconds=0.5)
+        yield 0.3
+
+    run = InStepRun(script, linked=False)
+    assert run.ticks[-1].states == {"left": "lost", "right": "engaged"}
+    way = {arm: run.tool(arm)[-1] - run.tool(arm)[0] for arm in SIDES}
+    assert np.linalg.norm(way["left"]) < STILL
+    np.testing.assert_allclose(way["right"], [0.0, 0.09, 0.0], atol=2e-3)
+
+
+def test_a_frame_that_breaks_the_protocol_in_mid_motion_ends_the_connection_and_pauses_both_arms() -> None:
+    def script(op: Operator) -> Iterator[float]:
+        yield from op.engage()
+        yield from op.move((0.0, 0.05, 0.0), seconds=0.3)
+        op.lose(lambda headset: headset.send(b"\xff" * 64))
+        yield 0.7
+
+    run = InStepRun(script)
+    assert run.reasons("lost") == ["connection lost"] * 2

@@ -1,0 +1,215 @@
+"""Poses that are no motion of the hands: frozen ones, and those of a frame that moved. Human hands are neither."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from q2r2_control.inputs import moved_frame
+from q2r2_control.inputs.hands_watch import HandsWatch, Watched
+from q2r2_control.inputs.messages import HandPose
+from q2r2_control.inputs.rigid_motion import Tolerance
+from q2r2_control.inputs.session import Reception
+from q2r2_control.types import SIDES, HandFault, HandInputs
+from tests.support.two_hands import PERIOD, START, TwoHands, carry, hand_pose, rest
+
+Message = tuple[float, str, HandPose | HandInputs]
+STEP_AT = 30 * PERIOD  # [s]
+CHORD, RELEASED = HandInputs(button_upper=True, button_lower=True), HandInputs()
+
+
+def reception(hand: str, message: HandPose | HandInputs) -> Reception:
+    return Reception(f"q2r_{hand}_hand_{'pose' if isinstance(message, HandPose) else 'inputs'}", hand, message)
+
+
+def handed_on(messages: Iterable[Message], watch: HandsWatch | None = None) -> list[Watched]:
+    watch = watch or HandsWatch()
+    return [watched for t, hand, message in messages for watched in watch.receive(reception(hand, message), t)]
+
+
+def faults(watched: Iterable[Watched]) -> set[tuple[str, HandFault]]:
+    return {(one.reception.hand, one.fault) for one in watched if one.fault is not None}
+
+
+def moved(samples: Iterable[Message], by: Callable[[float, str], pin.SE3]) -> Iterator[Message]:
+    """The same in a frame that has moved."""
+    for t, hand, pose in samples:
+        assert isinstance(pose, HandPose)
+        rotation = pin.Quaternion(pose.quaternion).matrix()
+        yield t, hand, hand_pose(by(t, hand) * pin.SE3(rotation, pose.position))
+
+
+def stepped(shift: float, degrees: float, hands: tuple[str, ...] = SIDES) -> Callable[[float, str], pin.SE3]:
+    """A frame that moves once, by ``shift`` [m] and about the vertical."""
+    step = pin.SE3(pin.exp3(np.array([0.0, 0.0, math.radians(degrees)])), shift * np.array([0.6, 0.0, 0.8]))
+    return lambda t, hand: step if t >= STEP_AT and hand in hands else pin.SE3.Identity()
+
+
+def resting(seed: int = 0) -> list[Message]:
+    return list(TwoHands(rest, seed).samples(1.2))
+
+
+# Frozen --------------------------------------------------------------------------------------------------------------
+
+
+def test_a_pose_that_stays_the_same_to_the_last_bit_is_frozen_whatever_its_stamp() -> None:
+    (_, _, pose), *_ = resting()
+    assert isinstance(pose, HandPose)
+    still = [(index * PERIOD, "left", replace(pose, stamp=float(index))) for index in range(60)]
+    found = [one.stamp for one in handed_on(still) if one.fault is HandFault.FROZEN]
+    assert found == [t for t, _, _ in still if t >= 0.5]
+    changed = replace(pose, position=np.nextafter(pose.position, 1e9))
+    assert handed_on([*still, (1.0, "left", changed)])[-1].fault is None
+
+
+def test_a_hand_that_rests_but_for_the_noise_of_its_sensor_is_not_frozen() -> None:
+    assert faults(handed_on(TwoHands(rest, 1, (0.0, 0.0), tremor=False, noise=1e-7).samples(2.0))) == set()
+
+
+def test_what_is_frozen_is_not_looked_for_where_no_time_is_set() -> None:
+    (_, _, pose), *_ = resting()
+    assert faults(handed_on([(0.1 * i, "left", pose) for i in range(60)], HandsWatch(None))) == set()
+
+
+# A frame that moves at once ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize(
+    ("shift", "degrees"), [(0.015, 0.0), (0.1, 0.0), (0.0, 3.0), (0.0, -40.0), (0.4, 120.0)], ids=str
+)
+def test_a_frame_that_steps_is_a_fault_of_both_hands_and_nobody_gets_a_pose_of_it(
+    shift: float, degrees: float, seed: int
+) -> None:
+    watched = handed_on(moved(resting(seed), stepped(shift, degrees)))
+    after = [one for one in watched if one.stamp >= STEP_AT]
+    bad = [one for one in after if one.fault]
+    assert faults(after) == {(hand, HandFault.FRAME_MOVED) for hand in SIDES}
+    assert after[0] is bad[0]
+    assert bad[0].stamp - STEP_AT < 0.05
+    assert bad[-1].stamp - bad[0].stamp == pytest.approx(0.3, abs=2.0 * PERIOD)
+    assert [one.fault for one in after[len(bad) :]] == [None] * (len(after) - len(bad))
+    assert len(after) > len(bad)
+
+
+def test_a_step_of_one_hand_is_handed_on_in_order_for_the_gate_to_judge() -> None:
+    for hand in SIDES:
+        samples = list(moved(resting(), stepped(0.3, 0.0, (hand,))))
+        watched = handed_on(samples)
+        assert faults(watched) == set()
+        assert sorted((one.stamp, one.reception.hand) for one in watched) == [(t, hand) for t, hand, _ in samples]
+        for side in SIDES:
+            stamps = [one.stamp for one in watched if one.reception.hand == side]
+            assert stamps == sorted(stamps)
+
+
+def test_a_step_of_each_hand_another_way_is_no_frame_but_for_the_gate_to_judge() -> None:
+    ways = {"left": stepped(0.3, 0.0), "right": stepped(-0.3, 0.0)}
+    watched = handed_on(moved(resting(), lambda t, hand: ways[hand](t, hand)))
+    assert faults(watched) == set()
+    assert len(watched) == len(resting())
+
+
+def test_a_hand_whose_other_one_is_not_there_does_not_wait_for_it() -> None:
+    alone = [message for message in moved(resting(), stepped(0.1, 0.0)) if message[1] == "right"]
+    watch = HandsWatch()
+    for t, hand, pose in alone:
+        assert [one.stamp for one in watch.receive(reception(hand, pose), t)] == [t]
+
+
+@pytest.mark.parametrize("begins", [-0.03, -0.0001, 0.0001, 0.003, 0.02], ids=str)
+@pytest.mark.parametrize("first", SIDES)
+def test_an_alignment_by_its_chord_is_no_fault_whether_the_buttons_come_before_or_behind_the_poses(
+    first: str, begins: float
+) -> None:
+    messages = [*moved(resting(), stepped(0.3, 60.0)), (STEP_AT + begins, first, CHORD)]
+    messages.append((STEP_AT + begins + 0.15, first, RELEASED))
+    watched = handed_on(sorted(messages, key=lambda message: message[0]))
+    assert faults(watched) == set()
+    assert watched[-1].stamp == max(t for t, _, _ in messages)
+
+
+def test_after_the_chord_is_let_go_a_step_is_a_fault_again() -> None:
+    chord = [(0.05, "left", CHORD), (0.15, "left", RELEASED)]
+    messages = sorted([*moved(resting(), stepped(0.1, 0.0)), *chord], key=lambda message: message[0])
+    assert {hand for hand, _ in faults(handed_on(messages))} == set(SIDES)
+
+
+# A frame that is carried along ---------------------------------------------------------------------------------------
+
+
+def nodding(t: float) -> pin.SE3:
+    """A head that turns by 35 degrees in 1.2 s."""
+    s = min(t / 1.2, 1.0)
+    return pin.SE3(
+        pin.exp3(np.array([0.0, 0.0, math.radians(35.0) * s**3 * (10.0 - 15.0 * s + 6.0 * s**2)])), np.zeros(3)
+    )
+
+
+def test_a_frame_that_turns_with_the_head_is_a_fault_of_both_hands() -> None:
+    still = list(TwoHands(rest, 3, (0.0, 0.0), tremor=False).samples(1.5))
+    coupled = list(moved(still, lambda t, hand: nodding(t)))
+    assert faults(handed_on(coupled)) == {(hand, HandFault.FRAME_MOVED) for hand in SIDES}
+    assert faults(handed_on(coupled, HandsWatch(frame=False))) == set()
+
+
+# Human hands ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("tremor", [True, False], ids=["trembling", "without tremor"])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_human_hands_that_carry_a_light_box_are_no_frame_with_a_margin_of_two(
+    seed: int, tremor: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("_CARRIED_TOLERANCE", "_STEP_TOLERANCE"):
+        distance, angle = getattr(moved_frame, name)
+        monkeypatch.setattr(moved_frame, name, Tolerance(2.0 * distance, 2.0 * angle))
+    assert faults(handed_on(TwoHands(carry, seed, tremor=tremor).samples(6.4))) == set()
+
+
+def snatch(t: float) -> pin.SE3:
+    """Both hands by 0.2 m, to and fro, from rest to 1.2 m/s at 18 m/s^2 and straight into a stop."""
+    stroke, phase = divmod(t, 0.4)
+    ramp = 1.2 / 18.0
+    way = min(9.0 * min(phase, ramp) ** 2 + 1.2 * max(phase - ramp, 0.0), 0.2)
+    return pin.SE3(np.eye(3), np.array([0.0, way if stroke % 2 == 0 else 0.2 - way, 0.0]))
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_hands_that_start_as_fast_as_hands_can_with_samples_lost_and_held_up_are_no_frame(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    lost = {index for index in range(600) if random.random() < 0.05}
+    samples = [
+        (t if not 2.0 < t < 2.1 else 2.1, hand, pose)
+        for index, (t, hand, pose) in enumerate(TwoHands(snatch, seed).samples(6.0))
+        if index // 2 not in lost
+    ]
+    watched = handed_on(samples)
+    assert faults(watched) == set()
+    assert len(watched) >= len(samples) - 1
+
+
+def test_hands_that_start_together_while_samples_are_lost_are_no_frame() -> None:
+    """At 16 m/s^2, for 60 ms, and without anything that tells them from one rigid body."""
+
+    def reach(t: float) -> pin.SE3:
+        return pin.SE3(np.eye(3), np.array([0.0, 8.0 * min(max(t - STEP_AT, 0.0), 0.06) ** 2, 0.0]))
+
+    rigid = TwoHands(reach, 0, (0.0, 0.0), tremor=False).samples(1.0)
+    assert faults(handed_on(one for one in rigid if not STEP_AT < one[0] < STEP_AT + 0.06)) == set()
+
+
+def test_hands_that_go_and_turn_alike_each_about_itself_are_no_frame() -> None:
+    still = TwoHands(rest, 0, (0.0, 0.0), tremor=False).samples(1.5)
+
+    def alike(t: float, hand: str) -> pin.SE3:
+        about = pin.SE3(np.eye(3), START[hand])
+        turn = pin.SE3(pin.exp3(np.array([0.0, 0.0, 0.3 * t])), np.zeros(3))
+        return pin.SE3(np.eye(3), np.array([0.3 * t, 0.0, 0.0])) * about * turn * about.inverse()
+
+    assert faults(handed_on(moved(still, alike))) == set()

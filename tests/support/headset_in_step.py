@@ -1,0 +1,252 @@
+"""An operator whose headset sends over TCP in simulated time: what was sent by a tick has arrived when it polls.
+
+So outcomes do not depend on how fast the machine is. A script is a generator that changes the operator and yields the
+times to wait [s]; the run ends with it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping
+
+import numpy as np
+import pinocchio as pin
+
+from q2r2_control.inputs.factory import hands_watch
+from q2r2_control.inputs.headset import HeadsetServer
+from q2r2_control.pipeline import Pipeline
+from q2r2_control.plants.mujoco import MujocoPlant
+from q2r2_control.runtime.recorder import Tick
+from q2r2_control.types import SIDES, Array, Event, HandSample, HapticFeedback
+from tests.support.fake_headset import FakeHeadset
+from tests.support.headset_server import eventually
+from tests.support.operator_script import START
+from tests.support.watch import Watch, cell
+
+PERIOD = 1.0 / 72.0  # of samples [s]
+PRESS = 0.12  # longer than a chord's window [s]
+NOISE = 2e-5  # of a position [m]
+_PATIENCE = 60.0  # of the machine's time [s]
+_AT_REST = 0.5  # after an arm was let go, it has braked [s]
+_FASTEST, _FASTEST_TURN = 2.0, 8.0  # of a target [m/s], [rad/s]
+
+Script = Callable[["Operator"], Iterator[float]]
+Sender = Callable[[str, Array, Array], bytes | None]  # of hand, position and quaternion
+
+
+class Operator:
+    """What the script changes. Hands are where ``hands`` says, in a frame that is at ``frame``."""
+
+    def __init__(self, server: HeadsetServer, plant: MujocoPlant) -> None:
+        self.plant = plant
+        self.hands = {hand: pin.SE3(np.eye(3), np.array(START[hand])) for hand in SIDES}
+        self.frame = pin.SE3.Identity()
+        self.lower: set[str] = set()
+        self.upper: set[str] = set()
+        self.period = PERIOD
+        self.silent = False
+        self.held_up = False  # by the network, which delivers in order and all at once later
+        self.send_pose: Sender = self.pose
+        self.noise = NOISE
+        self.headset: FakeHeadset | None = None
+        self.now = 0.0
+        self._server = server
+        self._backlog: list[bytes] = []
+        self._random = np.random.default_rng(5)
+
+    def connect(self) -> None:
+        self.headset = FakeHeadset(self._server.address, connect_timeout=_PATIENCE)
+        self.headset.send(self.headset.registrations())
+        self.headset.read_until("__topic_list", _PATIENCE)
+
+    def pose(self, hand: str, position: Array, quaternion: Array, stamp: tuple[int, int] = (12, 500)) -> bytes:
+        """The bytes of a pose."""
+        assert self.headset is not None
+        x, y, z = position.tolist()
+        qx, qy, qz, qw = quaternion.tolist()
+        return self.headset.pose(hand, (x, y, z), (qx, qy, qz, qw), stamp=stamp)
+
+    def send(self) -> None:
+        """Both hands' poses and buttons; returns when the server has read them."""
+        if self.headset is None or self.silent:
+            return
+        frames = []
+        for hand in SIDES:
+            seen = self.frame * self.hands[hand]
+            position = seen.translation + self._random.normal(0.0, self.noise, 3)
+            frames.append(self.send_pose(hand, position, pin.Quaternion(seen.rotation).coeffs()) or b"")
+            frames.append(self.headset.inputs(hand, hand in self.upper, hand in self.lower))
+        self._backlog += frames
+        if not self.held_up:
+            self.headset.send(b"".join(self._backlog))
+            self._backlog.clear()
+            self.wait_until_read()
+
+    def lose(self, end: Callable[[FakeHeadset], None]) -> None:
+        """End the connection, which the server has noticed behind this."""
+        assert self.headset is not None
+        end(self.headset)
+        self.headset = None
+        eventually(lambda: self._server.statistics.peer is None)
+
+    def wait_until_read(self) -> None:
+        """The server answers in the order in which it was asked."""
+        assert self.headset is not None
+        self.headset.send(self.headset.command("__topic_list"))
+        self.headset.read_until("__topic_list", _PATIENCE)
+
+    # Scripts -----------------------------------------------------------------------------------------------------
+
+    def press(self, *hands: str) -> Iterator[float]:
+        """The lower buttons, which engage and pause."""
+        self.lower |= set(hands)
+        yield PRESS
+        self.lower -= set(hands)
+        yield PRESS
+
+    def engage(self) -> Iterator[float]:
+        yield 0.1
+        yield from self.press(*SIDES)
+
+    def move(
+        self, way: Iterable[float], turn: Iterable[float] = (0.0, 0.0, 0.0), seconds: float = 0.6
+    ) -> Iterator[float]:
+        """Both hands, as people reach; the right one goes by 0.9 of the way, as human hands never move as one."""
+        steps, starts = max(round(seconds / PERIOD), 1), dict(self.hands)
+        whole = pin.Motion(np.array(list(way)), np.array(list(turn)))
+        for index in range(1, steps + 1):
+            s = index / steps
+            done = s**3 * (10.0 - 15.0 * s + 6.0 * s**2)  # least jerk (Flash and Hogan 1985)
+            for hand, share in (("left", done), ("right", 0.9 * done)):
+                rotation = pin.exp3(share * whole.angular) @ starts[hand].rotation
+                self.hands[hand] = pin.SE3(rotation, starts[hand].translation + share * whole.linear)
+            yield PERIOD
+
+
+class HeadsetInStep:
+    """The input of a run: the server, and the operator that the script plays."""
+
+    def __init__(self, script: Script, mujoco: Mapping[str, object], **teleop: object) -> None:
+        changed = cell().teleop.model_validate({**cell().teleop.model_dump(), **teleop})
+        softer = cell().mujoco.model_copy(update=mujoco)
+        self.config = cell().model_copy(update={"teleop": changed, "mujoco": softer, "loop_rate_hz": 500.0})
+        self.server = HeadsetServer(port=0, clock=lambda: self.now, watch=hands_watch(self.config))
+        self.now = 0.0
+        self.over = False
+        self.plant: MujocoPlant | None = None
+        self._make = script
+
+    @property
+    def connected(self) -> bool:
+        return self.server.connected
+
+    def start(self) -> None:
+        self.server.start()
+        assert self.plant is not None
+        self.operator = Operator(self.server, self.plant)
+        self.operator.connect()
+        self._script = self._make(self.operator)
+        self._wakes = self._sends = 0.0
+
+    def poll(self, now: float) -> list[HandSample]:
+        self.now = self.operator.now = now
+        while not self.over and now >= self._wakes - 1e-9:
+            try:
+                self._wakes += next(self._script)
+            except StopIteration:
+                self.over = True
+        if now >= self._sends - 1e-9:
+            self._sends += self.operator.period
+            self.operator.send()
+        return self.server.poll(now)
+
+    def send_haptic(self, feedback: HapticFeedback) -> None:
+        self.server.send_haptic(feedback)
+
+    def close(self) -> None:
+        if self.operator.headset is not None:
+            self.operator.headset.close()
+        self.server.close()
+
+
+class InStepRun:
+    """A whole run of a script: its ticks and events. The contract held at every one, and no arm caught up."""
+
+    def __init__(self, script: Script, mujoco: Mapping[str, object] | None = None, **teleop: object) -> None:
+        self.source = HeadsetInStep(script, mujoco or {}, **teleop)
+        self.loop = Pipeline.from_config(self.source.config, input=self.source, plant="mujoco")
+        assert isinstance(self.loop.plant, MujocoPlant)
+        self.source.plant = self.loop.plant
+        self.watch = Watch(self.loop)
+        self.loop.listeners.append(NoCatchUp(self.loop))
+        self.loop.listeners.append(self._end)
+        self.summary = self.loop.run(120.0, realtime=False)
+        assert self.source.over, "the script was played to its end"
+
+    def _end(self, tick: Tick) -> None:
+        if self.source.over:
+            self.loop.stop()
+
+    @property
+    def ticks(self) -> list[Tick]:
+        """Of the script, without the way to rest behind it."""
+        return [tick for tick in self.watch.ticks if tick.following]
+
+    def tool(self, arm: str) -> Array:
+        """Measured positions of a tool at every tick (n, 3) [m]."""
+        return np.array([tick.tools[arm].translation for tick in self.ticks])
+
+    @property
+    def states(self) -> set[str]:
+        """Of both arms at the end."""
+        return set(self.ticks[-1].states.values())
+
+    @property
+    def events(self) -> list[Event]:
+        return [event for tick in self.ticks for event in tick.events]
+
+    def reasons(self, destination: str) -> list[str]:
+        """Why arms came to a state, or what they were refused in it."""
+        return [event.reason for event in self.events if event.destination == destination]
+
+
+class NoCatchUp:
+    """Fails a run in which an arm moves that nobody engaged, or a target that jumps."""
+
+    def __init__(self, loop: Pipeline) -> None:
+        self._robot = loop.robot
+        self._data = loop.robot.model.createData()
+        self._before: dict[str, pin.SE3] = {}
+        self._let_go = dict.fromkeys(SIDES, -math.inf)
+        self._rests: dict[str, Array] = {}
+
+    def __call__(self, tick: Tick) -> None:
+        if not tick.following:
+            return
+        pin.forwardKinematics(self._robot.model, self._data, tick.reference.q)
+        for name, arm in self._robot.arms.items():
+            place = pin.updateFramePlacement(self._robot.model, self._data, arm.frame_id).translation.copy()
+            target = tick.targets[name].pose
+            if tick.engaged[name]:
+                assert target is not None
+                self._check_target(name, target, tick)
+                self._let_go[name] = tick.t
+                self._rests.pop(name, None)
+                continue
+            assert target is None, f"{name} has a target without being engaged, at {tick.t:.3f} s"
+            self._before.pop(name, None)
+            if tick.t - self._let_go[name] > _AT_REST:
+                rest = self._rests.setdefault(name, place)
+                assert math.dist(place, rest) < 1e-6, f"{name} moves without being engaged, at {tick.t:.3f} s"
+
+    def _check_target(self, name: str, target: pin.SE3, tick: Tick) -> None:
+        before = self._before.get(name)
+        if before is None:
+            off = math.dist(target.translation, tick.tools[name].translation)
+            assert off < 1e-9, f"{name} is engaged {off:.3g} m off its tool, at {tick.t:.3f} s"
+        else:
+            way = math.dist(target.translation, before.translation)
+            assert way < _FASTEST * tick.dt, f"the target of {name} jumps by {way:.3g} m, at {tick.t:.3f} s"
+            angle = float(np.linalg.norm(pin.log3(before.rotation.T @ target.rotation)))
+            assert angle < _FASTEST_TURN * tick.dt, f"the target of {name} turns by {angle:.3g} rad, at {tick.t:.3f} s"
+        self._before[name] = target
