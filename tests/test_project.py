@@ -17,7 +17,10 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 ROS = ROOT / "q2r2_control" / "ros"
 # Distributions whose import has another name.
-IMPORTS = {"pin": "pinocchio", "example-robot-data-loaders": "example_robot_data", "PyYAML": "yaml", "pin-pink": "pink"}
+IMPORTS = {
+    **{"pin": "pinocchio", "example-robot-data-loaders": "example_robot_data", "PyYAML": "yaml", "pin-pink": "pink"},
+    "pillow": "PIL",
+}
 
 
 def project() -> dict[str, Any]:
