@@ -13,6 +13,7 @@ from q2r2_control.cli.output import stderr_console
 from q2r2_control.errors import ConfigError, RecordingError
 from q2r2_control.export.csv_tables import write_table, write_tables
 from q2r2_control.export.episodes import FASTEST, Sampling, make_episodes
+from q2r2_control.export.kept_pictures import KeptAs
 from q2r2_control.export.lerobot import require_pyarrow, write_dataset
 from q2r2_control.export.output import Output
 from q2r2_control.recording.files import recordings_in
@@ -25,6 +26,7 @@ Recordings = Annotated[
 Fps = Annotated[int, typer.Option(help=f"Frames per second: 1 .. {FASTEST}.")]
 Trim = Annotated[bool, typer.Option("--trim", help="Leave out what is before and after any arm is engaged or moving.")]
 Workers = Annotated[int, typer.Option(min=1, help="Processes; the result is the same for any number.")]
+NoPictures = Annotated[bool, typer.Option("--no-pictures", help="Leave out what cameras recorded.")]
 SkipBad = Annotated[bool, typer.Option("--skip-bad", help="Say which recordings are bad, and go on without them.")]
 
 
@@ -36,10 +38,15 @@ def lerobot(
     trim: Trim = False,
     workers: Workers = 1,
     skip_bad: SkipBad = False,
+    no_pictures: NoPictures = False,
 ) -> None:
-    """Make a LeRobotDataset v3.0 of recordings: an episode each. Needs pyarrow, the extra `export`."""
+    """Make a LeRobotDataset v3.0 of recordings: an episode each, with a video of each camera.
+
+    Needs the extra `export`.
+    """
     require_pyarrow()
-    _export(recordings, Sampling(fps, trim), output, workers, skip_bad, lambda count: write_dataset)
+    kept = None if no_pictures else KeptAs.VIDEO
+    _export(recordings, Sampling(fps, trim, kept), output, workers, skip_bad, lambda count: write_dataset)
 
 
 @app.command(epilog="Example: q2r2 export csv recordings/20260101-120000-dual_iiwa7 --output circle.csv")

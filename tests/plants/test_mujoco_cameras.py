@@ -24,7 +24,8 @@ def axes(**camera: object) -> tuple[Array, Array]:
 
 
 def test_a_camera_that_looks_at_a_point_has_it_in_the_middle_and_stands_upright() -> None:
-    position, (right, up, back) = (lambda at, matrix: (at, matrix.T))(*axes(position=(2, 1, 1.5), look_at=(0.5, 0, 0)))
+    position, turned = axes(position=(2, 1, 1.5), look_at=(0.5, 0, 0))
+    right, up, back = turned.T
     np.testing.assert_allclose(position, (2, 1, 1.5))
     np.testing.assert_allclose(np.cross(-back, np.array((0.5, 0, 0)) - position), 0, atol=1e-12)
     assert -back @ (np.array((0.5, 0, 0)) - position) > 0
