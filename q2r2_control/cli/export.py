@@ -13,9 +13,11 @@ from q2r2_control.cli.output import stderr_console
 from q2r2_control.errors import ConfigError, RecordingError
 from q2r2_control.export.csv_tables import write_table, write_tables
 from q2r2_control.export.episodes import FASTEST, Sampling, make_episodes
+from q2r2_control.export.hdf5 import write_episodes
 from q2r2_control.export.kept_pictures import KeptAs
 from q2r2_control.export.lerobot import require_pyarrow, write_dataset
 from q2r2_control.export.output import Output
+from q2r2_control.export.pixel_files import require_h5py
 from q2r2_control.recording.files import recordings_in
 
 app = typer.Typer(rich_markup_mode=None, help="Recordings of q2r2 run --record as datasets to train on.")
@@ -47,6 +49,22 @@ def lerobot(
     require_pyarrow()
     kept = None if no_pictures else KeptAs.VIDEO
     _export(recordings, Sampling(fps, trim, kept), output, workers, skip_bad, lambda count: write_dataset)
+
+
+@app.command(epilog="Example: q2r2 export hdf5 recordings --output datasets/circle-act --fps 50")
+def hdf5(
+    recordings: Recordings,
+    output: Annotated[Path, typer.Option(metavar="OUT", help="A folder that does not exist yet.")],
+    fps: Fps = 30,
+    trim: Trim = False,
+    workers: Workers = 1,
+    skip_bad: SkipBad = False,
+    no_pictures: NoPictures = False,
+) -> None:
+    """Make HDF5 files of recordings, a file each, for trainers of ACT. Needs the extra `export`."""
+    require_h5py()
+    kept = None if no_pictures else KeptAs.PIXELS
+    _export(recordings, Sampling(fps, trim, kept), output, workers, skip_bad, lambda count: write_episodes)
 
 
 @app.command(epilog="Example: q2r2 export csv recordings/20260101-120000-dual_iiwa7 --output circle.csv")

@@ -7,10 +7,9 @@ from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 
-import numpy as np
-
 from q2r2_control.config.cameras import CameraConfig
 from q2r2_control.export.pictures import pictures_at
+from q2r2_control.export.pixel_files import write_pixels
 from q2r2_control.export.video import encode
 from q2r2_control.recording.reader import Recording
 
@@ -19,7 +18,7 @@ class KeptAs(StrEnum):
     """What pictures become, by the ending of their file."""
 
     VIDEO = "mp4"
-    PIXELS = "npy"  # (frames, height, width, 3) of bytes
+    PIXELS = "h5"
 
 
 @dataclass(frozen=True)
@@ -53,10 +52,6 @@ def keep_pictures(
             found = encode(pictures, len(stamps), place, fps)
             statistics = {key: values.tolist() for key, values in found.items()}
         else:
-            shape = (len(stamps), camera.height, camera.width, 3)
-            pixels = np.lib.format.open_memmap(place, "w+", np.uint8, shape)
-            for row, picture in zip(pixels, pictures, strict=True):
-                row[:] = picture
-            pixels.flush()
+            write_pixels(pictures, len(stamps), camera, place)
         kept[name] = KeptPictures(camera.width, camera.height, statistics)
     return kept
