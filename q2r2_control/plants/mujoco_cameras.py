@@ -55,8 +55,6 @@ class CellPictures:
     def __init__(self, model: mujoco.MjModel, cameras: Mapping[str, CameraConfig]) -> None:
         """``model`` is changed. Raises :class:`PlantError`, one line, where OpenGL without a window is missing."""
         model.vis.quality.shadowsize, model.vis.quality.offsamples = _SHADOW_MAP, _SAMPLES
-        # What sleeps would not be moved to where it is said to be.
-        model.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)
         model.vis.global_.offwidth = max(camera.width for camera in cameras.values())
         model.vis.global_.offheight = max(camera.height for camera in cameras.values())
         self._model, self._data = model, mujoco.MjData(model)

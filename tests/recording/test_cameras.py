@@ -23,6 +23,7 @@ from q2r2_control.recording.recorder import Recorder
 from q2r2_control.recording.replay import replay
 from q2r2_control.runtime.recorder import Tick
 from tests.recording.runs import RATE, file_of, pipeline, read_elsewhere, record
+from tests.recording.test_recorder import run_program
 from tests.recording.test_writer_process import Script
 from tests.support.pictures import needs_opengl
 from tests.support.processes import alive, wait_until
@@ -124,6 +125,43 @@ def test_pictures_that_are_not_taken_in_time_are_lost_and_counted(tmp_path: Path
     assert summary.pictures + summary.lost_pictures >= taken[0]
     assert summary.file is not None
     assert len(list(Recording(Path(summary.file)).pictures("front"))) == summary.pictures
+
+
+def test_pictures_that_are_due_between_two_ticks_are_lost_and_counted(tmp_path: Path) -> None:
+    needs_opengl()
+    loop = pipeline("circle", "mujoco", loop_rate_hz=100.0, cameras={"front": FRONT.model_copy(update={"rate": 240.0})})
+    observed = Observed(loop)
+    loop.listeners.append(observed)
+    summary = record(tmp_path, loop, 0.1)
+    assert summary.pictures == len(observed.times)
+    assert summary.pictures + summary.lost_pictures == int(observed.times[-1] * 240.0 + 1e-6) + 1
+
+
+def test_when_the_run_is_killed_the_pictures_that_wait_are_taken_and_the_file_is_closed(tmp_path: Path) -> None:
+    needs_opengl()
+    program = """
+        import os, signal, sys
+        from pathlib import Path
+        from tests.recording.runs import record
+        from tests.recording.test_cameras import FRONT, loop_with
+        loop = loop_with(front=FRONT)
+        def kill(tick):
+            if tick.t >= 0.8:
+                os.kill(os.getpid(), signal.SIGKILL)
+        loop.listeners.append(kill)
+        def tell(recorder):
+            print(recorder.writer.pid, recorder.cameras.pid, flush=True)
+        record(Path(sys.argv[1]), loop, 1.0, during=tell)
+    """
+    result = run_program(program, str(tmp_path))
+    assert result.returncode == -signal.SIGKILL, result.stderr
+    helpers = [int(pid) for pid in result.stdout.split()]
+    wait_until(lambda: not any(map(alive, helpers)))
+    (file,) = tmp_path.glob("*/*.mcap")
+    recording = Recording(file)
+    assert recording.closed
+    # The newest copy may not have been seen.
+    assert len(list(recording.pictures("front"))) >= 0.8 * FRONT.rate - 1
 
 
 def test_when_the_process_that_takes_pictures_is_killed_the_recording_goes_on(
