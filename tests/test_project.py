@@ -50,7 +50,7 @@ def modules_of_dependencies() -> set[str]:
 def modules_of_formats() -> set[str]:
     """What is imported only where a model has another format than URDF, or a dataset is written."""
     extras = project()["optional-dependencies"]
-    return set(map(distribution, extras["xacro"] + extras["export"]))
+    return set(map(distribution, extras["xacro"] + extras["export"] + extras["ray"]))
 
 
 def modules_of_ros() -> set[str]:

@@ -41,14 +41,19 @@ def lerobot(
     workers: Workers = 1,
     skip_bad: SkipBad = False,
     no_pictures: NoPictures = False,
+    ray: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="Of a Ray cluster that makes the episodes: HOST:PORT or auto.")
+    ] = None,
 ) -> None:
     """Make a LeRobotDataset v3.0 of recordings: an episode each, with a video of each camera.
 
-    Needs the extra `export`.
+    Needs the extra `export`; with --ray, whose workers see the same files, the extra `ray` as well.
     """
+    if ray is not None and workers != 1:
+        raise ConfigError("--workers and --ray exclude each other: the cluster has its own")
     require_pyarrow()
     kept = None if no_pictures else KeptAs.VIDEO
-    _export(recordings, Sampling(fps, trim, kept), output, workers, skip_bad, lambda count: write_dataset)
+    _export(recordings, Sampling(fps, trim, kept), output, workers, skip_bad, lambda count: write_dataset, ray)
 
 
 @app.command(epilog="Example: q2r2 export hdf5 recordings --output datasets/circle-act --fps 50")
@@ -97,6 +102,7 @@ def _export(
     workers: int,
     skip_bad: bool,
     writer_for: Callable[[int], Callable[[Sequence[Path], Path], None]],
+    ray: str | None = None,
 ) -> None:
     console = stderr_console()
     output = Output(path)
@@ -110,6 +116,7 @@ def _export(
                 sampling,
                 output.episodes(),
                 workers=workers,
+                ray=ray,
                 skip_bad=skip_bad,
                 progress=lambda done: progress.update(bar, completed=done),
             )

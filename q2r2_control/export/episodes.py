@@ -20,6 +20,7 @@ import numpy.typing as npt
 from q2r2_control.errors import ConfigError, RecordingError
 from q2r2_control.export.features import Names, features
 from q2r2_control.export.kept_pictures import KeptAs, KeptPictures, keep_pictures
+from q2r2_control.export.ray_cluster import mapped_over
 from q2r2_control.export.sampling import sample
 from q2r2_control.recording.reader import Recording
 from q2r2_control.recording.recorded_robot import cell_and_robot_of
@@ -130,19 +131,20 @@ def make_episodes(
     folder: Path,
     *,
     workers: int = 1,
+    ray: str | None = None,
     skip_bad: bool = False,
     progress: Callable[[int], None] = lambda done: None,
 ) -> Exported:
     """Make an episode of each recording, and keep it in ``folder``; those that are there already are not made again.
 
-    The same comes out for any number of ``workers``. ``progress`` is told how many are through. Raises the
-    :class:`RecordingError` of the first bad recording unless ``skip_bad``, and :class:`ConfigError` where nothing can
-    be written.
+    The same comes out for any number of ``workers``, and of a cluster at the address ``ray``. ``progress`` is told how
+    many are through. Raises the :class:`RecordingError` of the first bad recording unless ``skip_bad``, and
+    :class:`ConfigError` where nothing can be written.
     """
     targets = [folder / f"{_key(file, sampling)}.npz" for file in files]
     jobs = [(file, sampling, target) for file, target in zip(files, targets, strict=True)]
     exported = Exported([], [])
-    with _mapping(min(workers, len(jobs))) as run:
+    with _mapping(min(workers, len(jobs))) if ray is None else mapped_over(ray, _work) as run:
         for done, (target, fault) in enumerate(zip(targets, run(jobs), strict=True), start=1):
             if fault is not None and not skip_bad:
                 raise RecordingError(fault)
