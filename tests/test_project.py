@@ -17,7 +17,10 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 ROS = ROOT / "q2r2_control" / "ros"
 # Distributions whose import has another name.
-IMPORTS = {"pin": "pinocchio", "example-robot-data-loaders": "example_robot_data", "PyYAML": "yaml", "pin-pink": "pink"}
+IMPORTS = {
+    **{"pin": "pinocchio", "example-robot-data-loaders": "example_robot_data", "PyYAML": "yaml", "pin-pink": "pink"},
+    "pillow": "PIL",
+}
 
 
 def project() -> dict[str, Any]:
@@ -47,7 +50,7 @@ def modules_of_dependencies() -> set[str]:
 def modules_of_formats() -> set[str]:
     """What is imported only where a model has another format than URDF, or a dataset is written."""
     extras = project()["optional-dependencies"]
-    return set(map(distribution, extras["xacro"] + extras["export"]))
+    return set(map(distribution, extras["xacro"] + extras["export"] + extras["ray"]))
 
 
 def modules_of_ros() -> set[str]:

@@ -94,7 +94,10 @@ def run_cell(config: Config, options: RunOptions, console: Console) -> CellRun:
         recorder = None
         if options.record is not None:
             # Before the pipeline, which takes longer to build than the recorder's process to start.
-            recorder = stack.enter_context(Recorder(options.record, options.name, waits=options.fast))
+            pictures = bool(config.cameras) and options.plant == "mujoco"
+            recorder = stack.enter_context(
+                Recorder(options.record, options.name, waits=options.fast, pictures=pictures)
+            )
         with notice_of_compiling(console):
             source = _input_of(config, options, console)
             pipeline = Pipeline.from_config(config, input=source, plant=options.plant, mode=options.mode)
@@ -184,6 +187,12 @@ def _run(pipeline: Pipeline, options: RunOptions, recorder: Recorder | None, con
         if options.sound is not None:
             pipeline.listeners.append(stack.enter_context(sounding(options.sound)))
         if recorder is not None:
+            cameras = pipeline.config.cameras
+            if cameras and isinstance(pipeline.plant, MujocoPlant):
+                recorder.prepare(pipeline.plant, pipeline.robot, cameras)
+            elif cameras:
+                line = f"no pictures are recorded: the {options.plant} plant has none; allowed: --plant mujoco"
+                console.print(line, style="yellow", soft_wrap=True, highlight=False, markup=False)
             recorder.begin(_about(pipeline, options), pipeline.robot)
             pipeline.listeners.append(recorder)
         return pipeline.run(options.duration, realtime=not options.fast)
@@ -194,7 +203,8 @@ def _about(pipeline: Pipeline, options: RunOptions) -> About:
     notes = {"cell": pipeline.config.name, "input": options.input, **options.notes}
     if options.input == "scripted":
         notes |= {"trajectory": options.trajectory, "human": str(options.human).lower(), "seed": str(options.seed)}
-    return About.of(pipeline, not options.fast, notes)
+    cameras = tuple(pipeline.config.cameras) if isinstance(pipeline.plant, MujocoPlant) else ()
+    return About.of(pipeline, not options.fast, notes, cameras)
 
 
 class _WindowListener:

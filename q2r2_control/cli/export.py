@@ -13,8 +13,11 @@ from q2r2_control.cli.output import stderr_console
 from q2r2_control.errors import ConfigError, RecordingError
 from q2r2_control.export.csv_tables import write_table, write_tables
 from q2r2_control.export.episodes import FASTEST, Sampling, make_episodes
+from q2r2_control.export.hdf5 import write_episodes
+from q2r2_control.export.kept_pictures import KeptAs
 from q2r2_control.export.lerobot import require_pyarrow, write_dataset
 from q2r2_control.export.output import Output
+from q2r2_control.export.pixel_files import require_h5py
 from q2r2_control.recording.files import recordings_in
 
 app = typer.Typer(rich_markup_mode=None, help="Recordings of q2r2 run --record as datasets to train on.")
@@ -25,6 +28,7 @@ Recordings = Annotated[
 Fps = Annotated[int, typer.Option(help=f"Frames per second: 1 .. {FASTEST}.")]
 Trim = Annotated[bool, typer.Option("--trim", help="Leave out what is before and after any arm is engaged or moving.")]
 Workers = Annotated[int, typer.Option(min=1, help="Processes; the result is the same for any number.")]
+NoPictures = Annotated[bool, typer.Option("--no-pictures", help="Leave out what cameras recorded.")]
 SkipBad = Annotated[bool, typer.Option("--skip-bad", help="Say which recordings are bad, and go on without them.")]
 
 
@@ -36,10 +40,36 @@ def lerobot(
     trim: Trim = False,
     workers: Workers = 1,
     skip_bad: SkipBad = False,
+    no_pictures: NoPictures = False,
+    ray: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="Of a Ray cluster that makes the episodes: HOST:PORT or auto.")
+    ] = None,
 ) -> None:
-    """Make a LeRobotDataset v3.0 of recordings: an episode each. Needs pyarrow, the extra `export`."""
+    """Make a LeRobotDataset v3.0 of recordings: an episode each, with a video of each camera.
+
+    Needs the extra `export`; with --ray, whose workers see the same files, the extra `ray` as well.
+    """
+    if ray is not None and workers != 1:
+        raise ConfigError("--workers and --ray exclude each other: the cluster has its own")
     require_pyarrow()
-    _export(recordings, Sampling(fps, trim), output, workers, skip_bad, lambda count: write_dataset)
+    kept = None if no_pictures else KeptAs.VIDEO
+    _export(recordings, Sampling(fps, trim, kept), output, workers, skip_bad, lambda count: write_dataset, ray)
+
+
+@app.command(epilog="Example: q2r2 export hdf5 recordings --output datasets/circle-act --fps 50")
+def hdf5(
+    recordings: Recordings,
+    output: Annotated[Path, typer.Option(metavar="OUT", help="A folder that does not exist yet.")],
+    fps: Fps = 30,
+    trim: Trim = False,
+    workers: Workers = 1,
+    skip_bad: SkipBad = False,
+    no_pictures: NoPictures = False,
+) -> None:
+    """Make HDF5 files of recordings, a file each, for trainers of ACT. Needs the extra `export`."""
+    require_h5py()
+    kept = None if no_pictures else KeptAs.PIXELS
+    _export(recordings, Sampling(fps, trim, kept), output, workers, skip_bad, lambda count: write_episodes)
 
 
 @app.command(epilog="Example: q2r2 export csv recordings/20260101-120000-dual_iiwa7 --output circle.csv")
@@ -72,6 +102,7 @@ def _export(
     workers: int,
     skip_bad: bool,
     writer_for: Callable[[int], Callable[[Sequence[Path], Path], None]],
+    ray: str | None = None,
 ) -> None:
     console = stderr_console()
     output = Output(path)
@@ -85,6 +116,7 @@ def _export(
                 sampling,
                 output.episodes(),
                 workers=workers,
+                ray=ray,
                 skip_bad=skip_bad,
                 progress=lambda done: progress.update(bar, completed=done),
             )

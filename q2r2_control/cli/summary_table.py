@@ -80,7 +80,18 @@ def recording_line(recording: RecordingSummary) -> str:
         ended = f"[red]recording ended[/]: {escape(recording.fault)}"
         return f"{ended}; {recording.ticks} ticks recorded, {recording.lost_ticks} not"
     lost = f", [red]{recording.lost_ticks} lost[/]: the queue was full" if recording.lost_ticks else ""
-    return f"recording: {escape(str(recording.file))} ({recording.ticks} ticks{lost})"
+    return f"recording: {escape(str(recording.file))} ({recording.ticks} ticks{lost}{_pictures_of(recording)})"
+
+
+def _pictures_of(recording: RecordingSummary) -> str:
+    """What became of the pictures, where there are cameras."""
+    if not (recording.pictures or recording.lost_pictures or recording.pictures_fault):
+        return ""
+    pictures = f", {recording.pictures} pictures"
+    if recording.lost_pictures:
+        why = recording.pictures_fault or "they could not be taken fast enough"
+        pictures += f", [red]{recording.lost_pictures} lost[/]: {escape(why)}"
+    return pictures
 
 
 def verdict_markup(verdict: Verdict) -> str:

@@ -27,6 +27,7 @@ from q2r2_control.config.arms import (
     Side,
     check_models,
 )
+from q2r2_control.config.cameras import CameraConfig, CameraName
 from q2r2_control.config.control import AdmittanceSettings, ControllerSettings, ImpedanceSettings, check_priority
 from q2r2_control.config.external import ControllerKind, ExternalConfig, check_external
 from q2r2_control.config.judge import JudgeSettings
@@ -133,6 +134,9 @@ class Config(CellModel):
     teleop: TeleopSettings = TeleopSettings()
     headset: HeadsetConfig = HeadsetConfig()
     mujoco: MujocoConfig = MujocoConfig()
+    cameras: dict[CameraName, CameraConfig] = Field(
+        default_factory=dict, max_length=16, description="of the simulated cell, by name"
+    )
     judge: JudgeSettings = JudgeSettings()
 
     def model_of(self, arm: str) -> str:

@@ -8,7 +8,7 @@ import signal
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -19,12 +19,14 @@ import numpy.typing as npt
 
 from q2r2_control.errors import ConfigError, RecordingError
 from q2r2_control.export.features import Names, features
+from q2r2_control.export.kept_pictures import KeptAs, KeptPictures, keep_pictures
+from q2r2_control.export.ray_cluster import mapped_over
 from q2r2_control.export.sampling import sample
 from q2r2_control.recording.reader import Recording
 from q2r2_control.recording.recorded_robot import cell_and_robot_of
 
 FASTEST = 1000  # [frames/s]
-_FORMAT = 1  # of kept episodes; another one is made again
+_FORMAT = 2  # of kept episodes; another one is made again
 
 
 @dataclass(frozen=True)
@@ -33,6 +35,7 @@ class Sampling:
 
     fps: int = 30
     trim: bool = False  # to the time in which arms are engaged or moving
+    pictures: KeptAs | None = None  # None: they are left out
 
     def __post_init__(self) -> None:
         if not 1 <= self.fps <= FASTEST:
@@ -50,6 +53,7 @@ class Episode:
     names: Names  # of the numbers of each feature
     notes: dict[str, str]  # program, machine, operator and the like, as recorded
     vectors: dict[str, npt.NDArray[np.float32]]
+    cameras: dict[str, KeptPictures] = field(default_factory=dict)  # whose pictures are kept beside the episode
 
     @property
     def frames(self) -> int:
@@ -74,7 +78,8 @@ class Episode:
 
     def save(self, file: Path) -> None:
         """Keep it; a file of this name is always a whole one."""
-        about = {name: value for name, value in self.__dict__.items() if name != "vectors"}
+        about = {name: value for name, value in self.__dict__.items() if name not in ("vectors", "cameras")}
+        about["cameras"] = {name: asdict(kept) for name, kept in self.cameras.items()}
         unfinished = file.with_suffix(".unfinished")
         with unfinished.open("wb") as stream:
             np.savez(stream, about=np.array(json.dumps(about)), **self.vectors)  # type: ignore[arg-type]
@@ -87,11 +92,15 @@ class Episode:
             about = json.loads(str(kept["about"]))
             vectors = {name: kept[name] for name in about["names"]}
         about["names"] = {name: tuple(labels) for name, labels in about["names"].items()}
+        about["cameras"] = {name: KeptPictures(**kept) for name, kept in about["cameras"].items()}
         return cls(**about, vectors=vectors)
 
 
-def make_episode(file: Path, sampling: Sampling) -> Episode:
-    """An episode of a recording. Raises :class:`RecordingError` that names the file and what is wrong."""
+def make_episode(file: Path, sampling: Sampling, target: Path | None = None) -> Episode:
+    """An episode of a recording, whose pictures go beside ``target``, if that is the file it will be kept in.
+
+    Raises :class:`RecordingError` that names the file and what is wrong.
+    """
     recording = Recording(file)
     frames = sample(recording, sampling.fps, sampling.trim)
     cell, robot = cell_and_robot_of(recording)
@@ -101,7 +110,11 @@ def make_episode(file: Path, sampling: Sampling) -> Episode:
         raise RecordingError(f"{recording.file}: {error}") from error
     notes = dict(recording.about.notes)
     task = notes.pop("task", "")
-    return Episode(recording.file.name, cell.name, task, sampling.fps, labels, notes, vectors)
+    cameras = {}
+    if sampling.pictures is not None and target is not None:
+        used = {name: cell.cameras[name] for name in recording.about.cameras}
+        cameras = keep_pictures(recording, used, frames["stamp"].tolist(), sampling.fps, sampling.pictures, target)
+    return Episode(recording.file.name, cell.name, task, sampling.fps, labels, notes, vectors, cameras)
 
 
 @dataclass(frozen=True)
@@ -118,19 +131,20 @@ def make_episodes(
     folder: Path,
     *,
     workers: int = 1,
+    ray: str | None = None,
     skip_bad: bool = False,
     progress: Callable[[int], None] = lambda done: None,
 ) -> Exported:
     """Make an episode of each recording, and keep it in ``folder``; those that are there already are not made again.
 
-    The same comes out for any number of ``workers``. ``progress`` is told how many are through. Raises the
-    :class:`RecordingError` of the first bad recording unless ``skip_bad``, and :class:`ConfigError` where nothing can
-    be written.
+    The same comes out for any number of ``workers``, and of a cluster at the address ``ray``. ``progress`` is told how
+    many are through. Raises the :class:`RecordingError` of the first bad recording unless ``skip_bad``, and
+    :class:`ConfigError` where nothing can be written.
     """
     targets = [folder / f"{_key(file, sampling)}.npz" for file in files]
     jobs = [(file, sampling, target) for file, target in zip(files, targets, strict=True)]
     exported = Exported([], [])
-    with _mapping(min(workers, len(jobs))) as run:
+    with _mapping(min(workers, len(jobs))) if ray is None else mapped_over(ray, _work) as run:
         for done, (target, fault) in enumerate(zip(targets, run(jobs), strict=True), start=1):
             if fault is not None and not skip_bad:
                 raise RecordingError(fault)
@@ -168,11 +182,9 @@ def _work(job: tuple[Path, Sampling, Path]) -> str | None:
     if _is_kept(target):
         return None
     try:
-        episode = make_episode(file, sampling)
+        make_episode(file, sampling, target).save(target)
     except RecordingError as error:
         return str(error)
-    try:
-        episode.save(target)
     except OSError as error:
         raise ConfigError(f"--output {target.parent}: {error.strerror}") from error
     return None

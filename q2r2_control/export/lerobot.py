@@ -10,18 +10,22 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import numpy.typing as npt
 
 from q2r2_control.errors import ConfigError, RecordingError
 from q2r2_control.export.episodes import Episode
+from q2r2_control.export.kept_pictures import KeptAs, place_of
 from q2r2_control.export.statistics import Statistics, joined, statistics_of
+from q2r2_control.export.video import CODEC, PIXEL_FORMAT, VideoFiles
+from q2r2_control.export.video import FILE_SIZE as VIDEO_FILE_SIZE
 
 VERSION = "v3.0"
 FILES_PER_CHUNK = 1000
 FILE_SIZE = 100  # of data [MB]; an episode that would not fit begins a new file
-VIDEO_FILE_SIZE = 200  # [MB]; there are no videos yet: recordings have no pictures
 _PLACE = "chunk-{chunk_index:03d}/file-{file_index:03d}"
 DATA = f"data/{_PLACE}.parquet"
+VIDEOS = f"videos/{{video_key}}/{_PLACE}.mp4"
 EPISODES = f"meta/episodes/{_PLACE}.parquet"
 TASKS, INFO, STATISTICS, SOURCES = "meta/tasks.parquet", "meta/info.json", "meta/stats.json", "meta/recordings.json"
 _SCALARS = {
@@ -51,7 +55,7 @@ def write_dataset(files: Sequence[Path], folder: Path) -> None:
     """
     writer = _Writer(Episode.load(files[0]), folder)
     for file in files:
-        writer.add(Episode.load(file))
+        writer.add(Episode.load(file), file)
     writer.close()
 
 
@@ -61,11 +65,14 @@ class _Writer:
     def __init__(self, first: Episode, folder: Path) -> None:
         self._arrow = require_pyarrow()
         self._first, self._folder = first, folder
-        self._features = _features(first)
+        columns, videos = _column_features(first), _video_features(first)
+        self._features = {**columns, **videos}
+        self._columns = tuple(columns)
         self._schema = self._arrow.schema(
-            [(name, self._kind(feature)) for name, feature in self._features.items()],
-            metadata={"huggingface": json.dumps({"info": {"features": _loader_features(self._features)}})},
+            [(name, self._kind(feature)) for name, feature in columns.items()],
+            metadata={"huggingface": json.dumps({"info": {"features": _loader_features(columns)}})},
         )
+        self._videos = {camera: VideoFiles() for camera in first.cameras}
         self._tasks: dict[str, int] = {}
         self._frames = 0
         self._rows: list[dict[str, Any]] = []  # of the table of episodes
@@ -74,25 +81,30 @@ class _Writer:
         self._data: Any = None  # the file that is being written
         self._files, self._size = 0, 0  # begun, and what is in the last one [bytes]
 
-    def add(self, episode: Episode) -> None:
-        """Write one more episode."""
+    def add(self, episode: Episode, file: Path) -> None:
+        """Write one more episode, which is kept in ``file``."""
         self._check(episode)
         number = len(self._rows)
         task = self._tasks.setdefault(episode.task, len(self._tasks))
         columns = episode.columns(number, self._frames, task)
         self._write(columns)
-        statistics = {name: statistics_of(columns[name]) for name in self._features}
-        place = {"chunk_index": (self._files - 1) // FILES_PER_CHUNK, "file_index": (self._files - 1) % FILES_PER_CHUNK}
+        videos: dict[str, Any] = {}
+        for camera in episode.cameras:
+            videos |= self._add_video(camera, file, episode)
+        statistics = {name: statistics_of(columns[name]) for name in self._columns}
+        for camera, kept in episode.cameras.items():
+            statistics[video_key(camera)] = {name: np.array(values) for name, values in kept.statistics.items()}
         self._rows.append(
             {
                 "episode_index": number,
                 "tasks": [episode.task],
                 "length": episode.frames,
-                **{f"data/{name}": value for name, value in place.items()},
+                **{f"data/{name}": value for name, value in _place(self._files - 1).items()},
                 "dataset_from_index": self._frames,
                 "dataset_to_index": self._frames + episode.frames,
+                **videos,
                 **{
-                    f"stats/{feature}/{name}": values.tolist()
+                    f"stats/{feature}/{name}": self._shaped(feature, name, values)
                     for feature, found in statistics.items()
                     for name, values in found.items()
                 },
@@ -107,12 +119,17 @@ class _Writer:
     def close(self) -> None:
         """Write what is said of all episodes."""
         self._data.close()
+        for video in self._videos.values():
+            video.close()
         self._write_table(EPISODES.format(chunk_index=0, file_index=0), self._arrow.Table.from_pylist(self._rows))
         self._write_table(TASKS, self._task_table())
         together = {name: joined([part[name] for part in self._statistics]) for name in self._features}
         self._write_json(
             STATISTICS,
-            {feature: {name: values.tolist() for name, values in found.items()} for feature, found in together.items()},
+            {
+                feature: {name: self._shaped(feature, name, values) for name, values in found.items()}
+                for feature, found in together.items()
+            },
         )
         self._write_json(INFO, self._info())
         self._write_json(SOURCES, self._sources)
@@ -124,11 +141,33 @@ class _Writer:
         for feature, names in first.names.items():
             if episode.names.get(feature) != names:
                 raise RecordingError(f"{episode.recording}: {feature} has not the numbers that {first.recording} has")
+        sizes = [[(name, kept.width, kept.height) for name, kept in made.cameras.items()] for made in (episode, first)]
+        if sizes[0] != sizes[1]:
+            raise RecordingError(
+                f"{episode.recording}: has not the cameras that {first.recording} has; --no-pictures leaves them out"
+            )
+
+    def _add_video(self, camera: str, file: Path, episode: Episode) -> dict[str, Any]:
+        """Append an episode's video of a camera; returns where it is, as the table of episodes says it."""
+        key, videos, source = video_key(camera), self._videos[camera], place_of(file, camera, KeptAs.VIDEO)
+        if not videos.fits(source):
+            videos.begin(self._made(VIDEOS.format(video_key=key, **_place(videos.number + 1))))
+        begin = videos.add(source, episode.frames)
+        return {
+            **{f"videos/{key}/{name}": value for name, value in _place(videos.number).items()},
+            f"videos/{key}/from_timestamp": begin / episode.fps,
+            f"videos/{key}/to_timestamp": (begin + episode.frames) / episode.fps,
+        }
+
+    def _shaped(self, feature: str, name: str, values: npt.NDArray[Any]) -> Any:
+        """A statistic as lists; colours have the shape of a picture, channel, row, column."""
+        is_colour = self._features[feature]["dtype"] == "video" and name != "count"
+        return (values.reshape(-1, 1, 1) if is_colour else values).tolist()
 
     def _write(self, columns: Mapping[str, npt.NDArray[Any]]) -> None:
         arrow = self._arrow
         arrays = []
-        for name in self._features:
+        for name in self._columns:
             column, kind = columns[name], self._schema.field(name).type
             if column.ndim == 2:
                 arrays.append(arrow.FixedSizeListArray.from_arrays(arrow.array(column.ravel()), type=kind))
@@ -138,7 +177,7 @@ class _Writer:
         if self._data is None or self._size + table.nbytes > FILE_SIZE << 20:
             if self._data is not None:
                 self._data.close()
-            place = DATA.format(chunk_index=self._files // FILES_PER_CHUNK, file_index=self._files % FILES_PER_CHUNK)
+            place = DATA.format(**_place(self._files))
             self._data = arrow.parquet.ParquetWriter(self._made(place), self._schema, compression="snappy")
             self._files, self._size = self._files + 1, 0
         self._data.write_table(table)
@@ -173,7 +212,7 @@ class _Writer:
             "fps": self._first.fps,
             "splits": {"train": f"0:{len(self._rows)}"},
             "data_path": DATA,
-            "video_path": None,
+            "video_path": VIDEOS if self._videos else None,
             "features": self._features,
         }
 
@@ -190,13 +229,45 @@ class _Writer:
         return path
 
 
-def _features(episode: Episode) -> dict[str, dict[str, Any]]:
-    """As ``info.json`` describes them."""
+def video_key(camera: str) -> str:
+    """The feature of a camera's pictures."""
+    return f"observation.images.{camera}"
+
+
+def _place(number: int) -> dict[str, int]:
+    """Of a file, counted from 0."""
+    return {"chunk_index": number // FILES_PER_CHUNK, "file_index": number % FILES_PER_CHUNK}
+
+
+def _column_features(episode: Episode) -> dict[str, dict[str, Any]]:
+    """As ``info.json`` describes those of the table of frames."""
     vectors = {
         name: {"dtype": "float32", "shape": [len(labels)], "names": list(labels)}
         for name, labels in episode.names.items()
     }
     return {**vectors, **{name: {"dtype": kind, "shape": [1], "names": None} for name, kind in _SCALARS.items()}}
+
+
+def _video_features(episode: Episode) -> dict[str, dict[str, Any]]:
+    """As ``info.json`` describes videos."""
+    return {
+        video_key(camera): {
+            "dtype": "video",
+            "shape": [kept.height, kept.width, 3],
+            "names": ["height", "width", "channels"],
+            "info": {
+                "video.height": kept.height,
+                "video.width": kept.width,
+                "video.codec": CODEC,
+                "video.pix_fmt": PIXEL_FORMAT,
+                "video.is_depth_map": False,
+                "video.fps": episode.fps,
+                "video.channels": 3,
+                "has_audio": False,
+            },
+        }
+        for camera, kept in episode.cameras.items()
+    }
 
 
 def _loader_features(features: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:

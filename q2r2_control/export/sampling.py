@@ -32,7 +32,8 @@ def sample(recording: Recording, fps: int, trim: bool = False) -> dict[str, Arra
     ``position``, ``velocity``, ``effort`` (n, joints) are measured [rad, rad/s, Nm], ``opening`` (n, arms) too, 0
     closed .. 1 open, -inf where it is not measured. ``reference`` (n, joints) and ``gripper`` (n, arms) are commanded.
     ``target`` (n, arms, 7), x y z qx qy qz qw in the world, is what the operator asks for, and the tool at the
-    reference (``reference_tool``) while that is nothing. ``time`` (n,) [s] is since t_0.
+    reference (``reference_tool``) while that is nothing. ``time`` (n,) [s] is since t_0, ``stamp`` (n,) the time of day
+    [ns].
 
     ``trim``: from the first to the last tick at which an arm is engaged or the reference moves. Raises
     :class:`RecordingError` for a damaged file, one without a tick to take, and one in which ticks were lost for longer
@@ -69,7 +70,8 @@ def sample(recording: Recording, fps: int, trim: bool = False) -> dict[str, Arra
     frames = {name: np.concatenate(values) for name, values in picked.items()}
     kept = frames["time"] <= end
     frames = {name: values[kept] for name, values in frames.items()}
-    frames["time"] = (frames["time"] - start) / _NANOSECONDS
+    frames["stamp"] = frames["time"]
+    frames["time"] = (frames["stamp"] - start) / _NANOSECONDS
     return frames
 
 

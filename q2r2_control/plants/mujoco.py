@@ -88,6 +88,7 @@ class MujocoPlant:
         self._tools = {arm.name: self.model.body(arm.tool_frame).id for arm in robot.arms.values()}
         self._acceleration = np.zeros(self.model.nv)
         self._inertial_torque = np.zeros(self.model.nv)
+        self.observed_qpos: Array = self._qpos.copy()  # (model.nq,) of all that moves, at the last :meth:`state`
         self.reset()
         self._gains: ServoGains = self._tuned(config)
 
@@ -155,10 +156,11 @@ class MujocoPlant:
     def state(self) -> RobotState:
         """See :meth:`Plant.state`. External torque: contacts, pushes, and hard stops at the ends of a joint's range."""
         index, actuator = self._v_index, self._actuator
+        self.observed_qpos = self._qpos.copy()
         # What MuJoCo adds up before contacts, less what is not external, leaves pushes from here and from its window.
         pushed = self._smooth - self._passive + self._bias - actuator
         return RobotState(
-            q=self._qpos.take(self._q_index),
+            q=self.observed_qpos.take(self._q_index),
             v=self._qvel.take(index),
             tau=actuator.take(index),
             tau_external=(self._constraint + pushed).take(index),

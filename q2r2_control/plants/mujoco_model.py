@@ -14,6 +14,7 @@ import numpy as np
 
 from q2r2_control.config.cell import Config, MujocoConfig
 from q2r2_control.errors import PlantError
+from q2r2_control.plants.mujoco_cameras import add_cameras
 from q2r2_control.plants.mujoco_meshes import is_readable, load_meshes
 from q2r2_control.plants.scene import COLLISION_GROUP, ENVELOPE_GROUP, VISUAL_GROUP, furnish
 from q2r2_control.robot.model_srdf import ENVELOPE
@@ -59,6 +60,7 @@ def build_model(robot: Robot, config: Config) -> mujoco.MjModel:
         _set_grippers(spec, robot, config)
         _exclude_contacts(spec, robot)
         _add_objects(spec, config.mujoco)
+        add_cameras(spec, config.cameras)
         furnish(spec, floor=config.floor is not None)
         return spec.compile()
     except (ValueError, RuntimeError, mujoco.FatalError) as error:

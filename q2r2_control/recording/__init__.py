@@ -3,7 +3,9 @@
 ``recorder`` listens to a run: ``packing`` makes bytes of a tick, and ``ring`` takes them to the process that
 ``writer_process`` starts. There ``writer`` does the rest: ``encoder`` makes messages of packed ticks, ``topics`` and
 ``rows`` say where each number stands in them, ``mcap_file`` is the file, ``bag`` what rosbag2 wants beside it,
-``about`` what is said once. ``reader`` reads it again, ``replay`` gives it to the pipeline's own loop, and
+``about`` what is said once. ``camera_process`` starts another one, which takes pictures as ``camera_work`` says, and
+hands them to the first one through a ``picture_channel``; ``helper_process`` and ``helper`` are what both have in
+common. ``reader`` reads it again, ``replay`` gives it to the pipeline's own loop, and
 ``comparison`` holds what comes out to what was recorded.
 """
 

@@ -6,13 +6,15 @@ import json
 import platform
 import subprocess
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import yaml
+
+from q2r2_control.recording.topics import Topics
 
 if TYPE_CHECKING:  # the writer's process does without them
     from q2r2_control.config import Config
@@ -35,10 +37,11 @@ class About:
     realtime: bool
     cell: str  # the YAML of the cell with all its defaults
     robot: str  # URDF
+    cameras: tuple[str, ...] = ()  # of which there are pictures
     notes: dict[str, str] = field(default_factory=dict)  # program, machine, task and the like, for people
 
     @classmethod
-    def of(cls, pipeline: Pipeline, realtime: bool, notes: Mapping[str, str]) -> About:
+    def of(cls, pipeline: Pipeline, realtime: bool, notes: Mapping[str, str], cameras: Sequence[str] = ()) -> About:
         """Of a run that is about to begin; ``notes`` are added to those on program and machine."""
         return cls(
             arms=tuple(pipeline.robot.arms),
@@ -49,6 +52,7 @@ class About:
             realtime=realtime,
             cell=as_yaml(pipeline.config),
             robot=pipeline.robot.urdf,
+            cameras=tuple(cameras),
             notes={**program(), "plant": type(pipeline.plant).__name__, **notes},
         )
 
@@ -62,6 +66,7 @@ class About:
             "plant_modes": json.dumps(self.plant_modes),
             "epoch_ns": str(self.epoch),
             "realtime": json.dumps(self.realtime),
+            "cameras": json.dumps(self.cameras),
             **self.notes,
         }
 
@@ -80,8 +85,13 @@ class About:
             realtime=bool(json.loads(rest.pop("realtime"))),
             cell=cell,
             robot=robot,
+            cameras=tuple(json.loads(rest.pop("cameras", "[]"))),  # older files do not say that there are none
             notes=rest,
         )
+
+    def topics(self) -> Topics:
+        """All that is in the file."""
+        return Topics(self.arms, self.joints, self.cameras)
 
 
 def as_yaml(config: Config) -> str:

@@ -54,6 +54,30 @@ def _bytes_of(*records: McapRecord) -> bytes:
 _END = _bytes_of(DataEnd(0), Footer(summary_start=0, summary_offset_start=0, summary_crc=0)) + MAGIC
 
 
+class _Messages:
+    """Those of one chunk."""
+
+    def __init__(self) -> None:
+        self.records: list[bytes] = []
+        self.index: dict[int, array[int]] = {}  # time and offset of each, by channel
+        self.first = self.last = 0  # [ns]
+        self.size = 0  # [bytes]
+
+    def add(self, messages: Iterable[tuple[Topic, bytes]]) -> None:
+        for topic, record in messages:
+            entries = self.index.get(topic.channel)
+            if entries is None:
+                entries = self.index[topic.channel] = array("Q")
+            time = log_time(record)
+            entries.append(time)
+            entries.append(self.size)
+            self.first = time if not self.size else self.first
+            self.last = time
+            self.records.append(record)
+            self.size += len(record)
+        self.records = [b"".join(self.records)]
+
+
 class McapFile:
     """Writes one file; every method raises :class:`OSError` where that is not possible, and then leaves a whole file.
 
@@ -72,10 +96,7 @@ class McapFile:
         self._metadata: list[MetadataIndex] = []
         self._chunks = 0
         self._chunk_index = bytearray()  # their records, kept as bytes, since there are some for every second
-        self._records: list[bytes] = []  # added and not written
-        self._index: dict[int, array[int]] = {}  # of those: time and offset of each, by channel
-        self._first = self._last = 0
-        self.pending = 0  # bytes of those
+        self._waiting = _Messages()  # added and not written
         self.counts: dict[int, int] = {}  # messages of each channel
         self.first_time, self.last_time = 0, 0  # of messages [ns]
 
@@ -108,41 +129,44 @@ class McapFile:
 
     def add(self, messages: Iterable[tuple[Topic, bytes]]) -> None:
         """Take messages, each a whole record, in order of time; :meth:`flush` writes them."""
-        for topic, record in messages:
-            entries = self._index.get(topic.channel)
-            if entries is None:
-                entries = self._index[topic.channel] = array("Q")
-            time = log_time(record)
-            entries.append(time)
-            entries.append(self.pending)
-            self._first = time if not self._records else self._first
-            self._last = time
-            self._records.append(record)
-            self.pending += len(record)
-        self._records = [b"".join(self._records)]
+        self._waiting.add(messages)
+
+    @property
+    def pending(self) -> int:
+        """Bytes that were added and are not written."""
+        return self._waiting.size
 
     def flush(self) -> None:
         """Write what was added, as one chunk."""
-        if not self.pending:
-            return
-        data, index, size = b"".join(self._records), self._index, self.pending
-        self._records, self._index, self.pending = [], {}, 0
-        packed = self._compressor.compress(data)
-        chunk = _bytes_of(Chunk("zstd", packed, self._last, self._first, zlib.crc32(data), size))
+        if self._waiting.size:
+            messages, self._waiting = self._waiting, _Messages()
+            self._write_chunk(messages, "zstd")
+
+    def add_apart(self, messages: Iterable[tuple[Topic, bytes]]) -> None:
+        """Write messages that are compressed already, in order of time, as a chunk of their own."""
+        chunk = _Messages()
+        chunk.add(messages)
+        self._write_chunk(chunk, "")
+
+    def _write_chunk(self, messages: _Messages, compression: str) -> None:
+        data = b"".join(messages.records)
+        first, last, size = messages.first, messages.last, messages.size
+        packed = self._compressor.compress(data) if compression else data
+        chunk = _bytes_of(Chunk(compression, packed, last, first, zlib.crc32(data), size))
         offsets, indices = {}, b""
-        for channel, entries in index.items():
+        for channel, entries in messages.index.items():
             offsets[channel] = self._end + len(chunk) + len(indices)
             table = entries.tobytes()
             indices += struct.pack("<BQHI", Opcode.MESSAGE_INDEX, 6 + len(table), channel, len(table)) + table
         begin = self._end
         self._append(chunk + indices)
         self._chunk_index += _bytes_of(
-            ChunkIndex(len(chunk), begin, "zstd", len(packed), self._last, len(indices), offsets, self._first, size)
+            ChunkIndex(len(chunk), begin, compression, len(packed), last, len(indices), offsets, first, size)
         )
-        self.first_time = self._first if not self._chunks else min(self._first, self.first_time)
-        self.last_time = max(self._last, self.last_time)
+        self.first_time = first if not self._chunks else min(first, self.first_time)
+        self.last_time = max(last, self.last_time)
         self._chunks += 1
-        for channel, entries in index.items():
+        for channel, entries in messages.index.items():
             self.counts[channel] += len(entries) // 2
 
     def close(self) -> None:

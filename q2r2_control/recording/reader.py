@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,8 +18,8 @@ from zstandard import ZstdError
 from q2r2_control.errors import RecordingError
 from q2r2_control.recording.about import ABOUT, CELL, ROBOT, About
 from q2r2_control.recording.mcap_file import MAGIC
-from q2r2_control.recording.rows import HEAD, MESSAGE, Rows
-from q2r2_control.recording.topics import Topic, Topics
+from q2r2_control.recording.rows import HEAD, MESSAGE, Rows, jpeg_of
+from q2r2_control.recording.topics import PICTURE, Topic, picture
 
 _LARGEST = 1 << 30  # of a record [bytes]
 _OPCODE_AND_LENGTH = 9
@@ -35,6 +36,15 @@ class RecordedChunk:
     texts: dict[str, list[bytes]]
 
 
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """One picture of a camera."""
+
+    time: int  # of day, that of the tick at which all was where it shows it [ns]
+    tick: int  # its number
+    jpeg: bytes
+
+
 class Recording:
     """A file that ``q2r2 run --record`` wrote. Raises :class:`RecordingError`, one line, for any other."""
 
@@ -42,23 +52,45 @@ class Recording:
         """``path``: the file, or the folder that it is alone in."""
         self.file = _file_of(path)
         self.about = self._read_about()
-        self.topics = Topics(self.about.arms, self.about.joints)
+        self.topics = self.about.topics()
+        self._cameras = {topic.channel for topic in self.topics.all if topic.type == PICTURE}
 
     def chunks(self) -> Iterator[RecordedChunk]:
-        """All messages, some half a second at a time."""
+        """All messages but pictures, some half a second at a time."""
+        with self._faults():
+            for data in self._chunk_data():
+                yield self._split(data)
+
+    def pictures(self, camera: str) -> Iterator[Picture]:
+        """All pictures of a camera, in the order of time."""
+        channel = self.topics.by_name[picture(camera)].channel
+        with self._faults():
+            for data in self._chunk_data():
+                for found, at, end in _messages_in(data):
+                    if found == channel:
+                        _, _, _, tick, time, _ = HEAD.unpack_from(data, at)
+                        yield Picture(time, tick, jpeg_of(data[at:end]))
+
+    @contextmanager
+    def _faults(self) -> Iterator[None]:
+        """What is wrong with a file, as one line."""
         try:
-            for record in self._records():
-                if isinstance(record, Channel):
-                    self._check(record)
-                elif isinstance(record, Chunk):
-                    stream, size = get_chunk_data_stream(record, validate_crc=True)
-                    yield self._split(stream.read(size))
-                elif isinstance(record, DataEnd):
-                    return
+            yield
         except EndOfFile:
             return  # cut off in the middle of a record, by a machine that lost its power
         except _BROKEN as error:
             raise RecordingError(f"{self.file}: damaged: {_line(error)}") from error
+
+    def _chunk_data(self) -> Iterator[bytes]:
+        """The messages of each chunk."""
+        for record in self._records():
+            if isinstance(record, Channel):
+                self._check(record)
+            elif isinstance(record, Chunk):
+                stream, size = get_chunk_data_stream(record, validate_crc=True)
+                yield stream.read(size)
+            elif isinstance(record, DataEnd):
+                return
 
     @property
     def closed(self) -> bool:
@@ -114,14 +146,9 @@ class Recording:
     def _split(self, data: bytes) -> RecordedChunk:
         """The messages of a chunk by topic."""
         records: dict[int, list[bytes]] = {}
-        at = 0
-        while at < len(data):
-            opcode, length, channel, *_ = HEAD.unpack_from(data, at)
-            end = at + _OPCODE_AND_LENGTH + length
-            if opcode != MESSAGE or end > len(data):
-                raise ValueError("a chunk that does not end with a message")
-            records.setdefault(channel, []).append(data[at:end])
-            at = end
+        for channel, at, end in _messages_in(data):
+            if channel not in self._cameras:
+                records.setdefault(channel, []).append(data[at:end])
         rows, texts = {}, {}
         for channel, found in records.items():
             topic = self.topics.by_channel[channel]
@@ -130,6 +157,18 @@ class Recording:
             else:
                 rows[topic.name] = _as_rows(topic, found)
         return RecordedChunk(rows, texts)
+
+
+def _messages_in(data: bytes) -> Iterator[tuple[int, int, int]]:
+    """Channel, begin and end of each message."""
+    at = 0
+    while at < len(data):
+        opcode, length, channel, *_ = HEAD.unpack_from(data, at)
+        end = at + _OPCODE_AND_LENGTH + length
+        if opcode != MESSAGE or end > len(data):
+            raise ValueError("a chunk that does not end with a message")
+        yield channel, at, end
+        at = end
 
 
 def _as_rows(topic: Topic, records: list[bytes]) -> Rows:

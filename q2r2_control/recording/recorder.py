@@ -8,17 +8,23 @@ from __future__ import annotations
 
 import logging
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from types import TracebackType
 
+from q2r2_control.config.cameras import CameraConfig
 from q2r2_control.errors import ConfigError
+from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.recording.about import About
+from q2r2_control.recording.camera_process import CameraProcess
 from q2r2_control.recording.encoder import RecordedRobot
+from q2r2_control.recording.helper import reason_of
 from q2r2_control.recording.packing import TickPacker
+from q2r2_control.recording.picture_channel import PictureChannel
 from q2r2_control.recording.topics import Topics
-from q2r2_control.recording.writer import Setup, reason_of
+from q2r2_control.recording.writer import Setup
 from q2r2_control.recording.writer_process import ROOM, WriterProcess
 from q2r2_control.robot.robot import Robot
 from q2r2_control.runtime.folders import new_folder
@@ -38,18 +44,24 @@ class RecordingSummary:
     ticks: int  # written
     lost_ticks: int  # that came while there was no room, or after the disk had failed
     fault: str | None  # why it ended before the run did
+    pictures: int = 0  # written
+    lost_pictures: int = 0  # that were due and are not there
+    pictures_fault: str | None = None  # why they ended before the run did
 
 
 class Recorder:
     """A listener of one run, as a context around it. It raises nothing: what fails is logged once, and the run goes on.
 
     Its process starts with it, so make it before what takes long, and :meth:`begin` when the run is about to begin.
-    ``waits``: a tick waits for room, as it may in simulated time; otherwise it is lost, and counted.
+    ``waits``: a tick waits for room, as it may in simulated time; otherwise it is lost, and counted. With ``pictures``
+    there is one more process, which takes those of the cameras of :meth:`prepare`.
     """
 
     keeps_episodes = True  # its operator can tell where one begins and ends
 
-    def __init__(self, parent: Path, name: str, *, waits: bool = False, room: int = ROOM) -> None:
+    def __init__(
+        self, parent: Path, name: str, *, waits: bool = False, room: int = ROOM, pictures: bool = False
+    ) -> None:
         """``room`` [bytes] for ticks that wait to be written."""
         self._parent, self._name, self._waits = parent, name, waits
         self._count = self._written = 0  # ticks
@@ -58,10 +70,32 @@ class Recorder:
         self._path: Path | None = None
         self._packer: TickPacker | None = None  # None: not begun
         self.writer: WriterProcess | None = None
+        self._channel: PictureChannel | None = None
+        self.cameras: CameraProcess | None = None
+        self._pictures_fault: str | None = None
+        self._epoch = 0
         try:
-            self.writer = WriterProcess(room)
+            self._channel = PictureChannel() if pictures else None
+            self.writer = WriterProcess(room, self._channel)
         except (OSError, ValueError) as error:
             self._fail(reason_of(error))
+        if self._channel is not None and self.writer is not None:
+            try:
+                self.cameras = CameraProcess(self._channel)
+            except OSError as error:
+                self._fail_pictures(reason_of(error))
+        if self._channel is not None:
+            self._channel.close()
+
+    def prepare(self, plant: MujocoPlant, robot: Robot, cameras: Mapping[str, CameraConfig]) -> None:
+        """Make ready to take pictures of a run of ``plant``, just before :meth:`begin`; some seconds at most."""
+        if self.cameras is None:
+            return
+        try:
+            self.cameras.prepare(plant, cameras, Topics(tuple(robot.arms), tuple(robot.joint_names), tuple(cameras)))
+        except (OSError, ValueError) as error:
+            self._fail_pictures(reason_of(error))
+        self._look_at_cameras()
 
     def begin(self, about: About, robot: Robot) -> None:
         """Take ticks from now on, of a run that begins at ``about.epoch``."""
@@ -73,7 +107,7 @@ class Recorder:
             folder = new_folder(self._parent, f"{when:%Y%m%d-%H%M%S}-{self._name}", "--record")
             self._path = folder / f"{folder.name}.mcap"
             self.writer.begin(Setup(self._path.absolute(), about, RecordedRobot.of(robot)))
-            self._packer = TickPacker(Topics(about.arms, about.joints))
+            self._packer, self._epoch = TickPacker(about.topics()), about.epoch
         except (ConfigError, OSError, ValueError) as error:
             self._fail(reason_of(error))
 
@@ -82,6 +116,7 @@ class Recorder:
         number, self._count = self._count, self._count + 1
         if self._fault is not None or self._packer is None or self.writer is None:
             return
+        self._take_pictures(number, tick)
         try:
             record = self._packer.pack(number, tick)
             while not self.writer.ring.put(record):
@@ -103,6 +138,9 @@ class Recorder:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        # The pictures first: the writer waits for them.
+        if self.cameras is not None and (fault := self.cameras.finish(0.0 if self._fault else _PATIENCE)):
+            self._fail_pictures(fault)
         if self.writer is None:
             return
         if fault := self.writer.finish(_PATIENCE):
@@ -112,12 +150,44 @@ class Recorder:
     @property
     def summary(self) -> RecordingSummary:
         """After the run."""
+        pictures = 0 if self._channel is None else self._channel.ring.written
         return RecordingSummary(
             file=None if self._path is None else str(self._path),
             ticks=self._written,
             lost_ticks=self._count - self._written,
             fault=self._fault,
+            pictures=pictures,
+            lost_pictures=0 if self.cameras is None else self.cameras.due - pictures,
+            pictures_fault=self._pictures_fault,
         )
+
+    def _take_pictures(self, number: int, tick: Tick) -> None:
+        """Those that are due; whatever fails, ticks are recorded all the same."""
+        if self.cameras is None:
+            return
+        try:
+            while self._pictures_fault is None and not self.cameras.take(number, tick, self._epoch):
+                if not self._waits:
+                    break
+                time.sleep(1e-3)
+                self._look_at_cameras()
+                if self._look():
+                    break
+            self.cameras.skip(tick)
+            if number % _LOOKS == 0:
+                self._look_at_cameras()
+        except Exception as error:
+            self._fail_pictures(reason_of(error))
+
+    def _look_at_cameras(self) -> None:
+        if self.cameras is not None and self._pictures_fault is None and (fault := self.cameras.fault()):
+            self._fail_pictures(fault)
+
+    def _fail_pictures(self, reason: str) -> None:
+        """Log the first failure in one line; no more pictures are taken."""
+        if self._pictures_fault is None:
+            self._pictures_fault = reason
+            _logger.warning("no more pictures are recorded, the run goes on: %s", reason)
 
     def _look(self) -> bool:
         """Whether the writer has ended."""

@@ -115,6 +115,39 @@ def text_of(record: bytes) -> str:
     return record[HEAD.size + len(_ENCAPSULATION) + 4 : -1].decode()
 
 
+_PICTURE_FORMAT = b"jpeg\0"
+
+
+def picture_record(channel: int, sequence: int, log_time: int, camera: str, jpeg: bytes) -> bytes:
+    """The record of a sensor_msgs/CompressedImage of a camera, which is its frame too."""
+    frame = camera.encode() + b"\0"
+    head = struct.pack("<iII", *divmod(log_time, 1_000_000_000), len(frame)) + frame
+    head += bytes(-len(head) % 4) + struct.pack("<I", len(_PICTURE_FORMAT)) + _PICTURE_FORMAT
+    head += bytes(-len(head) % 4) + struct.pack("<I", len(jpeg))
+    length = HEAD.size - _OPCODE_AND_LENGTH + len(_ENCAPSULATION) + len(head) + len(jpeg)
+    begin = HEAD.pack(MESSAGE, length, channel, sequence, log_time, log_time)
+    return b"".join((begin, _ENCAPSULATION, head, jpeg))
+
+
+def jpeg_of(record: bytes) -> bytes:
+    """The picture in such a record. Raises :class:`ValueError` and :class:`struct.error` for another."""
+    begin = HEAD.size + len(_ENCAPSULATION)
+    at = 8
+    for _ in range(2):  # frame and format
+        (length,) = struct.unpack_from("<I", record, begin + at)
+        at += 4 + length
+        at += -at % 4
+    (length,) = struct.unpack_from("<I", record, begin + at)
+    if begin + at + 4 + length != len(record):
+        raise ValueError("a picture of another size than it says")
+    return record[begin + at + 4 :]
+
+
+def channel_of(record: bytes) -> int:
+    """Of a message's record."""
+    return int(HEAD.unpack_from(record)[2])
+
+
 def pose_stamped(frame: str) -> RowType:
     """geometry_msgs/PoseStamped with fields ``position`` and ``quaternion``, x y z w."""
     return RowType().header(frame).field("position", "<f8", 3).field("quaternion", "<f8", 4)

@@ -19,7 +19,7 @@ JOINT_STATES, EXTERNAL_TORQUE = "/joint_states", "/q2r2/external_torque"
 JOINT_COMMANDS, REFERENCE = "/joint_commands", "/q2r2/reference"
 GRIPPERS, FLAGS, STATE, DESCRIPTION = "/q2r2/grippers", "/q2r2/flags", "/q2r2/state", "/robot_description"
 
-_ARRAY, _TEXT = "std_msgs/msg/Float64MultiArray", "std_msgs/msg/String"
+_ARRAY, _TEXT, PICTURE = "std_msgs/msg/Float64MultiArray", "std_msgs/msg/String", "sensor_msgs/msg/CompressedImage"
 _POSE, _JOINTS = "geometry_msgs/msg/PoseStamped", "sensor_msgs/msg/JointState"
 
 SAMPLE_FIELDS = (
@@ -46,14 +46,14 @@ class Topic:
     channel: int
     name: str
     type: str
-    row: RowType | None = None  # None: std_msgs/String, of any length
+    row: RowType | None = None  # None: of any length, std_msgs/String or PICTURE
     labels: dict[str, tuple[str, ...]] = field(default_factory=dict)  # of a field's numbers, in their order
 
 
 class Topics:
-    """All topics for arms and joints of these names, in the order in which a tick's messages are written."""
+    """All topics for arms, joints and cameras of these names, in the order in which a tick's messages are written."""
 
-    def __init__(self, arms: Sequence[str], joints: Sequence[str]) -> None:
+    def __init__(self, arms: Sequence[str], joints: Sequence[str], cameras: Sequence[str] = ()) -> None:
         self.arms, self.joints = tuple(arms), tuple(joints)
         self.all: list[Topic] = []
         measured = tuple(f"{what}_{name}" for what in ("q", "v", "tau", "tau_external") for name in joints)
@@ -78,6 +78,8 @@ class Topics:
         flags = tuple(f"{what}_{arm}" for arm in arms for what in _ARM_FLAG_FIELDS)
         self._add_array(FLAGS, (*_FLAG_FIELDS, *flags))
         self._add(STATE, _TEXT)
+        for camera in cameras:
+            self._add(picture(camera), PICTURE)
         self.by_name = {topic.name: topic for topic in self.all}
         self.by_channel = {topic.channel: topic for topic in self.all}
 
@@ -109,3 +111,8 @@ def target(arm: str) -> str:
 def safe_target(arm: str) -> str:
     """The topic of an arm's tool at the controller's reference."""
     return f"/cartesian_controller/safe_target/{arm}"
+
+
+def picture(camera: str) -> str:
+    """The topic of a camera's pictures."""
+    return f"/{camera}/image/compressed"

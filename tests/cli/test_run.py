@@ -8,7 +8,9 @@ from pathlib import Path
 
 import pytest
 
+from q2r2_control.recording.reader import Recording
 from tests.cli.test_app import FAST, changed_cell, one_object, q2r2
+from tests.support.pictures import needs_opengl
 
 OPTIONS = (*FAST[2:], "--duration", "0.1")
 
@@ -76,3 +78,23 @@ def test_rt_and_simulated_time_exclude_each_other() -> None:
     result = q2r2(*FAST, "--duration", "0.1", "--rt")
     assert (result.exit_code, result.stdout) == (2, "")
     assert result.stderr == "q2r2: --rt and --fast exclude each other, since simulated time is never late\n"
+
+
+CAMERAS = "cameras: {front: {position: [1.9, 0, 1], look_at: [0.4, 0, 0.3], width: 32, height: 32, rate: 50}}"
+
+
+def test_a_cell_with_cameras_is_recorded_with_pictures(tmp_path: Path) -> None:
+    needs_opengl()
+    options = ("--fast", "--json", "--headless", "--duration", "0.1", "--record", str(tmp_path / "recordings"))
+    result = q2r2("run", changed_cell(tmp_path, "cameras: {}", CAMERAS), *options)
+    recording = one_object(result.stdout)["recording"]
+    assert (result.exit_code, recording["pictures_fault"], recording["lost_pictures"]) == (0, None, 0)
+    assert recording["pictures"] == len(list(Recording(Path(recording["file"])).pictures("front"))) >= 6
+
+
+def test_a_plant_without_pictures_is_named_and_recorded_without(tmp_path: Path) -> None:
+    file = changed_cell(tmp_path, "cameras: {}", CAMERAS)
+    result = q2r2("run", file, *OPTIONS, "--record", str(tmp_path / "recordings"))
+    assert result.exit_code == 0
+    assert "no pictures are recorded: the kinematic plant has none; allowed: --plant mujoco\n" in result.stderr
+    assert Recording(Path(one_object(result.stdout)["recording"]["file"])).about.cameras == ()

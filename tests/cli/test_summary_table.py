@@ -9,7 +9,8 @@ import pytest
 from rich.console import Console
 
 from q2r2_control import Pipeline, RunSummary
-from q2r2_control.cli.summary_table import summary_table, task_line
+from q2r2_control.cli.summary_table import recording_line, summary_table, task_line
+from q2r2_control.recording.recorder import RecordingSummary
 from q2r2_control.runtime.histogram import Percentiles
 from q2r2_control.types import Event
 from q2r2_control.verification.assembly_tasks import TaskResult
@@ -85,3 +86,13 @@ def test_a_gripper_that_was_held_is_named_with_what_held_it(summary: RunSummary)
     text = text_of(replace(summary, arms=summary.arms | {"left": held}))
     (row,) = (line for line in text.splitlines() if "left gripper held for" in line)
     assert "1.25 s, by left_finger_0 | block_0" in row
+
+
+def test_lost_pictures_are_said_with_the_reason() -> None:
+    recorded = RecordingSummary("a.mcap", 100, 0, None, pictures=20, lost_pictures=3)
+    assert recording_line(recorded).endswith(
+        "100 ticks, 20 pictures, [red]3 lost[/]: they could not be taken fast enough)"
+    )
+    ended = replace(recorded, pictures_fault="no pictures: no OpenGL")
+    assert recording_line(ended).endswith("[red]3 lost[/]: no pictures: no OpenGL)")
+    assert recording_line(replace(recorded, pictures=0, lost_pictures=0)).endswith("(100 ticks)")

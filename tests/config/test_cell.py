@@ -24,6 +24,7 @@ from q2r2_control.config.arms import (
     ToolConfig,
 )
 from q2r2_control.config.bindings import BindingSettings
+from q2r2_control.config.cameras import CameraConfig
 from q2r2_control.config.cell import (
     Config,
     HeadsetConfig,
@@ -137,7 +138,14 @@ class TestTheShippedCellShowsAllThereIsToTune:
     )
     # Not the default, and the file says so.
     CHOSEN = ("control.solve_time_limit", "control.distances", "mujoco.objects")
-    IN_A_COMMENT = (ContactPair, HeldObjectConfig, NamedPairDistance, SpeedLimitSettings, WorkspaceSettings)
+    IN_A_COMMENT = (
+        CameraConfig,
+        ContactPair,
+        HeldObjectConfig,
+        NamedPairDistance,
+        SpeedLimitSettings,
+        WorkspaceSettings,
+    )
     # A tool's mount and an obstacle's rpy are placements as an arm's mount is, which shows the keys.
     SHOWN_ELSEWHERE = ("arms.left.tool.mount", "obstacles.table.rpy")
 
@@ -197,6 +205,11 @@ class TestTheShippedCellShowsAllThereIsToTune:
         config = Config.model_validate(yaml.safe_load(changed("control.pairs", yaml.safe_load(example))))
         kept = kept_distances(Robot.from_config(config), config.control)
         assert "pairs[0]" in kept.keys
+
+    def test_the_example_of_a_camera_is_one(self) -> None:
+        (example,) = re.findall(r"# (\{front: \{.*\}\}):", CELL.read_text(encoding="utf-8"))
+        config = Config.model_validate(yaml.safe_load(changed("cameras", yaml.safe_load(example))))
+        assert config.cameras["front"].model_fields_set == CameraConfig.model_fields.keys() - {"link", "rpy"}
 
 
 @pytest.mark.parametrize(
@@ -383,6 +396,10 @@ def test_a_misspelt_key_is_named_before_the_one_that_is_missing_for_it(tmp_path:
         ("impedance.wall.maximum_force", -400, "greater than 0"),
         ("admittance.enabled", 1, "valid boolean"),
         ("admittance.mass", 0, "greater than or equal to 0.5"),
+        ("cameras.front", {"position": [1, 0, 1]}, "allowed: either look_at or rpy"),
+        ("cameras.front", {"position": [1, 0, 1], "look_at": [1, 0, 1]}, "allowed: another point"),
+        ("cameras.front", {"position": [1, 0, 1], "rpy": [0, 0, 0], "width": 641}, "a multiple of 2"),
+        ("cameras", {"front/left": {"position": [1, 0, 1], "rpy": [0, 0, 0]}}, "should match pattern"),
         ("mujoco.timestep", 0.01, "less than or equal to 0.001"),
         ("mujoco.rotor_share", 0.0, "greater than or equal to 0.01"),
         ("loop_rate_hz", 1, "greater than or equal to 50"),

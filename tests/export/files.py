@@ -2,24 +2,39 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
+from PIL import Image
 
+from q2r2_control.config.cameras import CameraConfig
 from q2r2_control.recording import topics as names
 from q2r2_control.recording.about import ABOUT, CELL, ROBOT, About, as_yaml
 from q2r2_control.recording.bag import definitions, qos_text
 from q2r2_control.recording.encoder import Block, in_order
 from q2r2_control.recording.mcap_file import McapFile
-from q2r2_control.recording.topics import Topics
+from q2r2_control.recording.rows import picture_record
 from tests.support.watch import cell
 
 ARMS = ("left", "right")
 JOINTS = tuple(f"{arm}_A{number}" for arm in ARMS for number in range(1, 8))
 EPOCH = 1_700_000_000_000_000_000  # [ns]
 CHUNK = 7  # ticks
+
+
+def brightness(number: int) -> int:
+    """Of the pictures that :func:`write_recording` makes."""
+    return 10 * number
+
+
+def plain_jpeg(camera: CameraConfig, value: int) -> bytes:
+    """A picture that is grey all over."""
+    packed = io.BytesIO()
+    Image.new("RGB", (camera.width, camera.height), (value, value, value)).save(packed, "JPEG", quality=95)
+    return packed.getvalue()
 
 
 def write_recording(
@@ -30,17 +45,29 @@ def write_recording(
     engaged: Sequence[int] = (),
     moving: Sequence[int] = (),
     changes: Mapping[tuple[str, str], npt.ArrayLike] | None = None,
+    cameras: Mapping[str, CameraConfig] | None = None,
+    pictures: Mapping[str, Sequence[int]] | None = None,
 ) -> Path:
     """A recording with ticks at ``times`` [ns] since its start.
 
     Measured joints are at minus the tick's place, the reference is at its place, and so are the x of tools at it;
     while engaged (places of ticks) the target of the left arm is at 1000 plus its place. ``changes``: by topic and
-    field what is there instead.
+    field what is there instead. ``pictures``: of ``cameras``, when they were taken [ns], each brighter than the last.
     """
+    config = cell().model_copy(update={"cameras": dict(cameras or {})})
     about = About(
-        ARMS, JOINTS, "position", ("position",), EPOCH, False, as_yaml(cell()), "<robot/>", {"task": "to count"}
+        ARMS,
+        JOINTS,
+        "position",
+        ("position",),
+        EPOCH,
+        False,
+        as_yaml(config),
+        "<robot/>",
+        tuple(config.cameras),
+        {"task": "to count"},
     )
-    topics = Topics(ARMS, JOINTS)
+    topics = about.topics()
     file = McapFile(path)
     file.add_topics(topics.all, definitions(topics.all), qos_text())
     file.add_metadata(ABOUT, about.texts())
@@ -95,5 +122,10 @@ def write_recording(
                 inside.append(Block(block.topic, block.at[first:last], block.rows[first:last]))
         file.add(in_order(inside))
         file.flush()
+    for name, taken in (pictures or {}).items():
+        shown = topics.by_name[names.picture(name)]
+        for number, time in enumerate(taken):
+            jpeg = plain_jpeg(config.cameras[name], brightness(number))
+            file.add_apart([(shown, picture_record(shown.channel, number, EPOCH + time, name, jpeg))])
     file.close()
     return path

@@ -19,6 +19,7 @@ from q2r2_control.inputs.base import Input
 from q2r2_control.inputs.scripted import ScriptedInput
 from q2r2_control.pipeline import Pipeline
 from q2r2_control.plants.base import Plant
+from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.recording.about import About
 from q2r2_control.recording.mcap_file import MAGIC
 from q2r2_control.recording.recorder import Recorder, RecordingSummary
@@ -85,9 +86,13 @@ def record(
     waits: bool = True,
     during: Callable[[Recorder], None] = lambda recorder: None,
 ) -> RecordingSummary:
-    """Record a run; ``during`` gets the recorder when it has begun."""
-    with Recorder(folder, "test", waits=waits and not realtime, room=room) as recorder:
-        recorder.begin(About.of(loop, realtime, {"task": "a test"}), loop.robot)
+    """Record a run, with its cameras where it has some; ``during`` gets the recorder when it has begun."""
+    cameras = loop.config.cameras
+    with Recorder(folder, "test", waits=waits and not realtime, room=room, pictures=bool(cameras)) as recorder:
+        if cameras:
+            assert isinstance(loop.plant, MujocoPlant)
+            recorder.prepare(loop.plant, loop.robot, cameras)
+        recorder.begin(About.of(loop, realtime, {"task": "a test"}, tuple(cameras)), loop.robot)
         loop.listeners.append(recorder)
         during(recorder)
         loop.run(duration, realtime=realtime)

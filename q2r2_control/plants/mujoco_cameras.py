@@ -1,0 +1,84 @@
+"""The cell's own cameras in MuJoCo: their places in the model, and pictures of them without a window."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import mujoco
+import numpy as np
+import numpy.typing as npt
+import pinocchio as pin
+
+from q2r2_control.config.cameras import CameraConfig
+from q2r2_control.errors import PlantError
+from q2r2_control.types import Array
+
+# MuJoCo's camera looks along -z, with y up in the picture; ours looks along x, with z up.
+_FROM_OURS = np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+_STRAIGHT = 1e-9  # of the sine between the line of sight and the vertical
+# Without a graphics card, the 8 samples a pixel and the shadow map of 8192 of a window take some five times as long.
+_SHADOW_MAP, _SAMPLES = 1024, 0
+
+
+def add_cameras(spec: mujoco.MjSpec, cameras: Mapping[str, CameraConfig]) -> None:
+    """Put cameras into a cell. Raises :class:`PlantError` for one on a link that there is not."""
+    for name, camera in cameras.items():
+        body = spec.worldbody if camera.link is None else spec.body(camera.link)
+        if body is None:
+            links = ", ".join(body.name for body in spec.bodies[1:])
+            raise PlantError(f"cameras.{name}.link = {camera.link!r}: no such link; allowed: {links}")
+        body.add_camera(
+            name=name,
+            pos=camera.position,
+            quat=np.roll(pin.Quaternion(_orientation(camera) @ _FROM_OURS).coeffs(), 1),
+            fovy=np.rad2deg(camera.field_of_view),
+        )
+
+
+def _orientation(camera: CameraConfig) -> Array:
+    """(3, 3) of the camera's frame in its link's: x is the line of sight, y is level where there is a choice."""
+    if camera.look_at is None:
+        assert camera.rpy is not None
+        return np.array(pin.rpy.rpyToMatrix(*camera.rpy))
+    sight = np.subtract(camera.look_at, camera.position)
+    sight /= np.linalg.norm(sight)
+    left = np.cross((0.0, 0.0, 1.0), sight)
+    if np.linalg.norm(left) < _STRAIGHT:  # straight up or down: x of the link is up in the picture
+        left = np.cross((1.0, 0.0, 0.0), sight)
+    left /= np.linalg.norm(left)
+    return np.stack((sight, left, np.cross(sight, left)), axis=1)
+
+
+class CellPictures:
+    """Takes pictures with the cameras of a model. Only for one thread, since OpenGL is."""
+
+    def __init__(self, model: mujoco.MjModel, cameras: Mapping[str, CameraConfig]) -> None:
+        """``model`` is changed. Raises :class:`PlantError`, one line, where OpenGL without a window is missing."""
+        model.vis.quality.shadowsize, model.vis.quality.offsamples = _SHADOW_MAP, _SAMPLES
+        model.vis.global_.offwidth = max(camera.width for camera in cameras.values())
+        model.vis.global_.offheight = max(camera.height for camera in cameras.values())
+        self._model, self._data = model, mujoco.MjData(model)
+        sizes = {name: (camera.height, camera.width) for name, camera in cameras.items()}
+        try:
+            renderers = {size: mujoco.Renderer(model, *size) for size in set(sizes.values())}
+        # Without the library, PyOpenGL fails at whatever it looks for first.
+        except (ImportError, AttributeError, RuntimeError, mujoco.FatalError) as error:
+            reason = " ".join(str(error).split())
+            raise PlantError(
+                f"no pictures: {reason}; allowed: MUJOCO_GL=egl (on Debian libegl1 and libgl1-mesa-dri), or "
+                "MUJOCO_GL=osmesa (libosmesa6)"
+            ) from error
+        self._renderers = {name: renderers[size] for name, size in sizes.items()}
+
+    def place(self, qpos: Array) -> None:
+        """Let the cell be where ``qpos`` (model.nq,) says."""
+        self._data.qpos[:] = qpos
+        mujoco.mj_kinematics(self._model, self._data)
+        mujoco.mj_comPos(self._model, self._data)
+        mujoco.mj_camlight(self._model, self._data)
+
+    def take(self, camera: str) -> npt.NDArray[np.uint8]:
+        """Picture (height, width, 3), r g b, of the cell as it was placed last."""
+        renderer = self._renderers[camera]
+        renderer.update_scene(self._data, camera)
+        return np.asarray(renderer.render())

@@ -1,0 +1,88 @@
+"""A Ray cluster makes the same dataset, also when one of its workers is killed."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+
+from q2r2_control.export.episodes import Sampling, make_episodes
+from q2r2_control.export.lerobot import write_dataset
+from tests.export.runs import contents, record_two
+
+ray = pytest.importorskip("ray", reason="the extra ray is not installed")
+pytest.importorskip("pyarrow", reason="the extra export is not installed")
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture(scope="module")
+def address() -> Iterator[str]:
+    """Of a cluster of two workers on this machine, which ends with the test."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PYTHONPATH", os.pathsep.join([str(ROOT), *os.environ.get("PYTHONPATH", "").split(os.pathsep)]))
+        ray.init(num_cpus=2, include_dashboard=False, log_to_driver=False, logging_level="ERROR")
+    yield ray.get_runtime_context().gcs_address
+    ray.shutdown()
+
+
+@pytest.fixture(scope="module")
+def recordings(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Files of two runs."""
+    return list(record_two(tmp_path_factory.mktemp("recordings")))
+
+
+def export(recordings: list[Path], out: Path, *options: str) -> subprocess.Popen[str]:
+    arguments = ["export", "lerobot", *map(str, recordings), "--output", str(out), *options]
+    command = [sys.executable, "-m", "q2r2_control", *arguments]
+    return subprocess.Popen(command, cwd=ROOT, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+
+
+def worker() -> int | None:
+    """A process of the cluster that makes an episode now."""
+    for folder in Path("/proc").iterdir():
+        with suppress(OSError):
+            if folder.name.isdigit() and (folder / "cmdline").read_bytes().startswith(b"ray::_work"):
+                return int(folder.name)
+    return None
+
+
+def test_the_dataset_is_the_same_when_a_worker_is_killed_in_the_middle(
+    recordings: list[Path], address: str, tmp_path: Path
+) -> None:
+    (tmp_path / "episodes").mkdir()
+    write_dataset(make_episodes(recordings, Sampling(), tmp_path / "episodes").kept, tmp_path / "here")
+    process = export(recordings, tmp_path / "there", "--ray", address)
+    killed = None
+    while killed is None and process.poll() is None:
+        killed = worker()
+        time.sleep(0.01)
+    assert killed is not None
+    os.kill(killed, signal.SIGKILL)
+    _, errors = process.communicate(timeout=300)
+    assert process.returncode == 0, errors
+    assert contents(tmp_path / "there") == contents(tmp_path / "here")
+
+
+def test_a_bad_recording_and_a_cluster_that_is_not_there_are_one_line(
+    recordings: list[Path], address: str, tmp_path: Path
+) -> None:
+    bad = tmp_path / "bad.mcap"
+    bad.write_bytes(b"no recording")
+    process = export([*recordings, bad], tmp_path / "out", "--ray", address)
+    _, errors = process.communicate(timeout=300)
+    assert process.returncode == 2
+    assert errors.startswith(f"q2r2: {bad}: not an MCAP file")
+    assert len(errors.splitlines()) == 1
+    process = export(recordings, tmp_path / "out", "--ray", "127.0.0.1:1")
+    _, errors = process.communicate(timeout=300)
+    assert process.returncode == 2
+    assert errors.startswith("q2r2: --ray 127.0.0.1:1: Connection refused; allowed: a running cluster, ")
+    assert len(errors.splitlines()) == 1

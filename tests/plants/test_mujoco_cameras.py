@@ -1,0 +1,48 @@
+"""Cameras stand where the cell says and look where it says. None of it needs OpenGL."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import pytest
+
+from q2r2_control.config.cameras import CameraConfig
+from q2r2_control.errors import PlantError
+from q2r2_control.plants.mujoco import MujocoPlant
+from q2r2_control.robot.robot import Robot
+from q2r2_control.types import Array
+from tests.support.watch import cell
+
+
+def axes(**camera: object) -> tuple[Array, Array]:
+    """Where a camera is, and in columns what is to the right in its picture, up, and away from what it sees."""
+    config = cell().model_copy(update={"cameras": {"one": CameraConfig.model_validate(camera)}})
+    plant = MujocoPlant(Robot.from_config(config), config)
+    mujoco.mj_camlight(plant.model, plant.data)
+    found = plant.data.camera("one")
+    return found.xpos.copy(), found.xmat.reshape(3, 3).copy()
+
+
+def test_a_camera_that_looks_at_a_point_has_it_in_the_middle_and_stands_upright() -> None:
+    position, turned = axes(position=(2, 1, 1.5), look_at=(0.5, 0, 0))
+    right, up, back = turned.T
+    np.testing.assert_allclose(position, (2, 1, 1.5))
+    np.testing.assert_allclose(np.cross(-back, np.array((0.5, 0, 0)) - position), 0, atol=1e-12)
+    assert -back @ (np.array((0.5, 0, 0)) - position) > 0
+    assert right[2] == pytest.approx(0.0)
+    assert up[2] > 0.5
+
+
+def test_a_camera_without_rotation_looks_along_x_with_z_up() -> None:
+    right, up, back = axes(position=(0, 0, 1), rpy=(0, 0, 0))[1].T
+    np.testing.assert_allclose((right, up, back), ((0, -1, 0), (0, 0, 1), (-1, 0, 0)), atol=1e-12)
+
+
+def test_a_camera_that_looks_straight_down_has_x_up_in_its_picture() -> None:
+    right, up, back = axes(position=(0.5, 0, 2), look_at=(0.5, 0, 0))[1].T
+    np.testing.assert_allclose((right, up, back), ((0, -1, 0), (1, 0, 0), (0, 0, 1)), atol=1e-12)
+
+
+def test_a_camera_on_a_link_that_there_is_not_is_refused_with_those_that_there_are() -> None:
+    with pytest.raises(PlantError, match=r"cameras\.one\.link = 'hand': no such link; allowed: left_link_0, "):
+        axes(link="hand", position=(0, 0, 1), rpy=(0, 0, 0))

@@ -1,0 +1,204 @@
+"""Pictures are recorded beside the loop: exact in simulated time, never in its way, and none is lost silently."""
+
+from __future__ import annotations
+
+import io
+import logging
+import os
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from PIL import Image
+
+from q2r2_control.config.cameras import CameraConfig
+from q2r2_control.pipeline import Pipeline
+from q2r2_control.plants.mujoco import MujocoPlant
+from q2r2_control.recording.camera_process import CameraProcess
+from q2r2_control.recording.reader import Picture, Recording
+from q2r2_control.recording.recorder import Recorder
+from q2r2_control.recording.replay import replay
+from q2r2_control.runtime.recorder import Tick
+from tests.recording.runs import RATE, file_of, pipeline, read_elsewhere, record
+from tests.recording.test_recorder import run_program
+from tests.recording.test_writer_process import Script
+from tests.support.pictures import needs_opengl
+from tests.support.processes import alive, wait_until
+
+FRONT = CameraConfig(position=(1.9, 0.0, 1.0), look_at=(0.4, 0.0, 0.3), width=64, height=48, rate=20.0)
+HAND = CameraConfig(
+    link="left_hand_e_base", position=(0.1, 0.0, 0.0), rpy=(0.0, -1.57, 0.0), width=32, height=32, rate=8.0
+)
+DURATION = 0.3  # [s]
+
+
+def loop_with(**cameras: CameraConfig) -> Pipeline:
+    return pipeline("circle", "mujoco", cameras=cameras)
+
+
+def cameras_of(recorder: Recorder) -> CameraProcess:
+    assert recorder.cameras is not None
+    return recorder.cameras
+
+
+def pixels(picture: Picture) -> npt.NDArray[np.int64]:
+    return np.asarray(Image.open(io.BytesIO(picture.jpeg)), dtype=np.int64)
+
+
+class Observed:
+    """A listener that keeps the times of ticks, and checks that copies for pictures are of the tick's own state."""
+
+    def __init__(self, loop: Pipeline) -> None:
+        assert isinstance(loop.plant, MujocoPlant)
+        self._plant, self._robot, self.times = loop.plant, loop.robot, list[float]()
+
+    def __call__(self, tick: Tick) -> None:
+        at = [self._plant.model.joint(name).qposadr[0] for name in self._robot.joint_names]
+        np.testing.assert_array_equal(self._plant.observed_qpos[at], tick.state.q)
+        self.times.append(tick.t)
+
+
+def test_in_simulated_time_there_is_a_picture_at_each_multiple_of_a_cameras_period(tmp_path: Path) -> None:
+    needs_opengl()
+    loop = loop_with(front=FRONT, hand=HAND)
+    observed = Observed(loop)
+    loop.listeners.append(observed)
+    summary = record(tmp_path, loop, DURATION)
+    assert (summary.pictures_fault, summary.lost_pictures) == (None, 0)
+    file = file_of(summary)
+    recording = Recording(file)
+    for name, camera in loop.config.cameras.items():
+        pictures = list(recording.pictures(name))
+        due = np.arange(len(pictures)) / camera.rate
+        first = [next(at for at, t in enumerate(observed.times) if t >= time - 1e-9) for time in due]
+        assert [picture.tick for picture in pictures] == first
+        assert len(pictures) == int(observed.times[-1] * camera.rate + 1e-6) + 1
+        stamps = [(picture.time - recording.about.epoch) * 1e-9 for picture in pictures]
+        assert stamps == pytest.approx([observed.times[at] for at in first], abs=1e-9)
+        assert {pixels(picture).shape for picture in pictures} == {(camera.height, camera.width, 3)}
+    found = read_elsewhere(file.parent, tmp_path)
+    assert found["/front/image/compressed"]["type"] == "sensor_msgs/msg/CompressedImage"
+    assert sum(found[f"/{name}/image/compressed"]["count"] for name in loop.config.cameras) == summary.pictures
+    assert replay(file).difference is None
+
+
+def test_a_picture_shows_where_things_are(tmp_path: Path) -> None:
+    needs_opengl()
+    loop = loop_with(front=FRONT)
+    plant = loop.plant
+    assert isinstance(plant, MujocoPlant)
+
+    def moves_a_block(tick: Tick) -> None:
+        if tick.t >= 0.5 * DURATION:  # the block sleeps by then
+            plant.data.joint("blue_block_free").qpos[:3] = (0.4, 0.0, 0.7)
+
+    loop.listeners.append(moves_a_block)
+    first, *_, last = list(Recording(file_of(record(tmp_path, loop, DURATION))).pictures("front"))
+    moved = np.abs(pixels(last) - pixels(first)).max(axis=2) > 60
+    rows, columns = np.nonzero(moved)
+    assert moved.any()
+    assert rows.min() < 24 < rows.max(), "gone from the table, and in the air"
+    assert columns.max() < 60
+
+
+def test_pictures_that_are_not_taken_in_time_are_lost_and_counted(tmp_path: Path) -> None:
+    needs_opengl()
+    taken: list[int] = []
+
+    def stopped_for_a_while(recorder: Recorder) -> Iterator[None]:
+        pid = cameras_of(recorder).pid
+        os.kill(pid, signal.SIGSTOP)
+        while cameras_of(recorder).due < 400:  # more than there is room for
+            yield
+        os.kill(pid, signal.SIGCONT)
+        taken.append(cameras_of(recorder).due)
+
+    loop = loop_with(front=FRONT.model_copy(update={"rate": 240.0}))
+    summary = record(tmp_path, loop, 60.0, waits=False, during=Script(loop, stopped_for_a_while))
+    assert (summary.fault, summary.pictures_fault) == (None, None)
+    assert summary.lost_ticks == 0
+    assert summary.lost_pictures > 50
+    assert summary.pictures > 100
+    assert summary.pictures + summary.lost_pictures >= taken[0]
+    assert summary.file is not None
+    assert len(list(Recording(Path(summary.file)).pictures("front"))) == summary.pictures
+
+
+def test_pictures_that_are_due_between_two_ticks_are_lost_and_counted(tmp_path: Path) -> None:
+    needs_opengl()
+    loop = pipeline("circle", "mujoco", loop_rate_hz=100.0, cameras={"front": FRONT.model_copy(update={"rate": 240.0})})
+    observed = Observed(loop)
+    loop.listeners.append(observed)
+    summary = record(tmp_path, loop, 0.1)
+    assert summary.pictures == len(observed.times)
+    assert summary.pictures + summary.lost_pictures == int(observed.times[-1] * 240.0 + 1e-6) + 1
+
+
+def test_when_the_run_is_killed_the_pictures_that_wait_are_taken_and_the_file_is_closed(tmp_path: Path) -> None:
+    needs_opengl()
+    program = """
+        import os, signal, sys
+        from pathlib import Path
+        from tests.recording.runs import record
+        from tests.recording.test_cameras import FRONT, loop_with
+        loop = loop_with(front=FRONT)
+        def kill(tick):
+            if tick.t >= 0.8:
+                os.kill(os.getpid(), signal.SIGKILL)
+        loop.listeners.append(kill)
+        def tell(recorder):
+            print(recorder.writer.pid, recorder.cameras.pid, flush=True)
+        record(Path(sys.argv[1]), loop, 1.0, during=tell)
+    """
+    result = run_program(program, str(tmp_path))
+    assert result.returncode == -signal.SIGKILL, result.stderr
+    helpers = [int(pid) for pid in result.stdout.split()]
+    wait_until(lambda: not any(map(alive, helpers)))
+    (file,) = tmp_path.glob("*/*.mcap")
+    recording = Recording(file)
+    assert recording.closed
+    # The newest copy may not have been seen.
+    assert len(list(recording.pictures("front"))) >= 0.8 * FRONT.rate - 1
+
+
+def test_when_the_process_that_takes_pictures_is_killed_the_recording_goes_on(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    needs_opengl()
+
+    def killed(recorder: Recorder) -> Iterator[None]:
+        while cameras_of(recorder).due < 4:
+            yield
+        wait_until(lambda: cameras_of(recorder).ring.written)
+        os.kill(cameras_of(recorder).pid, signal.SIGKILL)
+        wait_until(lambda: not alive(cameras_of(recorder).pid))
+        while not caplog.records:
+            yield
+
+    loop = loop_with(front=FRONT)
+    with caplog.at_level(logging.WARNING):
+        summary = record(tmp_path, loop, 60.0, during=Script(loop, killed))
+    (line,) = [entry.getMessage() for entry in caplog.records]
+    assert line == f"no more pictures are recorded, the run goes on: {summary.pictures_fault}"
+    assert summary.pictures_fault == "the process that takes pictures was ended by SIGKILL"
+    assert summary.lost_pictures > 0
+    assert replay(file_of(summary)).difference is None
+
+
+def test_without_opengl_one_line_says_so_and_the_run_is_recorded(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("MUJOCO_GL", "egl")
+    monkeypatch.setenv("__EGL_VENDOR_LIBRARY_FILENAMES", str(tmp_path / "none"))
+    with caplog.at_level(logging.WARNING):
+        summary = record(tmp_path, loop_with(front=FRONT), 0.1)
+    (line,) = [entry.getMessage() for entry in caplog.records]
+    assert line.startswith("no more pictures are recorded, the run goes on: no pictures: ")
+    assert "allowed: MUJOCO_GL=egl" in line
+    assert summary.pictures == 0
+    assert summary.lost_pictures > 0
+    assert summary.ticks >= 0.1 * RATE
+    assert file_of(summary).exists()
