@@ -118,7 +118,7 @@ def _export(
                 workers=workers,
                 ray=ray,
                 skip_bad=skip_bad,
-                progress=lambda done: progress.update(bar, completed=done),
+                progress=lambda done: progress.update(bar, completed=done, total=max(done, len(files))),
             )
     finally:
         output.tidy()
@@ -127,4 +127,6 @@ def _export(
     if not made.kept:
         raise RecordingError("none of the recordings can be exported")
     output.write(lambda target: writer(made.kept, target))
-    print(f"{path}: {len(made.kept)} of {len(files)} recordings at {sampling.fps} frames per second")
+    whole = len(made.kept) + len(made.skipped) == len(files)
+    count = f"{len(made.kept)} of" if whole else f"{len(made.kept)} episodes of"
+    print(f"{path}: {count} {len(files)} recordings at {sampling.fps} frames per second")

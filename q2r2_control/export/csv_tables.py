@@ -20,7 +20,7 @@ def write_tables(files: Sequence[Path], folder: Path) -> None:
     tasks: dict[str, int] = {}
     for index, file in enumerate(files):
         episode = Episode.load(file)
-        path = folder / f"{Path(episode.recording).stem}.csv"
+        path = folder / f"{episode.name}.csv"
         if path.exists():
             raise RecordingError(f"{episode.recording}: two recordings have this name; allowed: each one once")
         _write(episode, path, index, first_frame, tasks.setdefault(episode.task, len(tasks)))
@@ -28,9 +28,11 @@ def write_tables(files: Sequence[Path], folder: Path) -> None:
 
 
 def write_table(files: Sequence[Path], path: Path) -> None:
-    """Write the one kept episode to a file."""
-    (file,) = files
-    _write(Episode.load(file), path, 0, 0, 0)
+    """Write the one kept episode to a file. Raises :class:`RecordingError` where there are several."""
+    first = Episode.load(files[0])
+    if len(files) > 1:
+        raise RecordingError(f"{first.recording}: has {len(files)} episodes; allowed: a folder as --output, or one")
+    _write(first, path, 0, 0, 0)
 
 
 def _write(episode: Episode, path: Path, index: int, first_frame: int, task: int) -> None:

@@ -22,11 +22,12 @@ from q2r2_control.export.features import Names, features
 from q2r2_control.export.kept_pictures import KeptAs, KeptPictures, keep_pictures
 from q2r2_control.export.ray_cluster import mapped_over
 from q2r2_control.export.sampling import sample
+from q2r2_control.recording.episode_spans import WHOLE, EpisodeSpan, read_spans
 from q2r2_control.recording.reader import Recording
 from q2r2_control.recording.recorded_robot import cell_and_robot_of
 
 FASTEST = 1000  # [frames/s]
-_FORMAT = 2  # of kept episodes; another one is made again
+_FORMAT = 3  # of kept episodes; another one is made again
 
 
 @dataclass(frozen=True)
@@ -54,6 +55,12 @@ class Episode:
     notes: dict[str, str]  # program, machine, operator and the like, as recorded
     vectors: dict[str, npt.NDArray[np.float32]]
     cameras: dict[str, KeptPictures] = field(default_factory=dict)  # whose pictures are kept beside the episode
+    part: int = 0  # which of the episodes in the file, from 1 on; 0: the whole
+
+    @property
+    def name(self) -> str:
+        """Of the file, and which of several episodes in it."""
+        return Path(self.recording).stem + (f"-{self.part}" if self.part else "")
 
     @property
     def frames(self) -> int:
@@ -96,13 +103,22 @@ class Episode:
         return cls(**about, vectors=vectors)
 
 
-def make_episode(file: Path, sampling: Sampling, target: Path | None = None) -> Episode:
+@dataclass(frozen=True)
+class Part:
+    """An episode in a recording that has several; number 0: the whole."""
+
+    number: int = 0  # from 1 on
+    span: EpisodeSpan = WHOLE
+
+
+def make_episode(file: Path, sampling: Sampling, target: Path | None = None, part: Part | None = None) -> Episode:
     """An episode of a recording, whose pictures go beside ``target``, if that is the file it will be kept in.
 
     Raises :class:`RecordingError` that names the file and what is wrong.
     """
     recording = Recording(file)
-    frames = sample(recording, sampling.fps, sampling.trim)
+    part = part or Part()
+    frames = sample(recording, sampling.fps, sampling.trim, part.span)
     cell, robot = cell_and_robot_of(recording)
     try:
         vectors, labels = features(frames, robot)
@@ -114,7 +130,19 @@ def make_episode(file: Path, sampling: Sampling, target: Path | None = None) -> 
     if sampling.pictures is not None and target is not None:
         used = {name: cell.cameras[name] for name in recording.about.cameras}
         cameras = keep_pictures(recording, used, frames["stamp"].tolist(), sampling.fps, sampling.pictures, target)
-    return Episode(recording.file.name, cell.name, task, sampling.fps, labels, notes, vectors, cameras)
+    name = recording.file.name
+    return Episode(name, cell.name, task, sampling.fps, labels, notes, vectors, cameras, part.number)
+
+
+def parts_to_export(file: Path) -> list[Part]:
+    """The episodes of a recording but those that its operator discarded; of a file that cannot be read the whole."""
+    try:
+        spans = read_spans(Recording(file))
+    except RecordingError:
+        return [Part()]  # whoever makes an episode of it finds out
+    if spans[0].whole:
+        return [Part()]
+    return [Part(number, span) for number, span in enumerate(spans, 1) if not span.discarded]
 
 
 @dataclass(frozen=True)
@@ -135,14 +163,15 @@ def make_episodes(
     skip_bad: bool = False,
     progress: Callable[[int], None] = lambda done: None,
 ) -> Exported:
-    """Make an episode of each recording, and keep it in ``folder``; those that are there already are not made again.
+    """Make the episodes of recordings, and keep them in ``folder``; those that are there already are not made again.
 
-    The same comes out for any number of ``workers``, and of a cluster at the address ``ray``. ``progress`` is told how
-    many are through. Raises the :class:`RecordingError` of the first bad recording unless ``skip_bad``, and
-    :class:`ConfigError` where nothing can be written.
+    Those that an operator discarded while recording are left out. The same comes out for any number of ``workers``, and
+    of a cluster at the address ``ray``. ``progress`` is told how many are through. Raises the :class:`RecordingError`
+    of the first bad recording unless ``skip_bad``, and :class:`ConfigError` where nothing can be written.
     """
-    targets = [folder / f"{_key(file, sampling)}.npz" for file in files]
-    jobs = [(file, sampling, target) for file, target in zip(files, targets, strict=True)]
+    parts = [(file, part) for file in files for part in parts_to_export(file)]
+    targets = [folder / f"{_key(file, sampling, part)}.npz" for file, part in parts]
+    jobs = [(file, sampling, target, part) for (file, part), target in zip(parts, targets, strict=True)]
     exported = Exported([], [])
     with _mapping(min(workers, len(jobs))) if ray is None else mapped_over(ray, _work) as run:
         for done, (target, fault) in enumerate(zip(targets, run(jobs), strict=True), start=1):
@@ -176,13 +205,13 @@ _IGNORED = (
 )  # Ctrl-C goes to all of a terminal's processes; the first one ends the others
 
 
-def _work(job: tuple[Path, Sampling, Path]) -> str | None:
+def _work(job: tuple[Path, Sampling, Path, Part]) -> str | None:
     """Make one episode unless it is there; returns what was wrong."""
-    file, sampling, target = job
+    file, sampling, target, part = job
     if _is_kept(target):
         return None
     try:
-        make_episode(file, sampling, target).save(target)
+        make_episode(file, sampling, target, part).save(target)
     except RecordingError as error:
         return str(error)
     except OSError as error:
@@ -198,11 +227,11 @@ def _is_kept(target: Path) -> bool:
     return True
 
 
-def _key(file: Path, sampling: Sampling) -> str:
+def _key(file: Path, sampling: Sampling, part: Part) -> str:
     """Another one after any change of the recording or of what is asked for."""
     try:
         status = file.stat()
     except OSError as error:
         raise RecordingError(f"{file}: cannot be read: {error.strerror}") from error
-    identity = [str(file.resolve()), status.st_size, status.st_mtime_ns, asdict(sampling), _FORMAT]
+    identity = [str(file.resolve()), status.st_size, status.st_mtime_ns, asdict(sampling), part.number, _FORMAT]
     return hashlib.sha256(json.dumps(identity).encode()).hexdigest()[:24]

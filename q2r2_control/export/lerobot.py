@@ -113,7 +113,8 @@ class _Writer:
             }
         )
         self._statistics.append(statistics)
-        self._sources.append({"episode_index": number, "recording": episode.recording, **episode.notes})
+        part = {"part": episode.part} if episode.part else {}
+        self._sources.append({"episode_index": number, "recording": episode.recording, **part, **episode.notes})
         self._frames += episode.frames
 
     def close(self) -> None:

@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from q2r2_control.errors import RecordingError
 from q2r2_control.recording import topics as names
+from q2r2_control.recording.episode_spans import WHOLE, EpisodeSpan
 from q2r2_control.recording.reader import Recording
 from q2r2_control.recording.ticks import ChunkTicks, Column, ticks_of
 from q2r2_control.types import Array
@@ -26,8 +27,8 @@ _NANOSECONDS = 1_000_000_000
 _MOVING = 0.01  # fastest joint of a reference that moves [rad/s]
 
 
-def sample(recording: Recording, fps: int, trim: bool = False) -> dict[str, Array]:
-    """What is observed and commanded at each of n frames.
+def sample(recording: Recording, fps: int, trim: bool = False, span: EpisodeSpan = WHOLE) -> dict[str, Array]:
+    """What is observed and commanded at each of n frames of the ``span``, whose first tick gives t_0.
 
     ``position``, ``velocity``, ``effort`` (n, joints) are measured [rad, rad/s, Nm], ``opening`` (n, arms) too, 0
     closed .. 1 open, -inf where it is not measured. ``reference`` (n, joints) and ``gripper`` (n, arms) are commanded.
@@ -47,7 +48,9 @@ def sample(recording: Recording, fps: int, trim: bool = False) -> dict[str, Arra
         if previous is not None:
             known = {name: np.concatenate((previous[name], columns[name])) for name in columns}
         previous = {name: values[-1:] for name, values in columns.items()}
-        counting = np.flatnonzero(columns["active"]) if trim else np.arange(len(columns["time"]))
+        passed = (columns["time"] - recording.about.epoch) / _NANOSECONDS
+        inside = (span.start <= passed) & (passed <= span.end)
+        counting = np.flatnonzero(inside & columns["active"] if trim else inside)
         if len(counting):
             start = int(columns["time"][counting[0]]) if start is None else start
             end = int(columns["time"][counting[-1]])
@@ -66,7 +69,8 @@ def sample(recording: Recording, fps: int, trim: bool = False) -> dict[str, Arra
     if previous is None:
         raise RecordingError(f"{recording.file}: no tick was recorded")
     if start is None:
-        raise RecordingError(f"{recording.file}: no arm was ever engaged or moved, so --trim leaves nothing")
+        why = "no arm was ever engaged or moved, so --trim leaves nothing" if trim else "no tick is in the episode"
+        raise RecordingError(f"{recording.file}: {why}")
     frames = {name: np.concatenate(values) for name, values in picked.items()}
     kept = frames["time"] <= end
     frames = {name: values[kept] for name, values in frames.items()}

@@ -7,6 +7,7 @@ import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
+from q2r2_control.config.bindings import Action
 from q2r2_control.errors import RecordingError
 from q2r2_control.recording import topics as names
 from q2r2_control.recording.reader import RecordedChunk, Recording
@@ -30,6 +31,9 @@ class EpisodeSpan:
         return self.start == -math.inf
 
 
+WHOLE = EpisodeSpan()
+
+
 def spans_of(events: Iterable[Event]) -> list[EpisodeSpan]:
     """The episodes that an operator has told; the whole run where that are none.
 
@@ -47,9 +51,7 @@ def spans_of(events: Iterable[Event]) -> list[EpisodeSpan]:
             spans[-1] = replace(spans[-1], end=min(spans[-1].end, event.t), discarded=True)
         elif event.reason == MARK:
             marks.append(event.t)
-    return [
-        replace(span, marks=tuple(t for t in marks if span.start <= t <= span.end)) for span in spans or [EpisodeSpan()]
-    ]
+    return [replace(span, marks=tuple(t for t in marks if span.start <= t <= span.end)) for span in spans or [WHOLE]]
 
 
 def events_of_ticks(chunk: RecordedChunk) -> dict[int, list[Event]]:
@@ -71,6 +73,8 @@ def events_of(chunk: RecordedChunk) -> Iterator[Event]:
 
 def read_spans(recording: Recording) -> list[EpisodeSpan]:
     """The episodes of a recording. Raises :class:`RecordingError` for a damaged one."""
+    if Action.RECORD_TOGGLE not in recording.about.cell:
+        return [WHOLE]  # without reading all of it
     try:
         return spans_of(event for chunk in recording.chunks() for event in events_of(chunk))
     except (ValueError, KeyError, TypeError) as error:
