@@ -333,7 +333,8 @@ class PipelineRun:
         recorder.add_holding(dt, self._holding)
         if self._following:
             now, openings = self._clock.now, self._openings
-            self._operator.feel(now, events, self._targets, reference, state, self._grippers, openings)
+            feedback = self._operator.feedback
+            feedback.update(now, events, self._targets, reference.report, state, self._grippers, openings)
         if not recorder.listened:
             return
         tick = Tick(

@@ -15,20 +15,21 @@ from q2r2_control.runtime.wishes import Wishes
 from q2r2_control.supervision.supervisor import Supervisor
 from q2r2_control.teleop.arm_states import is_fault
 from q2r2_control.teleop.teleop import Teleop
-from q2r2_control.types import ArmTarget, Event, HandSample, Reference, RobotState
+from q2r2_control.types import ArmTarget, Event, HandSample
 
 _logger = logging.getLogger(__name__)
 
 
 class OperatorSide:
-    """Once a tick: :meth:`poll`, :meth:`targets`, and at its end :meth:`take_events` and :meth:`feel`."""
+    """Once a tick: :meth:`poll`, :meth:`targets`, and at its end :meth:`take_events` and the
+    ``feedback`` to the hands."""
 
     def __init__(
         self, teleop: Teleop, source: Input, supervisor: Supervisor, controller: CartesianController, wishes: Wishes
     ) -> None:
         self._teleop, self._input, self._supervisor, self._wishes = teleop, source, supervisor, wishes
         self._homing = False  # supervision is on the way home
-        self._feedback = OperatorFeedback(controller, teleop.hand_of, teleop.settings.haptics, source.send_haptic)
+        self.feedback = OperatorFeedback(controller, teleop.hand_of, teleop.settings.haptics, source.send_haptic)
         self.connected = False
 
     def poll(self, now: float) -> list[HandSample]:
@@ -69,19 +70,6 @@ class OperatorSide:
                 _logger.debug("%s arm: %s -> %s: %s", event.arm, event.source, event.destination, event.reason)
         return events
 
-    def feel(
-        self,
-        now: float,
-        events: list[Event],
-        targets: Mapping[str, ArmTarget],
-        reference: Reference,
-        state: RobotState,
-        grippers: Mapping[str, float],
-        openings: Mapping[str, float],
-    ) -> None:
-        """Send the hands what they shall feel; see :meth:`OperatorFeedback.update`."""
-        self._feedback.update(now, events, targets, reference.report, state, grippers, openings)
-
     def _fulfil(self, now: float) -> None:
         home, settings = self._wishes.home, self._wishes.settings
         for line in self._wishes.told(self._teleop.settings):
@@ -93,7 +81,7 @@ class OperatorSide:
             problem = self._teleop.change(settings, now)
             self._teleop.tell(now, "settings changed" if problem is None else f"not changed: {problem}")
             if problem is None:
-                self._feedback.scale(settings.haptics.strength)
+                self.feedback.scale(settings.haptics.strength)
 
     def _go_home(self, now: float) -> None:
         """Begin and end the way home as the operator asks, and tell the operator how it ended."""
