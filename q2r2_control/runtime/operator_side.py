@@ -21,8 +21,7 @@ _logger = logging.getLogger(__name__)
 
 
 class OperatorSide:
-    """Once a tick: :meth:`poll`, :meth:`targets`, and at its end :meth:`take_events` and the
-    ``feedback`` to the hands."""
+    """Once a tick: :meth:`poll`, :meth:`targets`, and at its end :meth:`take_events` and ``feedback`` to the hands."""
 
     def __init__(
         self, teleop: Teleop, source: Input, supervisor: Supervisor, controller: CartesianController, wishes: Wishes
