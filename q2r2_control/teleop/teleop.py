@@ -112,8 +112,8 @@ class Teleop:
         """One tick: process the samples and compute every arm's target.
 
         ``tools``: measured tool poses in the world frame. ``commanded``: tool poses of the controller's reference; when
-        engaging, the position anchors to the measured tool and the orientation to the commanded one, so that sag
-        does not add up over many pauses. Without ``commanded`` it is the last target's, at first the measured one.
+        engaging, the position anchors to the measured tool and the orientation to the commanded one, whose sag so does
+        not add up over many pauses. Without ``commanded`` it is the last target's, at first the measured one.
         ``commanded`` is also what the leash is tied to; without it there is none.
         ``obstacles``: why an arm may not be engaged now, for reasons outside of this layer.
         ``now`` [s] is the clock of the samples' stamps.
