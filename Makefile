@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV   := .venv
 BIN    := $(VENV)/bin
 
-.PHONY: setup demo test test-ros test-lerobot lint bench soak clean
+.PHONY: setup demo test test-slow test-ros test-lerobot lint bench soak clean
 .DEFAULT_GOAL := setup
 
 setup: $(VENV)/.installed
@@ -26,7 +26,11 @@ demo: setup
 	$(BIN)/q2r2 demo
 
 test: setup
-	$(BIN)/python -m pytest -n auto --ignore tests/ros --ignore tests/lerobot
+	$(BIN)/python -m pytest -n auto --ignore tests/ros --ignore tests/lerobot -m 'not slow'
+
+# What plays minutes of motion, or whole runs again and again.
+test-slow: setup
+	$(BIN)/python -m pytest -n auto --ignore tests/ros --ignore tests/lerobot -m slow
 
 # Real processes with real timeouts of 150 ms. Those with a whole set of nodes run on their own, since it keeps two cores busy.
 test-ros: setup

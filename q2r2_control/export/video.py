@@ -17,6 +17,7 @@ import numpy.typing as npt
 from q2r2_control.errors import ConfigError
 from q2r2_control.export.pictures import Pixels
 from q2r2_control.export.statistics import QUANTILES, Statistics
+from q2r2_control.export.thread_policies import left_as_they_are
 
 FILE_SIZE = 200  # [MB]; an episode that would not fit begins a new file
 CODEC, PIXEL_FORMAT = "av1", "yuv420p"
@@ -49,6 +50,8 @@ def encode(pictures: Iterable[Pixels], count: int, path: Path, fps: int) -> Stat
                 stream = output.add_stream(_ENCODER, fps, options=_OPTIONS)
                 stream.pix_fmt = PIXEL_FORMAT
                 stream.height, stream.width = pixels.shape[:2]
+                with left_as_they_are():
+                    stream.codec_context.open()
             output.mux(stream.encode(av.VideoFrame.from_ndarray(pixels, format="rgb24")))
             if number in counted:
                 statistics.add(_thinned(pixels))

@@ -17,6 +17,7 @@ import pytest
 
 from q2r2_control.errors import RecordingError
 from q2r2_control.pipeline import Pipeline
+from q2r2_control.recording.mcap_file import MAGIC
 from q2r2_control.recording.reader import Recording
 from q2r2_control.recording.recorder import Recorder
 from q2r2_control.recording.replay import replay
@@ -207,6 +208,20 @@ def has_ticks(folder: Path) -> bool:
         return False
 
 
+def stop_between_two_writes(writer: int, file: Path) -> None:
+    """Stop the process where the file has an end: bags are opened from there. ``Recording`` needs none."""
+
+    def is_stopped_there() -> bool:
+        os.kill(writer, signal.SIGSTOP)
+        wait_until(lambda: Path(f"/proc/{writer}/stat").read_text().rpartition(")")[2].split()[0] == "T")
+        if file.read_bytes().endswith(MAGIC):
+            return True
+        os.kill(writer, signal.SIGCONT)
+        return False
+
+    wait_until(is_stopped_there)
+
+
 @pytest.mark.parametrize("both", [False, True], ids=["the run alone", "the writer too"])
 def test_what_a_killed_run_leaves_opens_and_is_replayed(tmp_path: Path, both: bool) -> None:
     with started("-c", RUN, str(tmp_path)) as running:
@@ -218,6 +233,8 @@ def test_what_a_killed_run_leaves_opens_and_is_replayed(tmp_path: Path, both: bo
         memory = Path(f"/proc/{writer}/maps").read_text()
         assert "memfd:q2r2-recording (deleted)" in memory
         assert "/dev/shm" not in memory
+        if both:
+            stop_between_two_writes(writer, file_in(tmp_path))
         running.kill()
         if both:
             os.kill(writer, signal.SIGKILL)
