@@ -161,6 +161,17 @@ class ArmTarget:
     gripper: float  # opening, 0 closed .. 1 fully open
     slip: float = 0.0  # how far the target has slipped along with a tool held up, since engaging [m]
     slip_angle: float = 0.0  # the same of the rotation [rad]
+    sag: Array | None = None  # (3,) of the tool when the arm was engaged, see teleop.sag [m]; None: none
+    hand: pin.SE3 | None = None  # the pose of its hand, filtered, that the target is made of
+
+    @property
+    def command(self) -> pin.SE3 | None:
+        """What the controller is to be asked for, so that the tool is at ``pose``."""
+        return None if self.pose is None else self.command_for(self.pose)
+
+    def command_for(self, tool: pin.SE3) -> pin.SE3:
+        """What is commanded where the tool is at ``tool``, world frame."""
+        return tool if self.sag is None else pose_of(tool.rotation, tool.translation - self.sag)
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from dataclasses import dataclass
 
@@ -36,21 +37,40 @@ class HeadsetStatistics:
     last_disconnect: str | None  # reason
 
 
-class TopicRecorder:
-    """Counts the messages of one topic."""
+class Arrivals:
+    """Counts the messages of one topic. Times are receipt times [s]."""
 
     def __init__(self) -> None:
         self._stamps: deque[float] = deque(maxlen=_STAMPS_KEPT)
-        self._count = 0
+        self.count = 0
+
+    def note(self, now: float) -> None:
+        """A message has come."""
+        self._stamps.append(now)
+        self.count += 1
+
+    def rate(self, now: float) -> float:
+        """Messages in the last second [Hz]."""
+        return sum(stamp > now - RATE_WINDOW for stamp in self._stamps) / RATE_WINDOW
+
+    def age(self, now: float) -> float:
+        """Time since the last message [s]; infinite before the first."""
+        return now - self._stamps[-1] if self._stamps else math.inf
+
+
+class TopicRecorder:
+    """Counts the messages of one topic, and keeps the last."""
+
+    def __init__(self) -> None:
+        self._arrivals = Arrivals()
         self._last: HandMessage | None = None
 
     def record(self, message: HandMessage, now: float) -> None:
-        self._stamps.append(now)
-        self._count += 1
+        self._arrivals.note(now)
         self._last = message
 
     def snapshot(self, now: float) -> TopicStatistics:
         """The figures at ``now`` [s]; only after the first :meth:`record`."""
         assert self._last is not None
-        recent = sum(stamp > now - RATE_WINDOW for stamp in self._stamps)
-        return TopicStatistics(self._count, recent / RATE_WINDOW, now - self._stamps[-1], self._last)
+        arrivals = self._arrivals
+        return TopicStatistics(arrivals.count, arrivals.rate(now), arrivals.age(now), self._last)

@@ -56,7 +56,7 @@ class ExternalArms:
     ) -> None:
         self._robot, self._controller, self._settings = robot, controller, settings
         self._streams, self._watch = streams, watch
-        self._kept = kept_distances(robot, controller.settings)
+        self._keys = kept_distances(robot, controller.settings).keys
         self._near_at: dict[str, float] = {}  # when an arm's tool was last seen near [s]
         self._held: dict[str, pin.SE3] = {}
         self._v: Array = np.zeros_like(robot.home)
@@ -100,13 +100,13 @@ class ExternalArms:
 
     def too_close(self, state: RobotState) -> str | None:
         """One line where a measured pair is closer than allowed, else None."""
-        distances, kept = self._robot.distance_values(state.q), self._kept
-        if (distances - kept.values).min(initial=np.inf) >= -self._settings.tolerance:
+        distances, kept = self._robot.distance_values(state.q), self._controller.kept_distances
+        if (distances - kept).min(initial=np.inf) >= -self._settings.tolerance:
             return None
-        tightest = int(np.argmin(distances - kept.values))
-        least, tolerance = kept.values[tightest], self._settings.tolerance
+        tightest = int(np.argmin(distances - kept))
+        least, tolerance = kept[tightest], self._settings.tolerance
         names = "|".join(pair_names(self._robot.collision_model)[tightest])
         return (
             f"measured: {names} are {distances[tightest]:.4f} m apart; allowed: {least - tolerance:.4f}, "
-            f"{kept.keys[tightest]} {least:g} less distance_tolerance {tolerance:g}"
+            f"{self._keys[tightest]} {least:g} less distance_tolerance {tolerance:g}"
         )

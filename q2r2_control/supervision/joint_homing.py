@@ -1,9 +1,9 @@
-"""The way home of all arms in joint space: straight, or by way points where something is in between.
+"""The way of all arms to a posture, such as home, in joint space: straight, or by way points around what is between.
 
-Straight in the space of the joints every posture ends at home, elbows and turns of the wrist too, which a line of the
-tools does not. What is sent is not the way itself but joint positions for the controller to hold, which keeps every
-promise on the way there. The way is stretched in time where the arms lag behind, so an arm that is held up is waited
-for, and when it is free again it sets off little faster than it was.
+Straight in the space of the joints every posture ends at the goal, elbows and turns of the wrist too, which a
+line of the tools does not. What is sent is not the way itself but joint positions for the controller to hold, which
+keeps every promise on the way there. The way is stretched in time where the arms lag behind, so an arm that is held up
+is waited for, and when it is free again it sets off little faster than it was.
 
 Which way is free is looked for by samples of the distances, a few at a tick, while the arms stand still: straight; one
 arm first; by a random posture. Nobody's safety rests on what is found, because the controller is what keeps the arms
@@ -14,15 +14,17 @@ from __future__ import annotations
 
 from collections.abc import Generator, Iterator
 from itertools import pairwise
+from typing import Protocol
 
 import numpy as np
 
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 
+ARRIVED, HELD_UP = "arrived", "held up"  # outcomes
 _SPEED = 0.3  # of the fastest joint [rad/s]
 _SLOWED, _WAITED = 0.09, 0.12  # by how much the arms lag behind where the way is slowed, and where it waits [rad]
-_PASSED, _ARRIVED = 0.1, 0.003  # how near the arms come to a way point, and to home [rad]
+_PASSED, _ARRIVED = 0.1, 0.003  # how near the arms come to a way point, and to the goal [rad]
 _PATIENCE, _PROGRESS = 3.0, 1e-3  # without progress of so much [s], [rad]
 _AT_REST = 0.02  # [rad/s]
 _ROOM = 0.003  # more than what a pair keeps [m]
@@ -33,26 +35,37 @@ _SPREAD = 0.6  # of random way points [rad]
 _INSIDE = 0.02  # of joint limits [rad]
 
 
-class JointHoming:
-    """Leads all joints to the robot's home, from where they come to rest."""
+class JointWay(Protocol):
+    """Leads all joints; the controller follows as its promises allow."""
 
-    def __init__(self, robot: Robot, kept: Array) -> None:
-        """``kept`` (pairs,) [m]: what each monitored pair keeps."""
-        self._robot, self._kept = robot, kept
-        self._needed = kept
-        self._search: Iterator[tuple[Array, ...]] | None = None
-        self._points: list[Array] | None = None  # still to be reached, home last
-        self._at = self._leg = robot.home  # where the joints shall be, and where the leg to the next point began
-        self._share = 0.0  # of the leg
-        self._least_left = np.inf  # of the way to the next point, of the joint that has the most [rad]
-        self._waited = 0.0  # without progress [s]
-        self.outcome: str | None = None  # how it ended
+    outcome: str | None  # how it ended
 
     def step(self, q: Array, v: Array, dt: float) -> Array | None:
         """Where the joints shall be (nv,) after another ``dt`` [s], with the reference at ``q`` and ``v`` (nv,).
 
         None: where they come to rest.
         """
+        ...
+
+
+class JointHoming:
+    """Leads all joints to a goal, from where they come to rest. Implements :class:`JointWay`."""
+
+    def __init__(self, robot: Robot, kept: Array, goal: Array) -> None:
+        """``kept`` (pairs,) [m]: what each monitored pair keeps; ``goal`` (nv,) [rad]."""
+        self._robot, self._kept = robot, kept
+        self._goal = goal
+        self._needed = kept
+        self._search: Iterator[tuple[Array, ...]] | None = None
+        self._points: list[Array] | None = None  # still to be reached, the goal last
+        self._at = self._leg = self._goal  # where the joints shall be, and where the leg to the next point began
+        self._share = 0.0  # of the leg
+        self._least_left = np.inf  # of the way to the next point, of the joint that has the most [rad]
+        self._waited = 0.0  # without progress [s]
+        self.outcome: str | None = None  # how it ended
+
+    def step(self, q: Array, v: Array, dt: float) -> Array | None:
+        """See :meth:`JointWay.step`."""
         if self._search is None:
             if float(np.abs(v).max()) > _AT_REST:
                 return None
@@ -70,7 +83,7 @@ class JointHoming:
         for _ in range(_SAMPLES_A_TICK):
             found = next(search, None)
             if found is None:
-                self.outcome = "no way home was found"
+                self.outcome = "no free way was found"
                 return
             if found:
                 self._points = list(found)
@@ -93,35 +106,35 @@ class JointHoming:
             self._points.pop(0)
             self._leg, self._share = goal, 0.0
             self._least_left, self._waited = np.inf, 0.0
-            self.outcome = "at home" if last else None
+            self.outcome = ARRIVED if last else None
         elif self._waited > _PATIENCE:
-            self.outcome = "held up"
+            self.outcome = HELD_UP
 
     def _ways(self, start: Array) -> Iterator[tuple[Array, ...]]:
         """Samples one way after the other: an empty tuple after each sample, and the way points of one that is free."""
-        home = self._robot.home
+        goal = self._goal
         for between in self._candidates(start):
-            points = [start, *between, home]
+            points = [start, *between, goal]
             for a, b in pairwise(points):
                 free = yield from self._sample(a, b)
                 if not free:
                     break
             else:
-                yield (*between, home)
+                yield (*between, goal)
                 return
 
     def _candidates(self, start: Array) -> Iterator[tuple[Array, ...]]:
-        """Way points between ``start`` and home."""
-        robot, home = self._robot, self._robot.home
+        """Way points between ``start`` and the goal."""
+        robot, goal = self._robot, self._goal
         yield ()
         for arm in robot.arms.values():
             first = start.copy()
-            first[arm.joints] = home[arm.joints]
+            first[arm.joints] = goal[arm.joints]
             yield (first,)
         random = np.random.default_rng(0)  # the same way at every time
         for number in range(_RANDOM_WAYS):
-            middle = home if number % 2 else start + random.uniform(0.2, 0.8) * (home - start)
-            point = middle + random.normal(0.0, _SPREAD, len(home))
+            middle = goal if number % 2 else start + random.uniform(0.2, 0.8) * (goal - start)
+            point = middle + random.normal(0.0, _SPREAD, len(goal))
             yield (np.clip(point, robot.position_lower + _INSIDE, robot.position_upper - _INSIDE),)
 
     def _sample(self, a: Array, b: Array) -> Generator[tuple[Array, ...], None, bool]:

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from q2r2_control.config.control import ControllerSettings
 from q2r2_control.control.controller import CartesianController
-from q2r2_control.robot.floor import FLOOR
-from q2r2_control.robot.kept_distances import KeptDistances, kept_distances
-from q2r2_control.robot.pairs import link_of
-from q2r2_control.robot.robot import PairDistance, Robot
+from q2r2_control.robot.kept_distances import kept_distances, too_close_at_home
+from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 
 
@@ -21,7 +19,7 @@ def preflight_faults(
     two.
     The controller is left reset at home.
     """
-    too_close = _closer_than_allowed(robot, robot.home, kept_distances(robot, settings))
+    too_close = too_close_at_home(robot, kept_distances(robot, settings))
     faults = [*_outside_limits(robot, robot.home, settings.position_margin), *too_close]
     if controller is not None and not too_close:  # a pair that is too close leaves no certificate, and says more
         faults += _without_certificate(controller)
@@ -35,22 +33,6 @@ def _outside_limits(robot: Robot, home: Array, margin: float) -> list[str]:
         for index, name in enumerate(robot.joint_names)
         if not lower[index] <= home[index] <= upper[index]
     ]
-
-
-def _closer_than_allowed(robot: Robot, home: Array, kept: KeptDistances) -> list[str]:
-    pairs = zip(robot.distances(home), kept.values.tolist(), kept.keys, strict=True)
-    return [
-        f"home: {pair.name_a} and {pair.name_b} are {1e3 * pair.distance:.1f} mm apart; "
-        f"allowed: at least {key}, {1e3 * least:.1f} mm{_way_out(pair)}"
-        for pair, least, key in sorted(pairs, key=lambda found: found[0].distance)
-        if pair.distance < least
-    ]
-
-
-def _way_out(pair: PairDistance) -> str:
-    """What the cell's YAML says about a floor that is not where it was meant to be, or was not meant at all."""
-    with_floor = FLOOR in (link_of(pair.name_a), link_of(pair.name_b))
-    return "; the key floor takes another height, or null for no floor" if with_floor else ""
 
 
 def _without_certificate(controller: CartesianController) -> list[str]:

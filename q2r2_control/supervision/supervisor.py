@@ -18,15 +18,14 @@ import numpy as np
 import pinocchio as pin
 
 from q2r2_control.control.controller import CartesianController
-from q2r2_control.robot.kept_distances import kept_distances
 from q2r2_control.robot.robot import Robot
 from q2r2_control.supervision.external_arms import ExternalArms
 from q2r2_control.supervision.homing import Homing
-from q2r2_control.supervision.joint_homing import JointHoming
+from q2r2_control.supervision.joint_homing import ARRIVED, HELD_UP, JointHoming, JointWay
 from q2r2_control.supervision.joint_watch import NONE_YET, JointWatch, WatchSettings
 from q2r2_control.supervision.target_stream import Origins, Refusal, StreamSettings
 from q2r2_control.supervision.targets import Targets
-from q2r2_control.types import Reference, RobotState
+from q2r2_control.types import Array, Reference, RobotState
 
 _REST = 1e-4  # of the reference [rad/s]
 # A joint that stands still this far from the reference may have nothing that moves it [rad], [rad/s].
@@ -67,7 +66,7 @@ class Supervisor:
         self._home = {arm: robot.tool_pose(robot.home, arm) for arm in robot.arms}
         self._targets = Targets(robot.arms, streams, self._origins)
         self._watch = JointWatch(robot.joint_names, robot.velocity_limit, watch, self._origins.joint_states)
-        self._homing: Homing | JointHoming | None = None
+        self._homing: Homing | JointWay | None = None
         self._stopped: str | None = None  # why it takes a reset
         self._last: Reference | None = None
         self.phase = Phase.INACTIVE
@@ -266,9 +265,17 @@ class Supervisor:
         if self._external is not None:
             self._homing = Homing(self._tools(), self._home)  # the joints are another controller's
         else:
-            kept = kept_distances(self._robot, self._controller.settings).values
-            self._homing = JointHoming(self._robot, kept)
+            self._homing = self.way_to(self._robot.home)
         return None
+
+    def way_to(self, q: Array) -> JointHoming:
+        """A way of all joints to ``q`` (nv,) [rad]."""
+        return JointHoming(self._robot, self._controller.kept_distances, q)
+
+    def lead(self, way: JointWay) -> None:
+        """Let active arms go where ``way`` leads until it has an outcome, as on the way home."""
+        self._forget_targets()
+        self._homing = way
 
     def hold(self) -> str | None:
         """End the way home: the arms hold where they come to rest. Returns why that is not possible: never, so None."""
@@ -308,7 +315,7 @@ class Supervisor:
 
     def end_homing(self) -> None:
         """The arms hold where they come to rest."""
-        if isinstance(self._homing, JointHoming):
+        if self._homing is not None and not isinstance(self._homing, Homing):
             self._controller.hold_at(None)
         self._homing = None
 
@@ -326,9 +333,11 @@ class Supervisor:
         homing = self._homing
         if homing is None or self._last is None:
             return
-        outcome = homing.outcome if isinstance(homing, JointHoming) else homing.outcome(self._tools())
-        if outcome == "held up" and isinstance(homing, JointHoming):
+        outcome = homing.outcome(self._tools()) if isinstance(homing, Homing) else homing.outcome
+        if outcome == HELD_UP:
             outcome = f"held up by {' | '.join(self._last.report.tightest_pair)}"
+        elif outcome == ARRIVED:
+            outcome = "at home"
         if outcome:
             self.end_homing()
             self.homing_outcome = outcome

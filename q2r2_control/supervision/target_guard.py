@@ -32,17 +32,22 @@ class TargetGuard:
 
     def __init__(self, settings: GuardSettings, period: float) -> None:
         """``period`` [s]: of the steps."""
-        self.settings = settings
         self.pose: pin.SE3 | None = None
         self.clipped = 0  # steps in which a limit held the pose back, since the start
-        self._linear = _Limited(settings.max_velocity, settings.max_acceleration)
-        self._angular = _Limited(settings.max_angular_velocity, settings.max_angular_acceleration)
+        self._linear, self._angular = _Limited(), _Limited()
         self._target: pin.SE3 | None = None
-        self._now = -math.inf
+        self._now, self._period = -math.inf, period
+        self.change(settings)
+
+    def change(self, settings: GuardSettings) -> None:
+        """Other limits from the next step on. A pose that is faster than it may be now brakes at the acceleration."""
+        self.settings = settings
+        self._linear.limit(settings.max_velocity, settings.max_acceleration)
+        self._angular.limit(settings.max_angular_velocity, settings.max_angular_acceleration)
         # A step changes the velocity first and moves by the new one for all of dt: |v| dt + a dt^2, not half of that.
         velocities = np.array([settings.max_velocity, settings.max_angular_velocity])
         accelerations = np.array([settings.max_acceleration, settings.max_angular_acceleration])
-        self._pacer = TickPacer(period, velocities, 2.0 * accelerations)
+        self._pacer = TickPacer(self._period, velocities, 2.0 * accelerations)
 
     @property
     def at_rest(self) -> bool:
@@ -90,9 +95,12 @@ class TargetGuard:
 class _Limited:
     """Velocity of a position or a rotation, (3,), that is bounded together with its change."""
 
-    def __init__(self, velocity: float, acceleration: float) -> None:
-        self._max, self._acceleration = velocity, acceleration
+    def __init__(self) -> None:
+        self.limit(0.0, 0.0)
         self.stop()
+
+    def limit(self, velocity: float, acceleration: float) -> None:
+        self._max, self._acceleration = velocity, acceleration
 
     @property
     def speed(self) -> float:

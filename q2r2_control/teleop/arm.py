@@ -16,8 +16,9 @@ from q2r2_control.teleop.gate import PoseGate
 from q2r2_control.teleop.gestures import GestureRecognizer, Press
 from q2r2_control.teleop.hand_motion import HandMotion, Shares
 from q2r2_control.teleop.held_controls import HeldControls
+from q2r2_control.teleop.sag import Anchor
 from q2r2_control.teleop.workspace import Workspace
-from q2r2_control.types import Event, HandSample
+from q2r2_control.types import Array, Event, HandSample
 
 OPEN, CLOSED = 1.0, 0.0
 
@@ -32,6 +33,7 @@ class ArmTeleop:
         self.arm = arm
         self.state = ArmState.IDLE
         self.gripper = OPEN
+        self.sag: Array | None = None  # of the tool when the arm was last engaged (3,) [m]; None: none
         self.events: list[Event] = []
         self._settings, self._precision = settings, settings.precision_scale
         self._timeout = settings.gate.timeout
@@ -119,6 +121,8 @@ class ArmTeleop:
         """Gestures since the last call; those that nobody gives to :meth:`act` are lost."""
         presses = self._presses + self._gestures.due(now)
         self._presses = []
+        if (stuck := self._gestures.take_stuck(now)) is not None:
+            self.tell(now, f"not engaged: {stuck}")
         return presses
 
     @property
@@ -139,15 +143,15 @@ class ArmTeleop:
     def act(
         self,
         presses: Iterable[Press],
-        tool: Callable[[], pin.SE3 | None],
+        anchor: Callable[[], Anchor | None],
         now: float,
         chord: bool,
         obstacle: str | None = None,
     ) -> None:
         """Change the state by this hand's gestures, and by chords.
 
-        ``tool``: gives the pose to anchor to, None if not known, and is only asked where the arm is engaged;
-        ``chord``: whether an alignment chord stops this arm; ``obstacle``: why the arm may not be engaged now, or None.
+        ``anchor``: gives what to anchor to, None if not known, and is only asked where the arm is engaged;
+        ``chord``: whether a hand holds the alignment chord; ``obstacle``: why the arm may not be engaged now, or None.
         """
         self._obstacle = obstacle
         if self._gripped is False:
@@ -155,19 +159,19 @@ class ArmTeleop:
         if chord:
             self._align(now)
         elif self.state is ArmState.ALIGNING and self._gate.pose is not None and self._gate.stamp >= self._aligned_at:
-            self._engage(Cause.ALIGNED, tool(), now, "aligned anew")
+            self._engage(Cause.ALIGNED, anchor(), now, "aligned anew")
         elif self._gripped:
-            self._engage(Cause.ENGAGE, tool(), now, "dead man held")
+            self._engage(Cause.ENGAGE, anchor(), now, "dead man held")
         self._gripped = None
         for press in presses:
-            self._press(press, tool, now)
+            self._press(press, anchor, now)
         if self.state is not ArmState.STOPPED:
             self.gripper = self._analog.opening(self.gripper, now)
 
     def target(self, now: float, commanded: pin.SE3 | None = None) -> pin.SE3 | None:
         """Where the tool should be at ``now`` in the world frame, or the frame that it carries; None: hold.
 
-        ``commanded``: where the controller's reference has it, from which no target is farther than the leash.
+        ``commanded``: where it is to be by the controller's reference, from which no target is farther than the leash.
         """
         if self.state is not ArmState.ENGAGED:
             return None
@@ -178,20 +182,33 @@ class ArmTeleop:
         """See :attr:`HandMotion.slip`."""
         return self._motion.slip
 
+    @property
+    def filtered_hand(self) -> pin.SE3 | None:
+        """The pose of its hand, filtered, that its target is made of; None while it follows none."""
+        return self._motion.filtered if self.state is ArmState.ENGAGED else None
+
     def workspace(self) -> Workspace:
         """The box of its targets."""
         return self._motion.workspace()
 
-    def lead(self, tools: CarriedTools, other: ArmTeleop, now: float) -> None:
-        """Move the frame of ``tools``, of this arm and the ``other``, until this one is engaged anew."""
-        self._motion.carry(tools, other._motion, now)
+    def lead(self, tools: CarriedTools, other: str, box: Workspace, now: float) -> None:
+        """Move the frame of ``tools``, of this arm and the ``other`` with its ``box``, until the next engagement."""
+        self._motion.carry(tools, other, box, now)
+
+    def be_led(self) -> None:
+        """Go by :meth:`led_target` from now on, until this arm is engaged anew."""
+        self._motion.bound_one_tool()
+
+    def led_target(self, target: pin.SE3, commanded: pin.SE3 | None, now: float) -> pin.SE3:
+        """See :meth:`HandMotion.bounded`."""
+        return self._motion.bounded(target, commanded, now)
 
     def _align(self, now: float) -> None:
         self._aligned_at = now
         if self.state is not ArmState.PAUSING or self.chord:  # the other hand's chord does not say what this press is
             self._go(Cause.CHORD, now, "alignment chord")
 
-    def _press(self, press: Press, tool: Callable[[], pin.SE3 | None], now: float) -> None:
+    def _press(self, press: Press, anchor: Callable[[], Anchor | None], now: float) -> None:
         control, gesture = press
         action = self._bindings.action_of(control, gesture)
         pauses = self._bindings.action_of(control, Gesture.TAP) is Action.PAUSE_TOGGLE
@@ -204,9 +221,9 @@ class ArmTeleop:
         elif action is Action.GRIPPER_TOGGLE:
             self.gripper = CLOSED if self.gripper == OPEN else OPEN
         elif action is Action.PAUSE_TOGGLE:
-            self._engage(Cause.ENGAGE, tool(), now, reason)
+            self._engage(Cause.ENGAGE, anchor(), now, reason)
 
-    def _engage(self, cause: Cause, tool: pin.SE3 | None, now: float, reason: str) -> None:
+    def _engage(self, cause: Cause, anchor: Anchor | None, now: float, reason: str) -> None:
         """Engage where ``cause`` would, if nothing is in the way; else say what is."""
         if next_state(self.state, cause) is self.state:
             return
@@ -215,10 +232,11 @@ class ArmTeleop:
             obstacle = obstacle or "the dead man is not held"
         if self._gate.pose is None:
             obstacle = obstacle or self._gate.problem
-        elif tool is None or not np.isfinite(tool.homogeneous).all():
+        elif anchor is None or not np.isfinite(anchor.tool.homogeneous).all():
             obstacle = obstacle or "the tool's pose is not known"
         else:
-            self._motion.anchor(self._gate.pose, tool, self._shares(), now)
+            self.sag = anchor.sag
+            self._motion.anchor(self._gate.pose, anchor.tool, self._shares(), now)
         if obstacle is None:
             self._go(cause, now, reason)
         elif self.state is ArmState.ALIGNING:

@@ -70,7 +70,7 @@ TRANSITIONS = (
     Transition(frozenset({_S.ENGAGED}), Cause.PAUSE_BEGINS, _S.PAUSING),
     Transition(frozenset({_S.PAUSING}), Cause.PAUSE, _S.PAUSED),
     Transition(frozenset({_S.ENGAGED, _S.ALIGNING}), Cause.LET_GO, _S.PAUSED),
-    Transition(frozenset({_S.ENGAGED, _S.PAUSING}), Cause.CHORD, _S.ALIGNING, Who.LINKED),
+    Transition(frozenset({_S.ENGAGED, _S.PAUSING}), Cause.CHORD, _S.ALIGNING, Who.BOTH),
     Transition(frozenset({_S.ALIGNING}), Cause.ALIGNED, _S.ENGAGED),
     Transition(frozenset({_S.ALIGNING}), Cause.NOT_ALIGNED, _S.LOST),
     Transition(AT_REST | {_S.ENGAGED}, Cause.CARRY, _S.CARRIED),
@@ -98,4 +98,4 @@ def is_refusal(event: Event) -> bool:
 
 def is_fault(event: Event) -> bool:
     """Whether an arm stopped for another reason than what its operator pressed, or did not do what was pressed."""
-    return event.destination == ArmState.LOST or is_refusal(event)
+    return (event.destination == ArmState.LOST and event.source != event.destination) or is_refusal(event)

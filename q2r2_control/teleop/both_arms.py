@@ -11,10 +11,16 @@ import pinocchio as pin
 from q2r2_control.config.bindings import Action, Gesture
 from q2r2_control.config.teleop import Stance, TeleopSettings
 from q2r2_control.teleop.arm import ArmTeleop
-from q2r2_control.teleop.arm_states import AT_REST, ArmState, Cause
-from q2r2_control.teleop.carry_mode import CarryMode
+from q2r2_control.teleop.arm_states import AT_REST, FOLLOWING, ArmState, Cause
+from q2r2_control.teleop.carry_mode import CarriedMode, Carrying, CarryMode
 from q2r2_control.teleop.episode_marks import EpisodeMarks
 from q2r2_control.teleop.gestures import Press
+from q2r2_control.teleop.remote_arm import RemoteArm
+from q2r2_control.teleop.sag import Anchor, anchor_of, sagged
+
+PAUSE_FIRST = "pause both arms first"  # why hands are not swapped
+# Why arms do not carry.
+_ENGAGE, _UNKNOWN, _BOTH_ASK = "engage the arm first", "a tool's pose is not known", "both hands ask"
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,19 +32,26 @@ class Surroundings:
     commanded: Mapping[str, pin.SE3] | None = None  # by the controller's reference
     obstacles: Mapping[str, str] = field(default_factory=dict)  # arm -> why it may not be engaged
 
-    def anchor(self, arm: str) -> pin.SE3 | None:
+    def anchor(self, arm: str) -> Anchor | None:
         """The tool's pose for an anchor: measured position, commanded orientation. None: not known."""
         measured = self.tools.get(arm)
         if measured is None:
             return None
+        commanded = (self.commanded or {}).get(arm)
         reference = (self.commanded or self.targets).get(arm, measured)
-        return pin.SE3(reference.rotation, measured.translation)
+        return anchor_of(measured, commanded, reference.rotation)
 
-    def lag(self, arm: str) -> float:
+    def expected(self, arm: ArmTeleop) -> pin.SE3 | None:
+        """Where the tool of an arm that follows is to be measured, by what is commanded. None: not known."""
+        commanded = None if self.commanded is None else self.commanded.get(arm.arm)
+        return None if commanded is None else sagged(commanded, arm.sag)
+
+    def lag(self, arm: ArmTeleop) -> float:
         """From where the controller has a tool to its last target [m]."""
-        if self.commanded is None or arm not in self.commanded or arm not in self.targets:
+        expected, target = self.expected(arm), self.targets.get(arm.arm)
+        if expected is None or target is None:
             return 0.0
-        return float(np.linalg.norm(self.targets[arm].translation - self.commanded[arm].translation))
+        return float(np.linalg.norm(target.translation - expected.translation))
 
 
 class BothArms:
@@ -46,7 +59,10 @@ class BothArms:
 
     def __init__(self, settings: TeleopSettings, names: Iterable[str]) -> None:
         self.arms = {name: ArmTeleop(name, settings) for name in names}
-        self.carry: CarryMode | None = None
+        self.carry: Carrying | None = None
+        self.remote: RemoteArm | None = None  # the other one, where another program drives it
+        # Why hands are not swapped where there is one arm only; None: another program drives the other arm, and swaps.
+        self.alone: str | None = "this program drives one arm only"
         self.asks_home: str | None = None  # the arm whose hand asked for the way home; None: no hand did
         self.marks = EpisodeMarks()
         self.use(settings)
@@ -57,8 +73,9 @@ class BothArms:
         self._bindings, self._leash = settings.bindings, settings.leash.carried()
 
     def assign_hands(self, stance: Stance) -> None:
-        """Let the hands drive the arms as ``stance`` says."""
+        """Let the hands drive the arms as ``stance`` says, not swapped."""
         same = stance is Stance.SIDE_BY_SIDE
+        self.swapped = False
         self.arm_of_hand = {name if same else _other(name): name for name in self.arms}
 
     def hand_of(self, name: str) -> str:
@@ -127,17 +144,30 @@ class BothArms:
                 arm.change(Cause.HOME, now, "way home" if asked_by is None else self._reason(Action.HOME))
 
     def swap_hands(self, presses: Mapping[str, Sequence[Press]], now: float) -> None:
-        """If it is asked for, each hand drives the other arm, and has to be seen anew before it does."""
+        """If it is asked for, each hand drives the other arm."""
         if not any(presses.values()) or self._asked(presses, Action.SWAP_HANDS) is None:
             return
-        alone = len(self.arms) < 2 and "not swapped: this program drives one arm only"
-        busy = not self.all_in(AT_REST) and "not swapped: pause both arms first"
-        if problem := alone or busy:
-            for arm in self.arms.values():
-                arm.tell(now, problem)
+        problem = self.alone if len(self.arms) < 2 else None
+        if not self.all_in(AT_REST):
+            problem = PAUSE_FIRST
+        if problem is None:
+            self.set_swapped(not self.swapped, now)
             return
+        for arm in self.arms.values():
+            arm.tell(now, f"not swapped: {problem}")
+
+    def set_swapped(self, swapped: bool, now: float) -> None:
+        """Let each hand drive the other arm than by the stance, or the same one; it has to be seen anew before it does.
+
+        An arm that follows a hand is stopped first.
+        """
+        if swapped == self.swapped:
+            return
+        self.swapped = swapped
         self.arm_of_hand = {_other(hand): name for hand, name in self.arm_of_hand.items()}
         for arm in self.arms.values():
+            if arm.state in FOLLOWING:
+                arm.change(Cause.FAULT, now, "the hands were swapped")
             arm.forget()
             arm.tell(now, f"driven by the {self.hand_of(arm.arm)} hand")
 
@@ -145,36 +175,85 @@ class BothArms:
         """If two arms carry, both hold."""
         if self.carry is not None:
             self.carry.end(now, reason)
+            if self.remote is not None:
+                self.remote.end(reason)
         self.carry = None
+
+    def agree(self, around: Surroundings, now: float) -> None:
+        """Go by what the program of the other arm says of carrying, and answer it."""
+        remote = self.remote
+        if remote is None:
+            return
+        (arm,) = self.arms.values()
+        if self.carry is not None:
+            if not remote.agreed:
+                self.end_carry(now, remote.why_ended)
+            elif (problem := remote.problem or remote.silence(now)) is not None:
+                arm.change(Cause.FAULT, now, problem)
+        elif remote.leads:
+            self._take_answer(arm, remote, around, now)
+        if remote.asked:
+            self._answer(arm, remote, around, now)
+
+    def _take_answer(self, arm: ArmTeleop, remote: RemoteArm, around: Surroundings, now: float) -> None:
+        """Carry, if the other program agrees; until it does, this arm goes on following its hand."""
+        theirs, ours = remote.answer(now), self._take_up(arm, around)
+        if theirs is None and arm.state is ArmState.ENGAGED:
+            return
+        if isinstance(theirs, pin.SE3) and isinstance(ours, Anchor) and arm.state is ArmState.ENGAGED:
+            remote.begin(theirs, now)
+            self.carry = CarryMode(arm, remote, {arm.arm: ours.tool, remote.arm: theirs}, now)
+            return
+        problem = theirs if isinstance(theirs, str) else ours if isinstance(ours, str) else _UNKNOWN
+        if arm.state is not ArmState.ENGAGED:
+            problem = _ENGAGE
+        remote.end(problem)
+        arm.tell(now, f"not carried: {problem}")
+
+    def _answer(self, arm: ArmTeleop, remote: RemoteArm, around: Surroundings, now: float) -> None:
+        """Be carried, if nothing is in the way."""
+        found: Anchor | str = self._take_up(arm, around)
+        if remote.leads:
+            arm.tell(now, f"not carried: {_BOTH_ASK}")
+            found = _BOTH_ASK
+        if remote.problem is not None:
+            found = remote.problem
+        if isinstance(found, str):
+            remote.refuse(found)
+            return
+        arm.sag = found.sag
+        remote.agree(found.tool)
+        self.carry = CarriedMode(arm, remote, found.tool, now)
+
+    def _take_up(self, arm: ArmTeleop, around: Surroundings) -> Anchor | str:
+        """Where an arm's tool is when it begins to be carried, or why it may not be."""
+        if arm.state is not ArmState.ENGAGED:
+            if arm.state not in AT_REST:
+                return f"the other arm is {arm.state}"
+            if arm.arm in around.obstacles:
+                return around.obstacles[arm.arm]
+            return around.anchor(arm.arm) or _UNKNOWN
+        if around.lag(arm) >= (self._leash.distance or np.inf):
+            return "a tool is held up on the way to its target"
+        target = around.targets.get(arm.arm)
+        return _UNKNOWN if target is None else Anchor(target, arm.sag)
 
     def _begin_carry(self, name: str, around: Surroundings, now: float) -> None:
         """The hand of the arm ``name`` moves both tools."""
-        leader = self.arms[name]
+        leader, remote = self.arms[name], self.remote
         other = next((arm for arm in self.arms.values() if arm is not leader), None)
-        if other is None:
-            leader.tell(now, "not carried: this program drives one arm only")
-            return
-        engaged = [arm for arm in (leader, other) if arm.state is ArmState.ENGAGED]
-        asked = {
-            arm.arm: around.targets.get(arm.arm) if arm in engaged else around.anchor(arm.arm)
-            for arm in (leader, other)
-        }
-        tools = {arm: tool for arm, tool in asked.items() if tool is not None}
-        problem = None
-        if leader not in engaged:
-            problem = "engage the arm first"
-        elif other not in engaged and other.state not in AT_REST:
-            problem = f"the other arm is {other.state}"
-        elif other.arm in around.obstacles:
-            problem = around.obstacles[other.arm]
-        elif len(tools) < len(asked):
-            problem = "a tool's pose is not known"
-        elif any(around.lag(arm.arm) >= (self._leash.distance or np.inf) for arm in engaged):
-            problem = "a tool is held up on the way to its target"
+        taken = {arm.arm: self._take_up(arm, around) for arm in (leader, other) if arm is not None}
+        problem = next((found for found in taken.values() if isinstance(found, str)), None)
+        if leader.state is not ArmState.ENGAGED:
+            problem = _ENGAGE
+        elif other is None and problem is None:
+            problem = "this program drives one arm only" if remote is None else remote.ask(now)
         if problem is not None:
             leader.tell(now, f"not carried: {problem}")
-        else:
-            self.carry = CarryMode(leader, other, tools, now)
+        elif other is not None:
+            anchors = {arm: found for arm, found in taken.items() if isinstance(found, Anchor)}
+            other.sag = anchors[other.arm].sag
+            self.carry = CarryMode(leader, other, {arm: anchor.tool for arm, anchor in anchors.items()}, now)
 
     def _ends_carry(self, presses: Mapping[str, Sequence[Press]]) -> str | None:
         """What of this tick's controls ends it, or None."""

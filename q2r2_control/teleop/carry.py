@@ -16,7 +16,10 @@ import pinocchio as pin
 from q2r2_control.teleop.workspace import Workspace
 from q2r2_control.types import LONGEST_DT, Array, pose_of
 
-_GAIN = 20.0  # of keeping the relation [1/s]
+GAIN = 20.0  # of keeping the relation [1/s]
+# The same where another program tells of one tool. A loop of the first order that is late by T is stable with a gain
+# below pi/(2 T), and T is 0.3 s where the ways there and back are both as late as they may be.
+REMOTE_GAIN = 5.0
 _MOST = 0.01, 0.05  # that it shifts a target by [m], [rad]
 
 
@@ -67,21 +70,28 @@ class RelationKeeper:
     A target's own velocity is fed forward, so the tool goes where the shift goes, and the loop is of first order.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, gain: float = GAIN) -> None:
+        """``gain`` [1/s]: far below one over how late the frames are told."""
+        self._gain = gain
         self._shift, self._turn = np.zeros(3), np.eye(3)
         self._now: float | None = None
 
-    def frame(self, asked: pin.SE3, leading: pin.SE3, carried: pin.SE3, now: float) -> pin.SE3:
-        """The frame for the carried tool at ``now`` [s], where ``asked`` is that of the leading one.
+    @property
+    def begun(self) -> bool:
+        """Whether anything is known of the relation."""
+        return self._now is not None
 
-        ``leading``, ``carried``: where the controller's reference has the frame of either, world frame.
-        """
+    def note(self, leading: pin.SE3, carried: pin.SE3, now: float) -> None:
+        """Where the controller's reference has the frame of either tool at ``now`` [s], world frame."""
         dt = 0.0 if self._now is None else min(max(now - self._now, 0.0), LONGEST_DT)
         self._now = now
-        gain = min(_GAIN * dt, 1.0)
+        gain = min(self._gain * dt, 1.0)
         self._shift = _at_most(self._shift + gain * (leading.translation - carried.translation), _MOST[0])
         turn = pin.log3(pin.exp3(gain * pin.log3(leading.rotation @ carried.rotation.T)) @ self._turn)
         self._turn = pin.exp3(_at_most(turn, _MOST[1]))
+
+    def frame(self, asked: pin.SE3) -> pin.SE3:
+        """The frame for the carried tool, where ``asked`` is that of the leading one."""
         return pose_of(self._turn @ asked.rotation, asked.translation + self._shift)
 
 

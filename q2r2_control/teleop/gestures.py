@@ -10,6 +10,8 @@ from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.teleop.held_controls import is_held
 from q2r2_control.types import HandInputs
 
+_STUCK_AFTER = 1.0  # that a control is held from the first reading on before somebody is told [s]
+
 
 class Press(NamedTuple):
     """A gesture of one control."""
@@ -58,7 +60,8 @@ class GestureRecognizer:
     def forget(self) -> None:
         """Drop everything, and treat all controls as held until they are seen released."""
         self.chord = False  # both buttons were pressed together, and not all released since
-        self._stamp = -math.inf
+        self._stamp = self._first = -math.inf  # of the readings since then
+        self._told_stuck = False
         for control in self._controls.values():
             control.forget()
 
@@ -71,6 +74,8 @@ class GestureRecognizer:
         stamp = min(stamp, now)
         if not self._stamp <= stamp or stamp == -math.inf:
             return []
+        if self._first == -math.inf:
+            self._first = stamp
         self._stamp = stamp
         found, rose = [], False
         for name, control in self._controls.items():
@@ -79,6 +84,7 @@ class GestureRecognizer:
             rose |= rises and name in BUTTONS
             gesture = control.released(stamp) if control.down and not level else None
             control.down = level
+            control.seen_up |= not level
             if gesture is not None:
                 found.append(Press(name, gesture))
             # With the other button it is a chord, or the rest of one.
@@ -95,6 +101,14 @@ class GestureRecognizer:
                 button.cancel()
             found = [press for press in found if press.control not in BUTTONS]
         return found
+
+    def take_stuck(self, now: float) -> str | None:
+        """One line, returned once, if controls do nothing since they are held for long from the first reading on."""
+        if self._told_stuck or self._first == -math.inf or now - self._first <= _STUCK_AFTER:
+            return None
+        stuck = [name for name, control in self._controls.items() if control.down and not control.seen_up]
+        self._told_stuck = True
+        return f"{' and '.join(stuck)} held since the hand was first heard of: let go first" if stuck else None
 
     def due(self, now: float) -> list[Press]:
         """Gestures that are over because time has passed."""
@@ -119,6 +133,7 @@ class _Control:
 
     def forget(self) -> None:
         self.down = True  # as held until seen released, so that only a press that was seen from its start counts
+        self.seen_up = False
         self.cancel()
 
     def mute(self) -> None:

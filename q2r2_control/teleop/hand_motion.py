@@ -27,7 +27,6 @@ class HandMotion:
 
     def __init__(self, arm: str, settings: TeleopSettings) -> None:
         self._arm = arm
-        self._carried: CarriedTools | None = None
         self._use(settings)
 
     def _use(self, settings: TeleopSettings) -> None:
@@ -36,12 +35,15 @@ class HandMotion:
         self._rest = RestingPose(settings.filter.average_at_rest)
         self._motion, self._unslipped = (RelativeMotion.of(settings) for _ in range(2))
         self._shares: Shares = (1.0, 1.0)
+        self.filtered: pin.SE3 | None = None  # the hand's pose that the last target was made of
         # The newest hand pose, and where it would have the tool if nothing had slipped.
         self._newest: tuple[pin.SE3, pin.SE3] | None = None
-        self._bound_one_tool()
+        self.bound_one_tool()
 
-    def _bound_one_tool(self) -> None:
+    def bound_one_tool(self) -> None:
+        """Targets are those of this arm's tool from now on, and nothing has slipped."""
         settings, arm = self._settings, self._arm
+        self._carried: CarriedTools | None = None
         self._leash = Leash(settings.leash)
         self._workspace: Workspace | CarriedWorkspace = self.workspace()
         self._speed = SpeedLimit([settings.speed_limit.get(arm)])  # type: ignore[call-overload]
@@ -74,8 +76,7 @@ class HandMotion:
     def anchor(self, hand: pin.SE3, tool: pin.SE3, shares: Shares, now: float) -> None:
         """The newest pose of the ``hand`` and ``tool``, in the world, correspond from now on."""
         if self._carried is not None:
-            self._carried = None
-            self._bound_one_tool()
+            self.bound_one_tool()
         hand = self._rest.begin(hand, now)
         self._filter.reset(hand, now)
         self._rescale(hand, tool, shares)
@@ -83,11 +84,11 @@ class HandMotion:
         self._workspace.reset()
         self._speed.reset()
 
-    def carry(self, tools: CarriedTools, other: HandMotion, now: float) -> None:
-        """Move the frame of ``tools`` from now on, until the next anchor; ``other``: that of the other arm."""
+    def carry(self, tools: CarriedTools, other: str, box: Workspace, now: float) -> None:
+        """Move the frame of ``tools`` from now on, until the next anchor; ``box``: that of the ``other`` arm."""
         self._carried = tools
         self._leash = Leash(self._settings.leash.carried())
-        self._workspace = CarriedWorkspace(tools, {self._arm: self.workspace(), other._arm: other.workspace()})
+        self._workspace = CarriedWorkspace(tools, {self._arm: self.workspace(), other: box})
         limits = self._settings.speed_limit
         self._speed = SpeedLimit(limits.values(), tools.lever)
         self._rescale(self._hand(now), tools.frame, self._shares)
@@ -98,7 +99,7 @@ class HandMotion:
         ``newest``: the hand's newest pose, or None; ``commanded``: where the controller's reference has the tool or
         the frame, from which no target is farther than the leash, or None: then there is none.
         """
-        hand = self._hand(now)
+        hand = self.filtered = self._hand(now)
         if commanded is None or newest is None:
             target = self._motion.target(hand)
         else:
@@ -111,6 +112,17 @@ class HandMotion:
         if self._shares != shares:
             self._rescale(hand, target, shares)  # from here on, so the target does not jump
             self._leash.anchor_anew()
+        return self._speed.limit(target, now)
+
+    def bounded(self, target: pin.SE3, commanded: pin.SE3 | None, now: float) -> pin.SE3:
+        """A target that this hand has not made, within the arm's bounds: world frame, at ``now`` [s].
+
+        ``commanded``: see :meth:`target`.
+        """
+        if commanded is not None:
+            target = self._leash.hold(target, commanded)
+        if isinstance(self._workspace, Workspace):
+            target = pose_of(target.rotation, self._workspace.clip(target.translation))
         return self._speed.limit(target, now)
 
     def _hand(self, now: float) -> pin.SE3:

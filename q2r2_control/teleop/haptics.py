@@ -9,7 +9,7 @@ from typing import NamedTuple
 from q2r2_control.config.teleop import HapticSettings
 from q2r2_control.teleop.arm_states import ArmState, is_fault
 from q2r2_control.teleop.carry_mode import CARRIES
-from q2r2_control.teleop.episode_marks import BEGINS, DISCARDED, ENDS, MARK
+from q2r2_control.teleop.episode_marks import BEGINS, DISCARDED, ENDS, FAILED, MARK, SUCCEEDED, is_kept
 from q2r2_control.types import Event, HapticFeedback
 
 
@@ -41,6 +41,7 @@ HOMING = Pulse(0.4, 0.55, 0.2)
 STOPPED = Pulse(0.9, 0.9, 0.25)
 EPISODE_BEGINS, EPISODE_ENDS = Pulse(0.6, 0.45, 0.15), Pulse(0.35, 0.35, 0.15)
 EPISODE_DISCARDED = Pulse(0.2, 0.65, 0.25)
+EPISODE_KEPT, EPISODE_REJECTED = Pulse(0.75, 0.42, 0.4), Pulse(0.15, 0.7, 0.5)
 _NEAREST, _HARDEST = 0.6, 0.8  # amplitudes that NEAR and CONTACT grow to
 # The weakest first: where two are due at once, the stronger one is felt. The docs' table is this one.
 VOCABULARY = (
@@ -49,12 +50,14 @@ VOCABULARY = (
     Word("the tool's contact force has grown by another 5 N", CONTACT, _HARDEST),
     Word("a joint has come to its position limit", LIMIT),
     Word("paused, by its control or the alignment chord; home, or interrupted on the way", PAUSED),
-    Word("an episode of the recording ends", EPISODE_ENDS),
+    Word("an episode of the recording ends, or succeeded", EPISODE_ENDS),
     Word("engaged; both arms carry", ENGAGED),
+    Word("the verdict on an episode: keep", EPISODE_KEPT),
     Word("an episode of the recording begins; a mark", EPISODE_BEGINS),
     Word("the gripper has closed on something", GRASP),
     Word("on the way home", HOMING),
-    Word("an episode is discarded", EPISODE_DISCARDED),
+    Word("an episode is discarded, or failed", EPISODE_DISCARDED),
+    Word("the verdict on an episode: discard", EPISODE_REJECTED),
     Word("stopped, by the control that stops", STOPPED),
     Word("lost: stopped by a fault (lost data, a jump, a stop), or a press that was refused", FAULT),
 )
@@ -70,6 +73,8 @@ _TOLD = {
     BEGINS: EPISODE_BEGINS,
     MARK: EPISODE_BEGINS,
     ENDS: EPISODE_ENDS,
+    SUCCEEDED: EPISODE_ENDS,
+    FAILED: EPISODE_DISCARDED,
     DISCARDED: EPISODE_DISCARDED,
 }
 
@@ -78,6 +83,14 @@ _SLIP_ANGLE_STEP = 0.1  # or by this [rad]
 _NEAR_STEP, _NEAR_FROM = 0.005, 0.05  # [m]
 _FORCE_STEP, _FORCE_TO = 5.0, 50.0  # [N]
 _PAUSE = 0.05  # between two vibrations, so that they are felt as two [s]
+
+
+class ArmCondition(NamedTuple):
+    """What of an arm's surroundings and joints its hand feels."""
+
+    spare: float  # how much nearer it may come to what it has to keep away from; inf: nothing is there [m]
+    limits: frozenset[str]  # joints at a position limit
+    force: float | None  # contact force at the tool, None: not measured [N]
 
 
 class HapticPulses:
@@ -90,7 +103,7 @@ class HapticPulses:
         self.strength = (settings or HapticSettings()).strength  # of all vibrations, 0: none
         self._ends: float | None = None
         self._next = 0.0  # no vibration begins before [s]
-        self._amplitude = 0.0
+        self._amplitude, self._felt_by = 0.0, ""
         self._slipped = _Steps(_SLIP_STEP), _Steps(_SLIP_ANGLE_STEP)
         self._nearness, self._force = _Steps(_NEAR_STEP), _Steps(_FORCE_STEP)
         self._limits: frozenset[str] = frozenset()
@@ -104,6 +117,8 @@ class HapticPulses:
         elif event.source == event.destination:
             if (pulse := _TOLD.get(event.reason)) is not None:
                 self._want(pulse)
+            elif (kept := is_kept(event.reason)) is not None:
+                self._want(EPISODE_KEPT if kept else EPISODE_REJECTED)
         elif event.destination in _BEGINS:
             self._want(_BEGINS[ArmState(event.destination)])
         elif event.source in (ArmState.ENGAGED, ArmState.CARRIED, ArmState.HOMING):
@@ -114,6 +129,13 @@ class HapticPulses:
         position, rotation = self._slipped
         if position.grew(slip) | rotation.grew(slip_angle):  # both count
             self._want(SLIP)
+
+    def notice(self, condition: ArmCondition) -> None:
+        """All of the next three."""
+        self.near(condition.spare)
+        self.limits(condition.limits)
+        if condition.force is not None:
+            self.contact(condition.force)
 
     def near(self, spare: float) -> None:
         """How much nearer the arm may come to what it has to keep away from [m]."""
@@ -143,14 +165,14 @@ class HapticPulses:
         """What to send to ``hand``, which drives the arm at ``now`` [s], or None."""
         if self._ends is not None and now >= self._ends:
             self._ends, self._next = None, now + _PAUSE
-            return HapticFeedback(hand, 0.0, 0.0)
+            return HapticFeedback(self._felt_by, 0.0, 0.0)  # which may not drive the arm any more
         pulse = self._waiting
         if pulse is None or (self._ends is None and now < self._next and pulse is not FAULT):
             return None
         self._waiting = None
         if self._ends is not None and pulse.amplitude < self._amplitude:
             return None
-        self._ends, self._amplitude = now + pulse.duration, pulse.amplitude
+        self._ends, self._amplitude, self._felt_by = now + pulse.duration, pulse.amplitude, hand
         return HapticFeedback(hand, pulse.frequency, pulse.amplitude * self.strength)
 
     def _want(self, pulse: Pulse) -> None:

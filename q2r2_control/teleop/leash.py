@@ -138,6 +138,14 @@ class Leash:
             motion.anchor_rotation(hand, target)
         return target
 
+    def hold(self, target: pin.SE3, tool: pin.SE3) -> pin.SE3:
+        """A target that no hand moves, no farther from ``tool`` (world frame) than the leash reaches."""
+        if not self._ends(tool, target):
+            return target
+        ways = [component.hold(way) for component, way in zip(self._components, _ways(tool, target), strict=True)]
+        position = target.translation if ways[0] is None else tool.translation + ways[0]
+        return pin.SE3(target.rotation if ways[1] is None else pin.exp3(ways[1]) @ tool.rotation, position)
+
     def _ends(self, tool: pin.SE3, target: pin.SE3) -> bool:
         """Whether the target is as far as a leash reaches, told with little work: at most ticks it is not."""
         x, y, z, _, _, _, w = pin.SE3ToXYZQUATtuple(tool.actInv(target))

@@ -13,6 +13,7 @@ from q2r2_control.teleop.arm import of_controls
 from q2r2_control.teleop.arm_states import FOLLOWING, HOLDING, ArmState, Cause
 from q2r2_control.teleop.both_arms import BothArms, Surroundings
 from q2r2_control.teleop.episode_marks import EpisodeMarks
+from q2r2_control.teleop.remote_arm import RemoteArm
 from q2r2_control.types import ArmTarget, Event, HandSample
 
 
@@ -22,7 +23,8 @@ class Teleop:
     An engaged arm is stopped by: no pose or no button data for ``gate.timeout`` of receipt time, a pose that is not
     finite or not a rotation, a jump or a speed past the gate, a fault that the input found, a lost connection, a loop
     that stalled or a clock that went back by more than ``gate.timeout``; with ``linked`` the other arm too. Only a new
-    press engages again.
+    press engages again. The alignment chord of either hand stops both arms, ``linked`` or not, since it moves the frame
+    that both hands are measured in.
 
     Of what is pressed at once, a stop comes first, then the alignment chord, then a pause, then the rest. What is
     for both arms either hand may ask for. The way home is the caller's to go while :attr:`homing`.
@@ -74,6 +76,11 @@ class Teleop:
         return {name: arm.state in (ArmState.ENGAGED, ArmState.CARRIED) for name, arm in self._arms.items()}
 
     @property
+    def aligning(self) -> bool:
+        """Whether a hand holds the alignment chord: the frame may move that all hands are measured in."""
+        return any(arm.chord for arm in self._arms.values())
+
+    @property
     def homing(self) -> bool:
         """Whether both arms are to be brought home, until :meth:`end_homing` or what stops them."""
         return self._pair.any_in(ArmState.HOMING)
@@ -112,8 +119,9 @@ class Teleop:
         """One tick: process the samples and compute every arm's target.
 
         ``tools``: measured tool poses in the world frame. ``commanded``: tool poses of the controller's reference; when
-        engaging, the position anchors to the measured tool and the orientation to the commanded one, whose sag so does
-        not add up over many pauses. Without ``commanded`` it is the last target's, at first the measured one.
+        engaging, the position anchors to the measured tool and the orientation to the commanded one. How far the tool
+        is from its command then is the targets' sag, see :mod:`sag`: what they command begins at ``commanded``.
+        Without ``commanded`` the orientation is the last target's, at first the measured one, and there is no sag.
         ``commanded`` is also what the leash is tied to; without it there is none.
         ``obstacles``: why an arm may not be engaged now, for reasons outside of this layer.
         ``now`` [s] is the clock of the samples' stamps.
@@ -129,35 +137,58 @@ class Teleop:
             faults[name] = faults.get(name) or arm.watchdog(now) or clock_fault
         self._disengage(faults, now)
         around = Surroundings(tools, self._commanded, commanded, obstacles or {})
+        self._pair.agree(around, now)
         presses = self._pair.act(around, now)
-        chord = any(arm.chord for arm in self._arms.values())
+        chord = self.aligning
         for name, arm in self._arms.items():
             arm.act(
                 presses[name],
                 partial(around.anchor, name),
                 now,
-                chord if self._linked else arm.chord,
+                chord,
                 around.obstacles.get(name),
             )
-        targets = self._targets(now, commanded)
+        targets = self._targets(now, around)
         self._pair.swap_hands(presses, now)
         return targets
 
-    def _targets(self, now: float, commanded: Mapping[str, pin.SE3] | None) -> dict[str, ArmTarget]:
+    def _targets(self, now: float, around: Surroundings) -> dict[str, ArmTarget]:
         """Of every arm, by its state."""
         if self._pair.carry is not None and not self._pair.carry.lasts:
             self._pair.end_carry(now, "the other arm was stopped")
         carry, targets = self._pair.carry, {}
-        carried = {} if carry is None else carry.targets(now, commanded)
+        expected = {name: pose for name, arm in self._arms.items() if (pose := around.expected(arm)) is not None}
+        carried = self._carried(now, expected)
         for name, arm in self._arms.items():
             if carry is not None:
                 pose, slip = carried.get(name), carry.slip
             else:
-                pose, slip = arm.target(now, None if commanded is None else commanded.get(name)), arm.slip
+                pose, slip = arm.target(now, expected.get(name)), arm.slip
             if pose is not None:
                 self._commanded[name] = pose
-            targets[name] = ArmTarget(pose, arm.gripper, *slip)
+            targets[name] = ArmTarget(pose, arm.gripper, *slip, arm.sag, arm.filtered_hand)
         return targets
+
+    def _carried(self, now: float, expected: dict[str, pin.SE3]) -> Mapping[str, pin.SE3]:
+        """Targets of the arms that carry."""
+        carry, remote = self._pair.carry, self._pair.remote
+        if carry is None:
+            return {}
+        if remote is None:
+            return carry.targets(now, expected, expected)
+        (name,) = self._arms
+        tool = expected.get(name)
+        at_once = remote.tools_at_once(name, tool)
+        if remote.leads and remote.pose is not None:
+            expected[remote.arm] = remote.pose
+        targets = carry.targets(now, expected, at_once)
+        # Where no reference is known, the tool counts as at its target.
+        remote.sends = targets.get(remote.arm) if remote.leads else targets.get(name) if tool is None else tool
+        return targets
+
+    def pair_with(self, remote: RemoteArm) -> None:
+        """Carry together with the ``remote`` arm, which another program drives."""
+        self._pair.remote = remote
 
     def home(self, now: float) -> None:
         """Both arms shall go home, because a program says so. What is in the way is told as an event."""
@@ -175,6 +206,22 @@ class Teleop:
     def set_stopped(self, stopped: bool, now: float, reason: str) -> None:
         """Stop all arms, or take that back, because their operator did so elsewhere."""
         self._pair.change(Cause.STOP if stopped else Cause.GO_ON, now, reason)
+
+    @property
+    def swapped(self) -> bool:
+        """Whether each hand drives the other arm than by the stance."""
+        return self._pair.swapped
+
+    def set_swapped(self, swapped: bool, now: float) -> None:
+        """Swap the hands, or swap them back, as was asked for elsewhere; an arm that follows one is stopped."""
+        self._pair.set_swapped(swapped, now)
+
+    def allow_swapping(self, problem: str | None) -> None:
+        """Of one arm alone: why its hand may not be swapped for the other arm's now, or None.
+
+        None says that another program drives the other arm, and goes by :attr:`swapped`.
+        """
+        self._pair.alone = problem
 
     def tell(self, now: float, reason: str) -> None:
         """What the operator should know of both arms; what was not done begins with "not"."""

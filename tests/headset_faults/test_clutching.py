@@ -9,7 +9,8 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from q2r2_control.types import SIDES
+from q2r2_control.teleop.sag import MOST_SAG
+from q2r2_control.types import SIDES, CommandMode
 from tests.support.headset_in_step import InStepRun, Operator
 
 ANEW = pin.SE3(pin.exp3(np.array([0.0, 0.0, math.radians(120.0)])), np.array([0.4, 0.0, 0.0]))
@@ -47,20 +48,53 @@ def test_an_alignment_within_30_ms_moves_no_arm_and_no_gripper_wherever_the_fram
         assert np.linalg.norm(run.tool(arm) - run.tool(arm)[0], axis=1).max() < STILL
 
 
-def test_hands_that_resume_from_elsewhere_a_hundred_times_leave_the_arms_where_they_are() -> None:
-    def taps(op: Operator) -> Iterator[float]:
-        for _ in range(2):
-            op.lower |= set(SIDES)
-            yield 0.03
-            op.lower -= set(SIDES)
-            yield 0.03
+@pytest.mark.parametrize("engaged", [SIDES, ("right",)], ids=["both arms engaged", "the other arm alone engaged"])
+@pytest.mark.parametrize("shift", [1.0, 0.1], ids=["far", "by less than the gates"])
+def test_an_alignment_by_one_hand_moves_no_arm_although_the_arms_are_not_linked(
+    shift: float, engaged: tuple[str, ...]
+) -> None:
+    def script(op: Operator) -> Iterator[float]:
+        yield 0.1
+        yield from op.press(*engaged)
+        yield 0.2
+        op.lower.add("left")
+        op.upper.add("left")
+        yield op.period
+        op.frame = pin.SE3.Interpolate(pin.SE3.Identity(), ANEW, shift)
+        yield 0.2
+        op.lower.clear()
+        op.upper.clear()
+        yield 0.2
 
+    run = InStepRun(script, linked=False)
+    assert run.reasons("lost") == []
+    assert run.reasons("aligning") == ["alignment chord"] * len(engaged)
+    assert {arm for arm, state in run.ticks[-1].states.items() if state == "engaged"} == set(engaged)
+    for arm in SIDES:
+        assert np.linalg.norm(run.tool(arm) - run.tool(arm)[0], axis=1).max() < STILL
+
+
+def taps(op: Operator) -> Iterator[float]:
+    """A pause, and an engagement."""
+    for _ in range(2):
+        op.lower |= set(SIDES)
+        yield 0.03
+        op.lower -= set(SIDES)
+        yield 0.03
+
+
+def put_elsewhere(op: Operator) -> None:
+    """Both hands are turned by 120 degrees, 0.4 m away."""
+    for hand, at in op.hands.items():
+        op.hands[hand] = pin.SE3(ANEW.rotation @ at.rotation, at.translation + ANEW.translation)
+
+
+def test_hands_that_resume_from_elsewhere_a_hundred_times_leave_the_arms_where_they_are() -> None:
     def script(op: Operator) -> Iterator[float]:
         op.noise = 1e-9  # enough for no frozen pose
         yield from op.engage()
         yield from op.press(*SIDES)
-        for hand, at in op.hands.items():
-            op.hands[hand] = pin.SE3(ANEW.rotation @ at.rotation, at.translation + ANEW.translation)
+        put_elsewhere(op)
         yield 0.2
         yield from op.press(*SIDES)
         marks.append(op.now)
@@ -89,6 +123,101 @@ def test_an_arm_that_has_sagged_by_2_cm_resumes_from_where_it_is() -> None:
     run = InStepRun(script, {"position_stiffness": 1500.0})
     assert run.tool("left")[0, 2] - next(t for t in run.ticks if t.t >= sagged[0]).tools["left"].translation[2] > 0.018
     assert run.states == {"engaged"}
+
+
+def test_an_arm_under_a_load_that_nobody_knows_of_sinks_no_farther_when_it_resumes_a_hundred_times() -> None:
+    def script(op: Operator) -> Iterator[float]:
+        op.noise = 1e-9
+        yield from op.engage()
+        op.plant.push("left", np.array([0.0, 0.0, -42.0, 0.0, 0.0, 0.0]), 100.0)
+        yield 1.0
+        yield from op.press(*SIDES)
+        put_elsewhere(op)
+        yield 2.0  # until the arm rests on its spring
+        marks.append(op.now)
+        yield from op.press(*SIDES)
+        for _ in range(100):
+            yield from taps(op)
+
+    marks: list[float] = []
+    run = InStepRun(script, mode=CommandMode.TORQUE)
+    assert run.reasons("lost") == []
+    assert len(run.watch.engagements("left")) == 102
+    resumed = [tick for tick in run.ticks if tick.t >= marks[0]]
+    commanded = [run.loop.robot.tool_pose(tick.reference.q, "left").translation for tick in resumed]
+    measured = np.array([tick.tools["left"].translation for tick in resumed])
+    poses = [tick.targets["left"].pose for tick in resumed]
+    targets = np.array([pose.translation for pose in poses if pose is not None])
+    assert commanded[0][2] - measured[0][2] > 0.02
+    assert np.linalg.norm(np.array(commanded) - commanded[0], axis=1).max() < 1e-6
+    assert np.linalg.norm(targets - measured[0], axis=1).max() < 5e-6, "the target is where the tool is, not above"
+    assert np.linalg.norm(measured - measured[0], axis=1).max() < 5e-6
+
+
+@pytest.mark.parametrize(
+    ("mode", "mujoco", "load", "off"),
+    [
+        (CommandMode.TORQUE, {}, 42.0, 1e-3),
+        # How far soft joints let the tool hang depends on the posture: 2.6 mm more where this arm rests at last.
+        (CommandMode.POSITION, {"position_stiffness": 1500.0}, 75.0, 3.5e-3),
+    ],
+    ids=["on the spring of torque mode", "of soft joints"],
+)
+def test_an_arm_that_hangs_by_2_cm_and_is_engaged_in_full_motion_a_hundred_times_has_no_lag_in_its_sag(
+    mode: CommandMode, mujoco: dict[str, object], load: float, off: float
+) -> None:
+    """The hand goes to and fro at up to 0.6 m/s, and lets go for one sample where the tool is fastest, either way."""
+    turns, sampled = 30, 0.014  # samples of a cycle, and their time [s]
+
+    def script(op: Operator) -> Iterator[float]:
+        op.noise, op.period = 1e-9, sampled
+        op.plant.push("left", np.array([0.0, 0.0, -load, 0.0, 0.0, 0.0]), 100.0)
+        yield 1.4
+        op.grip.add("left")
+        yield 0.5 * turns * sampled
+        start = op.hands["left"]
+        for index in range(51 * turns + 1):
+            way = 0.04 * math.sin(2.0 * math.pi * index / turns)
+            op.hands["left"] = pin.SE3(start.rotation, start.translation + np.array([0.0, way, 0.0]))
+            (op.grip.discard if index > turns and index % (turns // 2) == 4 else op.grip.add)("left")
+            yield sampled
+        op.grip.add("left")
+        yield 1.5
+
+    run = InStepRun(script, mujoco, mode, bindings={"lower": "none", "grip": "dead_man"})
+    assert run.reasons("lost") == []
+    begins = run.watch.engagements("left")
+    assert len(begins) == 101
+    references = [run.loop.robot.tool_pose(tick.reference.q, "left").translation for tick in run.watch.ticks]
+    speeds = [
+        math.dist(references[index - 1], references[index - 2]) / run.watch.ticks[index - 1].dt for index in begins
+    ]
+    assert min(speeds[1:]) > 0.35, "the arm moves when it is engaged"
+    for index in begins:
+        command = run.watch.ticks[index].targets["left"].command
+        assert command is not None
+        assert math.dist(command.translation, references[index - 1]) < 1e-9, (
+            "what is commanded goes on from where it was"
+        )
+    first, last = run.ticks[begins[0]], run.ticks[-1]
+    assert references[begins[0]][2] - first.tools["left"].translation[2] > 0.018
+    target = last.targets["left"].pose
+    assert target is not None
+    assert math.dist(last.tools["left"].translation, target.translation) < off
+
+
+def test_an_arm_that_was_pushed_away_is_engaged_there_and_does_not_spring_back() -> None:
+    def script(op: Operator) -> Iterator[float]:
+        yield 0.1
+        op.plant.push("left", np.array([0.0, 140.0, 0.0, 0.0, 0.0, 0.0]), 2.0)
+        yield 1.8
+        yield from op.press("left")
+        yield 2.0
+
+    run = InStepRun(script, mode=CommandMode.TORQUE)
+    first = run.ticks[run.watch.engagements("left")[0]].tools["left"].translation
+    assert math.dist(first, run.ticks[0].tools["left"].translation) > MOST_SAG[0]
+    assert math.dist(run.tool("left")[-1], first) < 0.005
 
 
 @pytest.mark.parametrize(

@@ -201,3 +201,23 @@ def test_a_target_that_stays_is_where_it_ends() -> None:
         velocities.append(watched.velocity[0])
     np.testing.assert_allclose(watched.pose.homogeneous, goal.homogeneous, atol=1e-6)
     assert np.abs(velocities[-50:]).max() < 1e-6
+
+
+def test_limits_that_are_lowered_in_motion_brake_the_pose_at_the_acceleration_and_count_from_then_on() -> None:
+    guard, now, speed = TargetGuard(LIMITS, DT), 5.0, 0.4
+    guard.reset(pose(), now)
+    way = np.array([speed * DT, 0.0, 0.0])
+    target, velocities = pose(), [0.0]
+    for tick in range(120):
+        if tick == 40:
+            guard.change(LIMITS.model_copy(update={"max_velocity": 0.1}))
+        before, now = guard.pose, now + DT
+        target = pin.SE3(target.rotation, target.translation + way)
+        after = guard.step(target, now)
+        assert before is not None
+        assert after is not None
+        velocities.append(math.dist(after.translation, before.translation) / DT)
+    assert velocities[40] == pytest.approx(speed)
+    assert velocities[-1] == pytest.approx(0.1)
+    changes = np.abs(np.diff(velocities)) / DT
+    assert changes.max() <= LIMITS.max_acceleration * (1.0 + 1e-9)

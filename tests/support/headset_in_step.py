@@ -17,7 +17,7 @@ from q2r2_control.inputs.headset import HeadsetServer
 from q2r2_control.pipeline import Pipeline
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.runtime.recorder import Tick
-from q2r2_control.types import SIDES, Array, Event, HandSample, HapticFeedback
+from q2r2_control.types import SIDES, Array, CommandMode, Event, HandSample, HapticFeedback
 from tests.support.fake_headset import FakeHeadset
 from tests.support.headset_server import eventually
 from tests.support.operator_script import START
@@ -43,6 +43,7 @@ class Operator:
         self.frame = pin.SE3.Identity()
         self.lower: set[str] = set()
         self.upper: set[str] = set()
+        self.grip: set[str] = set()
         self.period = PERIOD
         self.silent = False
         self.held_up = False  # by the network, which delivers in order and all at once later
@@ -75,7 +76,11 @@ class Operator:
             seen = self.frame * self.hands[hand]
             position = seen.translation + self._random.normal(0.0, self.noise, 3)
             frames.append(self.send_pose(hand, position, pin.Quaternion(seen.rotation).coeffs()) or b"")
-            frames.append(self.headset.inputs(hand, hand in self.upper, hand in self.lower))
+            frames.append(
+                self.headset.inputs(
+                    hand, hand in self.upper, hand in self.lower, (0.0, 0.0, 0.0, float(hand in self.grip))
+                )
+            )
         self._backlog += frames
         if not self.held_up:
             self.headset.send(b"".join(self._backlog))
@@ -172,9 +177,15 @@ class HeadsetInStep:
 class InStepRun:
     """A whole run of a script: its ticks and events. The contract held at every one, and no arm caught up."""
 
-    def __init__(self, script: Script, mujoco: Mapping[str, object] | None = None, **teleop: object) -> None:
+    def __init__(
+        self,
+        script: Script,
+        mujoco: Mapping[str, object] | None = None,
+        mode: CommandMode = CommandMode.POSITION,
+        **teleop: object,
+    ) -> None:
         self.source = HeadsetInStep(script, mujoco or {}, **teleop)
-        self.loop = Pipeline.from_config(self.source.config, input=self.source, plant="mujoco")
+        self.loop = Pipeline.from_config(self.source.config, input=self.source, plant="mujoco", mode=mode)
         assert isinstance(self.loop.plant, MujocoPlant)
         self.source.plant = self.loop.plant
         self.watch = Watch(self.loop)

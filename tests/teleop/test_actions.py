@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 
+from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.teleop.arm_states import is_fault, is_refusal
 from q2r2_control.types import SIDES, HandInputs
 from tests.teleop.hands import (
@@ -218,6 +219,35 @@ class TestSwappedHands:
         assert driver.states == ENGAGED
         assert driver.teleop.hand_of("left") == "left"
         assert {event.reason for event in driver.events if is_refusal(event)} == {"not swapped: pause both arms first"}
+
+
+class TestTheHandOfOneArmAlone:
+    def driver(self) -> Squeezing:
+        driver = Squeezing(TeleopSettings.model_validate({"bindings": BINDINGS}), ("left",))
+        driver.run(0.1)
+        return driver
+
+    def test_is_not_swapped_unless_another_program_drives_the_other_arm(self) -> None:
+        driver = self.driver()
+        push(driver, "stick_left")
+        assert [event.reason for event in driver.events] == ["not swapped: this program drives one arm only"]
+        driver.teleop.allow_swapping(None)
+        push(driver, "stick_left")
+        assert driver.teleop.swapped
+        assert driver.teleop.hand_of("left") == "right"
+        driver.press("left")
+        assert driver.states == {"left": "idle"}
+        driver.press("right")
+        assert driver.states == {"left": "engaged"}
+
+    def test_lets_go_of_its_arm_where_hands_are_swapped_elsewhere(self) -> None:
+        driver = self.driver()
+        driver.press("left")
+        driver.teleop.set_swapped(True, driver.now)
+        assert all(targets["left"].pose is None for targets in driver.run(0.2, waving(driver)))
+        assert driver.states == {"left": "lost"}
+        driver.press("right")
+        assert driver.states == {"left": "engaged"}
 
 
 class TestAGripperThatFollowsATrigger:

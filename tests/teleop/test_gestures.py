@@ -84,6 +84,19 @@ def test_a_button_held_from_the_first_reading_does_not_count_until_released() ->
     assert play("l" * 20 + "." + "l" * 10, start_released=False)[0] == (LOWER_DOWN, 0.21)
 
 
+def test_controls_that_are_held_from_the_first_reading_on_are_told_once_after_a_second() -> None:
+    found = recognizer()
+    for step in range(30):
+        now = 0.1 * step
+        found.receive(HandInputs(button_lower=True), now, now)
+        told = found.take_stuck(now)
+        assert told == ("lower held since the hand was first heard of: let go first" if step == 11 else None), now
+    found.forget()
+    found.receive(HandInputs(), 3.0, 3.0)
+    found.receive(HandInputs(button_lower=True), 3.1, 3.1)
+    assert found.take_stuck(9.0) is None, "it was pressed"
+
+
 def test_forgetting_treats_a_held_button_as_not_pressed_until_released() -> None:
     gestures = recognizer()
     gestures.receive(HandInputs(), 0.0, 0.0)

@@ -1,0 +1,87 @@
+"""Arms that hang lower than they are commanded to: engaging them moves neither the tool nor the command."""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+
+from q2r2_control.teleop.sag import MOST_SAG
+from q2r2_control.types import SIDES, Array
+from tests.teleop.hands import Operator, engaged, operator, squeezing, waving
+
+SAG = np.array([0.005, 0.0, -0.02])
+
+
+def hanging(driver: Operator, by: Array = SAG) -> Operator:
+    """All tools hang ``by`` off their commands."""
+    driver.commanded = {arm: pin.SE3(tool.rotation, tool.translation - by) for arm, tool in driver.tools.items()}
+    return driver
+
+
+def command(driver: Operator, arm: str = "left") -> Array:
+    """The position that the controller is asked for."""
+    asked = driver.targets[arm].command
+    assert asked is not None
+    return asked.translation
+
+
+def target(driver: Operator, arm: str = "left") -> Array:
+    asked = driver.targets[arm].pose
+    assert asked is not None
+    return asked.translation
+
+
+def test_the_target_begins_at_the_tool_and_the_command_where_it_was() -> None:
+    driver = hanging(operator())
+    assert driver.commanded is not None
+    driver.engage()
+    np.testing.assert_allclose(target(driver), driver.tools["left"].translation, atol=1e-9)
+    np.testing.assert_allclose(command(driver), driver.commanded["left"].translation, atol=1e-9)
+    driver.run(0.5, waving(driver))
+    np.testing.assert_allclose(target(driver) - command(driver), SAG, atol=1e-12)
+
+
+def test_a_tool_that_is_farther_from_its_command_was_pushed_there_and_the_command_begins_at_it() -> None:
+    driver = hanging(operator(), np.array([0.0, 1.01 * MOST_SAG[0], 0.0]))
+    driver.engage()
+    np.testing.assert_allclose(command(driver), driver.tools["left"].translation, atol=1e-9)
+
+
+def test_each_engagement_goes_by_the_sag_that_there_is_then_and_changed_settings_do_not() -> None:
+    driver = hanging(engaged())
+    assert driver.targets["left"].sag is None
+    changed = driver.settings.model_copy(update={"position_scale": 0.5})
+    assert driver.teleop.change(changed, driver.now) is None
+    driver.run(0.1)
+    np.testing.assert_allclose(command(driver), target(driver), atol=1e-12)
+    driver.press(*SIDES)
+    driver.press(*SIDES)
+    np.testing.assert_allclose(command(driver) - target(driver), -SAG, atol=1e-12)
+
+
+def test_the_leash_is_measured_from_where_the_tool_hangs() -> None:
+    for way in (0.2, -0.2):
+        driver = hanging(operator(leash={"distance": 0.03}))
+        driver.engage()
+        start = dict(driver.hands)
+
+        def up(t: float, way: float = way, start: dict[str, pin.SE3] = start) -> dict[str, pin.SE3]:
+            return {
+                hand: pin.SE3(at.rotation, at.translation + np.array([0.0, 0.0, way * t])) for hand, at in start.items()
+            }
+
+        driver.run(1.0, up)
+        off = target(driver) - driver.tools["left"].translation
+        np.testing.assert_allclose(off, (0.0, 0.0, np.sign(way) * 0.03), atol=1e-6)
+
+
+def test_an_arm_that_was_never_engaged_is_carried_without_a_jump_of_either_command() -> None:
+    driver = squeezing(bindings={"grip": "carry"})
+    hanging(driver)
+    assert driver.commanded is not None
+    driver.engage("left")
+    driver.only, driver.held = "left", {"grip": 1.0}
+    driver.run(0.1)
+    assert driver.states == {"left": "engaged", "right": "carried"}
+    for arm in SIDES:
+        np.testing.assert_allclose(command(driver, arm), driver.commanded[arm].translation, atol=1e-9)
