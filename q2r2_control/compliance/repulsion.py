@@ -63,14 +63,14 @@ class MeasuredSeparation:
         law, self._model, self._data = wall_settings or WallSettings(), robot.model, robot.model.createData()
         collision = collision_model_of(robot)
         pairs, radius = collision.pairs, collision.bodies.radius
-        radii = radius[pairs.first] + radius[pairs.second]
-        # Pairs that may touch meet the wall only where they are deeper in each other than bodies get that touch.
-        shell = np.maximum(kept_distances(robot, settings).values, -_SOFT * radii)
+        self._radii = radius[pairs.first] + radius[pairs.second]
+        self._shell, self._smoothing = np.zeros_like(self._radii), np.zeros_like(self._radii)
+        self.set_kept_distances(kept_distances(robot, settings).values)
         model = RepulsionModel(
             collision=collision,
-            smoothing=(_SMOOTHING * (radii + shell)) ** 2,
-            deep=(_DEEP - 1.0) * radii,
-            shell=shell,
+            smoothing=self._smoothing,
+            deep=(_DEEP - 1.0) * self._radii,
+            shell=self._shell,
             stiffness=law.stiffness,
             damping_ratio=law.damping_ratio,
             maximum_force=law.maximum_force,
@@ -90,6 +90,12 @@ class MeasuredSeparation:
     def set_openings(self, openings: Mapping[str, Interval]) -> None:
         """Between which openings each arm's gripper is; of an arm that is not named, all of the way."""
         self._fingers.set_all(openings)
+
+    def set_kept_distances(self, kept: Array) -> None:
+        """How far apart every pair stays, (p,) [m], which is where its wall begins."""
+        # Pairs that may touch meet the wall only where they are deeper in each other than bodies get that touch.
+        self._shell[:] = np.maximum(kept, -_SOFT * self._radii)
+        self._smoothing[:] = (_SMOOTHING * (self._radii + self._shell)) ** 2
 
     def update(self, q: Array, v: Array) -> WallReport:
         """Wall torque at the measured ``q`` [rad] and ``v`` [rad/s], (nv,) each.

@@ -22,6 +22,8 @@ class Action(StrEnum):
     CARRY = "carry"  # this hand moves both tools as one body
     RECORD_TOGGLE = "record_toggle"  # an episode begins, or ends
     RECORD_DISCARD = "record_discard"  # the episode is not worth keeping
+    RECORD_SUCCESS = "record_success"  # the episode succeeded, and ends
+    RECORD_FAILURE = "record_failure"  # it failed, and ends
     RECORD_MARK = "record_mark"  # something happened now
     # For as long as a trigger or stick is held.
     DEAD_MAN = "dead_man"  # engaged while held
@@ -55,6 +57,8 @@ MEANINGS: dict[str, str] = {
     Action.CARRY: "lets this hand move both tools as one body, or ends that",
     Action.RECORD_TOGGLE: "begins an episode of the recording, or ends it",
     Action.RECORD_DISCARD: "throws away the episode, or the last one if it has ended",
+    Action.RECORD_SUCCESS: "says that the episode, or the last one, succeeded, and ends it",
+    Action.RECORD_FAILURE: "says that the episode, or the last one, failed, and ends it",
     Action.RECORD_MARK: "marks this moment in the recording",
     Action.DEAD_MAN: "held: the arm follows; let go: it pauses",
     Action.PRECISION: "held: motion is scaled by precision_scale",

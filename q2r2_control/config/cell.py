@@ -135,9 +135,14 @@ class Config(CellModel):
     headset: HeadsetConfig = HeadsetConfig()
     mujoco: MujocoConfig = MujocoConfig()
     cameras: dict[CameraName, CameraConfig] = Field(
-        default_factory=dict, max_length=16, description="of the simulated cell, by name"
+        default_factory=dict, max_length=16, description="of the simulated cell, or on ROS topics, by name"
     )
     judge: JudgeSettings = JudgeSettings()
+
+    @property
+    def simulated_cameras(self) -> dict[str, CameraConfig]:
+        """Those of the simulated cell; the others are on ROS topics."""
+        return {name: camera for name, camera in self.cameras.items() if camera.topic is None}
 
     def model_of(self, arm: str) -> str:
         """The model that an arm is, or is part of."""

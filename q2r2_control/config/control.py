@@ -2,14 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
-from typing import Annotated, Literal
+from collections.abc import Collection, Mapping
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from q2r2_control.errors import ConfigError
 
 EQUAL = "equal"
+# What may change while a controller runs, of its settings.
+LIVE = (
+    "min_distance",
+    "position_gain",
+    "rotation_gain",
+    "linear_deceleration",
+    "angular_deceleration",
+    "max_linear_speed",
+    "max_angular_speed",
+    "posture_gain",
+)
 
 Distance = Annotated[float, Field(ge=0, le=0.2)]  # [m]
 ObjectDistance = Annotated[
@@ -122,6 +133,20 @@ class ControllerSettings(BaseModel):
     def without_contact(self) -> ControllerSettings:
         """The same, for modes in which nothing gives way: there ``contact_allowed`` allows nothing."""
         return self.model_copy(update={"contact_allowed": ()}) if self.contact_allowed else self
+
+    def changed(self, values: Mapping[str, Any]) -> ControllerSettings:
+        """The same with other ``values`` of what is in ``LIVE``, by name.
+
+        Raises :class:`ConfigError` for a name that is not among them and for a value that is not allowed.
+        """
+        for name, value in values.items():
+            if name not in LIVE:
+                raise ConfigError(f"control.{name} = {value!r:.60}: while a controller runs: {', '.join(LIVE)}")
+        try:
+            return ControllerSettings.model_validate(self.model_dump() | dict(values))
+        except ValidationError as error:
+            fault = error.errors()[0]
+            raise ConfigError(f"control.{fault['loc'][0]} = {fault['input']!r:.60}: {fault['msg']}") from error
 
     @property
     def largest_distance(self) -> tuple[str, float]:

@@ -54,4 +54,5 @@ class JudgeSettings(BaseModel):
     max_lost_gap: Seconds | None = Field(0.03, description="longest time of which no tick is in the file [s]")
     max_missed_share: Share | None = Field(0.5, description="of the ticks that were due: the loop was late")
     max_tick_gap: Seconds | None = Field(0.1, description="longest time between two ticks of the loop [s]")
+    keep_failed: bool = Field(False, description="one that failed, as its operator or task says, is kept")
     needs_end: bool = Field(True, description="a file that was not ended, by a killed process say, is discarded")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -15,13 +16,14 @@ from q2r2_control.control.geometry.kinematics import IntArray
 from q2r2_control.control.held_objects import ObjectLoads
 from q2r2_control.control.jit import bound
 from q2r2_control.control.kernel_model import kernel_model_of
+from q2r2_control.control.live_settings import LiveSettings
 from q2r2_control.control.qp import QpProblem, Solver, make_solver
 from q2r2_control.control.qp_assembly import assemble
 from q2r2_control.control.reference import move_reference, observe_bodies, spare_distance, start_reference
 from q2r2_control.control.safety.joint_limits import ACCELERATION, POSITION, VELOCITY
 from q2r2_control.control.safety.safety_filter import FOLLOWED, SEPARATION, STOPPED
 from q2r2_control.control.targets import TargetTracker
-from q2r2_control.errors import RobotError
+from q2r2_control.errors import ConfigError, RobotError
 from q2r2_control.robot.pairs import pairs_with_others
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import LONGEST_DT, Array, Interval, Reference, StepReport, StepStatus, pose_of
@@ -46,11 +48,12 @@ class CartesianController:
         self, robot: Robot, settings: ControllerSettings | None = None, *, solver: Solver | None = None
     ) -> None:
         self.robot = robot
-        self.settings = settings or ControllerSettings()
+        settings = settings or ControllerSettings()
         self._nv = robot.model.nv
         self._arms = tuple(robot.arms)
-        self._solver = solver or make_solver(self.settings.solver, self._nv, self.settings.solve_time_limit)
-        self._objects = ObjectLoads(robot, self.settings, kernel_model_of(robot, self.settings))
+        self._solver = solver or make_solver(settings.solver, self._nv, settings.solve_time_limit)
+        self._objects = ObjectLoads(robot, settings, kernel_model_of(robot, settings))
+        self._live = LiveSettings(robot, settings, self._objects)
         model, data = self._objects.model, self._objects.data
         self._state, self._rows, self._active = data.safety.state, data.safety.rows, data.safety.active
         self._stop, self._tasks = data.safety.certified, data.tasks
@@ -65,7 +68,7 @@ class CartesianController:
         )
         self._fingers = FingerOpenings(robot, self._objects.bodies)
         self._unchanged: IntArray = np.zeros(len(self._objects.bodies.joint), dtype=np.int64)
-        self._targets = TargetTracker(model.tasks, self._arms, self.settings)
+        self._targets = TargetTracker(model.tasks, self._arms, settings)
         names = [geometry.name for geometry in robot.collision_model.geometryObjects]
         watched = collision_model_of(robot).pairs  # the model's own know boxes that may be touched by other numbers
         pairs = zip(watched.first.tolist(), watched.second.tolist(), strict=True)
@@ -73,6 +76,33 @@ class CartesianController:
         self._take_load()
         self._compile()
         self.reset(robot.home)
+
+    @property
+    def settings(self) -> ControllerSettings:
+        """What was asked for, by :meth:`change` or at first."""
+        return self._live.settings
+
+    def change(self, values: Mapping[str, Any]) -> str | None:
+        """Go by other settings from the next step on, by name as in ``LIVE``; returns why not, or None.
+
+        Gains change over half a second. A smaller ``min_distance`` counts at once; a greater one for each pair as far
+        as it is proven, see :mod:`live_settings`: so nothing jumps, nothing is pushed apart and every promise is kept
+        at every tick (:attr:`kept_distances`). One that home does not keep is not possible.
+        """
+        try:
+            return self._live.change(self.settings.changed(values))
+        except ConfigError as error:
+            return str(error)
+
+    @property
+    def kept_distances(self) -> Array:
+        """What every monitored pair keeps now (p,) [m]; another array, not a changed one, when that changes."""
+        return self._live.kept
+
+    @property
+    def narrow_pair(self) -> tuple[str, str] | None:
+        """The pair that is farthest from keeping what was asked for, since it was too near yet; None: all keep it."""
+        return None if self._live.narrow < 0 else self._names[self._live.narrow]
 
     def _compile(self) -> None:
         """Run every kernel once, so that none is compiled in mid-motion."""
@@ -97,11 +127,13 @@ class CartesianController:
         self._fingers.set_all({})
         self._objects.clear()
         self._take_load()
+        self._live.restart()
         self._targets.reset(state.q)
         observed = start_reference(self._held_model, self._held_data)
         self._closest, self._distance, self._tightest, self._margin, proven = observed
         self._apart = self._margin >= 0.0
         self._certified = proven and self._apart
+        self._live.begin(self._objects.load)
 
     def _checked(self, name: str, values: Array) -> Array:
         array = np.array(values, dtype=np.float64)
@@ -192,7 +224,7 @@ class CartesianController:
 
         Raises :class:`RobotError` for an arm that has no object.
         """
-        if not self._objects.change(arm, holds):
+        if not self._objects.tell(arm, holds):
             return
         self._take_load()
         self._look_again(self._unchanged)
@@ -244,6 +276,7 @@ class CartesianController:
 
     def _advance(self, h: float, share: float, summary: _Summary) -> bool:
         """One substep, which is a ``share`` of the tick: build, solve, certify and move; whether it was solved."""
+        self._live.step(self._objects.load, h)
         summary.inside &= self._assemble(self._held_model, self._targets.held, self._held_data, h)
         count = int(self._rows.used[0])
         self._problem.rows, self._problem.rows_lower = self._rows.matrix[:count], self._rows.lower[:count]

@@ -27,6 +27,7 @@ from q2r2_control.control.geometry.kinematics import IntArray
 from q2r2_control.control.jit import Held, hold
 from q2r2_control.control.kernel_data import KernelData
 from q2r2_control.control.kernel_model import KernelModel, stop_buffer
+from q2r2_control.control.safety.provable_distances import provable_distances
 from q2r2_control.control.safety.safety_data import ActiveBounds, Rollout, SafetyData, SeparationRows
 from q2r2_control.control.safety.safety_model import SafetyModel
 from q2r2_control.control.safety.velocity_bounds import BodyVelocities
@@ -58,6 +59,7 @@ class ObjectLoads:
 
     def __init__(self, robot: Robot, settings: ControllerSettings, model: KernelModel) -> None:
         objects = robot.objects
+        self._robot = robot
         self._arms, self._holders = tuple(objects.by_arm), objects.holders
         self._goal: KeptDistances = kept_by_objects(robot, settings)
         self._buffer = stop_buffer(self._goal.values, settings)
@@ -82,7 +84,7 @@ class ObjectLoads:
             self._loads[counting] = self._load(counting)
         self.load = self._nothing
 
-    def change(self, arm: str, holds: bool) -> bool:
+    def tell(self, arm: str, holds: bool) -> bool:
         """Take it that an arm's gripper holds its object, or does not; whether that is new.
 
         A pair that begins to count has to :meth:`begin` then, once it was measured with the new :attr:`load`. Raises
@@ -129,6 +131,19 @@ class ObjectLoads:
         self._kept[pairs] = np.maximum(self._kept[pairs], np.minimum(self._goal.values[pairs], self._within_reach()))
         self._write()
 
+    def change(self, settings: ControllerSettings) -> None:
+        """Let pairs of objects keep what ``settings`` say: less at once, more as :meth:`grow` finds the room."""
+        self._goal = kept_by_objects(self._robot, settings)
+        self._buffer = stop_buffer(self._goal.values, settings)
+        self._kept = np.minimum(self._kept, self._goal.values)
+        self._write()
+
+    def write_monitored(self, kept: Array, stop_distance: Array) -> None:
+        """Tell the kernels what the other pairs keep, and at what distance they stop in the QP (p,) each [m]."""
+        for load in (self._nothing, *self._loads.values()):
+            load.safety.min_distance[: len(kept)] = kept
+            load.safety.approach.stop_distance[: len(kept)] = stop_distance
+
     def kept(self) -> Array:
         """What every pair of an object keeps now [m]; minus infinity where it does not count."""
         kept = np.full(len(self._kept), -np.inf)
@@ -137,11 +152,8 @@ class ObjectLoads:
 
     def _within_reach(self) -> Array:
         """d - S - buffer of the pairs that count [m]."""
-        pairs, state = self.load.safety.collision.pairs, self.load.measured.state
-        travel = 0.5 * state.v**2 / self.load.measured.certified
-        first = len(pairs.first) - len(self.load.objects)
-        way = (pairs.reach[first:] * travel[pairs.joint[first:] - 1]).sum(axis=1)  # reach is 0 where there is no joint
-        return np.asarray(self._distances() - way - self._buffer[self.load.objects])
+        lasting = provable_distances(self.load.safety, self.load.measured)
+        return np.asarray(lasting[len(lasting) - len(self.load.objects) :] - self._buffer[self.load.objects])
 
     def _distances(self) -> Array:
         """Of the pairs that count, or lower bounds of them [m]."""

@@ -107,7 +107,9 @@ def _task_model(robot: Robot, settings: ControllerSettings, safety: SafetyModel)
             stretch_gain=settings.stretch_gain,
         ),
         posture=Posture(
-            home=np.array(robot.home, dtype=np.float64), gain=settings.posture_gain, speed=settings.posture_speed
+            home=np.array(robot.home, dtype=np.float64),
+            gain=np.array([settings.posture_gain]),
+            speed=settings.posture_speed,
         ),
         manipulability_gain=settings.manipulability_gain,
         swivels=swivels,

@@ -48,6 +48,10 @@ class Drive(Protocol):
         """Of each arm whose gripper has an object, whether it is held."""
         ...
 
+    def set_kept_distances(self, kept: Array) -> None:
+        """How far apart every pair stays from now on, (p,) [m], as the controller's settings were changed."""
+        ...
+
     def displaced(self, targets: ToolTargets, state: RobotState, dt: float) -> ToolTargets:
         """The tool targets that the controller is to follow in a tick of ``dt`` [s]."""
         ...

@@ -47,6 +47,9 @@ class PositionDrive:
     def set_holding(self, holding: Mapping[str, bool]) -> None:
         """See :meth:`Drive.set_holding`: the plant's own servos bear it."""
 
+    def set_kept_distances(self, kept: Array) -> None:
+        """See :meth:`Drive.set_kept_distances`: nothing here has bodies."""
+
     def displaced(self, targets: ToolTargets, state: RobotState, dt: float) -> ToolTargets:
         """See :meth:`Drive.displaced`."""
         if self.admittance is None:

@@ -50,6 +50,10 @@ class TorqueDrive:
         """See :meth:`Drive.set_holding`: the impedance bears it. The wall knows no objects: they may touch."""
         self.impedance.set_holding(holding)
 
+    def set_kept_distances(self, kept: Array) -> None:
+        """See :meth:`Drive.set_kept_distances`: the wall begins there."""
+        self.wall.set_kept_distances(kept)
+
     def displaced(self, targets: ToolTargets, state: RobotState, dt: float) -> ToolTargets:
         """See :meth:`Drive.displaced`."""
         return targets

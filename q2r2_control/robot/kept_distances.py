@@ -9,9 +9,10 @@ import numpy as np
 
 from q2r2_control.config.control import ControllerSettings
 from q2r2_control.errors import ConfigError
+from q2r2_control.robot.floor import FLOOR
 from q2r2_control.robot.link_roles import Part, Role
 from q2r2_control.robot.pairs import link_of, pair_names
-from q2r2_control.robot.robot import Robot
+from q2r2_control.robot.robot import PairDistance, Robot
 from q2r2_control.types import Array
 
 _OUTERMOST_FIRST = list(Part)
@@ -40,6 +41,23 @@ def kept_by_objects(robot: Robot, settings: ControllerSettings) -> KeptDistances
     """The same of the pairs of ``robot.objects``; raises as :func:`kept_distances` does."""
     kept = _of_all_pairs(robot, settings)
     return _part(kept, slice(len(kept.keys) - len(robot.objects.holders), None))
+
+
+def too_close_at_home(robot: Robot, kept: KeptDistances) -> list[str]:
+    """A line for each pair that is nearer at home than it has to be, the nearest first."""
+    pairs = zip(robot.distances(robot.home), kept.values.tolist(), kept.keys, strict=True)
+    return [
+        f"home: {pair.name_a} and {pair.name_b} are {1e3 * pair.distance:.1f} mm apart; "
+        f"allowed: at least {key}, {1e3 * least:.1f} mm{_way_out(pair)}"
+        for pair, least, key in sorted(pairs, key=lambda found: found[0].distance)
+        if pair.distance < least
+    ]
+
+
+def _way_out(pair: PairDistance) -> str:
+    """What the cell's YAML says about a floor that is not where it was meant to be, or was not meant at all."""
+    with_floor = FLOOR in (link_of(pair.name_a), link_of(pair.name_b))
+    return "; the key floor takes another height, or null for no floor" if with_floor else ""
 
 
 def _part(kept: KeptDistances, pairs: slice) -> KeptDistances:

@@ -183,6 +183,15 @@ class Robot:
         pin.computeDistances(self.model, self._data, self.collision_model, self._collision_data, q)
         return np.array([result.min_distance for result in self._collision_data.distanceResults], dtype=np.float64)
 
+    def closest_points(self, q: Array, pair: tuple[str, str]) -> Array | None:
+        """The nearest points (2, 3) [m] of a monitored pair in the world at ``q`` (nv,); None where it is none."""
+        names = pair_names(self.collision_model)
+        if pair not in names:
+            return None
+        pin.updateGeometryPlacements(self.model, self._data, self.collision_model, self._collision_data, q)
+        result = pin.computeDistance(self.collision_model, self._collision_data, names.index(pair))
+        return np.array([result.getNearestPoint1(), result.getNearestPoint2()])
+
     def _monitor(
         self, tree: LinkTree, exclusions: Iterable[ET.Element] | None, own_links: Sequence[set[str]]
     ) -> tuple[tuple[str, str], ...]:

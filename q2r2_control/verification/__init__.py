@@ -15,8 +15,9 @@ from q2r2_control._lazy import lazy_exports
 
 if TYPE_CHECKING:
     from q2r2_control.verification.adversary import Adversary
-    from q2r2_control.verification.contract import Contract, Margin
+    from q2r2_control.verification.contract import Contract
     from q2r2_control.verification.fault_injection import FaultySolver
+    from q2r2_control.verification.promises import Margin
     from q2r2_control.verification.soak import Soak, SoakReport, run_soak
     from q2r2_control.verification.work_hands import WorkHands
     from q2r2_control.verification.work_motions import WORK_MOTIONS, WorkMotion, motions_named
@@ -41,7 +42,7 @@ __getattr__ = lazy_exports(
         "Adversary": "adversary",
         "Contract": "contract",
         "FaultySolver": "fault_injection",
-        "Margin": "contract",
+        "Margin": "promises",
         "Soak": "soak",
         "SoakReport": "soak",
         "WORK_MOTIONS": "work_motions",

@@ -8,6 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import pinocchio as pin
 
+from q2r2_control.config.control import ControllerSettings
+from q2r2_control.robot.pairs import CLEARANCE
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import ALL_OF_THE_WAY, Array, Interval
 from q2r2_control.verification.work_motions import ARMS, WORK_MOTIONS
@@ -264,3 +266,20 @@ class HostileGrasps:
         if not self._arms or self._random.random() > 0.02:
             return None
         return str(self._random.choice(self._arms)), bool(self._random.random() < 0.7)
+
+
+class HostileChanges:
+    """Draws settings that change in mid-motion: distances up and down by any amount, gains of a tenth and of twice."""
+
+    def __init__(self, settings: ControllerSettings, random: np.random.Generator) -> None:
+        self._settings, self._random = settings, random
+
+    def draw(self) -> dict[str, float] | None:
+        """Settings for this tick by name, or None."""
+        if self._random.random() > 0.01:
+            return None
+        if self._random.random() < 0.7:
+            return {"min_distance": float(self._random.choice([0.0, self._settings.min_distance, CLEARANCE]))}
+        name = str(self._random.choice(["position_gain", "rotation_gain", "posture_gain", "max_linear_speed"]))
+        share = float(self._random.choice([0.1, 1.0, 2.0]))
+        return {name: share * float(getattr(self._settings, name))}

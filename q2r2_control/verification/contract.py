@@ -9,101 +9,41 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
-import pinocchio as pin
 
 from q2r2_control.config.control import ControllerSettings
-from q2r2_control.control.geometry.collision import collision_model_of
-from q2r2_control.control.geometry.rounded_boxes import deeper_at_corners
-from q2r2_control.robot.finger_openings import collision_model_at
-from q2r2_control.robot.kept_distances import kept_distances
+from q2r2_control.robot.kept_distances import kept_by_objects, kept_distances
 from q2r2_control.robot.pairs import pair_names
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import LONGEST_DT, Array, Interval, Reference, StepReport
+from q2r2_control.verification.measured_distances import MeasuredDistances
+from q2r2_control.verification.promises import PROMISES, RELATIVE, Margin
 
 _NEWEST = 5000  # ticks whose accelerations are kept
 _ROUNDING = 4.0 * np.finfo(np.float64).eps  # of a difference, relative to the numbers
-_RELATIVE = 1e-9  # to which the contract promises limits
-_COAL = 2e-6  # how exactly Coal measures a capsule from a box [m]
 _BETWEEN_SHARE, _BETWEEN_SAMPLES = 0.02, 4  # share of the ticks that are sampled, and postures in each
 _STOP_SHARE, _STOP_SAMPLES = 0.005, 41
-
-_PROMISES = {  # key: name, unit, and what its value has to be
-    "exceptions": ("exceptions raised by step", "", "<=", 0.0),
-    "not_finite": ("references that are not finite", "", "<=", 0.0),
-    "unreported": ("unusable targets not reported", "", "<=", 0.0),
-    "refused": ("usable targets rejected", "", "<=", 0.0),
-    "idle": ("motion in a dt that is no time", "rad", "<=", 0.0),
-    "acceleration": ("acceleration / limit", "", "<=", 1.0 + _RELATIVE),
-    "velocity": ("velocity / limit", "", "<=", 1.0 + _RELATIVE),
-    "too_fast": ("started too fast: faster still", "rad/s", "<=", 0.0),
-    "position": ("room to position limits", "rad", ">=", -1e-11),
-    "outward": ("started outside limits: further out", "rad", "<=", 0.0),
-    "deceleration": ("deceleration of the stop / limit", "", "<=", 1.0 + _RELATIVE),
-    "jump": ("travel in a tick / what v allows", "", "<=", 1.0),
-    "parabola": ("off constant acceleration or the stop", "rad", "<=", 1e-11),
-    "distance": ("distance - kept distance, at ticks", "m", ">=", 0.0),
-    "between": ("distance - kept distance, between ticks", "m", ">=", -_COAL),
-    "stop": ("distance - kept distance, full stops", "m", ">=", -_COAL),
-    "stop_position": ("room to position limits, full stops", "rad", ">=", -_RELATIVE),
-    "coal": ("reported distance off Coal's", "m", "<=", _COAL),
-    "bystanders": ("pairs apart while others recover", "m", ">=", -_COAL),
-    "uncertified": ("certificates lost", "", "<=", 0.0),
-    "loosened": ("held objects: kept distance falls by", "m", "<=", 0.0),
-    "approach": ("recovery: closer by, in a tick", "m", "<=", 1e-9),
-    "not_stopped": ("solver failed: off the stop", "rad", "<=", 1e-11),
-    "unsaid": ("solver failed: stop not reported", "", "<=", 0.0),
-}
-
-
-@dataclass(slots=True)
-class Margin:
-    """One promise: ``worst`` has to stay at or below ``allowed`` (``sense`` "<=") or at or above it (">=")."""
-
-    name: str
-    unit: str
-    sense: str
-    allowed: float
-    worst: float = field(init=False)
-    tick: int | None = None  # of the worst
-    checked: int = 0
-    violations: int = 0
-
-    def __post_init__(self) -> None:
-        self.worst = -math.inf if self.sense == "<=" else math.inf
-
-    def note(self, value: float, tick: int) -> bool:
-        """Keep the worst; False where the promise is broken. What is not a number breaks it."""
-        self.checked += 1
-        if self.sense == "<=":
-            worse, kept = not value <= self.worst, value <= self.allowed
-        else:
-            worse, kept = not value >= self.worst, value >= self.allowed
-        if worse and not math.isnan(self.worst):
-            self.worst, self.tick = value, tick
-        self.violations += not kept
-        return kept
-
-    def described(self, value: float) -> str:
-        """One value of this promise beside what is allowed."""
-        return f"{self.name}: {f'{value:.12g} {self.unit}'.rstrip()}, allowed {self.sense} {self.allowed:.12g}"
 
 
 class Checked(Protocol):
     """What a contract has to know of its controller."""
 
     robot: Robot
-    settings: ControllerSettings
+
+    @property
+    def settings(self) -> ControllerSettings: ...
 
     @property
     def stop_deceleration(self) -> Array: ...
 
     @property
     def object_distances(self) -> Array: ...
+
+    @property
+    def kept_distances(self) -> Array: ...
 
 
 def time_of(dt: Any) -> float:
@@ -131,39 +71,36 @@ class Contract:
         random: np.random.Generator | None = None,
         sample_all: bool = False,
     ) -> None:
-        self.margins = {key: Margin(*row) for key, row in _PROMISES.items()}
+        self.margins = {key: Margin(*row) for key, row in PROMISES.items()}
         self.ticks = self.fallbacks = self.uncertified = 0
         self._broken: dict[str, float] = {}
         robot, settings = controller.robot, controller.settings
         self._controller = controller
         self._robot, self._random = robot, np.random.default_rng(0) if random is None else random
-        self._data = robot.model.createData()
         self._sample_all = sample_all
         self._a = robot.capped_acceleration(settings.acceleration_limit)
         self._v_max = robot.velocity_limit * settings.velocity_scale
         self._lower = robot.position_lower + settings.position_margin
         self._upper = robot.position_upper - settings.position_margin
-        self._kept = kept_distances(robot, settings).values
-        self._at_corners = deeper_at_corners(collision_model_of(robot), self._kept)
-        pairs = map(frozenset, pair_names(robot.collision_model))
-        self._kept_by_name = dict(zip(pairs, self._kept.tolist(), strict=True))
+        self._ask(settings)
+        self._measured = MeasuredDistances(robot, self._asked)
+        self._pairs = [frozenset(pair) for pair in pair_names(robot.collision_model)]
+        self._take_kept()
         self._objects = [frozenset(pair) for pair in robot.objects.pair_names()]
-        self._held_model = robot.objects.geometry
-        self._held_data: pin.GeometryData = self._held_model.createData()
         self._substep = settings.max_substep
         self.start(robot.home if q is None else q, v)
 
     def start(self, q: Array, v: Array | None = None) -> None:
         """The controller was reset to ``q`` [rad], ``v`` [rad/s], (nv,) each; without ``v`` at rest."""
         v = np.zeros_like(q) if v is None else v
+        self._take_kept()
         self._q, self._v, self._stop = q.copy(), v.copy(), self._controller.stop_deceleration
-        self._fingers: tuple[pin.GeometryModel, pin.GeometryData] | None = None  # None: all of their way
+        self._measured.forget()
         self._outside = np.maximum(np.maximum(self._lower - q, q - self._upper), 0.0)
         self._excess = self._excess_of(v)
         self._can_stop = self._stops_inside(q, v)
         self._slow = self._excess == 0.0
-        self._held = np.full(len(self._objects), -np.inf)  # what pairs of objects keep [m]
-        margins = self._margins(q)
+        margins = self._measured.margins(q)
         self._from_rest = not v.any()
         self._apart = (margins >= 0.0) & self._from_rest
         # Whether a certificate has to be known from now on. A start at rest with all apart is its own.
@@ -178,16 +115,36 @@ class Contract:
         """
         if before_step:
             self._stop = self._controller.stop_deceleration
-        model = collision_model_at(self._robot.collision_model, self._robot.finger_bodies, openings)
-        self._fingers = model, model.createData()
+        self._measured.set_openings(openings)
+
+    def _ask(self, settings: ControllerSettings) -> None:
+        self._settings = settings
+        self._asked = kept_distances(self._robot, settings).values
+        self._asked_of_objects = kept_by_objects(self._robot, settings).values
+
+    def _take_kept(self) -> None:
+        """Take over what pairs keep since this tick began, for which it has to be proven."""
+        self._measured.kept = self._controller.kept_distances
+        self._kept_by_name = dict(zip(self._pairs, self._measured.kept.tolist(), strict=True))
+
+    def _note_kept(self) -> None:
+        """What pairs keep may fall to what is asked for, and no farther."""
+        before, kept, settings = self._measured.kept, self._controller.kept_distances, self._controller.settings
+        if settings is not self._settings:
+            self._ask(settings)
+        if len(before):
+            self._note("withdrawn", float((np.minimum(before, self._asked) - kept).max()))
+        if kept is not before:
+            self._take_kept()
 
     def _note_objects(self) -> None:
-        """Take over what pairs of objects keep, which never falls while they count."""
+        """Take over what pairs of objects keep, which never falls while they count but to what is asked for."""
         held = self._controller.object_distances
-        counted = np.isfinite(self._held) & np.isfinite(held)
+        counted = np.isfinite(self._measured.held) & np.isfinite(held)
         if counted.any():
-            self._note("loosened", float((self._held[counted] - held[counted]).max()))
-        self._held = held
+            before = np.minimum(self._measured.held, self._asked_of_objects)[counted]
+            self._note("loosened", float((before - held[counted]).max()))
+        self._measured.held = held
 
     def check(
         self, reference: Reference, dt: Any, unusable: frozenset[str] | None = None, failed: bool = False
@@ -209,6 +166,7 @@ class Contract:
         self._broken = {}
         q, v, h, report = reference.q, reference.v, time_of(dt), reference.report
         finite = bool(np.isfinite(np.sum(q) + np.sum(v) + np.sum(reference.a)))
+        self._note_kept()
         self._note("exceptions", 0.0)
         self._note("not_finite", float(not finite))
         if finite:
@@ -306,7 +264,7 @@ class Contract:
 
     def _excess_of(self, v: Array) -> Array:
         """Speed above the limit (nv,) [rad/s]."""
-        return np.asarray(np.maximum(np.abs(v) - self._v_max * (1.0 + _RELATIVE), 0.0))
+        return np.asarray(np.maximum(np.abs(v) - self._v_max * (1.0 + RELATIVE), 0.0))
 
     def _stops_inside(self, q: Array, v: Array) -> npt.NDArray[np.bool_]:
         """Joints inside their limits that full braking, begun one substep late, keeps there."""
@@ -337,14 +295,14 @@ class Contract:
         """Measure distances that the controller did not measure itself."""
         draw = 0.0 if self._sample_all else self._random.random()
         if draw < _BETWEEN_SHARE:
-            values = self._distances(q)
-            margins = values - self._kept + self._at_corners
+            values, kept = self._measured.values(q), self._measured.kept
+            margins = self._measured.less_kept(values)
             of_object = {frozenset(report.closest_pair), frozenset(report.tightest_pair)} & set(self._objects)
             if len(values) and values.min() > 0.0 and not of_object:  # Coal's penetration depth is another quantity
                 # Boxes that may be touched are rounded for the controller.
-                if self._kept[int(values.argmin())] >= 0.0 <= self._kept_by_name[frozenset(report.closest_pair)]:
+                if kept[int(values.argmin())] >= 0.0 <= self._kept_by_name[frozenset(report.closest_pair)]:
                     self._note("coal", abs(float(values.min()) - report.closest_distance))
-                if self._kept[int(margins.argmin())] >= 0.0 <= self._kept_by_name[frozenset(report.tightest_pair)]:
+                if kept[int(margins.argmin())] >= 0.0 <= self._kept_by_name[frozenset(report.tightest_pair)]:
                     self._note("coal", abs(float(margins.min()) - report.margin))
             if not self._certain and self._apart.any():
                 self._note("bystanders", float(margins[self._apart].min()))
@@ -353,7 +311,7 @@ class Contract:
         if draw < _STOP_SHARE and self._certain:
             duration = float(np.max(np.abs(v) / stop))
             times = duration * (np.arange(_STOP_SAMPLES) + self._random.random()) / _STOP_SAMPLES
-            self._note("stop", self._least_of(self._braked(q, v, stop, times[:, None])[0]))
+            self._note("stop", self._measured.least_of(self._braked(q, v, stop, times[:, None])[0]))
         if draw < _STOP_SHARE and self._can_stop.all():
             end = q + v * np.abs(v) / (2.0 * stop)
             self._note("stop_position", float(np.minimum(end - self._lower, self._upper - end).min()))
@@ -361,35 +319,5 @@ class Contract:
     def _least_between(self, v: Array, h: float) -> float:
         times = h * self._random.random((_BETWEEN_SAMPLES, 1))
         if self._parabola:
-            return self._least_of(self._q + times * self._v + 0.5 * times**2 / h * (v - self._v))
-        return self._least_of(self._braked(self._q, self._v, self._stop, times)[0])
-
-    def _least_of(self, postures: Array) -> float:
-        """Least margin of a pair at any of ``postures`` (s, nv) [m]."""
-        return min(
-            min(float(self._margins(q).min(initial=np.inf)), float(self._object_margins(q).min(initial=np.inf)))
-            for q in postures
-        )
-
-    def _margins(self, q: Array) -> Array:
-        """How much farther apart than it has to be every pair is (p,) [m]."""
-        return self._distances(q) - self._kept + self._at_corners
-
-    def _object_margins(self, q: Array) -> Array:
-        """The same of the pairs of held objects that are apart, or have to be [m]."""
-        count = len(self._held)
-        if not count or not np.isfinite(self._held).any():
-            return np.zeros(0)
-        pin.computeDistances(self._robot.model, self._data, self._held_model, self._held_data, q)
-        results = list(self._held_data.distanceResults)[-count:]
-        values = np.array([result.min_distance for result in results], dtype=np.float64)
-        seen = np.isfinite(self._held) & ((values > 0.0) | (self._held >= 0.0))  # Coal's depth is another quantity
-        return (values - self._held)[seen]
-
-    def _distances(self, q: Array) -> Array:
-        """As :meth:`Robot.distance_values`, with fingers at the openings that the controller counts with."""
-        if self._fingers is None:
-            return self._robot.distance_values(q)
-        model, data = self._fingers
-        pin.computeDistances(self._robot.model, self._data, model, data, q)
-        return np.array([result.min_distance for result in data.distanceResults], dtype=np.float64)
+            return self._measured.least_of(self._q + times * self._v + 0.5 * times**2 / h * (v - self._v))
+        return self._measured.least_of(self._braked(self._q, self._v, self._stop, times)[0])

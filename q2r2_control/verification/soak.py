@@ -19,9 +19,10 @@ from q2r2_control.errors import ConfigError
 from q2r2_control.robot.kept_distances import kept_distances
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, Interval, Reference
-from q2r2_control.verification.adversary import HostileGrasps, HostileGrippers, Request
-from q2r2_control.verification.contract import Checked, Contract, Margin, time_of
+from q2r2_control.verification.adversary import HostileChanges, HostileGrasps, HostileGrippers, Request
+from q2r2_control.verification.contract import Checked, Contract, time_of
 from q2r2_control.verification.fault_injection import STOPPING_FAULTS, FaultySolver, Segment, segments
+from q2r2_control.verification.promises import Margin
 
 FEWEST_TICKS = 100
 _SETTLED = 0.1  # share of the ticks after which memory should have stopped growing
@@ -33,6 +34,7 @@ _COUNTED = (
     "openings",
     "openings_refused",
     "grasps",
+    "changes",
     "fallbacks",
     "fallbacks_healthy",
 )
@@ -51,6 +53,8 @@ class Steppable(Checked, Protocol):
     def openings(self) -> Mapping[str, Interval]: ...
 
     def set_holding(self, arm: str, holds: bool) -> None: ...
+
+    def change(self, values: Mapping[str, Any]) -> str | None: ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,6 +86,7 @@ class SoakReport:
     openings: int  # of grippers that were told
     openings_refused: int
     grasps: int  # of objects, and releases
+    changes: int  # of settings
     fallbacks: int  # ticks, of all
     fallbacks_healthy: int  # ticks, of those with a healthy solver
     margins: list[Margin]
@@ -132,6 +137,7 @@ class Soak:
         self._simulated = 0.0
         self._grippers = HostileGrippers(controller.robot.arms, np.random.default_rng([seed, 3]))
         self._objects = HostileGrasps(controller.robot.objects.by_arm, np.random.default_rng([seed, 4]))
+        self._changes = HostileChanges(controller.settings, np.random.default_rng([seed, 5]))
 
     def run(self, ticks: int) -> SoakReport:
         """Run ``ticks`` ticks."""
@@ -181,6 +187,8 @@ class Soak:
         self._solver.fault = fault
         self._tell_opening()
         self._tell_holding()
+        if (values := self._changes.draw()) is not None:
+            self._counts["changes"] += self._controller.change(values) is None
         try:
             reference = self._controller.step(request.targets, dt)
         except Exception as error:  # the contract promises none

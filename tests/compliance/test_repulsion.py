@@ -15,6 +15,7 @@ from q2r2_control.config import load_config
 from q2r2_control.config.control import ControllerSettings, WallSettings
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.robot.finger_openings import collision_model_at
+from q2r2_control.robot.kept_distances import kept_distances
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, Command, CommandMode
 from tests.control.cells import cell, random_posture
@@ -298,3 +299,12 @@ def test_pressed_towards_the_table_the_arm_rests_where_the_spring_bears_the_forc
     deepest, alone = sum(depths[-100:]) / 100, 40.0 / WallSettings().stiffness
     assert alone / 4 < deepest < alone, "the four capsules of the finger tips share the force"
     assert np.abs(np.diff(torques[-500:], axis=0)).max() < 0.02
+
+
+def test_a_wall_begins_where_pairs_are_told_to_stay_later_as_if_it_had_been_made_so() -> None:
+    wider = ControllerSettings(min_distance=0.04)
+    made, told = MeasuredSeparation(ROBOT, wider), MeasuredSeparation(ROBOT, ControllerSettings())
+    q = _postures()[0][0]
+    assert not np.array_equal(told.update(q, REST).tau, made.update(q, REST).tau)
+    told.set_kept_distances(kept_distances(ROBOT, wider).values)
+    np.testing.assert_array_equal(told.update(q, REST).tau, made.update(q, REST).tau)

@@ -209,7 +209,13 @@ class TestTheShippedCellShowsAllThereIsToTune:
     def test_the_example_of_a_camera_is_one(self) -> None:
         (example,) = re.findall(r"# (\{front: \{.*\}\}):", CELL.read_text(encoding="utf-8"))
         config = Config.model_validate(yaml.safe_load(changed("cameras", yaml.safe_load(example))))
-        assert config.cameras["front"].model_fields_set == CameraConfig.model_fields.keys() - {"link", "rpy"}
+        assert config.cameras["front"].model_fields_set == CameraConfig.model_fields.keys() - {"link", "rpy", "topic"}
+
+    def test_the_example_of_a_real_camera_is_one_and_not_of_the_simulated_cell(self) -> None:
+        (example,) = re.findall(r"# (\{front: \{topic.*\}\})\n", CELL.read_text(encoding="utf-8"))
+        config = Config.model_validate(yaml.safe_load(changed("cameras", yaml.safe_load(example))))
+        assert config.cameras["front"].topic == "/front/image_raw/compressed"
+        assert config.simulated_cameras == {}
 
 
 @pytest.mark.parametrize(
@@ -397,6 +403,9 @@ def test_a_misspelt_key_is_named_before_the_one_that_is_missing_for_it(tmp_path:
         ("admittance.enabled", 1, "valid boolean"),
         ("admittance.mass", 0, "greater than or equal to 0.5"),
         ("cameras.front", {"position": [1, 0, 1]}, "allowed: either look_at or rpy"),
+        ("cameras.front", {"width": 640}, "allowed: position, or topic of a real camera"),
+        ("cameras.front", {"topic": "/front", "position": [1, 0, 1]}, "position: allowed: without topic"),
+        ("cameras.front", {"topic": "front image"}, "should match pattern"),
         ("cameras.front", {"position": [1, 0, 1], "look_at": [1, 0, 1]}, "allowed: another point"),
         ("cameras.front", {"position": [1, 0, 1], "rpy": [0, 0, 0], "width": 641}, "a multiple of 2"),
         ("cameras", {"front/left": {"position": [1, 0, 1], "rpy": [0, 0, 0]}}, "should match pattern"),

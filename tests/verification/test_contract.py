@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 
 from q2r2_control.config import ControllerSettings, load_config
+from q2r2_control.robot.kept_distances import kept_distances
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, Reference, StepReport, StepStatus
-from q2r2_control.verification.contract import Contract, Margin
+from q2r2_control.verification.contract import Contract
+from q2r2_control.verification.promises import Margin
 from tests.control.test_scenarios import in_penetration
 
 SETTINGS = ControllerSettings()
@@ -37,7 +39,10 @@ def apart(robot: Robot) -> StepReport:
 def checked(robot: Robot) -> Any:
     """A controller as a contract sees it, whose stop takes every joint's limit."""
     limit = robot.capped_acceleration(SETTINGS.acceleration_limit)
-    return SimpleNamespace(robot=robot, settings=SETTINGS, stop_deceleration=limit, object_distances=np.zeros(0))
+    kept = kept_distances(robot, SETTINGS).values
+    return SimpleNamespace(
+        robot=robot, settings=SETTINGS, stop_deceleration=limit, object_distances=np.zeros(0), kept_distances=kept
+    )
 
 
 def contract_of(robot: Robot, q: Array | None = None, v: Array | None = None) -> Contract:

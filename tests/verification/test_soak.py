@@ -15,6 +15,7 @@ from q2r2_control.config.control import ControllerSettings
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.control.qp import make_solver
 from q2r2_control.errors import ConfigError
+from q2r2_control.robot.kept_distances import kept_distances
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, Interval, Reference
 from q2r2_control.verification.contact_cells import FINGERS, with_contact
@@ -59,9 +60,16 @@ class Sabotaged:
     def set_holding(self, arm: str, holds: bool) -> None:
         controller_and_solver()[0].set_holding(arm, holds)
 
+    def change(self, values: Any) -> str | None:
+        return "a distance that has changed would hide what is sabotaged"
+
     @property
     def object_distances(self) -> Array:
         return controller_and_solver()[0].object_distances
+
+    @property
+    def kept_distances(self) -> Array:
+        return kept_distances(self.robot, self.settings).values
 
     @property
     def stop_deceleration(self) -> Array:

@@ -21,7 +21,7 @@ class Approach(NamedTuple):
 
 
 class SafetyModel(NamedTuple):
-    """What does not change in a tick, and between ticks but for bodies of fingers and what objects keep."""
+    """What does not change in a tick; between ticks bodies of fingers and the distances that pairs keep may."""
 
     collision: CollisionModel
     limits: JointLimits

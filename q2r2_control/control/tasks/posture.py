@@ -16,14 +16,14 @@ from q2r2_control.types import Array
 
 # A held arm is not pushed about by the other one's task, but may give way to recover separation.
 _HOLD_WEIGHT = 300.0
-_HOLD_GAIN = 4.0  # [1/s]
+HOLD_GAIN = 4.0  # [1/s]
 _PROJECTION_DAMPING = 1e-3
 
 
 @lean_kernel
 def pull_to_posture(model: TaskModel, data: TaskData, targets: Targets, q: Array) -> None:
     """Velocity of every joint from ``q`` (nv,) towards the posture that is asked for, into ``data.posture``."""
-    gain, speed = model.posture.gain, model.posture.speed
+    gain, speed = model.posture.gain[0], model.posture.speed
     for j in range(q.shape[0]):
         data.posture[j] = clamp(gain * (targets.posture[j] - q[j]), -speed, speed)
 
@@ -34,7 +34,7 @@ def add_hold_task(data: TaskData, targets: Targets, i: int, q: Array) -> None:
     for j in range(q.shape[0]):
         if targets.member[i, j] == 1.0:
             data.H[j, j] += _HOLD_WEIGHT
-            data.g[j] -= _HOLD_WEIGHT * _HOLD_GAIN * (targets.hold[j] - q[j])
+            data.g[j] -= _HOLD_WEIGHT * HOLD_GAIN * (targets.hold[j] - q[j])
             data.posture[j] = 0.0
 
 

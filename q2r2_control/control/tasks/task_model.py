@@ -21,7 +21,7 @@ class Tools(NamedTuple):
 
 
 class Motion(NamedTuple):
-    """How a tool approaches its target, linear then angular."""
+    """How a tool approaches its target, linear then angular; the arrays may change between ticks."""
 
     gain: Array  # (2,) [1/s]
     deceleration: Array  # (2,) [m/s^2, rad/s^2]
@@ -33,7 +33,7 @@ class Posture(NamedTuple):
     """Where joints go that the tools leave free."""
 
     home: Array  # (nv,) [rad]
-    gain: float  # [1/s]
+    gain: Array  # (1,), which may change between ticks [1/s]
     speed: float  # at most [rad/s]
 
 
@@ -66,7 +66,7 @@ class Priority(NamedTuple):
 
 
 class TaskModel(NamedTuple):
-    """What does not change between ticks."""
+    """What does not change in a tick, and between ticks but for the gains of ``motion`` and ``posture``."""
 
     chain: Chain
     tools: Tools

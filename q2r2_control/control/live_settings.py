@@ -1,0 +1,172 @@
+"""Settings of a controller that change while it moves: distances that pairs keep, and gains.
+
+**Distances.** A greater one makes a state uncertified that was certified. So a pair keeps more only as far as the stop
+at hand is proven with it: never more than  d - S - buffer,  with the pair's distance d at the reference and the bound S
+of how much closer the stop brings it (stop_certificate.py). What a pair keeps
+
+- falls at once, when less is asked for: what was proven stays proven;
+- grows at ``GROWTH`` towards what is asked for, and no farther than that bound, before a step is decided on. So the
+  step is proven with the greater distance, and the invariant of safety/README.md holds at every tick;
+- never falls while it grows. A pair that is nearer than asked for is not pushed apart: it keeps the room that it has,
+  and more when it gets more. It holds up no motion that opens it.
+
+After a reset pairs keep at once what the posture leaves them of what was asked for later, and what the controller
+was made with in any case: out of a start nearer than that it recovers, as without any change.
+
+**Gains** go to their new values on a straight line, so that what a tool is asked for does not jump. Speeds and
+accelerations stay within the limits of joints whatever the gains are.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from q2r2_control.config.control import ControllerSettings
+from q2r2_control.control.held_objects import Load, ObjectLoads
+from q2r2_control.control.kernel_model import stop_buffer
+from q2r2_control.control.safety.provable_distances import provable_distances
+from q2r2_control.control.tasks.task_model import TaskModel
+from q2r2_control.robot.kept_distances import KeptDistances, kept_distances, too_close_at_home
+from q2r2_control.robot.pairs import CLEARANCE
+from q2r2_control.robot.robot import Robot
+from q2r2_control.types import Array
+
+GROWTH = 0.05  # of what a pair keeps [m/s]
+_PERIOD = 0.01  # between two looks at distances that grow [s]
+_RAMP_TIME = 0.5  # of gains [s]
+
+
+class LiveSettings:
+    """What of one controller's settings is in force, on its way to what was asked for."""
+
+    def __init__(self, robot: Robot, settings: ControllerSettings, objects: ObjectLoads) -> None:
+        self._robot, self._objects = robot, objects
+        self._distances = LiveDistances(robot, settings, objects)
+        self._gains = LiveGains(objects.model.tasks, settings)
+        self.settings = settings
+
+    @property
+    def kept(self) -> Array:
+        """What every monitored pair keeps now (p,) [m]; another array whenever something of it has changed."""
+        return self._distances.kept
+
+    @property
+    def narrow(self) -> int:
+        """The pair that keeps the least of what it was asked for, or -1 where all keep all of it."""
+        return self._distances.narrow
+
+    def change(self, settings: ControllerSettings) -> str | None:
+        """Go to ``settings``, which differ in ``LIVE`` only; returns why not, and changes nothing then, or None."""
+        before, kept = self.settings.min_distance, kept_distances(self._robot, settings)
+        if settings.min_distance > before:
+            if settings.min_distance > CLEARANCE:
+                return (
+                    f"min_distance = {settings.min_distance:g} m: allowed while a controller runs: up to "
+                    f"{CLEARANCE:g}, since pairs that always stay farther apart are not watched"
+                )
+            # Arms at home then keep all of it, and rest.
+            room = replace(kept, values=kept.values + stop_buffer(kept.values, settings))
+            if faults := too_close_at_home(self._robot, room):
+                return f"min_distance = {settings.min_distance:g} m: {faults[0]} with distance_buffer"
+        self.settings = settings
+        self._distances.aim(kept, settings)
+        self._objects.change(settings)
+        self._gains.aim(settings)
+        return None
+
+    def restart(self) -> None:
+        """Before a reset is observed: begin with what does not depend on where that is."""
+        self._distances.restart()
+        self._gains.finish()
+
+    def begin(self, load: Load) -> None:
+        """After a reset was observed: keep what the posture allows."""
+        self._distances.grow(load, np.inf)
+
+    def step(self, load: Load, h: float) -> None:
+        """Before a step of ``h`` [s] from an observed reference."""
+        self._gains.step(h)
+        if self._distances.growing:
+            self._distances.step(load, h)
+
+
+class LiveDistances:
+    """What monitored pairs keep, and what they are to keep."""
+
+    def __init__(self, robot: Robot, settings: ControllerSettings, objects: ObjectLoads) -> None:
+        self._objects, self._settings = objects, settings
+        self._goal = self._least = kept_distances(robot, settings).values  # least: without any change
+        self.kept = self._goal
+        self.growing, self._due = False, 0.0
+
+    @property
+    def narrow(self) -> int:
+        return int(np.argmax(self._goal - self.kept)) if self.growing else -1
+
+    def aim(self, goal: KeptDistances, settings: ControllerSettings) -> None:
+        self._goal, self._settings, self._due = goal.values, settings, 0.0
+        self._write(np.minimum(self.kept, self._goal))
+
+    def restart(self) -> None:
+        self._due = 0.0
+        if self.growing:
+            self._write(np.minimum(self._goal, self._least))
+
+    def step(self, load: Load, h: float) -> None:
+        self._due -= h
+        if self._due <= 0.0:
+            self._due = _PERIOD
+            self.grow(load, GROWTH * max(_PERIOD, h))
+
+    def grow(self, load: Load, most: float) -> None:
+        """Keep more, by at most ``most`` [m], where the stop at hand proves it."""
+        if not self.growing:
+            return
+        lasting = provable_distances(load.safety, load.measured)[: len(self._goal)]
+        room = lasting - stop_buffer(self._goal, self._settings)
+        self._write(np.maximum(self.kept, np.minimum(np.minimum(self._goal, self.kept + most), room)))
+
+    def _write(self, kept: Array) -> None:
+        self.growing = bool((kept < self._goal).any())
+        if not np.array_equal(kept, self.kept):
+            self.kept = kept
+            self._objects.write_monitored(kept, kept + stop_buffer(kept, self._settings))
+
+
+class LiveGains:
+    """The task kernels' gains and speeds."""
+
+    def __init__(self, tasks: TaskModel, settings: ControllerSettings) -> None:
+        motion = tasks.motion
+        self._arrays = (motion.gain, motion.deceleration, motion.full_speed, tasks.posture.gain)
+        self._goal, self._left = _gains_of(settings), 0.0
+
+    def aim(self, settings: ControllerSettings) -> None:
+        goal = _gains_of(settings)
+        if not np.array_equal(goal, self._goal):
+            self._goal, self._left = goal, _RAMP_TIME
+
+    def finish(self) -> None:
+        if self._left:
+            self.step(self._left)
+
+    def step(self, h: float) -> None:
+        if not self._left:
+            return
+        share, self._left = min(h / self._left, 1.0), max(self._left - h, 0.0)
+        for values, goal in zip(self._arrays, np.split(self._goal, [2, 4, 6]), strict=True):
+            values[:] = goal if share == 1.0 else values + share * (goal - values)
+
+
+def _gains_of(settings: ControllerSettings) -> Array:
+    """In the order of the kernels' arrays."""
+    return np.array(
+        [
+            *(settings.position_gain, settings.rotation_gain),
+            *(settings.linear_deceleration, settings.angular_deceleration),
+            *(settings.max_linear_speed, settings.max_angular_speed),
+            settings.posture_gain,
+        ]
+    )

@@ -1,0 +1,199 @@
+"""Distances and gains that change while the arms move: every promise at every tick, and nothing jumps."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from q2r2_control.config.control import LIVE, ControllerSettings
+from q2r2_control.control.controller import CartesianController
+from q2r2_control.control.live_settings import GROWTH
+from q2r2_control.robot.kept_distances import kept_distances
+from q2r2_control.verification.contract import Contract
+from tests.control.scenarios import SCENARIOS, circle
+from tests.control.test_scenarios import robot_of
+
+DT = 0.002
+NEAR, FAR = 0.005, 0.035  # [m]
+UP = np.array([0.0, 0.0, 0.05])  # [m]
+
+
+@pytest.fixture
+def controller() -> CartesianController:
+    return CartesianController(robot_of("iiwa7"), ControllerSettings(min_distance=NEAR))
+
+
+class Run:
+    """A controller from home on, its contract checked at every tick."""
+
+    def __init__(self, controller: CartesianController) -> None:
+        self.controller = controller
+        controller.reset(controller.robot.home)
+        self.start = {arm: controller.tool_pose(arm) for arm in controller.robot.arms}
+        self.contract = Contract(controller)
+        self.ticks = 0
+        self.q = controller.robot.home
+        self.v = np.zeros_like(self.q)
+
+    def drive(self, seconds: float, scenario: Any = None) -> None:
+        for _ in range(round(seconds / DT)):
+            targets = {} if scenario is None else scenario(self.ticks * DT, self.start)
+            reference = self.controller.step(targets, DT)
+            self.contract.check(reference, DT)
+            self.q, self.v = reference.q, reference.v
+            self.ticks += 1
+
+    @property
+    def margins(self) -> np.ndarray:
+        """Of every pair, to what all are asked to keep [m]."""
+        robot = self.controller.robot
+        return robot.distance_values(self.q) - kept_distances(robot, self.controller.settings).values
+
+
+def test_arms_that_rest_against_each_other_are_not_pushed_apart_by_a_greater_distance(
+    controller: CartesianController,
+) -> None:
+    run = Run(controller)
+    run.drive(4.0, SCENARIOS["crossing"])
+    run.drive(0.5)
+    assert run.margins.min() < 0.005
+    before, pair = run.q, controller.robot.distance_values(run.q)
+    assert controller.change({"min_distance": FAR}) is None
+    run.drive(1.5)
+    assert np.abs(run.q - before).max() < 1e-4
+    assert run.margins.min() < -0.02  # nearer than asked for, and left so
+    assert controller.narrow_pair is not None
+    assert controller.kept_distances.min() > 0.6 * pair.min()  # but no nearer than it is
+
+
+def test_a_pair_keeps_all_of_a_greater_distance_once_it_has_been_opened_and_is_then_held_there(
+    controller: CartesianController,
+) -> None:
+    run = Run(controller)
+    run.drive(3.0, SCENARIOS["crossing"])
+    assert controller.change({"min_distance": FAR}) is None
+    run.drive(3.0, lambda _, start: dict(start))
+    assert controller.narrow_pair is None
+    assert controller.kept_distances.min() == FAR
+    run.drive(3.0, SCENARIOS["crossing"])
+    assert 0.0 <= run.margins.min() < 0.005
+    assert run.contract.uncertified == 0
+
+
+def test_a_distance_grows_no_faster_than_it_may_and_falls_at_once(controller: CartesianController) -> None:
+    run = Run(controller)
+    run.drive(0.1)
+    assert controller.change({"min_distance": FAR}) is None
+    seconds = 0.0
+    while controller.narrow_pair is not None and seconds < 2.0:
+        run.drive(0.01)
+        seconds += 0.01
+        assert controller.kept_distances.max() <= NEAR + GROWTH * (seconds + 0.011)
+    assert seconds == pytest.approx((FAR - NEAR) / GROWTH, abs=0.05)
+    assert controller.change({"min_distance": NEAR}) is None
+    assert controller.kept_distances.max() == NEAR
+
+
+def test_a_distance_that_grows_while_the_arms_rush_at_each_other_is_kept_from_where_it_is_proven(
+    controller: CartesianController,
+) -> None:
+    run = Run(controller)
+    run.drive(0.25, SCENARIOS["crossing"])
+    assert np.abs(run.v).max() > 0.5
+    assert controller.change({"min_distance": FAR}) is None
+    run.drive(1.5, SCENARIOS["crossing"])
+    assert run.contract.uncertified == 0
+
+
+def test_changes_drawn_at_random_in_mid_motion_break_no_promise(controller: CartesianController) -> None:
+    random, run = np.random.default_rng(3), Run(controller)
+    scenarios = [SCENARIOS[name] for name in ("crossing", "same point", "teleport", "into the table")] + [circle]
+    for _ in range(30):
+        name = str(random.choice(LIVE))
+        value = random.uniform(0.0, FAR) if name == "min_distance" else random.choice([0.2, 1.0, 2.9])
+        assert controller.change({name: float(value)}) is None
+        run.drive(0.2, scenarios[random.integers(len(scenarios))])
+    assert run.contract.uncertified == 0
+
+
+def test_after_a_reset_near_something_pairs_keep_what_the_posture_leaves_them(controller: CartesianController) -> None:
+    run = Run(controller)
+    run.drive(4.0, SCENARIOS["crossing"])
+    assert controller.change({"min_distance": FAR}) is None
+    controller.reset(run.q)
+    run.contract.start(run.q)
+    before = run.q
+    run.drive(0.5)
+    np.testing.assert_allclose(run.q, before, atol=1e-9)
+    assert controller.kept_distances.min() < 0.02
+    assert run.contract.uncertified == 0
+
+
+def test_a_pair_that_closes_in_keeps_no_more_than_the_stop_leaves_it(controller: CartesianController) -> None:
+    run, robot = Run(controller), controller.robot
+    lost = np.zeros(0)
+    while run.ticks < 800 and not (lost > 0.004).any():  # by a pair that a stop from here brings nearer than asked for
+        run.drive(0.01, SCENARIOS["crossing"])
+        stop = controller.stop_deceleration
+        ends = robot.distance_values(run.q + run.v * np.abs(run.v) / (2.0 * stop))
+        lost = np.where(ends < FAR - 0.004, robot.distance_values(run.q) - ends, 0.0)
+    assert (lost > 0.004).any()
+    assert controller.change({"min_distance": FAR}) is None
+    controller.reset(run.q, run.v)  # after which pairs keep at once all that they can
+    stop = controller.stop_deceleration
+    for share in np.linspace(0.0, 1.0, 41):
+        time = np.minimum(share * (np.abs(run.v) / stop).max(), np.abs(run.v) / stop)
+        q = run.q + run.v * time - 0.5 * np.sign(run.v) * stop * time**2
+        assert (robot.distance_values(q) - controller.kept_distances).min() >= 0.0
+
+
+def test_gains_change_over_half_a_second(controller: CartesianController) -> None:
+    controller.reset(controller.robot.home)
+    goal = {arm: pin.SE3(at.rotation, at.translation + UP) for arm, at in _tools(controller).items()}
+    errors = {}
+    for gain in (8.0, 1.0):
+        assert controller.change({"position_gain": gain}) is None
+        controller.reset(controller.robot.home)
+        for _ in range(300):
+            controller.step(dict(goal), DT)
+        errors[gain] = np.linalg.norm(controller.tool_pose("left").translation - goal["left"].translation)
+    assert errors[8.0] < 2e-3 < 0.02 < errors[1.0]
+    assert controller.change({"position_gain": 8.0}) is None
+    before = controller.step(dict(goal), DT)
+    after = controller.step(dict(goal), DT)
+    assert np.abs(after.v - before.v).max() < 2e-3
+    assert controller.settings.position_gain == 8.0
+
+
+@pytest.mark.parametrize(
+    ("values", "reason"),
+    [
+        ({"min_distance": 0.06}, "up to 0.05"),
+        ({"acceleration_limit": 5.0}, r"control.acceleration_limit = 5.0: while a controller runs: min_distance, "),
+        ({"position_gain": 0.0}, "control.position_gain = 0.0: Input should be greater than 0"),
+        ({"position_gain": 1.0, "min_distance": -1.0}, "control.min_distance"),
+    ],
+    ids=["pairs are not watched", "not a live one", "out of range", "as a whole"],
+)
+def test_what_is_not_possible_is_refused_with_the_reason_and_changes_nothing(
+    controller: CartesianController, values: dict[str, float], reason: str
+) -> None:
+    before = controller.settings
+    refusal = controller.change(values)
+    assert refusal is not None
+    assert reason in refusal
+    assert controller.settings is before
+
+
+def test_a_distance_that_home_does_not_keep_is_refused_and_names_the_pair(controller: CartesianController) -> None:
+    nearest = min(controller.robot.distances(controller.robot.home), key=lambda pair: pair.distance)
+    refusal = controller.change({"min_distance": nearest.distance - 0.001})  # distance_buffer would not be left
+    assert refusal is not None
+    assert nearest.name_a in refusal
+
+
+def _tools(controller: CartesianController) -> dict[str, pin.SE3]:
+    return {arm: controller.tool_pose(arm) for arm in controller.robot.arms}
