@@ -7,8 +7,9 @@ import json
 import signal
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -23,11 +24,11 @@ from q2r2_control.export.kept_pictures import KeptAs, KeptPictures, keep_picture
 from q2r2_control.export.ray_cluster import mapped_over
 from q2r2_control.export.sampling import sample
 from q2r2_control.recording.episode_spans import WHOLE, EpisodeSpan, read_spans
-from q2r2_control.recording.reader import Recording
 from q2r2_control.recording.recorded_robot import cell_and_robot_of
+from q2r2_control.recording.ros_recording import open_recording
 
 FASTEST = 1000  # [frames/s]
-_FORMAT = 3  # of kept episodes; another one is made again
+_FORMAT = 4  # of kept episodes; another one is made again
 
 
 @dataclass(frozen=True)
@@ -55,6 +56,7 @@ class Episode:
     notes: dict[str, str]  # program, machine, operator and the like, as recorded
     vectors: dict[str, npt.NDArray[np.float32]]
     cameras: dict[str, KeptPictures] = field(default_factory=dict)  # whose pictures are kept beside the episode
+    success: bool | None = None  # None: nobody said
     part: int = 0  # which of the episodes in the file, from 1 on; 0: the whole
 
     @property
@@ -76,6 +78,7 @@ class Episode:
         return {
             **self.vectors,
             "next.done": frames == self.frames - 1,
+            "next.success": (frames == self.frames - 1) & bool(self.success),
             "timestamp": (frames / self.fps).astype(np.float32),
             "frame_index": frames,
             "episode_index": np.full(self.frames, index),
@@ -116,8 +119,8 @@ def make_episode(file: Path, sampling: Sampling, target: Path | None = None, par
 
     Raises :class:`RecordingError` that names the file and what is wrong.
     """
-    recording = Recording(file)
-    part = part or Part()
+    recording = open_recording(file)
+    part = part or Part(0, replace(WHOLE, success=recording.conclusion.success))
     frames = sample(recording, sampling.fps, sampling.trim, part.span)
     cell, robot = cell_and_robot_of(recording)
     try:
@@ -131,17 +134,18 @@ def make_episode(file: Path, sampling: Sampling, target: Path | None = None, par
         used = {name: cell.cameras[name] for name in recording.about.cameras}
         cameras = keep_pictures(recording, used, frames["stamp"].tolist(), sampling.fps, sampling.pictures, target)
     name = recording.file.name
-    return Episode(name, cell.name, task, sampling.fps, labels, notes, vectors, cameras, part.number)
+    success = part.span.success
+    return Episode(name, cell.name, task, sampling.fps, labels, notes, vectors, cameras, success, part.number)
 
 
 def parts_to_export(file: Path) -> list[Part]:
     """The episodes of a recording but those that its operator discarded; of a file that cannot be read the whole."""
     try:
-        spans = read_spans(Recording(file))
+        spans = read_spans(open_recording(file))
     except RecordingError:
         return [Part()]  # whoever makes an episode of it finds out
     if spans[0].whole:
-        return [Part()]
+        return [Part(0, spans[0])]
     return [Part(number, span) for number, span in enumerate(spans, 1) if not span.discarded]
 
 
@@ -193,8 +197,19 @@ def _mapping(workers: int) -> Iterator[Callable[[list[Any]], Iterator[str | None
         return
     # Spawned, not forked: this process may have threads.
     pool = ProcessPoolExecutor(workers, get_context("spawn"), initializer=signal.signal, initargs=_IGNORED)
+
+    def run(jobs: list[Any]) -> Iterator[str | None]:
+        try:
+            return pool.map(_work, jobs)
+        except OSError as error:  # "handle is closed", of a pool that breaks while it is given its jobs
+            raise BrokenProcessPool from error
+
     try:
-        yield lambda jobs: pool.map(_work, jobs)
+        yield run
+    except BrokenProcessPool as error:
+        raise ConfigError(
+            "a process of --workers was killed, as for want of memory; the same command goes on with what is made"
+        ) from error
     finally:
         pool.shutdown(cancel_futures=True)
 

@@ -39,6 +39,8 @@ def _write(episode: Episode, kept: Path, path: Path) -> None:
         file.attrs["action_ahead_frames"] = _AHEAD
         for name in ("recording", "cell", "task"):
             file.attrs[name] = getattr(episode, name)
+        if episode.success is not None:
+            file.attrs["success"] = episode.success
         for name, text in episode.notes.items():
             file.attrs[f"note_{name}"] = text
         for name, feature, unit in _DATA:

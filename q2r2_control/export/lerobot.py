@@ -30,6 +30,7 @@ EPISODES = f"meta/episodes/{_PLACE}.parquet"
 TASKS, INFO, STATISTICS, SOURCES = "meta/tasks.parquet", "meta/info.json", "meta/stats.json", "meta/recordings.json"
 _SCALARS = {
     "next.done": "bool",
+    "next.success": "bool",
     "timestamp": "float32",
     "frame_index": "int64",
     "episode_index": "int64",
@@ -114,7 +115,8 @@ class _Writer:
         )
         self._statistics.append(statistics)
         part = {"part": episode.part} if episode.part else {}
-        self._sources.append({"episode_index": number, "recording": episode.recording, **part, **episode.notes})
+        source = {"episode_index": number, "recording": episode.recording, **part, "success": episode.success}
+        self._sources.append({**source, **episode.notes})
         self._frames += episode.frames
 
     def close(self) -> None:

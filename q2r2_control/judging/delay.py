@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import NamedTuple
+
 import numpy as np
 import pinocchio as pin
 
@@ -15,6 +18,21 @@ _STEP = 0.005  # of delays, and of the times that are compared [s]
 _DIFFERENCE = 0.025  # to either side, over which a motion is a difference [s]
 _SLOWEST = 0.01  # a hand that moves less has no delay [m/s], RMS
 _LEAST_FIT = 0.5  # of the tool's motion that the hand's explains
+
+
+class Track(NamedTuple):
+    """Where a point is over time."""
+
+    t: Array  # (n,) [s], rising
+    position: Array  # (n, 3) [m]
+
+    def velocity(self, when: Array) -> Array:
+        """(m, 3) [m/s] at times ``when`` (m,) [s], as a difference over 50 ms; before and after the track it rests."""
+        ahead, behind = (
+            np.stack([np.interp(when + shift, self.t, column) for column in self.position.T], axis=1)
+            for shift in (_DIFFERENCE, -_DIFFERENCE)
+        )
+        return (ahead - behind) / (2.0 * _DIFFERENCE)
 
 
 def delays(episode: Episode, hand: str) -> tuple[float | None, float | None]:
@@ -35,7 +53,6 @@ def delays(episode: Episode, hand: str) -> tuple[float | None, float | None]:
     teleop = episode.config.teleop
     position = samples.position[usable][first] @ _axes_of(teleop.stance, teleop.axes).T
     t = episode.frame_t
-    lags = np.arange(0.0, LONGEST + _STEP, _STEP)
     times = [
         np.arange(t[begin] + LONGEST + _DIFFERENCE, t[end - 1] - _DIFFERENCE, _STEP)
         for begin, end in stretches(episode.engaged[:, arm])
@@ -43,13 +60,16 @@ def delays(episode: Episode, hand: str) -> tuple[float | None, float | None]:
     ]
     if not times:
         return None, None
-    when = np.concatenate(times)
-    by_hand = [_velocity(received, position, when - lag) for lag in lags]
-    found = []
-    for poses in (episode.frames.target, episode.tools):
-        moved = _velocity(t, np.nan_to_num(poses[:, arm, :3]), when)
-        found.append(_best(lags, by_hand, moved))
-    return found[0], found[1]
+    followers = [Track(t, np.nan_to_num(poses[:, arm, :3])) for poses in (episode.frames.target, episode.tools)]
+    target, tool = delays_behind(Track(received, position), followers, np.concatenate(times))
+    return target, tool
+
+
+def delays_behind(hand: Track, followers: Sequence[Track], when: Array) -> list[float | None]:
+    """Delay [s] of each of ``followers`` behind ``hand``, of times ``when`` (n,) [s]; None as of :func:`delays`."""
+    lags = np.arange(0.0, LONGEST + _STEP, _STEP)
+    by_hand = [hand.velocity(when - lag) for lag in lags]
+    return [_best(lags, by_hand, follower.velocity(when)) for follower in followers]
 
 
 def _axes_of(stance: str, axes: tuple[str, str, str]) -> Array:
@@ -57,15 +77,6 @@ def _axes_of(stance: str, axes: tuple[str, str, str]) -> Array:
     motion = RelativeMotion(stance, axes=axes)
     motion.anchor(pin.SE3.Identity(), pin.SE3.Identity())
     return np.stack([motion.target(pin.SE3(np.eye(3), axis)).translation for axis in np.eye(3)], axis=1)
-
-
-def _velocity(t: Array, position: Array, when: Array) -> Array:
-    """(n, 3) [m/s] at times ``when`` (n,)."""
-
-    def at(times: Array) -> Array:
-        return np.stack([np.interp(times, t, column) for column in position.T], axis=1)
-
-    return (at(when + _DIFFERENCE) - at(when - _DIFFERENCE)) / (2.0 * _DIFFERENCE)
 
 
 def _best(lags: Array, by_hand: list[Array], moved: Array) -> float | None:

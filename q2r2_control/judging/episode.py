@@ -12,6 +12,7 @@ from q2r2_control.config import Config
 from q2r2_control.config.teleop import Stance
 from q2r2_control.errors import RecordingError
 from q2r2_control.recording import topics as names
+from q2r2_control.recording.about import Conclusion
 from q2r2_control.recording.episode_spans import events_of
 from q2r2_control.recording.reader import Recording
 from q2r2_control.recording.recorded_robot import cell_and_robot_of, check_tools, tool_poses
@@ -76,6 +77,8 @@ class Episode:
     hands: dict[str, Hand]  # those that lead an arm
     events: list[Event]
     damage: str | None  # why the file could be read no farther
+    ended_by: str | None = None  # the fault that ended the run
+    success: bool | None = None  # by the task's own check or the operator; None: nobody said
     part: int | None = None  # of the recording's episodes, from 1 on; None: the whole
     discarded: bool = False  # by its operator
     ended_by_operator: bool = False  # while the run went on
@@ -122,7 +125,13 @@ def read_episode(recording: Recording) -> Episode:
     arms = {SIDES[1 - SIDES.index(arm)] if swapped else arm: arm for arm in recording.about.arms}
     hands = {hand: reader.hand(hand, arm, ticks) for hand, arm in arms.items()}
     tools = tool_poses(frames.q, robot)
-    return Episode(recording, config, ticks, frames, tools, hands, reader.events, damage)
+    said = Conclusion()
+    if damage is None:
+        try:
+            said = recording.conclusion
+        except RecordingError as error:
+            damage = str(error)
+    return Episode(recording, config, ticks, frames, tools, hands, reader.events, damage, said.ended_by, said.success)
 
 
 class _Reader:

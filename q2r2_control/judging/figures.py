@@ -46,7 +46,9 @@ class EpisodeFigures:
     min_margin_mm: float | None  # of the tightest one, less the distance that it keeps
     timing: TimingFigures
     damage: str | None  # why the file could be read no farther
+    ended_by: str | None  # the fault that ended the run
     discarded: bool  # by the operator
+    success: bool | None  # by the task's own check or the operator; None: nobody said
 
     @property
     def name(self) -> str:
@@ -78,7 +80,9 @@ def figures_of(episode: Episode, dropout: float) -> EpisodeFigures:
         min_margin_mm=_least_mm(ticks.margin),
         timing=timing_figures(episode),
         damage=episode.damage,
+        ended_by=episode.ended_by,
         discarded=episode.discarded,
+        success=episode.success,
     )
 
 

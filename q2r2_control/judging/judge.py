@@ -17,6 +17,7 @@ from q2r2_control.judging.figures import EpisodeFigures, figures_of
 from q2r2_control.judging.parts import parts_of
 from q2r2_control.judging.verdict import Verdict, verdict_of
 from q2r2_control.recording.reader import Recording
+from q2r2_control.recording.ros_recording import open_recording
 
 VERDICT_FILE = "verdict.json"
 _FORMAT = 2
@@ -44,10 +45,12 @@ def judge(recording: Recording, settings: JudgeSettings | None = None) -> list[J
 
     Raises :class:`RecordingError` where that cell cannot be built.
     """
-    return [_judge(episode, settings or episode.config.judge) for episode in parts_of(read_episode(recording))]
+    return [judge_episode(episode, settings) for episode in parts_of(read_episode(recording))]
 
 
-def _judge(episode: Episode, settings: JudgeSettings) -> Judged:
+def judge_episode(episode: Episode, settings: JudgeSettings | None = None) -> Judged:
+    """Judge one episode; see :func:`judge`."""
+    settings = settings or episode.config.judge
     figures = figures_of(episode, settings.dropout)
     return Judged(episode, figures, verdict_of(figures, settings), settings)
 
@@ -57,7 +60,7 @@ def judge_all(files: Sequence[Path], settings: JudgeSettings | None = None) -> I
 
     Raises :class:`RecordingError` for a file that is none, before the first is judged.
     """
-    for recording in [Recording(file) for file in files]:
+    for recording in [open_recording(file) for file in files]:
         yield from judge(recording, settings)
 
 

@@ -21,6 +21,7 @@ class FigureColumn:
     unit: str
     digits: int
     value: Callable[[EpisodeFigures], float | None]
+    words: tuple[str, ...] = ()  # in place of the numbers 0, 1 and so on
 
     @property
     def heading(self) -> str:
@@ -30,7 +31,9 @@ class FigureColumn:
     def text(self, figures: EpisodeFigures) -> str:
         """The number, or a dash where there is nothing to tell it by."""
         value = self.value(figures)
-        return "-" if value is None else f"{value:.{self.digits}f}"
+        if value is None:
+            return "-"
+        return self.words[int(value)] if self.words else f"{value:.{self.digits}f}"
 
 
 def _worst(values: Sequence[float | None], worst: Callable[..., float] = max) -> float | None:
@@ -43,6 +46,7 @@ def _percent(share: float | None) -> float | None:
 
 
 COLUMNS = (
+    FigureColumn("success", "", 0, lambda of: None if of.success is None else float(of.success), ("no", "yes")),
     FigureColumn("time", "s", 1, lambda of: of.duration_s),
     FigureColumn("engaged", "s", 1, lambda of: of.engaged_s),
     FigureColumn("idle", "%", 0, lambda of: _percent(of.idle_share)),
@@ -87,7 +91,7 @@ def _row(judged: Judged, number: int) -> str:
         for column in COLUMNS
     )
     return (
-        f'<tr data-verdict="{word}"><td class="number" data-value="{number}">{number}</td>'
+        f'<tr {_filtered_by(judged)}><td class="number" data-value="{number}">{number}</td>'
         f'<td><a href="#episode-{number}">{escape(judged.figures.name)}</a></td><td>{_badge(word)}</td>{cells}</tr>'
     )
 
@@ -98,9 +102,15 @@ def _section(judged: Judged, number: int) -> str:
     task = f'<p class="task">{escape(figures.task)}</p>' if figures.task else ""
     why = f"<ul>{reasons}</ul>" if reasons else ""
     return (
-        f'<section id="episode-{number}" data-verdict="{word}">'
+        f'<section id="episode-{number}" {_filtered_by(judged)}>'
         f"<h2>{number}. {escape(judged.figures.name)} {_badge(word)}</h2>{task}{why}{_picture(judged)}</section>"
     )
+
+
+def _filtered_by(judged: Judged) -> str:
+    """What the page's filter goes by."""
+    success = {None: "", True: "succeeded", False: "failed"}[judged.figures.success]
+    return f'data-verdict="{judged.verdict.word}" data-success="{success}"'
 
 
 def _picture(judged: Judged) -> str:
@@ -157,7 +167,8 @@ heads.forEach((head, column) => head.addEventListener("click", () => {
 }));
 document.querySelector("select").addEventListener("change", event => {
   for (const item of document.querySelectorAll("[data-verdict]"))
-    item.hidden = event.target.value !== "all" && item.dataset.verdict !== event.target.value;
+    item.hidden = event.target.value !== "all" &&
+      ![item.dataset.verdict, item.dataset.success].includes(event.target.value);
 });
 """
 
@@ -172,7 +183,8 @@ _PAGE = """<!DOCTYPE html>
 <body>
 <h1>{title}</h1>
 <p>{count}</p>
-<p class="filter"><label>show <select><option>all</option><option>keep</option><option>discard</option></select></label>
+<p class="filter"><label>show <select><option>all</option><option>keep</option><option>discard</option>
+<option>succeeded</option><option>failed</option></select></label>
 &ensp;a click on a heading sorts; of several hands or arms the worst number counts</p>
 <div class="table"><table>
 <thead><tr><th>#</th><th>episode</th><th>verdict</th>{headings}</tr></thead>

@@ -13,14 +13,14 @@ from q2r2_control.recording.episode_spans import EpisodeSpan, spans_of
 
 def parts_of(episode: Episode) -> list[Episode]:
     """The episodes of a recording in their order; where the operator told of none, the whole."""
-    spans = spans_of(episode.events)
+    spans = spans_of(episode.events, episode.success)
     if len(spans) == 1 and spans[0].whole:
-        return [episode]
-    return [_part(episode, span, number) for number, span in enumerate(spans, 1)]
+        return [replace(episode, success=spans[0].success)]
+    return [part_of(episode, span, number) for number, span in enumerate(spans, 1)]
 
 
-def _part(episode: Episode, span: EpisodeSpan, number: int) -> Episode:
-    """Times are since the part began, and its first tick is number 0."""
+def part_of(episode: Episode, span: EpisodeSpan, number: int) -> Episode:
+    """The ``number``-th episode of a recording. Times are since it began, and its first tick is number 0."""
     ticks, frames = episode.ticks, episode.frames
     first, end = np.searchsorted(ticks.t, span.start), np.searchsorted(ticks.t, span.end, side="right")
     inside = slice(first, end)
@@ -40,6 +40,8 @@ def _part(episode: Episode, span: EpisodeSpan, number: int) -> Episode:
         hands={name: _hand(hand, span, began) for name, hand in episode.hands.items()},
         events=[replace(event, t=event.t - began) for event in episode.events if span.start <= event.t <= span.end],
         damage=None if told else episode.damage,
+        ended_by=None if told else episode.ended_by,
+        success=span.success,
         part=number,
         discarded=span.discarded,
         ended_by_operator=told,

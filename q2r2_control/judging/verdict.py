@@ -15,7 +15,7 @@ _MM, _MS, _PERCENT, _DEGREES = 1e3, 1e3, 1e2, 57.29577951308232
 class Reason:
     """Why an episode is discarded."""
 
-    name: str  # of the threshold, or of what no threshold says: never_engaged, damaged, operator
+    name: str  # of the threshold, or of what no threshold says: never_engaged, damaged, ended_by, operator
     text: str
 
 
@@ -72,6 +72,10 @@ def verdict_of(figures: EpisodeFigures, settings: JudgeSettings) -> Verdict:
 def _unreadable(figures: EpisodeFigures, settings: JudgeSettings) -> Iterator[Reason]:
     if figures.discarded:
         yield Reason("operator", "its operator discarded it")
+    if figures.success is False and not settings.keep_failed:
+        yield Reason("keep_failed", "it failed, as its operator or task says")
+    if figures.ended_by is not None:
+        yield Reason("ended_by", f"a fault ended the run: {figures.ended_by}")
     if figures.damage is not None:
         yield Reason("damaged", f"after {figures.duration_s:.2f} s {figures.damage}")
     elif settings.needs_end and not figures.timing.ended:

@@ -37,6 +37,7 @@ def add_cameras(spec: mujoco.MjSpec, cameras: Mapping[str, CameraConfig]) -> Non
 
 def _orientation(camera: CameraConfig) -> Array:
     """(3, 3) of the camera's frame in its link's: x is the line of sight, y is level where there is a choice."""
+    assert camera.position is not None
     if camera.look_at is None:
         assert camera.rpy is not None
         return np.array(pin.rpy.rpyToMatrix(*camera.rpy))

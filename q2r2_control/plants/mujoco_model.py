@@ -60,7 +60,7 @@ def build_model(robot: Robot, config: Config) -> mujoco.MjModel:
         _set_grippers(spec, robot, config)
         _exclude_contacts(spec, robot)
         _add_objects(spec, config.mujoco)
-        add_cameras(spec, config.cameras)
+        add_cameras(spec, config.simulated_cameras)
         furnish(spec, floor=config.floor is not None)
         return spec.compile()
     except (ValueError, RuntimeError, mujoco.FatalError) as error:

@@ -5,8 +5,11 @@
 ``rows`` say where each number stands in them, ``mcap_file`` is the file, ``bag`` what rosbag2 wants beside it,
 ``about`` what is said once. ``camera_process`` starts another one, which takes pictures as ``camera_work`` says, and
 hands them to the first one through a ``picture_channel``; ``helper_process`` and ``helper`` are what both have in
-common. ``reader`` reads it again, ``replay`` gives it to the pipeline's own loop, and
-``comparison`` holds what comes out to what was recorded.
+common. ``base_recorder`` is what ``recorder`` and ``message_recorder`` share, which takes messages of ROS nodes
+(``ros_topics``), serialized already. ``reader`` reads it again, ``ros_recording`` reads those of nodes by means of
+``ros_ticks``, ``replay`` gives it to the pipeline's own loop, and ``comparison`` holds what comes out to what was
+recorded, ``plant_difference`` where a plant moved to. ``joint_replay`` gives that loop the references alone, as
+``recorded_way`` leads them.
 """
 
 from __future__ import annotations

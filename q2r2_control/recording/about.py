@@ -21,7 +21,10 @@ if TYPE_CHECKING:  # the writer's process does without them
     from q2r2_control.pipeline import Pipeline
 
 FORMAT = "2"  # of topics and fields; another one cannot be replayed
-ABOUT, CELL, ROBOT, FIELDS = "q2r2_control", "cell.yaml", "robot.urdf", "fields.json"
+LOOP, ROS = "loop", "ros"  # sources: one loop's ticks, or what nodes published
+ABOUT, CONCLUSION = "q2r2_control", "q2r2_control_end"  # metadata records
+CUT_OUT_OF = "cut_out_of"  # a note of a bag of one episode: the file that has all of the run
+CELL, ROBOT, FIELDS = "cell.yaml", "robot.urdf", "fields.json"
 _GIT_TIME = 2.0  # [s]
 
 
@@ -39,6 +42,7 @@ class About:
     robot: str  # URDF
     cameras: tuple[str, ...] = ()  # of which there are pictures
     notes: dict[str, str] = field(default_factory=dict)  # program, machine, task and the like, for people
+    source: str = LOOP
 
     @classmethod
     def of(cls, pipeline: Pipeline, realtime: bool, notes: Mapping[str, str], cameras: Sequence[str] = ()) -> About:
@@ -67,6 +71,7 @@ class About:
             "epoch_ns": str(self.epoch),
             "realtime": json.dumps(self.realtime),
             "cameras": json.dumps(self.cameras),
+            "source": self.source,
             **self.notes,
         }
 
@@ -86,12 +91,32 @@ class About:
             cell=cell,
             robot=robot,
             cameras=tuple(json.loads(rest.pop("cameras", "[]"))),  # older files do not say that there are none
+            source=rest.pop("source", LOOP),
             notes=rest,
         )
 
     def topics(self) -> Topics:
         """All that is in the file."""
         return Topics(self.arms, self.joints, self.cameras)
+
+
+@dataclass(frozen=True)
+class Conclusion:
+    """What is said of a run at its end; nothing of one that was killed."""
+
+    success: bool | None = None  # by the task's own check; None: there was none
+    ended_by: str | None = None  # the fault that ended it
+
+    def texts(self) -> dict[str, str]:
+        """For a metadata record."""
+        success = {} if self.success is None else {"success": json.dumps(self.success)}
+        return success if self.ended_by is None else {**success, "ended_by": self.ended_by}
+
+    @classmethod
+    def from_texts(cls, texts: Mapping[str, str]) -> Conclusion:
+        """Raises :class:`ValueError` for what is not one."""
+        success = texts.get("success")
+        return cls(None if success is None else bool(json.loads(success)), texts.get("ended_by"))
 
 
 def as_yaml(config: Config) -> str:

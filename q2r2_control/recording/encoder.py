@@ -95,6 +95,9 @@ class TickEncoder:
         add(names.EXTERNAL_TORQUE, felt, effort=ticks["tau_external"][felt])
         tools = self._tools(ticks["reference_q"])
         for index, arm in enumerate(self.topics.arms):
+            hands = ticks["filtered_hands"][:, index]
+            moved = np.flatnonzero(hands.any(axis=1))
+            add(names.filtered_hand(arm), moved, **_pose_columns(hands[moved]))
             led = np.flatnonzero(ticks["led"][:, index])
             add(names.target(arm), led, **_pose_columns(ticks["targets"][led, index]))
             add(names.safe_target(arm), every, **_pose_columns(tools[:, index]))

@@ -7,12 +7,12 @@ import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
-from q2r2_control.config.bindings import Action
 from q2r2_control.errors import RecordingError
 from q2r2_control.recording import topics as names
+from q2r2_control.recording.about import LOOP
 from q2r2_control.recording.reader import RecordedChunk, Recording
 from q2r2_control.recording.rows import sequence_of, text_of
-from q2r2_control.teleop.episode_marks import BEGINS, DISCARDED, ENDS, MARK
+from q2r2_control.teleop.episode_marks import BEGINS, DISCARDED, ENDS, FAILED, MARK, SUCCEEDED, EpisodeMarks
 from q2r2_control.types import Event
 
 
@@ -24,6 +24,7 @@ class EpisodeSpan:
     end: float = math.inf  # inf: the run's
     discarded: bool = False  # by its operator
     marks: tuple[float, ...] = ()
+    success: bool | None = None  # None: nobody said
 
     @property
     def whole(self) -> bool:
@@ -34,11 +35,13 @@ class EpisodeSpan:
 WHOLE = EpisodeSpan()
 
 
-def spans_of(events: Iterable[Event]) -> list[EpisodeSpan]:
+def spans_of(events: Iterable[Event], run_succeeded: bool | None = None) -> list[EpisodeSpan]:
     """The episodes that an operator has told; the whole run where that are none.
 
-    A discard is for the episode that goes on, or else for the last one.
+    A discard, a success and a failure are for the episode that goes on, or else for the last one; what was said last
+    counts. Of the whole run they are what the operator said, or else ``run_succeeded``, what the task's own check did.
     """
+    whole = replace(WHOLE, success=run_succeeded)
     spans: list[EpisodeSpan] = []
     marks: list[float] = []  # outside of episodes too, since a run without any is one
     for event in events:
@@ -49,9 +52,15 @@ def spans_of(events: Iterable[Event]) -> list[EpisodeSpan]:
             spans[-1] = replace(spans[-1], end=event.t)
         elif event.reason == DISCARDED and spans:
             spans[-1] = replace(spans[-1], end=min(spans[-1].end, event.t), discarded=True)
+        elif event.reason in (SUCCEEDED, FAILED):
+            success = event.reason == SUCCEEDED
+            if spans:
+                spans[-1] = replace(spans[-1], end=min(spans[-1].end, event.t), success=success)
+            else:
+                whole = replace(whole, success=success)
         elif event.reason == MARK:
             marks.append(event.t)
-    return [replace(span, marks=tuple(t for t in marks if span.start <= t <= span.end)) for span in spans or [WHOLE]]
+    return [replace(span, marks=tuple(t for t in marks if span.start <= t <= span.end)) for span in spans or [whole]]
 
 
 def events_of_ticks(chunk: RecordedChunk) -> dict[int, list[Event]]:
@@ -73,9 +82,10 @@ def events_of(chunk: RecordedChunk) -> Iterator[Event]:
 
 def read_spans(recording: Recording) -> list[EpisodeSpan]:
     """The episodes of a recording. Raises :class:`RecordingError` for a damaged one."""
-    if Action.RECORD_TOGGLE not in recording.about.cell:
-        return [WHOLE]  # without reading all of it
+    about, success = recording.about, recording.conclusion.success
+    if about.source == LOOP and not any(action in about.cell for action in EpisodeMarks.actions):
+        return spans_of((), success)  # without reading all of it; of nodes, a service tells episodes too
     try:
-        return spans_of(event for chunk in recording.chunks() for event in events_of(chunk))
+        return spans_of((event for chunk in recording.chunks() for event in events_of(chunk)), success)
     except (ValueError, KeyError, TypeError) as error:
         raise RecordingError(f"{recording.file}: damaged: {error!r:.200}") from error

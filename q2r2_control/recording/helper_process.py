@@ -9,15 +9,18 @@ from __future__ import annotations
 
 import json
 import os
-import select
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Mapping, Sequence
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
 
-from q2r2_control.recording.helper import LONGEST_REASON
+from q2r2_control.recording.helper import LONGEST_REASON, LONGEST_TOLD
 
-_STARTING = 6.0  # times as long a patience with a process that has not taken anything yet
+_STARTING = 6.0  # times as long a patience with a process that has not taken anything yet: imports take their time
+_LOOKS = 0.1  # between two looks at whether it gets on [s]
 # Signals first, since a Ctrl-C may come at once; modules are looked for where this process looks.
 _PROGRAM = """\
 import signal
@@ -72,25 +75,29 @@ class HelperProcess:
             return None
         return said.decode(errors="replace") if said else self._how(self._process.returncode)
 
-    def last_words(self, patience: float, late: str) -> str | None:
+    def last_words(self, patience: float, late: str, told: bytes = b"") -> str | None:
         """Let it do what there is, and end. Returns why it did not, or None; ``late`` if it stops getting on.
 
-        That is for ``patience`` [s].
+        That is for ``patience`` [s] in which no other work kept it off the processors. It is ``told`` some bytes,
+        which :func:`helper.told` gives it.
         """
+        with suppress(OSError):  # one that has ended already says so below
+            os.write(self._input.fileno(), told[:LONGEST_TOLD])
         self._input.close()
-        answer = select.poll()
-        answer.register(self._output, select.POLLIN)
-        reached = self._progress()
-        # On a machine that is busy with other work its imports alone may take that long.
-        while not answer.poll(1000.0 * (patience if any(reached) else _STARTING * patience)):
-            if self._progress() == reached:
+        reached, waited = self._progress(), 0.0
+        looked, worked = time.monotonic(), self._processor_time()
+        while (code := self._code_within(_LOOKS)) is None:  # its exit takes its time too, after its last words
+            before, looked = (looked, worked), time.monotonic()
+            worked = self._processor_time()
+            # One that is ready to run has to wait for a processor, but for the time that it has had of one. Nor does it
+            # count that this process had none between two looks.
+            idle = min(looked - before[0], 2.0 * _LOOKS)
+            waited += max(worked - before[1], 0.0) if self._is_ready_to_run() else idle
+            if (now_reached := self._progress()) != reached:
+                reached, waited = now_reached, 0.0
+            elif waited >= (patience if any(reached) else _STARTING * patience):
                 return late
-            reached = self._progress()
         said = self._output.read(LONGEST_REASON)
-        try:
-            code = self._process.wait(patience)
-        except subprocess.TimeoutExpired:
-            return late
         if said:
             return said.decode(errors="replace")
         return self._how(code) if code else None
@@ -102,6 +109,27 @@ class HelperProcess:
             self._process.wait()
         self._input.close()
         self._output.close()
+
+    def _code_within(self, timeout: float) -> int | None:
+        """Its exit code; None where it has not ended within that [s]."""
+        try:
+            return self._process.wait(timeout)
+        except subprocess.TimeoutExpired:
+            return None
+
+    def _is_ready_to_run(self) -> bool:
+        """Whether one of its threads runs or could; only Linux tells that."""
+        return any(stat.rpartition(")")[2].split()[0] == "R" for stat in self._of_threads("stat"))
+
+    def _processor_time(self) -> float:
+        """Of all its threads that there are [s]; only Linux tells that."""
+        return 1e-9 * sum(int(text.split()[0]) for text in self._of_threads("schedstat"))
+
+    def _of_threads(self, name: str) -> Iterator[str]:
+        """What the system says of each thread in the file ``name``."""
+        for file in Path(f"/proc/{self.pid}/task").glob(f"*/{name}"):
+            with suppress(OSError):  # a thread that has ended
+                yield file.read_text()
 
     def _how(self, code: int) -> str:
         """How it ended where it said nothing."""

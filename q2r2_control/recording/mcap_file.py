@@ -51,6 +51,8 @@ def _bytes_of(*records: McapRecord) -> bytes:
     return builder.end()
 
 
+_RECORD_HEAD = 9  # opcode and length [bytes]
+_SKIPPED = 0x80  # the first opcode that the format leaves to applications
 _END = _bytes_of(DataEnd(0), Footer(summary_start=0, summary_offset_start=0, summary_crc=0)) + MAGIC
 
 
@@ -118,10 +120,14 @@ class McapFile:
         self._head += record
 
     def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
-        """Keep named texts in the file, before :meth:`begin`."""
+        """Keep named texts in the file, at its beginning or, after :meth:`begin`, behind what was written."""
         record = _bytes_of(Metadata(name, dict(values)))
-        self._metadata.append(MetadataIndex(len(self._head), len(record), name))
-        self._head += record
+        place = self._end or len(self._head)
+        if self._end:
+            self._append(record)
+        else:
+            self._head += record
+        self._metadata.append(MetadataIndex(place, len(record), name))
 
     def begin(self) -> None:
         """Write all that was added."""
@@ -217,9 +223,25 @@ class McapFile:
         return summary + _bytes_of(footer) + MAGIC
 
     def _append(self, data: bytes, end: bytes = _END) -> None:
-        """Write over the last end, with a new one behind: in one call, which a kill hardly ever cuts in two."""
+        """Write over the last end, with a new one behind, so that the file is whole while that goes on, too.
+
+        Readers look for the end of a file first, and then read record by record until there. So the new end is written
+        first, then the head of a record that readers skip and that leads there, then all behind that head, and the true
+        head last. A process that is killed meanwhile leaves the file with this chunk or without it; but for the moment
+        between the first two writes, in which ``rosbags`` goes on behind the last end and fails.
+        """
+        whole = data + end
+        tail = len(whole) - len(_END)
         try:
-            self._write(data + end, self._end)
+            if self._end and tail >= len(_END):
+                self._write(_END, self._end + tail)
+                self._write(struct.pack("<BQ", _SKIPPED, tail - _RECORD_HEAD), self._end)
+                self._write(whole[_RECORD_HEAD:tail], self._end + _RECORD_HEAD)
+                self._write(whole[:_RECORD_HEAD], self._end)
+                if not end:  # which is in the data, and tells where the index is, that is there now
+                    self._write(whole[tail:], self._end + tail)
+            else:
+                self._write(whole, self._end)
         except OSError:
             with suppress(OSError):
                 os.ftruncate(self._fd, self._end)

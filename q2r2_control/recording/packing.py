@@ -38,7 +38,7 @@ POSE = 7  # numbers of a pose: x y z qx qy qz qw
 _MODE_NUMBERS = {mode: number for number, mode in enumerate(COMMAND_MODES)}
 _STATUS_NUMBERS = {status: number for number, status in enumerate(STATUSES)}
 _SAMPLE = struct.Struct(f"<{len(SAMPLE_FIELDS)}d")
-_NO_POSE = (0.0,) * POSE
+_NO_POSE = (0.0,) * POSE  # whose quaternion is none
 
 
 class PackedTicks(NamedTuple):
@@ -55,7 +55,8 @@ def row_type(topics: Topics) -> np.dtype[np.void]:
     arms, joints = len(topics.arms), len(topics.joints)
     counts = {name: len(topics.by_name[name].labels["data"]) for name in (TICK, GRIPPERS, FLAGS)}
     fields: list[tuple[str, str, tuple[int, ...]]] = [(name, "<f8", (count,)) for name, count in counts.items()]
-    fields += [("led", "<f8", (arms,)), ("targets", "<f8", (arms, POSE)), ("begins", "<f8", ())]
+    poses = [(name, "<f8", (arms, POSE)) for name in ("targets", "filtered_hands")]
+    fields += [("led", "<f8", (arms,)), *poses, ("begins", "<f8", ())]
     fields += [(name, "<f8", (joints,)) for name in JOINT_FIELDS]
     return np.dtype(fields)
 
@@ -106,14 +107,17 @@ class TickPacker:
         flags: list[float] = []
         led: list[float] = []
         targets: list[float] = []
+        hands: list[float] = []
         for arm in self._arms:
             target, opening = tick.targets[arm], tick.openings.get(arm, NOT_MEASURED)
             held, holds = arm in tick.held_grippers, holding.get(arm, False)
             openings.append(opening)
             grippers += (target.gripper, command.grippers.get(arm, NOT_MEASURED), opening)
             flags += (tick.engaged[arm], arm in report.rejected, target.slip, target.slip_angle, held, holds)
-            led.append(target.pose is not None)
-            targets += _NO_POSE if target.pose is None else pin.SE3ToXYZQUATtuple(target.pose)
+            asked = target.command
+            led.append(asked is not None)
+            targets += _NO_POSE if asked is None else pin.SE3ToXYZQUATtuple(asked)
+            hands += _NO_POSE if target.hand is None else pin.SE3ToXYZQUATtuple(target.hand)
         self._numbers.pack_into(
             self._row,
             0,
@@ -141,6 +145,7 @@ class TickPacker:
             *flags,
             *led,
             *targets,
+            *hands,
             not self._begun,
         )
         external = 0.0 if state.tau_external is None else state.tau_external

@@ -11,12 +11,12 @@ from pathlib import Path
 import numpy as np
 from mcap.exceptions import EndOfFile, McapError
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, Chunk, DataEnd, McapRecord, Metadata
+from mcap.records import Attachment, Channel, Chunk, DataEnd, McapRecord, Metadata, MetadataIndex, Schema
 from mcap.stream_reader import StreamReader, get_chunk_data_stream
 from zstandard import ZstdError
 
 from q2r2_control.errors import RecordingError
-from q2r2_control.recording.about import ABOUT, CELL, ROBOT, About
+from q2r2_control.recording.about import ABOUT, CELL, CONCLUSION, CUT_OUT_OF, ROBOT, About, Conclusion
 from q2r2_control.recording.mcap_file import MAGIC
 from q2r2_control.recording.rows import HEAD, MESSAGE, Rows, jpeg_of
 from q2r2_control.recording.topics import PICTURE, Topic, picture
@@ -52,7 +52,10 @@ class Recording:
         """``path``: the file, or the folder that it is alone in."""
         self.file = _file_of(path)
         self.about = self._read_about()
+        if (whole := self.about.notes.get(CUT_OUT_OF)) is not None:
+            raise RecordingError(f"{self.file}: one episode, cut out of {whole}; allowed: the recording that has all")
         self.topics = self.about.topics()
+        self.since = 0  # time of day [ns]; what is known to be before it is left out
         self._cameras = {topic.channel for topic in self.topics.all if topic.type == PICTURE}
 
     def chunks(self) -> Iterator[RecordedChunk]:
@@ -66,10 +69,28 @@ class Recording:
         channel = self.topics.by_name[picture(camera)].channel
         with self._faults():
             for data in self._chunk_data():
-                for found, at, end in _messages_in(data):
+                for found, at, end in messages_in(data):
                     if found == channel:
                         _, _, _, tick, time, _ = HEAD.unpack_from(data, at)
                         yield Picture(time, tick, jpeg_of(data[at:end]))
+
+    def declared_topics(self) -> Iterator[Topic]:
+        """All topics that are in the file."""
+        types: dict[int, str] = {}
+        with self._faults():
+            for record in self._records():
+                if isinstance(record, Schema):
+                    types[record.id] = record.name
+                elif isinstance(record, Channel):
+                    yield Topic(record.id, record.topic, types[record.schema_id])
+                elif isinstance(record, Chunk):
+                    return
+
+    def messages(self) -> Iterator[list[bytes]]:
+        """The records of all messages as they are, chunk by chunk."""
+        with self._faults():
+            for data in self._chunk_data():
+                yield [data[at:end] for _, at, end in messages_in(data)]
 
     @contextmanager
     def _faults(self) -> Iterator[None]:
@@ -86,7 +107,7 @@ class Recording:
         for record in self._records():
             if isinstance(record, Channel):
                 self._check(record)
-            elif isinstance(record, Chunk):
+            elif isinstance(record, Chunk) and record.message_end_time >= self.since:
                 stream, size = get_chunk_data_stream(record, validate_crc=True)
                 yield stream.read(size)
             elif isinstance(record, DataEnd):
@@ -95,6 +116,24 @@ class Recording:
     @property
     def closed(self) -> bool:
         """Whether the file has an index, which is written last: not where its process was killed or the disk full."""
+        return self._index_start() > 0
+
+    @property
+    def conclusion(self) -> Conclusion:
+        """What was said at the end of the run; nothing where the file has no index."""
+        start = self._index_start()
+        if not start:
+            return Conclusion()
+        with self._faults():
+            for record in self._records(start):
+                if isinstance(record, MetadataIndex) and record.name == CONCLUSION:
+                    metadata = next(self._records(record.offset), None)
+                    if isinstance(metadata, Metadata):
+                        return Conclusion.from_texts(metadata.metadata)
+        return Conclusion()
+
+    def _index_start(self) -> int:
+        """Where the index begins in the file; 0: there is none."""
         try:
             with self.file.open("rb") as stream:
                 stream.seek(max(self.file.stat().st_size - _FOOTER.size, 0))
@@ -102,15 +141,18 @@ class Recording:
         except OSError as error:
             raise RecordingError(f"{self.file}: cannot be read: {error.strerror}") from error
         if len(end) != _FOOTER.size:
-            return False
+            return 0
         opcode, length, summary, _, _, magic = _FOOTER.unpack(end)
-        return bool(opcode == Opcode.FOOTER and length == _FOOTER_LENGTH and summary and magic == MAGIC)
+        return int(summary) if opcode == Opcode.FOOTER and length == _FOOTER_LENGTH and magic == MAGIC else 0
 
-    def _records(self) -> Iterator[McapRecord]:
+    def _records(self, start: int = 0) -> Iterator[McapRecord]:
+        """All from the beginning, or from a record that starts at ``start``."""
         try:
             with self.file.open("rb") as stream:
+                stream.seek(start)
                 # Not wrapped, so that a file that changes meanwhile is not read twice.
-                yield from StreamReader(stream, emit_chunks=True, record_size_limit=_LARGEST).records
+                reader = StreamReader(stream, start > 0, emit_chunks=True, record_size_limit=_LARGEST)
+                yield from reader.records
         except OSError as error:
             raise RecordingError(f"{self.file}: cannot be read: {error.strerror}") from error
 
@@ -146,7 +188,7 @@ class Recording:
     def _split(self, data: bytes) -> RecordedChunk:
         """The messages of a chunk by topic."""
         records: dict[int, list[bytes]] = {}
-        for channel, at, end in _messages_in(data):
+        for channel, at, end in messages_in(data):
             if channel not in self._cameras:
                 records.setdefault(channel, []).append(data[at:end])
         rows, texts = {}, {}
@@ -159,7 +201,7 @@ class Recording:
         return RecordedChunk(rows, texts)
 
 
-def _messages_in(data: bytes) -> Iterator[tuple[int, int, int]]:
+def messages_in(data: bytes) -> Iterator[tuple[int, int, int]]:
     """Channel, begin and end of each message."""
     at = 0
     while at < len(data):

@@ -10,28 +10,25 @@ import logging
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
-from datetime import datetime
 from pathlib import Path
 from types import TracebackType
 
 from q2r2_control.config.cameras import CameraConfig
-from q2r2_control.errors import ConfigError
 from q2r2_control.plants.mujoco import MujocoPlant
-from q2r2_control.recording.about import About
+from q2r2_control.recording.about import About, Conclusion
+from q2r2_control.recording.base_recorder import PATIENCE, BaseRecorder
 from q2r2_control.recording.camera_process import CameraProcess
 from q2r2_control.recording.encoder import RecordedRobot
 from q2r2_control.recording.helper import reason_of
 from q2r2_control.recording.packing import TickPacker
 from q2r2_control.recording.picture_channel import PictureChannel
 from q2r2_control.recording.topics import Topics
-from q2r2_control.recording.writer import Setup
-from q2r2_control.recording.writer_process import ROOM, WriterProcess
+from q2r2_control.recording.writer_process import ROOM
 from q2r2_control.robot.robot import Robot
-from q2r2_control.runtime.folders import new_folder
 from q2r2_control.runtime.recorder import Tick
 
 _LOOKS = 64  # ticks between two looks at whether the writer lives
-_PATIENCE = 10.0  # for a disk that hangs, at the end of a run [s]
+_LONGEST_FAULT = 500  # that ended a run [characters]
 
 _logger = logging.getLogger(__name__)
 
@@ -49,7 +46,7 @@ class RecordingSummary:
     pictures_fault: str | None = None  # why they ended before the run did
 
 
-class Recorder:
+class Recorder(BaseRecorder):
     """A listener of one run, as a context around it. It raises nothing: what fails is logged once, and the run goes on.
 
     Its process starts with it, so make it before what takes long, and :meth:`begin` when the run is about to begin.
@@ -63,22 +60,21 @@ class Recorder:
         self, parent: Path, name: str, *, waits: bool = False, room: int = ROOM, pictures: bool = False
     ) -> None:
         """``room`` [bytes] for ticks that wait to be written."""
-        self._parent, self._name, self._waits = parent, name, waits
+        self._waits = waits
         self._count = self._written = 0  # ticks
         self.overflows = 0  # ticks for which there was no room
-        self._fault: str | None = None
-        self._path: Path | None = None
         self._packer: TickPacker | None = None  # None: not begun
-        self.writer: WriterProcess | None = None
         self._channel: PictureChannel | None = None
         self.cameras: CameraProcess | None = None
         self._pictures_fault: str | None = None
         self._epoch = 0
-        try:
-            self._channel = PictureChannel() if pictures else None
-            self.writer = WriterProcess(room, self._channel)
-        except (OSError, ValueError) as error:
-            self._fail(reason_of(error))
+        self.success: bool | None = None  # of the run, where its task has a check of its own, set before the end
+        if pictures:
+            try:
+                self._channel = PictureChannel()
+            except OSError as error:
+                self._fail_pictures(reason_of(error))
+        super().__init__(parent, name, room, self._channel)
         if self._channel is not None and self.writer is not None:
             try:
                 self.cameras = CameraProcess(self._channel)
@@ -99,17 +95,9 @@ class Recorder:
 
     def begin(self, about: About, robot: Robot) -> None:
         """Take ticks from now on, of a run that begins at ``about.epoch``."""
-        if self.writer is None:
-            return
-        try:
-            # The time of day, so that recordings are listed in their order.
-            when = datetime.fromtimestamp(about.epoch * 1e-9)
-            folder = new_folder(self._parent, f"{when:%Y%m%d-%H%M%S}-{self._name}", "--record")
-            self._path = folder / f"{folder.name}.mcap"
-            self.writer.begin(Setup(self._path.absolute(), about, RecordedRobot.of(robot)))
-            self._packer, self._epoch = TickPacker(about.topics()), about.epoch
-        except (ConfigError, OSError, ValueError) as error:
-            self._fail(reason_of(error))
+        topics = about.topics()
+        if self._open(about, RecordedRobot.of(robot), tuple(topics.all)):
+            self._packer, self._epoch = TickPacker(topics), about.epoch
 
     def __call__(self, tick: Tick) -> None:
         """Take one tick; never raises, and waits in simulated time only."""
@@ -139,13 +127,10 @@ class Recorder:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         # The pictures first: the writer waits for them.
-        if self.cameras is not None and (fault := self.cameras.finish(0.0 if self._fault else _PATIENCE)):
+        if self.cameras is not None and (fault := self.cameras.finish(0.0 if self._fault else PATIENCE)):
             self._fail_pictures(fault)
-        if self.writer is None:
-            return
-        if fault := self.writer.finish(_PATIENCE):
-            self._fail(fault)
-        self._written = self.writer.ring.written
+        ended_by = None if error is None else reason_of(error)[:_LONGEST_FAULT]
+        self._written = self._end(Conclusion(self.success, ended_by))
 
     @property
     def summary(self) -> RecordingSummary:
@@ -188,17 +173,3 @@ class Recorder:
         if self._pictures_fault is None:
             self._pictures_fault = reason
             _logger.warning("no more pictures are recorded, the run goes on: %s", reason)
-
-    def _look(self) -> bool:
-        """Whether the writer has ended."""
-        assert self.writer is not None
-        if fault := self.writer.fault():
-            self._fail(fault)
-        return fault is not None
-
-    def _fail(self, reason: str) -> None:
-        """Log the first failure in one line; nothing more is recorded."""
-        if self._fault is not None:
-            return
-        self._fault = f"{self._path}: {reason}" if self._path is not None else reason
-        _logger.warning("recording ended, the run goes on: %s", self._fault)

@@ -2,141 +2,35 @@
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from pathlib import Path
-
-import numpy as np
 
 from q2r2_control.config import Config
 from q2r2_control.config.cell import parse_config
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.control.qp import QpProblem, QpSolution, Solver, make_solver
 from q2r2_control.drives import permitted
-from q2r2_control.errors import PlantError, RecordingError
+from q2r2_control.errors import ConfigError, PlantError, RecordingError
 from q2r2_control.pipeline import Pipeline
-from q2r2_control.recording import topics as names
+from q2r2_control.plants.base import Plant
+from q2r2_control.plants.factory import make_plant
+from q2r2_control.recording.about import ROS
 from q2r2_control.recording.comparison import Comparison, changes
-from q2r2_control.recording.episode_spans import events_of_ticks
-from q2r2_control.recording.packing import HAND_FAULTS, NOT_MEASURED
-from q2r2_control.recording.reader import RecordedChunk, Recording
+from q2r2_control.recording.plant_difference import ArmDifference, PlantDifference
+from q2r2_control.recording.reader import Recording
+from q2r2_control.recording.recorded_ticks import NoMoreTicksError, RecordedTick, RecordedTicks
 from q2r2_control.robot.robot import Robot
 from q2r2_control.runtime.loop_clock import LoopClock
-from q2r2_control.runtime.recorder import RunStart
 from q2r2_control.runtime.run_summary import RunSummary
-from q2r2_control.types import (
-    SIDES,
-    Array,
-    Command,
-    CommandMode,
-    Event,
-    HandInputs,
-    HandSample,
-    HapticFeedback,
-    RobotState,
-)
-
-
-@dataclass(frozen=True, slots=True)
-class RecordedTick:
-    """What one tick took."""
-
-    number: int
-    now: float
-    dt: float
-    following: bool
-    connected: bool
-    samples: list[HandSample]
-    state: RobotState
-    openings: dict[str, float]
-    unsolved: int
-    events: list[Event]
-
-
-class RecordedTicks:
-    """The ticks of a recording, one after the other. Ends before the first that is missing."""
-
-    def __init__(self, recording: Recording, comparison: Comparison) -> None:
-        self._arms, self._joints = recording.about.arms, len(recording.about.joints)
-        self._labels = recording.topics.by_name[names.TICK].labels["data"]
-        self._comparison = comparison
-        self._chunks = recording.chunks()
-        self._ticks = self._all()
-        self._starts: list[RunStart] = []
-        self.missing = 0  # ticks that were lost behind the last one
-        self.count = 0
-        self.current: RecordedTick | None = None
-        self.next = next(self._ticks, None)
-        if self.next is None or not self._starts:
-            raise RecordingError(f"{recording.file}: no tick was recorded")
-        self.start = self._starts[0]
-
-    def advance(self) -> RecordedTick:
-        """Go on to the next tick. Raises :class:`NoMoreTicksError` behind the last."""
-        if self.next is None:
-            raise NoMoreTicksError
-        self.current, self.next = self.next, next(self._ticks, None)
-        self.count += 1
-        return self.current
-
-    def _all(self) -> Iterator[RecordedTick]:
-        expected = 0
-        for chunk in self._chunks:
-            self._comparison.expect(chunk)
-            if names.START in chunk.rows:
-                self._starts.append(self._start_of(chunk))
-            for tick in self._ticks_of(chunk):
-                if tick.number != expected:
-                    self.missing = tick.number - expected
-                    return
-                yield tick
-                expected += 1
-
-    def _start_of(self, chunk: RecordedChunk) -> RunStart:
-        now, stamp, external, *joints = chunk.rows[names.START]["data"][0].tolist()
-        q, v, tau, felt = np.array(joints).reshape(4, self._joints)
-        return RunStart(now, RobotState(q, v, tau, felt if external else None, stamp))
-
-    def _ticks_of(self, chunk: RecordedChunk) -> Iterator[RecordedTick]:
-        if names.TICK not in chunk.rows:
-            return
-        states = chunk.rows[names.JOINT_STATES]
-        felt = deque(chunk.rows[names.EXTERNAL_TORQUE]["effort"]) if names.EXTERNAL_TORQUE in chunk.rows else deque()
-        samples = deque(chunk.rows[names.SAMPLES]["data"]) if names.SAMPLES in chunk.rows else deque()
-        events = events_of_ticks(chunk)
-        for numbers, state in zip(chunk.rows[names.TICK]["data"], states, strict=True):
-            tick = dict(zip(self._labels, numbers.tolist(), strict=True))
-            openings = {arm: tick[f"opening_{arm}"] for arm in self._arms}
-            yield RecordedTick(
-                number=int(tick["index"]),
-                now=tick["now"],
-                dt=tick["dt"],
-                following=bool(tick["following"]),
-                connected=bool(tick["connected"]),
-                samples=[_sample(samples.popleft()) for _ in range(int(tick["samples"]))],
-                state=RobotState(
-                    q=state["position"].copy(),
-                    v=state["velocity"].copy(),
-                    tau=state["effort"].copy(),
-                    tau_external=felt.popleft().copy() if tick["external"] else None,
-                    stamp=tick["state_stamp"],
-                ),
-                openings={arm: opening for arm, opening in openings.items() if opening != NOT_MEASURED},
-                unsolved=int(tick["unsolved"]),
-                events=events.get(int(tick["index"]), []),
-            )
-
-
-class NoMoreTicksError(Exception):
-    """There are no more ticks: the run was killed, or some were lost."""
+from q2r2_control.types import Array, Command, CommandMode, Event, HandSample, HapticFeedback, RobotState
 
 
 class ReplayPipeline(Pipeline):
-    """Runs the loop with the clock, input and plant of a recording, and its solver as late as it was then."""
+    """Runs the loop with the clock and input of a recording, and its solver as late as it was then."""
 
-    def __init__(self, config: Config, robot: Robot, ticks: RecordedTicks, mode: str, modes: tuple[str, ...]) -> None:
-        super().__init__(config, robot, _Input(ticks, self._wish_again), _Plant(ticks, modes), mode)
+    def __init__(self, config: Config, robot: Robot, ticks: RecordedTicks, plant: Plant, mode: str) -> None:
+        super().__init__(config, robot, _Input(ticks, self._wish_again), plant, mode)
         self._recorded = ticks
 
     def make_clock(self, realtime: bool) -> LoopClock:
@@ -164,25 +58,57 @@ class Replay:
     ended_by: str | None  # that fault, or why it ended before the recording did
     difference: str | None  # the first one; None: identical
     notes: list[str]  # what is not as it was when it was recorded
+    arms: dict[str, ArmDifference] = field(default_factory=dict)  # with a plant: where the tools were elsewhere
 
 
-def replay(path: Path, config: Config | None = None) -> Replay:
-    """Run a recording again, with its own cell or another one.
-
-    Raises :class:`RecordingError` for a file that is none or is damaged, and :class:`Q2R2Error` for a cell that cannot
-    be built or whose arms and joints have other names.
-    """
+def opened(path: Path, config: Config | None) -> tuple[Recording, Config, Robot]:
+    """A recording, and the cell to run it in: its own or ``config``. Raises as :func:`replay` does."""
     recording = Recording(path)
     about = recording.about
+    if about.source == ROS:
+        raise RecordingError(
+            f"{recording.file}: recorded from ROS nodes, which keeps messages and not what each loop took, so there is "
+            "nothing to replay to the bit; ros2 bag play plays it, q2r2 judge and q2r2 export read it"
+        )
     cell = config or parse_config(about.cell, f"{recording.file}: its cell")
     robot = Robot.from_config(cell)
     if tuple(robot.arms) != about.arms or tuple(robot.joint_names) != about.joints:
         raise RecordingError(f"{recording.file}: recorded with other arms or joints than {cell.name} has")
-    notes = changes(about, cell, robot)
-    comparison = Comparison(robot, recording.topics, about.epoch)
-    ticks = RecordedTicks(recording, comparison)
-    pipeline = ReplayPipeline(cell, robot, ticks, about.mode, about.plant_modes)
-    pipeline.listeners.append(comparison)
+    return recording, cell, robot
+
+
+def replay(
+    path: Path,
+    config: Config | None = None,
+    plant: str | None = None,
+    *,
+    compare: bool = True,
+    prepare: Callable[[Pipeline], None] = lambda pipeline: None,
+) -> Replay:
+    """Run a recording again, with its own cell or another one.
+
+    Without a ``plant``, what was measured then is measured again, whatever is commanded; with one, it moves and is
+    measured. Only a plant of the recorded kind can do the same to the bit, so ``compare`` then is for no other.
+    ``prepare`` gets the pipeline before it runs.
+
+    Raises :class:`RecordingError` for a file that is none or is damaged, and :class:`Q2R2Error` for a cell that cannot
+    be built or whose arms and joints have other names, and for a plant that does not have the recorded mode.
+    """
+    recording, cell, robot = opened(path, config)
+    about = recording.about
+    comparison = Comparison(robot, recording.topics, about.epoch) if compare or plant is None else None
+    ticks = RecordedTicks(recording) if comparison is None else RecordedTicks(recording, comparison.expect)
+    moves = _Plant(ticks, about.plant_modes) if plant is None else make_plant(plant, robot, cell)
+    if plant is not None and comparison is not None and about.notes.get("plant") != type(moves).__name__:
+        recorded = about.notes.get("plant", "another plant")
+        raise ConfigError(f"--plant {plant}: recorded with {recorded}; --compare is allowed with the recorded plant")
+    pipeline = ReplayPipeline(cell, robot, ticks, moves, about.mode)
+    if comparison is not None:
+        pipeline.listeners.append(comparison)
+    difference = None if plant is None else PlantDifference(robot, ticks)
+    if difference is not None:
+        pipeline.listeners.append(difference)
+    prepare(pipeline)
     summary, ended_by = None, None
     try:
         summary = pipeline.run(realtime=False)
@@ -190,8 +116,16 @@ def replay(path: Path, config: Config | None = None) -> Replay:
         ended_by = _end_of(ticks)
     except PlantError as error:
         ended_by = str(error)
-    comparison.finish(whole=not ticks.missing)
-    return Replay(ticks.count, summary, ended_by, comparison.difference, notes)
+    if comparison is not None:
+        comparison.finish(whole=not ticks.missing)
+    return Replay(
+        ticks.count,
+        summary,
+        ended_by,
+        None if comparison is None else comparison.difference,
+        changes(about, cell, robot),
+        {} if difference is None else difference.arms(),
+    )
 
 
 def _end_of(ticks: RecordedTicks) -> str:
@@ -289,19 +223,3 @@ class _Solver:
         if tick is not None and tick.unsolved >> self._substep & 1:
             return QpSolution(None, 0.0)
         return self._solver.solve(problem)
-
-
-def _sample(numbers: Array) -> HandSample:
-    values = dict(zip(names.SAMPLE_FIELDS, numbers.tolist(), strict=True))
-    inputs = {name: values[name] for name in HandInputs.__slots__}
-    for button in ("button_upper", "button_lower"):
-        inputs[button] = bool(inputs[button])
-    return HandSample(
-        hand=SIDES[int(values["hand"])],
-        position=numbers[4:7].copy(),
-        quaternion=numbers[7:11].copy(),
-        pose_stamp=values["pose_stamp"],
-        inputs=HandInputs(**inputs),
-        inputs_stamp=values["inputs_stamp"],
-        fault=HAND_FAULTS[int(values["fault"])],
-    )

@@ -102,12 +102,17 @@ class RowType:
         return offset
 
 
+def message_record(channel: int, sequence: int, log_time: int, publish_time: int, payload: bytes) -> bytes:
+    """The record of a message that is serialized already; times [ns]."""
+    length = HEAD.size - _OPCODE_AND_LENGTH + len(payload)
+    return HEAD.pack(MESSAGE, length, channel, sequence, log_time, publish_time) + payload
+
+
 def text_record(channel: int, sequence: int, log_time: int, text: str) -> bytes:
     """The record of a std_msgs/String."""
     data = text.encode() + b"\0"
     payload = _ENCAPSULATION + struct.pack("<I", len(data)) + data
-    length = HEAD.size - _OPCODE_AND_LENGTH + len(payload)
-    return HEAD.pack(MESSAGE, length, channel, sequence, log_time, log_time) + payload
+    return message_record(channel, sequence, log_time, log_time, payload)
 
 
 def text_of(record: bytes) -> str:
@@ -141,6 +146,12 @@ def jpeg_of(record: bytes) -> bytes:
     if begin + at + 4 + length != len(record):
         raise ValueError("a picture of another size than it says")
     return record[begin + at + 4 :]
+
+
+def at_time(record: bytes, log_time: int) -> bytes:
+    """The same message with other times [ns]."""
+    opcode, length, channel, sequence, _, _ = HEAD.unpack_from(record)
+    return HEAD.pack(opcode, length, channel, sequence, log_time, log_time) + record[HEAD.size :]
 
 
 def channel_of(record: bytes) -> int:

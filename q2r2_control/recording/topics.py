@@ -69,6 +69,7 @@ class Topics:
         self._add(JOINT_STATES, _JOINTS, joint_state(joints, *joint_lists), joint_lists)
         self._add(EXTERNAL_TORQUE, _JOINTS, joint_state(joints, "effort"), {"effort": joints})
         for arm in arms:
+            self._add(filtered_hand(arm), _POSE, pose_stamped(""))
             self._add(target(arm), _POSE, pose_stamped(WORLD))
             self._add(safe_target(arm), _POSE, pose_stamped(WORLD))
         motion = {"positions": joints, "velocities": joints, "accelerations": joints}
@@ -101,6 +102,11 @@ def hand_pose(hand: str) -> str:
 def hand_buttons(hand: str) -> str:
     """The topic of a hand's buttons, triggers and stick."""
     return f"/q2r_{hand}_hand_inputs"
+
+
+def filtered_hand(arm: str) -> str:
+    """The topic of the filtered poses of the hand that an arm follows."""
+    return f"/q2r2/{arm}/filtered_hand_pose"
 
 
 def target(arm: str) -> str:

@@ -9,18 +9,19 @@ from __future__ import annotations
 import json
 import pickle
 import time
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from q2r2_control.recording.about import ABOUT, CELL, FIELDS, ROBOT, About
+from q2r2_control.recording.about import ABOUT, CELL, CONCLUSION, FIELDS, ROBOT, About
 from q2r2_control.recording.bag import definitions, qos_text, write_metadata
 from q2r2_control.recording.encoder import RecordedRobot, TickEncoder, in_order
-from q2r2_control.recording.helper import be_nice, has_ended
+from q2r2_control.recording.helper import be_nice, has_ended, told
 from q2r2_control.recording.mcap_file import McapFile
 from q2r2_control.recording.picture_channel import PictureSource
 from q2r2_control.recording.ring import Ring
 from q2r2_control.recording.rows import channel_of
-from q2r2_control.recording.topics import Topics
+from q2r2_control.recording.topics import Topic
 
 # Between two looks at the ring [s]; a few ticks take nearly as long to encode as many.
 _PERIOD = 0.1
@@ -36,7 +37,8 @@ class Setup:
 
     path: Path  # of the file, in a folder that is there
     about: About
-    robot: RecordedRobot
+    robot: RecordedRobot | None  # None: what comes are not ticks but whole messages
+    topics: tuple[Topic, ...]  # of the file
 
 
 def main(memory: int, *rest: int) -> None:
@@ -68,20 +70,21 @@ def _record(ring: Ring, pictures: PictureSource | None, parent: int) -> None:
 
 
 def _write(ring: Ring, pictures: PictureSource | None, file: McapFile, setup: Setup, parent: int) -> None:
-    about, topics = setup.about, setup.about.topics()
+    about, topics = setup.about, setup.topics
     _begin(file, about, topics)
     # Once before the run too, so that what a killed process leaves is a bag.
-    write_metadata(setup.path, topics.all, {}, about.epoch, about.epoch, about.notes)
-    encoder = TickEncoder(setup.robot, topics, about.epoch)
+    write_metadata(setup.path, topics, {}, about.epoch, about.epoch, about.notes)
+    by_channel = {topic.channel: topic for topic in topics}
+    encode = _encoder(setup, by_channel)
     count, due = 0, time.monotonic() + _CHUNK_TIME
     over = ended = False  # the run; all that writes to the rings
     while True:
         batch = ring.take(_BATCH)
         if batch:
-            file.add(in_order(encoder.encode(batch)))
+            file.add(encode(batch))
             ring.release()
             count += len(batch)
-        taken = _write_pictures(pictures, file, topics)
+        taken = _write_pictures(pictures, file, by_channel)
         drained = ended and not batch
         if drained or time.monotonic() >= due or file.pending > _CHUNK_SIZE:
             file.flush()
@@ -92,24 +95,42 @@ def _write(ring: Ring, pictures: PictureSource | None, file: McapFile, setup: Se
             # Before the rings are looked at once more: nothing is added to them afterwards.
             over = over or has_ended(parent, _PERIOD)
             ended = over and (pictures is None or pictures.has_ended(_PERIOD))
+    conclusion = _conclusion()
+    if conclusion:
+        file.add_metadata(CONCLUSION, conclusion)
     file.close()
-    write_metadata(setup.path, topics.all, file.counts, file.first_time, file.last_time, about.notes)
+    notes = {**about.notes, **conclusion}
+    write_metadata(setup.path, topics, file.counts, file.first_time, file.last_time, notes)
 
 
-def _write_pictures(pictures: PictureSource | None, file: McapFile, topics: Topics) -> int:
+def _conclusion() -> dict[str, str]:
+    """What the run has said at its end."""
+    text = told()
+    return dict(json.loads(text)) if text else {}
+
+
+def _encoder(setup: Setup, topics: Mapping[int, Topic]) -> Callable[[Sequence[bytes]], Sequence[tuple[Topic, bytes]]]:
+    """What makes messages of records out of the ring."""
+    if setup.robot is None:
+        return lambda batch: [(topics[channel_of(record)], record) for record in batch]
+    encoder = TickEncoder(setup.robot, setup.about.topics(), setup.about.epoch)
+    return lambda batch: in_order(encoder.encode(batch))
+
+
+def _write_pictures(pictures: PictureSource | None, file: McapFile, topics: Mapping[int, Topic]) -> int:
     """Write the pictures that there are, as a chunk of their own; returns how many."""
     records = [] if pictures is None else pictures.take()
     if pictures is not None and records:
-        file.add_apart([(topics.by_channel[channel_of(record)], record) for record in records])
+        file.add_apart([(topics[channel_of(record)], record) for record in records])
         pictures.written(len(records))
     return len(records)
 
 
-def _begin(file: McapFile, about: About, topics: Topics) -> None:
+def _begin(file: McapFile, about: About, topics: Sequence[Topic]) -> None:
     """Write what is said once."""
-    file.add_topics(topics.all, definitions(topics.all), qos_text())
+    file.add_topics(topics, definitions(topics), qos_text())
     file.add_metadata(ABOUT, about.texts())
-    labels = {topic.name: topic.labels for topic in topics.all if topic.labels}
+    labels = {topic.name: topic.labels for topic in topics if topic.labels}
     for name, kind, text in (
         (CELL, "application/yaml", about.cell),
         (ROBOT, "application/xml", about.robot),

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import os
 import pickle
 
+from q2r2_control.recording.about import Conclusion
 from q2r2_control.recording.helper_process import HelperProcess
 from q2r2_control.recording.picture_channel import PictureChannel
 from q2r2_control.recording.ring import Ring, new_memory
@@ -48,14 +50,15 @@ class WriterProcess:
         """Why it has ended before it was told to; None while it has not. Does not wait."""
         return self._process.fault()
 
-    def finish(self, patience: float) -> str | None:
-        """Let it write what there is, and end. Returns why it did not, or None.
+    def finish(self, patience: float, conclusion: Conclusion) -> str | None:
+        """Let it write what there is and the ``conclusion``, and end. Returns why it did not, or None.
 
         One that gets nowhere for ``patience`` [s] is killed, and one that was told of no run at once.
         """
         fault = None
         if self._begun:
             self.ring.finish()
-            fault = self._process.last_words(patience, f"the disk took no data for {patience:g} s")
+            told = json.dumps(conclusion.texts()).encode()
+            fault = self._process.last_words(patience, f"the disk took no data for {patience:g} s", told)
         self._process.end()
         return fault

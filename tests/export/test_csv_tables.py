@@ -14,7 +14,7 @@ from tests.export.test_lerobot import EPISODES, NAMES
 
 HEAD = [
     *(f"{feature}.{name}" for feature, names in NAMES.items() for name in names),
-    *("next.done", "timestamp", "frame_index", "episode_index", "index", "task_index", "task"),
+    *("next.done", "next.success", "timestamp", "frame_index", "episode_index", "index", "task_index", "task"),
 ]
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import shutil
+from multiprocessing import active_children
 from pathlib import Path
 
 import numpy as np
@@ -119,6 +121,28 @@ def test_an_interrupted_export_goes_on_with_what_it_had(run: Run, tmp_path: Path
     assert Episode.load(first).frames == Episode.load(made.kept[1]).frames
     other = make_episodes(files[:1], Sampling(fps=10), kept)
     assert Episode.load(other.kept[0]).fps == 10
+
+
+def test_a_worker_that_is_killed_is_one_line_and_the_next_export_goes_on(run: Run, tmp_path: Path) -> None:
+    files = [run.file, *(Path(shutil.copy(run.file, tmp_path / f"copy-{number}.mcap")) for number in range(2))]
+    kept = tmp_path / "kept"
+    kept.mkdir()
+    *others, last = make_episodes(files, Sampling(), kept).kept
+    last.unlink()
+    made_at = [other.stat().st_mtime_ns for other in others]
+    os.mkfifo(last.with_suffix(".unfinished"))  # nobody reads it, so a worker is in the middle of its episode for good
+
+    def kill(done: int) -> None:
+        if done == len(others):
+            for process in active_children():
+                process.kill()
+
+    with pytest.raises(ConfigError, match="a process of --workers was killed") as fault:
+        make_episodes(files, Sampling(), kept, workers=2, progress=kill)
+    assert "\n" not in str(fault.value)
+    last.with_suffix(".unfinished").unlink()
+    assert make_episodes(files, Sampling(), kept, workers=2).kept == [*others, last]
+    assert [other.stat().st_mtime_ns for other in others] == made_at
 
 
 @pytest.mark.parametrize("workers", [1, 2])

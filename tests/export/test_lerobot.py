@@ -23,10 +23,15 @@ from q2r2_control.export.statistics import statistics_of
 NAMES = {"observation.state": ("left_A1", "left_gripper"), "action": ("left_A1", "left_gripper", "right_A1")}
 
 
+OUTCOMES = {1: True, 2: None, 3: False}
+
+
 def episode(seed: int, frames: int, task: str) -> Episode:
     random = np.random.default_rng(seed)
     vectors = {name: random.normal(size=(frames, len(labels))).astype(np.float32) for name, labels in NAMES.items()}
-    return Episode(f"run-{seed}.mcap", "two_arms", task, 30, NAMES, {"operator": "Ada"}, vectors)
+    return Episode(
+        f"run-{seed}.mcap", "two_arms", task, 30, NAMES, {"operator": "Ada"}, vectors, success=OUTCOMES[seed]
+    )
 
 
 EPISODES = (episode(1, 40, "stack"), episode(2, 25, "circle"), episode(3, 60, "stack"))
@@ -63,6 +68,7 @@ def test_frames_are_in_one_file_in_the_order_of_the_episodes(kept: list[Path], t
     assert column(table, "task_index").tolist() == [0] * 40 + [1] * 25 + [0] * 60
     assert column(table, "frame_index").tolist() == [*range(40), *range(25), *range(60)]
     assert np.flatnonzero(column(table, "next.done")).tolist() == [39, 64, 124]
+    assert np.flatnonzero(column(table, "next.success")).tolist() == [39]
     assert column(table, "timestamp")[39] == pytest.approx(39 / 30)
 
 
@@ -73,11 +79,12 @@ def test_info_says_what_is_in_it(kept: list[Path], tmp_path: Path, pyarrow: Any)
     assert (info["fps"], info["robot_type"], info["splits"]) == (30, "two_arms", {"train": "0:3"})
     assert (info["total_episodes"], info["total_frames"], info["total_tasks"]) == (3, 125, 2)
     assert info["features"]["action"] == {"dtype": "float32", "shape": [3], "names": list(NAMES["action"])}
-    assert info["features"]["next.done"] == {"dtype": "bool", "shape": [1], "names": None}
+    for name in ("next.done", "next.success"):
+        assert info["features"][name] == {"dtype": "bool", "shape": [1], "names": None}
     assert info["data_path"].format(chunk_index=0, file_index=0) == "data/chunk-000/file-000.parquet"
     assert info["video_path"] is None
     sources = json.loads((tmp_path / "made" / "meta" / "recordings.json").read_text())
-    assert sources[1] == {"episode_index": 1, "recording": "run-2.mcap", "operator": "Ada"}
+    assert sources[1] == {"episode_index": 1, "recording": "run-2.mcap", "success": None, "operator": "Ada"}
 
 
 def test_episodes_say_where_their_frames_are_and_what_is_in_them(

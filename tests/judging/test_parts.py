@@ -18,9 +18,14 @@ from q2r2_control.recording.replay import replay
 from q2r2_control.types import HandInputs
 from tests.judging.runs import hands, loop_of, press, record_episode
 
-BINDINGS = {"trigger": "record_toggle", "grip": "record_discard", "stick_up": "record_mark"}
-# Three episodes, 1 to 2.5, 3 to 4.5 and from 5 s on, of which the second is discarded after it has ended.
-TOGGLED, DISCARDED, MARKED = (1.0, 2.5, 3.0, 4.5, 5.0), 4.7, 1.7
+BINDINGS = {
+    "trigger": "record_toggle",
+    "grip": "record_discard",
+    "stick_up": "record_mark",
+    "stick_down": "record_success",
+}
+# Three episodes, 1 to 2.5, 3 to 4.5 and from 5 s on, of which the first succeeded and the second is discarded.
+TOGGLED, SUCCEEDED, DISCARDED, MARKED = (1.0, 2.5, 3.0, 4.5, 5.0), 2.7, 4.7, 1.7
 DURATION = 7.0
 
 
@@ -32,7 +37,7 @@ def controls(hand: str, t: float) -> HandInputs:
         press(hand, t),
         press_index=held(*TOGGLED),
         press_middle=held(DISCARDED),
-        thumb_stick_vertical=held(MARKED),
+        thumb_stick_vertical=held(MARKED) - held(SUCCEEDED),
     )
 
 
@@ -50,6 +55,7 @@ def judged(file: Path) -> list[Judged]:
 def test_each_is_judged_by_what_is_in_it_alone(judged: list[Judged]) -> None:
     assert [one.figures.part for one in judged] == [1, 2, 3]
     assert [one.verdict.line for one in judged] == ["keep", "discard: its operator discarded it", "keep"]
+    assert [one.figures.success for one in judged] == [True, None, None]
     durations = [one.figures.duration_s for one in judged]
     assert durations == [pytest.approx(seconds, abs=0.05) for seconds in (1.5, 1.5, 2.0)]
     assert [one.figures.timing.lost_ticks for one in judged] == [0, 0, 0]
@@ -98,6 +104,9 @@ def test_those_that_are_kept_become_episodes_of_a_dataset_with_frames_of_their_o
     assert made.skipped == []
     episodes = [Episode.load(kept) for kept in made.kept]
     assert [episode.name for episode in episodes] == [f"{file.stem}-1", f"{file.stem}-3"]
+    assert [episode.success for episode in episodes] == [True, None]
+    succeeded = [np.flatnonzero(episode.columns(0, 0, 0)["next.success"]).tolist() for episode in episodes]
+    assert succeeded == [[episodes[0].frames - 1], []]
     assert episodes[0].frames == pytest.approx(75, abs=2)
     assert episodes[1].frames >= 100  # and until the arms are at rest
     whole = make_episode(file, Sampling(fps=250))

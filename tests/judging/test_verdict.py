@@ -168,7 +168,17 @@ def test_a_number_beyond_its_threshold_is_the_one_reason(
 
 def test_every_threshold_is_tried_here() -> None:
     tried = {case[0] for case in CASES}
-    assert set(JudgeSettings.model_fields) - tried == {"dropout", "needs_end"}
+    assert set(JudgeSettings.model_fields) - tried == {"dropout", "keep_failed", "needs_end"}
+
+
+def test_a_failure_is_discarded_unless_failures_are_kept_and_a_run_that_a_fault_ended_always() -> None:
+    assert verdict_of(changed(success=True), JudgeSettings()).keep
+    assert verdict_of(changed(success=None), JudgeSettings()).keep
+    failed = changed(success=False)
+    assert verdict_of(failed, JudgeSettings()).line == "discard: it failed, as its operator or task says"
+    assert verdict_of(failed, JudgeSettings(keep_failed=True)).keep
+    ended = changed(ended_by="left_A3 stands still")
+    assert verdict_of(ended, JudgeSettings()).line == "discard: a fault ended the run: left_A3 stands still"
 
 
 def test_a_number_that_is_none_is_not_judged_and_one_that_is_no_number_is_discarded() -> None:

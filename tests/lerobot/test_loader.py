@@ -40,14 +40,17 @@ def theirs(tmp_path: Path) -> Path:
     vectors: dict[str, dict[str, Any]] = {
         name: {"dtype": "float32", "shape": (len(labels),), "names": list(labels)} for name, labels in NAMES.items()
     }
-    features = {**vectors, "next.done": {"dtype": "bool", "shape": (1,), "names": None}}
+    flag = {"dtype": "bool", "shape": (1,), "names": None}
+    features = {**vectors, "next.done": flag, "next.success": flag}
     folder = tmp_path / "theirs"
     dataset = LeRobotDataset.create("q2r2/test", FPS, features, root=folder, robot_type="two_arms", use_videos=False)
     for episode in EPISODES:
         for frame in range(episode.frames):
             values: dict[str, Any] = {name: episode.vectors[name][frame] for name in NAMES}
             done = np.array([frame == episode.frames - 1])
-            dataset.add_frame({**values, "next.done": done, "task": episode.task})
+            dataset.add_frame(
+                {**values, "next.done": done, "next.success": done & bool(episode.success), "task": episode.task}
+            )
         dataset.save_episode()
     dataset.finalize()
     return folder

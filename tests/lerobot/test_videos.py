@@ -46,6 +46,7 @@ def theirs(tmp_path_factory: pytest.TempPathFactory, ours: tuple[Path, list[list
     features = {
         **vectors,
         "next.done": {"dtype": "bool", "shape": (1,), "names": None},
+        "next.success": {"dtype": "bool", "shape": (1,), "names": None},
         KEY: {"dtype": "video", "shape": (HEIGHT, WIDTH, 3), "names": ["height", "width", "channels"]},
     }
     folder = tmp_path_factory.mktemp("theirs") / "made"
@@ -54,7 +55,8 @@ def theirs(tmp_path_factory: pytest.TempPathFactory, ours: tuple[Path, list[list
         for frame, pixels in enumerate(pictures):
             values: dict[str, Any] = {name: episode.vectors[name][frame] for name in NAMES}
             done = np.array([frame == episode.frames - 1])
-            dataset.add_frame({**values, "next.done": done, KEY: pixels, "task": episode.task})
+            flags = {"next.done": done, "next.success": done & bool(episode.success)}
+            dataset.add_frame({**values, **flags, KEY: pixels, "task": episode.task})
         dataset.save_episode()
     dataset.finalize()
     return folder

@@ -7,12 +7,13 @@ import subprocess
 import sys
 import zlib
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import zstandard
 from mcap.data_stream import RecordBuilder
-from mcap.records import Chunk, McapRecord
+from mcap.records import Chunk, DataEnd, Footer, McapRecord, Metadata, MetadataIndex
 from mcap.stream_reader import StreamReader, get_chunk_data_stream
 
 from q2r2_control.inputs.base import Input
@@ -114,8 +115,10 @@ def file_of(summary: RecordingSummary) -> Path:
 
 
 def rewrite(file: Path, target: Path, change: Callable[[bytearray], None]) -> Path:
-    """A copy whose messages were changed, with checksums that fit."""
-    builder = RecordBuilder()
+    """A copy whose messages were changed, with checksums that fit, and an end of the run that is found."""
+    written, builder = bytearray(MAGIC), RecordBuilder()
+    places: dict[str, int] = {}
+    summary = 0
     with file.open("rb") as stream:
         for record in StreamReader(stream, emit_chunks=True).records:
             changed: McapRecord = record
@@ -131,6 +134,15 @@ def rewrite(file: Path, target: Path, change: Callable[[bytearray], None]) -> Pa
                     zlib.crc32(content),
                     size,
                 )
+            elif isinstance(record, Metadata):
+                places[record.name] = len(written)
+            elif isinstance(record, MetadataIndex):
+                changed = replace(record, offset=places[record.name])
+            elif isinstance(record, Footer) and record.summary_start:
+                changed = replace(record, summary_start=summary)
             changed.write(builder)
-    target.write_bytes(MAGIC + builder.end() + MAGIC)
+            written += builder.end()
+            if isinstance(record, DataEnd):
+                summary = len(written)
+    target.write_bytes(written + MAGIC)
     return target

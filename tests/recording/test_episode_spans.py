@@ -10,6 +10,7 @@ from q2r2_control.recording.episode_spans import EpisodeSpan, spans_of
 from q2r2_control.types import Event
 
 BEGINS, ENDS, DISCARDED, MARK = "episode begins", "episode ends", "episode discarded", "mark"
+SUCCEEDED, FAILED = "episode succeeded", "episode failed"
 
 CASES = {
     "none at all: the whole run": ([], [(-math.inf, math.inf, False)]),
@@ -42,3 +43,26 @@ def test_marks_are_those_of_the_episode_that_they_are_in() -> None:
     told = events((0.5, MARK), (1.0, BEGINS), (1.2, MARK), (1.4, MARK), (2.0, ENDS), (3.0, MARK))
     assert [span.marks for span in spans_of(told)] == [(1.2, 1.4)]
     assert [span.marks for span in spans_of(events((0.5, MARK)))] == [(0.5,)]
+
+
+OUTCOMES = {
+    "of the episode that goes on, which it ends": (
+        [(1.0, BEGINS), (2.0, SUCCEEDED), (3.0, BEGINS), (4.0, FAILED)],
+        [(2.0, True), (4.0, False)],
+    ),
+    "of the last one, which has ended": ([(1.0, BEGINS), (2.0, ENDS), (2.5, FAILED)], [(2.0, False)]),
+    "what was said last": ([(1.0, BEGINS), (2.0, FAILED), (2.5, SUCCEEDED)], [(2.0, True)]),
+    "of the run, where no episode is told of": ([(1.0, FAILED)], [(math.inf, False)]),
+    "of nobody": ([(1.0, BEGINS)], [(math.inf, None)]),
+}
+
+
+@pytest.mark.parametrize(("told", "expected"), OUTCOMES.values(), ids=OUTCOMES)
+def test_success_and_failure_are(told: list[tuple[float, str]], expected: list[tuple[float, bool | None]]) -> None:
+    assert [(span.end, span.success) for span in spans_of(events(*told))] == expected
+
+
+def test_of_the_whole_run_the_operator_knows_better_than_the_check_of_its_task() -> None:
+    assert [span.success for span in spans_of([], run_succeeded=True)] == [True]
+    assert [span.success for span in spans_of(events((1.0, FAILED)), run_succeeded=True)] == [False]
+    assert [span.success for span in spans_of(events((1.0, BEGINS)), run_succeeded=True)] == [None]

@@ -12,8 +12,10 @@ import time
 import tracemalloc
 from dataclasses import replace as changed
 from functools import partial
+from itertools import count
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 
@@ -23,7 +25,7 @@ from q2r2_control.recording.packing import TickPacker
 from q2r2_control.recording.reader import Recording
 from q2r2_control.recording.recorder import Recorder
 from q2r2_control.recording.replay import replay
-from q2r2_control.recording.topics import Topics
+from q2r2_control.recording.topics import Topics, filtered_hand, target
 from q2r2_control.runtime.recorder import Tick
 from tests.recording.runs import RATE, file_of, pipeline, read_elsewhere, record, writer_of
 from tests.support.processes import wait_until
@@ -37,7 +39,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Tick]
     ticks: list[Tick] = []
     loop = pipeline("circle", "mujoco")
     loop.listeners.append(ticks.append)
-    return file_of(record(tmp_path_factory.mktemp("recordings"), loop, 1.0)), ticks
+    return file_of(record(tmp_path_factory.mktemp("recordings"), loop, 2.0)), ticks
 
 
 def test_every_topic_opens_with_rosbags_in_another_process(tmp_path: Path, recorded: tuple[Path, list[Tick]]) -> None:
@@ -59,6 +61,31 @@ def test_every_topic_opens_with_rosbags_in_another_process(tmp_path: Path, recor
     states = [json.loads(text) for text in found["/q2r2/state"]["texts"]]
     events = [event for state in states for event in state.get("events", ())]
     assert [event["reason"] for event in events] == ["lower button", "lower button"]
+
+
+def test_the_filtered_hand_is_recorded_that_each_target_is_made_of(recorded: tuple[Path, list[Tick]]) -> None:
+    file, ticks = recorded
+    poses, targets = (
+        np.concatenate([chunk.rows[topic]["position"] for chunk in Recording(file).chunks() if topic in chunk.rows])
+        for topic in (filtered_hand("left"), target("left"))
+    )
+    led = [tick.targets["left"] for tick in ticks if tick.targets["left"].pose is not None]
+    assert len(poses) == len(led) > 50
+    np.testing.assert_array_equal(poses, [one.hand.translation for one in led if one.hand is not None])
+    # Side by side and unscaled, a tool moves as its hand does: by the same from the first target on.
+    assert np.ptp(poses, axis=0).max() > 0.005
+    np.testing.assert_allclose(targets - targets[0], poses - poses[0], atol=1e-9)
+
+
+def test_a_clock_that_is_set_back_during_a_run_changes_no_time_in_the_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Each look at the time of day finds an hour less than the one before.
+    hours = count(1_700_000_000_000_000_000, -3_600_000_000_000)
+    monkeypatch.setattr(time, "time_ns", lambda: next(hours))
+    file = file_of(record(tmp_path, pipeline(), 0.5))
+    times = np.concatenate([chunk.rows["/q2r2/tick"]["log_time"] * 1e-9 for chunk in Recording(file).chunks()])
+    np.testing.assert_allclose(np.diff(times), 1.0 / RATE, atol=1e-6)
 
 
 def test_the_folder_is_a_bag_of_version_nine(recorded: tuple[Path, list[Tick]]) -> None:

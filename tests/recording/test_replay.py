@@ -12,8 +12,9 @@ import pytest
 from q2r2_control.config import Config
 from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.control.qp import DaqpSolver, QpProblem, QpSolution
-from q2r2_control.errors import PlantError, RecordingError
+from q2r2_control.errors import ConfigError, PlantError, RecordingError
 from q2r2_control.inputs.scripted import ScriptedInput
+from q2r2_control.judging.judge import judge
 from q2r2_control.plants.kinematic import KinematicPlant
 from q2r2_control.recording.reader import Recording
 from q2r2_control.recording.recorder import Recorder
@@ -56,6 +57,20 @@ def test_a_replay_of_a_run_in_simulated_time_is_identical(
     assert result.summary.at_rest
 
 
+def test_a_replay_on_a_plant_of_the_recorded_kind_is_identical_and_on_another_one_says_how_far_off(
+    tmp_path: Path,
+) -> None:
+    file = file_of(record(tmp_path, pipeline("rotate", "mujoco", human=True), 1.5))
+    same, other = replay(file, plant="mujoco"), replay(file, plant="kinematic", compare=False)
+    assert (same.difference, same.ended_by) == (None, None)
+    assert {arm.position_mm_max for arm in same.arms.values()} == {0.0}
+    assert other.ended_by is None
+    assert all(0.001 < arm.position_mm_rms < arm.position_mm_max < 5.0 for arm in other.arms.values())
+    assert all(0.001 < arm.rotation_deg_max < 5.0 for arm in other.arms.values())
+    with pytest.raises(ConfigError, match="recorded with MujocoPlant"):
+        replay(file, plant="kinematic")
+
+
 def test_what_a_program_asked_of_the_run_is_asked_again(tmp_path: Path) -> None:
     loop = pipeline("circle", "kinematic")
     teleop = loop.config.teleop
@@ -66,6 +81,8 @@ def test_what_a_program_asked_of_the_run_is_asked_again(tmp_path: Path) -> None:
     def ask(tick: Tick) -> None:
         if 0.8 <= tick.t < 0.8 + 0.9 / RATE:
             loop.change_teleop(other)
+        if 1.0 <= tick.t < 1.0 + 0.9 / RATE:
+            loop.change_control({"min_distance": 0.03, "position_gain": 4.0})
         if 1.2 <= tick.t < 1.2 + 0.9 / RATE:
             loop.go_home()
 
@@ -74,7 +91,8 @@ def test_what_a_program_asked_of_the_run_is_asked_again(tmp_path: Path) -> None:
     assert result.summary is not None
     told = [event.reason for event in result.summary.events if event.arm == "left"]
     assert told[1].startswith('a program changes settings: {"position_scale": 0.3')
-    assert told[2:5] == ["settings changed", "a program asks for the way home", "way home"]
+    control = 'a program changes control: {"min_distance": 0.03, "position_gain": 4.0}'
+    assert told[2:7] == ["settings changed", control, "control changed", "a program asks for the way home", "way home"]
     assert (result.difference, result.ended_by, result.notes) == (None, None, [])
 
 
@@ -154,6 +172,11 @@ def test_a_run_that_a_fault_ended_ends_by_the_same_fault(tmp_path: Path) -> None
     result = replay(file_of(recorders[0].summary))
     assert result.difference is None
     assert result.ended_by == str(fault.value)
+    recording = Recording(file_of(recorders[0].summary))
+    assert recording.closed
+    assert recording.conclusion.ended_by == str(fault.value)
+    (judged,) = judge(recording)
+    assert f"a fault ended the run: {fault.value}" in judged.verdict.line
 
 
 class SometimesLate(DaqpSolver):

@@ -1,0 +1,98 @@
+"""Writes each episode of a recording as a bag of its own: its messages as they were recorded, to the byte.
+
+For tools that take an episode for a file. What such a file lacks is what came before, which a replay needs, and which
+this package's own commands read in the recording that it was cut out of.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+from q2r2_control.errors import RecordingError
+from q2r2_control.export.episodes import Part, parts_to_export
+from q2r2_control.recording.about import ABOUT, CELL, CONCLUSION, CUT_OUT_OF, ROBOT, Conclusion
+from q2r2_control.recording.bag import definitions, qos_text, write_metadata
+from q2r2_control.recording.mcap_file import McapFile
+from q2r2_control.recording.reader import Recording
+from q2r2_control.recording.ros_recording import open_recording
+from q2r2_control.recording.ros_topics import is_latched
+from q2r2_control.recording.rows import at_time, channel_of, log_time
+from q2r2_control.recording.topics import PICTURE, STATE, Topic
+
+_Message = tuple[Topic, bytes]
+
+
+def write_bags(file: Path, folder: Path) -> int:
+    """Write the episodes of a recording but those that its operator discarded, each into a new folder in ``folder``.
+
+    Returns how many. Raises :class:`RecordingError` for a bad recording, and where two episodes have one name.
+    """
+    recording = open_recording(file)
+    made: list[Path] = []
+    try:
+        for part in parts_to_export(file):
+            bag = folder / (recording.file.stem + (f"-{part.number}" if part.number else ""))
+            if bag.exists():
+                raise RecordingError(f"{file}: two recordings have this name; allowed: each one once")
+            bag.mkdir()
+            made.append(bag)
+            _write(recording, part, bag / f"{bag.name}.mcap")
+    except RecordingError:
+        for bag in made:
+            shutil.rmtree(bag)
+        raise
+    return len(made)
+
+
+def _write(recording: Recording, part: Part, path: Path) -> None:
+    about, span = recording.about, part.span
+    start = about.epoch + max(round(span.start * 1e9), 0) if not span.whole else 0
+    end = about.epoch + round(span.end * 1e9) if span.end < float("inf") else None
+    conclusion = Conclusion(span.success, recording.conclusion.ended_by if end is None else None).texts()
+    topics = list(recording.declared_topics())
+    notes = {**about.notes, CUT_OUT_OF: recording.file.name, "episode": str(part.number)}
+    file = McapFile(path)
+    try:
+        file.add_topics(topics, definitions(topics), qos_text())
+        file.add_metadata(ABOUT, replace(about, notes=notes).texts())
+        for name, kind, text in ((CELL, "application/yaml", about.cell), (ROBOT, "application/xml", about.robot)):
+            file.add_attachment(name, kind, text, about.epoch)
+        file.begin()
+        for messages in _within(recording, {topic.channel: topic for topic in topics}, start, end):
+            pictures = [message for message in messages if message[0].type == PICTURE]
+            file.add([message for message in messages if message[0].type != PICTURE])
+            file.flush()
+            if pictures:
+                file.add_apart(pictures)
+        if conclusion:
+            file.add_metadata(CONCLUSION, conclusion)
+        file.close()
+    finally:
+        file.abandon()
+    write_metadata(path, topics, file.counts, file.first_time, file.last_time, {**notes, **conclusion})
+
+
+def _within(recording: Recording, topics: dict[int, Topic], start: int, end: int | None) -> Iterator[list[_Message]]:
+    """The messages from ``start`` to ``end`` [ns] of day, chunk by chunk.
+
+    At the start there is what lasts of what was said before.
+    """
+    lasting: dict[int, bytes] = {}
+    begun = False
+    for records in recording.messages():
+        inside = []
+        for record in records:
+            time, topic = log_time(record), topics[channel_of(record)]
+            if time < start:
+                if is_latched(topic.name) or topic.name == STATE:
+                    lasting[topic.channel] = at_time(record, start)
+            elif end is None or time <= end:
+                inside.append((topic, record))
+        if inside and not begun:
+            begun = True
+            inside = [(topics[channel], record) for channel, record in lasting.items()] + inside
+        if inside:
+            yield inside

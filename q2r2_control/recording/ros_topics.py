@@ -1,0 +1,99 @@
+"""What is recorded of the ROS nodes: their topics and types, and what the numbers of their arrays stand for."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from q2r2_control.recording.topics import (
+    DESCRIPTION,
+    JOINT_STATES,
+    PICTURE,
+    REFERENCE,
+    Topic,
+    hand_buttons,
+    hand_pose,
+    safe_target,
+    target,
+)
+from q2r2_control.types import SIDES
+
+CONTROLLER_TICK = "/cartesian_controller/tick"
+RECORDER = "/recorder"
+RECORDER_EVENTS = f"{RECORDER}/events"
+_NODES = ("mujoco_robot", "cartesian_controller", "tcp_endpoint", "simulation_input", "recorder")
+
+# `index` counts the ticks that moved the reference, `dt` is since the last of them; `rejected` is of each arm.
+TICK_FIELDS = (
+    *("index", "now", "dt", "step", "compute_time", "solve_time", "status", "certified", "fallback"),
+    *("closest_distance", "margin", "slack"),
+)
+ARM_FIELDS = ("engaged", "slip", "slip_angle", "wanted", "measured")  # the last two are openings, 0 closed .. 1 open
+
+_ARRAY, _TEXT, _BOOL = "std_msgs/msg/Float64MultiArray", "std_msgs/msg/String", "std_msgs/msg/Bool"
+_POSE, _JOINTS, _TWIST = "geometry_msgs/msg/PoseStamped", "sensor_msgs/msg/JointState", "geometry_msgs/msg/Twist"
+_TRANSFORMS, _IMAGE = "tf2_msgs/msg/TFMessage", "sensor_msgs/msg/Image"
+
+
+def tick_fields(arms: Sequence[str]) -> tuple[str, ...]:
+    """The numbers of the controller's tick, in their order."""
+    return (*TICK_FIELDS, *(f"rejected_{arm}" for arm in arms))
+
+
+def arm_flags(arm: str) -> str:
+    """The topic of what an arm's teleoperation says of each of its ticks."""
+    return f"/q2r2/{arm}/flags"
+
+
+def arm_events(arm: str) -> str:
+    """The topic of an arm's events, as JSON."""
+    return f"/q2r2/{arm}/events"
+
+
+def asked_target(arm: str) -> str:
+    """The topic on which an arm's node says for a recording what it asks for, while it does.
+
+    The recorder does not listen to :func:`target` itself, where it would count as the arm's controller.
+    """
+    return f"/q2r2/{arm}/asked_target"
+
+
+def heard_on(topic: str) -> str:
+    """The topic that the recorder listens to for a recorded one."""
+    arm = topic.removeprefix("/q2r2/").split("/")[0]
+    return asked_target(arm) if topic == target(arm) else topic
+
+
+def ros_topics(arms: Sequence[str], cameras: Mapping[str, str]) -> tuple[Topic, ...]:
+    """All topics of a recording of the nodes; ``cameras``: name -> topic of its pictures."""
+    types: dict[str, str] = {DESCRIPTION: _TEXT, JOINT_STATES: _JOINTS, "/mujoco_robot/external_torque": _JOINTS}
+    types |= {"/tf": _TRANSFORMS, "/tf_static": _TRANSFORMS, "/diagnostics": "diagnostic_msgs/msg/DiagnosticArray"}
+    for hand in SIDES:
+        types |= {hand_pose(hand): _POSE, hand_buttons(hand): "quest2ros/msg/OVR2ROSInputs"}
+        types |= {f"/q2r_{hand}_hand_twist": _TWIST}
+        types |= {f"/q2r_{hand}_hand_haptic_feedback": "quest2ros/msg/OVR2ROSHapticFeedback"}
+    types |= {CONTROLLER_TICK: _ARRAY, REFERENCE: "trajectory_msgs/msg/JointTrajectory", RECORDER_EVENTS: _TEXT}
+    for arm in arms:
+        types |= {target(arm): _POSE, safe_target(arm): _POSE, f"/cartesian_controller/following/{arm}": _BOOL}
+        types |= {arm_flags(arm): _ARRAY, arm_events(arm): _TEXT}
+    types |= {f"/{node}/state": _TEXT for node in (*_NODES, *(f"{arm}_q2r2_arm_controller" for arm in arms))}
+    types |= {topic: PICTURE if is_compressed(topic) else _IMAGE for topic in cameras.values()}
+    labels = {CONTROLLER_TICK: tick_fields(arms)} | {arm_flags(arm): ARM_FIELDS for arm in arms}
+    return tuple(
+        Topic(channel, name, kind, None, {"data": labels[name]} if name in labels else {})
+        for channel, (name, kind) in enumerate(types.items(), start=1)
+    )
+
+
+def is_compressed(topic: str) -> bool:
+    """Whether a camera's topic carries CompressedImage, as image_transport names those."""
+    return topic.endswith("/compressed")
+
+
+def is_latched(topic: str) -> bool:
+    """Whether its last message is for those that subscribe later too."""
+    return topic in (DESCRIPTION, "/tf_static") or topic.startswith("/cartesian_controller/following/")
+
+
+def is_reliable(topic: Topic) -> bool:
+    """Whether all of its messages are to arrive, at no one's cost: none that commands, and none of a stream."""
+    return topic.type in (_ARRAY, _TEXT) or topic.name == REFERENCE or heard_on(topic.name) != topic.name

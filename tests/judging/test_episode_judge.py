@@ -1,0 +1,145 @@
+"""While a run goes on, each episode gets its verdict as soon as it has ended, by the same rules as after the run."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from q2r2_control.config.teleop import TeleopSettings
+from q2r2_control.judging.episode_judge import EpisodeJudge
+from q2r2_control.judging.judge import judge
+from q2r2_control.judging.judge_work import Question, written_episode
+from q2r2_control.recording.about import About
+from q2r2_control.recording.reader import Recording
+from q2r2_control.recording.recorder import Recorder
+from q2r2_control.recording.replay import replay
+from q2r2_control.runtime.recorder import Tick
+from q2r2_control.teleop.episode_marks import BEGINS, DISCARDED, ENDS, VERDICT
+from q2r2_control.teleop.haptics import EPISODE_KEPT, EPISODE_REJECTED
+from q2r2_control.types import Event, HandInputs, HapticFeedback
+from tests.judging.runs import RATE, Work, hands, killed, loop_of, press
+from tests.support.processes import alive, wait_until
+
+BINDINGS = {"trigger": "record_toggle", "grip": "record_discard"}
+# One at work, one that its operator discards, one in which nothing moves.
+TOGGLED, GIVEN_UP = (1.0, 2.5, 3.0, 4.0, 6.0), 3.7
+VERDICTS_BY = {2.8: 1, 3.9: 1, 6.3: 2}  # [s]
+DURATION = 7.0
+RESTS = 3.6  # the hands, from then on [s]
+
+
+def controls(hand: str, t: float) -> HandInputs:
+    def held(*begin: float) -> float:
+        return float(hand == "left" and any(at <= t < at + 0.1 for at in begin))
+
+    return replace(press(hand, t), press_index=held(*TOGGLED), press_middle=held(GIVEN_UP))
+
+
+class PatientRun:
+    """A recorded run in simulated time, in which verdicts are waited for at some times."""
+
+    def __init__(self, folder: Path, before: Callable[[EpisodeJudge], None] = lambda judge: None) -> None:
+        self.told: list[str] = []
+        self.felt: list[HapticFeedback] = []
+        work = Work(5)
+        source = hands(pose=lambda hand, t: work(hand, min(t, RESTS)), inputs=controls)
+        source.send_haptic = self.felt.append  # type: ignore[method-assign, assignment]
+        loop = self.loop = loop_of(source, teleop=TeleopSettings.model_validate({"bindings": BINDINGS}))
+        with (
+            Recorder(folder, "test", waits=True) as recorder,
+            EpisodeJudge(lambda: recorder.file, self._tell) as judge_now,
+        ):
+            self.judge, self._due = judge_now, dict(VERDICTS_BY)
+            self.pid = judge_now.pid
+            recorder.begin(About.of(loop, False, {}), loop.robot)
+            before(judge_now)
+            loop.listeners += [recorder, judge_now, self._patient]
+            loop.run(DURATION, realtime=False)
+        assert recorder.file is not None
+        self.file = recorder.file
+
+    def _tell(self, line: str) -> None:
+        self.told.append(line)
+        self.loop.tell(line)
+
+    def _patient(self, tick: Tick) -> None:
+        for due in [due for due in self._due if tick.t >= due]:
+            count = self._due.pop(due)
+
+            def judged(count: int = count) -> bool:
+                self.judge.look()
+                return len(self.told) >= count or self.judge.pid is None
+
+            wait_until(judged)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> PatientRun:
+    return PatientRun(tmp_path_factory.mktemp("verdicts"))
+
+
+def test_each_verdict_is_the_one_that_it_gets_after_the_run(run: PatientRun) -> None:
+    after = judge(Recording(run.file))
+    lines = [one.verdict.line for one in after]
+    assert lines[1] == "discard: its operator discarded it"
+    assert run.told == [f"{VERDICT}1: {lines[0]}", f"{VERDICT}3: {lines[2]}"]  # the operator knows the other one
+    assert lines[0] == "keep"
+    assert lines[2].startswith("discard: idle: no engaged arm moves")
+
+
+def test_both_hands_feel_it_and_the_run_is_replayed_with_it(run: PatientRun) -> None:
+    for pulse in (EPISODE_KEPT, EPISODE_REJECTED):
+        felt = {one.hand for one in run.felt if (one.frequency, one.amplitude) == (pulse.frequency, pulse.amplitude)}
+        assert felt == {"left", "right"}
+    found = replay(run.file)
+    assert found.difference is None
+
+
+def test_none_is_judged_before_all_of_it_is_written(run: PatientRun, tmp_path: Path) -> None:
+    written = killed(run.file, tmp_path / "part.mcap", round(2.45 * RATE))
+    assert written_episode(Question(str(written), 1, 1.0, 2.5)) is None
+    whole = written_episode(Question(str(run.file), 1, 1.0, 2.5))
+    assert whole is not None
+    assert len(whole.ticks.t) == pytest.approx(1.5 * RATE, abs=2)
+
+
+def test_one_that_is_discarded_before_its_verdict_is_there_gets_none(run: PatientRun) -> None:
+    told: list[str] = []
+    with EpisodeJudge(lambda: run.file, told.append) as judge_now:
+        for t, reason in ((1.0, BEGINS), (2.5, ENDS), (2.6, DISCARDED), (4.0, BEGINS), (6.0, ENDS)):
+            judge_now.note(Event(t, "left", "", "", reason))
+
+        def answered() -> bool:
+            judge_now.look()
+            return bool(told)
+
+        wait_until(answered)
+    (line,) = told
+    assert line.startswith(f"{VERDICT}2: discard: idle")
+
+
+def test_its_process_ends_with_the_run(run: PatientRun) -> None:
+    assert run.pid is not None
+    assert not alive(run.pid)
+
+
+def test_one_whose_process_is_killed_says_so_once_and_the_run_goes_on(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    def kill(judge_now: EpisodeJudge) -> None:
+        assert judge_now.pid is not None
+        os.kill(judge_now.pid, signal.SIGKILL)
+
+    with caplog.at_level(logging.WARNING):
+        run = PatientRun(tmp_path, kill)
+    assert run.told == []
+    (line,) = [entry.getMessage() for entry in caplog.records if "judge" in entry.getMessage()]
+    ended = "the process that judges episodes was ended by SIGKILL"
+    assert line == f"episodes are not judged before the run ends: {ended}"
+    assert [one.verdict.keep for one in judge(Recording(run.file))] == [True, False, False]

@@ -1,0 +1,49 @@
+"""The README's way from episodes to a dataset, its own lines, with fewer episodes."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+# These lines install and use the package lerobot, which has tests of its own.
+_ELSEWHERE = ("make ", ".venv-lerobot/")
+_SEEDS, _EPISODES = "1 2 3 4 5 6 7 8 9 10", 2
+
+
+def lines_of_the_readme() -> list[str]:
+    section = (ROOT / "README.md").read_text().split("## From ten episodes to a dataset")[1]
+    found = re.search(r"```sh\n(.*?)```", section, re.DOTALL)
+    assert found is not None
+    return [line for line in found[1].splitlines() if not line.startswith(_ELSEWHERE)]
+
+
+def test_each_line_of_the_readme_does_what_is_said_beside_it(tmp_path: Path) -> None:
+    pytest.importorskip("pyarrow")
+    lines = lines_of_the_readme()
+    assert len(lines) == 5
+    assert _SEEDS in lines[0]
+    script = "\n".join(["set -e", *lines]).replace(_SEEDS, " ".join(map(str, range(1, _EPISODES + 1))))
+    commands = tmp_path / "bin"
+    commands.mkdir()
+    command = commands / "q2r2"
+    command.write_text(f'#!/bin/sh\nexec {sys.executable} -m q2r2_control "$@"\n')
+    command.chmod(0o755)
+    (tmp_path / "config").symlink_to(ROOT / "config")
+    environment = {**os.environ, "PATH": os.pathsep.join([str(commands), os.environ["PATH"]])}
+    done = subprocess.run(
+        ["bash", "-c", script], cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=900
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert done.stdout.count("grasp succeeded") == _EPISODES
+    assert done.stdout.splitlines().count("identical") == _EPISODES
+    assert (tmp_path / "report.html").stat().st_size > 10_000
+    info = json.loads((tmp_path / "datasets" / "grasp" / "meta" / "info.json").read_text())
+    assert info["total_episodes"] == _EPISODES
+    assert "next.success" in info["features"]
