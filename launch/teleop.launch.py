@@ -1,4 +1,7 @@
-"""What q2r2 ros up starts, for ROS: ``ros2 launch q2r2_control teleop.launch.py config:=... input:=... robot:=...``."""
+"""What q2r2 ros up starts, for ROS: ``ros2 launch q2r2_control teleop.launch.py config:=... input:=... robot:=...``.
+
+With ``record:=FOLDER`` it is recorded.
+"""
 
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument, OpaqueFunction, Shutdown
@@ -18,6 +21,7 @@ def generate_launch_description():
             DeclareLaunchArgument(
                 "robot", default_value="auto", choices=list(ROBOTS), description="auto: mujoco for controller: builtin"
             ),
+            DeclareLaunchArgument("record", default_value="", description="folder for a recording; empty: none"),
             OpaqueFunction(function=_nodes),
         ]
     )
@@ -25,6 +29,8 @@ def generate_launch_description():
 
 def _nodes(context):
     given = [LaunchConfiguration(name).perform(context) for name in ("config", "input", "robot")]
+    folder = LaunchConfiguration("record").perform(context)
+    recording = {"folder": folder} if folder else None
     return [
         Node(
             package="q2r2_control",
@@ -34,5 +40,5 @@ def _nodes(context):
             parameters=[{key: ParameterValue(value, value_type=type(value)) for key, value in node.parameters.items()}],
             on_exit=Shutdown(reason=f"{node.name} ended"),
         )
-        for node in nodes_of(*given)
+        for node in nodes_of(*given, recording)
     ]

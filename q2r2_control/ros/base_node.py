@@ -47,6 +47,8 @@ SENT_COMMAND_QOS = QoSProfile(
 )
 # Streams of a headset or of joint states: a late message is worth less than the next one.
 STREAM_QOS = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
+# What is published for recordings only: all of it counts, and nobody waits for it.
+RECORDED_QOS = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=200, reliability=ReliabilityPolicy.RELIABLE)
 # What subscribers that start later have to get too, such as robot_description.
 LATCHED_QOS = QoSProfile(
     history=HistoryPolicy.KEEP_LAST,
@@ -142,7 +144,7 @@ class BaseNode(Node):
     def report_health(self) -> None:
         """Publish :meth:`health` now. A timer does it twice a second; call it for a change that should not wait."""
         level, line, values = self.health()
-        if (problem := self._clock_problem()) is not None:
+        if (problem := self.clock_problem()) is not None:
             level, line = max(level, WARN), f"{problem}; {line}"
         status = DiagnosticStatus(level=level, name=self.get_fully_qualified_name(), message=line)
         status.values = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
@@ -150,15 +152,17 @@ class BaseNode(Node):
         array.header.stamp = self.get_clock().now().to_msg()
         self._diagnostics.publish(array)
         state = {"level": {OK: "ok", WARN: "warn", ERROR: "error"}[level], "message": line, **values}
+        if problem is not None:
+            state["clock_problem"] = problem
         self._state.publish(String(data=json.dumps(state, default=str)))
 
-    def _clock_problem(self) -> str | None:
-        """One line if ROS time is simulated and stands still."""
+    def clock_problem(self, timeout: float = _CLOCK_TIMEOUT) -> str | None:
+        """One line if ROS time is simulated and has stood still for ``timeout`` [s], as far as calls of this tell."""
         clock: Any = self.get_clock()
         now, wall = self.now, time.monotonic()
         if now != self._ros_time[0]:
             self._ros_time = now, wall
-        if not clock.ros_time_is_active or wall - self._ros_time[1] < _CLOCK_TIMEOUT:
+        if not clock.ros_time_is_active or wall - self._ros_time[1] < timeout:
             return None
         if now == 0.0:
             return "use_sim_time is set and nothing comes on /clock"

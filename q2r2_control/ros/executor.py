@@ -83,16 +83,20 @@ class TickExecutor(SingleThreadedExecutor):
         ready, others = self._ticks.wait(_CALLS_PERIOD if unlimited else min(timeout_sec or 0.0, _CALLS_PERIOD))
         if not self._context.ok():
             raise ExternalShutdownException
-        for subscription in self._subscriptions:
-            for _ in range(_MOST_MESSAGES):
-                if (taken := self._take_subscription(subscription)) is None:
-                    break
-                _call(taken)
+        self.take_messages()
         for timer in ready:
             if timer.handle.is_timer_ready():  # not cancelled meanwhile
                 _call(self._take_timer(timer))
         if others or self._something_else_is_ready():
             self._run_others()
+
+    def take_messages(self) -> None:
+        """Run the callbacks of all messages that have arrived; also for a callback that ticks by itself for a while."""
+        for subscription in self._subscriptions:
+            for _ in range(_MOST_MESSAGES):
+                if (taken := self._take_subscription(subscription)) is None:
+                    break
+                _call(taken)
 
     def _something_else_is_ready(self) -> bool:
         now, ready = time.monotonic(), False

@@ -177,11 +177,11 @@ class ArmRigs:
     def engage(self) -> None:
         """Press until all follow."""
         self.wait(lambda rig: rig.state.get("level") == "ok", "nothing keeps the arm from being engaged")
-        self._press_until(lambda rig: rig.state.get("engaged"), "the arm is engaged")
+        self.press_until(lambda rig: rig.state.get("engaged"), "the arm is engaged")
 
     def pause(self) -> None:
         """Press until all are paused."""
-        self._press_until(lambda rig: rig.state.get("state") in HOLDING, "the arm is paused")
+        self.press_until(lambda rig: rig.state.get("state") in HOLDING, "the arm is paused")
 
     def wait_for_pause(self) -> None:
         self.wait(lambda rig: rig.state.get("state") in HOLDING, "the arm is paused")
@@ -203,7 +203,7 @@ class ArmRigs:
             rig.hand = pin.SE3(rig.hand.rotation, rig.hand.translation + np.array([0.4, -0.4, 0.4]))
             rig.sends_hand = True
 
-    def _press_until(self, condition: Callable[[ArmRig], Any], what: str) -> None:
+    def press_until(self, condition: Callable[[ArmRig], Any], what: str) -> None:
         """Press again where a press had no effect for long: an overloaded machine loses one now and then."""
         deadline = time.monotonic() + PATIENCE
         while rigs := [rig for rig in self.rigs if not condition(rig)]:

@@ -38,6 +38,7 @@ class Stop:
 
     fault: float  # when it was [s]
     speed: float  # of the fastest joint at the fault [rad/s]
+    fastest: float  # and from then on: until the fault is noticed arms go on, and may get faster [rad/s]
     slow: float  # from the fault until all joints are slow for good [s]
     rest: float  # and until they rest [s]
     starved: float  # longest time without a joint state until then, above what is usual [s]
@@ -137,7 +138,9 @@ class JointRecorder:
         slow, rest = (self.since(last(speed))[0].t for speed in (SLOW, REST))
         gaps = np.diff([before.t, *(state.t for state in self.since(fault) if state.t <= rest)])
         starved = max(float(gaps.max()) - USUAL_GAP, 0.0)
-        return Stop(fault, float(np.abs(before.v).max()), slow - fault, rest - fault, starved, self.q, rest)
+        speed = float(np.abs(before.v).max())
+        fastest = max(speed, *(float(np.abs(state.v).max()) for state in self.since(fault)))
+        return Stop(fault, speed, fastest, slow - fault, rest - fault, starved, self.q, rest)
 
     @contextmanager
     def tools_rest(self, within: float, what: str) -> Iterator[None]:

@@ -15,6 +15,7 @@ from tests.ros.waiting import wait_until
 pytest.importorskip("rclpy", reason=NEEDS_ROS)
 
 from q2r2_control.ros.monitoring.arm_link import ArmLink
+from q2r2_control.teleop.both_arms import PAUSE_FIRST
 
 TIMEOUT = 1.0  # longer than by default, so that other load on the machine does not look like silence [s]
 MEANWHILE = 0.3  # time for several heartbeats [s]
@@ -27,9 +28,10 @@ class End:
         self.node = node
         self.link = ArmLink(node, "robot", arm, "side_by_side", TIMEOUT)
         self.faults: list[str] = []
+        self.linked = True
 
     def listen(self) -> list[str]:
-        if (fault := self.link.take_fault()) is not None:
+        if (fault := self.link.take_fault(self.linked)) is not None:
             self.faults.append(fault)
         return self.faults
 
@@ -122,6 +124,23 @@ def test_messages_that_a_node_had_no_time_to_read_cost_no_fault(domain: int, mak
         context.try_shutdown()
 
 
+def test_an_alignment_pauses_the_other_arm_even_where_they_are_not_linked_and_nothing_else_does(
+    pair: tuple[End, End],
+) -> None:
+    left, right = pair
+    right.linked = False
+    right.link.engaged()
+    left.link.report("the hand jumped")
+    assert right.listen_for_a_while() == []
+    left.link.set_aligning(True)
+    wait_until(right.hears("alignment chord"), "the alignment is heard")
+    assert right.link.aligning == "the left arm's hand aligns the frame"
+    assert right.listen_for_a_while() == ["linked to left: alignment chord"]
+    left.link.set_aligning(False)
+    wait_until(lambda: right.link.aligning is None, "its end is heard")
+    assert right.listen_for_a_while() == ["linked to left: alignment chord"]
+
+
 def test_an_old_fault_pauses_no_arm_that_started_later_or_was_engaged_since(make: Make) -> None:
     left = make("left")
     left.link.report("old")
@@ -190,6 +209,31 @@ def test_a_node_that_ends_in_order_pauses_the_other_arm_once(make: Make, domain:
         wait_until(right.hears("/left_arm has ended"), "the end is announced")
     time.sleep(TIMEOUT)
     assert right.listen_for_a_while() == ["linked to left: /left_arm has ended"]
+
+
+def test_hands_that_one_arm_has_swapped_are_swapped_for_both(pair: tuple[End, End]) -> None:
+    left, right = (end.link for end in pair)
+    wait_until(lambda: left.unswappable == PAUSE_FIRST, "the other arm is not at rest")
+    left.at_rest = right.at_rest = True
+    wait_until(lambda: left.unswappable is None and right.unswappable is None, "both are at rest")
+    for link, other, swapped in ((left, right, True), (right, left, False)):
+        link.set_swapped(swapped)
+        wait_until(lambda o=other, s=swapped: o.swapped is s, "the other node does so")  # type: ignore[misc]
+        wait_until(lambda o=link: o.swapping is None, "and says so")  # type: ignore[misc]
+
+
+def test_a_node_that_has_not_swapped_hands_yet_is_named(make: Make, domain: int) -> None:
+    from std_msgs.msg import String
+
+    link = make("left").link
+    assert link.unswappable == "the right arm's node is not there"
+    with spun_node(domain, "other") as node:
+        publisher = node.create_publisher(String, "/robot/right/link", 10)
+        node.create_timer(0.02, lambda: publisher.publish(String(data='{"node": "/it", "id": "1", "at_rest": true}')))
+        wait_until(lambda: link.unswappable is None, "its heartbeat comes")
+        link.set_swapped(True)
+        assert link.swapping == "/it has not swapped hands yet"
+        assert link.unswappable == link.swapping
 
 
 def test_messages_that_are_no_heartbeats_are_ignored(make: Make) -> None:

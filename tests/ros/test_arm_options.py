@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import inspect
+import os
 import time
 from pathlib import Path
 from queue import Queue
@@ -169,3 +171,24 @@ def test_a_target_that_slips_on_its_leash_is_felt(rig: ArmRig, processes: Proces
     rig.wait(lambda: rig.state["slip"] > 0.06, "the slip is reported")
     assert set(rig.pulses) == {(0.2, 0.2), (0.0, 0.0)}
     assert np.linalg.norm(rig.wait_for_rest().translation - TOOL.translation) < 0.051
+
+
+def test_the_first_line_of_a_press_costs_no_search_for_its_origin(
+    context: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from q2r2_control.ros import BaseArmController
+
+    for cache in ("modulesbyfile", "_filesbymodname"):  # as in a process that has logged nothing yet
+        monkeypatch.setattr(inspect, cache, {})
+    node = BaseArmController("left", context=context)
+    looked: list[Any] = []
+    realpath = os.path.realpath
+
+    def counted(path: Any, **options: Any) -> Any:
+        looked.append(path)
+        return realpath(path, **options)
+
+    monkeypatch.setattr(os.path, "realpath", counted)
+    node.get_logger().info("engaged: lower button")
+    node.destroy_node()
+    assert len(looked) < 50  # of more than a thousand modules

@@ -22,6 +22,7 @@ pytest.importorskip("quest2ros", reason="needs q2r2 ros build-interfaces")
 pytestmark = pytest.mark.usefixtures("interfaces")
 
 from q2r2_control.errors import ConfigError  # noqa: E402
+from q2r2_control.teleop.haptics import CONTACT, GRASP, LIMIT, NEAR  # noqa: E402
 from tests.ros.arm_rig import TOOL, ArmRig, assert_same, first, offset, patient, steps  # noqa: E402
 from tests.ros.programs.stalling_arm import STALL  # noqa: E402
 
@@ -65,6 +66,23 @@ def test_an_arm_engages_where_it_is_follows_pauses_and_resumes_without_a_jump(
 def _quaternion(target: Any) -> list[float]:
     orientation = target.pose.orientation
     return [orientation.x, orientation.y, orientation.z, orientation.w]
+
+
+def test_an_arm_that_hangs_below_its_target_resumes_with_that_target(rig: ArmRig, processes: Processes) -> None:
+    """The controller is another one, which tells of no command: the last target is what it holds."""
+    rig.start(processes)
+    rig.engage()
+    rig.wait(lambda: rig.targets, "targets come")
+    rig.follows = False
+    rig.tool = offset(TOOL, (0.0, 0.0, -0.02))
+    for _ in range(3):
+        rig.pause()
+        rig.engage()
+        rig.targets.clear()
+        rig.wait(lambda: len(rig.targets) > 5, "targets come again")
+        assert_same(rig.newest(), TOOL, 1e-5)
+    rig.move((0.0, 0.05, 0.0))
+    assert_same(rig.wait_for_rest(), offset(TOOL, (0.0, 0.05, 0.0)), 1e-3)
 
 
 def test_a_silent_hand_pauses_the_arm_and_its_return_moves_nothing(rig: ArmRig, processes: Processes) -> None:
@@ -188,11 +206,52 @@ def test_arms_with_different_mirror_settings_refuse_to_engage_and_a_fault_of_one
     assert right.state["last_event"].startswith("lost: linked to left: the hand jumped")
 
 
+def test_an_alignment_by_the_hand_of_a_paused_arm_pauses_the_other_arm_although_they_are_not_linked(
+    node: Any, processes: Processes
+) -> None:
+    left, right = ArmRig(node, "left"), ArmRig(node, "right")
+    for each in (left, right):
+        each.start(processes, {"teleop.linked": False})
+    right.engage()
+    left.lower = left.upper = True
+    right.wait(lambda: right.state["state"] == "lost", "the alignment pauses the arm")
+    assert right.state["last_event"] == "lost: linked to left: alignment chord"
+    right.wait(lambda: not right.state["ready"], "it may not be engaged meanwhile")
+    right.press()
+    right.wait(lambda: "not engaged: the left arm's hand aligns" in right.state["last_event"], "the press is refused")
+    left.lower = left.upper = False
+    right.engage()
+    assert left.state["state"] == "idle"
+
+
 def start_mirrored(rig: ArmRig, processes: Processes) -> RosProcess:
     process = processes.start_node(f"{rig.arm}_arm_controller", "mirror:=true")
     rig.wait(lambda: rig.state.get("stance") == "mirror", "the mirrored arm is there")
     rig.state = {}
     return process
+
+
+@pytest.mark.parametrize(
+    ("condition", "pulse"),
+    [
+        ('{"spare_distance": 0.0}', (NEAR.frequency, 0.6)),
+        ('{"joints_at_limit": ["left_A4"]}', LIMIT[:2]),
+        ('{"contact_force": 50.0}', (CONTACT.frequency, 0.8)),
+    ],
+    ids=["near", "limit", "contact"],
+)
+def test_a_hand_feels_what_the_controller_says_of_its_arm(
+    condition: str, pulse: tuple[float, float], rig: ArmRig, node: Any, processes: Processes
+) -> None:
+    from std_msgs.msg import String
+
+    publisher = node.create_publisher(String, "/cartesian_controller/condition/left", 10)
+    rig.start(processes)
+    rig.wait(publisher.get_subscription_count, "the node listens")
+    for data in ("no JSON", '{"spare_distance": "near"}', "{}", condition):
+        publisher.publish(String(data=data))
+    rig.wait(lambda: len(rig.pulses) >= 2, "a vibration comes, and its end")
+    assert rig.pulses == [pulse, (0.0, 0.0)]
 
 
 @pytest.mark.parametrize("kind", ["GripperCommand", "ParallelGripperCommand"])
@@ -227,6 +286,7 @@ def test_a_gripper_is_closed_when_its_result_says_so_even_stalled(
         rig.wait(lambda: rig.state["gripper"] == "closing", "the gripper is not taken for closed before its result")
         answers.put({"stalled": True})
         rig.wait(lambda: rig.state["gripper"] == "closed", "stalled is closed")
+        rig.wait(lambda: GRASP[:2] in rig.pulses, "the hand feels what the gripper has closed on")
 
         rig.press("upper")
         command = goals.get(timeout=PATIENCE)

@@ -290,6 +290,33 @@ def test_parameters_change_together_or_not_at_all(cell: Cell) -> None:
     assert [value.double_value for value in read.result().values] == [0.5, 0.03]
 
 
+def test_distances_and_gains_are_set_in_motion_and_what_home_does_not_allow_is_refused(
+    cell: Cell, robot: Robot, streams: list[Stream]
+) -> None:
+    client = AsyncParameterClient(cell.node, "/cartesian_controller")
+    assert client.wait_for_services(PATIENCE)
+
+    def set_to(**values: float) -> Any:
+        sent = client.set_parameters_atomically([Parameter(f"control.{name}", value=to) for name, to in values.items()])
+        wait_until(sent.done, "the parameters are answered")
+        return sent.result().result
+
+    stream = engage(cell, streams, "left", "right")
+    stream.move("left", (0.03, 0.0, 0.0))
+    assert set_to(min_distance=0.03, position_gain=4.0).successful
+    refused = set_to(min_distance=0.045, position_gain=8.0)
+    assert not refused.successful
+    assert "hand_e_envelope_0 are 41.6 mm apart" in refused.reason
+    assert not set_to(posture_gain=1000.0).successful
+    goal = stream.poses["left"]
+    wait_until(lambda: np.linalg.norm(cell.tool("left").translation - goal.translation) < 2e-3, "the arm is there")
+    assert cell.state("left_state") == "following"
+    read = client.get_parameters(["control.min_distance", "control.position_gain"])
+    wait_until(read.done, "the parameters are read")
+    assert [value.double_value for value in read.result().values] == [0.03, 4.0]
+    assert set_to(min_distance=0.02, position_gain=8.0).successful
+
+
 def test_it_follows_in_another_layout_and_frame_with_another_output_and_on_simulated_time(
     cell: Cell, robot: Robot, processes: Processes
 ) -> None:

@@ -14,7 +14,7 @@ from tests.ros.processes import ROOT
 
 PACKAGE = (
     *("package.xml", "pyproject.toml", "setup.py", "setup.cfg", "README.md", "LICENSE"),
-    *("config", "launch", "q2r2_control", "resource", "robots"),
+    *("config", "launch", "q2r2_control", "resource", "robots", "views"),
 )
 
 

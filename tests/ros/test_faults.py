@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 
 import numpy as np
@@ -54,11 +54,12 @@ FROZEN = {
 }
 
 Record = Callable[[str, object], None]
-ATTEMPTS = 5  # to catch both arms in motion, and to measure while the machine is not overloaded
+ATTEMPTS = 4  # to catch both arms in motion, and to measure while the machine is not overloaded
 LONGEST_STARVED = 0.1  # time without joint states that is allowed for; a longer one makes a measurement void [s]
 
-# Most of them just below the timeouts, where one node notices and the other does not [s].
+# Many just below the timeouts, where one node notices and the other does not; of each arm's node fifty in all [s].
 STALLS = (0.05, *3 * (0.11, 0.12, 0.13), 0.16, 0.4)
+MORE_STALLS = (*5 * (0.11, 0.12, 0.13), *np.random.default_rng(0).uniform(0.05, 0.4, 23).tolist())
 ALONE = 0.15  # one arm may be engaged without the other, after both run again [s]
 CONTROLLER = "/cartesian_controller"
 STOPPED = f"{CONTROLLER} is stopped: stopped by {CONTROLLER}/stop; {CONTROLLER}/reset activates again"
@@ -124,34 +125,30 @@ class Teleoperation:
         """How both arms come to rest after a ``fault``, which may take them no longer than it has to.
 
         ``fault`` causes it and returns when that was. The measurement is void if the arms did not move at the fault,
-        since the load of the machine had looked like another fault before, or if no joint states came for long. Then
-        ``again`` moves the arms once more.
+        since the load of the machine had looked like another fault before, or if no joint states came for long, and
+        a node that had no processor when it was to act is late without a trace in what comes here. Then ``again`` moves
+        the arms once more: what is too slow is too slow each time.
         """
-        stop = self.nodes.joints.stop_after(fault())
-        for _ in range(ATTEMPTS - 1):
-            if stop.speed > 0.1 and stop.starved <= LONGEST_STARVED:
-                break
-            print(f"\n{what}: at {stop.speed:.2f} rad/s, no joint state came for {stop.starved:.2f} s; once more")
-            again()
+        for attempt in range(ATTEMPTS):
+            if attempt:
+                again()
             stop = self.nodes.joints.stop_after(fault())
-        if stop.speed <= 0.1 or stop.starved > LONGEST_STARVED:
-            skip_if_overloaded("no stop could be measured")
-        assert stop.speed > 0.1, "the arms did not move at the fault"
-        # A machine that has no time for the robot or for this test has none for the node that has to act either.
-        assert stop.starved <= LONGEST_STARVED, "the robot or this test did not run"
-        allowed = STREAM_TIMEOUT + stop.speed / BRAKING + DELIVERY + 2.0 * stop.starved
-        line = (
-            f"from {stop.speed:.2f} rad/s slow within {1e3 * stop.slow:.0f} ms, allowed {1e3 * allowed:.0f}, "
-            f"at rest within {1e3 * stop.rest:.0f} ms, allowed {1e3 * (allowed + STREAM_TIMEOUT):.0f}; "
-            f"of which for an overloaded machine {2e3 * stop.starved:.0f}"
-        )
-        record(what, line)
-        print(f"\n{what}: {line}")
-        if stop.slow > allowed or stop.rest > allowed + STREAM_TIMEOUT:
-            skip_if_overloaded(line)
-        assert stop.slow <= allowed
-        assert stop.rest <= allowed + STREAM_TIMEOUT  # the hand's data end first, then the targets
-        return stop
+            # The fault is noticed in a time that the arms may still get faster in.
+            allowed = STREAM_TIMEOUT + stop.fastest / BRAKING + DELIVERY + 2.0 * stop.starved
+            line = (
+                f"from {stop.speed:.2f} rad/s, {stop.fastest:.2f} at most, slow within {1e3 * stop.slow:.0f} ms, "
+                f"allowed {1e3 * allowed:.0f}, at rest within {1e3 * stop.rest:.0f} ms, allowed "
+                f"{1e3 * (allowed + STREAM_TIMEOUT):.0f}; of which for an overloaded machine {2e3 * stop.starved:.0f}"
+            )
+            record(f"{what}, attempt {attempt + 1}", line)
+            print(f"\n{what}: {line}")
+            valid = stop.speed > 0.1 and stop.starved <= LONGEST_STARVED
+            # The hand's data end first, then the targets.
+            if valid and stop.slow <= allowed and stop.rest <= allowed + STREAM_TIMEOUT:
+                assert self.nodes.joints.fastest(stop.fault) < FAST
+                return stop
+        skip_if_overloaded(line)
+        raise AssertionError(f"{what}, the last of {ATTEMPTS}: {line}")
 
     def assert_only_a_press_moves(self, stop: Stop) -> None:
         """Nothing has moved since the stop; a press moves nothing either, but from then on the arms follow."""
@@ -277,10 +274,13 @@ def test_a_press_against_a_stopped_controller_says_why_nothing_follows_and_what_
     moving.move()
 
 
+@pytest.mark.parametrize("stalls", [STALLS, pytest.param(MORE_STALLS, marks=pytest.mark.soak)], ids=["few", "more"])
 @pytest.mark.parametrize("name", [f"{arm}_arm_controller" for arm in ARMS])
-def test_however_short_an_arm_s_node_stops_either_both_arms_go_on_or_none(name: str, moving: Teleoperation) -> None:
+def test_however_short_an_arm_s_node_stops_either_both_arms_go_on_or_none(
+    name: str, stalls: Sequence[float], moving: Teleoperation
+) -> None:
     nodes = moving.nodes
-    for stall in STALLS:
+    for stall in stalls:
         moving.move()
         nodes.signal(name, signal.SIGSTOP)
         time.sleep(stall)

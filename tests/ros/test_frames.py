@@ -9,7 +9,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from tests.ros.conftest import NEEDS_ROS
+from tests.ros.conftest import NEEDS_ROS, spun_node
 
 pytest.importorskip("rclpy", reason=NEEDS_ROS)
 pytest.importorskip("tf2_msgs", reason="needs q2r2 ros build-interfaces")
@@ -81,3 +81,35 @@ def test_a_name_that_is_no_text_is_another_node_s_fault_and_ends_nothing(node: A
     publisher.publish(good.replace(b"tool", b"\xe9ool"))
     publisher.publish(good)
     wait_until(lambda: listener.tree.find("tool", "mount") is not None, "the good one is heard")
+
+
+def send_from(node: Any, name: str, pose: pin.SE3, counted: int) -> Any:
+    """A timer that publishes the transform of ``name``; ``counted`` messages went before."""
+    publisher = node.create_publisher(TFMessage, "/tf", 10)
+    for _ in range(counted):
+        publisher.publish(TFMessage())
+    message = TFMessage(transforms=[stamped_transform("world", name, pose)])
+    return node.create_timer(0.01, lambda: publisher.publish(message))
+
+
+@pytest.mark.parametrize(("second", "disagree"), [(A, False), (C, True)], ids=["the same pose", "another pose"])
+def test_two_publishers_of_a_frame_are_told_once_and_block_the_tool_only_if_they_disagree(
+    second: pin.SE3, disagree: bool, domain: int, node: Any
+) -> None:
+    node.now = 0.0  # which nodes of the package have
+    listener = FrameListener(node)
+    timers = [send_from(node, "mount", A, 300), send_from(node, "elsewhere", B, 0)]
+    wait_until(lambda: listener.tree.find("mount", "world") is not None, "one publisher is heard")
+    assert listener.advice is None
+    with spun_node(domain, "another") as another:
+        send_from(another, "mount", second, 0)
+        wait_until(lambda: listener.advice is not None, "the second publisher is noticed")
+        assert "mount on /tf come from two publishers" in str(listener.advice)
+        wait_until(lambda: "/another and /test" in str(listener.advice), "both are named")
+        if disagree:
+            wait_until(lambda: listener.conflict("mount") is not None, "they disagree")
+        assert (listener.conflict("mount") is not None) == disagree
+        assert listener.conflict("elsewhere") is None
+    wait_until(lambda: listener.advice is None, "it is over when one ends")
+    for timer in timers:
+        node.destroy_timer(timer)

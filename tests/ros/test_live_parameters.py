@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 from typing import Any
 
@@ -32,8 +33,11 @@ class Settable(ArmRig):
         self._client = AsyncParameterClient(node, NODE)
 
     def set(self, **values: Any) -> Any:
-        """All together, ``__`` stands for a dot; the result, with ``successful`` and ``reason``."""
-        parameters = [Parameter("teleop." + name.replace("__", "."), value=value) for name, value in values.items()]
+        """Of ``teleop`` all together, ``__`` stands for a dot; the result, with ``successful`` and ``reason``."""
+        return self.set_named({"teleop." + name.replace("__", "."): value for name, value in values.items()})
+
+    def set_named(self, values: dict[str, Any]) -> Any:
+        parameters = [Parameter(name, value=value) for name, value in values.items()]
         future = self._client.set_parameters_atomically(parameters)
         wait_until(future.done, "the parameters are answered")
         return future.result().result
@@ -93,3 +97,34 @@ def test_controls_are_bound_anew_while_the_arm_is_paused(rig: Settable) -> None:
     rig.grip = 1.0
     rig.wait(lambda: rig.state["engaged"], "the arm is engaged")
     assert np.isfinite(rig.newest().homogeneous).all()
+
+
+def test_a_target_is_as_slow_as_the_guard_is_set_to_in_motion(rig: Settable) -> None:
+    before = rig.wait_for_rest()
+    assert rig.set_named({"guard.max_velocity": 0.05, "guard.max_acceleration": 2.0}).successful
+    began = time.monotonic()
+    rig.move((0.06, 0.0, 0.0))
+    way = np.linalg.norm(rig.newest().translation - before.translation)
+    assert way < 0.05 * (time.monotonic() - began)  # of 0.06 m, which the hand has gone
+    goal = offset(before, (0.06, 0.0, 0.0)).translation
+    rig.wait(lambda: np.linalg.norm(rig.newest().translation - goal) < 1e-3, "the target is where the hand is")
+    refused = rig.set_named({"guard.max_velocity": 0.5, "guard.max_angular_velocity": 0.0})
+    assert not refused.successful
+    assert "guard.max_angular_velocity" in refused.reason
+
+
+def test_mirror_is_set_while_the_arm_is_paused_and_gives_it_the_other_hand(rig: Settable) -> None:
+    refused = rig.set_named({"mirror": True})
+    assert not refused.successful
+    assert "may be changed while both arms hold" in refused.reason
+    rig.pause()
+    refused = rig.set_named({"mirror_reflected": True})
+    assert not refused.successful
+    assert "allowed with mirror = True only" in refused.reason
+    assert rig.state["hand"] == "left"
+    assert rig.set_named({"mirror": True, "mirror_reflected": True}).successful
+    rig.wait(lambda: rig.state["stance"] == "mirror_reflected", "the stance is told")
+    assert rig.state["hand"] == "right"
+    assert rig.set_named({"mirror": False, "mirror_reflected": False}).successful
+    rig.wait(lambda: rig.state["hand"] == "left", "the hand is its own again")
+    rig.engage()

@@ -16,6 +16,7 @@ from typing import Any
 import pytest
 import yaml
 
+from q2r2_control.ros.launch import executables
 from q2r2_control.ros.launch.processes import SOURCES, NodeProcess, nodes_of
 from tests.ros.conftest import NEEDS_ROS
 from tests.ros.processes import CONFIG, ROOT, Processes, RosProcess
@@ -152,8 +153,11 @@ def test_a_cell_with_one_arm_has_one_arms_nodes(tmp_path: Path) -> None:
 def test_every_node_of_a_set_is_an_executable(tmp_path: Path) -> None:
     scripts: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
     for source in SOURCES:
-        for node in nodes_of(CONFIG, source, "mujoco"):
-            assert scripts[node.name] == f"{node.module}:main"
+        for node in nodes_of(CONFIG, source, "mujoco", {"folder": "recordings"}):
+            module, _, function = scripts[node.name].partition(":")
+            assert module == executables.__name__
+            assert node.module == f"q2r2_control.ros.nodes.{executables.MODULES[node.name]}"
+            assert callable(getattr(executables, function))
 
 
 class Recorded:
@@ -186,8 +190,9 @@ def launch_file(monkeypatch: pytest.MonkeyPatch) -> Any:
 
 @pytest.mark.parametrize("source", SOURCES)
 @pytest.mark.parametrize("preset", ["builtin", "jtc"])
+@pytest.mark.parametrize("folder", ["", "recordings"])
 def test_the_launch_file_starts_what_the_command_starts(
-    launch_file: Any, tmp_path: Path, preset: str, source: str
+    launch_file: Any, tmp_path: Path, preset: str, source: str, folder: str
 ) -> None:
     config = CONFIG if preset == "builtin" else external_cell(tmp_path, preset, "filtered")
     *arguments, nodes = launch_file["generate_launch_description"]().given[0]
@@ -195,9 +200,11 @@ def test_the_launch_file_starts_what_the_command_starts(
         "config": CONFIG,
         "input": "scripted",
         "robot": "auto",
+        "record": "",
     }
-    actions = nodes.named["function"]({"config": config, "input": source, "robot": "auto"})
-    expected = nodes_of(config, source)
+    actions = nodes.named["function"]({"config": config, "input": source, "robot": "auto", "record": folder})
+    expected = nodes_of(config, source, recording={"folder": folder} if folder else None)
+    assert ("recorder" in names(expected)) == bool(folder)
     assert [(action.named["package"], action.named["executable"]) for action in actions] == [
         ("q2r2_control", node.name) for node in expected
     ]

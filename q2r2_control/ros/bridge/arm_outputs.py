@@ -12,13 +12,13 @@ from rclpy.node import Node
 from std_msgs.msg import Bool, String
 
 from q2r2_control.config.presets import BUILTIN, Mode
+from q2r2_control.config.teleop import GuardSettings
 from q2r2_control.ros.base_node import LATCHED_QOS, BaseNode
 from q2r2_control.ros.bridge.frames import PoseTopic
 from q2r2_control.ros.bridge.parameters import BUILTIN_NODE, ArmParameters
 from q2r2_control.ros.bridge.target_output import TargetOutput, near
+from q2r2_control.teleop.sag import MOST_SAG
 
-# A commanded pose may be this far from the measured one, because the arm sags under its load.
-SAG = 0.05, 0.1  # [m, rad]
 _POSE = 2  # of moveit_msgs/srv/ServoCommandType
 # What the built-in controller says of an arm that takes a stream of targets, and what helps where it takes none.
 _READY = ("holding", "following")
@@ -80,6 +80,12 @@ class ArmOutputs:
         self._has_safe_target = False  # of the built-in controller
         self._relaying = False
 
+    def limit(self, guard: GuardSettings) -> None:
+        """Other limits of the targets that go to the preset's controller, from the next one on."""
+        output = self._last if self._filtered else self.first
+        if output is not None:
+            output.guard.change(guard)
+
     @property
     def conflict(self) -> str | None:
         """One line if an output's topic has other publishers."""
@@ -97,14 +103,24 @@ class ArmOutputs:
         return None if self._command_type is None else self._command_type.unready
 
     @property
+    def builtin(self) -> str | None:
+        """The name of the built-in controller, where the hand's targets go to it."""
+        return None if self._follows is None else self._follows.controller
+
+    @property
     def home_controller(self) -> str | None:
         """The name of the built-in controller, which knows a way home, where it moves the arm."""
-        return None if self._follows is None or self._filtered else self._follows.controller
+        return None if self._filtered else self.builtin
 
     @property
     def homing(self) -> tuple[bool, str]:
         """Whether the built-in controller says that it goes home, and how the last way ended."""
         return (False, "") if self._follows is None else (self._follows.homing, self._follows.homing_ended)
+
+    @property
+    def sent(self) -> dict[str, int]:
+        """How many targets went out on each topic."""
+        return {output.topic: output.sent for output in self._all}
 
     @property
     def advice(self) -> str | None:
@@ -137,7 +153,7 @@ class ArmOutputs:
         safe, fault = self._safe_target.at(now), None
         self._has_safe_target = safe is not None
         if not self._relaying and engaged:
-            self._relaying = safe is not None and tool is not None and near(safe, tool, *SAG)
+            self._relaying = safe is not None and tool is not None and near(safe, tool, *MOST_SAG)
             if not self._relaying:
                 fault = self._safe_target.problem or f"{self._safe_topic} is not where the tool is"
         self._relaying = self._relaying and safe is not None

@@ -3,26 +3,27 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from functools import partial
+import time
+from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
 from geometry_msgs.msg import PoseStamped
 from rclpy.qos import DurabilityPolicy, QoSProfile
-from rclpy.serialization import serialize_message
-from rosbags.serde import SerdeError
-from rosbags.typesys import Stores, get_typestore
 from tf2_msgs.msg import TFMessage
 
 from q2r2_control.ros.base_node import STREAM_QOS, BaseNode
-from q2r2_control.ros.bridge.messages import pose_of
+from q2r2_control.ros.bridge.messages import nanoseconds, pose_of
 from q2r2_control.ros.monitoring.endpoints import Publishers
+from q2r2_control.ros.monitoring.frame_senders import FrameSenders, frame_reader
+from q2r2_control.supervision.target_stream import apart
 
 # A geometry_msgs/TransformStamped, as rclpy or as rosbags reads it.
 Transformed = Any
-_TF = "tf2_msgs/msg/TFMessage"
+# Two publishers whose poses of a frame differ by more do not tell of the same robot [m], [rad].
+_SAME = 0.05, 0.1
+_REMEMBERED = 2.0  # such a difference [s]
 _UNIT = 1e-3  # a quaternion's norm may be off by this
 
 
@@ -72,6 +73,18 @@ class FrameTree:
                 return Placement(pose, min(up[name].received, placement.received))
         return None
 
+    def ancestors(self, frame: str) -> list[str]:
+        """The frame, and all those that it hangs on."""
+        return [name for name, _ in self._upwards(_name(frame))]
+
+    def moves_far(self, transform: Transformed) -> bool:
+        """Whether the frame is elsewhere in a transform than it was in the last one."""
+        before = self._edges.get(_name(transform.child_frame_id))
+        if before is None or not _is_pose(transform):
+            return False
+        distance, angle = apart(before.pose, _Edge(transform, before.received).pose)
+        return distance > _SAME[0] or angle > _SAME[1]
+
     def _upwards(self, frame: str) -> Iterator[tuple[str, Placement]]:
         """The frame and all its ancestors, with the frame's pose in each; ends also if parents form a ring."""
         pose, received = pin.SE3.Identity(), math.inf
@@ -86,29 +99,58 @@ class FrameTree:
 
 
 class FrameListener:
-    """Keeps a :class:`FrameTree` up to date for a node.
-
-    A robot's message has dozens of transforms, fifty times a second, of which an arm needs a few. So rosbags reads
-    them, which makes no checked message object of each as rclpy does.
-    """
+    """Keeps a :class:`FrameTree` up to date for a node, and notices a second publisher of a frame on /tf."""
 
     def __init__(self, node: Any) -> None:
         self.tree = FrameTree()
-        self._read: Any = get_typestore(Stores.ROS2_JAZZY).deserialize_cdr
+        self._node, self._read = node, frame_reader()
+        self._senders, self._publishers = FrameSenders(), Publishers(node, ["/tf"])
+        self._disagree: dict[str, float] = {}  # frames of which two publishers say different things, and when [s]
+        self._told = False
         latched = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        for topic, qos, received in (("/tf", 100, None), ("/tf_static", latched, math.inf)):
-            take = partial(self._take, node, received)
-            node.create_subscription(TFMessage, topic, take, qos, raw=True)
-        self._read(serialize_message(TFMessage()), _TF)  # makes the reader, which takes a while
+        node.create_subscription(TFMessage, "/tf", self._take, 100, raw=True)
+        node.create_subscription(TFMessage, "/tf_static", self._take_fixed, latched, raw=True)
 
-    def _take(self, node: Any, received: float | None, message: bytes) -> None:
-        received = node.now if received is None else received
-        try:
-            transforms = self._read(message, _TF).transforms
-        except (SerdeError, ValueError):
-            return  # such as a name that is no UTF-8, which is some other node's fault
-        for transform in transforms:
+    @property
+    def advice(self) -> str | None:
+        """One line while two publishers send the same frames."""
+        shared = self._senders.shared(time.monotonic())
+        if not shared:
+            self._told = False
+            return None
+        more = f" and {len(shared) - 1} more frames" if len(shared) > 1 else ""
+        return f"{shared[0]}{more} on /tf come from two publishers; on /tf are {self._publishers.of('/tf')}"
+
+    def conflict(self, frame: str) -> str | None:
+        """One line while two publishers disagree about ``frame`` or what it hangs on."""
+        now = time.monotonic()
+        if not any(now - at <= _REMEMBERED for at in self._disagree.values()):
+            return None
+        for name in self.tree.ancestors(frame):
+            if now - self._disagree.get(name, -math.inf) <= _REMEMBERED:
+                senders = self._publishers.of("/tf")
+                return f"two publishers on /tf say different things of {name}: end one of {senders}"
+        return None
+
+    def _take(self, message: bytes, info: Mapping[str, int | None]) -> None:
+        received, now, number = self._node.now, time.monotonic(), info["publication_sequence_number"]
+        for transform in self._read(message):
+            frame = _name(transform.child_frame_id)
+            if self._senders.take(frame, number, now):
+                if self.tree.moves_far(transform):
+                    self._disagree[frame] = now
+                self._tell()
             self.tree.set(transform, received)
+
+    def _take_fixed(self, message: bytes) -> None:
+        for transform in self._read(message):
+            self.tree.set(transform, math.inf)
+
+    def _tell(self) -> None:
+        """Log it once, until it is over."""
+        if not self._told and (line := self.advice) is not None:
+            self._told = True
+            self._node.get_logger().warning(line)
 
 
 def _name(frame: str) -> str:
@@ -174,6 +216,11 @@ class PoseTopic:
             self.problem = None
             return placement.pose * pose
         return None
+
+    @property
+    def stamp(self) -> int | None:
+        """The newest message's own, by its sender's clock [ns]; None: there is none."""
+        return None if self._newest is None else nanoseconds(self._newest[0].header.stamp)
 
     def take_silence(self, now: float) -> str | None:
         """One line, returned once, if poses came and have stopped coming."""

@@ -37,10 +37,13 @@ class GripperClient:
 
     def __init__(self, node: Node, name: str, settings: GripperSettings) -> None:
         self.closed = False
+        self.holds = False  # closed on something, as the result of the last goal says
         self.problem: str | None = None
         self._node, self._name, self._settings = node, name, settings
         self._goal_closed: bool | None = None  # closed or not, while a goal is under way
+        self._position: float | None = None  # that the gripper told last
         self._sent, self._asked = -math.inf, 1.0  # the last goal: when [s], and its opening
+        self._closes = False  # it is a smaller one than that of the goal before
         self._goals = 0
         kind = settings.action_type
         self._publisher = self._client = None
@@ -56,6 +59,16 @@ class GripperClient:
         if self._goal_closed is None:
             return "closed" if self.closed else "open"
         return "closing" if self._goal_closed else "opening"
+
+    @property
+    def opening(self) -> float:
+        """0 closed .. 1 open, as the gripper told with its last goal; 1 before the first, -inf where it cannot tell."""
+        if self._client is None:
+            return -math.inf
+        if self._position is None:
+            return 1.0
+        stroke = Stroke(self._settings.open_position, self._settings.closed_position)
+        return min(max(stroke.opening(self._position), 0.0), 1.0)
 
     def toggle(self, now: float) -> None:
         """Ask for the opposite of the gripper's state, or of the state that it is moving to."""
@@ -78,6 +91,8 @@ class GripperClient:
         """
         settings, close = self._settings, opening < 0.5
         position = (1.0 - opening) * settings.closed_position + opening * settings.open_position
+        self._closes = opening < self._asked or (opening == self._asked and self._closes)
+        self.holds = self.holds and self._closes
         self.problem, self._asked, self._sent = None, opening, now
         if self._publisher is not None:
             self._publisher.publish(Float64MultiArray(data=[position]))
@@ -90,7 +105,7 @@ class GripperClient:
         self._goals += 1
         self._goal_closed = close
         number = self._goals
-        answer = self._client.send_goal_async(self._goal(position))
+        answer = self._client.send_goal_async(self._goal(position), feedback_callback=self._hear)
         answer.add_done_callback(lambda future: self._answered(future.result(), number))
 
     def check(self, now: float) -> None:
@@ -121,11 +136,22 @@ class GripperClient:
         if number != self._goals or self._goal_closed is None:
             return  # another goal has taken its place
         result = answer.result
+        self._note(result)
         if answer.status == GoalStatus.STATUS_SUCCEEDED or result.stalled or result.reached_goal:
-            self.closed = self._goal_closed
+            self.closed, self.holds = self._goal_closed, bool(result.stalled) and self._closes
             self._end(None)
         else:
             self._end(f"{self._name} ended with status {answer.status}, neither stalled nor at its goal")
+
+    def _hear(self, message: Any) -> None:
+        self._note(message.feedback)
+
+    def _note(self, told: Any) -> None:
+        """Where the gripper is, of a feedback or a result."""
+        if self._action is GripperCommand:
+            self._position = float(told.position)
+        elif len(told.state.position):
+            self._position = float(told.state.position[0])
 
     def _end(self, problem: str | None) -> None:
         self._goal_closed, self.problem = None, problem

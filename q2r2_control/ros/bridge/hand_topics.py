@@ -13,6 +13,7 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 
 from q2r2_control.inputs.messages import HandMessage, HandPose, HandTwist, MessageType
 from q2r2_control.inputs.session import HAND_TOPICS
+from q2r2_control.recording.ros_topics import RECORDER
 from q2r2_control.ros.base_node import STREAM_QOS
 from q2r2_control.ros.bridge.messages import (
     hand_inputs,
@@ -22,7 +23,7 @@ from q2r2_control.ros.bridge.messages import (
     hand_twist_message,
     inputs_message,
 )
-from q2r2_control.ros.monitoring.endpoints import Publishers
+from q2r2_control.ros.monitoring.endpoints import Publishers, node_of
 
 # Reliable, so that any subscriber matches: a best-effort publisher does not match reliable subscribers.
 PUBLISHED_QOS = QoSProfile(
@@ -44,23 +45,31 @@ class HandPublishers:
 
     def __init__(self, node: Node, topics: Iterable[str]) -> None:
         """``topics`` are of :data:`HAND_TOPICS`."""
+        self._node = node
         self._publishers = {
             topic: node.create_publisher(_TYPES[HAND_TOPICS[topic].kind], topic, PUBLISHED_QOS) for topic in topics
         }
+        self.sent: dict[str, int] = {publisher.topic_name: 0 for publisher in self._publishers.values()}
 
     def publish(self, topic: str, message: HandMessage, frame: str, t: float) -> None:
         """Publish at once. A pose is in ``frame`` at ``t`` [s]; other messages have neither."""
+        publisher = self._publishers[topic]
+        self.sent[publisher.topic_name] += 1
         if isinstance(message, HandPose):
-            self._publishers[topic].publish(hand_pose_message(message, frame, t))
+            publisher.publish(hand_pose_message(message, frame, t))
         elif isinstance(message, HandTwist):
-            self._publishers[topic].publish(hand_twist_message(message))
+            publisher.publish(hand_twist_message(message))
         else:
-            self._publishers[topic].publish(inputs_message(message))
+            publisher.publish(inputs_message(message))
 
     def subscribers(self, hand: str) -> int:
-        """How many subscribers the topics of ``hand`` have."""
-        publishers = (publisher for topic, publisher in self._publishers.items() if HAND_TOPICS[topic].hand == hand)
-        return sum(publisher.get_subscription_count() for publisher in publishers)
+        """How many subscribers the topics of ``hand`` have, a recorder aside."""
+        publishers = [publisher for topic, publisher in self._publishers.items() if HAND_TOPICS[topic].hand == hand]
+        matched = sum(publisher.get_subscription_count() for publisher in publishers)
+        if not matched:
+            return 0
+        listed = (self._node.get_subscriptions_info_by_topic(publisher.topic_name) for publisher in publishers)
+        return min(matched, sum(node_of(info) not in (None, RECORDER) for infos in listed for info in infos))
 
 
 class HandWatch:

@@ -138,8 +138,9 @@ class JointIntake:
         self._stamps = dict.fromkeys(self._topics, -math.inf)
         self._names = {topic: [robot.joint_names[joint] for joint in joints] for topic, joints in self._joints.items()}
         self._expected = {topic: set(names) for topic, names in self._names.items()}
-        what = 'external torques of all joints, for the admittance, as the effort of a JointState; "": none'
+        what = 'external torques of all joints, for admittance and vibrations: effort of a JointState; "": none'
         self._external_topic = node.parameter("external_torque_topic", "", what)
+        self.needs_external_torque = False  # without it no state is good
         self._external: Array | None = None  # newest (nv,) [Nm]
         self._external_stamp = -math.inf
         self._joint_names = list(robot.joint_names)
@@ -183,8 +184,10 @@ class JointIntake:
         oldest = min(self._stamps.values())
         if oldest > -math.inf:
             q, v, tau = self._values.copy()
-            self.state = RobotState(q=q, v=v, tau=tau, tau_external=self._external, stamp=oldest)
-            if self._external_topic and now - self._external_stamp > STREAM_TIMEOUT:
+            silent = now - self._external_stamp > STREAM_TIMEOUT
+            external = None if silent else self._external
+            self.state = RobotState(q=q, v=v, tau=tau, tau_external=external, stamp=oldest)
+            if silent and self.needs_external_torque:
                 take(f"no external torques on {self._external_topic}", now)
             else:
                 take(self.state, now)

@@ -19,6 +19,7 @@ from q2r2_control.errors import ConfigError
 from q2r2_control.robot.robot import Robot
 from q2r2_control.ros.base_node import BaseNode
 from q2r2_control.ros.bridge.joint_messages import KINDS, NONE, JointCommand, Kind
+from q2r2_control.ros.monitoring.command_watch import CommandWatch
 from q2r2_control.ros.monitoring.endpoints import WatchedPublisher
 from q2r2_control.types import CommandMode, Reference, RobotState
 
@@ -42,6 +43,10 @@ class JointOutput:
         self._kind, self._channels = kind, channels
         self._listeners = 0
 
+    def watch(self, node: BaseNode) -> CommandWatch:
+        """What tells whether another node sends such commands."""
+        return CommandWatch(node, self._kind.message, [channel.publisher.topic_name for channel in self._channels])
+
     def activate(self, state: RobotState) -> None:
         """Begin anew at a measured state."""
         if self._channels:
@@ -55,6 +60,11 @@ class JointOutput:
         if self._channels:
             command = self.drive.command(reference, state, {}, dt, trusted)
             self._publish(JointCommand(command, state, t), decided)
+
+    @property
+    def sent(self) -> dict[str, int]:
+        """How many messages went out on each topic."""
+        return {channel.publisher.topic_name: channel.publisher.sent for channel in self._channels}
 
     def end(self, state: RobotState, t: float) -> None:
         """What holds the arms where no more commands come, for drives that need it."""

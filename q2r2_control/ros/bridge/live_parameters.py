@@ -1,49 +1,104 @@
-"""Settings that change while a node runs: by ``ros2 param set``, rqt, or a service of rcl_interfaces."""
+"""Settings that change while a node runs: by ``ros2 param set``, rqt, or a service of rcl_interfaces.
+
+What is set together is one change, which is done as a whole or not at all, with the reason.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from pydantic import BaseModel, ValidationError
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.parameter import Parameter
 
-from q2r2_control.config import ImpedanceSettings
-from q2r2_control.config.teleop import TeleopSettings
+from q2r2_control.config import ControllerSettings, ImpedanceSettings
+from q2r2_control.config.control import LIVE
+from q2r2_control.config.teleop import GuardSettings, TeleopSettings
+from q2r2_control.errors import ConfigError
+from q2r2_control.robot.pairs import CLEARANCE
 from q2r2_control.ros.base_node import BaseNode
-from q2r2_control.ros.bridge.parameters import bounds_of, may_be_none, none_of_zero
+from q2r2_control.ros.bridge.parameters import Model, bounds_of, may_be_none, none_of_zero, stance_of
 
 if TYPE_CHECKING:  # arms' nodes have no controller, and need not wait for its kernels
     from q2r2_control.compliance.impedance import ImpedanceController
+    from q2r2_control.control.controller import CartesianController
+    from q2r2_control.supervision.external_arms import ExternalSettings
+    from q2r2_control.supervision.joint_watch import WatchSettings
+    from q2r2_control.supervision.target_stream import StreamSettings
+
+# Of the controller's watching: field, parameter, what it is, least and greatest value.
+_Table = tuple[tuple[str, str, str, float, float], ...]
+_STREAM_PARAMETERS: _Table = (
+    ("timeout", "target_timeout", "an arm without targets for this long holds [s]", 0.02, 2.0),
+    ("engage_distance", "engage_distance", "targets have to begin this near to the tool [m]", 0.0, 0.2),
+    ("engage_angle", "engage_angle", "and turned from it by no more [rad]", 0.0, 1.5),
+)
+_WATCH_PARAMETERS: _Table = (
+    ("timeout", "joint_state_timeout", "without joint states for this long the arms brake [s]", 0.01, 1.0),
+    ("settle_time", "settle_time", "joint states have to be good and at rest before activation [s]", 0.02, 10.0),
+    ("deviation", "max_deviation", "of a joint from its reference [rad]", 0.01, 3.0),
+    ("deviation_time", "deviation_time", "for this long stops the arms [s]", 0.05, 10.0),
+)
+_EXTERNAL_PARAMETERS: _Table = (
+    ("tolerance", "distance_tolerance", "output none: measured pairs may be closer than min_distance [m]", 0.0, 0.1),
+)
+_DONE = SetParametersResult(successful=True)
+_MIRROR = ("mirror", "mirror_reflected")
 
 
-class LiveTeleopParameters:
-    """Checks parameters ``teleop.*`` that are set together as one change, which is done as a whole or not at all."""
+class LiveArmParameters:
+    """Parameters ``teleop.*``, ``guard.*`` and ``mirror`` of an arm's node."""
 
-    def __init__(self, node: BaseNode, settings: TeleopSettings, apply: Callable[[TeleopSettings], str | None]) -> None:
+    def __init__(
+        self,
+        node: BaseNode,
+        teleop: TeleopSettings,
+        guard: GuardSettings,
+        apply: Callable[[TeleopSettings, GuardSettings], str | None],
+    ) -> None:
         """``apply``: takes the changed settings, or returns why that is not possible now."""
-        self._settings, self._apply = settings, apply
+        self._node, self._teleop, self._guard, self._apply = node, teleop, guard, apply
         node.add_on_set_parameters_callback(self._on_set)
 
     def _on_set(self, parameters: Sequence[Parameter]) -> SetParametersResult:
-        changes = {one.name: one.value for one in parameters if one.name.startswith("teleop.")}
-        if not changes:
-            return SetParametersResult(successful=True)
-        values = self._settings.model_dump()
-        for name, value in changes.items():
-            _put(values, TeleopSettings, name.split(".")[1:], value)
+        changes = {one.name: one.value for one in parameters}
+        teleop_changes, guard_changes = _within("teleop", changes), _within("guard", changes)
+        mirror = {name: value for name, value in changes.items() if name in _MIRROR}
+        if not (teleop_changes or guard_changes or mirror):
+            return _DONE
         try:
-            settings = TeleopSettings.model_validate(values)
-        except ValidationError as error:
-            fault = error.errors()[0]
-            name = ".".join(["teleop", *map(str, fault["loc"])])
-            reason = f"{name} = {fault['input']!r:.60}: {fault['msg'].removeprefix('Value error, ')}"
-            return SetParametersResult(successful=False, reason=reason)
-        if (problem := self._apply(settings)) is not None:
+            teleop = _changed(self._teleop, "teleop", teleop_changes)
+            if mirror:
+                wanted = [bool(mirror.get(name, self._node.get_parameter(name).value)) for name in _MIRROR]
+                teleop = teleop.model_copy(update={"stance": stance_of(*wanted)})
+            guard = _changed(self._guard, "guard", guard_changes)
+        except ConfigError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        if (problem := self._apply(teleop, guard)) is not None:
             return SetParametersResult(successful=False, reason=f"{', '.join(changes)}: {problem}")
-        self._settings = settings
-        return SetParametersResult(successful=True)
+        self._teleop, self._guard = teleop, guard
+        return _DONE
+
+
+class LiveControl:
+    """Parameters ``control.*``: what of a controller's settings may change, of which its own method decides."""
+
+    def __init__(self, node: BaseNode, controller: CartesianController) -> None:
+        self._controller = controller
+        for name in LIVE:
+            field = ControllerSettings.model_fields[name]
+            value, bounds = getattr(controller.settings, name), bounds_of(field)
+            if name == "min_distance":
+                # Pydantic keeps the bounds of an annotated type elsewhere.
+                bounds = {"at_least": 0.0, "at_most": max(CLEARANCE, value)}
+            node.parameter(f"control.{name}", value, field.description or name, read_only=False, **bounds)
+        node.add_on_set_parameters_callback(self._on_set)
+
+    def _on_set(self, parameters: Sequence[Parameter]) -> SetParametersResult:
+        values = {one.name.removeprefix("control."): one.value for one in parameters if one.name.startswith("control.")}
+        problem = self._controller.change(values) if values else None
+        return _DONE if problem is None else SetParametersResult(successful=False, reason=problem)
 
 
 class LiveStiffness:
@@ -64,6 +119,52 @@ class LiveStiffness:
         values = {one.name: one.value for one in parameters if one.name in self._NAMES}
         if values:
             self._impedance.set_stiffness(values.get(self._NAMES[0]), values.get(self._NAMES[1]))
+
+
+class LiveWatching:
+    """Timeouts and tolerances of the controller's node, which are read at every tick."""
+
+    def __init__(
+        self, node: BaseNode, streams: StreamSettings, watch: WatchSettings, external: ExternalSettings
+    ) -> None:
+        self._settings: dict[str, tuple[Any, str]] = {}
+        for target, table in (
+            (streams, _STREAM_PARAMETERS),
+            (watch, _WATCH_PARAMETERS),
+            (external, _EXTERNAL_PARAMETERS),
+        ):
+            for field, name, description, least, greatest in table:
+                value = node.parameter(
+                    name, getattr(target, field), description, at_least=least, at_most=greatest, read_only=False
+                )
+                setattr(target, field, value)
+                self._settings[name] = (target, field)
+        node.add_post_set_parameters_callback(self._on_set)
+
+    def _on_set(self, parameters: Sequence[Parameter]) -> None:
+        for parameter in parameters:
+            if parameter.name in self._settings:
+                target, field = self._settings[parameter.name]
+                setattr(target, field, parameter.value)
+
+
+def _within(prefix: str, changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Of ``changes`` those of names under ``prefix``, without it."""
+    begin = f"{prefix}."
+    return {name.removeprefix(begin): value for name, value in changes.items() if name.startswith(begin)}
+
+
+def _changed(settings: Model, prefix: str, changes: Mapping[str, Any]) -> Model:
+    """The same settings with some fields changed. Raises :class:`ConfigError` that names the parameter."""
+    values = settings.model_dump()
+    for name, value in changes.items():
+        _put(values, type(settings), name.split("."), value)
+    try:
+        return type(settings).model_validate(values)
+    except ValidationError as error:
+        fault = error.errors()[0]
+        name = ".".join([prefix, *map(str, fault["loc"])])
+        raise ConfigError(f"{name} = {fault['input']!r:.60}: {fault['msg'].removeprefix('Value error, ')}") from error
 
 
 def _put(values: dict[str, Any], model: type[BaseModel], path: Sequence[str], value: Any) -> None:

@@ -30,6 +30,11 @@ def seconds(stamp: Time) -> float:
     return float(stamp.sec) + 1e-9 * float(stamp.nanosec)
 
 
+def nanoseconds(stamp: Time) -> int:
+    """The same in nanoseconds, exactly."""
+    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
+
+
 def age(info: Mapping[str, Any]) -> float:
     """How long ago the middleware received a message [s], by the information that a subscription passes with it."""
     return min(max((time.time_ns() - int(info["received_timestamp"])) * 1e-9, 0.0), _OLDEST)
@@ -79,6 +84,18 @@ def pose_of(message: Pose) -> pin.SE3 | None:
     if not (np.isfinite(position).all() and abs(norm - 1.0) <= _UNIT):
         return None
     return pin.SE3(pin.Quaternion(quaternion / norm).toRotationMatrix(), position)
+
+
+def pose_numbers(pose: pin.SE3) -> tuple[float, ...]:
+    """Position and quaternion x y z w, of those that have no message of their own."""
+    return tuple(pin.SE3ToXYZQUATtuple(pose))
+
+
+def pose_of_numbers(numbers: Sequence[float]) -> pin.SE3 | None:
+    """The pose of :func:`pose_numbers`; None as in :func:`pose_of`."""
+    message = Pose()
+    _write(np.array(numbers[:3]), np.array(numbers[3:]), message.position, message.orientation)
+    return pose_of(message)
 
 
 def hand_sample(

@@ -123,7 +123,7 @@ def arm_parameters(node: BaseNode, subclass: ArmDefaults) -> ArmParameters:
         mode=mode,
         gripper_topic=declare("gripper_action_topic", given.gripper_action_topic, "action or topic"),
         gripper=settings_from_parameters(node, "gripper", given.gripper, frozenset()),
-        guard=settings_from_parameters(node, "guard", given.limits.over(preset.guard), frozenset()),
+        guard=settings_from_parameters(node, "guard", given.limits.over(preset.guard), frozenset(), read_only=False),
         teleop=_teleop_settings(node, given.teleop),
     )
 
@@ -190,18 +190,25 @@ def _rate(node: BaseNode, preset: Preset, wanted: float | None) -> float:
 
 def _teleop_settings(node: BaseNode, default: TeleopSettings) -> TeleopSettings:
     swapped = default.stance is not Stance.SIDE_BY_SIDE
-    mirror = node.parameter("mirror", swapped, "facing the robot: the other hand moves this arm")
+    mirror = node.parameter(
+        "mirror", swapped, "facing the robot: the other hand moves this arm; while both arms hold", read_only=False
+    )
     reflected = node.parameter(
         "mirror_reflected",
         mirror and default.stance is Stance.MIRROR_REFLECTED,
-        "with mirror: motion to the left becomes motion to the right",
+        "with mirror: motion to the left becomes motion to the right; while both arms hold",
+        read_only=False,
     )
-    if reflected and not mirror:
-        raise ConfigError("parameter mirror_reflected = True: allowed with mirror = True only")
-    stance = Stance.SIDE_BY_SIDE if not mirror else Stance.MIRROR_REFLECTED if reflected else Stance.MIRROR
-    default = default.model_copy(update={"stance": stance})
+    default = default.model_copy(update={"stance": stance_of(mirror, reflected)})
     left_out = frozenset({"stance", "workspace", "speed_limit"})
     return settings_from_parameters(node, "teleop", default, left_out, read_only=False)
+
+
+def stance_of(mirror: bool, reflected: bool) -> Stance:
+    """What the parameters ``mirror`` and ``mirror_reflected`` say. Raises :class:`ConfigError`."""
+    if reflected and not mirror:
+        raise ConfigError("parameter mirror_reflected = True: allowed with mirror = True only")
+    return Stance.SIDE_BY_SIDE if not mirror else Stance.MIRROR_REFLECTED if reflected else Stance.MIRROR
 
 
 def settings_from_parameters(

@@ -52,18 +52,23 @@ class TargetOutput:
         if preset.zero_wrench is not None:
             self._wrench = node.create_publisher(WrenchStamped, preset.zero_wrench.format(ctrl=prefix), LATCHED_QOS)
         self.following = False  # a hand's target
+        self.last_sent: pin.SE3 | None = None  # what the controller was asked for last, world frame; None: nothing
         self._restarted = False
         self._endpoints: set[bytes] = set()  # of the controller
         self._listeners = 0
         self._unknown = False  # a subscriber's node is not known yet
         self._asked_at = self._appeared_at = -math.inf  # the graph, and a subscriber [s]
-        self.sent = 0
         self.starts = 0  # how often the controller has appeared
 
     @property
     def topic(self) -> str:
         """Where the targets go."""
         return self._publisher.topic_name
+
+    @property
+    def sent(self) -> int:
+        """How many targets went out."""
+        return self._publisher.sent
 
     @property
     def others(self) -> int:
@@ -134,14 +139,16 @@ class TargetOutput:
         pose = self.guard.step(target, now)
         if pose is None or base is None or not (self.following or not self.guard.at_rest or self._holds(tool, now)):
             return None
-        if not (self.following and self._publisher.waits()):
-            self._publisher.publish(stamped_pose(base.actInv(pose), self._frame, now), decided)
-            self.sent += 1
+        if self.following and self._publisher.waits():
+            return pose
+        if self._publisher.publish(stamped_pose(base.actInv(pose), self._frame, now), decided):
+            self.last_sent = pose
         return pose
 
     def forget(self, now: float) -> None:
         """Drop the held target; the next target begins a new stream."""
         self.following = False
+        self.last_sent = None
         self.guard.reset(None, now)
 
     @property

@@ -44,18 +44,22 @@ class Interfaces:
         files = sorted([*self.source.glob("msg/*.msg"), *self.source.glob("action/*.action")])
         return [(f"{self.name}.{file.parent.name}", file.stem) for file in files]
 
-    def found_in(self) -> Path | None:
-        """The folder that a fresh Python imports all types from, or None; messages are serialised as a proof."""
+    @property
+    def proof(self) -> str:
+        """Python code that fails unless all types can be imported; messages are serialised."""
         lines = ["from rclpy.serialization import serialize_message"]
         for module, kind in self.types:
             probe = f"{kind}.Goal()" if module.endswith(".action") else f"{kind}()"
             lines += [f"from {module} import {kind}", f"serialize_message({probe})"]
-        lines += [f"import {self.name}", f"print({self.name}.__path__[0])"]
+        return "\n".join([*lines, f"import {self.name}"])
+
+    def found_in(self) -> Path | None:
+        """The folder that a fresh Python imports all types from, or None."""
         # Where a ROS is sourced, this environment's libraries are found once its own setup file is sourced too; the
         # user is told so, and here the path does the same.
         libraries = os.pathsep.join(filter(None, [str(Path(sys.prefix, "lib")), os.environ.get("LD_LIBRARY_PATH")]))
         environment = os.environ | {"LD_LIBRARY_PATH": libraries}
-        command = [sys.executable, "-c", "\n".join(lines)]
+        command = [sys.executable, "-c", f"{self.proof}\nprint({self.name}.__path__[0])"]
         run = subprocess.run(command, env=environment, capture_output=True, text=True)
         return Path(run.stdout.splitlines()[-1]) if run.returncode == 0 else None
 

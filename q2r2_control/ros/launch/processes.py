@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import importlib.util
+import json
 import os
 import queue
 import signal
@@ -28,6 +29,7 @@ _END_TIMEOUTS = {signal.SIGINT: 5.0, signal.SIGTERM: 3.0}
 # Looked up here, because few calls are safe between fork and exec.
 _prctl = ctypes.CDLL(None).prctl if sys.platform == "linux" else None
 _PR_SET_PDEATHSIG = 1
+_EXECUTABLES = "q2r2_control.ros.launch.executables"
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,26 +42,31 @@ class NodeProcess:
 
     def command(self) -> list[str]:
         """The command that starts it with this Python."""
-        parameters = [part for key, value in self.parameters.items() for part in ("-p", f"{key}:={value}")]
-        return [sys.executable, "-u", "-m", self.module, "--ros-args", *parameters]
+        parameters = [part for key, value in self.parameters.items() for part in ("-p", f"{key}:={_yaml(value)}")]
+        return [sys.executable, "-u", "-m", _EXECUTABLES, self.name, "--ros-args", *parameters]
 
 
-def nodes_of(path: str, source: str = "scripted", robot: str = "auto") -> list[NodeProcess]:
+def nodes_of(
+    path: str, source: str = "scripted", robot: str = "auto", recording: Mapping[str, str] | None = None
+) -> list[NodeProcess]:
     """The nodes for a cell's YAML, in the order of their start.
 
     ``source`` of the hands: scripted, headset or none. ``robot``: mujoco, none, or auto, which is mujoco for
-    ``controller: builtin`` only. Raises :class:`ConfigError`.
+    ``controller: builtin`` only. ``recording``: parameters of the recorder, None without one; it starts first, and so
+    ends last. Raises :class:`ConfigError`.
     """
     for name, value, allowed in (("input", source, SOURCES), ("robot", robot, ROBOTS)):
         if value not in allowed:
             raise ConfigError(f"{name} = {value!r:.60}: allowed are {', '.join(allowed)}")
     cell = load_config(path)
     config: dict[str, str | float] = {"config": path}
-    nodes = []
+    nodes = [] if recording is None else [_node("recorder", {**config, **recording})]
+    felt: dict[str, str | float] = {}
     if robot == "mujoco" or (robot == "auto" and cell.controller is ControllerKind.BUILTIN):
         nodes.append(_node("mujoco_robot", config))
+        felt["external_torque_topic"] = "/mujoco_robot/external_torque"
     if cell.external is None:
-        nodes.append(_node("cartesian_controller", config))
+        nodes.append(_node("cartesian_controller", config | felt))
     elif cell.external.filtered:
         nodes.append(_node("cartesian_controller", config | _relayed(cell.external)))
     nodes += [_node(f"{arm}_arm_controller", config) for arm in SIDES if arm in cell.arms]
@@ -68,6 +75,11 @@ def nodes_of(path: str, source: str = "scripted", robot: str = "auto") -> list[N
     elif source == "headset":
         nodes.append(_node("tcp_endpoint", config))
     return nodes
+
+
+def _yaml(value: str | float) -> str:
+    """As ROS reads it on a command line: a text that looks like something else, as "3", stays one."""
+    return json.dumps(value, ensure_ascii=False)
 
 
 def _node(name: str, parameters: Mapping[str, str | float]) -> NodeProcess:
@@ -89,7 +101,7 @@ def _relayed(external: ExternalConfig) -> dict[str, str | float]:
 
 
 class UpError(Q2R2Error):
-    """The set cannot be started; the message says what is missing."""
+    """ROS cannot be used here; the message says what is missing."""
 
 
 def run_together(nodes: Sequence[NodeProcess], say: Callable[[str], None]) -> int:
@@ -124,9 +136,14 @@ def run_together(nodes: Sequence[NodeProcess], say: Callable[[str], None]) -> in
     return 0
 
 
-def _check(nodes: Sequence[NodeProcess]) -> None:
+def check_rclpy() -> None:
+    """Raise :class:`UpError` where there is no ROS."""
     if importlib.util.find_spec("rclpy") is None:
         raise UpError("rclpy cannot be imported: pip install 'q2r2_control[ros]', or source a ROS 2 Jazzy")
+
+
+def _check(nodes: Sequence[NodeProcess]) -> None:
+    check_rclpy()
     missing = [node.module for node in nodes if importlib.util.find_spec(node.module) is None]
     if missing:
         raise UpError(f"no such module: {', '.join(missing)}")
@@ -148,8 +165,12 @@ def _start(node: NodeProcess) -> subprocess.Popen[str]:
 
 
 def _end_with(parent: int) -> None:
-    """In the new process: ask Linux for SIGINT when ``parent`` ends, which it may have done already."""
+    """In the new process: ask Linux for SIGINT when ``parent`` ends, which it may have done already.
+
+    The executable unblocks the signal: an interpreter that is starting would print a traceback.
+    """
     assert _prctl is not None
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     _prctl(_PR_SET_PDEATHSIG, signal.SIGINT)
     if os.getppid() != parent:
         os.kill(os.getpid(), signal.SIGINT)

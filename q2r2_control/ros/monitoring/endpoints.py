@@ -70,16 +70,20 @@ class Publishers:
             self._names[topic] = " and ".join(known)
 
 
-def publish_in_time(publisher: Any, message: Any, decided: float) -> None:
+def publish_in_time(publisher: Any, message: Any, decided: float) -> bool:
     """Publish what was decided on at ``decided`` [s] of the steady clock, unless its lifespan is over since then.
+
+    Returns whether it was published.
 
     The middleware counts the lifespan from the publishing. A process that is frozen between the two would send, when it
     continues, one command of the past: a jump for a robot that has come to rest meanwhile. Serializing comes first: it
     takes most of the time until the middleware notes when the message was sent; :mod:`delay_watch` covers the rest.
     """
     data = serialize_message(message)
-    if time.monotonic() - decided <= _LIFESPAN:
+    in_time = time.monotonic() - decided <= _LIFESPAN
+    if in_time:
         publisher.publish(data)
+    return in_time
 
 
 class WatchedPublisher:
@@ -94,6 +98,7 @@ class WatchedPublisher:
     def __init__(self, node: Node, kind: type, topic: str, timeout: float) -> None:
         self._publisher: Any = node.create_publisher(kind, topic, SENT_COMMAND_QOS)
         self._timeout = timeout
+        self.sent = 0
         self._streaming = False
         self._acknowledged: float | None = None  # when all messages last were; None: not yet in this stream [s]
         self._gap_began = -math.inf  # [s]
@@ -112,10 +117,12 @@ class WatchedPublisher:
         self._streaming, self._gap_began = False, -math.inf
         self._acknowledged = time.monotonic() if acknowledged else None
 
-    def publish(self, message: Any, decided: float) -> None:
-        """Publish a message of the stream; ``decided``: see :func:`publish_in_time`."""
-        publish_in_time(self._publisher, message, decided)
+    def publish(self, message: Any, decided: float) -> bool:
+        """Publish a message of the stream; ``decided`` and what it returns: see :func:`publish_in_time`."""
+        published = publish_in_time(self._publisher, message, decided)
+        self.sent += 1
         self._streaming = True
+        return published
 
     def waits(self) -> bool:
         """Whether the next message should be left out, so that the last one can be acknowledged."""

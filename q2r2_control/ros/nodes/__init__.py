@@ -3,7 +3,8 @@
 ``base_arm_controller`` teleoperates one arm and is what a robot's own arms are derived from, as ``left_arm_controller``
 and ``right_arm_controller`` are; ``cartesian_controller`` is the built-in controller; ``mujoco_robot`` is the simulated
 robot; ``tcp_endpoint`` serves the headset; ``simulation_input`` (SimulationInput) replaces it by a script;
-``check_tcp_connection`` (CheckTCPconnection) shows what arrives. A node is imported when its name is first used.
+``recorder`` keeps what they publish; ``check_tcp_connection`` (CheckTCPconnection) shows what arrives. A node is
+imported when its name is first used.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
     from q2r2_control.ros.nodes.check_tcp_connection import CheckTcpConnection
     from q2r2_control.ros.nodes.left_arm_controller import LeftArmController
     from q2r2_control.ros.nodes.mujoco_robot import MujocoRobot
+    from q2r2_control.ros.nodes.recorder import Recorder
     from q2r2_control.ros.nodes.right_arm_controller import RightArmController
     from q2r2_control.ros.nodes.simulation_input import SimulationInput
     from q2r2_control.ros.nodes.tcp_endpoint import TcpEndpoint
@@ -28,6 +30,7 @@ __all__ = [
     "CheckTcpConnection",
     "LeftArmController",
     "MujocoRobot",
+    "Recorder",
     "RightArmController",
     "SimulationInput",
     "TcpEndpoint",
@@ -41,6 +44,7 @@ __getattr__ = lazy_exports(
         "CheckTcpConnection": "check_tcp_connection",
         "LeftArmController": "left_arm_controller",
         "MujocoRobot": "mujoco_robot",
+        "Recorder": "recorder",
         "RightArmController": "right_arm_controller",
         "SimulationInput": "simulation_input",
         "TcpEndpoint": "tcp_endpoint",

@@ -2,44 +2,45 @@
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import pinocchio as pin
 from geometry_msgs.msg import PoseStamped
-from quest2ros.msg import OVR2ROSHapticFeedback, OVR2ROSInputs
+from quest2ros.msg import OVR2ROSInputs
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
 from std_srvs.srv import Trigger
-from visualization_msgs.msg import Marker
 
 from q2r2_control.config.bindings import Action
 from q2r2_control.config.presets import BUILTIN
-from q2r2_control.config.teleop import TeleopSettings
+from q2r2_control.config.teleop import GuardSettings, TeleopSettings
 from q2r2_control.errors import ConfigError
-from q2r2_control.inputs.samples import SampleQueue
-from q2r2_control.inputs.session import HAPTIC_TOPICS
-from q2r2_control.ros.base_node import COMMAND_QOS, ERROR, OK, STREAM_QOS, WARN, BaseNode
-from q2r2_control.ros.bridge.arm_outputs import SAG, ArmOutputs
+from q2r2_control.ros.base_node import ERROR, OK, WARN, BaseNode
+from q2r2_control.ros.bridge.arm_conditions import listen_to_condition
+from q2r2_control.ros.bridge.arm_feedback import ArmFeedback
+from q2r2_control.ros.bridge.arm_outputs import ArmOutputs
+from q2r2_control.ros.bridge.arm_pair import ArmPair
 from q2r2_control.ros.bridge.frames import FrameListener, PoseTopic, ToolFrame
 from q2r2_control.ros.bridge.grippers import GripperClient
-from q2r2_control.ros.bridge.hand_topics import HandWatch
+from q2r2_control.ros.bridge.hand_intake import HandIntake
 from q2r2_control.ros.bridge.home_client import HomeClient
-from q2r2_control.ros.bridge.live_parameters import LiveTeleopParameters
-from q2r2_control.ros.bridge.markers import TargetMarkers
-from q2r2_control.ros.bridge.messages import age, hand_sample
+from q2r2_control.ros.bridge.live_parameters import LiveArmParameters
 from q2r2_control.ros.bridge.parameters import ArmDefaults, ArmParameters, arm_parameters
+from q2r2_control.ros.bridge.reports import RecorderLink
 from q2r2_control.ros.bridge.target_output import near
 from q2r2_control.ros.monitoring.arm_link import ArmLink
 from q2r2_control.ros.monitoring.hand_listeners import PAUSED_BY_SERVICE
 from q2r2_control.teleop.arm import OPEN
-from q2r2_control.teleop.arm_states import AT_REST, HOLDING, ArmState, is_refusal
-from q2r2_control.teleop.haptics import HapticPulses
+from q2r2_control.teleop.arm_states import AT_REST, HOLDING, ArmState
+from q2r2_control.teleop.sag import MOST_SAG
 from q2r2_control.teleop.teleop import Teleop
-from q2r2_control.types import SIDES, ArmTarget
+from q2r2_control.types import SIDES, ArmTarget, Event
 
-_MARKER_PERIOD = 0.05  # [s]
+_TIME_PERIOD = 0.05  # [s]
 
 
 class BaseArmController(BaseNode):
@@ -90,6 +91,8 @@ class BaseArmController(BaseNode):
         except BaseException:
             self.destroy_node()  # a node that is never returned could keep the process from ending
             raise
+        # For the origin of a process's first line rclpy looks through all modules, some 60 ms: not at the first press.
+        self.get_logger().info(f"the {self.hand} hand moves the target on {self._outputs.first.topic}")
 
     def setup_parameters(self) -> ArmParameters:
         """Declare the parameters; returns what they say."""
@@ -98,22 +101,14 @@ class BaseArmController(BaseNode):
     def setup_state(self) -> None:
         """Make the objects that keep the node's state."""
         self.teleop = Teleop(self.parameters.teleop, (self.arm_name,))
-        self.hand = self.teleop.hand_of(self.arm_name)
-        self.haptics = HapticPulses(self.parameters.teleop.haptics)
-        self.markers = TargetMarkers(self.arm_name, self.parameters.tool_frame, self.parameters.world_frame)
         self._has_analog_gripper = self.parameters.teleop.bindings.words_of(Action.GRIPPER_ANALOG) is not None
-        self._samples = SampleQueue()
-        self._pose: tuple[PoseStamped, float] | None = None
-        self._inputs: tuple[OVR2ROSInputs | None, float] = (None, float("-inf"))
         self._target = ArmTarget(None, OPEN)
-        self._last_event = self._paused = "not engaged yet"
-        self._refusal: tuple[bytes, str] | None = None
-        self._shown = 0.0
-        self._received = self._ticked = self.now  # the message of the hand that is being taken was
+        self._refusal: tuple[bytes, str] | None = WARN, "has not begun yet"  # where time stands still it never does
+        self._ticked = self.now
 
     def setup_interfaces(self) -> None:
         """Make publishers, subscriptions, services, the action client and the timer."""
-        values, hand = self.parameters, self.hand
+        values = self.parameters
         self._frames = FrameListener(self)
         tree, world = self._frames.tree, values.world_frame
         self._tool: ToolFrame | PoseTopic = ToolFrame(self, tree, values.tool_frame, world, values.tool_timeout)
@@ -121,21 +116,22 @@ class BaseArmController(BaseNode):
             self._tool = PoseTopic(self, values.current_pose_topic, tree, world, values.tool_timeout)
         self._safe_target = PoseTopic(self, values.safe_target_topic, tree, world, values.tool_timeout)
         self._link = ArmLink(self, self.robot_name, self.arm_name, values.teleop.stance, values.link_timeout)
-        self._hand_watch = HandWatch(self, hand, values.teleop.gate.timeout)
+        self._pair = ArmPair(self, self._link, self.arm_name, values, self.teleop)
+        timeout = values.teleop.gate.timeout
+        self._hand = HandIntake(self, self.hand, timeout, self.pose_callback, self.inputs_callback)
         self._outputs = ArmOutputs(self, values, self._safe_target)
+        self._feedback = ArmFeedback(self, self.arm_name, values, self._link, self._hand)
+        self._recorder = RecorderLink(self, self.teleop.marks)
+        if (controller := self._outputs.builtin) is not None:
+            listen_to_condition(self, controller, self.arm_name, self._feedback.haptics.notice)
         self._home = HomeClient(self, self._outputs.home_controller)
         self.gripper = GripperClient(self, values.gripper_topic, values.gripper)
-        self._markers = self.create_publisher(Marker, "/visualization_marker", 10)
-        self._haptics = self.create_publisher(OVR2ROSHapticFeedback, HAPTIC_TOPICS[hand], COMMAND_QOS)
-        for kind, topic, callback in (
-            (PoseStamped, f"q2r_{hand}_hand_pose", self.pose_callback),
-            (OVR2ROSInputs, f"q2r_{hand}_hand_inputs", self.inputs_callback),
-        ):
-            self.create_subscription(kind, topic, partial(self._take, callback), STREAM_QOS)
-        self._live = LiveTeleopParameters(self, values.teleop, self._change_teleop)
+        self._live = LiveArmParameters(self, values.teleop, values.guard, self._change)
         self.create_service(Trigger, "~/pause", self._on_pause)
         self.create_service(Trigger, "~/reset", self._on_reset)
         self.create_timer(1.0 / values.rate, self.tick)
+        # Without time there are no ticks, and so nothing else that would pause the arm.
+        self.create_timer(_TIME_PERIOD, self._watch_time, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def current_pose(self) -> pin.SE3 | None:
         """The tool's pose in the world frame; None where it is not known."""
@@ -143,13 +139,11 @@ class BaseArmController(BaseNode):
 
     def pose_callback(self, message: PoseStamped) -> None:
         """Take a pose of the hand."""
-        self._pose = message, self._received
-        self._put_sample()
+        self._hand.put_pose(message)
 
     def inputs_callback(self, message: OVR2ROSInputs) -> None:
         """Take buttons, triggers and stick of the hand."""
-        self._inputs = message, self._received
-        self._put_sample()
+        self._hand.put_inputs(message)
 
     def toggle_gripper(self) -> None:
         """The upper button was pressed."""
@@ -159,38 +153,53 @@ class BaseArmController(BaseNode):
         """Process what arrived, and publish where the tool should go."""
         decided, now, tool = time.monotonic(), self.now, self.current_pose()
         base = self._base()
+        self._pair.hear(self._safe_target.stamp if self._safe_target.at(now) is not None else None)
         self._refusal = self._refuse(tool, base, now)
         obstacle = None if self._refusal is None else self._refusal[1]
         fault = self._faults(now) or obstacle
         if fault is not None and self.state not in HOLDING:
             self.teleop.pause(now, fault)
-        if self._link.stopped != self.teleop.stopped:
-            self.teleop.set_stopped(self._link.stopped, now, f"the {self._link.other} arm's operator")
-        samples, arm = self._samples.take(), self.arm_name
+        self._pair.agree(now)
+        samples, arm = self._hand.take(), self.arm_name
         tools = {} if tool is None else {arm: tool}
         commanded = {} if tool is None else {arm: self._commanded(tool, now)}
         obstacles = {} if obstacle is None else {arm: obstacle}
+        for reason in self._recorder.update():
+            self._feedback.haptics.tell(Event(now, arm, self.state, self.state, reason))
         target = self.teleop.update(samples, tools, now, commanded or None, obstacles)[arm]
-        self._link.set_stopped(self.teleop.stopped)
+        if self._hand.hand != self.hand:
+            self._hand.follow(self.hand)
         self._home.update(self.teleop, *self._outputs.homing, now)
         toggled = target.gripper != self._target.gripper
         self._target = target
         # If this process was frozen meanwhile, the target is out of date: it is not sent, and the next tick pauses.
-        sent = self._outputs.step(target.pose, tool, base, now, decided)
-        if (fault := self._outputs.relay(self.state is ArmState.ENGAGED, tool, base, now, decided)) is not None:
+        sent = self._outputs.step(target.command, tool, base, now, decided)
+        if (fault := self._outputs.relay(self.engaged, tool, base, now, decided)) is not None:
             self.teleop.pause(now, fault)
+        self._pair.send(now, decided)
         if self._has_analog_gripper:
             self.gripper.move(target.gripper, now)
         elif toggled:
             self.toggle_gripper()
         self.gripper.check(now)
-        self._publish_events(now)
-        self._publish_feedback(sent, tool, now)
+        self._publish_events()
+        self._pair.tell()  # after the events, so that a fault is told before what it ends
+        self._feedback.publish(self.engaged, target, sent, tool, self.gripper, self.hand, now)
+
+    @property
+    def hand(self) -> str:
+        """The hand that drives the arm."""
+        return self.teleop.hand_of(self.arm_name)
 
     @property
     def state(self) -> ArmState:
         """State of the teleop layer."""
         return self.teleop.states[self.arm_name]
+
+    @property
+    def engaged(self) -> bool:
+        """Whether the arm follows a hand."""
+        return self.teleop.engaged[self.arm_name]
 
     def health(self) -> tuple[bytes, str, Mapping[str, Any]]:
         """State, the reason why the arm cannot be engaged, and figures."""
@@ -198,30 +207,30 @@ class BaseArmController(BaseNode):
         values = {
             "arm": self.arm_name,
             "state": str(self.state),
-            "engaged": self.state is ArmState.ENGAGED,
+            "engaged": self.engaged,
             "ready": self._refusal is None and self.state not in (ArmState.STOPPED, ArmState.HOMING),  # to be engaged
             "hand": self.hand,
-            "hand_age": round(self.now - self._pose[1], 3) if self._pose else None,
-            "inputs_age": round(self.now - self._inputs[1], 3) if self._inputs[0] else None,
+            "hand_age": _rounded(self.now - self._hand.stamps[0]),
+            "inputs_age": _rounded(self.now - self._hand.stamps[1]),
             "stance": str(self.parameters.teleop.stance),
             "preset": self.parameters.preset.name,
             "mode": str(self.parameters.mode),
             "target_topic": output.topic,
-            "targets_sent": output.sent,
+            "sent": self._outputs.sent,
             "targets_clipped": output.guard.clipped,
             "slip": round(self._target.slip, 4),
             "slip_angle": round(self._target.slip_angle, 4),
             "gripper": self.gripper.state,
-            "last_event": self._last_event,
+            "last_event": self._feedback.last_event,
         }
         if self._refusal is not None:
             return *self._refusal, values
-        for problem in (self.gripper.problem, self._outputs.advice):
+        for problem in (self.gripper.problem, self._outputs.advice, self._frames.advice):
             if problem is not None:
                 return WARN, problem, values
         if self.state in AT_REST:
-            return OK, f"ready to engage ({self._paused})", values  # whatever refused an earlier press is over
-        return OK, self._last_event, values
+            return OK, f"ready to engage ({self._feedback.paused})", values  # whatever refused an earlier press is over
+        return OK, self._feedback.last_event, values
 
     def close(self) -> None:
         """Announce the end of this node to the other arm."""
@@ -236,7 +245,8 @@ class BaseArmController(BaseNode):
 
     def _refuse(self, tool: pin.SE3 | None, base: pin.SE3 | None, now: float) -> tuple[bytes, str] | None:
         """Why the arm may not be engaged now, with the level of the diagnostics."""
-        for line in (self._link.disagreement, self._outputs.conflict):
+        frames = self._frames.conflict(self.parameters.tool_frame)
+        for line in (self._link.disagreement, self._outputs.conflict, frames):
             if line is not None:
                 return ERROR, line
         if tool is None:
@@ -244,65 +254,56 @@ class BaseArmController(BaseNode):
         if base is None:
             values = self.parameters
             return WARN, f"no transform from {values.base_frame} to {values.world_frame} on /tf"
-        silence = self._hand_watch.silence(now, self._pose[1] if self._pose else float("-inf"), self._inputs[1])
-        problem = silence or self._outputs.unready
+        carried = self.state is ArmState.CARRIED or self._pair.asked  # for which no hand is needed
+        silence = None if carried else self._hand.silence(now)
+        problem = self._link.swapping or self._link.aligning or silence or self._outputs.unready
         return None if problem is None else (WARN, problem)
 
     def _faults(self, now: float) -> str | None:
         """What pauses this arm, besides its hand. A gap in its own ticks comes first: it makes others look silent."""
-        linked = self._link.take_fault() if self.parameters.teleop.linked else None
+        linked = self._link.take_fault(self.parameters.teleop.linked)
         output = self._outputs.take_fault(now)
         # Read after the others were judged: the process may have been frozen in the middle of this tick.
         gap, self._ticked = self.now - self._ticked, now
         stalled = f"this node stood still for {gap:.2f} s" if gap > self.parameters.teleop.gate.timeout else None
         return stalled or output or linked
 
-    def _commanded(self, tool: pin.SE3, now: float) -> pin.SE3:
-        """The commanded tool pose: the leash is measured from it, and an anchor takes its orientation."""
-        reference = self._safe_target.at(now)
-        if self.state is ArmState.ENGAGED:
-            return tool if reference is None else reference
-        reference = reference or self._outputs.first.guard.pose
-        return reference if reference is not None and near(reference, tool, *SAG) else tool
-
-    def _publish_events(self, now: float) -> None:
-        """Report changes of the state: to the log, to the hand as vibrations, and to the other arm."""
-        for event in self.teleop.take_events():
-            self._last_event = f"{event.destination}: {event.reason}"
-            if event.destination in AT_REST and not is_refusal(event):
-                self._paused = self._last_event
-            self.get_logger().info(self._last_event)
-            self.haptics.tell(event)
-            if event.destination is ArmState.ENGAGED:
-                self._link.engaged()
-            stopped = event.source not in AT_REST and event.destination in (ArmState.LOST, ArmState.ALIGNING)
-            if stopped and not self._link.told(event.reason):
-                self._link.report(event.reason)
-            self.report_health()
-
-    def _publish_feedback(self, sent: pin.SE3 | None, tool: pin.SE3 | None, now: float) -> None:
-        """Publish markers and vibrations."""
-        self.haptics.slip(self._target.slip, self._target.slip_angle)
-        if (pulse := self.haptics.at(now, self.hand)) is not None:
-            self._haptics.publish(OVR2ROSHapticFeedback(frequency=pulse.frequency, amplitude=pulse.amplitude))
-        if not 0.0 <= now - self._shown < _MARKER_PERIOD:
-            self._shown = now
-            for marker in self.markers.at(sent, tool, self.state is ArmState.ENGAGED, now):
-                self._markers.publish(marker)
-
-    def _take(self, callback: Callable[[Any], None], message: Any, info: Mapping[str, Any]) -> None:
-        self._received = self.now - age(info)
-        callback(message)
-
-    def _put_sample(self) -> None:
-        if self._pose is not None:
-            self._samples.put(hand_sample(self.hand, *self._pose, *self._inputs))
-
-    def _change_teleop(self, settings: TeleopSettings) -> str | None:
-        problem = self.teleop.change(settings, self.now)
+    def _watch_time(self) -> None:
+        """Pause where simulated time stands still: the hand goes on, and must not be followed later."""
+        problem = self.clock_problem(self.parameters.teleop.gate.timeout)
         if problem is None:
-            self.parameters = replace(self.parameters, teleop=settings)
-            self.haptics.strength = settings.haptics.strength
+            return
+        self._refusal = ERROR, problem
+        if self.state not in HOLDING:
+            self.teleop.pause(self.now, problem)
+            self._publish_events()
+
+    def _commanded(self, tool: pin.SE3, now: float) -> pin.SE3:
+        """The commanded tool pose: the leash is measured from it, and an anchor takes its orientation and the sag.
+
+        Another controller's is not known. Then the leash is measured from the tool, and the last target is what that
+        controller holds while the arm is paused.
+        """
+        reference = self._safe_target.at(now)
+        if self.engaged:
+            return self._target.command_for(tool) if reference is None else reference
+        reference = reference or self._outputs.first.last_sent
+        return reference if reference is not None and near(reference, tool, *MOST_SAG) else tool
+
+    def _publish_events(self) -> None:
+        for event in self.teleop.take_events():
+            self._feedback.tell(event)
+
+    def _change(self, settings: TeleopSettings, guard: GuardSettings) -> str | None:
+        turned = settings.stance is not self.parameters.teleop.stance
+        problem = self._link.turning_refused if turned else None
+        if problem is None and settings != self.parameters.teleop:
+            problem = self.teleop.change(settings, self.now)
+        if problem is None:
+            self.parameters = replace(self.parameters, teleop=settings, guard=guard)
+            self._feedback.haptics.strength = settings.haptics.strength
+            self._link.set_stance(settings.stance)
+            self._outputs.limit(guard)
         return problem
 
     def _on_pause(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
@@ -319,3 +320,7 @@ class BaseArmController(BaseNode):
         self._outputs.forget(now)
         response.success, response.message = True, f"{self.arm_name} is reset"
         return response
+
+
+def _rounded(duration: float) -> float | None:
+    return round(duration, 3) if math.isfinite(duration) else None

@@ -16,11 +16,8 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from geometry_msgs.msg import PoseStamped
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
-from rclpy.parameter import Parameter
-from std_msgs.msg import Bool
 from std_srvs.srv import SetBool, Trigger
 
 from q2r2_control.config import Config, load_config
@@ -28,12 +25,13 @@ from q2r2_control.control.controller import CartesianController
 from q2r2_control.drives import TorqueDrive, permitted
 from q2r2_control.errors import ConfigError
 from q2r2_control.robot.robot import Robot
-from q2r2_control.ros.base_node import ERROR, LATCHED_QOS, OK, SENT_COMMAND_QOS, WARN, BaseNode, run_node
+from q2r2_control.ros.base_node import ERROR, OK, WARN, run_node
+from q2r2_control.ros.bridge.controller_feedback import ControllerFeedback
 from q2r2_control.ros.bridge.intakes import JointIntake, TargetIntake
 from q2r2_control.ros.bridge.joint_outputs import NONE, make_output, output_name
-from q2r2_control.ros.bridge.live_parameters import LiveStiffness
-from q2r2_control.ros.bridge.messages import stamped_pose
-from q2r2_control.ros.monitoring.endpoints import publish_in_time
+from q2r2_control.ros.bridge.live_parameters import LiveControl, LiveStiffness, LiveWatching
+from q2r2_control.ros.executor import TickExecutor
+from q2r2_control.ros.managed_node import ManagedNode
 from q2r2_control.supervision.external_arms import ExternalArms, ExternalSettings, settings_for_external_arms
 from q2r2_control.supervision.joint_watch import watch_settings
 from q2r2_control.supervision.supervisor import Displace, Phase, Supervisor
@@ -42,28 +40,15 @@ from q2r2_control.supervision.tick_pacer import TickPacer
 from q2r2_control.types import LONGEST_DT, Reference
 
 _LONGEST_STOP = 3.0  # [s]
+_QUIET = 0.3  # nobody else commands the arms for so long before this node does [s]
+_LONGEST_ACTIVATION = 2.0  # besides the settle time [s]
+_DEACTIVATED = "deactivated"
+_CURE = "ros2 lifecycle set /cartesian_controller activate takes over where the arms are"
 _LOOK_PERIOD = 0.5  # between two looks at the graph [s]
-
 _SAFE_TARGET_PERIOD = 0.008  # [s]
-# Parameters that may change while the node runs: name, unit or meaning, least and greatest value.
-_Table = tuple[tuple[str, str, str, float, float], ...]
-_STREAM_PARAMETERS: _Table = (
-    ("timeout", "target_timeout", "an arm without targets for this long holds [s]", 0.02, 2.0),
-    ("engage_distance", "engage_distance", "targets have to begin this near to the tool [m]", 0.0, 0.2),
-    ("engage_angle", "engage_angle", "and turned from it by no more [rad]", 0.0, 1.5),
-)
-_WATCH_PARAMETERS: _Table = (
-    ("timeout", "joint_state_timeout", "without joint states for this long the arms brake [s]", 0.01, 1.0),
-    ("settle_time", "settle_time", "joint states have to be good and at rest before activation [s]", 0.02, 10.0),
-    ("deviation", "max_deviation", "of a joint from its reference [rad]", 0.01, 3.0),
-    ("deviation_time", "deviation_time", "for this long stops the arms [s]", 0.05, 10.0),
-)
-_EXTERNAL_PARAMETERS: _Table = (
-    ("tolerance", "distance_tolerance", "output none: measured pairs may be closer than min_distance [m]", 0.0, 0.1),
-)
 
 
-class CartesianControllerNode(BaseNode):
+class CartesianControllerNode(ManagedNode):
     """Feeds a :class:`Supervisor` from its topics and publishes the reference that comes of it."""
 
     ticks = True
@@ -84,14 +69,12 @@ class CartesianControllerNode(BaseNode):
         watch = watch_settings(config.supervision, self._output.drive.yields)
         # A message with a bad number among good ones is another publisher's: no reason to bridge it.
         watch.unusable_time = 0.0
-        self._settings: dict[str, tuple[Any, str]] = {}
-        self._declare(streams, _STREAM_PARAMETERS)
-        self._declare(watch, _WATCH_PARAMETERS)
-        self._declare(external, _EXTERNAL_PARAMETERS)
-        self.add_post_set_parameters_callback(self._on_parameters)
+        self._watching = LiveWatching(self, streams, watch, external)
         if isinstance(self._output.drive, TorqueDrive):
             self._stiffness = LiveStiffness(self, self._output.drive.impedance)
         self._controller = CartesianController(robot, permitted(config.control, self._output.drive))
+        self._live = LiveControl(self, self._controller)
+        self._kept = self._controller.kept_distances
         self._supervisor = Supervisor(
             robot,
             self._controller,
@@ -107,11 +90,14 @@ class CartesianControllerNode(BaseNode):
         self._velocity = np.zeros(robot.model.nv)  # of the last reference [rad/s]
         self._reference: Reference | None = None
         self._commanding = False
-        self._advances = 0
-        # Another controller follows every one; arms that listen take a hundred a second.
-        self._safe_target_ticks = 1 if output == NONE else max(round(_SAFE_TARGET_PERIOD * rate), 1)
+        self._advances = 0  # ticks that have gone by some time
+        # Another controller follows every safe target; arms that listen take a hundred a second.
+        every = 1 if output == NONE else max(round(_SAFE_TARGET_PERIOD * rate), 1)
+        self._feedback = ControllerFeedback(self, self._controller, self._targets, every)
         self._ticks, self._reported_at, self._last_tick = 0, time.monotonic(), self.now
+        self._others = self._output.watch(self)
         self._connect()
+        self.start_active()
         self.get_logger().info(f"{config.name}: {', '.join(robot.arms)}; waits for joint states")
 
     def _displacement(self, config: Config) -> Displace | None:
@@ -120,29 +106,10 @@ class CartesianControllerNode(BaseNode):
             return None
         if not self._joints.measures_external_torque:
             raise ConfigError("admittance.enabled = true: set the parameter external_torque_topic, which it needs")
+        self._joints.needs_external_torque = True
         return self._output.drive.displaced
 
-    def _declare(self, target: Any, table: _Table) -> None:
-        for field, name, description, least, greatest in table:
-            value = self.parameter(
-                name, getattr(target, field), description, at_least=least, at_most=greatest, read_only=False
-            )
-            setattr(target, field, value)
-            self._settings[name] = (target, field)
-
-    def _on_parameters(self, parameters: list[Parameter]) -> None:
-        for parameter in parameters:
-            if parameter.name in self._settings:
-                target, field = self._settings[parameter.name]
-                setattr(target, field, parameter.value)
-
     def _connect(self) -> None:
-        self._safe_targets = {
-            arm: self.create_publisher(PoseStamped, f"~/safe_target/{arm}", SENT_COMMAND_QOS)
-            for arm in self._targets.topics
-        }
-        self._follows: dict[str, bool | None] = dict.fromkeys(self._targets.topics)
-        self._following = {arm: self.create_publisher(Bool, f"~/following/{arm}", LATCHED_QOS) for arm in self._follows}
         self._targets.subscribe(self._supervisor.take_target)
         self._joints.subscribe(self._supervisor.take_joint_state)
         self.create_service(SetBool, "~/pause", self._on_pause)
@@ -172,7 +139,7 @@ class CartesianControllerNode(BaseNode):
         self._ticks += 1
         if dt > 0.0:
             self._advance(now, dt, decided)
-        self._tell_followed()
+        self._feedback.tell_followed(self._supervisor.follows)
 
     def _advance(self, now: float, dt: float, decided: float) -> None:
         self._advances += 1
@@ -183,30 +150,17 @@ class CartesianControllerNode(BaseNode):
         reference, state = self._supervisor.tick(now, dt), self._joints.state
         if not was_active and self._supervisor.phase is Phase.ACTIVE and state is not None:
             self._output.activate(state)
+        if self._controller.kept_distances is not self._kept:
+            self._kept = self._controller.kept_distances
+            self._output.drive.set_kept_distances(self._kept)
         if reference is not None and state is not None:
             self._output.send(reference, state, dt, now, self._supervisor.trusted, decided)
             self._reference, self._velocity = reference, reference.v
-            if self._advances % self._safe_target_ticks == 0:
-                self._publish_safe_targets(now, decided)
+            self._feedback.publish(reference, state, now, dt, decided)
         elif self._commanding and state is not None:
             self._output.end(state, now)
         self._commanding = reference is not None
         self._tell_events()
-
-    def _publish_safe_targets(self, now: float, decided: float) -> None:
-        for arm, publisher in self._safe_targets.items():
-            if publisher.get_subscription_count():
-                frame = self._targets.frames[arm]
-                tool = frame.pose.actInv(self._controller.tool_pose(arm))
-                publish_in_time(publisher, stamped_pose(tool, frame.name, now), decided)
-
-    def _tell_followed(self) -> None:
-        """Say of each arm whether its targets are followed, when that changes."""
-        for arm, publisher in self._following.items():
-            follows = self._supervisor.follows(arm)
-            if follows != self._follows[arm]:
-                self._follows[arm] = follows
-                publisher.publish(Bool(data=follows))
 
     def _tell_events(self) -> None:
         if not self._supervisor.events:
@@ -227,7 +181,7 @@ class CartesianControllerNode(BaseNode):
         return _answer(response, None)
 
     def _serve(self, act: Callable[[], str | None], request: Any, response: Any) -> Any:
-        refusal = act()
+        refusal = act() if self.is_active or act == self._stop else f"{_DEACTIVATED}: {_CURE}"
         self.report_health()
         return _answer(response, refusal)
 
@@ -239,19 +193,24 @@ class CartesianControllerNode(BaseNode):
         supervisor, now, wall = self._supervisor, self.now, time.monotonic()
         values: dict[str, Any] = {
             "phase": supervisor.phase,
+            "lifecycle": self.lifecycle_state,
             "homing_ended": supervisor.homing_outcome or "",
             "loop_rate_hz": round(self._ticks / max(wall - self._reported_at, 1e-9), 1),
             "missed_ticks": self._pacer.missed_ticks,
+            "sent": self._output.sent,
         }
         self._ticks, self._reported_at = 0, wall
         for arm, rejected in self._targets.rejected.items():
-            values[f"{arm}_state"] = "paused" if supervisor.paused else supervisor.arm_state(arm)
+            state = "paused" if supervisor.paused else supervisor.arm_state(arm)
+            values[f"{arm}_state"] = state if self.is_active else _DEACTIVATED
             age = supervisor.target_age(arm, now)
             values[f"{arm}_target_age_s"] = round(age, 3) if age < 1e6 else "none"
             values[f"{arm}_targets_rejected"] = rejected
             values[f"{arm}_targets_from"] = self._targets.publishers(arm)
         if self._reference is not None:
             report = self._reference.report
+            if (pair := self._controller.narrow_pair) is not None:
+                values["nearer_than_min_distance"] = "|".join(pair)
             values["qp_status"] = str(report.status)
             values["closest_pair"] = "|".join(report.closest_pair)
             values["closest_distance_m"] = round(report.closest_distance, 4)
@@ -259,6 +218,8 @@ class CartesianControllerNode(BaseNode):
         return level, line, values
 
     def _judge(self) -> tuple[bytes, str]:
+        if not self.is_active:
+            return WARN, self._supervisor.fault or _CURE
         if self._supervisor.fault is not None:
             return ERROR, self._supervisor.fault
         ended = self._supervisor.ended_targets
@@ -266,17 +227,48 @@ class CartesianControllerNode(BaseNode):
             return WARN, "; ".join(faults + ended)
         return OK, "; ".join(["paused" if self._supervisor.paused else "active", *ended])
 
+    def begin(self) -> str | None:
+        """Take over where the arms stand, if they do and nobody else commands them."""
+        self._tick_until(lambda: False, _QUIET)
+        if (other := self._others.commander(_QUIET)) is not None:
+            return other
+        if (refusal := self._supervisor.reset()) is not None:
+            return refusal
+        settle = float(self.get_parameter("settle_time").value)
+        active = self._tick_until(lambda: self._supervisor.phase is Phase.ACTIVE, settle + _LONGEST_ACTIVATION)
+        problem = None if active else self._supervisor.fault or "the arms do not stand still"
+        # Nothing was commanded yet: that begins with the next tick.
+        if (problem := self._others.commander(_QUIET) or problem) is not None:
+            self._supervisor.let_go(problem, self.now)
+            self._supervisor.stop(_CURE)
+            return problem
+        self._others.end()
+        return None
+
+    def end(self) -> str | None:
+        """Bring the arms to rest along the certified stop; then nothing is commanded, and another node may."""
+        self._come_to_rest(_CURE, self._tick_on)
+        self._others.begin()
+        return None
+
     def close(self) -> None:
         """Bring the arms to rest along the certified stop before the commands end."""
-        self._supervisor.stop("ending")
+
+        def spin() -> None:
+            if self.executor is not None:
+                self.executor.spin_once(timeout_sec=self._period)
+
+        self._come_to_rest("ending", spin)
+
+    def _come_to_rest(self, why: str, go_on: Callable[[], None]) -> None:
+        self._supervisor.stop(why)
         deadline = last = time.monotonic()
         deadline += _LONGEST_STOP
         advances = self._advances
         try:
             while self._supervisor.phase is Phase.BRAKING and (now := time.monotonic()) < deadline:
-                # Joint states still have to come in; the timer does the rest, unless simulated time has ended already.
-                if self.executor is not None:
-                    self.executor.spin_once(timeout_sec=self._period)
+                # Joint states still have to come in; ticks do the rest, unless simulated time has ended already.
+                go_on()
                 if self._advances != advances:
                     advances, last = self._advances, now
                 elif now - last > 2.0 * self._period:
@@ -284,6 +276,21 @@ class CartesianControllerNode(BaseNode):
         finally:
             if self._commanding and self._joints.state is not None:
                 self._output.end(self._joints.state, self.now)
+            self._commanding = False
+
+    def _tick_on(self) -> None:
+        """One tick in the middle of a service, which the executor waits for."""
+        time.sleep(self._period)
+        if isinstance(self.executor, TickExecutor):
+            self.executor.take_messages()
+        self._tick()
+
+    def _tick_until(self, condition: Callable[[], bool], longest: float) -> bool:
+        """Tick on until ``condition`` holds, for ``longest`` [s] at most; whether it does."""
+        deadline = time.monotonic() + longest
+        while not (fulfilled := condition()) and time.monotonic() < deadline:
+            self._tick_on()
+        return fulfilled
 
 
 def _answer(response: Any, refusal: str | None) -> Any:

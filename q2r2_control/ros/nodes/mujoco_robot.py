@@ -30,17 +30,18 @@ from q2r2_control.config.timeouts import STREAM_TIMEOUT
 from q2r2_control.errors import ConfigError
 from q2r2_control.plants.simulated_cell import JointSetpoint, SimulatedCell
 from q2r2_control.robot.robot import Robot
-from q2r2_control.ros.base_node import LATCHED_QOS, OK, WARN, BaseNode, run_node
+from q2r2_control.ros.base_node import LATCHED_QOS, OK, WARN, run_node
 from q2r2_control.ros.bridge.grippers import GripperServer, Stroke
 from q2r2_control.ros.bridge.link_frames import LinkFrames
 from q2r2_control.ros.bridge.messages import age, delay, joint_state_message, seconds
+from q2r2_control.ros.managed_node import ManagedNode
 from q2r2_control.supervision.delay_watch import DelayWatch
 from q2r2_control.types import RobotState
 
 _LOG_PERIOD = 1.0  # of lines about one topic [s]
 
 
-class MujocoRobot(BaseNode):
+class MujocoRobot(ManagedNode):
     """Runs a :class:`SimulatedCell` in real time between its topics, services and actions."""
 
     ticks = True
@@ -75,6 +76,7 @@ class MujocoRobot(BaseNode):
         steady = Clock(clock_type=ClockType.STEADY_TIME)  # the simulation makes its own time, whatever /clock says
         self.create_timer(self._period, self._tick, clock=steady)
         self.create_timer(1.0 / tf_rate, self._publish_transforms, clock=steady)
+        self.start_active()
         self.get_logger().info(f"{config.name}: {', '.join(self._robot.joint_names)}")
 
     def _make_publishers(self) -> None:
@@ -109,6 +111,9 @@ class MujocoRobot(BaseNode):
         )
 
     def _take(self, topic: str, callback: Callable[[Any], None], message: Any, info: Mapping[str, Any]) -> None:
+        if not self.is_active:
+            self._note(topic, "the robot is deactivated; ros2 lifecycle set /cartesian_controller activate")
+            return
         # Two controllers of an arm each may send on one topic, from hosts with clocks of their own.
         names = getattr(message, "joint_names", ()) or getattr(message, "name", ())
         delays = self._delays.setdefault((topic, *names[:1]), DelayWatch(STREAM_TIMEOUT))
@@ -195,6 +200,7 @@ class MujocoRobot(BaseNode):
         mode = self._cell.mode(now)
         values = {
             "mode": mode,
+            "lifecycle": self.lifecycle_state,
             "loop_rate_hz": round(self._ticks / max(now - self._reported_at, 1e-9), 1),
             "time_dropped_s": round(self._cell.dropped, 3),
             "refused_commands": self._refusals,
@@ -202,7 +208,14 @@ class MujocoRobot(BaseNode):
         self._ticks, self._reported_at = 0, now
         if self._refused:
             return WARN, "; ".join(f"{topic}: refused: {fault}" for topic, fault in self._refused.items()), values
+        if not self.is_active:
+            return WARN, "deactivated: takes no commands; ros2 lifecycle set /cartesian_controller activate", values
         return OK, mode, values
+
+    def begin(self) -> str | None:
+        """Take commands again; the first has to be where the arms are, as any has."""
+        self._refused.clear()
+        return None
 
     def close(self) -> None:
         """Give the plant back."""

@@ -85,7 +85,7 @@ class SimulationInput(BaseNode):
 
     def health(self) -> tuple[bytes, str, Mapping[str, Any]]:
         """What is played, or which subscriber is missing."""
-        values = {"samples": self._samples}
+        values = {"samples": self._samples, "sent": self._publishers_of_hands.sent}
         if self._waits_for_request:
             return WARN, "waits for a call of ~/start", values
         if self._waits_for_subscribers:

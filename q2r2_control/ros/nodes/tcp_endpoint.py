@@ -95,6 +95,7 @@ class TcpEndpoint(BaseNode):
             "dialect": statistics.dialect,
             "connections": statistics.connections,
             "last_disconnect": statistics.last_disconnect,
+            "sent": self._publishers_of_hands.sent,
             "rate_hz": {name: topic.rate for name, topic in statistics.topics.items()},
             "unknown_topics": statistics.unknown_topics,
         }

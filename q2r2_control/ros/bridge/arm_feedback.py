@@ -1,0 +1,70 @@
+"""What is told of one arm's teleoperation: to its hand as vibrations, to the log, to RViz, to a recording."""
+
+from __future__ import annotations
+
+import pinocchio as pin
+from visualization_msgs.msg import Marker
+
+from q2r2_control.ros.base_node import BaseNode
+from q2r2_control.ros.bridge.grippers import GripperClient
+from q2r2_control.ros.bridge.hand_intake import HandIntake
+from q2r2_control.ros.bridge.markers import TargetMarkers
+from q2r2_control.ros.bridge.parameters import ArmParameters
+from q2r2_control.ros.bridge.reports import ArmReport
+from q2r2_control.ros.monitoring.arm_link import ArmLink
+from q2r2_control.teleop.arm_states import AT_REST, ArmState, is_refusal
+from q2r2_control.teleop.haptics import HapticPulses
+from q2r2_control.teleop.sag import sagged
+from q2r2_control.types import ArmTarget, Event
+
+_MARKER_PERIOD = 0.05  # [s]
+
+
+class ArmFeedback:
+    """Keeps what was told last."""
+
+    def __init__(self, node: BaseNode, arm: str, values: ArmParameters, link: ArmLink, hand: HandIntake) -> None:
+        self._node, self._link, self._hand = node, link, hand
+        self.haptics = HapticPulses(values.teleop.haptics)
+        self.last_event = self.paused = "not engaged yet"  # of all events, and of those that let the arm hold
+        self._drawn = TargetMarkers(arm, values.tool_frame, values.world_frame)
+        self._markers = node.create_publisher(Marker, "/visualization_marker", 10)
+        self._shown = 0.0
+        self._report = ArmReport(node, arm)
+
+    def tell(self, event: Event) -> None:
+        """Report a change of the state: to the log, to the hand as vibrations, and to the other arm."""
+        self.last_event = f"{event.destination}: {event.reason}"
+        if event.destination in AT_REST and not is_refusal(event):
+            self.paused = self.last_event
+        self._node.get_logger().info(self.last_event)
+        self.haptics.tell(event)
+        self._report.tell(event)
+        if event.destination in (ArmState.ENGAGED, ArmState.CARRIED):
+            self._link.engaged()
+        stopped = event.source not in AT_REST and event.destination is ArmState.LOST
+        if stopped and not self._link.told(event.reason):
+            self._link.report(event.reason)
+        self._node.report_health()
+
+    def publish(
+        self,
+        engaged: bool,
+        target: ArmTarget,
+        sent: pin.SE3 | None,
+        tool: pin.SE3 | None,
+        gripper: GripperClient,
+        hand: str,
+        now: float,
+    ) -> None:
+        """Of one tick at ``now`` [s]: what the ``target`` has become, ``sent`` to the controller, world frame."""
+        self._report.publish(engaged, target, gripper.opening, now)
+        self.haptics.slip(target.slip, target.slip_angle)
+        self.haptics.grasps(gripper.holds)
+        if (pulse := self.haptics.at(now, hand)) is not None:
+            self._hand.feel(pulse)
+        if not 0.0 <= now - self._shown < _MARKER_PERIOD:
+            self._shown = now
+            asked = None if sent is None else sagged(sent, target.sag)  # where the tool is to be
+            for marker in self._drawn.at(asked, tool, engaged, now):
+                self._markers.publish(marker)

@@ -1,0 +1,62 @@
+"""Frames on /tf that two publishers send: a robot that is in two places."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from rclpy.serialization import serialize_message
+from rosbags.serde import SerdeError
+from rosbags.typesys import Stores, get_typestore
+from tf2_msgs.msg import TFMessage
+
+from q2r2_control.supervision.sequence_watch import SequenceWatch
+
+_TF = "tf2_msgs/msg/TFMessage"
+_PAUSE = 1.0  # after a silence of this long a publisher may have been restarted [s]
+_REMEMBERED = 2.0  # a frame counts as sent by two for this long after it was last found to be [s]
+
+
+class FrameSenders:
+    """Tells two publishers of one frame from one, by the numbers of the messages that the frame comes in.
+
+    Other publishers of the same topic that send other frames are as it should be. Times are the steady clock's [s].
+    """
+
+    def __init__(self) -> None:
+        self._numbers: dict[str, SequenceWatch] = {}
+        self._shared: dict[str, float] = {}
+
+    def take(self, frame: str, number: int | None, now: float) -> bool:
+        """A frame came in the message of this number, which some middleware does not tell; whether two send it."""
+        if number is None:
+            return False
+        if (watch := self._numbers.get(frame)) is None:
+            watch = self._numbers[frame] = SequenceWatch()
+        if watch.take(number, now, _PAUSE) < 2:
+            return False
+        self._shared[frame] = now
+        return True
+
+    def shared(self, now: float) -> tuple[str, ...]:
+        """The frames that two publishers send."""
+        return tuple(sorted(frame for frame, at in self._shared.items() if now - at <= _REMEMBERED))
+
+
+def frame_reader() -> Callable[[bytes], Sequence[Any]]:
+    """A function that reads the transforms in a serialized message; none where it is no message.
+
+    A robot's message has dozens of transforms, fifty times a second, of which a node needs a few. So rosbags reads
+    them, which makes no checked message object of each as rclpy does.
+    """
+    deserialize: Any = get_typestore(Stores.ROS2_JAZZY).deserialize_cdr
+
+    def read(message: bytes) -> Sequence[Any]:
+        try:
+            transforms: Sequence[Any] = deserialize(message, _TF).transforms
+        except (SerdeError, ValueError):
+            return ()  # such as a name that is no UTF-8, which is some other node's fault
+        return transforms
+
+    read(serialize_message(TFMessage()))  # makes the reader, which takes a while
+    return read

@@ -1,0 +1,232 @@
+"""``recorder``: keeps what the nodes of a cell publish in one MCAP file a run. It only listens.
+
+It listens to no topic that commands, where it would count as a receiver: an arm without a controller could be engaged
+then, and arms that are off their reference would be stopped. What arms ask for, and the reference that joint commands
+are made of, their nodes publish once more for it. Streams reach it by best effort, so no sender waits for it.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections.abc import Mapping
+from dataclasses import asdict
+from functools import partial
+from importlib import import_module
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.serialization import deserialize_message
+from std_msgs.msg import String
+from std_srvs.srv import Trigger
+
+from q2r2_control.config import Config, load_config
+from q2r2_control.errors import ConfigError
+from q2r2_control.judging.episode_judge import EpisodeJudge
+from q2r2_control.recording.about import ROS, About, as_yaml, program
+from q2r2_control.recording.message_recorder import ROOM, ROOM_WITH_PICTURES, MessageRecorder
+from q2r2_control.recording.ros_topics import RECORDER_EVENTS, arm_events, heard_on, is_latched, is_reliable, ros_topics
+from q2r2_control.recording.topics import Topic
+from q2r2_control.robot.robot import Robot
+from q2r2_control.ros.base_node import ERROR, LATCHED_QOS, OK, RECORDED_QOS, WARN, BaseNode, run_node
+from q2r2_control.ros.bridge.messages import age
+from q2r2_control.teleop.episode_marks import (
+    BEGINS,
+    DISCARDED,
+    ENDS,
+    FAILED,
+    MARK,
+    NO_RECORDING,
+    RECORDING_ENDED,
+    SUCCEEDED,
+    EpisodeMarks,
+)
+from q2r2_control.types import Event
+
+_SERVICES = {
+    **{"start": BEGINS, "stop": ENDS, "discard": DISCARDED},
+    **{"success": SUCCEEDED, "failure": FAILED, "mark": MARK},
+}
+_PERIOD = 0.02  # between two looks at what has arrived [s]
+_STREAM_QOS = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)
+
+
+class _Waiting(NamedTuple):
+    """A message that waits until all that came before it have been taken."""
+
+    received: int  # [ns] of day
+    topic: Topic
+    number: int
+    sent: int  # [ns] of day, by its sender's clock
+    payload: bytes
+
+
+class Recorder(BaseNode):
+    """Writes a file from its start to its end; episodes in it are told by controls of the operator, and by services."""
+
+    ticks = True
+
+    def __init__(self) -> None:
+        super().__init__("recorder")
+        config = load_config(self.parameter("config", "config/dual_iiwa7.yaml", "YAML of the cell"))
+        folder = self.parameter("folder", "recordings", "where each run gets a new folder")
+        rate = self.parameter(
+            "rate", 250.0, "of the controller's loop, as it is set there [Hz]", at_least=20, at_most=1000
+        )
+        notes = {
+            name: self.parameter(name, "", f"{what}, noted in the recording; empty: not")
+            for name, what in (("task", "what is done"), ("operator", "whose hands"))
+        }
+        if not folder:
+            raise ConfigError("parameter folder: empty; allowed: a folder")
+        cameras = {name: camera.topic for name, camera in config.cameras.items() if camera.topic is not None}
+        room = ROOM_WITH_PICTURES if cameras else ROOM
+        self._recorder = MessageRecorder(Path(folder), config.name, room)  # its process starts while this one builds
+        self._judge = EpisodeJudge(lambda: self._recorder.file, self._tell, timed=False)
+        robot = Robot.from_config(config)
+        self._marks = EpisodeMarks()
+        self._served, self._served_last = 0, ""
+        self._waiting: list[_Waiting] = []
+        self._events = self.create_publisher(String, RECORDER_EVENTS, RECORDED_QOS)
+        topics = ros_topics(tuple(robot.arms), cameras)
+        self._begun = time.monotonic_ns()
+        self._epoch, self._looked = time.time_ns(), 0
+        self._recorder.begin(self._about(config, robot, rate, notes, tuple(cameras)), topics)
+        told = {arm_events(arm) for arm in robot.arms}
+        for topic in topics:
+            qos = LATCHED_QOS if is_latched(topic.name) else RECORDED_QOS if is_reliable(topic) else _STREAM_QOS
+            take = partial(self._take, topic, topic.name in told)
+            self.create_subscription(_class_of(topic.type), heard_on(topic.name), take, qos, raw=True)
+        for name, reason in _SERVICES.items():
+            self.create_service(Trigger, f"~/{name}", partial(self._serve, reason))
+        self.create_timer(_PERIOD, self._write, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self._marks.recorded = self._recorder.fault is None
+        if self._marks.recorded:
+            self.get_logger().info(f"records to {self._recorder.file}")
+
+    def _about(
+        self, config: Config, robot: Robot, rate: float, notes: Mapping[str, str], cameras: tuple[str, ...]
+    ) -> About:
+        return About(
+            arms=tuple(robot.arms),
+            joints=tuple(robot.joint_names),
+            mode="",
+            plant_modes=(),
+            epoch=self._epoch,
+            realtime=True,
+            cell=as_yaml(config.model_copy(update={"loop_rate_hz": rate})),
+            robot=robot.urdf,
+            cameras=cameras,
+            source=ROS,
+            notes={**program(), **{name: text for name, text in notes.items() if text}},
+        )
+
+    def _take(self, topic: Topic, told: bool, payload: bytes, info: Mapping[str, Any]) -> None:
+        """Keep a message until :meth:`_write`; ``told``: it is an arm's event, which may be about an episode."""
+        received = self._day() - round(age(info) * 1e9)
+        number, sent = info["publication_sequence_number"] or 0, info["source_timestamp"]
+        self._waiting.append(_Waiting(received, topic, number, sent, bytes(payload)))
+        if told:
+            reason = json.loads(deserialize_message(payload, String).data)["reason"]
+            self._marks.follow(reason)
+            self._judge.note(self._event(reason))
+            self.report_health()
+
+    def _day(self) -> int:
+        """The time of day [ns], which goes on evenly when the computer's clock is set."""
+        return self._epoch + time.monotonic_ns() - self._begun
+
+    def _write(self) -> None:
+        """Pass on, in the order of their receipt, the messages that were there when this was last called.
+
+        Topics are taken one after the other: of what came since, an older message may not have been taken yet.
+        """
+        until, self._looked = self._looked, self._day()
+        self._put([one for one in self._waiting if one.received <= until])
+        self._waiting = [one for one in self._waiting if one.received > until]
+        self._recorder.look()
+        self._judge.look()
+        if self._marks.recorded and self._recorder.fault is not None:
+            self._marks.recorded = False
+            self.get_logger().error(f"nothing is recorded any more: {self._recorder.fault}")
+            self._tell(f"{RECORDING_ENDED}{self._recorder.fault}")
+
+    def _put(self, messages: list[_Waiting]) -> None:
+        for received, topic, number, sent, payload in sorted(messages, key=lambda one: one.received):
+            self._recorder.put(topic, number, received, sent, payload)
+
+    def _serve(self, reason: str, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        """Tell an event of the recording, unless it makes no sense now."""
+        refusal = self._refusal(reason)
+        response.success, response.message = refusal is None, refusal or reason
+        if refusal is None:
+            self._marks.follow(reason)
+            self._judge.note(self._event(reason))
+            self._tell(reason)
+        return response
+
+    def _event(self, reason: str) -> Event:
+        return Event(self._day() * 1e-9, "", "", "", reason)
+
+    def _tell(self, reason: str) -> None:
+        """Let the recording, and through the arms' nodes both hands, know of an event that no hand told."""
+        self._served, self._served_last = self._served + 1, reason
+        self._events.publish(String(data=json.dumps(asdict(self._event(reason)))))
+        self.report_health()
+
+    def _refusal(self, reason: str) -> str | None:
+        if not self._marks.recorded:
+            return f"{NO_RECORDING}: {self._recorder.fault}"
+        if reason == BEGINS and self._marks.open:
+            return "an episode has begun and not ended"
+        if reason == ENDS and not self._marks.open:
+            return "no episode has begun"
+        return "no episode has begun" if reason == DISCARDED and not self._marks.any else None
+
+    def health(self) -> tuple[bytes, str, Mapping[str, Any]]:
+        """What is recorded where, what was lost, and whether an episode is open, which arms' nodes read here."""
+        recorder = self._recorder
+        values = {
+            "records": self._marks.recorded,
+            "file": "" if recorder.file is None else str(recorder.file),
+            "messages": recorder.count,
+            "lost_messages": recorder.overflows,
+            "episode_open": self._marks.open,
+            "any_episode": self._marks.any,
+            "served": self._served,
+            "served_last": self._served_last,
+        }
+        if recorder.fault is not None:
+            return ERROR, f"nothing is recorded any more: {recorder.fault}", values
+        if recorder.overflows:
+            return WARN, f"{recorder.overflows} messages were lost: the disk is too slow", values
+        return OK, f"records to {recorder.file}", values
+
+    def close(self) -> None:
+        """Write what there is, and say what became of it."""
+        self._judge.close()
+        self._put(self._waiting)
+        self._recorder.finish()
+        recorder = self._recorder
+        lost = recorder.count - recorder.written
+        if recorder.file is not None:
+            self.get_logger().info(f"{recorder.file}: {recorder.written} messages" + (f", {lost} lost" if lost else ""))
+
+
+def _class_of(name: str) -> Any:
+    """The Python class of a type such as std_msgs/msg/String."""
+    package, _, kind = name.split("/")
+    return getattr(import_module(f"{package}.msg"), kind)
+
+
+def main() -> int:
+    """The executable ``recorder``."""
+    return run_node(Recorder)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,216 @@
+"""Listens to a set of nodes without taking part in it.
+
+No command is listened to, and no hand: an arm that has no controller would take a listener for one and could be
+engaged, SimulationInput would play to nobody, and a controller lets arms go whose commands get a new receiver. What
+goes over those topics is counted by who sends it, and said on ``~/state``.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import time
+from collections import defaultdict, deque
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any
+
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.node import Node
+from sensor_msgs.msg import JointState
+from std_msgs.msg import String
+from tf2_msgs.msg import TFMessage
+from visualization_msgs.msg import Marker
+
+from q2r2_control.config import Config
+from q2r2_control.errors import Q2R2Error
+from q2r2_control.inputs.statistics import Arrivals
+from q2r2_control.ros.base_node import STREAM_QOS
+from q2r2_control.ros.launch.middleware import set_up_middleware
+from q2r2_control.ros.monitoring.endpoints import node_of
+from q2r2_control.ros.monitoring.frame_senders import FrameSenders, frame_reader
+from q2r2_control.ros.watching.set_view import NodeView, SetView, TopicView, arm_views
+
+_LOOK_PERIOD = 0.5  # between two looks at the graph [s]
+_STATE = "/state"
+# What may be listened to: anything may, and does, come and go there. Commands have other names.
+_HEARD = {"joint_states": JointState, "visualization_marker": Marker, "tf": TFMessage}
+_OWN = ("/rosout", "/parameter_events")  # every node has them
+_COUNTS = 8  # of what a sender says, over which its rate is taken
+
+
+class WatchError(Q2R2Error):
+    """The middleware does not start; the message says why."""
+
+
+class _Said:
+    """What one node has said."""
+
+    def __init__(self) -> None:
+        self.newest: dict[str, Any] = {}
+        self.at = -math.inf  # [s]
+        self.sent: dict[str, deque[tuple[float, int]]] = defaultdict(partial(deque, maxlen=_COUNTS))
+
+    def take(self, message: String) -> None:
+        try:
+            said = json.loads(message.data)
+        except ValueError:
+            return
+        if not (isinstance(said, dict) and {"level", "message"} <= said.keys()):
+            return  # some other node's
+        self.newest, self.at = said, time.monotonic()
+        sent = said.get("sent")
+        for topic, count in sent.items() if isinstance(sent, dict) else ():
+            if isinstance(count, int):
+                self.sent[topic].append((self.at, count))
+
+    def rate(self, topic: str) -> float | None:
+        """How often it sends on ``topic``, as it says [Hz]."""
+        counts = self.sent.get(topic)
+        if counts is None or len(counts) < 2:
+            return None
+        (began, first), (ended, last) = counts[0], counts[-1]
+        return max(last - first, 0) / max(ended - began, 1e-9)
+
+
+class SetListener:
+    """Looks at the graph of one domain, and hears nodes that report on ``~/state``. Has to be spun."""
+
+    def __init__(self, node: Node, cell: Config) -> None:
+        self._node, self._cell = node, cell
+        self._senders = FrameSenders()
+        self._frames_of = frame_reader()
+        self._said: dict[str, _Said] = {}  # by full name of a node
+        self._arrivals: dict[str, Arrivals] = {}
+        self._topics: dict[str, tuple[str, ...]] = {}  # with their types
+        self._publishers: dict[str, tuple[str, ...]] = {}
+        self._subscribers: dict[str, tuple[str, ...]] = {}
+        self._names: tuple[str, ...] = ()
+
+    def look(self) -> None:
+        """Ask the graph; listen to what has appeared."""
+        node = self._node
+        own = node.get_fully_qualified_name()
+        self._topics = {name: tuple(types) for name, types in node.get_topic_names_and_types()}
+        for topic in self._topics:
+            self._publishers[topic] = _names(node.get_publishers_info_by_topic(topic), own)
+            self._subscribers[topic] = _names(node.get_subscriptions_info_by_topic(topic), own)
+            self._listen(topic)
+        found = (f"{space.rstrip('/')}/{name}" for name, space in node.get_node_names_and_namespaces())
+        self._names = tuple(sorted(name for name in found if name != own))
+
+    def view(self) -> SetView:
+        """All that is known now."""
+        now = time.monotonic()
+        nodes = tuple(
+            NodeView(name, said.newest["level"], said.newest["message"], now - said.at, said.newest)
+            for name, said in sorted(self._said.items())
+            if said.newest
+        )
+        members = {node.name for node in nodes}
+        topics = tuple(self._topic(name, now) for name in sorted(self._topics) if self._is_shown(name, members))
+        shared = self._senders.shared(now)
+        return SetView(nodes, topics, self._names, arm_views(nodes, self._cell), shared)
+
+    def _listen(self, topic: str) -> None:
+        if topic in self._arrivals or not self._publishers[topic]:
+            return
+        base = topic.rpartition("/")[2]
+        if topic.endswith(_STATE) and self._topics[topic] == ("std_msgs/msg/String",):
+            said = self._said.setdefault(topic.removesuffix(_STATE), _Said())
+            self._arrivals[topic] = Arrivals()
+            self._node.create_subscription(String, topic, said.take, STREAM_QOS)
+        elif (kind := _HEARD.get(base)) is not None and self._topics[topic] == (_type_name(kind),):
+            self._arrivals[topic] = arrivals = Arrivals()
+            hear = partial(self._hear_frames if topic == "/tf" else _note, arrivals)
+            self._node.create_subscription(kind, topic, hear, STREAM_QOS, raw=True)
+
+    def _hear_frames(self, arrivals: Arrivals, message: bytes, info: Mapping[str, int | None]) -> None:
+        _note(arrivals, message)
+        now, number = time.monotonic(), info["publication_sequence_number"]
+        for transform in self._frames_of(message):
+            self._senders.take(transform.child_frame_id, number, now)
+
+    def _is_shown(self, topic: str, members: set[str]) -> bool:
+        """Whether some node of the set awaits it, or sends it and somebody counts or takes it.
+
+        What every node has, and the parts of actions, are left out.
+        """
+        if topic in _OWN or "/_action/" in topic or topic.removesuffix(_STATE) in members:
+            return False
+        if members.intersection(self._publishers[topic]):
+            counted = any(topic in said.sent for said in self._said.values())
+            return bool(topic in self._arrivals or counted or self._subscribers[topic])
+        takers = members.intersection(self._subscribers[topic])
+        return any(self._publishers[topic] or _awaits(self._said[taker].newest) for taker in takers)
+
+    def _topic(self, topic: str, now: float) -> TopicView:
+        rate: float | None
+        age: float | None
+        if (arrivals := self._arrivals.get(topic)) is not None:
+            rate, age = arrivals.rate(now), arrivals.age(now)
+        else:
+            rates = [self._said[name].rate(topic) for name in self._publishers[topic] if name in self._said]
+            known = [value for value in rates if value is not None]
+            rate, age = sum(known) if known else None, None
+        return TopicView(
+            topic,
+            self._topics[topic],
+            self._publishers[topic],
+            self._subscribers[topic],
+            rate,
+            None if age is None or math.isinf(age) else age,
+        )
+
+
+def watch_set(
+    cell: Config, duration: float | None, show: Callable[[SetView], None], stop: Callable[[], bool]
+) -> SetView:
+    """Listen for ``duration`` [s], or without one until ``stop`` says so; ``show`` gets a view now and then.
+
+    Returns the last view. Raises :class:`WatchError`.
+    """
+    set_up_middleware(os.environ)
+    try:
+        rclpy.init(args=[], signal_handler_options=rclpy.SignalHandlerOptions.NO)
+    except (rclpy_implementation.RCLError, RuntimeError) as error:
+        raise WatchError(f"ROS does not start: {error}") from None
+    try:
+        node = Node(f"q2r2_watch_{os.getpid()}", enable_rosout=False, start_parameter_services=False)
+        listener, executor = SetListener(node, cell), SingleThreadedExecutor()
+        executor.add_node(node)
+        begin = looked = time.monotonic()
+        listener.look()
+        while not stop() and (duration is None or time.monotonic() - begin < duration):
+            executor.spin_once(timeout_sec=0.1)
+            if time.monotonic() - looked >= _LOOK_PERIOD:
+                looked = time.monotonic()
+                listener.look()
+                show(listener.view())
+        listener.look()
+        return listener.view()
+    finally:
+        rclpy.try_shutdown()
+
+
+def _awaits(state: dict[str, Any]) -> bool:
+    """Whether a node needs what it takes: arms and controllers do, a robot takes one of many kinds of commands."""
+    return "arm" in state or "phase" in state
+
+
+def _names(endpoints: list[Any], own: str) -> tuple[str, ...]:
+    """Full names of the nodes of ``endpoints`` without this one, once for each endpoint."""
+    names = (node_of(endpoint) or "a node not known yet" for endpoint in endpoints)
+    return tuple(sorted(name for name in names if name != own))
+
+
+def _note(arrivals: Arrivals, _: bytes) -> None:
+    arrivals.note(time.monotonic())
+
+
+def _type_name(kind: Any) -> str:
+    package, _, _ = kind.__module__.partition(".")
+    return f"{package}/msg/{kind.__name__}"

@@ -1,0 +1,161 @@
+"""What is known of a set of nodes at one moment: nodes by what they say, topics by the graph, arms in words."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from q2r2_control.config import Config
+from q2r2_control.config.bindings import Action
+from q2r2_control.teleop.arm_states import AT_REST, ArmState
+
+SILENT = 2.0  # nodes say what they do twice a second [s]
+_SLIPPED = 0.005  # a target that has slipped farther is held up [m]
+# What waits where the arms move already, and where nothing is wrong.
+_MOVES = {
+    ArmState.CARRIED: "goes with the other arm",
+    ArmState.HOMING: "goes home",
+    ArmState.PAUSING: "pauses, unless the press becomes another gesture",
+    ArmState.ALIGNING: "is being aligned: release both buttons to go on",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class NodeView:
+    """A node of the set, as it says on ``~/state``."""
+
+    name: str  # full
+    level: str  # ok, warn, error
+    message: str
+    age: float  # of what it said last [s]
+    values: Mapping[str, Any]
+
+    @property
+    def arm(self) -> str | None:
+        """Which arm it teleoperates, if it does."""
+        arm = self.values.get("arm")
+        return arm if isinstance(arm, str) else None
+
+    @property
+    def is_controller(self) -> bool:
+        """Whether it is a built-in controller."""
+        return "phase" in self.values
+
+    @property
+    def is_robot(self) -> bool:
+        """Whether it takes joint commands and says so."""
+        return "refused_commands" in self.values
+
+    @property
+    def arms(self) -> set[str]:
+        """Which arms it controls, if it does."""
+        return {key.removesuffix("_state") for key in self.values if key.endswith("_state")}
+
+    @property
+    def sent(self) -> tuple[str, ...]:
+        """The topics on which it counts what it sends."""
+        sent = self.values.get("sent")
+        return tuple(sent) if isinstance(sent, dict) else ()
+
+    @property
+    def clock_problem(self) -> str:
+        """What is wrong with its time; "" for nothing."""
+        return str(self.values.get("clock_problem", ""))
+
+
+@dataclass(frozen=True, slots=True)
+class TopicView:
+    """A topic that nodes of the set send or take."""
+
+    name: str
+    types: tuple[str, ...]
+    publishers: tuple[str, ...]  # full names of nodes
+    subscribers: tuple[str, ...]
+    rate: float | None  # [Hz]; None: not known
+    age: float | None  # of the newest message [s]; None: not known, or none has come
+
+
+@dataclass(frozen=True, slots=True)
+class ArmView:
+    """One arm and why it does or does not move."""
+
+    name: str
+    node: str  # full name; "": none runs
+    state: str  # of its teleoperation
+    controller: str  # what the built-in controller does with it; "" where that says nothing
+    why: str
+
+
+@dataclass(frozen=True, slots=True)
+class SetView:
+    """All of it."""
+
+    nodes: tuple[NodeView, ...]
+    topics: tuple[TopicView, ...]
+    names: tuple[str, ...]  # of all nodes in the domain, one that runs twice twice
+    arms: tuple[ArmView, ...]
+    shared_frames: tuple[str, ...] = ()  # that two publishers send on /tf
+
+    @property
+    def others(self) -> tuple[str, ...]:
+        """Nodes that say nothing on ``~/state``."""
+        members = {node.name for node in self.nodes}
+        return tuple(name for name in self.names if name not in members)
+
+
+def arm_views(nodes: tuple[NodeView, ...], cell: Config) -> tuple[ArmView, ...]:
+    """A row for every node of an arm, and for every arm of ``cell`` that has none."""
+    controller = next((node for node in nodes if node.is_controller), None)
+    views = []
+    for arm in cell.arms:
+        found = [node for node in nodes if node.arm == arm]
+        for node in found:
+            views.append(ArmView(arm, node.name, *_states(node, controller, arm), _why(node, controller, cell)))
+        if not found:
+            why = f"no node teleoperates this arm: start {arm}_arm_controller, or q2r2 ros up"
+            views.append(ArmView(arm, "", "", "", why))
+    return tuple(views)
+
+
+def _states(node: NodeView, controller: NodeView | None, arm: str) -> tuple[str, str]:
+    said = "" if controller is None else str(controller.values.get(f"{arm}_state", ""))
+    return str(node.values.get("state", "")), said
+
+
+def _why(node: NodeView, controller: NodeView | None, cell: Config) -> str:
+    """Why an arm moves, or does not, in one line."""
+    values, arm = node.values, node.arm or ""
+    if node.age > SILENT:
+        return f"{node.name} is silent for {node.age:.0f} s: it has ended, hangs, or the network lost it"
+    state = values.get("state")
+    if state == ArmState.ENGAGED:
+        return _why_engaged(values, controller, arm)
+    if state in _MOVES:
+        return _MOVES[ArmState(state)]
+    if state == ArmState.STOPPED:
+        return f"{node.message}; {node.name}/reset, or the control that stops, goes on"
+    if state in AT_REST and values.get("ready"):
+        bindings = cell.teleop.bindings
+        press = bindings.words_of(Action.PAUSE_TOGGLE) or bindings.words_of(Action.DEAD_MAN) or "a press"
+        last = values.get("last_event", "")
+        return f"waits for its operator: {press} of the {values.get('hand')} hand engages (last: {last})"
+    return node.message
+
+
+def _why_engaged(values: Mapping[str, Any], controller: NodeView | None, arm: str) -> str:
+    age = values.get("hand_age")
+    if isinstance(age, int | float) and age > SILENT:
+        return f"engaged, but no pose of the {values.get('hand')} hand for {age:.0f} s"
+    slip = values.get("slip")
+    if isinstance(slip, int | float) and slip > _SLIPPED:
+        near = "" if controller is None else _nearest(controller.values)
+        return f"held up, {1e3 * slip:.0f} mm short of the hand{near}"
+    if controller is not None and controller.level != "ok" and arm in controller.message:
+        return f"engaged; {controller.name}: {controller.message}"
+    return "follows the hand"
+
+
+def _nearest(values: Mapping[str, Any]) -> str:
+    distance, pair = values.get("closest_distance_m"), str(values.get("closest_pair", "")).replace("|", " | ")
+    return f"; nearest pair {pair}, {1e3 * distance:.0f} mm" if isinstance(distance, int | float) else ""

@@ -1,0 +1,52 @@
+"""The commands as they start: Ctrl-C while they import."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import tomllib
+
+import pytest
+
+from q2r2_control.ros.launch.executables import MODULES
+from tests.ros.processes import ROOT
+
+# Runs an entry point and presses Ctrl-C when a module is about to be imported.
+RUN = """
+import os, signal, sys
+from importlib import import_module
+
+class Interrupter:
+    def find_spec(self, name, path=None, target=None):
+        if name == {at!r}:
+            os.kill(os.getpid(), signal.SIGINT)
+
+module, _, function = {entry!r}.partition(":")
+sys.meta_path.insert(0, Interrupter())
+getattr(import_module(module), function)()
+"""
+SCRIPTS: dict[str, str] = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
+
+
+@pytest.mark.parametrize("name", SCRIPTS)
+def test_ctrl_c_while_importing_ends_a_command_and_prints_nothing(name: str) -> None:
+    at = f"q2r2_control.ros.nodes.{MODULES[name]}" if name in MODULES else "q2r2_control.cli.app"
+    code = RUN.format(at=at, entry=SCRIPTS[name])
+    run = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=120)
+    assert (run.stdout, run.stderr) == ("", "")
+    assert run.returncode == -signal.SIGINT
+
+
+def test_ctrl_c_before_the_interpreter_has_started_waits_for_the_executable_of_a_set() -> None:
+    process = subprocess.Popen(
+        [sys.executable, "-m", "q2r2_control.ros.launch.executables", "mujoco_robot"],
+        cwd=ROOT,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        preexec_fn=lambda: signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT}),
+    )
+    process.send_signal(signal.SIGINT)
+    output, _ = process.communicate(timeout=120)
+    assert (output, process.returncode) == ("", -signal.SIGINT)

@@ -1,0 +1,157 @@
+"""Controller and robot as managed nodes: rest before the answer, no commands while inactive, and no jump later."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+
+from q2r2_control import Robot
+from tests.ros.conftest import NEEDS_ROS, spun_node
+from tests.ros.processes import Processes
+
+pytest.importorskip("rclpy", reason=NEEDS_ROS)
+pytest.importorskip("control_msgs", reason="needs control_msgs: q2r2 ros build-interfaces")
+pytest.importorskip("lifecycle_msgs", reason="needs lifecycle_msgs")
+
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState, GetState
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+
+from q2r2_control.ros.base_node import STREAM_QOS
+from tests.ros.cell import PATIENT, Cell, start_controller, start_robot
+from tests.ros.waiting import wait_until
+
+pytestmark = pytest.mark.alone
+STILL = 5e-3  # [rad]
+
+
+class Managed(Cell):
+    """A cell whose nodes' states can be changed, and the joint commands that come."""
+
+    def __init__(self, node: Any, robot: Robot, *processes: Any) -> None:
+        super().__init__(node, robot, *processes)
+        self.commands: list[JointTrajectory] = []
+        node.create_subscription(JointTrajectory, "/joint_trajectory", self.commands.append, STREAM_QOS)
+        self.commander = node.create_publisher(JointTrajectory, "/joint_trajectory", 1)
+        self._clients = {
+            name: (
+                node.create_client(ChangeState, f"/{name}/change_state"),
+                node.create_client(GetState, f"/{name}/get_state"),
+            )
+            for name in ("cartesian_controller", "mujoco_robot")
+        }
+
+    def ask(self, transition: int, name: str = "cartesian_controller") -> bool:
+        """Whether the node says that it did it."""
+        change = self._clients[name][0]
+        wait_until(change.service_is_ready, "the lifecycle's services are there")
+        future = change.call_async(ChangeState.Request(transition=Transition(id=transition)))
+        wait_until(future.done, "the transition is answered")
+        return bool(future.result().success)
+
+    def lifecycle(self, name: str = "cartesian_controller") -> str:
+        future = self._clients[name][1].call_async(GetState.Request())
+        wait_until(future.done, "the state is answered")
+        return str(future.result().current_state.label)
+
+    def command(self, q: Any) -> None:
+        point = JointTrajectoryPoint(positions=[float(value) for value in q])
+        self.commander.publish(JointTrajectory(joint_names=list(self.robot.joint_names), points=[point]))
+
+    def move_by_another(self, q: Any, seconds: float = 1.0) -> None:
+        """Joint commands of another node to ``q`` [rad], evenly."""
+        start, began = self.q.copy(), time.monotonic()
+        while (share := (time.monotonic() - began) / seconds) < 1.5:
+            self.command(start + min(share, 1.0) * (q - start))
+            time.sleep(0.01)
+
+
+@pytest.fixture(scope="module")
+def running(domain: int, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Processes]:
+    processes = Processes(tmp_path_factory.mktemp("managed"), os.environ)
+    yield processes
+    processes.end_all()
+
+
+@pytest.fixture(scope="module")
+def cell(domain: int, running: Processes, robot: Robot) -> Iterator[Managed]:
+    with spun_node(domain) as node:
+        cell = Managed(node, robot, start_robot(running), start_controller(running, *PATIENT))
+        cell.wait_until_active()
+        yield cell
+
+
+def test_it_starts_active_and_comes_to_rest_before_it_answers_that_it_is_not(cell: Managed, robot: Robot) -> None:
+    assert cell.lifecycle() == "active"
+    stream = cell.engage("left")
+    stream.move("left", (0.0, 0.0, 0.15))
+    wait_until(lambda: np.abs(cell.joints.states[-1].v).max() > 0.05, "the arm moves")
+    assert cell.ask(Transition.TRANSITION_DEACTIVATE)
+    assert cell.lifecycle() == "inactive"
+    last = np.array(cell.commands[-1].points[0].velocities)
+    assert np.abs(last).max() < 1e-3  # the last command is one at rest
+    time.sleep(0.3)
+    cell.commands.clear()
+    at_rest = cell.q.copy()
+    time.sleep(0.5)
+    stream.end()
+    assert not cell.commands
+    assert np.abs(cell.q - at_rest).max() < STILL
+    answer = cell.call("/cartesian_controller/reset")
+    assert not answer.success
+    assert "ros2 lifecycle set" in answer.message
+    wait_until(lambda: cell.state("left_state") == "deactivated", "its state says so")
+
+
+def test_it_takes_over_where_another_node_has_left_the_arms(cell: Managed, robot: Robot) -> None:
+    if cell.lifecycle() == "active":
+        assert cell.ask(Transition.TRANSITION_DEACTIVATE)
+    goal = cell.q.copy()
+    goal[robot.arms["right"].joints[5]] += 0.3
+    cell.move_by_another(goal)
+    assert np.abs(cell.q - goal).max() < 0.02
+    time.sleep(0.5)
+    cell.commands.clear()
+    before = cell.q.copy()
+    assert cell.ask(Transition.TRANSITION_ACTIVATE)
+    wait_until(lambda: cell.commands, "it commands")
+    first = cell.commands[0]
+    order = [first.joint_names.index(name) for name in robot.joint_names]
+    assert np.abs(np.array(first.points[0].positions)[order] - before).max() < STILL
+    time.sleep(0.5)
+    assert np.abs(cell.q - before).max() < 2.0 * STILL
+    assert cell.lifecycle() == "active"
+
+
+def test_it_does_not_take_over_from_a_node_that_still_commands(cell: Managed, robot: Robot) -> None:
+    if cell.lifecycle() == "active":
+        assert cell.ask(Transition.TRANSITION_DEACTIVATE)
+    q, period = cell.q.copy(), 0.02
+    timer = cell.node.create_timer(period, lambda: cell.command(q))
+    time.sleep(0.5)
+    assert not cell.ask(Transition.TRANSITION_ACTIVATE)
+    assert cell.lifecycle() == "inactive"
+    wait_until(lambda: "commands the arms on /joint_trajectory" in cell.processes[1].output, "the log says why")
+    cell.node.destroy_timer(timer)
+    time.sleep(0.5)
+    assert cell.ask(Transition.TRANSITION_ACTIVATE)
+
+
+def test_a_robot_that_is_deactivated_takes_no_commands_and_stands(cell: Managed, robot: Robot) -> None:
+    if cell.lifecycle() == "active":
+        assert cell.ask(Transition.TRANSITION_DEACTIVATE)
+    assert cell.ask(Transition.TRANSITION_DEACTIVATE, "mujoco_robot")
+    before, goal = cell.q.copy(), cell.q.copy()
+    goal[0] += 0.2
+    cell.move_by_another(goal, 0.5)
+    assert np.abs(cell.q - before).max() < STILL
+    wait_until(lambda: cell.state("lifecycle", "mujoco_robot") == "inactive", "its state says so")
+    assert not cell.ask(Transition.TRANSITION_CLEANUP, "mujoco_robot")
+    assert cell.ask(Transition.TRANSITION_ACTIVATE, "mujoco_robot")
+    cell.move_by_another(goal)
+    assert abs(cell.q[0] - goal[0]) < 0.02

@@ -1,0 +1,236 @@
+"""The recorder's node: what it keeps of real nodes, episodes by controls and services, and what it does in trouble."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import sys
+import time
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.ros.conftest import NEEDS_ROS
+from tests.ros.processes import CONFIG, Processes
+
+pytest.importorskip("rclpy", reason=NEEDS_ROS)
+pytest.importorskip("quest2ros", reason="needs quest2ros: q2r2 ros build-interfaces")
+
+from geometry_msgs.msg import PoseStamped
+from quest2ros.msg import OVR2ROSHapticFeedback
+from rclpy.serialization import serialize_message
+from sensor_msgs.msg import CompressedImage
+from std_msgs.msg import String
+
+from q2r2_control.errors import RecordingError
+from q2r2_control.judging.judge import judge
+from q2r2_control.judging.judge_work import LONGEST_LINE
+from q2r2_control.recording.episode_spans import read_spans
+from q2r2_control.recording.reader import Recording
+from q2r2_control.recording.ros_recording import open_recording
+from q2r2_control.recording.ros_topics import RECORDER_EVENTS
+from q2r2_control.ros.base_node import COMMAND_QOS, RECORDED_QOS, STREAM_QOS
+from q2r2_control.teleop.episode_marks import NO_RECORDING, VERDICT, verdict_line
+from q2r2_control.teleop.haptics import (
+    EPISODE_BEGINS,
+    EPISODE_DISCARDED,
+    EPISODE_ENDS,
+    EPISODE_KEPT,
+    EPISODE_REJECTED,
+    Pulse,
+)
+from tests.recording.runs import read_elsewhere
+from tests.ros.arm_rig import ArmRig
+from tests.ros.cell import changed_cell
+from tests.ros.waiting import States, call, wait_until
+
+HAND = "/q2r_left_hand_pose"
+
+
+class RunningRecorder:
+    """A recorder's process, as a test's node sees it."""
+
+    def __init__(self, node: Any, processes: Processes, folder: Path, config: str = CONFIG) -> None:
+        self.node, self._states = node, States(node, "recorder")
+        self.process = processes.start_node("recorder", f"config:={config}", f"folder:={folder}", 'task:="3: blocks"')
+        self.state()
+
+    def state(self, text: str = "") -> dict[str, Any]:
+        """Its next state whose message contains ``text``."""
+        return self._states.wait_for(text)
+
+    def wait(self, key: str, value: object) -> None:
+        wait_until(lambda: self.state()[key] == value, f"{key} is {value}")
+
+    @property
+    def folder(self) -> Path:
+        return Path(self.state()["file"]).parent
+
+    def end(self) -> Path:
+        """Ctrl-C; the recording's folder."""
+        folder = self.folder
+        assert self.process.interrupt(60.0) == 0
+        return folder
+
+
+@pytest.fixture
+def recorder(node: Any, processes: Processes, tmp_path: Path) -> RunningRecorder:
+    return RunningRecorder(node, processes, tmp_path / "recordings")
+
+
+def publish(node: Any, count: int) -> PoseStamped:
+    """Poses of a hand, slowly enough for best effort; returns the last one."""
+    publisher = node.create_publisher(PoseStamped, HAND, STREAM_QOS)
+    wait_until(publisher.get_subscription_count, "the recorder listens")
+    message = PoseStamped()
+    for number in range(count):
+        message.pose.position.x = float(number)
+        message.header.stamp.sec = 1000 + number
+        publisher.publish(message)
+        time.sleep(0.002)
+    return message
+
+
+def test_messages_are_in_the_file_to_the_byte_and_no_ros_is_needed_to_read_it(
+    recorder: RunningRecorder, node: Any, tmp_path: Path
+) -> None:
+    from rosbags.highlevel import AnyReader
+
+    before = time.time_ns()
+    last = publish(node, 100)
+    recorder.wait("lost_messages", 0)
+    folder = recorder.end()
+    assert read_elsewhere(folder, tmp_path)[HAND]["count"] == 100
+    with AnyReader([folder]) as reader:
+        ((*_, (_, received, data)),) = [list(reader.messages([c for c in reader.connections if c.topic == HAND]))]
+    assert data == serialize_message(last)
+    assert before < received < time.time_ns()
+    about = Recording(folder).about
+    assert about.notes["task"] == "3: blocks"
+    assert Recording(folder).closed
+
+
+def test_pictures_of_a_real_camera_are_kept_as_they_came(node: Any, processes: Processes, tmp_path: Path) -> None:
+    camera = {"topic": "/front/image_raw/compressed", "width": 64, "height": 48, "rate": 30}
+    recorder = RunningRecorder(node, processes, tmp_path, changed_cell(tmp_path, cameras={"front": camera}))
+    publisher = node.create_publisher(CompressedImage, camera["topic"], 10)
+    wait_until(publisher.get_subscription_count, "the recorder listens")
+    sent = [bytes([number]) * 20_000 for number in range(10)]
+    for picture in sent:
+        publisher.publish(CompressedImage(format="jpeg", data=picture))
+        time.sleep(0.02)
+    assert [found.jpeg for found in open_recording(recorder.end()).pictures("front")] == sent
+
+
+def test_a_hand_and_services_tell_of_episodes_and_each_learns_of_the_others(
+    node: Any, processes: Processes, tmp_path: Path
+) -> None:
+    rig = ArmRig(node)
+    rig.start(processes, {"teleop.bindings.grip": "record_toggle"})
+    squeeze(rig)
+    rig.wait(lambda: NO_RECORDING in rig.state["last_event"], "without a recorder nothing is recorded")
+    recorder = RunningRecorder(node, processes, tmp_path / "recordings")
+    wait_until(lambda: node.count_subscribers("/recorder/state") > 1, "the arm's node listens to the recorder")
+    for _ in range(3):
+        recorder.state()
+    squeeze(rig)
+    recorder.wait("episode_open", True)
+    felt(rig, EPISODE_BEGINS)
+    assert call(node, "/recorder/stop").success
+    felt(rig, EPISODE_ENDS)
+    refused = call(node, "/recorder/stop")
+    assert (refused.success, refused.message) == (False, "no episode has begun")
+    squeeze(rig)
+    recorder.wait("episode_open", True)
+    assert call(node, "/recorder/discard").success
+    felt(rig, EPISODE_DISCARDED)
+    kept, discarded = read_spans(open_recording(recorder.end()))
+    assert (kept.discarded, discarded.discarded) == (False, True)
+
+
+def squeeze(rig: ArmRig) -> None:
+    rig.grip = 1.0
+    time.sleep(0.2)
+    rig.grip = 0.0
+    time.sleep(0.2)
+
+
+def felt(rig: ArmRig, pulse: Pulse) -> None:
+    wanted = (round(pulse.frequency, 3), round(pulse.amplitude, 3))
+    rig.wait(lambda: wanted in rig.pulses, f"{pulse} is felt")
+
+
+def test_a_killed_recorder_leaves_a_file_that_its_writer_closes(recorder: RunningRecorder, node: Any) -> None:
+    publish(node, 100)
+    recorder.wait("lost_messages", 0)
+    folder = recorder.folder
+    os.kill(recorder.process.pid, signal.SIGKILL)
+    wait_until(lambda: is_closed(folder), "the file is closed")
+    assert read_elsewhere(folder, folder.parent)[HAND]["count"] >= 90
+
+
+def is_closed(folder: Path) -> bool:
+    try:
+        return Recording(folder).closed
+    except RecordingError:  # of a file of which not even the head is written
+        return False
+
+
+def test_a_folder_that_cannot_be_written_is_one_line_and_the_node_goes_on(
+    node: Any, processes: Processes, tmp_path: Path
+) -> None:
+    (tmp_path / "file").write_text("")
+    recorder = RunningRecorder(node, processes, tmp_path / "file")
+    state = recorder.state("nothing is recorded any more")
+    assert (state["level"], state["records"]) == ("error", False)
+    refused = call(node, "/recorder/start")
+    assert not refused.success
+    assert "not recorded" in refused.message
+    assert recorder.process.running
+    assert recorder.process.interrupt(60.0) == 0
+    assert len([line for line in recorder.process.output.splitlines() if "recording ended" in line]) == 1
+
+
+def note_frequency(frequencies: list[float], pulse: OVR2ROSHapticFeedback) -> None:
+    frequencies.append(round(pulse.frequency, 3))
+
+
+def verdicts_in(reasons: list[str]) -> list[str]:
+    return [reason[:LONGEST_LINE] for reason in reasons if reason.startswith(VERDICT)]
+
+
+@pytest.mark.alone
+@pytest.mark.usefixtures("interfaces")
+def test_a_whole_set_is_recorded_judged_and_ends_at_ctrl_c(node: Any, processes: Processes, tmp_path: Path) -> None:
+    process = processes.start(
+        *(sys.executable, "-m", "q2r2_control", "ros", "up", CONFIG, "--record", str(tmp_path), "--operator", "Ada"),
+        name="up",
+    )
+    for arm in ("left", "right"):
+        process.wait_for(f"[{arm}_arm_controller]", 120.0)
+    process.wait_for("engaged: ", 120.0)
+    told: list[str] = []
+    felt_by: dict[str, list[float]] = {"left": [], "right": []}
+    take = partial(json.loads, object_hook=lambda event: event["reason"])
+    node.create_subscription(String, RECORDER_EVENTS, lambda event: told.append(take(event.data)), RECORDED_QOS)
+    for hand, frequencies in felt_by.items():
+        topic = f"/q2r_{hand}_hand_haptic_feedback"
+        node.create_subscription(OVR2ROSHapticFeedback, topic, partial(note_frequency, frequencies), COMMAND_QOS)
+    assert call(node, "/recorder/start").success
+    time.sleep(5.0)
+    assert call(node, "/recorder/stop").success
+    wait_until(lambda: verdicts_in(told), "the verdict is told")
+    pulses = {round(pulse.frequency, 3) for pulse in (EPISODE_KEPT, EPISODE_REJECTED)}
+    wait_until(lambda: all(pulses & set(felt) for felt in felt_by.values()), "both hands feel it")
+    assert process.interrupt(60.0) == 0
+    (file,) = tmp_path.glob("*/*.mcap")
+    recording = open_recording(file)
+    (judged,) = judge(recording)
+    assert judged.figures.timing.ended
+    assert verdicts_in(told) == [verdict_line(1, judged.verdict.line)[:LONGEST_LINE]]
+    assert judged.figures.timing.ticks > 100
+    assert max(figures.engaged_s for figures in judged.figures.arms.values()) > 0.0
+    assert recording.about.notes["operator"] == "Ada"

@@ -1,0 +1,166 @@
+"""What listens to a set: it hears what nodes say and how often, and takes no part in what they do."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import time
+from typing import Any
+
+import pytest
+
+from q2r2_control import load_config
+from tests.ros.conftest import NEEDS_ROS, spun_node
+from tests.ros.processes import CONFIG, PATIENCE, Processes
+from tests.ros.waiting import States, wait_until
+
+pytest.importorskip("rclpy", reason=NEEDS_ROS)
+pytestmark = pytest.mark.usefixtures("interfaces")
+
+from q2r2_control.ros.watching.set_listener import SetListener  # noqa: E402
+
+# The command tries ROS in a process of its own first, and listens for seconds [s].
+LONG = 4.0 * PATIENCE
+HEARD = {"state", "joint_states", "visualization_marker", "tf"}
+
+
+def test_what_one_may_listen_to_is_measured_and_what_not_is_what_the_sender_says(domain: int, node: Any) -> None:
+    with spun_node(domain, "watcher") as watcher:
+        _check_figures(node, SetListener(watcher, load_config(CONFIG)))
+
+
+def _check_figures(node: Any, listener: SetListener) -> None:
+    from geometry_msgs.msg import PoseStamped
+    from sensor_msgs.msg import JointState
+    from std_msgs.msg import String
+
+    state, joints = (
+        node.create_publisher(String, "/test/state", 10),
+        node.create_publisher(JointState, "/joint_states", 10),
+    )
+    other = node.create_publisher(String, "/stranger/state", 10)
+    sender = node.create_publisher(PoseStamped, "/target", 10)
+    counted = 0
+
+    def publish() -> None:
+        nonlocal counted
+        counted += 1
+        state.publish(String(data=json.dumps({"level": "ok", "message": "here", "sent": {"/target": counted}})))
+        joints.publish(JointState())
+        for text in ("not JSON", "[1]", '{"level": 1}'):
+            other.publish(String(data=text))
+
+    timer = node.create_timer(0.01, publish)
+
+    def views() -> Any:
+        listener.look()
+        time.sleep(0.05)
+        return listener.view()
+
+    def measured() -> bool:
+        return {"/target", "/joint_states"} <= {topic.name for topic in views().topics if topic.rate}
+
+    wait_until(measured, "the topics have rates")
+    view = views()
+    assert "/stranger" not in {one.name for one in view.nodes}  # which says something else
+    node.destroy_timer(timer)
+    topics = {topic.name: topic for topic in view.topics}
+    assert topics["/target"].rate is not None
+    assert topics["/target"].rate > 0.0
+    assert topics["/target"].age is None
+    assert topics["/joint_states"].age is not None
+    assert node.count_subscribers("/target") == 0
+    node.destroy_publisher(sender)
+
+
+def test_the_command_watches_nodes_and_subscribes_to_no_command_and_no_hand(node: Any, processes: Processes) -> None:
+    processes.start_node("left_arm_controller")
+    processes.start_node("simulation_input")
+    States(node, "left_q2r2_arm_controller").wait_for("not known")
+    states = States(node, "simulation_input")
+    states.wait_for("waits for a subscriber of the right hand")
+    watch = processes.start(
+        sys.executable, "-m", "q2r2_control", "ros", "watch", "--json", "--duration", "8", name="watch"
+    )
+    name = f"q2r2_watch_{watch.pid}"
+    taken: set[str] = set()
+
+    def look() -> bool:
+        if (name, "/") in node.get_node_names_and_namespaces():
+            taken.update(topic for topic, _ in node.get_subscriber_names_and_types_by_node(name, "/"))
+        return "/left_q2r2_arm_controller/state" in taken
+
+    wait_until(look, "the command hears the arm", lambda: taken)
+    end = time.monotonic() + LONG
+    while watch.running and time.monotonic() < end:
+        look()
+        time.sleep(0.05)
+    assert {topic.rpartition("/")[2] for topic in taken} <= HEARD
+    states.wait_for("waits for a subscriber of the right hand")  # it does not play for who watches
+    assert watch.wait(LONG) == 0
+    found = json.loads(watch.output.splitlines()[-1])
+    left, right = found["arms"]
+    assert left["node"] == "/left_q2r2_arm_controller"
+    assert "the tool's pose is not known" in left["why"]
+    assert right["why"].startswith("no node teleoperates this arm")
+    topics = {topic["name"]: topic for topic in found["topics"]}
+    assert topics["/q2r2/left/target_frame"]["subscribers"] == []
+    assert topics["/q2r_left_hand_pose"]["publishers"] == ["/simulation_input"]
+
+
+def test_a_domain_without_a_set_is_exit_code_1(processes: Processes) -> None:
+    watch = processes.start(
+        sys.executable, "-m", "q2r2_control", "ros", "watch", "--once", "--duration", "0.5", name="watch"
+    )
+    assert watch.wait(LONG) == 1
+    assert "0 nodes of a set" in watch.output
+    assert "no node teleoperates this arm" in watch.output
+
+
+@pytest.mark.parametrize("arguments", [("--duration", "-1"), ("nowhere.yaml",)])
+def test_what_cannot_be_watched_is_one_line(processes: Processes, arguments: tuple[str, ...]) -> None:
+    watch = processes.start(sys.executable, "-m", "q2r2_control", "ros", "watch", *arguments, name="watch")
+    assert watch.wait(LONG) == 2
+    (line,) = watch.output.splitlines()
+    assert arguments[-1] in line
+
+
+def test_the_doctor_finds_two_inputs_and_an_arm_without_its_robot_and_says_what_helps(
+    node: Any, processes: Processes
+) -> None:
+    processes.start_node("left_arm_controller")
+    for number in (1, 2):
+        processes.start_module(
+            *("q2r2_control.ros.nodes.simulation_input", "--ros-args", "-r", f"__node:=input_{number}"),
+            *("-p", "side:=left"),
+        )
+    States(node, "left_q2r2_arm_controller").wait_for("not known")
+    States(node, "input_1").wait_for("")
+    States(node, "input_2").wait_for("")
+    arguments = ("ros", "doctor", "--duration", "6")
+    doctor = processes.start(sys.executable, "-m", "q2r2_control", *arguments, "--json", name="doctor")
+    assert doctor.wait(LONG) == 1
+    found = json.loads(doctor.output.splitlines()[-1])
+    assert found["domain"] == os.environ["ROS_DOMAIN_ID"]
+    assert found["middleware"].startswith("rmw_")
+    assert "/left_q2r2_arm_controller" in found["nodes"]
+    cures = {finding["what"]: finding["cure"] for finding in found["findings"] if finding["stops_arms"]}
+    assert "end all but one" in cures["2 publishers of /q2r_left_hand_pose: /input_1, /input_2"]
+    (what,) = (what for what in cures if what.startswith("the left arm: the tool's pose is not known"))
+    assert "start the robot" in cures[what]
+    assert "start cartesian_controller" in cures["no built-in controller runs"]
+
+
+@pytest.mark.parametrize(
+    ("variable", "value", "finding"),
+    [
+        ("ROS_DOMAIN_ID", "999", "ROS_DOMAIN_ID is '999'"),
+        ("RMW_IMPLEMENTATION", "rmw_nothing_cpp", "no node can start"),
+    ],
+)
+def test_the_doctor_says_why_no_node_can_start(processes: Processes, variable: str, value: str, finding: str) -> None:
+    doctor = processes.start(sys.executable, "-m", "q2r2_control", "ros", "doctor", name="doctor", **{variable: value})
+    assert doctor.wait(LONG) == 1
+    (line,) = (line for line in doctor.output.splitlines() if line.startswith("stops arms"))
+    assert finding in line

@@ -1,0 +1,195 @@
+"""What RViz, Foxglove and PlotJuggler are told to show is there, with the type and the fields that they expect."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from collections.abc import Iterator
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+import yaml
+from rosbags.typesys import Stores, get_typestore
+
+from q2r2_control import Robot
+from q2r2_control.recording.topics import Topic, Topics
+from tests.ros.cell import PATIENT, start_controller, start_robot
+from tests.ros.conftest import NEEDS_ROS
+from tests.ros.processes import ROOT, Processes
+from tests.ros.waiting import wait_until
+
+pytest.importorskip("rclpy", reason=NEEDS_ROS)
+pytestmark = pytest.mark.usefixtures("interfaces")
+
+VIEWS = ROOT / "views"
+# The types that RViz's displays and Foxglove's panels take.
+KINDS = {
+    "RobotModel": "std_msgs/msg/String",
+    "Marker": "visualization_msgs/msg/Marker",
+    "Pose": "geometry_msgs/msg/PoseStamped",
+    "TF": "tf2_msgs/msg/TFMessage",
+    "DiagnosticSummary": "diagnostic_msgs/msg/DiagnosticArray",
+    "RawMessages": "std_msgs/msg/String",
+}
+POSE, MARKER = KINDS["Pose"], KINDS["Marker"]
+
+
+def rviz_topics() -> dict[str, str]:
+    """Type by topic, of every display that shows one."""
+    found = {}
+    for display in yaml.safe_load((VIEWS / "q2r2.rviz").read_text())["Visualization Manager"]["Displays"]:
+        kind = display["Class"].removeprefix("rviz_default_plugins/")
+        if kind != "Grid":
+            topic = display.get("Topic") or display.get("Description Topic") or {"Value": "/tf"}
+            found[topic["Value"]] = KINDS[kind]
+    return found
+
+
+def foxglove_panels() -> dict[str, Any]:
+    panels: dict[str, Any] = json.loads((VIEWS / "foxglove.json").read_text())["configById"]
+    return panels
+
+
+def foxglove_topics() -> dict[str, str]:
+    """Type by topic, of all but plots."""
+    panels = foxglove_panels()
+    found = {topic: POSE if "safe_target" in topic else MARKER for topic in panels["3D!arms"]["topics"]}
+    found[panels["3D!arms"]["layers"]["arms"]["topic"]] = KINDS["RobotModel"]
+    found[panels["RawMessages!controller"]["topicPath"].removesuffix(".data")] = KINDS["RawMessages"]
+    found[panels["DiagnosticSummary!nodes"]["topicToRender"]] = KINDS["DiagnosticSummary"]
+    return found
+
+
+def foxglove_paths() -> list[str]:
+    return [path["value"] for panel in foxglove_panels().values() for path in panel.get("paths", ())]
+
+
+@pytest.fixture(scope="module")
+def recorded(robot: Robot) -> dict[str, Topic]:
+    return Topics(tuple(robot.arms), robot.joint_names).by_name
+
+
+def check_field(topic: Topic, fields: list[str]) -> None:
+    """Check that a path of fields ends at a number of the topic's message, and that its index is one of those there."""
+    store: Any = get_typestore(Stores.ROS2_JAZZY)
+    kind = topic.type
+    for field in fields:
+        name, _, index = field.partition("[")
+        detail = dict(store.fielddefs[kind][1])[name][1]
+        if index:
+            assert name not in topic.labels or int(index.rstrip("]")) < len(topic.labels[name])
+            detail = detail[0][1]
+        kind = detail if isinstance(detail, str) else detail[0]
+    assert kind == "float64"
+
+
+def test_every_plot_of_a_recording_has_its_field(recorded: dict[str, Topic]) -> None:
+    curves = [curve.attrib["name"] for curve in ElementTree.parse(VIEWS / "plotjuggler.xml").iter("curve")]
+    assert len(curves) > 20
+    for curve in curves:
+        (name,) = (name for name in recorded if curve.startswith(f"{name}/"))
+        check_field(recorded[name], curve.removeprefix(f"{name}/").split("/"))
+    for path in foxglove_paths():
+        name, _, fields = path.partition(".")
+        check_field(recorded[name], fields.split("."))
+
+
+def test_what_the_flags_in_the_plots_mean_has_not_moved(recorded: dict[str, Topic]) -> None:
+    labels = recorded["/q2r2/flags"].labels["data"]
+    shown = [
+        labels[int(index)]
+        for index in re.findall(r"/q2r2/flags/data\[(\d+)\]", (VIEWS / "plotjuggler.xml").read_text())
+    ]
+    assert shown == [
+        *("closest_distance", "margin", "engaged_left", "engaged_right", "slip_left", "slip_right", "fallback", "slack")
+    ]
+    assert recorded["/q2r2/tick"].labels["data"][13:15] == ("compute_time", "solve_time")
+
+
+def test_no_view_of_a_running_set_listens_to_a_command() -> None:
+    shown = {
+        *recorded_by_hand(),
+        *rviz_topics(),
+        *foxglove_topics(),
+        *(path.partition(".")[0] for path in foxglove_paths()),
+    }
+    assert not [name for name in shown if re.search(r"target_frame|trajectory|command|_hand_", name)]
+
+
+def recorded_by_hand() -> list[str]:
+    """The topics that the docs record a running set with."""
+    (command,) = re.findall(r"ros2 bag record (.*)", (ROOT / "docs" / "ros.md").read_text())
+    return list(command.split())
+
+
+@pytest.fixture(scope="module")
+def running_set(
+    domain: int, robot: Robot, interfaces: None, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[None]:
+    """Robot, controller and arms."""
+    started = Processes(tmp_path_factory.mktemp("set"), os.environ)
+    start_robot(started)
+    start_controller(started, *PATIENT)
+    for arm in robot.arms:
+        started.start_node(f"{arm}_arm_controller", "rate:=50.0")
+    yield
+    started.end_all()
+
+
+@pytest.mark.alone
+@pytest.mark.usefixtures("running_set")
+def test_every_display_shows_what_the_set_publishes(node: Any, robot: Robot) -> None:
+    from visualization_msgs.msg import Marker
+
+    wanted = rviz_topics() | foxglove_topics()
+
+    def missing() -> dict[str, str]:
+        types = dict(node.get_topic_names_and_types())
+        return {
+            name: kind for name, kind in wanted.items() if types.get(name) != [kind] or not node.count_publishers(name)
+        }
+
+    wait_until(lambda: not missing(), "all that is shown is published", missing)
+    assert [name for name in recorded_by_hand() if not node.count_publishers(name)] == []
+    markers: list[Any] = []
+    node.create_subscription(Marker, "/cartesian_controller/distances", markers.append, 10)
+    wait_until(lambda: markers, "the closest pair is shown")
+    ends = [np.array([point.x, point.y, point.z]) for point in markers[-1].points]
+    nearest = min(robot.distance_values(robot.home))
+    assert markers[-1].header.frame_id == "world"
+    assert np.linalg.norm(ends[1] - ends[0]) == pytest.approx(nearest, abs=2e-3)
+
+
+def documented_qos() -> list[tuple[str, str, str]]:
+    """Topic, how it is sent and how it is taken, of the docs' table."""
+    table = (ROOT / "docs" / "ros.md").read_text().partition("| topic | sent | taken |")[2].partition("\n\n")[0]
+    rows = [line.strip("|").split("|") for line in table.splitlines()[2:]]
+    return [
+        (topic, sent.strip(), taken.strip()) for names, sent, taken in rows for topic in re.findall("`(.+?)`", names)
+    ]
+
+
+def in_words(endpoint: Any, sent: bool) -> str:
+    """The quality of service of an endpoint of the graph, as in the docs; which does not tell how many it keeps."""
+    qos = endpoint.qos_profile
+    words = [qos.reliability.name.lower().replace("_", " "), qos.durability.name.lower().replace("_", " ")]
+    lifespan = qos.lifespan.nanoseconds * 1e-9
+    return ", ".join([*words, *([f"the last one, for {lifespan:g} s"] if sent and lifespan < 1e3 else [])])
+
+
+@pytest.mark.alone
+@pytest.mark.usefixtures("running_set")
+def test_the_docs_say_how_topics_are_sent_and_taken(node: Any) -> None:
+    documented = documented_qos()
+    assert len(documented) > 10
+
+    def known() -> bool:
+        return all(node.count_publishers(name) or node.count_subscribers(name) for name, _, _ in documented)
+
+    wait_until(known, "all topics of the table are there", lambda: node.get_topic_names_and_types())
+    for name, sent, taken in documented:
+        assert {in_words(one, True) for one in node.get_publishers_info_by_topic(name)} <= {sent}, name
+        assert {in_words(one, False) for one in node.get_subscriptions_info_by_topic(name)} <= {taken}, name
