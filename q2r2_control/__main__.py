@@ -1,5 +1,16 @@
 """``python -m q2r2_control`` is the ``q2r2`` command."""
 
-from q2r2_control.cli.app import app
+import signal
 
-app()
+
+def main() -> None:
+    """Run the command. While it is importing Ctrl-C ends it at once, without a traceback."""
+    handler = signal.signal(signal.SIGINT, signal.SIG_DFL)
+    from q2r2_control.cli.app import app
+
+    signal.signal(signal.SIGINT, handler)
+    app()
+
+
+if __name__ == "__main__":
+    main()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import replace
 
@@ -114,6 +114,23 @@ class Pipeline:
         """
         self.wishes.settings = settings
 
+    def tell(self, line: str) -> None:
+        """Let the operator know what became of the recording or of an episode in it; see :mod:`episode_marks`.
+
+        From any thread.
+        """
+        self.wishes.told_of_recording.append(line)
+
+    def change_control(self, values: Mapping[str, float]) -> None:
+        """Other settings of the controller from the next tick on, by name, without a jump; from any thread.
+
+        What can be changed, and how a greater distance comes to count: see :meth:`CartesianController.change`. Whether
+        it was is in the events of the run; the next run begins with the settings of the cell. Raises
+        :class:`ConfigError` for a name or a value that is not allowed at all.
+        """
+        self.config.control.changed(values)
+        self.wishes.control = dict(values)
+
     def run(self, duration: float | None = None, realtime: bool = True) -> RunSummary:
         """Run for ``duration`` [s], or until :meth:`stop`, Ctrl-C or SIGTERM; the arms are brought to rest first.
 
@@ -193,6 +210,8 @@ class PipelineRun:
         self._limiter, self._grasps = GripperLimiter(pipeline.controller), GraspWatch(pipeline.controller)
         self._grippers: dict[str, float] = {arm: target.gripper for arm, target in self._targets.items()}
         pipeline.drive.set_openings(pipeline.controller.openings)
+        self._kept = pipeline.controller.kept_distances
+        pipeline.drive.set_kept_distances(self._kept)
         self._openings: dict[str, float] = {}  # measured, that the tick went by
         self._velocity = np.zeros(pipeline.robot.model.nv)
         self._operator = OperatorSide(
@@ -289,6 +308,9 @@ class PipelineRun:
         if reference is None:
             reference = self._pipeline.controller.step({}, dt)
         self._velocity = reference.v
+        if self._pipeline.controller.kept_distances is not self._kept:
+            self._kept = self._pipeline.controller.kept_distances
+            self._pipeline.drive.set_kept_distances(self._kept)
         return reference
 
     def limit_grippers(self) -> None:

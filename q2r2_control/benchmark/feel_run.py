@@ -1,8 +1,10 @@
 """What an operator feels of a filter: how late the tool is, what is left of tremor and noise, and how it stops.
 
-Nothing is taken from the settings: a hand moves in tones, rests, and moves and stops, and the tool is measured, through
-samples at a headset's rate, teleoperation, controller and an arm in MuJoCo. Delay and gain of a tone come from the
-least-squares fit of a sine and a cosine to the hand's way and to the tool's.
+Nothing is taken from the settings: a hand moves in tones, reaches, trembles, rests, and moves and stops, and the tool
+is measured, through samples at a headset's rate, teleoperation, controller and an arm in MuJoCo. Delay and gain of a
+tone come from the least-squares fit of a sine and a cosine to the hand's way and to the tool's. Hands do not move in
+tones: the delay of reaches is that of the highest correlation of velocities, and of a tremor within a band everything
+counts that it does to the tool, in the band or not.
 """
 
 from __future__ import annotations
@@ -10,15 +12,18 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import pinocchio as pin
 
+from q2r2_control.benchmark.feel_hands import SETTLES, Way, reaches, stop, tone, tremor
 from q2r2_control.config import Config
 from q2r2_control.config.teleop import FilterSettings
 from q2r2_control.inputs.played import PlayedInput
 from q2r2_control.inputs.sampling import HeadsetSampling
 from q2r2_control.inputs.scripted import HANDS_AT_REST
+from q2r2_control.judging.delay import Track, delays_behind
 from q2r2_control.pipeline import Pipeline
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.robot.robot import Robot
@@ -37,9 +42,15 @@ TREMOR = 0.5e-3  # amplitude [m]
 SLOWLY = 0.03  # of a hand that moves and trembles [m/s]
 NOISE = 2e-4  # of the sensor, standard deviation along each axis [m]
 STOP_SPEED, STOP_TIME = 0.3, 0.1  # of a hand that moves on and stops [m/s], and from that speed to rest [s]
+# Reaches, to and fro, each followed by a rest: peaks of 0.16 to 0.63 m/s, which the arm can follow sidewards [m], [s].
+REACHES, REACH_RESTS = ((0.1, 0.6), (0.1, 1.2), (0.2, 0.8), (0.3, 1.0), (0.4, 1.2)), 0.3
+BAND, BAND_RMS = (8.0, 12.0), 1e-3  # of a tremor [Hz], [m]
+_BAND_PERIOD, _BAND_SEED = 4.0, 0  # [s]
 _PRESSED, _BEGINS = (0.2, 0.35), 0.8  # [s]
-_SETTLES, _MEASURED = 0.7, 2.0  # of every tone, before and while it is measured [s]
+_MEASURED = 2.0  # of every tone [s]
 _RESTS, _CRUISES = 3.0, 0.4  # [s]
+_SIDEWARDS, _UP = 1, 2  # axes
+_A_TICK = 0.05  # the longest that there is [s]
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,6 +63,10 @@ class FeelFigures:
     gains_db: tuple[float, ...]  # of the same
     tremors_db: tuple[float, ...]  # of a hand that trembles at :data:`TREMORS` while it moves at :data:`SLOWLY`
     tremor_at_rest_db: float  # of the middle one, of a hand that rests otherwise
+    reach_delay_ms: float  # over all of :data:`REACHES`
+    worst_reach_delay_ms: float  # of the one that is latest; nan, as of all: the tool does not follow
+    band_db: float  # of a tremor in :data:`BAND`, of a hand that moves at :data:`SLOWLY`
+    band_at_rest_db: float  # of the same, of a hand that rests otherwise
     noise_um: float  # RMS of the tool in the worst axis, of a hand that rests
     stop_delay_ms: float  # from the hand's rest to the tool within 2 mm of its own for good
     overshoot_mm: float  # of the tool, beyond where it comes to rest
@@ -76,56 +91,49 @@ def _measure(name: str, config: Config, robot: Robot, plant: MujocoPlant, settin
     teleop = config.teleop.model_copy(update={"filter": settings})
     config = config.model_copy(update={"teleop": teleop})
 
-    def run(way: Callable[[float], float], lasts: float, noise: float) -> _Log:
-        log = _Log(way, noise)
+    def run(way: Way, lasts: float, noise: float = 0.0, axis: int = _UP) -> _Log:
+        log = _Log(way, noise, axis)
         pipeline = Pipeline(config, robot, log.hands, plant)
         pipeline.listeners.append(log.take)
         pipeline.run(_BEGINS + lasts, realtime=False)
+        if not log.reaches(lasts):
+            raise KeyboardInterrupt  # a signal has ended the run early: what is left of it says nothing
         return log
 
-    lasts = _SETTLES + _MEASURED
-    motions = [run(_tone(*motion), lasts, 0.0).tone(motion[0]) for motion in MOTIONS]
-    tremors = [run(_tone(each, TREMOR, SLOWLY), lasts, 0.0).tone(each)[1] for each in TREMORS]
+    def band(speed: float) -> float:
+        trembling = tremor(BAND, BAND_RMS, _BAND_PERIOD, _BAND_SEED, speed)
+        return run(trembling, SETTLES + _BAND_PERIOD, axis=_SIDEWARDS).attenuation(_BAND_PERIOD)
+
+    lasts = SETTLES + _MEASURED
+    motions = [run(tone(*motion), lasts).tone(motion[0]) for motion in MOTIONS]
+    tremors = [run(tone(each, TREMOR, SLOWLY), lasts).tone(each)[1] for each in TREMORS]
     at_rest = TREMORS[len(TREMORS) // 2]
+    ends = np.cumsum([0.0, *(2.0 * (time + REACH_RESTS) for _, time in REACHES)])
+    reached = run(reaches(REACHES, REACH_RESTS), ends[-1], axis=_SIDEWARDS)
     noise = run(lambda t: 0.0, _RESTS, NOISE).noise()
-    stop_delay, overshoot = run(_stop, _CRUISES + STOP_TIME + 1.5, 0.0).stop()
+    stop_delay, overshoot = run(stop(STOP_SPEED, STOP_TIME, _CRUISES), _CRUISES + STOP_TIME + 1.5).stop()
     return FeelFigures(
         name=name,
         filter_delay_ms=1e3 * (settings.interpolation_delay + settings.smoothing_delay),
         delays_ms=tuple(1e3 * delay for delay, _ in motions),
         gains_db=tuple(gain for _, gain in motions),
         tremors_db=tuple(tremors),
-        tremor_at_rest_db=run(_tone(at_rest, TREMOR), lasts, 0.0).tone(at_rest)[1],
+        tremor_at_rest_db=run(tone(at_rest, TREMOR), lasts).tone(at_rest)[1],
+        reach_delay_ms=1e3 * reached.delay(0.0, ends[-1]),
+        worst_reach_delay_ms=1e3 * float(np.max([reached.delay(*times) for times in pairwise(ends)])),
+        band_db=band(SLOWLY),
+        band_at_rest_db=band(0.0),
         noise_um=1e6 * noise,
         stop_delay_ms=1e3 * stop_delay,
         overshoot_mm=1e3 * overshoot,
     )
 
 
-def _tone(frequency: float, amplitude: float, speed: float = 0.0) -> Callable[[float], float]:
-    """Grows within the first half of :data:`_SETTLES`, on top of a steady motion."""
-
-    def way(t: float) -> float:
-        share = min(max(t, 0.0) / (0.5 * _SETTLES), 1.0)
-        return amplitude * math.sin(0.5 * math.pi * share) ** 2 * math.sin(2.0 * math.pi * frequency * t) + speed * t
-
-    return way
-
-
-def _stop(t: float) -> float:
-    """Speeds up in :data:`STOP_TIME`, goes on, and stops in the same time."""
-    ramp = STOP_TIME
-    up = min(max(t, 0.0), ramp)
-    along = min(max(t - ramp, 0.0), _CRUISES - ramp)
-    down = min(max(t - _CRUISES, 0.0), ramp)
-    return STOP_SPEED * (0.5 * up * up / ramp + along + down - 0.5 * down * down / ramp)
-
-
 class _Log:
-    """A run in which one hand goes a way [m] up and down, at most times at a headset's rate, and what the tool does."""
+    """A run in which one hand goes a way along an axis, sampled at a headset's rate, and what the tool does."""
 
-    def __init__(self, way: Callable[[float], float], noise: float) -> None:
-        self._way = way
+    def __init__(self, way: Way, noise: float, axis: int) -> None:
+        self._way, self._axis = way, axis
         samplings = {hand: HeadsetSampling(hand, 0, position_noise=noise) for hand in HANDS_AT_REST}
         self.hands = PlayedInput(self._pose, _buttons, samplings)
         self._t: list[float] = []
@@ -134,17 +142,21 @@ class _Log:
 
     def take(self, tick: Tick) -> None:
         """Keep a tick's hand and tool."""
-        t = self.hands.hand_pose(HAND, tick.now).translation[2] - HANDS_AT_REST[HAND].translation[2]
+        way = self.hands.hand_pose(HAND, tick.now).translation - HANDS_AT_REST[HAND].translation
         self._t.append(tick.t - _BEGINS)
-        self._asked.append(t)
+        self._asked.append(float(way[self._axis]))
         self._tool.append(tick.tools[ARM].translation.copy())
+
+    def reaches(self, lasts: float) -> bool:
+        """Whether it was run for so long [s]."""
+        return bool(self._t) and self._t[-1] > lasts - _A_TICK
 
     def tone(self, frequency: float) -> tuple[float, float]:
         """Delay [s] and gain [dB] of a tone."""
-        t, asked, tool = self._from(_SETTLES)
+        t, asked, tool = self._from(SETTLES)
         basis = np.stack((np.sin(2 * np.pi * frequency * t), np.cos(2 * np.pi * frequency * t), np.ones_like(t), t), 1)
         (hand_sin, hand_cos, *_), (tool_sin, tool_cos, *_) = (
-            np.linalg.lstsq(basis, way, rcond=None)[0] for way in (asked, tool[:, 2])
+            np.linalg.lstsq(basis, way, rcond=None)[0] for way in (asked, tool)
         )
         turn = complex(hand_sin, hand_cos) / complex(tool_sin, tool_cos)
         delay = (math.atan2(turn.imag, turn.real) % (2.0 * math.pi)) / (2.0 * math.pi * frequency)
@@ -152,25 +164,44 @@ class _Log:
 
     def noise(self) -> float:
         """RMS about the mean, of the worst axis [m]."""
-        _, _, tool = self._from(1.0)
-        return float(tool.std(axis=0).max())
+        chosen = np.array(self._t) >= 1.0
+        return float(np.array(self._tool)[chosen].std(axis=0).max())
+
+    def delay(self, begin: float, end: float) -> float:
+        """Of what the hand does between these times [s]."""
+        t, asked, tool = self._from(-math.inf)
+        hand, follower = (Track(t, way[:, None]) for way in (asked, tool))
+        (found,) = delays_behind(hand, [follower], t[(t >= begin) & (t < end)])
+        return math.nan if found is None else found
+
+    def attenuation(self, period: float) -> float:
+        """RMS of all that the tool does over a ``period`` [s] but to move steadily, to that of the hand [dB]."""
+        t, asked, tool = self._from(SETTLES)
+        within = t < SETTLES + period
+        line = np.stack((np.ones_like(t), t), 1)[within]
+        asked_rms, tool_rms = (
+            math.sqrt(np.mean((way - line @ np.linalg.lstsq(line, way, rcond=None)[0]) ** 2))
+            for way in (asked[within], tool[within])
+        )
+        return 20.0 * math.log10(tool_rms / asked_rms)
 
     def stop(self) -> tuple[float, float]:
         """When the tool is within 2 mm of its rest for good, after the hand's [s], and how far it went beyond [m]."""
         t, _, tool = self._from(0.0)
-        ahead = tool[:, 2] - tool[-1, 2]
+        ahead = tool - tool[-1]
         late = t[np.abs(ahead) > 2e-3]
         return float(late[-1]) - (_CRUISES + STOP_TIME), max(float(ahead.max()), 0.0)
 
     def _from(self, begin: float) -> tuple[Array, Array, Array]:
+        """Times, and the ways of hand and tool along the axis, each (n,)."""
         t = np.array(self._t)
         chosen = t >= begin
-        return t[chosen], np.array(self._asked)[chosen], np.array(self._tool)[chosen]
+        return t[chosen], np.array(self._asked)[chosen], np.array(self._tool)[chosen, self._axis]
 
     def _pose(self, hand: str, t: float) -> pin.SE3:
         home = HANDS_AT_REST[hand]
         way = self._way(t - _BEGINS) if hand == HAND and t >= _BEGINS else 0.0
-        return pin.SE3(home.rotation, home.translation + np.array([0.0, 0.0, way]))
+        return pin.SE3(home.rotation, home.translation + way * np.eye(3)[self._axis])
 
 
 def _buttons(hand: str, t: float) -> HandInputs:

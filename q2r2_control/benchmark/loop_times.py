@@ -18,10 +18,11 @@ import numpy as np
 
 from q2r2_control.benchmark.tick_times import FEWEST_TICKS
 from q2r2_control.config import Config
-from q2r2_control.errors import ConfigError
+from q2r2_control.errors import ConfigError, PlantError
 from q2r2_control.inputs.scripted import ScriptedInput
 from q2r2_control.pipeline import Pipeline, PipelineRun
 from q2r2_control.plants.factory import make_plant
+from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.recording.about import About
 from q2r2_control.recording.recorder import Recorder
 from q2r2_control.robot.robot import Robot
@@ -58,8 +59,10 @@ class LoopRow:
     rounds: int
     stages: list[StageTime]
     without_physics: StageTime  # of rounds without clocks in the stages
+    to_command: StageTime  # the same, until the command is applied: a tick's time in the summary of a run
     clocks_us: float  # that the clocks in the stages add to a tick
     recorded: StageTime | None = None  # without physics, of rounds that were recorded to a file
+    to_command_recorded: StageTime | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,9 +88,9 @@ def run_loop_bench(
 ) -> LoopReport:
     """Time ``ticks`` ticks of each case and round, with both arms engaged.
 
-    ``record``: time them also while they are recorded. ``paced``: ticks begin a period apart; otherwise each right
-    after the last, which is faster and tells less. Raises
-    :class:`ConfigError` for fewer than 100 ticks, and for a cell that cannot be built.
+    ``record``: time them also while they are recorded, with the cell's cameras where MuJoCo is. ``paced``: ticks begin
+    a period apart; otherwise each right after the last, which is faster and tells less. Raises :class:`ConfigError` for
+    fewer than 100 ticks, and for a cell that cannot be built, and :class:`PlantError` where no pictures can be taken.
     """
     if ticks < FEWEST_TICKS:
         raise ConfigError(f"bench: ticks = {ticks}: allowed: {FEWEST_TICKS} or more")
@@ -169,9 +172,17 @@ class _ClockedPipeline(Pipeline):
 
     stage_clock: StageClock
     clocks_in_stages: bool
+    compute_times: list[float]  # of each tick, until its command is applied [s]
 
     def _begin(self, realtime: bool) -> PipelineRun:
         run, clock = super()._begin(realtime), self.stage_clock
+        self.compute_times, record = [], run.record
+
+        def noted(*tick: Any) -> None:
+            self.compute_times.append(tick[-1])
+            record(*tick)
+
+        setattr(run, "record", noted)  # noqa: B010, as the clocks are put in
         clock.watch_ticks(run, "tick")
         clock.watch(self.plant, "advance", PHYSICS)
         if not self.clocks_in_stages:
@@ -205,13 +216,17 @@ class _Case:
         self._stages: list[Array] = []
         self._whole: list[Array] = []
         self._recorded: list[Array] = []
+        self._to_command: list[Array] = []
+        self._to_command_recorded: list[Array] = []
 
     def run_round(self) -> None:
         """One run with clocks in every stage, one without, and where asked for one that is recorded."""
         self._stages.append(self._run(clocks_in_stages=True))
         self._whole.append(self._run(clocks_in_stages=False))
+        self._to_command.append(self._compute_times())
         if self._record:
             self._recorded.append(self._run_recorded())
+            self._to_command_recorded.append(self._compute_times())
 
     def row(self) -> LoopRow:
         """The figures of all rounds."""
@@ -223,20 +238,35 @@ class _Case:
             rounds=len(self._stages),
             stages=[_time_of(stage, stages[:, index]) for index, stage in enumerate(STAGES)],
             without_physics=_time_of("without physics", whole),
+            to_command=_time_of("to the command", np.concatenate(self._to_command)),
             clocks_us=1e6 * float(np.median(_without_physics(stages)) - np.median(whole)),
-            recorded=_time_of("recorded", _without_physics(np.concatenate(self._recorded))) if self._record else None,
+            **self._while_recorded(),
         )
+
+    def _while_recorded(self) -> dict[str, StageTime]:
+        if not self._record:
+            return {}
+        return {
+            "recorded": _time_of("recorded", _without_physics(np.concatenate(self._recorded))),
+            "to_command_recorded": _time_of("to the command, recorded", np.concatenate(self._to_command_recorded)),
+        }
 
     def _run_recorded(self) -> Array:
         """As when a robot moves: where there is no room ticks are lost, so that nothing can hold up the loop."""
         pipeline = self._pipeline
-        with TemporaryDirectory() as folder, Recorder(Path(folder), "bench") as recorder:
-            recorder.begin(About.of(pipeline, True, {}), pipeline.robot)
+        plant = pipeline.plant
+        cameras = self._config.simulated_cameras if isinstance(plant, MujocoPlant) else {}
+        with TemporaryDirectory() as folder, Recorder(Path(folder), "bench", pictures=bool(cameras)) as recorder:
+            if isinstance(plant, MujocoPlant) and cameras:
+                recorder.prepare(plant, pipeline.robot, cameras)
+            recorder.begin(About.of(pipeline, True, {}, tuple(cameras)), pipeline.robot)
             pipeline.listeners.append(recorder)
             try:
                 return self._run(clocks_in_stages=False)
             finally:
                 pipeline.listeners.remove(recorder)
+                if fault := recorder.summary.pictures_fault:
+                    raise PlantError(f"no pictures: {fault}")
 
     def _run(self, clocks_in_stages: bool) -> Array:
         pipeline, engaged = self._pipeline, round(_ENGAGED_AFTER * self._config.loop_rate_hz)
@@ -248,6 +278,11 @@ class _Case:
         finally:
             pipeline.stage_clock.release()
         return pipeline.stage_clock.times[engaged : engaged + self._ticks]
+
+    def _compute_times(self) -> Array:
+        """Of the last run, of the ticks that count."""
+        engaged = round(_ENGAGED_AFTER * self._config.loop_rate_hz)
+        return np.array(self._pipeline.compute_times[engaged : engaged + self._ticks])
 
 
 def _without_physics(times: Array) -> Array:

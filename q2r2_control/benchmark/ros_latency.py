@@ -42,13 +42,13 @@ def measure_latency(config: str, duration: float, rate: float, progress: Callabl
     """Measure for ``duration`` [s] each way, with the controller at ``rate`` [Hz]. Raises :class:`LatencyError`."""
     cell = load_config(config)
     limit = Robot.from_config(cell).capped_acceleration(cell.control.acceleration_limit)
-    filters = {f"teleop.filter.{name}": str(value) for name, value in _SHORTEST_FILTER.items()}
+    filters = {f"teleop.filter.{name}": value for name, value in _SHORTEST_FILTER.items()}
     nodes = [
         NodeProcess("mujoco_robot", "q2r2_control.ros.nodes.mujoco_robot", {"config": config}),
         NodeProcess(
             "cartesian_controller",
             "q2r2_control.ros.nodes.cartesian_controller",
-            {"config": config, "rate": f"{rate:.1f}"},
+            {"config": config, "rate": float(rate)},
         ),
     ]
     arm = NodeProcess("left_arm_controller", "q2r2_control.ros.nodes.left_arm_controller", filters)

@@ -3,32 +3,32 @@
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from typing import Annotated, NoReturn
 
 import typer
 from rich.console import Console
-from rich.table import Table
-from rich.text import Text
 
 from q2r2_control.benchmark.feel_run import run_feel
-from q2r2_control.benchmark.loop_times import PHYSICS, LoopReport, StageTime, run_loop_bench
+from q2r2_control.benchmark.loop_times import LoopReport, run_loop_bench
 from q2r2_control.benchmark.peers.base import PEERS
 from q2r2_control.benchmark.press_run import run_press
 from q2r2_control.benchmark.stack_bench import StackReport, run_stack_bench
-from q2r2_control.benchmark.tick_times import BenchReport, BenchRow, run_bench
+from q2r2_control.benchmark.tick_times import run_bench
 from q2r2_control.benchmark.work_bench import WORK_PEERS, run_work_bench
 from q2r2_control.cli.feel_table import show_feel
-from q2r2_control.cli.figure_table import figure_table
+from q2r2_control.cli.loop_table import loop_table
 from q2r2_control.cli.options import DEMO_CONFIG, Json
 from q2r2_control.cli.output import as_json_text, notice_of_compiling, stderr_console
 from q2r2_control.cli.press_table import press_table
 from q2r2_control.cli.ros_table import latency_table, load_table
 from q2r2_control.cli.soak_table import soak_table
 from q2r2_control.cli.stack_table import following_table, safety_table
+from q2r2_control.cli.times_table import motion_table, times_table
 from q2r2_control.cli.work_table import work_table
 from q2r2_control.config import Config, load_config
+from q2r2_control.config.cameras import CameraConfig
 from q2r2_control.errors import ConfigError
 from q2r2_control.types import CommandMode
 from q2r2_control.verification.contact_cells import FINGERS, TABLE_ONLY, with_contact
@@ -36,6 +36,7 @@ from q2r2_control.verification.soak import SoakReport, run_soak
 from q2r2_control.verification.work_motions import WORK_MOTIONS, WorkMotion, motions_named
 
 _TICKS, _SOAK_TICKS, _SECONDS = 3000, 1_000_000, 30.0
+_CAMERA = CameraConfig(position=(1.9, 0.0, 1.0), look_at=(0.4, 0.0, 0.3), width=320, height=240, rate=10.0)
 _ROTOR_SHARES = (1.0, 0.1)  # all of the rotors' inertia, and what a joint torque loop leaves of it
 _RATE = 250.0  # of the controller's node by default [Hz]
 
@@ -66,6 +67,9 @@ def bench(
     seed: Annotated[int, typer.Option(min=0, help="Of the soak, or of the hands with --through.")] = 0,
     loop: Annotated[bool, typer.Option("--loop", help="Time the whole live loop instead, stage by stage.")] = False,
     record: Annotated[bool, typer.Option("--record", help="With --loop: also while the run is recorded.")] = False,
+    camera: Annotated[
+        bool, typer.Option("--camera", help="With --record: with pictures of MuJoCo, 320x240, ten a second.")
+    ] = False,
     press: Annotated[
         bool, typer.Option("--press", help="Press a finger on the table in torque mode: forces in MuJoCo.")
     ] = False,
@@ -112,6 +116,8 @@ def bench(
         raise ConfigError("--ticks cannot be used with --press and --feel, which have a length of their own")
     if record and not loop:
         raise ConfigError("--record needs --loop")
+    if camera and not record:
+        raise ConfigError("--camera needs --record")
     if contact and not soak:
         raise ConfigError("--contact needs --soak")
     if seed and not (soak or through):
@@ -143,7 +149,10 @@ def bench(
             show_feel(cell.name, run_feel(cell, _progress(console)), json)
         elif loop:
             loop_ticks = _TICKS if ticks is None else ticks
-            _show_loop(run_loop_bench(load_config(DEMO_CONFIG), loop_ticks, _progress(console), record=record), json)
+            cell = load_config(DEMO_CONFIG)
+            if camera:
+                cell = cell.model_copy(update={"cameras": {"front": _CAMERA}})
+            _show_loop(run_loop_bench(cell, loop_ticks, _progress(console), record=record), json)
         else:
             _show_times(_TICKS if ticks is None else ticks, tuple(PEERS) if peers else (), console, json)
 
@@ -226,81 +235,3 @@ def _progress(console: Console) -> Callable[[str], None]:
     if not console.is_terminal:
         return lambda what: None
     return lambda what: console.print(what, highlight=False)
-
-
-def times_table(report: BenchReport) -> Table:
-    """Times of a tick."""
-    table = figure_table(
-        f"{report.cell}: one tick of 1 ms with {report.pairs} pairs, each run of {report.rows[0].ticks} ticks",
-        "controller",
-        ("runs", "median [us]", "p99 [us]", "max [us]", "median / ours", "p99 / ours"),
-    )
-    for row in _by_scenario(report, table):
-        ratios = ("" if ratio is None else f"{ratio:.2f}" for ratio in (row.median_ratio, row.p99_ratio))
-        times = (f"{value:.0f}" for value in (row.median_us, row.p99_us, row.max_us))
-        table.add_row(f"  {row.controller}", str(row.rounds), *times, *ratios)
-    return table
-
-
-def motion_table(report: BenchReport) -> Table:
-    """Metrics of the controllers' motions, with notes on the limitations of each."""
-    table = figure_table(
-        "motion",
-        "controller",
-        ("a / limit", "v / limit", "room [rad]", "nearest [mm]", "held", "tail [rad/s^2]"),
-    )
-    for row in _by_scenario(report, table):
-        metrics = row.metrics
-        table.add_row(
-            f"  {row.controller}",
-            f"{metrics.max_acceleration_ratio:.2f}",
-            f"{metrics.max_velocity_ratio:.2f}",
-            f"{metrics.min_position_margin_rad:.3f}",
-            f"{metrics.min_distance_mm:.2f}",
-            str(metrics.failures if row.fallback_ticks is None else row.fallback_ticks),
-            f"{metrics.tail_acceleration:.3f}",
-        )
-    held = "held: ticks without a solution, in which a peer's arms stand still and ours execute the certified stop"
-    table.caption = Text("\n".join([held, *report.notes]))
-    table.caption_justify = "left"
-    return table
-
-
-def _by_scenario(report: BenchReport, table: Table) -> Iterator[BenchRow]:
-    """The rows; each scenario's heading is added to the table before its first row."""
-    heading = ""
-    for row in report.rows:
-        if row.name != heading:
-            heading = row.name
-            table.add_row(Text(heading, style="bold"))
-        yield row
-
-
-def loop_table(report: LoopReport) -> Table:
-    """Where a tick of the live loop goes: a column for each plant and mode."""
-    first = report.rows[0]
-    table = figure_table(
-        f"{report.cell}: one tick of the live loop at {report.loop_rate_hz:g} Hz, {first.rounds} runs of {first.ticks} "
-        "ticks each [us]",
-        "stage",
-        tuple(text for row in report.rows for text in (f"{row.plant} {row.mode}\nmedian", "\np99")),
-    )
-    for index, stage in enumerate(first.stages):
-        if stage.stage == PHYSICS:
-            table.add_row(Text("without physics", style="bold"), *_times_of(row.without_physics for row in report.rows))
-            if recorded := [row.recorded for row in report.rows if row.recorded is not None]:
-                table.add_row("the same, recorded", *_times_of(recorded))
-        table.add_row(stage.stage, *_times_of(row.stages[index] for row in report.rows))
-    added = ", ".join(f"{row.clocks_us:.0f}" for row in report.rows)
-    table.caption = Text(
-        f"without physics: of runs without clocks in the stages, which add {added} us; medians do not add up\n"
-        "drive: impedance and wall in torque mode; physics: of the simulator, where a real robot would move"
-    )
-    table.caption_justify = "left"
-    return table
-
-
-def _times_of(stages: Iterable[StageTime]) -> Iterator[str]:
-    for stage in stages:
-        yield f"{stage.median_us:.0f}"
-        yield f"{stage.p99_us:.0f}"

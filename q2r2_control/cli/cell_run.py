@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from contextlib import ExitStack
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, nullcontext
 from dataclasses import asdict, dataclass, field
 from datetime import datetime
 from pathlib import Path
@@ -14,12 +14,14 @@ from rich.console import Console
 from q2r2_control.cli.headset_server import AnnouncedHeadset
 from q2r2_control.cli.output import as_json_text, notice_of_compiling, stderr_console
 from q2r2_control.cli.summary_table import recording_line, summary_table, task_line, verdict_markup
+from q2r2_control.cli.window import check_window, show_window
 from q2r2_control.config import Config
 from q2r2_control.config.external import ControllerKind
-from q2r2_control.errors import ConfigError, RecordingError
+from q2r2_control.errors import ConfigError, PlantError, RecordingError
 from q2r2_control.inputs.base import Input
 from q2r2_control.inputs.factory import make_input
 from q2r2_control.inputs.scripted import ScriptedInput
+from q2r2_control.judging.episode_judge import EpisodeJudge
 from q2r2_control.judging.judge import Judged, judge, keep_verdicts
 from q2r2_control.pipeline import Pipeline
 from q2r2_control.plants.mujoco import MujocoPlant
@@ -27,17 +29,15 @@ from q2r2_control.recording.about import About
 from q2r2_control.recording.reader import Recording
 from q2r2_control.recording.recorder import Recorder, RecordingSummary
 from q2r2_control.runtime.folders import new_folder
-from q2r2_control.runtime.recorder import Tick
 from q2r2_control.runtime.run_summary import RunSummary
 from q2r2_control.runtime.scheduling import real_time
 from q2r2_control.supervision.preflight import preflight_faults
+from q2r2_control.teleop.episode_marks import EpisodeMarks
 from q2r2_control.verification.assembly_tasks import AssemblyTask, TaskResult, TaskWatch
 from q2r2_control.viewer.history import History
 from q2r2_control.viewer.live import LiveTable
 from q2r2_control.viewer.report import draw_report
 from q2r2_control.viewer.sound import SoundKind, sounding
-
-_WINDOW_PERIOD = 1.0 / 30.0  # [s]
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,16 +88,23 @@ def run_cell(config: Config, options: RunOptions, console: Console) -> CellRun:
         raise ConfigError(
             f"{config.name}: controller: external is driven by q2r2 ros up; this command runs controller: builtin only"
         )
-    if options.window and options.plant != "mujoco":
-        raise ConfigError(f"--viewer: the {options.plant} plant has no window; allowed: --plant mujoco")
-    with ExitStack() as stack:
-        recorder = None
-        if options.record is not None:
-            # Before the pipeline, which takes longer to build than the recorder's process to start.
-            pictures = bool(config.cameras) and options.plant == "mujoco"
-            recorder = stack.enter_context(
-                Recorder(options.record, options.name, waits=options.fast, pictures=pictures)
-            )
+    if options.window:
+        check_window(options.plant)
+    if options.record is None:
+        return _run_cell(config, options, None, console)
+    # Before the pipeline, which takes longer to build than the recorder's process to start.
+    pictures = bool(config.simulated_cameras) and options.plant == "mujoco"
+    recorder = Recorder(options.record, options.name, waits=options.fast, pictures=pictures)
+    try:
+        return _run_cell(config, options, recorder, console)
+    except PlantError:
+        for line in _recording_lines(recorder.summary):
+            console.print(line, soft_wrap=True, highlight=False)
+        raise
+
+
+def _run_cell(config: Config, options: RunOptions, recorder: Recorder | None, console: Console) -> CellRun:
+    with recorder or nullcontext():
         with notice_of_compiling(console):
             source = _input_of(config, options, console)
             pipeline = Pipeline.from_config(config, input=source, plant=options.plant, mode=options.mode)
@@ -110,6 +117,8 @@ def run_cell(config: Config, options: RunOptions, console: Console) -> CellRun:
             watch = TaskWatch(options.tasks, pipeline.plant, pipeline.robot, config)
             pipeline.listeners.append(watch)
         summary = _run(pipeline, options, recorder, console)
+        if recorder is not None and watch is not None:
+            recorder.success = all(task.succeeded for task in watch.results())
     recording = None if recorder is None else recorder.summary
     run = CellRun(summary, watch.results() if watch is not None else (), recording)
     if options.report:
@@ -130,10 +139,16 @@ def print_summary(run: CellRun, json: bool) -> None:
     for task in run.tasks:
         console.print(task_line(task), soft_wrap=True, highlight=False)
     if run.recording is not None:
-        console.print(recording_line(run.recording), soft_wrap=True, highlight=False)
-        for one in _judge_recording(run.recording):
-            which = "" if one.figures.part is None else f" on episode {one.figures.part}"
-            console.print(f"verdict{which}: {verdict_markup(one.verdict)}", soft_wrap=True, highlight=False)
+        for line in _recording_lines(run.recording):
+            console.print(line, soft_wrap=True, highlight=False)
+
+
+def _recording_lines(recording: RecordingSummary) -> Iterator[str]:
+    """Lines of markup: where the run was recorded, and the verdicts on its episodes."""
+    yield recording_line(recording)
+    for one in _judge_recording(recording):
+        which = "" if one.figures.part is None else f" on episode {one.figures.part}"
+        yield f"verdict{which}: {verdict_markup(one.verdict)}"
 
 
 def _judge_recording(recording: RecordingSummary | None) -> list[Judged]:
@@ -172,9 +187,8 @@ def _input_of(config: Config, options: RunOptions, console: Console) -> Input:
 def _run(pipeline: Pipeline, options: RunOptions, recorder: Recorder | None, console: Console) -> RunSummary:
     """Run with what is to be shown and recorded of it."""
     with ExitStack() as stack:
-        if options.window and isinstance(pipeline.plant, MujocoPlant):
-            pipeline.plant.launch_viewer()
-            pipeline.listeners.append(_WindowListener(pipeline, pipeline.plant))
+        if options.window:
+            show_window(pipeline)
         if options.table:
             robot = pipeline.robot
             joints = {arm: [robot.joint_names[joint] for joint in its.joints] for arm, its in robot.arms.items()}
@@ -187,14 +201,18 @@ def _run(pipeline: Pipeline, options: RunOptions, recorder: Recorder | None, con
         if options.sound is not None:
             pipeline.listeners.append(stack.enter_context(sounding(options.sound)))
         if recorder is not None:
-            cameras = pipeline.config.cameras
+            cameras = pipeline.config.simulated_cameras
             if cameras and isinstance(pipeline.plant, MujocoPlant):
                 recorder.prepare(pipeline.plant, pipeline.robot, cameras)
             elif cameras:
                 line = f"no pictures are recorded: the {options.plant} plant has none; allowed: --plant mujoco"
                 console.print(line, style="yellow", soft_wrap=True, highlight=False, markup=False)
+            recorder.tell = pipeline.tell
             recorder.begin(_about(pipeline, options), pipeline.robot)
             pipeline.listeners.append(recorder)
+            if any(map(pipeline.config.teleop.bindings.words_of, EpisodeMarks.actions)):
+                judge_now = EpisodeJudge(lambda: recorder.file, pipeline.tell)
+                pipeline.listeners.append(stack.enter_context(judge_now))
         return pipeline.run(options.duration, realtime=not options.fast)
 
 
@@ -203,22 +221,8 @@ def _about(pipeline: Pipeline, options: RunOptions) -> About:
     notes = {"cell": pipeline.config.name, "input": options.input, **options.notes}
     if options.input == "scripted":
         notes |= {"trajectory": options.trajectory, "human": str(options.human).lower(), "seed": str(options.seed)}
-    cameras = tuple(pipeline.config.cameras) if isinstance(pipeline.plant, MujocoPlant) else ()
+    cameras = tuple(pipeline.config.simulated_cameras) if isinstance(pipeline.plant, MujocoPlant) else ()
     return About.of(pipeline, not options.fast, notes, cameras)
-
-
-class _WindowListener:
-    """Shows MuJoCo's window some thirty times a second; closing it ends the run."""
-
-    def __init__(self, pipeline: Pipeline, plant: MujocoPlant) -> None:
-        self._pipeline, self._plant = pipeline, plant
-        self._due = 0.0
-
-    def __call__(self, tick: Tick) -> None:
-        if tick.t >= self._due:
-            self._due = tick.t + _WINDOW_PERIOD
-            if not self._plant.viewer_sync():
-                self._pipeline.stop()
 
 
 def _write_report(config: Config, options: RunOptions, history: History, run: CellRun) -> Path:

@@ -2,12 +2,24 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from q2r2_control.cli.cell_run import RunOptions, print_summary, run_cell
-from q2r2_control.cli.options import DEMO_CONFIG, Headless, Human, Json, RealTime, Viewer, positive, shows_table
+from q2r2_control.cli.options import (
+    DEMO_CONFIG,
+    Headless,
+    Human,
+    Json,
+    RealTime,
+    Record,
+    Seed,
+    Viewer,
+    positive,
+    shows_table,
+)
 from q2r2_control.cli.output import stderr_console
 from q2r2_control.config import load_config
 from q2r2_control.errors import ConfigError
@@ -32,13 +44,15 @@ def demo(
     viewer: Viewer = False,
     headless: Headless = False,
     human: Human = False,
+    seed: Seed = 0,
+    record: Record = None,
     rt: RealTime = False,
     json: Json = False,
 ) -> None:
     """Two simulated arms hand a bar to each other and stack blocks, led by nothing but the samples of scripted hands.
 
     Ends with a line for each task, as the simulation measured it, and exit code 1 where one did not succeed.
-    Writes plots and a summary to a folder under runs/.
+    Writes plots and a summary to a folder under runs/. With --record, whether all succeeded is in the recording.
     """
     if fast and rt:
         raise ConfigError("--rt and --fast exclude each other, since simulated time is never late")
@@ -53,13 +67,15 @@ def demo(
         fast=fast,
         trajectory=trajectory,
         human=human,
-        seed=0,
+        seed=seed,
         table=shows_table(headless, viewer),
         window=viewer,
         report=True,
         force=False,
         real_time=rt,
         tasks=chosen,
+        record=None if record is None else Path(record),
+        notes={"task": "; ".join(task.about for task in chosen)},
     )
     run = run_cell(load_config(DEMO_CONFIG), options, stderr_console())
     print_summary(run, json)

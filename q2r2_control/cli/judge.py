@@ -24,7 +24,7 @@ from q2r2_control.judging.judge import Judged, judge_all
 from q2r2_control.judging.page import COLUMNS, page_of
 from q2r2_control.recording.files import recordings_in
 
-_SHOWN = ("time", "idle", "gap", "delay", "error", "LDLJ")  # what a terminal has room for; the page has all
+_SHOWN = ("success", "time", "idle", "gap", "delay", "error", "LDLJ")  # what a terminal has room for; the page has all
 
 Recordings = Annotated[list[Path], typer.Argument(metavar="DIR_OR_FILES...", help="Recordings, or folders of them.")]
 Thresholds = Annotated[

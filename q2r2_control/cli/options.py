@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
+from enum import StrEnum
 from typing import Annotated
 
 import typer
@@ -17,10 +18,31 @@ Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on std
 Headless = Annotated[bool, typer.Option("--headless", help="No live table, no window.")]
 Viewer = Annotated[bool, typer.Option("--viewer", help="Open MuJoCo's window; closing it ends the run.")]
 Human = Annotated[bool, typer.Option("--human", help="Scripted hands tremble, and samples get lost and late.")]
+Seed = Annotated[int, typer.Option(min=0, help="Of what --human adds.")]
+Record = Annotated[str | None, typer.Option(metavar="DIR", help="Record the run to a new folder in DIR.")]
 RealTime = Annotated[
     bool,
     typer.Option("--rt", help="Lock memory and run under SCHED_FIFO; says what the system refuses, and runs anyway."),
 ]
+
+Task = Annotated[str | None, typer.Option(help="With --record: what is done, noted in the recording.")]
+Operator = Annotated[str | None, typer.Option(help="With --record: whose hands, noted as well.")]
+
+
+def notes_of(task: str | None, operator: str | None, record: str | None) -> dict[str, str]:
+    """What is noted in a recording. Raises :class:`ConfigError` where there is none."""
+    notes = {name: text for name, text in (("task", task), ("operator", operator)) if text is not None}
+    for name in notes:
+        if record is None:
+            raise ConfigError(f"--{name} needs --record")
+    return notes
+
+
+class PlantName(StrEnum):
+    """What moves."""
+
+    MUJOCO = "mujoco"
+    KINEMATIC = "kinematic"
 
 
 def positive(option: str, value: float) -> float:

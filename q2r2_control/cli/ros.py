@@ -8,10 +8,15 @@ from typing import Annotated
 
 import typer
 
+from q2r2_control.cli.options import Operator, Task, notes_of
+from q2r2_control.cli.ros_doctor import doctor
+from q2r2_control.cli.ros_watch import watch
 from q2r2_control.ros.launch.build import BuildError, build_interfaces
 from q2r2_control.ros.launch.processes import nodes_of, run_together
 
 app = typer.Typer(rich_markup_mode=None, help="ROS 2 Jazzy, from apt or from the Python registry.")
+app.command(epilog="Example: q2r2 ros watch config/dual_iiwa7.yaml --once")(watch)
+app.command(epilog="Example: q2r2 ros doctor config/dual_iiwa7.yaml")(doctor)
 
 
 class HandSource(StrEnum):
@@ -55,6 +60,11 @@ def up(
         RobotSource,
         typer.Option(help="Simulated, or one that is there; auto: mujoco for controller: builtin."),
     ] = RobotSource.AUTO,
+    record: Annotated[
+        str | None, typer.Option(metavar="DIR", help="Record what the nodes publish to a new folder in DIR.")
+    ] = None,
+    task: Task = None,
+    operator: Operator = None,
 ) -> None:
     """Start what a cell needs as ROS nodes, until Ctrl-C: robot, controller, the arms' teleop and an input.
 
@@ -62,5 +72,7 @@ def up(
     and in mode filtered the built-in controller between both.
     A node that ends by itself is reported, and all others are stopped: exit 1.
     """
-    nodes = nodes_of(config, input.value, robot.value)
+    notes = notes_of(task, operator, record)
+    recording = None if record is None else {"folder": record, **notes}
+    nodes = nodes_of(config, input.value, robot.value, recording)
     raise typer.Exit(run_together(nodes, lambda line: print(line, flush=True)))

@@ -10,7 +10,22 @@ import typer
 
 from q2r2_control.cli.cell_run import RunOptions, print_summary, run_cell
 from q2r2_control.cli.headset_server import Host, Port, with_address
-from q2r2_control.cli.options import ConfigFile, Headless, Human, Json, RealTime, Viewer, positive, shows_table
+from q2r2_control.cli.options import (
+    ConfigFile,
+    Headless,
+    Human,
+    Json,
+    Operator,
+    PlantName,
+    RealTime,
+    Record,
+    Seed,
+    Task,
+    Viewer,
+    notes_of,
+    positive,
+    shows_table,
+)
 from q2r2_control.cli.output import stderr_console
 from q2r2_control.config import load_config
 from q2r2_control.errors import ConfigError
@@ -27,13 +42,6 @@ class InputName(StrEnum):
     HEADSET = "headset"
 
 
-class PlantName(StrEnum):
-    """What moves."""
-
-    MUJOCO = "mujoco"
-    KINEMATIC = "kinematic"
-
-
 def run(
     config: ConfigFile,
     input: Annotated[InputName, typer.Option(help="Where hand samples come from.")] = InputName.SCRIPTED,
@@ -45,7 +53,7 @@ def run(
     fast: Annotated[bool, typer.Option("--fast", help="Simulated time, as fast as it can, repeatable.")] = False,
     trajectory: Annotated[str | None, typer.Option(help=f"Scripted: {', '.join(TRAJECTORIES)}.")] = None,
     human: Human = False,
-    seed: Annotated[int, typer.Option(min=0, help="Of what --human adds.")] = 0,
+    seed: Seed = 0,
     host: Host = None,
     port: Port = None,
     viewer: Viewer = False,
@@ -53,9 +61,9 @@ def run(
     rt: RealTime = False,
     report: Annotated[bool, typer.Option(help="Write plots and a summary to a folder under runs/.")] = False,
     sound: Annotated[SoundKind | None, typer.Option(help="When engaged, at faults and episodes: how.")] = None,
-    record: Annotated[str | None, typer.Option(metavar="DIR", help="Record the run to a new folder in DIR.")] = None,
-    task: Annotated[str | None, typer.Option(help="With --record: what is done, noted in the recording.")] = None,
-    operator: Annotated[str | None, typer.Option(help="With --record: whose hands, noted as well.")] = None,
+    record: Record = None,
+    task: Task = None,
+    operator: Operator = None,
     force: Annotated[bool, typer.Option("--force", help="Run even where q2r2 check finds a fault.")] = False,
     json: Json = False,
 ) -> None:
@@ -74,9 +82,7 @@ def run(
         raise ConfigError("--fast needs --duration, since simulated time has no end of its own")
     if fast and rt:
         raise ConfigError("--rt and --fast exclude each other, since simulated time is never late")
-    for option, text in (("--task", task), ("--operator", operator)):
-        if text is not None and record is None:
-            raise ConfigError(f"{option} needs --record")
+    notes = notes_of(task, operator, record)
     cell = with_address(load_config(config), host, port)
     options = RunOptions(
         name=cell.name,
@@ -95,6 +101,6 @@ def run(
         real_time=rt,
         sound=sound,
         record=None if record is None else Path(record),
-        notes={name: text for name, text in (("task", task), ("operator", operator)) if text is not None},
+        notes=notes,
     )
     print_summary(run_cell(cell, options, stderr_console()), json)

@@ -38,6 +38,7 @@ def _soak_notes(report: SoakReport) -> str:
         f" {report.fallbacks} stops ({report.fallbacks_healthy} with a healthy solver),"
         f" {report.openings} openings of grippers ({report.openings_refused} refused)"
         + (f", {report.grasps} grasps and releases" if report.grasps else "")
+        + f", {report.changes} changes of settings"
     ]
     for found in report.broken:
         error = f": {found.error}" if found.error else ""

@@ -1,9 +1,9 @@
 """What a control loop needs besides its data: time, signals, garbage collection, and the figures of a run.
 
 ``loop_clock`` says when a tick is due, ``process`` stops on signals without interrupting a tick, ``scheduling`` asks
-the system for punctuality, ``operator_side`` has all that is the operator's. ``recorder`` gives each ``Tick`` to
-listeners and its figures to ``run_summary``, which gathers them with ``joint_extremes``, ``histogram`` and
-``torque_summary``.
+the system for punctuality, ``operator_side`` has all that is the operator's, and ``arm_conditions`` what hands feel of
+arms. ``recorder`` gives each ``Tick`` to listeners and its figures to ``run_summary``, which gathers them with
+``joint_extremes``, ``histogram`` and ``torque_summary``.
 """
 
 from __future__ import annotations

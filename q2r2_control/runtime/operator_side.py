@@ -14,6 +14,7 @@ from q2r2_control.runtime.operator_feedback import OperatorFeedback
 from q2r2_control.runtime.wishes import Wishes
 from q2r2_control.supervision.supervisor import Supervisor
 from q2r2_control.teleop.arm_states import is_fault
+from q2r2_control.teleop.episode_marks import RECORDING_ENDED
 from q2r2_control.teleop.teleop import Teleop
 from q2r2_control.types import ArmTarget, Event, HandSample
 
@@ -27,6 +28,7 @@ class OperatorSide:
         self, teleop: Teleop, source: Input, supervisor: Supervisor, controller: CartesianController, wishes: Wishes
     ) -> None:
         self._teleop, self._input, self._supervisor, self._wishes = teleop, source, supervisor, wishes
+        self._controller = controller
         self._homing = False  # supervision is on the way home
         self.feedback = OperatorFeedback(controller, teleop.hand_of, teleop.settings.haptics, source.send_haptic)
         self.connected = False
@@ -48,13 +50,14 @@ class OperatorSide:
         commanded: Mapping[str, pin.SE3],
     ) -> dict[str, ArmTarget]:
         """What the operator asks of the arms, handed over to supervision; see :meth:`Teleop.update`."""
-        if self._wishes.home or self._wishes.settings is not None:
+        if self._wishes:
             self._fulfil(now)
         targets = self._teleop.update(samples, tools, now, commanded)
         for arm, target in targets.items():
-            if target.pose is None:
+            command = target.command
+            if command is None:
                 self._supervisor.release_target(arm)
-            elif refusal := self._supervisor.take_target(arm, target.pose, now, measured=tools[arm]):
+            elif refusal := self._supervisor.take_target(arm, command, now, measured=tools[arm]):
                 self._teleop.pause(now, refusal.line)  # or the operator would think that the arm follows
         self._go_home(now)
         return targets
@@ -63,14 +66,14 @@ class OperatorSide:
         """What happened to the arms' states since the last call, by the time since ``start`` [s]; it is logged."""
         events = [replace(event, t=event.t - start) for event in self._teleop.take_events()]
         for event in events:
-            if is_fault(event):
+            if is_fault(event) and not event.reason.startswith(RECORDING_ENDED):  # which the recorder has logged
                 _logger.warning("%s arm: %s", event.arm, event.reason)
             else:
                 _logger.debug("%s arm: %s -> %s: %s", event.arm, event.source, event.destination, event.reason)
         return events
 
     def _fulfil(self, now: float) -> None:
-        home, settings = self._wishes.home, self._wishes.settings
+        home, settings, control = self._wishes.home, self._wishes.settings, self._wishes.control
         for line in self._wishes.told(self._teleop.settings):
             self._teleop.tell(now, line)
         self._wishes.clear()
@@ -78,9 +81,14 @@ class OperatorSide:
             self._teleop.home(now)
         if settings is not None:
             problem = self._teleop.change(settings, now)
-            self._teleop.tell(now, "settings changed" if problem is None else f"not changed: {problem}")
+            self._tell_change("settings", problem, now)
             if problem is None:
                 self.feedback.scale(settings.haptics.strength)
+        if control is not None:
+            self._tell_change("control", self._controller.change(control), now)
+
+    def _tell_change(self, what: str, problem: str | None, now: float) -> None:
+        self._teleop.tell(now, f"{what} changed" if problem is None else f"not changed: {problem}")
 
     def _go_home(self, now: float) -> None:
         """Begin and end the way home as the operator asks, and tell the operator how it ended."""

@@ -20,7 +20,7 @@ from typing import NamedTuple
 from q2r2_control.errors import ConfigError
 from q2r2_control.runtime.recorder import Tick
 from q2r2_control.teleop.arm_states import ArmState, is_fault
-from q2r2_control.teleop.episode_marks import BEGINS, DISCARDED, ENDS
+from q2r2_control.teleop.episode_marks import BEGINS, DISCARDED, ENDS, FAILED, SUCCEEDED, is_kept
 from q2r2_control.types import Event
 
 PLAYERS = ("pw-play", "paplay", "aplay", "afplay")  # each plays a file that is its only argument
@@ -45,7 +45,9 @@ ENGAGED = Sound(1, ((660.0, 0.1), (880.0, 0.1)))
 FAULT = Sound(3, ((220.0, 0.2), (0.0, 0.08), (220.0, 0.2), (0.0, 0.08), (220.0, 0.3)))
 EPISODE_BEGINS = Sound(1, ((1320.0, 0.08), (0.0, 0.05), (1320.0, 0.08)))
 EPISODE_ENDS = Sound(2, ((1320.0, 0.08), (0.0, 0.05), (880.0, 0.15)))
-ALL = (ENGAGED, FAULT, EPISODE_BEGINS, EPISODE_ENDS)
+EPISODE_KEPT = Sound(1, ((880.0, 0.1), (0.0, 0.05), (1320.0, 0.25)))
+EPISODE_REJECTED = Sound(3, ((440.0, 0.15), (0.0, 0.05), (330.0, 0.3)))
+ALL = (ENGAGED, FAULT, EPISODE_BEGINS, EPISODE_ENDS, EPISODE_KEPT, EPISODE_REJECTED)
 
 
 def sound_of(event: Event) -> Sound | None:
@@ -54,7 +56,10 @@ def sound_of(event: Event) -> Sound | None:
         return FAULT
     if event.source != event.destination:
         return ENGAGED if event.destination == ArmState.ENGAGED else None
-    return {BEGINS: EPISODE_BEGINS, ENDS: EPISODE_ENDS, DISCARDED: EPISODE_ENDS}.get(event.reason)
+    if (kept := is_kept(event.reason)) is not None:
+        return EPISODE_KEPT if kept else EPISODE_REJECTED
+    ends = dict.fromkeys((ENDS, DISCARDED, SUCCEEDED, FAILED), EPISODE_ENDS)
+    return {BEGINS: EPISODE_BEGINS, **ends}.get(event.reason)
 
 
 class SoundListener:

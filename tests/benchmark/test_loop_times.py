@@ -10,6 +10,7 @@ import pytest
 from q2r2_control.benchmark import loop_times
 from q2r2_control.benchmark.loop_times import CASES, REST, STAGES, StageClock, run_loop_bench
 from q2r2_control.config import load_config
+from q2r2_control.config.cameras import CameraConfig
 from q2r2_control.errors import ConfigError
 
 CONFIG = load_config("config/dual_iiwa7.yaml")
@@ -116,15 +117,24 @@ def test_what_was_watched_is_left_as_it_was(time: Time) -> None:
 
 
 def test_it_times_the_loop_s_own_ticks_of_every_plant_and_mode() -> None:
-    report = run_loop_bench(CONFIG, 100, paced=False)
+    report = run_loop_bench(CONFIG, 100, paced=False, record=True)
     assert [(row.plant, row.mode) for row in report.rows] == [(plant, str(mode)) for plant, mode in CASES]
     for row in report.rows:
         assert tuple(stage.stage for stage in row.stages) == STAGES
         assert (row.ticks, row.rounds) == (100, 3)
         # Each stage is called at every tick.
         assert all(0.0 < stage.median_us <= stage.p99_us for stage in row.stages)
-        assert 0.0 < row.without_physics.median_us <= row.without_physics.p99_us
+        assert 0.0 < row.to_command.median_us < row.without_physics.median_us <= row.without_physics.p99_us
+        assert row.recorded is not None
+        assert row.to_command_recorded is not None
+        assert 0.0 < row.to_command_recorded.median_us < row.recorded.median_us
     json.dumps(report.as_json(), allow_nan=False)
+
+
+def test_pictures_are_taken_where_mujoco_is() -> None:
+    camera = CameraConfig(position=(1.9, 0.0, 1.0), look_at=(0.4, 0.0, 0.3), width=64, height=48, rate=10.0)
+    report = run_loop_bench(CONFIG.model_copy(update={"cameras": {"front": camera}}), 100, paced=False, record=True)
+    assert all(row.recorded is not None for row in report.rows)
 
 
 def test_too_few_ticks_are_refused() -> None:

@@ -16,13 +16,14 @@ from q2r2_control.benchmark.stack_run import StackFigures
 from q2r2_control.benchmark.tick_times import BenchReport, BenchRow
 from q2r2_control.benchmark.timed_run import RunMetrics
 from q2r2_control.benchmark.work_bench import WorkReport, WorkRow
-from q2r2_control.cli.bench import loop_table, motion_table, times_table
+from q2r2_control.cli.loop_table import loop_table
 from q2r2_control.cli.soak_table import soak_table
 from q2r2_control.cli.stack_table import following_table, safety_table
+from q2r2_control.cli.times_table import motion_table, times_table
 from q2r2_control.cli.work_table import work_table
 from q2r2_control.config import Config
 from q2r2_control.types import CommandMode
-from q2r2_control.verification.contract import Margin
+from q2r2_control.verification.promises import Margin
 from q2r2_control.verification.soak import SoakReport, Violation
 from q2r2_control.verification.work_motions import motions_named
 from tests.cli.test_app import one_object, q2r2
@@ -193,7 +194,7 @@ def test_a_broken_promise_is_in_the_table_with_its_tick_and_its_segment() -> Non
     margin.note(-0.25, 7)
     q = np.zeros(14)
     found = Violation("least distance", 7, "teleport, dt 1 ms", 3, q, q, {}, "0.001", "")
-    text = printed(soak_table(SoakReport("cell", 5, 9, 0.1, 1, 1, 0, 0, 0, 0, 0, 0, [margin], 0.5, [found])))
+    text = printed(soak_table(SoakReport("cell", 5, 9, 0.1, 1, 1, 0, 0, 0, 0, 0, 0, 0, [margin], 0.5, [found])))
     assert "seed 5" in text
     assert "-0.25 m" in text
     assert "first broken at tick 7: least distance" in " ".join(text.split())
@@ -203,8 +204,8 @@ def test_a_broken_promise_is_in_the_table_with_its_tick_and_its_segment() -> Non
 
 def test_eighty_columns_hold_every_stage_of_the_loop_for_each_plant_and_mode() -> None:
     stages = [StageTime(stage, 100.0 + index, 12340.0 + index) for index, stage in enumerate(STAGES)]
-    whole = StageTime("without physics", 237.0, 54321.0)
-    rows = [LoopRow(plant, str(mode), 3000, 3, stages, whole, 6.4) for plant, mode in CASES]
+    whole, command = StageTime("without physics", 237.0, 54321.0), StageTime("to the command", 198.0, 43210.0)
+    rows = [LoopRow(plant, str(mode), 3000, 3, stages, whole, command, 6.4) for plant, mode in CASES]
     text = printed(loop_table(LoopReport("cell", 1000.0, rows)))
     in_one_line = " ".join(text.split())
     for word in (*STAGES, "kinematic", "mujoco", "position", "torque", "p99", "[us]", "1000 Hz", "6, 6, 6 us"):
@@ -212,7 +213,8 @@ def test_eighty_columns_hold_every_stage_of_the_loop_for_each_plant_and_mode() -
     lines = text.splitlines()
     (total,) = (index for index, line in enumerate(lines) if "237" in line)
     assert lines[total].split() == ["without", "physics", *["237", "54321"] * 3]
-    assert lines[total + 1].split()[0] == PHYSICS, "below the sum, which it is not in"
+    assert lines[total + 1].split() == ["to", "the", "command", *["198", "43210"] * 3]
+    assert lines[total + 2].split()[0] == PHYSICS, "below the sum, which it is not in"
     assert "…" not in text
 
 
@@ -224,7 +226,7 @@ def test_the_loop_s_bench_prints_its_figures_as_one_object(monkeypatch: pytest.M
         stages = [StageTime(stage, 1.0, 2.0) for stage in STAGES]
         whole = StageTime("without physics", 9.0, 12.0)
         return LoopReport(
-            "cell", 1e3, [LoopRow(plant, str(mode), ticks, 3, stages, whole, 0.1) for plant, mode in CASES]
+            "cell", 1e3, [LoopRow(plant, str(mode), ticks, 3, stages, whole, whole, 0.1) for plant, mode in CASES]
         )
 
     monkeypatch.setattr("q2r2_control.cli.bench.run_loop_bench", made_up)
@@ -232,6 +234,22 @@ def test_the_loop_s_bench_prints_its_figures_as_one_object(monkeypatch: pytest.M
     assert asked == [(200, True)]
     assert {stage["stage"] for stage in found["rows"][2]["stages"]} == set(STAGES)
     assert found["rows"][2]["without_physics"]["median_us"] == 9.0
+
+
+def test_the_loop_s_bench_has_a_camera_where_one_is_asked_for_and_it_is_recorded(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    asked: list[Config] = []
+
+    def made_up(config: Config, *_: object, **__: object) -> LoopReport:
+        asked.append(config)
+        return LoopReport("cell", 1e3, [])
+
+    monkeypatch.setattr("q2r2_control.cli.bench.run_loop_bench", made_up)
+    q2r2("bench", "--loop", "--record", "--camera", "--json")
+    assert list(asked[0].simulated_cameras) == ["front"]
+    refused = q2r2("bench", "--loop", "--camera")
+    assert (refused.exit_code, refused.stderr) == (2, "q2r2: --camera needs --record\n")
 
 
 @pytest.mark.parametrize("other", ["--soak", "--ros"])

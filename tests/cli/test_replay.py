@@ -46,6 +46,40 @@ def test_without_compare_it_prints_the_summary_of_the_replayed_run(recorded: Pat
     assert "difference" not in data
 
 
+def test_on_another_plant_it_says_how_far_the_tools_are_off(recorded: Path) -> None:
+    data = one_object(q2r2("replay", str(recorded), "--plant", "mujoco", "--json").stdout)
+    assert data["ended_by"] is None
+    assert all(0.0 < arm["position_mm_max"] < 5.0 for arm in data["arms"].values())
+    lines = q2r2("replay", str(recorded), "--plant", "kinematic", "--compare").stdout.splitlines()
+    assert lines[0] == "identical"
+    assert lines[1].startswith("left arm: tool 0.000 mm RMS, 0.000 mm and 0.000 deg at most from")
+
+
+def test_joints_are_sent_to_a_plant_and_followed(recorded: Path) -> None:
+    result = q2r2("replay", str(recorded), "--joints", "--plant", "kinematic")
+    assert result.exit_code == 0
+    assert " references sent, 0 held back; the others were followed to " in result.stdout
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (("--joints",), "--joints needs --plant mujoco or --plant kinematic"),
+        (("--joints", "--plant", "kinematic", "--compare"), "--joints and --compare exclude each other"),
+        (("--viewer",), "--viewer: without --plant there is no window; allowed: --plant mujoco"),
+        (("--plant", "kinematic", "--viewer"), "--viewer: the kinematic plant has no window"),
+        (("--plant", "mujoco", "--compare"), "recorded with KinematicPlant"),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, tuple) else "",
+)
+def test_options_that_cannot_be_together_are_one_line_and_exit_code_2(
+    recorded: Path, options: tuple[str, ...], said: str
+) -> None:
+    result = q2r2("replay", str(recorded), *options)
+    assert (result.exit_code, result.stdout, result.stderr.count("\n")) == (2, "", 1)
+    assert said in result.stderr
+
+
 def test_a_file_that_is_no_recording_is_one_line_and_exit_code_2(tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("no recording\n")
     for file in (tmp_path / "notes.txt", tmp_path / "missing.mcap"):

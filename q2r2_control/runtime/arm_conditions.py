@@ -1,0 +1,56 @@
+"""What a hand is to feel of its arm besides its state: nearness, position limits, contact. For both loops."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import pinocchio as pin
+
+from q2r2_control.control.controller import CartesianController
+from q2r2_control.teleop.haptics import ArmCondition
+from q2r2_control.types import RobotState, StepReport
+
+_DAMPING = 1e-4  # of a wrench's estimate where a posture is singular [m^2]
+_LIMIT_LASTS = 0.5  # a joint counts as at its limit for so long after it last was: limits bind on and off [s]
+_LIMIT = " position"  # ends the names of position limits in a report
+
+
+class ArmConditions:
+    """Looks at a controller and at what was measured. Times are the loop's [s]."""
+
+    def __init__(self, controller: CartesianController) -> None:
+        robot = controller.robot
+        self._controller, self._robot = controller, robot
+        self._data = robot.model.createData()
+        self._joints = {arm: {robot.joint_names[j] for j in robot.arms[arm].joints} for arm in robot.arms}
+        self._limited: dict[str, float] = {}  # when a joint last was at its position limit [s]
+
+    def note(self, report: StepReport, now: float) -> None:
+        """Remember which limits held up a step; of every tick."""
+        for name in report.binding:
+            if name.endswith(_LIMIT):
+                self._limited[name.removesuffix(_LIMIT)] = now
+
+    def look(self, state: RobotState, now: float) -> Mapping[str, ArmCondition]:
+        """Of every arm, at ``now``; less often than every tick, since distances take their time."""
+        self._limited = {name: t for name, t in self._limited.items() if now - t <= _LIMIT_LASTS}
+        return {
+            arm: ArmCondition(
+                self._controller.spare_distance(arm),
+                frozenset(joints & self._limited.keys()),
+                self._contact_force(arm, state),
+            )
+            for arm, joints in self._joints.items()
+        }
+
+    def _contact_force(self, arm: str, state: RobotState) -> float | None:
+        if state.tau_external is None or not np.isfinite((state.tau_external, state.q)).all():
+            return None
+        members = self._robot.arms[arm]
+        jacobian = pin.computeFrameJacobian(
+            self._robot.model, self._data, state.q, members.frame_id, pin.LOCAL_WORLD_ALIGNED
+        )[:, members.joints]
+        square = jacobian @ jacobian.T + _DAMPING * np.eye(6)
+        wrench = np.linalg.solve(square, jacobian @ state.tau_external[members.joints])
+        return float(np.linalg.norm(wrench[:3]))
