@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV   := .venv
 BIN    := $(VENV)/bin
 
-.PHONY: setup demo test test-slow test-ros test-lerobot lint bench soak clean
+.PHONY: setup demo test test-slow test-ros test-ros-slow test-lerobot lint bench soak soak-ros clean
 .DEFAULT_GOAL := setup
 
 setup: $(VENV)/.installed
@@ -34,8 +34,16 @@ test-slow: setup
 
 # Real processes with real timeouts of 150 ms. Those with a whole set of nodes run on their own, since it keeps two cores busy.
 test-ros: setup
-	$(BIN)/python -m pytest tests/ros -n 2 --dist loadfile -m 'not alone'; failed=$$?; \
-		$(BIN)/python -m pytest tests/ros -m alone && exit $$failed
+	$(BIN)/python -m pytest tests/ros -n 2 --dist loadfile -m 'not alone and not slow'; failed=$$?; \
+		$(BIN)/python -m pytest tests/ros -m 'alone and not slow' && exit $$failed
+
+# What plays motions with whole sets of nodes for minutes, or builds packages.
+test-ros-slow: setup
+	$(BIN)/python -m pytest tests/ros -m 'slow and not soak'
+
+# With those: the README's command started ten times, and each arm's node stalled fifty times.
+soak-ros: setup
+	$(BIN)/python -m pytest tests/ros -m soak
 
 # The real package, whose loader reads what q2r2 export lerobot writes. It takes some gigabytes, so it has an environment of its own.
 LEROBOT := .venv-lerobot
