@@ -65,6 +65,10 @@ class RunningRecorder:
     def wait(self, key: str, value: object) -> None:
         wait_until(lambda: self.state()[key] == value, f"{key} is {value}")
 
+    def wait_for_messages(self, count: int) -> None:
+        """What was published before Ctrl-C may still be on its way: wait until so many have been taken."""
+        wait_until(lambda: self.state()["messages"] >= count, f"{count} messages have been taken")
+
     @property
     def folder(self) -> Path:
         return Path(self.state()["file"]).parent
@@ -101,7 +105,8 @@ def test_messages_are_in_the_file_to_the_byte_and_no_ros_is_needed_to_read_it(
 
     before = time.time_ns()
     last = publish(node, 100)
-    recorder.wait("lost_messages", 0)
+    recorder.wait_for_messages(100)
+    assert recorder.state()["lost_messages"] == 0
     folder = recorder.end()
     assert read_elsewhere(folder, tmp_path)[HAND]["count"] == 100
     with AnyReader([folder]) as reader:
@@ -118,10 +123,11 @@ def test_pictures_of_a_real_camera_are_kept_as_they_came(node: Any, processes: P
     recorder = RunningRecorder(node, processes, tmp_path, changed_cell(tmp_path, cameras={"front": camera}))
     publisher = node.create_publisher(CompressedImage, camera["topic"], 10)
     wait_until(publisher.get_subscription_count, "the recorder listens")
-    sent = [bytes([number]) * 20_000 for number in range(10)]
+    sent = [bytes([number]) * 5_000 for number in range(10)]
     for picture in sent:
         publisher.publish(CompressedImage(format="jpeg", data=picture))
         time.sleep(0.02)
+    recorder.wait_for_messages(len(sent))
     assert [found.jpeg for found in open_recording(recorder.end()).pictures("front")] == sent
 
 
@@ -165,7 +171,7 @@ def felt(rig: ArmRig, pulse: Pulse) -> None:
 
 def test_a_killed_recorder_leaves_a_file_that_its_writer_closes(recorder: RunningRecorder, node: Any) -> None:
     publish(node, 100)
-    recorder.wait("lost_messages", 0)
+    recorder.wait_for_messages(100)
     folder = recorder.folder
     os.kill(recorder.process.pid, signal.SIGKILL)
     wait_until(lambda: is_closed(folder), "the file is closed")
