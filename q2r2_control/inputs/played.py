@@ -66,6 +66,12 @@ class PlayedInput:
                 self._next[index] = next(stream)
         return sorted(samples, key=lambda sample: sample.pose_stamp)
 
+    def due(self) -> float:
+        """When the next sample comes due, on the clock of the polls [s]; inf where there was no poll yet."""
+        if self._origin is None:
+            return math.inf
+        return self._origin + min((sample.due for sample in self._next), default=math.inf)
+
     def _samples(self, hand: str, sampling: Sampling) -> Iterator[_Played]:
         for t in sampling.times():
             pose = sampling.measured(self._pose(hand, t), t)

@@ -2,7 +2,8 @@
 
 rclpy's own executor wakes for each message, and for each callback it collects all entities, builds a wait set and
 makes a task, twice. In a node that ticks that takes much processor time, for messages that wait for the next tick
-anyway.
+anyway. A wait set takes as long as all the rest of an idle tick, even one that is kept: this one sleeps until the
+next timer.
 """
 
 from __future__ import annotations
@@ -12,8 +13,10 @@ import math
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, suppress
+from itertools import compress
 from typing import Any
 
+from rclpy.clock import ROSClock
 from rclpy.context import Context
 from rclpy.event_handler import EventHandler
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor, TimeoutException
@@ -23,6 +26,7 @@ from rclpy.task import Task
 
 # Between two looks at what does not wait for a tick: services, clients and actions, and events [s].
 _CALLS_PERIOD, _EVENTS_PERIOD = 0.02, 0.5
+_LONG = 10**18  # [ns]
 _MOST_MESSAGES = 100  # of one subscription between two ticks
 # What nodes have, and its name in wait sets, in the order of a wait set's sizes.
 _KINDS = {
@@ -38,8 +42,9 @@ _KINDS = {
 class TickExecutor(SingleThreadedExecutor):
     """Waits for timers only, and takes all messages before it runs them.
 
-    Services, clients and actions are looked at fifty times a second; events, which tell of settings that do not match,
-    twice a second. They are rclpy's executor to run, as callbacks are that are coroutines.
+    Services, clients, actions, and what other threads ask for, are looked at fifty times a second; events, which tell
+    of settings that do not match, twice a second. They are rclpy's executor to run, as callbacks are that are
+    coroutines.
     """
 
     def __init__(self, *, context: Context | None = None) -> None:
@@ -49,6 +54,8 @@ class TickExecutor(SingleThreadedExecutor):
         self._held = ExitStack()  # an entity that is destroyed lives until it is no longer looked at
         self._waiting = False  # a coroutine
         self._subscriptions: list[Any] = []
+        self._timers: list[Any] = []
+        self._ros_clocks: list[ROSClock] = []  # of the timers
         self._ticks = self._calls = self._events = _KeptWaitSet({}, (), self._context)
 
     def add_node(self, node: Node) -> bool:
@@ -80,7 +87,7 @@ class TickExecutor(SingleThreadedExecutor):
             self._collect()
             self._run_others()
         unlimited = timeout_sec is None or timeout_sec < 0.0
-        ready, others = self._ticks.wait(_CALLS_PERIOD if unlimited else min(timeout_sec or 0.0, _CALLS_PERIOD))
+        ready, others = self._wait(_CALLS_PERIOD if unlimited else min(timeout_sec or 0.0, _CALLS_PERIOD))
         if not self._context.ok():
             raise ExternalShutdownException
         self.take_messages()
@@ -97,6 +104,17 @@ class TickExecutor(SingleThreadedExecutor):
                 if (taken := self._take_subscription(subscription)) is None:
                     break
                 _call(taken)
+
+    def _wait(self, timeout: float) -> tuple[list[Any], bool]:
+        """Wait for at most ``timeout`` [s]; returns the timers that may be ready, and whether something else is."""
+        if any(clock.ros_time_is_active for clock in self._ros_clocks):
+            return self._ticks.wait(timeout)  # which notices that simulated time has moved on
+        left = [timer.handle.time_until_next_call() for timer in self._timers]  # [ns]; None: cancelled
+        longest = min(int(timeout * 1e9), min((one for one in left if one is not None), default=_LONG))
+        if longest > 0:
+            time.sleep(longest * 1e-9)
+        due = [one is not None and one <= longest for one in left]
+        return list(compress(self._timers, due)), False
 
     def _something_else_is_ready(self) -> bool:
         now, ready = time.monotonic(), False
@@ -140,9 +158,12 @@ class TickExecutor(SingleThreadedExecutor):
         actions = [one for one in waitables if not isinstance(one, EventHandler)]
         self._subscriptions = [one for one in found["subscription"] if _is_plain(one)]
         coroutines = {kind: [one for one in found[kind] if not _is_plain(one)] for kind in ("subscription", "timer")}
-        timers = [one for one in found["timer"] if _is_plain(one)]
-        calls = coroutines | {kind: found[kind] for kind in ("client", "service", "guard")}
-        self._ticks = _KeptWaitSet({"timer": timers, "guard": [self._guard, self._sigint_gc]}, (), self._context)
+        self._timers = timers = [one for one in found["timer"] if _is_plain(one)]
+        clocks = {id(one.clock): one.clock for one in timers}
+        self._ros_clocks = [clock for clock in clocks.values() if isinstance(clock, ROSClock)]
+        own = [self._guard, self._sigint_gc]
+        calls = coroutines | {kind: found[kind] for kind in ("client", "service")} | {"guard": found["guard"] + own}
+        self._ticks = _KeptWaitSet({"timer": timers, "guard": own}, (), self._context)
         self._calls = _KeptWaitSet(calls, actions, self._context)
         self._events = _KeptWaitSet({}, events, self._context)
 
@@ -167,6 +188,8 @@ class _KeptWaitSet:
 
     def wait(self, timeout: float) -> tuple[list[Any], bool]:
         """Wait for at most ``timeout`` [s]; returns the timers that are ready, and whether something else is."""
+        if not self._kinds and not self._waitables:
+            return [], False  # rcl takes it for a mistake
         wait_set = self._wait_set
         wait_set.clear_entities()
         for name, _, handles in self._kinds:

@@ -18,7 +18,7 @@ from q2r2_control.ros.bridge.hand_topics import HandPublishers
 from q2r2_control.ros.monitoring.hand_listeners import HandListeners
 from q2r2_control.types import SIDES, HandSample
 
-_PERIOD = 0.002  # samples that came due are published this often [s]
+_SHORTEST, _LONGEST = 0.001, 0.02  # between two looks at what has come due [s]
 # Of the script, when it is decided whether the buttons are pressed, and whether the hands move [s].
 _BEFORE_PRESS, _BEFORE_MOTION = FIRST_PRESS - 0.1, START - 0.05
 # An arm that stops within this time of a motion's begin is engaged again, if it is ready within the same time [s], and
@@ -44,6 +44,8 @@ class SimulationInput(BaseNode):
     node after a crash does not, and the arms that the crash has stopped must not move then. Use ``start_on_request``
     there: after each start nothing is published until ``~/start`` is called.
     """
+
+    ticks = True
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("simulation_input", **kwargs)
@@ -81,7 +83,7 @@ class SimulationInput(BaseNode):
         self._not_to_press: set[str] | None = None  # hands; None: that is not decided yet
         self._rewind(self.now)
         self.create_service(Trigger, "~/start", self._on_start)
-        self.create_timer(_PERIOD, self._play)
+        self._timer = self.create_timer(_LONGEST, self._tick)
 
     def health(self) -> tuple[bytes, str, Mapping[str, Any]]:
         """What is played, or which subscriber is missing."""
@@ -105,6 +107,13 @@ class SimulationInput(BaseNode):
         self._waits_for_request = False
         self._rewind(self.now)
         return response
+
+    def _tick(self) -> None:
+        """Play, and come again when the next sample is due."""
+        self._play()
+        wait = min(max(self._script.due() - self.now, _SHORTEST), _LONGEST)
+        self._timer.timer_period_ns = int(1e9 * wait)
+        self._timer.reset()
 
     def _play(self) -> None:
         if self._waits_for_request:
