@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import os
 import signal
@@ -189,6 +190,9 @@ def run_node(make: Callable[[], Node], args: Sequence[str] | None = None) -> int
         node = make()
         executor = TickExecutor() if getattr(node, "ticks", False) else SingleThreadedExecutor()
         executor.add_node(node)
+        # What there is now stays: a collection of all of it would take longer than a tick.
+        gc.collect()
+        gc.freeze()
         while rclpy.ok() and not stop.asked and getattr(node, "exit_code", None) is None:
             executor.spin_once(timeout_sec=0.1)
     except (Q2R2Error, ParameterException) as error:

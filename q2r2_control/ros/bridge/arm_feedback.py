@@ -65,6 +65,8 @@ class ArmFeedback:
             self._hand.feel(pulse)
         if not 0.0 <= now - self._shown < _MARKER_PERIOD:
             self._shown = now
+            if not self._markers.get_subscription_count():
+                return
             asked = None if sent is None else sagged(sent, target.sag)  # where the tool is to be
             for marker in self._drawn.at(asked, tool, engaged, now):
                 self._markers.publish(marker)

@@ -58,14 +58,21 @@ class FrameTree:
 
     def __init__(self) -> None:
         self._edges: dict[str, _Edge] = {}
+        self._found: dict[tuple[str, str], Placement | None] = {}  # since a transform last came
 
     def set(self, transform: Transformed, received: float) -> None:
         """Store one transform; one with numbers that are not finite, or without a unit quaternion, is ignored."""
         if _is_pose(transform):
             self._edges[_name(transform.child_frame_id)] = _Edge(transform, received)
+            self._found.clear()
 
     def find(self, frame: str, within: str) -> Placement | None:
         """Pose of ``frame`` in ``within``; None if no chain of transforms connects them."""
+        if (frame, within) not in self._found:
+            self._found[frame, within] = self._search(frame, within)
+        return self._found[frame, within]
+
+    def _search(self, frame: str, within: str) -> Placement | None:
         up = dict(self._upwards(_name(within)))
         for name, placement in self._upwards(_name(frame)):
             if name in up:
@@ -190,6 +197,7 @@ class PoseTopic:
     def __init__(self, node: BaseNode, topic: str, tree: FrameTree, world: str, timeout: float) -> None:
         self._tree, self._world, self._timeout = tree, world, timeout
         self._newest: tuple[PoseStamped, float] | None = None
+        self._pose: pin.SE3 | None = None  # of the newest, in the message's frame
         self._topic, self._publishers = topic, Publishers(node, [topic])
         self._publishers.look_steadily()
         self.problem: str | None = None
@@ -207,14 +215,13 @@ class PoseTopic:
             return None
         frame = message.header.frame_id
         placement = self._tree.find(frame, self._world) if frame else Placement(pin.SE3.Identity(), math.inf)
-        pose = pose_of(message.pose)
-        if pose is None:
+        if self._pose is None:
             self.problem = f"{self._topic}: not finite or not a rotation"
         elif placement is None:
             self.problem = f"no transform from {frame} of {self._topic} to {self._world} on /tf"
         else:
             self.problem = None
-            return placement.pose * pose
+            return placement.pose * self._pose
         return None
 
     @property
@@ -231,4 +238,4 @@ class PoseTopic:
         return self.problem
 
     def _take(self, message: PoseStamped, now: float) -> None:
-        self._newest = message, now
+        self._newest, self._pose = (message, now), pose_of(message.pose)

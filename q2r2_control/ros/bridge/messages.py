@@ -78,12 +78,12 @@ def stamped_pose(pose: pin.SE3, frame: str, t: float) -> PoseStamped:
 
 def pose_of(message: Pose) -> pin.SE3 | None:
     """The pose of a message, its quaternion normalised; None for numbers that are not finite or no rotation."""
-    position = np.array([message.position.x, message.position.y, message.position.z])
-    quaternion = _quaternion(message)
-    norm = float(np.linalg.norm(quaternion))
-    if not (np.isfinite(position).all() and abs(norm - 1.0) <= _UNIT):
+    p, o = message.position, message.orientation
+    norm = math.hypot(o.x, o.y, o.z, o.w)
+    # A sum or a norm with NaN or infinity in it is not finite.
+    if not (math.isfinite(p.x + p.y + p.z) and abs(norm - 1.0) <= _UNIT):
         return None
-    return pin.SE3(pin.Quaternion(quaternion / norm).toRotationMatrix(), position)
+    return pin.XYZQUATToSE3(np.array((p.x, p.y, p.z, o.x / norm, o.y / norm, o.z / norm, o.w / norm)))
 
 
 def pose_numbers(pose: pin.SE3) -> tuple[float, ...]:

@@ -21,6 +21,7 @@ _NO_WAIT = Duration(nanoseconds=0)
 # A subscriber may take 5 ms to acknowledge, longer than the period of a fast stream. So messages are left out every
 # _CHECK seconds, until the one before has been acknowledged, or for at most _GAP seconds.
 _CHECK, _GAP = 0.05, 0.015
+_ASKED = 0.02  # after all was acknowledged, it is asked again [s]
 _LIFESPAN = SENT_COMMAND_QOS.lifespan.nanoseconds * 1e-9  # [s]
 
 
@@ -141,6 +142,8 @@ class WatchedPublisher:
         if not self._streaming:
             return None
         now = time.monotonic()
+        if self._acknowledged is not None and now - self._acknowledged < _ASKED:
+            return None
         if self._publisher.wait_for_all_acked(_NO_WAIT):
             self._acknowledged = now
         if self._acknowledged is None or now - self._acknowledged <= self._timeout:
