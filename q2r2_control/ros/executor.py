@@ -3,7 +3,7 @@
 rclpy's own executor wakes for each message, and for each callback it collects all entities, builds a wait set and
 makes a task, twice. In a node that ticks that takes much processor time, for messages that wait for the next tick
 anyway. A wait set takes as long as all the rest of an idle tick, even one that is kept: this one sleeps until the
-next timer.
+next tick.
 """
 
 from __future__ import annotations
@@ -55,6 +55,7 @@ class TickExecutor(SingleThreadedExecutor):
         self._waiting = False  # a coroutine
         self._subscriptions: list[Any] = []
         self._timers: list[Any] = []
+        self._periods: list[int] = []  # [ns]
         self._ros_clocks: list[ROSClock] = []  # of the timers
         self._ticks = self._calls = self._events = _KeptWaitSet({}, (), self._context)
 
@@ -109,8 +110,11 @@ class TickExecutor(SingleThreadedExecutor):
         """Wait for at most ``timeout`` [s]; returns the timers that may be ready, and whether something else is."""
         if any(clock.ros_time_is_active for clock in self._ros_clocks):
             return self._ticks.wait(timeout)  # which notices that simulated time has moved on
+        # Until the next tick, and not until each slower timer: those that come due in between run with it.
         left = [timer.handle.time_until_next_call() for timer in self._timers]  # [ns]; None: cancelled
-        longest = min(int(timeout * 1e9), min((one for one in left if one is not None), default=_LONG))
+        tick = min((p for p, one in zip(self._periods, left, strict=True) if one is not None), default=0)
+        until = [one for p, one in zip(self._periods, left, strict=True) if one is not None and p == tick]
+        longest = min(int(timeout * 1e9), *until, _LONG)
         if longest > 0:
             time.sleep(longest * 1e-9)
         due = [one is not None and one <= longest for one in left]
@@ -159,6 +163,7 @@ class TickExecutor(SingleThreadedExecutor):
         self._subscriptions = [one for one in found["subscription"] if _is_plain(one)]
         coroutines = {kind: [one for one in found[kind] if not _is_plain(one)] for kind in ("subscription", "timer")}
         self._timers = timers = [one for one in found["timer"] if _is_plain(one)]
+        self._periods = [int(one.timer_period_ns) for one in timers]
         clocks = {id(one.clock): one.clock for one in timers}
         self._ros_clocks = [clock for clock in clocks.values() if isinstance(clock, ROSClock)]
         own = [self._guard, self._sigint_gc]

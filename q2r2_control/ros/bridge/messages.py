@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -171,13 +172,9 @@ def robot_state(message: JointState, names: Sequence[str], t: float) -> RobotSta
 
     Other joints in the message are ignored. Velocities and torques may be missing as a whole and are then zero.
     """
-    columns: Mapping[str, int] = {name: index for index, name in enumerate(message.name)}
-    if len(columns) != len(message.name):
-        return "a joint is named twice"
-    missing = [name for name in names if name not in columns]
-    if missing:
-        return f"no joint {missing[0]}" + (f" and {len(missing) - 1} more" if len(missing) > 1 else "")
-    order = [columns[name] for name in names]
+    order = _order(tuple(message.name), tuple(names))
+    if isinstance(order, str):
+        return order
     values = []
     for field, required in (("position", True), ("velocity", False), ("effort", False)):
         numbers = np.array(getattr(message, field), dtype=np.float64)
@@ -191,6 +188,18 @@ def robot_state(message: JointState, names: Sequence[str], t: float) -> RobotSta
             return f"{field} of {names[int(np.flatnonzero(~np.isfinite(numbers))[0])]} is not finite"
         values.append(numbers)
     return RobotState(q=values[0], v=values[1], tau=values[2], tau_external=None, stamp=t)
+
+
+@lru_cache(maxsize=64)  # publishers send the same names again and again
+def _order(given: tuple[str, ...], names: tuple[str, ...]) -> Array | str:
+    """Where each of ``names`` is among those of a message; or what is wrong with these, in one line."""
+    columns: Mapping[str, int] = {name: index for index, name in enumerate(given)}
+    if len(columns) != len(given):
+        return "a joint is named twice"
+    missing = [name for name in names if name not in columns]
+    if missing:
+        return f"no joint {missing[0]}" + (f" and {len(missing) - 1} more" if len(missing) > 1 else "")
+    return np.array([columns[name] for name in names], dtype=np.intp)
 
 
 def _quaternion(message: Pose) -> Array:
