@@ -22,7 +22,8 @@ from q2r2_control.ros.launch.processes import NodeProcess, nodes_of
 
 _START_TIMEOUT = 300.0  # kernels may have to be compiled [s]
 _SETTLE = 3.0  # after the nodes have begun, and after the hands have [s]
-_SCRIPT = NodeProcess("SimulationInput", "q2r2_control.ros.nodes.simulation_input")
+_JITTER = 0.002  # of a headset's samples: each comes later by up to this [s]
+_SCRIPT = NodeProcess("SimulationInput", "q2r2_control.ros.nodes.simulation_input", {"jitter": _JITTER})
 
 
 class LoadError(Q2R2Error):

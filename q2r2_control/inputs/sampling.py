@@ -35,10 +35,10 @@ class Sampling(Protocol):
 
 
 class EvenSampling:
-    """Exact poses at an even rate [Hz], received at once."""
+    """Exact poses at an even rate [Hz], received at once, or each later by up to ``jitter`` [s], from ``seed``."""
 
-    def __init__(self, rate_hz: float) -> None:
-        self._rate = rate_hz
+    def __init__(self, rate_hz: float, jitter: float = 0.0, seed: int | tuple[int, ...] = 0) -> None:
+        self._rate, self._jitter, self._random = rate_hz, jitter, np.random.default_rng(seed)
 
     def times(self) -> Iterator[float]:
         """See :class:`Sampling`."""
@@ -53,7 +53,7 @@ class EvenSampling:
 
     def lateness(self) -> float:
         """See :class:`Sampling`."""
-        return 0.0
+        return float(self._random.uniform(0.0, self._jitter))
 
 
 class HeadsetSampling:

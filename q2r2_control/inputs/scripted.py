@@ -27,10 +27,12 @@ class ScriptedInput(PlayedInput):
     """Plays a trajectory of both hands, from the first poll on. Implements :class:`Input`.
 
     ``human`` adds, all from ``seed``: tremor of 8-12 Hz with about 1 mm and 0.3 degrees, sensor noise, sampling at
-    72-76 Hz (``rate_hz`` then means nothing) with late receipts and dropouts of up to 5 samples. The samples do not
-    depend on when they are polled. Circle, line and rotate repeat ``frequency_hz`` times a second.
+    72-76 Hz (``rate_hz`` and ``jitter`` then mean nothing) with late receipts and dropouts of up to 5 samples. Without
+    it samples are received at an even rate, or each later by up to ``jitter`` [s]. They do not depend on when they are
+    polled. Circle, line and rotate repeat ``frequency_hz`` times a second.
 
-    Raises :class:`ConfigError` for an unknown trajectory or hand, or a rate that is not positive.
+    Raises :class:`ConfigError` for an unknown trajectory or hand, a rate that is not positive, or a jitter of more than
+    half of the time between two samples.
     """
 
     def __init__(
@@ -41,6 +43,7 @@ class ScriptedInput(PlayedInput):
         seed: int = 0,
         rate_hz: float = 75.0,
         frequency_hz: float = 0.25,
+        jitter: float = 0.0,
     ) -> None:
         for hand in hands:
             if hand not in SIDES:
@@ -48,12 +51,16 @@ class ScriptedInput(PlayedInput):
         for name, value, limit in (("rate_hz", rate_hz, 2000.0), ("frequency_hz", frequency_hz, 2.0)):
             if not 0.0 < value <= limit:
                 raise ConfigError(f"scripted input: {name} = {value!r}: allowed is above 0 and up to {limit:g}")
+        if not 0.0 <= jitter <= 0.5 / rate_hz:
+            raise ConfigError(
+                f"scripted input: jitter = {jitter!r}: allowed is 0 .. {0.5 / rate_hz:.3g}, half a sample"
+            )
         self._trajectory = trajectory_named(trajectory)
         self._frequency = frequency_hz
 
         def sampling(hand: str) -> Sampling:
             if not human:
-                return EvenSampling(rate_hz)
+                return EvenSampling(rate_hz, jitter, (seed, SIDES.index(hand)))
             return HeadsetSampling(hand, seed, tremor=True, dropout_probability=_DROPOUT_PROBABILITY)
 
         super().__init__(self._ideal, self._trajectory.inputs, {hand: sampling(hand) for hand in hands})

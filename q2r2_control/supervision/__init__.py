@@ -1,11 +1,12 @@
 """What stops an arm, and what keeps one from starting: the same rules for the pipeline and the ROS nodes.
 
 ``supervisor`` decides at every tick what the controller is asked for and whether the arms may move; ``joint_watch``
-judges measured states, ``targets`` and ``target_stream`` who is followed, ``tick_pacer`` what a late tick may move,
-``delay_watch`` and ``sequence_watch`` whether a message is of the past, or of another sender; ``joint_homing``,
-``homing`` and ``external_arms`` are special ways to be led. ``preflight`` looks at a cell before it runs, and
-``target_guard`` limits targets for controllers that have no limits of their own. For loops that drive grippers, as the
-pipeline does, there are ``gripper_limiter`` and ``grasp_watch``. No ROS and no clock in here.
+judges measured states, ``targets`` and ``target_stream`` who is followed, ``target_line`` where to, ``tick_clock`` when
+a tick counts, ``tick_pacer`` what a late one may move, ``delay_watch`` and ``sequence_watch`` whether a message is of
+the past, or of another sender; ``joint_homing``, ``homing`` and ``external_arms`` are special ways to be led.
+``preflight`` looks at a cell before it runs, and ``target_guard`` limits targets for controllers that have no limits of
+their own. For loops that drive grippers, as the pipeline does, there are ``gripper_limiter`` and ``grasp_watch``. No
+ROS and no clock in here.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
     from q2r2_control.supervision.supervisor import Phase, Supervisor
     from q2r2_control.supervision.target_guard import TargetGuard
     from q2r2_control.supervision.target_stream import Origins, Refusal, StreamSettings, TargetStream
+    from q2r2_control.supervision.tick_clock import TickClock
     from q2r2_control.supervision.tick_pacer import TickPacer
 
 __all__ = [
@@ -45,6 +47,7 @@ __all__ = [
     "Supervisor",
     "TargetGuard",
     "TargetStream",
+    "TickClock",
     "TickPacer",
     "WatchSettings",
     "preflight_faults",
@@ -70,6 +73,7 @@ __getattr__ = lazy_exports(
         "Supervisor": "supervisor",
         "TargetGuard": "target_guard",
         "TargetStream": "target_stream",
+        "TickClock": "tick_clock",
         "TickPacer": "tick_pacer",
         "WatchSettings": "joint_watch",
         "preflight_faults": "preflight",

@@ -25,6 +25,11 @@ class DelayWatch:
         self._usual, self._stamp = math.inf, 0.0
         self._late_since: float | None = None
 
+    @property
+    def usual(self) -> float:
+        """The least delay of the past [s], which clocks that drift apart may change; inf before the first message."""
+        return self._usual
+
     def take(self, delay: float, now: float) -> float:
         """How much too late [s] a message is that came at ``now`` [s] with ``delay`` [s]; 0 if it may be used.
 

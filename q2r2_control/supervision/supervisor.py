@@ -124,19 +124,26 @@ class Supervisor:
             self.events.append(f"joint states: {self._watch.fault}")
 
     def take_target(
-        self, arm: str, pose: pin.SE3 | None, now: float, number: int | None = None, measured: pin.SE3 | None = None
+        self,
+        arm: str,
+        pose: pin.SE3 | None,
+        now: float,
+        number: int | None = None,
+        measured: pin.SE3 | None = None,
+        due: float | None = None,
     ) -> Refusal | None:
         """A target in the world frame, or None for one that was no pose; returns why it is not followed, or None.
 
         ``number`` is the one among its publisher's messages, where the middleware tells; ``measured`` the tool's pose
-        at the measured state, which is computed where it is needed and not given.
+        at the measured state, which is computed where it is needed and not given; ``due``: when the target is to be
+        reached [s], None: at once, and until the next one comes.
         """
         tools: list[pin.SE3] = []
         if not self._targets.follows_on(arm, now):
             tools.append(self._controller.tool_pose(arm))
             if self._external is None and self._watch.state is not None:
                 tools.append(self._robot.tool_pose(self._watch.state.q, arm) if measured is None else measured)
-        return self._targets.take(arm, pose, tools, now, number, self.no_targets)
+        return self._targets.take(arm, pose, tools, now, number, self.no_targets, due)
 
     def release_target(self, arm: str) -> None:
         """The sender of an arm's targets ended them: the arm holds, and the next target begins a stream."""
@@ -324,7 +331,7 @@ class Supervisor:
         if isinstance(self._homing, Homing):
             return self._homing.targets(dt)
         if self._homing is None:
-            return self._targets.poses
+            return self._targets.at(now)
         if self._last is not None:
             self._controller.hold_at(self._homing.step(self._last.q, self._last.v, dt))
         return dict.fromkeys(self._targets.arms)

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Sequence
 import pinocchio as pin
 
 from q2r2_control.supervision.sequence_watch import SequenceWatch
+from q2r2_control.supervision.target_line import TargetLine
 from q2r2_control.supervision.target_stream import Origins, Refusal, StreamSettings, TargetStream
 
 
@@ -16,13 +17,13 @@ class Targets:
     def __init__(self, arms: Iterable[str], settings: StreamSettings, origins: Origins) -> None:
         self._settings, self._origins = settings, origins
         self._streams = {arm: TargetStream(settings) for arm in arms}
+        self._lines = {arm: TargetLine() for arm in self._streams}
         self._sequences = {arm: SequenceWatch() for arm in self._streams}
         self.ended: dict[str, str] = {}  # arms that hold since their targets ended, with a line that says so
 
-    @property
-    def poses(self) -> dict[str, pin.SE3 | None]:
-        """What each arm follows; None: it holds."""
-        return {arm: stream.pose for arm, stream in self._streams.items()}
+    def at(self, now: float) -> dict[str, pin.SE3 | None]:
+        """What each arm follows at ``now`` [s], see :mod:`target_line`; None: it holds."""
+        return {arm: self._lines[arm].at(now) if stream.following else None for arm, stream in self._streams.items()}
 
     @property
     def arms(self) -> tuple[str, ...]:
@@ -51,14 +52,17 @@ class Targets:
         now: float,
         number: int | None,
         forbidden: str | None,
+        due: float | None = None,
     ) -> Refusal | None:
         """Take a target, None for one that was no pose; returns why it is not followed, or None.
 
         ``tools``: see :meth:`TargetStream.offer`; ``number``: of the message at its publisher, None where that is not
-        known; ``forbidden``: why no arm may follow targets now, or None.
+        known; ``forbidden``: why no arm may follow targets now, or None; ``due``: see :meth:`TargetLine.put`.
         """
         stream = self._streams[arm]
         others = None if number is None else self._other_publishers(arm, number, now)
+        if not stream.following:
+            self._lines[arm].reset()
         refusal = None if pose is None else stream.offer(pose, tools, now)
         if others is not None:
             stream.drop()
@@ -69,6 +73,7 @@ class Targets:
             stream.drop()
             return Refusal("stream", forbidden)
         if refusal is None:
+            self._lines[arm].put(pose, due)
             self.ended.pop(arm, None)
             return None
         return Refusal("stream", refusal)

@@ -19,15 +19,17 @@ from q2r2_control.robot.compose import WORLD
 from q2r2_control.robot.robot import Robot
 from q2r2_control.ros.base_node import COMMAND_QOS, STREAM_QOS, BaseNode
 from q2r2_control.ros.bridge.joint_outputs import joints_of
-from q2r2_control.ros.bridge.messages import delay, pose_of, robot_state
+from q2r2_control.ros.bridge.messages import age, delay, pose_of, robot_state, seconds
 from q2r2_control.ros.monitoring.endpoints import Publishers
 from q2r2_control.supervision.delay_watch import DelayWatch
 from q2r2_control.supervision.target_stream import Refusal
 from q2r2_control.types import Array, RobotState
 
+_LATEST = 0.02  # that a target is received, later than others after the time of its stamp, for that to say anything [s]
 _WARNING_TIME = 1.0  # refused targets are reported for this long [s]
-# Takes an arm's target in the world frame, or None if it is no pose, the time [s], and the message's number.
-Take = Callable[[str, pin.SE3 | None, float, int | None], Refusal | None]
+# Takes an arm's target in the world frame, or None if it is no pose, the time [s], the message's number, and when the
+# target is due [s], or None.
+Take = Callable[[str, pin.SE3 | None, float, int | None, float | None], Refusal | None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,6 +54,7 @@ class TargetIntake:
             self.topics[arm] = topic
         self._publishers = Publishers(node, self.topics.values())
         self._delays = {arm: DelayWatch(STREAM_TIMEOUT) for arm in robot.arms}
+        self._stamps = {arm: DelayWatch(_LATEST) for arm in robot.arms}  # the delays since targets were made
         self._refused: dict[str, tuple[Refusal, float]] = {}  # why an arm's last target was not used, and when [s]
         self.rejected = dict.fromkeys(robot.arms, 0)
 
@@ -83,7 +86,7 @@ class TargetIntake:
         pose = pose_of(message.pose) if message.header.frame_id == frame.name else None
         late = self._delays[arm].take(delay(info), time.monotonic())
         wanted = None if pose is None or late else frame.pose * pose
-        refusal = take(arm, wanted, now, info["publication_sequence_number"])
+        refusal = take(arm, wanted, now, info["publication_sequence_number"], self._due(arm, message, now - age(info)))
         if refusal is not None:
             self._refuse(arm, refusal)
         elif late:
@@ -95,6 +98,15 @@ class TargetIntake:
             self._refuse(arm, Refusal("pose", "not a finite pose with a unit quaternion"))
         else:
             self._refused.pop(arm, None)
+
+    def _due(self, arm: str, message: PoseStamped, received: float) -> float | None:
+        """When a target is due that was received then [s], by its stamp; None where the stamp does not say.
+
+        What is made once a tick is sent a little later at one tick than at another.
+        """
+        stamp, stamps = seconds(message.header.stamp), self._stamps[arm]
+        known = stamp > 0.0 and stamps.take(received - stamp, received) == 0.0
+        return stamp + stamps.usual if known else None
 
     def _refuse(self, arm: str, refusal: Refusal) -> None:
         """Log why targets are not used: once for each kind of fault, until a target is used again or none comes."""

@@ -16,6 +16,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+import pinocchio as pin
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from std_srvs.srv import SetBool, Trigger
@@ -35,7 +36,8 @@ from q2r2_control.ros.managed_node import ManagedNode
 from q2r2_control.supervision.external_arms import ExternalArms, ExternalSettings, settings_for_external_arms
 from q2r2_control.supervision.joint_watch import watch_settings
 from q2r2_control.supervision.supervisor import Displace, Phase, Supervisor
-from q2r2_control.supervision.target_stream import Origins, StreamSettings
+from q2r2_control.supervision.target_stream import Origins, Refusal, StreamSettings
+from q2r2_control.supervision.tick_clock import TickClock
 from q2r2_control.supervision.tick_pacer import TickPacer
 from q2r2_control.types import LONGEST_DT, Reference
 
@@ -87,6 +89,7 @@ class CartesianControllerNode(ManagedNode):
         limit = robot.velocity_limit * config.control.velocity_scale
         acceleration = robot.capped_acceleration(config.control.acceleration_limit)
         self._pacer = TickPacer(self._period, limit, acceleration, self._output.drive.coasts)
+        self._clock_of_ticks = TickClock(self._period)
         self._velocity = np.zeros(robot.model.nv)  # of the last reference [rad/s]
         self._reference: Reference | None = None
         self._commanding = False
@@ -110,7 +113,7 @@ class CartesianControllerNode(ManagedNode):
         return self._output.drive.displaced
 
     def _connect(self) -> None:
-        self._targets.subscribe(self._supervisor.take_target)
+        self._targets.subscribe(self._take_target)
         self._joints.subscribe(self._supervisor.take_joint_state)
         self.create_service(SetBool, "~/pause", self._on_pause)
         services: dict[str, Callable[[], str | None]] = {
@@ -125,11 +128,16 @@ class CartesianControllerNode(ManagedNode):
         # Looks even while /clock stands still.
         self.create_timer(_LOOK_PERIOD, self._look, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
+    def _take_target(
+        self, arm: str, pose: pin.SE3 | None, now: float, number: int | None, due: float | None
+    ) -> Refusal | None:
+        return self._supervisor.take_target(arm, pose, now, number, due=due)
+
     def _tick(self) -> None:
         decided = time.monotonic()
         if self._output.waits():
             return  # this tick is a missed one, and the next a late one
-        now = self.now
+        now = self._clock_of_ticks.at(self.now)
         # A late tick is no jump; a clock that was set back moves nothing.
         gap = now - self._last_tick
         dt = self._pacer.step(gap, self._velocity)

@@ -55,6 +55,9 @@ class SimulationInput(BaseNode):
         )
         trajectory = self.parameter("trajectory", "circle", "What the hands do.", one_of=tuple(TRAJECTORIES))
         rate = self.parameter("rate", 75.0, "Samples of each hand [Hz].", at_least=1.0, at_most=250.0)
+        jitter = self.parameter(
+            "jitter", 0.0, "Samples come later by up to this, at random [s].", at_least=0.0, at_most=0.01
+        )
         self._frame = self.parameter("frame_id", "", "Frame of the poses; a headset gives none.")
         self._waits_for_subscribers = self.parameter(
             "wait_for_subscribers", True, "Start when every hand has a subscriber."
@@ -71,7 +74,7 @@ class SimulationInput(BaseNode):
         }
         self._publishers_of_hands = HandPublishers(self, self._topics.values())
         self._samples = 0
-        self._trajectory, self._rate = trajectory, rate
+        self._trajectory, self._rate, self._jitter = trajectory, rate, jitter
         self._listeners = HandListeners(
             self, {hand: topic for (hand, kind), topic in self._topics.items() if kind is MessageType.INPUTS}
         )
@@ -165,7 +168,7 @@ class SimulationInput(BaseNode):
         self._starts, self._not_to_press = False, set(self._hands)
 
     def _rewind(self, now: float) -> None:
-        self._script = ScriptedInput(self._trajectory, self._hands, rate_hz=self._rate)
+        self._script = ScriptedInput(self._trajectory, self._hands, rate_hz=self._rate, jitter=self._jitter)
         self._script.start()
         self._began, self._not_to_press, self._moves, self._moved_at = now, None, False, None
 

@@ -1,0 +1,60 @@
+"""Where a target is at the time of a tick: on the line through the last two that came.
+
+A loop that takes the newest target at each tick sees a target that stands still in one tick and goes twice as far in
+the next: sender and loop do not tick together. Then an even motion of a hand leaves as uneven speeds of the joints. So
+a target that has moved evenly goes on until the tick, for at most two and a half times the time between the last two.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pinocchio as pin
+
+from q2r2_control.types import Array
+
+# Between two targets of a line: slower ones are steps, and stamps that are nearer say nothing [s].
+_SHORTEST, _LONGEST = 0.001, 0.025
+_LOOKAHEAD = 2.5  # of the time between two: one may be left out, and the next one late
+# Where the last target was not where the line led to, within this, it does not move evenly and is taken as it is.
+_EVEN, _EVEN_TURN = 1.5e-3, 0.01  # [m], [rad]
+
+
+class TargetLine:
+    """The targets of one stream. Times are those at which targets are due [s]."""
+
+    def __init__(self) -> None:
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all targets; the next one begins a line."""
+        self._pose: pin.SE3 | None = None
+        self._due = -math.inf
+        self._gap = 0.0
+        self._twist: tuple[Array, Array] | None = None  # linear, and angular in the target's frame [m/s], [rad/s]
+        self._even = False
+
+    def put(self, pose: pin.SE3, due: float | None) -> None:
+        """A target; ``due``: when it is to be reached, None where that is not known."""
+        last, gap, twist = self._pose, math.nan if due is None else due - self._due, self._twist
+        self._pose, self._due = pose, -math.inf if due is None else due
+        self._twist, self._even = None, False
+        if last is None or not _SHORTEST <= gap <= _LONGEST:
+            return
+        moved = pose.translation - last.translation
+        turned = pin.log3(last.rotation.T @ pose.rotation)
+        if twist is not None:
+            surprise, turn = moved - gap * twist[0], turned - gap * twist[1]
+            self._even = bool(surprise @ surprise <= _EVEN**2 and turn @ turn <= _EVEN_TURN**2)
+        self._gap, self._twist = gap, (moved / gap, turned / gap)
+
+    def at(self, t: float) -> pin.SE3 | None:
+        """Where the target is at ``t`` [s]; None where there is none."""
+        if self._pose is None or self._twist is None or not self._even:
+            return self._pose
+        linear, angular = self._twist
+        ahead = min(max(t - self._due, -self._gap), _LOOKAHEAD * self._gap)
+        return pin.SE3(
+            self._pose.rotation @ pin.exp3(ahead * angular), np.asarray(self._pose.translation + ahead * linear)
+        )
