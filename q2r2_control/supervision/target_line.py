@@ -39,6 +39,8 @@ class TargetLine:
         """A target; ``due``: when it is to be reached, None where that is not known."""
         last, gap, twist = self._pose, math.nan if due is None else due - self._due, self._twist
         self._pose, self._due = pose, -math.inf if due is None else due
+        if 0.0 <= gap < _SHORTEST:
+            return  # a late tick of its sender, and the next one
         self._twist, self._even = None, False
         if last is None or not _SHORTEST <= gap <= _LONGEST:
             return

@@ -18,13 +18,29 @@ def test_a_busy_machines_ticks_are_even_and_on_time() -> None:
     assert np.diff(counted)[200:].std() < 0.05 * np.diff(ran).std()
 
 
-@pytest.mark.parametrize("late", [0.6, 1.5, 20.0, -3.0])
-def test_a_tick_that_is_late_by_half_a_period_or_in_the_past_counts_when_it_runs(late: float) -> None:
+def ten_ticks() -> TickClock:
     clock = TickClock(PERIOD)
     for k in range(10):
         clock.at(k * PERIOD)
-    now = (10 + late) * PERIOD
+    return clock
+
+
+@pytest.mark.parametrize("late", [0.4, 0.9, 1.7, 4.0, 20.3])
+def test_a_late_tick_counts_for_all_that_were_due_and_those_that_hurry_after_it_for_nothing(late: float) -> None:
+    clock = ten_ticks()
+    due = 10 + round(late)
+    assert clock.at((10 + late) * PERIOD) == pytest.approx(due * PERIOD, abs=0.02 * PERIOD)
+    last = clock.at((10 + late + 0.05) * PERIOD)
+    assert last == clock.at((10 + late) * PERIOD)
+    assert clock.at((due + 1) * PERIOD) == pytest.approx((due + 1) * PERIOD, abs=0.03 * PERIOD)
+
+
+@pytest.mark.parametrize("gap", [0.2, 1e6, -0.02, -1e6])
+def test_time_begins_anew_after_a_long_gap_and_where_it_was_set_back(gap: float) -> None:
+    clock = ten_ticks()
+    now = 9 * PERIOD + gap
     assert clock.at(now) == now
+    assert clock.at(now + PERIOD) == pytest.approx(now + PERIOD)
 
 
 def test_another_rate_than_the_wanted_one_is_kept_up_with() -> None:
