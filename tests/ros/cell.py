@@ -172,9 +172,9 @@ def start_robot(processes: Processes) -> RosProcess:
     return processes.start_node("mujoco_robot", f"config:={CONFIG}", f"rate:={NODE_RATE}")
 
 
-def start_controller(processes: Processes, *parameters: str, **environment: str) -> RosProcess:
+def start_controller(processes: Processes, *parameters: str, config: str = CONFIG, **environment: str) -> RosProcess:
     """Start the built-in controller."""
-    given = (f"config:={CONFIG}", f"rate:={NODE_RATE}", *parameters)
+    given = (f"config:={config}", f"rate:={NODE_RATE}", *parameters)
     return processes.start_node("cartesian_controller", *given, **environment)
 
 

@@ -20,17 +20,15 @@ pytestmark = pytest.mark.usefixtures("interfaces")
 from rclpy.parameter import Parameter  # noqa: E402
 from rclpy.parameter_client import AsyncParameterClient  # noqa: E402
 
-from tests.ros.arm_rig import ArmRig, assert_same, offset, steps  # noqa: E402
-
-NODE = "left_q2r2_arm_controller"
+from tests.ros.arm_rig import ArmRig, ArmRigs, assert_same, offset, steps  # noqa: E402
 
 
 class Settable(ArmRig):
     """An arm whose node's parameters can be set and read."""
 
-    def __init__(self, node: Any) -> None:
-        super().__init__(node)
-        self._client = AsyncParameterClient(node, NODE)
+    def __init__(self, node: Any, arm: str = "left") -> None:
+        super().__init__(node, arm)
+        self._client = AsyncParameterClient(node, f"{arm}_q2r2_arm_controller")
 
     def set(self, **values: Any) -> Any:
         """Of ``teleop`` all together, ``__`` stands for a dot; the result, with ``successful`` and ``reason``."""
@@ -128,3 +126,25 @@ def test_mirror_is_set_while_the_arm_is_paused_and_gives_it_the_other_hand(rig: 
     assert rig.set_named({"mirror": False, "mirror_reflected": False}).successful
     rig.wait(lambda: rig.state["hand"] == "left", "the hand is its own again")
     rig.engage()
+
+
+def test_mirror_that_is_set_in_both_nodes_lets_each_hand_drive_the_other_arm(domain: int, processes: Processes) -> None:
+    with spun_node(domain) as node:
+        left, right = rigs = [Settable(node, arm) for arm in ("left", "right")]
+        for rig in rigs:
+            rig.start(processes)
+        both = ArmRigs(list(rigs))
+        both.engage()
+        both.pause()
+        assert left.set_named({"mirror": True}).successful
+        both.wait(lambda rig: "set mirror alike in both" in rig.state["message"], "they say that they differ")
+        assert not any(rig.state["ready"] for rig in rigs)
+        assert right.set_named({"mirror": True}).successful
+        both.wait(lambda rig: rig.state["ready"], "the arms may be engaged")
+        assert (left.state["hand"], right.state["hand"]) == ("right", "left")
+        both.engage()
+        held, before = left.wait_for_rest(), right.wait_for_rest()
+        left.move((0.0, 0.0, 0.05))  # this is the left hand
+        assert_same(right.wait_for_rest(), offset(before, (0.0, 0.0, 0.05)), 1e-3)
+        assert_same(left.newest(), held, 1e-3)
+        assert max(map(max, (steps(rig.targets) for rig in rigs))) < 0.01

@@ -58,7 +58,7 @@ class FrameTree:
 
     def __init__(self) -> None:
         self._edges: dict[str, _Edge] = {}
-        self._found: dict[tuple[str, str], Placement | None] = {}  # since a transform last came
+        self._found: dict[tuple[str, str], Placement] = {}  # since a transform last came
 
     def set(self, transform: Transformed, received: float) -> None:
         """Store one transform; one with numbers that are not finite, or without a unit quaternion, is ignored."""
@@ -68,9 +68,10 @@ class FrameTree:
 
     def find(self, frame: str, within: str) -> Placement | None:
         """Pose of ``frame`` in ``within``; None if no chain of transforms connects them."""
-        if (frame, within) not in self._found:
-            self._found[frame, within] = self._search(frame, within)
-        return self._found[frame, within]
+        found = self._found.get((frame, within))
+        if found is None and (found := self._search(frame, within)) is not None:
+            self._found[frame, within] = found
+        return found
 
     def _search(self, frame: str, within: str) -> Placement | None:
         up = dict(self._upwards(_name(within)))
