@@ -36,7 +36,7 @@ from q2r2_control.control.safety.safety_data import SafetyData
 from q2r2_control.control.safety.safety_model import SafetyModel
 from q2r2_control.control.safety.separating_plane import curvature
 from q2r2_control.control.safety.stop_rollout import begin_rollout, sample_of
-from q2r2_control.control.safety.velocity_bounds import fastest_approach
+from q2r2_control.control.safety.velocity_bounds import fastest_approach, fastest_body
 from q2r2_control.types import Array
 
 
@@ -73,15 +73,19 @@ def measure_pairs(model: SafetyModel, data: SafetyData) -> int:
     for j in range(v.shape[0]):
         surge = max(surge, model.limits.acceleration[j] * model.limits.longest_step)
         duration = max(duration, abs(v[j]) / data.certified[j])
+    horizon = 2.0 / approach.gain + 0.5 * duration
+    fastest = 2.0 * fastest_body(data.velocities)
     for p in range(pairs.first.shape[0]):
         distance[p] = at_least(collision, data.collision, p)
+        data.near[p] = 0
         # The fastest that the pair can close in after this step. Farther than twice what the gain needs for that, and
         # the way of the stop, a row would bind at very low leverage: it would add comfort, and safety needs none.
-        closing = fastest_approach(data.velocities, pairs.first[p], pairs.second[p]) + pairs.leverage[p] * surge
-        relevant = approach.stop_distance[p] + (2.0 / approach.gain + 0.5 * duration) * closing
-        relevant += approach.contact_zone[p]
-        data.near[p] = 0
-        if distance[p] > relevant and distance[p] >= least:
+        always = approach.stop_distance[p] + approach.contact_zone[p] + horizon * pairs.leverage[p] * surge
+        far = distance[p] >= least
+        if far and distance[p] > always + horizon * fastest:
+            continue  # whichever its bodies are, without a look at them
+        relevant = always + horizon * fastest_approach(data.velocities, pairs.first[p], pairs.second[p])
+        if far and distance[p] > relevant:
             continue
         distance[p] = measure(collision, data.collision, p)
         if distance[p] < least:

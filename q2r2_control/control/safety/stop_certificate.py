@@ -47,7 +47,10 @@ def certify(model: SafetyModel, data: SafetyData, h: float) -> bool:
     distance = data.distance
     duration = begin_rollout(data)
     _write_step(data, h)
+    farthest = _farthest_travel(data)
     for p in range(distance.shape[0]):
+        if distance[p] - model.collision.pairs.leverage[p] * farthest >= model.min_distance[p]:
+            continue  # no joint travels farther, so neither way is longer
         step = _way(model, p, data.rollout.step.travel)
         stop = _way(model, p, data.rollout.stop.travel)
         threshold = model.min_distance[p]
@@ -73,6 +76,15 @@ def _write_step(data: SafetyData, h: float) -> None:
         piece.rate[j] = v[j]
         piece.change[j] = (v_next[j] - v[j]) / h if h > 0.0 else 0.0
         piece.travel[j] = step_travel(v[j], v_next[j], h)
+
+
+@lean_kernel
+def _farthest_travel(data: SafetyData) -> float:
+    """The farthest that any joint travels in the step and the stop [rad or m]."""
+    farthest = 0.0
+    for j in range(data.rollout.step.travel.shape[0]):
+        farthest = max(farthest, data.rollout.step.travel[j] + data.rollout.stop.travel[j])
+    return farthest
 
 
 @lean_kernel

@@ -73,6 +73,18 @@ def _velocity_at(linear: Array, angular: Array, origin: Array, point: Array, out
 
 
 @lean_kernel
+def fastest_body(velocities: BodyVelocities) -> float:
+    """Bound on the speed of any point of any geometry [m/s]."""
+    fastest = 0.0
+    for g in range(velocities.swing.shape[0]):
+        square = 0.0
+        for k in range(3):
+            square += velocities.middle[g, k] ** 2
+        fastest = max(fastest, np.sqrt(square) + velocities.swing[g])
+    return fastest
+
+
+@lean_kernel
 def fastest_approach(velocities: BodyVelocities, first: int, second: int) -> float:
     """Bound on how fast two geometries close in [m/s]."""
     square = 0.0
