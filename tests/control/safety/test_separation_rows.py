@@ -25,7 +25,7 @@ class Seen:
         write_stop(model, q, v, TOGETHER, data.certified)
         self.closest = measure_pairs(model, data)
         write_separation_rows(model, data, H)
-        self.distance, rows = data.distance, data.rows
+        self.distance, self.near, rows = data.distance, data.near, data.rows
         used = int(rows.used[0])
         self.matrix, self.lower, self.pair = rows.matrix[:used], rows.lower[:used], rows.pair[:used]
         self.duration = float(np.max(np.abs(v) / data.certified))
@@ -50,6 +50,17 @@ def test_distances_are_exact_where_they_matter_and_never_too_large(seed: int, na
     assert seen.distance[seen.closest] == pytest.approx(exact.min(), abs=1e-12)
     # The stop certificate takes a bound below the least distance for a pair that is too close.
     assert (seen.distance[~matters] > STOP_DISTANCE).all()
+
+
+@given(seed=SEEDS, name=st.sampled_from(NAMES), speed=st.floats(0.05, 1.0))
+@settings(derandomize=True, max_examples=80, deadline=None)
+def test_a_pair_that_closes_in_fast_is_looked_at_in_time(seed: int, name: str, speed: float) -> None:
+    q, v = _state(name, seed, speed)
+    seen, exact = Seen(name, q, v), distances(cell(name), q[None])[0]
+    before, after = distances(cell(name), q + 1e-6 * np.array([[-1.0], [1.0]]) * v)
+    closing = np.maximum((before - after) / 2e-6, 0.0)
+    in_time = STOP_DISTANCE + (2.0 / APPROACH.gain + 0.5 * seen.duration) * closing
+    assert seen.near[exact < in_time - 1e-4].all()
 
 
 def _gradient(name: str, q: Array, p: int) -> Array:
