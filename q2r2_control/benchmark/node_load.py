@@ -27,6 +27,7 @@ class LoadReport:
     """What ``q2r2 bench --ros`` measured of the whole set."""
 
     seconds: float  # of each of both
+    jitter: float  # each sample of the hands comes later by up to this, at random [s]
     rows: tuple[NodeLoad, ...]
     commands_hz: float
     speed_ripple: float  # RMS of the joints' commanded speed about its trend, as a share of its RMS, to a robot

@@ -50,7 +50,7 @@ def measure_load(config: str, duration: float, progress: Callable[[str], None]) 
         raise LoadError(f"an arm was paused within {duration:g} s; engaged: {watcher.engaged}")
     times, q = np.array([at for at, _ in watcher.commands]), np.array([q for _, q in watcher.commands])
     rows = tuple(NodeLoad(name, idle.get(name, 0.0), moving[name]) for name in moving)
-    return LoadReport(duration, rows, len(times) / duration, speed_ripple(times_of_a_robot(times), q))
+    return LoadReport(duration, _JITTER, rows, len(times) / duration, speed_ripple(times_of_a_robot(times), q))
 
 
 def _arms(nodes: list[NodeProcess]) -> int:

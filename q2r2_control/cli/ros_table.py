@@ -40,7 +40,8 @@ def load_table(report: LoadReport) -> Table:
         table.add_row(row.node, f"{row.idle:.0f}", f"{row.moving:.0f}", end_section=row is report.rows[-1])
     table.caption = Text(
         f"moving: {report.commands_hz:.0f} joint commands a second; their speeds ripple by "
-        f"{100.0 * report.speed_ripple:.1f} % RMS while both hands go round circles"
+        f"{100.0 * report.speed_ripple:.1f} % RMS while both hands go round circles, "
+        f"with samples up to {1e3 * report.jitter:g} ms late"
     )
     table.caption_justify = "left"
     return table

@@ -36,5 +36,5 @@ def test_a_robot_takes_commands_once_a_period_and_waits_for_one_that_is_missing(
 
 
 def test_all_nodes_together_are_in_the_report() -> None:
-    report = LoadReport(5.0, (NodeLoad("a", 10.0, 20.0), NodeLoad("b", 1.0, 2.0)), 250.0, 0.02)
+    report = LoadReport(5.0, 0.002, (NodeLoad("a", 10.0, 20.0), NodeLoad("b", 1.0, 2.0)), 250.0, 0.02)
     assert report.as_json()["total"] == {"node": "all", "idle": 11.0, "moving": 22.0}
