@@ -24,8 +24,18 @@ from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.task import Task
 
-# Between two looks at what does not wait for a tick: services, clients and actions, and events [s].
-_CALLS_PERIOD, _EVENTS_PERIOD = 0.02, 0.5
+# Between two looks at what does not wait for a tick: services, clients and actions; services of parameters; events [s].
+_CALLS_PERIOD, _PARAMETERS_PERIOD, _EVENTS_PERIOD = 0.02, 0.1, 0.5
+# Every node has these services.
+_PARAMETERS = (
+    "/describe_parameters",
+    "/get_parameters",
+    "/get_parameter_types",
+    "/list_parameters",
+    "/set_parameters",
+    "/set_parameters_atomically",
+    "/get_type_description",
+)
 _LONG = 10**18  # [ns]
 _MOST_MESSAGES = 100  # of one subscription between two ticks
 # What nodes have, and its name in wait sets, in the order of a wait set's sizes.
@@ -42,22 +52,23 @@ _KINDS = {
 class TickExecutor(SingleThreadedExecutor):
     """Waits for timers only, and takes all messages before it runs them.
 
-    Services, clients, actions, and what other threads ask for, are looked at fifty times a second; events, which tell
-    of settings that do not match, twice a second. They are rclpy's executor to run, as callbacks are that are
-    coroutines.
+    Services, clients, actions, and what other threads ask for, are looked at fifty times a second; services of
+    parameters ten times; events, which tell of settings that do not match, twice a second. They are rclpy's executor to
+    run, as callbacks are that are coroutines.
     """
 
     def __init__(self, *, context: Context | None = None) -> None:
         super().__init__(context=context)
         self._outdated = True
-        self._calls_at = self._events_at = -math.inf  # when they were looked at [s]
         self._held = ExitStack()  # an entity that is destroyed lives until it is no longer looked at
         self._waiting = False  # a coroutine
         self._subscriptions: list[Any] = []
         self._timers: list[Any] = []
         self._periods: list[int] = []  # [ns]
         self._ros_clocks: list[ROSClock] = []  # of the timers
-        self._ticks = self._calls = self._events = _KeptWaitSet({}, (), self._context)
+        self._ticks = _KeptWaitSet({}, (), self._context)
+        self._others: dict[float, _KeptWaitSet] = {}  # by the time between two looks at them [s]
+        self._looked: dict[float, float] = {}  # by the same, when they were looked at [s]
 
     def add_node(self, node: Node) -> bool:
         """See :class:`rclpy.executors.Executor`."""
@@ -122,13 +133,11 @@ class TickExecutor(SingleThreadedExecutor):
 
     def _something_else_is_ready(self) -> bool:
         now, ready = time.monotonic(), False
-        if now - self._calls_at >= _CALLS_PERIOD:
-            self._calls_at = now
-            timers, others = self._calls.wait(0.0)
-            ready = others or bool(timers) or self._waiting
-        if now - self._events_at >= _EVENTS_PERIOD:
-            self._events_at = now
-            ready = self._events.wait(0.0)[1] or ready
+        for period, wait_set in self._others.items():
+            if now - self._looked.get(period, -math.inf) >= period:
+                self._looked[period] = now
+                timers, others = wait_set.wait(0.0)
+                ready = ready or others or bool(timers) or self._waiting
         return ready
 
     def _run_others(self) -> None:
@@ -167,10 +176,15 @@ class TickExecutor(SingleThreadedExecutor):
         clocks = {id(one.clock): one.clock for one in timers}
         self._ros_clocks = [clock for clock in clocks.values() if isinstance(clock, ROSClock)]
         own = [self._guard, self._sigint_gc]
-        calls = coroutines | {kind: found[kind] for kind in ("client", "service")} | {"guard": found["guard"] + own}
+        parameters = [one for one in found["service"] if one.srv_name.endswith(_PARAMETERS)]
+        services = [one for one in found["service"] if one not in parameters]
+        calls = coroutines | {"client": found["client"], "service": services, "guard": found["guard"] + own}
         self._ticks = _KeptWaitSet({"timer": timers, "guard": own}, (), self._context)
-        self._calls = _KeptWaitSet(calls, actions, self._context)
-        self._events = _KeptWaitSet({}, events, self._context)
+        self._others = {
+            _CALLS_PERIOD: _KeptWaitSet(calls, actions, self._context),
+            _PARAMETERS_PERIOD: _KeptWaitSet({"service": parameters}, (), self._context),
+            _EVENTS_PERIOD: _KeptWaitSet({}, events, self._context),
+        }
 
 
 class _KeptWaitSet:

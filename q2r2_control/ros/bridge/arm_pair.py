@@ -21,7 +21,7 @@ from q2r2_control.ros.base_node import COMMAND_QOS, SENT_COMMAND_QOS, BaseNode
 from q2r2_control.ros.bridge.messages import nanoseconds, pose_numbers, pose_of_numbers, time_message
 from q2r2_control.ros.bridge.parameters import ArmParameters
 from q2r2_control.ros.monitoring.arm_link import ArmLink, CarryTold, PoseNumbers
-from q2r2_control.ros.monitoring.endpoints import publish_in_time
+from q2r2_control.ros.monitoring.endpoints import PublisherCount, publish_in_time
 from q2r2_control.supervision.delay_watch import DelayWatch
 from q2r2_control.teleop.arm_states import AT_REST
 from q2r2_control.teleop.remote_arm import CarriedPose, CarryWord, RemoteArm
@@ -48,6 +48,7 @@ class ArmPair:
         teleop.pair_with(self._remote)
         self._delays = DelayWatch(STREAM_TIMEOUT)
         self._topic = link.topic_of(link.other, "carry")
+        self._senders = PublisherCount(node, self._topic)
         self._publisher = node.create_publisher(String, link.topic_of(arm, "carry"), SENT_COMMAND_QOS)
         node.create_subscription(String, self._topic, self._on_pose, COMMAND_QOS)
 
@@ -61,7 +62,7 @@ class ArmPair:
         remote, told = self._remote, self._link.carry
         remote.other_run, remote.reference = self._link.other_run, reference
         remote.heard = None if told is None else _word(told)
-        senders = self._node.count_publishers(self._topic)
+        senders = self._senders.count
         remote.problem = None
         if told is not None and told.leads and told.frame != self._frame:
             frames = f"{self._frame!r:.40} of the {self._arm} arm and {told.frame!r:.40} of the {remote.arm} one"

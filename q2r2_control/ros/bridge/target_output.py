@@ -11,7 +11,7 @@ from q2r2_control.config.presets import Hold, Preset
 from q2r2_control.config.teleop import GuardSettings
 from q2r2_control.ros.base_node import LATCHED_QOS, BaseNode
 from q2r2_control.ros.bridge.messages import stamped_pose, time_message
-from q2r2_control.ros.monitoring.endpoints import WatchedPublisher, node_of
+from q2r2_control.ros.monitoring.endpoints import PublisherCount, WatchedPublisher, node_of
 from q2r2_control.supervision.target_guard import TargetGuard
 from q2r2_control.supervision.target_stream import apart
 
@@ -48,6 +48,7 @@ class TargetOutput:
         self.guard = TargetGuard(guard, 1.0 / rate)
         self._node, self._controller, self._frame = node, controller, frame
         self._publisher = WatchedPublisher(node, PoseStamped, topic, listener_timeout)
+        self._publishers = PublisherCount(node, self._publisher.topic_name)
         self._wrench = None
         if preset.zero_wrench is not None:
             self._wrench = node.create_publisher(WrenchStamped, preset.zero_wrench.format(ctrl=prefix), LATCHED_QOS)
@@ -73,14 +74,15 @@ class TargetOutput:
     @property
     def others(self) -> int:
         """Publishers of the same topic besides this one."""
-        return max(0, self._node.count_publishers(self.topic) - 1)
+        return max(0, self._publishers.count - 1)
 
     @property
     def conflict(self) -> str | None:
         """One line if there are other publishers of the same topic."""
-        if self.others == 0:
+        others = self.others
+        if others == 0:
             return None
-        return f"{self.others + 1} publishers of {self.topic}, allowed is one (a killed one counts for some seconds)"
+        return f"{others + 1} publishers of {self.topic}, allowed is one (a killed one counts for some seconds)"
 
     @property
     def unready(self) -> str | None:
