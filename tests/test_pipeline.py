@@ -396,14 +396,19 @@ class TestStop:
             "loop = pipeline(plant='mujoco')\n"
             "watch = Watch(loop)\n"
             "loop.listeners.append(when_moving(lambda: print('moving', flush=True)))\n"
-            "print(json.dumps(loop.run().as_json()), flush=True)\n"
+            "print(json.dumps(loop.run(10.0).as_json()), flush=True)\n"
         )
-        with subprocess.Popen([sys.executable, "-c", script], cwd=CHECKOUT, stdout=subprocess.PIPE, text=True) as run:
-            assert run.stdout is not None
-            assert run.stdout.readline() == "moving\n"
-            run.send_signal(getattr(signal, name))
-            summary = json.loads(run.stdout.readline())
-            assert run.wait(10.0) == 0
+        for _ in range(10):
+            with subprocess.Popen(
+                [sys.executable, "-c", script], cwd=CHECKOUT, stdout=subprocess.PIPE, text=True
+            ) as run:
+                assert run.stdout is not None
+                if run.stdout.readline() != "moving\n":
+                    continue  # other load on the machine has paused the arms before they moved
+                run.send_signal(getattr(signal, name))
+                summary = json.loads(run.stdout.readline())
+                assert run.wait(60.0) == 0
+                break
         assert summary["at_rest"]
         assert summary["max_velocity_ratio"] > 0.0
         assert summary["max_acceleration_ratio"] <= 1.0 + 1e-9
