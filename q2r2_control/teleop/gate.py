@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from operator import mul
+from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
 
 from q2r2_control.config.teleop import GateSettings
-from q2r2_control.types import Array, HandSample
+from q2r2_control.types import HandSample, pose_of
 
 # Beyond this, doubles no longer resolve a tenth of a nanometre, and no tracking system reaches as far [m].
 _MAX_COORDINATE = 1e6
@@ -18,6 +20,14 @@ _QUATERNION_LENGTHS = (1e-6, 1e6)
 # Speeds are taken over at least this time. Messages that a network held up come within a millisecond of each other, and
 # then say nothing about a speed [s].
 _SPEED_WINDOW = 0.05
+
+
+class _Pose(NamedTuple):
+    """A usable pose, its numbers as floats too: sums of a few of those cost less than NumPy's."""
+
+    position: list[float]  # [m]
+    quaternion: list[float]  # x y z w, of length 1
+    pose: pin.SE3
 
 
 class PoseGate:
@@ -29,15 +39,15 @@ class PoseGate:
 
     def __init__(self, settings: GateSettings) -> None:
         self.settings = settings
-        self._pose: pin.SE3 | None = None
+        self._newest: _Pose | None = None
         self._stamp = -math.inf
         self._problem = ""
-        self._way: deque[tuple[float, pin.SE3]] = deque()  # the first is _SPEED_WINDOW old, or the oldest
+        self._way: deque[tuple[float, _Pose]] = deque()  # the first is _SPEED_WINDOW old, or the oldest
 
     @property
     def pose(self) -> pin.SE3 | None:
         """The newest pose, in the input's frame; None when there is none or the newest was not usable."""
-        return self._pose
+        return None if self._newest is None else self._newest.pose
 
     @property
     def stamp(self) -> float:
@@ -47,11 +57,11 @@ class PoseGate:
     @property
     def problem(self) -> str | None:
         """Why no arm may be anchored to the newest pose, None where it may."""
-        return None if self._pose is not None else self._problem or "the newest pose is not usable"
+        return None if self._newest is not None else self._problem or "the newest pose is not usable"
 
     def reset(self) -> None:
         """Forget everything received."""
-        self._pose = None
+        self._newest = None
         self._stamp = -math.inf
         self._problem = ""
         self._way.clear()
@@ -71,8 +81,8 @@ class PoseGate:
         if stamp < self._stamp or stamp == -math.inf:
             return False, None
         pose, self._problem = (None, str(sample.fault)) if sample.fault else (_pose_of(sample), "")
-        previous, gap = self._pose, stamp - self._stamp
-        self._pose, self._stamp = pose, stamp
+        previous, gap = self._newest, stamp - self._stamp
+        self._newest, self._stamp = pose, stamp
         if pose is None:
             self._way.clear()
             return False, self._problem or "a pose that is not finite or not a rotation"
@@ -81,19 +91,19 @@ class PoseGate:
             self._way.clear()  # no speed is taken across it
         return True, jump or self._speed(pose, stamp)
 
-    def _jump(self, previous: pin.SE3, pose: pin.SE3, gap: float) -> str | None:
+    def _jump(self, previous: _Pose, pose: _Pose, gap: float) -> str | None:
         limits = self.settings
         if gap > limits.timeout:
             return f"no pose for {gap:.3f} s"
-        distance = math.dist(pose.translation, previous.translation)
+        distance = math.dist(pose.position, previous.position)
         if distance > limits.max_jump:
             return f"the hand jumped {distance:.3f} m"
-        angle = math.hypot(*pin.log3(previous.rotation.T @ pose.rotation))
+        angle = _angle(previous.quaternion, pose.quaternion)
         if angle > limits.max_rotation_jump:
             return f"the hand's rotation jumped {angle:.2f} rad"
         return None
 
-    def _speed(self, pose: pin.SE3, stamp: float) -> str | None:
+    def _speed(self, pose: _Pose, stamp: float) -> str | None:
         """What is wrong with the hand's mean speed over the last ``_SPEED_WINDOW`` or a little more, or None."""
         way = self._way
         way.append((stamp, pose))
@@ -103,30 +113,39 @@ class PoseGate:
         time = stamp - since
         if time < _SPEED_WINDOW:
             return None
-        speed = math.dist(pose.translation, start.translation) / time
+        speed = math.dist(pose.position, start.position) / time
         if speed > self.settings.max_speed:
             return f"the hand moved at {speed:.1f} m/s"
-        angular_speed = math.hypot(*pin.log3(start.rotation.T @ pose.rotation)) / time
+        angular_speed = _angle(start.quaternion, pose.quaternion) / time
         if angular_speed > self.settings.max_angular_speed:
             return f"the hand turned at {angular_speed:.0f} rad/s"
         return None
 
 
-def _pose_of(sample: HandSample) -> pin.SE3 | None:
+def _pose_of(sample: HandSample) -> _Pose | None:
     """The sample's pose with its quaternion normalised; None when that is not possible."""
-    position, quaternion = _vector(sample.position, 3), _vector(sample.quaternion, 4)
-    if position is None or quaternion is None or np.abs(position).max() > _MAX_COORDINATE:
+    position, quaternion = _numbers(sample.position, 3), _numbers(sample.quaternion, 4)
+    if position is None or quaternion is None or max(map(abs, position)) > _MAX_COORDINATE:
         return None
     length = math.hypot(*quaternion)
     if not _QUATERNION_LENGTHS[0] <= length <= _QUATERNION_LENGTHS[1]:
         return None
-    return pin.SE3(pin.Quaternion(quaternion / length).toRotationMatrix(), position)
+    x, y, z, w = quaternion = [value / length for value in quaternion]
+    return _Pose(position, quaternion, pose_of(pin.Quaternion(w, x, y, z).toRotationMatrix(), np.array(position)))
 
 
-def _vector(values: object, size: int) -> Array | None:
+def _numbers(values: object, size: int) -> list[float] | None:
     """``values`` as ``size`` finite numbers, or None."""
     try:
-        vector = np.array(values, dtype=np.float64)
+        vector = np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError):
         return None
-    return vector if vector.shape == (size,) and np.isfinite(vector).all() else None
+    if vector.shape != (size,):
+        return None
+    numbers: list[float] = vector.tolist()
+    return numbers if all(map(math.isfinite, numbers)) else None
+
+
+def _angle(one: list[float], other: list[float]) -> float:
+    """Between two unit quaternions [rad]; within 1e-7 of none it is no better than that."""
+    return 2.0 * math.acos(min(abs(sum(map(mul, one, other))), 1.0))

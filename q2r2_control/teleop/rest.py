@@ -10,11 +10,12 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Sequence
 
 import numpy as np
 import pinocchio as pin
 
-from q2r2_control.types import Array, pose_of
+from q2r2_control.types import pose_of
 
 # A hand rests while the mean of its newest samples is this near to that of all since it came to rest, and no sample is
 # farther from it than a headset's noise makes one in thousands [m], [rad].
@@ -22,6 +23,10 @@ _NEWEST, _DRIFTED, _FAR = 8, (0.35e-3, 2e-3), (1.0e-3, 5e-3)
 _LONGEST = 150  # samples of the mean: two seconds of a 75 Hz headset
 _TRUSTED = 10, 50  # the mean begins to count from so many samples on, and is all that counts from so many
 _LEAVING = 0.05  # the mean of a hand that moves again counts for so long, less and less [s]
+# Rotation vectors can be averaged while they are short: farther from the origin of a rest another one begins [rad].
+_TURNED = 0.3
+
+_Sample = Sequence[float]  # position [m] and rotation vector from the origin [rad]; a few floats cost less than NumPy
 
 
 class RestingPose:
@@ -33,8 +38,10 @@ class RestingPose:
 
     def forget(self) -> None:
         """Nothing is known."""
-        self._restart([pin.SE3.Identity()])
-        self._count = 0
+        self._origin = np.eye(3)  # rotations are told as vectors from here
+        self._newest: deque[_Sample] = deque(maxlen=_NEWEST)
+        self._mean: _Sample = (0.0,) * 6
+        self._count = 0  # samples that are known of this rest
         self._share = 0.0
         self._held = pin.SE3.Identity()  # the mean that is drawn to
         self._of = self._episode = 0  # the rest that it is of, and the one that is going on
@@ -44,17 +51,24 @@ class RestingPose:
         """A sample of the hand."""
         if not self._enabled:
             return
-        sample = np.concatenate((pose.translation, pin.log3(pose.rotation.dot(self._origin.T))))
-        self._newest.append((sample, pose))
-        if self._count == 0 or self._away(sample, _FAR):
-            self._leave([pose])
+        turn = pin.log3(pose.rotation.dot(self._origin.T)).tolist()
+        known = self._count > 0 and math.hypot(*turn) <= _TURNED
+        if not known:
+            self._origin, turn = np.array(pose.rotation), (0.0, 0.0, 0.0)
+        sample = (*pose.translation.tolist(), *turn)
+        if not known or self._away(sample, _FAR):
+            self._newest.clear()
+            self._newest.append(sample)
+            self._leave(sample, 1)
             return
+        self._newest.append(sample)
         self._count += 1
-        self._mean += (sample - self._mean) / min(self._count, _LONGEST)
+        share = 1.0 / min(self._count, _LONGEST)
+        self._mean = [mean + share * (new - mean) for mean, new in zip(self._mean, sample, strict=True)]
         if self._count > _NEWEST:
-            newest = np.mean([one for one, _ in self._newest], axis=0)
+            newest = [sum(values) / _NEWEST for values in zip(*self._newest, strict=True)]
             if self._away(newest, _DRIFTED):
-                self._leave([pose for _, pose in self._newest])
+                self._leave(newest, _NEWEST)
 
     def begin(self, newest: pin.SE3, now: float) -> pin.SE3:
         """Where the hand is at ``now`` [s]: at the mean if it rests, else at its ``newest`` pose."""
@@ -87,19 +101,16 @@ class RestingPose:
         return (self._count - least) / (most - least)
 
     def _mean_pose(self) -> pin.SE3:
-        return pose_of(pin.exp3(self._mean[3:]).dot(self._origin), self._mean[:3].copy())
+        turn = pin.exp3(np.array(self._mean[3:]))
+        return pose_of(turn.dot(self._origin), np.array(self._mean[:3]))
 
-    def _away(self, sample: Array, bounds: tuple[float, float]) -> bool:
-        way = sample - self._mean
-        return math.hypot(*way[:3]) > bounds[0] or math.hypot(*way[3:]) > bounds[1]
+    def _away(self, sample: _Sample, bounds: tuple[float, float]) -> bool:
+        (x, y, z, a, b, c), (to_x, to_y, to_z, to_a, to_b, to_c) = self._mean, sample
+        return (
+            math.hypot(to_x - x, to_y - y, to_z - z) > bounds[0] or math.hypot(to_a - a, to_b - b, to_c - c) > bounds[1]
+        )
 
-    def _leave(self, samples: list[pin.SE3]) -> None:
+    def _leave(self, mean: _Sample, count: int) -> None:
+        """A rest begins whose first ``count`` samples have this ``mean``."""
         self._episode += 1
-        self._restart(samples)
-
-    def _restart(self, samples: list[pin.SE3]) -> None:
-        """A rest that begins with these samples."""
-        self._origin = np.array(samples[-1].rotation)  # rotations are told as vectors from here
-        rows = [np.concatenate((one.translation, pin.log3(one.rotation.dot(self._origin.T)))) for one in samples]
-        self._newest = deque(zip(rows, samples, strict=True), maxlen=_NEWEST)
-        self._mean, self._count = np.mean(rows, axis=0), len(rows)
+        self._mean, self._count = mean, count
