@@ -3,19 +3,24 @@
 Ticks come at the loop's rate, since one that comes right after another finds warmer caches; time in the run is
 simulated all the same, so every round moves the same way whatever the machine does. The cases run in turns, and rounds
 with clocks in the stages alternate with rounds that have them only around tick and physics, which tell the whole.
+
+What recording costs is less than a machine's speed changes within a minute. So runs with and without it come in pairs,
+next to each other and in changing order, and the ratio of their times has an interval: the pairs are drawn again and
+again, as many as there are, with replacement (Efron, Bootstrap methods, Annals of Statistics 7, 1979).
 """
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
+from q2r2_control.benchmark.stage_clock import PHYSICS, STAGES, StageClock
 from q2r2_control.benchmark.tick_times import FEWEST_TICKS
 from q2r2_control.config import Config
 from q2r2_control.errors import ConfigError, PlantError
@@ -28,14 +33,14 @@ from q2r2_control.recording.recorder import Recorder
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, CommandMode
 
-PHYSICS, REST = "physics", "rest of the loop"
-STAGES = ("inputs", "measured state", "teleop", "supervision", "control", "drive", "apply", "recording", REST, PHYSICS)
 CASES = (
     ("kinematic", CommandMode.POSITION),
     ("mujoco", CommandMode.POSITION),
     ("mujoco", CommandMode.TORQUE),
 )
 _ROUNDS = 3
+_PAIRS = 10  # of runs with and without recording
+_DRAWS = 1000
 # Scripted hands move both arms at any time, once they are engaged.
 _TRAJECTORY, _ENGAGED_AFTER = "circle", 1.0  # [s]
 
@@ -47,6 +52,24 @@ class StageTime:
     stage: str
     median_us: float
     p99_us: float
+
+
+class Ratio(NamedTuple):
+    """Of two times, and the interval that holds it with a probability of 90 %."""
+
+    value: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True, slots=True)
+class RecordingCost:
+    """The same times of runs that are recorded to a file, and how many times as long their p99 is."""
+
+    without_physics: StageTime
+    to_command: StageTime
+    p99_ratio: Ratio  # of ticks without physics
+    to_command_p99_ratio: Ratio
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,8 +84,7 @@ class LoopRow:
     without_physics: StageTime  # of rounds without clocks in the stages
     to_command: StageTime  # the same, until the command is applied: a tick's time in the summary of a run
     clocks_us: float  # that the clocks in the stages add to a tick
-    recorded: StageTime | None = None  # without physics, of rounds that were recorded to a file
-    to_command_recorded: StageTime | None = None
+    recording: RecordingCost | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,76 +117,12 @@ def run_loop_bench(
     if ticks < FEWEST_TICKS:
         raise ConfigError(f"bench: ticks = {ticks}: allowed: {FEWEST_TICKS} or more")
     cases = [_Case(config, plant, mode, ticks, paced, record) for plant, mode in CASES]
-    for turn in range(_ROUNDS):
+    rounds = _PAIRS if record else _ROUNDS
+    for turn in range(rounds):
         for case in cases:
-            progress(f"{case.plant}, {case.mode}, round {turn + 1} of {_ROUNDS}")
-            case.run_round()
+            progress(f"{case.plant}, {case.mode}, round {turn + 1} of {rounds}")
+            case.run_round(turn)
     return LoopReport(config.name, config.loop_rate_hz, [case.row() for case in cases])
-
-
-class StageClock:
-    """Charges every moment of a run to the innermost watched function that runs, or to :data:`REST`."""
-
-    def __init__(self, period: float = 0.0) -> None:
-        """``period`` [s]: ticks are held back until one is over since the last."""
-        self._period = period
-        self._due = self._last = time.perf_counter()
-        self._stage = STAGES.index(REST)
-        self._row = [0.0] * len(STAGES)
-        self._rows: list[list[float]] = []
-        self._watched: list[tuple[object, str]] = []
-
-    @property
-    def times(self) -> Array:
-        """(ticks, stages) [s]; what came before the first tick is left out."""
-        return np.array(self._rows[1:])
-
-    def watch(self, owner: object, name: str, stage: str) -> None:
-        """Charge calls of a method of ``owner`` to ``stage``, until :meth:`release`."""
-        method, index = getattr(owner, name), STAGES.index(stage)
-
-        def timed(*arguments: Any, **options: Any) -> Any:
-            before = self._turn_to(index)
-            try:
-                return method(*arguments, **options)
-            finally:
-                self._turn_to(before)
-
-        setattr(owner, name, timed)
-        self._watched.append((owner, name))
-
-    def watch_ticks(self, owner: object, name: str) -> None:
-        """Begin a row at every call of a method of ``owner``."""
-        method = getattr(owner, name)
-
-        def timed(*arguments: Any, **options: Any) -> Any:
-            self._begin_row()
-            return method(*arguments, **options)
-
-        setattr(owner, name, timed)
-        self._watched.append((owner, name))
-
-    def release(self) -> None:
-        """Leave all owners as they were."""
-        for owner, name in self._watched:
-            delattr(owner, name)
-        self._watched.clear()
-
-    def _turn_to(self, stage: int) -> int:
-        now = time.perf_counter()
-        before, self._stage = self._stage, stage
-        self._row[before] += now - self._last
-        self._last = now
-        return before
-
-    def _begin_row(self) -> None:
-        self._turn_to(self._stage)
-        self._rows.append(self._row)
-        self._row = [0.0] * len(STAGES)
-        self._due = max(self._due + self._period, self._last - self._period)
-        if (rest := self._due - time.perf_counter()) > 0.0:
-            time.sleep(rest)
-        self._last = time.perf_counter()
 
 
 class _ClockedPipeline(Pipeline):
@@ -219,14 +177,13 @@ class _Case:
         self._to_command: list[Array] = []
         self._to_command_recorded: list[Array] = []
 
-    def run_round(self) -> None:
+    def run_round(self, number: int) -> None:
         """One run with clocks in every stage, one without, and where asked for one that is recorded."""
-        self._stages.append(self._run(clocks_in_stages=True))
-        self._whole.append(self._run(clocks_in_stages=False))
-        self._to_command.append(self._compute_times())
-        if self._record:
-            self._recorded.append(self._run_recorded())
-            self._to_command_recorded.append(self._compute_times())
+        if number < _ROUNDS:
+            self._stages.append(self._run(clocks_in_stages=True))
+        runs = [self._run_plainly, self._run_recorded] if self._record else [self._run_plainly]
+        for run in runs if number % 2 == 0 else reversed(runs):
+            run()
 
     def row(self) -> LoopRow:
         """The figures of all rounds."""
@@ -235,23 +192,28 @@ class _Case:
             plant=self.plant,
             mode=self.mode,
             ticks=self._ticks,
-            rounds=len(self._stages),
+            rounds=len(self._whole),
             stages=[_time_of(stage, stages[:, index]) for index, stage in enumerate(STAGES)],
             without_physics=_time_of("without physics", whole),
             to_command=_time_of("to the command", np.concatenate(self._to_command)),
             clocks_us=1e6 * float(np.median(_without_physics(stages)) - np.median(whole)),
-            **self._while_recorded(),
+            recording=self._recording_cost() if self._record else None,
         )
 
-    def _while_recorded(self) -> dict[str, StageTime]:
-        if not self._record:
-            return {}
-        return {
-            "recorded": _time_of("recorded", _without_physics(np.concatenate(self._recorded))),
-            "to_command_recorded": _time_of("to the command, recorded", np.concatenate(self._to_command_recorded)),
-        }
+    def _recording_cost(self) -> RecordingCost:
+        plain, recorded = ([_without_physics(run) for run in runs] for runs in (self._whole, self._recorded))
+        return RecordingCost(
+            _time_of("recorded", np.concatenate(recorded)),
+            _time_of("to the command, recorded", np.concatenate(self._to_command_recorded)),
+            _p99_ratio(recorded, plain),
+            _p99_ratio(self._to_command_recorded, self._to_command),
+        )
 
-    def _run_recorded(self) -> Array:
+    def _run_plainly(self) -> None:
+        self._whole.append(self._run(clocks_in_stages=False))
+        self._to_command.append(self._compute_times())
+
+    def _run_recorded(self) -> None:
         """As when a robot moves: where there is no room ticks are lost, so that nothing can hold up the loop."""
         pipeline = self._pipeline
         plant = pipeline.plant
@@ -262,7 +224,8 @@ class _Case:
             recorder.begin(About.of(pipeline, True, {}, tuple(cameras)), pipeline.robot)
             pipeline.listeners.append(recorder)
             try:
-                return self._run(clocks_in_stages=False)
+                self._recorded.append(self._run(clocks_in_stages=False))
+                self._to_command_recorded.append(self._compute_times())
             finally:
                 pipeline.listeners.remove(recorder)
                 if fault := recorder.summary.pictures_fault:
@@ -291,3 +254,17 @@ def _without_physics(times: Array) -> Array:
 
 def _time_of(stage: str, times: Array) -> StageTime:
     return StageTime(stage, 1e6 * float(np.median(times)), 1e6 * float(np.percentile(times, 99)))
+
+
+def _p99_ratio(runs: list[Array], others: list[Array]) -> Ratio:
+    """Of the times of ``runs`` to those of ``others``, each of which was next to one of them."""
+    pairs, random = np.array([others, runs]), np.random.default_rng(0)
+
+    def ratio(chosen: npt.NDArray[np.int64]) -> float:
+        other, one = np.percentile(pairs[:, chosen], 99, axis=(1, 2))
+        return float(one / other)
+
+    count = len(runs)
+    drawn = [ratio(random.integers(0, count, count)) for _ in range(_DRAWS)]
+    low, high = np.percentile(drawn, (5, 95))
+    return Ratio(ratio(np.arange(count)), float(low), float(high))

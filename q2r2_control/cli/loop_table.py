@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 
 from rich.table import Table
 from rich.text import Text
 
-from q2r2_control.benchmark.loop_times import PHYSICS, LoopReport, StageTime
+from q2r2_control.benchmark.loop_times import LoopReport, LoopRow, Ratio, StageTime
+from q2r2_control.benchmark.stage_clock import PHYSICS
 from q2r2_control.cli.figure_table import figure_table
 
 
@@ -22,20 +23,41 @@ def loop_table(report: LoopReport) -> Table:
     )
     for index, stage in enumerate(first.stages):
         if stage.stage == PHYSICS:
-            whole = {"without physics": "without_physics", "the same, recorded": "recorded"}
-            until = {"to the command": "to_command", "to it, recorded": "to_command_recorded"}
-            for text, name in (whole | until).items():
-                if times := [time for row in report.rows if (time := getattr(row, name)) is not None]:
-                    table.add_row(Text(text, style="" if "recorded" in text else "bold"), *_times_of(times))
+            for text, times in _sums(report.rows):
+                table.add_row(Text(text, style="" if "recorded" in text else "bold"), *_times_of(times))
         table.add_row(stage.stage, *_times_of(row.stages[index] for row in report.rows))
     added = ", ".join(f"{row.clocks_us:.0f}" for row in report.rows)
-    table.caption = Text(
+    caption = (
         f"without physics: of runs without clocks in the stages, which add {added} us; medians do not add up\n"
         "to the command: from the inputs until it is applied, a tick's time in the summary of a run\n"
         "drive: impedance and wall in torque mode; physics: of the simulator, where a real robot would move"
     )
+    table.caption = Text("\n".join((caption, *_recording_costs(report.rows))))
     table.caption_justify = "left"
     return table
+
+
+def _sums(rows: Sequence[LoopRow]) -> Iterator[tuple[str, list[StageTime]]]:
+    recorded = [row.recording for row in rows if row.recording is not None]
+    yield "without physics", [row.without_physics for row in rows]
+    if recorded:
+        yield "the same, recorded", [cost.without_physics for cost in recorded]
+    yield "to the command", [row.to_command for row in rows]
+    if recorded:
+        yield "to it, recorded", [cost.to_command for cost in recorded]
+
+
+def _recording_costs(rows: Sequence[LoopRow]) -> Iterator[str]:
+    recorded = [(row, row.recording) for row in rows if row.recording is not None]
+    if recorded:
+        yield "p99 with recording to p99 without, to 90 %; then the same to the command:"
+    for row, cost in recorded:
+        whole, command = _ratio_text(cost.p99_ratio), _ratio_text(cost.to_command_p99_ratio)
+        yield f"  {row.plant}, {row.mode}: {whole}; {command}"
+
+
+def _ratio_text(ratio: Ratio) -> str:
+    return f"{ratio.value:.2f} ({ratio.low:.2f}-{ratio.high:.2f})"
 
 
 def _times_of(stages: Iterable[StageTime]) -> Iterator[str]:

@@ -13,6 +13,7 @@ import struct
 from array import array
 from collections.abc import Sequence
 from dataclasses import asdict
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -38,6 +39,7 @@ POSE = 7  # numbers of a pose: x y z qx qy qz qw
 _MODE_NUMBERS = {mode: number for number, mode in enumerate(COMMAND_MODES)}
 _STATUS_NUMBERS = {status: number for number, status in enumerate(STATUSES)}
 _SAMPLE = struct.Struct(f"<{len(SAMPLE_FIELDS)}d")
+_values_of = attrgetter(*HandInputs.__slots__)
 _NO_POSE = (0.0,) * POSE  # whose quaternion is none
 
 
@@ -191,7 +193,6 @@ def _packed_start(now: float, state: RobotState) -> bytes:
 
 
 def _packed_sample(number: int, sample: HandSample) -> bytes:
-    inputs = [getattr(sample.inputs, name) for name in HandInputs.__slots__]
     side, stamps = SIDES.index(sample.hand), (sample.pose_stamp, sample.inputs_stamp)
-    fault = HAND_FAULTS.index(sample.fault)
-    return _SAMPLE.pack(number, side, *stamps, *sample.position.tolist(), *sample.quaternion.tolist(), *inputs, fault)
+    pose, fault = (*sample.position.tolist(), *sample.quaternion.tolist()), HAND_FAULTS.index(sample.fault)
+    return _SAMPLE.pack(number, side, *stamps, *pose, *_values_of(sample.inputs), fault)

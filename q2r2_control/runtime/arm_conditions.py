@@ -11,7 +11,7 @@ from q2r2_control.control.controller import CartesianController
 from q2r2_control.teleop.haptics import ArmCondition
 from q2r2_control.types import RobotState, StepReport
 
-_DAMPING = 1e-4  # of a wrench's estimate where a posture is singular [m^2]
+_DAMPING = 1e-4 * np.eye(6)  # of a wrench's estimate where a posture is singular [m^2]
 _LIMIT_LASTS = 0.5  # a joint counts as at its limit for so long after it last was: limits bind on and off [s]
 _LIMIT = " position"  # ends the names of position limits in a report
 
@@ -33,16 +33,14 @@ class ArmConditions:
                 self._limited[name.removesuffix(_LIMIT)] = now
 
     def look(self, state: RobotState, now: float) -> Mapping[str, ArmCondition]:
-        """Of every arm, at ``now``; less often than every tick, since distances take their time."""
+        """Of every arm, at ``now``."""
+        return {arm: self.look_at(arm, state, now) for arm in self._joints}
+
+    def look_at(self, arm: str, state: RobotState, now: float) -> ArmCondition:
+        """Of one arm, at ``now``; less often than every tick, since distances take their time."""
         self._limited = {name: t for name, t in self._limited.items() if now - t <= _LIMIT_LASTS}
-        return {
-            arm: ArmCondition(
-                self._controller.spare_distance(arm),
-                frozenset(joints & self._limited.keys()),
-                self._contact_force(arm, state),
-            )
-            for arm, joints in self._joints.items()
-        }
+        limited = frozenset(self._joints[arm] & self._limited.keys())
+        return ArmCondition(self._controller.spare_distance(arm), limited, self._contact_force(arm, state))
 
     def _contact_force(self, arm: str, state: RobotState) -> float | None:
         if state.tau_external is None or not np.isfinite((state.tau_external, state.q)).all():
@@ -51,6 +49,6 @@ class ArmConditions:
         jacobian = pin.computeFrameJacobian(
             self._robot.model, self._data, state.q, members.frame_id, pin.LOCAL_WORLD_ALIGNED
         )[:, members.joints]
-        square = jacobian @ jacobian.T + _DAMPING * np.eye(6)
+        square = jacobian @ jacobian.T + _DAMPING
         wrench = np.linalg.solve(square, jacobian @ state.tau_external[members.joints])
         return float(np.linalg.norm(wrench[:3]))

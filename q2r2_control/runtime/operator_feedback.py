@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
+from itertools import cycle
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from q2r2_control.supervision.grasp_watch import Grip
 from q2r2_control.teleop.haptics import HapticPulses
 from q2r2_control.types import ArmTarget, Event, HapticFeedback, RobotState, StepReport
 
-_PERIOD = 0.02  # of looking at more than events [s]
+_PERIOD = 0.02  # of looking at more of an arm than its events [s]
 
 
 class OperatorFeedback:
@@ -34,6 +35,8 @@ class OperatorFeedback:
         self._conditions = ArmConditions(controller)
         self._pulses = {arm: HapticPulses(settings) for arm in robot.arms}
         self._grips = {arm: Grip(robot.arms[arm].stroke) for arm in robot.arms}
+        # One arm after the other: both in one tick would make that tick a long one.
+        self._turns, self._wait = cycle(robot.arms), _PERIOD / len(robot.arms)
         self._due = -np.inf
 
     def scale(self, strength: float) -> None:
@@ -56,23 +59,23 @@ class OperatorFeedback:
             self._pulses[event.arm].tell(event)
         self._conditions.note(report, now)
         if now >= self._due:
-            self._due = now + _PERIOD
-            self._look(now, targets, state, grippers, openings)
+            self._due = now + self._wait
+            self._look(next(self._turns), now, targets, state, grippers, openings)
         for arm, pulses in self._pulses.items():
             if (feedback := pulses.at(now, self._hand_of(arm))) is not None:
                 self._send(feedback)
 
     def _look(
         self,
+        arm: str,
         now: float,
         targets: Mapping[str, ArmTarget],
         state: RobotState,
         grippers: Mapping[str, float],
         openings: Mapping[str, float],
     ) -> None:
-        for arm, condition in self._conditions.look(state, now).items():
-            pulses = self._pulses[arm]
-            pulses.slip(targets[arm].slip, targets[arm].slip_angle)
-            pulses.notice(condition)
-            if arm in grippers and arm in openings:
-                pulses.grasps(self._grips[arm].look(grippers[arm], openings[arm], now))
+        pulses = self._pulses[arm]
+        pulses.slip(targets[arm].slip, targets[arm].slip_angle)
+        pulses.notice(self._conditions.look_at(arm, state, now))
+        if arm in grippers and arm in openings:
+            pulses.grasps(self._grips[arm].look(grippers[arm], openings[arm], now))

@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from q2r2_control.benchmark.loop_times import CASES, PHYSICS, STAGES, LoopReport, LoopRow, StageTime
+from q2r2_control.benchmark.loop_times import CASES, LoopReport, LoopRow, Ratio, RecordingCost, StageTime
 from q2r2_control.benchmark.motion_run import MotionFigures
 from q2r2_control.benchmark.stack_bench import StackReport, StackRow
 from q2r2_control.benchmark.stack_run import StackFigures
+from q2r2_control.benchmark.stage_clock import PHYSICS, STAGES
 from q2r2_control.benchmark.tick_times import BenchReport, BenchRow
 from q2r2_control.benchmark.timed_run import RunMetrics
 from q2r2_control.benchmark.work_bench import WorkReport, WorkRow
@@ -216,6 +217,21 @@ def test_eighty_columns_hold_every_stage_of_the_loop_for_each_plant_and_mode() -
     assert lines[total + 1].split() == ["to", "the", "command", *["198", "43210"] * 3]
     assert lines[total + 2].split()[0] == PHYSICS, "below the sum, which it is not in"
     assert "…" not in text
+
+
+def test_the_cost_of_recording_is_a_ratio_with_its_interval_for_each_plant_and_mode() -> None:
+    stages = [StageTime(stage, 100.0, 200.0) for stage in STAGES]
+    whole, recorded = StageTime("without physics", 237.0, 500.0), StageTime("recorded", 251.0, 525.0)
+    cost = RecordingCost(recorded, recorded, Ratio(1.05, 0.98, 1.12), Ratio(1.01, 0.957, 1.083))
+    rows = [LoopRow(plant, str(mode), 3000, 10, stages, whole, whole, 6.4, cost) for plant, mode in CASES]
+    lines = printed(loop_table(LoopReport("cell", 1000.0, rows))).splitlines()
+    assert [line.split() for line in lines if "recorded" in line] == [
+        ["the", "same,", "recorded", *["251", "525"] * 3],
+        ["to", "it,", "recorded", *["251", "525"] * 3],
+    ]
+    for plant, mode in CASES:
+        line = f"  {plant}, {mode}: 1.05 (0.98-1.12); 1.01 (0.96-1.08)"
+        assert line in [found.rstrip() for found in lines]
 
 
 def test_the_loop_s_bench_prints_its_figures_as_one_object(monkeypatch: pytest.MonkeyPatch) -> None:
