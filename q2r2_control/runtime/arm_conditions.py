@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
 import numpy as np
 import pinocchio as pin
 
+from q2r2_control.compliance.admittance_kernels import estimate_wrench
 from q2r2_control.control.controller import CartesianController
+from q2r2_control.control.tasks.task_model import tools_of
 from q2r2_control.teleop.haptics import ArmCondition
 from q2r2_control.types import RobotState, StepReport
 
-_DAMPING = 1e-4 * np.eye(6)  # of a wrench's estimate where a posture is singular [m^2]
 _LIMIT_LASTS = 0.5  # a joint counts as at its limit for so long after it last was: limits bind on and off [s]
 _LIMIT = " position"  # ends the names of position limits in a report
 
@@ -24,6 +26,12 @@ class ArmConditions:
         self._controller, self._robot = controller, robot
         self._data = robot.model.createData()
         self._joints = {arm: {robot.joint_names[j] for j in robot.arms[arm].joints} for arm in robot.arms}
+        nv = robot.model.nv
+        self._member = dict(zip(robot.arms, tools_of(robot).member, strict=True))
+        self._J, self._wrench = np.zeros((6, nv)), np.zeros(6)
+        self._scratch = np.zeros((6, 6)), np.zeros((6, 6))
+        # What is compiled is loaded now, not in a tick.
+        estimate_wrench(self._J, np.zeros(nv), np.zeros(nv), *self._scratch, self._wrench)
         self._limited: dict[str, float] = {}  # when a joint last was at its position limit [s]
 
     def note(self, report: StepReport, now: float) -> None:
@@ -43,12 +51,10 @@ class ArmConditions:
         return ArmCondition(self._controller.spare_distance(arm), limited, self._contact_force(arm, state))
 
     def _contact_force(self, arm: str, state: RobotState) -> float | None:
+        """As an admittance estimates it [N]; None where nothing is measured."""
         if state.tau_external is None or not np.isfinite((state.tau_external, state.q)).all():
             return None
-        members = self._robot.arms[arm]
-        jacobian = pin.computeFrameJacobian(
-            self._robot.model, self._data, state.q, members.frame_id, pin.LOCAL_WORLD_ALIGNED
-        )[:, members.joints]
-        square = jacobian @ jacobian.T + _DAMPING
-        wrench = np.linalg.solve(square, jacobian @ state.tau_external[members.joints])
-        return float(np.linalg.norm(wrench[:3]))
+        frame, wrench = self._robot.arms[arm].frame_id, self._wrench
+        self._J[:] = pin.computeFrameJacobian(self._robot.model, self._data, state.q, frame, pin.LOCAL_WORLD_ALIGNED)
+        estimate_wrench(self._J, state.tau_external, self._member[arm], *self._scratch, wrench)
+        return math.hypot(*wrench[:3].tolist())
