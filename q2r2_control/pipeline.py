@@ -22,14 +22,14 @@ from q2r2_control.inputs.factory import make_input
 from q2r2_control.plants.base import Plant
 from q2r2_control.plants.factory import check_mode, make_plant
 from q2r2_control.robot.robot import Robot
+from q2r2_control.runtime.body_changes import BodyChanges
 from q2r2_control.runtime.loop_clock import LoopClock
 from q2r2_control.runtime.operator_side import OperatorSide
+from q2r2_control.runtime.plant_clock import PlantClock
 from q2r2_control.runtime.process import few_garbage_collections, stop_on_signals
 from q2r2_control.runtime.recorder import RunRecorder, RunStart, Tick
 from q2r2_control.runtime.run_summary import RunSummary
 from q2r2_control.runtime.wishes import Wishes
-from q2r2_control.supervision.grasp_watch import GraspWatch
-from q2r2_control.supervision.gripper_limiter import GripperLimiter
 from q2r2_control.supervision.joint_watch import watch_settings
 from q2r2_control.supervision.supervisor import Phase, Supervisor
 from q2r2_control.supervision.target_stream import StreamSettings
@@ -198,20 +198,15 @@ class PipelineRun:
         limit = pipeline.robot.velocity_limit * control.velocity_scale
         self._acceleration = pipeline.robot.capped_acceleration(control.acceleration_limit)
         self._pacer = TickPacer(1.0 / pipeline.config.loop_rate_hz, limit, self._acceleration, pipeline.drive.coasts)
-        self._stamp = state.stamp  # of the newest state, by the plant's clock [s]
-        self._unanswered = 0.0  # time that the plant was given since without a newer one [s]
+        self._plant_clock = PlantClock(state)
         self._state = state  # the newest that the plant gave
         self._supervisor = pipeline.supervisor
         self._supervisor.activate(replace(state, stamp=self._clock.now), self._clock.now)
         self._supervisor.events.clear()
-        self._holding = pipeline.controller.holding
-        pipeline.drive.set_holding(self._holding)  # before the reset, which begins with the weight of what is held
+        self._bodies = BodyChanges(pipeline.controller, pipeline.drive)
         pipeline.drive.reset(state)
-        self._limiter, self._grasps = GripperLimiter(pipeline.controller), GraspWatch(pipeline.controller)
+        self._bodies.begin()
         self._grippers: dict[str, float] = {arm: target.gripper for arm, target in self._targets.items()}
-        pipeline.drive.set_openings(pipeline.controller.openings)
-        self._kept = pipeline.controller.kept_distances
-        pipeline.drive.set_kept_distances(self._kept)
         self._openings: dict[str, float] = {}  # measured, that the tick went by
         self._velocity = np.zeros(pipeline.robot.model.nv)
         self._operator = OperatorSide(
@@ -282,20 +277,14 @@ class PipelineRun:
         # A plant that is simulated lets no more time pass at once, as if the computer had stood still.
         given = min(gap, LONGEST_DT)
         pipeline.plant.advance(given)
-        self._unanswered += given
+        self._plant_clock.give(given)
         self.record(gap, dt, samples, reference, state, tools, command, compute_time)
         return reference
 
     def _observe(self, state: RobotState) -> None:
         """Let supervision look at what was measured. A stall needs no more than that: nothing else moves this plant."""
         supervisor, now = self._supervisor, self._clock.now
-        passed = state.stamp - self._stamp
-        if passed != 0.0:
-            self._stamp, self._unanswered = state.stamp, 0.0
-        # A plant that hangs repeats its last state, which is as old as the time that it was given since.
-        stamp = now - self._unanswered
-        # Written out, since dataclasses.replace takes three times as long.
-        seen = RobotState(state.q, state.v, state.tau, state.tau_external, stamp)
+        seen, passed = self._plant_clock.stamped(state, now)
         supervisor.take_joint_state(seen, now, passed)
         if supervisor.events:
             for line in supervisor.events:
@@ -308,24 +297,14 @@ class PipelineRun:
         if reference is None:
             reference = self._pipeline.controller.step({}, dt)
         self._velocity = reference.v
-        if self._pipeline.controller.kept_distances is not self._kept:
-            self._kept = self._pipeline.controller.kept_distances
-            self._pipeline.drive.set_kept_distances(self._kept)
+        self._bodies.after_step()
         return reference
 
     def limit_grippers(self) -> None:
-        """What the grippers are commanded to, and whether they hold something.
-
-        Before the step, which has to be proven with fingers that move in it and with objects that are held.
-        """
-        pipeline, wanted = self._pipeline, {arm: target.gripper for arm, target in self._targets.items()}
-        measured = self._openings = pipeline.plant.gripper_openings()
-        self._grippers = self._limiter.limit(wanted, measured, self._clock.now)
-        if self._limiter.changed:
-            pipeline.drive.set_openings(pipeline.controller.openings)
-        if self._grasps.update(self._grippers, measured, self._clock.now):
-            self._holding = pipeline.controller.holding
-            pipeline.drive.set_holding(self._holding)
+        """What the grippers are commanded to; see :meth:`BodyChanges.limit_grippers`."""
+        wanted = {arm: target.gripper for arm, target in self._targets.items()}
+        self._openings = self._pipeline.plant.gripper_openings()
+        self._grippers = self._bodies.limit_grippers(wanted, self._openings, self._clock.now)
 
     def tools(self, state: RobotState) -> dict[str, pin.SE3]:
         """Measured tool poses, world frame."""
@@ -351,8 +330,10 @@ class PipelineRun:
         teleop, report, recorder = self._pipeline.teleop, self._pipeline.drive.report, self._recorder
         engaged = teleop.engaged if self._following else dict.fromkeys(self._targets, False)
         events = self._operator.take_events(self._clock.start)
-        recorder.add(dt, compute_time, reference, self._targets, tools, engaged, report, events, self._limiter.held)
-        recorder.add_holding(dt, self._holding)
+        recorder.add(
+            dt, compute_time, reference, self._targets, tools, engaged, report, events, self._bodies.held_grippers
+        )
+        recorder.add_holding(dt, self._bodies.holding)
         if self._following:
             now, openings = self._clock.now, self._openings
             feedback = self._operator.feedback
@@ -378,8 +359,8 @@ class PipelineRun:
             command=command,
             events=events,
             grippers=self._pipeline.plant.gripper_openings(),
-            held_grippers=dict(self._limiter.held),
-            holding=self._holding,
+            held_grippers=dict(self._bodies.held_grippers),
+            holding=self._bodies.holding,
             compute_time=compute_time,
             impedance=report.impedance,
             wall=report.wall,

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import tomllib
 from collections.abc import Iterable
+from functools import cache
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -61,15 +62,19 @@ def modules_of_ros() -> set[str]:
     return registry | {file.parent.name for file in (ROS / "interfaces").glob("*/package.xml")}
 
 
-def imported(files: Iterable[Path]) -> set[str]:
+@cache
+def imported_by(file: Path) -> frozenset[str]:
     names = set()
-    for file in files:
-        for node in ast.walk(ast.parse(file.read_text())):
-            if isinstance(node, ast.Import):
-                names |= {alias.name.split(".")[0] for alias in node.names}
-            elif isinstance(node, ast.ImportFrom) and node.module:
-                names.add(node.module.split(".")[0])
-    return names - set(sys.stdlib_module_names) - {"q2r2_control"}
+    for node in ast.walk(ast.parse(file.read_text())):
+        if isinstance(node, ast.Import):
+            names |= {alias.name.split(".")[0] for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            names.add(node.module.split(".")[0])
+    return frozenset(names - set(sys.stdlib_module_names) - {"q2r2_control"})
+
+
+def imported(files: Iterable[Path]) -> set[str]:
+    return {name for file in files for name in imported_by(file)}
 
 
 def modules_outside_ros() -> set[Path]:

@@ -1,0 +1,56 @@
+"""What of the bodies that are kept apart changes while a run goes on, and that the drive is told of it too."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from q2r2_control.control.controller import CartesianController
+from q2r2_control.drives import Drive
+from q2r2_control.supervision.grasp_watch import GraspWatch
+from q2r2_control.supervision.gripper_limiter import GripperLimiter
+
+
+class BodyChanges:
+    """Fingers that move, objects that are held, and distances that other settings ask for.
+
+    Made before the drive is reset, which begins with the weight of what is held; then :meth:`begin`, and in every tick
+    :meth:`limit_grippers` before the step and :meth:`after_step`.
+    """
+
+    def __init__(self, controller: CartesianController, drive: Drive) -> None:
+        self._controller, self._drive = controller, drive
+        self._limiter, self._grasps = GripperLimiter(controller), GraspWatch(controller)
+        self.holding = controller.holding  # of arms whose grippers have an object, whether they hold it
+        drive.set_holding(self.holding)
+
+    @property
+    def held_grippers(self) -> dict[str, tuple[str, str]]:
+        """Arm -> pair of bodies that keeps its gripper from being commanded as wanted."""
+        return self._limiter.held
+
+    def begin(self) -> None:
+        """The drive was reset."""
+        self._kept = self._controller.kept_distances
+        self._drive.set_openings(self._controller.openings)
+        self._drive.set_kept_distances(self._kept)
+
+    def limit_grippers(
+        self, wanted: Mapping[str, float], measured: Mapping[str, float], now: float
+    ) -> dict[str, float]:
+        """What the grippers are to be commanded to, 0 closed .. 1 fully open; see also whether they hold something.
+
+        Before the step, which has to be proven with fingers that move in it and with objects that are held.
+        """
+        commanded = self._limiter.limit(wanted, measured, now)
+        if self._limiter.changed:
+            self._drive.set_openings(self._controller.openings)
+        if self._grasps.update(commanded, measured, now):
+            self.holding = self._controller.holding
+            self._drive.set_holding(self.holding)
+        return commanded
+
+    def after_step(self) -> None:
+        """The controller's step may have taken up other distances."""
+        if self._controller.kept_distances is not self._kept:
+            self._kept = self._controller.kept_distances
+            self._drive.set_kept_distances(self._kept)
