@@ -87,10 +87,11 @@ class TickPacker:
         kind = row_type(topics)
         assert kind.fields is not None
         self._row = bytearray(kind.itemsize)
-        joints = np.frombuffer(self._row, dtype=kind)[0]
-        self._joints = [joints[name] for name in JOINT_FIELDS]  # views of the row
+        first = kind.fields[JOINT_FIELDS[0]][1] // 8
+        self._joints = np.frombuffer(self._row)[first:]  # a view of the row
+        self._not_measured = np.zeros(len(topics.joints))
         # Most of the numbers are by themselves, and numpy takes one as long as a whole list.
-        self._numbers = struct.Struct(f"<{kind.fields['q'][1] // 8}d")
+        self._numbers = struct.Struct(f"<{first}d")
         self._state: tuple[Any, ...] | None = None  # in names, as it was told last
         self._begun = False
 
@@ -150,10 +151,9 @@ class TickPacker:
             *hands,
             not self._begun,
         )
-        external = 0.0 if state.tau_external is None else state.tau_external
+        external = self._not_measured if state.tau_external is None else state.tau_external
         measured, moved = (state.q, state.v, state.tau, external), (reference.q, reference.v, reference.a)
-        for view, values in zip(self._joints, (*measured, *moved, command.q, command.v, command.tau), strict=True):
-            view[:] = values
+        np.concatenate((*measured, *moved, command.q, command.v, command.tau), out=self._joints)
         record = bytes(self._row)
         for sample in samples:
             record += _packed_sample(number, sample)
