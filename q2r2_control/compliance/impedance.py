@@ -37,7 +37,7 @@ from q2r2_control.compliance.impedance_kernels import (
     bound_torques,
 )
 from q2r2_control.compliance.impedance_terms import BoolArray, PositionLimits
-from q2r2_control.config.control import ImpedanceSettings
+from q2r2_control.config.control import LIVE_IMPEDANCE, ImpedanceSettings
 from q2r2_control.control.geometry.kinematics import IntArray, chain_of
 from q2r2_control.control.jit import bound, hold
 from q2r2_control.control.tasks.task_model import tools_of
@@ -89,9 +89,9 @@ class ImpedanceController:
         model = _model_of(robot, self.settings)
         self._kernel_data = ImpedanceData.empty(model)
         self._held_model, self._held_data = hold(model), hold(self._kernel_data)
-        self._kernel_data.stiffness[:] = self.settings.translational_stiffness, self.settings.rotational_stiffness
-        self._wanted_stiffness = self._kernel_data.stiffness.copy()  # at the end of a ramp (k, 2) [N/m, Nm/rad]
-        self._ramp_rate = np.zeros_like(self._wanted_stiffness)
+        self._kernel_data.springs[:] = [getattr(self.settings, name) for name in LIVE_IMPEDANCE]
+        self._wanted_springs = self._kernel_data.springs.copy()  # at the end of a ramp
+        self._ramp_rate = np.zeros_like(self._wanted_springs)
         self._ramping = False
         # Every kernel runs once here, so that none is compiled in mid-motion.
         self._add_torque = bound(add_impedance_torque, self._held_model, self._held_data)
@@ -101,13 +101,13 @@ class ImpedanceController:
     def reset(self, state: RobotState) -> None:
         """Start anew at rest at the measured posture: the first torque is that of gravity there, without a bump.
 
-        A stiffness or a payload that is being changed is reached at once. Raises :class:`RobotError` for a posture that
-        is not nv finite numbers.
+        Stiffness, damping or a payload that is being changed is reached at once. Raises :class:`RobotError` for a
+        posture that is not nv finite numbers.
         """
         q = np.array(state.q, dtype=np.float64)
         if q.shape != self._limit.shape or not np.isfinite(q).all():
             raise RobotError(f"impedance reset: q = {q!s:.80}: expected {len(self._limit)} finite numbers")
-        self._kernel_data.stiffness[:] = self._wanted_stiffness
+        self._kernel_data.springs[:] = self._wanted_springs
         self._ramping = False
         if self._borne != self._wanted_borne:
             self._bear(1.0)
@@ -139,35 +139,34 @@ class ImpedanceController:
         for joint, inertia in inertias.items():
             self._model.inertias[joint] = inertia
 
-    def set_stiffness(
-        self, translational: float | None = None, rotational: float | None = None, arm: str | None = None
-    ) -> None:
-        """Change the stiffness [N/m], [Nm/rad] of one arm or of all, on a straight line over ``ramp_time``.
+    def change(self, values: Mapping[str, float], arm: str | None = None) -> None:
+        """Go by other stiffness and damping of one arm or of all, by name as in ``LIVE_IMPEDANCE``.
 
-        The damping follows, so that the damping ratio stays. A ramp and no jump: stiffness is energy in a spring that
-        is stretched. Raises :class:`ConfigError` for a value out of range or an arm that does not exist.
+        On a straight line over ``ramp_time``, and no jump: stiffness is energy in a spring that is stretched. The
+        damping follows the stiffness, so that a damping ratio stays that is not changed itself. Raises
+        :class:`ConfigError`, and changes nothing, for another name, a value out of range or an arm that does not exist.
         """
-        arms = list(self.robot.arms)
-        if arm is not None and arm not in arms:
-            raise ConfigError(f"stiffness: no arm {arm!r:.40}; arms: {', '.join(arms)}")
-        given = {"translational_stiffness": translational, "rotational_stiffness": rotational}
-        changes = {key: value for key, value in given.items() if value is not None}
+        if arm is not None and arm not in self._arms:
+            raise ConfigError(f"impedance: no arm {arm!r:.40}; arms: {', '.join(self._arms)}")
+        for name, value in values.items():
+            if name not in LIVE_IMPEDANCE:
+                allowed = ", ".join(LIVE_IMPEDANCE)
+                raise ConfigError(f"impedance: {name} = {value!r:.40}: while a controller runs: {allowed}")
         try:
-            ImpedanceSettings.model_validate(changes, strict=True)
+            ImpedanceSettings.model_validate(dict(values), strict=True)
         except ValidationError as error:
             fault = error.errors()[0]
             raise ConfigError(f"{fault['loc'][0]} = {fault['input']!r:.40}: {fault['msg']}") from error
-        for i in range(len(arms)) if arm is None else (arms.index(arm),):
-            for k, wanted in enumerate((translational, rotational)):
-                self._wanted_stiffness[i, k] = self._wanted_stiffness[i, k] if wanted is None else wanted
-            way = self._wanted_stiffness[i] - self._kernel_data.stiffness[i]
-            self._ramp_rate[i] = np.abs(way) / self.settings.ramp_time
+        changed = slice(None) if arm is None else self._arms.index(arm)
+        for name, value in values.items():
+            self._wanted_springs[changed, LIVE_IMPEDANCE.index(name)] = value
+        way = self._wanted_springs - self._kernel_data.springs
+        self._ramp_rate[changed] = np.abs(way)[changed] / self.settings.ramp_time
         self._ramping = True
 
-    def stiffness(self, arm: str) -> tuple[float, float]:
-        """Stiffness of an arm's tool in force now: translational [N/m], rotational [Nm/rad]."""
-        translational, rotational = self._kernel_data.stiffness[list(self.robot.arms).index(arm)]
-        return float(translational), float(rotational)
+    def in_force(self, arm: str) -> dict[str, float]:
+        """What of ``LIVE_IMPEDANCE`` an arm goes by now."""
+        return dict(zip(LIVE_IMPEDANCE, self._kernel_data.springs[self._arms.index(arm)].tolist(), strict=True))
 
     def step(self, reference: Reference, state: RobotState, dt: float, extra: Array | None = None) -> TorqueCommand:
         """Torques for a tick of ``dt`` [s] that begins at ``state`` and ends when ``reference`` is due.
@@ -200,9 +199,9 @@ class ImpedanceController:
         return TorqueCommand(data.bounded.copy(), report)
 
     def _ramp(self, time: float) -> None:
-        reach, stiffness = self._ramp_rate * time, self._kernel_data.stiffness
-        stiffness[:] += np.minimum(np.maximum(self._wanted_stiffness - stiffness, -reach), reach)
-        self._ramping = bool((stiffness != self._wanted_stiffness).any())
+        reach, springs = self._ramp_rate * time, self._kernel_data.springs
+        springs[:] += np.minimum(np.maximum(self._wanted_springs - springs, -reach), reach)
+        self._ramping = bool((springs != self._wanted_springs).any())
 
     def _exchange(self, reference: Reference) -> Array:
         """Take the newest reference in for the next tick; returns the acceleration (nv,) that leads to it."""
@@ -250,9 +249,6 @@ def _model_of(robot: Robot, settings: ImpedanceSettings) -> ImpedanceModel:
             damping=settings.limit_damping,
             distance=settings.limit_distance,
         ),
-        damping_ratio=settings.damping_ratio,
-        posture_stiffness=settings.nullspace_stiffness,
-        posture_damping_ratio=settings.nullspace_damping_ratio,
         max_position_error=settings.max_position_error,
         max_rotation_error=settings.max_rotation_error,
         consistent=settings.nullspace_projector == "consistent",

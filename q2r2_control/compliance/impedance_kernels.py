@@ -38,9 +38,6 @@ class ImpedanceModel(NamedTuple):
     dofs: IntArray  # (k,)
     torque_limit: Array  # (nv,) [Nm]
     limits: PositionLimits
-    damping_ratio: float
-    posture_stiffness: float  # [Nm/rad]
-    posture_damping_ratio: float
     max_position_error: float  # [m]
     max_rotation_error: float  # [rad]
     consistent: bool  # which nullspace projector
@@ -70,7 +67,7 @@ class ImpedanceData(NamedTuple):
     M: Array  # (nv, nv)
     M_inverse: Array  # (nv, nv) scratch
     M_factor: Array  # (nv, nv) scratch
-    stiffness: Array  # (k, 2) in force [N/m, Nm/rad]
+    springs: Array  # (k, 5) in force: the values of LIVE_IMPEDANCE [N/m, Nm/rad, 1, Nm/rad, 1]
     errors: Array  # (k, 6) after clipping [m, rad]
     clipped: IntArray  # (k,) 1 where it was longer
     repulsion: Array  # (nv,) from position limits [Nm]
@@ -92,7 +89,7 @@ class ImpedanceData(NamedTuple):
             M=np.eye(nv),
             M_inverse=np.eye(nv),
             M_factor=np.eye(nv),
-            stiffness=np.ones((arms, 2)),
+            springs=np.ones((arms, 5)),
             errors=np.zeros((arms, 6)),
             clipped=np.zeros(arms, dtype=np.int64),
             repulsion=np.zeros(nv),
@@ -145,13 +142,14 @@ def _arm_torque(model: ImpedanceModel, data: ImpedanceData, i: int, joints: IntA
     data.errors[i], data.clipped[i] = error, was_clipped
     error_rate = times(wanted_J, data.wanted_v[joints]) - times(J, data.v[joints])
     tool_inertia = task_inertia(J, M_inverse)
-    stiffness = np.repeat(data.stiffness[i], 3)
-    damping = double_diagonalised_damping(stiffness, tool_inertia, model.damping_ratio)
-    posture_stiffness = np.full(len(joints), model.posture_stiffness)
-    posture_damping = double_diagonalised_damping(posture_stiffness, M, model.posture_damping_ratio)
-    posture = posture_stiffness * way + times(posture_damping, speed)
+    linear, angular, damping_ratio, posture, posture_damping_ratio = data.springs[i]
+    stiffness = np.array([linear, linear, linear, angular, angular, angular])
+    damping = double_diagonalised_damping(stiffness, tool_inertia, damping_ratio)
+    posture_stiffness = np.full(len(joints), posture)
+    posture_damping = double_diagonalised_damping(posture_stiffness, M, posture_damping_ratio)
+    posture_torque = posture_stiffness * way + times(posture_damping, speed)
     N = consistent_projector(J, M_inverse, tool_inertia) if model.consistent else kinematic_projector(J)
-    return times(J.T, stiffness * error + times(damping, error_rate)) + times(N, posture)
+    return times(J.T, stiffness * error + times(damping, error_rate)) + times(N, posture_torque)
 
 
 @kernel

@@ -21,6 +21,14 @@ LIVE = (
     "max_angular_speed",
     "posture_gain",
 )
+# The same, of the settings of an impedance.
+LIVE_IMPEDANCE = (
+    "translational_stiffness",
+    "rotational_stiffness",
+    "damping_ratio",
+    "nullspace_stiffness",
+    "nullspace_damping_ratio",
+)
 
 Distance = Annotated[float, Field(ge=0, le=0.2)]  # [m]
 ObjectDistance = Annotated[
@@ -193,7 +201,7 @@ class ImpedanceSettings(BaseModel):
     limit_damping: float = Field(20.0, gt=0, le=200, description="of that repulsion [Nms/rad]")
     torque_scale: float = Field(1.0, gt=0, le=1, description="fraction of the robot's torque limits")
     torque_rate_limit: float = Field(5000.0, gt=0, le=1e5, description="of every joint [Nm/s]")
-    ramp_time: float = Field(0.5, ge=0.01, le=10, description="a change of stiffness at run time takes [s]")
+    ramp_time: float = Field(0.5, ge=0.01, le=10, description="a change of stiffness or damping at run time takes [s]")
     wall: WallSettings = WallSettings()
 
 

@@ -367,37 +367,77 @@ class TestController:
             ImpedanceController(robot).reset(at(bad))
 
 
-class TestStiffnessAtRunTime:
+class TestAnImpedanceThatChanges:
     def test_it_changes_on_a_straight_line_over_the_ramp_time(self, robot: Robot) -> None:
         controller = ImpedanceController(robot, ImpedanceSettings(ramp_time=0.1))
         controller.reset(at(robot.home))
-        controller.set_stiffness(translational=500.0, arm="left")
+        before = controller.in_force("right")
+        asked = {
+            **{"translational_stiffness": 500.0, "rotational_stiffness": 150.0, "damping_ratio": 0.5},
+            **{"nullspace_stiffness": 10.0, "nullspace_damping_ratio": 0.7},
+        }
+        controller.change(asked, arm="left")
         for tick in range(1, 121):
             controller.step(reference(robot.home), at(robot.home), DT)
             share = min(tick / 100, 1.0)
-            assert controller.stiffness("left") == pytest.approx((2000.0 - 1500.0 * share, 200.0))
-            assert controller.stiffness("right") == (2000.0, 200.0)
+            now = {name: value + share * (asked[name] - value) for name, value in before.items()}
+            assert controller.in_force("left") == pytest.approx(now)
+            assert controller.in_force("right") == before
+        assert controller.in_force("left") == asked
+
+    def test_another_change_begins_where_the_last_one_is_and_the_other_arm_s_goes_on(self, robot: Robot) -> None:
+        controller = ImpedanceController(robot, ImpedanceSettings(ramp_time=0.1))
+        controller.reset(at(robot.home))
+
+        def tick(count: int) -> None:
+            for _ in range(count):
+                controller.step(reference(robot.home), at(robot.home), DT)
+
+        controller.change({"damping_ratio": 0.5})
+        tick(50)
+        controller.change({"damping_ratio": 1.75}, arm="left")
+        tick(50)
+        assert [controller.in_force(arm)["damping_ratio"] for arm in ("left", "right")] == pytest.approx([1.25, 0.5])
+        tick(50)
+        assert [controller.in_force(arm)["damping_ratio"] for arm in ("left", "right")] == [1.75, 0.5]
+
+    def test_what_is_in_force_afterwards_is_as_if_the_controller_had_been_made_with_it(self, robot: Robot) -> None:
+        soft = {"translational_stiffness": 300.0, "damping_ratio": 0.4, "nullspace_stiffness": 20.0}
+        made = ImpedanceController(robot, ImpedanceSettings(**soft))
+        changed = ImpedanceController(robot)
+        changed.change(soft)
+        random = np.random.default_rng(2)
+        for controller in (made, changed):
+            controller.reset(at(robot.home))
+        for _ in range(50):
+            q, v = robot.home + random.normal(0.0, 0.02, 14), random.normal(0.0, 0.1, 14)
+            expected, found = (one.step(reference(robot.home), at(q, v), DT).tau for one in (made, changed))
+            np.testing.assert_array_equal(found, expected)
 
     @pytest.mark.parametrize(
-        ("arguments", "message"),
+        ("values", "arm", "message"),
         [
-            ({"translational": 0.0}, "translational_stiffness = 0.0: .*greater than 0"),
-            ({"translational": -1.0}, "translational_stiffness = -1.0"),
-            ({"translational": 1e4}, "translational_stiffness = 10000.0: .*5000"),
-            ({"rotational": np.inf}, "rotational_stiffness = inf: .*finite"),
-            ({"rotational": np.nan}, "rotational_stiffness = nan"),
-            ({"rotational": True}, "rotational_stiffness = True"),
-            ({"translational": 100.0, "arm": "middle"}, "no arm 'middle'; arms: left, right"),
+            ({"translational_stiffness": 0.0}, None, "translational_stiffness = 0.0: .*greater than 0"),
+            ({"translational_stiffness": -1.0}, None, "translational_stiffness = -1.0"),
+            ({"translational_stiffness": 1e4}, None, "translational_stiffness = 10000.0: .*5000"),
+            ({"rotational_stiffness": np.inf}, None, "rotational_stiffness = inf: .*finite"),
+            ({"rotational_stiffness": np.nan}, None, "rotational_stiffness = nan"),
+            ({"rotational_stiffness": True}, None, "rotational_stiffness = True"),
+            ({"damping_ratio": 0.05}, None, "damping_ratio = 0.05: .*0.1"),
+            ({"nullspace_stiffness": 10.0, "nullspace_damping_ratio": 3.0}, None, "nullspace_damping_ratio = 3.0"),
+            ({"torque_scale": 0.5}, None, "torque_scale = 0.5: while a controller runs: translational_stiffness, "),
+            ({"translational_stiffness": 100.0}, "middle", "no arm 'middle'; arms: left, right"),
         ],
     )
-    def test_a_stiffness_that_cannot_be_is_refused_and_nothing_changes(
-        self, robot: Robot, arguments: dict, message: str
+    def test_what_cannot_be_is_refused_and_nothing_changes(
+        self, robot: Robot, values: dict, arm: str | None, message: str
     ) -> None:
         controller = ImpedanceController(robot)
+        before = controller.in_force("left")
         with pytest.raises(ConfigError, match=message):
-            controller.set_stiffness(**arguments)
+            controller.change(values, arm)
         controller.step(reference(robot.home), at(robot.home), DT)
-        assert controller.stiffness("left") == (2000.0, 200.0)
+        assert controller.in_force("left") == before
 
 
 @pytest.mark.parametrize(("model", "joints"), [("panda", 7), ("ur5", 6)])

@@ -244,14 +244,14 @@ def test_a_change_of_stiffness_under_load_is_a_ramp_and_no_jump(bare: MujocoPlan
     bare.push("left", along(2), 60.0)
     loop.settle()
     for stiffness in (500.0, 4000.0):
-        loop.controller.set_stiffness(translational=stiffness)
+        loop.controller.change({"translational_stiffness": stiffness})
         for _ in range(round(SETTINGS.ramp_time / DT)):
-            before = loop.controller.stiffness("left")[0]
+            before = loop.controller.in_force("left")["translational_stiffness"]
             # The rate limit, which would hide a jump, is never touched.
             assert not loop.tick().report.rate_limited
-            change = abs(loop.controller.stiffness("left")[0] - before)
+            change = abs(loop.controller.in_force("left")["translational_stiffness"] - before)
             assert change <= 3500.0 * DT / SETTINGS.ramp_time * (1 + 1e-9)
-        assert loop.controller.stiffness("left")[0] == stiffness
+        assert loop.controller.in_force("left")["translational_stiffness"] == stiffness
         loop.run(2.0)
         assert loop.displacement()[2] == pytest.approx(FORCE / stiffness, rel=0.05)
 

@@ -13,7 +13,7 @@ from rcl_interfaces.msg import SetParametersResult
 from rclpy.parameter import Parameter
 
 from q2r2_control.config import ControllerSettings, ImpedanceSettings
-from q2r2_control.config.control import LIVE
+from q2r2_control.config.control import LIVE, LIVE_IMPEDANCE
 from q2r2_control.config.teleop import GuardSettings, TeleopSettings
 from q2r2_control.errors import ConfigError
 from q2r2_control.robot.pairs import CLEARANCE
@@ -101,24 +101,23 @@ class LiveControl:
         return _DONE if problem is None else SetParametersResult(successful=False, reason=problem)
 
 
-class LiveStiffness:
-    """Parameters of the tools' stiffness in torque mode, which ramps to what is set."""
-
-    _NAMES = ("translational_stiffness", "rotational_stiffness")
+class LiveImpedance:
+    """Parameters of the impedance in torque mode, which ramps to what is set."""
 
     def __init__(self, node: BaseNode, impedance: ImpedanceController) -> None:
         self._impedance = impedance
-        for name in self._NAMES:
+        for name in LIVE_IMPEDANCE:
             field = ImpedanceSettings.model_fields[name]
-            value, most = getattr(impedance.settings, name), bounds_of(field)["at_most"]
-            words = f"{field.description}; changes over ramp_time"
-            node.parameter(name, value, words, at_least=1.0, at_most=most, read_only=False)
+            words, bounds = f"{field.description}; changes over ramp_time", bounds_of(field)
+            # Ends of a parameter's range are allowed, and none of these may be 0.
+            bounds["at_least"] = max(bounds["at_least"], 0.1)
+            node.parameter(name, getattr(impedance.settings, name), words, read_only=False, **bounds)
         node.add_post_set_parameters_callback(self._on_set)
 
     def _on_set(self, parameters: Sequence[Parameter]) -> None:
-        values = {one.name: one.value for one in parameters if one.name in self._NAMES}
+        values = {one.name: one.value for one in parameters if one.name in LIVE_IMPEDANCE}
         if values:
-            self._impedance.set_stiffness(values.get(self._NAMES[0]), values.get(self._NAMES[1]))
+            self._impedance.change(values)
 
 
 class LiveWatching:

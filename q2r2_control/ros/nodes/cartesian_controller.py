@@ -30,7 +30,7 @@ from q2r2_control.ros.base_node import ERROR, OK, WARN, run_node
 from q2r2_control.ros.bridge.controller_feedback import ControllerFeedback
 from q2r2_control.ros.bridge.intakes import JointIntake, TargetIntake
 from q2r2_control.ros.bridge.joint_outputs import NONE, make_output, output_name
-from q2r2_control.ros.bridge.live_parameters import LiveControl, LiveStiffness, LiveWatching
+from q2r2_control.ros.bridge.live_parameters import LiveControl, LiveImpedance, LiveWatching
 from q2r2_control.ros.executor import TickExecutor
 from q2r2_control.ros.managed_node import ManagedNode
 from q2r2_control.supervision.external_arms import ExternalArms, ExternalSettings, settings_for_external_arms
@@ -73,7 +73,7 @@ class CartesianControllerNode(ManagedNode):
         watch.unusable_time = 0.0
         self._watching = LiveWatching(self, streams, watch, external)
         if isinstance(self._output.drive, TorqueDrive):
-            self._stiffness = LiveStiffness(self, self._output.drive.impedance)
+            self._live_impedance = LiveImpedance(self, self._output.drive.impedance)
         self._controller = CartesianController(robot, permitted(config.control, self._output.drive))
         self._live = LiveControl(self, self._controller)
         self._kept = self._controller.kept_distances

@@ -1,4 +1,4 @@
-"""The stiffness of arms that are commanded torques, set while the controller's node runs."""
+"""Stiffness and damping of arms that are commanded torques, set while the controller's node runs."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from rclpy.parameter_client import AsyncParameterClient
 from q2r2_control.compliance.impedance import ImpedanceController
 from q2r2_control.config import ImpedanceSettings
 from q2r2_control.ros.base_node import BaseNode
-from q2r2_control.ros.bridge.live_parameters import LiveStiffness
+from q2r2_control.ros.bridge.live_parameters import LiveImpedance
 from q2r2_control.types import RobotState
 
 
@@ -32,7 +32,7 @@ def test_what_is_set_counts_for_both_arms_without_a_jump_and_what_is_not_allowed
     impedance.reset(at_home)
     with spun_node(domain) as other:
         node = BaseNode("torques", context=other.context)
-        LiveStiffness(node, impedance)
+        LiveImpedance(node, impedance)
         other.executor.add_node(node)
         client = AsyncParameterClient(other, "torques")
 
@@ -42,12 +42,17 @@ def test_what_is_set_counts_for_both_arms_without_a_jump_and_what_is_not_allowed
             wait_until(future.done, "the parameters are answered")
             return future.result().result
 
-        assert {impedance.stiffness(arm) for arm in robot.arms} == {(2000.0, 200.0)}
-        assert set_to(translational_stiffness=500.0, rotational_stiffness=50.0).successful
-        refused = set_to(translational_stiffness=9000.0)
-        assert not refused.successful
-        assert "translational_stiffness" in refused.reason
+        before = impedance.in_force("left")
+        asked = {
+            **{"translational_stiffness": 500.0, "rotational_stiffness": 50.0, "damping_ratio": 0.5},
+            **{"nullspace_stiffness": 10.0, "nullspace_damping_ratio": 0.7},
+        }
+        assert set_to(**asked).successful
+        for name, value in {"translational_stiffness": 9000.0, "damping_ratio": 0.0}.items():
+            refused = set_to(nullspace_stiffness=20.0, **{name: value})
+            assert not refused.successful
+            assert name in refused.reason
         node.destroy_node()
-    assert {impedance.stiffness(arm) for arm in robot.arms} == {(2000.0, 200.0)}  # until the arms are commanded
+    assert [impedance.in_force(arm) for arm in robot.arms] == [before] * 2  # until the arms are commanded
     impedance.reset(at_home)
-    assert {impedance.stiffness(arm) for arm in robot.arms} == {(500.0, 50.0)}
+    assert [impedance.in_force(arm) for arm in robot.arms] == [asked] * 2
