@@ -44,7 +44,10 @@ class Plant(Protocol):
         ...
 
     def state(self) -> RobotState:
-        """The newest measurement; its stamp is on the plant's own clock, which starts at 0 on ``reset``."""
+        """The newest measurement; its stamp is on the plant's own clock, which starts at 0 on ``reset``.
+
+        Its arrays stay as they are: others keep them for some ticks.
+        """
         ...
 
     def gripper_openings(self) -> dict[str, float]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 import time
+from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,6 +29,7 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.runtime.recorder import Tick
 
 _LOOKS = 64  # ticks between two looks at whether the writer lives
+_MOST_WAITING = 4  # ticks that may wait to be packed
 _LONGEST_FAULT = 500  # that ended a run [characters]
 
 _logger = logging.getLogger(__name__)
@@ -64,6 +66,7 @@ class Recorder(BaseRecorder):
         self._count = self._written = 0  # ticks
         self.overflows = 0  # ticks for which there was no room
         self._packer: TickPacker | None = None  # None: not begun
+        self._waiting: deque[tuple[int, Tick]] = deque()
         self._channel: PictureChannel | None = None
         self.cameras: CameraProcess | None = None
         self._pictures_fault: str | None = None
@@ -102,23 +105,37 @@ class Recorder(BaseRecorder):
     def __call__(self, tick: Tick) -> None:
         """Take one tick; never raises, and waits in simulated time only."""
         number, self._count = self._count, self._count + 1
-        if self._fault is not None or self._packer is None or self.writer is None:
+        if self._fault is not None or self._packer is None:
             return
         self._take_pictures(number, tick)
+        self._waiting.append((number, tick))
+        # Ticks that take samples of hands are the longest ones; those between them have time for more.
+        if not tick.samples or len(self._waiting) >= _MOST_WAITING:
+            self._pack()
+
+    def _pack(self) -> None:
+        """Give the writer all ticks that wait."""
         try:
-            record = self._packer.pack(number, tick)
-            while not self.writer.ring.put(record):
-                if not self._waits:
-                    self.overflows += 1
-                    self._packer.repeat_state()
-                    break
-                time.sleep(1e-3)
-                if self._look():
-                    return
-            if number % _LOOKS == 0:
-                self._look()
+            while self._waiting and self._fault is None:
+                number, tick = self._waiting.popleft()
+                self._put(number, tick)
         except Exception as error:  # the arms move on, whatever it is
             self._fail(reason_of(error))
+
+    def _put(self, number: int, tick: Tick) -> None:
+        assert self._packer is not None
+        assert self.writer is not None
+        record = self._packer.pack(number, tick)
+        while not self.writer.ring.put(record):
+            if not self._waits:
+                self.overflows += 1
+                self._packer.repeat_state()
+                break
+            time.sleep(1e-3)
+            if self._look():
+                return
+        if number % _LOOKS == 0:
+            self._look()
 
     def __enter__(self) -> Recorder:
         return self
@@ -126,6 +143,7 @@ class Recorder(BaseRecorder):
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        self._pack()
         # The pictures first: the writer waits for them.
         if self.cameras is not None and (fault := self.cameras.finish(0.0 if self._fault else PATIENCE)):
             self._fail_pictures(fault)

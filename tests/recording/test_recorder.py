@@ -150,6 +150,33 @@ def test_two_processes_that_record_at_once_get_a_folder_each(tmp_path: Path, mon
         assert replay(file).difference is None
 
 
+def test_ticks_with_samples_of_hands_are_packed_later_and_all_are_there_at_any_end(
+    tmp_path: Path, recorded: tuple[Path, list[Tick]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    packed: list[int] = []
+    pack = TickPacker.pack
+
+    def noted(packer: TickPacker, number: int, tick: Tick) -> bytes:
+        packed.append(number)
+        return pack(packer, number, tick)
+
+    monkeypatch.setattr(TickPacker, "pack", noted)
+    loop, ticks = pipeline("circle", "mujoco"), recorded[1]
+    (busy,) = [tick for tick in ticks if tick.t > 1.0 and tick.samples][:1]
+    (calm,) = [tick for tick in ticks if tick.t > 1.0 and not tick.samples][:1]
+    counts = []
+    with Recorder(tmp_path, "busy", waits=True) as recorder:
+        recorder.begin(About.of(loop, False, {}), loop.robot)
+        for number, tick in enumerate([calm, busy, calm, *[busy] * 10]):
+            recorder(changed(tick, now=tick.start.now + 1e-3 * number))
+            counts.append(len(packed))
+    # At most four wait, such as where samples come as often as ticks.
+    assert counts == [1, 1, 3, 3, 3, 3, 7, 7, 7, 7, 11, 11, 11]
+    assert packed == list(range(13))
+    assert recorder.summary.ticks == 13
+    assert recorder.summary.lost_ticks == 0
+
+
 class Broken(TickPacker):
     def __init__(self) -> None:
         pass
