@@ -27,7 +27,7 @@ SLOW = (
     "control/test_contract.py::test_separation_holds_between_ticks",
     "control/test_jit.py::test_kernels_run_where_no_cache",
     "control/test_jit.py::test_what_is_held",
-    "control/test_scenarios.py::test_the_contract_holds_at_every_tick[1 ms",
+    "control/test_scenarios.py::test_the_contract_holds_at_every_tick[1 ms-panda",
     "control/test_scenarios.py::test_the_contract_holds_at_every_tick[2 ms",
     "control/test_work.py",
     "drives/test_drive.py",

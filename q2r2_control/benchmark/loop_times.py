@@ -55,7 +55,7 @@ class StageTime:
 
 
 class Ratio(NamedTuple):
-    """Of two times, and the interval that holds it with a probability of 90 %."""
+    """Of two times, and the interval of 90 % of what other draws of the pairs give."""
 
     value: float
     low: float
@@ -80,7 +80,7 @@ class LoopRow:
     mode: str
     ticks: int  # timed, of a round
     rounds: int
-    stages: list[StageTime]
+    stages: list[StageTime]  # of the first three rounds
     without_physics: StageTime  # of rounds without clocks in the stages
     to_command: StageTime  # the same, until the command is applied: a tick's time in the summary of a run
     clocks_us: float  # that the clocks in the stages add to a tick
@@ -188,6 +188,7 @@ class _Case:
     def row(self) -> LoopRow:
         """The figures of all rounds."""
         stages, whole = np.concatenate(self._stages), _without_physics(np.concatenate(self._whole))
+        beside = whole[: len(stages)]  # of the same rounds
         return LoopRow(
             plant=self.plant,
             mode=self.mode,
@@ -196,7 +197,7 @@ class _Case:
             stages=[_time_of(stage, stages[:, index]) for index, stage in enumerate(STAGES)],
             without_physics=_time_of("without physics", whole),
             to_command=_time_of("to the command", np.concatenate(self._to_command)),
-            clocks_us=1e6 * float(np.median(_without_physics(stages)) - np.median(whole)),
+            clocks_us=1e6 * float(np.median(_without_physics(stages)) - np.median(beside)),
             recording=self._recording_cost() if self._record else None,
         )
 

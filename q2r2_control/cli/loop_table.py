@@ -29,6 +29,7 @@ def loop_table(report: LoopReport) -> Table:
     added = ", ".join(f"{row.clocks_us:.0f}" for row in report.rows)
     caption = (
         f"without physics: of runs without clocks in the stages, which add {added} us; medians do not add up\n"
+        "stages: of three runs with clocks\n"
         "to the command: from the inputs until it is applied, a tick's time in the summary of a run\n"
         "drive: impedance and wall in torque mode; physics: of the simulator, where a real robot would move"
     )

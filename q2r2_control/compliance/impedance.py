@@ -159,9 +159,10 @@ class ImpedanceController:
             raise ConfigError(f"{fault['loc'][0]} = {fault['input']!r:.40}: {fault['msg']}") from error
         changed = slice(None) if arm is None else self._arms.index(arm)
         for name, value in values.items():
-            self._wanted_springs[changed, LIVE_IMPEDANCE.index(name)] = value
-        way = self._wanted_springs - self._kernel_data.springs
-        self._ramp_rate[changed] = np.abs(way)[changed] / self.settings.ramp_time
+            column = LIVE_IMPEDANCE.index(name)
+            self._wanted_springs[changed, column] = value
+            way = self._wanted_springs[changed, column] - self._kernel_data.springs[changed, column]
+            self._ramp_rate[changed, column] = np.abs(way) / self.settings.ramp_time
         self._ramping = True
 
     def in_force(self, arm: str) -> dict[str, float]:

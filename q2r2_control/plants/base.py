@@ -51,7 +51,7 @@ class Plant(Protocol):
         ...
 
     def gripper_openings(self) -> dict[str, float]:
-        """Measured opening of each arm that has a gripper, 0 closed .. 1 fully open."""
+        """Measured opening of each arm that has a gripper, 0 closed .. 1 fully open; another mapping at each call."""
         ...
 
     def close(self) -> None:

@@ -109,7 +109,7 @@ class Recorder(BaseRecorder):
             return
         self._take_pictures(number, tick)
         self._waiting.append((number, tick))
-        # Ticks that take samples of hands are the longest ones; those between them have time for more.
+        # Ticks that take samples of hands are the longest ones; those between them, if there are any, have time.
         if not tick.samples or len(self._waiting) >= _MOST_WAITING:
             self._pack()
 

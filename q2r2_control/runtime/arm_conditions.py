@@ -28,10 +28,10 @@ class ArmConditions:
         self._joints = {arm: {robot.joint_names[j] for j in robot.arms[arm].joints} for arm in robot.arms}
         nv = robot.model.nv
         self._member = dict(zip(robot.arms, tools_of(robot).member, strict=True))
-        self._J, self._wrench = np.zeros((6, nv)), np.zeros(6)
+        self._J, self._tau, self._wrench = np.zeros((6, nv)), np.zeros(nv), np.zeros(6)
         self._scratch = np.zeros((6, 6)), np.zeros((6, 6))
         # What is compiled is loaded now, not in a tick.
-        estimate_wrench(self._J, np.zeros(nv), np.zeros(nv), *self._scratch, self._wrench)
+        estimate_wrench(self._J, self._tau, self._tau, *self._scratch, self._wrench)
         self._limited: dict[str, float] = {}  # when a joint last was at its position limit [s]
 
     def note(self, report: StepReport, now: float) -> None:
@@ -56,5 +56,6 @@ class ArmConditions:
             return None
         frame, wrench = self._robot.arms[arm].frame_id, self._wrench
         self._J[:] = pin.computeFrameJacobian(self._robot.model, self._data, state.q, frame, pin.LOCAL_WORLD_ALIGNED)
-        estimate_wrench(self._J, state.tau_external, self._member[arm], *self._scratch, wrench)
+        self._tau[:] = state.tau_external
+        estimate_wrench(self._J, self._tau, self._member[arm], *self._scratch, wrench)
         return math.hypot(*wrench[:3].tolist())

@@ -58,8 +58,9 @@ class OperatorFeedback:
         for event in events:
             self._pulses[event.arm].tell(event)
         self._conditions.note(report, now)
-        if now >= self._due:
-            self._due = now + self._wait
+        self._due = max(self._due, now - _PERIOD + self._wait)  # each arm once at most
+        while now >= self._due:
+            self._due += self._wait
             self._look(next(self._turns), now, targets, state, grippers, openings)
         for arm, pulses in self._pulses.items():
             if (feedback := pulses.at(now, self._hand_of(arm))) is not None:

@@ -138,7 +138,7 @@ def _numbers(values: object, size: int) -> list[float] | None:
     """``values`` as ``size`` finite numbers, or None."""
     try:
         vector = np.asarray(values, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         return None
     if vector.shape != (size,):
         return None

@@ -385,7 +385,7 @@ class TestAnImpedanceThatChanges:
             assert controller.in_force("right") == before
         assert controller.in_force("left") == asked
 
-    def test_another_change_begins_where_the_last_one_is_and_the_other_arm_s_goes_on(self, robot: Robot) -> None:
+    def test_another_change_begins_where_the_last_one_is_and_what_it_does_not_name_goes_on(self, robot: Robot) -> None:
         controller = ImpedanceController(robot, ImpedanceSettings(ramp_time=0.1))
         controller.reset(at(robot.home))
 
@@ -393,10 +393,12 @@ class TestAnImpedanceThatChanges:
             for _ in range(count):
                 controller.step(reference(robot.home), at(robot.home), DT)
 
-        controller.change({"damping_ratio": 0.5})
+        controller.change({"damping_ratio": 0.5, "nullspace_stiffness": 10.0})
         tick(50)
         controller.change({"damping_ratio": 1.75}, arm="left")
         tick(50)
+        # What was not changed again was on its way for the ramp's time.
+        assert [controller.in_force(arm)["nullspace_stiffness"] for arm in ("left", "right")] == [10.0, 10.0]
         assert [controller.in_force(arm)["damping_ratio"] for arm in ("left", "right")] == pytest.approx([1.25, 0.5])
         tick(50)
         assert [controller.in_force(arm)["damping_ratio"] for arm in ("left", "right")] == [1.75, 0.5]

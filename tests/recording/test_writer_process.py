@@ -239,8 +239,8 @@ def test_what_a_killed_run_leaves_opens_and_is_replayed(tmp_path: Path, both: bo
     assert set(found) >= {"/joint_states", "/robot_description", "/q2r2/run_start"}
     count = found["/q2r2/tick"]["count"]
     if not both:
-        # All but the newest: the last one in the ring comes with the next.
-        assert told - 1 <= count <= told + 1
+        # All but the newest: those that took samples wait for a calmer one, the last in the ring for the next.
+        assert told - 4 <= count <= told + 1
     result = replay(file)
     assert (result.difference, result.ticks) == (None, count)
     assert result.ended_by is not None

@@ -32,6 +32,7 @@ def gate() -> PoseGate:
         {"position": np.zeros((3, 1))},
         {"position": None},
         {"position": "here"},
+        {"position": [10**400, 0, 0]},
         {"quaternion": np.zeros(4)},
         {"quaternion": np.array([0, 0, 0, np.nan])},
         {"quaternion": np.array([0, 0, 0, 1e200])},

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pinocchio as pin
@@ -136,3 +137,44 @@ def test_a_hundred_pauses_of_a_resting_hand_with_noise_hardly_displace_the_tool(
         assert np.mean(after_engaging) < 0.05e-3
     else:
         assert max(drift) > 1e-3  # which is what the average is for
+
+
+def turning(speed: float, seconds: float, then: float) -> tuple[list[pin.SE3], list[pin.SE3]]:
+    """A noisy hand that turns [rad/s] and then rests: what was drawn at each tick, and where the hand really was."""
+    random, rest, filtered = np.random.default_rng(6), RestingPose(), PoseFilter(FilterSettings())
+    axis = np.array([0.6, 0.0, 0.8])
+    drawn, real = [], []
+    due = 0.0
+    for tick in range(round((seconds + then) / TICK)):
+        t = tick * TICK
+        hand = pose(0.0, 0.0, 0.0, tuple(axis * speed * min(t, seconds)))
+        if t >= due:
+            due += PERIOD
+            noise = pin.SE3(pin.exp3(random.normal(0.0, TURN_NOISE, 3)), random.normal(0.0, NOISE, 3))
+            if tick == 0:
+                filtered.reset(hand, t)
+                rest.begin(hand, t)
+            filtered.add(hand * noise, t, t)
+            rest.add(hand * noise)
+        drawn.append(rest.draw(filtered.at(t), t))
+        real.append(hand)
+    return drawn, real
+
+
+def angle(one: pin.SE3, other: pin.SE3) -> float:
+    return float(np.linalg.norm(pin.log3(one.rotation.T @ other.rotation)))
+
+
+@pytest.mark.parametrize("speed", [0.1, 1.0, 0.5 * np.pi, 6.0])
+def test_a_hand_that_has_turned_however_far_is_known_as_well_as_any_when_it_rests(speed: float) -> None:
+    drawn, real = turning(speed, seconds=2.0, then=4.0)
+    settled = [angle(*both) for both in zip(drawn[-250:], real[-250:], strict=True)]
+    assert max(settled) < TURN_NOISE / 2.0, "a mean of 150 samples; the filter alone leaves more than that"
+
+
+def test_a_hand_that_creeps_out_of_what_rotation_vectors_can_tell_is_followed_without_a_jump() -> None:
+    drawn, real = turning(1.5e-3, seconds=250.0, then=1.0)
+    assert angle(real[0], real[-1]) > 0.3, "it has left the origin of its rest"
+    assert max(angle(*both) for both in zip(drawn[25:], real[25:], strict=True)) < 4e-3
+    # With 25 steps in the time in which a mean comes and goes, what it counts for changes by a share of 0.08 at each.
+    assert max(angle(*both) for both in pairwise(drawn[25:])) < 5e-4

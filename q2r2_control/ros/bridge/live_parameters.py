@@ -108,10 +108,10 @@ class LiveImpedance:
         self._impedance = impedance
         for name in LIVE_IMPEDANCE:
             field = ImpedanceSettings.model_fields[name]
-            words, bounds = f"{field.description}; changes over ramp_time", bounds_of(field)
+            value, bounds = getattr(impedance.settings, name), bounds_of(field)
             # Ends of a parameter's range are allowed, and none of these may be 0.
-            bounds["at_least"] = max(bounds["at_least"], 0.1)
-            node.parameter(name, getattr(impedance.settings, name), words, read_only=False, **bounds)
+            bounds["at_least"] = max(bounds["at_least"], min(0.1, value))
+            node.parameter(name, value, f"{field.description}; changes over ramp_time", read_only=False, **bounds)
         node.add_post_set_parameters_callback(self._on_set)
 
     def _on_set(self, parameters: Sequence[Parameter]) -> None:
