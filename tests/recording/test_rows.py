@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import struct
 from typing import Any
 
 import numpy as np
 import pytest
 
 from q2r2_control.inputs.messages import Dialect, message_types
-from q2r2_control.recording.rows import HEAD, RowType, log_time, text_of, text_record
+from q2r2_control.recording.rows import HEAD, RowType, jpeg_of, log_time, picture_record, text_of, text_record
 from q2r2_control.recording.topics import Topic, Topics
 
 ARMS, JOINTS = ("left", "right"), ("left_A1", "left_A2", "right_A1_with_a_longer_name")
@@ -76,3 +77,16 @@ def test_every_number_of_an_array_has_a_name_of_its_own() -> None:
     for topic in TOPICS.all:
         for labels in topic.labels.values():
             assert len(set(labels)) == len(labels)
+
+
+@pytest.mark.parametrize("length", [0, 1, 2, 3, 4, 5000, 5001])
+def test_a_picture_of_any_length_is_read_as_it_was_also_where_a_middleware_filled_the_message_up(
+    length: int,
+) -> None:
+    jpeg = bytes(number % 251 for number in range(length))
+    record = picture_record(3, 7, 1_500_000_000, "front", jpeg)
+    for padding in range(4):
+        assert jpeg_of(record + bytes(padding)) == jpeg
+    for wrong in (record + bytes(4), record[:-1]):
+        with pytest.raises((ValueError, struct.error)):
+            jpeg_of(wrong)
