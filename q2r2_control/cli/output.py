@@ -43,7 +43,7 @@ def stderr_console() -> Console:
 @contextmanager
 def notice_of_compiling(console: Console) -> Iterator[None]:
     """Say what takes so long, where building the controller does."""
-    text = "compiling the controller for this machine: once for each version of the code, 1-2 minutes"
+    text = "building the controller; where its code is new it is compiled for this machine first, 1-2 minutes"
     timer = threading.Timer(_NOTICE_AFTER, lambda: console.print(text, soft_wrap=True, highlight=False))
     timer.daemon = True
     timer.start()
