@@ -398,7 +398,8 @@ class TestAnImpedanceThatChanges:
         controller.change({"damping_ratio": 1.75}, arm="left")
         tick(50)
         # What was not changed again was on its way for the ramp's time.
-        assert [controller.in_force(arm)["nullspace_stiffness"] for arm in ("left", "right")] == [10.0, 10.0]
+        posture = [controller.in_force(arm)["nullspace_stiffness"] for arm in ("left", "right")]
+        assert posture == pytest.approx([10.0, 10.0])
         assert [controller.in_force(arm)["damping_ratio"] for arm in ("left", "right")] == pytest.approx([1.25, 0.5])
         tick(50)
         assert [controller.in_force(arm)["damping_ratio"] for arm in ("left", "right")] == [1.75, 0.5]
