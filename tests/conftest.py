@@ -20,6 +20,8 @@ SLOW = (
     "cli/test_app.py::test_a_search_for_pairs_says_how_far_it_has_got",
     "cli/test_app.py::test_a_run_by_torque_repeats_itself",
     "cli/test_app.py::test_bench",
+    "cli/test_app.py::test_ctrl_c",
+    "cli/test_app.py::test_headset_check_shows",
     "cli/test_app.py::test_the_demo",
     "cli/test_judge.py::TestARunThatIsRecorded",
     "cli/test_replay.py",
