@@ -10,7 +10,6 @@ import numpy as np
 import pinocchio as pin
 
 from q2r2_control.config.control import ControllerSettings
-from q2r2_control.control.geometry.collision import collision_model_of
 from q2r2_control.control.geometry.finger_openings import FingerOpenings
 from q2r2_control.control.geometry.kinematics import IntArray
 from q2r2_control.control.held_objects import ObjectLoads
@@ -20,15 +19,13 @@ from q2r2_control.control.live_settings import LiveSettings
 from q2r2_control.control.qp import QpProblem, Solver, make_solver
 from q2r2_control.control.qp_assembly import assemble
 from q2r2_control.control.reference import move_reference, observe_bodies, spare_distance, start_reference
-from q2r2_control.control.safety.joint_limits import ACCELERATION, POSITION, VELOCITY
-from q2r2_control.control.safety.safety_filter import FOLLOWED, SEPARATION, STOPPED
+from q2r2_control.control.safety.safety_filter import FOLLOWED, STOPPED
+from q2r2_control.control.step_report import BoundNames, StepSummary
 from q2r2_control.control.targets import TargetTracker
 from q2r2_control.errors import ConfigError, RobotError
 from q2r2_control.robot.pairs import pairs_with_others
 from q2r2_control.robot.robot import Robot
-from q2r2_control.types import LONGEST_DT, Array, Interval, Reference, StepReport, StepStatus, pose_of
-
-_LIMIT_NAMES = {POSITION: "position", VELOCITY: "velocity", ACCELERATION: "acceleration"}
+from q2r2_control.types import LONGEST_DT, Array, Interval, Reference, StepReport, pose_of
 
 
 class CartesianController:
@@ -69,10 +66,7 @@ class CartesianController:
         self._fingers = FingerOpenings(robot, self._objects.bodies)
         self._unchanged: IntArray = np.zeros(len(self._objects.bodies.joint), dtype=np.int64)
         self._targets = TargetTracker(model.tasks, self._arms, settings)
-        names = [geometry.name for geometry in robot.collision_model.geometryObjects]
-        watched = collision_model_of(robot).pairs  # the model's own know boxes that may be touched by other numbers
-        pairs = zip(watched.first.tolist(), watched.second.tolist(), strict=True)
-        self._names = [(names[first], names[second]) for first, second in pairs]
+        self._names = BoundNames(robot)
         self._take_load()
         self._compile()
         self.reset(robot.home)
@@ -102,7 +96,7 @@ class CartesianController:
     @property
     def narrow_pair(self) -> tuple[str, str] | None:
         """The pair that is farthest from keeping what was asked for, since it was too near yet; None: all keep it."""
-        return None if self._live.narrow < 0 else self._names[self._live.narrow]
+        return None if self._live.narrow < 0 else self._names.pair(self._live.narrow)
 
     def _compile(self) -> None:
         """Run every kernel once, so that none is compiled in mid-motion."""
@@ -157,23 +151,23 @@ class CartesianController:
         self._targets.aim_posture(posture)
         rejected = self._targets.update(targets, time, state.q, state.v)
         state.a[:] = 0.0
-        summary = _Summary()
+        summary = StepSummary()
         if time > 0.0:
             substeps = max(math.ceil(time / self.settings.max_substep - 1e-9), 1)
             for index in range(substeps):
                 if not self._advance(time / substeps, 1.0 / substeps, summary):
                     summary.unsolved |= 1 << index
         report = StepReport(
-            status=self._status(usable and dt <= LONGEST_DT, rejected, summary),
+            status=summary.status(self._apart, usable and dt <= LONGEST_DT, rejected),
             rejected=rejected,
-            binding=self._binding(),
-            closest_pair=self._names_of(self._closest),
+            binding=self._names.of(self._active),
+            closest_pair=self._names.pair(self._closest),
             closest_distance=self._distance,
             certified=self._certified,
             fallback=summary.fallback,
             slack=summary.slack,
             solve_time=summary.solve_time,
-            tightest_pair=self._names_of(self._tightest),
+            tightest_pair=self._names.pair(self._tightest),
             margin=self._margin,
             unsolved=summary.unsolved,
         )
@@ -207,7 +201,7 @@ class CartesianController:
             return None
         self._fingers.set(arm, before)
         self._look_again(self._unchanged)
-        return self._names_of(blocked)
+        return self._names.pair(blocked)
 
     @property
     def openings(self) -> dict[str, Interval]:
@@ -246,9 +240,9 @@ class CartesianController:
         """Go on with the kernels' model and data of what is held now."""
         load = self._objects.load
         self._held_model, self._held_data = load.model, load.data
-        self._pair_names = self._names + [self._objects.pair_names[pair] for pair in load.objects]
+        self._names.take_pairs([self._objects.pair_names[pair] for pair in load.objects])
         self._active.used[0] = 0  # pairs are numbered anew
-        self._with_others = {arm: pairs_with_others(self._pair_names, self.robot.roles, arm) for arm in self._arms}
+        self._with_others = {arm: pairs_with_others(self._names.pairs, self.robot.roles, arm) for arm in self._arms}
 
     def _look_again(self, grown: IntArray) -> int:
         """Observe with bodies that have changed; returns the pair in the way of those that have ``grown``, or -1."""
@@ -274,7 +268,7 @@ class CartesianController:
         """Of each joint in the full stop from the reference that is known, (nv,) [rad/s^2]."""
         return self._stop.copy()
 
-    def _advance(self, h: float, share: float, summary: _Summary) -> bool:
+    def _advance(self, h: float, share: float, summary: StepSummary) -> bool:
         """One substep, which is a ``share`` of the tick: build, solve, certify and move; whether it was solved."""
         self._live.step(self._objects.load, h)
         summary.inside &= self._assemble(self._held_model, self._targets.held, self._held_data, h)
@@ -297,40 +291,3 @@ class CartesianController:
         # A certified stop stays certified. Anything else was proven just now, and if all was apart before, in full.
         self._certified = self._apart and (self._certified if outcome == STOPPED else was_apart)
         return usable
-
-    def _status(self, dt_usable: bool, rejected: tuple[str, ...], summary: _Summary) -> StepStatus:
-        if summary.fallback:
-            return StepStatus.FALLBACK
-        if not (summary.inside and self._apart):
-            return StepStatus.RECOVERING
-        if not dt_usable:
-            return StepStatus.DT_REJECTED
-        return StepStatus.TARGET_REJECTED if rejected else StepStatus.OK
-
-    def _binding(self) -> tuple[str, ...]:
-        """Names of limits and pairs that held the last step back."""
-        active = self._active
-        found = int(active.used[0])
-        if not found:
-            return ()
-        bounds = zip(active.kind[:found].tolist(), active.subject[:found].tolist(), strict=True)
-        return tuple(dict.fromkeys(self._bound_name(kind, subject) for kind, subject in bounds))
-
-    def _names_of(self, pair: int) -> tuple[str, str]:
-        return self._pair_names[pair] if self._pair_names else ("", "")
-
-    def _bound_name(self, kind: int, subject: int) -> str:
-        if kind == SEPARATION:
-            return "|".join(self._pair_names[subject])
-        return f"{self.robot.joint_names[subject]} {_LIMIT_NAMES[kind]}"
-
-
-class _Summary:
-    """What the substeps of one tick add up to."""
-
-    def __init__(self) -> None:
-        self.fallback = False
-        self.inside = True
-        self.unsolved = 0
-        self.slack = 0.0
-        self.solve_time = 0.0

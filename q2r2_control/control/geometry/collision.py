@@ -71,11 +71,11 @@ class Contact(NamedTuple):
     second: Array  # (3,)
     normal: Array  # (3,) from the first to the second body
     local: Array  # (3, 3) scratch
-    witness: Array  # (3,) scratch
+    kept: Array  # (2, 3) scratch: closest points that are needed after another part has been measured
 
     @classmethod
     def empty(cls) -> Contact:
-        return cls(np.zeros(3), np.zeros(3), np.zeros(3), np.zeros((3, 3)), np.zeros(3))
+        return cls(np.zeros(3), np.zeros(3), np.zeros(3), np.zeros((3, 3)), np.zeros((2, 3)))
 
 
 class CollisionData(NamedTuple):

@@ -32,11 +32,13 @@ class SeparationRows(NamedTuple):
     lower: Array  # (m,) [m/s]; of unit rows [rad/s]
     pair: IntArray  # (m,)
     used: IntArray  # (1,) number of valid rows
+    lever: Array  # (3, nv) scratch: what a joint's next speed adds to its way until an instant of the stop [s]
 
     @classmethod
     def empty(cls, pairs: int, nv: int) -> SeparationRows:
         m = _ROWS_PER_PAIR * pairs
-        return cls(np.zeros((m, nv)), np.zeros(m), np.zeros(m, dtype=np.int64), np.zeros(1, dtype=np.int64))
+        counts = np.zeros(m, dtype=np.int64), np.zeros(1, dtype=np.int64)
+        return cls(np.zeros((m, nv)), np.zeros(m), *counts, lever=np.zeros((3, nv)))
 
 
 class Candidate(NamedTuple):

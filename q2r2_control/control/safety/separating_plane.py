@@ -25,10 +25,24 @@ anywhere between its ends. So what is to be bounded is a parabola for each two c
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 from q2r2_control.control.geometry.collision import Bodies, CollisionData, CollisionModel, Pairs, Posed
-from q2r2_control.control.jit import lean_kernel
+from q2r2_control.control.jit import inlined_kernel, lean_kernel
 from q2r2_control.control.safety.safety_data import Piece
 from q2r2_control.types import Array
+
+
+class Gap(NamedTuple):
+    """What a corner adds to the gap between the bodies along the normal: now, in a piece, in another one after it."""
+
+    now: float  # [m]
+    rate: float  # [m/s]
+    change: float  # [m/s^2]
+    loose: float  # the least that loose joints add [m]
+    then_rate: float
+    then_change: float
+    then_loose: float
 
 
 @lean_kernel
@@ -54,31 +68,20 @@ def stay_beyond(
     threshold: float,
 ) -> bool:
     """As :func:`stays_beyond`, for a ``piece`` and another one after it."""
-    pairs, bodies, contact = model.pairs, model.bodies, data.contact
+    pairs, bodies, posed = model.pairs, model.bodies, data.posed
     first, second = pairs.first[p], pairs.second[p]
     needed = threshold + bodies.radius[first] + bodies.radius[second]
     needed += curvature(pairs, p, piece.travel, then.travel, 1.0 if then_length > 0.0 else 0.0)
-    corner = contact.witness
-    for i in range(2):
-        _corner(bodies, data.posed, first, i, corner)
-        first_gap = _gap(model, data, p, -1.0, piece, then)
-        for j in range(8 if bodies.box[second] == 1 else 2):
-            _corner(bodies, data.posed, second, j, corner)
-            second_gap = _gap(model, data, p, 1.0, piece, then)
-            gap = first_gap[0] + second_gap[0] - needed
-            rate, change, loose = (
-                first_gap[1] + second_gap[1],
-                first_gap[2] + second_gap[2],
-                first_gap[3] + second_gap[3],
-            )
-            if _least_on_the_way(gap, rate, change, length) + loose < 0.0:
-                return False
-            if then_length > 0.0:
-                gap += rate * length + 0.5 * change * length * length + loose
-                rate, change = first_gap[4] + second_gap[4], first_gap[5] + second_gap[5]
-                loose = first_gap[6] + second_gap[6]
-                if _least_on_the_way(gap, rate, change, then_length) + loose < 0.0:
-                    return False
+    start, end = _gaps(model, data, p, -1.0, posed.start[first], posed.end[first], piece, then)
+    if bodies.box[second] == 0:
+        other_start, other_end = _gaps(model, data, p, 1.0, posed.start[second], posed.end[second], piece, then)
+        return _all_open(start, end, other_start, other_end, needed, length, then_length)
+    for edge in range(4):
+        _write_edge(bodies, posed, second, edge, data.contact.local)
+        corner, next_corner = data.contact.local[0], data.contact.local[1]
+        other_start, other_end = _gaps(model, data, p, 1.0, corner, next_corner, piece, then)
+        if not _all_open(start, end, other_start, other_end, needed, length, then_length):
+            return False
     return True
 
 
@@ -106,52 +109,90 @@ def curvature(pairs: Pairs, p: int, travel: Array, then: Array, share: float) ->
 
 
 @lean_kernel
-def _corner(bodies: Bodies, posed: Posed, body: int, number: int, out: Array) -> None:
+def _write_edge(bodies: Bodies, posed: Posed, box: int, number: int, out: Array) -> None:
+    """Ends of one of a box's four edges along its third axis, into the first two rows of ``out``."""
     for k in range(3):
-        out[k] = posed.start[body, k] if number == 0 else posed.end[body, k]
-        if bodies.box[body] == 1:
-            out[k] = posed.start[body, k]
-            for axis in range(3):
-                sign = 1.0 if (number >> axis) & 1 else -1.0
-                out[k] += sign * bodies.half[body, axis] * posed.rotation[body, k, axis]
+        middle = posed.start[box, k]
+        for axis in range(2):
+            sign = 1.0 if (number >> axis) & 1 else -1.0
+            middle += sign * bodies.half[box, axis] * posed.rotation[box, k, axis]
+        half = bodies.half[box, 2] * posed.rotation[box, k, 2]
+        out[0, k] = middle - half
+        out[1, k] = middle + half
 
 
 @lean_kernel
-def _gap(
-    model: CollisionModel, data: CollisionData, p: int, side: float, piece: Piece, then: Piece
-) -> tuple[float, float, float, float, float, float, float]:
-    """What one side of a pair, -1 the first's or 1 the second's, adds to the gap at a corner, the ``witness``.
-
-    Returns the gap itself [m], and for each piece its rate [m/s], the rate's change [m/s^2], and the least that loose
-    joints add [m].
-    """
-    chain, pairs, placements = model.chain, model.pairs, data.placements
-    point, normal = data.contact.witness, data.contact.normal
-    gap = side * (normal[0] * point[0] + normal[1] * point[1] + normal[2] * point[2])
-    rate, change, loose = 0.0, 0.0, 0.0
-    then_rate, then_change, then_loose = 0.0, 0.0, 0.0
+def _gaps(
+    model: CollisionModel, data: CollisionData, p: int, side: float, start: Array, end: Array, piece: Piece, then: Piece
+) -> tuple[Gap, Gap]:
+    """What two corners of one side of a pair, -1 the first's or 1 the second's, add to the gap."""
+    chain, pairs, placements, normal = model.chain, model.pairs, data.placements, data.contact.normal
+    nx, ny, nz = side * normal[0], side * normal[1], side * normal[2]
+    gap = nx * start[0] + ny * start[1] + nz * start[2]
+    end_gap = nx * end[0] + ny * end[1] + nz * end[2]
+    rate, change, loose, then_rate, then_change, then_loose = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    end_rate, end_change, end_loose, end_then_rate, end_then_change, end_then_loose = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for k in range(pairs.joint.shape[1]):
         joint = pairs.joint[p, k]
         if joint == 0:
             break
         if pairs.sign[p, k] != side:
             continue
+        j = joint - 1
         ax, ay, az = placements.axis[joint, 0], placements.axis[joint, 1], placements.axis[joint, 2]
         if chain.prismatic[joint] == 1:
-            along = normal[0] * ax + normal[1] * ay + normal[2] * az
+            along = nx * ax + ny * ay + nz * az
+            end_along = along
         else:
-            x = point[0] - placements.translation[joint, 0]
-            y = point[1] - placements.translation[joint, 1]
-            z = point[2] - placements.translation[joint, 2]
-            along = normal[0] * (ay * z - az * y) + normal[1] * (az * x - ax * z) + normal[2] * (ax * y - ay * x)
-        along *= side
-        rate += along * piece.rate[joint - 1]
-        change += along * piece.change[joint - 1]
-        loose += min(0.0, along * piece.loose[joint - 1])
-        then_rate += along * then.rate[joint - 1]
-        then_change += along * then.change[joint - 1]
-        then_loose += min(0.0, along * then.loose[joint - 1])
-    return gap, rate, change, loose, then_rate, then_change, then_loose
+            # n'(axis x r) = (n x axis)'r, for the levers r of both corners.
+            mx, my, mz = ny * az - nz * ay, nz * ax - nx * az, nx * ay - ny * ax
+            origin = placements.translation[joint]
+            along = mx * (start[0] - origin[0]) + my * (start[1] - origin[1]) + mz * (start[2] - origin[2])
+            end_along = mx * (end[0] - origin[0]) + my * (end[1] - origin[1]) + mz * (end[2] - origin[2])
+        rate += along * piece.rate[j]
+        change += along * piece.change[j]
+        loose += min(0.0, along * piece.loose[j])
+        then_rate += along * then.rate[j]
+        then_change += along * then.change[j]
+        then_loose += min(0.0, along * then.loose[j])
+        end_rate += end_along * piece.rate[j]
+        end_change += end_along * piece.change[j]
+        end_loose += min(0.0, end_along * piece.loose[j])
+        end_then_rate += end_along * then.rate[j]
+        end_then_change += end_along * then.change[j]
+        end_then_loose += min(0.0, end_along * then.loose[j])
+    return (
+        Gap(gap, rate, change, loose, then_rate, then_change, then_loose),
+        Gap(end_gap, end_rate, end_change, end_loose, end_then_rate, end_then_change, end_then_loose),
+    )
+
+
+@lean_kernel
+def _all_open(
+    start: Gap, end: Gap, other_start: Gap, other_end: Gap, needed: float, length: float, then_length: float
+) -> bool:
+    """Whether all four gaps between corners of one body and of the other stay beyond what is ``needed`` [m]."""
+    return (
+        _opens(start, other_start, needed, length, then_length)
+        and _opens(start, other_end, needed, length, then_length)
+        and _opens(end, other_start, needed, length, then_length)
+        and _opens(end, other_end, needed, length, then_length)
+    )
+
+
+@inlined_kernel
+def _opens(corner: Gap, other: Gap, needed: float, length: float, then_length: float) -> bool:
+    """Whether the gap between two corners stays beyond what is ``needed`` [m] in a piece and in the one after it."""
+    gap = corner.now + other.now - needed
+    rate, change, loose = corner.rate + other.rate, corner.change + other.change, corner.loose + other.loose
+    if _least_on_the_way(gap, rate, change, length) + loose < 0.0:
+        return False
+    if then_length <= 0.0:
+        return True
+    gap += rate * length + 0.5 * change * length * length + loose
+    rate, change = corner.then_rate + other.then_rate, corner.then_change + other.then_change
+    least = _least_on_the_way(gap, rate, change, then_length)
+    return least + corner.then_loose + other.then_loose >= 0.0
 
 
 @lean_kernel

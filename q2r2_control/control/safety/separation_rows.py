@@ -31,7 +31,7 @@ import numpy as np
 from q2r2_control.control.geometry.closest_points import segment_segment
 from q2r2_control.control.geometry.collision import CollisionData
 from q2r2_control.control.geometry.pair_distance import at_least, distance_row, measure, measure_part
-from q2r2_control.control.jit import lean_kernel
+from q2r2_control.control.jit import inlined_kernel, lean_kernel
 from q2r2_control.control.safety.safety_data import SafetyData
 from q2r2_control.control.safety.safety_model import SafetyModel
 from q2r2_control.control.safety.separating_plane import curvature
@@ -43,8 +43,7 @@ from q2r2_control.types import Array
 class Moment(NamedTuple):
     """When of the stop a row looks at its pair."""
 
-    t: float  # into the stop [s]
-    duration: float  # of the stop [s]
+    number: int  # of the instants
     straight: bool  # the pair is measured at the stop's start, and the row follows the tangent
     h: float  # length of the step that the row is for [s]
 
@@ -107,30 +106,44 @@ def write_separation_rows(model: SafetyModel, data: SafetyData, h: float) -> Non
         candidate.v[j] = data.state.v[j]
         candidate.deceleration[j] = data.certified[j]
     duration = begin_rollout(data)
+    _write_levers(data, duration, h)
+    stop = data.rollout.stop.travel
     count = 0
     for p in range(data.near.shape[0]):
         if data.near[p] == 0:
             continue
-        instant = 0
+        number = 0
         least = data.distance[p]
-        stop = data.rollout.stop.travel
         straight = curvature(model.collision.pairs, p, stop, stop, 0.0) < _STRAIGHT
         if not straight and least >= model.min_distance[p]:
-            for i in _INSTANTS[1:]:
-                distance = measure(model.collision, sample_of(model, data, i, duration), p)
+            for i in range(1, len(_INSTANTS)):
+                distance = measure(model.collision, sample_of(model, data, _INSTANTS[i], duration), p)
                 if distance < least:
                     least = distance
-                    instant = i
-        at = data.collision if instant == 0 else sample_of(model, data, instant, duration)
+                    number = i
+        at = data.collision if number == 0 else sample_of(model, data, _INSTANTS[number], duration)
         least = measure(model.collision, at, p)
-        t = duration if straight else duration * instant / _INSTANTS[-1]
-        moment = Moment(t, duration, straight, h)
+        moment = Moment(number, straight, h)
         before = count
         count = _append_row(model, data, at, p, least, moment, count)
         if count > before:
             count = _append_end_rows(model, data, at, p, moment, count)
     data.rows.used[0] = count
     _normalise_rows(data)
+
+
+@lean_kernel
+def _write_levers(data: SafetyData, duration: float, h: float) -> None:
+    """By s_j + h / 2 a joint's next speed v+_j lengthens its way until an instant, of the step and of the stop."""
+    candidate, lever = data.candidate, data.rows.lever
+    for i in range(len(_INSTANTS)):
+        t = duration * _INSTANTS[i] / _INSTANTS[-1]
+        for j in range(lever.shape[1]):
+            speed = abs(candidate.v[j])
+            whole = speed / candidate.deceleration[j] if speed > 0.0 else duration
+            s = t - 0.5 * t * t / whole if t < whole else 0.5 * whole
+            # At rest a faster step lengthens the stop by as much as the step itself.
+            lever[i, j] = max(s, 0.5 * h) + 0.5 * h
 
 
 @lean_kernel
@@ -147,7 +160,7 @@ def _normalise_rows(data: SafetyData) -> None:
         rows.lower[i] /= size
 
 
-@lean_kernel
+@inlined_kernel
 def _append_row(
     model: SafetyModel,
     data: SafetyData,
@@ -162,8 +175,8 @@ def _append_row(
     Pair ``p`` has been measured in ``at``, the posture at the ``moment``; of a straight stop that is its start, and the
     row looks along the tangent at the end if the pair closes in until there.
     """
-    t, duration, h = moment.t, moment.duration, moment.h
-    a, v, row = model.limits.acceleration, data.state.v, data.rows.matrix[count]
+    h = moment.h
+    a, v, row, lever = model.limits.acceleration, data.state.v, data.rows.matrix[count], data.rows.lever[moment.number]
     distance_row(model.collision, at, p, row)
     free = distance - model.approach.stop_distance[p]
     if moment.straight:
@@ -172,21 +185,13 @@ def _append_row(
             ahead += row[j] * 0.5 * v[j] * abs(v[j]) / data.certified[j]
         if ahead < 0.0 and distance >= model.min_distance[p]:
             free += ahead
-        else:
-            t = 0.0
-    lower = 0.0  # so far what v alone adds to the change of B
-    for j in range(row.shape[0]):
-        whole = abs(v[j]) / data.certified[j] if v[j] != 0.0 else duration
-        s = t - 0.5 * t * t / whole if t < whole else 0.5 * whole
-        # At rest a faster step lengthens the stop by as much as the step itself.
-        s = max(s, 0.5 * h)
-        lower += (s - 0.5 * h) * row[j] * v[j]
-        row[j] *= s + 0.5 * h
-    rate = 0.0
-    change = 0.0
+            lever = data.rows.lever[len(_INSTANTS) - 1]
+    rate = 0.0  # of the distance [m/s]: with v kept up, B changes by as much in a second
+    change = 0.0  # how much the acceleration can do about that in this step [m]
     for j in range(row.shape[0]):
         rate += row[j] * v[j]
-        change += abs(row[j]) * a[j] * h
+        change += abs(row[j]) * lever[j] * a[j]
+    change *= h
     allowed = -model.approach.gain * h * free
     slow = model.approach.contact_speed[p]
     if slow < np.inf:
@@ -196,16 +201,19 @@ def _append_row(
         # Asked for more than the joints can do in this step, rows of several pairs would be weighed against each other,
         # and the deeper pair would be opened at the cost of closing another one.
         allowed = min(allowed, model.approach.recovery_speed * h)
-        allowed = min(allowed, max(rate - lower, 0.0) + _SHARE * change)
-    lower += allowed
-    if rate - change >= lower or change <= 0.0:
+        allowed = min(allowed, max(h * rate, 0.0) + _SHARE * change)
+    if h * rate - change >= allowed or change <= 0.0:
         return count
+    lower = allowed
+    for j in range(row.shape[0]):
+        lower += (lever[j] - h) * row[j] * v[j]  # what v alone adds to the change of B
+        row[j] *= lever[j]
     data.rows.lower[count] = lower
     data.rows.pair[count] = p
     return count + 1
 
 
-@lean_kernel
+@inlined_kernel
 def _append_end_rows(
     model: SafetyModel,
     data: SafetyData,
@@ -217,22 +225,21 @@ def _append_end_rows(
     """Rows at the ends of both bodies of a pair.
 
     The closest points of near-parallel bodies jump from end to end; rows at all ends leave nothing to jump.
+    Pair ``p`` has been measured in ``at``.
     """
     bodies, posed, contact = model.collision.bodies, at.posed, at.contact
     first, second = model.collision.pairs.first[p], model.collision.pairs.second[p]
-    start, end, witness = posed.start[first], posed.end[first], contact.witness
-    measure(model.collision, at, p)
-    _copy(contact.first, witness)
+    start, end, closest = posed.start[first], posed.end[first], contact.kept
+    _copy(contact.first, closest[0])
+    _copy(contact.second, closest[1])
     for point in (start, end):
-        if not _near(point, witness):
+        if not _near(point, closest[0]):
             reached = measure_part(model.collision, at, p, point, point)
             count = _append_row(model, data, at, p, reached, moment, count)
     if bodies.box[second] == 1:
         return count
-    measure(model.collision, at, p)
-    _copy(contact.second, witness)
     for point in (posed.start[second], posed.end[second]):
-        if not _near(point, witness):
+        if not _near(point, closest[1]):
             reached = segment_segment(start, end, point, point, contact.first, contact.second)
             if reached > 1e-9:
                 for k in range(3):

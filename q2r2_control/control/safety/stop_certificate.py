@@ -16,7 +16,7 @@ from __future__ import annotations
 import numpy as np
 
 from q2r2_control.control.geometry.pair_distance import distance_row, measure
-from q2r2_control.control.jit import lean_kernel
+from q2r2_control.control.jit import inlined_kernel, lean_kernel
 from q2r2_control.control.safety.safety_data import SafetyData
 from q2r2_control.control.safety.safety_model import SafetyModel
 from q2r2_control.control.safety.separating_plane import stay_beyond, stays_beyond
@@ -87,7 +87,7 @@ def _farthest_travel(data: SafetyData) -> float:
     return farthest
 
 
-@lean_kernel
+@inlined_kernel
 def _way(model: SafetyModel, p: int, travel: Array) -> float:
     """S: how far the bodies of pair ``p`` can have moved relative to each other when joints travel (nv,) [m]."""
     pairs = model.collision.pairs
@@ -106,7 +106,7 @@ def _distance_at(model: SafetyModel, data: SafetyData, p: int, i: int, duration:
     return measure(model.collision, sample_of(model, data, i, duration), p)
 
 
-@lean_kernel
+@inlined_kernel
 def _plane_keeps_apart(model: SafetyModel, data: SafetyData, p: int, h: float, duration: float) -> bool:
     """Prove pair ``p`` apart in the step and in the stop by the plane at the reference, without a sample."""
     threshold = model.min_distance[p]

@@ -1,0 +1,68 @@
+"""What a step says of itself: what became of it, and the names of what held it back."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from q2r2_control.control.geometry.collision import collision_model_of
+from q2r2_control.control.safety.joint_limits import ACCELERATION, POSITION, VELOCITY
+from q2r2_control.control.safety.safety_data import ActiveBounds
+from q2r2_control.control.safety.safety_filter import SEPARATION
+from q2r2_control.robot.robot import Robot
+from q2r2_control.types import StepStatus
+
+_LIMIT_NAMES = {POSITION: "position", VELOCITY: "velocity", ACCELERATION: "acceleration"}
+
+
+class BoundNames:
+    """Names of limits and pairs, by the numbers that kernels know them by."""
+
+    def __init__(self, robot: Robot) -> None:
+        names = [geometry.name for geometry in robot.collision_model.geometryObjects]
+        watched = collision_model_of(robot).pairs  # the model's own know boxes that may be touched by other numbers
+        both = zip(watched.first.tolist(), watched.second.tolist(), strict=True)
+        self._watched = [(names[first], names[second]) for first, second in both]
+        self.pairs: list[tuple[str, str]] = []  # those of the cell, and of objects that are held
+        self._by_kind: dict[int, list[str]] = {
+            kind: [f"{joint} {limit}" for joint in robot.joint_names] for kind, limit in _LIMIT_NAMES.items()
+        }
+        self.take_pairs(())
+
+    def take_pairs(self, of_objects: Sequence[tuple[str, str]]) -> None:
+        """Go on with the pairs of the cell and those of objects that are held."""
+        self.pairs = [*self._watched, *of_objects]
+        self._by_kind[SEPARATION] = ["|".join(pair) for pair in self.pairs]
+
+    def pair(self, number: int) -> tuple[str, str]:
+        """Both bodies of a pair; empty names in a cell without pairs."""
+        return self.pairs[number] if self.pairs else ("", "")
+
+    def of(self, active: ActiveBounds) -> tuple[str, ...]:
+        """Limits and pairs, each once."""
+        found = int(active.used[0])
+        if not found:
+            return ()
+        kinds, subjects = active.kind[:found].tolist(), active.subject[:found].tolist()
+        names = self._by_kind
+        return tuple(dict.fromkeys([names[kind][subject] for kind, subject in zip(kinds, subjects, strict=True)]))
+
+
+class StepSummary:
+    """What the substeps of one tick add up to."""
+
+    def __init__(self) -> None:
+        self.fallback = False
+        self.inside = True  # all joints are within their limits
+        self.unsolved = 0  # bit by bit, which substeps had no solution
+        self.slack = 0.0
+        self.solve_time = 0.0
+
+    def status(self, apart: bool, dt_usable: bool, rejected: tuple[str, ...]) -> StepStatus:
+        """The most important of what happened."""
+        if self.fallback:
+            return StepStatus.FALLBACK
+        if not (self.inside and apart):
+            return StepStatus.RECOVERING
+        if not dt_usable:
+            return StepStatus.DT_REJECTED
+        return StepStatus.TARGET_REJECTED if rejected else StepStatus.OK
