@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.drives import Drive
 from q2r2_control.supervision.grasp_watch import GraspWatch
-from q2r2_control.supervision.gripper_limiter import GripperLimiter
+from q2r2_control.supervision.gripper_limiter import REMEMBERED, GripperLimiter
 
 
 class BodyChanges:
@@ -17,9 +17,16 @@ class BodyChanges:
     :meth:`limit_grippers` before the step and :meth:`after_step`.
     """
 
-    def __init__(self, controller: CartesianController, drive: Drive) -> None:
+    def __init__(
+        self,
+        controller: CartesianController,
+        drive: Drive,
+        gripper_delay: float = REMEMBERED,
+        grasps: GraspWatch | None = None,
+    ) -> None:
+        """``gripper_delay``: until a gripper does what it is commanded to, at most [s]; ``grasps``: what is known."""
         self._controller, self._drive = controller, drive
-        self._limiter, self._grasps = GripperLimiter(controller), GraspWatch(controller)
+        self._limiter, self._grasps = GripperLimiter(controller, gripper_delay), grasps or GraspWatch(controller)
         self.holding = controller.holding  # of arms whose grippers have an object, whether they hold it
         drive.set_holding(self.holding)
 
@@ -27,6 +34,10 @@ class BodyChanges:
     def held_grippers(self) -> dict[str, tuple[str, str]]:
         """Arm -> pair of bodies that keeps its gripper from being commanded as wanted."""
         return self._limiter.held
+
+    def resume(self, commanded: Mapping[str, float], measured: Mapping[str, float], now: float) -> None:
+        """Begin with grippers that are commanded already; see :meth:`GripperLimiter.resume`. Before :meth:`begin`."""
+        self._limiter.resume(commanded, measured, now)
 
     def begin(self) -> None:
         """The drive was reset."""

@@ -20,7 +20,7 @@ TOLERANCE = 0.001
 # Least step that is asked for, and least change for which bodies are worked out anew [m or rad].
 _FINEST = 0.0005
 # What was measured or commanded counts for at least this long: the delay of a gripper that is allowed for [s].
-_REMEMBERED = 0.05
+REMEMBERED = 0.05
 # A gripper that is held at its finest step asks again after this time [s].
 _PATIENCE = 0.005
 _BELIEVABLE = (-0.2, 1.2)  # measured openings; a finger may go a little beyond its calibrated ends
@@ -33,9 +33,11 @@ class GripperLimiter:
     :meth:`CartesianController.reset`, with all fingers all of their way, and is made anew with it.
     """
 
-    def __init__(self, controller: CartesianController) -> None:
+    def __init__(self, controller: CartesianController, remembered: float = REMEMBERED) -> None:
+        """``remembered``: the delay of a gripper that is allowed for [s]."""
         self._controller = controller
-        self._grippers = {name: _Gripper(arm.stroke) for name, arm in controller.robot.arms.items() if arm.stroke > 0.0}
+        arms = controller.robot.arms
+        self._grippers = {name: _Gripper(arm.stroke, remembered) for name, arm in arms.items() if arm.stroke > 0.0}
         self.held: dict[str, tuple[str, str]] = {}  # arm -> pair of bodies that keeps its gripper from going on
         self.changed = False  # whether the controller's openings did, in the last tick
 
@@ -54,6 +56,17 @@ class GripperLimiter:
                 if gripper.granted is not None:
                     granted[arm] = gripper.granted
         return granted
+
+    def resume(self, commanded: Mapping[str, float], measured: Mapping[str, float], now: float) -> None:
+        """Begin with grippers that have been ``commanded`` already: their fingers take up no more than they do at once.
+
+        So that arms which came to rest near each other with closed grippers are not too close to go on.
+        """
+        for arm, gripper in self._grippers.items():
+            if arm in commanded and _BELIEVABLE[0] <= measured.get(arm, math.nan) <= _BELIEVABLE[1]:
+                gripper.granted = commanded[arm]
+                gripper.note(commanded[arm], measured[arm], now)
+                self._controller.set_opening(arm, *gripper.needed())
 
     def _go_on(self, arm: str, gripper: _Gripper, wanted: float, measured: float, now: float) -> None:
         if gripper.rests(wanted, measured, now):
@@ -79,7 +92,8 @@ class GripperLimiter:
 class _Gripper:
     """What was measured and commanded of one gripper, and how far it may ask to go."""
 
-    def __init__(self, stroke: float) -> None:
+    def __init__(self, stroke: float, remembered: float) -> None:
+        self._remembered = remembered
         self._tolerance, self._finest = TOLERANCE / stroke, min(_FINEST / stroke, 1.0)
         self.granted: float | None = None  # the opening that is commanded
         self.asks_at = -math.inf
@@ -90,7 +104,7 @@ class _Gripper:
 
     def rests(self, wanted: float, measured: float, now: float) -> bool:
         """Whether this tick's openings tell nothing new; most ticks' do not."""
-        if not wanted == self._wanted == self.granted or now - self._since >= _REMEMBERED:
+        if not wanted == self._wanted == self.granted or now - self._since >= self._remembered:
             return False
         least, greatest = self._seen[0]
         return least <= measured <= greatest
@@ -102,7 +116,7 @@ class _Gripper:
         if wanted != self._wanted:
             self._wanted, self._step, self.asks_at = wanted, 1.0, now
         spread = min(measured, self.granted), max(measured, self.granted)
-        rolled = now - self._since >= _REMEMBERED
+        rolled = now - self._since >= self._remembered
         if rolled:
             self._seen, self._since = [spread, *self._seen[:1]], now
         else:

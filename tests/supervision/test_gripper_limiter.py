@@ -148,3 +148,31 @@ def test_one_that_is_forced_into_what_is_near_is_named_and_may_close(controller:
     for wanted in (0.4, 0.1, 0.0):
         cell.tick(wanted, {"left": 0.9, "right": 1.0})
         assert cell.granted["left"] == wanted
+
+
+def test_one_that_was_commanded_before_takes_up_what_it_does_from_the_first_step_on(
+    controller: CartesianController,
+) -> None:
+    controller.reset(controller.robot.home)
+    limiter = GripperLimiter(controller)
+    limiter.resume({"left": 0.0, "right": 0.3}, {"left": 0.2, "right": math.nan}, 1.0)
+    assert controller.openings["left"] == pytest.approx((0.0, 0.2 + TOLERANCE / STROKE))
+    assert controller.openings["right"] == ALL_OF_THE_WAY
+    granted = limiter.limit({"left": 0.0, "right": 1.0}, {"left": 0.1, "right": 1.0}, 1.0 + DT)
+    assert granted == {"left": 0.0, "right": 1.0}
+    assert controller.openings["left"][1] < 0.3
+
+
+def test_an_opening_counts_for_as_long_as_the_gripper_may_take_to_do_what_it_is_commanded_to(
+    controller: CartesianController,
+) -> None:
+    least = {}
+    for remembered in (0.05, 0.3):
+        controller.reset(controller.robot.home)
+        limiter, now = GripperLimiter(controller, remembered), 0.0
+        while controller.openings["left"][1] == 1.0:
+            now += DT
+            limiter.limit({"left": 0.0 if now > 0.01 else 1.0}, {"left": 0.0}, now)
+        least[remembered] = now
+    assert 0.05 <= least[0.05] < 0.15
+    assert 0.3 <= least[0.3] < 0.7

@@ -118,6 +118,12 @@ class ArmOutputs:
         return (False, "") if self._follows is None else (self._follows.homing, self._follows.homing_ended)
 
     @property
+    def gripper_held(self) -> str | None:
+        """What the built-in controller says keeps the gripper from the opening that was asked for."""
+        pair = "" if self._follows is None else self._follows.gripper_held
+        return f"the gripper opens no farther: {pair} would come too close" if pair else None
+
+    @property
     def sent(self) -> dict[str, int]:
         """How many targets went out on each topic."""
         return {output.topic: output.sent for output in self._all}
@@ -184,6 +190,7 @@ class FollowWatch:
         self._followed_since = math.inf  # targets have been sent and followed [s]
         self.unready: str | None = None  # why the controller would follow no stream of targets now
         self.homing, self.homing_ended = False, ""  # whether it says that it goes home; how the last way ended
+        self.gripper_held = ""  # the pair of bodies that keeps the gripper from opening farther
         node.create_subscription(Bool, topic, self._on_following, LATCHED_QOS)
         node.create_subscription(String, f"{self.controller}/state", self._on_state, 1)
 
@@ -213,7 +220,7 @@ class FollowWatch:
             state, why = said[f"{self._arm}_state"], said["message"]
         except (ValueError, TypeError, KeyError):
             return  # some other node's
-        self.unready = None
+        self.unready, self.gripper_held = None, str(said.get(f"{self._arm}_gripper_held_by", ""))
         self.homing, self.homing_ended = state == _HOMING, str(said.get("homing_ended", ""))
         if state not in (*_READY, _HOMING):
             line = state if why in _NO_FAULT else f"{state}: {why}".replace("~", self.controller)

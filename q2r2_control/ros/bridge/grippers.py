@@ -16,6 +16,7 @@ from std_msgs.msg import Float64MultiArray
 
 from q2r2_control.config.external import GripperSettings, GripperType
 from q2r2_control.ros.base_node import COMMAND_QOS
+from q2r2_control.ros.bridge.opening_grants import OpeningGrants
 
 # The client.
 _RESULT_TIMEOUT = 10.0  # of a goal [s]
@@ -33,16 +34,22 @@ class GripperClient:
     ``closed`` is the known state of the gripper. It changes with the result of a goal; a gripper that has stalled holds
     an object, which is success whatever the status of the goal. A topic gives no result, so there it changes with the
     command. Before the first result the gripper counts as open.
+
+    With ``grants`` it is commanded no farther than the built-in controller allows, on and on until it is where it was
+    asked to be.
     """
 
-    def __init__(self, node: Node, name: str, settings: GripperSettings) -> None:
+    def __init__(self, node: Node, name: str, settings: GripperSettings, grants: OpeningGrants | None = None) -> None:
         self.closed = False
         self.holds = False  # closed on something, as the result of the last goal says
         self.problem: str | None = None
-        self._node, self._name, self._settings = node, name, settings
+        self._node, self._name, self._settings, self._grants = node, name, settings, grants
         self._goal_closed: bool | None = None  # closed or not, while a goal is under way
         self._position: float | None = None  # that the gripper told last
-        self._sent, self._asked = -math.inf, 1.0  # the last goal: when [s], and its opening
+        self._sent, self._asked = -math.inf, 1.0  # what was asked for last: when [s], and the opening
+        self._commanded: float | None = None  # opening on the way there, None: none yet
+        self._commanded_at = -math.inf  # [s]
+        self._waits = False  # for more to be granted
         self._closes = False  # it is a smaller one than that of the goal before
         self._goals = 0
         kind = settings.action_type
@@ -89,28 +96,55 @@ class GripperClient:
 
         It is not kept for later: a gripper that moves when its server starts would be a surprise.
         """
-        settings, close = self._settings, opening < 0.5
-        position = (1.0 - opening) * settings.closed_position + opening * settings.open_position
         self._closes = opening < self._asked or (opening == self._asked and self._closes)
         self.holds = self.holds and self._closes
         self.problem, self._asked, self._sent = None, opening, now
+        if self._client is not None:
+            if not self._client.server_is_ready():
+                self.problem = f"no gripper server at {self._name}"
+                return
+            self._goal_closed = opening < 0.5
+        self._commanded, self._waits = None, self._grants is not None and self._grants.answered
+        if self._grants is not None:
+            self._grants.ask(opening)
+        if not self._waits:
+            self._command(opening, now)
+
+    def _go_on(self, now: float) -> None:
+        """Command what is granted. A gripper goes no farther because its controller has ended."""
+        assert self._grants is not None
+        if not self._grants.answered:
+            self._waits = False
+            self._end(f"{self._name} goes no farther: the controller that grants openings has ended")
+            return
+        granted = self._grants.granted
+        if granted is None or granted == self._commanded:
+            return
+        if granted == self._asked:
+            self._waits = False
+        elif now - self._commanded_at < _MOVE_PERIOD:
+            return
+        self._command(granted, now)
+
+    def _command(self, opening: float, now: float) -> None:
+        """Send a goal, or a message."""
+        self._commanded, self._commanded_at, settings = opening, now, self._settings
+        position = (1.0 - opening) * settings.closed_position + opening * settings.open_position
         if self._publisher is not None:
             self._publisher.publish(Float64MultiArray(data=[position]))
-            self.closed = close
+            self.closed = self._asked < 0.5
             return
         assert self._client is not None
-        if not self._client.server_is_ready():
-            self.problem = f"no gripper server at {self._name}"
-            return
         self._goals += 1
-        self._goal_closed = close
         number = self._goals
         answer = self._client.send_goal_async(self._goal(position), feedback_callback=self._hear)
         answer.add_done_callback(lambda future: self._answered(future.result(), number))
 
     def check(self, now: float) -> None:
-        """Give up a goal that is not answered in time."""
-        if self._goal_closed is not None and now - self._sent > _RESULT_TIMEOUT:
+        """Go on with what is granted; give up a goal that is not answered in time."""
+        if self._waits:
+            self._go_on(now)
+        elif self._goal_closed is not None and now - self._commanded_at > _RESULT_TIMEOUT:
             self._end(f"no result from {self._name} for {_RESULT_TIMEOUT:g} s")
 
     def _goal(self, position: float) -> Any:
@@ -137,6 +171,8 @@ class GripperClient:
             return  # another goal has taken its place
         result = answer.result
         self._note(result)
+        if self._waits:
+            return  # on the way to where it was asked to be
         if answer.status == GoalStatus.STATUS_SUCCEEDED or result.stalled or result.reached_goal:
             self.closed, self.holds = self._goal_closed, bool(result.stalled) and self._closes
             self._end(None)

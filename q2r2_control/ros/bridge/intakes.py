@@ -160,10 +160,13 @@ class JointIntake:
         self._values = np.zeros((3, len(robot.joint_names)))
         self.state: RobotState | None = None  # the newest of all arms
 
-    def subscribe(self, take: Callable[[RobotState | str, float], None]) -> None:
-        """Pass each state of all arms, or what is wrong with a message, to ``take``, with the time [s]."""
+    def subscribe(self, take: Callable[[RobotState | str, float], None], look: Callable[[JointState], None]) -> None:
+        """Pass each state of all arms, or what is wrong with a message, to ``take``, with the time [s].
+
+        ``look`` gets every message as it is first: there may be fingers in it.
+        """
         for topic in self._topics:
-            self._node.create_subscription(JointState, topic, partial(self._on_message, take, topic), STREAM_QOS)
+            self._node.create_subscription(JointState, topic, partial(self._on_message, take, look, topic), STREAM_QOS)
         if self._external_topic:
             self._node.create_subscription(JointState, self._external_topic, self._on_external, STREAM_QOS)
 
@@ -182,7 +185,14 @@ class JointIntake:
         where = f" on {topic}" if len(self._topics) > 1 else ""
         return self._publishers.source(topic) + where
 
-    def _on_message(self, take: Callable[[RobotState | str, float], None], topic: str, message: JointState) -> None:
+    def _on_message(
+        self,
+        take: Callable[[RobotState | str, float], None],
+        look: Callable[[JointState], None],
+        topic: str,
+        message: JointState,
+    ) -> None:
+        look(message)
         joints, names = self._joints[topic], self._names[topic]
         if not self._expected[topic] & set(message.name):
             return  # of a gripper or another robot

@@ -29,6 +29,7 @@ from q2r2_control.ros.bridge.grippers import GripperClient
 from q2r2_control.ros.bridge.hand_intake import HandIntake
 from q2r2_control.ros.bridge.home_client import HomeClient
 from q2r2_control.ros.bridge.live_parameters import LiveArmParameters
+from q2r2_control.ros.bridge.opening_grants import OpeningGrants
 from q2r2_control.ros.bridge.parameters import ArmDefaults, ArmParameters, arm_parameters
 from q2r2_control.ros.bridge.reports import RecorderLink
 from q2r2_control.ros.bridge.target_output import near
@@ -122,10 +123,12 @@ class BaseArmController(BaseNode):
         self._outputs = ArmOutputs(self, values, self._safe_target)
         self._feedback = ArmFeedback(self, self.arm_name, values, self._link, self._hand)
         self._recorder = RecorderLink(self, self.teleop.marks)
+        grants = None
         if (controller := self._outputs.builtin) is not None:
             listen_to_condition(self, controller, self.arm_name, self._feedback.haptics.notice)
+            grants = OpeningGrants(self, controller, self.arm_name, self._outputs.first.topic)
         self._home = HomeClient(self, self._outputs.home_controller)
-        self.gripper = GripperClient(self, values.gripper_topic, values.gripper)
+        self.gripper = GripperClient(self, values.gripper_topic, values.gripper, grants)
         self._live = LiveArmParameters(self, values.teleop, values.guard, self._change)
         self.create_service(Trigger, "~/pause", self._on_pause)
         self.create_service(Trigger, "~/reset", self._on_reset)
@@ -225,7 +228,7 @@ class BaseArmController(BaseNode):
         }
         if self._refusal is not None:
             return *self._refusal, values
-        for problem in (self.gripper.problem, self._outputs.advice, self._frames.advice):
+        for problem in (self.gripper.problem, self._outputs.gripper_held, self._outputs.advice, self._frames.advice):
             if problem is not None:
                 return WARN, problem, values
         if self.state in AT_REST:

@@ -28,6 +28,7 @@ from q2r2_control.errors import ConfigError
 from q2r2_control.robot.robot import Robot
 from q2r2_control.ros.base_node import ERROR, OK, WARN, run_node
 from q2r2_control.ros.bridge.controller_feedback import ControllerFeedback
+from q2r2_control.ros.bridge.gripper_limits import GripperLimits
 from q2r2_control.ros.bridge.intakes import JointIntake, TargetIntake
 from q2r2_control.ros.bridge.joint_outputs import NONE, make_output, output_name
 from q2r2_control.ros.bridge.live_parameters import LiveControl, LiveImpedance, LiveWatching
@@ -76,7 +77,7 @@ class CartesianControllerNode(ManagedNode):
             self._live_impedance = LiveImpedance(self, self._output.drive.impedance)
         self._controller = CartesianController(robot, permitted(config.control, self._output.drive))
         self._live = LiveControl(self, self._controller)
-        self._kept = self._controller.kept_distances
+        self._grippers = GripperLimits(self, config, self._controller, self._output.drive, self._targets.topics)
         self._supervisor = Supervisor(
             robot,
             self._controller,
@@ -114,7 +115,7 @@ class CartesianControllerNode(ManagedNode):
 
     def _connect(self) -> None:
         self._targets.subscribe(self._take_target)
-        self._joints.subscribe(self._supervisor.take_joint_state)
+        self._joints.subscribe(self._supervisor.take_joint_state, self._grippers.take_joint_state)
         self.create_service(SetBool, "~/pause", self._on_pause)
         services: dict[str, Callable[[], str | None]] = {
             "home": self._supervisor.go_home,
@@ -155,12 +156,13 @@ class CartesianControllerNode(ManagedNode):
         if fault := self._output.listener_fault(self._supervisor.off_reference):
             self._supervisor.let_go(fault, now)
         was_active = self._supervisor.phase is Phase.ACTIVE
+        self._grippers.limit(self._supervisor.phase in (Phase.ACTIVE, Phase.BRAKING), now)
         reference, state = self._supervisor.tick(now, dt), self._joints.state
         if not was_active and self._supervisor.phase is Phase.ACTIVE and state is not None:
+            self._grippers.prepare()
             self._output.activate(state)
-        if self._controller.kept_distances is not self._kept:
-            self._kept = self._controller.kept_distances
-            self._output.drive.set_kept_distances(self._kept)
+            self._grippers.begin(now)
+        self._grippers.after_step()
         if reference is not None and state is not None:
             self._output.send(reference, state, dt, now, self._supervisor.trusted, decided)
             self._reference, self._velocity = reference, reference.v
@@ -215,6 +217,9 @@ class CartesianControllerNode(ManagedNode):
             values[f"{arm}_target_age_s"] = round(age, 3) if age < 1e6 else "none"
             values[f"{arm}_targets_rejected"] = rejected
             values[f"{arm}_targets_from"] = self._targets.publishers(arm)
+            values[f"{arm}_gripper_held_by"] = self._grippers.held.get(arm, "")
+        for arm, holds in self._grippers.holding.items():
+            values[f"{arm}_holds_object"] = holds
         if self._reference is not None:
             report = self._reference.report
             if (pair := self._controller.narrow_pair) is not None:

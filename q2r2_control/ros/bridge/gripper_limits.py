@@ -1,0 +1,140 @@
+"""What the built-in controller grants grippers: openings that are proven, since fingers and what they hold are bodies.
+
+Whoever commands a gripper asks on ``wanted_opening`` beside the arm's targets, and commands what ``~/opening/<arm>``
+answers: the wanted opening and the one that may be commanded now, 0 closed .. 1 fully open. Where nobody has asked yet,
+or nothing is measured, the fingers count as all of their way, for which nothing needs to be known.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from functools import partial
+from typing import Any
+
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64, Float64MultiArray
+
+from q2r2_control.config import Config
+from q2r2_control.config.timeouts import STREAM_TIMEOUT
+from q2r2_control.control.controller import CartesianController
+from q2r2_control.drives import Drive
+from q2r2_control.ros.base_node import LATCHED_QOS, BaseNode
+from q2r2_control.runtime.body_changes import BodyChanges
+from q2r2_control.supervision.grasp_watch import GraspWatch
+
+# Until a gripper does what was granted: the answer has to arrive, ten goals a second go out, and it may be slow [s].
+_GRIPPER_DELAY = 0.3
+
+
+def wanted_topic(target_topic: str) -> str:
+    """Where the sender of targets asks for openings."""
+    return f"{target_topic.rpartition('/')[0]}/wanted_opening"
+
+
+class GripperLimits:
+    """Fingers, held objects and distances of the controller, for all arms; see :class:`BodyChanges`."""
+
+    def __init__(
+        self, node: BaseNode, config: Config, controller: CartesianController, drive: Drive, targets: Mapping[str, str]
+    ) -> None:
+        """``targets``: topic of each arm's targets."""
+        self._node, self._controller, self._drive = node, controller, drive
+        self._fingers, self._grasps = FingerStates(config, controller), GraspWatch(controller)
+        self._wanted: dict[str, float] = {}
+        self._granted: dict[str, float] = {}
+        self._told: dict[str, tuple[float, float]] = {}
+        self._bodies: BodyChanges | None = None  # while the controller's reference is where the arms are
+        self._answers: dict[str, Any] = {}
+        for arm in self._fingers.arms:
+            self._answers[arm] = node.create_publisher(Float64MultiArray, f"~/opening/{arm}", LATCHED_QOS)
+            node.create_subscription(Float64, wanted_topic(targets[arm]), partial(self._on_wanted, arm), LATCHED_QOS)
+
+    @property
+    def held(self) -> dict[str, str]:
+        """Arm -> pair of bodies that keeps its gripper from the wanted opening."""
+        return {} if self._bodies is None else {arm: "|".join(pair) for arm, pair in self._bodies.held_grippers.items()}
+
+    @property
+    def holding(self) -> dict[str, bool]:
+        """Of each arm that has an object, whether its gripper holds it."""
+        return {} if self._bodies is None else self._bodies.holding
+
+    def take_joint_state(self, message: JointState) -> None:
+        """Note the fingers of a message of joint states, if there are any."""
+        if self._wanted:
+            self._fingers.take(message, self._node.now)
+
+    def prepare(self) -> None:
+        """The controller was reset; before the drive is."""
+        self._bodies = BodyChanges(self._controller, self._drive, _GRIPPER_DELAY, self._grasps)
+
+    def begin(self, now: float) -> None:
+        """The drive was reset."""
+        assert self._bodies is not None
+        self._bodies.resume(self._granted, self._fingers.openings(now), now)
+        self._bodies.begin()
+
+    def limit(self, active: bool, now: float) -> None:
+        """Answer what was asked for, before a step.
+
+        An inactive controller moves no arm and proves nothing: it grants what it is asked for then, for instance to let
+        go of something, but nothing more of what was asked for before. No gripper moves because the arms were stopped.
+        """
+        if not active:
+            self._bodies = None
+        if not self._wanted:
+            return
+        if self._bodies is not None:
+            granted = self._bodies.limit_grippers(self._wanted, self._fingers.openings(now), now)
+        else:
+            granted = {arm: wanted for arm, wanted in self._wanted.items() if self._told.get(arm, (None,))[0] != wanted}
+        for arm, opening in granted.items():
+            answer = (self._wanted[arm], opening)
+            if self._told.get(arm) != answer:
+                self._told[arm], self._granted[arm] = answer, opening
+                self._answers[arm].publish(Float64MultiArray(data=answer))
+
+    def after_step(self) -> None:
+        """See :meth:`BodyChanges.after_step`."""
+        if self._bodies is not None:
+            self._bodies.after_step()
+
+    def _on_wanted(self, arm: str, message: Float64) -> None:
+        if 0.0 <= message.data <= 1.0:
+            self._wanted[arm] = message.data
+        else:
+            self._node.get_logger().warning(f"{arm}: opening {message.data:g} not used; allowed: 0 closed .. 1 open")
+
+
+class FingerStates:
+    """How far grippers are open, from joint states that have their fingers' joints."""
+
+    def __init__(self, config: Config, controller: CartesianController) -> None:
+        robot = controller.robot
+        grippers = {str(arm): each.gripper for arm, each in config.arms.items()}
+        self.arms = [arm for arm in robot.arms if robot.arms[arm].stroke > 0.0 or arm in robot.objects.by_arm]
+        self._grippers = {
+            arm: (robot.arms[arm].finger_joints, grippers[arm].closed_position, grippers[arm].open_position)
+            for arm in self.arms
+            if robot.arms[arm].stroke > 0.0
+        }
+        self._measured: dict[str, tuple[float, float]] = {}  # arm -> opening, and when it was measured [s]
+
+    def take(self, message: JointState, now: float) -> None:
+        """Note what a message says of fingers; what it says of other joints is not looked at."""
+        if len(message.position) != len(message.name):
+            return
+        columns = {name: column for column, name in enumerate(message.name)}
+        for arm, (joints, closed, opened) in self._grippers.items():
+            if all(joint in columns for joint in joints):
+                position = sum(message.position[columns[joint]] for joint in joints) / len(joints)
+                self._measured[arm] = ((position - closed) / (opened - closed), now)
+
+    def openings(self, now: float) -> dict[str, float]:
+        """Of the arms whose fingers were measured just now, 0 closed .. 1 fully open; a little beyond is possible."""
+        return {
+            arm: opening
+            for arm, (opening, at) in self._measured.items()
+            if now - at <= STREAM_TIMEOUT and math.isfinite(opening)
+        }

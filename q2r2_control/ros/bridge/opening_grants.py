@@ -1,0 +1,44 @@
+"""Asks the built-in controller, which has to prove the bodies of fingers, how far a gripper may be opened."""
+
+from __future__ import annotations
+
+from rclpy.node import Node
+from std_msgs.msg import Float64, Float64MultiArray
+
+from q2r2_control.ros.base_node import LATCHED_QOS
+from q2r2_control.ros.bridge.gripper_limits import wanted_topic
+from q2r2_control.ros.monitoring.endpoints import PublisherCount
+
+
+class OpeningGrants:
+    """One arm's gripper; openings are 0 closed .. 1 fully open."""
+
+    def __init__(self, node: Node, controller: str, arm: str, target_topic: str) -> None:
+        """``controller``: the built-in one's name; ``target_topic``: where the arm's targets go."""
+        self._wanted: float | None = None
+        self._answer: tuple[float, float] | None = None  # what was wanted, and what is granted of it
+        self._publisher = node.create_publisher(Float64, wanted_topic(target_topic), LATCHED_QOS)
+        topic = f"{controller}/opening/{arm}"
+        node.create_subscription(Float64MultiArray, topic, self._on_answer, LATCHED_QOS)
+        self._answering = PublisherCount(node, topic)
+
+    @property
+    def answered(self) -> bool:
+        """Whether there is a controller that answers."""
+        return self._answering.count > 0
+
+    @property
+    def granted(self) -> float | None:
+        """The opening that may be commanded now, on the way to the one that was asked for; None: not answered yet."""
+        if self._answer is None or self._answer[0] != self._wanted:
+            return None
+        return self._answer[1]
+
+    def ask(self, opening: float) -> None:
+        """Ask for an opening, until another one is asked for."""
+        self._wanted = opening
+        self._publisher.publish(Float64(data=opening))
+
+    def _on_answer(self, message: Float64MultiArray) -> None:
+        if len(message.data) == 2 and all(0.0 <= number <= 1.0 for number in message.data):
+            self._answer = message.data[0], message.data[1]

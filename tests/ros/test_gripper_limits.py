@@ -1,0 +1,188 @@
+"""Grippers ask the controller before they move: fingers are bodies where they are, in ROS as in the pipeline's loop."""
+
+from __future__ import annotations
+
+import math
+import os
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+
+from q2r2_control import Robot
+from q2r2_control.config.external import GripperSettings
+from tests.ros.conftest import NEEDS_ROS, spun_node
+from tests.ros.processes import Processes
+from tests.support.block_cell import ABOVE, BESIDE
+from tests.support.block_cell import CELL as BLOCK_CELL
+
+pytest.importorskip("rclpy", reason=NEEDS_ROS)
+pytest.importorskip("control_msgs", reason="needs control_msgs: q2r2 ros build-interfaces")
+
+import pinocchio as pin
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64
+
+from q2r2_control.ros.base_node import LATCHED_QOS, STREAM_QOS
+from q2r2_control.ros.bridge.grippers import GripperClient
+from q2r2_control.ros.bridge.opening_grants import OpeningGrants
+from tests.ros.cell import NODE_RATE, PATIENT, STILL, Cell, Stream, changed_cell, start_controller
+from tests.ros.waiting import wait_until
+
+pytestmark = pytest.mark.alone
+
+_ARRIVED = 0.002  # of a tool at its target [m]
+_FINGERS = ("left_finger_joint_1", "left_finger_joint_2")
+
+
+class Gripper:
+    """The left gripper, commanded as an arm's node commands it; and what its fingers do."""
+
+    def __init__(self, cell: Cell) -> None:
+        self._cell, self.opening = cell, 1.0  # 0 closed .. 1 open, as joint states have it
+        cell.node.create_subscription(JointState, "/joint_states", self._on_joint_state, STREAM_QOS)
+        self.grants = OpeningGrants(cell.node, "/cartesian_controller", "left", "/q2r2/left/target_frame")
+        self.client = GripperClient(cell.node, "/q2r2/left_gripper/gripper_cmd", GripperSettings(), self.grants)
+
+    def _on_joint_state(self, message: JointState) -> None:
+        found = [at for name, at in zip(message.name, message.position, strict=True) if name in _FINGERS]
+        self.opening = float(np.mean(found)) / BLOCK_CELL.arms["left"].gripper.open_position
+
+    def wait_until(self, condition: Callable[[], object], what: str) -> None:
+        """Go on as an arm's node does in its ticks, until ``condition`` holds."""
+
+        def ticked() -> object:
+            self.client.check(time.monotonic())
+            return condition()
+
+        wait_until(ticked, what, lambda: (self.opening, self.grants.granted, self.client.state, self._cell.states))
+
+    def close(self) -> None:
+        """Ask for it until there is a server that is asked."""
+
+        def asked() -> bool:
+            self.client.command(True, time.monotonic())
+            return self.client.problem is None
+
+        wait_until(asked, "the gripper has a server")
+
+
+@pytest.fixture(scope="module")
+def cell(domain: int, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cell]:
+    folder = tmp_path_factory.mktemp("grippers")
+    data = BLOCK_CELL.model_dump(mode="json")
+    data["arms"]["right"]["gripper"]["object"] = {}
+    alone: dict[str, Any] = {"objects": {}}  # nothing lies where the gripper goes
+    config = changed_cell(folder, obstacles=data["obstacles"], arms=data["arms"], mujoco=alone)
+    processes = Processes(folder, os.environ)
+    robot = Robot.from_config(BLOCK_CELL)
+    try:
+        with spun_node(domain) as node:
+            simulated = processes.start_node("mujoco_robot", f"config:={config}", f"rate:={NODE_RATE}")
+            cell = Cell(node, robot, simulated, start_controller(processes, *PATIENT, config=config))
+            cell.wait_until_active()
+            yield cell
+    finally:
+        processes.end_all()
+
+
+def _go(cell: Cell, stream: Stream, goal: pin.SE3) -> None:
+    way = goal.translation - stream.poses["left"].translation
+    stream.move("left", tuple(way))
+    stream.poses["left"] = goal
+
+
+def _is_at(cell: Cell, goal: pin.SE3) -> bool:
+    return float(np.linalg.norm(cell.tool("left").translation - goal.translation)) < _ARRIVED
+
+
+def _stop_and_reset(cell: Cell) -> None:
+    assert cell.call("/cartesian_controller/stop").success
+    wait_until(lambda: cell.state("phase") == "stopped", "the arms are stopped")
+    assert cell.call("/cartesian_controller/reset").success
+    wait_until(lambda: cell.state("phase") == "active", "the arms are active")
+
+
+def test_a_closed_gripper_goes_where_an_open_one_could_not_and_opens_there_as_far_as_is_proven(cell: Cell) -> None:
+    gripper = Gripper(cell)
+    wait_until(lambda: gripper.grants.answered, "the controller answers")
+    stream = cell.engage("left")
+    try:
+        _go(cell, stream, ABOVE)
+        gripper.close()
+        gripper.wait_until(lambda: gripper.opening < 0.02 and gripper.client.closed, "the gripper is closed")
+        # An open gripper's fingers would be 12 mm inside of the block.
+        _go(cell, stream, BESIDE)
+        gripper.wait_until(lambda: _is_at(cell, BESIDE), "the tool is beside the block")
+
+        # Stopped and activated anew where they are: nothing is too close, so nothing moves.
+        stream.end()
+        rest = cell.joints.wait_for_rest()
+        _stop_and_reset(cell)
+        began = time.monotonic()
+        wait_until(lambda: time.monotonic() - began > 1.0, "a second passes")
+        assert cell.joints.farthest_from(rest, began) < STILL
+
+        gripper.client.command(False, time.monotonic())
+        gripper.wait_until(lambda: cell.state("left_gripper_held_by"), "the block holds the gripper")
+        assert "block" in cell.state("left_gripper_held_by")
+        gripper.wait_until(lambda: gripper.opening > 0.3, "the gripper opens as far as it may")
+        _stop_and_reset(cell)
+        began = time.monotonic()
+        gripper.wait_until(lambda: time.monotonic() - began > 1.0, "a second passes")
+        assert 0.3 < gripper.opening < 0.5
+        assert gripper.client.state == "opening"
+
+        stream = cell.engage("left")
+        _go(cell, stream, ABOVE)
+        gripper.wait_until(lambda: gripper.opening > 0.98, "the gripper opens by itself where there is room")
+        gripper.wait_until(lambda: gripper.client.state == "open", "the goal has its result")
+        wait_until(lambda: cell.state("left_gripper_held_by") == "", "nothing holds it")
+    finally:
+        stream.end()
+
+
+def test_a_gripper_that_does_not_close_holds_its_object(cell: Cell) -> None:
+    wanted = cell.node.create_publisher(Float64, "/q2r2/right/wanted_opening", LATCHED_QOS)
+    assert cell.state("right_holds_object") is False
+    wanted.publish(Float64(data=0.3))  # and no goal: it stays open
+    wait_until(lambda: cell.state("right_holds_object") is True, "the object counts")
+    wanted.publish(Float64(data=1.0))
+    wait_until(lambda: cell.state("right_holds_object") is False, "the object does not count any more")
+
+
+def test_an_opening_that_is_none_is_refused_by_name_and_the_last_one_stays(cell: Cell) -> None:
+    gripper = Gripper(cell)
+    gripper.grants.ask(1.0)
+    wait_until(lambda: gripper.grants.granted == 1.0, "it is granted")
+    controller = cell.processes[1]
+    sender = cell.node.create_publisher(Float64, "/q2r2/left/wanted_opening", LATCHED_QOS)
+    for bad, said in ((7.0, "7"), (math.nan, "nan")):
+        sender.publish(Float64(data=bad))
+        controller.wait_for(f"left: opening {said} not used")
+    assert gripper.grants.granted == 1.0
+
+
+def test_a_gripper_that_waits_stays_where_it_is_when_the_controller_ends_and_then_does_what_it_is_asked(
+    cell: Cell,
+) -> None:
+    gripper = Gripper(cell)
+    wait_until(lambda: gripper.grants.answered, "the controller answers")
+    stream = cell.engage("left")
+    try:
+        gripper.close()
+        gripper.wait_until(lambda: gripper.opening < 0.02 and gripper.client.closed, "the gripper is closed")
+        _go(cell, stream, BESIDE)
+        gripper.wait_until(lambda: _is_at(cell, BESIDE), "the tool is beside the block")
+        gripper.client.command(False, time.monotonic())
+        gripper.wait_until(lambda: gripper.opening > 0.3, "the gripper opens as far as it may")
+    finally:
+        stream.end()
+    cell.processes[1].interrupt()
+    gripper.wait_until(lambda: gripper.client.problem, "the gripper's client gives up")
+    assert "the controller that grants openings has ended" in str(gripper.client.problem)
+    assert 0.3 < gripper.opening < 0.5
+    gripper.client.command(True, time.monotonic())
+    gripper.wait_until(lambda: gripper.opening < 0.02 and gripper.client.closed, "it closes without a controller")
