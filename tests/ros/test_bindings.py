@@ -17,6 +17,9 @@ pytest.importorskip("rclpy", reason=NEEDS_ROS)
 pytest.importorskip("control_msgs", reason="needs control_msgs: q2r2 ros build-interfaces")
 pytest.importorskip("tf2_msgs", reason="needs tf2_msgs: q2r2 ros build-interfaces")
 
+from std_msgs.msg import Float64MultiArray
+
+from q2r2_control.ros.base_node import LATCHED_QOS
 from tests.ros.arm_rig import HOLDING, ArmRigs
 from tests.ros.cockpit import Cockpit
 from tests.ros.waiting import call, wait_until
@@ -56,6 +59,21 @@ def test_the_way_home_that_one_hand_asks_for_brings_both_arms_home_and_a_press_e
     assert cockpit.from_home < HOME
     cockpit.rigs.engage()
     assert cockpit.from_home < HOME
+
+
+def test_a_button_closes_and_opens_a_gripper_as_far_as_the_controller_grants(cockpit: Cockpit) -> None:
+    answers: list[list[float]] = []
+    topic = "/cartesian_controller/opening/left"
+    heard = cockpit.cell.node.create_subscription(
+        Float64MultiArray, topic, lambda message: answers.append(list(message.data)), LATCHED_QOS
+    )
+    left = cockpit.left
+    left.press("upper")
+    left.wait(lambda: left.state["gripper"] == "closed", "the gripper is closed")
+    left.press("upper")
+    left.wait(lambda: left.state["gripper"] == "open", "the gripper is open")
+    assert answers == [[0.0, 0.0], [1.0, 1.0]]
+    cockpit.cell.node.destroy_subscription(heard)
 
 
 def test_a_press_of_the_other_hand_ends_the_way_home_where_the_arms_are(cockpit: Cockpit) -> None:
