@@ -150,7 +150,7 @@ class CartesianController:
         state = self._state
         self._targets.aim_posture(posture)
         rejected = self._targets.update(targets, time, state.q, state.v)
-        state.a[:] = 0.0
+        state.a.fill(0.0)
         summary = StepSummary()
         if time > 0.0:
             substeps = max(math.ceil(time / self.settings.max_substep - 1e-9), 1)

@@ -23,6 +23,7 @@ class BoundNames:
         both = zip(watched.first.tolist(), watched.second.tolist(), strict=True)
         self._watched = [(names[first], names[second]) for first, second in both]
         self.pairs: list[tuple[str, str]] = []  # those of the cell, and of objects that are held
+        self._last: tuple[bytes, tuple[str, ...]] = b"", ()  # most ticks bind as the one before
         self._by_kind: dict[int, list[str]] = {
             kind: [f"{joint} {limit}" for joint in robot.joint_names] for kind, limit in _LIMIT_NAMES.items()
         }
@@ -32,6 +33,7 @@ class BoundNames:
         """Go on with the pairs of the cell and those of objects that are held."""
         self.pairs = [*self._watched, *of_objects]
         self._by_kind[SEPARATION] = ["|".join(pair) for pair in self.pairs]
+        self._last = b"", ()
 
     def pair(self, number: int) -> tuple[str, str]:
         """Both bodies of a pair; empty names in a cell without pairs."""
@@ -42,9 +44,12 @@ class BoundNames:
         found = int(active.used[0])
         if not found:
             return ()
-        kinds, subjects = active.kind[:found].tolist(), active.subject[:found].tolist()
-        names = self._by_kind
-        return tuple(dict.fromkeys([names[kind][subject] for kind, subject in zip(kinds, subjects, strict=True)]))
+        kinds, subjects = active.kind[:found], active.subject[:found]
+        key = kinds.tobytes() + subjects.tobytes()
+        if key != self._last[0]:
+            names, both = self._by_kind, zip(kinds.tolist(), subjects.tolist(), strict=True)
+            self._last = key, tuple(dict.fromkeys([names[kind][subject] for kind, subject in both]))
+        return self._last[1]
 
 
 class StepSummary:

@@ -20,16 +20,12 @@ from q2r2_control.config.timeouts import STREAM_TIMEOUT
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.drives import Drive
 from q2r2_control.ros.base_node import LATCHED_QOS, BaseNode
+from q2r2_control.ros.bridge.opening_grants import wanted_topic
 from q2r2_control.runtime.body_changes import BodyChanges
 from q2r2_control.supervision.grasp_watch import GraspWatch
 
 # Until a gripper does what was granted: the answer has to arrive, ten goals a second go out, and it may be slow [s].
 _GRIPPER_DELAY = 0.3
-
-
-def wanted_topic(target_topic: str) -> str:
-    """Where the sender of targets asks for openings."""
-    return f"{target_topic.rpartition('/')[0]}/wanted_opening"
 
 
 class GripperLimits:

@@ -6,8 +6,12 @@ from rclpy.node import Node
 from std_msgs.msg import Float64, Float64MultiArray
 
 from q2r2_control.ros.base_node import LATCHED_QOS
-from q2r2_control.ros.bridge.gripper_limits import wanted_topic
 from q2r2_control.ros.monitoring.endpoints import PublisherCount
+
+
+def wanted_topic(target_topic: str) -> str:
+    """Where the sender of targets asks for openings."""
+    return f"{target_topic.rpartition('/')[0]}/wanted_opening"
 
 
 class OpeningGrants:
