@@ -23,7 +23,7 @@ pytest.importorskip("control_msgs", reason="needs control_msgs: q2r2 ros build-i
 
 import pinocchio as pin
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Float64
+from std_msgs.msg import Float64MultiArray
 
 from q2r2_control.ros.base_node import LATCHED_QOS, STREAM_QOS
 from q2r2_control.ros.bridge.grippers import GripperClient
@@ -70,22 +70,29 @@ class Gripper:
 
 
 @pytest.fixture(scope="module")
-def cell(domain: int, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cell]:
-    folder = tmp_path_factory.mktemp("grippers")
+def running(domain: int, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Processes]:
+    processes = Processes(tmp_path_factory.mktemp("grippers"), os.environ)
+    yield processes
+    processes.end_all()
+
+
+@pytest.fixture(scope="module")
+def config(tmp_path_factory: pytest.TempPathFactory) -> str:
     data = BLOCK_CELL.model_dump(mode="json")
     data["arms"]["right"]["gripper"]["object"] = {}
     alone: dict[str, Any] = {"objects": {}}  # nothing lies where the gripper goes
-    config = changed_cell(folder, obstacles=data["obstacles"], arms=data["arms"], mujoco=alone)
-    processes = Processes(folder, os.environ)
-    robot = Robot.from_config(BLOCK_CELL)
-    try:
-        with spun_node(domain) as node:
-            simulated = processes.start_node("mujoco_robot", f"config:={config}", f"rate:={NODE_RATE}")
-            cell = Cell(node, robot, simulated, start_controller(processes, *PATIENT, config=config))
-            cell.wait_until_active()
-            yield cell
-    finally:
-        processes.end_all()
+    folder = tmp_path_factory.mktemp("cell")
+    return changed_cell(folder, obstacles=data["obstacles"], arms=data["arms"], mujoco=alone)
+
+
+@pytest.fixture(scope="module")
+def cell(domain: int, running: Processes, config: str) -> Iterator[Cell]:
+    with spun_node(domain) as node:
+        simulated = running.start_node("mujoco_robot", f"config:={config}", f"rate:={NODE_RATE}")
+        controller = start_controller(running, *PATIENT, config=config)
+        cell = Cell(node, Robot.from_config(BLOCK_CELL), simulated, controller)
+        cell.wait_until_active()
+        yield cell
 
 
 def _go(cell: Cell, stream: Stream, goal: pin.SE3) -> None:
@@ -145,28 +152,30 @@ def test_a_closed_gripper_goes_where_an_open_one_could_not_and_opens_there_as_fa
 
 
 def test_a_gripper_that_does_not_close_holds_its_object(cell: Cell) -> None:
-    wanted = cell.node.create_publisher(Float64, "/q2r2/right/wanted_opening", LATCHED_QOS)
+    wanted = cell.node.create_publisher(Float64MultiArray, "/q2r2/right/target_frame/wanted_opening", LATCHED_QOS)
     assert cell.state("right_holds_object") is False
-    wanted.publish(Float64(data=0.3))  # and no goal: it stays open
+    wanted.publish(Float64MultiArray(data=[0.3, math.nan]))  # and no goal: it stays open
     wait_until(lambda: cell.state("right_holds_object") is True, "the object counts")
-    wanted.publish(Float64(data=1.0))
+    _stop_and_reset(cell)
+    wait_until(lambda: cell.state("right_holds_object") is True, "it still does")
+    wanted.publish(Float64MultiArray(data=[1.0, math.nan]))
     wait_until(lambda: cell.state("right_holds_object") is False, "the object does not count any more")
 
 
-def test_an_opening_that_is_none_is_refused_by_name_and_the_last_one_stays(cell: Cell) -> None:
+@pytest.mark.parametrize("bad", [[7.0, 0.0], [math.nan, 0.0], [0.5, 3.0], [0.5]], ids=str)
+def test_an_opening_that_is_none_is_refused_by_name_and_the_last_one_stays(cell: Cell, bad: list[float]) -> None:
     gripper = Gripper(cell)
     gripper.grants.ask(1.0)
     wait_until(lambda: gripper.grants.granted == 1.0, "it is granted")
-    controller = cell.processes[1]
-    sender = cell.node.create_publisher(Float64, "/q2r2/left/wanted_opening", LATCHED_QOS)
-    for bad, said in ((7.0, "7"), (math.nan, "nan")):
-        sender.publish(Float64(data=bad))
-        controller.wait_for(f"left: opening {said} not used")
+    sender = cell.node.create_publisher(Float64MultiArray, "/q2r2/left/target_frame/wanted_opening", LATCHED_QOS)
+    sender.publish(Float64MultiArray(data=bad))
+    cell.processes[1].wait_for(f"left: openings {bad} not used")
     assert gripper.grants.granted == 1.0
+    cell.node.destroy_publisher(sender)
 
 
-def test_a_gripper_that_waits_stays_where_it_is_when_the_controller_ends_and_then_does_what_it_is_asked(
-    cell: Cell,
+def test_when_a_controller_ends_and_another_begins_a_gripper_that_waited_stays_and_so_do_the_arms(
+    cell: Cell, running: Processes, config: str
 ) -> None:
     gripper = Gripper(cell)
     wait_until(lambda: gripper.grants.answered, "the controller answers")
@@ -180,9 +189,19 @@ def test_a_gripper_that_waits_stays_where_it_is_when_the_controller_ends_and_the
         gripper.wait_until(lambda: gripper.opening > 0.3, "the gripper opens as far as it may")
     finally:
         stream.end()
+    cell.joints.wait_for_rest()
     cell.processes[1].interrupt()
     gripper.wait_until(lambda: gripper.client.problem, "the gripper's client gives up")
     assert "the controller that grants openings has ended" in str(gripper.client.problem)
+    rest = cell.joints.wait_for_rest()
+
+    cell.states.clear()
+    start_controller(running, *PATIENT, config=config)
+    wait_until(lambda: cell.state("phase") == "active", "the new controller is active")
+    began = time.monotonic()
+    gripper.wait_until(lambda: time.monotonic() - began > 1.5, "a second and a half pass")
+    # The fingers rest where they are just proven; at most a millimetre of tracking is given back.
+    assert cell.joints.tool_farthest_from(rest, began) < 0.002
     assert 0.3 < gripper.opening < 0.5
-    gripper.client.command(True, time.monotonic())
-    gripper.wait_until(lambda: gripper.opening < 0.02 and gripper.client.closed, "it closes without a controller")
+    gripper.close()
+    gripper.wait_until(lambda: gripper.opening < 0.02 and gripper.client.closed, "it closes")

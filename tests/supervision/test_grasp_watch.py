@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 
 from q2r2_control import CartesianController, Robot
-from q2r2_control.supervision.grasp_watch import GraspWatch
+from q2r2_control.supervision.grasp_watch import GraspWatch, Grip
 from tests.support.object_cell import BLOCK, cell
 
 NO_CLOCK = {"solve_time_limit": None}  # whether a solution is late depends on the machine
@@ -102,3 +103,17 @@ def test_where_no_opening_is_measured_a_closed_gripper_holds() -> None:
         watch.update({"left": wanted, "right": wanted}, {}, 0.0)
         held.append(controller.holding["left"])
     assert held == [False, True, True, False]
+
+
+def test_one_whose_fingers_were_never_measured_holds_when_it_is_told_to_close() -> None:
+    grip = Grip(0.025)
+    assert not grip.look(1.0, None, 0.0)
+    assert grip.look(0.0, None, 0.1)
+    assert not grip.look(1.0, None, 0.2)
+
+
+def test_a_gripper_that_may_begin_late_is_given_that_time() -> None:
+    for stall in (0.2, 0.5):
+        grip = Grip(0.025, stall)
+        held = [at for at in np.arange(0.0, 1.0, 0.01) if grip.look(0.0, 1.0, float(at))]
+        assert stall <= held[0] < stall + 0.03

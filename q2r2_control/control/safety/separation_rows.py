@@ -32,7 +32,7 @@ from q2r2_control.control.geometry.closest_points import segment_segment
 from q2r2_control.control.geometry.collision import CollisionData
 from q2r2_control.control.geometry.pair_distance import at_least, distance_row, measure, measure_part
 from q2r2_control.control.jit import inlined_kernel, lean_kernel
-from q2r2_control.control.safety.safety_data import SafetyData
+from q2r2_control.control.safety.safety_data import INSTANTS, SafetyData
 from q2r2_control.control.safety.safety_model import SafetyModel
 from q2r2_control.control.safety.separating_plane import curvature
 from q2r2_control.control.safety.stop_rollout import begin_rollout, sample_of
@@ -53,7 +53,6 @@ _SHARE = 0.25
 _SAME_POINT = 0.005  # [m]
 # A stop that takes a pair's points off the tangent by less than this is looked at from its start, along the tangent.
 _STRAIGHT = 2e-4  # [m]
-_INSTANTS = (0, 20, 64)  # of 64, where B is looked for: the start, half of the way, and the end of the stop
 
 
 @lean_kernel
@@ -116,12 +115,12 @@ def write_separation_rows(model: SafetyModel, data: SafetyData, h: float) -> Non
         least = data.distance[p]
         straight = curvature(model.collision.pairs, p, stop, stop, 0.0) < _STRAIGHT
         if not straight and least >= model.min_distance[p]:
-            for i in range(1, len(_INSTANTS)):
-                distance = measure(model.collision, sample_of(model, data, _INSTANTS[i], duration), p)
+            for i in range(1, len(INSTANTS)):
+                distance = measure(model.collision, sample_of(model, data, INSTANTS[i], duration), p)
                 if distance < least:
                     least = distance
                     number = i
-        at = data.collision if number == 0 else sample_of(model, data, _INSTANTS[number], duration)
+        at = data.collision if number == 0 else sample_of(model, data, INSTANTS[number], duration)
         least = measure(model.collision, at, p)
         moment = Moment(number, straight, h)
         before = count
@@ -136,8 +135,8 @@ def write_separation_rows(model: SafetyModel, data: SafetyData, h: float) -> Non
 def _write_levers(data: SafetyData, duration: float, h: float) -> None:
     """By s_j + h / 2 a joint's next speed v+_j lengthens its way until an instant, of the step and of the stop."""
     candidate, lever = data.candidate, data.rows.lever
-    for i in range(len(_INSTANTS)):
-        t = duration * _INSTANTS[i] / _INSTANTS[-1]
+    for i in range(len(INSTANTS)):
+        t = duration * INSTANTS[i] / INSTANTS[-1]
         for j in range(lever.shape[1]):
             speed = abs(candidate.v[j])
             whole = speed / candidate.deceleration[j] if speed > 0.0 else duration
@@ -185,7 +184,7 @@ def _append_row(
             ahead += row[j] * 0.5 * v[j] * abs(v[j]) / data.certified[j]
         if ahead < 0.0 and distance >= model.min_distance[p]:
             free += ahead
-            lever = data.rows.lever[len(_INSTANTS) - 1]
+            lever = data.rows.lever[len(INSTANTS) - 1]
     rate = 0.0  # of the distance [m/s]: with v kept up, B changes by as much in a second
     change = 0.0  # how much the acceleration can do about that in this step [m]
     for j in range(row.shape[0]):

@@ -120,8 +120,8 @@ class ArmOutputs:
     @property
     def gripper_held(self) -> str | None:
         """What the built-in controller says keeps the gripper from the opening that was asked for."""
-        pair = "" if self._follows is None else self._follows.gripper_held
-        return f"the gripper opens no farther: {pair} would come too close" if pair else None
+        why = "" if self._follows is None else self._follows.gripper_held
+        return f"the gripper goes no farther: {why}" if why else None
 
     @property
     def sent(self) -> dict[str, int]:
@@ -190,7 +190,7 @@ class FollowWatch:
         self._followed_since = math.inf  # targets have been sent and followed [s]
         self.unready: str | None = None  # why the controller would follow no stream of targets now
         self.homing, self.homing_ended = False, ""  # whether it says that it goes home; how the last way ended
-        self.gripper_held = ""  # the pair of bodies that keeps the gripper from opening farther
+        self.gripper_held = ""  # what keeps the gripper from going farther
         node.create_subscription(Bool, topic, self._on_following, LATCHED_QOS)
         node.create_subscription(String, f"{self.controller}/state", self._on_state, 1)
 

@@ -1,8 +1,9 @@
 """What the built-in controller grants grippers: openings that are proven, since fingers and what they hold are bodies.
 
-Whoever commands a gripper asks on ``wanted_opening`` beside the arm's targets, and commands what ``~/opening/<arm>``
-answers: the wanted opening and the one that may be commanded now, 0 closed .. 1 fully open. Where nobody has asked yet,
-or nothing is measured, the fingers count as all of their way, for which nothing needs to be known.
+Whoever commands a gripper tells the opening that is wanted, and the one that was commanded last, on the topic of the
+arm's targets with ``/wanted_opening`` after it, and commands what ``~/opening/<arm>`` answers: the wanted opening and
+the one that may be commanded now, 0 closed .. 1 fully open. Where nobody has asked yet, or fingers were never measured,
+they count as all of their way, for which nothing needs to be known. So they do where another controller moves the arms.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from functools import partial
 from typing import Any
 
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Float64, Float64MultiArray
+from std_msgs.msg import Float64MultiArray
 
 from q2r2_control.config import Config
 from q2r2_control.config.timeouts import STREAM_TIMEOUT
@@ -22,34 +23,43 @@ from q2r2_control.drives import Drive
 from q2r2_control.ros.base_node import LATCHED_QOS, BaseNode
 from q2r2_control.ros.bridge.opening_grants import wanted_topic
 from q2r2_control.runtime.body_changes import BodyChanges
-from q2r2_control.supervision.grasp_watch import GraspWatch
+from q2r2_control.supervision.grasp_watch import STALL, GraspWatch
 
 # Until a gripper does what was granted: the answer has to arrive, ten goals a second go out, and it may be slow [s].
 _GRIPPER_DELAY = 0.3
+_UNMEASURED = "its fingers are not in the joint states, or nothing is proven while the arms are stopped"
 
 
 class GripperLimits:
     """Fingers, held objects and distances of the controller, for all arms; see :class:`BodyChanges`."""
 
     def __init__(
-        self, node: BaseNode, config: Config, controller: CartesianController, drive: Drive, targets: Mapping[str, str]
+        self,
+        node: BaseNode,
+        config: Config,
+        controller: CartesianController,
+        drive: Drive,
+        targets: Mapping[str, str],
     ) -> None:
-        """``targets``: topic of each arm's targets."""
+        """``targets``: topic of the targets of each arm whose gripper may ask."""
         self._node, self._controller, self._drive = node, controller, drive
-        self._fingers, self._grasps = FingerStates(config, controller), GraspWatch(controller)
+        self._fingers = FingerStates(config, controller)
+        self._grasps = GraspWatch(controller, STALL + _GRIPPER_DELAY)
         self._wanted: dict[str, float] = {}
-        self._granted: dict[str, float] = {}
         self._told: dict[str, tuple[float, float]] = {}
         self._bodies: BodyChanges | None = None  # while the controller's reference is where the arms are
         self._answers: dict[str, Any] = {}
-        for arm in self._fingers.arms:
+        for arm in (arm for arm in self._fingers.arms if arm in targets):
             self._answers[arm] = node.create_publisher(Float64MultiArray, f"~/opening/{arm}", LATCHED_QOS)
-            node.create_subscription(Float64, wanted_topic(targets[arm]), partial(self._on_wanted, arm), LATCHED_QOS)
+            topic = wanted_topic(targets[arm])
+            node.create_subscription(Float64MultiArray, topic, partial(self._on_wanted, arm), LATCHED_QOS)
 
     @property
     def held(self) -> dict[str, str]:
-        """Arm -> pair of bodies that keeps its gripper from the wanted opening."""
-        return {} if self._bodies is None else {arm: "|".join(pair) for arm, pair in self._bodies.held_grippers.items()}
+        """Arm -> what keeps its gripper from the wanted opening."""
+        pairs = {} if self._bodies is None else self._bodies.held_grippers
+        held = {arm: _UNMEASURED for arm, (wanted, granted) in self._told.items() if granted != wanted}
+        return held | {arm: f"{'|'.join(pair)} would come too close" for arm, pair in pairs.items()}
 
     @property
     def holding(self) -> dict[str, bool]:
@@ -58,24 +68,26 @@ class GripperLimits:
 
     def take_joint_state(self, message: JointState) -> None:
         """Note the fingers of a message of joint states, if there are any."""
-        if self._wanted:
+        if self._answers:
             self._fingers.take(message, self._node.now)
 
     def prepare(self) -> None:
         """The controller was reset; before the drive is."""
+        self._grasps.tell_again()
         self._bodies = BodyChanges(self._controller, self._drive, _GRIPPER_DELAY, self._grasps)
 
     def begin(self, now: float) -> None:
         """The drive was reset."""
         assert self._bodies is not None
-        self._bodies.resume(self._granted, self._fingers.openings(now), now)
+        granted = {arm: granted for arm, (_, granted) in self._told.items()}
+        self._bodies.resume(granted, self._fingers.openings(now), now)
         self._bodies.begin()
 
     def limit(self, active: bool, now: float) -> None:
         """Answer what was asked for, before a step.
 
         An inactive controller moves no arm and proves nothing: it grants what it is asked for then, for instance to let
-        go of something, but nothing more of what was asked for before. No gripper moves because the arms were stopped.
+        go of something, but no gripper that was held opens farther because the arms were stopped.
         """
         if not active:
             self._bodies = None
@@ -84,23 +96,39 @@ class GripperLimits:
         if self._bodies is not None:
             granted = self._bodies.limit_grippers(self._wanted, self._fingers.openings(now), now)
         else:
-            granted = {arm: wanted for arm, wanted in self._wanted.items() if self._told.get(arm, (None,))[0] != wanted}
+            granted = {arm: self._unproven(arm, wanted) for arm, wanted in self._wanted.items()}
         for arm, opening in granted.items():
-            answer = (self._wanted[arm], opening)
-            if self._told.get(arm) != answer:
-                self._told[arm], self._granted[arm] = answer, opening
-                self._answers[arm].publish(Float64MultiArray(data=answer))
+            self._answer(arm, self._wanted[arm], opening)
+
+    def _unproven(self, arm: str, wanted: float) -> float:
+        """What is granted while the arms do not move."""
+        before = self._told.get(arm)
+        return wanted if before is None or before[0] == before[1] else min(wanted, before[1])
+
+    def _answer(self, arm: str, wanted: float, granted: float) -> None:
+        if self._told.get(arm) != (wanted, granted):
+            self._told[arm] = wanted, granted
+            self._answers[arm].publish(Float64MultiArray(data=(wanted, granted)))
 
     def after_step(self) -> None:
         """See :meth:`BodyChanges.after_step`."""
         if self._bodies is not None:
             self._bodies.after_step()
 
-    def _on_wanted(self, arm: str, message: Float64) -> None:
-        if 0.0 <= message.data <= 1.0:
-            self._wanted[arm] = message.data
-        else:
-            self._node.get_logger().warning(f"{arm}: opening {message.data:g} not used; allowed: 0 closed .. 1 open")
+    def _on_wanted(self, arm: str, message: Float64MultiArray) -> None:
+        told = list(message.data)
+        if len(told) != 2 or not 0.0 <= told[0] <= 1.0 or (told[1] == told[1] and not 0.0 <= told[1] <= 1.0):
+            allowed = "two, wanted and commanded last (or NaN), 0 closed .. 1 open"
+            self._node.get_logger().warning(f"{arm}: openings {told!s:.60} not used; allowed: {allowed}")
+            return
+        wanted, commanded = told
+        if arm not in self._wanted and commanded == commanded:
+            # Asked for before this node began, maybe long ago: the gripper is where it was commanded to be, and stays.
+            self._answer(arm, wanted, commanded)
+            if self._bodies is not None:
+                now = self._node.now
+                self._bodies.resume({arm: commanded}, self._fingers.openings(now), now)
+        self._wanted[arm] = wanted
 
 
 class FingerStates:

@@ -20,6 +20,7 @@ from q2r2_control.ros.bridge.opening_grants import OpeningGrants
 
 # The client.
 _RESULT_TIMEOUT = 10.0  # of a goal [s]
+_ANSWER_TIMEOUT = 1.0  # of the controller that grants openings [s]
 _MOVE_PERIOD, _MOVE_STEP = 0.1, 0.01  # between two goals of a gripper that follows a trigger [s], of the stroke
 # The server.
 _REACHED = 0.02  # of the stroke
@@ -47,7 +48,8 @@ class GripperClient:
         self._goal_closed: bool | None = None  # closed or not, while a goal is under way
         self._position: float | None = None  # that the gripper told last
         self._sent, self._asked = -math.inf, 1.0  # what was asked for last: when [s], and the opening
-        self._commanded: float | None = None  # opening on the way there, None: none yet
+        self._commanded: float | None = None  # the last opening that was commanded
+        self._begins = False  # nothing was commanded yet of what was asked for
         self._commanded_at = -math.inf  # [s]
         self._waits = False  # for more to be granted
         self._closes = False  # it is a smaller one than that of the goal before
@@ -79,7 +81,8 @@ class GripperClient:
 
     def toggle(self, now: float) -> None:
         """Ask for the opposite of the gripper's state, or of the state that it is moving to."""
-        self.command(not (self.closed if self._goal_closed is None else self._goal_closed), now)
+        closed = self._asked < 0.5 if self._waits else self.closed if self._goal_closed is None else self._goal_closed
+        self.command(not closed, now)
 
     def command(self, close: bool, now: float) -> None:
         """Ask to close or open, see :meth:`move`."""
@@ -98,13 +101,14 @@ class GripperClient:
         """
         self._closes = opening < self._asked or (opening == self._asked and self._closes)
         self.holds = self.holds and self._closes
-        self.problem, self._asked, self._sent = None, opening, now
+        self.problem, self._asked, self._sent, self._waits = None, opening, now, False
+        if not self._has_server():
+            self._drop(f"no gripper server at {self._name}")
+            return
+        self._goals += 1  # what goals before this one lead to is not asked for any more
         if self._client is not None:
-            if not self._client.server_is_ready():
-                self.problem = f"no gripper server at {self._name}"
-                return
             self._goal_closed = opening < 0.5
-        self._commanded, self._waits = None, self._grants is not None and self._grants.answered
+        self._begins, self._waits = True, self._grants is not None and self._grants.answered
         if self._grants is not None:
             self._grants.ask(opening)
         if not self._waits:
@@ -113,22 +117,40 @@ class GripperClient:
     def _go_on(self, now: float) -> None:
         """Command what is granted. A gripper goes no farther because its controller has ended."""
         assert self._grants is not None
-        if not self._grants.answered:
-            self._waits = False
-            self._end(f"{self._name} goes no farther: the controller that grants openings has ended")
-            return
         granted = self._grants.granted
-        if granted is None or granted == self._commanded:
-            return
-        if granted == self._asked:
-            self._waits = False
-        elif now - self._commanded_at < _MOVE_PERIOD:
-            return
-        self._command(granted, now)
+        if not self._grants.answered:
+            self._give_up("the controller that grants openings has ended")
+        elif granted is None:
+            if now - self._sent > _ANSWER_TIMEOUT:
+                self._give_up("the controller that grants openings does not answer")
+        elif self._begins or granted != self._commanded:
+            if granted != self._asked and now - self._commanded_at < _MOVE_PERIOD:
+                return
+            if not self._has_server():
+                self._give_up("it has no server any more")
+                return
+            self._waits = granted != self._asked
+            self._command(granted, now)
+
+    def _has_server(self) -> bool:
+        return self._client is None or self._client.server_is_ready()
+
+    def _give_up(self, why: str) -> None:
+        """Go no farther."""
+        self._end(f"{self._name} goes no farther: {why}")
+        self._drop(self.problem)
+
+    def _drop(self, problem: str | None) -> None:
+        """What was asked for is not wanted any more."""
+        self.problem = problem
+        if self._grants is not None and self._commanded is not None:
+            self._grants.ask(self._commanded)
 
     def _command(self, opening: float, now: float) -> None:
         """Send a goal, or a message."""
-        self._commanded, self._commanded_at, settings = opening, now, self._settings
+        self._commanded, self._commanded_at, self._begins, settings = opening, now, False, self._settings
+        if self._grants is not None:
+            self._grants.commanded(opening)
         position = (1.0 - opening) * settings.closed_position + opening * settings.open_position
         if self._publisher is not None:
             self._publisher.publish(Float64MultiArray(data=[position]))
@@ -190,7 +212,7 @@ class GripperClient:
             self._position = float(told.state.position[0])
 
     def _end(self, problem: str | None) -> None:
-        self._goal_closed, self.problem = None, problem
+        self._goal_closed, self.problem, self._waits = None, problem, False
         self._goals += 1  # later answers to this goal are ignored
         if problem is not None:
             self._node.get_logger().warning(problem)

@@ -2,26 +2,32 @@
 
 from __future__ import annotations
 
+import math
+
 from rclpy.node import Node
-from std_msgs.msg import Float64, Float64MultiArray
+from std_msgs.msg import Float64MultiArray
 
 from q2r2_control.ros.base_node import LATCHED_QOS
 from q2r2_control.ros.monitoring.endpoints import PublisherCount
 
 
 def wanted_topic(target_topic: str) -> str:
-    """Where the sender of targets asks for openings."""
-    return f"{target_topic.rpartition('/')[0]}/wanted_opening"
+    """Where the sender of an arm's targets asks for openings."""
+    return f"{target_topic}/wanted_opening"
 
 
 class OpeningGrants:
-    """One arm's gripper; openings are 0 closed .. 1 fully open."""
+    """One arm's gripper; openings are 0 closed .. 1 fully open.
+
+    It says what is wanted, and what the gripper was commanded to last: a controller that starts anew then knows where
+    the gripper may be, and does not take an old wish for a new one.
+    """
 
     def __init__(self, node: Node, controller: str, arm: str, target_topic: str) -> None:
         """``controller``: the built-in one's name; ``target_topic``: where the arm's targets go."""
-        self._wanted: float | None = None
+        self._wanted, self._commanded = math.nan, math.nan
         self._answer: tuple[float, float] | None = None  # what was wanted, and what is granted of it
-        self._publisher = node.create_publisher(Float64, wanted_topic(target_topic), LATCHED_QOS)
+        self._publisher = node.create_publisher(Float64MultiArray, wanted_topic(target_topic), LATCHED_QOS)
         topic = f"{controller}/opening/{arm}"
         node.create_subscription(Float64MultiArray, topic, self._on_answer, LATCHED_QOS)
         self._answering = PublisherCount(node, topic)
@@ -41,7 +47,15 @@ class OpeningGrants:
     def ask(self, opening: float) -> None:
         """Ask for an opening, until another one is asked for."""
         self._wanted = opening
-        self._publisher.publish(Float64(data=opening))
+        self._tell()
+
+    def commanded(self, opening: float) -> None:
+        """Say what the gripper is commanded to."""
+        self._commanded = opening
+        self._tell()
+
+    def _tell(self) -> None:
+        self._publisher.publish(Float64MultiArray(data=[self._wanted, self._commanded]))
 
     def _on_answer(self, message: Float64MultiArray) -> None:
         if len(message.data) == 2 and all(0.0 <= number <= 1.0 for number in message.data):

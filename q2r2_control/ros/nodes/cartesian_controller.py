@@ -77,7 +77,9 @@ class CartesianControllerNode(ManagedNode):
             self._live_impedance = LiveImpedance(self, self._output.drive.impedance)
         self._controller = CartesianController(robot, permitted(config.control, self._output.drive))
         self._live = LiveControl(self, self._controller)
-        self._grippers = GripperLimits(self, config, self._controller, self._output.drive, self._targets.topics)
+        # Another controller's arms are judged with fingers all of their way.
+        asking = self._targets.topics if output != NONE else {}
+        self._grippers = GripperLimits(self, config, self._controller, self._output.drive, asking)
         self._supervisor = Supervisor(
             robot,
             self._controller,

@@ -1,0 +1,173 @@
+"""A gripper's client that asks before it commands: it goes where it is granted, and no farther whatever fails."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from queue import Queue
+
+import pytest
+
+from q2r2_control.config.external import GripperSettings, GripperType
+from tests.ros.conftest import NEEDS_ROS, spun_node
+from tests.ros.processes import Processes
+
+pytest.importorskip("rclpy", reason=NEEDS_ROS)
+pytest.importorskip("control_msgs", reason="needs control_msgs: q2r2 ros build-interfaces")
+
+from control_msgs.action import GripperCommand
+from rclpy.action import ActionServer, GoalResponse
+from std_msgs.msg import Float64MultiArray
+
+from q2r2_control.ros.base_node import LATCHED_QOS
+from q2r2_control.ros.bridge.grippers import GripperClient
+from q2r2_control.ros.bridge.opening_grants import OpeningGrants
+from tests.ros.waiting import wait_until
+
+_CLOSED = 0.05  # [m]
+
+
+class Bench:
+    """A client, a gripper that reaches or refuses every goal, and who grants: the test."""
+
+    def __init__(self, domain: int, kind: GripperType = GripperType.GRIPPER_COMMAND, topic: str = "/gripper") -> None:
+        self._nodes = ExitStack()
+        near, self.far = (self._nodes.enter_context(spun_node(domain, name)) for name in ("near", "far"))
+        self.goals: Queue[float] = Queue()  # openings
+        self.asked: list[list[float]] = []  # wanted, commanded
+        self.refuses = False
+        self.answers = self.far.create_publisher(Float64MultiArray, "/controller/opening/left", LATCHED_QOS)
+        self.far.create_subscription(
+            Float64MultiArray, "/targets/wanted_opening", lambda message: self.asked.append(list(message.data)), 10
+        )
+        self.far.create_subscription(
+            Float64MultiArray, "/fingers", lambda message: self.goals.put(1.0 - message.data[0] / _CLOSED), 10
+        )
+        self._server = ActionServer(self.far, GripperCommand, "/gripper", self._execute, goal_callback=self._check)
+        self.grants = OpeningGrants(near, "/controller", "left", "/targets")
+        settings = GripperSettings(action_type=kind, closed_position=_CLOSED)
+        self.client = GripperClient(near, topic, settings, self.grants)
+        wait_until(lambda: self.grants.answered and self.client._has_server(), "all know of each other")
+
+    def _check(self, goal: GripperCommand.Goal) -> GoalResponse:
+        return GoalResponse.REJECT if self.refuses else GoalResponse.ACCEPT
+
+    def _execute(self, handle: object) -> GripperCommand.Result:
+        position = handle.request.command.position  # type: ignore[attr-defined]
+        self.goals.put(1.0 - position / _CLOSED)
+        handle.succeed()  # type: ignore[attr-defined]
+        return GripperCommand.Result(position=position, reached_goal=True)
+
+    def grant(self, wanted: float, granted: float) -> None:
+        self.answers.publish(Float64MultiArray(data=[wanted, granted]))
+
+    def wait(self, condition: Callable[[], object], what: str) -> None:
+        def ticked() -> object:
+            self.client.check(time.monotonic())
+            return condition()
+
+        wait_until(ticked, what, lambda: (self.client.state, self.client.problem, list(self.goals.queue), self.asked))
+
+    def pass_time(self, seconds: float) -> None:
+        until = time.monotonic() + seconds
+        self.wait(lambda: time.monotonic() > until, "time passes")
+
+    def command(self, close: bool) -> None:
+        self.client.command(close, time.monotonic())
+
+    def openings(self) -> list[float]:
+        return [round(opening, 6) for opening in list(self.goals.queue)]
+
+    def close(self) -> None:
+        self._nodes.close()
+
+
+@pytest.fixture
+def bench(domain: int) -> Iterator[Bench]:
+    bench = Bench(domain)
+    yield bench
+    bench.close()
+
+
+def test_it_goes_on_as_more_is_granted_and_has_opened_only_at_the_end(bench: Bench) -> None:
+    bench.command(close=True)
+    bench.pass_time(0.3)
+    assert bench.openings() == []  # nothing is granted yet
+    bench.grant(0.0, 0.0)
+    bench.wait(lambda: bench.client.closed, "it is closed")
+    bench.command(close=False)
+    bench.grant(1.0, 0.4)
+    bench.wait(lambda: bench.openings() == [0.0, 0.4], "it opens a part of the way")
+    bench.pass_time(0.5)
+    assert bench.client.state == "opening"
+    assert bench.client.closed
+    bench.grant(1.0, 1.0)
+    bench.wait(lambda: bench.client.state == "open", "it is open")
+    assert bench.openings() == [0.0, 0.4, 1.0]
+    wait_until(lambda: bench.asked and bench.asked[-1] == [1.0, 1.0], "it says what it was commanded to")
+
+
+def test_what_was_granted_of_an_earlier_wish_is_not_taken_for_this_one(bench: Bench) -> None:
+    bench.grant(1.0, 1.0)
+    bench.command(close=True)
+    bench.pass_time(0.3)
+    assert bench.openings() == []
+
+
+def test_a_wish_without_an_answer_is_dropped_and_says_so(bench: Bench) -> None:
+    bench.command(close=True)
+    bench.wait(lambda: bench.client.problem, "it gives up")
+    assert bench.client.problem == "/gripper goes no farther: the controller that grants openings does not answer"
+    bench.grant(0.0, 0.0)
+    bench.pass_time(0.5)
+    assert bench.openings() == []
+
+
+def test_a_press_without_a_server_ends_the_wish_before_it(domain: int, processes: Processes) -> None:
+    gripper = processes.start_module("tests.ros.programs.gripper")
+    gripper.wait_for("ready")
+    bench = Bench(domain, topic="/gripper/command")
+    try:
+        bench.command(close=False)
+        bench.grant(1.0, 0.4)
+        bench.wait(lambda: bench.asked and bench.asked[-1] == [1.0, 0.4], "it opens a part of the way")
+        gripper.end()
+        wait_until(lambda: not bench.client._has_server(), "the server is gone")
+        bench.command(close=True)
+        assert bench.client.problem == "no gripper server at /gripper/command"
+        wait_until(lambda: bench.asked[-1] == [0.4, 0.4], "it wants to stay where it is")
+        bench.grant(1.0, 1.0)
+        bench.pass_time(0.5)
+        assert bench.asked[-1] == [0.4, 0.4]
+    finally:
+        bench.close()
+
+
+def test_a_goal_that_is_refused_on_the_way_ends_the_wish(bench: Bench) -> None:
+    bench.command(close=True)
+    bench.grant(0.0, 0.0)
+    bench.wait(lambda: bench.client.closed, "it is closed")
+    bench.refuses = True
+    bench.command(close=False)
+    bench.grant(1.0, 0.3)
+    bench.wait(lambda: bench.client.problem, "the refusal is told")
+    bench.refuses = False
+    bench.grant(1.0, 1.0)
+    bench.pass_time(0.5)
+    assert bench.openings() == [0.0]
+    assert bench.client.state == "closed"
+
+
+def test_a_gripper_behind_a_topic_waits_too_and_two_presses_before_an_answer_are_two(domain: int) -> None:
+    bench = Bench(domain, GripperType.FLOAT64_MULTI_ARRAY, "/fingers")
+    try:
+        bench.client.toggle(time.monotonic())
+        bench.client.toggle(time.monotonic())
+        bench.grant(1.0, 0.6)
+        bench.wait(lambda: bench.openings() == [0.6], "it opens a part of the way")
+        bench.grant(1.0, 1.0)
+        bench.wait(lambda: bench.openings() == [0.6, 1.0], "and to the end")
+        assert bench.client.state == "open"
+    finally:
+        bench.close()
