@@ -117,3 +117,12 @@ def test_a_gripper_that_may_begin_late_is_given_that_time() -> None:
         grip = Grip(0.025, stall)
         held = [at for at in np.arange(0.0, 1.0, 0.01) if grip.look(0.0, 1.0, float(at))]
         assert stall <= held[0] < stall + 0.03
+
+
+def test_a_controller_that_was_reset_is_told_at_once_of_what_is_held(controller: CartesianController) -> None:
+    hand = Hand(controller)
+    assert hand.run(0.0, 0.5, least=0.8)
+    controller.reset(controller.robot.home)
+    assert not controller.holding["left"]
+    hand.watch.tell_again()
+    assert controller.holding["left"]

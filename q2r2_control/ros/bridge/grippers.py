@@ -103,7 +103,8 @@ class GripperClient:
         self.holds = self.holds and self._closes
         self.problem, self._asked, self._sent, self._waits = None, opening, now, False
         if not self._has_server():
-            self._drop(f"no gripper server at {self._name}")
+            self.problem = f"no gripper server at {self._name}"
+            self._ask_to_stay()
             return
         self._goals += 1  # what goals before this one lead to is not asked for any more
         if self._client is not None:
@@ -138,11 +139,10 @@ class GripperClient:
     def _give_up(self, why: str) -> None:
         """Go no farther."""
         self._end(f"{self._name} goes no farther: {why}")
-        self._drop(self.problem)
+        self._ask_to_stay()
 
-    def _drop(self, problem: str | None) -> None:
+    def _ask_to_stay(self) -> None:
         """What was asked for is not wanted any more."""
-        self.problem = problem
         if self._grants is not None and self._commanded is not None:
             self._grants.ask(self._commanded)
 
