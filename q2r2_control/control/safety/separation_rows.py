@@ -36,7 +36,7 @@ from q2r2_control.control.safety.safety_data import INSTANTS, SafetyData
 from q2r2_control.control.safety.safety_model import SafetyModel
 from q2r2_control.control.safety.separating_plane import curvature
 from q2r2_control.control.safety.stop_rollout import begin_rollout, sample_of
-from q2r2_control.control.safety.velocity_bounds import fastest_approach, fastest_body
+from q2r2_control.control.safety.velocity_bounds import BodyVelocities, fastest_approach, fastest_body
 from q2r2_control.types import Array
 
 
@@ -46,6 +46,7 @@ class Moment(NamedTuple):
     number: int  # of the instants
     straight: bool  # the pair is measured at the stop's start, and the row follows the tangent
     h: float  # length of the step that the row is for [s]
+    ahead: float  # how far in time the row looks: half of the stop, which is as far as it leads, and 1 / gain [s]
 
 
 _SHARE = 0.25
@@ -122,11 +123,11 @@ def write_separation_rows(model: SafetyModel, data: SafetyData, h: float) -> Non
                     number = i
         at = data.collision if number == 0 else sample_of(model, data, INSTANTS[number], duration)
         least = measure(model.collision, at, p)
-        moment = Moment(number, straight, h)
+        moment = Moment(number, straight, h, 0.5 * duration + 1.0 / model.approach.gain)
         before = count
         count = _append_row(model, data, at, p, least, moment, count)
         if count > before:
-            count = _append_end_rows(model, data, at, p, moment, count)
+            count = _append_end_rows(model, data, at, p, least, moment, count)
     data.rows.used[0] = count
     _normalise_rows(data)
 
@@ -218,12 +219,14 @@ def _append_end_rows(
     data: SafetyData,
     at: CollisionData,
     p: int,
+    distance: float,
     moment: Moment,
     count: int,
 ) -> int:
-    """Rows at the ends of both bodies of a pair.
+    """Rows at those ends of both bodies of a pair that may soon be as close as its ``distance``.
 
-    The closest points of near-parallel bodies jump from end to end; rows at all ends leave nothing to jump.
+    The closest points of near-parallel bodies jump from end to end; rows at the ends leave nothing to jump. An end that
+    is farther by more than the bodies turn it towards each other while the row looks ahead does not take part.
     Pair ``p`` has been measured in ``at``.
     """
     bodies, posed, contact = model.collision.bodies, at.posed, at.contact
@@ -231,30 +234,44 @@ def _append_end_rows(
     start, end, closest = posed.start[first], posed.end[first], contact.kept
     _copy(contact.first, closest[0])
     _copy(contact.second, closest[1])
+    turned = _turning(data.velocities, bodies.joint[first], bodies.joint[second]) * moment.ahead
     for point in (start, end):
-        if not _near(point, closest[0]):
-            reached = measure_part(model.collision, at, p, point, point)
+        apart = _way_between(point, closest[0])
+        if apart < _SAME_POINT:
+            continue
+        reached = measure_part(model.collision, at, p, point, point)
+        if reached <= distance + turned * apart + _SAME_POINT:
             count = _append_row(model, data, at, p, reached, moment, count)
     if bodies.box[second] == 1:
         return count
     for point in (posed.start[second], posed.end[second]):
-        if not _near(point, closest[1]):
-            reached = segment_segment(start, end, point, point, contact.first, contact.second)
-            if reached > 1e-9:
-                for k in range(3):
-                    contact.normal[k] = (contact.second[k] - contact.first[k]) / reached
-                reached -= bodies.radius[first] + bodies.radius[second]
-                count = _append_row(model, data, at, p, reached, moment, count)
+        apart = _way_between(point, closest[1])
+        if apart < _SAME_POINT:
+            continue
+        cores = segment_segment(start, end, point, point, contact.first, contact.second)
+        reached = cores - bodies.radius[first] - bodies.radius[second]
+        if cores > 1e-9 and reached <= distance + turned * apart + _SAME_POINT:
+            for k in range(3):
+                contact.normal[k] = (contact.second[k] - contact.first[k]) / cores
+            count = _append_row(model, data, at, p, reached, moment, count)
     return count
 
 
 @lean_kernel
-def _near(point: Array, other: Array) -> bool:
-    return (
-        abs(point[0] - other[0]) < _SAME_POINT
-        and abs(point[1] - other[1]) < _SAME_POINT
-        and abs(point[2] - other[2]) < _SAME_POINT
-    )
+def _turning(velocities: BodyVelocities, joint: int, other: int) -> float:
+    """How fast the link of one joint turns relative to that of another [rad/s]."""
+    square = 0.0
+    for k in range(3):
+        square += (velocities.angular[joint, k] - velocities.angular[other, k]) ** 2
+    return np.sqrt(square)
+
+
+@lean_kernel
+def _way_between(point: Array, other: Array) -> float:
+    square = 0.0
+    for k in range(3):
+        square += (point[k] - other[k]) ** 2
+    return np.sqrt(square)
 
 
 @lean_kernel
