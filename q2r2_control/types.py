@@ -120,7 +120,7 @@ class StepStatus(StrEnum):
     FALLBACK = "fallback"  # the stopping motion was executed instead of the QP's solution
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)  # not frozen: that would cost a microsecond a tick
 class StepReport:
     """What one control tick did and why. Distances in metres, joints by name."""
 
@@ -138,7 +138,7 @@ class StepReport:
     unsolved: int = 0  # bit i: the QP of substep i had no solution, or too late, and the stop went on
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)  # not frozen: that would cost a microsecond a tick
 class Reference:
     """Joint motion that the QP allows, once per tick.
 

@@ -47,6 +47,7 @@ class TargetTracker:
         self._targets.follows[:] = 0
         self._targets.hold[:] = q
         self._targets.posture[:] = self._home
+        self._aims_home = True
 
     def hold_at(self, q: Array | None) -> None:
         """Arms that follow no target go to ``q`` (nv,) [rad] and hold there; None: where they come to rest."""
@@ -59,9 +60,12 @@ class TargetTracker:
     def aim_posture(self, posture: Array | None) -> None:
         """Let the free joints go to ``posture`` (nv,) [rad], home where there is none; a bad one changes nothing."""
         if posture is None:
-            self._targets.posture[:] = self._home
+            if not self._aims_home:
+                self._targets.posture[:] = self._home
+                self._aims_home = True
         elif posture.shape == self._home.shape and np.isfinite(posture).all():
             self._targets.posture[:] = posture
+            self._aims_home = False
 
     def update(self, targets: Mapping[str, pin.SE3 | None], dt: float, q: Array, v: Array) -> tuple[str, ...]:
         """Take the targets of one tick; returns the names whose target is not usable, unknown names among them."""
