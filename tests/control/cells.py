@@ -21,6 +21,7 @@ from q2r2_control.control.geometry.pair_distance import at_least, measure
 from q2r2_control.control.jit import kernel
 from q2r2_control.control.kernel_data import KernelData
 from q2r2_control.control.kernel_model import KernelModel, kernel_model_of
+from q2r2_control.control.safety.velocity_bounds import update_body_velocities
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 
@@ -60,11 +61,13 @@ def kernel_model(name: str) -> KernelModel:
 
 
 def kernel_data(name: str, q: Array, v: Array | None = None) -> KernelData:
-    """The controller's data with bodies and joints placed at ``q`` (nv,), nothing else computed."""
+    """The controller's data with bodies and joints at ``q`` (nv,) and as fast as ``v``, nothing else computed."""
     data = KernelData.empty(kernel_model(name))
     data.safety.state.q[:] = q
     data.safety.state.v[:] = 0.0 if v is None else v
-    update_placements(kernel_model(name).safety.collision, data.safety.collision, data.safety.state.q)
+    model, state = kernel_model(name).safety.collision, data.safety.state
+    update_placements(model, data.safety.collision, state.q)
+    update_body_velocities(model, data.safety.collision, state.v, data.safety.velocities)
     return data
 
 

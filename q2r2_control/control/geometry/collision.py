@@ -41,6 +41,7 @@ class Pairs(NamedTuple):
     sign: Array  # (p, k) +1: the joint moves the second geometry, -1: the first
     reach: Array  # (p, k) bound on how far the geometry's points are from the joint's axis [m]; 1 for a sliding joint
     leverage: Array  # (p,) sum of reach
+    carried: IntArray  # (p,) 1: some joint moves both geometries alike, and is not listed
 
 
 class CollisionModel(NamedTuple):
@@ -140,6 +141,7 @@ def pairs_of(model: pin.GeometryModel, chain: Chain, bodies: Bodies, travel: Arr
             names = [model.geometryObjects[i].name for i in (first, second)]
             raise RobotError(f"pair {names[0]}, {names[1]}: two boxes; allowed: at most one box in a pair")
         moving: dict[int, tuple[float, float]] = {}
+        carried = False
         for body, sign in ((first, -1.0), (second, 1.0)):
             farthest = np.linalg.norm(bodies.half[body]) + max(
                 np.linalg.norm(bodies.start[body]), np.linalg.norm(bodies.end[body])
@@ -151,12 +153,13 @@ def pairs_of(model: pin.GeometryModel, chain: Chain, bodies: Bodies, travel: Arr
                     farthest += travel[joint - 1]
                 if joint in moving:
                     del moving[joint]  # moves both alike: no relative motion
+                    carried = True
                 else:
                     moving[joint] = (sign, 1.0 if prismatic[joint] else float(farthest))
                 farthest += np.linalg.norm(translation[joint])
                 joint = int(parent[joint])
-        rows.append((first, second, moving))
-    width = max([len(moving) for _, _, moving in rows], default=1)
+        rows.append((first, second, moving, carried))
+    width = max([len(moving) for _, _, moving, _ in rows], default=1)
     pairs = Pairs(
         first=np.array([row[0] for row in rows], dtype=np.int64),
         second=np.array([row[1] for row in rows], dtype=np.int64),
@@ -164,8 +167,9 @@ def pairs_of(model: pin.GeometryModel, chain: Chain, bodies: Bodies, travel: Arr
         sign=np.zeros((len(rows), width)),
         reach=np.zeros((len(rows), width)),
         leverage=np.zeros(len(rows)),
+        carried=np.array([row[3] for row in rows], dtype=np.int64),
     )
-    for p, (_, _, moving) in enumerate(rows):
+    for p, (_, _, moving, _) in enumerate(rows):
         for k, (joint, (sign, reach)) in enumerate(sorted(moving.items())):
             pairs.joint[p, k], pairs.sign[p, k], pairs.reach[p, k] = joint, sign, reach
             pairs.leverage[p] += reach

@@ -83,6 +83,7 @@ class Rollout(NamedTuple):
     step: Piece  # from the reference to the candidate
     stop: Piece  # all of the candidate's stop
     piece: Piece  # a part of it
+    astray: Array  # (nv,) how far from going on as the reference does a joint may lead, see speed_bound [rad or m]
 
     @classmethod
     def empty(cls, model: CollisionModel) -> Rollout:
@@ -102,6 +103,7 @@ class Rollout(NamedTuple):
             step=Piece.empty(nv),
             stop=Piece.empty(nv),
             piece=Piece.empty(nv),
+            astray=np.zeros(nv),
         )
 
 

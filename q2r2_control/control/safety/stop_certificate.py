@@ -6,9 +6,10 @@ always safe: the last tick's certified stop can be executed now, and what is lef
 
 **Between samples.** A point of a body is never farther than reach_j from joint j's axis, so while the joints travel
 ways w_j (total variation) a pair's distance changes by at most S = sum_j reach_j w_j over the joints that move one body
-relative to the other. One sample with distance d proves d - S, enough for most pairs. Where it is not, the plane
-between the bodies proves a piece of the motion, with the direction of it (separating_plane.py): the stop is walked
-through in pieces as long as can be proven, each from a sample of its own.
+relative to the other. One sample with distance d proves d - S. Of pairs that share no joint more is known: how fast
+their bodies are at the reference (speed_bound.py), enough for most. Where it is not, the plane between the bodies
+proves a piece of the motion, with the direction of it (separating_plane.py): the stop is walked through in pieces as
+long as can be proven, each from a sample of its own.
 """
 
 from __future__ import annotations
@@ -20,8 +21,8 @@ from q2r2_control.control.jit import inlined_kernel, lean_kernel
 from q2r2_control.control.safety.safety_data import SafetyData
 from q2r2_control.control.safety.safety_model import SafetyModel
 from q2r2_control.control.safety.separating_plane import stay_beyond, stays_beyond
+from q2r2_control.control.safety.speed_bound import least_distance, way, write_astray
 from q2r2_control.control.safety.stop_rollout import begin_rollout, sample_of, write_piece
-from q2r2_control.types import Array
 
 # A pair that starts closer than its distance may not come closer; this is rounding only.
 _ROUNDING = 1e-12  # [m], and relative
@@ -46,15 +47,15 @@ def certify(model: SafetyModel, data: SafetyData, h: float) -> bool:
     """
     distance = data.distance
     duration = begin_rollout(data)
-    _write_step(data, h)
+    write_step(data, h)
     farthest = _farthest_travel(data)
+    time = h + 0.5 * duration
+    write_astray(model, data, h, duration)
     for p in range(distance.shape[0]):
-        if distance[p] - model.collision.pairs.leverage[p] * farthest >= model.min_distance[p]:
-            continue  # no joint travels farther, so neither way is longer
-        step = _way(model, p, data.rollout.step.travel)
-        stop = _way(model, p, data.rollout.stop.travel)
         threshold = model.min_distance[p]
-        if distance[p] - step - stop >= threshold:
+        if distance[p] - model.collision.pairs.leverage[p] * farthest >= threshold:
+            continue  # no joint travels farther, so the way is no longer
+        if _has_room(model, data, p, time):
             continue
         data.unproven[0] = p
         if distance[p] < threshold:
@@ -63,13 +64,13 @@ def certify(model: SafetyModel, data: SafetyData, h: float) -> bool:
             continue
         if _plane_keeps_apart(model, data, p, h, duration):
             continue
-        if not (_step_keeps_apart(model, data, p, h, step, duration) and _stop_keeps_apart(model, data, p, duration)):
+        if not (_step_keeps_apart(model, data, p, h, duration) and _stop_keeps_apart(model, data, p, duration)):
             return False
     return True
 
 
 @lean_kernel
-def _write_step(data: SafetyData, h: float) -> None:
+def write_step(data: SafetyData, h: float) -> None:
     """The parabola from the reference to the candidate."""
     v, v_next, piece = data.state.v, data.candidate.v, data.rollout.step
     for j in range(v.shape[0]):
@@ -88,16 +89,12 @@ def _farthest_travel(data: SafetyData) -> float:
 
 
 @inlined_kernel
-def _way(model: SafetyModel, p: int, travel: Array) -> float:
-    """S: how far the bodies of pair ``p`` can have moved relative to each other when joints travel (nv,) [m]."""
-    pairs = model.collision.pairs
-    total = 0.0
-    for k in range(pairs.joint.shape[1]):
-        joint = pairs.joint[p, k]
-        if joint == 0:
-            break
-        total += pairs.reach[p, k] * travel[joint - 1]
-    return total
+def _has_room(model: SafetyModel, data: SafetyData, p: int, time: float) -> bool:
+    """Whether pair ``p`` is farther apart than it can come closer: by its speed, in ``time`` [s], or by the ways."""
+    if model.collision.pairs.carried[p] == 0:
+        return least_distance(model, data, p, time) >= model.min_distance[p]
+    step, stop = way(model, p, data.rollout.step.travel), way(model, p, data.rollout.stop.travel)
+    return data.distance[p] - step - stop >= model.min_distance[p]
 
 
 @lean_kernel
@@ -117,12 +114,12 @@ def _plane_keeps_apart(model: SafetyModel, data: SafetyData, p: int, h: float, d
 
 
 @lean_kernel
-def _step_keeps_apart(model: SafetyModel, data: SafetyData, p: int, h: float, way: float, duration: float) -> bool:
+def _step_keeps_apart(model: SafetyModel, data: SafetyData, p: int, h: float, duration: float) -> bool:
     """Prove pair ``p`` apart in the step: from both of its ends by the way, or else from the first by a plane."""
     after, threshold = _distance_at(model, data, p, 0, duration), model.min_distance[p]
     if after < threshold:
         return False
-    if 0.5 * (data.distance[p] + after - way) >= threshold:
+    if 0.5 * (data.distance[p] + after - way(model, p, data.rollout.step.travel)) >= threshold:
         return True
     measure(model.collision, data.collision, p)
     return stays_beyond(model.collision, data.collision, p, data.rollout.step, h, threshold)

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -9,14 +8,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from q2r2_control.control.safety.stop_certificate import certify, step_travel
-from q2r2_control.control.safety.stop_shapes import OWN, SHAPES, TOGETHER, write_stop
+from q2r2_control.control.safety.stop_shapes import OWN, SHAPES, TOGETHER
 from q2r2_control.types import Array
 from tests.control.cells import NAMES, CellArrays, cell, distances, kernel_data, kernel_model, random_posture
+from tests.control.safety.motions import ACCELERATION, DENSE, H, Motion, motion_of
 
 MIN_DISTANCE = 0.02
-ACCELERATION = 10.0
-H = 0.002
-DENSE = 500  # samples of a motion
 
 
 @given(v=st.floats(-3, 3), v_next=st.floats(-3, 3), h=st.floats(1e-5, 0.02))
@@ -26,35 +23,6 @@ def test_the_way_of_a_step_counts_there_and_back(v: float, v_next: float, h: flo
     q = v * t + 0.5 * (v_next - v) / h * t**2
     way = float(np.abs(np.diff(q)).sum())
     assert way - 1e-15 <= step_travel(v, v_next, h) <= way + 1e-6 * h * (abs(v) + abs(v_next)) + 1e-15
-
-
-@dataclass(frozen=True)
-class Motion:
-    """A step and the stop after it."""
-
-    q: Array
-    v: Array
-    v_next: Array
-    deceleration: Array
-
-    @property
-    def q_next(self) -> Array:
-        return np.asarray(self.q + 0.5 * H * (self.v + self.v_next))
-
-    def step(self) -> Array:
-        t = np.linspace(0.0, H, DENSE // 25)[:, None]
-        return np.asarray(self.q + self.v * t + 0.5 * (self.v_next - self.v) / H * t**2)
-
-    def stop(self, samples: int = DENSE) -> Array:
-        t = np.linspace(0.0, np.max(np.abs(self.v_next) / self.deceleration), samples)[:, None]
-        ran = np.minimum(t, np.abs(self.v_next) / self.deceleration)
-        return np.asarray(self.q_next + self.v_next * ran - np.sign(self.v_next) * self.deceleration * ran**2 / 2)
-
-
-def _motion(name: str, q: Array, v: Array, v_next: Array, shape: int = OWN) -> Motion:
-    deceleration = np.zeros(14)
-    write_stop(kernel_model(name).safety, q + 0.5 * H * (v + v_next), v_next, shape, deceleration)
-    return Motion(q, v, v_next, deceleration)
 
 
 def _least(name: str, motion: Motion) -> Array:
@@ -78,7 +46,7 @@ def _motions_from(
     limit = cell(name).robot.velocity_limit
     for q in starts:
         v = random.choice([0.1, 0.5, 1.0]) * random.uniform(-limit, limit)
-        yield _motion(name, q, v, v + random.uniform(-1, 1, 14) * ACCELERATION * H, shape)
+        yield motion_of(name, q, v, v + random.uniform(-1, 1, 14) * ACCELERATION * H, shape)
 
 
 def _starts_apart(name: str, random: np.random.Generator, near: bool, count: int) -> Iterator[Array]:
@@ -126,15 +94,15 @@ def _aimed_at_the_threshold(name: str, random: np.random.Generator, count: int, 
         low, high = 0.0, 2.0
         for _ in range(8):
             share = 0.5 * (low + high)
-            scaled = _motion(name, motion.q, share * motion.v, share * motion.v, shape)
+            scaled = motion_of(name, motion.q, share * motion.v, share * motion.v, shape)
             if _least(name, scaled).min() >= MIN_DISTANCE:
                 low = share
             else:
                 high = share
         if low > 0.0 and high < 2.0:
             found += 1
-            yield _motion(name, motion.q, 1.01 * high * motion.v, 1.01 * high * motion.v, shape)
-            yield _motion(name, motion.q, 0.8 * low * motion.v, 0.8 * low * motion.v, shape)
+            yield motion_of(name, motion.q, 1.01 * high * motion.v, 1.01 * high * motion.v, shape)
+            yield motion_of(name, motion.q, 0.8 * low * motion.v, 0.8 * low * motion.v, shape)
         if found == count:
             return
 
@@ -166,7 +134,7 @@ def test_lower_bounds_in_place_of_distances_prove_nothing_that_is_not_so(name: s
 def test_rest_with_everything_apart_is_certified(name: str) -> None:
     random, still = np.random.default_rng(18), np.zeros(14)
     for q in _starts_apart(name, random, True, 20):
-        assert _certified(name, _motion(name, q, still, still))
+        assert _certified(name, motion_of(name, q, still, still))
 
 
 def _too_close(arrays: CellArrays, random: np.random.Generator, count: int) -> Iterator[Array]:
@@ -179,11 +147,11 @@ def _too_close(arrays: CellArrays, random: np.random.Generator, count: int) -> I
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_pair_that_starts_too_close_comes_no_closer_in_a_certified_motion(name: str) -> None:
+def test_a_pair_that_starts_too_close_comes_no_closer_in_a_certifiedmotion_of(name: str) -> None:
     arrays, random = cell(name), np.random.default_rng(19)
     certified = 0
     for motion in _motions_from(name, _too_close(arrays, random, 100), random):
-        slow = _motion(name, motion.q, 0.1 * motion.v, 0.1 * motion.v)
+        slow = motion_of(name, motion.q, 0.1 * motion.v, 0.1 * motion.v)
         if not _certified(name, slow):
             continue
         certified += 1
@@ -206,10 +174,10 @@ def _turning_at_its_end(name: str, random: np.random.Generator, count: int) -> I
         for _ in range(20):
             share = 0.5 * (low + high)
             v = share * motion.v
-            low, high = (share, high) if _certified(name, _motion(name, motion.q, v, v, TOGETHER)) else (low, share)
+            low, high = (share, high) if _certified(name, motion_of(name, motion.q, v, v, TOGETHER)) else (low, share)
         if low > 0.05 and high < 1.0:
             found += 1
-            yield _motion(name, motion.q, low * motion.v, low * motion.v, TOGETHER)
+            yield motion_of(name, motion.q, low * motion.v, low * motion.v, TOGETHER)
         if found == count:
             return
 

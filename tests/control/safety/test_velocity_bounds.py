@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from q2r2_control.control.safety.velocity_bounds import fastest_approach, update_body_velocities
+from q2r2_control.control.safety.velocity_bounds import fastest_approach
 from q2r2_control.types import Array
 from tests.control.cells import NAMES, cell, distances, kernel_data, kernel_model, random_posture
 
@@ -13,7 +13,6 @@ STEP = 1e-6  # of finite differences [s]
 def bounds_at(name: str, q: Array, v: Array) -> Array:
     """Fastest approach (p,) of every pair [m/s]."""
     model, data = kernel_model(name).safety.collision, kernel_data(name, q, v).safety
-    update_body_velocities(model, data.collision, v, data.velocities)
     pairs = zip(model.pairs.first, model.pairs.second, strict=True)
     return np.array([fastest_approach(data.velocities, first, second) for first, second in pairs])
 

@@ -1,0 +1,103 @@
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from q2r2_control.control.safety.speed_bound import least_distance, write_astray
+from q2r2_control.control.safety.stop_certificate import write_step
+from q2r2_control.control.safety.stop_rollout import begin_rollout
+from q2r2_control.control.safety.stop_shapes import OWN, SHAPES, TOGETHER
+from q2r2_control.types import Array
+from tests.control.cells import NAMES, cell, distances, kernel_data, kernel_model, random_posture
+from tests.control.safety.motions import ACCELERATION, H, Motion, motion_of
+
+
+def bounds_of(name: str, motion: Motion) -> Array:
+    """What each pair's distance is at least (p,) by its speed [m]."""
+    model, data = kernel_model(name).safety, kernel_data(name, motion.q, motion.v).safety
+    data.distance[:] = distances(cell(name), motion.q[None])[0]
+    data.candidate.q[:] = motion.q_next
+    data.candidate.v[:] = motion.v_next
+    data.candidate.deceleration[:] = motion.deceleration
+    duration = begin_rollout(data)
+    write_step(data, H)
+    write_astray(model, data, H, duration)
+    return np.array([least_distance(model, data, p, H + 0.5 * duration) for p in range(len(data.distance))])
+
+
+def least_along(name: str, motion: Motion) -> Array:
+    return np.asarray(distances(cell(name), np.concatenate([motion.step(), motion.stop()])).min(axis=0))
+
+
+def share_no_joint(name: str) -> Array:
+    return cell(name).pairs.carried == 0
+
+
+@pytest.mark.parametrize("shape", range(SHAPES), ids=["together", "arm by arm", "own"])
+@pytest.mark.parametrize("name", NAMES)
+def test_no_pair_comes_closer_than_its_speed_says_in_a_step_and_a_stop_of_any_shape(name: str, shape: int) -> None:
+    random, robot = np.random.default_rng(61), cell(name).robot
+    apart = share_no_joint(name)
+    for _ in range(40):
+        v = random.choice([0.02, 0.3, 1.0]) * random.uniform(-robot.velocity_limit, robot.velocity_limit)
+        v_next = v + random.uniform(-1, 1, 14) * ACCELERATION * H
+        motion = motion_of(name, random_posture(robot, random), v, v_next, shape)
+        assert (bounds_of(name, motion) <= least_along(name, motion) + 1e-12)[apart].all()
+
+
+def still_hand(q: Array, random: np.random.Generator) -> Array:
+    """Velocities (14,) that turn the left elbow about a hand at rest; the right arm rests."""
+    robot = cell("dual_iiwa7").robot
+    data = robot.model.createData()
+    pin.computeJointJacobians(robot.model, data, q)
+    J = pin.getJointJacobian(robot.model, data, robot.model.getJointId("left_A7"), pin.WORLD)[:, :7]
+    return np.concatenate([np.linalg.svd(J)[2][-1] * random.choice([-1.0, 1.0]), np.zeros(7)])
+
+
+@pytest.mark.parametrize(
+    ("shape", "speed"), [(TOGETHER, 2.0), (OWN, 0.2)], ids=["the ways are curved", "joints rest one after the other"]
+)
+def test_a_hand_at_rest_whose_arm_moves_may_come_closer_while_that_stops(shape: int, speed: float) -> None:
+    random, robot = np.random.default_rng(62), cell("dual_iiwa7").robot
+    apart, moved = share_no_joint("dual_iiwa7"), 0
+    for _ in range(40):
+        q = random_posture(robot, random)
+        v = speed * still_hand(q, random)
+        motion = motion_of("dual_iiwa7", q, v, v, shape)
+        bounds, least = bounds_of("dual_iiwa7", motion), least_along("dual_iiwa7", motion)
+        assert (bounds <= least + 1e-12)[apart].all()
+        moved += int((least < distances(cell("dual_iiwa7"), q[None])[0] - 1e-6)[apart].sum())
+    assert moved > 100
+
+
+def test_what_a_step_from_rest_adds_counts() -> None:
+    random, robot = np.random.default_rng(63), cell("dual_iiwa7").robot
+    apart = share_no_joint("dual_iiwa7")
+    for _ in range(40):
+        v_next = random.uniform(-1, 1, 14) * ACCELERATION * H
+        for shape in (TOGETHER, OWN):
+            motion = motion_of("dual_iiwa7", random_posture(robot, random), np.zeros(14), v_next, shape)
+            assert (bounds_of("dual_iiwa7", motion) <= least_along("dual_iiwa7", motion) + 1e-12)[apart].all()
+
+
+def test_the_bound_leaves_little_room_to_what_joints_that_stop_together_do() -> None:
+    random, robot = np.random.default_rng(63), cell("dual_iiwa7").robot
+    used = []
+    for _ in range(40):
+        v = 0.1 * random.uniform(-robot.velocity_limit, robot.velocity_limit)
+        motion = motion_of("dual_iiwa7", random_posture(robot, random), v, v, TOGETHER)
+        now = distances(cell("dual_iiwa7"), motion.q[None])[0]
+        closer, bound = now - least_along("dual_iiwa7", motion), now - bounds_of("dual_iiwa7", motion)
+        used.append((closer / bound)[share_no_joint("dual_iiwa7")].max())
+    assert np.median(used) > 0.6  # else it would prove little
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_pairs_that_a_joint_carries_together_are_told_from_those_that_share_none(name: str) -> None:
+    model, pairs, bodies = cell(name).robot.model, cell(name).pairs, cell(name).bodies
+    movers = [set(model.supports[int(joint)]) - {0} for joint in bodies.joint]
+    together = [bool(movers[first] & movers[second]) for first, second in zip(pairs.first, pairs.second, strict=True)]
+    assert (pairs.carried == together).all()
+    assert any(together)
+    assert not all(together)
