@@ -6,9 +6,8 @@ takes the dt of each tick, so neither the headset's rate nor the loop's changes 
 
 Rotations are filtered as rotations, by their logarithm, so q and -q are the same and nothing is averaged over signs.
 
-All of this runs at every control tick, for vectors of three: sums of three floats cost a tenth of NumPy's calls,
-``dot`` a third of ``@``, and each look into an SE3, or a new one, as much as the product of two rotations. So positions
-are three floats in here and rotations (3, 3) arrays.
+All of this runs at every control tick, for vectors of three: sums of three floats cost a tenth of NumPy's calls. So
+positions are three floats in here and rotations four, see :mod:`quaternions`.
 """
 
 from __future__ import annotations
@@ -17,16 +16,14 @@ import math
 from collections import deque
 from collections.abc import Sequence
 
-import numpy as np
 import pinocchio as pin
 
 from q2r2_control.config.teleop import FilterSettings
-from q2r2_control.types import Array, pose_of
+from q2r2_control.teleop.quaternions import Quaternion, Vector, normalized, product, rotation_of, turn_between
 
 # Closer samples are merged: over so short a time receipt jitter would look like speed [s].
 _MIN_SPACING = 0.005
-
-Vector = tuple[float, float, float]
+_NO_TURN = (0.0, 0.0, 0.0)
 
 
 class Interpolator:
@@ -38,37 +35,51 @@ class Interpolator:
 
     def __init__(self, delay: float) -> None:
         self.delay = delay
-        self._knots: deque[tuple[float, Vector, Array]] = deque()
+        self._knots: deque[tuple[float, Vector, Quaternion]] = deque()
+        self._velocity: tuple[Vector, Vector] | None = None  # from the first knot to the second; None: not known yet
 
-    def reset(self, position: Vector, rotation: Array, now: float) -> None:
-        """Rest at a pose; ``rotation`` is (3, 3)."""
-        self._knots = deque([(now - self.delay, position, rotation)])
+    def reset(self, position: Vector, rotation: Quaternion, now: float) -> None:
+        """Rest at a pose."""
+        self._knots, self._velocity = deque([(now - self.delay, position, rotation)]), None
 
-    def add(self, position: Vector, rotation: Array, stamp: float, now: float) -> None:
+    def add(self, position: Vector, rotation: Quaternion, stamp: float, now: float) -> None:
         """Append a sample received at ``stamp`` <= ``now`` [s]; ``reset`` has to come first."""
-        while len(self._knots) > 1 and stamp - self._knots[-1][0] < _MIN_SPACING:
-            self._knots.pop()
+        knots, self._velocity = self._knots, None
+        while len(knots) > 1 and stamp - knots[-1][0] < _MIN_SPACING:
+            knots.pop()
         # A sample in time is reached after the whole delay; so is a late one, without a faster motion.
-        earliest = self._knots[0][0] + max(self.delay / 2.0, _MIN_SPACING)
-        self._knots.append((max(stamp, earliest), position, rotation))
+        earliest = knots[0][0] + max(self.delay / 2.0, _MIN_SPACING)
+        knots.append((max(stamp, earliest), position, rotation))
 
-    def at(self, now: float) -> tuple[Vector, Array]:
-        """The position and rotation played back at ``now`` [s], which never goes back."""
+    def at(self, now: float) -> tuple[Vector, Quaternion, Vector]:
+        """The position and rotation played back at ``now`` [s], which never goes back, and the turn since the last."""
         playhead, knots = now - self.delay, self._knots
+        last = knots[0][2]
+        passed = False
         while len(knots) > 1 and knots[1][0] <= playhead:
             knots.popleft()
-        start, position, rotation = knots[0]
+            passed, self._velocity = True, None
+        start, (x, y, z), rotation = knots[0]
+        turn = _NO_TURN
         if len(knots) > 1:
-            end, next_position, next_rotation = knots[1]
-            share = (playhead - start) / (end - start)
-            x, y, z = position
-            to_x, to_y, to_z = next_position
-            position = x + share * (to_x - x), y + share * (to_y - y), z + share * (to_z - z)
-            # About one fixed axis.
-            rotation = pin.exp3(share * pin.log3(next_rotation.dot(rotation.T))).dot(rotation)
+            linear, angular = self._velocity = self._velocity or _velocity(*knots[0], *knots[1])
+            dt = playhead - start
+            x, y, z = x + dt * linear[0], y + dt * linear[1], z + dt * linear[2]
+            turn = dt * angular[0], dt * angular[1], dt * angular[2]
+            rotation = product(rotation_of(turn), rotation)
         # What was played is where the next line starts, so a sample that replaces another cannot make the output step.
-        knots[0] = playhead, position, rotation
-        return position, rotation
+        knots[0] = playhead, (x, y, z), rotation
+        return (x, y, z), rotation, turn_between(last, rotation) if passed else turn
+
+
+def _velocity(
+    start: float, position: Vector, rotation: Quaternion, end: float, to: Vector, turned: Quaternion
+) -> tuple[Vector, Vector]:
+    """Of a straight line from one knot to the next, about one fixed axis."""
+    rate = 1.0 / (end - start)
+    a, b, c = turn_between(rotation, turned)
+    linear = rate * (to[0] - position[0]), rate * (to[1] - position[1]), rate * (to[2] - position[2])
+    return linear, (rate * a, rate * b, rate * c)
 
 
 class OneEuro:
@@ -130,8 +141,9 @@ class PoseFilter:
 
     def reset(self, pose: pin.SE3, now: float) -> None:
         """Rest at ``pose``; earlier samples are forgotten."""
-        self._in = self._out = _parts(pose)
-        self._interpolator.reset(*self._in, now)
+        self._out = position, rotation = _parts(pose)
+        self._in = position
+        self._interpolator.reset(position, rotation, now)
         self._position.reset()
         self._rotation.reset()
         self._output = pose
@@ -146,22 +158,19 @@ class PoseFilter:
         dt = now - self._now
         if dt <= 0.0:
             return self._output
-        (before_x, before_y, before_z), before = self._in
-        (last_x, last_y, last_z), last = self._out
-        self._now, self._in = now, self._interpolator.at(now)
-        (x, y, z), rotation = self._in
+        (before_x, before_y, before_z), (last_x, last_y, last_z), last = self._in, *self._out
+        self._in, rotation, turned = self._interpolator.at(now)
+        self._now, (x, y, z) = now, self._in
         shift = self._position.correction(
             (x - last_x, y - last_y, z - last_z), (x - before_x, y - before_y, z - before_z), dt
         )
-        turn = self._rotation.correction(
-            pin.log3(rotation.dot(last.T)).tolist(), pin.log3(rotation.dot(before.T)).tolist(), dt
-        )
+        turn = self._rotation.correction(turn_between(last, rotation), turned, dt)
         position = last_x + shift[0], last_y + shift[1], last_z + shift[2]
-        rotation = pin.exp3(np.array(turn)).dot(last)
-        self._out, self._output = (position, rotation), pose_of(rotation, np.array(position))
+        rotation = normalized(product(rotation_of(turn), last))
+        self._out, self._output = (position, rotation), pin.XYZQUATToSE3((*position, *rotation))
         return self._output
 
 
-def _parts(pose: pin.SE3) -> tuple[Vector, Array]:
-    x, y, z = pose.translation.tolist()
-    return (x, y, z), np.array(pose.rotation)
+def _parts(pose: pin.SE3) -> tuple[Vector, Quaternion]:
+    x, y, z, a, b, c, w = pin.SE3ToXYZQUATtuple(pose)
+    return (x, y, z), (a, b, c, w)

@@ -12,7 +12,17 @@ from pydantic import ValidationError
 from q2r2_control.config.axes import axes_matrix
 from q2r2_control.config.teleop import RotationFrame, Stance, TeleopSettings
 from q2r2_control.errors import ConfigError, Q2R2Error
-from q2r2_control.types import Array, pose_of
+from q2r2_control.teleop.quaternions import (
+    IDENTITY,
+    Quaternion,
+    Vector,
+    inverse,
+    normalized,
+    product,
+    rotation_of,
+    rotation_vector,
+)
+from q2r2_control.types import Array
 
 # Left and right change sign, forward and up do not.
 _REFLECTION = np.diag([1.0, -1.0, 1.0])
@@ -71,12 +81,13 @@ class RelativeMotion:
         if settings.stance is Stance.MIRROR_REFLECTED:
             self._map = _REFLECTION @ self._map
         self._axes = self._scaled_axes()
-        self._hand_position: list[float] | None = None
-        self._hand_rotation = np.eye(3)
-        self._tool_position = [0.0, 0.0, 0.0]
-        # The tool's rotation is before * (the hand's own rotation since the anchor) * after.
-        self._before = self._after = np.eye(3)
-        self._vector = np.zeros(3)
+        # M exp(w) M' = exp(det(M) M w): where M reflects, what turns one way turns the other way.
+        self._turn_map: Array = np.linalg.det(self._map) * self._map
+        self._turn_axes = _axes_of(self._turn_map)
+        self._hand_position: Vector | None = None
+        self._hand_rotation = self._tool_rotation = IDENTITY
+        self._tool_position = (0.0, 0.0, 0.0)
+        self._vector = (0.0, 0.0, 0.0)
 
     @classmethod
     def of(cls, settings: TeleopSettings) -> RelativeMotion:
@@ -100,19 +111,14 @@ class RelativeMotion:
 
     def anchor_position(self, hand: pin.SE3, tool: pin.SE3) -> None:
         """Make only the positions of ``hand`` and ``tool`` correspond from now on; rotations go on as they were."""
-        self._hand_position = hand.translation.tolist()
-        self._tool_position = tool.translation.tolist()
+        self._hand_position = pin.SE3ToXYZQUATtuple(hand)[:3]
+        self._tool_position = pin.SE3ToXYZQUATtuple(tool)[:3]
 
     def anchor_rotation(self, hand: pin.SE3, tool: pin.SE3) -> None:
         """Make only the rotations of ``hand`` and ``tool`` correspond from now on; positions go on as they were."""
-        self._hand_rotation = np.array(hand.rotation)
-        rotation = _orthonormal(tool.rotation)
-        # M exp(s w) M' = exp(s M w), up to the sign that a reflection gives an axis: scaling and mapping commute.
-        if self._in_tool_frame:
-            self._before, self._after = rotation @ self._map, self._map.T
-        else:
-            self._before, self._after = self._map, self._map.T @ rotation
-        self._vector = np.zeros(3)
+        self._hand_rotation = normalized(pin.SE3ToXYZQUATtuple(hand)[3:])
+        self._tool_rotation = normalized(pin.SE3ToXYZQUATtuple(tool)[3:])
+        self._vector = (0.0, 0.0, 0.0)
 
     def target(self, hand: pin.SE3) -> pin.SE3:
         """Tool pose in the world frame for a hand pose in the input's frame.
@@ -121,17 +127,24 @@ class RelativeMotion:
         """
         if self._hand_position is None:
             raise Q2R2Error("RelativeMotion.target: call anchor(hand, tool) first")
-        # At every tick: sums of floats cost a third of NumPy's of vectors of three, and dot a third of @.
-        now, before, tool = hand.translation.tolist(), self._hand_position, self._tool_position
+        # At every tick, and so in floats.
+        now, before, tool = pin.SE3ToXYZQUATtuple(hand), self._hand_position, self._tool_position
         (i, a), (j, b), (k, c) = self._axes
         x, y, z = a * (now[i] - before[i]), b * (now[j] - before[j]), c * (now[k] - before[k])
-        anchored, turned = self._hand_rotation.T, hand.rotation
-        turn = anchored.dot(turned) if self._in_tool_frame else turned.dot(anchored)
-        rotation = self._before.dot(self._scaled(turn)).dot(self._after)
-        target = pose_of(rotation, np.array((tool[0] + x, tool[1] + y, tool[2] + z)))
-        if self._rotation_scale != 1.0 and np.linalg.norm(self._vector) > _REANCHOR_ANGLE:
+        rotation = self._turned_tool(now[3:])
+        target = pin.XYZQUATToSE3((tool[0] + x, tool[1] + y, tool[2] + z, *rotation))
+        if self._rotation_scale != 1.0 and math.hypot(*self._vector) > _REANCHOR_ANGLE:
             self.anchor_rotation(hand, target)
         return target
+
+    def _turned_tool(self, hand: Quaternion) -> Quaternion:
+        """The tool's rotation for that of the hand."""
+        back = inverse(self._hand_rotation)
+        turn = self._scaled(product(back, hand) if self._in_tool_frame else product(hand, back))
+        (i, a), (j, b), (k, c) = self._turn_axes
+        turn = a * turn[i], b * turn[j], c * turn[k], turn[3]
+        tool = self._tool_rotation
+        return product(tool, turn) if self._in_tool_frame else product(turn, tool)
 
     def hand(self, tool: pin.SE3) -> pin.SE3:
         """The hand pose, in the input's frame, whose :meth:`target` is ``tool``: where an operator has to put the hand.
@@ -145,36 +158,38 @@ class RelativeMotion:
         scales = self._scale * self._axis_scales
         moved = tool.translation - self._tool_position
         way = self._map.T @ np.divide(moved, scales, out=np.zeros(3), where=scales > 0.0)
-        turn = np.eye(3)
+        rotation = self._hand_rotation
         if self._rotation_scale > 0.0:
-            scaled = self._before.T @ tool.rotation @ self._after.T
-            turn = pin.exp3(pin.log3(scaled) / self._rotation_scale)
-        anchor = self._hand_rotation
-        return pin.SE3(anchor @ turn if self._in_tool_frame else turn @ anchor, self._hand_position + way)
+            now, back = pin.SE3ToXYZQUATtuple(tool)[3:], inverse(self._tool_rotation)
+            scaled = rotation_vector(product(back, now) if self._in_tool_frame else product(now, back))
+            x, y, z = (self._turn_map.T @ scaled / self._rotation_scale).tolist()
+            turn = rotation_of((x, y, z))
+            rotation = product(rotation, turn) if self._in_tool_frame else product(turn, rotation)
+        return pin.XYZQUATToSE3((*(self._hand_position + way), *rotation))
 
     def _scaled_axes(self) -> list[tuple[int, float]]:
-        """A signed permutation: each axis of the tool goes along one of the hand's, by so much of it."""
-        sources = np.abs(self._map).argmax(axis=1)
-        rows = zip(self._map, sources, self._axis_scales.tolist(), strict=True)
-        return [(int(j), self._scale * scale * float(row[j])) for row, j, scale in rows]
+        return _axes_of(self._scale * self._axis_scales[:, None] * self._map)
 
-    def _scaled(self, rotation: Array) -> Array:
+    def _scaled(self, turn: Quaternion) -> Quaternion:
         if self._rotation_scale == 1.0:
-            return rotation
-        self._vector = _continued(pin.log3(rotation), self._vector)
-        return pin.exp3(self._rotation_scale * self._vector)
+            return turn
+        x, y, z = self._vector = _continued(rotation_vector(turn), self._vector)
+        scale = self._rotation_scale
+        return rotation_of((scale * x, scale * y, scale * z))
 
 
-def _continued(vector: Array, previous: Array) -> Array:
+def _axes_of(matrix: Array) -> list[tuple[int, float]]:
+    """Of a signed permutation that may be scaled: where each axis comes from, and by how much of that it goes."""
+    sources = np.abs(matrix).argmax(axis=1)
+    return [(int(j), float(row[j])) for row, j in zip(matrix, sources, strict=True)]
+
+
+def _continued(vector: Vector, previous: Vector) -> Vector:
     """Of the two rotation vectors of one rotation, shorter than a turn, the one that continues ``previous``."""
-    angle = float(np.linalg.norm(vector))
+    angle = math.hypot(*vector)
     if angle == 0.0:
         return vector
-    longer = vector * (1.0 - 2.0 * math.pi / angle)
-    gap = float(np.linalg.norm(longer - previous))
-    return longer if gap < min(_CONTINUOUS, float(np.linalg.norm(vector - previous))) else vector
-
-
-def _orthonormal(rotation: Array) -> Array:
-    """Keeps rounding from adding up over any number of anchors."""
-    return pin.Quaternion(rotation).normalized().toRotationMatrix()
+    x, y, z = vector
+    share = 1.0 - 2.0 * math.pi / angle
+    longer = share * x, share * y, share * z
+    return longer if math.dist(longer, previous) < min(_CONTINUOUS, math.dist(vector, previous)) else vector

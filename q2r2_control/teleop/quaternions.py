@@ -1,0 +1,61 @@
+"""Rotations as four floats, for what is done with them at every tick.
+
+A product of quaternions, or the rotation vector of one, written out in floats costs a third of what the same costs with
+matrices, where most of the time goes into making arrays. Quaternions are x y z w and of length 1, and q and -q are one
+rotation; rotation vectors are in the axes that the rotations are told in.
+"""
+
+from __future__ import annotations
+
+import math
+
+Vector = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
+IDENTITY: Quaternion = (0.0, 0.0, 0.0, 1.0)
+
+
+def product(p: Quaternion, q: Quaternion) -> Quaternion:
+    """First ``q``, then ``p``."""
+    a, b, c, d = p
+    x, y, z, w = q
+    return (
+        d * x + a * w + b * z - c * y,
+        d * y - a * z + b * w + c * x,
+        d * z + a * y - b * x + c * w,
+        d * w - a * x - b * y - c * z,
+    )
+
+
+def inverse(q: Quaternion) -> Quaternion:
+    """The rotation back."""
+    return -q[0], -q[1], -q[2], q[3]
+
+
+def rotation_vector(q: Quaternion) -> Vector:
+    """Axis times angle, of at most half a turn [rad]."""
+    x, y, z, w = q
+    sine = math.hypot(x, y, z)
+    if sine == 0.0:
+        return 0.0, 0.0, 0.0
+    ratio = 2.0 * math.atan2(math.copysign(sine, w), abs(w)) / sine
+    return ratio * x, ratio * y, ratio * z
+
+
+def turn_between(start: Quaternion, end: Quaternion) -> Vector:
+    """The rotation vector that leads from one rotation to another."""
+    return rotation_vector(product(end, inverse(start)))
+
+
+def rotation_of(vector: Vector) -> Quaternion:
+    """The rotation by a rotation vector."""
+    x, y, z = vector
+    half = 0.5 * math.hypot(x, y, z)
+    ratio = 0.5 * math.sin(half) / half if half > 0.0 else 0.5
+    return ratio * x, ratio * y, ratio * z, math.cos(half)
+
+
+def normalized(q: Quaternion) -> Quaternion:
+    """Keeps rounding from adding up over any number of products."""
+    x, y, z, w = q
+    length = math.hypot(x, y, z, w)
+    return x / length, y / length, z / length, w / length
