@@ -32,6 +32,14 @@ def pose_of(rotation: Array, translation: Array) -> pin.SE3:
     return pose
 
 
+def moved_by(pose: pin.SE3, way: Array) -> pin.SE3:
+    """The pose with its origin elsewhere, by ``way`` (3,) [m] in the frame that the pose is told in."""
+    moved = pose.copy()
+    translation = moved.translation  # a view: to set the pose's own takes another third of the time
+    translation += way
+    return moved
+
+
 @dataclass(frozen=True, slots=True)
 class HandInputs:
     """Buttons, triggers and stick of one hand controller, as the headset names them.
@@ -171,7 +179,7 @@ class ArmTarget:
 
     def command_for(self, tool: pin.SE3) -> pin.SE3:
         """What is commanded where the tool is at ``tool``, world frame."""
-        return tool if self.sag is None else pose_of(tool.rotation, tool.translation - self.sag)
+        return tool if self.sag is None else moved_by(tool, -self.sag)
 
 
 @dataclass(frozen=True, slots=True)

@@ -50,6 +50,7 @@ class GestureRecognizer:
             if control in BUTTONS or (control not in lasting and any(name == control for name, _ in bound))
         }
         self._buttons = [self._controls[control] for control in BUTTONS]
+        self._open = False  # whether time alone may end a gesture; at most ticks it cannot
         self.forget()
 
     def cancel(self) -> None:
@@ -77,6 +78,7 @@ class GestureRecognizer:
         if self._first == -math.inf:
             self._first = stamp
         self._stamp = stamp
+        self._open = True
         found, rose = [], False
         for name, control in self._controls.items():
             level = is_held(name, inputs, control.down)
@@ -112,6 +114,9 @@ class GestureRecognizer:
 
     def due(self, now: float) -> list[Press]:
         """Gestures that are over because time has passed."""
+        if not self._open:
+            return []
+        self._open = any(control.open for control in self._controls.values())
         return [
             Press(name, gesture)
             for name, control in self._controls.items()
@@ -146,6 +151,11 @@ class _Control:
         self._muted = False
         self._began: float | None = None  # of a press that is not over [s]
         self._tapped: float | None = None  # when a tap that may become a double one was over [s]
+
+    @property
+    def open(self) -> bool:
+        """Whether a press, or what may become a double tap, has begun and is not over."""
+        return self._began is not None or self._tapped is not None
 
     def begin(self, stamp: float) -> Gesture | None:
         """A press begins; returns the tap before it, where that was not the first of two."""

@@ -95,7 +95,7 @@ class Leash:
         # A little less than the leash's, so that it is looked at in time; of the angle, the quaternion's w.
         self._distance = math.inf if settings.distance is None else settings.distance - _ROUNDING
         self._cosine = -math.inf if settings.angle is None else math.cos(0.5 * settings.angle) + _ROUNDING
-        self._last: _Tick | None = None
+        self._last: tuple[pin.SE3, pin.SE3, float] | None = None  # a _Tick, which is only made where it is looked at
 
     @property
     def slip(self) -> float:
@@ -124,12 +124,12 @@ class Leash:
         ``motion`` is anchored anew, so that the hand moves the target from there.
         """
         target, last = motion.target(hand), self._last
-        self._last = _Tick(tool, newest, now)
+        self._last = this = tool, newest, now
         # The first target is the anchor, which must not move the arm wherever the plant says the tool is.
         position_leash, rotation_leash = self._components
         if last is None or not (position_leash.taut or rotation_leash.taut or self._ends(tool, target)):
             return target
-        position, rotation = self._pull(_ways(tool, target), last, self._last)
+        position, rotation = self._pull(_ways(tool, target), _Tick(*last), _Tick(*this))
         if position is not None:
             target = pin.SE3(target.rotation, tool.translation + position)
             motion.anchor_position(hand, target)
@@ -165,7 +165,7 @@ class Leash:
 
 
 class _Tick(NamedTuple):
-    """The last tick."""
+    """What of a tick the next one looks at."""
 
     tool: pin.SE3
     newest: pin.SE3

@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 import pinocchio as pin
 
-from q2r2_control.types import Array, pose_of
+from q2r2_control.types import Array, moved_by
 
 # A tool that is farther from its command does not sag [m], [rad].
 MOST_SAG = 0.05, 0.1
@@ -43,4 +43,4 @@ def anchor_of(measured: pin.SE3, commanded: pin.SE3 | None, rotation: Array) -> 
 
 def sagged(commanded: pin.SE3, sag: Array | None) -> pin.SE3:
     """Where a tool is to be measured that is commanded to be at ``commanded``."""
-    return commanded if sag is None else pose_of(commanded.rotation, commanded.translation + sag)
+    return commanded if sag is None else moved_by(commanded, sag)

@@ -16,6 +16,8 @@ from q2r2_control.teleop.episode_marks import EpisodeMarks
 from q2r2_control.teleop.remote_arm import RemoteArm
 from q2r2_control.types import ArmTarget, Event, HandSample
 
+_LED = FOLLOWING - {ArmState.CARRIED}  # by their own hand, which does not move an arm that is carried
+
 
 class Teleop:
     """Hands drive arms relative to anchors; faults stop them. What leads where is the table of :mod:`arm_states`.
@@ -259,14 +261,14 @@ class Teleop:
 
     def _disengage(self, faults: Mapping[str, str | None], now: float) -> None:
         """Stop the arms whose hand has a fault; that of a hand whose arm holds anyway has no effect."""
+        if not any(faults.values()):
+            return  # as at most ticks
         if self.homing:
             fault = faults.get(self._pair.asks_home) if self._pair.asks_home is not None else None
             if fault:
                 self._pair.change(Cause.FAULT, now, f"on the way home: {fault}")
             return
-        # A carried arm's own hand does not move it.
-        led = FOLLOWING - {ArmState.CARRIED}
-        active = {name: fault for name, fault in faults.items() if fault and self._arms[name].state in led}
+        active = {name: fault for name, fault in faults.items() if fault and self._arms[name].state in _LED}
         for name, fault in active.items():
             self._arms[name].change(Cause.FAULT, now, fault)
         if active and self._linked:
