@@ -63,7 +63,7 @@ class OperatorFeedback:
             self._due += self._wait
             self._look(next(self._turns), now, targets, state, grippers, openings)
         for arm, pulses in self._pulses.items():
-            if (feedback := pulses.at(now, self._hand_of(arm))) is not None:
+            if not pulses.idle and (feedback := pulses.at(now, self._hand_of(arm))) is not None:
                 self._send(feedback)
 
     def _look(

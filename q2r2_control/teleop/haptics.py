@@ -161,6 +161,11 @@ class HapticPulses:
             self._want(GRASP)
         self._grasps = holds
 
+    @property
+    def idle(self) -> bool:
+        """Whether nothing vibrates and nothing waits, so that :meth:`at` has nothing to send."""
+        return self._ends is None and self._waiting is None
+
     def at(self, now: float, hand: str) -> HapticFeedback | None:
         """What to send to ``hand``, which drives the arm at ``now`` [s], or None."""
         if self._ends is not None and now >= self._ends:
