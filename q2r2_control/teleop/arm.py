@@ -21,6 +21,7 @@ from q2r2_control.teleop.workspace import Workspace
 from q2r2_control.types import Array, Event, HandSample
 
 OPEN, CLOSED = 1.0, 0.0
+_WHOLE: Shares = (1.0, 1.0)
 
 
 class ArmTeleop:
@@ -246,6 +247,8 @@ class ArmTeleop:
 
     def _shares(self) -> Shares:
         """Of the scales, by what is held."""
+        if not self.held:
+            return _WHOLE  # as at most ticks
         share = self._precision if Action.PRECISION in self.held else 1.0
         return (
             0.0 if Action.TRANSLATION_LOCK in self.held else share,

@@ -11,7 +11,7 @@ import numpy as np
 import pinocchio as pin
 
 from q2r2_control.config.teleop import GateSettings
-from q2r2_control.types import HandSample, pose_of
+from q2r2_control.types import HandSample
 
 # Beyond this, doubles no longer resolve a tenth of a nanometre, and no tracking system reaches as far [m].
 _MAX_COORDINATE = 1e6
@@ -130,8 +130,8 @@ def _pose_of(sample: HandSample) -> _Pose | None:
     length = math.hypot(*quaternion)
     if not _QUATERNION_LENGTHS[0] <= length <= _QUATERNION_LENGTHS[1]:
         return None
-    x, y, z, w = quaternion = [value / length for value in quaternion]
-    return _Pose(position, quaternion, pose_of(pin.Quaternion(w, x, y, z).toRotationMatrix(), np.array(position)))
+    quaternion = [value / length for value in quaternion]
+    return _Pose(position, quaternion, pin.XYZQUATToSE3(position + quaternion))
 
 
 def _numbers(values: object, size: int) -> list[float] | None:
