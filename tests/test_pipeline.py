@@ -24,7 +24,8 @@ from q2r2_control.config.control import ContactPair
 from q2r2_control.errors import ConfigError, InputError
 from q2r2_control.inputs.headset import HeadsetServer
 from q2r2_control.inputs.scripted import ScriptedInput
-from q2r2_control.pipeline import STOPPING, Pipeline
+from q2r2_control.pipeline import Pipeline
+from q2r2_control.pipeline.pipeline_run import STOPPING
 from q2r2_control.plants.kinematic import KinematicPlant
 from q2r2_control.robot.robot import Robot
 from q2r2_control.runtime.recorder import Tick
