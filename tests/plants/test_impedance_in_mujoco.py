@@ -15,6 +15,7 @@ from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 from tests.plants.conftest import tool_motion
+from tests.support.arm_dynamics import left_arm
 from tests.support.poses import pose_error
 from tests.support.torque_loop import DT, TorqueLoop, reference
 
@@ -67,14 +68,6 @@ def posture(robot: Robot, name: str) -> Array:
 
 def along(axis: int, force: float = FORCE) -> Array:
     return force * np.eye(6)[axis]
-
-
-def left_arm(robot: Robot, q: Array) -> tuple[Array, Array]:
-    """Jacobian (6, 7) and inertia (7, 7) of the left arm."""
-    data, arm = robot.model.createData(), robot.arms["left"]
-    pin.computeJointJacobians(robot.model, data, q)
-    J = pin.getFrameJacobian(robot.model, data, arm.frame_id, pin.LOCAL_WORLD_ALIGNED)[:, arm.joints]
-    return J, pin.crba(robot.model, data, q)[np.ix_(arm.joints, arm.joints)]
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2], ids=["x", "y", "z"])

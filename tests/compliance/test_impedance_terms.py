@@ -1,0 +1,187 @@
+"""The formulas of the impedance, each on its own: damping, inertia, projectors, and the bounds of its torque."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scipy.linalg
+
+from q2r2_control.compliance.impedance_terms import (
+    PositionLimits,
+    bound_torque,
+    clip_error,
+    consistent_projector,
+    double_diagonalised_damping,
+    kinematic_projector,
+    limit_repulsion,
+    task_inertia,
+)
+from q2r2_control.config import load_config
+from q2r2_control.robot.robot import Robot
+from q2r2_control.types import Array
+from tests.support.arm_dynamics import left_arm
+
+STRETCHED = np.zeros(14)
+
+
+@pytest.fixture(scope="module")
+def robot() -> Robot:
+    return Robot.from_config(load_config("config/dual_iiwa7.yaml"))
+
+
+def inverse(M: Array) -> Array:
+    return np.asarray(np.linalg.inv(M), dtype=np.float64)
+
+
+def positive_definite(random: np.random.Generator, n: int) -> Array:
+    A = random.normal(size=(n, n))
+    matrix: Array = A @ A.T + 0.1 * np.eye(n)
+    return matrix
+
+
+class TestClipping:
+    @pytest.mark.parametrize(
+        ("error", "expected"),
+        [
+            ([0.03, 0.0, 0.04, 0.0, 0.3, 0.4], [0.03, 0.0, 0.04, 0.0, 0.3, 0.4]),
+            ([0.3, 0.0, 0.4, 0.0, 0.3, 0.0], [0.06, 0.0, 0.08, 0.0, 0.3, 0.0]),
+            ([0.0, 0.0, 0.01, 3.0, 0.0, 0.0], [0.0, 0.0, 0.01, 0.5, 0.0, 0.0]),
+        ],
+        ids=["short", "far", "turned"],
+    )
+    def test_each_part_is_clipped_by_its_length_and_keeps_its_direction(
+        self, error: list[float], expected: list[float]
+    ) -> None:
+        clipped, was = clip_error(np.array(error), 0.1, 0.5)
+        np.testing.assert_allclose(clipped, expected, atol=1e-15)
+        assert was == (error != expected)
+
+
+class TestDamping:
+    @pytest.mark.parametrize("ratio", [0.1, 0.7, 1.0, 2.0])
+    @pytest.mark.parametrize("n", [1, 6, 7])
+    def test_it_is_the_formula_of_the_paper(self, ratio: float, n: int) -> None:
+        random = np.random.default_rng(n)
+        for _ in range(20):
+            stiffness, inertia = random.uniform(10, 5000, n), positive_definite(random, n)
+            values, V = scipy.linalg.eigh(np.diag(stiffness), inertia)
+            np.testing.assert_allclose(V.T @ inertia @ V, np.eye(n), atol=1e-8)
+            Q = np.linalg.inv(V)
+            expected = 2 * Q.T @ np.diag(ratio * np.sqrt(values)) @ Q
+            damping = double_diagonalised_damping(stiffness, inertia, ratio)
+            np.testing.assert_allclose(damping, expected, rtol=1e-6, atol=1e-6 * np.abs(expected).max())
+
+    @pytest.mark.parametrize("ratio", [0.1, 0.7, 0.95])
+    def test_every_mode_has_the_ratio_where_the_simple_formula_misses_it(self, robot: Robot, ratio: float) -> None:
+        J, M = left_arm(robot, robot.home)
+        stiffness, inertia = np.array([2000.0] * 3 + [200.0] * 3), task_inertia(J, inverse(M))
+
+        def ratios(damping: Array) -> Array:
+            flow = -np.linalg.solve(inertia, np.hstack([np.diag(stiffness), damping]))
+            poles = np.linalg.eigvals(np.vstack([np.hstack([np.zeros((6, 6)), np.eye(6)]), flow]))
+            return -poles.real / np.abs(poles)
+
+        np.testing.assert_allclose(ratios(double_diagonalised_damping(stiffness, inertia, ratio)), ratio, rtol=1e-6)
+        assert np.abs(ratios(2 * ratio * np.diag(np.sqrt(stiffness))) - ratio).max() > 0.5 * ratio
+
+
+class TestTaskInertia:
+    def test_where_the_arm_moves_freely_it_is_exact(self, robot: Robot) -> None:
+        J, M = left_arm(robot, robot.home)
+        inertia = task_inertia(J, inverse(M))
+        np.testing.assert_allclose(inertia @ J @ np.linalg.solve(M, J.T), np.eye(6), atol=1e-9)
+
+    def test_in_a_singular_posture_no_direction_is_heavier_than_1000_kg(self, robot: Robot) -> None:
+        J, M = left_arm(robot, STRETCHED)
+        assert np.linalg.matrix_rank(J) < 6
+        inertia = task_inertia(J, inverse(M))
+        metres = np.array([1.0, 1.0, 1.0, 0.3, 0.3, 0.3])
+        heaviest = np.linalg.eigvalsh(inertia / np.outer(metres, metres)).max()
+        assert heaviest == pytest.approx(1000.0)
+
+    def test_rotors_are_part_of_it(self, robot: Robot) -> None:
+        _, M = left_arm(robot, robot.home)
+        assert (np.diag(M) >= robot.model.armature[:7]).all()
+        assert (robot.model.armature > 1.0).all()
+
+
+class TestNullspace:
+    def test_dynamically_consistent_torque_accelerates_no_tool(self, robot: Robot) -> None:
+        J, M = left_arm(robot, robot.home)
+        M_inverse = inverse(M)
+        N = consistent_projector(J, M_inverse, task_inertia(J, M_inverse))
+        np.testing.assert_allclose(J @ M_inverse @ N, 0, atol=1e-9)
+        assert np.trace(N) == pytest.approx(1.0)
+
+    def test_kinematic_torque_is_balanced_without_a_force_at_the_tool(self, robot: Robot) -> None:
+        J, _ = left_arm(robot, robot.home)
+        N = kinematic_projector(J)
+        np.testing.assert_allclose(J @ N, 0, atol=1e-9)
+        np.testing.assert_allclose(N, np.eye(7) - J.T @ np.linalg.pinv(J.T), atol=1e-9)
+        assert np.trace(N) == pytest.approx(1.0)
+
+    def test_a_push_at_the_tool_loads_no_posture(self, robot: Robot) -> None:
+        J, M = left_arm(robot, robot.home)
+        M_inverse = inverse(M)
+        for N in (consistent_projector(J, M_inverse, task_inertia(J, M_inverse)), kinematic_projector(J)):
+            np.testing.assert_allclose(N @ J.T, 0, atol=1e-9)
+
+    def test_around_a_singular_posture_neither_jumps_nor_amplifies_without_bound(self, robot: Robot) -> None:
+        projectors = []
+        for bend in np.linspace(-0.02, 0.02, 41):
+            q = STRETCHED.copy()
+            q[3] = bend
+            J, M = left_arm(robot, q)
+            M_inverse = inverse(M)
+            projectors.append((consistent_projector(J, M_inverse, task_inertia(J, M_inverse)), kinematic_projector(J)))
+        steps = np.diff(np.array(projectors), axis=0)
+        assert np.abs(projectors).max() < 10.0
+        assert np.abs(steps).max() < 0.1
+
+
+class TestLimitRepulsion:
+    LIMITS = PositionLimits(np.full(3, -1.0), np.full(3, 1.0), stiffness=300.0, damping=20.0, distance=0.1)
+
+    def torque(self, q: float, v: float = 0.0, wanted: float = 0.0) -> float:
+        torques = limit_repulsion(self.LIMITS, np.full(3, q), np.full(3, v), np.full(3, wanted))
+        assert np.ptp(torques) == 0
+        return float(torques[0])
+
+    def test_it_is_a_spring_that_begins_before_the_limit(self) -> None:
+        assert [self.torque(q) for q in (-0.9, 0.0, 0.9)] == [0.0, 0.0, 0.0]
+        assert self.torque(0.95) == pytest.approx(-15.0)
+        assert self.torque(-0.95) == pytest.approx(15.0)
+        assert self.torque(1.1) == pytest.approx(-60.0)
+
+    def test_it_brakes_what_approaches_and_never_holds_what_leaves(self) -> None:
+        assert self.torque(0.95, v=1.0) == pytest.approx(-25.0)
+        assert self.torque(0.95, v=-1.0) == pytest.approx(-5.0)
+        assert self.torque(0.95, v=-3.0) == 0.0
+        assert self.torque(-0.95, v=3.0) == 0.0
+
+    def test_it_leaves_a_joint_alone_that_is_where_the_reference_wants_it(self) -> None:
+        assert self.torque(0.97, wanted=0.97) == 0.0
+        assert self.torque(0.98, wanted=0.97) == pytest.approx(-3.0)
+        assert self.torque(-0.98, wanted=-0.97) == pytest.approx(3.0)
+
+    def test_it_never_jumps(self) -> None:
+        torques = [self.torque(q, v=0.5) for q in np.linspace(0.8, 1.1, 3001)]
+        assert np.abs(np.diff(torques)).max() < 0.05
+
+
+def test_both_torque_bounds_hold_whatever_is_asked_for() -> None:
+    random = np.random.default_rng(5)
+    limit = np.array([176.0, 110.0, 40.0])
+    last = np.zeros(3)
+    saturated = np.zeros(3, dtype=bool)
+    for _ in range(5000):
+        wanted = random.choice([-1e300, -1e3, -50.0, 0.0, 50.0, 1e3, 1e300], 3) * random.random(3)
+        change = random.choice([0.0, 1.0, 5.0, 1e9])
+        bounded = bound_torque(wanted, last, limit, change)
+        assert (np.abs(bounded.tau) <= limit).all()
+        assert (np.abs(bounded.tau - last) <= change * (1 + 1e-12)).all()
+        free = ~(bounded.saturated | bounded.rate_limited)
+        np.testing.assert_array_equal(bounded.tau[free], wanted[free])
+        saturated |= bounded.saturated & ~bounded.rate_limited
+        last = bounded.tau
+    assert saturated.all()
