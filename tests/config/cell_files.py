@@ -1,0 +1,51 @@
+"""Files of cells for tests: the shipped one with something changed, and what is said of a fault in one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from q2r2_control.config.cell import Config, load_config
+from q2r2_control.errors import ConfigError
+
+SHIPPED = Path(__file__).resolve().parents[2] / "config"
+CELL = SHIPPED / "dual_iiwa7.yaml"
+
+
+def shipped() -> dict[str, Any]:
+    """What the shipped cell of two iiwa 7 says."""
+    data: dict[str, Any] = yaml.safe_load(CELL.read_text(encoding="utf-8"))
+    return data
+
+
+def loaded(tmp_path: Path, text: str | bytes) -> Config:
+    """The cell that a file with ``text`` describes."""
+    file = tmp_path / "cell.yaml"
+    file.write_bytes(text if isinstance(text, bytes) else text.encode())
+    return load_config(file)
+
+
+def fault(tmp_path: Path, text: str | bytes) -> str:
+    """What the one line says after the file's name."""
+    with pytest.raises(ConfigError) as caught:
+        loaded(tmp_path, text)
+    message = str(caught.value)
+    assert message.startswith(f"{tmp_path / 'cell.yaml'}: ")
+    assert len(message.splitlines()) == 1
+    assert len(message) < 700
+    return message.removeprefix(f"{tmp_path / 'cell.yaml'}: ")
+
+
+def changed(path: str, value: object, cell: Callable[[], dict[str, Any]] = shipped) -> str:
+    """A cell as YAML with one value replaced or added; ``path`` is written with dots."""
+    data = yaml.safe_load(yaml.safe_dump(cell()))
+    *parents, key = path.split(".")
+    place = data
+    for parent in parents:
+        place = place[int(parent)] if isinstance(place, list) else place.setdefault(parent, {})
+    place[int(key) if isinstance(place, list) else key] = value
+    return yaml.safe_dump(data)

@@ -1,0 +1,104 @@
+"""The block of another controller in a cell: its faults are told as those of the rest are."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from tests.config.cell_files import changed, fault, loaded
+from tests.support.external_cell import external
+
+
+@pytest.mark.parametrize(
+    "path",
+    ["external.presets", "external.limits.velocity", "external.arms.left.topic", "external.arms.left.gripper.action"],
+)
+def test_an_unknown_key_of_an_external_controller_is_named_with_those_allowed_there(tmp_path: Path, path: str) -> None:
+    message = fault(tmp_path, changed(path, 1.5, external))
+    assert message.startswith(f"{path} = 1.5: unknown key; allowed here: ")
+    place: Any = external()
+    for parent in path.split(".")[:-1]:
+        place = place[parent]
+    assert set(place) <= set(message.partition("allowed here: ")[2].split(", "))
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "allowed"),
+    [
+        ("controller", "kuka", "'builtin' or 'external'"),
+        ("external.preset", "kuka", "allowed are kuka_lbr_clik, kuka_lbr_impedance, fzi, mayr, crisp, moveit_servo, "),
+        ("external.preset", "builtin", "allowed are kuka_lbr_clik"),
+        ("external.preset", "jtc", "it takes joint positions, which the built-in controller has to make"),
+        ("external.mode", "direct", "'raw' or 'filtered'"),
+        ("external.rate", 20, "preset kuka_lbr_clik needs at least 50 Hz"),
+        ("external.rate", 1e6, "less than or equal to 1000"),
+        ("external.limits.max_velocity", 500, "less than or equal to 5"),
+        ("external.limits.max_acceleration", 0, "greater than 0"),
+        ("external.arms.left.ctrl_prefix", "left_ctrl", "begins with /"),
+        ("external.arms.left.ctrl_prefix", "/left ctrl", "allowed is a ROS name"),
+        ("external.arms.left.ctrl_prefix", "/left_ctrl/", "without / at its end"),
+        ("external.arms.left.target_topic", "1st", "allowed is a ROS name"),
+        ("external.arms.left.base_frame", "", "at least 1 character"),
+        ("external.arms.left.base_frame", None, "valid string"),
+        ("external.arms.left.gripper.action_type", "Vacuum", "'Float64MultiArray'"),
+        ("external.arms.left.gripper.closed_position", 0.0, "have to differ"),
+        ("external.arms.middle", {}, "'left' or 'right'"),
+        ("external.arms", {}, "at least 1"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else f"{value!r:.24}",
+)
+def test_a_bad_value_of_an_external_controller_is_named_with_what_is_allowed(
+    tmp_path: Path, path: str, value: object, allowed: str
+) -> None:
+    message = fault(tmp_path, changed(path, value, external))
+    assert message.startswith((path, path.rpartition(".")[0] + " = "))
+    assert allowed in message
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        (changed("controller", "external"), "controller = 'external': needs the block external, with preset and arms"),
+        (changed("controller", "builtin", external), "external: allowed with controller: external only"),
+        (
+            changed("external.arms", {"left": external()["external"]["arms"]["left"]}, external),
+            "external.arms: without right; needed: left, right",
+        ),
+        (
+            changed("arms", {"left": external()["arms"]["left"]}, external),
+            "external.arms.right: the cell has no such arm; allowed: left",
+        ),
+        (
+            changed("external.arms.right.ctrl_prefix", "/bh_robot/left_arm_clik_controller", external),
+            "external.arms: both have commands /bh_robot/left_arm_clik_controller/target_frame; "
+            "allowed: one of its own for each arm",
+        ),
+        (
+            changed("external.arms.right.tool_frame", "left_arm_link_ee", external),
+            "external.arms: both have tool_frame left_arm_link_ee; allowed: one of its own for each arm",
+        ),
+    ],
+    ids=[
+        "no block",
+        "a block too many",
+        "an arm missing",
+        "an arm too many",
+        "one topic for both",
+        "one tool for both",
+    ],
+)
+def test_who_drives_the_arms_has_to_be_clear(tmp_path: Path, text: str, says: str) -> None:
+    assert fault(tmp_path, text) == says
+
+
+def test_limits_of_targets_are_for_presets_that_take_targets(tmp_path: Path) -> None:
+    cell = external()
+    cell["external"] |= {"preset": "jtc", "mode": "filtered"}
+    assert loaded(tmp_path, yaml.safe_dump(cell)).external is not None
+    cell["external"]["limits"]["max_velocity"] = 0.2
+    assert "preset jtc gets joint positions within the limits of the block control" in fault(
+        tmp_path, yaml.safe_dump(cell)
+    )
