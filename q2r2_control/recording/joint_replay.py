@@ -101,7 +101,7 @@ class JointReplayPipeline(Pipeline):
     def __init__(self, config: Config, robot: Robot, ticks: RecordedTicks, plant: Plant, mode: str) -> None:
         super().__init__(config, robot, _NoHands(), plant, mode)
         joints = tuple(robot.joint_names)
-        self.way = RecordedWay(ticks, joints, robot.velocity_limit, lambda q: self.supervisor.way_to(q))
+        self.way = RecordedWay(ticks, joints, robot.velocity_limit, lambda q: self.supervisor.homing.way_to(q))
 
     def make_clock(self, realtime: bool) -> LoopClock:
         """See :meth:`Pipeline.make_clock`: ticks take what the recorded ones took."""

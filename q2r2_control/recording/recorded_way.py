@@ -30,7 +30,7 @@ class RecordedWay:
     def __init__(
         self, ticks: RecordedTicks, names: tuple[str, ...], limit: Array, way_to: Callable[[Array], JointHoming]
     ) -> None:
-        """``names`` and velocity ``limit`` (nv,) [rad/s] of the joints; ``way_to``: see :meth:`Supervisor.way_to`."""
+        """``names`` and velocity ``limit`` (nv,) [rad/s] of the joints; ``way_to``: see :meth:`Homing.way_to`."""
         self._ticks, self._names, self._limit, self._way_to = ticks, names, limit * (1.0 + _ROUNDING), way_to
         self._approach: JointHoming | None = None
         self._accepted: Array | None = None  # the last reference that was followed

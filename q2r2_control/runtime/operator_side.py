@@ -100,7 +100,7 @@ class OperatorSide:
                 self._homing = True
         elif self._homing and not asked:
             self._homing = False
-            supervisor.end_homing()
-        elif self._homing and not supervisor.homing:
+            supervisor.homing.end()
+        elif self._homing and not supervisor.homing.active:
             self._homing = False
-            self._teleop.end_homing(now, supervisor.homing_outcome or "the way home was ended")
+            self._teleop.end_homing(now, supervisor.homing.outcome or "the way home was ended")

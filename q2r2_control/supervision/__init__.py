@@ -3,7 +3,8 @@
 ``supervisor`` decides at every tick what the controller is asked for and whether the arms may move; ``joint_watch``
 judges measured states, ``targets`` and ``target_stream`` who is followed, ``target_line`` where to, ``tick_clock`` when
 a tick counts, ``tick_pacer`` what a late one may move, ``delay_watch`` and ``sequence_watch`` whether a message is of
-the past, or of another sender; ``joint_homing``, ``homing`` and ``external_arms`` are special ways to be led.
+the past, or of another sender. ``homing`` leads arms without targets, by ``joint_homing`` or ``tool_homing``;
+``external_arms`` are those that another controller moves.
 ``preflight`` looks at a cell before it runs, and ``target_guard`` limits targets for controllers that have no limits of
 their own. For loops that drive grippers, as the pipeline does, there are ``gripper_limiter`` and ``grasp_watch``. No
 ROS and no clock in here.
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
     from q2r2_control.supervision.target_stream import Origins, Refusal, StreamSettings, TargetStream
     from q2r2_control.supervision.tick_clock import TickClock
     from q2r2_control.supervision.tick_pacer import TickPacer
+    from q2r2_control.supervision.tool_homing import ToolHoming
 
 __all__ = [
     "DelayWatch",
@@ -49,6 +51,7 @@ __all__ = [
     "TargetStream",
     "TickClock",
     "TickPacer",
+    "ToolHoming",
     "WatchSettings",
     "preflight_faults",
     "watch_settings",
@@ -75,6 +78,7 @@ __getattr__ = lazy_exports(
         "TargetStream": "target_stream",
         "TickClock": "tick_clock",
         "TickPacer": "tick_pacer",
+        "ToolHoming": "tool_homing",
         "WatchSettings": "joint_watch",
         "preflight_faults": "preflight",
         "watch_settings": "joint_watch",

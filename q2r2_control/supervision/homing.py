@@ -1,56 +1,83 @@
-"""A slow way home for the tools alone, of arms whose joints another controller moves."""
+"""The way home, or another one that all arms are led along in place of targets: which one it is, and how it ended."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
-import numpy as np
 import pinocchio as pin
 
-_LINEAR_SPEED, _ANGULAR_SPEED = 0.1, 0.3  # [m/s], [rad/s]
-_ARRIVED, _TURNED = 0.003, 0.01  # [m], [rad]
-_PATIENCE = 5.0  # after the targets have arrived [s]
+from q2r2_control.control.controller import CartesianController
+from q2r2_control.robot.robot import Robot
+from q2r2_control.supervision.joint_homing import ARRIVED, HELD_UP, JointHoming, JointWay
+from q2r2_control.supervision.tool_homing import ToolHoming
+from q2r2_control.types import Array, Reference
 
 
 class Homing:
-    """Targets on a straight line from where the tools are to where they are at home, all arms at once.
+    """Leads the joints of all arms; with ``tools_only`` the tools, where another controller moves the joints.
 
-    The QP keeps limits and distances on the way, and the posture's pull brings the elbows home; where it holds the
-    tools up the homing ends there.
+    Only the supervisor begins a way, once the arms are active and have no targets any more; anybody may end it.
     """
 
-    def __init__(self, start: Mapping[str, pin.SE3], home: Mapping[str, pin.SE3]) -> None:
-        self._start, self._home = dict(start), dict(home)
-        self._duration = max(self._needed(arm) for arm in start)
-        self._time = 0.0
+    def __init__(self, robot: Robot, controller: CartesianController, tools_only: bool) -> None:
+        self._robot, self._controller, self._tools_only = robot, controller, tools_only
+        self._home = {arm: robot.tool_pose(robot.home, arm) for arm in robot.arms}
+        self._way: ToolHoming | JointWay | None = None
+        self.outcome: str | None = None  # how the last way home ended, where it did by itself
 
-    def targets(self, dt: float) -> dict[str, pin.SE3 | None]:
-        """Where the tools have to be after another ``dt`` [s]."""
-        self._time += dt
-        share = min(self._time / self._duration, 1.0)
-        return {arm: _between(start, self._home[arm], share) for arm, start in self._start.items()}
+    @property
+    def active(self) -> bool:
+        """Whether the arms are led."""
+        return self._way is not None
 
-    def outcome(self, tools: Mapping[str, pin.SE3]) -> str | None:
-        """How the homing ended, or None while it goes on."""
-        if self._time < self._duration:
+    def begin(self) -> None:
+        """Begin the way home."""
+        self.outcome = None
+        self._way = ToolHoming(self._tools(), self._home) if self._tools_only else self.way_to(self._robot.home)
+
+    def way_to(self, q: Array) -> JointHoming:
+        """A way of all joints to ``q`` (nv,) [rad]."""
+        return JointHoming(self._robot, self._controller.kept_distances, q)
+
+    def follow(self, way: JointWay) -> None:
+        """Lead the joints along ``way`` until it has an outcome."""
+        self._way = way
+
+    def targets(self, last: Reference | None, dt: float) -> dict[str, pin.SE3 | None]:
+        """What each tool is asked for after another ``dt`` [s] from the ``last`` reference, None: before the first.
+
+        Where joints are led no tool is asked for anything, and the controller is told which joint positions to hold.
+        """
+        if isinstance(self._way, ToolHoming):
+            return self._way.targets(dt)
+        if self._way is not None and last is not None:
+            self._controller.hold_at(self._way.step(last.q, last.v, dt))
+        return dict.fromkeys(self._robot.arms)
+
+    def check(self, reference: Reference) -> str | None:
+        """End the way where it has an outcome at the tick's ``reference``; returns that, or None."""
+        if self._way is None:
             return None
-        far = []
-        for arm, tool in tools.items():
-            error = tool.actInv(self._home[arm])
-            if np.linalg.norm(error.translation) > _ARRIVED or np.linalg.norm(pin.log3(error.rotation)) > _TURNED:
-                far.append(arm)
-        if not far:
-            return "at home"
-        return f"held up: {', '.join(far)}" if self._time > self._duration + _PATIENCE else None
+        outcome = self._way.outcome(self._tools()) if isinstance(self._way, ToolHoming) else self._way.outcome
+        if outcome == HELD_UP:
+            outcome = f"held up by {' | '.join(reference.report.tightest_pair)}"
+        elif outcome == ARRIVED:
+            outcome = "at home"
+        if outcome:
+            self.end()
+            self.outcome = outcome
+        return outcome
 
-    def _needed(self, arm: str) -> float:
-        start, home = self._start[arm], self._home[arm]
-        way = float(np.linalg.norm(home.translation - start.translation))
-        turn = float(np.linalg.norm(pin.log3(start.rotation.T @ home.rotation)))
-        return max(way / _LINEAR_SPEED, turn / _ANGULAR_SPEED, 0.1)
+    def end(self) -> None:
+        """The arms hold where they come to rest."""
+        if self._way is not None and not isinstance(self._way, ToolHoming):
+            self._controller.hold_at(None)
+        self._way = None
 
+    def hold(self) -> str | None:
+        """End the way home as :meth:`end` does. Returns why that is not possible: never, so None."""
+        if self.active:
+            self.end()
+            self.outcome = "the way home was interrupted"
+        return None
 
-def _between(start: pin.SE3, home: pin.SE3, share: float) -> pin.SE3:
-    turn = pin.log3(start.rotation.T @ home.rotation)
-    translation = start.translation + share * (home.translation - start.translation)
-    return pin.SE3(start.rotation @ pin.exp3(share * turn), translation)
+    def _tools(self) -> dict[str, pin.SE3]:
+        return {arm: self._controller.tool_pose(arm) for arm in self._robot.arms}

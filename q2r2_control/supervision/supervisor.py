@@ -21,11 +21,11 @@ from q2r2_control.control.controller import CartesianController
 from q2r2_control.robot.robot import Robot
 from q2r2_control.supervision.external_arms import ExternalArms
 from q2r2_control.supervision.homing import Homing
-from q2r2_control.supervision.joint_homing import ARRIVED, HELD_UP, JointHoming, JointWay
+from q2r2_control.supervision.joint_homing import JointWay
 from q2r2_control.supervision.joint_watch import NONE_YET, JointWatch, WatchSettings
 from q2r2_control.supervision.target_stream import Origins, Refusal, StreamSettings
 from q2r2_control.supervision.targets import Targets
-from q2r2_control.types import Array, Reference, RobotState
+from q2r2_control.types import Reference, RobotState
 
 _REST = 1e-4  # of the reference [rad/s]
 # A joint that stands still this far from the reference may have nothing that moves it [rad], [rad/s].
@@ -63,15 +63,13 @@ class Supervisor:
         self._robot, self._controller, self._external = robot, controller, external
         self._displace = displace
         self._origins = origins or Origins()
-        self._home = {arm: robot.tool_pose(robot.home, arm) for arm in robot.arms}
         self._targets = Targets(robot.arms, streams, self._origins)
         self._watch = JointWatch(robot.joint_names, robot.velocity_limit, watch, self._origins.joint_states)
-        self._homing: Homing | JointWay | None = None
+        self.homing = Homing(robot, controller, tools_only=external is not None)
         self._stopped: str | None = None  # why it takes a reset
         self._last: Reference | None = None
         self.phase = Phase.INACTIVE
         self.paused = False
-        self.homing_outcome: str | None = None  # how the last way home ended, where it did by itself
         self.events: list[str] = []  # what happened, for the log; its writer clears them
 
     @property
@@ -80,10 +78,6 @@ class Supervisor:
         if self._stopped is None and self._watch.fault == NONE_YET:
             return NONE_YET + self._origins.joint_states()
         return self._stopped or self._watch.fault
-
-    @property
-    def homing(self) -> bool:
-        return self._homing is not None
 
     @property
     def state_fault(self) -> str | None:
@@ -99,7 +93,7 @@ class Supervisor:
         """What one arm does: following, homing or holding; or why no arm does anything."""
         if self.phase is not Phase.ACTIVE:
             return str(self.phase)
-        if self.homing:
+        if self.homing.active:
             return "homing"
         return "following" if self.follows(arm) else "holding"
 
@@ -156,7 +150,7 @@ class Supervisor:
             return f"the controller is {self.phase}"
         if self.paused:
             return "the controller is paused"
-        return "the arms are on their way home" if self.homing else None
+        return "the arms are on their way home" if self.homing.active else None
 
     def tick(self, now: float, dt: float) -> Reference | None:
         """Move on by ``dt`` [s]; the reference to be commanded, or None."""
@@ -174,7 +168,8 @@ class Supervisor:
         self._last = reference
         if self.phase is Phase.ACTIVE:
             self._compare(reference, now)
-            self._look_home()
+            if outcome := self.homing.check(reference):
+                self.events.append(f"homing ended: {outcome}")
         elif float(np.abs(reference.v).max()) <= _REST:
             self.phase = Phase.INACTIVE if self._stopped is None else Phase.STOPPED
         return reference
@@ -258,7 +253,7 @@ class Supervisor:
             return "the arms are braking"
         self._stopped, self.paused = None, False
         self._targets.reset()
-        self.end_homing()
+        self.homing.end()
         if self.phase is Phase.STOPPED:
             self.phase = Phase.INACTIVE
         return None
@@ -268,28 +263,13 @@ class Supervisor:
         if self.phase is not Phase.ACTIVE or self.paused:
             return "the controller is paused" if self.paused else f"the controller is {self.phase}"
         self._forget_targets()
-        self.homing_outcome = None
-        if self._external is not None:
-            self._homing = Homing(self._tools(), self._home)  # the joints are another controller's
-        else:
-            self._homing = self.way_to(self._robot.home)
+        self.homing.begin()
         return None
-
-    def way_to(self, q: Array) -> JointHoming:
-        """A way of all joints to ``q`` (nv,) [rad]."""
-        return JointHoming(self._robot, self._controller.kept_distances, q)
 
     def lead(self, way: JointWay) -> None:
         """Let active arms go where ``way`` leads until it has an outcome, as on the way home."""
         self._forget_targets()
-        self._homing = way
-
-    def hold(self) -> str | None:
-        """End the way home: the arms hold where they come to rest. Returns why that is not possible: never, so None."""
-        if self.homing:
-            self.end_homing()
-            self.homing_outcome = "the way home was interrupted"
-        return None
+        self.homing.follow(way)
 
     def activate(self, state: RobotState, now: float) -> None:
         """Start at once at ``state``, at which the arms are known to be at rest. Raises :class:`RobotError`."""
@@ -317,38 +297,9 @@ class Supervisor:
             self.phase = Phase.BRAKING
 
     def _forget_targets(self) -> None:
-        self.end_homing()
+        self.homing.end()
         self._targets.drop()
-
-    def end_homing(self) -> None:
-        """The arms hold where they come to rest."""
-        if self._homing is not None and not isinstance(self._homing, Homing):
-            self._controller.hold_at(None)
-        self._homing = None
 
     def _wanted(self, now: float, dt: float) -> dict[str, pin.SE3 | None]:
         self.events += self._targets.expire(now)
-        if isinstance(self._homing, Homing):
-            return self._homing.targets(dt)
-        if self._homing is None:
-            return self._targets.at(now)
-        if self._last is not None:
-            self._controller.hold_at(self._homing.step(self._last.q, self._last.v, dt))
-        return dict.fromkeys(self._targets.arms)
-
-    def _look_home(self) -> None:
-        homing = self._homing
-        if homing is None or self._last is None:
-            return
-        outcome = homing.outcome(self._tools()) if isinstance(homing, Homing) else homing.outcome
-        if outcome == HELD_UP:
-            outcome = f"held up by {' | '.join(self._last.report.tightest_pair)}"
-        elif outcome == ARRIVED:
-            outcome = "at home"
-        if outcome:
-            self.end_homing()
-            self.homing_outcome = outcome
-            self.events.append(f"homing ended: {outcome}")
-
-    def _tools(self) -> dict[str, pin.SE3]:
-        return {arm: self._controller.tool_pose(arm) for arm in self._targets.arms}
+        return self.homing.targets(self._last, dt) if self.homing.active else self._targets.at(now)

@@ -16,7 +16,7 @@ from q2r2_control.supervision.external_arms import ExternalArms, ExternalSetting
 from q2r2_control.supervision.joint_watch import watch_settings
 from q2r2_control.supervision.supervisor import Phase, Supervisor
 from q2r2_control.supervision.target_stream import StreamSettings
-from q2r2_control.types import Array, RobotState
+from q2r2_control.types import Array, Reference, RobotState
 
 NO_CLOCK = {"solve_time_limit": None}  # whether a solution is late depends on the machine
 
@@ -75,13 +75,14 @@ class World:
         self.supervisor = Supervisor(self.robot, self.controller, streams, watch, external=external)
         self.now = 0.0
 
-    def show(self, postures: list[Array]) -> None:
-        """One measured posture and one tick after another."""
-        zero = np.zeros_like(self.robot.home)
+    def show(self, postures: list[Array]) -> Reference | None:
+        """One measured posture and one tick after another; the reference of the last."""
+        zero, reference = np.zeros_like(self.robot.home), None
         for q in postures:
             self.now += DT
             self.supervisor.take_joint_state(RobotState(q, zero, zero, None, self.now), self.now)
-            self.supervisor.tick(self.now, DT)
+            reference = self.supervisor.tick(self.now, DT)
+        return reference
 
 
 @pytest.fixture
@@ -127,3 +128,25 @@ def test_a_tool_that_is_not_where_its_reference_is_starts_over(world: World) -> 
     assert world.supervisor.phase is Phase.ACTIVE
     tool = world.robot.tool_pose(moved, "left").translation
     assert np.linalg.norm(world.controller.tool_pose("left").translation - tool) < 1e-3
+
+
+def test_the_way_home_leads_the_tools_until_they_are_there_and_takes_no_targets(config: Config) -> None:
+    world = World(config)
+    q = world.robot.home.copy()
+    q[[1, 8]] += 0.2
+    world.show([q] * 50)
+    world.supervisor.events.clear()
+    assert world.supervisor.go_home() is None
+    for _ in range(round(6.0 / DT)):
+        reference = world.show([q])
+        assert reference is not None
+        q = reference.q  # the other controller follows at once
+        if not world.supervisor.homing.active:
+            break
+        refusal = world.supervisor.take_target("left", world.controller.tool_pose("left"), world.now)
+        assert refusal is not None
+    assert world.supervisor.events == ["homing ended: at home"]
+    assert world.supervisor.homing.outcome == "at home"
+    for arm in world.robot.arms:
+        home, tool = (world.robot.tool_pose(posture, arm).translation for posture in (world.robot.home, q))
+        assert np.linalg.norm(tool - home) < 3e-3

@@ -67,7 +67,7 @@ class World:
     def go_home(self) -> str:
         """How it ended."""
         assert self.supervisor.go_home() is None
-        while self.now < LONGEST and self.supervisor.homing:
+        while self.now < LONGEST and self.supervisor.homing.active:
             self.tick()
         return next((line for line in self.supervisor.events if line.startswith("homing ended")), "it goes on")
 
@@ -140,7 +140,7 @@ def test_it_can_be_interrupted_and_the_arms_come_to_rest_where_they_are(
         if how == "stop" and np.abs(world.state.v).max() < 1e-4:
             break
         world.tick()
-    assert not world.supervisor.homing
+    assert not world.supervisor.homing.active
     assert np.abs(world.state.v).max() < 1e-2
     assert np.abs(world.state.q - at).max() < 0.04
 

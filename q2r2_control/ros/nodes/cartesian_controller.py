@@ -121,7 +121,7 @@ class CartesianControllerNode(ManagedNode):
         self.create_service(SetBool, "~/pause", self._on_pause)
         services: dict[str, Callable[[], str | None]] = {
             "home": self._supervisor.go_home,
-            "hold": self._supervisor.hold,
+            "hold": self._supervisor.homing.hold,
             "reset": self._supervisor.reset,
             "stop": self._stop,
         }
@@ -206,7 +206,7 @@ class CartesianControllerNode(ManagedNode):
         values: dict[str, Any] = {
             "phase": supervisor.phase,
             "lifecycle": self.lifecycle_state,
-            "homing_ended": supervisor.homing_outcome or "",
+            "homing_ended": supervisor.homing.outcome or "",
             "loop_rate_hz": round(self._ticks / max(wall - self._reported_at, 1e-9), 1),
             "missed_ticks": self._pacer.missed_ticks,
             "sent": self._output.sent,
