@@ -1,0 +1,30 @@
+"""Loops in simulated time, and what happens to them in mid-motion."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from q2r2_control.inputs.scripted import ScriptedInput
+from q2r2_control.pipeline import Pipeline
+from q2r2_control.runtime.recorder import Tick
+from tests.support.watch import cell, speed
+
+
+def pipeline(
+    trajectory: str = "circle", plant: str = "kinematic", mode: str = "position", **changes: object
+) -> Pipeline:
+    """At 500 Hz, the lowest rate with one substep a tick, since most of a test's time goes by ticks."""
+    config = cell().model_copy(update={"loop_rate_hz": 500.0, **changes})
+    return Pipeline.from_config(config, input=ScriptedInput(trajectory, frequency_hz=0.5), plant=plant, mode=mode)
+
+
+def when_moving(action: Callable[[], object]) -> Callable[[Tick], None]:
+    """A listener that acts once, in mid-motion."""
+    acted: list[Tick] = []
+
+    def listener(tick: Tick) -> None:
+        if not acted and speed(tick) > 0.1:
+            acted.append(tick)
+            action()
+
+    return listener

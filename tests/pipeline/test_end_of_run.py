@@ -1,0 +1,225 @@
+"""What ends a run, asked for or failed: the arms are at rest before it does, and nothing is left open."""
+
+from __future__ import annotations
+
+import gc
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from q2r2_control.errors import InputError
+from q2r2_control.inputs.headset import HeadsetServer
+from q2r2_control.inputs.scripted import ScriptedInput
+from q2r2_control.pipeline import Pipeline
+from q2r2_control.pipeline.pipeline_run import STOPPING
+from q2r2_control.plants.kinematic import KinematicPlant
+from q2r2_control.robot.robot import Robot
+from q2r2_control.runtime.run_summary import RunSummary
+from q2r2_control.types import SIDES, Command
+from tests.pipeline.loops import pipeline, when_moving
+from tests.support.watch import Watch, assert_torque_bounds, cell, speed
+
+CHECKOUT = Path(__file__).resolve().parents[2]
+
+
+class RecordingPlant(KinematicPlant):
+    """Keeps every command, counts calls of close, and fails at a given command."""
+
+    def __init__(self) -> None:
+        super().__init__(Robot.from_config(cell()), cell())
+        self.closed = 0
+        self.fails_at: int | None = None
+        self.commands: list[Command] = []
+
+    def apply(self, command: Command) -> None:
+        self.commands.append(command)
+        if self.fails_at is not None and len(self.commands) >= self.fails_at:
+            raise RuntimeError("the plant failed")
+        super().apply(command)
+
+    def close(self) -> None:
+        self.closed += 1
+
+
+class TestStop:
+    @pytest.mark.parametrize("how", ["stop", "SIGINT", "SIGTERM"])
+    def test_in_mid_motion_brakes_first(self, how: str) -> None:
+        loop = pipeline()
+        handlers = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
+        watch = Watch(loop)
+        action = loop.stop if how == "stop" else lambda: os.kill(os.getpid(), getattr(signal, how))
+        loop.listeners.append(when_moving(action))
+        summary = loop.run(60.0, realtime=False)
+        assert summary.duration_s < 5.0
+        assert_braked(loop, watch, summary)
+        assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == handlers
+
+    def test_from_another_thread_in_mid_motion_brakes_first(self) -> None:
+        loop = pipeline()
+        watch = Watch(loop)
+        moving = threading.Event()
+        loop.listeners.append(when_moving(moving.set))
+        summaries: list[RunSummary] = []
+        thread = threading.Thread(target=lambda: summaries.append(loop.run()))
+        thread.start()
+        assert moving.wait(30.0)
+        loop.stop()
+        thread.join(10.0)
+        assert not thread.is_alive()
+        assert_braked(loop, watch, summaries[0])
+
+    def test_at_the_end_of_the_duration_brakes_first(self) -> None:
+        loop = pipeline()
+        watch = Watch(loop)
+        assert_braked(loop, watch, loop.run(2.5, realtime=False))
+
+    def test_in_torque_mode_the_arms_come_to_rest_at_the_reference_and_do_not_drop_afterwards(self) -> None:
+        loop = pipeline(plant="mujoco", mode="torque")
+        watch = Watch(loop)
+        loop.listeners.append(when_moving(loop.stop))
+        summary = loop.run(60.0, realtime=False)
+        assert_braked(loop, watch, summary)
+        assert_torque_bounds(loop, watch.ticks)
+        rest = loop.plant.state()
+        assert np.abs(rest.v).max() < 1e-2
+        np.testing.assert_allclose(rest.q, watch.ticks[-1].reference.q, atol=5e-3)
+        for tick, after in pairwise(watch.ticks):
+            for arm in SIDES:
+                due = loop.robot.tool_pose(tick.reference.q, arm).translation
+                assert np.linalg.norm(after.tools[arm].translation - due) < 3e-3
+        for _ in range(20):
+            loop.plant.advance(0.1)
+            np.testing.assert_allclose(loop.plant.state().q, rest.q, atol=1e-3)
+
+    def test_waits_for_slow_braking(self) -> None:
+        # Braking takes longer than the second that is allowed for in addition.
+        control = cell().control.model_copy(update={"acceleration_limit": 0.05})
+        loop = pipeline(control=control)
+        watch = Watch(loop)
+        summary = loop.run(4.0, realtime=False)
+        before = next(tick for tick in watch.ticks if STOPPING in tick.states.values())
+        assert speed(before) > 0.05, "a stop of more than a second"
+        assert speed(watch.ticks[-1]) < 1e-3
+        assert summary.at_rest
+
+    def test_asked_for_before_the_run_ends_it_at_once_and_the_next_one_runs(self) -> None:
+        loop = pipeline()
+        loop.stop()
+        assert loop.run(10.0, realtime=False).ticks == 1
+        assert loop.run(0.1, realtime=False).ticks > 50
+
+    @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
+    def test_of_a_process_by_a_signal_returns_its_summary(self, name: str) -> None:
+        script = (
+            "import json\n"
+            "from tests.pipeline.loops import pipeline, when_moving\n"
+            "from tests.support.watch import Watch\n"
+            "loop = pipeline(plant='mujoco')\n"
+            "watch = Watch(loop)\n"
+            "loop.listeners.append(when_moving(lambda: print('moving', flush=True)))\n"
+            "print(json.dumps(loop.run(10.0).as_json()), flush=True)\n"
+        )
+        for _ in range(10):
+            with subprocess.Popen(
+                [sys.executable, "-c", script], cwd=CHECKOUT, stdout=subprocess.PIPE, text=True
+            ) as run:
+                assert run.stdout is not None
+                if run.stdout.readline() != "moving\n":
+                    continue  # other load on the machine has paused the arms before they moved
+                run.send_signal(getattr(signal, name))
+                summary = json.loads(run.stdout.readline())
+                assert run.wait(60.0) == 0
+                break
+        assert summary["at_rest"]
+        assert summary["max_velocity_ratio"] > 0.0
+        assert summary["max_acceleration_ratio"] <= 1.0 + 1e-9
+
+
+def assert_braked(loop: Pipeline, watch: Watch, summary: RunSummary) -> None:
+    """The run ended at rest, without input from the stop on; the contract was checked at every tick."""
+    stopping = [tick for tick in watch.ticks if STOPPING in tick.states.values()]
+    assert stopping[0] is watch.ticks[-len(stopping)]
+    assert all(not tick.samples and not any(tick.engaged.values()) for tick in stopping)
+    assert speed(watch.ticks[-len(stopping) - 1]) > 0.05, "it was moving"
+    assert speed(watch.ticks[-1]) < 1e-3
+    assert summary.at_rest
+    limit = loop.robot.capped_acceleration(loop.config.control.acceleration_limit)
+    braking = float((np.abs(watch.ticks[-len(stopping) - 1].reference.v) / limit).max())
+    # Slower motion than that is the last correction of a posture that is held.
+    rest = next(tick for tick in stopping if speed(tick) < 1e-3)
+    assert rest.t - stopping[0].t <= 1.5 * braking + 0.05 + 3.0 * max(tick.dt for tick in stopping)
+    assert not loop.stopping
+
+
+class TestFailure:
+    def test_of_a_listener_brakes_first_and_calls_it_no_more(self) -> None:
+        loop, calls = pipeline(), []
+
+        def fail() -> None:
+            calls.append(1)
+            raise RuntimeError("the listener failed")
+
+        loop.listeners.append(when_moving(fail))
+        watch = Watch(loop)
+        with pytest.raises(RuntimeError, match="the listener failed"):
+            loop.run(60.0, realtime=False)
+        assert len(calls) == 1
+        assert speed(watch.ticks[-1]) <= 1e-6 < max(map(speed, watch.ticks))
+
+    @pytest.mark.parametrize("call", ["poll", "connected"])
+    def test_of_the_input_brakes_first(self, call: str, monkeypatch: pytest.MonkeyPatch) -> None:
+        loop = pipeline()
+        watch = Watch(loop)
+
+        def fail(*_: object) -> None:
+            raise RuntimeError("the input failed")
+
+        broken = property(fail) if call == "connected" else fail
+        loop.listeners.append(when_moving(lambda: monkeypatch.setattr(ScriptedInput, call, broken)))
+        with pytest.raises(RuntimeError, match="the input failed"):
+            loop.run(60.0, realtime=False)
+        assert speed(watch.ticks[-1]) <= 1e-6 < max(map(speed, watch.ticks))
+
+    @pytest.mark.parametrize("who", ["plant", "listener", "reset", "nobody"])
+    def test_leaves_no_thread_no_port_and_no_plant_behind(self, who: str, monkeypatch: pytest.MonkeyPatch) -> None:
+        plant, server = RecordingPlant(), HeadsetServer(port=0)
+        loop = Pipeline.from_config(cell(), input=server, plant=plant)
+
+        def fail(*_: object) -> None:
+            raise RuntimeError(f"the {who} failed")
+
+        if who == "plant":
+            plant.fails_at = 20
+        elif who == "listener":
+            loop.listeners.append(fail)
+        elif who == "reset":
+            monkeypatch.setattr(plant, "reset", fail)
+        if who == "nobody":
+            loop.run(0.1, realtime=False)
+        else:
+            with pytest.raises(RuntimeError, match=f"the {who} failed"):
+                loop.run(1.0, realtime=False)
+        assert plant.closed == 1
+        assert "headset" not in {thread.name for thread in threading.enumerate()}
+        with socket.create_server(server.address):
+            pass
+        assert gc.isenabled()
+        assert gc.get_freeze_count() == 0
+
+    def test_to_open_the_input_closes_the_plant_and_names_the_port(self) -> None:
+        plant = RecordingPlant()
+        with socket.create_server(("127.0.0.1", 0)) as taken:
+            loop = Pipeline.from_config(cell(), input=HeadsetServer(port=taken.getsockname()[1]), plant=plant)
+            with pytest.raises(InputError, match=str(taken.getsockname()[1])):
+                loop.run(1.0, realtime=False)
+        assert plant.closed == 1
+        assert not plant.commands

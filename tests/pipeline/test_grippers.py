@@ -1,0 +1,104 @@
+"""Grippers in the whole loop: they close and open, count as wide as they are, and hold what they have closed on."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from q2r2_control.inputs.scripted import ScriptedInput
+from q2r2_control.pipeline import Pipeline
+from q2r2_control.runtime.recorder import Tick
+from q2r2_control.supervision.gripper_limiter import GripperLimiter
+from q2r2_control.types import HandSample
+from tests.support.object_cell import cell as object_cell
+from tests.support.watch import Watch, cell
+
+
+@pytest.mark.parametrize("plant", ["kinematic", "mujoco"])
+def test_fingers_count_as_wide_as_the_grippers_are_at_every_tick(plant: str) -> None:
+    loop = Pipeline.from_config(cell(), input=ScriptedInput("meet"), plant=plant)
+    watch, widest = Watch(loop), list[float]()
+
+    def listener(tick: Tick) -> None:
+        for arm, (least, greatest) in loop.controller.openings.items():
+            assert least <= tick.grippers[arm] <= greatest
+        widest.append(loop.controller.openings["left"][1])
+
+    loop.listeners.append(listener)
+    summary = loop.run(5.6, realtime=False)
+    # In MuJoCo the gripper has closed on a block.
+    assert widest[0] == 1.0
+    assert widest[-1] < 0.9
+    assert widest[-1] == pytest.approx(watch.ticks[-1].grippers["left"] + 0.04, abs=0.02)
+    assert summary.fallback_ticks == summary.uncertified_ticks == 0
+    assert all(not figures.gripper_held_s for figures in summary.arms.values())
+    assert len(watch.ticks) == len(widest)
+
+
+def test_what_is_gripped_is_part_of_the_tool_until_it_is_put_down() -> None:
+    """The flat block of the demo; the contract, objects included, is checked at every tick."""
+    flat = {"box": (0.06, 0.04, 0.015), "at": (0.0, 0.0, 0.0085), "mass": 0.1}
+    config = object_cell(None, flat)
+    loop = Pipeline.from_config(config, input=ScriptedInput("grasp"), plant="mujoco")
+    watch = Watch(loop)
+    summary = loop.run(10.0, realtime=False)
+    held = [tick.t for tick in watch.ticks if tick.holding["right"]]
+    assert 4.0 < held[0] < 5.0
+    assert 8.5 < held[-1] < 9.5
+    assert summary.arms["right"].object_held_s == pytest.approx(held[-1] - held[0], abs=0.01)
+    assert summary.arms["left"].object_held_s is None
+    assert summary.fallback_ticks == summary.uncertified_ticks == 0
+    jumps = [np.abs(second.reference.v - first.reference.v).max() for first, second in pairwise(watch.ticks)]
+    gripped = next(i for i, tick in enumerate(watch.ticks) if tick.holding["right"])
+    assert max(jumps[gripped - 1 : gripped + 20]) < 2e-4  # [rad/s]; a hand that rests is averaged meanwhile
+
+
+def test_a_run_after_one_that_ended_while_something_was_held_bears_no_weight_that_is_not_there() -> None:
+    config = object_cell({"mass": 2.0})
+    loop = Pipeline.from_config(config, input=ScriptedInput("circle"), plant="mujoco", mode="torque")
+    drive: Any = loop.drive
+    drive.set_holding({"left": True})
+    drive.reset(loop.plant.state())
+    home, model = loop.robot.home, loop.robot.model
+    bare = pin.computeGeneralizedGravity(model, model.createData(), home)
+    assert np.abs(drive.impedance.gravity(home) - bare).max() > 1.0
+    loop.run(0.01, realtime=False)
+    np.testing.assert_allclose(drive.impedance.gravity(home), bare, atol=1e-9)
+
+
+class LeftUpperPresses(ScriptedInput):
+    """The left hand presses its upper button at 1.0 and at 1.6 s, and moves in between."""
+
+    def poll(self, now: float) -> list[HandSample]:
+        held = 1.0 <= now < 1.1 or 1.6 <= now < 1.7
+        return [
+            replace(sample, inputs=replace(sample.inputs, button_upper=held)) if sample.hand == "left" else sample
+            for sample in super().poll(now)
+        ]
+
+
+def test_a_gripper_that_something_keeps_from_closing_holds_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(GripperLimiter, "limit", lambda *_: {"left": 0.5, "right": 1.0})
+    loop = Pipeline.from_config(object_cell({}), input=LeftUpperPresses("circle"), plant="mujoco")
+    watch = Watch(loop)
+    loop.run(1.55, realtime=False)
+    assert watch.ticks[-1].targets["left"].gripper == 0.0
+    assert loop.plant.gripper_openings()["left"] == pytest.approx(0.5, abs=0.05)
+    assert not any(tick.holding["left"] for tick in watch.ticks)
+
+
+def test_a_gripper_closes_and_opens_with_the_upper_button_of_its_hand() -> None:
+    loop = Pipeline.from_config(cell(), input=LeftUpperPresses("line"), plant="mujoco")
+    watch = Watch(loop)
+    summary = loop.run(2.2, realtime=False)
+    assert {arm: figures.gripper_changes for arm, figures in summary.arms.items()} == {"left": 2, "right": 0}
+    openings = {t: watch.ticks[round(t * 1000)].grippers for t in (0.95, 1.55, 2.15)}
+    assert openings[0.95]["left"] > 0.95
+    assert openings[1.55]["left"] < 0.05
+    assert openings[2.15]["left"] > 0.95
+    assert all(opening["right"] > 0.95 for opening in openings.values())

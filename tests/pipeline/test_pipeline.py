@@ -1,0 +1,177 @@
+"""The whole loop in simulated time: limits at every tick, repeatability, and what a pipeline is made of."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from q2r2_control.config.control import ContactPair
+from q2r2_control.errors import ConfigError
+from q2r2_control.inputs.scripted import ScriptedInput
+from q2r2_control.pipeline import Pipeline
+from q2r2_control.runtime.run_summary import RunSummary
+from q2r2_control.types import SIDES
+from tests.pipeline.loops import pipeline
+from tests.support.watch import Watch, assert_torque_bounds, cell, changes, speed
+
+
+@pytest.mark.parametrize(
+    ("trajectory", "human", "plant", "mode", "millimetres", "degrees"),
+    [
+        ("circle", False, "mujoco", "position", 2.0, 0.3),
+        ("line", False, "kinematic", "position", 2.0, 0.3),
+        ("rotate", False, "mujoco", "position", 2.0, 0.5),
+        ("meet", False, "kinematic", "position", 2.0, 0.3),
+        ("circle", True, "mujoco", "position", 2.0, 0.5),
+        ("circle", True, "mujoco", "torque", 2.0, 0.5),
+        ("rotate", False, "mujoco", "torque", 2.0, 0.5),
+    ],
+    ids=["circle", "line", "rotate", "meet", "a human's circle", "a human's circle by torque", "rotate by torque"],
+)
+def test_both_arms_follow_within_every_limit(
+    trajectory: str, human: bool, plant: str, mode: str, millimetres: float, degrees: float
+) -> None:
+    source = ScriptedInput(trajectory, human=human, seed=3)
+    loop = Pipeline.from_config(cell(), input=source, plant=plant, mode=mode)
+    watch = Watch(loop)
+    summary = loop.run(2.4, realtime=False)
+    assert summary.ticks == len(watch.ticks) >= 2400
+    assert summary.fallback_ticks == summary.uncertified_ticks == summary.rejected_targets == 0
+    assert summary.at_rest
+    for arm in SIDES:
+        assert changes(summary.events, arm) == [("idle", "engaged", "lower button")]
+        figures = summary.arms[arm]
+        assert figures.engaged_s == pytest.approx(2.4 - 0.68, abs=0.05)
+        assert figures.position_error_mm_rms is not None
+        assert figures.rotation_error_deg_rms is not None
+        assert figures.position_error_mm_rms < millimetres
+        assert figures.rotation_error_deg_rms < degrees
+        (start,) = watch.engagements(arm)
+        first = watch.ticks[start]
+        pose = first.targets[arm].pose
+        assert pose is not None
+        assert np.linalg.norm(pose.translation - first.tools[arm].translation) < 1e-6
+        travelled = [tick.tools[arm].translation for tick in watch.ticks]
+        assert np.ptp(travelled, axis=0).max() > 0.01 or trajectory == "rotate"
+    assert max(map(speed, watch.ticks)) > 0.05
+    if mode == "torque":
+        assert_torque_bounds(loop, watch.ticks)
+
+
+@pytest.mark.parametrize("mode", ["position", "torque"])
+def test_two_simulated_runs_are_equal_bit_for_bit_also_on_the_same_pipeline(mode: str) -> None:
+    def run(loop: Pipeline) -> tuple[list[bytes], RunSummary]:
+        watch = Watch(loop)
+        loop.input = ScriptedInput("circle", human=True, seed=1)
+        summary = loop.run(1.5, realtime=False)
+        loop.listeners.clear()
+        bits = [b"".join((x.reference.q.tobytes(), x.reference.v.tobytes(), x.state.q.tobytes())) for x in watch.ticks]
+        return bits, summary
+
+    loop = pipeline(plant="mujoco", mode=mode)
+    (first, one), (again, two), (third, _) = run(loop), run(loop), run(pipeline(plant="mujoco", mode=mode))
+    assert first == again == third
+    assert one.events == two.events
+    assert [without_times(one), without_times(two)] == [without_times(one)] * 2
+
+
+def without_times(summary: RunSummary) -> str:
+    """A summary as JSON without the figures that depend on the machine's speed."""
+    data = summary.as_json()
+    del data["tick_us"], data["loop_rate_hz"]
+    return json.dumps(data)
+
+
+def test_a_run_starts_paused_even_when_the_one_before_ended_engaged() -> None:
+    loop = pipeline()
+    assert loop.run(2.0, realtime=False).arms["left"].engaged_s > 1.0
+    for realtime in (False, True):
+        loop.input = ScriptedInput("circle")
+        watch = Watch(loop)
+        summary = loop.run(0.3, realtime=realtime)
+        assert not summary.events
+        assert max(map(speed, watch.ticks)) < 1e-6
+        loop.listeners.clear()
+
+
+def test_runs_by_the_clock_keep_the_solver_s_time_limit_and_simulated_ones_have_none() -> None:
+    loop = pipeline()
+    assert loop.config.control.solve_time_limit is not None
+    for realtime, expected in ((False, None), (True, loop.config.control.solve_time_limit), (False, None)):
+        loop.run(0.05, realtime=realtime)
+        assert loop.controller.settings.solve_time_limit == expected
+
+
+@pytest.mark.parametrize(("mode", "may_touch"), [("position", 0), ("velocity", 0), ("torque", 1)])
+def test_pairs_may_touch_in_torque_mode_only(mode: str, may_touch: int) -> None:
+    contact = (ContactPair(pair=("*_finger_*", "table")),)
+    config = cell()
+    config = config.model_copy(update={"control": config.control.model_copy(update={"contact_allowed": contact})})
+    running = Pipeline.from_config(config, plant="mujoco", mode=mode)
+    assert len(running.controller.settings.contact_allowed) == may_touch
+    running.run(0.05, realtime=False)
+    assert len(running.controller.settings.contact_allowed) == may_touch
+
+
+@pytest.mark.parametrize("rate", [50.0, 333.0, 1000.0])
+def test_a_run_takes_as_many_ticks_as_its_duration_has_periods(rate: float) -> None:
+    summary = pipeline(loop_rate_hz=rate).run(0.4, realtime=False)
+    assert summary.ticks == round(0.4 * rate) + 1, "and one to come to rest"
+    assert summary.duration_s == pytest.approx(summary.ticks / rate)
+
+
+@pytest.mark.parametrize("rate", [50.0, 200.0])
+def test_a_slow_loop_keeps_the_limits_too(rate: float) -> None:
+    loop = pipeline(plant="mujoco", loop_rate_hz=rate)
+    watch = Watch(loop)
+    summary = loop.run(3.0, realtime=False)
+    error = summary.arms["left"].position_error_mm_rms
+    assert error is not None
+    assert error < 15.0
+    assert len(watch.ticks) == summary.ticks
+
+
+def test_by_the_clock_a_run_lasts_as_long_as_it_is_asked_to() -> None:
+    loop = pipeline(loop_rate_hz=100.0)
+    watch = Watch(loop)
+    summary = loop.run(0.5)
+    times = np.array([tick.t for tick in watch.ticks])
+    assert times[-1] >= 0.49
+    assert summary.duration_s == pytest.approx(times[-1])
+    assert summary.input_to_command_ms.p50 is not None
+
+
+@pytest.mark.parametrize("duration", [0.0, -1.0, float("nan"), float("inf")])
+def test_a_duration_that_is_no_time_is_refused(duration: float) -> None:
+    with pytest.raises(ConfigError, match="allowed: a positive number of seconds"):
+        pipeline().run(duration, realtime=False)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"input": "mouse"}, "input 'mouse': allowed are scripted, headset"),
+        ({"plant": "gazebo"}, "plant 'gazebo': allowed are mujoco, kinematic"),
+        ({"mode": "jerk"}, "mode jerk: MujocoPlant follows position, velocity, torque commands only"),
+        (
+            {"plant": "kinematic", "mode": "torque"},
+            "mode torque: KinematicPlant follows position, velocity commands only",
+        ),
+    ],
+)
+def test_an_unknown_input_or_plant_and_a_mode_that_the_plant_does_not_have_are_refused(
+    arguments: dict[str, str], message: str
+) -> None:
+    with pytest.raises(ConfigError, match=message):
+        Pipeline.from_config(cell(), **arguments)
+
+
+def test_one_arm_alone_is_a_cell() -> None:
+    config = cell().model_copy(update={"arms": {"left": cell().arms["left"]}, "obstacles": {}})
+    loop = Pipeline.from_config(config, input=ScriptedInput("circle"), plant="kinematic")
+    Watch(loop)
+    summary = loop.run(2.0, realtime=False)
+    assert list(summary.arms) == ["left"]
+    assert summary.arms["left"].engaged_s > 1.0
