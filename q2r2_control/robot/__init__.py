@@ -2,8 +2,9 @@
 
 ``description`` finds and parses a model (``packages``, ``xacro_model``), ``arm_chain`` finds an arm in it. What
 ``compose`` joins stands in ``cell_parts``, ``urdf_parts``, ``locking`` and ``floor``. ``robot`` is what the controller
-sees; ``enclose`` and ``pairs`` make its collision pairs, ``reachability`` and ``model_srdf`` find those that can never
-meet, and ``stop_torque`` says what a full stop asks of the joints.
+sees, with the checked joints and the models of ``pinocchio_models``; ``enclose`` and ``pairs`` make its collision
+pairs, ``reachability`` and ``model_srdf`` find those that can never meet, and ``stop_torque`` says what a full stop
+asks of the joints.
 """
 
 from q2r2_control.robot.robot import Arm, PairDistance, Robot

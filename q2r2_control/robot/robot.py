@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import os
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Mapping, Sequence
@@ -23,18 +22,14 @@ from q2r2_control.robot.floor import remove_unreachable_floor_pairs, sink_boxes_
 from q2r2_control.robot.held_objects import HeldObjects, held_objects
 from q2r2_control.robot.joint_accelerations import acceleration_limit
 from q2r2_control.robot.link_roles import KnownParts, Role, roles_of
-from q2r2_control.robot.locking import lock_joints
 from q2r2_control.robot.pairs import (
     add_movable_pairs,
     pair_names,
     remove_disabled_pairs,
     remove_overlapping_own_pairs,
 )
+from q2r2_control.robot.pinocchio_models import build_models, checked_chain
 from q2r2_control.types import Array
-
-# Inertia that the rotor of a geared drive adds to its joint where the URDF does not say [kg m^2]. Without any, light
-# wrist joints would need torques faster than a control loop gives them.
-_USUAL_ARMATURE = 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,11 +91,11 @@ class Robot:
         parts: KnownParts | None = None,
     ) -> None:
         tree = LinkTree(urdf, where)
-        chains = {name: _checked_chain(tree, name, frame, where) for name, frame in tool_frames.items()}
+        chains = {name: checked_chain(tree, name, frame, where) for name, frame in tool_frames.items()}
         parts = parts or KnownParts.carried_by(tree, chains)
         self.name: str = urdf.get("name", "robot")
         self.urdf: str = ET.tostring(urdf, encoding="unicode")
-        self.model, self.collision_model = _models(urdf, chains, home, where)
+        self.model, self.collision_model = build_models(urdf, chains, home, where)
         self.joint_names: tuple[str, ...] = tuple(self.model.names)[1:]
         self.arms: dict[str, Arm] = {
             name: Arm(
@@ -120,7 +115,6 @@ class Robot:
         self.torque_limit: Array = self.model.effortLimit.copy()
         joints = {joint.get("name", ""): joint for joint in urdf.findall("joint")}
         self.acceleration_limit: Array = np.array([acceleration_limit(joints[name]) for name in self.joint_names])
-        _set_rotors(self.model, urdf)
         own_links = {name: set(tree.path(arm.tool_frame)) | self._moved_links(arm) for name, arm in self.arms.items()}
         self.roles: dict[str, Role] = roles_of(tree, own_links, parts)
         enclose_shapes(self.collision_model)
@@ -262,61 +256,3 @@ def _text_of(path_or_text: str | os.PathLike[str], name_of_text: str) -> tuple[s
 
 def _resting(lower: float, upper: float) -> float:
     return 0.0 if lower <= 0.0 <= upper else (lower + upper) / 2
-
-
-def _checked_chain(tree: LinkTree, arm: str, frame: str, where: str) -> list[str]:
-    """Names of the joints that move ``frame``, each of a kind and with limits that the controller can hold to."""
-    if frame != tree.root and frame not in tree.joint_to:
-        raise RobotError(f"{where}: arm {arm}: no link {frame!r:.60}; links: {', '.join([tree.root, *tree.joint_to])}")
-    chain = tree.chain(frame)
-    if not chain:
-        raise RobotError(f"{where}: arm {arm}: no movable joint carries {frame}")
-    for joint in chain:
-        name, kind = joint.get("name", ""), joint.get("type")
-        if kind not in ("revolute", "prismatic") or joint.find("mimic") is not None:
-            kind = kind if joint.find("mimic") is None else "mimic"
-            raise RobotError(f"{where}: joint {name} is {kind}; an arm's joints have to be revolute or prismatic")
-        lower, upper = joint_limits(joint)
-        if not lower < upper:
-            raise RobotError(
-                f"{where}: joint {name} has position limits {lower:g} .. {upper:g}; expected lower < upper"
-            )
-        limit = joint.find("limit")
-        for what in ("velocity", "effort"):
-            value = 0.0 if limit is None else float(limit.get(what, "0"))
-            if not value > 0:
-                raise RobotError(f"{where}: joint {name} has {what} limit {value:g}; expected more than 0")
-        if not (value := acceleration_limit(joint)) > 0:
-            raise RobotError(f"{where}: joint {name} has acceleration limit {value:g}; expected more than 0, or none")
-    return [joint.get("name", "") for joint in chain]
-
-
-def _models(
-    urdf: ET.Element, chains: Mapping[str, list[str]], home: Mapping[str, float], where: str
-) -> tuple[pin.Model, pin.GeometryModel]:
-    """Pinocchio's models with every joint outside ``chains`` locked at home."""
-    locked = copy.deepcopy(urdf)
-    lock_joints(locked, {name for chain in chains.values() for name in chain}, home)
-    try:
-        text = ET.tostring(locked, encoding="unicode")
-        model = pin.buildModelFromXML(text)
-        geometry = pin.buildGeomFromUrdfString(model, text, pin.GeometryType.COLLISION)
-        if geometry.ngeoms != (written := len(urdf.findall("link/collision"))):
-            raise RobotError(f"{where}: Pinocchio read {geometry.ngeoms} of {written} collision shapes")
-        return model, geometry
-    except (ValueError, RuntimeError, IndexError) as error:
-        raise RobotError(f"{where}: Pinocchio cannot read it: {' '.join(str(error).split())}") from error
-
-
-def _set_rotors(model: pin.Model, urdf: ET.Element) -> None:
-    """Put each joint's rotor into the model, its armature (rotor inertia times gear squared) included."""
-    model.armature[:] = _USUAL_ARMATURE
-    for joint in urdf.findall("joint"):
-        rotor, name = joint.find("rotor"), joint.get("name", "")
-        if rotor is None or not model.existJointName(name):
-            continue
-        index = model.joints[model.getJointId(name)].idx_v
-        inertia, gear = float(rotor.get("inertia", "0")), float(rotor.get("gear", "1"))
-        model.rotorInertia[index] = inertia
-        model.rotorGearRatio[index] = gear
-        model.armature[index] = inertia * gear**2 or _USUAL_ARMATURE
