@@ -20,6 +20,10 @@ LIVE = (
     "max_linear_speed",
     "max_angular_speed",
     "posture_gain",
+    "posture_weight",
+    "yield_weight",
+    "stretch_gain",
+    "separation_gain",
 )
 # The same, of the settings of an impedance.
 LIVE_IMPEDANCE = (

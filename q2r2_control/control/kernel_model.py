@@ -69,7 +69,7 @@ def _safety_model(robot: Robot, settings: ControllerSettings) -> SafetyModel:
         ),
         approach=Approach(
             stop_distance=min_distance + stop_buffer(min_distance, settings),
-            gain=settings.separation_gain,
+            gain=np.array([settings.separation_gain]),
             contact_speed=kept.contact_speed,
             contact_zone=np.where(np.isfinite(kept.contact_speed), _CONTACT_ZONE - min_distance, 0.0),
             recovery_speed=settings.separation_recovery_speed,
@@ -104,7 +104,7 @@ def _task_model(robot: Robot, settings: ControllerSettings, safety: SafetyModel)
             gain=np.array([settings.position_gain, settings.rotation_gain]),
             deceleration=np.array([settings.linear_deceleration, settings.angular_deceleration]),
             full_speed=np.array([settings.max_linear_speed, settings.max_angular_speed]),
-            stretch_gain=settings.stretch_gain,
+            stretch_gain=np.array([settings.stretch_gain]),
         ),
         posture=Posture(
             home=np.array(robot.home, dtype=np.float64),
@@ -114,11 +114,12 @@ def _task_model(robot: Robot, settings: ControllerSettings, safety: SafetyModel)
         manipulability_gain=settings.manipulability_gain,
         swivels=swivels,
         has_swivels=int(swivels.gain.any()),
-        priority=_priority(robot, settings),
+        priority=priority_of(robot, settings),
     )
 
 
-def _priority(robot: Robot, settings: ControllerSettings) -> Priority:
+def priority_of(robot: Robot, settings: ControllerSettings) -> Priority:
+    """The weights of the arms' costs; ``settings.priority`` names an arm, or none."""
     n, nv = len(robot.arms), robot.model.nv
     priority = Priority(np.ones(n), np.full(nv, settings.posture_weight))
     if settings.priority == EQUAL:

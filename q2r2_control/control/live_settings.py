@@ -13,8 +13,9 @@ of how much closer the stop brings it (stop_certificate.py). What a pair keeps
 After a reset pairs keep at once what the posture leaves them of what was asked for later, and what the controller
 was made with in any case: out of a start nearer than that it recovers, as without any change.
 
-**Gains** go to their new values on a straight line, so that what a tool is asked for does not jump. Speeds and
-accelerations stay within the limits of joints whatever the gains are.
+**Gains** and weights go to their new values on a straight line, so that what a tool is asked for does not jump. Speeds
+and accelerations stay within the limits of joints whatever they are. That of separation is one of them: it says how
+briskly pairs may close in, and the certificate, which keeps them apart, does not read it (safety/separation_rows.py).
 """
 
 from __future__ import annotations
@@ -25,9 +26,8 @@ import numpy as np
 
 from q2r2_control.config.control import ControllerSettings
 from q2r2_control.control.held_objects import Load, ObjectLoads
-from q2r2_control.control.kernel_model import stop_buffer
+from q2r2_control.control.kernel_model import KernelModel, priority_of, stop_buffer
 from q2r2_control.control.safety.provable_distances import provable_distances
-from q2r2_control.control.tasks.task_model import TaskModel
 from q2r2_control.robot.kept_distances import KeptDistances, kept_distances, too_close_at_home
 from q2r2_control.robot.pairs import CLEARANCE
 from q2r2_control.robot.robot import Robot
@@ -44,7 +44,7 @@ class LiveSettings:
     def __init__(self, robot: Robot, settings: ControllerSettings, objects: ObjectLoads) -> None:
         self._robot, self._objects = robot, objects
         self._distances = LiveDistances(robot, settings, objects)
-        self._gains = LiveGains(objects.model.tasks, settings)
+        self._gains = LiveGains(robot, objects.model, settings)
         self.settings = settings
 
     @property
@@ -136,15 +136,22 @@ class LiveDistances:
 
 
 class LiveGains:
-    """The task kernels' gains and speeds."""
+    """The kernels' gains, speeds and weights."""
 
-    def __init__(self, tasks: TaskModel, settings: ControllerSettings) -> None:
-        motion = tasks.motion
-        self._arrays = (motion.gain, motion.deceleration, motion.full_speed, tasks.posture.gain)
-        self._goal, self._left = _gains_of(settings), 0.0
+    def __init__(self, robot: Robot, model: KernelModel, settings: ControllerSettings) -> None:
+        tasks, motion = model.tasks, model.tasks.motion
+        self._robot = robot
+        # In the order of _gains_of; whatever is held, the kernels read these arrays.
+        self._arrays = (
+            *(motion.gain, motion.deceleration, motion.full_speed, motion.stretch_gain),
+            *(tasks.posture.gain, model.safety.approach.gain),
+            *(tasks.priority.weight, tasks.priority.posture_weight),
+        )
+        self._ends = np.cumsum([len(values) for values in self._arrays])[:-1]
+        self._goal, self._left = _gains_of(robot, settings), 0.0
 
     def aim(self, settings: ControllerSettings) -> None:
-        goal = _gains_of(settings)
+        goal = _gains_of(self._robot, settings)
         if not np.array_equal(goal, self._goal):
             self._goal, self._left = goal, _RAMP_TIME
 
@@ -156,17 +163,20 @@ class LiveGains:
         if not self._left:
             return
         share, self._left = min(h / self._left, 1.0), max(self._left - h, 0.0)
-        for values, goal in zip(self._arrays, np.split(self._goal, [2, 4, 6]), strict=True):
+        for values, goal in zip(self._arrays, np.split(self._goal, self._ends), strict=True):
             values[:] = goal if share == 1.0 else values + share * (goal - values)
 
 
-def _gains_of(settings: ControllerSettings) -> Array:
+def _gains_of(robot: Robot, settings: ControllerSettings) -> Array:
     """In the order of the kernels' arrays."""
+    priority = priority_of(robot, settings)
     return np.array(
         [
             *(settings.position_gain, settings.rotation_gain),
             *(settings.linear_deceleration, settings.angular_deceleration),
             *(settings.max_linear_speed, settings.max_angular_speed),
-            settings.posture_gain,
+            settings.stretch_gain,
+            *(settings.posture_gain, settings.separation_gain),
+            *(*priority.weight, *priority.posture_weight),
         ]
     )

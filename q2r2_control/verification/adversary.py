@@ -27,6 +27,11 @@ Stream = Callable[[int, Array], Request]
 _NONE: frozenset[str] = frozenset()
 _TABLE = 0.2  # height of the top that is pressed on, as in the shipped cells [m]
 _TICK = 0.001  # that motions at work are played at [s]
+# Of the settings at the start, what gains change to; arms that separation slows long before contact test little.
+_GAIN_SHARES = {
+    **dict.fromkeys(("position_gain", "rotation_gain", "posture_gain", "max_linear_speed"), (0.1, 1.0, 2.0)),
+    **{"separation_gain": (0.5, 1.0, 4.0), "stretch_gain": (0.1, 1.0, 10.0), "posture_weight": (0.1, 1.0, 100.0)},
+}
 _WORKSPACE = np.array([[-0.6, -1.1, -0.1], [1.1, 1.1, 1.4]])  # [m]
 
 
@@ -269,7 +274,7 @@ class HostileGrasps:
 
 
 class HostileChanges:
-    """Draws settings that change in mid-motion: distances up and down by any amount, gains of a tenth and of twice."""
+    """Draws settings that change in mid-motion: distances up and down by any amount, and gains."""
 
     def __init__(self, settings: ControllerSettings, random: np.random.Generator) -> None:
         self._settings, self._random = settings, random
@@ -280,6 +285,6 @@ class HostileChanges:
             return None
         if self._random.random() < 0.7:
             return {"min_distance": float(self._random.choice([0.0, self._settings.min_distance, CLEARANCE]))}
-        name = str(self._random.choice(["position_gain", "rotation_gain", "posture_gain", "max_linear_speed"]))
-        share = float(self._random.choice([0.1, 1.0, 2.0]))
+        name = str(self._random.choice(list(_GAIN_SHARES)))
+        share = float(self._random.choice(_GAIN_SHARES[name]))
         return {name: share * float(getattr(self._settings, name))}

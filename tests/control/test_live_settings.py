@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,12 +12,15 @@ import pytest
 from q2r2_control.config.control import LIVE, ControllerSettings
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.control.live_settings import GROWTH
+from q2r2_control.control.qp import QpProblem, QpSolution, Solver, make_solver
 from q2r2_control.robot.kept_distances import kept_distances
 from q2r2_control.verification.contract import Contract
 from tests.control.scenarios import SCENARIOS, circle
 from tests.control.test_scenarios import robot_of
 
 DT = 0.002
+# Ranges within which gains and weights are drawn, of which every digit counts alike.
+ANY = {"separation_gain": (0.01, 50.0), "stretch_gain": (0.1, 200.0), "posture_weight": (1e-6, 1.0)}
 NEAR, FAR = 0.005, 0.035  # [m]
 UP = np.array([0.0, 0.0, 0.05])  # [m]
 
@@ -37,13 +41,14 @@ class Run:
         self.ticks = 0
         self.q = controller.robot.home
         self.v = np.zeros_like(self.q)
+        self.a = np.zeros_like(self.q)
 
     def drive(self, seconds: float, scenario: Any = None) -> None:
         for _ in range(round(seconds / DT)):
             targets = {} if scenario is None else scenario(self.ticks * DT, self.start)
             reference = self.controller.step(targets, DT)
             self.contract.check(reference, DT)
-            self.q, self.v = reference.q, reference.v
+            self.q, self.v, self.a = reference.q, reference.v, reference.a
             self.ticks += 1
 
     @property
@@ -113,10 +118,90 @@ def test_changes_drawn_at_random_in_mid_motion_break_no_promise(controller: Cart
     scenarios = [SCENARIOS[name] for name in ("crossing", "same point", "teleport", "into the table")] + [circle]
     for _ in range(30):
         name = str(random.choice(LIVE))
-        value = random.uniform(0.0, FAR) if name == "min_distance" else random.choice([0.2, 1.0, 2.9])
+        drawn = random.choice([0.2, 0.9] if name.endswith("weight") else [0.2, 1.0, 2.9])
+        value = random.uniform(0.0, FAR) if name == "min_distance" else drawn
         assert controller.change({name: float(value)}) is None
         run.drive(0.2, scenarios[random.integers(len(scenarios))])
     assert run.contract.uncertified == 0
+
+
+class WithoutRows:
+    """A solver that knows of no separation: whatever it asks for, only the certificate keeps pairs apart."""
+
+    def __init__(self, inner: Solver) -> None:
+        self._inner = inner
+
+    def solve(self, problem: QpProblem) -> QpSolution:
+        return self._inner.solve(replace(problem, rows=problem.rows[:0], rows_lower=problem.rows_lower[:0]))
+
+
+def drawn_gains(random: np.random.Generator) -> dict[str, float]:
+    return {key: float(np.exp(random.uniform(*np.log(ends)))) for key, ends in ANY.items()}
+
+
+@pytest.mark.parametrize("name", ["crossing", "into the table"])
+def test_the_certificate_keeps_distances_whatever_the_gain_is_and_where_the_solver_knows_no_rows(name: str) -> None:
+    robot = robot_of("iiwa7")
+    solver = WithoutRows(make_solver("daqp", robot.model.nv, None))
+    run = Run(CartesianController(robot, ControllerSettings(min_distance=NEAR), solver=solver))
+    random = np.random.default_rng(6)
+    for _ in range(20):
+        assert run.controller.change(drawn_gains(random)) is None
+        run.drive(0.1, SCENARIOS[name])
+    assert run.contract.fallbacks > 100
+    assert run.margins.min() < 0.005
+    assert run.contract.uncertified == 0
+
+
+@pytest.mark.parametrize("name", ["crossing", "into the table"])
+def test_gains_that_change_all_the_time_near_contact_break_no_promise_and_leave_the_arms_at_rest(
+    controller: CartesianController, name: str
+) -> None:
+    random, run, scenario = np.random.default_rng(5), Run(controller), SCENARIOS[name]
+    fastest = 0.0
+    for _ in range(30):
+        assert controller.change(drawn_gains(random)) is None
+        run.drive(0.1, scenario)
+        fastest = max(fastest, np.abs(run.v).max() if run.margins.min() < 0.01 else 0.0)
+    assert fastest > 0.1  # it was in motion there
+    run.drive(5.0, scenario)
+    assert run.contract.uncertified == 0
+    squares = []
+    for _ in range(50):
+        run.drive(0.01, scenario)
+        squares.append(float(run.a @ run.a))
+    assert np.sqrt(np.mean(squares)) < 0.1
+
+
+def test_arms_that_close_in_are_slowed_by_a_smaller_gain_of_separation_and_not_with_a_jerk(
+    controller: CartesianController,
+) -> None:
+    closing, changes = {}, {}
+    for gain in (10.0, 0.5):
+        assert controller.change({"separation_gain": 10.0}) is None
+        run = Run(controller)
+        run.drive(0.2, SCENARIOS["crossing"])
+        room, before = run.margins.min(), run.v
+        assert controller.change({"separation_gain": gain}) is None
+        run.drive(DT, SCENARIOS["crossing"])
+        changes[gain] = run.v - before
+        run.drive(0.4, SCENARIOS["crossing"])
+        closing[gain] = room - run.margins.min()
+    assert closing[0.5] < 0.8 * closing[10.0]
+    assert np.abs(changes[0.5] - changes[10.0]).max() < 3e-4
+
+
+@pytest.mark.parametrize("name", [name for name in LIVE if name != "min_distance"])
+def test_what_was_changed_is_what_a_controller_that_is_made_with_it_has(name: str) -> None:
+    """To the bit, after a reset, with one arm that gives way to the other one, out of reach and near it."""
+    usual = ControllerSettings(priority="left")
+    value = 0.4 * getattr(usual, name)
+    made = [CartesianController(robot_of("iiwa7"), usual.model_copy(update=update)) for update in ({name: value}, {})]
+    ways = [_way(one) for one in made]
+    assert made[1].change({name: value}) is None
+    made[1].reset(made[1].robot.home)
+    np.testing.assert_array_equal(_way(made[1]), ways[0])
+    assert np.abs(ways[0] - ways[1]).max() > 1e-4
 
 
 def test_after_a_reset_near_something_pairs_keep_what_the_posture_leaves_them(controller: CartesianController) -> None:
@@ -193,6 +278,14 @@ def test_a_distance_that_home_does_not_keep_is_refused_and_names_the_pair(contro
     refusal = controller.change({"min_distance": nearest.distance - 0.001})  # distance_buffer would not be left
     assert refusal is not None
     assert nearest.name_a in refusal
+
+
+def _way(controller: CartesianController) -> np.ndarray:
+    """Positions while both arms reach across each other, and then upwards."""
+    start, way = _tools(controller), []
+    for scenario in (SCENARIOS["crossing"], SCENARIOS["overhead"]):
+        way += [controller.step(scenario(0.0, start), DT).q for _ in range(400)]
+    return np.array(way)
 
 
 def _tools(controller: CartesianController) -> dict[str, pin.SE3]:

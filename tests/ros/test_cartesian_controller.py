@@ -303,18 +303,19 @@ def test_distances_and_gains_are_set_in_motion_and_what_home_does_not_allow_is_r
 
     stream = engage(cell, streams, "left", "right")
     stream.move("left", (0.03, 0.0, 0.0))
-    assert set_to(min_distance=0.03, position_gain=4.0).successful
+    assert set_to(min_distance=0.03, position_gain=4.0, separation_gain=5.0, stretch_gain=20.0).successful
     refused = set_to(min_distance=0.045, position_gain=8.0)
     assert not refused.successful
     assert "hand_e_envelope_0 are 41.6 mm apart" in refused.reason
     assert not set_to(posture_gain=1000.0).successful
+    assert "separation_gain = 0.0" in set_to(separation_gain=0.0).reason
     goal = stream.poses["left"]
     wait_until(lambda: np.linalg.norm(cell.tool("left").translation - goal.translation) < 2e-3, "the arm is there")
     assert cell.state("left_state") == "following"
-    read = client.get_parameters(["control.min_distance", "control.position_gain"])
+    read = client.get_parameters([f"control.{name}" for name in ("min_distance", "position_gain", "separation_gain")])
     wait_until(read.done, "the parameters are read")
-    assert [value.double_value for value in read.result().values] == [0.03, 4.0]
-    assert set_to(min_distance=0.02, position_gain=8.0).successful
+    assert [value.double_value for value in read.result().values] == [0.03, 4.0, 5.0]
+    assert set_to(min_distance=0.02, position_gain=8.0, separation_gain=10.0, stretch_gain=10.0).successful
 
 
 def test_it_follows_in_another_layout_and_frame_with_another_output_and_on_simulated_time(

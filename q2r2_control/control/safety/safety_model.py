@@ -14,14 +14,14 @@ class Approach(NamedTuple):
     """How pairs may approach each other in the QP."""
 
     stop_distance: Array  # (p,) min_distance + buffer [m]
-    gain: float  # [1/s]
+    gain: Array  # (1,), which may change between ticks, see separation_rows.py [1/s]
     contact_speed: Array  # (p,) of pairs that may touch, in the contact zone [m/s]; of the others infinite
     contact_zone: Array  # (p,) free distance from which on that holds [m]; of the others 0
     recovery_speed: float  # [m/s]
 
 
 class SafetyModel(NamedTuple):
-    """What does not change in a tick; between ticks bodies of fingers and the distances that pairs keep may."""
+    """What does not change in a tick; between ticks bodies of fingers, kept distances and the rows' gain may."""
 
     collision: CollisionModel
     limits: JointLimits

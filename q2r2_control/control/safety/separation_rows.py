@@ -20,6 +20,12 @@ the solution change from tick to tick.) For a pair at rest this is the usual row
 than the buffer the row asks for opening, as fast as a part of the acceleration limits gives. Pairs that may touch have
 a distance below zero, and a zone before and in contact where B is used up no faster than a speed of their own. The rows
 give comfort only: they are soft, so that the QP always has a solution; safety is the certificate's.
+
+**The gain may change between any two ticks.** It stands in the bound above, and in how near a pair has to be for a row
+and for an exact distance. The certificate reads no row and no gain; it reads distances, and where one is a lower bound
+that proves less, never more. So what is taken of a solution is proven whatever the gain was, is or will be. A gain that
+falls makes pairs that close in brake, no harder than the joints' limits allow. The speed of pairs that touch is their
+own, with any gain: B counts the stop, so that they are slowed to it in time.
 """
 
 from __future__ import annotations
@@ -72,7 +78,7 @@ def measure_pairs(model: SafetyModel, data: SafetyData) -> int:
     for j in range(v.shape[0]):
         surge = max(surge, model.limits.acceleration[j] * model.limits.longest_step)
         duration = max(duration, abs(v[j]) / data.certified[j])
-    horizon = 2.0 / approach.gain + 0.5 * duration
+    horizon = 2.0 / approach.gain[0] + 0.5 * duration
     fastest = 2.0 * fastest_body(data.velocities)
     for p in range(pairs.first.shape[0]):
         distance[p] = at_least(collision, data.collision, p)
@@ -192,11 +198,12 @@ def _append_row(
         rate += row[j] * v[j]
         change += abs(row[j]) * lever[j] * a[j]
     change *= h
-    allowed = -model.approach.gain * h * free
+    gain = model.approach.gain[0]
+    allowed = -gain * h * free
     slow = model.approach.contact_speed[p]
     if slow < np.inf:
         beyond = free - model.approach.contact_zone[p]
-        allowed = max(allowed, -h * max(slow, model.approach.gain * beyond))
+        allowed = max(allowed, -h * max(slow, gain * beyond))
     if free < 0.0:
         # Asked for more than the joints can do in this step, rows of several pairs would be weighed against each other,
         # and the deeper pair would be opened at the cost of closing another one.

@@ -164,7 +164,7 @@ def add_stretch_damping(model: TaskModel, data: TaskData, i: int) -> None:
     for k in range(3):
         turning += feedback[3 + k] * feedback[3 + k]
     turning = ROTATION_LENGTH * ROTATION_LENGTH * np.sqrt(turning)
-    scale = model.priority.weight[i] / model.motion.stretch_gain
+    scale = model.priority.weight[i] / model.motion.stretch_gain[0]
     far = model.tools.joint[i]
     while far != 0:
         j = far - 1

@@ -21,12 +21,12 @@ class Tools(NamedTuple):
 
 
 class Motion(NamedTuple):
-    """How a tool approaches its target, linear then angular; the arrays may change between ticks."""
+    """How a tool approaches its target, linear then angular; all of it may change between ticks."""
 
     gain: Array  # (2,) [1/s]
     deceleration: Array  # (2,) [m/s^2, rad/s^2]
     full_speed: Array  # (2,) [m/s, rad/s]
-    stretch_gain: float  # k [1/s]
+    stretch_gain: Array  # (1,) k [1/s]
 
 
 class Posture(NamedTuple):
@@ -58,7 +58,8 @@ class Priority(NamedTuple):
     row is active nothing changes, since the least of a sum of independent costs does not depend on their weights; that
     is why posture and damping are scaled along with the tool's task.
 
-    An arm without a target holds its joints, and holding is never given up: it does not give way.
+    An arm without a target holds its joints, and holding is never given up: it does not give way. The weights may
+    change between ticks.
     """
 
     weight: Array  # (n,) of an arm's costs while it follows a target: 1, less if it gives way
@@ -66,7 +67,7 @@ class Priority(NamedTuple):
 
 
 class TaskModel(NamedTuple):
-    """What does not change in a tick, and between ticks but for the gains of ``motion`` and ``posture``."""
+    """What does not change in a tick, and between ticks but for gains and weights."""
 
     chain: Chain
     tools: Tools

@@ -20,7 +20,7 @@ from q2r2_control.control.tasks.task_model import Motion, tools_of
 from q2r2_control.types import Array
 from tests.control.cells import NAMES, cell, kernel_data, kernel_model, placed, random_posture
 
-MOTION = Motion(np.array([6.0, 5.0]), np.array([2.0, 5.0]), np.array([1.0, 2.5]), 0.02)
+MOTION = Motion(np.array([6.0, 5.0]), np.array([2.0, 5.0]), np.array([1.0, 2.5]), np.array([0.02]))
 
 
 @pytest.mark.parametrize("name", NAMES)
