@@ -106,6 +106,7 @@ def test_one_hand_moves_both_tools_whose_targets_of_one_tick_keep_their_relation
     pair.right.move((-0.2, 0.0, 0.0), 0.3)  # whose hand moves nothing
     ends = {rig.arm: rig.wait_for_rest() for rig in pair.rigs.rigs}
     wanted = start["left"].actInv(start["right"])
+    pair.left.wait(lambda: pair.left.state["sent"]["/q2r2/left/carry"] >= len(sent) > 20, "the node counts them")
     both = sent.keys() & led.keys()
     assert len(both) > 20
     for stamp in both:

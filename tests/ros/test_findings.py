@@ -31,7 +31,7 @@ def arm(name: str, **values: Any) -> NodeView:
         "state": "idle",
         "ready": True,
         "engaged": False,
-        "sent": {f"/{name}/target": 1},
+        "sent": {f"/{name}/target": 1, f"/{name}/carry": 0},
     }
     return node(f"/{name}_arm", **(given | values))
 
@@ -77,6 +77,12 @@ def test_nothing_is_found_in_a_good_set_nor_where_none_runs() -> None:
             "2 publishers of /left/target: /left_arm, /x",
             "end all but one",
             id="two publishers of a target",
+        ),
+        pytest.param(
+            view(topic("/left/carry", ("/left_arm", "/x"), ("/right_arm",))),
+            "2 publishers of /left/carry: /left_arm, /x",
+            "end all but one",
+            id="two publishers for the arm that is carried",
         ),
         pytest.param(
             view(topic("/q2r_left_hand_pose", ("/hand", "/hand2"), ("/left_arm",))),
@@ -138,6 +144,10 @@ def test_nothing_is_found_in_a_good_set_nor_where_none_runs() -> None:
 )
 def test_what_stops_the_arms_is_found_with_its_cure(seen: SetView, what: str, cure: str) -> None:
     assert [one for one in found(seen) if one.stops_arms and what in one.what and cure in one.cure], found(seen)
+
+
+def test_who_listens_to_what_arms_say_while_they_carry_is_nobodys_receiver() -> None:
+    assert found(view(topic("/left/carry", ("/left_arm",), ("/right_arm", "/recorder")))) == []
 
 
 def test_controllers_of_an_arm_each_may_share_a_topic_of_commands() -> None:

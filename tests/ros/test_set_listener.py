@@ -107,6 +107,8 @@ def test_the_command_watches_nodes_and_subscribes_to_no_command_and_no_hand(node
     topics = {topic["name"]: topic for topic in found["topics"]}
     assert topics["/q2r2/left/target_frame"]["subscribers"] == []
     assert topics["/q2r_left_hand_pose"]["publishers"] == ["/simulation_input"]
+    carried = topics["/q2r2/left/carry"]
+    assert (carried["publishers"], carried["rate"]) == (["/left_q2r2_arm_controller"], 0.0)
 
 
 def test_a_domain_without_a_set_is_exit_code_1(processes: Processes) -> None:

@@ -50,12 +50,18 @@ class ArmPair:
         self._topic = link.topic_of(link.other, "carry")
         self._senders = PublisherCount(node, self._topic)
         self._publisher = node.create_publisher(String, link.topic_of(arm, "carry"), SENT_COMMAND_QOS)
+        self._sent = 0
         node.create_subscription(String, self._topic, self._on_pose, COMMAND_QOS)
 
     @property
     def asked(self) -> bool:
         """Whether this arm is asked to be carried, for which its hand need not be there."""
         return self._remote.asked
+
+    @property
+    def sent(self) -> dict[str, int]:
+        """How many poses went out to the other node, by topic."""
+        return {self._publisher.topic_name: self._sent}
 
     def hear(self, reference: int | None) -> None:
         """What the other node says; ``reference``: stamp of the controller's reference in this tick [ns], or None."""
@@ -92,7 +98,7 @@ class ArmPair:
             pose=pose_numbers(pose),
             reference=self._remote.reference,
         )
-        publish_in_time(self._publisher, String(data=message.model_dump_json()), decided)
+        self._sent += publish_in_time(self._publisher, String(data=message.model_dump_json()), decided)
 
     def tell(self) -> None:
         """Tell the other node what this arm does, and what its hand has asked for, for both."""

@@ -219,7 +219,7 @@ class BaseArmController(BaseNode):
             "preset": self.parameters.preset.name,
             "mode": str(self.parameters.mode),
             "target_topic": output.topic,
-            "sent": self._outputs.sent,
+            "sent": self._outputs.sent | self._pair.sent,
             "targets_clipped": output.guard.clipped,
             "slip": round(self._target.slip, 4),
             "slip_angle": round(self._target.slip_angle, 4),

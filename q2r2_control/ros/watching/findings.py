@@ -8,6 +8,8 @@ from dataclasses import dataclass
 
 from q2r2_control.ros.watching.set_view import SILENT, ArmView, NodeView, SetView, TopicView
 
+# Topics on which nobody counts a listener: what an arm's node sends to the other one while both carry.
+_OPEN_TO_LISTENERS = "/carry"
 _ONE = "end all but one (a killed one counts for some seconds)"
 # What an arm's node says where something is in the way, and what helps.
 _CURES = (
@@ -112,7 +114,7 @@ def _takers(view: SetView) -> Iterator[Finding]:
     senders = [node for node in view.nodes if node.arm is not None or node.is_controller]
     counted = {topic for node in senders for topic in node.sent}
     for topic in view.topics:
-        if topic.name not in counted or len(topic.subscribers) < 2:
+        if topic.name not in counted or len(topic.subscribers) < 2 or topic.name.endswith(_OPEN_TO_LISTENERS):
             continue
         names = ", ".join(topic.subscribers)
         if len(controllers.intersection(topic.subscribers)) > 1 or len(set(topic.subscribers)) == 1:
