@@ -4,7 +4,8 @@
 two-armed work, one motion and one controller at a time by ``motion_run``, which tests can use alone. ``stack_bench``
 runs the same motions from hand samples to arms in MuJoCo, by ``stack_run``. ``loop_times`` tells where a tick of the
 live loop goes, by ``stage_clock``, and ``feel_run`` what an operator feels of a filter. ``command_responses`` finds the
-commands that answer steps of an input, and ``ros_latency``, which needs ROS, records them.
+commands that answer steps of an input, ``press_times`` what follows a press; ``ros_latency`` and ``ros_press``, which
+need ROS, record them.
 """
 
 from __future__ import annotations

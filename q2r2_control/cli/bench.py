@@ -22,7 +22,7 @@ from q2r2_control.cli.loop_table import loop_table
 from q2r2_control.cli.options import DEMO_CONFIG, Json
 from q2r2_control.cli.output import as_json_text, notice_of_compiling, stderr_console
 from q2r2_control.cli.press_table import press_table
-from q2r2_control.cli.ros_table import latency_table, load_table
+from q2r2_control.cli.ros_table import latency_table, load_table, presses_table
 from q2r2_control.cli.soak_table import soak_table
 from q2r2_control.cli.stack_table import following_table, safety_table
 from q2r2_control.cli.times_table import motion_table, times_table
@@ -38,6 +38,7 @@ from q2r2_control.verification.work_motions import WORK_MOTIONS, WorkMotion, mot
 _TICKS, _SOAK_TICKS, _SECONDS = 3000, 1_000_000, 30.0
 _CAMERA = CameraConfig(position=(1.9, 0.0, 1.0), look_at=(0.4, 0.0, 0.3), width=320, height=240, rate=10.0)
 _ROTOR_SHARES = (1.0, 0.1)  # all of the rotors' inertia, and what a joint torque loop leaves of it
+_STARTS = 3  # of the set of nodes, for presses; fewer in a short bench
 _RATE = 250.0  # of the controller's node by default [Hz]
 
 
@@ -102,8 +103,9 @@ def bench(
     With --feel: a hand moves in tones, trembles, rests and stops; for the cell's filter, one for precision and one for
     speed. Delays and gains from the hand to the measured tool.
 
-    With --ros: the time from a message on an input topic to the joint command that answers it, what each node takes of
-    the processors, and how evenly the commands move; through real nodes on this machine, in a domain of their own.
+    With --ros: the time from a message on an input topic to the joint command that answers it, what follows the first
+    press and later ones, what each node takes of the processors, and how evenly the commands move; through real nodes
+    on this machine, in a domain of their own.
     """
     if sum((work, soak, ros, loop, press, feel)) > 1:
         raise ConfigError("--work, --soak, --ros, --loop, --press and --feel exclude each other")
@@ -219,15 +221,23 @@ def _show_ros(duration: float, rate: float, console: Console, json: bool) -> Non
     # All else works without ROS.
     from q2r2_control.benchmark.ros_latency import measure_latency
     from q2r2_control.benchmark.ros_load import measure_load
+    from q2r2_control.benchmark.ros_press import measure_presses
 
     latency = measure_latency(DEMO_CONFIG, duration, rate, _progress(console))
+    presses = measure_presses(DEMO_CONFIG, _starts(duration), _progress(console))
     load = measure_load(DEMO_CONFIG, duration, _progress(console))
     if json:
-        print(as_json_text(latency.as_json() | {"load": load.as_json()}))
+        print(as_json_text(latency.as_json() | {"presses": presses.as_json(), "load": load.as_json()}))
     else:
         out = Console()
         out.print(latency_table(latency))
+        out.print(presses_table(presses))
         out.print(load_table(load))
+
+
+def _starts(duration: float) -> int:
+    """How often nodes are started for a first press: about as long as the rest of a bench of ``duration`` [s] takes."""
+    return max(1, min(_STARTS, round(duration / 10.0)))
 
 
 def _progress(console: Console) -> Callable[[str], None]:

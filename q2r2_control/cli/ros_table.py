@@ -7,6 +7,7 @@ from rich.text import Text
 
 from q2r2_control.benchmark.command_responses import LatencyReport
 from q2r2_control.benchmark.node_load import LoadReport
+from q2r2_control.benchmark.press_times import WATCHED, PressReport
 from q2r2_control.cli.figure_table import figure_table
 
 
@@ -24,6 +25,26 @@ def latency_table(report: LatencyReport) -> Table:
         f"one joint command between two processes: p50 {report.transport_p50_ms:.2f} ms, p99 "
         f"{report.transport_p99_ms:.2f} ms\n"
         "the hand's latency includes an interpolation of 5 ms, the shortest; its filters are off"
+    )
+    table.caption_justify = "left"
+    return table
+
+
+def presses_table(report: PressReport) -> Table:
+    """What follows a press, the first time and later."""
+    table = figure_table(
+        f"from a press until the arm moves; starts of the nodes: {report.starts}",
+        "",
+        tuple(f"{row.press} {figure} [ms]" for row in report.rows for figure in ("p50", "max")),
+    )
+    for what, name in (("longest tick", "tick"), ("until the first target", "target"), ("until it moves", "motion")):
+        times = (getattr(row, f"{name}_{figure}_ms") for row in report.rows for figure in ("p50", "max"))
+        table.add_row(what, *("" if time is None else f"{time:.1f}" for time in times))
+    counts = ", ".join(f"{row.count} {row.press}" for row in report.rows)
+    table.caption = Text(
+        f"presses: {counts}; not answered: {sum(row.unanswered for row in report.rows)}\n"
+        f"longest tick: of the arm's node, until its next one, within {WATCHED:g} s of the press; "
+        f"usually {report.period_ms:.1f} ms"
     )
     table.caption_justify = "left"
     return table

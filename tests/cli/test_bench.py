@@ -11,6 +11,7 @@ from rich.console import Console
 
 from q2r2_control.benchmark.loop_times import CASES, LoopReport, LoopRow, Ratio, RecordingCost, StageTime
 from q2r2_control.benchmark.motion_run import MotionFigures
+from q2r2_control.benchmark.press_times import PressReport, PressRow
 from q2r2_control.benchmark.stack_bench import StackReport, StackRow
 from q2r2_control.benchmark.stack_run import StackFigures
 from q2r2_control.benchmark.stage_clock import PHYSICS, STAGES
@@ -18,6 +19,7 @@ from q2r2_control.benchmark.tick_times import BenchReport, BenchRow
 from q2r2_control.benchmark.timed_run import RunMetrics
 from q2r2_control.benchmark.work_bench import WorkReport, WorkRow
 from q2r2_control.cli.loop_table import loop_table
+from q2r2_control.cli.ros_table import presses_table
 from q2r2_control.cli.soak_table import soak_table
 from q2r2_control.cli.stack_table import following_table, safety_table
 from q2r2_control.cli.times_table import motion_table, times_table
@@ -217,6 +219,17 @@ def test_eighty_columns_hold_every_stage_of_the_loop_for_each_plant_and_mode() -
     assert lines[total + 1].split() == ["to", "the", "command", *["198", "43210"] * 3]
     assert lines[total + 2].split()[0] == PHYSICS, "below the sum, which it is not in"
     assert "…" not in text
+
+
+def test_the_first_press_and_later_ones_stand_side_by_side_and_what_was_not_measured_is_left_out() -> None:
+    first = PressRow("first", 3, 3, None, None, None, None, None, None)
+    later = PressRow("later", 12, 1, 10.04, 19.2, 87.5, 91.1, 112.3, 122.3)
+    lines = [line.split() for line in printed(presses_table(PressReport(3, 5.02, (first, later)))).splitlines()]
+    assert ["first", "first", "later", "later"] in lines
+    assert ["longest", "tick", "10.0", "19.2"] in lines
+    assert ["until", "the", "first", "target", "87.5", "91.1"] in lines
+    assert ["until", "it", "moves", "112.3", "122.3"] in lines
+    assert ["presses:", "3", "first,", "12", "later;", "not", "answered:", "4"] in lines
 
 
 def test_the_cost_of_recording_is_a_ratio_with_its_interval_for_each_plant_and_mode() -> None:

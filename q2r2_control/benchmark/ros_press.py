@@ -1,0 +1,166 @@
+"""``q2r2 bench --ros``: presses on a set of nodes that has just said that it is ready, the first one and later ones.
+
+The set is started anew for each first press. The hand goes round a circle all the time, so that an arm that is engaged
+moves at once. A tick of the arm's node ends with its flags, which it publishes for whoever records it.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Callable
+from typing import Any
+
+import rclpy
+from geometry_msgs.msg import PoseStamped
+from quest2ros.msg import OVR2ROSInputs
+from rclpy.executors import SingleThreadedExecutor
+from std_msgs.msg import Float64MultiArray, String
+from trajectory_msgs.msg import JointTrajectory
+
+from q2r2_control.benchmark.press_times import PressRecording, PressReport, press_report
+from q2r2_control.benchmark.ros_processes import private_domain, started
+from q2r2_control.errors import Q2R2Error
+from q2r2_control.recording.ros_topics import ARM_FIELDS, arm_flags, asked_target
+from q2r2_control.ros.base_node import RECORDED_QOS, STREAM_QOS
+from q2r2_control.ros.launch.processes import nodes_of
+
+_LATER = 4  # presses that engage after the first one, at each start
+_TIMEOUT = 300.0  # kernels may have to be compiled [s]
+_HELD = 0.3  # the lower button, and as long after its release: together longer than WATCHED [s]
+_STILL, _REST = 0.005, 0.5  # joints rest when all commands were slower for so long [rad/s], [s]
+_SAMPLE = 1.0 / 75.0  # from one sample of the hand to the next [s]
+_RADIUS, _TURN = 0.03, 2.0  # of the hand's circle [m], [s]
+
+
+class PressError(Q2R2Error):
+    """The nodes did not become ready in time; the message says what was waited for."""
+
+
+def measure_presses(config: str, starts: int, progress: Callable[[str], None]) -> PressReport:
+    """Press for the first time and four times more, at each of ``starts`` of the set. Raises :class:`PressError`."""
+    runs = []
+    for number in range(starts):
+        with private_domain(), _Hand() as hand, started(nodes_of(config, "none")):
+            progress(f"presses: waiting for the nodes, {number + 1} of {starts}")
+            hand.wait_until_ready()
+            run = [hand.press_to_engage()]
+            for _ in range(_LATER):
+                hand.pause()
+                run.append(hand.press_to_engage())
+            runs.append(run)
+    return press_report(runs)
+
+
+class _Hand:
+    """The left hand, and what its arm's node and the controller answer; times are the middleware's, at the sender."""
+
+    def __init__(self) -> None:
+        self._state: dict[str, Any] = {}
+        self._engaged = self._pressed = False
+        self._ticks: list[float] = []
+        self._targets: list[float] = []
+        self._commands: list[float] = []
+        self._speeds: list[float] = []
+        self._moved = math.inf  # when a command moved a joint last [s] of steady time
+        self._context = rclpy.Context()
+        rclpy.init(context=self._context)
+        self._node = rclpy.create_node("press_probe", context=self._context)
+        listen: Any = self._node.create_subscription  # rclpy's types know callbacks without the message's stamps only
+        listen(Float64MultiArray, arm_flags("left"), self._on_flags, RECORDED_QOS)
+        listen(PoseStamped, asked_target("left"), self._on_target, RECORDED_QOS)
+        listen(JointTrajectory, "/joint_trajectory", self._on_command, STREAM_QOS)
+        self._node.create_subscription(String, "/left_q2r2_arm_controller/state", self._on_state, 10)
+        self._pose = self._node.create_publisher(PoseStamped, "/q2r_left_hand_pose", STREAM_QOS)
+        self._inputs = self._node.create_publisher(OVR2ROSInputs, "/q2r_left_hand_inputs", STREAM_QOS)
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self._node)
+
+    def __enter__(self) -> _Hand:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._executor.shutdown()
+        self._node.destroy_node()
+        self._context.try_shutdown()
+
+    def wait_until_ready(self) -> None:
+        """Wait until the arm's node says that it can be engaged, and the arms rest."""
+        self._state = {}
+        self._moved = time.monotonic()
+
+        def ready() -> bool:
+            rests = time.monotonic() - self._moved > _REST
+            return bool(self._state.get("ready") and not self._engaged and self._ticks and self._commands and rests)
+
+        self._wait(ready, "left_arm_controller to be ready, which says: {message}")
+
+    def press_to_engage(self) -> PressRecording:
+        """Press, and record what follows for as long as is watched."""
+        for times in (self._ticks, self._targets, self._commands, self._speeds):
+            del times[:-1]
+        press = time.time()  # the clock of the middleware's stamps
+        self._press()
+        return PressRecording(
+            press, tuple(self._ticks), tuple(self._targets), tuple(self._commands), tuple(self._speeds)
+        )
+
+    def pause(self) -> None:
+        """Press once more where the arm is engaged, and wait until it can be engaged again."""
+        if self._engaged:
+            self._press()
+        self.wait_until_ready()
+
+    def _press(self) -> None:
+        self._pressed = True
+        self._move(_HELD)
+        self._pressed = False
+        self._move(_HELD)
+
+    def _wait(self, condition: Callable[[], bool], what: str) -> None:
+        deadline = time.monotonic() + _TIMEOUT
+        while not condition():
+            if time.monotonic() > deadline:
+                said = self._state.get("message", "nothing")
+                raise PressError(f"waited {_TIMEOUT:g} s for {what.format(message=said)}")
+            self._move(_SAMPLE)
+
+    def _move(self, period: float) -> None:
+        """Publish samples of the hand for ``period`` [s], and take what comes."""
+        end = time.monotonic() + period
+        while (now := time.monotonic()) < end:
+            self._inputs.publish(OVR2ROSInputs(button_lower=self._pressed))
+            self._pose.publish(_on_circle(now))
+            until = min(now + _SAMPLE, end)
+            while (left := until - time.monotonic()) > 0.0:
+                self._executor.spin_once(left)
+
+    def _on_flags(self, message: Float64MultiArray, info: dict[str, int]) -> None:
+        self._ticks.append(_sent(info))
+        self._engaged = message.data[ARM_FIELDS.index("engaged")] > 0.0
+
+    def _on_target(self, _: PoseStamped, info: dict[str, int]) -> None:
+        self._targets.append(_sent(info))
+
+    def _on_command(self, message: JointTrajectory, info: dict[str, int]) -> None:
+        self._commands.append(_sent(info))
+        self._speeds.append(max(abs(v) for v in message.points[0].velocities))
+        if self._speeds[-1] > _STILL:
+            self._moved = time.monotonic()
+
+    def _on_state(self, message: String) -> None:
+        self._state = json.loads(message.data)
+
+
+def _sent(info: dict[str, int]) -> float:
+    return 1e-9 * info["source_timestamp"]
+
+
+def _on_circle(now: float) -> PoseStamped:
+    """Where the hand is at ``now`` [s] of steady time."""
+    message = PoseStamped()
+    angle = 2.0 * math.pi * now / _TURN
+    message.pose.position.y, message.pose.position.z = _RADIUS * math.cos(angle), _RADIUS * math.sin(angle)
+    message.pose.orientation.w = 1.0
+    return message
