@@ -129,7 +129,7 @@ def write_separation_rows(model: SafetyModel, data: SafetyData, h: float) -> Non
                     number = i
         at = data.collision if number == 0 else sample_of(model, data, INSTANTS[number], duration)
         least = measure(model.collision, at, p)
-        moment = Moment(number, straight, h, 0.5 * duration + 1.0 / model.approach.gain)
+        moment = Moment(number, straight, h, 0.5 * duration + 1.0 / model.approach.gain[0])
         before = count
         count = _append_row(model, data, at, p, least, moment, count)
         if count > before:
