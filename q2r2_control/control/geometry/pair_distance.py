@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from q2r2_control.control.geometry.closest_points import dot, segment_box, segment_segment
-from q2r2_control.control.geometry.collision import Bodies, CollisionData, CollisionModel, Contact, Posed
+from q2r2_control.control.geometry.collision import CollisionData, CollisionModel, Contact
 from q2r2_control.control.jit import inlined_kernel, lean_kernel
 from q2r2_control.types import Array
 
@@ -50,41 +50,47 @@ def measure(model: CollisionModel, data: CollisionData, p: int) -> float:
 @inlined_kernel
 def measure_part(model: CollisionModel, data: CollisionData, p: int, start: Array, end: Array) -> float:
     """As :func:`measure`, of the part from ``start`` to ``end``, (3,) each, of the pair's first geometry."""
-    first, second = model.pairs.first[p], model.pairs.second[p]
-    return _measure(model.bodies, data.posed, first, second, start, end, data.contact)
+    bodies, posed, first, second = model.bodies, data.posed, model.pairs.first[p], model.pairs.second[p]
+    if bodies.box[second] == 1:
+        cores = _to_box(start, end, posed.start[second], posed.rotation[second], bodies.half[second], data.contact)
+    else:
+        cores = _to_segment(start, end, posed.start[second], posed.end[second], data.contact)
+    return cores - bodies.radius[first] - bodies.radius[second]
 
 
 @lean_kernel
-def _measure(
-    bodies: Bodies, posed: Posed, first: int, second: int, start: Array, end: Array, contact: Contact
-) -> float:
-    if bodies.box[second] == 1:
-        local = contact.local
-        axes = posed.rotation[second]
-        for k in range(3):
-            along_start = 0.0
-            along_end = 0.0
-            for row in range(3):
-                along_start += axes[row, k] * (start[row] - posed.start[second, row])
-                along_end += axes[row, k] * (end[row] - posed.start[second, row])
-            local[0, k] = along_start
-            local[1, k] = along_end
-        normal = local[2]
-        distance = segment_box(local[0], local[1], bodies.half[second], contact.first, contact.second, normal)
-        for points in (contact.first, contact.second):
-            x, y, z = points[0], points[1], points[2]
-            for row in range(3):
-                points[row] = posed.start[second, row] + axes[row, 0] * x + axes[row, 1] * y + axes[row, 2] * z
+def _to_box(start: Array, end: Array, centre: Array, axes: Array, half: Array, contact: Contact) -> float:
+    """Signed distance [m] of a segment and a box, of which ``axes`` (3, 3) and ``half`` sides (3,) are given."""
+    local = contact.local
+    for k in range(3):
+        along_start = 0.0
+        along_end = 0.0
         for row in range(3):
-            contact.normal[row] = axes[row, 0] * normal[0] + axes[row, 1] * normal[1] + axes[row, 2] * normal[2]
-        return distance - bodies.radius[first] - bodies.radius[second]
-    distance = segment_segment(start, end, posed.start[second], posed.end[second], contact.first, contact.second)
+            along_start += axes[row, k] * (start[row] - centre[row])
+            along_end += axes[row, k] * (end[row] - centre[row])
+        local[0, k] = along_start
+        local[1, k] = along_end
+    normal = local[2]
+    distance = segment_box(local[0], local[1], half, contact.first, contact.second, normal)
+    for points in (contact.first, contact.second):
+        x, y, z = points[0], points[1], points[2]
+        for row in range(3):
+            points[row] = centre[row] + axes[row, 0] * x + axes[row, 1] * y + axes[row, 2] * z
+    for row in range(3):
+        contact.normal[row] = axes[row, 0] * normal[0] + axes[row, 1] * normal[1] + axes[row, 2] * normal[2]
+    return distance
+
+
+@lean_kernel
+def _to_segment(start: Array, end: Array, other_start: Array, other_end: Array, contact: Contact) -> float:
+    """Distance [m] of two segments."""
+    distance = segment_segment(start, end, other_start, other_end, contact.first, contact.second)
     if distance > 1e-9:
         for k in range(3):
             contact.normal[k] = (contact.second[k] - contact.first[k]) / distance
     else:
-        _any_normal(posed.start[first], posed.end[first], posed.start[second], posed.end[second], contact.normal)
-    return distance - bodies.radius[first] - bodies.radius[second]
+        _any_normal(start, end, other_start, other_end, contact.normal)
+    return distance
 
 
 @lean_kernel
