@@ -27,7 +27,7 @@ class PressRecording:
 
 @dataclass(frozen=True, slots=True)
 class PressRow:
-    """Presses of one kind. Medians and most, in ms from the press; None where none was answered."""
+    """Presses of one kind. Medians and maxima, in ms from the press; None where none was answered."""
 
     press: str  # which
     count: int

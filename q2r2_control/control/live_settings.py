@@ -14,7 +14,7 @@ After a reset pairs keep at once what the posture leaves them of what was asked 
 was made with in any case: out of a start nearer than that it recovers, as without any change.
 
 **Gains** and weights go to their new values on a straight line, so that what a tool is asked for does not jump. Speeds
-and accelerations stay within the limits of joints whatever they are. That of separation is one of them: it says how
+and accelerations stay within the limits of joints whatever they are. The gain of separation is one of them: it says how
 briskly pairs may close in, and the certificate, which keeps them apart, does not read it (safety/separation_rows.py).
 """
 

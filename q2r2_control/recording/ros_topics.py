@@ -50,7 +50,10 @@ def arm_events(arm: str) -> str:
 
 
 def carry_poses(arm: str) -> str:
-    """The topic on which an arm's node sends poses to the other one while both carry, as JSON."""
+    """The topic on which an arm's node sends poses to the other one while both carry, as JSON.
+
+    That of nodes whose ``robot_name`` is ``q2r2``, which it is by default.
+    """
     return f"/q2r2/{arm}/carry"
 
 

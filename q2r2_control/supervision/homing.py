@@ -1,4 +1,4 @@
-"""The way home, or another one that all arms are led along in place of targets: which one it is, and how it ended."""
+"""The way home, or another way that all arms are led along instead of following targets, and how it ended."""
 
 from __future__ import annotations
 

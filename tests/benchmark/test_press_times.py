@@ -39,7 +39,7 @@ def test_target_and_motion_count_from_the_press_and_what_was_there_before_it_doe
     assert (row.target_p50_ms, row.motion_p50_ms) == pytest.approx((90.0, 120.0))
 
 
-def test_a_tick_that_is_long_before_the_press_or_long_after_it_is_not_the_presses() -> None:
+def test_a_long_tick_before_the_press_or_long_after_it_does_not_count() -> None:
     one = recording()
     ticks = np.array(one.ticks)
     ticks[ticks < one.press - 0.05] -= 0.1
@@ -56,7 +56,7 @@ def test_a_press_that_is_held_up_from_the_tick_before_it_has_all_of_that_tick() 
     assert row.tick_max_ms == pytest.approx(45.0)
 
 
-def test_a_press_that_moved_nothing_is_unanswered_and_in_no_figure() -> None:
+def test_a_press_that_moved_nothing_is_unanswered_and_changes_no_figure() -> None:
     silent = recording(motion=0.9)
     row, later = press_report([[silent, silent, recording()]]).rows
     assert (row.count, row.unanswered, row.tick_p50_ms, row.motion_max_ms) == (1, 1, None, None)

@@ -146,7 +146,7 @@ def test_what_stops_the_arms_is_found_with_its_cure(seen: SetView, what: str, cu
     assert [one for one in found(seen) if one.stops_arms and what in one.what and cure in one.cure], found(seen)
 
 
-def test_who_listens_to_what_arms_say_while_they_carry_is_nobodys_receiver() -> None:
+def test_a_recorder_may_listen_to_what_arms_say_while_they_carry() -> None:
     assert found(view(topic("/left/carry", ("/left_arm",), ("/right_arm", "/recorder")))) == []
 
 

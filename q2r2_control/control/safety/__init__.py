@@ -1,10 +1,10 @@
 """What keeps every limit and every distance, whatever targets and solver do; the argument is in README.md.
 
 ``joint_limits`` bounds the next velocities; ``stop_certificate`` proves a step and the stop after it, by
-``speed_bound`` or, where distances leave no room for that, ``separating_plane``; ``safety_filter`` takes of a solution
-what can be certified. ``separation_rows``, with ``velocity_bounds``, are for comfort: they make the solver ask for
-little else. Each takes a ``SafetyModel`` (fixed) and ``SafetyData`` (the reference's state, and what is rewritten at
-each tick).
+``speed_bound`` with ``velocity_bounds`` or, where distances leave no room for that, ``separating_plane``;
+``safety_filter`` takes of a solution what can be certified. ``separation_rows`` are for comfort: they make the solver
+ask for little else. Each takes a ``SafetyModel`` (fixed) and ``SafetyData`` (the reference's state, and what is
+rewritten at each tick).
 """
 
 from q2r2_control.control.safety.joint_limits import JointLimits, VelocityBox, next_velocity_box

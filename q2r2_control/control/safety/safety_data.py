@@ -83,7 +83,9 @@ class Rollout(NamedTuple):
     step: Piece  # from the reference to the candidate
     stop: Piece  # all of the candidate's stop
     piece: Piece  # a part of it
-    astray: Array  # (nv,) how far from going on as the reference does a joint may lead, see speed_bound [rad or m]
+    deviation: (
+        Array  # (nv,) of each joint from straight on at the reference's velocity at most, see speed_bound [rad or m]
+    )
 
     @classmethod
     def empty(cls, model: CollisionModel) -> Rollout:
@@ -103,7 +105,7 @@ class Rollout(NamedTuple):
             step=Piece.empty(nv),
             stop=Piece.empty(nv),
             piece=Piece.empty(nv),
-            astray=np.zeros(nv),
+            deviation=np.zeros(nv),
         )
 
 

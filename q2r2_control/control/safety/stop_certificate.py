@@ -21,7 +21,7 @@ from q2r2_control.control.jit import inlined_kernel, lean_kernel
 from q2r2_control.control.safety.safety_data import SafetyData
 from q2r2_control.control.safety.safety_model import SafetyModel
 from q2r2_control.control.safety.separating_plane import stay_beyond, stays_beyond
-from q2r2_control.control.safety.speed_bound import least_distance, way, write_astray
+from q2r2_control.control.safety.speed_bound import least_distance, way, write_deviations
 from q2r2_control.control.safety.stop_rollout import begin_rollout, sample_of, write_piece
 
 # A pair that starts closer than its distance may not come closer; this is rounding only.
@@ -42,15 +42,15 @@ def certify(model: SafetyModel, data: SafetyData, h: float) -> bool:
     """Whether the step to ``data.candidate`` in ``h`` and the full stop from there keep every pair apart.
 
     ``data.distance`` holds distances at the reference, or lower bounds of them; a bound that does not suffice is
-    replaced by the distance. A pair that is closer than its distance already must not come closer at the step's end and
-    during the stop. Where a pair fails, ``data.unproven`` says which.
+    replaced by the distance. ``data.velocities`` are those at the reference, of the bodies as they are now. A pair that
+    is closer than its distance already must not come closer at the step's end and during the stop. Where a pair fails,
+    ``data.unproven`` says which.
     """
     distance = data.distance
     duration = begin_rollout(data)
     write_step(data, h)
     farthest = _farthest_travel(data)
-    time = h + 0.5 * duration
-    write_astray(model, data, h, duration)
+    time = write_deviations(model, data, h, duration)
     for p in range(distance.shape[0]):
         threshold = model.min_distance[p]
         if distance[p] - model.collision.pairs.leverage[p] * farthest >= threshold:
@@ -90,7 +90,7 @@ def _farthest_travel(data: SafetyData) -> float:
 
 @inlined_kernel
 def _has_room(model: SafetyModel, data: SafetyData, p: int, time: float) -> bool:
-    """Whether pair ``p`` is farther apart than it can come closer: by its speed, in ``time`` [s], or by the ways."""
+    """Whether pair ``p`` is farther apart than it can come closer: by its speed; by the ways if it shares a joint."""
     if model.collision.pairs.carried[p] == 0:
         return least_distance(model, data, p, time) >= model.min_distance[p]
     step, stop = way(model, p, data.rollout.step.travel), way(model, p, data.rollout.stop.travel)

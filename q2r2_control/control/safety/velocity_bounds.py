@@ -5,8 +5,8 @@ point of it is faster than |u| + |w| s, so the distance of two geometries falls 
 
     |u_2 - u_1| + |w_1| s_1 + |w_2| s_2.
 
-Arms that move alike do not close in at all, however fast they are; the bound by reach (stop_certificate.py) cannot see
-that.
+The certificate relies on this bound (speed_bound.py). Arms that move alike do not close in at all, however fast they
+are; the bound by reach (stop_certificate.py) cannot see that.
 """
 
 from __future__ import annotations

@@ -2,8 +2,8 @@
 
 It listens to no topic that commands, where it would count as a receiver: an arm without a controller could be engaged
 then, and arms that are off their reference would be stopped. What arms ask for, and the reference that joint commands
-are made of, their nodes publish once more for it. Receivers of what arms' nodes send each other while they carry nobody
-counts. Streams reach it by best effort, so no sender waits for it.
+are made of, their nodes publish once more for it. On ``carry``, where arms' nodes talk to each other, nobody counts
+receivers, so it listens there too. Streams reach it by best effort, so no sender waits for it.
 """
 
 from __future__ import annotations

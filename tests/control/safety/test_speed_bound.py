@@ -4,7 +4,8 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from q2r2_control.control.safety.speed_bound import least_distance, write_astray
+from q2r2_control.control.safety.safety_data import SafetyData
+from q2r2_control.control.safety.speed_bound import least_distance, write_deviations
 from q2r2_control.control.safety.stop_certificate import write_step
 from q2r2_control.control.safety.stop_rollout import begin_rollout
 from q2r2_control.control.safety.stop_shapes import OWN, SHAPES, TOGETHER
@@ -13,8 +14,8 @@ from tests.control.cells import NAMES, cell, distances, kernel_data, kernel_mode
 from tests.control.safety.motions import ACCELERATION, H, Motion, motion_of
 
 
-def bounds_of(name: str, motion: Motion) -> Array:
-    """What each pair's distance is at least (p,) by its speed [m]."""
+def prepared(name: str, motion: Motion) -> tuple[SafetyData, float]:
+    """Data as the certificate has it before it looks at pairs, and the time of the bound [s]."""
     model, data = kernel_model(name).safety, kernel_data(name, motion.q, motion.v).safety
     data.distance[:] = distances(cell(name), motion.q[None])[0]
     data.candidate.q[:] = motion.q_next
@@ -22,8 +23,13 @@ def bounds_of(name: str, motion: Motion) -> Array:
     data.candidate.deceleration[:] = motion.deceleration
     duration = begin_rollout(data)
     write_step(data, H)
-    write_astray(model, data, H, duration)
-    return np.array([least_distance(model, data, p, H + 0.5 * duration) for p in range(len(data.distance))])
+    return data, write_deviations(model, data, H, duration)
+
+
+def bounds_of(name: str, motion: Motion) -> Array:
+    """What each pair's distance is at least (p,) by its speed [m]."""
+    data, time = prepared(name, motion)
+    return np.array([least_distance(kernel_model(name).safety, data, p, time) for p in range(len(data.distance))])
 
 
 def least_along(name: str, motion: Motion) -> Array:
@@ -81,16 +87,36 @@ def test_what_a_step_from_rest_adds_counts() -> None:
             assert (bounds_of("dual_iiwa7", motion) <= least_along("dual_iiwa7", motion) + 1e-12)[apart].all()
 
 
-def test_the_bound_leaves_little_room_to_what_joints_that_stop_together_do() -> None:
-    random, robot = np.random.default_rng(63), cell("dual_iiwa7").robot
-    used = []
+@pytest.mark.parametrize("speed", [0.01, 0.1], ids=["a stop as short as the step", "a long stop"])
+def test_the_bound_holds_and_leaves_little_room_where_joints_stop_together(speed: float) -> None:
+    random, robot = np.random.default_rng(64), cell("dual_iiwa7").robot
+    apart, used = share_no_joint("dual_iiwa7"), []
     for _ in range(40):
-        v = 0.1 * random.uniform(-robot.velocity_limit, robot.velocity_limit)
+        v = speed * random.uniform(-robot.velocity_limit, robot.velocity_limit)
         motion = motion_of("dual_iiwa7", random_posture(robot, random), v, v, TOGETHER)
         now = distances(cell("dual_iiwa7"), motion.q[None])[0]
         closer, bound = now - least_along("dual_iiwa7", motion), now - bounds_of("dual_iiwa7", motion)
-        used.append((closer / bound)[share_no_joint("dual_iiwa7")].max())
+        assert (closer <= bound + 1e-12)[apart].all()
+        used.append((closer / bound)[apart].max())
     assert np.median(used) > 0.6  # else it would prove little
+
+
+@pytest.mark.parametrize("shape", [TOGETHER, OWN])
+def test_the_deviation_of_a_joint_counts_those_before_it_that_carry_it(shape: int) -> None:
+    random, robot = np.random.default_rng(65), cell("dual_iiwa7").robot
+    v, dv = random.uniform(-1, 1, 14), random.uniform(-1, 1, 14) * ACCELERATION * H
+    motion = motion_of("dual_iiwa7", random_posture(robot, random), v, v + dv, shape)
+    braking = np.abs(motion.v_next) / motion.deceleration
+    last = braking.max()
+    stop = 0.5 * np.abs(motion.v_next) * braking
+    ways = np.abs(np.diff(motion.step(), axis=0)).sum(axis=0) + stop
+    rho = 0.5 * np.abs(dv) * (H + last) + 0.5 * np.abs(motion.v_next) * last - stop
+    carriers = [[i - 1 for i in robot.model.supports[j + 1] if 0 < i <= j] for j in range(14)]
+    kappa = ways * (0.5 * ways + np.array([ways[before].sum() for before in carriers]))
+    data, time = prepared("dual_iiwa7", motion)
+    assert time == pytest.approx(H + 0.5 * last)
+    assert data.rollout.deviation == pytest.approx(rho + kappa, rel=1e-3)
+    assert kappa.max() > 0.01 * rho.max()
 
 
 @pytest.mark.parametrize("name", NAMES)

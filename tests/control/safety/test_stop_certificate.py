@@ -147,7 +147,7 @@ def _too_close(arrays: CellArrays, random: np.random.Generator, count: int) -> I
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_pair_that_starts_too_close_comes_no_closer_in_a_certifiedmotion_of(name: str) -> None:
+def test_a_pair_that_starts_too_close_comes_no_closer_in_a_certified_motion(name: str) -> None:
     arrays, random = cell(name), np.random.default_rng(19)
     certified = 0
     for motion in _motions_from(name, _too_close(arrays, random, 100), random):
