@@ -223,16 +223,16 @@ def _show_ros(duration: float, rate: float, console: Console, json: bool) -> Non
     from q2r2_control.benchmark.ros_load import measure_load
     from q2r2_control.benchmark.ros_press import measure_presses
 
+    # Each table as soon as it is measured: what fails later takes nothing away.
+    out = Console(quiet=json)
     latency = measure_latency(DEMO_CONFIG, duration, rate, _progress(console))
+    out.print(latency_table(latency))
     presses = measure_presses(DEMO_CONFIG, _starts(duration), _progress(console))
+    out.print(presses_table(presses))
     load = measure_load(DEMO_CONFIG, duration, _progress(console))
+    out.print(load_table(load))
     if json:
         print(as_json_text(latency.as_json() | {"presses": presses.as_json(), "load": load.as_json()}))
-    else:
-        out = Console()
-        out.print(latency_table(latency))
-        out.print(presses_table(presses))
-        out.print(load_table(load))
 
 
 def _starts(duration: float) -> int:
