@@ -32,14 +32,14 @@ BOX = {"x": [0.3, 0.8], "y": [0.0, 0.6], "z": [0.1, 0.7]}
 
 @pytest.fixture(scope="module")
 def circle(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Both arms on a circle for half a second, after they were engaged."""
-    return file_of(record(tmp_path_factory.mktemp("recordings"), pipeline(), 1.2))
+    """Both arms are engaged, and from 1.2 s on go round a circle for half a second."""
+    return file_of(record(tmp_path_factory.mktemp("recordings"), pipeline(), 1.8))
 
 
 @pytest.mark.parametrize(
     ("trajectory", "plant", "mode", "human", "duration"),
     [
-        ("line", "kinematic", "velocity", False, 1.2),
+        ("line", "kinematic", "velocity", False, 1.8),
         ("rotate", "mujoco", "position", True, 1.2),
         ("meet", "mujoco", "torque", False, 2.0),
     ],
@@ -249,8 +249,8 @@ def test_another_filter_is_named_and_so_is_the_first_difference(circle: Path) ->
     assert [note.split(" ")[1] for note in result.notes] == ["teleop.filter.smoothing_delay:"]
     assert result.difference is not None
     time, _, rest = result.difference.partition(" s: ")
-    assert 0.6 < float(time) < 0.9
-    assert rest.startswith("/q2r2/left/target_frame: ")
+    assert 1.2 < float(time) < 1.4  # where the hand begins to move
+    assert rest.startswith("/q2r2/left/filtered_hand_pose: position")
 
 
 def test_a_file_that_is_no_recording_is_one_line(tmp_path: Path, circle: Path) -> None:
