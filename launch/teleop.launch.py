@@ -22,6 +22,9 @@ def generate_launch_description():
                 "robot", default_value="auto", choices=list(ROBOTS), description="auto: mujoco for controller: builtin"
             ),
             DeclareLaunchArgument("record", default_value="", description="folder for a recording; empty: none"),
+            DeclareLaunchArgument(
+                "separate", default_value="false", choices=["true", "false"], description="each arm a process"
+            ),
             OpaqueFunction(function=_nodes),
         ]
     )
@@ -31,6 +34,7 @@ def _nodes(context):
     given = [LaunchConfiguration(name).perform(context) for name in ("config", "input", "robot")]
     folder = LaunchConfiguration("record").perform(context)
     recording = {"folder": folder} if folder else None
+    separate = LaunchConfiguration("separate").perform(context) == "true"
     return [
         Node(
             package="q2r2_control",
@@ -40,5 +44,5 @@ def _nodes(context):
             parameters=[{key: ParameterValue(value, value_type=type(value)) for key, value in node.parameters.items()}],
             on_exit=Shutdown(reason=f"{node.name} ended"),
         )
-        for node in nodes_of(*given, recording)
+        for node in nodes_of(*given, recording, separate)
     ]

@@ -63,6 +63,9 @@ def up(
     record: Annotated[
         str | None, typer.Option(metavar="DIR", help="Record what the nodes publish to a new folder in DIR.")
     ] = None,
+    separate: Annotated[
+        bool, typer.Option("--separate", help="A process for each arm's node, not one for both, which takes less time.")
+    ] = False,
     task: Task = None,
     operator: Operator = None,
 ) -> None:
@@ -74,5 +77,5 @@ def up(
     """
     notes = notes_of(task, operator, record)
     recording = None if record is None else {"folder": record, **notes}
-    nodes = nodes_of(config, input.value, robot.value, recording)
+    nodes = nodes_of(config, input.value, robot.value, recording, separate)
     raise typer.Exit(run_together(nodes, lambda line: print(line, flush=True)))

@@ -175,6 +175,11 @@ def run_node(make: Callable[[], Node], args: Sequence[str] | None = None) -> int
 
     A wrong configuration is one line on stderr and exit code 2. ``node.close()`` is called if there is one.
     """
+    return run_nodes([make], args)
+
+
+def run_nodes(makes: Sequence[Callable[[], Node]], args: Sequence[str] | None = None) -> int:
+    """The same for several nodes in one process and thread: what ends one of them ends all."""
     name = sys.argv[0].rsplit("/", 1)[-1]
     set_up_middleware(os.environ)
     try:
@@ -185,15 +190,19 @@ def run_node(make: Callable[[], Node], args: Sequence[str] | None = None) -> int
     stop = StopRequest()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.ask())
-    node: Any = None
+    nodes: list[Any] = []
     try:
-        node = make()
-        executor = TickExecutor() if getattr(node, "ticks", False) else SingleThreadedExecutor()
-        executor.add_node(node)
+        for make in makes:
+            nodes.append(make())
+        executor = TickExecutor() if all(getattr(node, "ticks", False) for node in nodes) else SingleThreadedExecutor()
+        for node in nodes:
+            executor.add_node(node)
+        for timer in [timer for node in nodes for timer in node.timers if not timer.is_canceled()]:
+            timer.reset()  # from now on: nodes of one rate tick at one moment, for which the process wakes once
         # What there is now stays: a collection of all of it would take longer than a tick.
         gc.collect()
         gc.freeze()
-        while rclpy.ok() and not stop.asked and getattr(node, "exit_code", None) is None:
+        while rclpy.ok() and not stop.asked and _exit_code(nodes) is None:
             executor.spin_once(timeout_sec=0.1)
     except (Q2R2Error, ParameterException) as error:
         print(f"{name}: {error}", file=sys.stderr)
@@ -201,9 +210,15 @@ def run_node(make: Callable[[], Node], args: Sequence[str] | None = None) -> int
     except ExternalShutdownException:
         pass
     finally:
-        if node is not None:
+        for node in reversed(nodes):
             if hasattr(node, "close"):
                 node.close()
             node.destroy_node()
         rclpy.try_shutdown()
-    return getattr(node, "exit_code", None) or 0
+    return _exit_code(nodes) or 0
+
+
+def _exit_code(nodes: Sequence[Any]) -> int | None:
+    """That of the first node that wants to end."""
+    codes = (getattr(node, "exit_code", None) for node in nodes)
+    return next((code for code in codes if code is not None), None)

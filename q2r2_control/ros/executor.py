@@ -37,6 +37,8 @@ _PARAMETERS = (
     "/get_type_description",
 )
 _LONG = 10**18  # [ns]
+# Timers of one rate that are due so soon after one another are waited for together [ns].
+_TOGETHER = 200_000
 _MOST_MESSAGES = 100  # of one subscription between two ticks
 # What nodes have, and its name in wait sets, in the order of a wait set's sizes.
 _KINDS = {
@@ -125,7 +127,8 @@ class TickExecutor(SingleThreadedExecutor):
         left = [timer.handle.time_until_next_call() for timer in self._timers]  # [ns]; None: cancelled
         tick = min((p for p, one in zip(self._periods, left, strict=True) if one is not None), default=0)
         until = [one for p, one in zip(self._periods, left, strict=True) if one is not None and p == tick]
-        longest = min(int(timeout * 1e9), *until, _LONG)
+        together = min(until, default=_LONG) + _TOGETHER
+        longest = min(int(timeout * 1e9), max((one for one in until if one <= together), default=_LONG))
         if longest > 0:
             time.sleep(longest * 1e-9)
         due = [one is not None and one <= longest for one in left]

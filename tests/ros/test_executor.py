@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 import pytest
@@ -82,6 +83,19 @@ def test_timers_keep_their_period(ticking: Node, executor: TickExecutor) -> None
     spin_until(executor, lambda: len(ticks) == 50)
     # A stall of the machine leaves ticks out; none comes early.
     assert ticks[-1] - ticks[0] > 48.0 * PERIOD
+
+
+def test_timers_of_one_rate_that_are_due_together_run_after_one_wait(ticking: Node, executor: TickExecutor) -> None:
+    log: list[str] = []
+    timers = [ticking.create_timer(10.0 * PERIOD, partial(log.append, name)) for name in ("first", "second")]
+    executor.spin_once(timeout_sec=0.0)
+    for timer in timers:
+        timer.reset()
+    left = [timer.handle.time_until_next_call() for timer in timers]
+    assert 0 <= left[1] - left[0] < 100_000, "microseconds lie between them"
+    while not log:
+        executor.spin_once(timeout_sec=1.0)
+    assert log == ["first", "second"]
 
 
 def test_a_cancelled_timer_and_a_destroyed_subscription_are_silent(ticking: Node, executor: TickExecutor) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import runpy
 import signal
@@ -75,7 +76,7 @@ def test_the_command_starts_and_stops_the_whole_set(processes: Processes) -> Non
         process.wait_for(f"[{name}] ")
     process.wait_for("active: ")
     started = children(process.pid)
-    assert len(started) == len(nodes) == 5
+    assert len(started) == len(nodes) == 4
     assert process.interrupt(60.0) == 0
     assert not any(map(alive, started))
 
@@ -99,20 +100,21 @@ def names(nodes: Sequence[NodeProcess]) -> list[str]:
     return [node.name for node in nodes]
 
 
-ARMS = ["left_arm_controller", "right_arm_controller"]
+TOGETHER = ["arm_controllers"]
+SEPARATE = ["left_arm_controller", "right_arm_controller"]
 
 
 def test_controllers_that_take_the_hands_target_need_no_other(tmp_path: Path) -> None:
     file = external_cell(tmp_path, "fzi", "raw")
-    assert names(nodes_of(file, "headset")) == [*ARMS, "tcp_endpoint"]
-    assert names(nodes_of(file, "none", "mujoco")) == ["mujoco_robot", *ARMS]
+    assert names(nodes_of(file, "headset")) == [*TOGETHER, "tcp_endpoint"]
+    assert names(nodes_of(file, "none", "mujoco")) == ["mujoco_robot", *TOGETHER]
     assert all(node.parameters == {"config": file} for node in nodes_of(file, "none"))
 
 
 def test_controllers_that_take_what_the_built_in_one_allows_get_it_without_joint_commands(tmp_path: Path) -> None:
     file = external_cell(tmp_path, "fzi", "filtered", world_frame="cell")
     nodes = nodes_of(file)
-    assert names(nodes) == ["cartesian_controller", *ARMS, "SimulationInput"]
+    assert names(nodes) == ["cartesian_controller", *TOGETHER, "SimulationInput"]
     assert nodes[0].parameters == {
         "config": file,
         "output": "none",
@@ -142,6 +144,14 @@ def test_controllers_of_joints_get_them_from_the_built_in_one_each_on_its_topic(
         assert parameters[f"{arm}.target_frame_id"] == "bh_robot_base"
 
 
+def test_arms_have_a_process_each_where_that_is_asked_for_or_they_are_not_linked(tmp_path: Path) -> None:
+    assert names(nodes_of(CONFIG, "none"))[2:] == TOGETHER
+    assert names(nodes_of(CONFIG, "none", separate=True))[2:] == SEPARATE
+    file = tmp_path / "not_linked.yaml"
+    file.write_text(yaml.safe_dump(external() | {"teleop": {"linked": False}}))
+    assert names(nodes_of(str(file), "none")) == SEPARATE
+
+
 def test_a_cell_with_one_arm_has_one_arms_nodes(tmp_path: Path) -> None:
     cell = external() | {"controller": "builtin"}
     del cell["external"], cell["arms"]["right"]
@@ -153,7 +163,8 @@ def test_a_cell_with_one_arm_has_one_arms_nodes(tmp_path: Path) -> None:
 def test_every_node_of_a_set_is_an_executable(tmp_path: Path) -> None:
     scripts: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
     for source in SOURCES:
-        for node in nodes_of(CONFIG, source, "mujoco", {"folder": "recordings"}):
+        sets = (nodes_of(CONFIG, source, "mujoco", {"folder": "recordings"}, separate) for separate in (True, False))
+        for node in itertools.chain(*sets):
             module, _, function = scripts[node.name].partition(":")
             assert module == executables.__name__
             assert node.module == f"q2r2_control.ros.nodes.{executables.MODULES[node.name]}"
@@ -195,15 +206,22 @@ def test_the_launch_file_starts_what_the_command_starts(
     launch_file: Any, tmp_path: Path, preset: str, source: str, folder: str
 ) -> None:
     config = CONFIG if preset == "builtin" else external_cell(tmp_path, preset, "filtered")
+    recording = {"folder": folder} if folder else None
     *arguments, nodes = launch_file["generate_launch_description"]().given[0]
     assert {argument.given[0]: argument.named["default_value"] for argument in arguments} == {
         "config": CONFIG,
         "input": "scripted",
         "robot": "auto",
         "record": "",
+        "separate": "false",
     }
-    actions = nodes.named["function"]({"config": config, "input": source, "robot": "auto", "record": folder})
-    expected = nodes_of(config, source, recording={"folder": folder} if folder else None)
+    given = {"config": config, "input": source, "robot": "auto", "record": folder}
+    actions = nodes.named["function"](given | {"separate": "false"})
+    apart = nodes.named["function"](given | {"separate": "true"})
+    assert [action.named["executable"] for action in apart] == names(
+        nodes_of(config, source, separate=True, recording=recording)
+    )
+    expected = nodes_of(config, source, recording=recording)
     assert ("recorder" in names(expected)) == bool(folder)
     assert [(action.named["package"], action.named["executable"]) for action in actions] == [
         ("q2r2_control", node.name) for node in expected

@@ -20,6 +20,7 @@ MODULES = {
     "recorder": "recorder",
     "left_arm_controller": "left_arm_controller",
     "right_arm_controller": "right_arm_controller",
+    "arm_controllers": "arm_controllers",
 }
 
 
@@ -43,6 +44,7 @@ mujoco_robot = _executable("mujoco_robot")
 recorder = _executable("recorder")
 left_arm_controller = _executable("left_arm_controller")
 right_arm_controller = _executable("right_arm_controller")
+arm_controllers = _executable("arm_controllers")
 
 if __name__ == "__main__":
     sys.exit(_executable(sys.argv.pop(1))())

@@ -34,7 +34,7 @@ _EXECUTABLES = "q2r2_control.ros.launch.executables"
 
 @dataclass(frozen=True, slots=True)
 class NodeProcess:
-    """One node to start: its executable's name, its module, and its parameters."""
+    """One process to start: its executable's name, its module, and the parameters of its nodes."""
 
     name: str
     module: str
@@ -47,9 +47,15 @@ class NodeProcess:
 
 
 def nodes_of(
-    path: str, source: str = "scripted", robot: str = "auto", recording: Mapping[str, str] | None = None
+    path: str,
+    source: str = "scripted",
+    robot: str = "auto",
+    recording: Mapping[str, str] | None = None,
+    separate: bool = False,
 ) -> list[NodeProcess]:
-    """The nodes for a cell's YAML, in the order of their start.
+    """The processes for a cell's YAML, in the order of their start: one for both arms, one for each other node.
+
+    ``separate``: one for each arm, as in a cell whose arms are not linked: there one arm goes on without the other.
 
     ``source`` of the hands: scripted, headset or none. ``robot``: mujoco, none, or auto, which is mujoco for
     ``controller: builtin`` only. ``recording``: parameters of the recorder, None without one; it starts first, and so
@@ -69,7 +75,9 @@ def nodes_of(
         nodes.append(_node("cartesian_controller", config | felt))
     elif cell.external.filtered:
         nodes.append(_node("cartesian_controller", config | _relayed(cell.external)))
-    nodes += [_node(f"{arm}_arm_controller", config) for arm in SIDES if arm in cell.arms]
+    arms = [f"{arm}_arm_controller" for arm in SIDES if arm in cell.arms]
+    together = cell.teleop.linked and not separate and len(arms) == len(SIDES)
+    nodes += [_node(name, config) for name in (["arm_controllers"] if together else arms)]
     if source == "scripted":
         nodes.append(NodeProcess("SimulationInput", "q2r2_control.ros.nodes.simulation_input"))
     elif source == "headset":
