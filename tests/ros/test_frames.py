@@ -113,3 +113,14 @@ def test_two_publishers_of_a_frame_are_told_once_and_block_the_tool_only_if_they
     wait_until(lambda: listener.advice is None, "it is over when one ends")
     for timer in timers:
         node.destroy_timer(timer)
+
+
+def test_nodes_of_one_process_read_each_message_once() -> None:
+    from q2r2_control.ros.monitoring.frame_senders import frame_reader
+
+    message = serialize_message(TFMessage(transforms=[stamped_transform("world", "tool", pin.SE3.Identity())]))
+    first, second = frame_reader(), frame_reader()
+    assert first(message) is second(bytes(bytearray(message)))
+    other = serialize_message(TFMessage(transforms=[stamped_transform("world", "hand", pin.SE3.Identity())]))
+    assert [transform.child_frame_id for transform in first(other)] == ["hand"]
+    assert [transform.child_frame_id for transform in second(message)] == ["tool"]

@@ -241,3 +241,25 @@ def result_of(client: ActionClient, position: float) -> Any:
     ended = sent.result().get_result_async()
     wait_until(ended.done, "the goal has ended")
     return ended.result().result
+
+
+def test_external_torques_come_as_often_as_hands_feel_them_each_with_one_of_the_joint_states(cell: Cell) -> None:
+    states: list[tuple[int, int]] = []
+    torques: list[tuple[int, int]] = []
+
+    def stamp_of(message: JointState) -> tuple[int, int]:
+        return message.header.stamp.sec, message.header.stamp.nanosec
+
+    listen = cell.node.create_subscription
+    listening = [
+        listen(JointState, "joint_states", lambda message: states.append(stamp_of(message)), 1000),
+        listen(JointState, "/mujoco_robot/external_torque", lambda message: torques.append(stamp_of(message)), 1000),
+    ]
+    wait_until(lambda: len(torques) > 40, "external torques come")
+    for subscription in listening:
+        cell.node.destroy_subscription(subscription)
+    ticks = [states.index(stamp) for stamp in torques[1:] if stamp in states]
+    assert len(ticks) > 30, "a robot's torques are of the tick of its joint states"
+    # One in five of 250 Hz; ticks that a busy machine leaves out make gaps shorter, none longer.
+    assert 3 <= np.median(np.diff(ticks)) <= 5
+    assert np.diff(ticks).max() <= 5

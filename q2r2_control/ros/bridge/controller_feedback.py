@@ -34,6 +34,7 @@ class ControllerFeedback:
         self._safe_targets = {
             arm: node.create_publisher(PoseStamped, f"~/safe_target/{arm}", SENT_COMMAND_QOS) for arm in targets.topics
         }
+        self._message = PoseStamped()  # of the safe target that is being sent
         self._follows: dict[str, bool | None] = dict.fromkeys(targets.topics)
         self._following = {arm: node.create_publisher(Bool, f"~/following/{arm}", LATCHED_QOS) for arm in self._follows}
         self._conditions = ConditionPublishers(node, self._follows, ArmConditions(controller))
@@ -62,7 +63,7 @@ class ControllerFeedback:
             if publisher.get_subscription_count():
                 frame = self._targets.frames[arm]
                 tool = frame.pose.actInv(self._controller.tool_pose(arm))
-                publish_in_time(publisher, stamped_pose(tool, frame.name, now), decided)
+                publish_in_time(publisher, stamped_pose(tool, frame.name, now, self._message), decided)
 
     def _show_distance(self) -> None:
         if self._reference is not None and self._distances.get_subscription_count():

@@ -68,12 +68,13 @@ def write_transform(position: Array, quaternion: Array, message: Transform) -> N
     _write(position, quaternion, message.translation, message.rotation)
 
 
-def stamped_pose(pose: pin.SE3, frame: str, t: float) -> PoseStamped:
-    """A pose in ``frame`` at ``t`` [s]."""
-    message = PoseStamped()
+def stamped_pose(pose: pin.SE3, frame: str, t: float, message: PoseStamped | None = None) -> PoseStamped:
+    """A pose in ``frame`` at ``t`` [s]; written into ``message`` where one is sent again and again."""
+    message = message or PoseStamped()
     message.header.frame_id = frame
     message.header.stamp = time_message(t)
-    message.pose = pose_message(pose)
+    to = message.pose
+    _write(pose.translation, pin.Quaternion(pose.rotation).normalized().coeffs(), to.position, to.orientation)
     return message
 
 

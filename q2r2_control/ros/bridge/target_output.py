@@ -56,7 +56,9 @@ class TargetOutput:
         self.last_sent: pin.SE3 | None = None  # what the controller was asked for last, world frame; None: nothing
         self._restarted = False
         self._endpoints: set[bytes] = set()  # of the controller
+        self._message = PoseStamped()  # that is being sent
         self._listeners = 0
+        self._counted = 0, -math.inf  # subscribers that are present, and when they were counted [s]
         self._unknown = False  # a subscriber's node is not known yet
         self._asked_at = self._appeared_at = -math.inf  # the graph, and a subscriber [s]
         self.starts = 0  # how often the controller has appeared
@@ -93,7 +95,7 @@ class TargetOutput:
 
     def take_fault(self, now: float) -> str | None:
         """Check the subscribers; returns once why the controller that is driven is not there any more."""
-        listeners = self._present
+        listeners = self._present(now)
         if listeners > self._listeners or listeners == 0:
             self._appeared_at = now
             if not self.following:
@@ -130,7 +132,7 @@ class TargetOutput:
         the controller reads its targets. All are in the world frame; the latter two are None while not known.
         ``decided``: see :func:`publish_in_time`; ``start``: where a stream begins, by default at its first target.
         """
-        if self._unknown or self._present > self._listeners:
+        if self._unknown or self._present(now) > self._listeners:
             return None
         idle = not self.following and self.guard.at_rest
         self.following = target is not None
@@ -143,7 +145,7 @@ class TargetOutput:
             return None
         if self.following and self._publisher.waits():
             return pose
-        if self._publisher.publish(stamped_pose(base.actInv(pose), self._frame, now), decided):
+        if self._publisher.publish(stamped_pose(base.actInv(pose), self._frame, now, self._message), decided):
             self.last_sent = pose
         return pose
 
@@ -153,10 +155,11 @@ class TargetOutput:
         self.last_sent = None
         self.guard.reset(None, now)
 
-    @property
-    def _present(self) -> int:
-        """Number of subscribers; the graph lists one before the publisher can send to it."""
-        return max(self._publisher.listeners, self._node.count_subscribers(self.topic))
+    def _present(self, now: float) -> int:
+        """Number of subscribers in the tick of ``now``; the graph lists one before the publisher can send to it."""
+        if self._counted[1] != now:
+            self._counted = max(self._publisher.listeners, self._node.count_subscribers(self.topic)), now
+        return self._counted[0]
 
     def _holds(self, tool: pin.SE3 | None, now: float) -> bool:
         """Whether the last target may be repeated."""

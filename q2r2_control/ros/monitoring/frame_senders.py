@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import cache, lru_cache
 from typing import Any
 
 from rclpy.serialization import serialize_message
@@ -12,6 +13,7 @@ from tf2_msgs.msg import TFMessage
 
 from q2r2_control.supervision.sequence_watch import SequenceWatch
 
+_KEPT = 16  # messages that one node of a process has read and another may still have to
 _TF = "tf2_msgs/msg/TFMessage"
 _PAUSE = 1.0  # after a silence of this long a publisher may have been restarted [s]
 _REMEMBERED = 2.0  # a frame counts as sent by two for this long after it was last found to be [s]
@@ -43,14 +45,16 @@ class FrameSenders:
         return tuple(sorted(frame for frame, at in self._shared.items() if now - at <= _REMEMBERED))
 
 
+@cache
 def frame_reader() -> Callable[[bytes], Sequence[Any]]:
-    """A function that reads the transforms in a serialized message; none where it is no message.
+    """A function that reads the transforms in a serialized message, not to be changed; none where it is no message.
 
     A robot's message has dozens of transforms, fifty times a second, of which a node needs a few. So rosbags reads
-    them, which makes no checked message object of each as rclpy does.
+    them, which makes no checked message object of each as rclpy does; and each once for all nodes of a process.
     """
     deserialize: Any = get_typestore(Stores.ROS2_JAZZY).deserialize_cdr
 
+    @lru_cache(maxsize=_KEPT)
     def read(message: bytes) -> Sequence[Any]:
         try:
             transforms: Sequence[Any] = deserialize(message, _TF).transforms

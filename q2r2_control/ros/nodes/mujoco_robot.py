@@ -36,7 +36,7 @@ from q2r2_control.ros.bridge.link_frames import LinkFrames
 from q2r2_control.ros.bridge.messages import age, delay, joint_state_message, seconds
 from q2r2_control.ros.managed_node import ManagedNode
 from q2r2_control.supervision.delay_watch import DelayWatch
-from q2r2_control.types import RobotState
+from q2r2_control.types import Array, RobotState
 
 _LOG_PERIOD = 1.0  # of lines about one topic [s]
 
@@ -51,6 +51,11 @@ class MujocoRobot(ManagedNode):
         config = load_config(self.parameter("config", "config/dual_iiwa7.yaml", "YAML of the cell"))
         rate = self.parameter("rate", 250.0, "joint states per second [Hz]", at_least=20, at_most=1000)
         tf_rate = self.parameter("tf_rate", 50.0, "transforms per second [Hz]", at_least=1, at_most=1000)
+        # Hands feel it fifty times a second; an admittance needs it in every tick.
+        felt = rate if config.admittance.enabled else 50.0
+        what = "external torques per second, as often as joint states at most [Hz]"
+        self._external_period = 1.0 / self.parameter("external_torque_rate", felt, what, at_least=20, at_most=1000)
+        self._external_due = 0.0  # [s]
         hold_after = self.parameter("hold_after", 0.1, "without commands [s]", at_least=0.01, at_most=1)
         max_jump = self.parameter("max_jump", 0.1, "of a commanded position [rad]", at_least=0.001, at_most=7)
         stroke = Stroke(
@@ -170,12 +175,18 @@ class MujocoRobot(ManagedNode):
         self._ticks += 1
         stamp = self.now
         self._joint_states.publish(self._measured(state, stamp))
-        if state.tau_external is not None and self._external.get_subscription_count():
-            names, zero = self._robot.joint_names, np.zeros(0)
-            self._external.publish(joint_state_message(names, zero, zero, state.tau_external, stamp))
+        if state.tau_external is not None and now >= self._external_due:
+            # On a grid, half a tick early so that no tick of the grid is too early by its jitter.
+            self._external_due = max(self._external_due + self._external_period, now - 0.5 * self._period)
+            self._publish_external(state.tau_external, stamp)
         openings = cell.plant.gripper_openings()
         for arm, gripper in self._grippers.items():
             gripper.update(now, openings[arm], cell.gripper_force(arm))
+
+    def _publish_external(self, torques: Array, stamp: float) -> None:
+        if self._external.get_subscription_count():
+            names, zero = self._robot.joint_names, np.zeros(0)
+            self._external.publish(joint_state_message(names, zero, zero, torques, stamp))
 
     def _measured(self, state: RobotState, stamp: float) -> JointState:
         cell = self._cell
