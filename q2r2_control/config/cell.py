@@ -107,6 +107,9 @@ class MujocoConfig(CellModel):
         le=1,
         description="of the rotors' inertia that the joints feel; a torque loop on the joint hides most",
     )
+    obstacle_friction: float = Field(
+        0.6, ge=0, le=1.5, description="of what touches obstacles; metal on wood 0.3, rubber on wood up to 0.9"
+    )
     objects: dict[str, ObjectConfig] = Field(default_factory=dict, description="loose boxes by name")
 
 

@@ -16,6 +16,14 @@ from q2r2_control.config.cell import Config, MujocoConfig
 from q2r2_control.errors import PlantError
 from q2r2_control.plants.mujoco_cameras import add_cameras
 from q2r2_control.plants.mujoco_meshes import is_readable, load_meshes
+from q2r2_control.plants.mujoco_obstacles import (
+    FRICTION_IMPEDANCE,
+    PAD_PRIORITY,
+    ROLLING,
+    TORSION,
+    let_fingers_slide,
+    set_obstacles,
+)
 from q2r2_control.plants.scene import COLLISION_GROUP, ENVELOPE_GROUP, VISUAL_GROUP, furnish
 from q2r2_control.robot.model_srdf import ENVELOPE
 from q2r2_control.robot.pairs import link_of, pair_names
@@ -27,17 +35,12 @@ _MIN_DAMPING = 0.2
 # [kg m^2]: a thousandth of what a drive's rotor adds to its joint.
 _NEGLIGIBLE_INERTIA = 1e-6
 
-# Rubber on a box: sliding 1, and torsion [m] and rolling [m] of a pad of about a square centimetre.
-_PAD_FRICTION = (1.0, 0.02, 0.001)
+# Rubber on a box.
+_PAD_FRICTION = (1.0, TORSION, ROLLING)
 
 # Time constant [s] and damping ratio of a finger's contacts: MuJoCo scales their stiffness with the inertia behind
 # them, which is small in a finger, and with its usual 0.02 s the grip would sink millimetres into what it holds.
 _PAD_STIFFNESS = (0.004, 1.0)
-
-# Wood under rubber or plastic, and MuJoCo's usual time constant [s] and damping ratio: the pads' would make a table of
-# millions of N/m of it, with the inertia of a whole arm behind them.
-_OBSTACLE_FRICTION = (0.6, 0.02, 0.001)
-_OBSTACLE_STIFFNESS = (0.02, 1.0)
 
 # A finger servo gives its full force at this part of the stroke.
 _FINGER_SERVO_BAND = 0.05
@@ -55,10 +58,11 @@ def build_model(robot: Robot, config: Config) -> mujoco.MjModel:
         _correct_inertias(spec)
         _set_solver(spec, config.mujoco)
         _set_shapes(spec, _capsules(robot.urdf))
-        _set_obstacles(spec, config)
+        set_obstacles(spec, config)
         _set_arm_joints(spec, robot, config.mujoco)
         _set_grippers(spec, robot, config)
         _exclude_contacts(spec, robot)
+        let_fingers_slide(spec, config)
         _add_objects(spec, config.mujoco)
         add_cameras(spec, config.simulated_cameras)
         furnish(spec, floor=config.floor is not None)
@@ -100,7 +104,7 @@ def _set_solver(spec: mujoco.MjSpec, config: MujocoConfig) -> None:
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     # The elliptic cone with this ratio keeps what is grasped from creeping out of the fingers.
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
-    spec.option.impratio = 10
+    spec.option.impratio = FRICTION_IMPEDANCE
 
 
 def _correct_inertias(spec: mujoco.MjSpec) -> None:
@@ -133,14 +137,6 @@ def _set_shapes(spec: mujoco.MjSpec, capsules: set[str]) -> None:
                 geom.group, geom.contype, geom.conaffinity = ENVELOPE_GROUP, 0, 0
             elif drawn:
                 geom.group = COLLISION_GROUP
-
-
-def _set_obstacles(spec: mujoco.MjSpec, config: Config) -> None:
-    """Contacts of what stands in the cell; they count before those of the pads."""
-    for name in config.obstacles:
-        for geom in spec.body(name).geoms:
-            geom.condim, geom.friction, geom.solref = 4, _OBSTACLE_FRICTION, _OBSTACLE_STIFFNESS
-            geom.priority = 2
 
 
 def _set_arm_joints(spec: mujoco.MjSpec, robot: Robot, config: MujocoConfig) -> None:
@@ -179,7 +175,7 @@ def _set_grippers(spec: mujoco.MjSpec, robot: Robot, config: Config) -> None:
         for name in moved:
             for geom in spec.joint(name).parent.geoms:
                 geom.condim, geom.friction, geom.solref = 4, _PAD_FRICTION, _PAD_STIFFNESS
-                geom.priority = 1
+                geom.priority = PAD_PRIORITY
         # The joint limits keep the fingers apart already.
         for first, second in combinations(moved, 2):
             _exclude(spec, spec.joint(first).parent.name, spec.joint(second).parent.name)

@@ -116,6 +116,7 @@ def test_a_misspelt_key_is_named_before_the_one_that_is_missing_for_it(tmp_path:
         ("cameras", {"front/left": {"position": [1, 0, 1], "rpy": [0, 0, 0]}}, "should match pattern"),
         ("mujoco.timestep", 0.01, "less than or equal to 0.001"),
         ("mujoco.rotor_share", 0.0, "greater than or equal to 0.01"),
+        ("mujoco.obstacle_friction", 2.0, "less than or equal to 1.5"),
         ("loop_rate_hz", 1, "greater than or equal to 50"),
         ("loop_rate_hz", 1e300, "less than or equal to 2000"),
         ("loop_rate_hz", 10**400, "finite number"),

@@ -1,0 +1,68 @@
+"""What obstacles feel like in MuJoCo: which contacts are named, and how deep a finger is that slides."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+
+from q2r2_control.config import Config
+from q2r2_control.plants.mujoco import MujocoPlant
+from q2r2_control.plants.mujoco_obstacles import let_fingers_slide, set_obstacles
+from q2r2_control.robot.robot import Robot
+from q2r2_control.types import Array
+
+LOAD = 20.0  # [N]
+MASS = 0.1  # of the pad; MuJoCo scales stiffness with what moves most easily, as a finger in its gripper does [kg]
+
+
+def test_every_pad_and_the_table_are_named_with_the_cells_friction(robot: Robot, config: Config) -> None:
+    slippery = config.mujoco.model_copy(update={"obstacle_friction": 0.3})
+    model = MujocoPlant(robot, config.model_copy(update={"mujoco": slippery})).model
+    table = model.geom("table_collision").id
+    pads = {
+        index
+        for index in range(model.ngeom)
+        if model.geom_contype[index] and "_finger_" in model.body(model.geom_bodyid[index]).name
+    }
+    named = {frozenset(pair) for pair in zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True)}
+    assert len(pads) >= 4
+    assert named == {frozenset((pad, table)) for pad in pads}
+    np.testing.assert_array_equal(model.pair_friction[:, :2], 0.3)
+    assert model.geom_friction[table, 0] == 0.3
+    # How the table bears a finger is what it is for everything else.
+    np.testing.assert_array_equal(model.pair_solref, np.tile(model.geom_solref[table], (model.npair, 1)))
+
+
+def depths(config: Config, speed: float, named: bool) -> Array:
+    """How deep in the table a pad is, at each millisecond, that :data:`LOAD` presses and that is led along it [m]."""
+    spec = mujoco.MjSpec()
+    spec.option.cone, spec.option.impratio = mujoco.mjtCone.mjCONE_ELLIPTIC, 100.0
+    spec.option.gravity = (0.0, 0.0, -LOAD / MASS)
+    table = spec.worldbody.add_body(name="table")
+    table.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=(5.0, 1.0, 0.1), pos=(0.0, 0.0, -0.1))
+    finger = spec.worldbody.add_body(name="finger", pos=(0.0, 0.0, 0.01))
+    for name, axis, rotors in (("x", (1, 0, 0), 100.0), ("z", (0, 0, 1), 0.0)):
+        finger.add_joint(name=name, type=mujoco.mjtJoint.mjJNT_SLIDE, axis=axis, armature=rotors)
+    finger.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=(0.01, 0.01, 0.01), mass=MASS, priority=1)
+    set_obstacles(spec, config)
+    if named:
+        let_fingers_slide(spec, config)
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    seen = []
+    for step in range(2000):
+        data.joint("x").qvel = speed
+        mujoco.mj_step(model, data)
+        if step > 1500:
+            seen.append(-data.joint("z").qpos[0])
+    return np.array(seen)
+
+
+def test_a_finger_stays_in_contact_and_about_as_deep_when_it_slides(config: Config) -> None:
+    """Were friction as quick as what bears the finger, it would rise by all of its depth, and hop."""
+    still = depths(config, 0.0, named=True)
+    np.testing.assert_allclose(still, depths(config, 0.0, named=False), rtol=0.01)
+    sliding = depths(config, 0.1, named=True)
+    assert sliding.min() > 0.6 * still.mean()
+    assert sliding.max() <= still.max()
+    assert depths(config, 0.1, named=False).min() < 0.0
