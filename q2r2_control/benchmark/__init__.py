@@ -5,7 +5,8 @@ two-armed work, one motion and one controller at a time by ``motion_run``, which
 runs the same motions from hand samples to arms in MuJoCo, by ``stack_run``. ``loop_times`` tells where a tick of the
 live loop goes, by ``stage_clock``, and ``feel_run`` what an operator feels of a filter. ``command_responses`` finds the
 commands that answer steps of an input, ``press_times`` what follows a press; ``ros_latency`` and ``ros_press``, which
-need ROS, record them.
+need ROS, record them. ``press_run`` presses a finger on the table, and ``sliding_stability`` tells from which
+friction on such a slide chatters by itself.
 """
 
 from __future__ import annotations

@@ -1,18 +1,21 @@
 """A finger that presses on the table on purpose, in torque mode: the whole of controller, impedance and MuJoCo.
 
 The left tool is asked to go straight down until :data:`COMMANDED` inside the table, much faster than contact allows,
-stays, slides away from the arm's base while it presses, and is lifted. That way is the hardest: the arm moves in its
-own plane, where pressing and sliding are coupled by its masses. What the table feels is read from MuJoCo's contacts at
-every tick.
+stays, slides away from the arm's base or towards it while it presses, and is lifted. That way is the hardest: the arm
+moves in its own plane, where pressing and sliding are coupled by its masses. What the table feels is read from MuJoCo's
+contacts at every tick; MuJoCo's table is soft, so :mod:`sliding_stability` says from which friction on a harder one
+would make the slide chatter.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import StrEnum
 
 import numpy as np
 import pinocchio as pin
 
+from q2r2_control.benchmark.sliding_stability import chatter_friction
 from q2r2_control.config import Config
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.drives.torque import TorqueDrive
@@ -29,21 +32,32 @@ from q2r2_control.verification.contract import Contract
 
 COMMANDED = 0.010  # inside the table [m]
 _ARM, _TABLE = "left", "table"
-_PLACE = (0.50, 0.40)  # x and y [m]
+_Y = 0.40  # of all the run [m]
+_SPAN = (0.50, 0.60)  # of x, over which it slides [m]
 _HEIGHT, _LOWEST, _RISE = 0.30, 0.10, 0.10  # of the tool before, at least, and after [m]
 _APPROACH_SPEED = 0.5  # asked for, far above what contact allows [m/s]
-_SLIDE = 0.10  # [m]
 # Times at which parts of the run begin [s].
 _DOWN, _SLIDING, _LIFT, _END = 2.5, 6.0, 8.5, 10.5
 _APPROACH, _SLIDE_TIME = 2.0, 1.5  # [s]
 _SETTLED = 1.0  # of a part, after which force is steady [s]
+# Of a finger with a rubber pad and of a bare metal one on hard wood, in orders of magnitude [N/m].
+PAD_STIFFNESS, METAL_STIFFNESS = 1e5, 1e6
+
+
+class Slide(StrEnum):
+    """Where a press slides to, as seen from the arm's base."""
+
+    AWAY = "away"
+    TOWARDS = "towards"
 
 
 @dataclass(frozen=True, slots=True)
 class PressFigures:
     """One press. Forces are the table's normal force on the hand [N]."""
 
+    slide: Slide
     rotor_share: float
+    friction: float
     impact_speed: float  # of the tool in the tick before it first touches [m/s]
     impact_force: float  # greatest in the first 0.25 s of contact [N]
     steady_force: float  # mean while it stays [N]
@@ -52,20 +66,50 @@ class PressFigures:
     bound: float  # stiffness times the depth that the reference may have [N]
     bounce_s: float  # without contact from the first touch to the slide [s]
     lost_contact_s: float  # the same from there to the lift [s]
-    slide_error_mm: float  # tool against target along the table at the slide's end [mm]
-    slide_force: float  # mean while it slides and after [N]
+    slide_error_mm: float  # tool behind its target along the table when the slide has just ended [mm]
+    friction_lag_mm: float  # friction times the mean force over the stiffness: what that has to be [mm]
+    slide_force: float  # mean while it slides [N]
+    slide_least: float  # and the extremes [N]
+    slide_largest: float
+    pad_chatter: float  # friction from which such a slide is unstable on a contact of PAD_STIFFNESS; inf: none up to 2
+    metal_chatter: float  # of METAL_STIFFNESS
     violations: int  # of the controller's promises, over all ticks
 
 
-def run_press(config: Config, rotor_share: float) -> PressFigures:
+# Slides with the rotor share and the friction of each: metal on wood, the cell's own, and rubber that grips well.
+PRESSES = (
+    *((Slide.AWAY, 1.0, friction) for friction in (0.3, 0.6, 0.9)),
+    (Slide.TOWARDS, 1.0, 0.9),
+    *((slide, 0.1, 0.9) for slide in Slide),
+)
+
+
+def run_press(config: Config, slide: Slide, rotor_share: float, friction: float) -> PressFigures:
     """Press with the cell of ``config``, in which the left fingers and the table may touch.
 
     Raises :class:`ConfigError` where nothing of that arm may touch the table.
     """
-    mujoco = config.mujoco.model_copy(update={"rotor_share": rotor_share})
+    mujoco = config.mujoco.model_copy(update={"rotor_share": rotor_share, "obstacle_friction": friction})
     config = config.model_copy(update={"mujoco": mujoco})
     robot = Robot.from_config(config)
-    depth = _depth(robot, config)
+    bound = config.impedance.translational_stiffness * _depth(robot, config)
+    trace = _press(robot, config, slide)
+    return _figures(robot, config, slide, bound, trace)
+
+
+@dataclass(frozen=True, slots=True)
+class _Trace:
+    """One run, by ticks (n,)."""
+
+    force: Array  # of the table [N]
+    height: Array  # of the tool [m]
+    reference_height: Array
+    behind: Array  # of the target, along the slide [m]
+    q: Array  # (nv,) at the slide's beginning [rad]
+    violations: int
+
+
+def _press(robot: Robot, config: Config, slide: Slide) -> _Trace:
     controller = CartesianController(robot, config.control)
     drive, plant = TorqueDrive(robot, config), MujocoPlant(robot, config)
     contract = Contract(controller, random=np.random.default_rng(0))
@@ -74,18 +118,19 @@ def run_press(config: Config, rotor_share: float) -> PressFigures:
     dt = 1.0 / config.loop_rate_hz
     touch: float | None = None  # height of the tool when it first touched [m]
     ticks = round(_END / dt)
-    force, height, along, reference_height = (np.zeros(ticks) for _ in range(4))
-    frame = robot.arms[_ARM].frame_id
+    force, height, behind, reference_height = (np.zeros(ticks) for _ in range(4))
+    q = robot.home
     for i in range(ticks):
         t = i * dt
         state = plant.state()
-        target = pin.SE3(start.rotation, _asked(t, start.translation, touch))
+        target = pin.SE3(start.rotation, _asked(t, start.translation, touch, slide))
         reference = controller.step({_ARM: target}, dt)
         contract.observe(reference, dt)
         pin.forwardKinematics(robot.model, data, state.q)
-        measured = pin.updateFramePlacement(robot.model, data, frame).translation
-        height[i], along[i] = measured[2], measured[0] - target.translation[0]
+        measured = pin.updateFramePlacement(robot.model, data, robot.arms[_ARM].frame_id).translation
+        height[i], behind[i] = measured[2], _along(slide)[0] * (target.translation[0] - measured[0])
         reference_height[i] = controller.tool_pose(_ARM).translation[2]
+        q = state.q if t <= _SLIDING else q
         plant.apply(drive.command(reference, state, {_ARM: 0.0}, dt))
         plant.advance(dt)
         force[i] = pressing_force(
@@ -94,40 +139,65 @@ def run_press(config: Config, rotor_share: float) -> PressFigures:
         if touch is None and force[i] > 0.0:
             touch = height[i]
     plant.close()
-    touching = np.flatnonzero(force > 0.0)
     if touch is None:
         raise ConfigError(f"obstacles.{_TABLE}: not reached by arm {_ARM}; allowed: as in config/dual_iiwa7.yaml")
-    first = int(touching[0])
-    lift, stays = round(_LIFT / dt), slice(round((_DOWN + _SETTLED) / dt), round(_SLIDING / dt))
-    slides = slice(round(_SLIDING / dt), lift)
-    stiffness = config.impedance.translational_stiffness
+    violations = sum(margin.violations for margin in contract.margins.values())
+    return _Trace(force, height, reference_height, behind, q, violations)
+
+
+def _figures(robot: Robot, config: Config, slide: Slide, bound: float, trace: _Trace) -> PressFigures:
+    dt, force, height = 1.0 / config.loop_rate_hz, trace.force, trace.height
+    first = int(np.flatnonzero(force > 0.0)[0])
+    stays = slice(round((_DOWN + _SETTLED) / dt), round(_SLIDING / dt))
+    end = round((_SLIDING + _SLIDE_TIME) / dt)
+    slides, pressed = slice(stays.stop, end), slice(stays.stop, round(_LIFT / dt))
+    settings, sliding = config.impedance, float(force[slides].mean())
+    share, friction = config.mujoco.rotor_share, config.mujoco.obstacle_friction
+    pad, metal = (
+        chatter_friction(robot, settings, _ARM, trace.q, _along(slide), stiffness, share)
+        for stiffness in (PAD_STIFFNESS, METAL_STIFFNESS)
+    )
+    spring = settings.translational_stiffness * (height - trace.reference_height)[stays].mean()
     return PressFigures(
-        rotor_share=rotor_share,
+        slide=slide,
+        rotor_share=share,
+        friction=friction,
         impact_speed=float(height[first - 1] - height[first]) / dt,
         impact_force=float(force[first : first + round(0.25 / dt)].max()),
         steady_force=float(force[stays].mean()),
-        spring_force=float(stiffness * (height - reference_height)[stays].mean()),
+        spring_force=float(spring),
         largest_force=float(force.max()),
-        bound=stiffness * depth,
+        bound=bound,
         bounce_s=float(np.count_nonzero(force[first : slides.start] <= 0.0)) * dt,
-        lost_contact_s=float(np.count_nonzero(force[slides] <= 0.0)) * dt,
-        slide_error_mm=1e3 * float(abs(along[lift - 1])),
-        slide_force=float(force[slides].mean()),
-        violations=sum(margin.violations for margin in contract.margins.values()),
+        lost_contact_s=float(np.count_nonzero(force[pressed] <= 0.0)) * dt,
+        slide_error_mm=1e3 * float(trace.behind[end]),
+        friction_lag_mm=1e3 * friction * sliding / settings.translational_stiffness,
+        slide_force=sliding,
+        slide_least=float(force[pressed].min()),
+        slide_largest=float(force[pressed].max()),
+        pad_chatter=pad,
+        metal_chatter=metal,
+        violations=trace.violations,
     )
 
 
-def _asked(t: float, start: Array, touch: float | None) -> Array:
+def _along(slide: Slide) -> Array:
+    """Direction (3,) of a slide."""
+    return np.array([1.0 if slide is Slide.AWAY else -1.0, 0.0, 0.0])
+
+
+def _asked(t: float, start: Array, touch: float | None, slide: Slide) -> Array:
     """Where the tool is asked to be (3,) [m]."""
-    above = np.array([*_PLACE, _HEIGHT])
+    begin, end = _SPAN if slide is Slide.AWAY else _SPAN[::-1]
+    above = np.array([begin, _Y, _HEIGHT])
     if t < _DOWN:
         return start + minimum_jerk(min(t / _APPROACH, 1.0)) * (above - start)
     bottom = -np.inf if touch is None else touch - COMMANDED
     z = max(_HEIGHT - _APPROACH_SPEED * (t - _DOWN), bottom, _LOWEST)
-    x = _PLACE[0] + _SLIDE * minimum_jerk(min(max(t - _SLIDING, 0.0) / _SLIDE_TIME, 1.0))
+    x = begin + (end - begin) * minimum_jerk(min(max(t - _SLIDING, 0.0) / _SLIDE_TIME, 1.0))
     if t > _LIFT:
         z += minimum_jerk(min((t - _LIFT) / _APPROACH, 1.0)) * _RISE
-    return np.array([x, _PLACE[1], z])
+    return np.array([x, _Y, z])
 
 
 def _depth(robot: Robot, config: Config) -> float:

@@ -13,7 +13,7 @@ from rich.console import Console
 from q2r2_control.benchmark.feel_run import run_feel
 from q2r2_control.benchmark.loop_times import LoopReport, run_loop_bench
 from q2r2_control.benchmark.peers.base import PEERS
-from q2r2_control.benchmark.press_run import run_press
+from q2r2_control.benchmark.press_run import PRESSES, run_press
 from q2r2_control.benchmark.stack_bench import StackReport, run_stack_bench
 from q2r2_control.benchmark.tick_times import run_bench
 from q2r2_control.benchmark.work_bench import WORK_PEERS, run_work_bench
@@ -37,7 +37,6 @@ from q2r2_control.verification.work_motions import WORK_MOTIONS, WorkMotion, mot
 
 _TICKS, _SOAK_TICKS, _SECONDS = 3000, 1_000_000, 30.0
 _CAMERA = CameraConfig(position=(1.9, 0.0, 1.0), look_at=(0.4, 0.0, 0.3), width=320, height=240, rate=10.0)
-_ROTOR_SHARES = (1.0, 0.1)  # all of the rotors' inertia, and what a joint torque loop leaves of it
 _STARTS = 3  # of the set of nodes, for presses; fewer in a short bench
 _RATE = 250.0  # of the controller's node by default [Hz]
 
@@ -178,7 +177,7 @@ def _show_work(motions: Sequence[WorkMotion], peers: tuple[str, ...], console: C
 
 
 def _show_press(config: Config, json: bool) -> NoReturn:
-    figures = [run_press(config, share) for share in _ROTOR_SHARES]
+    figures = [run_press(config, *press) for press in PRESSES]
     if json:
         print(as_json_text({"cell": config.name, "presses": [asdict(press) for press in figures]}))
     else:
