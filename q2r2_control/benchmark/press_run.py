@@ -42,6 +42,7 @@ _APPROACH, _SLIDE_TIME = 2.0, 1.5  # [s]
 _SETTLED = 1.0  # of a part, after which force is steady [s]
 # Of a finger with a rubber pad and of a bare metal one on hard wood, in orders of magnitude [N/m].
 PAD_STIFFNESS, METAL_STIFFNESS = 1e5, 1e6
+MOST_DAMPED = 2.0  # damping ratio
 
 
 class Slide(StrEnum):
@@ -73,6 +74,8 @@ class PressFigures:
     slide_largest: float
     pad_chatter: float  # friction from which such a slide is unstable on a contact of PAD_STIFFNESS; inf: none up to 2
     metal_chatter: float  # of METAL_STIFFNESS
+    pad_chatter_damped: float  # the same two with the largest damping ratio that may be set
+    metal_chatter_damped: float
     violations: int  # of the controller's promises, over all ticks
 
 
@@ -153,8 +156,9 @@ def _figures(robot: Robot, config: Config, slide: Slide, bound: float, trace: _T
     slides, pressed = slice(stays.stop, end), slice(stays.stop, round(_LIFT / dt))
     settings, sliding = config.impedance, float(force[slides].mean())
     share, friction = config.mujoco.rotor_share, config.mujoco.obstacle_friction
-    pad, metal = (
-        chatter_friction(robot, settings, _ARM, trace.q, _along(slide), stiffness, share)
+    pad, metal, pad_damped, metal_damped = (
+        chatter_friction(robot, damped, _ARM, trace.q, _along(slide), stiffness, share)
+        for damped in (settings, settings.model_copy(update={"damping_ratio": MOST_DAMPED}))
         for stiffness in (PAD_STIFFNESS, METAL_STIFFNESS)
     )
     spring = settings.translational_stiffness * (height - trace.reference_height)[stays].mean()
@@ -177,6 +181,8 @@ def _figures(robot: Robot, config: Config, slide: Slide, bound: float, trace: _T
         slide_largest=float(force[pressed].max()),
         pad_chatter=pad,
         metal_chatter=metal,
+        pad_chatter_damped=pad_damped,
+        metal_chatter_damped=metal_damped,
         violations=trace.violations,
     )
 

@@ -16,7 +16,8 @@ touch: speed of the tool when it first touches, and the greatest force in the 0.
 stays: mean force of the table; spring: stiffness times the tool's way from its reference; bound: times depth allowed
 bounce: time without contact until the slide; slides: mean force, extremes and time without contact until the lift
 lag: of the tool at the slide's end, and friction times mean force over stiffness, which it has to be
-chatters: friction from which the slide is unstable on a contact of 100 kN/m (a rubber pad) or 1 MN/m (bare metal)
+chatters: friction from which the slide is unstable on a contact of 100 kN/m (a rubber pad) or 1 MN/m (bare metal);
+    damped: with impedance.damping_ratio 2
 rotor share: of the rotors' inertia that the joints feel (mujoco.rotor_share); friction: mujoco.obstacle_friction"""
 
 
@@ -41,6 +42,8 @@ def press_table(cell: str, figures: Sequence[PressFigures]) -> Table:
         "lag, friction [mm]": [f"{press.friction_lag_mm:.1f}" for press in figures],
         "chatters, pad": [_from(press.pad_chatter) for press in figures],
         "chatters, metal": [_from(press.metal_chatter) for press in figures],
+        "chatters, pad, damped": [_from(press.pad_chatter_damped) for press in figures],
+        "chatters, metal, damped": [_from(press.metal_chatter_damped) for press in figures],
         "largest force [N]": [f"{press.largest_force:.0f}" for press in figures],
         "promises broken": [str(press.violations) for press in figures],
     }
