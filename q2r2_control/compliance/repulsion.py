@@ -63,13 +63,14 @@ class MeasuredSeparation:
         law, self._model, self._data = wall_settings or WallSettings(), robot.model, robot.model.createData()
         collision = collision_model_of(robot)
         pairs, radius = collision.pairs, collision.bodies.radius
+        self._bodies, self._pairs = collision.bodies, pairs
         self._radii = radius[pairs.first] + radius[pairs.second]
-        self._shell, self._smoothing = np.zeros_like(self._radii), np.zeros_like(self._radii)
+        self._shell, self._smoothing, self._deep = (np.zeros_like(self._radii) for _ in range(3))
         self.set_kept_distances(kept_distances(robot, settings).values)
         model = RepulsionModel(
             collision=collision,
             smoothing=self._smoothing,
-            deep=(_DEEP - 1.0) * self._radii,
+            deep=self._deep,
             shell=self._shell,
             stiffness=law.stiffness,
             damping_ratio=law.damping_ratio,
@@ -90,9 +91,15 @@ class MeasuredSeparation:
     def set_openings(self, openings: Mapping[str, Interval]) -> None:
         """Between which openings each arm's gripper is; of an arm that is not named, all of the way."""
         self._fingers.set_all(openings)
+        if self._fingers.turn:
+            radius = self._bodies.radius
+            self._radii = radius[self._pairs.first] + radius[self._pairs.second]
+            self.set_kept_distances(self._kept)
 
     def set_kept_distances(self, kept: Array) -> None:
         """How far apart every pair stays, (p,) [m], which is where its wall begins."""
+        self._kept = kept
+        self._deep[:] = (_DEEP - 1.0) * self._radii
         # Pairs that may touch meet the wall only where they are deeper in each other than bodies get that touch.
         self._shell[:] = np.maximum(kept, -_SOFT * self._radii)
         self._smoothing[:] = (_SMOOTHING * (self._radii + self._shell)) ** 2

@@ -184,12 +184,14 @@ class CartesianController:
     def set_opening(self, arm: str, least: float, greatest: float) -> tuple[str, str] | None:
         """Say that the gripper of ``arm`` is, and stays, between two openings, 0 closed .. 1 fully open.
 
-        Its fingers count as what they sweep between these, from the next step on. Less is always accepted. Where a
-        finger's body grows it is accepted if every pair keeps its distance with it, at the reference and on a certified
-        stop from there; else nothing changes, and the pair that is in the way is returned. So a gripper may be
-        commanded to what was accepted, and to nothing else. An end of the interval at 0 or 1 is that of the joints'
-        travel. Until something is said, and after :meth:`reset`, fingers are all of their way, for which nothing needs
-        to be known; so are those that turn, and those of an arm whose config tells no open and closed position.
+        Its fingers count as what they sweep between these, from the next step on. A finger's body that is within what
+        it was is always accepted, as with less for fingers that slide. One that is not, as with more, or with less for
+        fingers that turn, is accepted if every pair keeps its distance with it, at the reference and on a certified
+        stop from there; else nothing changes, and the pair that is in the way is returned. What was accepted before
+        then still holds, so a gripper may be commanded to what was accepted, and to nothing else. An end of the
+        interval at 0 or 1 is that of the joints' travel. Until something is said, and after :meth:`reset`, fingers are
+        all of their way, for which nothing needs to be known; so are those of an arm whose config tells no open and
+        closed position.
 
         Raises :class:`RobotError` for a name that is no arm's and for numbers that are no interval.
         """

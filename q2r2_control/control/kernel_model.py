@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from q2r2_control.config.control import EQUAL, ControllerSettings, check_priority
-from q2r2_control.control.geometry.collision import CollisionModel, collision_model_of
+from q2r2_control.control.geometry.collision import CollisionModel, collision_model_of, turning_bodies
 from q2r2_control.control.geometry.kinematics import Chain, Placements, place
 from q2r2_control.control.geometry.rounded_boxes import deepest, with_rounded_boxes
 from q2r2_control.control.safety.joint_limits import JointLimits
@@ -81,7 +81,10 @@ def _safety_model(robot: Robot, settings: ControllerSettings) -> SafetyModel:
 
 def _check_depths(robot: Robot, collision: CollisionModel, kept: KeptDistances) -> None:
     """Raises :class:`ConfigError` where two bodies may get so deep into each other that no direction leads out."""
-    allowed = _DEEPEST * deepest(collision)
+    radius = collision.bodies.radius.copy()
+    for number, finger in turning_bodies(robot):
+        radius[number] = finger.radius
+    allowed = _DEEPEST * deepest(collision, radius)
     for p in np.flatnonzero(-kept.values > allowed):
         names = " and ".join(pair_names(robot.collision_model)[p])
         raise ConfigError(

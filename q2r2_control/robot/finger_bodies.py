@@ -1,7 +1,7 @@
-"""The bodies of fingers that slide: each is what it sweeps from one end of its joint's travel to the other.
+"""The bodies of fingers: each is what it sweeps from one end of its joints' travel to the other.
 
 Distances know arm joints only, so a finger's body is all of its way; what of it counts while the gripper's opening is
-known says finger_openings.py. Fingers that turn stay as they are at home, open.
+known says finger_openings.py of those that slide, turning_fingers.py of those that turn.
 """
 
 from __future__ import annotations
@@ -21,7 +21,9 @@ from q2r2_control.robot.finger_openings import FingerBody, Slide
 from q2r2_control.robot.link_roles import KnownParts, links_moved_by
 from q2r2_control.robot.locking import joint_axis
 from q2r2_control.robot.pairs import link_of
-from q2r2_control.types import Array
+from q2r2_control.robot.turning_fingers import TurningBody
+from q2r2_control.robot.turning_joints import finger_joint, turns
+from q2r2_control.types import ALL_OF_THE_WAY, Array
 
 _ON_ONE_LINE = 1e-9  # [m]
 
@@ -48,49 +50,43 @@ _Finger = tuple[Array, list[_Way]]
 
 def sweep_fingers(
     model: pin.Model, geometry: pin.GeometryModel, tree: LinkTree, parts: KnownParts, home: Mapping[str, float]
-) -> tuple[FingerBody, ...]:
-    """Replace in place the capsules and spheres of sliding fingers, locked at ``home``, by what they sweep.
+) -> tuple[FingerBody | TurningBody, ...]:
+    """Replace in place the capsules and spheres of fingers, locked at ``home``, by what they sweep.
 
-    Capsules of two fingers of one gripper that lie on one line and are equally thick become one, which keeps the first
-    one's name: what is between the fingers is theirs. Returns the bodies of which less counts where the gripper's
-    opening is known: those along whose line the fingers move. A finger that moves across its body is all of its way
-    always.
+    Capsules of two fingers of one gripper that slide on one line and are equally thick become one, which keeps the
+    first one's name: what is between the fingers is theirs. Returns the bodies of which less counts where the gripper's
+    opening is known: those along whose line the fingers slide, and those that turn. A finger that slides across its
+    body is all of its way always; one that is moved by a joint of more than one axis stays as it is.
     """
-    bodies = []
+    bodies: list[FingerBody | TurningBody] = []
     for arm, joints in parts.finger_joints.items():
-        links = links_moved_by(tree, joints)
+        links, stroke = links_moved_by(tree, joints), parts.strokes.get(arm)
         swept: dict[str, list[_Finger] | None] = {}
         for item in geometry.geometryObjects:
-            link = link_of(item.name)
-            ways = _ways(model, tree, link, links, home, parts.strokes.get(arm)) if link in links else []
-            if ways:
+            chain = _chain(tree, link_of(item.name), links)
+            if turns(chain):
+                turning = tuple(finger_joint(model, tree, joint, home, joints, stroke) for joint in chain)
+                body = TurningBody(arm, item.name, _ends(item), float(item.geometry.radius), turning)
+                start, end, radius = body.capsule(ALL_OF_THE_WAY)
+                item.geometry, item.placement = capsule_between(radius, start, end)
+                bodies += [body] if stroke is not None else []
+            elif chain and all(joint.get("type") == "prismatic" for joint in chain):
+                ways = [_way(model, joint, home, stroke) for joint in chain]
                 drawn = _ends(item)
                 swept[item.name] = [(drawn, ways)] if _sweep(item, ways) else None
         for name, fingers in _merge(geometry, swept).items():
-            body = fingers and _body(arm, geometry.geometryObjects[geometry.getGeometryId(name)], fingers)
-            if body:
-                bodies.append(body)
+            sliding = fingers and _body(arm, geometry.geometryObjects[geometry.getGeometryId(name)], fingers)
+            if sliding:
+                bodies.append(sliding)
     return tuple(bodies)
 
 
-def _ways(
-    model: pin.Model,
-    tree: LinkTree,
-    link: str,
-    links: set[str],
-    home: Mapping[str, float],
-    stroke: tuple[float, float] | None,
-) -> list[_Way]:
-    """What each finger joint that carries ``link`` moves it by; none where one turns."""
-    ways = []
-    for joint in tree.chain(link):
-        child = next(name for name, carrier in tree.joint_to.items() if carrier is joint)
-        if child not in links:
-            continue
-        if joint.get("type") != "prismatic":
-            return []
-        ways.append(_way(model, joint, home, stroke))
-    return ways
+def _chain(tree: LinkTree, link: str, links: set[str]) -> list[ET.Element]:
+    """The finger joints that carry ``link``, from the hand outwards, of a gripper that moves ``links``."""
+    if link not in links:
+        return []
+    moving = {id(joint) for child, joint in tree.joint_to.items() if child in links}
+    return [joint for joint in tree.chain(link) if id(joint) in moving]
 
 
 def _way(model: pin.Model, joint: ET.Element, home: Mapping[str, float], stroke: tuple[float, float] | None) -> _Way:

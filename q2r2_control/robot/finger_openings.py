@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import pinocchio as pin
 
 from q2r2_control.robot.enclose import capsule_between
+from q2r2_control.robot.turning_fingers import TurningBody
 from q2r2_control.types import ALL_OF_THE_WAY, Array, Interval
 
 
@@ -73,7 +74,7 @@ def part_of_segment(start: Array, end: Array, part: tuple[float, float]) -> tupl
 
 
 def collision_model_at(
-    geometry: pin.GeometryModel, fingers: Iterable[FingerBody], openings: Mapping[str, Interval]
+    geometry: pin.GeometryModel, fingers: Iterable[FingerBody | TurningBody], openings: Mapping[str, Interval]
 ) -> pin.GeometryModel:
     """A copy of ``Robot.collision_model`` with fingers as they are at ``openings`` by arm, others all of their way."""
     made = geometry.copy()
@@ -81,8 +82,11 @@ def collision_model_at(
         interval = openings.get(body.arm, ALL_OF_THE_WAY)
         if interval != ALL_OF_THE_WAY:
             item = made.geometryObjects[made.getGeometryId(body.name)]
-            half = item.geometry.halfLength * item.placement.rotation[:, 2]
-            middle = item.placement.translation
-            start, end = part_of_segment(middle - half, middle + half, body.part(interval))
-            item.geometry, item.placement = capsule_between(float(item.geometry.radius), start, end)
+            if isinstance(body, TurningBody):
+                start, end, radius = body.capsule(interval)
+            else:
+                half = item.geometry.halfLength * item.placement.rotation[:, 2]
+                middle, radius = item.placement.translation, float(item.geometry.radius)
+                start, end = part_of_segment(middle - half, middle + half, body.part(interval))
+            item.geometry, item.placement = capsule_between(radius, start, end)
     return made

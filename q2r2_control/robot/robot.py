@@ -18,6 +18,7 @@ from q2r2_control.robot.compose import compose
 from q2r2_control.robot.description import LinkTree, joint_limits, parse_srdf, parse_urdf
 from q2r2_control.robot.enclose import enclose_shapes
 from q2r2_control.robot.finger_bodies import sweep_fingers
+from q2r2_control.robot.finger_openings import FingerBody
 from q2r2_control.robot.floor import remove_unreachable_floor_pairs, sink_boxes_into_floor
 from q2r2_control.robot.held_objects import HeldObjects, held_objects
 from q2r2_control.robot.joint_accelerations import acceleration_limit
@@ -29,6 +30,7 @@ from q2r2_control.robot.pairs import (
     remove_overlapping_own_pairs,
 )
 from q2r2_control.robot.pinocchio_models import build_models, checked_chain
+from q2r2_control.robot.turning_fingers import TurningBody
 from q2r2_control.types import Array
 
 
@@ -54,6 +56,7 @@ class Arm:
     swivel: Swivel | None = None  # None: the elbow is free
     finger_joints: tuple[str, ...] = ()  # that its gripper drives
     stroke: float = 0.0  # of each of them, from closed to open [m or rad]; 0: not known
+    finger_way: float = 0.0  # how far that moves a finger [m]; 0: not known
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,8 +78,8 @@ class Robot:
 
     ``collision_model`` holds exactly the monitored pairs: each arm against the other with its base, against its own
     links that can meet, and against what stands in the cell. Every monitored shape is a capsule, a sphere, or a box
-    fixed in the world; a finger that slides is all that it sweeps, and ``finger_bodies`` says what of that counts while
-    its gripper's opening is known. ``objects`` are what grippers hold, of which the collision model knows nothing.
+    fixed in the world; a finger is all that it sweeps, and ``finger_bodies`` says what counts while its gripper's
+    opening is known. ``objects`` are what grippers hold, of which the collision model knows nothing.
     ``roles`` says what each link is. ``ignored_pairs`` names pairs of one arm's own shapes that overlap by construction
     and are not monitored.
     """
@@ -119,6 +122,8 @@ class Robot:
         self.roles: dict[str, Role] = roles_of(tree, own_links, parts)
         enclose_shapes(self.collision_model)
         self.finger_bodies = sweep_fingers(self.model, self.collision_model, tree, parts, home)
+        for name, arm in self.arms.items():
+            self.arms[name] = replace(arm, finger_way=_finger_way(arm, self.finger_bodies))
         self.ignored_pairs = self._monitor(tree, exclusions, list(own_links.values()))
         self.objects = HeldObjects(self.collision_model, {}, ())
         self._data: pin.Data = self.model.createData()
@@ -219,6 +224,12 @@ class Robot:
         joints = {int(index) + 1 for index in arm.joints}
         bodies = (frame for frame in self.model.frames if frame.type == pin.FrameType.BODY)
         return {body.name for body in bodies if body.parentJoint in joints}
+
+
+def _finger_way(arm: Arm, bodies: Iterable[FingerBody | TurningBody]) -> float:
+    """How far the finger moves that moves the most [m]; of fingers that slide, their joints' stroke."""
+    ways = [body.way for body in bodies if isinstance(body, TurningBody) and body.arm == arm.name]
+    return max(ways, default=arm.stroke) or arm.stroke
 
 
 def _length(stroke: tuple[float, float] | None) -> float:

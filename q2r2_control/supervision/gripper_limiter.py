@@ -1,9 +1,11 @@
 """How far grippers may be opened and closed: as far as the controller has proven their fingers' bodies.
 
 The controller counts the fingers of an arm as what they sweep between two openings. That interval has to hold where the
-gripper is and where it may go: what was measured and what was commanded a moment ago, with a tolerance. So a gripper
-that has closed takes up less room at no cost, and one that is to open is commanded to the opening that was accepted. It
-is asked for in steps that are halved where the certificate fails and doubled where it holds.
+gripper is and where it may go: what was measured and what was commanded a moment ago, with a tolerance. A gripper is
+commanded to openings in the accepted interval only, opening or closing: fingers that turn reach farther forward as they
+close. Others go on in steps that are halved where the certificate fails and doubled where it holds. A gripper that has
+moved takes up less room: of fingers that slide at no cost, of those that turn as soon as that is proven, and until then
+the wider interval counts, which holds where the gripper is too.
 """
 
 from __future__ import annotations
@@ -14,10 +16,10 @@ from collections.abc import Mapping
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.types import Interval
 
-# How exactly openings are measured, and how far a finger overshoots, on the way of one finger [m or rad]. Half of it is
+# How exactly openings are measured, and how far a finger overshoots, on the way of one finger [m]. Half of it is
 # there always, so that a measurement that trembles does not ask at every tick.
 TOLERANCE = 0.001
-# Least step that is asked for, and least change for which bodies are worked out anew [m or rad].
+# Least step that is asked for, and least change for which bodies are worked out anew [m].
 _FINEST = 0.0005
 # What was measured or commanded counts for at least this long: the delay of a gripper that is allowed for [s].
 REMEMBERED = 0.05
@@ -37,7 +39,9 @@ class GripperLimiter:
         """``remembered``: the delay of a gripper that is allowed for [s]."""
         self._controller = controller
         arms = controller.robot.arms
-        self._grippers = {name: _Gripper(arm.stroke, remembered) for name, arm in arms.items() if arm.stroke > 0.0}
+        self._grippers = {
+            name: _Gripper(arm.finger_way, remembered) for name, arm in arms.items() if arm.finger_way > 0.0
+        }
         self.held: dict[str, tuple[str, str]] = {}  # arm -> pair of bodies that keeps its gripper from going on
         self.changed = False  # whether the controller's openings did, in the last tick
 
@@ -83,7 +87,8 @@ class GripperLimiter:
             refused = self._controller.set_opening(arm, *_hull(gripper.needed(), gripper.around(goal)))
         gripper.answered(goal, free, refused is None, now)
         self.changed |= self._controller.openings[arm] != accepted
-        if refused is None:
+        # Less that cannot be proven yet holds no gripper: what was accepted before holds all that is needed.
+        if refused is None or (free and _holds(accepted, gripper.needed(0.5))):
             self.held.pop(arm, None)
         else:
             self.held[arm] = refused
@@ -92,9 +97,10 @@ class GripperLimiter:
 class _Gripper:
     """What was measured and commanded of one gripper, and how far it may ask to go."""
 
-    def __init__(self, stroke: float, remembered: float) -> None:
+    def __init__(self, way: float, remembered: float) -> None:
+        """``way``: of a finger, from closed to open [m]."""
         self._remembered = remembered
-        self._tolerance, self._finest = TOLERANCE / stroke, min(_FINEST / stroke, 1.0)
+        self._tolerance, self._finest = TOLERANCE / way, min(_FINEST / way, 1.0)
         self.granted: float | None = None  # the opening that is commanded
         self.asks_at = -math.inf
         self._wanted = math.nan

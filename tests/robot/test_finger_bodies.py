@@ -1,4 +1,4 @@
-"""A finger that slides is watched as all that it sweeps."""
+"""A finger is watched as all that it sweeps."""
 
 from __future__ import annotations
 
@@ -81,9 +81,14 @@ def test_the_body_is_no_thicker_and_no_longer_than_the_way(shape: str) -> None:
     assert 2 * body.geometry.halfLength == pytest.approx(0.05 + (0.02 if shape == "capsule along" else 0.0))
 
 
-def test_a_finger_that_turns_stays_as_it_is() -> None:
-    (body,) = bodies(robot_with("sphere", kind="revolute"), "finger")
-    assert isinstance(body.geometry, coal.Sphere)
+def test_a_finger_that_turns_is_all_that_it_sweeps_too_and_one_that_does_neither_stays_as_it_is() -> None:
+    (ball,) = bodies(robot_with("sphere", kind="planar"), "finger")
+    assert isinstance(ball.geometry, coal.Sphere)
+    (body,) = bodies(robot_with("cylinder across", kind="revolute"), "finger")
+    for angle in np.linspace(-0.01, 0.04, 11):
+        turn = pin.SE3(pin.AngleAxis(angle, np.array([0.0, 1.0, 0.0])).matrix(), np.zeros(3))
+        for point in ([0.02, 0.0, 0.05], [0.01, 0.01, -0.01], [0.0, 0.0, 0.02]):
+            assert beyond((finger_at(0.0) * turn).act(np.array(point)), body) <= 1e-9, angle
 
 
 @pytest.mark.parametrize(("away", "count"), [(0.0, 1), (0.001, 2)], ids=["on its line", "beside it"])

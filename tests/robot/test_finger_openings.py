@@ -7,7 +7,7 @@ import pinocchio as pin
 import pytest
 
 from q2r2_control.config import Config, load_config
-from q2r2_control.robot.finger_openings import collision_model_at
+from q2r2_control.robot.finger_openings import FingerBody, collision_model_at
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import ALL_OF_THE_WAY, Array, Interval
 
@@ -117,6 +117,7 @@ def test_a_finger_that_mimics_another_is_where_that_one_puts_it(tmp_path: object
 def test_what_holds_more_openings_holds_the_body_of_fewer() -> None:
     robot, random = Robot.from_config(HAND_E), np.random.default_rng(0)
     for body in robot.finger_bodies:
+        assert isinstance(body, FingerBody)
         for _ in range(50):
             a, b, c, d = np.sort(random.random(4))
             inner, outer = body.part((b, c)), body.part((a, d))

@@ -16,11 +16,15 @@ from q2r2_control.control.geometry.kinematics import Chain, IntArray, Placements
 from q2r2_control.control.jit import lean_kernel
 from q2r2_control.errors import RobotError
 from q2r2_control.robot.robot import Robot
+from q2r2_control.robot.turning_fingers import TurningBody
 from q2r2_control.types import Array
 
 
 class Bodies(NamedTuple):
-    """Collision geometries in their joint's frame; start and end of fingers change, see :mod:`finger_openings`."""
+    """Collision geometries in their joint's frame.
+
+    Start and end of fingers change, radius and size of those that turn too, see :mod:`finger_openings`.
+    """
 
     joint: IntArray  # (g,) 0 is the world
     box: IntArray  # (g,) 1 for a box
@@ -95,7 +99,11 @@ def collision_model_of(robot: Robot) -> CollisionModel:
     """Joints, geometries and monitored pairs of a robot. Raises :class:`RobotError` for what no kernel handles."""
     chain, bodies = chain_of(robot.model), bodies_of(robot.collision_model)
     travel = np.maximum(np.abs(robot.position_lower), np.abs(robot.position_upper))
-    return CollisionModel(chain, bodies, pairs_of(robot.collision_model, chain, bodies, travel))
+    extent = farthest_of(bodies)
+    for number, finger in turning_bodies(robot):
+        # Its capsules of other intervals are not within the one of all of the way.
+        extent[number] = max(extent[number], finger.extent)
+    return CollisionModel(chain, bodies, pairs_of(robot.collision_model, chain, bodies, travel, extent))
 
 
 def bodies_of(model: pin.GeometryModel) -> Bodies:
@@ -128,11 +136,27 @@ def bodies_of(model: pin.GeometryModel) -> Bodies:
     return bodies
 
 
-def pairs_of(model: pin.GeometryModel, chain: Chain, bodies: Bodies, travel: Array) -> Pairs:
+def turning_bodies(robot: Robot) -> list[tuple[int, TurningBody]]:
+    """Fingers that turn, each with the number of its geometry."""
+    numbers = {geometry.name: number for number, geometry in enumerate(robot.collision_model.geometryObjects)}
+    return [(numbers[finger.name], finger) for finger in robot.finger_bodies if isinstance(finger, TurningBody)]
+
+
+def farthest_of(bodies: Bodies) -> Array:
+    """How far segments and boxes reach from the origins of their joints' frames (g,) [m]."""
+    ends = np.maximum(np.linalg.norm(bodies.start, axis=1), np.linalg.norm(bodies.end, axis=1))
+    return np.asarray(np.linalg.norm(bodies.half, axis=1) + ends)
+
+
+def pairs_of(
+    model: pin.GeometryModel, chain: Chain, bodies: Bodies, travel: Array, extent: Array | None = None
+) -> Pairs:
     """Monitored pairs of ``model``; ``travel`` (nv,) is how far each joint can be from zero [rad or m].
 
-    Raises :class:`RobotError` for a pair of two boxes, which no kernel measures.
+    ``extent`` (g,) is what :func:`farthest_of` the bodies never exceeds, whatever becomes of them [m]; None: as they
+    are. Raises :class:`RobotError` for a pair of two boxes, which no kernel measures.
     """
+    extent = farthest_of(bodies) if extent is None else extent
     parent, translation, prismatic = chain.parent, chain.translation, chain.prismatic
     rows = []
     for pair in model.collisionPairs:
@@ -143,9 +167,7 @@ def pairs_of(model: pin.GeometryModel, chain: Chain, bodies: Bodies, travel: Arr
         moving: dict[int, tuple[float, float]] = {}
         carried = False
         for body, sign in ((first, -1.0), (second, 1.0)):
-            farthest = np.linalg.norm(bodies.half[body]) + max(
-                np.linalg.norm(bodies.start[body]), np.linalg.norm(bodies.end[body])
-            )
+            farthest = extent[body]
             joint = int(bodies.joint[body])
             # Walking up, the bound grows by each link's offset and by how far each slide extends.
             while joint != 0:

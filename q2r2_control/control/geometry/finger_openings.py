@@ -1,23 +1,30 @@
 """The fingers' bodies of one collision model, as their grippers' openings are known.
 
-They are changed in place, where the kernels read them. What was worked out once of all of a finger's way stays: its
-part is nowhere farther from a joint's axis (``Pairs.reach``, ``leverage``) and fits into a ball of that size about its
-own middle (``Bodies.size``), so that every bound made of these holds as it is.
+They are changed in place, where the kernels read them. What was worked out once of all of a sliding finger's way stays:
+its part is nowhere farther from a joint's axis (``Pairs.reach``, ``leverage``) and fits into a ball of that size about
+its own middle (``Bodies.size``), so that every bound made of these holds as it is. A finger that turns has another
+capsule for each interval. ``Pairs.reach`` and ``leverage`` are made of how far any of these is from a joint's axis
+(``collision_model_of``); radius and size change with it.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from functools import lru_cache
 
 import numpy as np
 
-from q2r2_control.control.geometry.collision import Bodies
+from q2r2_control.control.geometry.collision import Bodies, turning_bodies
 from q2r2_control.control.geometry.kinematics import IntArray
 from q2r2_control.errors import RobotError
 from q2r2_control.robot.finger_openings import FingerBody, part_of_segment
 from q2r2_control.robot.robot import Robot
+from q2r2_control.robot.turning_fingers import Capsules, TurningBody, TurningSweeps, sticks_out
 from q2r2_control.types import ALL_OF_THE_WAY, Interval
+
+# A gripper that is held asks for the same again and again, between intervals that it has.
+_REMEMBERED = 16
 
 
 class FingerOpenings:
@@ -30,7 +37,12 @@ class FingerOpenings:
         names = [geometry.name for geometry in robot.collision_model.geometryObjects]
         self._fingers: dict[str, list[tuple[int, FingerBody]]] = {arm: [] for arm in robot.arms}
         for finger in robot.finger_bodies:
-            self._fingers[finger.arm].append((names.index(finger.name), finger))
+            if isinstance(finger, FingerBody):
+                self._fingers[finger.arm].append((names.index(finger.name), finger))
+        turning: dict[str, list[tuple[int, TurningBody]]] = {}
+        for number, turned in turning_bodies(robot):
+            turning.setdefault(turned.arm, []).append((number, turned))
+        self._turning = {arm: _Turning(found, bodies) for arm, found in turning.items()}
         self._start, self._end = bodies.start.copy(), bodies.end.copy()
         self._parts: dict[int, tuple[float, float]] = {}
         self._none: IntArray = np.zeros(len(bodies.joint), dtype=np.int64)
@@ -47,7 +59,11 @@ class FingerOpenings:
         return min(max(float(least), 0.0), 1.0), min(max(float(greatest), 0.0), 1.0)
 
     def set(self, arm: str, interval: Interval) -> IntArray:
-        """Make an arm's fingers what they sweep in ``interval``; returns a 1 for each body (g,) that has grown."""
+        """Make an arm's fingers what they sweep in ``interval``; returns a 1 for each body (g,) that has grown.
+
+        That is: is not within what it was before. One that slides grows by a wider interval only, one that turns may
+        by a narrower one.
+        """
         grown = self._none.copy()
         self.intervals[arm] = interval
         for body, finger in self._fingers[arm]:
@@ -58,9 +74,38 @@ class FingerOpenings:
                     self._start[body], self._end[body], part
                 )
                 grown[body] = part[0] < before[0] or part[1] > before[1]
+        if arm in self._turning:
+            self._turning[arm].set(interval, grown)
         return grown
+
+    @property
+    def turn(self) -> bool:
+        """Whether some fingers turn, so that radii change too."""
+        return bool(self._turning)
 
     def set_all(self, intervals: Mapping[str, Interval]) -> None:
         """The same for every arm; one that is not named is all of its way."""
         for arm in self._fingers:
             self.set(arm, intervals.get(arm, ALL_OF_THE_WAY))
+
+
+class _Turning:
+    """The fingers of one arm that turn, as capsules of their own for each interval."""
+
+    def __init__(self, found: Sequence[tuple[int, TurningBody]], bodies: Bodies) -> None:
+        self._bodies, self._indices = bodies, np.array([index for index, _ in found])
+        self._all = self._now()
+        self._capsules = lru_cache(maxsize=_REMEMBERED)(TurningSweeps([body for _, body in found]).capsules)
+
+    def set(self, interval: Interval, grown: IntArray) -> None:
+        """Take what ``interval`` takes up, and mark in ``grown`` (g,) what is not within what it was."""
+        bodies, at = self._bodies, self._indices
+        capsules = self._all if interval == ALL_OF_THE_WAY else self._capsules(interval)
+        changed = sticks_out(capsules, self._now())
+        bodies.start[at], bodies.end[at], bodies.radius[at] = capsules
+        bodies.size[at] = 0.5 * np.linalg.norm(capsules.end - capsules.start, axis=1) + capsules.radius
+        grown[at] = changed
+
+    def _now(self) -> Capsules:
+        bodies, at = self._bodies, self._indices
+        return Capsules(bodies.start[at].copy(), bodies.end[at].copy(), bodies.radius[at].copy())

@@ -51,7 +51,9 @@ def deeper_at_corners(model: CollisionModel, kept: Array) -> Array:
     return np.where(boxed, (1.0 - 1.0 / np.sqrt(3.0)) * model.bodies.radius[model.pairs.first], 0.0)
 
 
-def deepest(model: CollisionModel) -> Array:
-    """How far the two bodies of each pair may get into each other until their cores meet (p,) [m]."""
-    radius: Array = model.bodies.radius
+def deepest(model: CollisionModel, radius: Array) -> Array:
+    """How far the two bodies of each pair may get into each other until their cores meet (p,) [m].
+
+    ``radius`` (g,) are the least that the bodies ever have [m].
+    """
     return radius[model.pairs.first] + radius[model.pairs.second]

@@ -87,7 +87,7 @@ class GripperLimits:
         """Answer what was asked for, before a step.
 
         An inactive controller moves no arm and proves nothing: it grants what it is asked for then, for instance to let
-        go of something, but no gripper that was held opens farther because the arms were stopped.
+        go of something, but no gripper that was held goes on in that direction because the arms were stopped.
         """
         if not active:
             self._bodies = None
@@ -102,8 +102,9 @@ class GripperLimits:
 
     def _unproven(self, arm: str, wanted: float) -> float:
         """What is granted while the arms do not move."""
-        before = self._told.get(arm)
-        return wanted if before is None or before[0] == before[1] else min(wanted, before[1])
+        if (before := self._told.get(arm)) is None or before[0] == before[1]:
+            return wanted
+        return min(wanted, before[1]) if before[0] > before[1] else max(wanted, before[1])
 
     def _answer(self, arm: str, wanted: float, granted: float) -> None:
         if self._told.get(arm) != (wanted, granted):

@@ -1,0 +1,238 @@
+"""The body of a finger that turns holds the finger at every opening of its interval, and hardly more."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from q2r2_control.control.geometry.collision import collision_model_of
+from q2r2_control.robot.description import load_description
+from q2r2_control.robot.enclose import enclose_shapes
+from q2r2_control.robot.finger_openings import collision_model_at
+from q2r2_control.robot.robot import Robot
+from q2r2_control.robot.turning_fingers import (
+    Capsules,
+    FingerJoint,
+    TurningBody,
+    TurningSweeps,
+    sticks_out,
+)
+from q2r2_control.types import ALL_OF_THE_WAY, Array, Interval
+from tests.support.turning_hand import RealHands, turning_cell
+
+OPENINGS = 200
+
+
+def outside(points: Array, body: tuple[Array, Array, float], radius: float) -> float:
+    """How far the farthest ball of ``radius`` about one of ``points`` (n, 3) sticks out of a capsule [m]."""
+    start, end, thick = body
+    along = end - start
+    share = np.clip((points - start) @ along / max(float(along @ along), 1e-30), 0.0, 1.0)
+    return float(np.linalg.norm(points - start - share[:, None] * along, axis=1).max() + radius - thick)
+
+
+@pytest.fixture(scope="module")
+def hand(tmp_path_factory: pytest.TempPathFactory) -> tuple[Robot, RealHands, dict[str, TurningBody]]:
+    robot = Robot.from_config(turning_cell(tmp_path_factory.mktemp("hand")))
+    bodies = {body.name: body for body in robot.finger_bodies if isinstance(body, TurningBody)}
+    return robot, RealHands(robot), bodies
+
+
+def test_every_moving_link_of_the_hand_has_a_body_and_holds_its_shape_at_200_openings(
+    hand: tuple[Robot, RealHands, dict[str, TurningBody]],
+) -> None:
+    _, real, bodies = hand
+    assert {name for name in bodies if name.startswith("left_")} == set(real.fingers)
+    random = np.random.default_rng(0)
+    intervals: list[Interval] = [ALL_OF_THE_WAY, (0.0, 0.0), (1.0, 1.0), (0.3, 0.3)]
+    intervals += [(float(a), float(b)) for a, b in np.sort(random.random((12, 2)), axis=1)]
+    for name in real.fingers:
+        at = {opening: real.ends("left", name, opening) for opening in np.linspace(0.0, 1.0, OPENINGS + 1).tolist()}
+        for interval in intervals:
+            found = [at[opening] for opening in at if interval[0] <= opening <= interval[1]]
+            found += [real.ends("left", name, opening) for opening in interval]
+            points, radius = np.concatenate([ends for ends, _ in found]), found[0][1]
+            beyond = outside(points, bodies[name].capsule(interval), radius)
+            assert -0.05 < beyond <= 0.0, (name, interval)
+
+
+def test_at_one_opening_a_body_is_its_shape_and_a_narrow_interval_adds_little(
+    hand: tuple[Robot, RealHands, dict[str, TurningBody]],
+) -> None:
+    _, real, bodies = hand
+    for name in real.fingers:
+        body = bodies[name]
+        for opening in (0.0, 0.37, 1.0):
+            start, end, radius = body.capsule((opening, opening))
+            ends, drawn = real.ends("left", name, opening)
+            np.testing.assert_allclose(np.sort([start, end], axis=0), np.sort(ends, axis=0), atol=1e-9)
+            assert radius == pytest.approx(drawn, abs=1e-8)
+        # A finger of 44 mm of way goes 2.2 mm in a twentieth of it.
+        assert body.capsule((0.5, 0.55))[2] - drawn < 0.0013
+
+
+def test_what_the_controller_and_coal_see_are_the_same_bodies(
+    hand: tuple[Robot, RealHands, dict[str, TurningBody]],
+) -> None:
+    robot, _, bodies = hand
+    for interval in (ALL_OF_THE_WAY, (0.2, 0.5)):
+        model = collision_model_at(robot.collision_model, robot.finger_bodies, {"left": interval})
+        for name, body in bodies.items():
+            item = model.geometryObjects[model.getGeometryId(name)]
+            half = item.geometry.halfLength * item.placement.rotation[:, 2]
+            start, end, radius = body.capsule(interval if body.arm == "left" else ALL_OF_THE_WAY)
+            np.testing.assert_allclose(item.placement.translation - half, start, atol=1e-12)
+            np.testing.assert_allclose(item.placement.translation + half, end, atol=1e-12)
+            assert item.geometry.radius == radius
+
+
+def test_no_interval_reaches_farther_from_a_joint_than_the_kernels_bounds_know(
+    hand: tuple[Robot, RealHands, dict[str, TurningBody]],
+) -> None:
+    robot, _, bodies = hand
+    model, random = collision_model_of(robot), np.random.default_rng(1)
+    names = [item.name for item in robot.collision_model.geometryObjects]
+    for name, body in bodies.items():
+        number = names.index(name)
+        pairs = [p for p in range(len(model.pairs.first)) if number in (model.pairs.first[p], model.pairs.second[p])]
+        last = int(model.bodies.joint[number])
+        reach = [model.pairs.reach[p, list(model.pairs.joint[p]).index(last)] for p in pairs]
+        for _ in range(30):
+            low, high = np.sort(random.random(2)).tolist()
+            start, end, _ = body.capsule((low, high))
+            assert max(np.linalg.norm(start), np.linalg.norm(end)) <= min(reach) + 1e-12
+
+
+# Any chain: turns and slides, of one driver or of several.
+_NUMBERS = st.floats(-0.1, 0.1)
+_VECTORS = st.tuples(_NUMBERS, _NUMBERS, _NUMBERS)
+_AXES = st.sampled_from([(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.6, 0.8), (-0.48, 0.6, 0.64)])
+
+
+@st.composite
+def joints(draw: st.DrawFn) -> FingerJoint:
+    slides = draw(st.booleans())
+    size = 0.05 if slides else 1.6
+    closed, opened, home = (size * draw(st.floats(-1.0, 1.0)) for _ in range(3))
+    beyond = 0.1 * size * (1.0 if opened >= closed else -1.0)
+    axis, point = np.array(draw(_AXES)), np.array(draw(_VECTORS))
+    driver = draw(st.sampled_from("ab"))
+    return FingerJoint(slides, axis, point, home, closed, opened, closed - beyond, opened + beyond, driver)
+
+
+def moved(chain: Sequence[FingerJoint], ends: Array, at: dict[str, float], travel: bool = False) -> Array:
+    """Ends (2, 3) of a shape with each driver at an opening in 0 .. 1, or at such a part of all of the travel."""
+    for joint in reversed(chain):
+        first, last = (joint.before, joint.beyond) if travel else (joint.closed, joint.open)
+        by = first + at[joint.driver] * (last - first) - joint.home
+        if joint.slides:
+            ends = ends + by * joint.axis
+        else:
+            ends = (ends - joint.point) @ pin.AngleAxis(by, joint.axis).matrix().T + joint.point
+    return ends
+
+
+@given(st.lists(joints(), min_size=1, max_size=4), _VECTORS, _VECTORS, st.tuples(st.floats(0, 1), st.floats(0, 1)))
+@settings(max_examples=150, deadline=None)
+def test_any_chain_of_fingers_is_in_its_body_wherever_its_drivers_are(
+    chain: list[FingerJoint], first: Array, second: Array, between: tuple[float, float]
+) -> None:
+    body = TurningBody("left", "finger_0", np.array([first, second]), 0.01, tuple(chain))
+    random = np.random.default_rng(0)
+    for interval in ((min(between), max(between)), ALL_OF_THE_WAY):
+        capsule, travel = body.capsule(interval), interval == ALL_OF_THE_WAY
+        at = random.uniform(*interval, (OPENINGS, 2))
+        at[:4] = [(interval[a], interval[b]) for a in (0, 1) for b in (0, 1)]
+        points = np.array([moved(chain, body.ends, dict(zip("ab", each, strict=True)), travel) for each in at])
+        assert outside(points.reshape(-1, 3), capsule, body.radius) <= 0.0
+        assert max(np.linalg.norm(capsule[0]), np.linalg.norm(capsule[1])) <= body.extent + 1e-12
+
+
+def test_between_samples_as_far_as_the_remainder_allows_is_held_too() -> None:
+    """A driver that turns by two turns, with as few samples as there may be: three drivers share them."""
+    chain = [
+        FingerJoint(False, np.array([0.0, 0.0, 1.0]), np.zeros(3), 0.0, -turn, turn, -turn, turn, driver)
+        for driver, turn in (("a", 3.0), ("b", 3.0), ("c", 3.0))
+    ]
+    body = TurningBody("left", "finger_0", np.array([[0.1, 0.0, 0.0], [0.1, 0.0, 0.02]]), 0.005, tuple(chain))
+    capsule, random = body.capsule(ALL_OF_THE_WAY), np.random.default_rng(0)
+    for _ in range(OPENINGS):
+        at = dict(zip("abc", random.random(3), strict=True))
+        assert outside(moved(chain, body.ends, at), capsule, body.radius) <= 0.0
+
+
+def test_a_capsule_is_within_another_one_where_both_of_its_ends_are() -> None:
+    outer = Capsules(np.zeros((1, 3)), np.array([[0.0, 0.0, 0.1]]), np.array([0.02]))
+    inside = Capsules(np.array([[0.005, 0.0, 0.0]]), np.array([[0.0, 0.004, 0.1]]), np.array([0.014]))
+    assert not sticks_out(inside, outer).any()
+    for end in ([0.0, 0.007, 0.1], [0.0, 0.0, 0.107]):
+        assert sticks_out(inside._replace(end=np.array([end])), outer).all()
+    assert sticks_out(inside._replace(radius=np.array([0.016])), outer).all()
+
+
+def test_several_bodies_at_once_are_what_each_is_alone_within_what_the_samples_leave(
+    hand: tuple[Robot, RealHands, dict[str, TurningBody]],
+) -> None:
+    _, _, bodies = hand
+    together = TurningSweeps(list(bodies.values())).capsules((0.1, 0.4))
+    for row, body in enumerate(bodies.values()):
+        start, end, radius = body.capsule((0.1, 0.4))
+        np.testing.assert_allclose(together.start[row], start, atol=5e-4)
+        np.testing.assert_allclose(together.end[row], end, atol=5e-4)
+        assert together.radius[row] == pytest.approx(radius, abs=1e-4)
+
+
+def test_without_known_openings_a_body_is_all_that_the_joints_limits_allow(tmp_path: Path) -> None:
+    cell = Robot.from_config(turning_cell(tmp_path))
+    plain = Robot.from_urdf(cell.urdf, {arm.name: arm.tool_frame for arm in cell.arms.values()})
+    assert plain.finger_bodies == ()
+    real = RealHands(cell)
+    for name in real.fingers:
+        item = plain.collision_model.geometryObjects[plain.collision_model.getGeometryId(name)]
+        half = item.geometry.halfLength * item.placement.rotation[:, 2]
+        middle = item.placement.translation
+        for opening in np.linspace(0.0, 1.0, 41).tolist():
+            ends, radius = real.ends("left", name, opening)
+            assert outside(ends, (middle - half, middle + half, float(item.geometry.radius)), radius) <= 0.0
+
+
+@pytest.mark.parametrize(
+    ("model", "tip", "fingers"),
+    [
+        ("so101", "gripper_frame_link", ("gripper",)),
+        ("z1", "gripperStator", ("jointGripper",)),
+    ],
+)
+def test_grippers_that_turn_of_other_robots_are_held_too(model: str, tip: str, fingers: tuple[str, ...]) -> None:
+    """The URDF's own shapes at the joints' own positions, by Pinocchio, in bodies of intervals of the travel."""
+    description = load_description(f"example-robot-data:{model}")
+    robot = Robot.from_urdf(ET.tostring(description.urdf, encoding="unicode"), {"left": tip})
+    full = pin.buildModelFromXML(robot.urdf)
+    geometry = pin.buildGeomFromUrdfString(full, robot.urdf, pin.GeometryType.COLLISION)
+    enclose_shapes(geometry)
+    data, geometry_data = full.createData(), geometry.createData()
+    moving = [item.name for item in geometry.geometryObjects if full.names[item.parentJoint] in fingers]
+    assert moving
+    q = pin.neutral(full)
+    for share in np.linspace(0.0, 1.0, 41):
+        for name in fingers:
+            index = full.joints[full.getJointId(name)].idx_q
+            q[index] = (1.0 - share) * full.lowerPositionLimit[index] + share * full.upperPositionLimit[index]
+        pin.updateGeometryPlacements(full, data, geometry, geometry_data, q)
+        for name in moving:
+            body = robot.collision_model.geometryObjects[robot.collision_model.getGeometryId(name)]
+            carrier = data.oMi[full.getJointId(robot.model.names[body.parentJoint])]
+            number = geometry.getGeometryId(name)
+            shape, placement = geometry.geometryObjects[number].geometry, carrier.actInv(geometry_data.oMg[number])
+            half = getattr(shape, "halfLength", 0.0) * placement.rotation[:, 2]
+            ends = np.array([placement.translation - half, placement.translation + half])
+            own = body.geometry.halfLength * body.placement.rotation[:, 2]
+            capsule = body.placement.translation - own, body.placement.translation + own, float(body.geometry.radius)
+            assert outside(ends, capsule, float(shape.radius)) <= 1e-9

@@ -1,0 +1,123 @@
+"""A hand whose fingers turn, as those of a Robotiq 2F-85 do, on both arms of the shipped cell; and where it really is.
+
+Each finger hangs on a knuckle that the gripper turns by 0.8 rad; its tip turns back by as much, so that it stays
+parallel, and a second knuckle follows. The tips are 14 mm farther out when the hand is closed. Axes are where the
+published drawings of that gripper have them; shapes are simple ones of about its size.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+
+from q2r2_control.config import Config, load_config
+from q2r2_control.robot.enclose import enclose_shapes
+from q2r2_control.robot.pairs import link_of
+from q2r2_control.robot.robot import Robot
+from q2r2_control.types import Array
+
+CLOSED, OPEN = 0.8, 0.0  # [rad]
+# By which part of the drive's turn the other joints turn.
+_FOLLOWERS = {"one_tip": -1.0, "one_inner": 1.0, "two_knuckle": 1.0, "two_tip": -1.0, "two_inner": 1.0}
+
+
+def _shape(xyz: str, rpy: str, radius: float, length: float) -> str:
+    geometry = f'<geometry><cylinder radius="{radius}" length="{length}"/></geometry>'
+    return f'<collision><origin xyz="{xyz}" rpy="{rpy}"/>{geometry}</collision>'
+
+
+def _joint(name: str, parent: str, child: str, origin: str) -> str:
+    share = _FOLLOWERS.get(name.removesuffix("_joint"))
+    mimic = "" if share is None else f'<mimic joint="drive" multiplier="{share}"/>'
+    limits = 'lower="-0.8" upper="0"' if share == -1.0 else 'lower="0" upper="0.8"'
+    return (
+        f'<joint name="{name}" type="revolute"><parent link="{parent}"/><child link="{child}"/><origin {origin}/>'
+        f'<axis xyz="1 0 0"/><limit {limits} velocity="2" effort="50"/>{mimic}</joint>'
+    )
+
+
+def _finger(side: str, y: float, yaw: float, drive: str) -> str:
+    knuckle, inner = (f'xyz="0 {y * at} {z}" rpy="0 0 {yaw}"' for at, z in ((0.0306, 0.0549), (0.0127, 0.0614)))
+    return (
+        f'<link name="{side}_knuckle">{_shape("0 0.0345 0.0195", "0.1 0 0", 0.008, 0.04)}</link>'
+        f'<link name="{side}_tip">{_shape("0 -0.006 0.02", "0 0 0", 0.009, 0.05)}</link>'
+        f'<link name="{side}_inner">{_shape("0 0.02 0.02", "-0.75 0 0", 0.006, 0.045)}</link>'
+        + _joint(drive, "palm", f"{side}_knuckle", knuckle)
+        + _joint(f"{side}_tip_joint", f"{side}_knuckle", f"{side}_tip", 'xyz="0 0.0376 0.043"')
+        + _joint(f"{side}_inner_joint", "palm", f"{side}_inner", inner)
+    )
+
+
+def hand_urdf() -> str:
+    """The hand as a model of a tool, with its frame between the tips."""
+    return (
+        f'<robot name="turning_hand"><link name="palm">{_shape("0 0 0.045", "0 0 0", 0.035, 0.05)}</link>'
+        + _finger("one", -1.0, np.pi, "drive")
+        + _finger("two", 1.0, 0.0, "two_knuckle_joint")
+        + '<link name="frame"/><joint name="to_frame" type="fixed"><parent link="palm"/><child link="frame"/>'
+        '<origin xyz="0 0 0.14"/></joint></robot>'
+    )
+
+
+def turning_cell(folder: Path, **obstacles: object) -> Config:
+    """The shipped cell with this hand on both arms; its model is written to ``folder``."""
+    model = folder / "turning_hand.urdf"
+    model.write_text(hand_urdf(), encoding="utf-8")
+    data = load_config("config/dual_iiwa7.yaml").model_dump()
+    for arm in data["arms"].values():
+        arm["tool"] = {"model": str(model), "frame": "frame"}
+        arm["gripper"] |= {"joints": ("drive",), "open_position": OPEN, "closed_position": CLOSED, "speed": 1.5}
+    data["obstacles"] |= obstacles
+    return Config.model_validate(data)
+
+
+class RealHands:
+    """Shapes as drawn, enclosed but not swept, with fingers where the joints of the URDF put them."""
+
+    def __init__(self, robot: Robot) -> None:
+        self._robot, self._model = robot, pin.buildModelFromXML(robot.urdf)
+        geometry = pin.buildGeomFromUrdfString(self._model, robot.urdf, pin.GeometryType.COLLISION)
+        enclose_shapes(geometry)
+        self.geometry, self._data = geometry, self._model.createData()
+        for name in robot.collision_model.collisionPairs:
+            pair = [robot.collision_model.geometryObjects[i].name for i in (name.first, name.second)]
+            geometry.addCollisionPair(pin.CollisionPair(*(geometry.getGeometryId(each) for each in pair)))
+        self._geometry_data = geometry.createData()
+
+    def _posture(self, q: Array, openings: Mapping[str, float]) -> Array:
+        full = np.zeros(self._model.nq)
+        for name, value in zip(self._robot.joint_names, q, strict=True):
+            full[self._model.joints[self._model.getJointId(name)].idx_q] = value
+        for arm, opening in openings.items():
+            drive = CLOSED + opening * (OPEN - CLOSED)
+            turns = {"drive": 1.0} | {f"{link}_joint": share for link, share in _FOLLOWERS.items()}
+            for name, share in turns.items():
+                full[self._model.joints[self._model.getJointId(f"{arm}_{name}")].idx_q] = share * drive
+        return full
+
+    def distances(self, q: Array, openings: Mapping[str, float]) -> Array:
+        """Of every monitored pair as Coal measures them (pairs,) [m]."""
+        full = self._posture(q, openings)
+        pin.computeDistances(self._model, self._data, self.geometry, self._geometry_data, full)
+        return np.array([result.min_distance for result in self._geometry_data.distanceResults])
+
+    def ends(self, arm: str, name: str, opening: float) -> tuple[Array, float]:
+        """Both ends (2, 3) of a capsule in the frame of the arm's last joint, and its radius [m]."""
+        full = self._posture(self._robot.home, {arm: opening})
+        pin.forwardKinematics(self._model, self._data, full)
+        pin.updateGeometryPlacements(self._model, self._data, self.geometry, self._geometry_data)
+        index = self.geometry.getGeometryId(name)
+        placement, shape = self._geometry_data.oMg[index], self.geometry.geometryObjects[index].geometry
+        last = self._robot.joint_names[int(self._robot.arms[arm].joints[-1])]
+        local = self._data.oMi[self._model.getJointId(last)].actInv(placement)
+        half = getattr(shape, "halfLength", 0.0) * local.rotation[:, 2]
+        return np.array([local.translation - half, local.translation + half]), float(shape.radius)
+
+    @property
+    def fingers(self) -> list[str]:
+        """Geometry names of the left hand's fingers."""
+        found = [item.name for item in self.geometry.geometryObjects]
+        return [name for name in found if link_of(name).startswith(("left_one_", "left_two_"))]
