@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import pinocchio as pin
 
 from q2r2_control.robot.enclose import capsule_between
-from q2r2_control.robot.turning_fingers import TurningBody
+from q2r2_control.robot.turning_fingers import TurningBody, TurningSweeps
 from q2r2_control.types import ALL_OF_THE_WAY, Array, Interval
 
 
@@ -77,16 +77,20 @@ def collision_model_at(
     geometry: pin.GeometryModel, fingers: Iterable[FingerBody | TurningBody], openings: Mapping[str, Interval]
 ) -> pin.GeometryModel:
     """A copy of ``Robot.collision_model`` with fingers as they are at ``openings`` by arm, others all of their way."""
-    made = geometry.copy()
-    for body in fingers:
+    made, bodies = geometry.copy(), list(fingers)
+    for body in bodies:
         interval = openings.get(body.arm, ALL_OF_THE_WAY)
-        if interval != ALL_OF_THE_WAY:
+        if isinstance(body, FingerBody) and interval != ALL_OF_THE_WAY:
             item = made.geometryObjects[made.getGeometryId(body.name)]
-            if isinstance(body, TurningBody):
-                start, end, radius = body.capsule(interval)
-            else:
-                half = item.geometry.halfLength * item.placement.rotation[:, 2]
-                middle, radius = item.placement.translation, float(item.geometry.radius)
-                start, end = part_of_segment(middle - half, middle + half, body.part(interval))
-            item.geometry, item.placement = capsule_between(radius, start, end)
+            half = item.geometry.halfLength * item.placement.rotation[:, 2]
+            middle = item.placement.translation
+            start, end = part_of_segment(middle - half, middle + half, body.part(interval))
+            item.geometry, item.placement = capsule_between(float(item.geometry.radius), start, end)
+    for arm, interval in openings.items():
+        # All of an arm's at once, as the kernels have them: how many samples are taken is a matter of all of them.
+        turning = [body for body in bodies if isinstance(body, TurningBody) and body.arm == arm]
+        if turning and interval != ALL_OF_THE_WAY:
+            for body, *capsule in zip(turning, *TurningSweeps(turning).capsules(interval), strict=True):
+                item = made.geometryObjects[made.getGeometryId(body.name)]
+                item.geometry, item.placement = capsule_between(float(capsule[2]), capsule[0], capsule[1])
     return made

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import xml.etree.ElementTree as ET
 from collections.abc import Sequence
+from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from q2r2_control.control.geometry.collision import collision_model_of
+from q2r2_control.control.geometry.finger_openings import FingerOpenings
 from q2r2_control.robot.description import load_description
 from q2r2_control.robot.enclose import enclose_shapes
 from q2r2_control.robot.finger_openings import collision_model_at
@@ -82,15 +85,19 @@ def test_what_the_controller_and_coal_see_are_the_same_bodies(
     hand: tuple[Robot, RealHands, dict[str, TurningBody]],
 ) -> None:
     robot, _, bodies = hand
-    for interval in (ALL_OF_THE_WAY, (0.2, 0.5)):
+    kernels = collision_model_of(robot).bodies
+    fingers = FingerOpenings(robot, kernels)
+    names = [item.name for item in robot.collision_model.geometryObjects]
+    for interval in (ALL_OF_THE_WAY, (0.2, 0.9), (0.4, 0.41), ALL_OF_THE_WAY):
+        fingers.set("left", interval)
         model = collision_model_at(robot.collision_model, robot.finger_bodies, {"left": interval})
-        for name, body in bodies.items():
-            item = model.geometryObjects[model.getGeometryId(name)]
+        for name in bodies:
+            item, number = model.geometryObjects[model.getGeometryId(name)], names.index(name)
             half = item.geometry.halfLength * item.placement.rotation[:, 2]
-            start, end, radius = body.capsule(interval if body.arm == "left" else ALL_OF_THE_WAY)
-            np.testing.assert_allclose(item.placement.translation - half, start, atol=1e-12)
-            np.testing.assert_allclose(item.placement.translation + half, end, atol=1e-12)
-            assert item.geometry.radius == radius
+            np.testing.assert_allclose(item.placement.translation - half, kernels.start[number], atol=1e-12)
+            np.testing.assert_allclose(item.placement.translation + half, kernels.end[number], atol=1e-12)
+            assert item.geometry.radius == kernels.radius[number]
+            assert kernels.size[number] == pytest.approx(item.geometry.halfLength + item.geometry.radius, abs=1e-12)
 
 
 def test_no_interval_reaches_farther_from_a_joint_than_the_kernels_bounds_know(
@@ -236,3 +243,35 @@ def test_grippers_that_turn_of_other_robots_are_held_too(model: str, tip: str, f
             own = body.geometry.halfLength * body.placement.rotation[:, 2]
             capsule = body.placement.translation - own, body.placement.translation + own, float(body.geometry.radius)
             assert outside(ends, capsule, float(shape.radius)) <= 1e-9
+
+
+def test_no_second_derivative_by_two_joints_exceeds_its_bound() -> None:
+    """By differences, for chains of turns and slides that one driver moves, anywhere on their travel."""
+    random, h = np.random.default_rng(2), 1e-3
+    nearest = np.zeros((3, 3))
+    for _ in range(300):
+        chain = []
+        for _ in range(3):
+            axis, slides = random.normal(size=3), bool(random.random() < 0.4)
+            axis /= np.linalg.norm(axis)
+            last = 0.3 if slides else 1.5
+            chain.append(FingerJoint(slides, axis, random.uniform(-0.1, 0.1, 3), 0.0, -last, last, -last, last, "a"))
+        body = TurningBody("left", "finger_0", random.uniform(-0.1, 0.1, (2, 3)), 0.01, tuple(chain))
+        bounds, at = body.curvatures(), [random.uniform(joint.before, joint.beyond) for joint in chain]
+
+        def ends(positions: Array, body: TurningBody = body) -> Array:
+            alone = [replace(joint, driver=str(j)) for j, joint in enumerate(body.joints)]
+            shares = {
+                str(j): (by - joint.closed) / (joint.open - joint.closed)
+                for j, (by, joint) in enumerate(zip(positions, alone, strict=True))
+            }
+            return moved(alone, body.ends, shares)
+
+        for i, k in product(range(3), repeat=2):
+            steps = h * np.eye(3)
+            second = ends(at + steps[i] + steps[k]) - ends(at + steps[i] - steps[k])
+            second -= ends(at - steps[i] + steps[k]) - ends(at - steps[i] - steps[k])
+            found = float(np.linalg.norm(second, axis=1).max()) / (4.0 * h**2)
+            assert found <= bounds[i, k] + 1e-6, (i, k)
+            nearest[i, k] = max(nearest[i, k], found / max(bounds[i, k], 1e-9) if bounds[i, k] else 0.0)
+    assert nearest.min() > 0.5  # bounds that say something

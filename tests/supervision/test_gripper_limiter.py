@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from pathlib import Path
 
 import pinocchio as pin
 import pytest
 
 from q2r2_control import CartesianController, Robot
 from q2r2_control.plants.base import GripperMotion
+from q2r2_control.robot.kept_distances import kept_distances
 from q2r2_control.supervision.gripper_limiter import TOLERANCE, GripperLimiter
 from q2r2_control.types import ALL_OF_THE_WAY
 from tests.support.block_cell import ABOVE, BESIDE, CELL, SETTINGS
+from tests.support.turning_hand import RealHands, above_table, turning_cell
 
 DT = 0.002
 STROKE = 0.025  # [m]
@@ -176,3 +179,37 @@ def test_an_opening_counts_for_as_long_as_the_gripper_may_take_to_do_what_it_is_
         least[remembered] = now
     assert 0.05 <= least[0.05] < 0.15
     assert 0.3 <= least[0.3] < 0.7
+
+
+def test_fingers_that_turn_wait_above_the_table_with_closing_and_go_on_by_themselves(tmp_path: Path) -> None:
+    config = turning_cell(tmp_path)
+    robot = Robot.from_config(config)
+    real = RealHands(robot)
+    controller = CartesianController(robot, config.control.model_copy(update={"solve_time_limit": None}))
+    kept = kept_distances(robot, config.control).values
+    limiter, motion, now = GripperLimiter(controller), GripperMotion(config), 0.0
+
+    def run(wanted: float, goal: pin.SE3, seconds: float) -> None:
+        nonlocal now
+        for tick in range(round(seconds / DT)):
+            now += DT
+            granted = limiter.limit({"left": wanted, "right": 1.0}, motion.openings, now)
+            reference = controller.step({"left": goal}, DT)
+            motion.command(granted)
+            motion.advance(DT)
+            for opening in (granted["left"], motion.openings["left"]):
+                assert controller.openings["left"][0] <= opening <= controller.openings["left"][1]
+            if tick % 10 == 0:
+                assert (real.distances(reference.q, motion.openings) >= kept - 2e-6).all()
+
+    run(1.0, above_table(0.006), 1.8)
+    assert not limiter.held
+    run(0.0, above_table(0.006), 0.6)
+    assert 0.3 < motion.openings["left"] < 0.95
+    assert "table_0" in limiter.held["left"]
+    run(0.0, above_table(0.06), 1.5)
+    assert motion.openings["left"] == 0.0
+    assert not limiter.held
+    # Down with closed fingers, which reach farther: it is the arm that waits.
+    run(0.0, above_table(0.006), 1.0)
+    assert controller.tool_pose("left").translation[2] > above_table(0.006).translation[2] + 0.005

@@ -20,6 +20,8 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 
 CLOSED, OPEN = 0.8, 0.0  # [rad]
+_TABLE = 0.2  # height of its top [m]
+_FRAME_TO_OPEN_TIPS = 0.0107  # [m]; closed ones are 14 mm farther
 # By which part of the drive's turn the other joints turn.
 _FOLLOWERS = {"one_tip": -1.0, "one_inner": 1.0, "two_knuckle": 1.0, "two_tip": -1.0, "two_inner": 1.0}
 
@@ -72,6 +74,11 @@ def turning_cell(folder: Path, **obstacles: object) -> Config:
         arm["gripper"] |= {"joints": ("drive",), "open_position": OPEN, "closed_position": CLOSED, "speed": 1.5}
     data["obstacles"] |= obstacles
     return Config.model_validate(data)
+
+
+def above_table(tips: float) -> pin.SE3:
+    """The left tool pointing down with the tips of its open fingers this far above the table [m]."""
+    return pin.SE3(pin.rpy.rpyToMatrix(np.pi, 0.0, np.pi), np.array([0.5, 0.25, _TABLE + _FRAME_TO_OPEN_TIPS + tips]))
 
 
 class RealHands:
