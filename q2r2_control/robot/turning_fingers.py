@@ -44,7 +44,10 @@ _PULLED_IN = np.array([0.0, 0.58, 1.2])
 
 @dataclass(frozen=True, slots=True)
 class FingerJoint:
-    """A joint that moves a shape, as that was drawn, in the frame of the arm's link that carries the hand."""
+    """A joint that moves a shape, as that was drawn, in the frame of the arm's link that carries the hand.
+
+    Positions of the joints of one driver are linear in the driver's, also beyond the stroke.
+    """
 
     slides: bool
     axis: Array  # (3,) unit vector

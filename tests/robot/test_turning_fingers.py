@@ -128,7 +128,7 @@ def joints(draw: st.DrawFn) -> FingerJoint:
     slides = draw(st.booleans())
     size = 0.05 if slides else 1.6
     closed, opened, home = (size * draw(st.floats(-1.0, 1.0)) for _ in range(3))
-    beyond = 0.1 * size * (1.0 if opened >= closed else -1.0)
+    beyond = 0.1 * (opened - closed)  # a part of the stroke that is the same for all joints of one driver
     axis, point = np.array(draw(_AXES)), np.array(draw(_VECTORS))
     driver = draw(st.sampled_from("ab"))
     return FingerJoint(slides, axis, point, home, closed, opened, closed - beyond, opened + beyond, driver)
