@@ -16,6 +16,7 @@ from trajectory_msgs.msg import JointTrajectory
 
 from q2r2_control.benchmark.node_load import LoadReport, NodeLoad, speed_ripple, times_of_a_robot
 from q2r2_control.benchmark.ros_processes import private_domain, processor_time, started
+from q2r2_control.config import load_config
 from q2r2_control.errors import Q2R2Error
 from q2r2_control.ros.base_node import STREAM_QOS
 from q2r2_control.ros.launch.processes import NodeProcess, nodes_of
@@ -32,10 +33,10 @@ class LoadError(Q2R2Error):
 
 def measure_load(config: str, duration: float, progress: Callable[[str], None]) -> LoadReport:
     """Measure for ``duration`` [s] at rest, and as long with both arms moving. Raises :class:`LoadError`."""
-    nodes = nodes_of(config, "none")
+    nodes, arms = nodes_of(config, "none"), len(load_config(config).arms)
     with private_domain(), _Watcher() as watcher, started(nodes) as processes:
         progress("waiting for all nodes")
-        watcher.wait(lambda: watcher.active and len(watcher.engaged) == _arms(nodes), "the nodes")
+        watcher.wait(lambda: watcher.active and len(watcher.engaged) == arms, "the nodes")
         watcher.spin(_SETTLE)
         progress(f"idle: {duration:g} s")
         idle = watcher.shares(processes, duration)
@@ -51,10 +52,6 @@ def measure_load(config: str, duration: float, progress: Callable[[str], None]) 
     times, q = np.array([at for at, _ in watcher.commands]), np.array([q for _, q in watcher.commands])
     rows = tuple(NodeLoad(name, idle.get(name, 0.0), moving[name]) for name in moving)
     return LoadReport(duration, _JITTER, rows, len(times) / duration, speed_ripple(times_of_a_robot(times), q))
-
-
-def _arms(nodes: list[NodeProcess]) -> int:
-    return sum(node.name.endswith("_arm_controller") for node in nodes)
 
 
 class _Watcher:

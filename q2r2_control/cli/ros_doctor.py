@@ -35,7 +35,7 @@ def doctor(
     """
     positive("--duration", duration)
     cell = load_config(config)
-    expected = [node.name for node in nodes_of(config, "none")]
+    expected = [node.name for node in nodes_of(config, "none", separate=True)]
     facts, findings = watching.examine_environment(os.environ)
     nodes: tuple[str, ...] = ()
     others: tuple[str, ...] = ()

@@ -39,13 +39,7 @@ def test_the_bench_measures_both_ways_in_and_presses_and_the_load_of_real_nodes(
         assert 80.0 <= row["target_p50_ms"] < row["motion_p50_ms"] <= row["motion_max_ms"]
     load = report["load"]
     nodes = [row["node"] for row in load["rows"]]
-    assert nodes == [
-        "mujoco_robot",
-        "cartesian_controller",
-        "left_arm_controller",
-        "right_arm_controller",
-        "SimulationInput",
-    ]
+    assert nodes == ["mujoco_robot", "cartesian_controller", "arm_controllers", "SimulationInput"]
     assert all(row["moving"] > 0.0 for row in load["rows"])
     assert load["total"]["moving"] == pytest.approx(sum(row["moving"] for row in load["rows"]))
     assert load["commands_hz"] > 10.0
