@@ -213,3 +213,18 @@ def test_fingers_that_turn_wait_above_the_table_with_closing_and_go_on_by_themse
     # Down with closed fingers, which reach farther: it is the arm that waits.
     run(0.0, above_table(0.006), 1.0)
     assert controller.tool_pose("left").translation[2] > above_table(0.006).translation[2] + 0.005
+
+
+def test_one_whose_bodies_may_not_get_smaller_yet_is_not_held(
+    controller: CartesianController, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cell = Cell(controller)
+    cell.run(0.0, 0.05)
+    with monkeypatch.context() as patch:
+        patch.setattr(controller, "set_opening", lambda *_: ("finger", "table"))
+        cell.run(0.0, 0.4)
+        assert not cell.limiter.held
+    assert cell.motion.openings["left"] == cell.granted["left"] == 0.0
+    assert controller.openings["left"][1] == 1.0
+    cell.run(0.0, 0.2)
+    assert controller.openings["left"][1] < 0.1

@@ -96,15 +96,9 @@ class GripperLimits:
         if self._bodies is not None:
             granted = self._bodies.limit_grippers(self._wanted, self._fingers.openings(now), now)
         else:
-            granted = {arm: self._unproven(arm, wanted) for arm, wanted in self._wanted.items()}
+            granted = {arm: without_proof(wanted, self._told.get(arm)) for arm, wanted in self._wanted.items()}
         for arm, opening in granted.items():
             self._answer(arm, self._wanted[arm], opening)
-
-    def _unproven(self, arm: str, wanted: float) -> float:
-        """What is granted while the arms do not move."""
-        if (before := self._told.get(arm)) is None or before[0] == before[1]:
-            return wanted
-        return min(wanted, before[1]) if before[0] > before[1] else max(wanted, before[1])
 
     def _answer(self, arm: str, wanted: float, granted: float) -> None:
         if self._told.get(arm) != (wanted, granted):
@@ -130,6 +124,13 @@ class GripperLimits:
                 now = self._node.now
                 self._bodies.resume({arm: commanded}, self._fingers.openings(now), now)
         self._wanted[arm] = wanted
+
+
+def without_proof(wanted: float, told: tuple[float, float] | None) -> float:
+    """What is granted while the arms do not move; ``told`` is what was wanted and granted before."""
+    if told is None or told[0] == told[1]:
+        return wanted
+    return min(wanted, told[1]) if told[0] > told[1] else max(wanted, told[1])
 
 
 class FingerStates:
