@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import json
 import random
+import signal
 import socket
 import struct
 import sys
@@ -232,21 +233,22 @@ def main() -> int:
     parser.add_argument("--dialect", choices=DIALECTS, default="ros2")
     parser.add_argument("--script", choices=sorted(SCRIPTS), default="acceptance")
     parser.add_argument("--duration", type=float, default=20.0, help="[s]")
-    parser.add_argument("--end", choices=("close", "cut", "stall"), default="close", help="cut: inside a frame")
+    parser.add_argument("--end", choices=("close", "stall"), default="close", help="SIGTERM ends it inside a frame")
     parser.add_argument("--connect-timeout", type=float, default=30.0, help="waits for the server this long [s]")
     parser.add_argument("--log", type=Path, help="writes what was sent, a JSON line each")
     arguments = parser.parse_args()
     sent: list[tuple[float, Reading]] = []
     address = (arguments.host, arguments.port)
     headset = FakeHeadset(address, arguments.dialect, connect_timeout=arguments.connect_timeout)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         headset.send(headset.registrations())
         for time_and_reading in play(headset, SCRIPTS[arguments.script](arguments.duration), arguments.duration):
             sent.append(time_and_reading)
-        if arguments.end == "cut":
-            headset.send(headset.pose("left", START["left"], (0.0, 0.0, 0.0, -1.0))[:30])
-        elif arguments.end == "stall":
+        if arguments.end == "stall":
             time.sleep(3.0)
+    except KeyboardInterrupt:
+        headset.send(headset.pose("left", START["left"], (0.0, 0.0, 0.0, -1.0))[:30])
     except ConnectionError:
         pass
     finally:
