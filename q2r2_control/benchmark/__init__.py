@@ -6,7 +6,7 @@ runs the same motions from hand samples to arms in MuJoCo, by ``stack_run``. ``l
 live loop goes, by ``stage_clock``, and ``feel_run`` what an operator feels of a filter. ``command_responses`` finds the
 commands that answer steps of an input, ``press_times`` what follows a press; ``ros_latency`` and ``ros_press``, which
 need ROS, record them. ``press_run`` presses a finger on the table, and ``sliding_stability`` tells from which
-friction on such a slide chatters by itself.
+friction on such a slide chatters by itself. ``rest_run`` asks for places that the arms get in each other's way at.
 """
 
 from __future__ import annotations

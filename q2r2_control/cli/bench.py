@@ -14,6 +14,7 @@ from q2r2_control.benchmark.feel_run import run_feel
 from q2r2_control.benchmark.loop_times import LoopReport, run_loop_bench
 from q2r2_control.benchmark.peers.base import PEERS
 from q2r2_control.benchmark.press_run import PRESSES, run_press
+from q2r2_control.benchmark.rest_run import RestReport, run_rest
 from q2r2_control.benchmark.stack_bench import StackReport, run_stack_bench
 from q2r2_control.benchmark.tick_times import run_bench
 from q2r2_control.benchmark.work_bench import WORK_PEERS, run_work_bench
@@ -22,6 +23,7 @@ from q2r2_control.cli.loop_table import loop_table
 from q2r2_control.cli.options import DEMO_CONFIG, Json
 from q2r2_control.cli.output import as_json_text, notice_of_compiling, stderr_console
 from q2r2_control.cli.press_table import press_table
+from q2r2_control.cli.rest_table import rest_table
 from q2r2_control.cli.ros_table import latency_table, load_table, presses_table
 from q2r2_control.cli.soak_table import soak_table
 from q2r2_control.cli.stack_table import following_table, safety_table
@@ -64,7 +66,10 @@ def bench(
         bool,
         typer.Option("--contact", help="With --soak: fingers may touch table and fingers, as in torque mode."),
     ] = False,
-    seed: Annotated[int, typer.Option(min=0, help="Of the soak, or of the hands with --through.")] = 0,
+    rest: Annotated[
+        bool, typer.Option("--rest", help="Ask for constant targets, most out of reach: do the arms come to rest?")
+    ] = False,
+    seed: Annotated[int, typer.Option(min=0, help="Of the soak, of --rest, or of the hands with --through.")] = 0,
     loop: Annotated[bool, typer.Option("--loop", help="Time the whole live loop instead, stage by stage.")] = False,
     record: Annotated[bool, typer.Option("--record", help="With --loop: also while the run is recorded.")] = False,
     camera: Annotated[
@@ -95,6 +100,9 @@ def bench(
     With --soak: random hostile targets, ticks, starts and solver failures; every promise of the controller is checked
     at every tick, and the worst margin of each is printed. Exit 1 if one was broken.
 
+    With --rest: targets drawn at random that stay, near both arms and on the other arm's side. How quiet the arms are
+    at the end, and how smoothly they got there.
+
     With --loop: where a tick of q2r2 run goes, from inputs to recording, for three plants and modes.
 
     With --press: what the table feels of a finger that is commanded into it, and slides. Exit 1 if a promise is broken.
@@ -106,23 +114,23 @@ def bench(
     press and later ones, what each node takes of the processors, and how evenly the commands move; through real nodes
     on this machine, in a domain of their own.
     """
-    if sum((work, soak, ros, loop, press, feel)) > 1:
-        raise ConfigError("--work, --soak, --ros, --loop, --press and --feel exclude each other")
+    if sum((work, soak, rest, ros, loop, press, feel)) > 1:
+        raise ConfigError("--work, --soak, --rest, --ros, --loop, --press and --feel exclude each other")
     for option, given in (("--motion", motion), ("--through", through)):
         if given and not work:
             raise ConfigError(f"{option} needs --work")
     if work and ticks is not None:
         raise ConfigError("--ticks cannot be used with --work, whose motions have a length of their own")
-    if (press or feel) and ticks is not None:
-        raise ConfigError("--ticks cannot be used with --press and --feel, which have a length of their own")
+    if (press or feel or rest) and ticks is not None:
+        raise ConfigError("--ticks cannot be used with --press, --feel and --rest, which have a length of their own")
     if record and not loop:
         raise ConfigError("--record needs --loop")
     if camera and not record:
         raise ConfigError("--camera needs --record")
     if contact and not soak:
         raise ConfigError("--contact needs --soak")
-    if seed and not (soak or through):
-        raise ConfigError("--seed needs --soak or --through, since nothing else draws")
+    if seed and not (soak or rest or through):
+        raise ConfigError("--seed needs --soak, --rest or --through, since nothing else draws")
     if ros and ticks is not None:
         raise ConfigError("--ticks cannot be used with --ros, which takes --duration")
     if not ros and (duration is not None or rate is not None):
@@ -138,6 +146,8 @@ def bench(
             cell = load_config(DEMO_CONFIG)
             cell = with_contact(cell, FINGERS) if contact else cell
             _show_soak(run_soak(cell, soak_ticks, seed, _progress(console)), json)
+        elif rest:
+            _show_rest(run_rest(load_config(DEMO_CONFIG), seed, _progress(console)), json)
         elif through:
             modes = tuple(dict.fromkeys(through))
             _show_stack(run_stack_bench(load_config(DEMO_CONFIG), motions, modes, seed, _progress(console)), json)
@@ -183,6 +193,13 @@ def _show_press(config: Config, json: bool) -> NoReturn:
     else:
         Console().print(press_table(config.name, figures))
     raise typer.Exit(1 if any(press.violations for press in figures) else 0)
+
+
+def _show_rest(report: RestReport, json: bool) -> None:
+    if json:
+        print(as_json_text(report.as_json()))
+    else:
+        Console().print(rest_table(report))
 
 
 def _show_stack(report: StackReport, json: bool) -> NoReturn:

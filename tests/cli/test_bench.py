@@ -183,7 +183,7 @@ def test_through_the_stack_every_mode_runs_once_and_a_broken_promise_is_exit_cod
     [
         (["--through", "torque"], "--through needs --work"),
         (["--contact"], "--contact needs --soak"),
-        (["--work", "--seed", "3"], "--seed needs --soak or --through, since nothing else draws"),
+        (["--work", "--seed", "3"], "--seed needs --soak, --rest or --through, since nothing else draws"),
     ],
 )
 def test_options_of_the_stack_that_make_no_sense_are_one_line(options: list[str], line: str) -> None:
@@ -284,5 +284,5 @@ def test_the_loop_s_bench_has_a_camera_where_one_is_asked_for_and_it_is_recorded
 @pytest.mark.parametrize("other", ["--soak", "--ros"])
 def test_one_bench_at_a_time(other: str) -> None:
     refused = q2r2("bench", "--loop", other)
-    line = "q2r2: --work, --soak, --ros, --loop, --press and --feel exclude each other\n"
+    line = "q2r2: --work, --soak, --rest, --ros, --loop, --press and --feel exclude each other\n"
     assert (refused.exit_code, refused.stderr) == (2, line)

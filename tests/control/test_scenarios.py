@@ -170,8 +170,8 @@ def test_the_contract_holds_at_every_tick(name: str, robot: str, dt: float) -> N
     # Only a start in penetration has no certificate at first.
     assert (contract.uncertified > 0) == (case.start is in_penetration)
     assert failed == 0 or case.fault in STOPPING_FAULTS
-    # After an absurd solution, which was followed as far as it could be certified, the arms may be where rows are late.
-    assert unfounded <= (0.01 if case.fault == "absurd" else 0.001) * contract.ticks
+    # After an absurd solution, which was followed as far as could be certified, rows may be late by a part of a stop.
+    assert unfounded <= (0.02 if case.fault == "absurd" else 0.001) * contract.ticks
     if case.recovers:
         assert StepStatus.RECOVERING in statuses
         assert reference.report.status is not StepStatus.RECOVERING

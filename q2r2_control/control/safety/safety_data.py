@@ -14,8 +14,7 @@ from q2r2_control.control.safety.velocity_bounds import BodyVelocities
 from q2r2_control.types import Array
 
 _DEEPEST = 6  # halvings of the stop: 64 intervals
-_ROWS_PER_PAIR = 5  # the closest points and four segment ends
-INSTANTS = (0, 20, 64)  # of 64, where a row looks at the stop: the start, half of the way, and the end
+_ROWS_PER_PAIR = 15  # the closest points and four segment ends
 
 
 class ReferenceState(NamedTuple):
@@ -33,13 +32,13 @@ class SeparationRows(NamedTuple):
     lower: Array  # (m,) [m/s]; of unit rows [rad/s]
     pair: IntArray  # (m,)
     used: IntArray  # (1,) number of valid rows
-    lever: Array  # (instants, nv) scratch: what a joint's next speed adds to its way until an instant of the stop [s]
+    ahead: Array  # (3,) scratch: how far a pair is apart at three instants of the stop [m]
 
     @classmethod
     def empty(cls, pairs: int, nv: int) -> SeparationRows:
         m = _ROWS_PER_PAIR * pairs
         counts = np.zeros(m, dtype=np.int64), np.zeros(1, dtype=np.int64)
-        return cls(np.zeros((m, nv)), np.zeros(m), *counts, lever=np.zeros((len(INSTANTS), nv)))
+        return cls(np.zeros((m, nv)), np.zeros(m), *counts, ahead=np.zeros(3))
 
 
 class Candidate(NamedTuple):

@@ -10,16 +10,20 @@ It may be used up no faster than at a rate:
 
 (a control barrier function made of a backup manoeuvre: Gurriet, Mote, Ames, Feron, CDC 2018). Motion that keeps its
 distance uses up nothing and is not slowed, however fast it is; motion that closes in is slowed in time for the stop,
-with the curvature of the way, by all pairs alike. B is linearised where it is least. Let joint j travel v_j s_j of the
-stop until there. With a stop of the same duration after the step,
+with the curvature of the way, by all pairs alike. B is linearised at the instants of the stop where it is least, or may
+soon be: with a row for the nearest alone, each of two that are about as near would be forgotten at every other tick. At
+t of a stop that takes T joints that stop together have travelled v s, s = t - t^2 / 2T. With the same T after the step,
 
-    D q_j = h (v_j + v+_j) / 2 + s_j (v+_j - v_j).
+    D q = h (v + v+) / 2 + s (v+ - v),    n'(J_2 - J_1) D q >= -gain h B.
 
-(That the duration shrinks as the slowest joint brakes is left out: it would make that joint the lever of all rows, and
-the solution change from tick to tick.) For a pair at rest this is the usual row, n'(J_2 - J_1) v+ >= -gain B. Closer
-than the buffer the row asks for opening, as fast as a part of the acceleration limits gives. Pairs that may touch have
-a distance below zero, and a zone before and in contact where B is used up no faster than a speed of their own. The rows
-give comfort only: they are soft, so that the QP always has a solution; safety is the certificate's.
+For a pair at rest this is the usual row, n'(J_2 - J_1) v+ >= -gain B. The change of speed counts alike for all joints,
+also in stops in which they rest one after the other, and that T shrinks as the slowest joint brakes is left out: so the
+row is always along the pair's own normal. With a lever of its own for each joint the correction of a strong pull leaves
+the normal, by another angle in each shape of stop, and joints alternate from tick to tick as the shape does.
+
+Closer than the buffer the row asks for opening, as fast as a part of the acceleration limits gives. Pairs that may
+touch have a distance below zero, and a zone before and in contact where B is used up no faster than a speed of their
+own. The rows give comfort only: they are soft, so that the QP always has a solution; safety is the certificate's.
 
 **The gain may change between any two ticks.** It stands in the bound above, and in how near a pair has to be for a row
 and for an exact distance. The certificate reads no row and no gain; it reads distances, and where one is a lower bound
@@ -38,7 +42,7 @@ from q2r2_control.control.geometry.closest_points import segment_segment
 from q2r2_control.control.geometry.collision import CollisionData
 from q2r2_control.control.geometry.pair_distance import at_least, distance_row, measure, measure_part
 from q2r2_control.control.jit import inlined_kernel, lean_kernel
-from q2r2_control.control.safety.safety_data import INSTANTS, SafetyData
+from q2r2_control.control.safety.safety_data import SafetyData
 from q2r2_control.control.safety.safety_model import SafetyModel
 from q2r2_control.control.safety.separating_plane import curvature
 from q2r2_control.control.safety.stop_rollout import begin_rollout, sample_of
@@ -49,17 +53,20 @@ from q2r2_control.types import Array
 class Moment(NamedTuple):
     """When of the stop a row looks at its pair."""
 
-    number: int  # of the instants
-    straight: bool  # the pair is measured at the stop's start, and the row follows the tangent
+    along: bool  # the pair is measured at the stop's start, and the row follows the tangent to the end
     h: float  # length of the step that the row is for [s]
+    lever: float  # what the next speeds add to the way until the moment [s]
     ahead: float  # how far in time the row looks: half of the stop, which is as far as it leads, and 1 / gain [s]
 
 
+_INSTANTS = (0, 20, 64)  # of 64, where a row looks at the stop: the start, half of the way, and the end
 _SHARE = 0.25
 # Ends of near-parallel capsules get rows of their own, unless the closest point is practically there already.
 _SAME_POINT = 0.005  # [m]
+# An instant of the stop that may soon be the nearest has a row already, so that nothing switches from tick to tick.
+_SAME_DISTANCE = 0.002  # [m]
 # A stop that takes a pair's points off the tangent by less than this is looked at from its start, along the tangent.
-_STRAIGHT = 2e-4  # [m]
+_STRAIGHT = 5e-5  # [m]
 
 
 @lean_kernel
@@ -112,44 +119,69 @@ def write_separation_rows(model: SafetyModel, data: SafetyData, h: float) -> Non
         candidate.v[j] = data.state.v[j]
         candidate.deceleration[j] = data.certified[j]
     duration = begin_rollout(data)
-    _write_levers(data, duration, h)
     stop = data.rollout.stop.travel
     count = 0
     for p in range(data.near.shape[0]):
         if data.near[p] == 0:
             continue
-        number = 0
-        least = data.distance[p]
         straight = curvature(model.collision.pairs, p, stop, stop, 0.0) < _STRAIGHT
-        if not straight and least >= model.min_distance[p]:
-            for i in range(1, len(INSTANTS)):
-                distance = measure(model.collision, sample_of(model, data, INSTANTS[i], duration), p)
-                if distance < least:
-                    least = distance
-                    number = i
-        at = data.collision if number == 0 else sample_of(model, data, INSTANTS[number], duration)
-        least = measure(model.collision, at, p)
-        moment = Moment(number, straight, h, 0.5 * duration + 1.0 / model.approach.gain[0])
-        before = count
-        count = _append_row(model, data, at, p, least, moment, count)
-        if count > before:
-            count = _append_end_rows(model, data, at, p, least, moment, count)
+        least = _distances_ahead(model, data, p, duration, straight)
+        for i in range(len(_INSTANTS)):
+            lever = _lever(i, duration, h)
+            if data.rows.ahead[i] > least + _SAME_DISTANCE or (i > 0 and lever <= h):
+                continue
+            along = straight and i > 0
+            at = data.collision if i == 0 or along else sample_of(model, data, _INSTANTS[i], duration)
+            distance = measure(model.collision, at, p)
+            moment = Moment(along, h, lever, 0.5 * duration + 1.0 / model.approach.gain[0])
+            before = count
+            count = _append_row(model, data, at, p, distance, moment, count)
+            if count > before:
+                count = _append_end_rows(model, data, at, p, distance, moment, count)
     data.rows.used[0] = count
     _normalise_rows(data)
 
 
+@inlined_kernel
+def _distances_ahead(model: SafetyModel, data: SafetyData, p: int, duration: float, straight: bool) -> float:
+    """Write how far pair ``p`` is apart at the instants, infinite where none is looked at; returns the least [m].
+
+    On a straight way it is nearest at one of both ends. One that is too close has to open from where it is.
+    """
+    ahead, last = data.rows.ahead, len(_INSTANTS) - 1
+    ahead[:] = np.inf
+    ahead[0] = measure(model.collision, data.collision, p)
+    if ahead[0] < model.min_distance[p]:
+        return ahead[0]
+    if straight:
+        row = data.rows.matrix[-1]  # scratch: so many rows are never in use
+        distance_row(model.collision, data.collision, p, row)
+        ahead[last] = ahead[0] + _tangent(data, row)
+        return min(ahead[0], ahead[last])
+    least = ahead[0]
+    for i in range(1, last + 1):
+        ahead[i] = measure(model.collision, sample_of(model, data, _INSTANTS[i], duration), p)
+        least = min(least, ahead[i])
+    return least
+
+
+@inlined_kernel
+def _tangent(data: SafetyData, row: Array) -> float:
+    """By how much the certified stop opens a pair with the given ``row`` along the tangent [m]."""
+    v = data.state.v
+    change = 0.0
+    for j in range(row.shape[0]):
+        change += row[j] * 0.5 * v[j] * abs(v[j]) / data.certified[j]
+    return change
+
+
 @lean_kernel
-def _write_levers(data: SafetyData, duration: float, h: float) -> None:
-    """By s_j + h / 2 a joint's next speed v+_j lengthens its way until an instant, of the step and of the stop."""
-    candidate, lever = data.candidate, data.rows.lever
-    for i in range(len(INSTANTS)):
-        t = duration * INSTANTS[i] / INSTANTS[-1]
-        for j in range(lever.shape[1]):
-            speed = abs(candidate.v[j])
-            whole = speed / candidate.deceleration[j] if speed > 0.0 else duration
-            s = t - 0.5 * t * t / whole if t < whole else 0.5 * whole
-            # At rest a faster step lengthens the stop by as much as the step itself.
-            lever[i, j] = max(s, 0.5 * h) + 0.5 * h
+def _lever(number: int, duration: float, h: float) -> float:
+    """By s + h / 2 the next speeds lengthen the way until an instant, of the step and of the stop [s]."""
+    t = duration * _INSTANTS[number] / _INSTANTS[-1]
+    s = t - 0.5 * t * t / duration if duration > 0.0 else 0.0
+    # At rest a faster step lengthens the stop by as much as the step itself.
+    return max(s, 0.5 * h) + 0.5 * h
 
 
 @lean_kernel
@@ -178,26 +210,21 @@ def _append_row(
 ) -> int:
     """Keep the row if some velocity that the acceleration allows (v +- a h) breaks it; any other cannot bind.
 
-    Pair ``p`` has been measured in ``at``, the posture at the ``moment``; of a straight stop that is its start, and the
-    row looks along the tangent at the end if the pair closes in until there.
+    Pair ``p`` has been measured in ``at``, the posture at the ``moment``, or at the start of a straight stop whose end
+    the row looks at along the tangent.
     """
     h = moment.h
-    a, v, row, lever = model.limits.acceleration, data.state.v, data.rows.matrix[count], data.rows.lever[moment.number]
+    a, v, row, lever = model.limits.acceleration, data.state.v, data.rows.matrix[count], moment.lever
     distance_row(model.collision, at, p, row)
     free = distance - model.approach.stop_distance[p]
-    if moment.straight:
-        ahead = 0.0
-        for j in range(row.shape[0]):
-            ahead += row[j] * 0.5 * v[j] * abs(v[j]) / data.certified[j]
-        if ahead < 0.0 and distance >= model.min_distance[p]:
-            free += ahead
-            lever = data.rows.lever[len(INSTANTS) - 1]
+    if moment.along:
+        free += _tangent(data, row)
     rate = 0.0  # of the distance [m/s]: with v kept up, B changes by as much in a second
     change = 0.0  # how much the acceleration can do about that in this step [m]
     for j in range(row.shape[0]):
         rate += row[j] * v[j]
-        change += abs(row[j]) * lever[j] * a[j]
-    change *= h
+        change += abs(row[j]) * a[j]
+    change *= h * lever
     gain = model.approach.gain[0]
     allowed = -gain * h * free
     slow = model.approach.contact_speed[p]
@@ -211,11 +238,7 @@ def _append_row(
         allowed = min(allowed, max(h * rate, 0.0) + _SHARE * change)
     if h * rate - change >= allowed or change <= 0.0:
         return count
-    lower = allowed
-    for j in range(row.shape[0]):
-        lower += (lever[j] - h) * row[j] * v[j]  # what v alone adds to the change of B
-        row[j] *= lever[j]
-    data.rows.lower[count] = lower
+    data.rows.lower[count] = rate + (allowed - h * rate) / lever
     data.rows.pair[count] = p
     return count + 1
 
