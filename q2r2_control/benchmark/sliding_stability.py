@@ -14,13 +14,16 @@ undamped. Coulomb's friction mu does not depend on speed, so the speed of the sl
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pinocchio as pin
 
 from q2r2_control.compliance.impedance_terms import (
-    consistent_projector,
-    double_diagonalised_damping,
-    kinematic_projector,
+    TermScratch,
+    damp,
+    take_consistent,
+    take_kinematic,
     task_inertia,
 )
 from q2r2_control.config.control import ImpedanceSettings
@@ -73,15 +76,29 @@ def _jacobian_and_inertia(robot: Robot, arm: str, q: Array) -> tuple[Array, Arra
 
 def _impedance(settings: ImpedanceSettings, J: Array, M: Array) -> tuple[Array, Array]:
     """Stiffness and damping (n, n) of the joints by the impedance."""
-    M_inverse = np.linalg.inv(M)
-    inertia = task_inertia(J, M_inverse)
+    terms, inertia, M_inverse = TermScratch.empty(len(M)), np.zeros((6, 6)), np.linalg.inv(M)
+    task_inertia(J @ M_inverse @ J.T, terms, inertia)
     stiffness = np.repeat([settings.translational_stiffness, settings.rotational_stiffness], 3)
     posture = np.full(len(M), settings.nullspace_stiffness)
-    consistent = settings.nullspace_projector == "consistent"
-    N = consistent_projector(J, M_inverse, inertia) if consistent else kinematic_projector(J)
-    damping = double_diagonalised_damping(stiffness, inertia, settings.damping_ratio)
-    posture_damping = double_diagonalised_damping(posture, M, settings.nullspace_damping_ratio)
+
+    def projected(torque: Array) -> None:
+        if settings.nullspace_projector == "consistent":
+            take_consistent(J, inertia, J @ M_inverse @ torque, torque, terms)
+        else:
+            take_kinematic(J, torque, terms)
+
+    N = _matrix_of(projected, len(M))
+    damping = _matrix_of(lambda rate: damp(stiffness, inertia, settings.damping_ratio, rate, terms), 6)
+    posture_damping = _matrix_of(lambda rate: damp(posture, M, settings.nullspace_damping_ratio, rate, terms), len(M))
     return J.T @ np.diag(stiffness) @ J + N @ np.diag(posture), J.T @ damping @ J + N @ posture_damping
+
+
+def _matrix_of(change: Callable[[Array], None], n: int) -> Array:
+    """The matrix (n, n) by which a linear law changes a vector in its place."""
+    columns = np.eye(n)
+    for column in columns:
+        change(column)
+    return columns.T
 
 
 def _growth(inertia: Array, damping: Array, stiffness: Array) -> float:

@@ -3,7 +3,7 @@
     tau = J' (K e + D e') + N (K_n (q_r - q) + D_n (v_r - v)) + M(q) a_r + C(q, v) v + g(q) + joint-limit repulsion
 
 e is the way from the measured tool to that of the reference, e' the difference of their twists, D and D_n the damping
-of :func:`double_diagonalised_damping`, N a nullspace projector. Hogan 1985, Albu-Schaeffer et al. 2003.
+of :func:`damp`, N a nullspace projector. Hogan 1985, Albu-Schaeffer et al. 2003.
 
 **Feed-forward M a_r.** Seen from the tool an arm weighs what its rotors weigh geared up, 20 to 140 kg for a robot of
 22 kg. Without feed-forward the spring would have to give the force for every acceleration and would have to yield for
@@ -27,16 +27,19 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-import pinocchio as pin
 from pydantic import ValidationError
 
+from q2r2_control.compliance.impedance_data import ImpedanceData, ImpedanceModel
 from q2r2_control.compliance.impedance_kernels import (
-    ImpedanceData,
-    ImpedanceModel,
-    add_impedance_torque,
-    bound_torques,
+    BOUNDED,
+    CLIPPED,
+    HELD,
+    REPELLED,
+    gravity_torque,
+    impedance_torque,
 )
 from q2r2_control.compliance.impedance_terms import BoolArray, PositionLimits
+from q2r2_control.compliance.joint_dynamics import Bodies
 from q2r2_control.config.control import LIVE_IMPEDANCE, ImpedanceSettings
 from q2r2_control.control.geometry.kinematics import IntArray, chain_of
 from q2r2_control.control.jit import bound, hold
@@ -48,7 +51,7 @@ from q2r2_control.types import LONGEST_DT, Array, Reference, RobotState
 _PAYLOAD_TIME = 0.3  # over which a payload's mass comes or goes [s]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)  # not frozen: that would cost a microsecond a tick
 class ImpedanceReport:
     """What one tick did and why. Joints and arms by name."""
 
@@ -60,7 +63,7 @@ class ImpedanceReport:
     held: bool  # the measured state was of no use: the last gravity torque is held
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class TorqueCommand:
     """Joint torques of one tick."""
 
@@ -84,19 +87,18 @@ class ImpedanceController:
         self._payloads = {arm: held for arm, held in robot.objects.by_arm.items() if held.config.mass > 0.0}
         self._borne = dict.fromkeys(self._payloads, 0.0)  # share of each payload's mass
         self._wanted_borne = dict(self._borne)
-        self._model = robot.model.copy() if self._payloads else robot.model  # with what is held
-        self._data = self._model.createData()
         model = _model_of(robot, self.settings)
-        self._kernel_data = ImpedanceData.empty(model)
-        self._held_model, self._held_data = hold(model), hold(self._kernel_data)
-        self._kernel_data.springs[:] = [getattr(self.settings, name) for name in LIVE_IMPEDANCE]
-        self._wanted_springs = self._kernel_data.springs.copy()  # at the end of a ramp
+        self._bodies, self._data = model.bodies, ImpedanceData.empty(model)
+        self._inputs = self._data.inputs.reshape(-1)  # a view
+        self._held_model, self._held_data = hold(model), hold(self._data)
+        self._data.springs[:] = [getattr(self.settings, name) for name in LIVE_IMPEDANCE]
+        self._wanted_springs = self._data.springs.copy()  # at the end of a ramp
         self._ramp_rate = np.zeros_like(self._wanted_springs)
         self._ramping = False
         # Every kernel runs once here, so that none is compiled in mid-motion.
-        self._add_torque = bound(add_impedance_torque, self._held_model, self._held_data)
-        self._bound_torques = bound(bound_torques, self._held_model, self._held_data, 0.0)
-        self._begin(robot.home, np.zeros(robot.model.nv))
+        self._gravity_torque = bound(gravity_torque, self._held_model, self._held_data)
+        self._impedance_torque = bound(impedance_torque, self._held_model, self._held_data, 0.0)
+        self._begin(robot.home)
 
     def reset(self, state: RobotState) -> None:
         """Start anew at rest at the measured posture: the first torque is that of gravity there, without a bump.
@@ -107,21 +109,25 @@ class ImpedanceController:
         q = np.array(state.q, dtype=np.float64)
         if q.shape != self._limit.shape or not np.isfinite(q).all():
             raise RobotError(f"impedance reset: q = {q!s:.80}: expected {len(self._limit)} finite numbers")
-        self._kernel_data.springs[:] = self._wanted_springs
+        self._data.springs[:] = self._wanted_springs
         self._ramping = False
         if self._borne != self._wanted_borne:
             self._bear(1.0)
-        self._begin(q, np.zeros_like(q))
+        self._begin(q)
 
-    def _begin(self, q: Array, v: Array) -> None:
-        self._due_q, self._due_v = q.copy(), v  # of the newest reference, due at the end of its tick
-        self._wanted_q, self._wanted_v = self._due_q, self._due_v  # of the one before, due now
-        self._usable_q = q.copy()  # the newest measured posture that was of use
-        self._kernel_data.bounded[:] = np.minimum(np.maximum(self.gravity(q), -self._limit), self._limit)
+    def _begin(self, q: Array) -> None:
+        data = self._data
+        data.references.due_q[:], data.references.due_v[:] = q, 0.0
+        data.usable_q[:] = q
+        data.bounded[:] = np.minimum(np.maximum(self.gravity(q), -self._limit), self._limit)
 
     def gravity(self, q: Array) -> Array:
         """Torque (nv,) that bears the arms, with what they hold, at a posture ``q`` (nv,) [rad], [Nm]."""
-        return np.array(pin.computeGeneralizedGravity(self._model, self._data, q))
+        data = self._data
+        usable, data.usable_q[:] = data.usable_q.copy(), q
+        self._gravity_torque(self._held_model, self._held_data)
+        data.usable_q[:] = usable
+        return data.tau.copy()
 
     def set_holding(self, holding: Mapping[str, bool]) -> None:
         """Of each arm whose gripper has an object, whether it is held and its mass to be borne."""
@@ -137,7 +143,7 @@ class ImpedanceController:
             if self._borne[arm] > 0.0:
                 inertias[held.joint] = inertias[held.joint] + held.inertia(self._borne[arm])
         for joint, inertia in inertias.items():
-            self._model.inertias[joint] = inertia
+            self._bodies.put(joint, inertia)
 
     def change(self, values: Mapping[str, float], arm: str | None = None) -> None:
         """Go by other stiffness and damping of one arm or of all, by name as in ``LIVE_IMPEDANCE``.
@@ -161,13 +167,13 @@ class ImpedanceController:
         for name, value in values.items():
             column = LIVE_IMPEDANCE.index(name)
             self._wanted_springs[changed, column] = value
-            way = self._wanted_springs[changed, column] - self._kernel_data.springs[changed, column]
+            way = self._wanted_springs[changed, column] - self._data.springs[changed, column]
             self._ramp_rate[changed, column] = np.abs(way) / self.settings.ramp_time
         self._ramping = True
 
     def in_force(self, arm: str) -> dict[str, float]:
         """What of ``LIVE_IMPEDANCE`` an arm goes by now."""
-        return dict(zip(LIVE_IMPEDANCE, self._kernel_data.springs[self._arms.index(arm)].tolist(), strict=True))
+        return dict(zip(LIVE_IMPEDANCE, self._data.springs[self._arms.index(arm)].tolist(), strict=True))
 
     def step(self, reference: Reference, state: RobotState, dt: float, extra: Array | None = None) -> TorqueCommand:
         """Torques for a tick of ``dt`` [s] that begins at ``state`` and ends when ``reference`` is due.
@@ -182,54 +188,26 @@ class ImpedanceController:
             self._ramp(time)
         if self._borne != self._wanted_borne:
             self._bear(time / _PAYLOAD_TIME)
-        acceleration, data = self._exchange(reference), self._kernel_data
-        held = not (_finite(state.q, state.v) and self._law(state, acceleration, extra))
-        if held:
-            data.tau[:] = self.gravity(self._usable_q)
-        else:
-            self._usable_q[:] = state.q
-        limited = self._bound_torques(self._held_model, self._held_data, self.settings.torque_rate_limit * time)
+        data = self._data
+        added = data.no_motion if extra is None else extra
+        np.concatenate((state.q, state.v, reference.q, reference.v, reference.a, added), out=self._inputs)
+        change = self.settings.torque_rate_limit * time
+        found = self._impedance_torque(self._held_model, self._held_data, change)
+        held, joints = bool(found & HELD), self.robot.joint_names
         report = ImpedanceReport(
             errors={} if held else dict(zip(self._arms, data.errors.copy(), strict=True)),
-            clipped=() if held else _those(self._arms, data.clipped),
-            saturated=_those(self.robot.joint_names, data.saturated) if limited else (),
-            rate_limited=_those(self.robot.joint_names, data.rate_limited) if limited else (),
-            repelled=() if held else _those(self.robot.joint_names, data.repulsion),
+            clipped=_those(self._arms, data.clipped) if found & CLIPPED else (),
+            saturated=_those(joints, data.saturated) if found & BOUNDED else (),
+            rate_limited=_those(joints, data.rate_limited) if found & BOUNDED else (),
+            repelled=_those(joints, data.repulsion) if found & REPELLED else (),
             held=held,
         )
         return TorqueCommand(data.bounded.copy(), report)
 
     def _ramp(self, time: float) -> None:
-        reach, springs = self._ramp_rate * time, self._kernel_data.springs
+        reach, springs = self._ramp_rate * time, self._data.springs
         springs[:] += np.minimum(np.maximum(self._wanted_springs - springs, -reach), reach)
         self._ramping = bool((springs != self._wanted_springs).any())
-
-    def _exchange(self, reference: Reference) -> Array:
-        """Take the newest reference in for the next tick; returns the acceleration (nv,) that leads to it."""
-        self._wanted_q, self._wanted_v = self._due_q, self._due_v
-        if _finite(reference.q, reference.v, reference.a):
-            self._due_q, self._due_v = reference.q.copy(), reference.v.copy()
-            return reference.a
-        self._due_v = np.zeros_like(self._due_v)
-        return self._due_v
-
-    def _law(self, state: RobotState, acceleration: Array, extra: Array | None) -> bool:
-        """The torque of all arms and ``extra``, without bounds, into the kernel's data.
-
-        False where the numbers are too large to be computed with.
-        """
-        model, data, kernel_data = self._model, self._data, self._kernel_data
-        kernel_data.q[:], kernel_data.v[:] = state.q, state.v
-        kernel_data.wanted_q[:], kernel_data.wanted_v[:] = self._wanted_q, self._wanted_v
-        kernel_data.tau[:] = pin.rnea(model, data, kernel_data.q, kernel_data.v, acceleration)
-        kernel_data.M[:] = pin.crba(model, data, kernel_data.q)
-        try:
-            self._add_torque(self._held_model, self._held_data)
-        except np.linalg.LinAlgError:
-            return False
-        if extra is not None:
-            kernel_data.tau[:] += extra
-        return _finite(kernel_data.tau)
 
 
 def _model_of(robot: Robot, settings: ImpedanceSettings) -> ImpedanceModel:
@@ -239,6 +217,7 @@ def _model_of(robot: Robot, settings: ImpedanceSettings) -> ImpedanceModel:
         row[: len(arm.joints)] = arm.joints
     return ImpedanceModel(
         chain=chain_of(robot.model),
+        bodies=Bodies.of(robot.model),
         tools=tools_of(robot),
         joints=joints,
         dofs=np.array([len(arm.joints) for arm in arms]),
@@ -258,11 +237,4 @@ def _model_of(robot: Robot, settings: ImpedanceSettings) -> ImpedanceModel:
 
 def _those(names: tuple[str, ...], which: IntArray | BoolArray | Array) -> tuple[str, ...]:
     """The names at which ``which`` is not 0."""
-    if not np.count_nonzero(which):
-        return ()
     return tuple(names[index] for index in np.flatnonzero(which))
-
-
-def _finite(*arrays: Array) -> bool:
-    """Sums of squares are finite where all numbers are, and none is so large that it means nothing."""
-    return math.isfinite(sum([array.dot(array) for array in arrays]))

@@ -1,170 +1,188 @@
 """The law of the impedance, compiled: see :class:`ImpedanceController`; its pieces stand in impedance_terms.py.
 
-Inertia and feed-forward come in from Pinocchio, torque goes out. One call for all arms, since a dozen NumPy calls on
-matrices of seven rows cost more than the work they do.
+One call makes a tick's torques of all arms out of what was measured and wanted: a dozen NumPy calls on matrices of
+seven rows cost more than the work they do, and Pinocchio's on the way in and out.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
-import numpy as np
-
+from q2r2_control.compliance.impedance_data import ArmScratch, ImpedanceData, ImpedanceModel, ToolState
 from q2r2_control.compliance.impedance_terms import (
-    BoolArray,
-    PositionLimits,
     bound_torque,
     clip_error,
-    consistent_projector,
-    double_diagonalised_damping,
-    kinematic_projector,
+    damp,
     limit_repulsion,
+    take_consistent,
+    take_kinematic,
     task_inertia,
 )
-from q2r2_control.compliance.small_matrices import invert, times
-from q2r2_control.control.geometry.kinematics import Chain, IntArray, Placements, place
-from q2r2_control.control.jit import Held, kernel, lean_kernel
+from q2r2_control.compliance.joint_dynamics import inverse_dynamics
+from q2r2_control.compliance.small_matrices import factorise, finite, solve_factor, times
+from q2r2_control.control.geometry.kinematics import IntArray, place
+from q2r2_control.control.jit import Held, inlined_kernel, kernel, lean_kernel
 from q2r2_control.control.tasks.frame import rotation_vector, tool_jacobian, tool_pose
-from q2r2_control.control.tasks.task_model import Tools
 from q2r2_control.types import Array
 
-
-class ImpedanceModel(NamedTuple):
-    """What does not change between ticks; k arms of at most m joints."""
-
-    chain: Chain
-    tools: Tools
-    joints: IntArray  # (k, m) of each arm, the first ``dofs`` of a row
-    dofs: IntArray  # (k,)
-    torque_limit: Array  # (nv,) [Nm]
-    limits: PositionLimits
-    max_position_error: float  # [m]
-    max_rotation_error: float  # [rad]
-    consistent: bool  # which nullspace projector
-
-
-class ToolState(NamedTuple):
-    """One tool at one posture of all joints. World axes at its origin."""
-
-    placements: Placements  # of the joint frames
-    rotation: Array  # (3, 3)
-    translation: Array  # (3,) [m]
-    J: Array  # (6, nv)
-
-    @classmethod
-    def empty(cls, chain: Chain) -> ToolState:
-        nv = len(chain.parent) - 1
-        return cls(Placements.empty(chain), np.zeros((3, 3)), np.zeros(3), np.zeros((6, nv)))
-
-
-class ImpedanceData(NamedTuple):
-    """One tick: what was measured, what is wanted, and what comes of it. World axes at the tools' origins."""
-
-    q: Array  # (nv,) measured [rad]
-    v: Array  # (nv,) [rad/s]
-    wanted_q: Array  # (nv,)
-    wanted_v: Array  # (nv,)
-    M: Array  # (nv, nv)
-    M_inverse: Array  # (nv, nv) scratch
-    M_factor: Array  # (nv, nv) scratch
-    springs: Array  # (k, 5) in force: the values of LIVE_IMPEDANCE [N/m, Nm/rad, 1, Nm/rad, 1]
-    errors: Array  # (k, 6) after clipping [m, rad]
-    clipped: IntArray  # (k,) 1 where it was longer
-    repulsion: Array  # (nv,) from position limits [Nm]
-    tau: Array  # (nv,) in: feed-forward; out: with springs and repulsion [Nm]
-    bounded: Array  # (nv,) in: commanded last; out: what of tau is commanded now [Nm]
-    saturated: BoolArray  # (nv,)
-    rate_limited: BoolArray  # (nv,)
-    measured: ToolState  # scratch: of one tool at q
-    wanted: ToolState  # scratch: at wanted_q
-
-    @classmethod
-    def empty(cls, model: ImpedanceModel) -> ImpedanceData:
-        arms, nv = len(model.dofs), len(model.limits.lower)
-        return cls(
-            q=np.zeros(nv),
-            v=np.zeros(nv),
-            wanted_q=np.zeros(nv),
-            wanted_v=np.zeros(nv),
-            M=np.eye(nv),
-            M_inverse=np.eye(nv),
-            M_factor=np.eye(nv),
-            springs=np.ones((arms, 5)),
-            errors=np.zeros((arms, 6)),
-            clipped=np.zeros(arms, dtype=np.int64),
-            repulsion=np.zeros(nv),
-            tau=np.zeros(nv),
-            bounded=np.zeros(nv),
-            saturated=np.zeros(nv, dtype=np.bool_),
-            rate_limited=np.zeros(nv, dtype=np.bool_),
-            measured=ToolState.empty(model.chain),
-            wanted=ToolState.empty(model.chain),
-        )
+# What there is to report of a tick, as bits.
+HELD, BOUNDED, CLIPPED, REPELLED = 1, 2, 4, 8
 
 
 @kernel
-def add_impedance_torque(held_model: Held, held_data: Held) -> None:
-    """Add every arm's spring, posture and repulsion from limits to ``tau``.
+def impedance_torque(held_model: Held, held_data: Held, change: float) -> int:
+    """Of ``inputs`` the torques ``bounded``, no further than ``change`` [Nm] from the last; what there is to report.
 
-    Raises :class:`numpy.linalg.LinAlgError` where the numbers are too large to be computed with.
+    Where the state, or what comes of it, is not finite, they are gravity's at the last usable posture.
     """
     model, data = held_model.value, held_data.value
-    if not invert(data.M, data.M_factor, data.M_inverse):
-        raise np.linalg.LinAlgError("the inertia matrix is not positive definite")
-    data.repulsion[:] = limit_repulsion(model.limits, data.q, data.v, data.wanted_q)
-    data.tau[:] += data.repulsion
-    place(model.chain, data.q, data.measured.placements)
-    place(model.chain, data.wanted_q, data.wanted.placements)
-    for i in range(model.dofs.shape[0]):
-        joints = model.joints[i, : model.dofs[i]]
-        torque = _arm_torque(model, data, i, joints)
-        for k in range(joints.shape[0]):
-            data.tau[joints[k]] += torque[k]
+    _exchange(data)
+    if not (finite(data.inputs[0:2]) and _law(model, data) and finite(data.tau.reshape(1, -1))):
+        _gravity(model, data)
+        return HELD | _bound(model, data, change)
+    data.usable_q[:] = data.inputs[0]
+    found = CLIPPED if data.clipped.any() else 0
+    if data.repulsion.any():
+        found |= REPELLED
+    return found | _bound(model, data, change)
 
 
 @kernel
-def bound_torques(held_model: Held, held_data: Held, change: float) -> int:
-    """Bring ``tau`` within its limits and ``change`` [Nm] of the last command; how many bounds held it back."""
-    model, data = held_model.value, held_data.value
-    within = bound_torque(data.tau, data.bounded, model.torque_limit, change)
-    data.bounded[:], data.saturated[:], data.rate_limited[:] = within
-    return data.saturated.sum() + data.rate_limited.sum()
+def gravity_torque(held_model: Held, held_data: Held) -> None:
+    """What bears the arms at rest at ``usable_q`` into ``tau``."""
+    _gravity(held_model.value, held_data.value)
 
 
-@kernel
-def _arm_torque(model: ImpedanceModel, data: ImpedanceData, i: int, joints: IntArray) -> Array:
-    """Torque (n,) of one arm's spring and posture; writes its clipped error."""
-    error = _tool_error(model, data, i)
-    J, wanted_J = data.measured.J[:, joints], data.wanted.J[:, joints]
-    way, speed = (data.wanted_q - data.q)[joints], (data.wanted_v - data.v)[joints]
-    M, M_inverse = data.M[joints][:, joints], data.M_inverse[joints][:, joints]
-    error, was_clipped = clip_error(error, model.max_position_error, model.max_rotation_error)
-    data.errors[i], data.clipped[i] = error, was_clipped
-    error_rate = times(wanted_J, data.wanted_v[joints]) - times(J, data.v[joints])
-    tool_inertia = task_inertia(J, M_inverse)
-    linear, angular, damping_ratio, posture, posture_damping_ratio = data.springs[i]
-    stiffness = np.array([linear, linear, linear, angular, angular, angular])
-    damping = double_diagonalised_damping(stiffness, tool_inertia, damping_ratio)
-    posture_stiffness = np.full(len(joints), posture)
-    posture_damping = double_diagonalised_damping(posture_stiffness, M, posture_damping_ratio)
-    posture_torque = posture_stiffness * way + times(posture_damping, speed)
-    N = consistent_projector(J, M_inverse, tool_inertia) if model.consistent else kinematic_projector(J)
-    return times(J.T, stiffness * error + times(damping, error_rate)) + times(N, posture_torque)
-
-
-@kernel
-def _tool_error(model: ImpedanceModel, data: ImpedanceData, i: int) -> Array:
-    """Way (6,) from the measured to the wanted pose of tool ``i``; writes both Jacobians."""
-    measured, wanted = data.measured, data.wanted
-    _update_tool(model, i, measured)
-    _update_tool(model, i, wanted)
-    error = np.empty(6)
-    error[:3] = wanted.translation - measured.translation
-    rotation_vector(wanted.rotation @ measured.rotation.T, error[3:])
-    return error
+@inlined_kernel
+def _exchange(data: ImpedanceData) -> None:
+    """Take the newest reference in for the next tick; one that is not finite is not used, and the last one is held."""
+    references = data.references
+    usable = finite(data.inputs[2:5])
+    for j in range(data.inputs.shape[1]):
+        references.wanted_q[j], references.wanted_v[j] = references.due_q[j], references.due_v[j]
+        references.due_v[j], references.a[j] = 0.0, 0.0
+        if usable:
+            references.due_q[j], references.due_v[j] = data.inputs[2, j], data.inputs[3, j]
+            references.a[j] = data.inputs[4, j]
 
 
 @lean_kernel
+def _law(model: ImpedanceModel, data: ImpedanceData) -> bool:
+    """The torque of all arms, without bounds, into ``tau``; False where the numbers are too large for that."""
+    q, v, references, dynamics = data.inputs[0], data.inputs[1], data.references, data.dynamics
+    place(model.chain, q, data.measured.placements)
+    place(model.chain, references.wanted_q, data.wanted.placements)
+    inverse_dynamics(model.chain, model.bodies, data.measured.placements, v, references.a, dynamics)
+    for i in range(q.shape[0]):
+        for j in range(i, q.shape[0]):
+            data.factor[i, j] = dynamics.M[i, j]
+    if not factorise(data.factor):
+        return False
+    limit_repulsion(model.limits, q, v, references.wanted_q, data.repulsion)
+    for j in range(q.shape[0]):
+        data.tau[j] = dynamics.tau[j] + data.repulsion[j] + data.inputs[5, j]
+    for i in range(model.dofs.shape[0]):
+        _add_arm(model, data, i, model.joints[i, : model.dofs[i]])
+    return True
+
+
+@lean_kernel
+def _gravity(model: ImpedanceModel, data: ImpedanceData) -> None:
+    place(model.chain, data.usable_q, data.measured.placements)
+    still = data.no_motion
+    inverse_dynamics(model.chain, model.bodies, data.measured.placements, still, still, data.dynamics)
+    for j in range(data.tau.shape[0]):
+        data.tau[j] = data.dynamics.tau[j]
+
+
+@inlined_kernel
+def _bound(model: ImpedanceModel, data: ImpedanceData, change: float) -> int:
+    """Bring ``tau`` within its limits and ``change`` [Nm] of the last command."""
+    held_back = bound_torque(data.tau, data.bounded, model.torque_limit, change, data.saturated, data.rate_limited)
+    return BOUNDED if held_back else 0
+
+
+@inlined_kernel
+def _add_arm(model: ImpedanceModel, data: ImpedanceData, i: int, joints: IntArray) -> None:
+    """Add the torque of one arm's spring and posture to ``tau``; writes its clipped error."""
+    _tool_error(model, data, i)
+    data.clipped[i] = clip_error(data.errors[i], model.max_position_error, model.max_rotation_error)
+    n = joints.shape[0]
+    arm, terms, springs = data.arm, data.arm.terms, data.springs[i]
+    J, M, speed, torque = arm.J[: 6 * n].reshape(6, n), arm.M[: n * n].reshape(n, n), arm.speed[:n], arm.torque[:n]
+    _gather(data, joints, J, M)
+    for k in range(n):
+        arm.springs[k] = springs[3]
+    damp(arm.springs[:n], M, springs[4], speed, terms)
+    for k in range(n):
+        j = joints[k]
+        torque[k] = springs[3] * (data.references.wanted_q[j] - data.inputs[0, j]) + speed[k]
+    _move_tool(data.factor, joints, J, arm)
+    task_inertia(arm.mobility, terms, arm.inertia)
+    for k in range(6):
+        arm.stiffness[k] = springs[0] if k < 3 else springs[1]
+    damp(arm.stiffness, arm.inertia, springs[2], arm.error_rate, terms)
+    if model.consistent:
+        take_consistent(J, arm.inertia, arm.acceleration, torque, terms)
+    else:
+        take_kinematic(J, torque, terms)
+    for k in range(n):
+        total = torque[k]
+        for row in range(6):
+            total += J[row, k] * (arm.stiffness[row] * data.errors[i, row] + arm.error_rate[row])
+        data.tau[joints[k]] += total
+
+
+@inlined_kernel
+def _gather(data: ImpedanceData, joints: IntArray, J: Array, M: Array) -> None:
+    """Of one arm's joints Jacobian and inertia, and how fast tool and joints are to be faster than they are."""
+    arm, references, v = data.arm, data.references, data.inputs[1]
+    for row in range(6):
+        arm.error_rate[row] = 0.0
+    for k in range(joints.shape[0]):
+        j = joints[k]
+        arm.speed[k] = references.wanted_v[j] - v[j]
+        for row in range(6):
+            J[row, k] = data.measured.J[row, j]
+            arm.error_rate[row] += data.wanted.J[row, j] * references.wanted_v[j] - J[row, k] * v[j]
+        for m in range(joints.shape[0]):
+            M[k, m] = data.dynamics.M[j, joints[m]]
+
+
+@inlined_kernel
+def _move_tool(factor: Array, joints: IntArray, J: Array, arm: ArmScratch) -> None:
+    """How forces and the posture's torque move the tool, of the ``factor`` L of M: by W = L^-1 (J', torque)."""
+    W = arm.W
+    for j in range(W.shape[0]):
+        for row in range(7):
+            W[j, row] = 0.0
+    for k in range(joints.shape[0]):
+        for row in range(6):
+            W[joints[k], row] = J[row, k]
+        W[joints[k], 6] = arm.torque[k]
+    solve_factor(factor, W)
+    for row in range(6):
+        arm.acceleration[row] = 0.0
+        for column in range(6):
+            arm.mobility[row, column] = 0.0
+    for j in range(W.shape[0]):
+        for row in range(6):
+            arm.acceleration[row] += W[j, row] * W[j, 6]
+            for column in range(6):
+                arm.mobility[row, column] += W[j, row] * W[j, column]
+
+
+@inlined_kernel
+def _tool_error(model: ImpedanceModel, data: ImpedanceData, i: int) -> None:
+    """Way from the measured to the wanted pose of tool ``i`` into ``errors``; writes both Jacobians."""
+    measured, wanted, error, turn = data.measured, data.wanted, data.errors[i], data.arm.turn
+    _update_tool(model, i, measured)
+    _update_tool(model, i, wanted)
+    for row in range(3):
+        error[row] = wanted.translation[row] - measured.translation[row]
+        times(measured.rotation, wanted.rotation[row], turn[row])
+    rotation_vector(turn, error[3:])
+
+
+@inlined_kernel
 def _update_tool(model: ImpedanceModel, i: int, tool: ToolState) -> None:
     """Pose and Jacobian of tool ``i`` where the joint frames are placed."""
     tool_pose(tool.placements, model.tools, i, tool.rotation, tool.translation)

@@ -1,9 +1,11 @@
-"""Pure pieces of Cartesian impedance control: task inertia, damping design, nullspaces, torque bounds, compiled.
+"""Pieces of Cartesian impedance control: task inertia, damping design, nullspaces, torque bounds, compiled.
 
 Task vectors (6,) are linear, then angular, in world axes at the tool's origin; J (6, n) is that Jacobian of an arm's n
 joints. Stiffness [N/m, Nm/rad], damping [Ns/m, Nms/rad], task inertia [kg, kg m^2].
 
-impedance_kernels.py puts them together. Matrices that are not finite raise :class:`numpy.linalg.LinAlgError`.
+impedance_kernels.py puts them together. Of damping and projectors only what they make of a vector is computed, in its
+place, and nothing is allocated: an array costs as much as what is in it. Nothing raises: what comes of numbers that are
+not finite, or too large, is not finite.
 """
 
 from __future__ import annotations
@@ -13,8 +15,15 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from q2r2_control.compliance.small_matrices import factorise, invert, product, square_root
-from q2r2_control.control.jit import kernel
+from q2r2_control.compliance.small_matrices import (
+    Scratch,
+    diagonalise,
+    factorise,
+    invert,
+    root_times,
+    times,
+)
+from q2r2_control.control.jit import lean_kernel
 from q2r2_control.control.tasks.frame import ROTATION_LENGTH
 from q2r2_control.types import Array
 
@@ -22,8 +31,6 @@ BoolArray = npt.NDArray[np.bool_]
 
 # Makes radians comparable to metres, as in the QP's tool task.
 _METRES = np.array([1.0, 1.0, 1.0, ROTATION_LENGTH, ROTATION_LENGTH, ROTATION_LENGTH])
-_SCALE = np.outer(_METRES, _METRES)
-_ROWS = _METRES.reshape(6, 1)
 # No direction of a tool counts for more than this [kg], a rotation for this times 0.3^2 [kg m^2]. An arm whose
 # rotors weigh most of it stays below a fifth of it in every posture that it works in.
 _HEAVIEST = 1000.0
@@ -41,48 +48,80 @@ class PositionLimits(NamedTuple):
     distance: float  # where the spring begins [rad]
 
 
-@kernel
-def clip_error(error: Array, position: float, rotation: float) -> tuple[Array, bool]:
-    """``error`` (6,) with each part no longer than ``position`` [m], ``rotation`` [rad]; and whether it was longer."""
-    nearer = position / max(np.sqrt(np.sum(error[:3] ** 2)), position)
-    less = rotation / max(np.sqrt(np.sum(error[3:] ** 2)), rotation)
-    clipped = error.copy()
-    clipped[:3] *= nearer
-    clipped[3:] *= less
-    return clipped, min(nearer, less) < 1.0
+class TermScratch(NamedTuple):
+    """For an arm of up to m joints."""
+
+    matrices: Scratch
+    root: Array  # (n,), n being the greater of m and 6
+    rate: Array  # (n,)
+    force: Array  # (6,)
+    motion: Array  # (6,)
+    square: Array  # (6, 6)
+    inverse: Array  # (6, 6)
+
+    @classmethod
+    def empty(cls, joints: int) -> TermScratch:
+        n = max(joints, 6)
+        sixes = np.zeros(6), np.zeros(6), np.zeros((6, 6)), np.zeros((6, 6))
+        return cls(Scratch.empty(n), np.zeros(n), np.zeros(n), *sixes)
 
 
-@kernel
-def task_inertia(J: Array, M_inverse: Array) -> Array:
-    """Inertia Lambda = (J M^-1 J')^-1 (6, 6) that a hand at the tool feels (Khatib 1987, eq. 18).
+@lean_kernel
+def clip_error(error: Array, position: float, rotation: float) -> bool:
+    """Make each part of ``error`` (6,) no longer than ``position`` [m], ``rotation`` [rad]; whether it was longer."""
+    nearer = position / max(_length(error[:3]), position)
+    less = rotation / max(_length(error[3:]), rotation)
+    for k in range(3):
+        error[k] *= nearer
+        error[3 + k] *= less
+    return min(nearer, less) < 1.0
 
-    Near a singular posture the mobility J M^-1 J' vanishes along some direction and Lambda, and with it the damping
-    force, would grow without bound. There the mobility's eigenvalues, after a radian was made comparable to a metre,
-    are raised to that of 1000 kg. All others stay exact, other than with a damping term on the diagonal, which would
-    make the projector that is built with Lambda leak everywhere.
+
+@lean_kernel
+def _length(vector: Array) -> float:
+    return np.sqrt(vector[0] ** 2 + vector[1] ** 2 + vector[2] ** 2)
+
+
+@lean_kernel
+def task_inertia(mobility: Array, scratch: TermScratch, out: Array) -> None:
+    """Inertia Lambda (6, 6) that a hand at the tool feels, of its ``mobility`` J M^-1 J' (Khatib 1987, eq. 18).
+
+    Near a singular posture the mobility vanishes along some direction and Lambda, and with it the damping force, would
+    grow without bound. There the mobility's eigenvalues, after a radian was made comparable to a metre, are raised to
+    that of 1000 kg. All others stay exact, other than with a damping term on the diagonal, which would make the
+    projector that is built with Lambda leak everywhere.
     """
-    return _floored_inverse(product(product(J, M_inverse), J.T), 1.0 / _HEAVIEST)
+    _invert_floored(mobility, 1.0 / _HEAVIEST, scratch, out)
 
 
-@kernel
-def _floored_inverse(A: Array, least: float) -> Array:
+@lean_kernel
+def _invert_floored(A: Array, least: float, scratch: TermScratch, out: Array) -> None:
     """Inverse of a symmetric positive semidefinite A (6, 6) whose scaled eigenvalues are raised to ``least``.
 
     Away from singular postures none has to be raised: A - least is positive definite, and no eigenvalue is needed.
     """
-    factor, inverse = A * _SCALE, np.empty_like(A)
-    for i in range(A.shape[0]):
+    factor, vectors = scratch.matrices.factor[:36].reshape(6, 6), scratch.matrices.inverse[:36].reshape(6, 6)
+    for i in range(6):
+        for j in range(6):
+            factor[i, j] = A[i, j] * (_METRES[i] * _METRES[j])
         factor[i, i] -= least
-    if factorise(factor) and invert(A, factor, inverse):
-        return inverse
-    values, vectors = np.linalg.eigh(A * _SCALE)
-    vectors *= _ROWS
-    return (vectors / np.maximum(values, least)) @ vectors.T
+    if factorise(factor) and invert(A, factor, out):
+        return
+    for i in range(6):
+        for j in range(6):
+            factor[i, j] = A[i, j] * (_METRES[i] * _METRES[j])
+    diagonalise(factor, vectors)
+    for i in range(6):
+        for j in range(6):
+            out[i, j] = 0.0
+            for k in range(6):
+                out[i, j] += vectors[i, k] * vectors[j, k] / max(factor[k, k], least)
+            out[i, j] *= _METRES[i] * _METRES[j]
 
 
-@kernel
-def double_diagonalised_damping(stiffness: Array, inertia: Array, damping_ratio: float) -> Array:
-    """Damping D (n, n) that gives every mode of  inertia x'' + D x' + diag(stiffness) x = 0  the damping ratio xi.
+@lean_kernel
+def damp(stiffness: Array, inertia: Array, damping_ratio: float, rate: Array, scratch: TermScratch) -> None:
+    """Make ``rate`` (n,) x' D x', D giving every mode of  inertia x'' + D x' + diag(stiffness) x = 0  the ratio xi.
 
     ``stiffness`` (n,) along the axes, positive; ``inertia`` (n, n) symmetric positive definite. Albu-Schaeffer, Ott,
     Frese, Hirzinger: "Cartesian impedance control of redundant robots: recent results with the
@@ -91,63 +130,109 @@ def double_diagonalised_damping(stiffness: Array, inertia: Array, damping_ratio:
     lambda = 1 / W, Q = W^1/2 U' K^1/2, and D = 2 xi K^1/2 U W^1/2 U' K^1/2: between the K^1/2 stands the square root of
     K^-1/2 Lambda K^-1/2.
     """
-    root = np.sqrt(stiffness)
-    both = np.outer(root, root)
-    scaled = inertia / both
-    X, found = square_root(scaled)
-    if found:
-        return 2.0 * damping_ratio * both * X
-    # Of an inertia that is positive definite but for rounding.
-    W, U = np.linalg.eigh(scaled)
-    U *= root.reshape((-1, 1))
-    return (U * (2.0 * damping_ratio * np.sqrt(np.maximum(W, 0.0)))) @ U.T
+    n, root, matrices = len(stiffness), scratch.root, scratch.matrices
+    scaled = matrices.matrix[: n * n].reshape(n, n)
+    for i in range(n):
+        root[i] = np.sqrt(stiffness[i])
+        rate[i] *= root[i]
+        scratch.rate[i] = rate[i]
+    _scale(inertia, root, scaled)
+    if not root_times(scaled, rate, matrices):
+        _scale(inertia, root, scaled)
+        _root_times_nearly(scaled, scratch.rate, matrices.inverse[: n * n].reshape(n, n), rate)
+    for i in range(n):
+        rate[i] *= 2.0 * damping_ratio * root[i]
 
 
-@kernel
-def consistent_projector(J: Array, M_inverse: Array, inertia: Array) -> Array:
-    """N (n, n): torque N tau accelerates no tool, J M^-1 N = 0: I - J' Lambda J M^-1 (Khatib 1987, eq. 51)."""
-    return np.eye(J.shape[1]) - product(product(product(J.T, inertia), J), M_inverse)
+@lean_kernel
+def _scale(inertia: Array, root: Array, out: Array) -> None:
+    for i in range(inertia.shape[0]):
+        for j in range(inertia.shape[0]):
+            out[i, j] = inertia[i, j] / (root[i] * root[j])
 
 
-@kernel
-def kinematic_projector(J: Array) -> Array:
-    """N (n, n): torque N tau balances no static force at the tool, J N = 0: I - J' J'^+; needs no inertia."""
-    return np.eye(J.shape[1]) - product(product(J.T, _floored_inverse(product(J, J.T), _LEAST_MOTION**2)), J)
+@lean_kernel
+def _root_times_nearly(A: Array, x: Array, vectors: Array, out: Array) -> None:
+    """As :func:`root_times`, of an A that is positive definite but for rounding."""
+    n = A.shape[0]
+    diagonalise(A, vectors)
+    for i in range(n):
+        out[i] = 0.0
+    for k in range(n):
+        share = 0.0
+        for i in range(n):
+            share += vectors[i, k] * x[i]
+        share *= np.sqrt(max(A[k, k], 0.0))
+        for i in range(n):
+            out[i] += share * vectors[i, k]
 
 
-@kernel
-def limit_repulsion(limits: PositionLimits, q: Array, v: Array, wanted: Array) -> Array:
-    """Torque (n,) [Nm] away from position limits, of a spring that begins some way before each.
+@lean_kernel
+def take_consistent(J: Array, inertia: Array, acceleration: Array, torque: Array, scratch: TermScratch) -> None:
+    """Make ``torque`` (n,) tau N tau, which accelerates no tool; ``acceleration`` (6,) is that of tau, J M^-1 tau.
+
+    N = I - J' Lambda J M^-1 (Khatib 1987, eq. 51).
+    """
+    times(inertia, acceleration, scratch.force)
+    _take(J, scratch.force, torque)
+
+
+@lean_kernel
+def take_kinematic(J: Array, torque: Array, scratch: TermScratch) -> None:
+    """Make ``torque`` (n,) tau N tau, which balances no static force at the tool, J N = 0; needs no inertia.
+
+    N = I - J' J'^+.
+    """
+    for i in range(6):
+        times(J, J[i], scratch.motion)
+        for j in range(6):
+            scratch.square[i, j] = scratch.motion[j]
+    times(J, torque, scratch.motion)
+    _invert_floored(scratch.square, _LEAST_MOTION**2, scratch, scratch.inverse)
+    times(scratch.inverse, scratch.motion, scratch.force)
+    _take(J, scratch.force, torque)
+
+
+@lean_kernel
+def _take(J: Array, force: Array, torque: Array) -> None:
+    """Take J' force away from ``torque``."""
+    for k in range(J.shape[1]):
+        for i in range(6):
+            torque[k] -= J[i, k] * force[i]
+
+
+@lean_kernel
+def limit_repulsion(limits: PositionLimits, q: Array, v: Array, wanted: Array, out: Array) -> bool:
+    """Torque (n,) [Nm] away from position limits into ``out``, of a spring that begins some way before each; if any.
 
     Where ``wanted`` (n,), the reference, lies nearer to the limit, the spring begins there: the reference keeps the
     limits by itself, and what holds a joint off its reference would hold the tool off its target. The damping
     grows from 0 over that way, so that the torque does not jump, and it only brakes, it never pulls.
     """
-    reach = limits.distance
-    below = np.maximum(np.minimum(limits.lower + reach, wanted) - q, 0.0)
-    above = np.maximum(q - np.maximum(limits.upper - reach, wanted), 0.0)
-    share = limits.damping / reach
-    towards_upper = np.maximum(limits.stiffness * below - share * np.minimum(below, reach) * v, 0.0)
-    towards_lower = np.maximum(limits.stiffness * above + share * np.minimum(above, reach) * v, 0.0)
-    return towards_upper - towards_lower
+    reach, share, pushes = limits.distance, limits.damping / limits.distance, False
+    for i in range(len(q)):
+        below = max(min(limits.lower[i] + reach, wanted[i]) - q[i], 0.0)
+        above = max(q[i] - max(limits.upper[i] - reach, wanted[i]), 0.0)
+        towards_upper = max(limits.stiffness * below - share * min(below, reach) * v[i], 0.0)
+        towards_lower = max(limits.stiffness * above + share * min(above, reach) * v[i], 0.0)
+        out[i] = towards_upper - towards_lower
+        pushes |= out[i] != 0.0
+    return pushes
 
 
-class BoundedTorque(NamedTuple):
-    """A torque within its bounds, and which bounds held it back."""
-
-    tau: Array  # (n,) [Nm]
-    saturated: BoolArray  # (n,)
-    rate_limited: BoolArray  # (n,)
-
-
-@kernel
-def bound_torque(tau: Array, last: Array, limit: Array, change: float) -> BoundedTorque:
-    """``tau`` (n,) within +-``limit`` (n,) and no further than ``change`` from ``last`` (n,), all [Nm].
+@lean_kernel
+def bound_torque(tau: Array, last: Array, limit: Array, change: float, saturated: BoolArray, late: BoolArray) -> bool:
+    """Make ``last`` (n,) ``tau`` (n,) within +-``limit`` (n,) and no further than ``change`` from it, all [Nm].
 
     First the torque is saturated, then it approaches what remains by at most ``change``. Both bounds hold afterwards
     whenever ``last`` is within the limit: the result lies between ``last`` and the saturated torque, hence within the
-    limit too.
+    limit too. ``saturated`` and ``late`` (n,) tell what held it back, the result whether anything did.
     """
-    saturated = np.minimum(np.maximum(tau, -limit), limit)
-    bounded = np.minimum(np.maximum(saturated, last - change), last + change)
-    return BoundedTorque(bounded, saturated != tau, bounded != saturated)
+    held_back = False
+    for i in range(len(tau)):
+        within = min(max(tau[i], -limit[i]), limit[i])
+        bounded = min(max(within, last[i] - change), last[i] + change)
+        saturated[i], late[i] = within != tau[i], bounded != within
+        held_back |= saturated[i] or late[i]
+        last[i] = bounded
+    return held_back

@@ -29,7 +29,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from q2r2_control.compliance.small_matrices import factorise
+from q2r2_control.compliance.small_matrices import factorise, finite
 from q2r2_control.control.geometry.closest_points import clamp
 from q2r2_control.control.geometry.collision import CollisionData, CollisionModel, update_placements
 from q2r2_control.control.geometry.kinematics import IntArray
@@ -60,8 +60,7 @@ class RepulsionModel(NamedTuple):
 class RepulsionData(NamedTuple):
     """One tick's measurement and arrays written anew."""
 
-    q: Array  # (nv,)
-    v: Array  # (nv,)
+    measured: Array  # (2, nv) q and v
     M: Array  # (nv, nv) mass matrix, read from its upper triangle; overwritten
     collision: CollisionData  # at q
     near: IntArray  # (p,) pairs in the shell or just outside
@@ -76,8 +75,7 @@ class RepulsionData(NamedTuple):
     def empty(cls, model: RepulsionModel) -> RepulsionData:
         pairs, nv = len(model.collision.pairs.first), len(model.collision.chain.parent) - 1
         return cls(
-            q=np.zeros(nv),
-            v=np.zeros(nv),
+            measured=np.zeros((2, nv)),
             M=np.eye(nv),
             collision=CollisionData.empty(model.collision),
             near=np.zeros(pairs, dtype=np.int64),
@@ -94,10 +92,12 @@ class RepulsionData(NamedTuple):
 def find_near(held_model: Held, held_data: Held) -> tuple[int, int, float]:
     """Depths and gradients of the pairs in the shell or just outside.
 
-    Returns how many these are, the closest pair of all and its distance.
+    Returns how many these are, the closest pair of all and its distance; -1 where q or v is not finite.
     """
     model, data = held_model.value, held_data.value
-    update_placements(model.collision, data.collision, data.q)
+    if not finite(data.measured):
+        return -1, 0, np.nan
+    update_placements(model.collision, data.collision, data.measured[0])
     count, closest, least = 0, 0, np.inf
     for p in range(model.collision.pairs.first.shape[0]):
         if at_least(model.collision, data.collision, p) >= max(least, model.shell[p] + _BAND):
@@ -120,7 +120,7 @@ def find_near(held_model: Held, held_data: Held) -> tuple[int, int, float]:
 @kernel
 def repulsion_torque(held_model: Held, held_data: Held, count: int) -> float:
     """Add up the torques of the ``count`` pairs found near; returns the energy stored in the wall [J]."""
-    model, data = held_model.value, held_data.value
+    model, data, v = held_model.value, held_data.value, held_data.value.measured[1]
     depth, mobility, force = data.depth, data.mobility, data.force
     factorise(data.M)
     total = 0.0
@@ -143,13 +143,13 @@ def repulsion_torque(held_model: Held, held_data: Held, count: int) -> float:
         if x <= 0.0 or mobility[i] <= _IMMOBILE:
             continue
         rate = 0.0
-        for j in range(data.v.shape[0]):
-            rate += data.rows[i, j] * data.v[j]
+        for j in range(v.shape[0]):
+            rate += data.rows[i, j] * v[j]
         elastic = stiffness * min(x, softest)
         damped = damping * np.sqrt(stiffness / mobility[i]) * clamp(x / _BAND, 0.0, 1.0) * rate
         force[i] = clamp(elastic - damped, 0.0, model.maximum_force)
         energy += elastic * (x - 0.5 * min(x, softest))
-        for j in range(data.v.shape[0]):
+        for j in range(v.shape[0]):
             data.tau[j] += force[i] * data.rows[i, j]
     return energy
 

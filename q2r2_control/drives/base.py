@@ -19,7 +19,7 @@ ToolTargets = dict[str, pin.SE3 | None]
 Openings = dict[str, float]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class DriveReport:
     """What the mode's own laws did in one tick; None for those of the other modes, or not enabled."""
 
