@@ -40,6 +40,14 @@ def moved_by(pose: pin.SE3, way: Array) -> pin.SE3:
     return moved
 
 
+def moved_back_by(pose: pin.SE3, way: Array) -> pin.SE3:
+    """The pose that :func:`moved_by` would move here."""
+    moved = pose.copy()
+    translation = moved.translation
+    translation -= way
+    return moved
+
+
 @dataclass(frozen=True, slots=True)
 class HandInputs:
     """Buttons, triggers and stick of one hand controller, as the headset names them.
@@ -88,7 +96,7 @@ class HapticFeedback:
     amplitude: float
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)  # not frozen, as all that every tick makes anew: that would cost up to half a microsecond
 class RobotState:
     """What the plant measured, in the joint order of ``Robot.model``."""
 
@@ -107,7 +115,7 @@ class CommandMode(StrEnum):
     TORQUE = "torque"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)  # not frozen, as above
 class Command:
     """What goes to the plant, in the joint order of ``Robot.model``."""
 
@@ -161,7 +169,7 @@ class Reference:
     report: StepReport
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)  # not frozen, as above
 class ArmTarget:
     """What the teleop layer asks of one arm."""
 
@@ -179,7 +187,7 @@ class ArmTarget:
 
     def command_for(self, tool: pin.SE3) -> pin.SE3:
         """What is commanded where the tool is at ``tool``, world frame."""
-        return tool if self.sag is None else moved_by(tool, -self.sag)
+        return tool if self.sag is None else moved_back_by(tool, self.sag)
 
 
 @dataclass(frozen=True, slots=True)

@@ -77,9 +77,9 @@ def check_command(command: Command, robot: Robot, modes: tuple[CommandMode, ...]
 
 def check_joints(what: str, values: Array, robot: Robot) -> None:
     """Raise :class:`PlantError` unless ``values`` has one finite number for each joint of the robot."""
-    shape, count = values.shape, len(robot.joint_names)
-    if shape != (count,):
-        raise PlantError(f"{what} has shape {shape}; expected ({count},), one value for each joint")
+    count = len(robot.joint_names)
+    if values.shape != (count,):
+        raise PlantError(f"{what} has shape {values.shape}; expected ({count},), one value for each joint")
     # The usual case costs one product; squares of finite numbers may overflow.
     if not math.isfinite(values.dot(values)) and not np.isfinite(values).all():
         joint = int(np.flatnonzero(~np.isfinite(values))[0])

@@ -41,7 +41,10 @@ class _Fingers:
         return self.closed_position + opening * (self.open_position - self.closed_position)
 
     def opening(self, qpos: Array) -> float:
-        position = sum(float(qpos[index]) for index in self.positions) / len(self.positions)
+        position = 0.0
+        for index in self.positions:
+            position += qpos.item(index)
+        position /= len(self.positions)
         opening = (position - self.closed_position) / (self.open_position - self.closed_position)
         return min(max(opening, 0.0), 1.0)
 

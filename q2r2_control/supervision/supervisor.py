@@ -132,6 +132,9 @@ class Supervisor:
         at the measured state, which is computed where it is needed and not given; ``due``: when the target is to be
         reached [s], None: at once, and until the next one comes.
         """
+        plain = number is None and pose is not None and self.no_targets is None
+        if plain and self._targets.go_on(arm, pose, now, due):
+            return None
         tools: list[pin.SE3] = []
         if not self._targets.follows_on(arm, now):
             tools.append(self._controller.tool_pose(arm))

@@ -75,17 +75,23 @@ class TargetStream:
         self.reset()
         return was_following
 
+    def goes_on(self, pose: pin.SE3, now: float) -> bool:
+        """Take a target of the stream that is followed, which needs no tools; False, and nothing, where none is."""
+        if self.pose is None or not now - self.stamp <= self._settings.timeout:
+            return False
+        self.pose, self._last, self.stamp = pose, pose, now
+        return True
+
     def offer(self, pose: pin.SE3, tools: Sequence[pin.SE3], now: float) -> str | None:
         """Take a target; returns why it is not followed, or None.
 
         ``tools`` are the poses that count as the tool's: the reference's, and the measured one where it is known. An
         arm that was pushed away from its reference is engaged where it is. An arm that follows a stream needs none.
         """
+        if self.goes_on(pose, now):
+            return None
         self.expire(now)
         last, self._last, self.stamp = self._last, pose, now
-        if self.following:
-            self.pose = pose
-            return None
         begins = _begins(pose, last)
         offsets = [apart(pose, tool) for tool in tools]
         # Position and rotation may each be near another one of the poses: an operator's first target has the

@@ -23,7 +23,8 @@ class Targets:
 
     def at(self, now: float) -> dict[str, pin.SE3 | None]:
         """What each arm follows at ``now`` [s], see :mod:`target_line`; None: it holds."""
-        return {arm: self._lines[arm].at(now) if stream.following else None for arm, stream in self._streams.items()}
+        lines = self._lines
+        return {arm: None if stream.pose is None else lines[arm].at(now) for arm, stream in self._streams.items()}
 
     @property
     def arms(self) -> tuple[str, ...]:
@@ -39,6 +40,16 @@ class Targets:
         stream = self._streams[arm]
         stream.expire(now)
         return stream.following
+
+    def go_on(self, arm: str, pose: pin.SE3, now: float, due: float | None = None) -> bool:
+        """Take a target that an arm follows since it followed the last one; False, and nothing, where it followed none.
+
+        What :meth:`take` does at most ticks, where nothing forbids it and its message has no number.
+        """
+        if not self._streams[arm].goes_on(pose, now):
+            return False
+        self._lines[arm].put(pose, due)
+        return True
 
     def age(self, arm: str, now: float) -> float:
         """Time since the last target of an arm that was a pose [s]."""

@@ -28,6 +28,11 @@ class AnalogGripper:
         self._stamp, self._at = -math.inf, -math.inf
         self.forget()
 
+    @property
+    def bound(self) -> bool:
+        """Whether a trigger moves the gripper at all."""
+        return self._control is not None
+
     def forget(self) -> None:
         """The trigger has to come to where the gripper is before it counts."""
         self._wanted: float | None = None

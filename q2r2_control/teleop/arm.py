@@ -118,6 +118,16 @@ class ArmTeleop:
         """What the operator should know while the state stays; what was not done begins with "not"."""
         self.events.append(Event(now, self.arm, self.state, self.state, reason))
 
+    @property
+    def settled(self) -> bool:
+        """Whether nothing can come of this hand's controls before its next sample: no gesture goes on, nothing waits."""
+        return (
+            self._gestures.settled
+            and self._gripped is None
+            and self.state is not ArmState.ALIGNING
+            and not (self._presses or self._analog.bound)
+        )
+
     def take_presses(self, now: float) -> list[Press]:
         """Gestures since the last call; those that nobody gives to :meth:`act` are lost."""
         presses = self._presses + self._gestures.due(now)

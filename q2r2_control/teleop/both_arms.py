@@ -23,7 +23,7 @@ PAUSE_FIRST = "pause both arms first"  # why hands are not swapped
 _ENGAGE, _UNKNOWN, _BOTH_ASK = "engage the arm first", "a tool's pose is not known", "both hands ask"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)  # not frozen: that would cost half a microsecond a tick
 class Surroundings:
     """What of the arms themselves counts in one tick; poses are in the world."""
 

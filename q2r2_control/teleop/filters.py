@@ -19,7 +19,7 @@ from collections.abc import Sequence
 import pinocchio as pin
 
 from q2r2_control.config.teleop import FilterSettings
-from q2r2_control.teleop.quaternions import Quaternion, Vector, normalized, product, rotation_of, turn_between
+from q2r2_control.teleop.quaternions import Quaternion, Vector, normalized, turn_between, turned_by
 
 # Closer samples are merged: over so short a time receipt jitter would look like speed [s].
 _MIN_SPACING = 0.005
@@ -66,7 +66,7 @@ class Interpolator:
             dt = playhead - start
             x, y, z = x + dt * linear[0], y + dt * linear[1], z + dt * linear[2]
             turn = dt * angular[0], dt * angular[1], dt * angular[2]
-            rotation = product(rotation_of(turn), rotation)
+            rotation = turned_by(rotation, turn)
         # What was played is where the next line starts, so a sample that replaces another cannot make the output step.
         knots[0] = playhead, (x, y, z), rotation
         return (x, y, z), rotation, turn_between(last, rotation) if passed else turn
@@ -166,7 +166,7 @@ class PoseFilter:
         )
         turn = self._rotation.correction(turn_between(last, rotation), turned, dt)
         position = last_x + shift[0], last_y + shift[1], last_z + shift[2]
-        rotation = normalized(product(rotation_of(turn), last))
+        rotation = normalized(turned_by(last, turn))
         self._out, self._output = (position, rotation), pin.XYZQUATToSE3((*position, *rotation))
         return self._output
 

@@ -66,6 +66,11 @@ class GestureRecognizer:
         for control in self._controls.values():
             control.forget()
 
+    @property
+    def settled(self) -> bool:
+        """Whether nothing is going on, and nothing can begin before the next reading."""
+        return not self._open and not self.chord and (self._told_stuck or self._first == -math.inf)
+
     def stale(self, now: float, timeout: float) -> bool:
         """Whether no inputs were received for ``timeout`` [s]: the operator could not stop the arm by a button."""
         return now - self._stamp > timeout

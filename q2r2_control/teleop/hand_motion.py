@@ -55,7 +55,7 @@ class HandMotion:
     @property
     def slip(self) -> tuple[float, float]:
         """How far the target has slipped along since the anchor, with the tool or along its workspace [m, rad]."""
-        return self._leash.slip + self._workspace.slip, self._leash.slip_angle
+        return self._leash.position.slip + self._workspace.slip, self._leash.rotation.slip
 
     def note(self, hand: pin.SE3) -> None:
         """A usable pose of the hand, whether its arm is engaged or not."""

@@ -49,7 +49,7 @@ class ComponentLeash:
 
     def reset(self) -> None:
         """Slack, nothing slipped."""
-        self.slip = 0.0
+        self.slip = 0.0  # how far the target has slipped since then, to and fro counted [m or rad]
         self.taut = False
         self._back = 0.0  # of the hand, since it was farthest
 
@@ -91,21 +91,13 @@ class Leash:
 
     def __init__(self, settings: LeashSettings) -> None:
         limits = list(zip(_WAY_BACK, _HELD_UP, _NO_MOTION, strict=True))
-        self._components = ComponentLeash(settings.distance, *limits[0]), ComponentLeash(settings.angle, *limits[1])
+        self.position = ComponentLeash(settings.distance, *limits[0])
+        self.rotation = ComponentLeash(settings.angle, *limits[1])
+        self._components = self.position, self.rotation
         # A little less than the leash's, so that it is looked at in time; of the angle, the quaternion's w.
         self._distance = math.inf if settings.distance is None else settings.distance - _ROUNDING
         self._cosine = -math.inf if settings.angle is None else math.cos(0.5 * settings.angle) + _ROUNDING
         self._last: tuple[pin.SE3, pin.SE3, float] | None = None  # a _Tick, which is only made where it is looked at
-
-    @property
-    def slip(self) -> float:
-        """How far the target's position has slipped since the reset, to and fro counted [m]."""
-        return self._components[0].slip
-
-    @property
-    def slip_angle(self) -> float:
-        """How far the target's rotation has slipped since the reset, to and fro counted [rad]."""
-        return self._components[1].slip
 
     def reset(self) -> None:
         """Slack, nothing slipped: for a new anchor."""
@@ -126,8 +118,7 @@ class Leash:
         target, last = motion.target(hand), self._last
         self._last = this = tool, newest, now
         # The first target is the anchor, which must not move the arm wherever the plant says the tool is.
-        position_leash, rotation_leash = self._components
-        if last is None or not (position_leash.taut or rotation_leash.taut or self._ends(tool, target)):
+        if last is None or not (self.position.taut or self.rotation.taut or self._ends(tool, target)):
             return target
         position, rotation = self._pull(_ways(tool, target), _Tick(*last), _Tick(*this))
         if position is not None:

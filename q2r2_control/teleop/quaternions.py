@@ -43,7 +43,31 @@ def rotation_vector(q: Quaternion) -> Vector:
 
 def turn_between(start: Quaternion, end: Quaternion) -> Vector:
     """The rotation vector that leads from one rotation to another."""
-    return rotation_vector(product(end, inverse(start)))
+    a, b, c, d = end
+    x, y, z, w = start
+    return rotation_vector(
+        (
+            a * w - d * x - b * z + c * y,
+            a * z - d * y + b * w - c * x,
+            b * x - d * z - a * y + c * w,
+            d * w + a * x + b * y + c * z,
+        )
+    )
+
+
+def turned_by(q: Quaternion, vector: Vector) -> Quaternion:
+    """First ``q``, then the rotation by a rotation vector."""
+    a, b, c = vector
+    half = 0.5 * math.hypot(a, b, c)
+    ratio = 0.5 * math.sin(half) / half if half > 0.0 else 0.5
+    a, b, c, d = ratio * a, ratio * b, ratio * c, math.cos(half)
+    x, y, z, w = q
+    return (
+        d * x + a * w + b * z - c * y,
+        d * y - a * z + b * w + c * x,
+        d * z + a * y - b * x + c * w,
+        d * w - a * x - b * y - c * z,
+    )
 
 
 def rotation_of(vector: Vector) -> Quaternion:

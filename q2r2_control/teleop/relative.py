@@ -85,7 +85,7 @@ class RelativeMotion:
         self._turn_map: Array = np.linalg.det(self._map) * self._map
         self._turn_axes = _axes_of(self._turn_map)
         self._hand_position: Vector | None = None
-        self._hand_rotation = self._tool_rotation = IDENTITY
+        self._hand_rotation = self._hand_back = self._tool_rotation = IDENTITY
         self._tool_position = (0.0, 0.0, 0.0)
         self._vector = (0.0, 0.0, 0.0)
 
@@ -117,6 +117,7 @@ class RelativeMotion:
     def anchor_rotation(self, hand: pin.SE3, tool: pin.SE3) -> None:
         """Make only the rotations of ``hand`` and ``tool`` correspond from now on; positions go on as they were."""
         self._hand_rotation = normalized(pin.SE3ToXYZQUATtuple(hand)[3:])
+        self._hand_back = inverse(self._hand_rotation)
         self._tool_rotation = normalized(pin.SE3ToXYZQUATtuple(tool)[3:])
         self._vector = (0.0, 0.0, 0.0)
 
@@ -139,8 +140,10 @@ class RelativeMotion:
 
     def _turned_tool(self, hand: Quaternion) -> Quaternion:
         """The tool's rotation for that of the hand."""
-        back = inverse(self._hand_rotation)
-        turn = self._scaled(product(back, hand) if self._in_tool_frame else product(hand, back))
+        back = self._hand_back
+        turn = product(back, hand) if self._in_tool_frame else product(hand, back)
+        if self._rotation_scale != 1.0:
+            turn = self._scaled(turn)
         (i, a), (j, b), (k, c) = self._turn_axes
         turn = a * turn[i], b * turn[j], c * turn[k], turn[3]
         tool = self._tool_rotation
@@ -171,8 +174,6 @@ class RelativeMotion:
         return _axes_of(self._scale * self._axis_scales[:, None] * self._map)
 
     def _scaled(self, turn: Quaternion) -> Quaternion:
-        if self._rotation_scale == 1.0:
-            return turn
         x, y, z = self._vector = _continued(rotation_vector(turn), self._vector)
         scale = self._rotation_scale
         return rotation_of((scale * x, scale * y, scale * z))

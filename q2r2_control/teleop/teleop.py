@@ -130,16 +130,25 @@ class Teleop:
         """
         clock_fault = self._clock(now)
         now = self._now if self._now is not None else 0.0
-        faults: dict[str, str | None] = {}
+        faults: dict[str, str] = {}
         for sample in samples:
             name = self._pair.arm_of_hand.get(sample.hand)
-            if name is not None:
-                faults[name] = self._arms[name].receive(sample, now) or faults.get(name)
+            if name is not None and (fault := self._arms[name].receive(sample, now)):
+                faults[name] = fault
         for name, arm in self._arms.items():
-            faults[name] = faults.get(name) or arm.watchdog(now) or clock_fault
-        self._disengage(faults, now)
+            if name not in faults and (fault := arm.watchdog(now) or clock_fault):
+                faults[name] = fault
+        if faults:
+            self._disengage(faults, now)
         around = Surroundings(tools, self._commanded, commanded, obstacles or {})
         self._pair.agree(around, now)
+        for arm in self._arms.values():
+            if samples or not arm.settled:
+                return self._act(around, now)
+        return self._targets(now, around)  # as at most ticks
+
+    def _act(self, around: Surroundings, now: float) -> dict[str, ArmTarget]:
+        """Do what the hands ask for; every arm's target after it."""
         presses = self._pair.act(around, now)
         chord = self.aligning
         for name, arm in self._arms.items():
@@ -156,16 +165,26 @@ class Teleop:
 
     def _targets(self, now: float, around: Surroundings) -> dict[str, ArmTarget]:
         """Of every arm, by its state."""
-        if self._pair.carry is not None and not self._pair.carry.lasts:
-            self._pair.end_carry(now, "the other arm was stopped")
-        carry, targets = self._pair.carry, {}
-        expected = {name: pose for name, arm in self._arms.items() if (pose := around.expected(arm)) is not None}
-        carried = self._carried(now, expected)
+        if self._pair.carry is not None:
+            return self._carried_targets(now, around)
+        targets = {}
         for name, arm in self._arms.items():
-            if carry is not None:
-                pose, slip = carried.get(name), carry.slip
-            else:
-                pose, slip = arm.target(now, expected.get(name)), arm.slip
+            pose = arm.target(now, around.expected(arm)) if arm.state is ArmState.ENGAGED else None
+            if pose is not None:
+                self._commanded[name] = pose
+            targets[name] = ArmTarget(pose, arm.gripper, *arm.slip, arm.sag, arm.filtered_hand)
+        return targets
+
+    def _carried_targets(self, now: float, around: Surroundings) -> dict[str, ArmTarget]:
+        """Of every arm, while two carry or until one of them was stopped."""
+        assert self._pair.carry is not None
+        if not self._pair.carry.lasts:
+            self._pair.end_carry(now, "the other arm was stopped")
+            return self._targets(now, around)
+        expected = {name: pose for name, arm in self._arms.items() if (pose := around.expected(arm)) is not None}
+        carried, slip, targets = self._carried(now, expected), self._pair.carry.slip, {}
+        for name, arm in self._arms.items():
+            pose = carried.get(name)
             if pose is not None:
                 self._commanded[name] = pose
             targets[name] = ArmTarget(pose, arm.gripper, *slip, arm.sag, arm.filtered_hand)
@@ -259,16 +278,14 @@ class Teleop:
             arm.forget()
         return f"the clock went back by {last - now:.3f} s"
 
-    def _disengage(self, faults: Mapping[str, str | None], now: float) -> None:
+    def _disengage(self, faults: Mapping[str, str], now: float) -> None:
         """Stop the arms whose hand has a fault; that of a hand whose arm holds anyway has no effect."""
-        if not any(faults.values()):
-            return  # as at most ticks
         if self.homing:
             fault = faults.get(self._pair.asks_home) if self._pair.asks_home is not None else None
             if fault:
                 self._pair.change(Cause.FAULT, now, f"on the way home: {fault}")
             return
-        active = {name: fault for name, fault in faults.items() if fault and self._arms[name].state in _LED}
+        active = {name: fault for name, fault in faults.items() if self._arms[name].state in _LED}
         for name, fault in active.items():
             self._arms[name].change(Cause.FAULT, now, fault)
         if active and self._linked:

@@ -84,7 +84,7 @@ def test_a_target_within_the_leash_is_the_relative_motion_bit_for_bit(motion: Re
         untied.append(hand)
     motion.anchor(HAND, TOOL)
     np.testing.assert_array_equal(targets, [motion.target(hand).homogeneous for hand in [HAND, *untied]][1:])
-    assert tied.leash.slip == tied.leash.slip_angle == 0.0
+    assert tied.leash.position.slip == tied.leash.rotation.slip == 0.0
 
 
 @pytest.mark.parametrize("motion", MOTIONS.values(), ids=MOTIONS.keys())
@@ -100,8 +100,8 @@ def test_a_taut_leash_holds_the_target_at_its_length_and_counts_what_slipped(mot
     angle = np.linalg.norm(pin.log3(free.rotation @ TOOL.rotation.T))
     assert tied.distance == pytest.approx(min(whole, 0.1))
     assert tied.angle == pytest.approx(min(angle, 0.5))
-    assert tied.leash.slip == pytest.approx(whole - 0.1)
-    assert tied.leash.slip_angle == pytest.approx(max(angle - 0.5, 0.0), abs=1e-9)
+    assert tied.leash.position.slip == pytest.approx(whole - 0.1)
+    assert tied.leash.rotation.slip == pytest.approx(max(angle - 0.5, 0.0), abs=1e-9)
 
 
 @pytest.mark.parametrize("motion", MOTIONS.values(), ids=MOTIONS.keys())
@@ -109,8 +109,8 @@ def test_what_slipped_is_a_new_anchor(motion: RelativeMotion) -> None:
     tied = Tied(motion, distance=0.1, angle=0.5)
     tied.go(along(0.001, 0.0005, 0, 0, 0.002, 0.002), 900)
     held, hand = tied.target, tied.hand
-    assert tied.leash.slip > 0.0
-    assert tied.leash.slip_angle > 0.0
+    assert tied.leash.position.slip > 0.0
+    assert tied.leash.rotation.slip > 0.0
     # Across both leashes, by less than what drops the slack.
     across = along(0.0002, -0.0004, 0.0002, 0.004, 0.002, -0.002)
     motion.anchor(hand, held)
@@ -122,13 +122,13 @@ def test_what_slipped_is_a_new_anchor(motion: RelativeMotion) -> None:
 def test_position_and_rotation_have_a_leash_each() -> None:
     tied = Tied(RelativeMotion(), distance=0.1, angle=0.5)
     tied.go(along(0.001), 300)
-    assert tied.leash.slip == pytest.approx(0.2)
-    assert tied.leash.slip_angle == 0.0
+    assert tied.leash.position.slip == pytest.approx(0.2)
+    assert tied.leash.rotation.slip == 0.0
     np.testing.assert_array_equal(tied.target.rotation, Tied(RelativeMotion()).target.rotation)
     tied = Tied(RelativeMotion(), distance=0.1, angle=0.5)
     tied.go(along(0, 0, 0, 0.002, 0, 0), 450)
-    assert tied.leash.slip == 0.0
-    assert tied.leash.slip_angle == pytest.approx(0.4)
+    assert tied.leash.position.slip == 0.0
+    assert tied.leash.rotation.slip == pytest.approx(0.4)
     np.testing.assert_array_equal(tied.target.translation, TOOL.translation)
 
 
@@ -150,7 +150,7 @@ def test_a_taut_target_goes_along_with_its_tool_without_a_step() -> None:
         assert np.linalg.norm(target.translation - before.translation) < 0.0006
         assert tied.distance <= 0.1 + 1e-12
         before = target
-    assert tied.leash.slip == pytest.approx(0.35, abs=0.01)
+    assert tied.leash.position.slip == pytest.approx(0.35, abs=0.01)
 
 
 @pytest.mark.parametrize("motion", MOTIONS.values(), ids=MOTIONS.keys())
@@ -169,7 +169,7 @@ def test_a_hand_that_comes_back_takes_the_target_from_the_tool_at_once(motion: R
     assert np.linalg.norm(pin.log3(missing.rotation)) < 13e-3
     way = held.actInv(tied.target)
     assert np.linalg.norm(pin.log3(way.rotation) if turning else way.translation) > 0.1
-    assert (tied.leash.slip_angle if turning else tied.leash.slip) > 0.1
+    assert (tied.leash.rotation.slip if turning else tied.leash.position.slip) > 0.1
 
 
 def test_tremor_drops_no_slack() -> None:
