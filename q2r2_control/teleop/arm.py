@@ -120,13 +120,8 @@ class ArmTeleop:
 
     @property
     def settled(self) -> bool:
-        """Whether nothing can come of this hand's controls before its next sample: no gesture goes on, nothing waits."""
-        return (
-            self._gestures.settled
-            and self._gripped is None
-            and self.state is not ArmState.ALIGNING
-            and not (self._presses or self._analog.bound)
-        )
+        """Whether nothing can come of this hand's controls before a hand's next sample, which :meth:`act` goes by."""
+        return self._gestures.settled and not self._analog.bound
 
     def take_presses(self, now: float) -> list[Press]:
         """Gestures since the last call; those that nobody gives to :meth:`act` are lost."""

@@ -168,6 +168,28 @@ def test_a_stream_that_begins_at_the_tool_is_followed_until_it_ceases() -> None:
     assert not stream.expire(1.0)
 
 
+def test_a_stream_that_was_followed_goes_on_anywhere_and_after_a_silence_only_from_the_tool() -> None:
+    stream = TargetStream(StreamSettings())
+    assert stream.offer(TOOL, [TOOL], 0.0) is None
+    assert stream.offer(raised(TOOL, 0.2), [], 0.1) is None
+    assert stream.pose is not None
+    assert stream.pose.translation[2] == TOOL.translation[2] + 0.2
+    assert "begins 0.200 m" in (stream.offer(raised(TOOL, 0.2), [TOOL], 0.5) or "")
+    assert not stream.following
+
+
+def test_targets_are_followed_no_longer_than_nothing_forbids_it(world: World, controller: CartesianController) -> None:
+    world.run(0.5)
+    tool = controller.tool_pose("left")
+    world.run(0.1, tool)
+    assert world.supervisor.follows("left")
+    world.supervisor.paused = True
+    refusal = world.supervisor.take_target("left", tool, world.now)
+    assert refusal is not None
+    assert refusal.line == "the controller is paused"
+    assert not world.supervisor.follows("left")
+
+
 def test_a_stream_that_begins_elsewhere_is_refused_even_where_it_comes_by() -> None:
     stream = TargetStream(StreamSettings())
     for step in range(100):
