@@ -64,7 +64,10 @@ class OperatorSide:
 
     def take_events(self, start: float) -> list[Event]:
         """What happened to the arms' states since the last call, by the time since ``start`` [s]; it is logged."""
-        events = [replace(event, t=event.t - start) for event in self._teleop.take_events()]
+        events = self._teleop.take_events()
+        if not events:
+            return events  # as at most ticks
+        events = [replace(event, t=event.t - start) for event in events]
         for event in events:
             if is_fault(event) and not event.reason.startswith(RECORDING_ENDED):  # which the recorder has logged
                 _logger.warning("%s arm: %s", event.arm, event.reason)

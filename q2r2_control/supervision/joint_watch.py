@@ -71,8 +71,10 @@ class JointWatch:
         if isinstance(state, str):
             self._fail(state)
             return
-        q = state.q.tolist()
-        if fault := self._unusable(state, q):
+        q, external = state.q.tolist(), state.q if state.tau_external is None else state.tau_external
+        # The usual case costs three sums; the joint is looked for only where there is something to say.
+        known = math.isfinite(sum(q) + sum(state.v.tolist()) + sum(external.tolist()))
+        if not known and (fault := self._unusable(state, external)):
             allowed = self._settings.unusable_time
             if now - self._stamp > allowed:
                 bridged = f" for more than {1e3 * allowed:g} ms" if allowed else ""
@@ -82,9 +84,11 @@ class JointWatch:
         if last is None or self._still_since == math.inf:
             self._begin(q, now)
             return
-        if fault := self._jump(q, last_q, max(now - last.stamp, passed, 0.0)):
+        # What is nearer all together is nearer in every joint, which is told first.
+        far = math.dist(q, last_q) >= _JUMP_ALLOWANCE
+        if far and (fault := self._jump(q, last_q, max(now - last.stamp, passed, 0.0))):
             self._fail(fault)
-        elif not _all_within(q, self._still_at, _REST):
+        elif math.dist(q, self._still_at) >= _REST and not _all_within(q, self._still_at, _REST):
             self._begin(q, now)
 
     def settled(self, now: float) -> bool:
@@ -131,11 +135,7 @@ class JointWatch:
     def _stamp(self) -> float:
         return -math.inf if self.state is None else self.state.stamp
 
-    def _unusable(self, state: RobotState, q: list[float]) -> str | None:
-        external = state.q if state.tau_external is None else state.tau_external
-        # The usual case costs three sums; the joint is looked for only where there is something to say.
-        if math.isfinite(sum(q) + sum(state.v.tolist()) + sum(external.tolist())):
-            return None
+    def _unusable(self, state: RobotState, external: Array) -> str | None:
         for what, values in (("position", state.q), ("velocity", state.v), ("external torque", external)):
             if not np.isfinite(values).all():
                 worst = int(np.flatnonzero(~np.isfinite(values))[0])

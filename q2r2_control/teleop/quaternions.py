@@ -49,7 +49,7 @@ def turn_between(start: Quaternion, end: Quaternion) -> Vector:
         (
             a * w - d * x - b * z + c * y,
             a * z - d * y + b * w - c * x,
-            b * x - d * z - a * y + c * w,
+            -d * z - a * y + b * x + c * w,
             d * w + a * x + b * y + c * z,
         )
     )

@@ -16,6 +16,7 @@ from q2r2_control.teleop.quaternions import (
     rotation_of,
     rotation_vector,
     turn_between,
+    turned_by,
 )
 from q2r2_control.types import Array
 
@@ -52,6 +53,8 @@ def test_products_and_inverses_are_those_of_matrices() -> None:
         assert matrix(product(p, q)) == pytest.approx(matrix(p) @ matrix(q), abs=1e-14)
         assert matrix(inverse(q)) == pytest.approx(matrix(q).T, abs=1e-14)
         assert matrix(product(rotation_of(turn_between(q, p)), q)) == pytest.approx(matrix(p), abs=1e-14)
+        assert turned_by(q, turn_between(q, p)) == product(rotation_of(turn_between(q, p)), q)
+        assert turn_between(q, p) == rotation_vector(product(p, inverse(q)))
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-300, 1e-12, 1e-6, math.pi - 1e-6, math.pi - 1e-12], ids="{:g} rad".format)
