@@ -56,11 +56,16 @@ class JointFollower:
         age = now - self._due
         coast = np.minimum(np.maximum(_COAST_INTERVALS * self._interval, _SHORTEST_COAST), _LONGEST_COAST)
         fresh = age <= coast
+        reach = self._velocity_limit * dt
+        if fresh.all():
+            way = self._command_q + self._command_v * age - self.q
+            if (np.abs(way) <= reach).all():  # as it is but for a joint that is left behind
+                self.q, self.v = self.q + way, self._command_v.copy()
+                return
         slower = np.sign(self.v) * np.maximum(np.abs(self.v) - self._acceleration * dt, 0.0)
         way = np.where(
             fresh, self._command_q + self._command_v * np.where(fresh, age, 0.0) - self.q, 0.5 * (self.v + slower) * dt
         )
-        reach = self._velocity_limit * dt
         bounded = np.minimum(np.maximum(way, -reach), reach)
         self.q = self.q + bounded
         # A joint that is far from where it should be catches up at its limit; its velocity is then that of this way.

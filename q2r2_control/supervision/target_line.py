@@ -12,7 +12,7 @@ import math
 import numpy as np
 import pinocchio as pin
 
-from q2r2_control.types import Array
+from q2r2_control.types import pose_of
 
 # Between two targets of a line: slower ones are steps, and stamps that are nearer say nothing [s].
 _SHORTEST, _LONGEST = 0.001, 0.025
@@ -32,24 +32,27 @@ class TargetLine:
         self._pose: pin.SE3 | None = None
         self._due = -math.inf
         self._gap = 0.0
-        self._twist: tuple[Array, Array] | None = None  # linear, and angular in the target's frame [m/s], [rad/s]
+        self._position: list[float] = []  # of the pose [m]
+        # Linear, and angular in the target's frame [m/s], [rad/s]; floats, since NumPy takes longer for three.
+        self._twist: tuple[list[float], list[float]] | None = None
         self._even = False
 
     def put(self, pose: pin.SE3, due: float | None) -> None:
         """A target; ``due``: when it is to be reached, None where that is not known."""
         last, gap, twist = self._pose, math.nan if due is None else due - self._due, self._twist
+        last_position, self._position = self._position, pose.translation.tolist()
         self._pose, self._due = pose, -math.inf if due is None else due
         if 0.0 <= gap < _SHORTEST:
             return  # a late tick of its sender, and the next one
         self._twist, self._even = None, False
         if last is None or not _SHORTEST <= gap <= _LONGEST:
             return
-        moved = pose.translation - last.translation
-        turned = pin.log3(last.rotation.T @ pose.rotation)
+        linear = [(there - here) / gap for here, there in zip(last_position, self._position, strict=True)]
+        angular = (pin.log3(last.rotation.T @ pose.rotation) / gap).tolist()
         if twist is not None:
-            surprise, turn = moved - gap * twist[0], turned - gap * twist[1]
-            self._even = bool(surprise @ surprise <= _EVEN**2 and turn @ turn <= _EVEN_TURN**2)
-        self._gap, self._twist = gap, (moved / gap, turned / gap)
+            surprise, turn = gap * math.dist(linear, twist[0]), gap * math.dist(angular, twist[1])
+            self._even = surprise <= _EVEN and turn <= _EVEN_TURN
+        self._gap, self._twist = gap, (linear, angular)
 
     def at(self, t: float) -> pin.SE3 | None:
         """Where the target is at ``t`` [s]; None where there is none."""
@@ -57,6 +60,5 @@ class TargetLine:
             return self._pose
         linear, angular = self._twist
         ahead = min(max(t - self._due, -self._gap), _LOOKAHEAD * self._gap)
-        return pin.SE3(
-            self._pose.rotation @ pin.exp3(ahead * angular), np.asarray(self._pose.translation + ahead * linear)
-        )
+        position = np.array([at + ahead * speed for at, speed in zip(self._position, linear, strict=True)])
+        return pose_of(self._pose.rotation @ pin.exp3(ahead * np.array(angular)), position)
