@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -44,6 +45,7 @@ class SimulatedCell:
         self.dropped = 0.0  # time that the simulation fell behind, or waited for torques, in all [s]
         self._hold_after, self._max_jump = hold_after, max_jump
         self._columns = {name: index for index, name in enumerate(robot.joint_names)}
+        self._places = lru_cache(maxsize=64)(self._find)  # senders name the same joints again and again
         self._timestep = config.mujoco.timestep
         self._follower = JointFollower(
             robot.home, robot.capped_acceleration(config.control.acceleration_limit), robot.velocity_limit
@@ -74,11 +76,12 @@ class SimulatedCell:
 
     def command_positions(self, setpoint: JointSetpoint, now: float) -> str | None:
         """Follow joint positions that came at ``now`` [s]; joints of others may be among them."""
-        fault, columns = self._columns_of(setpoint)
-        if fault is not None:
+        if fault := self._unusable(setpoint):
             return fault
-        names = list(setpoint.names)
-        ours = np.array([names.index(self.robot.joint_names[column]) for column in columns])
+        places = self._places(tuple(setpoint.names))
+        if isinstance(places, str):
+            return places
+        ours, columns = places
         q = setpoint.q[ours]
         reference = self._follower.q if self._tau is None else self.plant.state().q
         jump = np.abs(q - reference[columns])
@@ -178,19 +181,22 @@ class SimulatedCell:
         self._follower.stop(state.q, state.v)
         self._tau = None
 
-    def _columns_of(self, setpoint: JointSetpoint) -> tuple[str | None, np.ndarray]:
-        none = np.empty(0, dtype=np.intp)
-        names, count = setpoint.names, len(setpoint.names)
+    def _unusable(self, setpoint: JointSetpoint) -> str | None:
+        """What is wrong with a setpoint's numbers, or None."""
+        count = len(setpoint.names)
         if len(setpoint.q) != count or (setpoint.v is not None and len(setpoint.v) != count):
-            return f"{len(setpoint.q)} positions for {count} joints", none
-        if len(set(names)) != count:
-            return "a joint is named twice", none
-        columns = [self._columns[name] for name in names if name in self._columns]
-        if not columns:
-            return f"none of its joints is one of {', '.join(self._columns)}"[:200], none
-        values = setpoint.q if setpoint.v is None else np.concatenate((setpoint.q, setpoint.v))
-        if not np.isfinite(values).all():
-            return "a number is not finite", none
+            return f"{len(setpoint.q)} positions for {count} joints"
+        if not math.isfinite(sum(setpoint.q.tolist()) + (0.0 if setpoint.v is None else sum(setpoint.v.tolist()))):
+            return "a number is not finite"
         if not 0.0 <= setpoint.delay <= 1.0:
-            return f"due in {setpoint.delay:g} s; allowed: 0 .. 1", none
-        return None, np.array(columns)
+            return f"due in {setpoint.delay:g} s; allowed: 0 .. 1"
+        return None
+
+    def _find(self, names: tuple[str, ...]) -> tuple[Array, Array] | str:
+        """Which of ``names`` are joints of ours, and their columns; or what is wrong with the names."""
+        if len(set(names)) != len(names):
+            return "a joint is named twice"
+        ours = [place for place, name in enumerate(names) if name in self._columns]
+        if not ours:
+            return f"none of its joints is one of {', '.join(self._columns)}"[:200]
+        return np.array(ours), np.array([self._columns[names[place]] for place in ours])

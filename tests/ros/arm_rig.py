@@ -20,7 +20,7 @@ from std_msgs.msg import String
 from tf2_msgs.msg import TFMessage
 
 from q2r2_control.ros.base_node import COMMAND_QOS, STREAM_QOS
-from q2r2_control.ros.bridge.messages import pose_of, stamped_pose, write_transform
+from q2r2_control.ros.bridge.messages import pose_message, pose_of, stamped_pose
 from tests.ros.processes import PATIENCE, Processes, RosProcess
 from tests.ros.waiting import wait_until
 
@@ -221,7 +221,10 @@ class ArmRigs:
 def stamped_transform(parent: str, child: str, pose: pin.SE3) -> TransformStamped:
     """Where a frame is in another, as on /tf; the stamp is not set."""
     message = TransformStamped(child_frame_id=child)
-    write_transform(pose.translation, pin.Quaternion(pose.rotation).coeffs(), message.transform)
+    as_pose = pose_message(pose)
+    to, position = message.transform.translation, as_pose.position
+    to.x, to.y, to.z = position.x, position.y, position.z
+    message.transform.rotation = as_pose.orientation
     message.header.frame_id = parent
     return message
 

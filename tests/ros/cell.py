@@ -21,6 +21,7 @@ from q2r2_control.robot.compose import WORLD
 from q2r2_control.ros.base_node import COMMAND_QOS, LATCHED_QOS, STREAM_QOS
 from q2r2_control.ros.bridge.frames import FrameTree
 from q2r2_control.ros.bridge.messages import pose_message
+from q2r2_control.ros.monitoring.frame_senders import ReadTransform
 from q2r2_control.types import Array
 from tests.ros import waiting
 from tests.ros.joint_recorder import JointRecorder
@@ -59,7 +60,9 @@ class Cell:
     def _on_transforms(self, message: TFMessage) -> None:
         for transform in message.transforms:
             self.parents[transform.child_frame_id] = transform.header.frame_id
-            self.frames.set(transform, time.monotonic())
+            p, r = transform.transform.translation, transform.transform.rotation
+            names = transform.child_frame_id, transform.header.frame_id
+            self.frames.set(ReadTransform(*names, (p.x, p.y, p.z, r.x, r.y, r.z, r.w)), time.monotonic())
 
     def _on_state(self, name: str, message: String) -> None:
         self.states[name] = json.loads(message.data)

@@ -16,11 +16,13 @@ pytest.importorskip("tf2_msgs", reason="needs q2r2 ros build-interfaces")
 pytest.importorskip("quest2ros", reason="needs q2r2 ros build-interfaces")
 
 
+from geometry_msgs.msg import TransformStamped
 from rclpy.serialization import serialize_message
 from tf2_msgs.msg import TFMessage
 
 from q2r2_control.ros.base_node import LATCHED_QOS
 from q2r2_control.ros.bridge.frames import FrameListener, FrameTree
+from q2r2_control.ros.monitoring.frame_senders import ReadTransform, frame_reader
 from tests.ros.arm_rig import stamped_transform
 from tests.ros.waiting import wait_until
 
@@ -29,13 +31,18 @@ B = pin.SE3(pin.exp3(np.array([-0.7, 0.1, 2.0])), np.array([0.2, -0.4, 0.9]))
 C = pin.SE3(pin.exp3(np.array([1.1, 0.4, -0.3])), np.array([-0.6, 0.1, 0.3]))
 
 
+def read(transform: TransformStamped) -> ReadTransform:
+    """What a listener reads of a message with this transform."""
+    return frame_reader()(serialize_message(TFMessage(transforms=[transform])))[0]
+
+
 @pytest.fixture
 def tree() -> FrameTree:
     """World with a mount, which carries an arm, and a table beside."""
     made = FrameTree()
-    made.set(stamped_transform("world", "mount", A), math.inf)
-    made.set(stamped_transform("mount", "/tool", B), 3.0)
-    made.set(stamped_transform("world", "table", C), 2.0)
+    made.set(read(stamped_transform("world", "mount", A)), math.inf)
+    made.set(read(stamped_transform("mount", "/tool", B)), 3.0)
+    made.set(read(stamped_transform("world", "table", C)), 2.0)
     return made
 
 
@@ -58,7 +65,7 @@ def test_a_frame_is_found(frame: str, within: str, pose: pin.SE3, received: floa
 
 def test_frames_that_nothing_joins_are_not_found_even_in_a_ring(tree: FrameTree) -> None:
     assert tree.find("tool", "elsewhere") is None
-    tree.set(stamped_transform("tool", "world", A), 4.0)
+    tree.set(read(stamped_transform("tool", "world", A)), 4.0)
     assert tree.find("tool", "elsewhere") is None
 
 
@@ -67,7 +74,7 @@ def test_a_transform_that_is_none_is_passed_over(bad: float, tree: FrameTree) ->
     message = stamped_transform("mount", "tool", C)
     rotation = message.transform.rotation
     rotation.x = rotation.y = rotation.z = rotation.w = bad
-    tree.set(message, 9.0)
+    tree.set(read(message), 9.0)
     placement = tree.find("tool", "mount")
     assert placement is not None
     np.testing.assert_allclose(placement.pose.homogeneous, B.homogeneous, atol=1e-12)
@@ -116,8 +123,6 @@ def test_two_publishers_of_a_frame_are_told_once_and_block_the_tool_only_if_they
 
 
 def test_nodes_of_one_process_read_each_message_once() -> None:
-    from q2r2_control.ros.monitoring.frame_senders import frame_reader
-
     message = serialize_message(TFMessage(transforms=[stamped_transform("world", "tool", pin.SE3.Identity())]))
     first, second = frame_reader(), frame_reader()
     assert first(message) is second(bytes(bytearray(message)))

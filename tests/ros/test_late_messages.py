@@ -19,6 +19,7 @@ pytest.importorskip("control_msgs", reason="needs control_msgs: q2r2 ros build-i
 pytest.importorskip("tf2_msgs", reason="needs tf2_msgs: q2r2 ros build-interfaces")
 
 import rclpy
+from rclpy.serialization import serialize_message
 from sensor_msgs.msg import JointState
 
 from q2r2_control.ros.base_node import WARN, BaseNode
@@ -33,14 +34,15 @@ class Arrivals:
     """Calls the callback of a node's subscription as the executor does."""
 
     def __init__(self, node: Any, topic: str) -> None:
-        self._callback = next(one for one in node.subscriptions if one.topic_name == topic).callback
+        self._subscription = next(one for one in node.subscriptions if one.topic_name == topic)
         self._number = 0
 
     def arrive(self, message: Any, took: int) -> None:
         self._number += 1
         received = 1_700_000_000_000_000_000 + self._number * 10_000_000
         times = {"source_timestamp": received - took, "received_timestamp": received}
-        self._callback(message, {"publication_sequence_number": self._number, **times})
+        taken = serialize_message(message) if self._subscription.raw else message
+        self._subscription.callback(taken, {"publication_sequence_number": self._number, **times})
 
 
 @pytest.fixture

@@ -7,42 +7,38 @@ import time
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
-import numpy as np
 import pinocchio as pin
 from geometry_msgs.msg import PoseStamped
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from tf2_msgs.msg import TFMessage
 
 from q2r2_control.ros.base_node import STREAM_QOS, BaseNode
-from q2r2_control.ros.bridge.messages import nanoseconds, pose_of
+from q2r2_control.ros.bridge.messages import are_a_pose, pose_of_numbers
+from q2r2_control.ros.bridge.serialized import MessageReader
 from q2r2_control.ros.monitoring.endpoints import Publishers
-from q2r2_control.ros.monitoring.frame_senders import FrameSenders, frame_reader
+from q2r2_control.ros.monitoring.frame_senders import FrameSenders, ReadTransform, frame_reader
 from q2r2_control.supervision.target_stream import apart
 
-# A geometry_msgs/TransformStamped, as rclpy or as rosbags reads it.
-Transformed = Any
 # Two publishers whose poses of a frame differ by more do not tell of the same robot [m], [rad].
 _SAME = 0.05, 0.1
 _REMEMBERED = 2.0  # such a difference [s]
-_UNIT = 1e-3  # a quaternion's norm may be off by this
 
 
 class _Edge:
     """Pose of a child frame in its parent; computed when asked for, since most frames of a robot never are."""
 
-    __slots__ = ("_pose", "_transform", "parent", "received")
+    __slots__ = ("_numbers", "_pose", "parent", "received")
 
-    def __init__(self, transform: Transformed, received: float) -> None:
-        self.parent, self.received = _name(transform.header.frame_id), received  # [s]; inf: static
-        self._transform = transform.transform
+    def __init__(self, transform: ReadTransform, received: float) -> None:
+        self.parent, self.received = _name(transform.frame_id), received  # [s]; inf: static
+        self._numbers = transform.numbers
         self._pose: pin.SE3 | None = None
 
     @property
     def pose(self) -> pin.SE3:
         if self._pose is None:
-            position, rotation = self._transform.translation, self._transform.rotation
-            quaternion = pin.Quaternion(rotation.w, rotation.x, rotation.y, rotation.z).normalized()
-            self._pose = pin.SE3(quaternion.toRotationMatrix(), np.array([position.x, position.y, position.z]))
+            self._pose = pose_of_numbers(self._numbers)
+            assert self._pose is not None  # which :class:`FrameTree` has asked
         return self._pose
 
 
@@ -60,9 +56,9 @@ class FrameTree:
         self._edges: dict[str, _Edge] = {}
         self._found: dict[tuple[str, str], Placement] = {}  # since a transform last came
 
-    def set(self, transform: Transformed, received: float) -> None:
+    def set(self, transform: ReadTransform, received: float) -> None:
         """Store one transform; one with numbers that are not finite, or without a unit quaternion, is ignored."""
-        if _is_pose(transform):
+        if are_a_pose(transform.numbers):
             self._edges[_name(transform.child_frame_id)] = _Edge(transform, received)
             self._found.clear()
 
@@ -85,10 +81,10 @@ class FrameTree:
         """The frame, and all those that it hangs on."""
         return [name for name, _ in self._upwards(_name(frame))]
 
-    def moves_far(self, transform: Transformed) -> bool:
+    def moves_far(self, transform: ReadTransform) -> bool:
         """Whether the frame is elsewhere in a transform than it was in the last one."""
         before = self._edges.get(_name(transform.child_frame_id))
-        if before is None or not _is_pose(transform):
+        if before is None or not are_a_pose(transform.numbers):
             return False
         distance, angle = apart(before.pose, _Edge(transform, before.received).pose)
         return distance > _SAME[0] or angle > _SAME[1]
@@ -165,12 +161,6 @@ def _name(frame: str) -> str:
     return frame.lstrip("/")
 
 
-def _is_pose(message: Transformed) -> bool:
-    p, r = message.transform.translation, message.transform.rotation
-    # A sum or a norm with NaN or infinity in it is not finite.
-    return math.isfinite(p.x + p.y + p.z) and abs(math.hypot(r.x, r.y, r.z, r.w) - 1.0) <= _UNIT
-
-
 class ToolFrame:
     """The pose of a frame of /tf in the world."""
 
@@ -197,24 +187,26 @@ class PoseTopic:
 
     def __init__(self, node: BaseNode, topic: str, tree: FrameTree, world: str, timeout: float) -> None:
         self._tree, self._world, self._timeout = tree, world, timeout
-        self._newest: tuple[PoseStamped, float] | None = None
+        self._newest: tuple[str, int, float] | None = None  # its frame, its stamp [ns], and when it was received [s]
         self._pose: pin.SE3 | None = None  # of the newest, in the message's frame
+        self._reader = MessageReader(PoseStamped)
         self._topic, self._publishers = topic, Publishers(node, [topic])
         self._publishers.look_steadily()
         self.problem: str | None = None
-        node.create_subscription(PoseStamped, topic, lambda message: self._take(message, node.now), STREAM_QOS)
+        node.create_subscription(
+            PoseStamped, topic, lambda message: self._take(message, node.now), STREAM_QOS, raw=True
+        )
 
     def at(self, now: float) -> pin.SE3 | None:
         """The newest pose at ``now`` [s]; None if it is not known, and then ``problem`` says why."""
         if self._newest is None:
             self.problem = f"nothing on {self._topic}"
             return None
-        message, received = self._newest
+        frame, _, received = self._newest
         if now - received > self._timeout:
             source = self._publishers.source(self._topic)
             self.problem = f"{self._topic}{source} is silent for {now - received:.2f} s"
             return None
-        frame = message.header.frame_id
         placement = self._tree.find(frame, self._world) if frame else Placement(pin.SE3.Identity(), math.inf)
         if self._pose is None:
             self.problem = f"{self._topic}: not finite or not a rotation"
@@ -228,15 +220,17 @@ class PoseTopic:
     @property
     def stamp(self) -> int | None:
         """The newest message's own, by its sender's clock [ns]; None: there is none."""
-        return None if self._newest is None else nanoseconds(self._newest[0].header.stamp)
+        return None if self._newest is None else self._newest[1]
 
     def take_silence(self, now: float) -> str | None:
         """One line, returned once, if poses came and have stopped coming."""
-        if self._newest is None or now - self._newest[1] <= self._timeout:
+        if self._newest is None or now - self._newest[2] <= self._timeout:
             return None
         self.at(now)
         self._newest = None
         return self.problem
 
-    def _take(self, message: PoseStamped, now: float) -> None:
-        self._newest, self._pose = (message, now), pose_of(message.pose)
+    def _take(self, message: bytes, now: float) -> None:
+        if (told := self._reader.read(message)) is not None:
+            self._newest = told.like.header.frame_id, told.stamp, now
+            self._pose = pose_of_numbers(told.values.tolist())

@@ -10,10 +10,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any
 
-from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
 from q2r2_control.config import Config
@@ -21,6 +20,7 @@ from q2r2_control.config.timeouts import STREAM_TIMEOUT
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.drives import Drive
 from q2r2_control.ros.base_node import LATCHED_QOS, BaseNode
+from q2r2_control.ros.bridge.messages import JointNumbers
 from q2r2_control.ros.bridge.opening_grants import wanted_topic
 from q2r2_control.runtime.body_changes import BodyChanges
 from q2r2_control.supervision.grasp_watch import STALL, GraspWatch
@@ -66,7 +66,7 @@ class GripperLimits:
         """Of each arm that has an object, whether its gripper holds it."""
         return {} if self._bodies is None else self._bodies.holding
 
-    def take_joint_state(self, message: JointState) -> None:
+    def take_joint_state(self, message: JointNumbers) -> None:
         """Note the fingers of a message of joint states, if there are any."""
         if self._answers:
             self._fingers.take(message, self._node.now)
@@ -147,14 +147,13 @@ class FingerStates:
         }
         self._measured: dict[str, tuple[float, float]] = {}  # arm -> opening, and when it was measured [s]
 
-    def take(self, message: JointState, now: float) -> None:
+    def take(self, message: JointNumbers, now: float) -> None:
         """Note what a message says of fingers; what it says of other joints is not looked at."""
         if len(message.position) != len(message.name):
             return
-        columns = {name: column for column, name in enumerate(message.name)}
         for arm, (joints, closed, opened) in self._grippers.items():
-            if all(joint in columns for joint in joints):
-                position = sum(message.position[columns[joint]] for joint in joints) / len(joints)
+            if columns := _columns(message.name, joints):
+                position = float(message.position[columns].sum()) / len(joints)
                 self._measured[arm] = ((position - closed) / (opened - closed), now)
 
     def openings(self, now: float) -> dict[str, float]:
@@ -164,3 +163,9 @@ class FingerStates:
             for arm, (opening, at) in self._measured.items()
             if now - at <= STREAM_TIMEOUT and math.isfinite(opening)
         }
+
+
+@lru_cache(maxsize=64)  # publishers send the same names again and again
+def _columns(given: tuple[str, ...], joints: tuple[str, ...]) -> list[int]:
+    """Where ``joints`` are among the names of a message; empty where one is missing."""
+    return [given.index(joint) for joint in joints] if set(joints) <= set(given) else []

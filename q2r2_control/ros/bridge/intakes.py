@@ -19,7 +19,15 @@ from q2r2_control.robot.compose import WORLD
 from q2r2_control.robot.robot import Robot
 from q2r2_control.ros.base_node import COMMAND_QOS, STREAM_QOS, BaseNode
 from q2r2_control.ros.bridge.joint_outputs import joints_of
-from q2r2_control.ros.bridge.messages import age, delay, pose_of, robot_state, seconds
+from q2r2_control.ros.bridge.messages import (
+    JointNumbers,
+    age,
+    delay,
+    joint_numbers,
+    pose_of_numbers,
+    robot_state,
+)
+from q2r2_control.ros.bridge.serialized import MessageReader
 from q2r2_control.ros.monitoring.endpoints import Publishers
 from q2r2_control.supervision.delay_watch import DelayWatch
 from q2r2_control.supervision.target_stream import Refusal
@@ -53,6 +61,7 @@ class TargetIntake:
                 raise ConfigError(f"{arm}.target_topic = {topic!r:.80}: another arm has it; allowed: one of its own")
             self.topics[arm] = topic
         self._publishers = Publishers(node, self.topics.values())
+        self._readers = {arm: MessageReader(PoseStamped) for arm in robot.arms}
         self._delays = {arm: DelayWatch(STREAM_TIMEOUT) for arm in robot.arms}
         self._stamps = {arm: DelayWatch(_LATEST) for arm in robot.arms}  # the delays since targets were made
         self._refused: dict[str, tuple[Refusal, float]] = {}  # why an arm's last target was not used, and when [s]
@@ -61,7 +70,8 @@ class TargetIntake:
     def subscribe(self, take: Take) -> None:
         """Pass each target to ``take``."""
         for arm, topic in self.topics.items():
-            self._node.create_subscription(PoseStamped, topic, partial(self._on_target, take, arm), COMMAND_QOS)
+            on_target = partial(self._on_target, take, arm)
+            self._node.create_subscription(PoseStamped, topic, on_target, COMMAND_QOS, raw=True)
 
     def look(self) -> None:
         """Ask the graph which nodes publish."""
@@ -81,30 +91,33 @@ class TargetIntake:
         self._refused = {arm: entry for arm, entry in self._refused.items() if now - entry[1] <= _WARNING_TIME}
         return [f"target of {arm} not used: {refusal.line}" for arm, (refusal, _) in self._refused.items()]
 
-    def _on_target(self, take: Take, arm: str, message: PoseStamped, info: Mapping[str, int | None]) -> None:
-        frame, now = self.frames[arm], self._node.now
-        pose = pose_of(message.pose) if message.header.frame_id == frame.name else None
+    def _on_target(self, take: Take, arm: str, message: bytes, info: Mapping[str, int | None]) -> None:
+        if (told := self._readers[arm].read(message)) is None:
+            return
+        frame, now, frame_id = self.frames[arm], self._node.now, told.like.header.frame_id
+        pose = pose_of_numbers(told.values.tolist()) if frame_id == frame.name else None
         late = self._delays[arm].take(delay(info), time.monotonic())
         wanted = None if pose is None or late else frame.pose * pose
-        refusal = take(arm, wanted, now, info["publication_sequence_number"], self._due(arm, message, now - age(info)))
+        due = self._due(arm, told.stamp, now - age(info))
+        refusal = take(arm, wanted, now, info["publication_sequence_number"], due)
         if refusal is not None:
             self._refuse(arm, refusal)
         elif late:
             self._refuse(arm, Refusal("late", f"{late:.2f} s late; its sender or this node stood still"))
-        elif message.header.frame_id != frame.name:
-            fault = f"frame_id {message.header.frame_id!r:.40}; allowed: {frame.name!r}"
+        elif frame_id != frame.name:
+            fault = f"frame_id {frame_id!r:.40}; allowed: {frame.name!r}"
             self._refuse(arm, Refusal("frame", fault))
         elif pose is None:
             self._refuse(arm, Refusal("pose", "not a finite pose with a unit quaternion"))
         else:
             self._refused.pop(arm, None)
 
-    def _due(self, arm: str, message: PoseStamped, received: float) -> float | None:
-        """When a target is due that was received then [s], by its stamp; None where the stamp does not say.
+    def _due(self, arm: str, made: int, received: float) -> float | None:
+        """When a target is due that was received then [s], by its stamp [ns]; None where the stamp does not say.
 
         What is made once a tick is sent a little later at one tick than at another.
         """
-        stamp, stamps = seconds(message.header.stamp), self._stamps[arm]
+        stamp, stamps = 1e-9 * made, self._stamps[arm]
         known = stamp > 0.0 and stamps.take(received - stamp, received) == 0.0
         return stamp + stamps.usual if known else None
 
@@ -160,15 +173,17 @@ class JointIntake:
         self._values = np.zeros((3, len(robot.joint_names)))
         self.state: RobotState | None = None  # the newest of all arms
 
-    def subscribe(self, take: Callable[[RobotState | str, float], None], look: Callable[[JointState], None]) -> None:
+    def subscribe(self, take: Callable[[RobotState | str, float], None], look: Callable[[JointNumbers], None]) -> None:
         """Pass each state of all arms, or what is wrong with a message, to ``take``, with the time [s].
 
         ``look`` gets every message as it is first: there may be fingers in it.
         """
         for topic in self._topics:
-            self._node.create_subscription(JointState, topic, partial(self._on_message, take, look, topic), STREAM_QOS)
+            on_message = partial(self._on_message, take, look, topic, MessageReader(JointState))
+            self._node.create_subscription(JointState, topic, on_message, STREAM_QOS, raw=True)
         if self._external_topic:
-            self._node.create_subscription(JointState, self._external_topic, self._on_external, STREAM_QOS)
+            on_external = partial(self._on_external, MessageReader(JointState))
+            self._node.create_subscription(JointState, self._external_topic, on_external, STREAM_QOS, raw=True)
 
     @property
     def measures_external_torque(self) -> bool:
@@ -188,24 +203,30 @@ class JointIntake:
     def _on_message(
         self,
         take: Callable[[RobotState | str, float], None],
-        look: Callable[[JointState], None],
+        look: Callable[[JointNumbers], None],
         topic: str,
-        message: JointState,
+        reader: MessageReader,
+        message: bytes,
     ) -> None:
-        look(message)
+        if (read := reader.read(message)) is None:
+            return
+        look(told := joint_numbers(read))
         joints, names = self._joints[topic], self._names[topic]
-        if not self._expected[topic] & set(message.name):
+        if self._expected[topic].isdisjoint(told.name):
             return  # of a gripper or another robot
         now = self._node.now
-        part = robot_state(message, names, now)
+        part = robot_state(told, names, now)
         if isinstance(part, str):
             take(part if len(self._topics) == 1 else f"{topic}: {part}", now)
             return
         self._stamps[topic] = now
-        self._values[:, joints] = part.q, part.v, part.tau
         oldest = min(self._stamps.values())
-        if oldest > -math.inf:
+        if len(joints) == self._values.shape[1]:
+            q, v, tau = part.q, part.v, part.tau  # this topic carries all joints
+        else:
+            self._values[:, joints] = part.q, part.v, part.tau
             q, v, tau = self._values.copy()
+        if oldest > -math.inf:
             silent = now - self._external_stamp > STREAM_TIMEOUT
             external = None if silent else self._external
             self.state = RobotState(q=q, v=v, tau=tau, tau_external=external, stamp=oldest)
@@ -214,9 +235,12 @@ class JointIntake:
             else:
                 take(self.state, now)
 
-    def _on_external(self, message: JointState) -> None:
-        columns = {name: index for index, name in enumerate(message.name)}
-        if len(message.effort) == len(message.name) and all(name in columns for name in self._joint_names):
-            torques = np.array([message.effort[columns[name]] for name in self._joint_names])
+    def _on_external(self, reader: MessageReader, message: bytes) -> None:
+        if (read := reader.read(message)) is None:
+            return
+        told = joint_numbers(read)
+        columns = {name: index for index, name in enumerate(told.name)}
+        if len(told.effort) == len(told.name) and all(name in columns for name in self._joint_names):
+            torques = np.array([told.effort[columns[name]] for name in self._joint_names])
             if np.isfinite(torques).all():
                 self._external, self._external_stamp = torques, self._node.now

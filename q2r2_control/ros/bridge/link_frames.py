@@ -6,11 +6,10 @@ from collections.abc import Collection
 from typing import Any
 
 import numpy as np
-from builtin_interfaces.msg import Time
 from geometry_msgs.msg import TransformStamped
 from tf2_msgs.msg import TFMessage
 
-from q2r2_control.ros.bridge.messages import write_transform
+from q2r2_control.ros.bridge.serialized import MessageWriter
 
 
 class LinkFrames:
@@ -26,30 +25,34 @@ class LinkFrames:
 
 
 class _Transforms:
-    """Transforms of some bodies, written into one message again and again."""
+    """Transforms of some bodies, serialized again and again."""
 
     def __init__(self, model: Any, bodies: list[int]) -> None:
         self._bodies, self._parents = np.array(bodies, int), model.body_parentid[bodies]
-        self._message = TFMessage()
+        message = TFMessage()
         for body, parent in zip(bodies, self._parents, strict=True):
             transform = TransformStamped(child_frame_id=model.body(body).name)
             transform.header.frame_id = model.body(parent).name
-            self._message.transforms.append(transform)
+            message.transforms.append(transform)
+        self._writer = MessageWriter(message)
 
-    def at(self, data: Any, stamp: Time) -> TFMessage:
-        """The message for a ``mujoco.MjData``; valid until the next call."""
+    def at(self, data: Any, t: float) -> bytes:
+        """The message for a ``mujoco.MjData`` at ``t`` [s], for a publisher."""
         matrices = data.xmat[self._parents].reshape(-1, 3, 3)
-        positions = np.einsum("nji,nj->ni", matrices, data.xpos[self._bodies] - data.xpos[self._parents])
-        quaternions = _relative(data.xquat[self._parents], data.xquat[self._bodies])
-        for transform, position, quaternion in zip(self._message.transforms, positions, quaternions, strict=True):
-            transform.header.stamp = stamp
-            write_transform(position, quaternion, transform.transform)
-        return self._message
+        numbers = self._writer.numbers.reshape(-1, 7)
+        numbers[:, :3] = np.einsum("nji,nj->ni", matrices, data.xpos[self._bodies] - data.xpos[self._parents])
+        numbers[:, 3:] = _relative(data.xquat[self._parents], data.xquat[self._bodies])
+        return self._writer.at(t)
 
 
 def _relative(parent: Any, child: Any) -> Any:
     """Rotations of children in their parents: (n, 4) from w first, as in MuJoCo, to x y z w, as in messages."""
     w, v = parent[:, :1], -parent[:, 1:]
     child_w, child_v = child[:, :1], child[:, 1:]
-    scalar = w * child_w - np.sum(v * child_v, axis=1, keepdims=True)
-    return np.hstack((w * child_v + child_w * v + np.cross(v, child_v), scalar))
+    scalar = w * child_w - np.einsum("ni,ni->n", v, child_v)[:, None]
+    return np.hstack((w * child_v + child_w * v + _cross(v, child_v), scalar))
+
+
+def _cross(a: Any, b: Any) -> Any:
+    """Cross products of rows (n, 3); NumPy's own takes ten times as long."""
+    return a[:, (1, 2, 0)] * b[:, (2, 0, 1)] - a[:, (2, 0, 1)] * b[:, (1, 2, 0)]

@@ -10,16 +10,17 @@ import math
 import time
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import Pose, PoseStamped, Transform, Twist, Vector3
+from geometry_msgs.msg import Pose, PoseStamped, Twist
 from quest2ros.msg import OVR2ROSInputs
 from sensor_msgs.msg import JointState
 
 from q2r2_control.inputs.messages import HandPose, HandTwist
+from q2r2_control.ros.bridge.serialized import MessageWriter, Numbers
 from q2r2_control.types import Array, HandInputs, HandSample, RobotState
 
 _UNIT = 1e-3  # a quaternion's norm may be off by this
@@ -63,14 +64,9 @@ def pose_message(pose: pin.SE3) -> Pose:
     return message
 
 
-def write_transform(position: Array, quaternion: Array, message: Transform) -> None:
-    """A position (3,) and a unit quaternion x y z w into a message that is sent again and again."""
-    _write(position, quaternion, message.translation, message.rotation)
-
-
-def stamped_pose(pose: pin.SE3, frame: str, t: float, message: PoseStamped | None = None) -> PoseStamped:
-    """A pose in ``frame`` at ``t`` [s]; written into ``message`` where one is sent again and again."""
-    message = message or PoseStamped()
+def stamped_pose(pose: pin.SE3, frame: str, t: float) -> PoseStamped:
+    """A pose in ``frame`` at ``t`` [s]."""
+    message = PoseStamped()
     message.header.frame_id = frame
     message.header.stamp = time_message(t)
     to = message.pose
@@ -78,14 +74,23 @@ def stamped_pose(pose: pin.SE3, frame: str, t: float, message: PoseStamped | Non
     return message
 
 
+class PoseWriter:
+    """Serializes :func:`stamped_pose` in one frame again and again, for a publisher."""
+
+    def __init__(self, frame: str) -> None:
+        self._writer = MessageWriter(stamped_pose(pin.SE3.Identity(), frame, 0.0))
+
+    def at(self, pose: pin.SE3, t: float) -> bytes:
+        """The message for ``t`` [s]."""
+        numbers = self._writer.numbers
+        numbers[:3], numbers[3:] = pose.translation, pin.Quaternion(pose.rotation).normalized().coeffs()
+        return self._writer.at(t)
+
+
 def pose_of(message: Pose) -> pin.SE3 | None:
     """The pose of a message, its quaternion normalised; None for numbers that are not finite or no rotation."""
     p, o = message.position, message.orientation
-    norm = math.hypot(o.x, o.y, o.z, o.w)
-    # A sum or a norm with NaN or infinity in it is not finite.
-    if not (math.isfinite(p.x + p.y + p.z) and abs(norm - 1.0) <= _UNIT):
-        return None
-    return pin.XYZQUATToSE3(np.array((p.x, p.y, p.z, o.x / norm, o.y / norm, o.z / norm, o.w / norm)))
+    return pose_of_numbers((p.x, p.y, p.z, o.x, o.y, o.z, o.w))
 
 
 def pose_numbers(pose: pin.SE3) -> tuple[float, ...]:
@@ -95,9 +100,17 @@ def pose_numbers(pose: pin.SE3) -> tuple[float, ...]:
 
 def pose_of_numbers(numbers: Sequence[float]) -> pin.SE3 | None:
     """The pose of :func:`pose_numbers`; None as in :func:`pose_of`."""
-    message = Pose()
-    _write(np.array(numbers[:3]), np.array(numbers[3:]), message.position, message.orientation)
-    return pose_of(message)
+    if not are_a_pose(numbers):
+        return None
+    pose = np.array(numbers)
+    pose[3:] /= math.hypot(*numbers[3:])
+    return pin.XYZQUATToSE3(pose)
+
+
+def are_a_pose(numbers: Sequence[float]) -> bool:
+    """Whether these are a finite position and a unit quaternion x y z w."""
+    # A sum or a norm with NaN or infinity in it is not finite.
+    return math.isfinite(sum(numbers[:3])) and abs(math.hypot(*numbers[3:]) - 1.0) <= _UNIT
 
 
 def hand_sample(
@@ -142,14 +155,6 @@ def hand_twist(message: Twist) -> HandTwist:
     return HandTwist(*(np.array([vector.x, vector.y, vector.z]) for vector in (message.linear, message.angular)))
 
 
-def hand_twist_message(twist: HandTwist) -> Twist:
-    """The same as a message."""
-    linear, angular = (
-        Vector3(**dict(zip("xyz", vector.tolist(), strict=True))) for vector in (twist.linear, twist.angular)
-    )
-    return Twist(linear=linear, angular=angular)
-
-
 def hand_inputs(message: OVR2ROSInputs) -> HandInputs:
     """Buttons, triggers and stick of one hand."""
     return HandInputs(**{name: getattr(message, name) for name in HandInputs.__slots__})
@@ -168,7 +173,43 @@ def joint_state_message(names: Sequence[str], q: Array, v: Array, tau: Array, t:
     return message
 
 
-def robot_state(message: JointState, names: Sequence[str], t: float) -> RobotState | str:
+class JointNumbers(NamedTuple):
+    """What a serialized JointState says; (n,) each, or empty."""
+
+    name: tuple[str, ...]
+    position: Array
+    velocity: Array
+    effort: Array
+
+
+def joint_numbers(numbers: Numbers) -> JointNumbers:
+    """Those of a JointState."""
+    like, values = numbers.like, numbers.values
+    first = len(like.position)
+    second = first + len(like.velocity)
+    return JointNumbers(tuple(like.name), values[:first], values[first:second], values[second:])
+
+
+class JointStateWriter:
+    """Serializes :func:`joint_state_message` of the same joints again and again, for a publisher."""
+
+    def __init__(self, names: Sequence[str], velocities: bool = True) -> None:
+        """Without ``velocities`` the message has efforts only."""
+        zero, none = np.zeros(len(names)), np.zeros(0)
+        with_or_without = (zero, zero) if velocities else (none, none)
+        self._writer = MessageWriter(joint_state_message(names, *with_or_without, zero, 0.0))
+
+    @property
+    def numbers(self) -> Array:
+        """Positions [rad], velocities [rad/s] and torques [Nm], one after the other, for the caller to set."""
+        return self._writer.numbers
+
+    def at(self, t: float) -> bytes:
+        """The message for ``t`` [s]."""
+        return self._writer.at(t)
+
+
+def robot_state(message: JointState | JointNumbers, names: Sequence[str], t: float) -> RobotState | str:
     """State in the order of ``names``, received at ``t`` [s]; or what is wrong with the message, in one line.
 
     Other joints in the message are ignored. Velocities and torques may be missing as a whole and are then zero.
@@ -178,14 +219,14 @@ def robot_state(message: JointState, names: Sequence[str], t: float) -> RobotSta
         return order
     values = []
     for field, required in (("position", True), ("velocity", False), ("effort", False)):
-        numbers = np.array(getattr(message, field), dtype=np.float64)
+        numbers = np.asarray(getattr(message, field), dtype=np.float64)
         if len(numbers) == 0 and not required:
             values.append(np.zeros(len(names)))
             continue
         if len(numbers) != len(message.name):
             return f"{len(numbers)} {field} values for {len(message.name)} joints"
         numbers = numbers[order]
-        if not np.isfinite(numbers).all():
+        if not math.isfinite(sum(numbers.tolist())) and not np.isfinite(numbers).all():
             return f"{field} of {names[int(np.flatnonzero(~np.isfinite(numbers))[0])]} is not finite"
         values.append(numbers)
     return RobotState(q=values[0], v=values[1], tau=values[2], tau_external=None, stamp=t)

@@ -10,7 +10,7 @@ from geometry_msgs.msg import PoseStamped, WrenchStamped
 from q2r2_control.config.presets import Hold, Preset
 from q2r2_control.config.teleop import GuardSettings
 from q2r2_control.ros.base_node import LATCHED_QOS, BaseNode
-from q2r2_control.ros.bridge.messages import stamped_pose, time_message
+from q2r2_control.ros.bridge.messages import PoseWriter, time_message
 from q2r2_control.ros.monitoring.endpoints import PublisherCount, WatchedPublisher, node_of
 from q2r2_control.supervision.target_guard import TargetGuard
 from q2r2_control.supervision.target_stream import apart
@@ -48,7 +48,8 @@ class TargetOutput:
         self.guard = TargetGuard(guard, 1.0 / rate)
         self._node, self._controller, self._frame = node, controller, frame
         self._publisher = WatchedPublisher(node, PoseStamped, topic, listener_timeout)
-        self._publishers = PublisherCount(node, self._publisher.topic_name)
+        self._topic = self._publisher.topic_name  # as the graph knows it: asked in each tick, without a look at names
+        self._publishers = PublisherCount(node, self._topic)
         self._wrench = None
         if preset.zero_wrench is not None:
             self._wrench = node.create_publisher(WrenchStamped, preset.zero_wrench.format(ctrl=prefix), LATCHED_QOS)
@@ -56,7 +57,7 @@ class TargetOutput:
         self.last_sent: pin.SE3 | None = None  # what the controller was asked for last, world frame; None: nothing
         self._restarted = False
         self._endpoints: set[bytes] = set()  # of the controller
-        self._message = PoseStamped()  # that is being sent
+        self._messages = PoseWriter(frame)
         self._listeners = 0
         self._counted = 0, -math.inf  # subscribers that are present, and when they were counted [s]
         self._unknown = False  # a subscriber's node is not known yet
@@ -66,7 +67,7 @@ class TargetOutput:
     @property
     def topic(self) -> str:
         """Where the targets go."""
-        return self._publisher.topic_name
+        return self._topic
 
     @property
     def sent(self) -> int:
@@ -145,7 +146,7 @@ class TargetOutput:
             return None
         if self.following and self._publisher.waits():
             return pose
-        if self._publisher.publish(stamped_pose(base.actInv(pose), self._frame, now, self._message), decided):
+        if self._publisher.publish(self._messages.at(base.actInv(pose), now), decided):
             self.last_sent = pose
         return pose
 
@@ -158,7 +159,8 @@ class TargetOutput:
     def _present(self, now: float) -> int:
         """Number of subscribers in the tick of ``now``; the graph lists one before the publisher can send to it."""
         if self._counted[1] != now:
-            self._counted = max(self._publisher.listeners, self._node.count_subscribers(self.topic)), now
+            listed = self._node.handle.get_count_subscribers(self._topic)
+            self._counted = max(self._publisher.listeners, listed), now
         return self._counted[0]
 
     def _holds(self, tool: pin.SE3 | None, now: float) -> bool:

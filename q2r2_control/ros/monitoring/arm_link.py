@@ -13,6 +13,7 @@ from rclpy.clock_type import ClockType
 from std_msgs.msg import String
 
 from q2r2_control.ros.base_node import LATCHED_QOS
+from q2r2_control.ros.monitoring.endpoints import PublisherCount
 from q2r2_control.teleop.both_arms import PAUSE_FIRST
 from q2r2_control.types import SIDES
 
@@ -120,8 +121,9 @@ class ArmLink:
         self._robot = robot
         self._stances = node.create_publisher(String, self.topic_of(arm, "stance"), LATCHED_QOS)
         self._heartbeats = node.create_publisher(String, self.topic_of(arm, "link"), 10)
-        self._stance_of_other = self.topic_of(self.other, "stance")
-        node.create_subscription(String, self._stance_of_other, self._on_stance, LATCHED_QOS)
+        stance_of_other = self.topic_of(self.other, "stance")
+        self._stances_of_other = PublisherCount(node, stance_of_other)
+        node.create_subscription(String, stance_of_other, self._on_stance, LATCHED_QOS)
         node.create_subscription(String, self.topic_of(self.other, "link"), self._on_heartbeat, 10)
         node.create_timer(_PERIOD, self._send_heartbeat, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self._stances.publish(String(data=stance))
@@ -133,7 +135,7 @@ class ArmLink:
     @property
     def disagreement(self) -> str | None:
         """One line if the two arms have different stances."""
-        if self._node.count_publishers(self._stance_of_other) == 0:
+        if self._stances_of_other.count == 0:
             self._other_stance = None  # that node has ended; the next one publishes its own stance
         theirs = self._other_stance
         if theirs in (None, self._stance):
@@ -266,6 +268,7 @@ class ArmLink:
 
     def _on_stance(self, message: String) -> None:
         self._other_stance = message.data
+        self._stances_of_other.ask_anew()  # it is latched and comes once: an older count must not take it back
 
     def _on_heartbeat(self, message: String) -> None:
         try:

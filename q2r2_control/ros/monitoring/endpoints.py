@@ -86,6 +86,10 @@ class PublisherCount:
             self._asked_at, self._count = now, self._node.count_publishers(self._topic)
         return self._count
 
+    def ask_anew(self) -> None:
+        """A message shows that there is one: the next count is the graph's of then."""
+        self._asked_at = -math.inf
+
 
 def publish_in_time(publisher: Any, message: Any, decided: float) -> bool:
     """Publish what was decided on at ``decided`` [s] of the steady clock, unless its lifespan is over since then.
@@ -96,7 +100,7 @@ def publish_in_time(publisher: Any, message: Any, decided: float) -> bool:
     continues, one command of the past: a jump for a robot that has come to rest meanwhile. Serializing comes first: it
     takes most of the time until the middleware notes when the message was sent; :mod:`delay_watch` covers the rest.
     """
-    data = serialize_message(message)
+    data = message if isinstance(message, bytes) else serialize_message(message)
     in_time = time.monotonic() - decided <= _LIFESPAN
     if in_time:
         publisher.publish(data)

@@ -4,17 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import cache, lru_cache
-from typing import Any
+from typing import NamedTuple
 
-from rclpy.serialization import serialize_message
-from rosbags.serde import SerdeError
-from rosbags.typesys import Stores, get_typestore
 from tf2_msgs.msg import TFMessage
 
+from q2r2_control.ros.bridge.serialized import MessageReader
 from q2r2_control.supervision.sequence_watch import SequenceWatch
 
 _KEPT = 16  # messages that one node of a process has read and another may still have to
-_TF = "tf2_msgs/msg/TFMessage"
 _PAUSE = 1.0  # after a silence of this long a publisher may have been restarted [s]
 _REMEMBERED = 2.0  # a frame counts as sent by two for this long after it was last found to be [s]
 
@@ -45,22 +42,28 @@ class FrameSenders:
         return tuple(sorted(frame for frame, at in self._shared.items() if now - at <= _REMEMBERED))
 
 
-@cache
-def frame_reader() -> Callable[[bytes], Sequence[Any]]:
-    """A function that reads the transforms in a serialized message, not to be changed; none where it is no message.
+class ReadTransform(NamedTuple):
+    """One transform of a message on /tf."""
 
-    A robot's message has dozens of transforms, fifty times a second, of which a node needs a few. So rosbags reads
-    them, which makes no checked message object of each as rclpy does; and each once for all nodes of a process.
+    child_frame_id: str
+    frame_id: str
+    numbers: Sequence[float]  # position [m] and quaternion x y z w
+
+
+@cache
+def frame_reader() -> Callable[[bytes], Sequence[ReadTransform]]:
+    """A function that reads the transforms in a serialized message; none where it is no message.
+
+    A robot's message has dozens of transforms, fifty times a second; each is read once for all nodes of a process.
     """
-    deserialize: Any = get_typestore(Stores.ROS2_JAZZY).deserialize_cdr
+    reader = MessageReader(TFMessage)
 
     @lru_cache(maxsize=_KEPT)
-    def read(message: bytes) -> Sequence[Any]:
-        try:
-            transforms: Sequence[Any] = deserialize(message, _TF).transforms
-        except (SerdeError, ValueError):
-            return ()  # such as a name that is no UTF-8, which is some other node's fault
-        return transforms
+    def read(message: bytes) -> Sequence[ReadTransform]:
+        if (told := reader.read(message)) is None:
+            return ()  # which is some other node's fault
+        rows = told.values.reshape(-1, 7).tolist()
+        names = ((one.child_frame_id, one.header.frame_id) for one in told.like.transforms)
+        return tuple(ReadTransform(*both, row) for both, row in zip(names, rows, strict=True))
 
-    read(serialize_message(TFMessage()))  # makes the reader, which takes a while
     return read

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -33,18 +33,21 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.ros.base_node import LATCHED_QOS, OK, WARN, run_node
 from q2r2_control.ros.bridge.grippers import GripperServer, Stroke
 from q2r2_control.ros.bridge.link_frames import LinkFrames
-from q2r2_control.ros.bridge.messages import age, delay, joint_state_message, seconds
+from q2r2_control.ros.bridge.messages import JointStateWriter, age, delay, seconds
+from q2r2_control.ros.bridge.serialized import MessageReader, Numbers
 from q2r2_control.ros.managed_node import ManagedNode
 from q2r2_control.supervision.delay_watch import DelayWatch
 from q2r2_control.types import Array, RobotState
 
 _LOG_PERIOD = 1.0  # of lines about one topic [s]
+_TRAJECTORY = "joint_trajectory"
 
 
 class MujocoRobot(ManagedNode):
     """Runs a :class:`SimulatedCell` in real time between its topics, services and actions."""
 
     ticks = True
+    priority = 39
 
     def __init__(self) -> None:
         super().__init__("mujoco_robot")
@@ -86,19 +89,22 @@ class MujocoRobot(ManagedNode):
 
     def _make_publishers(self) -> None:
         self._joint_states = self.create_publisher(JointState, "joint_states", 10)
+        self._measured = JointStateWriter((*self._robot.joint_names, *self._cell.fingers))
+        self._felt = JointStateWriter(self._robot.joint_names, velocities=False)
         self._external = self.create_publisher(JointState, "~/external_torque", 10)
         self._tf = self.create_publisher(TFMessage, "/tf", 10)
         self._tf_static = self.create_publisher(TFMessage, "/tf_static", LATCHED_QOS)
         self._description = self.create_publisher(String, "robot_description", LATCHED_QOS)
         self._description.publish(String(data=self._robot.urdf))
         self._frames = LinkFrames(self._cell.plant.model, self._cell.loose_objects)
-        self._tf_static.publish(self._frames.fixed.at(self._cell.plant.data, self.get_clock().now().to_msg()))
+        self._tf_static.publish(self._frames.fixed.at(self._cell.plant.data, self.now))
 
     def _make_subscriptions(self) -> None:
         # Each arm may have a sender of its own, and the one's message is not to take the place of the other's.
         commands = QoSProfile(depth=2 * len(self._robot.arms), reliability=ReliabilityPolicy.RELIABLE)
+        trajectory = partial(self._take_trajectory, MessageReader(JointTrajectory))
+        self.create_subscription(JointTrajectory, _TRAJECTORY, trajectory, commands, raw=True)
         for kind, topic, callback in (
-            (JointTrajectory, "joint_trajectory", self._on_trajectory),
             (JointState, "joint_commands", self._on_joint_state),
             (Float64MultiArray, "position_commands", self._on_positions),
             (Float64MultiArray, "velocity_commands", self._on_velocities),
@@ -115,26 +121,37 @@ class MujocoRobot(ManagedNode):
             lambda fault: self._note(f"{arm}_gripper", fault),
         )
 
+    def _take_trajectory(self, reader: MessageReader, message: bytes, info: Mapping[str, Any]) -> None:
+        if (read := reader.read(message)) is not None and self._may_take(_TRAJECTORY, read.like.joint_names, info):
+            self._on_trajectory(read)
+
     def _take(self, topic: str, callback: Callable[[Any], None], message: Any, info: Mapping[str, Any]) -> None:
+        if self._may_take(topic, getattr(message, "name", ()), info):
+            callback(message)
+
+    def _may_take(self, topic: str, names: Sequence[str], info: Mapping[str, Any]) -> bool:
+        """Whether a message that names these joints may be used now; notes when it was received, or why not."""
         if not self.is_active:
             self._note(topic, "the robot is deactivated; ros2 lifecycle set /cartesian_controller activate")
-            return
+            return False
         # Two controllers of an arm each may send on one topic, from hosts with clocks of their own.
-        names = getattr(message, "joint_names", ()) or getattr(message, "name", ())
         delays = self._delays.setdefault((topic, *names[:1]), DelayWatch(STREAM_TIMEOUT))
         if late := delays.take(delay(info), time.monotonic()):
             self._note(topic, f"{late:.2f} s late; its sender or this node stood still")
-            return
+            return False
         # What came while this process stood still is as new as what came since the last tick.
         self._received = time.monotonic() - min(age(info), self._period)
-        callback(message)
+        return True
 
-    def _on_trajectory(self, message: JointTrajectory) -> None:
-        if len(message.points) != 1:
-            self._note("joint_trajectory", f"{len(message.points)} points; allowed: one, a setpoint of a stream")
+    def _on_trajectory(self, read: Numbers) -> None:
+        points = read.like.points
+        if len(points) != 1:
+            self._note(_TRAJECTORY, f"{len(points)} points; allowed: one, a setpoint of a stream")
             return
-        point = message.points[0]
-        self._follow("joint_trajectory", message.joint_names, point.positions, point.velocities, point.time_from_start)
+        positions = len(points[0].positions)
+        velocities = read.values[positions : positions + len(points[0].velocities)]
+        due = points[0].time_from_start
+        self._follow(_TRAJECTORY, read.like.joint_names, read.values[:positions], velocities, due)
 
     def _on_joint_state(self, message: JointState) -> None:
         self._follow("joint_commands", message.name, message.position, message.velocity)
@@ -150,8 +167,8 @@ class MujocoRobot(ManagedNode):
         self._note("torque_commands", self._cell.command_torques(np.array(message.data, float), self._received))
 
     def _follow(self, topic: str, names: Any, positions: Any, velocities: Any, delay: Any = None) -> None:
-        v = np.array(velocities, float) if len(velocities) else None
-        setpoint = JointSetpoint(names, np.array(positions, float), v, 0.0 if delay is None else seconds(delay))
+        v = np.asarray(velocities, float) if len(velocities) else None
+        setpoint = JointSetpoint(names, np.asarray(positions, float), v, 0.0 if delay is None else seconds(delay))
         self._note(topic, self._cell.command_positions(setpoint, self._received))
 
     def _note(self, topic: str, fault: str | None) -> None:
@@ -174,7 +191,7 @@ class MujocoRobot(ManagedNode):
         state = cell.advance(now)
         self._ticks += 1
         stamp = self.now
-        self._joint_states.publish(self._measured(state, stamp))
+        self._publish_measured(state, stamp)
         if state.tau_external is not None and now >= self._external_due:
             # On a grid, half a tick early so that no tick of the grid is too early by its jitter.
             self._external_due = max(self._external_due + self._external_period, now - 0.5 * self._period)
@@ -185,21 +202,19 @@ class MujocoRobot(ManagedNode):
 
     def _publish_external(self, torques: Array, stamp: float) -> None:
         if self._external.get_subscription_count():
-            names, zero = self._robot.joint_names, np.zeros(0)
-            self._external.publish(joint_state_message(names, zero, zero, torques, stamp))
+            self._felt.numbers[:] = torques
+            self._external.publish(self._felt.at(stamp))
 
-    def _measured(self, state: RobotState, stamp: float) -> JointState:
-        cell = self._cell
-        return joint_state_message(
-            (*self._robot.joint_names, *cell.fingers),
-            np.concatenate((state.q, cell.finger_positions())),
-            np.concatenate((state.v, cell.finger_velocities())),
-            np.concatenate((state.tau, np.zeros(len(cell.fingers)))),
-            stamp,
-        )
+    def _publish_measured(self, state: RobotState, stamp: float) -> None:
+        cell, joints = self._cell, len(state.q)
+        q, v, tau = self._measured.numbers.reshape(3, -1)
+        q[:joints], q[joints:] = state.q, cell.finger_positions()
+        v[:joints], v[joints:] = state.v, cell.finger_velocities()
+        tau[:joints] = state.tau  # what fingers press with is not measured
+        self._joint_states.publish(self._measured.at(stamp))
 
     def _publish_transforms(self) -> None:
-        self._tf.publish(self._frames.moving.at(self._cell.plant.data, self.get_clock().now().to_msg()))
+        self._tf.publish(self._frames.moving.at(self._cell.plant.data, self.now))
 
     def _reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self._cell.reset()
