@@ -11,10 +11,10 @@ from __future__ import annotations
 import inspect
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from itertools import compress
-from typing import Any
+from typing import Any, NamedTuple
 
 from rclpy.clock import ROSClock
 from rclpy.context import Context
@@ -22,9 +22,12 @@ from rclpy.event_handler import EventHandler
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor, TimeoutException
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy
+from rclpy.subscription import Subscription
 from rclpy.task import Task
 
-# Between two looks at what does not wait for a tick: services, clients and actions; services of parameters; events [s].
+# Between two looks at what does not wait for a tick: services, clients, actions, and topics that are latched or have no
+# publisher; services of parameters; events, and which topics have publishers [s].
 _CALLS_PERIOD, _PARAMETERS_PERIOD, _EVENTS_PERIOD = 0.02, 0.1, 0.5
 # Every node has these services.
 _PARAMETERS = (
@@ -56,7 +59,8 @@ class TickExecutor(SingleThreadedExecutor):
 
     Services, clients, actions, and what other threads ask for, are looked at fifty times a second; services of
     parameters ten times; events, which tell of settings that do not match, twice a second. They are rclpy's executor to
-    run, as callbacks are that are coroutines.
+    run, as callbacks are that are coroutines. Topics that are latched, or had no publisher within the last half second,
+    are looked at fifty times a second as well; the first message makes the latter ones like all others.
     """
 
     def __init__(self, *, context: Context | None = None) -> None:
@@ -64,7 +68,9 @@ class TickExecutor(SingleThreadedExecutor):
         self._outdated = True
         self._held = ExitStack()  # an entity that is destroyed lives until it is no longer looked at
         self._waiting = False  # a coroutine
-        self._subscriptions: list[Any] = []
+        self._streams: list[_Subscription] = []  # looked at in each tick
+        self._quiet: list[_Subscription] = []  # and with services
+        self._heard = self._sorted = -math.inf  # when the quiet ones were looked at, and when sorted out [s]
         self._timers: list[Any] = []
         self._periods: list[int] = []  # [ns]
         self._ros_clocks: list[ROSClock] = []  # of the timers
@@ -94,9 +100,9 @@ class TickExecutor(SingleThreadedExecutor):
 
     def spin_once(self, timeout_sec: float | None = None) -> None:
         """Wait for at most ``timeout_sec`` or 20 ms for a timer; then run what is ready."""
-        if not self._context.ok():
-            raise ExternalShutdownException
         if self._outdated:
+            if not self._context.ok():
+                raise ExternalShutdownException
             self._outdated = False
             self._collect()
             self._run_others()
@@ -104,20 +110,61 @@ class TickExecutor(SingleThreadedExecutor):
         ready, others = self._wait(_CALLS_PERIOD if unlimited else min(timeout_sec or 0.0, _CALLS_PERIOD))
         if not self._context.ok():
             raise ExternalShutdownException
-        self.take_messages()
+        for one in self._streams:
+            self._take(one)
+        now = time.monotonic()
+        if now - self._heard >= _CALLS_PERIOD:
+            self._heard = now
+            self._take_quiet(now)
         for timer in ready:
-            if timer.handle.is_timer_ready():  # not cancelled meanwhile
-                _call(self._take_timer(timer))
-        if others or self._something_else_is_ready():
+            if self._outdated:
+                if timer.handle.is_timer_ready():  # not cancelled meanwhile
+                    _call(self._take_timer(timer))
+            elif (handle := timer.handle).is_timer_ready():
+                handle.call_timer()
+                timer.callback()
+        # What was destroyed just now is not to be waited for; the next call collects the entities and runs the others.
+        if not self._outdated and (others or self._something_else_is_ready()):
             self._run_others()
 
     def take_messages(self) -> None:
         """Run the callbacks of all messages that have arrived; also for a callback that ticks by itself for a while."""
-        for subscription in self._subscriptions:
-            for _ in range(_MOST_MESSAGES):
+        for one in (*self._streams, *self._quiet):
+            self._take(one)
+
+    def _take(self, one: _Subscription) -> bool:
+        """Run the callbacks of all messages that have arrived on a topic; whether there were any.
+
+        Where nothing was destroyed since the entities were collected, rclpy's way would cost more than the message.
+        """
+        subscription, take, arguments = one.entity, one.take, one.arguments
+        for number in range(_MOST_MESSAGES):
+            if self._outdated:
                 if (taken := self._take_subscription(subscription)) is None:
-                    break
+                    return number > 0
                 _call(taken)
+            elif (message := take(subscription.msg_type, subscription.raw)) is None:
+                return number > 0
+            else:
+                subscription.callback(*message[:arguments])
+        return True
+
+    def _take_quiet(self, now: float) -> None:
+        """Look at topics that seldom bring something; now and then also which these are.
+
+        To look takes a third as long as to take a message, and what has no publisher brings none.
+        """
+        woken = [one for one in self._quiet if self._take(one) and not one.latched]
+        if self._outdated:
+            return  # the lists are made anew
+        if woken:
+            self._streams += woken
+            self._quiet = [one for one in self._quiet if one not in woken]
+        if now - self._sorted >= _EVENTS_PERIOD:
+            self._sorted = now
+            every = (*self._streams, *self._quiet)
+            self._quiet = [one for one in every if one.latched or not one.entity.handle.get_publisher_count()]
+            self._streams = [one for one in every if one not in self._quiet]
 
     def _wait(self, timeout: float) -> tuple[list[Any], bool]:
         """Wait for at most ``timeout`` [s]; returns the timers that may be ready, and whether something else is."""
@@ -172,7 +219,8 @@ class TickExecutor(SingleThreadedExecutor):
             self._held.enter_context(waitable)
         events = [one for one in waitables if isinstance(one, EventHandler)]
         actions = [one for one in waitables if not isinstance(one, EventHandler)]
-        self._subscriptions = [one for one in found["subscription"] if _is_plain(one)]
+        self._streams = [_Subscription.of(one) for one in found["subscription"] if _is_plain(one)]
+        self._quiet = []
         coroutines = {kind: [one for one in found[kind] if not _is_plain(one)] for kind in ("subscription", "timer")}
         self._timers = timers = [one for one in found["timer"] if _is_plain(one)]
         self._periods = [int(one.timer_period_ns) for one in timers]
@@ -188,6 +236,21 @@ class TickExecutor(SingleThreadedExecutor):
             _PARAMETERS_PERIOD: _KeptWaitSet({"service": parameters}, (), self._context),
             _EVENTS_PERIOD: _KeptWaitSet({}, events, self._context),
         }
+
+
+class _Subscription(NamedTuple):
+    """One subscription whose callback is a plain function."""
+
+    entity: Any
+    take: Callable[..., Any]  # a message and its information, or None
+    arguments: int  # how many of these two the callback gets
+    latched: bool  # holds what seldom changes
+
+    @classmethod
+    def of(cls, entity: Any) -> _Subscription:
+        alone = entity._callback_type is Subscription.CallbackType.MessageOnly
+        latched = entity.qos_profile.durability is DurabilityPolicy.TRANSIENT_LOCAL
+        return cls(entity, entity.handle.take_message, 1 if alone else 2, latched)
 
 
 class _KeptWaitSet:

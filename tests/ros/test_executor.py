@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from functools import partial
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -183,3 +184,82 @@ def test_it_ends_with_its_context(executor: TickExecutor, context: Any) -> None:
     context.try_shutdown()
     with pytest.raises(ExternalShutdownException):
         spin_until(executor, lambda: False)
+
+
+def test_a_topic_without_a_publisher_is_looked_at_less_often_and_its_first_message_is_heard(
+    ticking: Node, executor: TickExecutor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = 100.0
+    monkeypatch.setattr("q2r2_control.ros.executor.time", SimpleNamespace(monotonic=lambda: now, sleep=time.sleep))
+    heard: list[str] = []
+
+    def hear(message: Any) -> None:
+        heard.append(message.data)
+
+    subscription = ticking.create_subscription(String, "later", hear, 10)
+    ticking.create_timer(0.0, lambda: None)  # each spin is a tick
+    executor.spin_once(timeout_sec=0.0)
+    assert [one.entity for one in executor._quiet] == [subscription]
+    publisher = ticking.create_publisher(String, "later", 10)
+    executor._outdated = False  # as if another node had made it
+    while not publisher.get_subscription_count():
+        time.sleep(0.01)
+    publisher.publish(String(data="first"))
+    time.sleep(0.1)
+    executor.spin_once(timeout_sec=0.0)
+    assert heard == []
+    now += 0.03
+    executor.spin_once(timeout_sec=0.0)
+    assert heard == ["first"]
+    publisher.publish(String(data="second"))
+    time.sleep(0.1)
+    executor.spin_once(timeout_sec=0.0)
+    assert heard == ["first", "second"]
+
+
+def test_a_topic_whose_publisher_has_said_nothing_yet_is_looked_at_in_each_tick(
+    ticking: Node, executor: TickExecutor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = 100.0
+    monkeypatch.setattr("q2r2_control.ros.executor.time", SimpleNamespace(monotonic=lambda: now, sleep=time.sleep))
+    heard: list[str] = []
+
+    def hear(message: Any) -> None:
+        heard.append(message.data)
+
+    subscription = ticking.create_subscription(String, "later", hear, 10)
+    ticking.create_timer(0.0, lambda: None)
+    executor.spin_once(timeout_sec=0.0)
+    publisher = ticking.create_publisher(String, "later", 10)
+    executor._outdated = False
+    while not (publisher.get_subscription_count() and subscription.get_publisher_count()):
+        time.sleep(0.01)
+    now += 1.0
+    executor.spin_once(timeout_sec=0.0)
+    publisher.publish(String(data="first"))
+    time.sleep(0.1)
+    executor.spin_once(timeout_sec=0.0)
+    assert heard == ["first"]
+
+
+def test_a_subscription_that_a_message_destroys_gets_none_that_had_come_before(
+    ticking: Node, executor: TickExecutor
+) -> None:
+    heard: list[str] = []
+    subscriptions: list[Any] = []
+
+    def hear(message: Any) -> None:
+        heard.append(message.data)
+        for subscription in subscriptions:
+            ticking.destroy_subscription(subscription)
+        subscriptions.clear()
+
+    subscriptions += [ticking.create_subscription(String, "words", hear, 10) for _ in range(2)]
+    publisher = ticking.create_publisher(String, "words", 10)
+    spin_until(executor, lambda: publisher.get_subscription_count() == 2)
+    for word in ("one", "two"):
+        publisher.publish(String(data=word))
+    time.sleep(0.1)
+    for _ in range(3):
+        executor.spin_once(timeout_sec=0.05)
+    assert heard == ["one"]
