@@ -29,6 +29,7 @@ from q2r2_control.errors import ConfigError, Q2R2Error
 from q2r2_control.ros.executor import TickExecutor
 from q2r2_control.ros.launch.middleware import set_up_middleware
 from q2r2_control.runtime.process import StopRequest
+from q2r2_control.runtime.scheduling import schedule_process_first
 
 # Commands, at the receiver: only the newest counts, and it has to arrive.
 COMMAND_QOS = QoSProfile(
@@ -71,9 +72,12 @@ class BaseNode(Node):
 
     exit_code: int | None = None
     ticks = False  # whether its messages wait for its timers, see TickExecutor
+    priority = 0  # of real time, where it is permitted; 0: as other programs
 
     def __init__(self, name: str, **kwargs: Any) -> None:
         super().__init__(name, **kwargs)
+        what = "of SCHED_FIFO, where the system permits it; 0: as any other program; of nodes in a process the highest"
+        self.priority = self.parameter("realtime_priority", self.priority, what, at_least=0, at_most=98)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._state = self.create_publisher(String, "~/state", 10)
         self._ros_time = (
@@ -136,7 +140,8 @@ class BaseNode(Node):
     @property
     def now(self) -> float:
         """The node's clock [s]: ROS time, so that use_sim_time has its effect."""
-        return float(self.get_clock().now().nanoseconds) * 1e-9
+        # What ``get_clock().now()`` asks, without the object that it makes: nodes ask several times in each tick.
+        return float(self.get_clock().handle.get_now().nanoseconds) * 1e-9
 
     def health(self) -> tuple[bytes, str, Mapping[str, Any]]:
         """Level (OK, WARN, ERROR), one line, and figures."""
@@ -202,6 +207,7 @@ def run_nodes(makes: Sequence[Callable[[], Node]], args: Sequence[str] | None = 
         # What there is now stays: a collection of all of it would take longer than a tick.
         gc.collect()
         gc.freeze()
+        _take_priority(nodes)
         while rclpy.ok() and not stop.asked and _exit_code(nodes) is None:
             executor.spin_once(timeout_sec=0.1)
     except (Q2R2Error, ParameterException) as error:
@@ -216,6 +222,13 @@ def run_nodes(makes: Sequence[Callable[[], Node]], args: Sequence[str] | None = 
             node.destroy_node()
         rclpy.try_shutdown()
     return _exit_code(nodes) or 0
+
+
+def _take_priority(nodes: Sequence[Any]) -> None:
+    """From here on nodes tick; what takes long, such as compiling, is done, and did not keep other programs waiting."""
+    priority = max((getattr(node, "priority", 0) for node in nodes), default=0)
+    if priority and (problem := schedule_process_first(priority)):
+        nodes[0].get_logger().info(f"real time: {problem}")
 
 
 def _exit_code(nodes: Sequence[Any]) -> int | None:

@@ -1,4 +1,4 @@
-"""What an operating system does for a loop that must not be late: memory stays in RAM, and its thread goes first.
+"""What an operating system does for a loop that must not be late: memory stays in RAM, and its threads go first.
 
 Both need a permission. Without it a run goes on as it would have, so what was refused is a line and no error.
 """
@@ -10,9 +10,11 @@ import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from pathlib import Path
 
 # Below 50, at which Linux with PREEMPT_RT runs the interrupts that the loop itself waits for.
 _PRIORITY = 40
+_ONLY_LINUX = "no SCHED_FIFO: only asked for on Linux"
 _CURRENT, _FUTURE = 1, 2  # of mlockall on Linux
 _ADVICE = (
     "to permit it, give the user 'rtprio 40' and 'memlock unlimited' in /etc/security/limits.conf and log in anew, or "
@@ -33,6 +35,24 @@ def real_time() -> Iterator[str | None]:
     finally:
         _unlock_memory()
         _schedule_as_others()
+
+
+def schedule_process_first(priority: int) -> str | None:
+    """Let all threads that this process has now run under SCHED_FIFO at ``priority``, 1..99.
+
+    For a process whose other threads bring and take what its loop waits for. Returns None, or one line that says why
+    that is not permitted, and how to permit it. Threads and processes that are started later do not inherit it.
+    """
+    if sys.platform != "linux":
+        return _ONLY_LINUX
+    scheduler, parameters = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(priority)
+    try:
+        for thread in Path("/proc/self/task").iterdir():
+            with suppress(ProcessLookupError):  # it has ended meanwhile
+                os.sched_setscheduler(int(thread.name), scheduler, parameters)
+    except OSError as error:
+        return f"no SCHED_FIFO: {error.strerror}; {_ADVICE}"
+    return None
 
 
 def _lock_memory() -> str | None:
@@ -58,7 +78,7 @@ def _unlock_memory() -> None:
 def _schedule_first() -> str | None:
     """Why the calling thread does not get SCHED_FIFO, or None."""
     if sys.platform != "linux":
-        return "no SCHED_FIFO: only asked for on Linux"
+        return _ONLY_LINUX
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(_PRIORITY))
     except OSError as error:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import sys
 import time
 from typing import Any
 
@@ -44,3 +46,23 @@ def test_a_node_in_simulated_time_says_that_no_clock_comes_until_one_does_and_wh
     wait_until(lambda: diagnostics and "clock" not in diagnostics[-1].message, "the warning goes when the clock comes")
     node.destroy_timer(timer)
     states.wait_for("use_sim_time is set and the time on /clock stands still")
+
+
+@pytest.mark.parametrize("wanted", [0, 7], ids=["none is wanted", "one is wanted"])
+def test_all_threads_of_a_node_that_ticks_have_its_real_time_priority_where_it_is_permitted(
+    wanted: int, node: Any, processes: Processes
+) -> None:
+    if sys.platform != "linux":
+        pytest.skip("only Linux has SCHED_FIFO")
+    states = States(node, "simulation_input")
+    process = processes.start_module(
+        "q2r2_control.ros.nodes.simulation_input", "--ros-args", "-p", f"realtime_priority:={wanted}"
+    )
+    states.wait_for("waits for a subscriber")
+    refused = "no SCHED_FIFO" in process.output
+    expected = {(0, 0)} if refused or not wanted else {(os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, wanted)}
+    assert not (refused and not wanted)
+    threads = [int(name) for name in os.listdir(f"/proc/{process.pid}/task")]
+    found = {(os.sched_getscheduler(thread), os.sched_getparam(thread).sched_priority) for thread in threads}
+    assert len(threads) > 1
+    assert found == expected

@@ -10,7 +10,7 @@ import threading
 
 import pytest
 
-from q2r2_control.runtime.scheduling import real_time
+from q2r2_control.runtime.scheduling import real_time, schedule_process_first
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="only asked for on Linux")
 
@@ -100,3 +100,25 @@ def test_the_real_system_is_left_as_it_was_and_other_threads_are_not_put_first()
         thread.join()
     assert policies == [before]
     assert os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK == before
+
+
+def test_all_threads_of_a_process_are_scheduled_first_and_none_that_begins_later(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    system = FakeSystem(monkeypatch, grants_memory=True, grants_scheduler=True)
+    ended = threading.Event()
+    threads = [threading.Thread(target=ended.wait) for _ in range(2)]
+    for thread in threads:
+        thread.start()
+    assert schedule_process_first(38) is None
+    ended.set()
+    scheduled = {call[1] for call in system.calls}
+    assert {threading.get_native_id(), *(thread.native_id for thread in threads)} <= scheduled
+    assert {call[2:] for call in system.calls} == {(os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, 38)}
+
+
+def test_a_process_that_may_not_be_scheduled_first_is_told_how_to_permit_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    FakeSystem(monkeypatch, grants_memory=True, grants_scheduler=False)
+    refused = schedule_process_first(38)
+    assert refused is not None
+    assert refused.startswith("no SCHED_FIFO: Operation not permitted; to permit it")

@@ -56,6 +56,7 @@ class BaseArmController(BaseNode):
     """
 
     ticks = True
+    priority = 38
 
     def __init__(
         self,

@@ -55,6 +55,7 @@ class CartesianControllerNode(ManagedNode):
     """Feeds a :class:`Supervisor` from its topics and publishes the reference that comes of it."""
 
     ticks = True
+    priority = 40  # nothing may delay a joint command; below drivers, which ros2_control runs at 50
 
     def __init__(self) -> None:
         super().__init__("cartesian_controller")

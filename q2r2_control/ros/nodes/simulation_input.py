@@ -46,6 +46,7 @@ class SimulationInput(BaseNode):
     """
 
     ticks = True
+    priority = 37
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("simulation_input", **kwargs)
