@@ -69,7 +69,7 @@ class TargetStream:
 
     def expire(self, now: float) -> bool:
         """Whether the stream that was followed has just run dry."""
-        if self._last is None or now - self.stamp <= self._settings.timeout:
+        if self._last is None or self._is_recent(now):
             return False
         was_following = self.following
         self.reset()
@@ -77,10 +77,14 @@ class TargetStream:
 
     def goes_on(self, pose: pin.SE3, now: float) -> bool:
         """Take a target of the stream that is followed, which needs no tools; False, and nothing, where none is."""
-        if self.pose is None or not now - self.stamp <= self._settings.timeout:
+        if self.pose is None or not self._is_recent(now):
             return False
         self.pose, self._last, self.stamp = pose, pose, now
         return True
+
+    def _is_recent(self, now: float) -> bool:
+        """Whether the last target came within the timeout."""
+        return now - self.stamp <= self._settings.timeout
 
     def offer(self, pose: pin.SE3, tools: Sequence[pin.SE3], now: float) -> str | None:
         """Take a target; returns why it is not followed, or None.
