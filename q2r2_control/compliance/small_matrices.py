@@ -108,8 +108,8 @@ def solve_factor(factor: Array, B: Array) -> None:
 
 
 @lean_kernel
-def diagonalise(A: Array, vectors: Array) -> None:
-    """Eigenvalues of a symmetric A (n, n) onto its diagonal, and their ``vectors`` (n, n) as columns.
+def diagonalise(A: Array, vectors: Array) -> int:
+    """Eigenvalues of a symmetric A (n, n) onto its diagonal, and their ``vectors`` (n, n) as columns; returns sweeps.
 
     By cyclic Jacobi rotations: Golub and Van Loan, "Matrix Computations", 2013, section 8.5. What comes of a matrix
     that is not finite means nothing.
@@ -118,18 +118,19 @@ def diagonalise(A: Array, vectors: Array) -> None:
     for i in range(n):
         for j in range(n):
             vectors[i, j] = 1.0 if i == j else 0.0
-    for _ in range(_MOST_STEPS):
+    for sweep in range(_MOST_STEPS):
         size, rest = 0.0, 0.0
         for i in range(n):
             size += A[i, i] * A[i, i]
             for j in range(i):
-                rest += A[i, j] * A[i, j]
+                rest += A[j, i] * A[j, i]  # above the diagonal, where rotations make zeros
         if not rest > _ROUNDING**2 * size:
-            return
+            return sweep
         for p in range(n - 1):
             for q in range(p + 1, n):
                 if A[p, q] != 0.0:
                     _rotate(A, vectors, p, q)
+    return _MOST_STEPS
 
 
 @lean_kernel

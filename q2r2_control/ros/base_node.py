@@ -29,8 +29,9 @@ from q2r2_control.errors import ConfigError, Q2R2Error
 from q2r2_control.ros.executor import TickExecutor
 from q2r2_control.ros.launch.middleware import set_up_middleware
 from q2r2_control.runtime.process import StopRequest
-from q2r2_control.runtime.scheduling import schedule_process_first
+from q2r2_control.runtime.scheduling import schedule_process_as_others, schedule_process_first
 
+_NEVER_IDLE = 0.5  # without sleep, after which a process no longer goes first [s]
 # Commands, at the receiver: only the newest counts, and it has to arrive.
 COMMAND_QOS = QoSProfile(
     history=HistoryPolicy.KEEP_LAST,
@@ -207,9 +208,12 @@ def run_nodes(makes: Sequence[Callable[[], Node]], args: Sequence[str] | None = 
         # What there is now stays: a collection of all of it would take longer than a tick.
         gc.collect()
         gc.freeze()
-        _take_priority(nodes)
+        first = _take_priority(nodes)
         while rclpy.ok() and not stop.asked and _exit_code(nodes) is None:
             executor.spin_once(timeout_sec=0.1)
+            if first and isinstance(executor, TickExecutor) and executor.awake > _NEVER_IDLE:
+                first = False
+                _yield_priority(nodes)
     except (Q2R2Error, ParameterException) as error:
         print(f"{name}: {error}", file=sys.stderr)
         return 2
@@ -224,11 +228,24 @@ def run_nodes(makes: Sequence[Callable[[], Node]], args: Sequence[str] | None = 
     return _exit_code(nodes) or 0
 
 
-def _take_priority(nodes: Sequence[Any]) -> None:
-    """From here on nodes tick; what takes long, such as compiling, is done, and did not keep other programs waiting."""
+def _take_priority(nodes: Sequence[Any]) -> bool:
+    """From here on nodes tick; what takes long, such as compiling, is done, and did not keep other programs waiting.
+
+    Returns whether the process goes first now.
+    """
     priority = max((getattr(node, "priority", 0) for node in nodes), default=0)
     if priority and (problem := schedule_process_first(priority)):
         nodes[0].get_logger().info(f"real time: {problem}")
+        return False
+    return priority > 0
+
+
+def _yield_priority(nodes: Sequence[Any]) -> None:
+    """A process that never sleeps and goes first would leave nothing of its processor to other programs."""
+    schedule_process_as_others()
+    nodes[0].get_logger().warning(
+        f"real time: given up, since ticks have left no time to sleep for {_NEVER_IDLE:g} s; allowed: a lower rate"
+    )
 
 
 def _exit_code(nodes: Sequence[Any]) -> int | None:

@@ -68,6 +68,7 @@ class TickExecutor(SingleThreadedExecutor):
         self._outdated = True
         self._held = ExitStack()  # an entity that is destroyed lives until it is no longer looked at
         self._waiting = False  # a coroutine
+        self._slept = time.monotonic()
         self._streams: list[_Subscription] = []  # looked at in each tick
         self._quiet: list[_Subscription] = []  # and with services
         self._heard = self._sorted = -math.inf  # when the quiet ones were looked at, and when sorted out [s]
@@ -127,6 +128,11 @@ class TickExecutor(SingleThreadedExecutor):
         if not self._outdated and (others or self._something_else_is_ready()):
             self._run_others()
 
+    @property
+    def awake(self) -> float:
+        """Time without sleep [s]: how long ticks have come later than they were due."""
+        return time.monotonic() - self._slept
+
     def take_messages(self) -> None:
         """Run the callbacks of all messages that have arrived; also for a callback that ticks by itself for a while."""
         for one in (*self._streams, *self._quiet):
@@ -178,6 +184,7 @@ class TickExecutor(SingleThreadedExecutor):
         longest = min(int(timeout * 1e9), max((one for one in until if one <= together), default=_LONG))
         if longest > 0:
             time.sleep(longest * 1e-9)
+            self._slept = time.monotonic()
         due = [one is not None and one <= longest for one in left]
         return list(compress(self._timers, due)), False
 

@@ -55,6 +55,13 @@ def schedule_process_first(priority: int) -> str | None:
     return None
 
 
+def schedule_process_as_others() -> None:
+    """Take back what :func:`schedule_process_first` did."""
+    if sys.platform == "linux":
+        for thread in Path("/proc/self/task").iterdir():
+            _schedule_as_others(int(thread.name))
+
+
 def _lock_memory() -> str | None:
     """Why memory cannot be locked, or None."""
     if sys.platform != "linux":
@@ -86,11 +93,12 @@ def _schedule_first() -> str | None:
     return None
 
 
-def _schedule_as_others() -> None:
+def _schedule_as_others(thread: int = 0) -> None:
+    """Of a thread of this process; 0: the calling one."""
     if sys.platform != "linux":
         return
     # Only a privileged process may take the flag back; others keep it, where it does nothing more.
     with suppress(OSError):
-        os.sched_setscheduler(0, os.SCHED_OTHER | os.SCHED_RESET_ON_FORK, os.sched_param(0))
+        os.sched_setscheduler(thread, os.SCHED_OTHER | os.SCHED_RESET_ON_FORK, os.sched_param(0))
     with suppress(OSError):
-        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+        os.sched_setscheduler(thread, os.SCHED_OTHER, os.sched_param(0))

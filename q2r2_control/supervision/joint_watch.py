@@ -84,11 +84,11 @@ class JointWatch:
         if last is None or self._still_since == math.inf:
             self._begin(q, now)
             return
-        # What is nearer all together is nearer in every joint, which is told first.
-        far = math.dist(q, last_q) >= _JUMP_ALLOWANCE
+        # If the distance of all joints is below the limit, so is that of every joint. What is not a number is far.
+        far = not math.dist(q, last_q) < _JUMP_ALLOWANCE
         if far and (fault := self._jump(q, last_q, max(now - last.stamp, passed, 0.0))):
             self._fail(fault)
-        elif math.dist(q, self._still_at) >= _REST and not _all_within(q, self._still_at, _REST):
+        elif not math.dist(q, self._still_at) < _REST and not _all_within(q, self._still_at, _REST):
             self._begin(q, now)
 
     def settled(self, now: float) -> bool:

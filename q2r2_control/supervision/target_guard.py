@@ -75,7 +75,7 @@ class TargetGuard:
             self._linear.stop()
             self._angular.stop()
         dt = gap
-        if not (self._linear.keeps_up(gap, self._period) and self._angular.keeps_up(gap, self._period)):
+        if gap > self._period:
             dt = self._pacer.step(gap, np.array([self._linear.speed, self._angular.speed]))
         self._now = now
         position, rotation = self.pose.translation, self.pose.rotation
@@ -119,10 +119,6 @@ class _Limited:
 
     def stop(self) -> None:
         self._velocity = _ZERO
-
-    def keeps_up(self, gap: float, period: float) -> bool:
-        """Whether a step that comes after ``gap`` [s] may move by all of it; see :class:`TickPacer`."""
-        return (self.speed + self._acceleration * gap) * gap <= self._max * period
 
     def brake(self, dt: float) -> _Vector:
         """What to move in ``dt`` [s] while coming to rest."""

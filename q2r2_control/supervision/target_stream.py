@@ -76,7 +76,7 @@ class TargetStream:
         return was_following
 
     def goes_on(self, pose: pin.SE3, now: float) -> bool:
-        """Take a target of the stream that is followed, which needs no tools; False, and nothing, where none is."""
+        """Take the next target of the followed stream. Returns False and changes nothing if none is followed."""
         if self.pose is None or not self._is_recent(now):
             return False
         self.pose, self._last, self.stamp = pose, pose, now

@@ -42,7 +42,7 @@ class Targets:
         return stream.following
 
     def go_on(self, arm: str, pose: pin.SE3, now: float, due: float | None = None) -> bool:
-        """Take a target that an arm follows since it followed the last one; False, and nothing, where it followed none.
+        """Take the next target of a stream that an arm follows. Returns False and changes nothing if it follows none.
 
         What :meth:`take` does at most ticks, where nothing forbids it and its message has no number.
         """

@@ -120,7 +120,7 @@ class ArmTeleop:
 
     @property
     def settled(self) -> bool:
-        """Whether nothing can come of this hand's controls before a hand's next sample, which :meth:`act` goes by."""
+        """Whether this hand's controls can cause nothing before its next sample, so that :meth:`act` can wait."""
         return self._gestures.settled and not self._analog.bound
 
     def take_presses(self, now: float) -> list[Press]:

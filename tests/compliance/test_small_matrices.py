@@ -88,11 +88,16 @@ def test_eigenvalues_and_vectors_are_exact_to_rounding(values: list[float]) -> N
     A = (turned * np.array(values)) @ turned.T
     A = 0.5 * (A + A.T)
     diagonal, vectors = A.copy(), np.zeros((n, n))
-    diagonalise(diagonal, vectors)
+    assert diagonalise(diagonal, vectors) <= 10, "and in few sweeps"
     size = np.abs(values).max()
     np.testing.assert_allclose(np.sort(np.diag(diagonal)), values, atol=1e-14 * size)
     np.testing.assert_allclose(vectors.T @ vectors, np.eye(n), atol=1e-14)
     np.testing.assert_allclose((vectors * np.diag(diagonal)) @ vectors.T, A, atol=1e-14 * size)
+
+
+def test_eigenvalues_a_million_times_apart_take_few_sweeps() -> None:
+    for _ in range(300):
+        assert diagonalise(positive_definite(6, 1e6), np.zeros((6, 6))) <= 10
 
 
 def test_the_eigenvalues_of_what_is_not_finite_end_in_time() -> None:

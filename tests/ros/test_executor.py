@@ -209,12 +209,15 @@ def test_a_topic_without_a_publisher_is_looked_at_less_often_and_its_first_messa
     executor.spin_once(timeout_sec=0.0)
     assert heard == []
     now += 0.03
-    executor.spin_once(timeout_sec=0.0)
-    assert heard == ["first"]
+
+    def heard_when_looked_at_again() -> bool:
+        nonlocal now
+        now += 0.03
+        return heard == ["first"]
+
+    spin_until(executor, heard_when_looked_at_again)
     publisher.publish(String(data="second"))
-    time.sleep(0.1)
-    executor.spin_once(timeout_sec=0.0)
-    assert heard == ["first", "second"]
+    spin_until(executor, lambda: heard == ["first", "second"])  # at the same time by that clock
 
 
 def test_a_topic_whose_publisher_has_said_nothing_yet_is_looked_at_in_each_tick(
@@ -237,9 +240,7 @@ def test_a_topic_whose_publisher_has_said_nothing_yet_is_looked_at_in_each_tick(
     now += 1.0
     executor.spin_once(timeout_sec=0.0)
     publisher.publish(String(data="first"))
-    time.sleep(0.1)
-    executor.spin_once(timeout_sec=0.0)
-    assert heard == ["first"]
+    spin_until(executor, lambda: heard == ["first"])  # at the same time by that clock
 
 
 def test_a_subscription_that_a_message_destroys_gets_none_that_had_come_before(
@@ -263,3 +264,20 @@ def test_a_subscription_that_a_message_destroys_gets_none_that_had_come_before(
     for _ in range(3):
         executor.spin_once(timeout_sec=0.05)
     assert heard == ["one"]
+
+
+def test_the_time_without_sleep_begins_anew_whenever_no_timer_is_due(
+    ticking: Node, executor: TickExecutor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = 100.0
+    monkeypatch.setattr("q2r2_control.ros.executor.time", SimpleNamespace(monotonic=lambda: now, sleep=lambda _: None))
+    late = ticking.create_timer(0.0, lambda: None)  # always due
+    ticking.create_timer(10.0, lambda: None)
+    executor._slept = now
+    for _ in range(3):
+        now += 0.2
+        executor.spin_once(timeout_sec=0.01)
+    assert executor.awake == pytest.approx(0.6)
+    late.cancel()
+    executor.spin_once(timeout_sec=0.01)
+    assert executor.awake == 0.0

@@ -10,7 +10,7 @@ import threading
 
 import pytest
 
-from q2r2_control.runtime.scheduling import real_time, schedule_process_first
+from q2r2_control.runtime.scheduling import real_time, schedule_process_as_others, schedule_process_first
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="only asked for on Linux")
 
@@ -122,3 +122,17 @@ def test_a_process_that_may_not_be_scheduled_first_is_told_how_to_permit_it(monk
     refused = schedule_process_first(38)
     assert refused is not None
     assert refused.startswith("no SCHED_FIFO: Operation not permitted; to permit it")
+
+
+def test_a_process_that_was_scheduled_first_is_scheduled_as_others_with_all_its_threads(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    system = FakeSystem(monkeypatch, grants_memory=True, grants_scheduler=True)
+    ended = threading.Event()
+    thread = threading.Thread(target=ended.wait)
+    thread.start()
+    schedule_process_as_others()
+    ended.set()
+    last = {call[1]: call[2:] for call in system.calls}
+    assert {threading.get_native_id(), thread.native_id} <= last.keys()
+    assert set(last.values()) == {(os.SCHED_OTHER, 0)}

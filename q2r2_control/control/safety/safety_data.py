@@ -14,7 +14,8 @@ from q2r2_control.control.safety.velocity_bounds import BodyVelocities
 from q2r2_control.types import Array
 
 _DEEPEST = 6  # halvings of the stop: 64 intervals
-_ROWS_PER_PAIR = 15  # the closest points and four segment ends
+INSTANTS = (0, 20, 64)  # of 64, where a row looks at the stop: the start, half of the way, and the end
+_ROWS_PER_PAIR = 5 * len(INSTANTS)  # the closest points and four segment ends, at each
 
 
 class ReferenceState(NamedTuple):
@@ -32,13 +33,13 @@ class SeparationRows(NamedTuple):
     lower: Array  # (m,) [m/s]; of unit rows [rad/s]
     pair: IntArray  # (m,)
     used: IntArray  # (1,) number of valid rows
-    ahead: Array  # (3,) scratch: how far a pair is apart at three instants of the stop [m]
+    ahead: Array  # (instants,) scratch: how far a pair is apart at each [m]
 
     @classmethod
     def empty(cls, pairs: int, nv: int) -> SeparationRows:
         m = _ROWS_PER_PAIR * pairs
         counts = np.zeros(m, dtype=np.int64), np.zeros(1, dtype=np.int64)
-        return cls(np.zeros((m, nv)), np.zeros(m), *counts, ahead=np.zeros(3))
+        return cls(np.zeros((m, nv)), np.zeros(m), *counts, ahead=np.zeros(len(INSTANTS)))
 
 
 class Candidate(NamedTuple):

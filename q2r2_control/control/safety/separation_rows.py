@@ -12,7 +12,7 @@ It may be used up no faster than at a rate:
 distance uses up nothing and is not slowed, however fast it is; motion that closes in is slowed in time for the stop,
 with the curvature of the way, by all pairs alike. B is linearised at the instants of the stop where it is least, or may
 soon be: with a row for the nearest alone, each of two that are about as near would be forgotten at every other tick.
-What an instant has free more than B may be used up 1 / 20 ms faster, so that its row comes in gradually. At
+What an instant has free beyond B may be used up at 50 /s, so that its row comes in gradually. At
 t of a stop that takes T joints that stop together have travelled v s, s = t - t^2 / 2T. With the same T after the step,
 
     D q = h (v + v+) / 2 + s (v+ - v),    n'(J_2 - J_1) D q >= -gain h B.
@@ -43,7 +43,7 @@ from q2r2_control.control.geometry.closest_points import segment_segment
 from q2r2_control.control.geometry.collision import CollisionData
 from q2r2_control.control.geometry.pair_distance import at_least, distance_row, measure, measure_part
 from q2r2_control.control.jit import inlined_kernel, lean_kernel
-from q2r2_control.control.safety.safety_data import SafetyData
+from q2r2_control.control.safety.safety_data import INSTANTS, SafetyData
 from q2r2_control.control.safety.safety_model import SafetyModel
 from q2r2_control.control.safety.separating_plane import curvature
 from q2r2_control.control.safety.stop_rollout import begin_rollout, sample_of
@@ -61,7 +61,6 @@ class Moment(NamedTuple):
     ahead: float  # how far in time the row looks: half of the stop, which is as far as it leads, and 1 / gain [s]
 
 
-_INSTANTS = (0, 20, 64)  # of 64, where a row looks at the stop: the start, half of the way, and the end
 _SHARE = 0.25
 # Ends of near-parallel capsules get rows of their own, unless the closest point is practically there already.
 _SAME_POINT = 0.005  # [m]
@@ -130,12 +129,12 @@ def write_separation_rows(model: SafetyModel, data: SafetyData, h: float) -> Non
             continue
         straight = curvature(model.collision.pairs, p, stop, stop, 0.0) < _STRAIGHT
         least = _distances_ahead(model, data, p, duration, straight)
-        for i in range(len(_INSTANTS)):
+        for i in range(len(INSTANTS)):
             lever = _lever(i, duration, h)
             if data.rows.ahead[i] > least + _SAME_DISTANCE or (i > 0 and lever <= h):
                 continue
             along = straight and i > 0
-            at = data.collision if i == 0 or along else sample_of(model, data, _INSTANTS[i], duration)
+            at = data.collision if i == 0 or along else sample_of(model, data, INSTANTS[i], duration)
             distance = measure(model.collision, at, p)
             moment = Moment(
                 along, h, lever, least - model.approach.stop_distance[p], 0.5 * duration + 1.0 / model.approach.gain[0]
@@ -154,7 +153,7 @@ def _distances_ahead(model: SafetyModel, data: SafetyData, p: int, duration: flo
 
     On a straight way it is nearest at one of both ends. One that is too close has to open from where it is.
     """
-    ahead, last = data.rows.ahead, len(_INSTANTS) - 1
+    ahead, last = data.rows.ahead, len(INSTANTS) - 1
     ahead[:] = np.inf
     ahead[0] = measure(model.collision, data.collision, p)
     if ahead[0] < model.min_distance[p]:
@@ -166,7 +165,7 @@ def _distances_ahead(model: SafetyModel, data: SafetyData, p: int, duration: flo
         return min(ahead[0], ahead[last])
     least = ahead[0]
     for i in range(1, last + 1):
-        ahead[i] = measure(model.collision, sample_of(model, data, _INSTANTS[i], duration), p)
+        ahead[i] = measure(model.collision, sample_of(model, data, INSTANTS[i], duration), p)
         least = min(least, ahead[i])
     return least
 
@@ -184,7 +183,7 @@ def _tangent(data: SafetyData, row: Array) -> float:
 @lean_kernel
 def _lever(number: int, duration: float, h: float) -> float:
     """By s + h / 2 the next speeds lengthen the way until an instant, of the step and of the stop [s]."""
-    t = duration * _INSTANTS[number] / _INSTANTS[-1]
+    t = duration * INSTANTS[number] / INSTANTS[-1]
     s = t - 0.5 * t * t / duration if duration > 0.0 else 0.0
     # At rest a faster step lengthens the stop by as much as the step itself.
     return max(s, 0.5 * h) + 0.5 * h

@@ -25,6 +25,7 @@ _NATIVE = np.dtype(np.float64).newbyteorder("<") == np.dtype(np.float64)
 _STAMP = struct.Struct("<iI")  # seconds and nanoseconds
 _SECOND = 1_000_000_000  # [ns]
 _KEPT = 16  # layouts of one topic: that many publishers may send other names
+_LONGEST = 1 << 16  # of a message whose layout is kept [bytes]
 
 
 class Numbers(NamedTuple):
@@ -65,6 +66,12 @@ class _Places:
         if kind == "double":
             self.numbers.append(self._take(8, 8))
             self._values.append(value)
+        elif kind == "sequence<double>":
+            self._fix(4, 4)
+            if len(value):
+                at = self._take(8, 8 * len(value))
+                self.numbers.extend(range(at, at + 8 * len(value), 8))
+                self._values.extend(value)
         elif kind == "builtin_interfaces/Time":
             self.stamps.append(self._take(4, 8))
             self.times.append(value)
@@ -114,7 +121,8 @@ class MessageWriter:
         self._message, self._places = message, _Places(message)
         data = serialize_message(message)
         self._is_plain = _NATIVE and _is_plain(data, self._places) and _same_numbers(data, self._places)
-        self._data = bytearray(data)
+        # What serialize_message gives may be longer than the message, with whatever the memory held.
+        self._data = bytearray(data[: self._places.end] if self._is_plain else data)
         self._bytes = np.frombuffer(self._data, np.uint8)
         self.numbers = self._places.values.copy()
         self._raw = self.numbers.view(np.uint8).reshape(-1, 8)
@@ -144,19 +152,21 @@ class MessageReader:
 
     def __init__(self, kind: type) -> None:
         self._kind = kind
-        self._layouts: list[_Layout] = []  # the newest first
+        self._layouts: list[_Layout] = []  # the last used first
 
     def read(self, data: bytes) -> Numbers | None:
         """What is in it; None where rclpy finds no message in it, which a subscription drops as well."""
-        for layout in self._layouts:
+        for place, layout in enumerate(self._layouts):
             if (numbers := layout.read(data)) is not None:
+                if place:  # those that are in use stay
+                    self._layouts.insert(0, self._layouts.pop(place))
                 return numbers
         try:
             message = deserialize_message(data, self._kind)
         except rclpy_implementation.RMWError:
             return None
         layout = _Layout(message)
-        if layout.fits(data):
+        if len(data) <= _LONGEST and layout.fits(data):
             self._layouts = [layout, *self._layouts[: _KEPT - 1]]
         return layout.own
 
