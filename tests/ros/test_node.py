@@ -67,3 +67,35 @@ def test_all_threads_of_a_node_that_ticks_have_its_real_time_priority_where_it_i
     found = [(os.sched_getscheduler(thread), os.sched_getparam(thread).sched_priority) for thread in sorted(threads)]
     assert found[0] == expected
     assert found.count(expected) > 1
+
+
+BUSY = """
+import sys, time
+from q2r2_control.ros.base_node import BaseNode, run_nodes
+
+class Busy(BaseNode):
+    ticks, priority = True, 7
+
+    def __init__(self):
+        super().__init__("busy")
+        self.begin = time.monotonic()
+        self.create_timer(0.001, self.tick)
+
+    def tick(self):  # which takes twice as long as its period
+        end = time.monotonic() + 0.002
+        while time.monotonic() < end:
+            pass
+        self.exit_code = 0 if time.monotonic() > self.begin + 2.0 else None
+
+    def health(self):
+        return b"\\0", "", {}
+
+sys.exit(run_nodes([Busy]))
+"""
+
+
+def test_a_node_whose_ticks_leave_no_time_to_sleep_gives_up_its_priority(processes: Processes) -> None:
+    process = processes.start(sys.executable, "-c", BUSY, name="busy")
+    assert process.wait() == 0
+    said = "given up, since ticks have left no time to sleep for 0.5 s", "no SCHED_FIFO"
+    assert any(line in process.output for line in said)
