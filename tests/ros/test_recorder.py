@@ -260,7 +260,7 @@ def test_a_whole_set_is_recorded_judged_and_ends_at_ctrl_c(node: Any, processes:
         name="up",
     )
     for arm in ("left", "right"):
-        process.wait_for(f"[{arm}_arm_controller]", 120.0)
+        process.wait_for(f"[{arm}_q2r2_arm_controller]", 120.0)
     process.wait_for("engaged: ", 120.0)
     told: list[str] = []
     felt_by: dict[str, list[float]] = {"left": [], "right": []}
