@@ -27,6 +27,8 @@ from q2r2_control.robot.pairs import pairs_with_others
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import LONGEST_DT, Array, Interval, Reference, StepReport, pose_of
 
+_NUMBER = (float, int, np.floating)
+
 
 class CartesianController:
     """QP differential inverse kinematics for all arms of a cell at once, with a certified stop at every tick.
@@ -145,7 +147,7 @@ class CartesianController:
         it that is home. Where something else moves the arms it is what was measured, so that the reference's elbows
         are where the arms' are. One that is not nv finite numbers is not used: the last one stays.
         """
-        usable = isinstance(dt, int | float | np.floating) and math.isfinite(dt) and dt > 0.0
+        usable = isinstance(dt, _NUMBER) and math.isfinite(dt) and dt > 0.0
         time = min(float(dt), LONGEST_DT) if usable else 0.0
         state = self._state
         self._targets.aim_posture(posture)

@@ -28,6 +28,7 @@ class PlayedInput:
         self._pose, self._inputs = pose, inputs
         self._streams = [self._samples(hand, sampling) for hand, sampling in samplings.items()]
         self._next = [next(stream) for stream in self._streams]
+        self._due = self._first_due()
         self._origin: float | None = None
         self._connected = False
 
@@ -57,20 +58,27 @@ class PlayedInput:
             return []
         if self._origin is None:
             self._origin = now
-        backlog = now - self._origin - min((sample.due for sample in self._next), default=math.inf)
+        backlog = now - self._origin - self._due
+        if backlog < 0.0:
+            return []  # as at most polls
         self._origin += max(backlog - _LONGEST_BACKLOG, 0.0)
         samples = []
         for index, stream in enumerate(self._streams):
             while self._next[index].due <= now - self._origin:
                 samples.append(self._next[index].received(self._origin))
                 self._next[index] = next(stream)
+        self._due = self._first_due()
         return sorted(samples, key=lambda sample: sample.pose_stamp)
 
     def due(self) -> float:
         """When the next sample comes due, on the clock of the polls [s]; inf where there was no poll yet."""
         if self._origin is None:
             return math.inf
-        return self._origin + min((sample.due for sample in self._next), default=math.inf)
+        return self._origin + self._due
+
+    def _first_due(self) -> float:
+        """When the next sample comes due in play time [s]; inf where there is no hand."""
+        return min((sample.due for sample in self._next), default=math.inf)
 
     def _samples(self, hand: str, sampling: Sampling) -> Iterator[_Played]:
         for t in sampling.times():

@@ -64,8 +64,11 @@ def check_command(command: Command, robot: Robot, modes: tuple[CommandMode, ...]
     if command.mode not in modes:
         allowed = ", ".join(modes)
         raise PlantError(f"command mode {command.mode!s:.40}: this plant follows {allowed} commands only")
-    check_joints("command q", command.q, robot)
-    check_joints("command v", command.v, robot)
+    q, v, shape = command.q, command.v, (len(robot.joint_names),)
+    # At every tick, where one sum of squares tells of both.
+    if q.shape != shape or v.shape != shape or not math.isfinite(q.dot(q) + v.dot(v)):
+        check_joints("command q", q, robot)
+        check_joints("command v", v, robot)
     if command.mode is CommandMode.TORQUE:
         check_joints("command tau", command.tau, robot)
     for arm, opening in command.grippers.items():
@@ -110,7 +113,9 @@ class GripperMotion:
 
     def command(self, openings: dict[str, float]) -> None:
         """Set where to go; arms without a gripper are passed over, grippers not named keep their goal."""
-        self._wanted.update({arm: float(openings[arm]) for arm in self._rate if arm in openings})
+        for arm in self._rate:
+            if arm in openings:
+                self._wanted[arm] = float(openings[arm])
 
     def advance(self, dt: float) -> None:
         """Move for ``dt`` [s]."""

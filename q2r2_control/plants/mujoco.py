@@ -41,12 +41,12 @@ class _Fingers:
         return self.closed_position + opening * (self.open_position - self.closed_position)
 
     def opening(self, qpos: Array) -> float:
-        position = 0.0
+        total = 0.0
         for index in self.positions:
-            position += qpos.item(index)
-        position /= len(self.positions)
-        opening = (position - self.closed_position) / (self.open_position - self.closed_position)
-        return min(max(opening, 0.0), 1.0)
+            total += qpos.item(index)
+        closed = self.closed_position
+        opening = (total / len(self.positions) - closed) / (self.open_position - closed)
+        return 0.0 if opening < 0.0 else min(opening, 1.0)
 
 
 class MujocoPlant:

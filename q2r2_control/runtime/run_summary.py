@@ -143,15 +143,17 @@ class RunStatistics:
         self._uncertified += not report.certified
         self._rejected += len(report.rejected)
         for name, target in targets.items():
-            figures = self._arms[name]
-            if figures.gripper is not None and figures.gripper != target.gripper:
-                figures.gripper_changes += 1
-            figures.gripper = target.gripper
-            figures.slip = max(figures.slip, target.slip)
-            figures.slip_angle = max(figures.slip_angle, target.slip_angle)
-            if engaged[name] and target.pose is not None:
+            figures, pose = self._arms[name], target.pose
+            if figures.gripper != target.gripper:
+                figures.gripper_changes += figures.gripper is not None
+                figures.gripper = target.gripper
+            if target.slip > figures.slip:
+                figures.slip = target.slip
+            if target.slip_angle > figures.slip_angle:
+                figures.slip_angle = target.slip_angle
+            if pose is not None and engaged[name]:
                 figures.engaged += dt
-                x, y, z, a, b, c, w = pin.SE3ToXYZQUATtuple(tools[name].actInv(target.pose))
+                x, y, z, a, b, c, w = pin.SE3ToXYZQUATtuple(tools[name].actInv(pose))
                 square = x * x + y * y + z * z
                 if not math.isfinite(square):
                     continue  # nothing was measured

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from operator import sub
 
 import numpy as np
 
@@ -72,8 +73,8 @@ class JointWatch:
             self._fail(state)
             return
         q, external = state.q.tolist(), state.q if state.tau_external is None else state.tau_external
-        # The usual case costs three sums; the joint is looked for only where there is something to say.
-        known = math.isfinite(sum(q) + sum(state.v.tolist()) + sum(external.tolist()))
+        # The usual case costs a sum of squares; the joint is looked for only where there is something to say.
+        known = math.isfinite(state.q.dot(state.q) + state.v.dot(state.v) + external.dot(external))
         if not known and (fault := self._unusable(state, external)):
             allowed = self._settings.unusable_time
             if now - self._stamp > allowed:
@@ -88,7 +89,7 @@ class JointWatch:
         far = not math.dist(q, last_q) < _JUMP_ALLOWANCE
         if far and (fault := self._jump(q, last_q, max(now - last.stamp, passed, 0.0))):
             self._fail(fault)
-        elif not math.dist(q, self._still_at) < _REST and not _all_within(q, self._still_at, _REST):
+        elif not _all_within(q, self._still_at, _REST):
             self._begin(q, now)
 
     def settled(self, now: float) -> bool:
@@ -164,5 +165,9 @@ class JointWatch:
 
 
 def _all_within(q: list[float], other: list[float], limit: float) -> bool:
-    """Whether no value is farther from the other than ``limit``; most are nearer all together, which is told first."""
-    return math.dist(q, other) < limit or bool(np.abs(np.subtract(q, other)).max() <= limit)
+    """Whether no value is farther from the other than ``limit``; not where one is not a number.
+
+    Most are nearer all together, which is told first.
+    """
+    distance = math.dist(q, other)
+    return distance < limit or (math.isfinite(distance) and max(map(abs, map(sub, q, other))) <= limit)

@@ -39,9 +39,13 @@ class TargetLine:
 
     def put(self, pose: pin.SE3, due: float | None) -> None:
         """A target; ``due``: when it is to be reached, None where that is not known."""
-        last, gap, twist = self._pose, math.nan if due is None else due - self._due, self._twist
+        if due is None:
+            self.reset()
+            self._pose = pose
+            return
+        last, gap, twist = self._pose, due - self._due, self._twist
         last_position, self._position = self._position, pose.translation.tolist()
-        self._pose, self._due = pose, -math.inf if due is None else due
+        self._pose, self._due = pose, due
         if 0.0 <= gap < _SHORTEST:
             return  # a late tick of its sender, and the next one
         self._twist, self._even = None, False
