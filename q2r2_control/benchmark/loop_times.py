@@ -2,7 +2,9 @@
 
 Ticks come at the loop's rate, since one that comes right after another finds warmer caches; time in the run is
 simulated all the same, so every round moves the same way whatever the machine does. The cases run in turns, and rounds
-with clocks in the stages alternate with rounds that have them only around tick and physics, which tell the whole.
+with clocks in the stages alternate with rounds that have them only around tick and physics, which tell the whole, and
+with rounds whose ticks come right after one another: what the program itself takes, whatever else the machine does
+while a loop sleeps.
 
 What recording costs is less than a machine's speed changes within a minute. So runs with and without it come in pairs,
 next to each other and in changing order, and the ratio of their times has an interval: the pairs are drawn again and
@@ -83,6 +85,7 @@ class LoopRow:
     stages: list[StageTime]  # of the first three rounds
     without_physics: StageTime  # of rounds without clocks in the stages
     to_command: StageTime  # the same, until the command is applied: a tick's time in the summary of a run
+    back_to_back: StageTime  # without physics, of ticks that come right after one another
     clocks_us: float  # that the clocks in the stages add to a tick
     recording: RecordingCost | None = None
 
@@ -173,14 +176,16 @@ class _Case:
         )
         self._stages: list[Array] = []
         self._whole: list[Array] = []
+        self._back_to_back: list[Array] = []
         self._recorded: list[Array] = []
         self._to_command: list[Array] = []
         self._to_command_recorded: list[Array] = []
 
     def run_round(self, number: int) -> None:
-        """One run with clocks in every stage, one without, and where asked for one that is recorded."""
+        """One run with clocks in every stage, one without and one back to back, and where asked for one recorded."""
         if number < _ROUNDS:
             self._stages.append(self._run(clocks_in_stages=True))
+            self._back_to_back.append(self._run(clocks_in_stages=False, paced=False))
         runs = [self._run_plainly, self._run_recorded] if self._record else [self._run_plainly]
         for run in runs if number % 2 == 0 else reversed(runs):
             run()
@@ -197,6 +202,7 @@ class _Case:
             stages=[_time_of(stage, stages[:, index]) for index, stage in enumerate(STAGES)],
             without_physics=_time_of("without physics", whole),
             to_command=_time_of("to the command", np.concatenate(self._to_command)),
+            back_to_back=_time_of("back to back", _without_physics(np.concatenate(self._back_to_back))),
             clocks_us=1e6 * float(np.median(_without_physics(stages)) - np.median(beside)),
             recording=self._recording_cost() if self._record else None,
         )
@@ -232,10 +238,11 @@ class _Case:
                 if fault := recorder.summary.pictures_fault:
                     raise PlantError(f"no pictures: {fault}")
 
-    def _run(self, clocks_in_stages: bool) -> Array:
+    def _run(self, clocks_in_stages: bool, paced: bool = True) -> Array:
         pipeline, engaged = self._pipeline, round(_ENGAGED_AFTER * self._config.loop_rate_hz)
         pipeline.input = ScriptedInput(_TRAJECTORY, hands=tuple(pipeline.robot.arms))
-        pipeline.stage_clock, pipeline.clocks_in_stages = StageClock(self._period), clocks_in_stages
+        pipeline.stage_clock = StageClock(self._period if paced else 0.0)
+        pipeline.clocks_in_stages = clocks_in_stages
         try:
             # One more, since the last one's end is the next one's begin.
             pipeline.run((engaged + self._ticks + 1) / self._config.loop_rate_hz, realtime=False)

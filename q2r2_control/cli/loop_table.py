@@ -31,6 +31,7 @@ def loop_table(report: LoopReport) -> Table:
         f"without physics: of runs without clocks in the stages, which add {added} us; medians do not add up\n"
         "stages: of three runs with clocks\n"
         "to the command: from the inputs until it is applied, a tick's time in the summary of a run\n"
+        "back to back: without physics, where no tick waits until it is due\n"
         "drive: impedance and wall in torque mode; physics: of the simulator, where a real robot would move"
     )
     table.caption = Text("\n".join((caption, *_recording_costs(report.rows))))
@@ -46,6 +47,7 @@ def _sums(rows: Sequence[LoopRow]) -> Iterator[tuple[str, list[StageTime]]]:
     yield "to the command", [row.to_command for row in rows]
     if recorded:
         yield "to it, recorded", [cost.to_command for cost in recorded]
+    yield "back to back", [row.back_to_back for row in rows]
 
 
 def _recording_costs(rows: Sequence[LoopRow]) -> Iterator[str]:

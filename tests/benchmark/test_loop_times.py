@@ -25,6 +25,7 @@ def test_it_times_the_loop_s_own_ticks_of_every_plant_and_mode() -> None:
         # Each stage is called at every tick.
         assert all(0.0 < stage.median_us <= stage.p99_us for stage in row.stages)
         assert 0.0 < row.to_command.median_us < row.without_physics.median_us <= row.without_physics.p99_us
+        assert 0.0 < row.back_to_back.median_us <= row.back_to_back.p99_us
         cost = row.recording
         assert cost is not None
         assert 0.0 < cost.to_command.median_us < cost.without_physics.median_us

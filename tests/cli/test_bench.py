@@ -208,7 +208,8 @@ def test_a_broken_promise_is_in_the_table_with_its_tick_and_its_segment() -> Non
 def test_eighty_columns_hold_every_stage_of_the_loop_for_each_plant_and_mode() -> None:
     stages = [StageTime(stage, 100.0 + index, 12340.0 + index) for index, stage in enumerate(STAGES)]
     whole, command = StageTime("without physics", 237.0, 54321.0), StageTime("to the command", 198.0, 43210.0)
-    rows = [LoopRow(plant, str(mode), 3000, 3, stages, whole, command, 6.4) for plant, mode in CASES]
+    warm = StageTime("back to back", 152.0, 32101.0)
+    rows = [LoopRow(plant, str(mode), 3000, 3, stages, whole, command, warm, 6.4) for plant, mode in CASES]
     text = printed(loop_table(LoopReport("cell", 1000.0, rows)))
     in_one_line = " ".join(text.split())
     for word in (*STAGES, "kinematic", "mujoco", "position", "torque", "p99", "[us]", "1000 Hz", "6, 6, 6 us"):
@@ -217,7 +218,8 @@ def test_eighty_columns_hold_every_stage_of_the_loop_for_each_plant_and_mode() -
     (total,) = (index for index, line in enumerate(lines) if "237" in line)
     assert lines[total].split() == ["without", "physics", *["237", "54321"] * 3]
     assert lines[total + 1].split() == ["to", "the", "command", *["198", "43210"] * 3]
-    assert lines[total + 2].split()[0] == PHYSICS, "below the sum, which it is not in"
+    assert lines[total + 2].split() == ["back", "to", "back", *["152", "32101"] * 3]
+    assert lines[total + 3].split()[0] == PHYSICS, "below the sum, which it is not in"
     assert "…" not in text
 
 
@@ -236,7 +238,7 @@ def test_the_cost_of_recording_is_a_ratio_with_its_interval_for_each_plant_and_m
     stages = [StageTime(stage, 100.0, 200.0) for stage in STAGES]
     whole, recorded = StageTime("without physics", 237.0, 500.0), StageTime("recorded", 251.0, 525.0)
     cost = RecordingCost(recorded, recorded, Ratio(1.05, 0.98, 1.12), Ratio(1.01, 0.957, 1.083))
-    rows = [LoopRow(plant, str(mode), 3000, 10, stages, whole, whole, 6.4, cost) for plant, mode in CASES]
+    rows = [LoopRow(plant, str(mode), 3000, 10, stages, whole, whole, whole, 6.4, cost) for plant, mode in CASES]
     lines = printed(loop_table(LoopReport("cell", 1000.0, rows))).splitlines()
     assert [line.split() for line in lines if "recorded" in line] == [
         ["the", "same,", "recorded", *["251", "525"] * 3],
@@ -254,9 +256,8 @@ def test_the_loop_s_bench_prints_its_figures_as_one_object(monkeypatch: pytest.M
         asked.append((ticks, record))
         stages = [StageTime(stage, 1.0, 2.0) for stage in STAGES]
         whole = StageTime("without physics", 9.0, 12.0)
-        return LoopReport(
-            "cell", 1e3, [LoopRow(plant, str(mode), ticks, 3, stages, whole, whole, 0.1) for plant, mode in CASES]
-        )
+        rows = [LoopRow(plant, str(mode), ticks, 3, stages, whole, whole, whole, 0.1) for plant, mode in CASES]
+        return LoopReport("cell", 1e3, rows)
 
     monkeypatch.setattr("q2r2_control.cli.bench.run_loop_bench", made_up)
     found = one_object(q2r2("bench", "--loop", "--record", "--ticks", "200", "--json").stdout)
