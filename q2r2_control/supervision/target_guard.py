@@ -9,11 +9,20 @@ import pinocchio as pin
 
 from q2r2_control.config.teleop import GuardSettings
 from q2r2_control.supervision.tick_pacer import TickPacer
-from q2r2_control.types import LONGEST_DT, Array, pose_of
+from q2r2_control.teleop.quaternions import (
+    IDENTITY,
+    Pose,
+    Vector,
+    floats_of,
+    normalized,
+    se3_of,
+    turn_between,
+    turned_by,
+)
+from q2r2_control.types import LONGEST_DT
 
 _REST = 1e-9  # slower than this is at rest [m/s, rad/s]
-_Vector = tuple[float, float, float]
-_ZERO: _Vector = (0.0, 0.0, 0.0)
+_ZERO: Vector = (0.0, 0.0, 0.0)
 
 
 class TargetGuard:
@@ -37,7 +46,8 @@ class TargetGuard:
         self.pose: pin.SE3 | None = None
         self.clipped = 0  # steps in which a limit held the pose back, since the start
         self._linear, self._angular = _Limited(), _Limited()
-        self._target: pin.SE3 | None = None
+        self._at: Pose = _ZERO, IDENTITY  # of ``pose``, in floats: they take a fraction of the time of NumPy's arrays
+        self._target: Pose | None = None
         self._now, self._period = -math.inf, period
         self.change(settings)
 
@@ -58,8 +68,10 @@ class TargetGuard:
 
     def reset(self, pose: pin.SE3 | None, now: float) -> None:
         """Rest at ``pose``, or at none, from ``now`` [s] on."""
-        self.pose = None if pose is None else _unit(pose)
-        self._target, self._now = self.pose, now
+        self.pose, self._target, self._now = pose, None, now
+        if pose is not None:
+            position, rotation = floats_of(pose)
+            self._at = position, normalized(rotation)
         self._linear.stop()
         self._angular.stop()
 
@@ -78,16 +90,16 @@ class TargetGuard:
         if gap > self._period:
             dt = self._pacer.step(gap, np.array([self._linear.speed, self._angular.speed]))
         self._now = now
-        position, rotation = self.pose.translation, self.pose.rotation
-        if target is None or not _is_finite(target):
+        at, faces = self._at
+        wanted = None if target is None else floats_of(target)
+        if wanted is None or not _is_finite(wanted):
             limited = False
             self._target = None
             shift, turn = self._linear.brake(dt), self._angular.brake(dt)
         else:
-            last, self._target = self._target or self.pose, target
-            last_position, last_rotation = last.translation, last.rotation
-            lag, way = (last_position - position).tolist(), (target.translation - last_position).tolist()
-            angle_lag, angle_way = _turn(rotation, last_rotation), _turn(last_rotation, target.rotation)
+            last, self._target = self._target or self._at, wanted
+            lag, way = _sum(last[0], at, -1.0), _sum(wanted[0], last[0], -1.0)
+            angle_lag, angle_way = turn_between(faces, last[1]), turn_between(last[1], wanted[1])
             # Of a late step only the part that is moved now counts as the target's own motion; the rest is lag.
             now_share, late_share = dt / gap, 1.0 - dt / gap
             shift, slow = self._linear.follow(_sum(lag, way, late_share), _scaled(way, now_share), dt)
@@ -96,7 +108,8 @@ class TargetGuard:
             )
             limited = slow or slow_turn
         self.clipped += limited
-        self.pose = _unit(pose_of(pin.exp3(np.array(turn)) @ rotation, position + np.array(shift)))
+        self._at = _sum(at, shift), normalized(turned_by(faces, turn))
+        self.pose = se3_of(self._at)
         return self.pose
 
 
@@ -120,11 +133,11 @@ class _Limited:
     def stop(self) -> None:
         self._velocity = _ZERO
 
-    def brake(self, dt: float) -> _Vector:
+    def brake(self, dt: float) -> Vector:
         """What to move in ``dt`` [s] while coming to rest."""
         return self._towards(_ZERO, dt)[0]
 
-    def follow(self, lag: _Vector, way: _Vector, dt: float) -> tuple[_Vector, bool]:
+    def follow(self, lag: Vector, way: Vector, dt: float) -> tuple[Vector, bool]:
         """What to move in ``dt`` [s], and whether that is less than asked for.
 
         ``lag`` is from the pose to the last target, ``way`` from that to this one.
@@ -141,41 +154,28 @@ class _Limited:
         shift, limited = self._towards(wanted, dt)
         return shift, limited or distance > self._max * dt
 
-    def _towards(self, wanted: _Vector, dt: float) -> tuple[_Vector, bool]:
+    def _towards(self, wanted: Vector, dt: float) -> tuple[Vector, bool]:
         change = _sum(_at_most(wanted, self._max), self._velocity, -1.0)
         self._velocity = _sum(self._velocity, _at_most(change, self._acceleration * dt))
         return _scaled(self._velocity, dt), math.dist(self._velocity, wanted) > _REST
 
 
-def _at_most(vector: _Vector, length: float) -> _Vector:
+def _at_most(vector: Vector, length: float) -> Vector:
     norm = math.hypot(*vector)
     return vector if norm <= length else _scaled(vector, length / norm)
 
 
-def _scaled(a: _Vector, factor: float) -> _Vector:
+def _scaled(a: Vector, factor: float) -> Vector:
     x, y, z = a
     return factor * x, factor * y, factor * z
 
 
-def _sum(a: _Vector, b: _Vector, factor: float = 1.0) -> _Vector:
+def _sum(a: Vector, b: Vector, factor: float = 1.0) -> Vector:
     """a + factor b."""
     (x, y, z), (dx, dy, dz) = a, b
     return x + factor * dx, y + factor * dy, z + factor * dz
 
 
-def _turn(from_rotation: Array, to_rotation: Array) -> _Vector:
-    """Rotation vector that leads from one rotation to the other."""
-    x, y, z = pin.log3(to_rotation @ from_rotation.T).tolist()
-    return x, y, z
-
-
-def _is_finite(pose: pin.SE3) -> bool:
-    # A sum with NaN or infinity in it is not finite.
-    return math.isfinite(sum(pose.translation.tolist()) + sum(pose.rotation.ravel().tolist()))
-
-
-def _unit(pose: pin.SE3) -> pin.SE3:
-    """Keeps rounding from adding up."""
-    numbers = pin.SE3ToXYZQUAT(pose)
-    numbers[3:] /= math.hypot(*numbers[3:].tolist())
-    return pin.XYZQUATToSE3(numbers)
+def _is_finite(pose: Pose) -> bool:
+    # A sum with NaN or infinity in it is not finite; nor is the quaternion of a matrix with one.
+    return math.isfinite(sum(pose[0]) + sum(pose[1]))

@@ -9,10 +9,18 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
 import pinocchio as pin
 
-from q2r2_control.types import pose_of
+from q2r2_control.teleop.quaternions import (
+    Pose,
+    Vector,
+    floats_of,
+    inverse,
+    product,
+    rotation_of,
+    rotation_vector,
+    se3_of,
+)
 
 # Between two targets of a line: slower ones are steps, and stamps that are nearer say nothing [s].
 _SHORTEST, _LONGEST = 0.001, 0.025
@@ -32,9 +40,8 @@ class TargetLine:
         self._pose: pin.SE3 | None = None
         self._due = -math.inf
         self._gap = 0.0
-        self._position: list[float] = []  # of the pose [m]
-        # Linear, and angular in the target's frame [m/s], [rad/s]; floats, since NumPy takes longer for three.
-        self._twist: tuple[list[float], list[float]] | None = None
+        self._at: Pose | None = None  # of the pose, where it is due at a known time; floats, since NumPy takes longer
+        self._twist: tuple[Vector, Vector] | None = None  # linear, and angular in the target's frame [m/s], [rad/s]
         self._even = False
 
     def put(self, pose: pin.SE3, due: float | None) -> None:
@@ -43,16 +50,18 @@ class TargetLine:
             self.reset()
             self._pose = pose
             return
-        last, gap, twist = self._pose, due - self._due, self._twist
-        last_position, self._position = self._position, pose.translation.tolist()
-        self._pose, self._due = pose, due
+        last, gap, twist = self._at, due - self._due, self._twist
+        self._pose, self._due, self._at = pose, due, floats_of(pose)
         if 0.0 <= gap < _SHORTEST:
             return  # a late tick of its sender, and the next one
         self._twist, self._even = None, False
         if last is None or not _SHORTEST <= gap <= _LONGEST:
             return
-        linear = [(there - here) / gap for here, there in zip(last_position, self._position, strict=True)]
-        angular = (pin.log3(last.rotation.T @ pose.rotation) / gap).tolist()
+        (x, y, z), rotation = self._at
+        before, turned = last
+        linear = (x - before[0]) / gap, (y - before[1]) / gap, (z - before[2]) / gap
+        a, b, c = rotation_vector(product(inverse(turned), rotation))
+        angular = a / gap, b / gap, c / gap
         if twist is not None:
             surprise, turn = gap * math.dist(linear, twist[0]), gap * math.dist(angular, twist[1])
             self._even = surprise <= _EVEN and turn <= _EVEN_TURN
@@ -60,9 +69,10 @@ class TargetLine:
 
     def at(self, t: float) -> pin.SE3 | None:
         """Where the target is at ``t`` [s]; None where there is none."""
-        if self._pose is None or self._twist is None or not self._even:
+        if self._at is None or self._twist is None or not self._even:
             return self._pose
-        linear, angular = self._twist
+        (x, y, z), rotation = self._at
+        (dx, dy, dz), (a, b, c) = self._twist
         ahead = min(max(t - self._due, -self._gap), _LOOKAHEAD * self._gap)
-        position = np.array([at + ahead * speed for at, speed in zip(self._position, linear, strict=True)])
-        return pose_of(self._pose.rotation @ pin.exp3(ahead * np.array(angular)), position)
+        turned = product(rotation, rotation_of((ahead * a, ahead * b, ahead * c)))
+        return se3_of(((x + ahead * dx, y + ahead * dy, z + ahead * dz), turned))

@@ -157,6 +157,17 @@ def test_a_target_that_is_not_finite_is_held_off(bad: float) -> None:
     assert watched.guard.at_rest
 
 
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize("entry", range(9))
+def test_one_number_of_a_rotation_that_is_not_finite_is_enough(entry: int, bad: float) -> None:
+    watched = Watched()
+    rotation = pose(0.0, 0.0, 0.0, (0.3, -2.0, 1.0)).rotation.copy()
+    rotation.flat[entry] = bad
+    held = watched.step(pose(0.0))
+    for _ in range(50):
+        assert watched.step(pin.SE3(rotation, np.array([0.1, 0.0, 0.0]))).isApprox(held, 1e-12)
+
+
 def test_a_loop_that_stalled_makes_up_for_nothing() -> None:
     watched = Watched()
     for tick in range(1, 50):
