@@ -16,10 +16,8 @@ import math
 from collections import deque
 from collections.abc import Sequence
 
-import pinocchio as pin
-
 from q2r2_control.config.teleop import FilterSettings
-from q2r2_control.teleop.quaternions import Quaternion, Vector, normalized, turn_between, turned_by
+from q2r2_control.teleop.quaternions import IDENTITY, Pose, Quaternion, Vector, normalized, turn_between, turned_by
 
 # Closer samples are merged: over so short a time receipt jitter would look like speed [s].
 _MIN_SPACING = 0.005
@@ -132,32 +130,31 @@ class PoseFilter:
         self._interpolator = Interpolator(settings.interpolation_delay)
         self._position = OneEuro(settings.min_cutoff, settings.beta, *smoothing)
         self._rotation = OneEuro(settings.min_cutoff, settings.rotation_beta, *smoothing)
-        self.reset(pin.SE3.Identity(), 0.0)
+        self.reset(((0.0, 0.0, 0.0), IDENTITY), 0.0)
 
     @property
     def delay(self) -> float:
         """Low-frequency delay from a sample's receipt to the output [s]."""
         return self._interpolator.delay + self._position.delay
 
-    def reset(self, pose: pin.SE3, now: float) -> None:
+    def reset(self, pose: Pose, now: float) -> None:
         """Rest at ``pose``; earlier samples are forgotten."""
-        self._out = position, rotation = _parts(pose)
-        self._in = position
-        self._interpolator.reset(position, rotation, now)
+        self._out = pose
+        self._in, rotation = pose
+        self._interpolator.reset(self._in, rotation, now)
         self._position.reset()
         self._rotation.reset()
-        self._output = pose
         self._now = now
 
-    def add(self, pose: pin.SE3, stamp: float, now: float) -> None:
+    def add(self, pose: Pose, stamp: float, now: float) -> None:
         """Add a sample received at ``stamp`` [s]."""
-        self._interpolator.add(*_parts(pose), stamp, now)
+        self._interpolator.add(*pose, stamp, now)
 
-    def at(self, now: float) -> pin.SE3:
+    def at(self, now: float) -> Pose:
         """The filtered pose at ``now`` [s]; a time that does not advance returns the same pose again."""
         dt = now - self._now
         if dt <= 0.0:
-            return self._output
+            return self._out
         (before_x, before_y, before_z), (last_x, last_y, last_z), last = self._in, *self._out
         self._in, rotation, turned = self._interpolator.at(now)
         self._now, (x, y, z) = now, self._in
@@ -166,11 +163,5 @@ class PoseFilter:
         )
         turn = self._rotation.correction(turn_between(last, rotation), turned, dt)
         position = last_x + shift[0], last_y + shift[1], last_z + shift[2]
-        rotation = normalized(turned_by(last, turn))
-        self._out, self._output = (position, rotation), pin.XYZQUATToSE3((*position, *rotation))
-        return self._output
-
-
-def _parts(pose: pin.SE3) -> tuple[Vector, Quaternion]:
-    x, y, z, a, b, c, w = pin.SE3ToXYZQUATtuple(pose)
-    return (x, y, z), (a, b, c, w)
+        self._out = position, normalized(turned_by(last, turn))
+        return self._out

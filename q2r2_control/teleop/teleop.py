@@ -9,10 +9,11 @@ from functools import partial
 import pinocchio as pin
 
 from q2r2_control.config.teleop import TeleopSettings
-from q2r2_control.teleop.arm import of_controls
+from q2r2_control.teleop.arm import ArmTeleop, of_controls
 from q2r2_control.teleop.arm_states import FOLLOWING, HOLDING, ArmState, Cause
 from q2r2_control.teleop.both_arms import BothArms, Surroundings
 from q2r2_control.teleop.episode_marks import EpisodeMarks
+from q2r2_control.teleop.quaternions import se3_of
 from q2r2_control.teleop.remote_arm import RemoteArm
 from q2r2_control.types import ArmTarget, Event, HandSample
 
@@ -169,10 +170,8 @@ class Teleop:
             return self._carried_targets(now, around)
         targets = {}
         for name, arm in self._arms.items():
-            pose = arm.target(now, around.expected(arm)) if arm.state is ArmState.ENGAGED else None
-            if pose is not None:
-                self._commanded[name] = pose
-            targets[name] = ArmTarget(pose, arm.gripper, *arm.slip, arm.sag, arm.filtered_hand)
+            target = arm.target(now, around.expected(arm)) if arm.state is ArmState.ENGAGED else None
+            targets[name] = self._target_of(arm, None if target is None else se3_of(target), arm.slip)
         return targets
 
     def _carried_targets(self, now: float, around: Surroundings) -> dict[str, ArmTarget]:
@@ -181,14 +180,18 @@ class Teleop:
         if not self._pair.carry.lasts:
             self._pair.end_carry(now, "the other arm was stopped")
             return self._targets(now, around)
-        expected = {name: pose for name, arm in self._arms.items() if (pose := around.expected(arm)) is not None}
-        carried, slip, targets = self._carried(now, expected), self._pair.carry.slip, {}
-        for name, arm in self._arms.items():
-            pose = carried.get(name)
-            if pose is not None:
-                self._commanded[name] = pose
-            targets[name] = ArmTarget(pose, arm.gripper, *slip, arm.sag, arm.filtered_hand)
-        return targets
+        expected = {
+            name: se3_of(pose) for name, arm in self._arms.items() if (pose := around.expected(arm)) is not None
+        }
+        carried, slip = self._carried(now, expected), self._pair.carry.slip
+        return {name: self._target_of(arm, carried.get(name), slip) for name, arm in self._arms.items()}
+
+    def _target_of(self, arm: ArmTeleop, pose: pin.SE3 | None, slip: tuple[float, float]) -> ArmTarget:
+        """What is asked of an arm: this tool pose in the world frame, None: hold."""
+        if pose is not None:
+            self._commanded[arm.arm] = pose
+        hand = arm.filtered_hand
+        return ArmTarget(pose, arm.gripper, *slip, arm.sag, None if hand is None else se3_of(hand))
 
     def _carried(self, now: float, expected: dict[str, pin.SE3]) -> Mapping[str, pin.SE3]:
         """Targets of the arms that carry."""
