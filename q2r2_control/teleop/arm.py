@@ -16,10 +16,10 @@ from q2r2_control.teleop.gate import PoseGate
 from q2r2_control.teleop.gestures import GestureRecognizer, Press
 from q2r2_control.teleop.hand_motion import HandMotion, Shares
 from q2r2_control.teleop.held_controls import HeldControls
-from q2r2_control.teleop.quaternions import Pose, floats_of
+from q2r2_control.teleop.quaternions import floats_of
 from q2r2_control.teleop.sag import Anchor
 from q2r2_control.teleop.workspace import Workspace
-from q2r2_control.types import Array, Event, HandSample
+from q2r2_control.types import Array, Event, HandSample, Pose
 
 OPEN, CLOSED = 1.0, 0.0
 _WHOLE: Shares = (1.0, 1.0)
@@ -175,14 +175,12 @@ class ArmTeleop:
         if self.state is not ArmState.STOPPED:
             self.gripper = self._analog.opening(self.gripper, now)
 
-    def target(self, now: float, expected: Pose | None = None) -> Pose | None:
-        """Where the tool should be at ``now`` in the world frame, or the frame that it carries; None: hold.
+    def target(self, now: float, expected: Pose | None = None) -> Pose:
+        """Where the tool of an engaged arm should be at ``now`` in the world frame, or the frame that it carries.
 
         ``expected``: where it is to be measured by the controller's reference, from which no target is farther than
         the leash.
         """
-        if self.state is not ArmState.ENGAGED:
-            return None
         return self._motion.target(self._gate.pose, expected, self._shares(), now)
 
     @property
@@ -192,8 +190,8 @@ class ArmTeleop:
 
     @property
     def filtered_hand(self) -> Pose | None:
-        """The pose of its hand, filtered, that its target is made of; None while it follows none."""
-        return self._motion.filtered if self.state is ArmState.ENGAGED else None
+        """The pose of its hand, filtered, that the last :meth:`target` was made of; None before the first."""
+        return self._motion.filtered
 
     def workspace(self) -> Workspace:
         """The box of its targets."""
@@ -254,13 +252,11 @@ class ArmTeleop:
 
     def _shares(self) -> Shares:
         """Of the scales, by what is held."""
-        if not self.held:
+        held = self._held.actions
+        if not held:
             return _WHOLE  # as at most ticks
-        share = self._precision if Action.PRECISION in self.held else 1.0
-        return (
-            0.0 if Action.TRANSLATION_LOCK in self.held else share,
-            0.0 if Action.ROTATION_LOCK in self.held else share,
-        )
+        share = self._precision if Action.PRECISION in held else 1.0
+        return 0.0 if Action.TRANSLATION_LOCK in held else share, 0.0 if Action.ROTATION_LOCK in held else share
 
     def _go(self, cause: Cause, now: float, reason: str) -> None:
         state = next_state(self.state, cause)

@@ -15,9 +15,9 @@ from q2r2_control.teleop.arm_states import AT_REST, FOLLOWING, ArmState, Cause
 from q2r2_control.teleop.carry_mode import CarriedMode, Carrying, CarryMode
 from q2r2_control.teleop.episode_marks import EpisodeMarks
 from q2r2_control.teleop.gestures import Press
-from q2r2_control.teleop.quaternions import Pose
 from q2r2_control.teleop.remote_arm import RemoteArm
 from q2r2_control.teleop.sag import Anchor, anchor_of, expected
+from q2r2_control.types import Pose
 
 PAUSE_FIRST = "pause both arms first"  # why hands are not swapped
 # Why arms do not carry.

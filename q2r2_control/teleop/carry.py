@@ -13,9 +13,9 @@ from collections.abc import Mapping
 import numpy as np
 import pinocchio as pin
 
-from q2r2_control.teleop.quaternions import Pose, Vector, floats_of, se3_of
+from q2r2_control.teleop.quaternions import Vector, floats_of, se3_of
 from q2r2_control.teleop.workspace import Workspace
-from q2r2_control.types import LONGEST_DT, Array, pose_of
+from q2r2_control.types import LONGEST_DT, Array, Pose, pose_of
 
 GAIN = 20.0  # of keeping the relation [1/s]
 # The same where another program tells of one tool. A loop of the first order that is late by T is stable with a gain

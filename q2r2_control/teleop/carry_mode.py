@@ -65,10 +65,7 @@ class CarryMode:
         """Of both arms, see :class:`Carrying`."""
         tools, leader, follower = self._tools, self._leader.arm, self._follower.arm
         slowest = tools.slowest(tools.frames_of(expected))
-        moved = self._leader.target(now, None if slowest is None else floats_of(slowest))
-        if moved is None:
-            return {}
-        tools.frame = frame = se3_of(moved)
+        tools.frame = frame = se3_of(self._leader.target(now, None if slowest is None else floats_of(slowest)))
         targets = tools.at(frame)
         if len(frames := tools.frames_of(at_once)) == len(targets):
             self._keeper.note(frames[leader], frames[follower], now)

@@ -17,7 +17,8 @@ from collections import deque
 from collections.abc import Sequence
 
 from q2r2_control.config.teleop import FilterSettings
-from q2r2_control.teleop.quaternions import IDENTITY, Pose, Quaternion, Vector, normalized, turn_between, turned_by
+from q2r2_control.teleop.quaternions import IDENTITY, Quaternion, Vector, normalized, turn_between, turned_by
+from q2r2_control.types import Pose
 
 # Closer samples are merged: over so short a time receipt jitter would look like speed [s].
 _MIN_SPACING = 0.005

@@ -23,8 +23,9 @@ import math
 from typing import NamedTuple
 
 from q2r2_control.config.teleop import LeashSettings
-from q2r2_control.teleop.quaternions import Pose, Vector, turn_between, turned_by
+from q2r2_control.teleop.quaternions import Vector, turn_between, turned_by
 from q2r2_control.teleop.relative import RelativeMotion
+from q2r2_control.types import Pose
 
 # The way back that drops the slack: more than tremor of 0.2 mm and 0.2 degrees to either side, and than the noise of a
 # headset, 0.2 mm and 0.03 degrees, of which seven times lie between the farthest samples of a hand that rests.

@@ -11,9 +11,10 @@ import math
 
 import pinocchio as pin
 
+from q2r2_control.types import Pose
+
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
-Pose = tuple[Vector, Quaternion]  # position [m] and rotation
 IDENTITY: Quaternion = (0.0, 0.0, 0.0, 1.0)
 
 
@@ -26,7 +27,7 @@ def floats_of(pose: pin.SE3) -> Pose:
 def se3_of(pose: Pose) -> pin.SE3:
     """The pose of these floats."""
     position, rotation = pose
-    return pin.XYZQUATToSE3((*position, *rotation))
+    return pin.XYZQUATToSE3(position + rotation)
 
 
 def product(p: Quaternion, q: Quaternion) -> Quaternion:

@@ -14,7 +14,6 @@ from q2r2_control.config.teleop import RotationFrame, Stance, TeleopSettings
 from q2r2_control.errors import ConfigError, Q2R2Error
 from q2r2_control.teleop.quaternions import (
     IDENTITY,
-    Pose,
     Quaternion,
     Vector,
     floats_of,
@@ -25,7 +24,7 @@ from q2r2_control.teleop.quaternions import (
     rotation_vector,
     se3_of,
 )
-from q2r2_control.types import Array
+from q2r2_control.types import Array, Pose
 
 # Left and right change sign, forward and up do not.
 _REFLECTION = np.diag([1.0, -1.0, 1.0])

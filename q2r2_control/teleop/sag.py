@@ -19,8 +19,8 @@ from typing import NamedTuple
 
 import pinocchio as pin
 
-from q2r2_control.teleop.quaternions import Pose, floats_of
-from q2r2_control.types import Array, moved_by
+from q2r2_control.teleop.quaternions import floats_of
+from q2r2_control.types import Array, Pose, moved_by
 
 # A tool that is farther from its command does not sag [m], [rad].
 MOST_SAG = 0.05, 0.1

@@ -9,7 +9,7 @@ from functools import partial
 import pinocchio as pin
 
 from q2r2_control.config.teleop import TeleopSettings
-from q2r2_control.teleop.arm import ArmTeleop, of_controls
+from q2r2_control.teleop.arm import of_controls
 from q2r2_control.teleop.arm_states import FOLLOWING, HOLDING, ArmState, Cause
 from q2r2_control.teleop.both_arms import BothArms, Surroundings
 from q2r2_control.teleop.episode_marks import EpisodeMarks
@@ -17,6 +17,7 @@ from q2r2_control.teleop.quaternions import se3_of
 from q2r2_control.teleop.remote_arm import RemoteArm
 from q2r2_control.types import ArmTarget, Event, HandSample
 
+_BY_HANDS = ArmState.ENGAGED, ArmState.CARRIED
 _LED = FOLLOWING - {ArmState.CARRIED}  # by their own hand, which does not move an arm that is carried
 
 
@@ -76,7 +77,7 @@ class Teleop:
     @property
     def engaged(self) -> dict[str, bool]:
         """Whether each arm follows a hand now."""
-        return {name: arm.state in (ArmState.ENGAGED, ArmState.CARRIED) for name, arm in self._arms.items()}
+        return {name: arm.state in _BY_HANDS for name, arm in self._arms.items()}
 
     @property
     def aligning(self) -> bool:
@@ -170,8 +171,11 @@ class Teleop:
             return self._carried_targets(now, around)
         targets = {}
         for name, arm in self._arms.items():
-            target = arm.target(now, around.expected(arm)) if arm.state is ArmState.ENGAGED else None
-            targets[name] = self._target_of(arm, None if target is None else se3_of(target), arm.slip)
+            pose = hand = None
+            if arm.state is ArmState.ENGAGED:
+                self._commanded[name] = pose = se3_of(arm.target(now, around.expected(arm)))
+                hand = arm.filtered_hand
+            targets[name] = ArmTarget(pose, arm.gripper, *arm.slip, arm.sag, hand)
         return targets
 
     def _carried_targets(self, now: float, around: Surroundings) -> dict[str, ArmTarget]:
@@ -183,15 +187,14 @@ class Teleop:
         expected = {
             name: se3_of(pose) for name, arm in self._arms.items() if (pose := around.expected(arm)) is not None
         }
-        carried, slip = self._carried(now, expected), self._pair.carry.slip
-        return {name: self._target_of(arm, carried.get(name), slip) for name, arm in self._arms.items()}
-
-    def _target_of(self, arm: ArmTeleop, pose: pin.SE3 | None, slip: tuple[float, float]) -> ArmTarget:
-        """What is asked of an arm: this tool pose in the world frame, None: hold."""
-        if pose is not None:
-            self._commanded[arm.arm] = pose
-        hand = arm.filtered_hand
-        return ArmTarget(pose, arm.gripper, *slip, arm.sag, None if hand is None else se3_of(hand))
+        carried, slip, targets = self._carried(now, expected), self._pair.carry.slip, {}
+        for name, arm in self._arms.items():
+            pose = carried.get(name)
+            if pose is not None:
+                self._commanded[name] = pose
+            hand = arm.filtered_hand if arm.state is ArmState.ENGAGED else None
+            targets[name] = ArmTarget(pose, arm.gripper, *slip, arm.sag, hand)
+        return targets
 
     def _carried(self, now: float, expected: dict[str, pin.SE3]) -> Mapping[str, pin.SE3]:
         """Targets of the arms that carry."""

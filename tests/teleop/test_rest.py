@@ -11,9 +11,9 @@ import pytest
 
 from q2r2_control.config.teleop import FilterSettings
 from q2r2_control.teleop.filters import PoseFilter
-from q2r2_control.teleop.quaternions import Pose, floats_of, rotation_vector, se3_of
+from q2r2_control.teleop.quaternions import floats_of, rotation_vector, se3_of
 from q2r2_control.teleop.rest import RestingPose
-from q2r2_control.types import SIDES, Array, HandSample
+from q2r2_control.types import SIDES, Array, HandSample, Pose
 from tests.teleop.hands import PAUSED, Operator, operator, pose
 
 TICK, PERIOD = 0.004, 1.0 / 75.0  # of the loop and of the samples [s]
