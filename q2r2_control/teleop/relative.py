@@ -87,7 +87,7 @@ class RelativeMotion:
         self._turn_map: Array = np.linalg.det(self._map) * self._map
         self._turn_axes = _axes_of(self._turn_map)
         self._hand_position: Vector | None = None
-        self._hand_rotation = self._hand_back = self._tool_rotation = IDENTITY
+        self._hand_rotation = self._hand_back = self._tool_rotation = self._turned_back = IDENTITY
         self._tool_position = (0.0, 0.0, 0.0)
         self._vector = (0.0, 0.0, 0.0)
 
@@ -123,7 +123,9 @@ class RelativeMotion:
         """Make only the rotations of ``hand`` and ``tool`` correspond from now on; positions go on as they were."""
         self._hand_rotation = normalized(hand)
         self._hand_back = inverse(self._hand_rotation)
-        self._tool_rotation = normalized(tool)
+        self._tool_rotation = tool = normalized(tool)
+        back = self._in_world(self._hand_back)
+        self._turned_back = product(tool, back) if self._in_tool_frame else product(back, tool)
         self._vector = (0.0, 0.0, 0.0)
 
     def target(self, hand: pin.SE3) -> pin.SE3:
@@ -148,14 +150,18 @@ class RelativeMotion:
 
     def _turned_tool(self, hand: Quaternion) -> Quaternion:
         """The tool's rotation for that of the hand."""
-        back = self._hand_back
-        turn = product(back, hand) if self._in_tool_frame else product(hand, back)
-        if self._rotation_scale != 1.0:
-            turn = self._scaled(turn)
-        (i, a), (j, b), (k, c) = self._turn_axes
-        turn = a * turn[i], b * turn[j], c * turn[k], turn[3]
-        tool = self._tool_rotation
+        if self._rotation_scale == 1.0:  # M R R0' M' Rtool0 = (M R M') (M R0' M' Rtool0), and the latter is known
+            turn, tool = hand, self._turned_back
+        else:
+            back, tool = self._hand_back, self._tool_rotation
+            turn = self._scaled(product(back, hand) if self._in_tool_frame else product(hand, back))
+        turn = self._in_world(turn)
         return product(tool, turn) if self._in_tool_frame else product(turn, tool)
+
+    def _in_world(self, turn: Quaternion) -> Quaternion:
+        """A turn of the hand as it counts in the world: M R M'."""
+        (i, a), (j, b), (k, c) = self._turn_axes
+        return a * turn[i], b * turn[j], c * turn[k], turn[3]
 
     def hand(self, tool: pin.SE3) -> pin.SE3:
         """The hand pose, in the input's frame, whose :meth:`target` is ``tool``: where an operator has to put the hand.
