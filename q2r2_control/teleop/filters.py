@@ -92,8 +92,7 @@ class OneEuro:
 
     def __init__(self, min_cutoff: float, beta: float, derivative_cutoff: float, delay: float) -> None:
         self.delay = delay
-        self._min_cutoff = min_cutoff
-        self._beta = beta
+        self._least_rate, self._rate_per_speed = 2.0 * math.pi * min_cutoff, 2.0 * math.pi * beta  # of 1 / tau
         self._derivative_tau = 1.0 / (2.0 * math.pi * derivative_cutoff)
         self.reset()
 
@@ -108,13 +107,10 @@ class OneEuro:
         rotations. Backward Euler: stable for every dt, and the lag at constant velocity is exact for any constant dt.
         """
         x, y, z = self._velocity
-        constant = self._derivative_tau + dt
-        x += (step[0] - x * dt) / constant
-        y += (step[1] - y * dt) / constant
-        z += (step[2] - z * dt) / constant
-        self._velocity = x, y, z
-        cutoff = self._min_cutoff + self._beta * math.hypot(x, y, z)
-        tau = 1.0 / (2.0 * math.pi * cutoff)
+        rate = 1.0 / (self._derivative_tau + dt)
+        kept = rate * self._derivative_tau
+        self._velocity = x, y, z = kept * x + rate * step[0], kept * y + rate * step[1], kept * z + rate * step[2]
+        tau = 1.0 / (self._least_rate + self._rate_per_speed * math.hypot(x, y, z))
         share, lead = dt / (tau + dt), tau - self.delay
         return share * (error[0] + lead * x), share * (error[1] + lead * y), share * (error[2] + lead * z)
 
@@ -149,6 +145,8 @@ class PoseFilter:
 
     def add(self, pose: Pose, stamp: float, now: float) -> None:
         """Add a sample received at ``stamp`` [s]."""
+        # Products of quaternions add rounding up; a few from one sample to the next do not matter.
+        self._out = self._out[0], normalized(self._out[1])
         self._interpolator.add(*pose, stamp, now)
 
     def at(self, now: float) -> Pose:
@@ -164,5 +162,5 @@ class PoseFilter:
         )
         turn = self._rotation.correction(turn_between(last, rotation), turned, dt)
         position = last_x + shift[0], last_y + shift[1], last_z + shift[2]
-        self._out = position, normalized(turned_by(last, turn))
+        self._out = position, turned_by(last, turn)
         return self._out

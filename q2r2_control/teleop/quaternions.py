@@ -49,26 +49,25 @@ def inverse(q: Quaternion) -> Quaternion:
 
 def rotation_vector(q: Quaternion) -> Vector:
     """Axis times angle, of at most half a turn [rad]."""
-    x, y, z, w = q
-    sine = math.hypot(x, y, z)
-    if sine == 0.0:
-        return 0.0, 0.0, 0.0
-    ratio = 2.0 * math.atan2(math.copysign(sine, w), abs(w)) / sine
-    return ratio * x, ratio * y, ratio * z
+    return turn_between(IDENTITY, q)
 
 
 def turn_between(start: Quaternion, end: Quaternion) -> Vector:
-    """The rotation vector that leads from one rotation to another."""
+    """The rotation vector that leads from one rotation to another, of at most half a turn [rad]."""
     a, b, c, d = end
     x, y, z, w = start
-    return rotation_vector(
-        (
-            a * w - d * x - b * z + c * y,
-            a * z - d * y + b * w - c * x,
-            -d * z - a * y + b * x + c * w,
-            d * w + a * x + b * y + c * z,
-        )
+    a, b, c, cosine = (
+        a * w - d * x - b * z + c * y,
+        a * z - d * y + b * w - c * x,
+        -d * z - a * y + b * x + c * w,
+        d * w + a * x + b * y + c * z,
     )
+    sine = math.hypot(a, b, c)
+    if sine == 0.0:
+        return 0.0, 0.0, 0.0
+    half = math.atan2(sine, cosine) if cosine >= 0.0 else -math.atan2(sine, -cosine)
+    ratio = 2.0 * half / sine
+    return ratio * a, ratio * b, ratio * c
 
 
 def turned_by(q: Quaternion, vector: Vector) -> Quaternion:

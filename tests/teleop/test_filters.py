@@ -161,6 +161,18 @@ def test_a_clock_that_stands_still_or_goes_back_returns_the_same_pose() -> None:
         assert pose_filter.at(now) == here
 
 
+def test_a_rotation_that_is_filtered_for_long_stays_one() -> None:
+    pose_filter = PoseFilter(FilterSettings())
+    pose_filter.reset(floats_of(STILL), 0.0)
+    for tick in range(20_000):
+        now = tick * 0.001
+        if tick % 13 == 0:
+            turn = math.sin(now), math.cos(1.3 * now), 0.5 * now % 3.0
+            pose_filter.add(floats_of(pose(turn=turn)), now, now)
+        _, rotation = pose_filter.at(now)
+        assert math.hypot(*rotation) == pytest.approx(1.0, abs=4e-15)
+
+
 def test_the_delay_stated_follows_the_settings() -> None:
     settings = FilterSettings(interpolation_delay=0.05, smoothing_delay=0.1)
     assert PoseFilter(settings).delay == pytest.approx(0.15)
