@@ -78,7 +78,11 @@ class RestingPose:
 
     def draw(self, pose: Pose, now: float) -> Pose:
         """The filtered ``pose`` at ``now`` [s], drawn towards the mean as far as that is to be trusted."""
-        passed, self._now = max(now - self._now, 0.0) / _LEAVING, now
+        last, self._now = self._now, now
+        if self._share == 0.0 and self._count <= _TRUSTED[0]:
+            self._of = self._episode
+            return pose  # as while a hand moves
+        passed = max(now - last, 0.0) / _LEAVING
         if self._of != self._episode and self._share == 0.0:
             self._of = self._episode
         if self._of == self._episode:
