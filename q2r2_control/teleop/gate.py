@@ -30,36 +30,27 @@ class PoseGate:
 
     def __init__(self, settings: GateSettings) -> None:
         self.settings = settings
-        self._newest: Pose | None = None
-        self._stamp = -math.inf
+        # The newest pose, in the input's frame; None when there is none or the newest was not usable.
+        self.pose: Pose | None = None
+        self.stamp = -math.inf  # receipt time of the newest pose [s], usable or not; -inf before the first
         self._problem = ""
         self._way: deque[tuple[float, Pose]] = deque()  # the first is _SPEED_WINDOW old, or the oldest
 
     @property
-    def pose(self) -> Pose | None:
-        """The newest pose, in the input's frame; None when there is none or the newest was not usable."""
-        return self._newest
-
-    @property
-    def stamp(self) -> float:
-        """Receipt time of the newest pose [s], usable or not; -inf before the first."""
-        return self._stamp
-
-    @property
     def problem(self) -> str | None:
         """Why no arm may be anchored to the newest pose, None where it may."""
-        return None if self._newest is not None else self._problem or "the newest pose is not usable"
+        return None if self.pose is not None else self._problem or "the newest pose is not usable"
 
     def reset(self) -> None:
         """Forget everything received."""
-        self._newest = None
-        self._stamp = -math.inf
+        self.pose = None
+        self.stamp = -math.inf
         self._problem = ""
         self._way.clear()
 
     def stale(self, now: float) -> bool:
         """Whether no pose was received for ``timeout``."""
-        return now - self._stamp > self.settings.timeout
+        return now - self.stamp > self.settings.timeout
 
     def receive(self, sample: HandSample, now: float) -> tuple[bool, str | None]:
         """Process one sample; returns whether its pose is new and usable, and what forbids to follow it, or None.
@@ -69,11 +60,11 @@ class PoseGate:
         stamp = min(float(sample.pose_stamp), now)
         if math.isnan(stamp):
             return False, "a pose without a receipt time"
-        if stamp < self._stamp or stamp == -math.inf:
+        if stamp < self.stamp or stamp == -math.inf:
             return False, None
         pose, self._problem = (None, str(sample.fault)) if sample.fault else (_pose_of(sample), "")
-        previous, gap = self._newest, stamp - self._stamp
-        self._newest, self._stamp = pose, stamp
+        previous, gap = self.pose, stamp - self.stamp
+        self.pose, self.stamp = pose, stamp
         if pose is None:
             self._way.clear()
             return False, self._problem or "a pose that is not finite or not a rotation"
