@@ -18,6 +18,8 @@ Array = npt.NDArray[np.float64]
 
 SIDES = ("left", "right")
 Interval = tuple[float, float]  # least and greatest
+# Position [m] and quaternion x y z w, in floats: for what is done with poses at every tick.
+Pose = tuple[tuple[float, float, float], tuple[float, float, float, float]]
 ALL_OF_THE_WAY: Interval = (0.0, 1.0)  # of a gripper's opening, 0 closed .. 1 fully open
 
 LONGEST_DT = 0.1  # [s] of a tick; after a longer gap nothing moves further than in this time
@@ -178,7 +180,15 @@ class ArmTarget:
     slip: float = 0.0  # how far the target has slipped along with a tool held up, since engaging [m]
     slip_angle: float = 0.0  # the same of the rotation [rad]
     sag: Array | None = None  # (3,) of the tool when the arm was engaged, see teleop.sag [m]; None: none
-    hand: pin.SE3 | None = None  # the pose of its hand, filtered, that the target is made of
+    filtered_hand: Pose | None = None  # the pose of its hand, filtered, that the target is made of
+
+    @property
+    def hand(self) -> pin.SE3 | None:
+        """``filtered_hand`` for those who ask for more than floats."""
+        if self.filtered_hand is None:
+            return None
+        position, quaternion = self.filtered_hand
+        return pin.XYZQUATToSE3(position + quaternion)
 
     @property
     def command(self) -> pin.SE3 | None:

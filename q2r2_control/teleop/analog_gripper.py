@@ -24,14 +24,10 @@ class AnalogGripper:
         """``speed``: greatest, in openings a second."""
         bound = (binding.control for binding in bindings.bound() if binding.action is Action.GRIPPER_ANALOG)
         self._control = next(bound, None)
+        self.bound = self._control is not None  # a trigger moves the gripper at all
         self._speed = speed
         self._stamp, self._at = -math.inf, -math.inf
         self.forget()
-
-    @property
-    def bound(self) -> bool:
-        """Whether a trigger moves the gripper at all."""
-        return self._control is not None
 
     def forget(self) -> None:
         """The trigger has to come to where the gripper is before it counts."""

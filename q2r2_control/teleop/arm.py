@@ -16,9 +16,10 @@ from q2r2_control.teleop.gate import PoseGate
 from q2r2_control.teleop.gestures import GestureRecognizer, Press
 from q2r2_control.teleop.hand_motion import HandMotion, Shares
 from q2r2_control.teleop.held_controls import HeldControls
+from q2r2_control.teleop.quaternions import floats_of
 from q2r2_control.teleop.sag import Anchor
 from q2r2_control.teleop.workspace import Workspace
-from q2r2_control.types import Array, Event, HandSample
+from q2r2_control.types import Array, Event, HandSample, Pose
 
 OPEN, CLOSED = 1.0, 0.0
 _WHOLE: Shares = (1.0, 1.0)
@@ -65,7 +66,7 @@ class ArmTeleop:
         self._gate.settings = settings.gate
         self._motion.change(settings)
         if self.state is ArmState.ENGAGED and self._gate.pose is not None and last is not None:
-            self._motion.anchor(self._gate.pose, last, self._shares(), now)
+            self._motion.anchor(self._gate.pose, floats_of(last), self._shares(), now)
 
     @property
     def chord(self) -> bool:
@@ -174,14 +175,13 @@ class ArmTeleop:
         if self.state is not ArmState.STOPPED:
             self.gripper = self._analog.opening(self.gripper, now)
 
-    def target(self, now: float, commanded: pin.SE3 | None = None) -> pin.SE3 | None:
-        """Where the tool should be at ``now`` in the world frame, or the frame that it carries; None: hold.
+    def target(self, now: float, expected: Pose | None = None) -> Pose:
+        """Where the tool of an engaged arm should be at ``now`` in the world frame, or the frame that it carries.
 
-        ``commanded``: where it is to be by the controller's reference, from which no target is farther than the leash.
+        ``expected``: where it is to be measured by the controller's reference, from which no target is farther than
+        the leash.
         """
-        if self.state is not ArmState.ENGAGED:
-            return None
-        return self._motion.target(self._gate.pose, commanded, self._shares(), now)
+        return self._motion.target(self._gate.pose, expected, self._shares(), now)
 
     @property
     def slip(self) -> tuple[float, float]:
@@ -189,9 +189,9 @@ class ArmTeleop:
         return self._motion.slip
 
     @property
-    def filtered_hand(self) -> pin.SE3 | None:
-        """The pose of its hand, filtered, that its target is made of; None while it follows none."""
-        return self._motion.filtered if self.state is ArmState.ENGAGED else None
+    def filtered_hand(self) -> Pose | None:
+        """The pose of its hand, filtered, that the last :meth:`target` was made of; None before the first."""
+        return self._motion.filtered
 
     def workspace(self) -> Workspace:
         """The box of its targets."""
@@ -205,9 +205,9 @@ class ArmTeleop:
         """Go by :meth:`led_target` from now on, until this arm is engaged anew."""
         self._motion.bound_one_tool()
 
-    def led_target(self, target: pin.SE3, commanded: pin.SE3 | None, now: float) -> pin.SE3:
+    def led_target(self, target: Pose, expected: Pose | None, now: float) -> Pose:
         """See :meth:`HandMotion.bounded`."""
-        return self._motion.bounded(target, commanded, now)
+        return self._motion.bounded(target, expected, now)
 
     def _align(self, now: float) -> None:
         self._aligned_at = now
@@ -242,7 +242,7 @@ class ArmTeleop:
             obstacle = obstacle or "the tool's pose is not known"
         else:
             self.sag = anchor.sag
-            self._motion.anchor(self._gate.pose, anchor.tool, self._shares(), now)
+            self._motion.anchor(self._gate.pose, floats_of(anchor.tool), self._shares(), now)
         if obstacle is None:
             self._go(cause, now, reason)
         elif self.state is ArmState.ALIGNING:
@@ -252,13 +252,11 @@ class ArmTeleop:
 
     def _shares(self) -> Shares:
         """Of the scales, by what is held."""
-        if not self.held:
+        held = self._held.actions
+        if not held:
             return _WHOLE  # as at most ticks
-        share = self._precision if Action.PRECISION in self.held else 1.0
-        return (
-            0.0 if Action.TRANSLATION_LOCK in self.held else share,
-            0.0 if Action.ROTATION_LOCK in self.held else share,
-        )
+        share = self._precision if Action.PRECISION in held else 1.0
+        return 0.0 if Action.TRANSLATION_LOCK in held else share, 0.0 if Action.ROTATION_LOCK in held else share
 
     def _go(self, cause: Cause, now: float, reason: str) -> None:
         state = next_state(self.state, cause)

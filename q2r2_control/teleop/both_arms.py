@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
-import numpy as np
 import pinocchio as pin
 
 from q2r2_control.config.bindings import Action, Gesture
@@ -16,7 +16,8 @@ from q2r2_control.teleop.carry_mode import CarriedMode, Carrying, CarryMode
 from q2r2_control.teleop.episode_marks import EpisodeMarks
 from q2r2_control.teleop.gestures import Press
 from q2r2_control.teleop.remote_arm import RemoteArm
-from q2r2_control.teleop.sag import Anchor, anchor_of, sagged
+from q2r2_control.teleop.sag import Anchor, anchor_of, expected
+from q2r2_control.types import Pose
 
 PAUSE_FIRST = "pause both arms first"  # why hands are not swapped
 # Why arms do not carry.
@@ -41,17 +42,15 @@ class Surroundings:
         reference = (self.commanded or self.targets).get(arm, measured)
         return anchor_of(measured, commanded, reference.rotation)
 
-    def expected(self, arm: ArmTeleop) -> pin.SE3 | None:
+    def expected(self, arm: ArmTeleop) -> Pose | None:
         """Where the tool of an arm that follows is to be measured, by what is commanded. None: not known."""
         commanded = None if self.commanded is None else self.commanded.get(arm.arm)
-        return None if commanded is None else sagged(commanded, arm.sag)
+        return None if commanded is None else expected(commanded, arm.sag)
 
     def lag(self, arm: ArmTeleop) -> float:
         """From where the controller has a tool to its last target [m]."""
-        expected, target = self.expected(arm), self.targets.get(arm.arm)
-        if expected is None or target is None:
-            return 0.0
-        return float(np.linalg.norm(target.translation - expected.translation))
+        pose, target = self.expected(arm), self.targets.get(arm.arm)
+        return 0.0 if pose is None or target is None else math.dist(pose[0], target.translation)
 
 
 class BothArms:
@@ -233,7 +232,7 @@ class BothArms:
             if arm.arm in around.obstacles:
                 return around.obstacles[arm.arm]
             return around.anchor(arm.arm) or _UNKNOWN
-        if around.lag(arm) >= (self._leash.distance or np.inf):
+        if around.lag(arm) >= (self._leash.distance or math.inf):
             return "a tool is held up on the way to its target"
         target = around.targets.get(arm.arm)
         return _UNKNOWN if target is None else Anchor(target, arm.sag)

@@ -13,8 +13,9 @@ from collections.abc import Mapping
 import numpy as np
 import pinocchio as pin
 
+from q2r2_control.teleop.quaternions import Vector, floats_of, se3_of
 from q2r2_control.teleop.workspace import Workspace
-from q2r2_control.types import LONGEST_DT, Array, pose_of
+from q2r2_control.types import LONGEST_DT, Array, Pose, pose_of
 
 GAIN = 20.0  # of keeping the relation [1/s]
 # The same where another program tells of one tool. A loop of the first order that is late by T is stable with a gain
@@ -113,17 +114,22 @@ class CarriedWorkspace:
         for box in self._boxes.values():
             box.reset()
 
-    def hold(self, frame: pin.SE3) -> list[float] | None:
+    def hold(self, frame: Pose) -> Vector | None:
         """Where the frame that is asked to be at ``frame`` may be; None: there. See :meth:`Workspace.hold`."""
         shift = np.zeros(3)
-        tools = self._tools.at(frame)
+        tools = {arm: floats_of(tool) for arm, tool in self._tools.at(se3_of(frame)).items()}
         for arm, box in self._boxes.items():
             if (held := box.hold(tools[arm])) is not None:
-                back = np.array(held) - tools[arm].translation
+                back = np.subtract(held, tools[arm][0])
                 shift = np.where(np.abs(back) > np.abs(shift), back, shift)
         if not shift.any():
             return None
         for arm, box in self._boxes.items():
-            box.move_to(tools[arm].translation + shift)
+            box.move_to(_shifted(tools[arm][0], shift))
         self.slip += float(np.linalg.norm(shift))
-        return [float(value) for value in frame.translation + shift]
+        return _shifted(frame[0], shift)
+
+
+def _shifted(position: Vector, shift: Array) -> Vector:
+    x, y, z = (position + shift).tolist()
+    return x, y, z

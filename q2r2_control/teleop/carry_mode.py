@@ -10,8 +10,8 @@ import pinocchio as pin
 from q2r2_control.teleop.arm import ArmTeleop
 from q2r2_control.teleop.arm_states import ArmState, Cause
 from q2r2_control.teleop.carry import GAIN, REMOTE_GAIN, CarriedTools, RelationKeeper
+from q2r2_control.teleop.quaternions import floats_of, se3_of
 from q2r2_control.teleop.remote_arm import RemoteArm
-from q2r2_control.types import pose_of
 
 CARRIES = "carries both tools"  # what the arm that leads is told
 _Poses = Mapping[str, pin.SE3]
@@ -64,16 +64,14 @@ class CarryMode:
     def targets(self, now: float, expected: _Poses, at_once: _Poses) -> dict[str, pin.SE3]:
         """Of both arms, see :class:`Carrying`."""
         tools, leader, follower = self._tools, self._leader.arm, self._follower.arm
-        frame = self._leader.target(now, tools.slowest(tools.frames_of(expected)))
-        if frame is None:
-            return {}
-        tools.frame = frame
+        slowest = tools.slowest(tools.frames_of(expected))
+        tools.frame = frame = se3_of(self._leader.target(now, None if slowest is None else floats_of(slowest)))
         targets = tools.at(frame)
         if len(frames := tools.frames_of(at_once)) == len(targets):
             self._keeper.note(frames[leader], frames[follower], now)
         if self._keeper.begun:
-            kept = tools.tool_at(follower, self._keeper.frame(frame))
-            targets[follower] = pose_of(kept.rotation, self._box.clip(kept.translation))
+            position, rotation = floats_of(tools.tool_at(follower, self._keeper.frame(frame)))
+            targets[follower] = se3_of((self._box.clip(position), rotation))
         return targets
 
     @property
@@ -106,7 +104,9 @@ class CarriedMode:
         arm = self._follower
         if not self.lasts or self._leader.pose is None:
             return {}
-        return {arm.arm: arm.led_target(self._leader.pose, expected.get(arm.arm), now)}
+        tool = expected.get(arm.arm)
+        led = arm.led_target(floats_of(self._leader.pose), None if tool is None else floats_of(tool), now)
+        return {arm.arm: se3_of(led)}
 
     @property
     def slip(self) -> tuple[float, float]:

@@ -16,10 +16,9 @@ import math
 from collections import deque
 from collections.abc import Sequence
 
-import pinocchio as pin
-
 from q2r2_control.config.teleop import FilterSettings
-from q2r2_control.teleop.quaternions import Quaternion, Vector, normalized, turn_between, turned_by
+from q2r2_control.teleop.quaternions import IDENTITY, Quaternion, Vector, normalized, turn_between, turned_by
+from q2r2_control.types import Pose
 
 # Closer samples are merged: over so short a time receipt jitter would look like speed [s].
 _MIN_SPACING = 0.005
@@ -93,8 +92,7 @@ class OneEuro:
 
     def __init__(self, min_cutoff: float, beta: float, derivative_cutoff: float, delay: float) -> None:
         self.delay = delay
-        self._min_cutoff = min_cutoff
-        self._beta = beta
+        self._least_rate, self._rate_per_speed = 2.0 * math.pi * min_cutoff, 2.0 * math.pi * beta  # of 1 / tau
         self._derivative_tau = 1.0 / (2.0 * math.pi * derivative_cutoff)
         self.reset()
 
@@ -109,13 +107,10 @@ class OneEuro:
         rotations. Backward Euler: stable for every dt, and the lag at constant velocity is exact for any constant dt.
         """
         x, y, z = self._velocity
-        constant = self._derivative_tau + dt
-        x += (step[0] - x * dt) / constant
-        y += (step[1] - y * dt) / constant
-        z += (step[2] - z * dt) / constant
-        self._velocity = x, y, z
-        cutoff = self._min_cutoff + self._beta * math.hypot(x, y, z)
-        tau = 1.0 / (2.0 * math.pi * cutoff)
+        rate = 1.0 / (self._derivative_tau + dt)
+        kept = rate * self._derivative_tau
+        self._velocity = x, y, z = kept * x + rate * step[0], kept * y + rate * step[1], kept * z + rate * step[2]
+        tau = 1.0 / (self._least_rate + self._rate_per_speed * math.hypot(x, y, z))
         share, lead = dt / (tau + dt), tau - self.delay
         return share * (error[0] + lead * x), share * (error[1] + lead * y), share * (error[2] + lead * z)
 
@@ -132,32 +127,33 @@ class PoseFilter:
         self._interpolator = Interpolator(settings.interpolation_delay)
         self._position = OneEuro(settings.min_cutoff, settings.beta, *smoothing)
         self._rotation = OneEuro(settings.min_cutoff, settings.rotation_beta, *smoothing)
-        self.reset(pin.SE3.Identity(), 0.0)
+        self.reset(((0.0, 0.0, 0.0), IDENTITY), 0.0)
 
     @property
     def delay(self) -> float:
         """Low-frequency delay from a sample's receipt to the output [s]."""
         return self._interpolator.delay + self._position.delay
 
-    def reset(self, pose: pin.SE3, now: float) -> None:
+    def reset(self, pose: Pose, now: float) -> None:
         """Rest at ``pose``; earlier samples are forgotten."""
-        self._out = position, rotation = _parts(pose)
-        self._in = position
-        self._interpolator.reset(position, rotation, now)
+        self._out = pose
+        self._in, rotation = pose
+        self._interpolator.reset(self._in, rotation, now)
         self._position.reset()
         self._rotation.reset()
-        self._output = pose
         self._now = now
 
-    def add(self, pose: pin.SE3, stamp: float, now: float) -> None:
+    def add(self, pose: Pose, stamp: float, now: float) -> None:
         """Add a sample received at ``stamp`` [s]."""
-        self._interpolator.add(*_parts(pose), stamp, now)
+        # Products of quaternions add rounding up; a few from one sample to the next do not matter.
+        self._out = self._out[0], normalized(self._out[1])
+        self._interpolator.add(*pose, stamp, now)
 
-    def at(self, now: float) -> pin.SE3:
+    def at(self, now: float) -> Pose:
         """The filtered pose at ``now`` [s]; a time that does not advance returns the same pose again."""
         dt = now - self._now
         if dt <= 0.0:
-            return self._output
+            return self._out
         (before_x, before_y, before_z), (last_x, last_y, last_z), last = self._in, *self._out
         self._in, rotation, turned = self._interpolator.at(now)
         self._now, (x, y, z) = now, self._in
@@ -166,11 +162,5 @@ class PoseFilter:
         )
         turn = self._rotation.correction(turn_between(last, rotation), turned, dt)
         position = last_x + shift[0], last_y + shift[1], last_z + shift[2]
-        rotation = normalized(turned_by(last, turn))
-        self._out, self._output = (position, rotation), pin.XYZQUATToSE3((*position, *rotation))
-        return self._output
-
-
-def _parts(pose: pin.SE3) -> tuple[Vector, Quaternion]:
-    x, y, z, a, b, c, w = pin.SE3ToXYZQUATtuple(pose)
-    return (x, y, z), (a, b, c, w)
+        self._out = position, turned_by(last, turn)
+        return self._out

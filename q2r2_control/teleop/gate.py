@@ -5,13 +5,12 @@ from __future__ import annotations
 import math
 from collections import deque
 from operator import mul
-from typing import NamedTuple
 
 import numpy as np
-import pinocchio as pin
 
 from q2r2_control.config.teleop import GateSettings
-from q2r2_control.types import HandSample
+from q2r2_control.teleop.quaternions import Quaternion
+from q2r2_control.types import HandSample, Pose
 
 # Beyond this, doubles no longer resolve a tenth of a nanometre, and no tracking system reaches as far [m].
 _MAX_COORDINATE = 1e6
@@ -20,14 +19,6 @@ _QUATERNION_LENGTHS = (1e-6, 1e6)
 # Speeds are taken over at least this time. Messages that a network held up come within a millisecond of each other, and
 # then say nothing about a speed [s].
 _SPEED_WINDOW = 0.05
-
-
-class _Pose(NamedTuple):
-    """A usable pose, its numbers as floats too: sums of a few of those cost less than NumPy's."""
-
-    position: list[float]  # [m]
-    quaternion: list[float]  # x y z w, of length 1
-    pose: pin.SE3
 
 
 class PoseGate:
@@ -39,36 +30,27 @@ class PoseGate:
 
     def __init__(self, settings: GateSettings) -> None:
         self.settings = settings
-        self._newest: _Pose | None = None
-        self._stamp = -math.inf
+        # The newest pose, in the input's frame; None when there is none or the newest was not usable.
+        self.pose: Pose | None = None
+        self.stamp = -math.inf  # receipt time of the newest pose [s], usable or not; -inf before the first
         self._problem = ""
-        self._way: deque[tuple[float, _Pose]] = deque()  # the first is _SPEED_WINDOW old, or the oldest
-
-    @property
-    def pose(self) -> pin.SE3 | None:
-        """The newest pose, in the input's frame; None when there is none or the newest was not usable."""
-        return None if self._newest is None else self._newest.pose
-
-    @property
-    def stamp(self) -> float:
-        """Receipt time of the newest pose [s], usable or not; -inf before the first."""
-        return self._stamp
+        self._way: deque[tuple[float, Pose]] = deque()  # the first is _SPEED_WINDOW old, or the oldest
 
     @property
     def problem(self) -> str | None:
         """Why no arm may be anchored to the newest pose, None where it may."""
-        return None if self._newest is not None else self._problem or "the newest pose is not usable"
+        return None if self.pose is not None else self._problem or "the newest pose is not usable"
 
     def reset(self) -> None:
         """Forget everything received."""
-        self._newest = None
-        self._stamp = -math.inf
+        self.pose = None
+        self.stamp = -math.inf
         self._problem = ""
         self._way.clear()
 
     def stale(self, now: float) -> bool:
         """Whether no pose was received for ``timeout``."""
-        return now - self._stamp > self.settings.timeout
+        return now - self.stamp > self.settings.timeout
 
     def receive(self, sample: HandSample, now: float) -> tuple[bool, str | None]:
         """Process one sample; returns whether its pose is new and usable, and what forbids to follow it, or None.
@@ -78,11 +60,11 @@ class PoseGate:
         stamp = min(float(sample.pose_stamp), now)
         if math.isnan(stamp):
             return False, "a pose without a receipt time"
-        if stamp < self._stamp or stamp == -math.inf:
+        if stamp < self.stamp or stamp == -math.inf:
             return False, None
         pose, self._problem = (None, str(sample.fault)) if sample.fault else (_pose_of(sample), "")
-        previous, gap = self._newest, stamp - self._stamp
-        self._newest, self._stamp = pose, stamp
+        previous, gap = self.pose, stamp - self.stamp
+        self.pose, self.stamp = pose, stamp
         if pose is None:
             self._way.clear()
             return False, self._problem or "a pose that is not finite or not a rotation"
@@ -91,19 +73,19 @@ class PoseGate:
             self._way.clear()  # no speed is taken across it
         return True, jump or self._speed(pose, stamp)
 
-    def _jump(self, previous: _Pose, pose: _Pose, gap: float) -> str | None:
+    def _jump(self, previous: Pose, pose: Pose, gap: float) -> str | None:
         limits = self.settings
         if gap > limits.timeout:
             return f"no pose for {gap:.3f} s"
-        distance = math.dist(pose.position, previous.position)
+        distance = math.dist(pose[0], previous[0])
         if distance > limits.max_jump:
             return f"the hand jumped {distance:.3f} m"
-        angle = _angle(previous.quaternion, pose.quaternion)
+        angle = _angle(previous[1], pose[1])
         if angle > limits.max_rotation_jump:
             return f"the hand's rotation jumped {angle:.2f} rad"
         return None
 
-    def _speed(self, pose: _Pose, stamp: float) -> str | None:
+    def _speed(self, pose: Pose, stamp: float) -> str | None:
         """What is wrong with the hand's mean speed over the last ``_SPEED_WINDOW`` or a little more, or None."""
         way = self._way
         way.append((stamp, pose))
@@ -113,16 +95,16 @@ class PoseGate:
         time = stamp - since
         if time < _SPEED_WINDOW:
             return None
-        speed = math.dist(pose.position, start.position) / time
+        speed = math.dist(pose[0], start[0]) / time
         if speed > self.settings.max_speed:
             return f"the hand moved at {speed:.1f} m/s"
-        angular_speed = _angle(start.quaternion, pose.quaternion) / time
+        angular_speed = _angle(start[1], pose[1]) / time
         if angular_speed > self.settings.max_angular_speed:
             return f"the hand turned at {angular_speed:.0f} rad/s"
         return None
 
 
-def _pose_of(sample: HandSample) -> _Pose | None:
+def _pose_of(sample: HandSample) -> Pose | None:
     """The sample's pose with its quaternion normalised; None when that is not possible."""
     position, quaternion = _numbers(sample.position, 3), _numbers(sample.quaternion, 4)
     if position is None or quaternion is None or max(map(abs, position)) > _MAX_COORDINATE:
@@ -130,8 +112,8 @@ def _pose_of(sample: HandSample) -> _Pose | None:
     length = math.hypot(*quaternion)
     if not _QUATERNION_LENGTHS[0] <= length <= _QUATERNION_LENGTHS[1]:
         return None
-    quaternion = [value / length for value in quaternion]
-    return _Pose(position, quaternion, pin.XYZQUATToSE3(position + quaternion))
+    (x, y, z), (a, b, c, w) = position, quaternion
+    return (x, y, z), (a / length, b / length, c / length, w / length)
 
 
 def _numbers(values: object, size: int) -> list[float] | None:
@@ -146,6 +128,6 @@ def _numbers(values: object, size: int) -> list[float] | None:
     return numbers if all(map(math.isfinite, numbers)) else None
 
 
-def _angle(one: list[float], other: list[float]) -> float:
+def _angle(one: Quaternion, other: Quaternion) -> float:
     """Between two unit quaternions [rad]; within 1e-7 of none it is no better than that."""
     return 2.0 * math.acos(min(abs(sum(map(mul, one, other))), 1.0))

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import numpy as np
-import pinocchio as pin
-
 from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.teleop.carry import CarriedTools, CarriedWorkspace
 from q2r2_control.teleop.filters import PoseFilter
 from q2r2_control.teleop.leash import Leash
+from q2r2_control.teleop.quaternions import floats_of
 from q2r2_control.teleop.relative import RelativeMotion
 from q2r2_control.teleop.rest import RestingPose
 from q2r2_control.teleop.speed_limit import SpeedLimit
 from q2r2_control.teleop.workspace import Workspace
-from q2r2_control.types import pose_of
+from q2r2_control.types import Pose
 
 Shares = tuple[float, float]  # of the scales of positions and rotations
 
@@ -35,9 +33,9 @@ class HandMotion:
         self._rest = RestingPose(settings.filter.average_at_rest)
         self._motion, self._unslipped = (RelativeMotion.of(settings) for _ in range(2))
         self._shares: Shares = (1.0, 1.0)
-        self.filtered: pin.SE3 | None = None  # the hand's pose that the last target was made of
+        self.filtered: Pose | None = None  # the hand's pose that the last target was made of
         # The newest hand pose, and where it would have the tool if nothing had slipped.
-        self._newest: tuple[pin.SE3, pin.SE3] | None = None
+        self._newest: tuple[Pose, Pose] | None = None
         self.bound_one_tool()
 
     def bound_one_tool(self) -> None:
@@ -57,11 +55,11 @@ class HandMotion:
         """How far the target has slipped along since the anchor, with the tool or along its workspace [m, rad]."""
         return self._leash.position.slip + self._workspace.slip, self._leash.rotation.slip
 
-    def note(self, hand: pin.SE3) -> None:
+    def note(self, hand: Pose) -> None:
         """A usable pose of the hand, whether its arm is engaged or not."""
         self._rest.add(hand)
 
-    def add(self, hand: pin.SE3, stamp: float, now: float) -> None:
+    def add(self, hand: Pose, stamp: float, now: float) -> None:
         """A pose that may be followed, received at ``stamp`` [s]; an anchor has to come first."""
         self._filter.add(hand, stamp, now)
 
@@ -73,7 +71,7 @@ class HandMotion:
         """Other settings from now on. Before the next target there has to be an anchor."""
         self._use(settings)
 
-    def anchor(self, hand: pin.SE3, tool: pin.SE3, shares: Shares, now: float) -> None:
+    def anchor(self, hand: Pose, tool: Pose, shares: Shares, now: float) -> None:
         """The newest pose of the ``hand`` and ``tool``, in the world, correspond from now on."""
         if self._carried is not None:
             self.bound_one_tool()
@@ -91,44 +89,44 @@ class HandMotion:
         self._workspace = CarriedWorkspace(tools, {self._arm: self.workspace(), other: box})
         limits = self._settings.speed_limit
         self._speed = SpeedLimit(limits.values(), tools.lever)
-        self._rescale(self._hand(now), tools.frame, self._shares)
+        self._rescale(self._hand(now), floats_of(tools.frame), self._shares)
 
-    def target(self, newest: pin.SE3 | None, commanded: pin.SE3 | None, shares: Shares, now: float) -> pin.SE3:
+    def target(self, newest: Pose | None, expected: Pose | None, shares: Shares, now: float) -> Pose:
         """Where the tool, or the frame, should be at ``now`` [s] in the world.
 
-        ``newest``: the hand's newest pose, or None; ``commanded``: where the controller's reference has the tool or
-        the frame, from which no target is farther than the leash, or None: then there is none.
+        ``newest``: the hand's newest pose, or None; ``expected``: where the tool or the frame is to be measured by
+        the controller's reference, from which no target is farther than the leash, or None: then there is none.
         """
         hand = self.filtered = self._hand(now)
-        if commanded is None or newest is None:
-            target = self._motion.target(hand)
+        if expected is None or newest is None:
+            target = self._motion.target_floats(hand)
         else:
             if self._newest is None or self._newest[0] is not newest:
-                self._newest = newest, self._unslipped.target(newest)
-            target = self._leash.target(self._motion, hand, self._newest[1], commanded, now)
+                self._newest = newest, self._unslipped.target_floats(newest)
+            target = self._leash.target(self._motion, hand, self._newest[1], expected, now)
         if (held := self._workspace.hold(target)) is not None:
-            target = pose_of(target.rotation, np.array(held))
-            self._motion.anchor_position(hand, target)
+            target = held, target[1]
+            self._motion.anchor_position(hand[0], held)
         if self._shares != shares:
             self._rescale(hand, target, shares)  # from here on, so the target does not jump
             self._leash.anchor_anew()
         return self._speed.limit(target, now)
 
-    def bounded(self, target: pin.SE3, commanded: pin.SE3 | None, now: float) -> pin.SE3:
+    def bounded(self, target: Pose, expected: Pose | None, now: float) -> Pose:
         """A target that this hand has not made, within the arm's bounds: world frame, at ``now`` [s].
 
-        ``commanded``: see :meth:`target`.
+        ``expected``: see :meth:`target`.
         """
-        if commanded is not None:
-            target = self._leash.hold(target, commanded)
+        if expected is not None:
+            target = self._leash.hold(target, expected)
         if isinstance(self._workspace, Workspace):
-            target = pose_of(target.rotation, self._workspace.clip(target.translation))
+            target = self._workspace.clip(target[0]), target[1]
         return self._speed.limit(target, now)
 
-    def _hand(self, now: float) -> pin.SE3:
+    def _hand(self, now: float) -> Pose:
         return self._rest.draw(self._filter.at(now), now)
 
-    def _rescale(self, hand: pin.SE3, tool: pin.SE3, shares: Shares) -> None:
+    def _rescale(self, hand: Pose, tool: Pose, shares: Shares) -> None:
         """Anchor hand and tool, with the scales that hold from now on."""
         self._shares, self._newest = shares, None
         self._motion.rescale(*shares, hand, tool)

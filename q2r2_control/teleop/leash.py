@@ -22,12 +22,10 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numpy as np
-import pinocchio as pin
-
 from q2r2_control.config.teleop import LeashSettings
+from q2r2_control.teleop.quaternions import Vector, turn_between, turned_by
 from q2r2_control.teleop.relative import RelativeMotion
-from q2r2_control.types import Array
+from q2r2_control.types import Pose
 
 # The way back that drops the slack: more than tremor of 0.2 mm and 0.2 degrees to either side, and than the noise of a
 # headset, 0.2 mm and 0.03 degrees, of which seven times lie between the farthest samples of a hand that rests.
@@ -40,7 +38,7 @@ _ROUNDING = 1e-9  # [m], and of a cosine
 
 
 class ComponentLeash:
-    """The leash of a position or of a rotation; displacements are vectors (3,) in the world frame [m or rad]."""
+    """The leash of a position or of a rotation; displacements are vectors in the world frame [m or rad]."""
 
     def __init__(self, length: float | None, way_back: float, held_up: float, no_motion: float) -> None:
         self._length = math.inf if length is None else length
@@ -53,7 +51,7 @@ class ComponentLeash:
         self.taut = False
         self._back = 0.0  # of the hand, since it was farthest
 
-    def releases_slack(self, way: Array, by_hand: Array, by_tool: Array, dt: float) -> bool:
+    def releases_slack(self, way: Vector, by_hand: Vector, by_tool: Vector, dt: float) -> bool:
         """Whether the slack is to be dropped.
 
         ``way`` is from the tool to the target; ``by_hand`` and ``by_tool`` are what the unfiltered hand and the tool
@@ -67,23 +65,24 @@ class ComponentLeash:
         if not self.taut:
             self._back = 0.0
             return False
-        self._back = max(0.0, self._back - float(way @ by_hand) / distance)
-        held_up = abs(float(way @ by_tool)) < self._held_up * distance * dt
+        self._back = max(0.0, self._back - _dot(way, by_hand) / distance)
+        held_up = abs(_dot(way, by_tool)) < self._held_up * distance * dt
         return self._back > self._way_back and held_up and distance > self._no_motion * dt
 
-    def drop(self, way: Array) -> Array:
+    def drop(self, way: Vector) -> Vector:
         """The way to a target that is put at the tool."""
         self.taut, self._back = False, 0.0
         self.slip += math.hypot(*way)
-        return np.zeros(3)
+        return 0.0, 0.0, 0.0
 
-    def hold(self, way: Array) -> Array | None:
+    def hold(self, way: Vector) -> Vector | None:
         """The way to a target that the leash holds; None: the leash is not taut."""
         distance = math.hypot(*way)
         if distance <= self._length:
             return None
         self.slip += distance - self._length
-        return way * (self._length / distance)
+        share, (x, y, z) = self._length / distance, way
+        return share * x, share * y, share * z
 
 
 class Leash:
@@ -94,10 +93,10 @@ class Leash:
         self.position = ComponentLeash(settings.distance, *limits[0])
         self.rotation = ComponentLeash(settings.angle, *limits[1])
         self._components = self.position, self.rotation
-        # A little less than the leash's, so that it is looked at in time; of the angle, the quaternion's w.
+        # A little less than the leash's, so that it is looked at in time; of the angle, the cosine of half of it.
         self._distance = math.inf if settings.distance is None else settings.distance - _ROUNDING
         self._cosine = -math.inf if settings.angle is None else math.cos(0.5 * settings.angle) + _ROUNDING
-        self._last: tuple[pin.SE3, pin.SE3, float] | None = None  # a _Tick, which is only made where it is looked at
+        self._last: tuple[Pose, Pose, float] | None = None  # a _Tick, which is only made where it is looked at
 
     def reset(self) -> None:
         """Slack, nothing slipped: for a new anchor."""
@@ -109,40 +108,39 @@ class Leash:
         """The hand was anchored anew where it is: its way since the last tick is not known; what has slipped stays."""
         self._last = None
 
-    def target(self, motion: RelativeMotion, hand: pin.SE3, newest: pin.SE3, tool: pin.SE3, now: float) -> pin.SE3:
+    def target(self, motion: RelativeMotion, hand: Pose, newest: Pose, tool: Pose, now: float) -> Pose:
         """The target of ``hand`` at ``now`` [s], no farther from ``tool`` (world frame) than the leash reaches.
 
         ``newest`` is where the unfiltered hand would have the tool if nothing had ever slipped. Where the leash pulls,
         ``motion`` is anchored anew, so that the hand moves the target from there.
         """
-        target, last = motion.target(hand), self._last
+        target, last = motion.target_floats(hand), self._last
         self._last = this = tool, newest, now
         # The first target is the anchor, which must not move the arm wherever the plant says the tool is.
         if last is None or not (self.position.taut or self.rotation.taut or self._ends(tool, target)):
             return target
-        position, rotation = self._pull(_ways(tool, target), _Tick(*last), _Tick(*this))
-        if position is not None:
-            target = pin.SE3(target.rotation, tool.translation + position)
-            motion.anchor_position(hand, target)
-        if rotation is not None:
-            target = pin.SE3(pin.exp3(rotation) @ tool.rotation, target.translation)
-            motion.anchor_rotation(hand, target)
+        way, turn = self._pull(_ways(tool, target), _Tick(*last), _Tick(*this))
+        position, rotation = target = _put(target, tool, way, turn)
+        if way is not None:
+            motion.anchor_position(hand[0], position)
+        if turn is not None:
+            motion.anchor_rotation(hand[1], rotation)
         return target
 
-    def hold(self, target: pin.SE3, tool: pin.SE3) -> pin.SE3:
+    def hold(self, target: Pose, tool: Pose) -> Pose:
         """A target that no hand moves, no farther from ``tool`` (world frame) than the leash reaches."""
         if not self._ends(tool, target):
             return target
-        ways = [component.hold(way) for component, way in zip(self._components, _ways(tool, target), strict=True)]
-        position = target.translation if ways[0] is None else tool.translation + ways[0]
-        return pin.SE3(target.rotation if ways[1] is None else pin.exp3(ways[1]) @ tool.rotation, position)
+        way, turn = (component.hold(way) for component, way in zip(self._components, _ways(tool, target), strict=True))
+        return _put(target, tool, way, turn)
 
-    def _ends(self, tool: pin.SE3, target: pin.SE3) -> bool:
+    def _ends(self, tool: Pose, target: Pose) -> bool:
         """Whether the target is as far as a leash reaches, told with little work: at most ticks it is not."""
-        x, y, z, _, _, _, w = pin.SE3ToXYZQUATtuple(tool.actInv(target))
-        return math.hypot(x, y, z) >= self._distance or abs(w) <= self._cosine
+        (start, (a, b, c, d)), (end, (x, y, z, w)) = tool, target
+        # Of two unit quaternions the scalar product is the cosine of half the angle between them, but for its sign.
+        return math.dist(start, end) >= self._distance or abs(a * x + b * y + c * z + d * w) <= self._cosine
 
-    def _pull(self, ways: tuple[Array, Array], last: _Tick, this: _Tick) -> list[Array | None]:
+    def _pull(self, ways: tuple[Vector, Vector], last: _Tick, this: _Tick) -> list[Vector | None]:
         """Ways from the tool to the target's new position and rotation, None for what the leash leaves alone."""
         moves = zip(self._components, ways, _ways(last.newest, this.newest), _ways(last.tool, this.tool), strict=True)
         # Both are asked, since each has to see every tick.
@@ -158,11 +156,24 @@ class Leash:
 class _Tick(NamedTuple):
     """What of a tick the next one looks at."""
 
-    tool: pin.SE3
-    newest: pin.SE3
+    tool: Pose
+    newest: Pose
     now: float  # [s]
 
 
-def _ways(start: pin.SE3, end: pin.SE3) -> tuple[Array, Array]:
+def _ways(start: Pose, end: Pose) -> tuple[Vector, Vector]:
     """Position and rotation vector from one pose to another."""
-    return end.translation - start.translation, pin.log3(end.rotation @ start.rotation.T)
+    ((x, y, z), rotation), ((to_x, to_y, to_z), turned) = start, end
+    return (to_x - x, to_y - y, to_z - z), turn_between(rotation, turned)
+
+
+def _put(target: Pose, tool: Pose, way: Vector | None, turn: Vector | None) -> Pose:
+    """The target at this way and turn from the tool; None: where it is."""
+    (position, rotation), ((x, y, z), tool_rotation) = target, tool
+    if way is not None:
+        position = x + way[0], y + way[1], z + way[2]
+    return position, rotation if turn is None else turned_by(tool_rotation, turn)
+
+
+def _dot(one: Vector, other: Vector) -> float:
+    return one[0] * other[0] + one[1] * other[1] + one[2] * other[2]

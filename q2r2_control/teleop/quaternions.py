@@ -11,9 +11,10 @@ import math
 
 import pinocchio as pin
 
+from q2r2_control.types import Pose
+
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
-Pose = tuple[Vector, Quaternion]  # position [m] and rotation
 IDENTITY: Quaternion = (0.0, 0.0, 0.0, 1.0)
 
 
@@ -26,7 +27,7 @@ def floats_of(pose: pin.SE3) -> Pose:
 def se3_of(pose: Pose) -> pin.SE3:
     """The pose of these floats."""
     position, rotation = pose
-    return pin.XYZQUATToSE3((*position, *rotation))
+    return pin.XYZQUATToSE3(position + rotation)
 
 
 def product(p: Quaternion, q: Quaternion) -> Quaternion:
@@ -48,26 +49,25 @@ def inverse(q: Quaternion) -> Quaternion:
 
 def rotation_vector(q: Quaternion) -> Vector:
     """Axis times angle, of at most half a turn [rad]."""
-    x, y, z, w = q
-    sine = math.hypot(x, y, z)
-    if sine == 0.0:
-        return 0.0, 0.0, 0.0
-    ratio = 2.0 * math.atan2(math.copysign(sine, w), abs(w)) / sine
-    return ratio * x, ratio * y, ratio * z
+    return turn_between(IDENTITY, q)
 
 
 def turn_between(start: Quaternion, end: Quaternion) -> Vector:
-    """The rotation vector that leads from one rotation to another."""
+    """The rotation vector that leads from one rotation to another, of at most half a turn [rad]."""
     a, b, c, d = end
     x, y, z, w = start
-    return rotation_vector(
-        (
-            a * w - d * x - b * z + c * y,
-            a * z - d * y + b * w - c * x,
-            -d * z - a * y + b * x + c * w,
-            d * w + a * x + b * y + c * z,
-        )
+    a, b, c, cosine = (
+        a * w - d * x - b * z + c * y,
+        a * z - d * y + b * w - c * x,
+        -d * z - a * y + b * x + c * w,
+        d * w + a * x + b * y + c * z,
     )
+    sine = math.hypot(a, b, c)
+    if sine == 0.0:
+        return 0.0, 0.0, 0.0
+    half = math.atan2(sine, cosine) if cosine >= 0.0 else -math.atan2(sine, -cosine)
+    ratio = 2.0 * half / sine
+    return ratio * a, ratio * b, ratio * c
 
 
 def turned_by(q: Quaternion, vector: Vector) -> Quaternion:

@@ -16,13 +16,15 @@ from q2r2_control.teleop.quaternions import (
     IDENTITY,
     Quaternion,
     Vector,
+    floats_of,
     inverse,
     normalized,
     product,
     rotation_of,
     rotation_vector,
+    se3_of,
 )
-from q2r2_control.types import Array
+from q2r2_control.types import Array, Pose
 
 # Left and right change sign, forward and up do not.
 _REFLECTION = np.diag([1.0, -1.0, 1.0])
@@ -85,7 +87,7 @@ class RelativeMotion:
         self._turn_map: Array = np.linalg.det(self._map) * self._map
         self._turn_axes = _axes_of(self._turn_map)
         self._hand_position: Vector | None = None
-        self._hand_rotation = self._hand_back = self._tool_rotation = IDENTITY
+        self._hand_rotation = self._hand_back = self._tool_rotation = self._turned_back = IDENTITY
         self._tool_position = (0.0, 0.0, 0.0)
         self._vector = (0.0, 0.0, 0.0)
 
@@ -97,28 +99,33 @@ class RelativeMotion:
 
     def anchor(self, hand: pin.SE3, tool: pin.SE3) -> None:
         """Make ``hand`` (finite, input's frame) and ``tool`` (world frame) correspond from now on."""
-        self.anchor_position(hand, tool)
-        self.anchor_rotation(hand, tool)
+        self.anchor_floats(floats_of(hand), floats_of(tool))
 
-    def rescale(self, position: float, rotation: float, hand: pin.SE3, tool: pin.SE3) -> None:
+    def anchor_floats(self, hand: Pose, tool: Pose) -> None:
+        """See :meth:`anchor`."""
+        self.anchor_position(hand[0], tool[0])
+        self.anchor_rotation(hand[1], tool[1])
+
+    def rescale(self, position: float, rotation: float, hand: Pose, tool: Pose) -> None:
         """From now on scale by these shares of the scales; ``hand`` and ``tool`` are anchored, so nothing jumps.
 
         A share of 0 keeps the tool's position, or its rotation, where it is.
         """
         self._scale, self._rotation_scale = position * self._full[0], rotation * self._full[1]
         self._axes = self._scaled_axes()
-        self.anchor(hand, tool)
+        self.anchor_floats(hand, tool)
 
-    def anchor_position(self, hand: pin.SE3, tool: pin.SE3) -> None:
+    def anchor_position(self, hand: Vector, tool: Vector) -> None:
         """Make only the positions of ``hand`` and ``tool`` correspond from now on; rotations go on as they were."""
-        self._hand_position = pin.SE3ToXYZQUATtuple(hand)[:3]
-        self._tool_position = pin.SE3ToXYZQUATtuple(tool)[:3]
+        self._hand_position, self._tool_position = hand, tool
 
-    def anchor_rotation(self, hand: pin.SE3, tool: pin.SE3) -> None:
+    def anchor_rotation(self, hand: Quaternion, tool: Quaternion) -> None:
         """Make only the rotations of ``hand`` and ``tool`` correspond from now on; positions go on as they were."""
-        self._hand_rotation = normalized(pin.SE3ToXYZQUATtuple(hand)[3:])
+        self._hand_rotation = normalized(hand)
         self._hand_back = inverse(self._hand_rotation)
-        self._tool_rotation = normalized(pin.SE3ToXYZQUATtuple(tool)[3:])
+        self._tool_rotation = tool = normalized(tool)
+        back = self._in_world(self._hand_back)
+        self._turned_back = product(tool, back) if self._in_tool_frame else product(back, tool)
         self._vector = (0.0, 0.0, 0.0)
 
     def target(self, hand: pin.SE3) -> pin.SE3:
@@ -126,28 +133,35 @@ class RelativeMotion:
 
         Raises :class:`Q2R2Error` when nothing has been anchored.
         """
+        return se3_of(self.target_floats(floats_of(hand)))
+
+    def target_floats(self, hand: Pose) -> Pose:
+        """See :meth:`target`."""
         if self._hand_position is None:
             raise Q2R2Error("RelativeMotion.target: call anchor(hand, tool) first")
-        # At every tick, and so in floats.
-        now, before, tool = pin.SE3ToXYZQUATtuple(hand), self._hand_position, self._tool_position
+        now, rotation = hand
+        before, (x, y, z) = self._hand_position, self._tool_position
         (i, a), (j, b), (k, c) = self._axes
-        x, y, z = a * (now[i] - before[i]), b * (now[j] - before[j]), c * (now[k] - before[k])
-        rotation = self._turned_tool(now[3:])
-        target = pin.XYZQUATToSE3((tool[0] + x, tool[1] + y, tool[2] + z, *rotation))
+        position = x + a * (now[i] - before[i]), y + b * (now[j] - before[j]), z + c * (now[k] - before[k])
+        turned = self._turned_tool(rotation)
         if self._rotation_scale != 1.0 and math.hypot(*self._vector) > _REANCHOR_ANGLE:
-            self.anchor_rotation(hand, target)
-        return target
+            self.anchor_rotation(rotation, turned)
+        return position, turned
 
     def _turned_tool(self, hand: Quaternion) -> Quaternion:
         """The tool's rotation for that of the hand."""
-        back = self._hand_back
-        turn = product(back, hand) if self._in_tool_frame else product(hand, back)
-        if self._rotation_scale != 1.0:
-            turn = self._scaled(turn)
-        (i, a), (j, b), (k, c) = self._turn_axes
-        turn = a * turn[i], b * turn[j], c * turn[k], turn[3]
-        tool = self._tool_rotation
+        if self._rotation_scale == 1.0:  # M R R0' M' Rtool0 = (M R M') (M R0' M' Rtool0), and the latter is known
+            turn, tool = hand, self._turned_back
+        else:
+            back, tool = self._hand_back, self._tool_rotation
+            turn = self._scaled(product(back, hand) if self._in_tool_frame else product(hand, back))
+        turn = self._in_world(turn)
         return product(tool, turn) if self._in_tool_frame else product(turn, tool)
+
+    def _in_world(self, turn: Quaternion) -> Quaternion:
+        """A turn of the hand as it counts in the world: M R M'."""
+        (i, a), (j, b), (k, c) = self._turn_axes
+        return a * turn[i], b * turn[j], c * turn[k], turn[3]
 
     def hand(self, tool: pin.SE3) -> pin.SE3:
         """The hand pose, in the input's frame, whose :meth:`target` is ``tool``: where an operator has to put the hand.
@@ -163,7 +177,7 @@ class RelativeMotion:
         way = self._map.T @ np.divide(moved, scales, out=np.zeros(3), where=scales > 0.0)
         rotation = self._hand_rotation
         if self._rotation_scale > 0.0:
-            now, back = pin.SE3ToXYZQUATtuple(tool)[3:], inverse(self._tool_rotation)
+            (_, now), back = floats_of(tool), inverse(self._tool_rotation)
             scaled = rotation_vector(product(back, now) if self._in_tool_frame else product(now, back))
             x, y, z = (self._turn_map.T @ scaled / self._rotation_scale).tolist()
             turn = rotation_of((x, y, z))

@@ -12,10 +12,8 @@ import math
 from collections import deque
 from collections.abc import Sequence
 
-import numpy as np
-import pinocchio as pin
-
-from q2r2_control.types import pose_of
+from q2r2_control.teleop.quaternions import IDENTITY, turn_between, turned_by
+from q2r2_control.types import Pose
 
 # A hand rests while the mean of its newest samples is this near to that of all since it came to rest, and no sample is
 # farther from it than a headset's noise makes one in thousands [m], [rad].
@@ -38,24 +36,25 @@ class RestingPose:
 
     def forget(self) -> None:
         """Nothing is known."""
-        self._origin = np.eye(3)  # rotations are told as vectors from here
+        self._origin = IDENTITY  # rotations are told as vectors from here
         self._newest: deque[_Sample] = deque(maxlen=_NEWEST)
         self._mean: _Sample = (0.0,) * 6
         self._count = 0  # samples that are known of this rest
         self._share = 0.0
-        self._held = pin.SE3.Identity()  # the mean that is drawn to
+        self._held: Pose = (0.0, 0.0, 0.0), IDENTITY  # the mean that is drawn to
         self._of = self._episode = 0  # the rest that it is of, and the one that is going on
         self._now = 0.0
 
-    def add(self, pose: pin.SE3) -> None:
+    def add(self, pose: Pose) -> None:
         """A sample of the hand."""
         if not self._enabled:
             return
-        turn = pin.log3(pose.rotation.dot(self._origin.T)).tolist()
+        position, rotation = pose
+        turn = turn_between(self._origin, rotation)
         known = self._count > 0 and math.hypot(*turn) <= _TURNED
         if not known:
-            self._origin, turn = np.array(pose.rotation), (0.0, 0.0, 0.0)
-        sample = (*pose.translation.tolist(), *turn)
+            self._origin, turn = rotation, (0.0, 0.0, 0.0)
+        sample = (*position, *turn)
         if not known or self._away(sample, _FAR):
             self._newest.clear()
             self._newest.append(sample)
@@ -70,16 +69,20 @@ class RestingPose:
             if self._away(newest, _DRIFTED):
                 self._leave(newest, _NEWEST)
 
-    def begin(self, newest: pin.SE3, now: float) -> pin.SE3:
+    def begin(self, newest: Pose, now: float) -> Pose:
         """Where the hand is at ``now`` [s]: at the mean if it rests, else at its ``newest`` pose."""
         self._now, self._of = now, self._episode
         self._share = min(max(self._trusted, 0.0), 1.0)
         self._held = self._mean_pose() if self._share > 0.0 else newest
         return self._held
 
-    def draw(self, pose: pin.SE3, now: float) -> pin.SE3:
+    def draw(self, pose: Pose, now: float) -> Pose:
         """The filtered ``pose`` at ``now`` [s], drawn towards the mean as far as that is to be trusted."""
-        passed, self._now = max(now - self._now, 0.0) / _LEAVING, now
+        last, self._now = self._now, now
+        if self._share == 0.0 and self._count <= _TRUSTED[0]:
+            self._of = self._episode
+            return pose  # as while a hand moves
+        passed = max(now - last, 0.0) / _LEAVING
         if self._of != self._episode and self._share == 0.0:
             self._of = self._episode
         if self._of == self._episode:
@@ -90,9 +93,10 @@ class RestingPose:
             return pose
         if self._of == self._episode:
             self._held = self._mean_pose()
-        position = pose.translation + self._share * (self._held.translation - pose.translation)
-        turn = pin.exp3(self._share * pin.log3(self._held.rotation.dot(pose.rotation.T)))
-        return pose_of(turn.dot(pose.rotation), position)
+        share, ((x, y, z), rotation), ((to_x, to_y, to_z), to) = self._share, pose, self._held
+        a, b, c = turn_between(rotation, to)
+        position = x + share * (to_x - x), y + share * (to_y - y), z + share * (to_z - z)
+        return position, turned_by(rotation, (share * a, share * b, share * c))
 
     @property
     def _trusted(self) -> float:
@@ -100,9 +104,9 @@ class RestingPose:
         least, most = _TRUSTED
         return (self._count - least) / (most - least)
 
-    def _mean_pose(self) -> pin.SE3:
-        turn = pin.exp3(np.array(self._mean[3:]))
-        return pose_of(turn.dot(self._origin), np.array(self._mean[:3]))
+    def _mean_pose(self) -> Pose:
+        x, y, z, a, b, c = self._mean
+        return (x, y, z), turned_by(self._origin, (a, b, c))
 
     def _away(self, sample: _Sample, bounds: tuple[float, float]) -> bool:
         (x, y, z, a, b, c), (to_x, to_y, to_z, to_a, to_b, to_c) = self._mean, sample

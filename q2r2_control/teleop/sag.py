@@ -19,7 +19,8 @@ from typing import NamedTuple
 
 import pinocchio as pin
 
-from q2r2_control.types import Array, moved_by
+from q2r2_control.teleop.quaternions import floats_of
+from q2r2_control.types import Array, Pose, moved_by
 
 # A tool that is farther from its command does not sag [m], [rad].
 MOST_SAG = 0.05, 0.1
@@ -44,3 +45,12 @@ def anchor_of(measured: pin.SE3, commanded: pin.SE3 | None, rotation: Array) -> 
 def sagged(commanded: pin.SE3, sag: Array | None) -> pin.SE3:
     """Where a tool is to be measured that is commanded to be at ``commanded``."""
     return commanded if sag is None else moved_by(commanded, sag)
+
+
+def expected(commanded: pin.SE3, sag: Array | None) -> Pose:
+    """The same as :func:`sagged`, in floats."""
+    (x, y, z), rotation = pose = floats_of(commanded)
+    if sag is None:
+        return pose
+    by_x, by_y, by_z = sag.tolist()
+    return (x + by_x, y + by_y, z + by_z), rotation

@@ -5,10 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 
-import pinocchio as pin
-
 from q2r2_control.config.teleop import SpeedLimitSettings
-from q2r2_control.types import LONGEST_DT, pose_of
+from q2r2_control.teleop.quaternions import normalized, turn_between, turned_by
+from q2r2_control.types import LONGEST_DT, Pose
 
 
 class SpeedLimit:
@@ -25,30 +24,34 @@ class SpeedLimit:
         self._angular = min((limit.angular for limit in limits if limit.angular is not None), default=math.inf)
         self._lever = lever
         self._any = min(self._linear, self._angular) < math.inf
-        self._last: tuple[pin.SE3, float] | None = None
+        self._last: tuple[Pose, float] | None = None
 
     def reset(self) -> None:
         """For a new anchor: the next target is where the tool is."""
         self._last = None
 
-    def limit(self, target: pin.SE3, now: float) -> pin.SE3:
-        """Where the target may be at ``now`` [s]."""
+    def limit(self, target: Pose, now: float) -> Pose:
+        """Where the target may be at ``now`` [s], in the frame that it is told in."""
         if not self._any:
             return target
         if self._last is None:
             self._last = target, now
             return target
-        last, before = self._last
+        ((x, y, z), rotation), before = self._last
+        position, turned = target
         dt = min(max(now - before, 0.0), LONGEST_DT)
-        way, turn = target.translation - last.translation, pin.log3(target.rotation @ last.rotation.T)
-        angle = math.hypot(*turn)
-        reach = math.hypot(*way) + self._lever * angle
+        a, b, c = turn_between(rotation, turned)
+        angle = math.hypot(a, b, c)
+        reach = math.dist(position, (x, y, z)) + self._lever * angle
         share = min(
             1.0,
             self._linear * dt / reach if reach > 0.0 else 1.0,
             self._angular * dt / angle if angle > 0.0 else 1.0,
         )
         if share < 1.0:
-            target = pose_of(pin.exp3(share * turn) @ last.rotation, last.translation + share * way)
+            to_x, to_y, to_z = position
+            # Each is turned from the last one, for as long as the hand is ahead.
+            turned = normalized(turned_by(rotation, (share * a, share * b, share * c)))
+            target = (x + share * (to_x - x), y + share * (to_y - y), z + share * (to_z - z)), turned
         self._last = target, now
         return target

@@ -13,9 +13,11 @@ from q2r2_control.teleop.arm import of_controls
 from q2r2_control.teleop.arm_states import FOLLOWING, HOLDING, ArmState, Cause
 from q2r2_control.teleop.both_arms import BothArms, Surroundings
 from q2r2_control.teleop.episode_marks import EpisodeMarks
+from q2r2_control.teleop.quaternions import se3_of
 from q2r2_control.teleop.remote_arm import RemoteArm
 from q2r2_control.types import ArmTarget, Event, HandSample
 
+_BY_HANDS = ArmState.ENGAGED, ArmState.CARRIED
 _LED = FOLLOWING - {ArmState.CARRIED}  # by their own hand, which does not move an arm that is carried
 
 
@@ -75,7 +77,7 @@ class Teleop:
     @property
     def engaged(self) -> dict[str, bool]:
         """Whether each arm follows a hand now."""
-        return {name: arm.state in (ArmState.ENGAGED, ArmState.CARRIED) for name, arm in self._arms.items()}
+        return {name: arm.state in _BY_HANDS for name, arm in self._arms.items()}
 
     @property
     def aligning(self) -> bool:
@@ -169,10 +171,11 @@ class Teleop:
             return self._carried_targets(now, around)
         targets = {}
         for name, arm in self._arms.items():
-            pose = arm.target(now, around.expected(arm)) if arm.state is ArmState.ENGAGED else None
-            if pose is not None:
-                self._commanded[name] = pose
-            targets[name] = ArmTarget(pose, arm.gripper, *arm.slip, arm.sag, arm.filtered_hand)
+            pose = hand = None
+            if arm.state is ArmState.ENGAGED:
+                self._commanded[name] = pose = se3_of(arm.target(now, around.expected(arm)))
+                hand = arm.filtered_hand
+            targets[name] = ArmTarget(pose, arm.gripper, *arm.slip, arm.sag, hand)
         return targets
 
     def _carried_targets(self, now: float, around: Surroundings) -> dict[str, ArmTarget]:
@@ -181,13 +184,16 @@ class Teleop:
         if not self._pair.carry.lasts:
             self._pair.end_carry(now, "the other arm was stopped")
             return self._targets(now, around)
-        expected = {name: pose for name, arm in self._arms.items() if (pose := around.expected(arm)) is not None}
+        expected = {
+            name: se3_of(pose) for name, arm in self._arms.items() if (pose := around.expected(arm)) is not None
+        }
         carried, slip, targets = self._carried(now, expected), self._pair.carry.slip, {}
         for name, arm in self._arms.items():
             pose = carried.get(name)
             if pose is not None:
                 self._commanded[name] = pose
-            targets[name] = ArmTarget(pose, arm.gripper, *slip, arm.sag, arm.filtered_hand)
+            hand = arm.filtered_hand if arm.state is ArmState.ENGAGED else None
+            targets[name] = ArmTarget(pose, arm.gripper, *slip, arm.sag, hand)
         return targets
 
     def _carried(self, now: float, expected: dict[str, pin.SE3]) -> Mapping[str, pin.SE3]:

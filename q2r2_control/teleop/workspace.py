@@ -11,13 +11,12 @@ and goes out as fast as it came back until the hand has turned again.
 
 from __future__ import annotations
 
+import math
 from itertools import starmap
 
-import numpy as np
-import pinocchio as pin
-
 from q2r2_control.config.teleop import WorkspaceSettings
-from q2r2_control.types import Array
+from q2r2_control.teleop.quaternions import Vector
+from q2r2_control.types import Pose
 
 _TURNED = 1.5e-3  # the hand has turned, and does not only tremble [m]
 
@@ -32,43 +31,45 @@ class Workspace:
         self._axes: list[_Axis] = []
         if settings is not None:
             self._axes = [_Axis(*side, settings.soft_edge) for side in (settings.x, settings.y, settings.z)]
-        self._last: list[float] | None = None
+        self._last: Vector | None = None
         self.slip = 0.0  # how much of the hand's way was not made since the reset [m]
 
     def reset(self) -> None:
         """For a new anchor: the next target is where the tool is, wherever that may be."""
         self._last, self.slip = None, 0.0
 
-    def hold(self, target: pin.SE3) -> list[float] | None:
+    def hold(self, target: Pose) -> Vector | None:
         """Where a target that is asked to be at ``target``, world frame, may be; None: there.
 
         Asked at every tick; what it returns the hand has to be anchored to.
         """
         if not self._axes:
             return None
-        asked = target.translation.tolist()
+        asked = target[0]
         last, self._last = self._last, asked
         if last is None:
             for axis, value in zip(self._axes, asked, strict=True):
                 axis.begin(value)
             return None
-        allowed = list(starmap(_Axis.step, zip(self._axes, last, asked, strict=True)))
+        x, y, z = starmap(_Axis.step, zip(self._axes, last, asked, strict=True))
+        allowed = x, y, z
         if allowed == asked:
             return None
-        self.slip += sum((a - b) ** 2 for a, b in zip(allowed, asked, strict=True)) ** 0.5
+        self.slip += math.dist(allowed, asked)
         self._last = allowed
         return allowed
 
-    def clip(self, position: Array) -> Array:
-        """The nearest position (3,) within the sides, world frame."""
+    def clip(self, position: Vector) -> Vector:
+        """The nearest position within the sides, world frame [m]."""
         if not self._axes:
             return position
-        return np.array([axis.clip(value) for axis, value in zip(self._axes, position.tolist(), strict=True)])
+        x, y, z = map(_Axis.clip, self._axes, position)
+        return x, y, z
 
-    def move_to(self, position: Array) -> None:
-        """The target is at ``position`` (3,) instead of what :meth:`hold` returned last."""
+    def move_to(self, position: Vector) -> None:
+        """The target is at ``position`` [m] instead of what :meth:`hold` returned last."""
         if self._last is not None:
-            self._last = position.tolist()
+            self._last = position
 
 
 class _Axis:

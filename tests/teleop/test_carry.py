@@ -86,6 +86,7 @@ class TestBothTools:
         driver.engage()
         push(driver, "grip", hand)
         assert driver.states == {hand: "engaged", ("right" if hand == "left" else "left"): "carried"}
+        assert [arm for arm, target in driver.targets.items() if target.hand is not None] == [hand]
 
     def test_need_only_the_arm_of_that_hand_engaged_and_the_other_one_does_not_move_when_it_begins(self) -> None:
         driver = carrying("left")

@@ -6,12 +6,12 @@ import math
 from collections.abc import Callable
 
 import numpy as np
-import numpy.typing as npt
 import pinocchio as pin
 import pytest
 
 from q2r2_control.config.teleop import FilterSettings
 from q2r2_control.teleop.filters import PoseFilter
+from q2r2_control.teleop.quaternions import floats_of, se3_of
 from tests.teleop.hands import pose
 
 Path = Callable[[float], pin.SE3]
@@ -21,14 +21,14 @@ STILL = pose(0.1, 0.2, 0.3, (0.4, 0.5, 0.6))
 def follow(path: Path, duration: float = 3.0, dt: float = 0.002, period: float = 1 / 75) -> tuple[float, list[pin.SE3]]:
     """The filter's delay and its output at every tick."""
     pose_filter = PoseFilter(FilterSettings())
-    pose_filter.reset(path(0.0), 0.0)
+    pose_filter.reset(floats_of(path(0.0)), 0.0)
     due, outputs = period, []
     for tick in range(round(duration / dt)):
         now = tick * dt
         while due <= now:
-            pose_filter.add(path(due), due, now)
+            pose_filter.add(floats_of(path(due)), due, now)
             due += period
-        outputs.append(pose_filter.at(now))
+        outputs.append(se3_of(pose_filter.at(now)))
     return pose_filter.delay, outputs
 
 
@@ -111,27 +111,28 @@ def test_the_output_moves_in_every_tick_although_samples_come_every_thirteenth()
 
 def test_a_reset_filter_rests_at_its_pose_whatever_went_before() -> None:
     pose_filter = PoseFilter(FilterSettings())
-    pose_filter.reset(pose(), 0.0)
+    pose_filter.reset(floats_of(pose()), 0.0)
     for tick in range(100):
-        pose_filter.add(pose(0.01 * tick, turn=(0.02 * tick, 0, 0)), tick * 0.013, tick * 0.013)
+        pose_filter.add(floats_of(pose(0.01 * tick, turn=(0.02 * tick, 0, 0))), tick * 0.013, tick * 0.013)
         pose_filter.at(tick * 0.013)
-    pose_filter.reset(STILL, 1.3)
+    pose_filter.reset(floats_of(STILL), 1.3)
     for tick in range(200):
-        np.testing.assert_allclose(pose_filter.at(1.3 + 0.001 * tick).homogeneous, STILL.homogeneous, atol=1e-12)
+        output = se3_of(pose_filter.at(1.3 + 0.001 * tick))
+        np.testing.assert_allclose(output.homogeneous, STILL.homogeneous, atol=1e-12)
 
 
 def largest_step(arrivals: list[tuple[float, list[tuple[float, float]]]]) -> float:
     """Largest step of the output in 1 ms, for samples (stamp, x) that arrive at given times."""
     pose_filter = PoseFilter(FilterSettings())
-    pose_filter.reset(pose(), 0.0)
+    pose_filter.reset(floats_of(pose()), 0.0)
     outputs: list[float] = []
     queue = list(arrivals)
     for tick in range(2000):
         now = tick * 0.001
         while queue and queue[0][0] <= now:
             for stamp, x in queue.pop(0)[1]:
-                pose_filter.add(pose(x), stamp, now)
-        outputs.append(float(pose_filter.at(now).translation[0]))
+                pose_filter.add(floats_of(pose(x)), stamp, now)
+        outputs.append(pose_filter.at(now)[0][0])
     return float(np.abs(np.diff(outputs)).max())
 
 
@@ -153,11 +154,23 @@ def test_the_output_is_continuous_when_the_stream_has(arrivals: list[tuple[float
 
 def test_a_clock_that_stands_still_or_goes_back_returns_the_same_pose() -> None:
     pose_filter = PoseFilter(FilterSettings())
-    pose_filter.reset(pose(), 1.0)
-    pose_filter.add(pose(0.1), 1.01, 1.01)
-    here: npt.NDArray[np.float64] = pose_filter.at(1.02).homogeneous
+    pose_filter.reset(floats_of(pose()), 1.0)
+    pose_filter.add(floats_of(pose(0.1)), 1.01, 1.01)
+    here = pose_filter.at(1.02)
     for now in (1.02, 1.0, -5.0):
-        np.testing.assert_array_equal(pose_filter.at(now).homogeneous, here)
+        assert pose_filter.at(now) == here
+
+
+def test_a_rotation_that_is_filtered_for_long_stays_one() -> None:
+    pose_filter = PoseFilter(FilterSettings())
+    pose_filter.reset(floats_of(STILL), 0.0)
+    for tick in range(20_000):
+        now = tick * 0.001
+        if tick % 13 == 0:
+            turn = math.sin(now), math.cos(1.3 * now), 0.5 * now % 3.0
+            pose_filter.add(floats_of(pose(turn=turn)), now, now)
+        _, rotation = pose_filter.at(now)
+        assert math.hypot(*rotation) == pytest.approx(1.0, abs=4e-15)
 
 
 def test_the_delay_stated_follows_the_settings() -> None:

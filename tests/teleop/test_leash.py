@@ -17,6 +17,7 @@ from q2r2_control.pipeline import Pipeline
 from q2r2_control.runtime.recorder import Tick
 from q2r2_control.runtime.run_summary import RunSummary
 from q2r2_control.teleop.leash import Leash
+from q2r2_control.teleop.quaternions import floats_of, se3_of
 from q2r2_control.teleop.relative import RelativeMotion
 from q2r2_control.types import Array
 from tests.support.hands_input import HandsInput
@@ -49,7 +50,8 @@ class Tied:
 
     def tick(self, hand: pin.SE3, dt: float = DT) -> pin.SE3:
         self.hand, self.now = hand, self.now + dt
-        self.target = self.leash.target(self.motion, hand, self.newest.target(hand), self.tool, self.now)
+        newest, tool = floats_of(self.newest.target(hand)), floats_of(self.tool)
+        self.target = se3_of(self.leash.target(self.motion, floats_of(hand), newest, tool, self.now))
         return self.target
 
     def go(self, twist: Array, ticks: int) -> list[pin.SE3]:
@@ -130,6 +132,22 @@ def test_position_and_rotation_have_a_leash_each() -> None:
     assert tied.leash.position.slip == 0.0
     assert tied.leash.rotation.slip == pytest.approx(0.4)
     np.testing.assert_array_equal(tied.target.translation, TOOL.translation)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0], ids=["a quaternion", "the other one of the same rotation"])
+@pytest.mark.parametrize("turning", [False, True], ids=["position", "rotation"])
+def test_a_target_is_held_from_the_end_of_the_leash_on_and_not_before(turning: bool, sign: float) -> None:
+    leash, length = Leash(LeashSettings(distance=0.1, angle=0.5)), 0.5 if turning else 0.1
+    position, (a, b, c, w) = floats_of(TOOL)
+    tool = position, (sign * a, sign * b, sign * c, sign * w)
+    out = along(0.03, 0, 0, 0, 0.6, 0.8) if turning else along(0.6, 0, -0.8, 0, 0, 0.2)
+    out[3 * turning : 3 * turning + 3] *= length
+    for beyond in (-1e-8, -1e-11, 1e-11, 1e-8):
+        asked = floats_of(moved(TOOL, out * (1.0 + beyond)))
+        held = leash.hold(asked, tool)
+        assert (held == asked) == (beyond < 0.0)
+        slip = (leash.rotation if turning else leash.position).slip
+        assert slip == pytest.approx(sum(length * one for one in (1e-11, 1e-8) if 0.0 < one <= beyond), rel=1e-3)
 
 
 @pytest.mark.parametrize("settings", [{"distance": None}, {"angle": None}, {"distance": None, "angle": None}], ids=str)

@@ -11,8 +11,9 @@ import pytest
 
 from q2r2_control.config.teleop import FilterSettings
 from q2r2_control.teleop.filters import PoseFilter
+from q2r2_control.teleop.quaternions import floats_of, rotation_vector, se3_of
 from q2r2_control.teleop.rest import RestingPose
-from q2r2_control.types import SIDES, Array, HandSample
+from q2r2_control.types import SIDES, Array, HandSample, Pose
 from tests.teleop.hands import PAUSED, Operator, operator, pose
 
 TICK, PERIOD = 0.004, 1.0 / 75.0  # of the loop and of the samples [s]
@@ -33,9 +34,9 @@ class Filtered:
         self.drawn: list[Array] = []
         self.turned: list[Array] = []
 
-    def _sample(self, x: float) -> pin.SE3:
+    def _sample(self, x: float) -> Pose:
         noise = self._random.normal(0.0, 1.0, 6) * self._noise
-        return pose(x + noise[0], noise[1], noise[2], tuple(noise[3:] * TURN_NOISE / NOISE))
+        return floats_of(pose(x + noise[0], noise[1], noise[2], tuple(noise[3:] * TURN_NOISE / NOISE)))
 
     def run(self, seconds: float, speed: float = 0.0, x: float = 0.0) -> float:
         """Returns where the hand is at the end [m]."""
@@ -49,9 +50,9 @@ class Filtered:
                 self._rest.add(sample)
             plain = self._filter.at(self.t)
             drawn = self._rest.draw(plain, self.t)
-            self.plain.append(plain.translation.copy())
-            self.drawn.append(drawn.translation.copy())
-            self.turned.append(pin.log3(drawn.rotation))
+            self.plain.append(np.array(plain[0]))
+            self.drawn.append(np.array(drawn[0]))
+            self.turned.append(np.array(rotation_vector(drawn[1])))
         return x
 
 
@@ -152,11 +153,11 @@ def turning(speed: float, seconds: float, then: float) -> tuple[list[pin.SE3], l
             due += PERIOD
             noise = pin.SE3(pin.exp3(random.normal(0.0, TURN_NOISE, 3)), random.normal(0.0, NOISE, 3))
             if tick == 0:
-                filtered.reset(hand, t)
-                rest.begin(hand, t)
-            filtered.add(hand * noise, t, t)
-            rest.add(hand * noise)
-        drawn.append(rest.draw(filtered.at(t), t))
+                filtered.reset(floats_of(hand), t)
+                rest.begin(floats_of(hand), t)
+            filtered.add(floats_of(hand * noise), t, t)
+            rest.add(floats_of(hand * noise))
+        drawn.append(se3_of(rest.draw(filtered.at(t), t)))
         real.append(hand)
     return drawn, real
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pinocchio as pin
 
-from q2r2_control.teleop.sag import MOST_SAG
+from q2r2_control.teleop.quaternions import se3_of
+from q2r2_control.teleop.sag import MOST_SAG, expected, sagged
 from q2r2_control.types import SIDES, Array
 from tests.teleop.hands import Operator, engaged, operator, squeezing, waving
 
@@ -39,6 +40,12 @@ def test_the_target_begins_at_the_tool_and_the_command_where_it_was() -> None:
     np.testing.assert_allclose(command(driver), driver.commanded["left"].translation, atol=1e-9)
     driver.run(0.5, waving(driver))
     np.testing.assert_allclose(target(driver) - command(driver), SAG, atol=1e-12)
+
+
+def test_where_a_tool_hangs_is_the_same_in_floats() -> None:
+    tool = operator().tools["right"]
+    for sag in (np.array([0.005, 0.01, -0.02]), None):
+        np.testing.assert_allclose(se3_of(expected(tool, sag)).homogeneous, sagged(tool, sag).homogeneous, atol=1e-15)
 
 
 def test_a_tool_that_is_farther_from_its_command_was_pushed_there_and_the_command_begins_at_it() -> None:

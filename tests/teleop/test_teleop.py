@@ -37,6 +37,18 @@ def test_it_starts_idle_and_the_first_press_of_the_lower_button_engages_that_arm
     ]
 
 
+def test_a_target_tells_the_hand_that_it_is_made_of_and_none_while_the_arm_holds() -> None:
+    driver = engaged()
+    driver.run(0.3, waving(driver))
+    driver.run(0.5)
+    for arm in SIDES:
+        hand = driver.targets[arm].hand
+        assert hand is not None
+        np.testing.assert_allclose(hand.homogeneous, driver.hands[arm].homogeneous, atol=1e-4)
+    driver.press(*SIDES)
+    assert all(target.hand is None for target in driver.targets.values())
+
+
 @settings(derandomize=True, max_examples=25, deadline=None)
 @given(st.lists(st.floats(-3.0, 3.0), min_size=12, max_size=12), st.sampled_from([1.0, -1.0]))
 def test_the_first_target_is_the_measured_tool_pose_whatever_the_hand(n: list[float], sign: float) -> None:

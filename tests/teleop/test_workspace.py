@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from q2r2_control.config.teleop import WorkspaceSettings
+from q2r2_control.teleop.quaternions import IDENTITY
 from q2r2_control.teleop.workspace import Workspace
 from q2r2_control.types import SIDES
 from tests.teleop.hands import ENGAGED, TICK, Operator, assert_smooth, operator
@@ -79,14 +80,14 @@ def test_an_arm_that_is_engaged_outside_does_not_jump_and_may_only_come_in() -> 
 @pytest.mark.parametrize("at", [0.62, 0.6499, 0.66])
 def test_a_hand_that_trembles_at_a_side_does_not_creep_away_from_it(at: float) -> None:
     workspace = Workspace(WorkspaceSettings.model_validate(BOX))
-    position, way = np.array([at, 0.4, 0.4]), 0.0
-    assert workspace.hold(pin.SE3(np.eye(3), position)) is None
+    position, way = (at, 0.4, 0.4), 0.0
+    assert workspace.hold((position, IDENTITY)) is None
     random = np.random.default_rng(0)
     for tick in range(5000):
         wanted = 0.5e-3 * np.sin(2.0 * np.pi * 10.0 * tick * TICK) + random.normal(0.0, 2e-5)
-        asked = position + np.array([wanted - way, 0.0, 0.0])
-        way, held = wanted, workspace.hold(pin.SE3(np.eye(3), asked))
-        position = asked if held is None else np.array(held)
+        asked = position[0] + wanted - way, 0.4, 0.4
+        way, held = wanted, workspace.hold((asked, IDENTITY))
+        position = asked if held is None else held
         assert abs(position[0] - at) < 1.5e-3
 
 
@@ -94,12 +95,12 @@ def test_a_hand_that_trembles_at_a_side_does_not_creep_away_from_it(at: float) -
 @given(st.lists(st.tuples(*[st.floats(-0.2, 0.2)] * 3), min_size=1, max_size=40))
 def test_no_steps_of_any_size_lead_outside(steps: list[tuple[float, float, float]]) -> None:
     workspace = Workspace(WorkspaceSettings.model_validate(BOX))
-    position = np.array([0.5, 0.4, 0.4])
-    assert workspace.hold(pin.SE3(np.eye(3), position)) is None
+    position = (0.5, 0.4, 0.4)
+    assert workspace.hold((position, IDENTITY)) is None
     for step in steps:
-        asked = position + np.array(step)
-        held = workspace.hold(pin.SE3(np.eye(3), asked))
-        position = asked if held is None else np.array(held)
+        x, y, z = np.add(position, step).tolist()
+        held = workspace.hold(((x, y, z), IDENTITY))
+        position = (x, y, z) if held is None else held
         for value, side in zip(position, (BOX["x"], BOX["y"], BOX["z"]), strict=True):
             assert side[0] - 1e-12 <= value <= side[1] + 1e-12  # type: ignore[index]
 
