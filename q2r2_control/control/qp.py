@@ -71,15 +71,17 @@ class DaqpSolver:
         self._sense = np.zeros(nv, dtype=np.int32)
 
     def solve(self, problem: QpProblem) -> QpSolution:
-        m = self._nv + len(problem.rows_lower)
+        nv = self._nv
+        m = nv + len(problem.rows_lower)
         if m > len(self._upper):
             self._upper = np.full(m, _UNBOUNDED)
             self._lower = np.empty(m)
             self._sense = np.full(m, 8, dtype=np.int32)  # soft
-            self._sense[: self._nv] = 0
-        self._upper[: self._nv] = problem.upper
-        self._lower[: self._nv] = problem.lower
-        self._lower[self._nv : m] = problem.rows_lower
+            self._sense[:nv] = 0
+        self._upper[:nv] = problem.upper
+        self._lower[:nv] = problem.lower
+        if m > nv:
+            self._lower[nv:m] = problem.rows_lower
         v, _, flag, info = daqp.solve(
             problem.H,
             problem.g,

@@ -158,17 +158,13 @@ class MujocoPlant:
 
     def state(self) -> RobotState:
         """See :meth:`Plant.state`. External torque: contacts, pushes, and hard stops at the ends of a joint's range."""
-        index, actuator = self._v_index, self._actuator
-        self.observed_qpos = self._qpos.copy()
+        index, qpos = self._v_index, self._qpos.copy()
+        self.observed_qpos = qpos
+        tau = self._actuator.take(index)
         # What MuJoCo adds up before contacts, less what is not external, leaves pushes from here and from its window.
-        pushed = self._smooth - self._passive + self._bias - actuator
-        return RobotState(
-            q=self.observed_qpos.take(self._q_index),
-            v=self._qvel.take(index),
-            tau=actuator.take(index),
-            tau_external=(self._constraint + pushed).take(index),
-            stamp=self._steps * self._timestep,
-        )
+        external = (self._constraint + self._smooth - self._passive + self._bias).take(index)
+        external -= tau
+        return RobotState(qpos.take(self._q_index), self._qvel.take(index), tau, external, self._steps * self._timestep)
 
     def gripper_openings(self) -> dict[str, float]:
         """See :meth:`Plant.gripper_openings`."""

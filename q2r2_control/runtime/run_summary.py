@@ -153,14 +153,11 @@ class RunStatistics:
                 figures.slip_angle = target.slip_angle
             if pose is not None and engaged[name]:
                 figures.engaged += dt
-                x, y, z, a, b, c, w = pin.SE3ToXYZQUATtuple(tools[name].actInv(pose))
-                square = x * x + y * y + z * z
-                if not math.isfinite(square):
-                    continue  # nothing was measured
-                angle = 2.0 * math.atan2(math.hypot(a, b, c), abs(w))
-                figures.ticks += 1
-                figures.position += square
-                figures.rotation += angle * angle
+                error = _error(pin.SE3ToXYZQUATtuple(tools[name]), pin.SE3ToXYZQUATtuple(pose))
+                if math.isfinite(error[0]):  # else nothing was measured
+                    figures.ticks += 1
+                    figures.position += error[0]
+                    figures.rotation += error[1]
 
     def add_latency(self, samples: list[HandSample], now: float) -> None:
         """Count the time from the receipt of a tick's newest sample to its command, sent at ``now`` [s]."""
@@ -225,6 +222,15 @@ class RunStatistics:
             torque=self._torque.summary(),
             events=list(self.events),
         )
+
+
+def _error(tool: tuple[float, ...], target: tuple[float, ...]) -> tuple[float, float]:
+    """Squares of distance [m^2] and angle [rad^2] between two poses, as floats, quaternions x y z w."""
+    x, y, z, a, b, c, w = tool
+    to_x, to_y, to_z, to_a, to_b, to_c, to_w = target
+    dx, dy, dz = to_x - x, to_y - y, to_z - z
+    half = math.acos(min(1.0, abs(a * to_a + b * to_b + c * to_c + w * to_w)))  # rounded to 1e-8 rad
+    return dx * dx + dy * dy + dz * dz, 4.0 * half * half
 
 
 def _arm_summary(figures: _ArmFigures) -> ArmSummary:

@@ -11,7 +11,6 @@ from q2r2_control.config.teleop import GuardSettings
 from q2r2_control.supervision.tick_pacer import TickPacer
 from q2r2_control.teleop.quaternions import (
     IDENTITY,
-    Pose,
     Vector,
     floats_of,
     normalized,
@@ -19,7 +18,7 @@ from q2r2_control.teleop.quaternions import (
     turn_between,
     turned_by,
 )
-from q2r2_control.types import LONGEST_DT
+from q2r2_control.types import LONGEST_DT, Pose
 
 _REST = 1e-9  # slower than this is at rest [m/s, rad/s]
 _ZERO: Vector = (0.0, 0.0, 0.0)

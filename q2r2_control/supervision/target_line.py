@@ -12,7 +12,6 @@ import math
 import pinocchio as pin
 
 from q2r2_control.teleop.quaternions import (
-    Pose,
     Vector,
     floats_of,
     inverse,
@@ -21,6 +20,7 @@ from q2r2_control.teleop.quaternions import (
     rotation_vector,
     se3_of,
 )
+from q2r2_control.types import Pose
 
 # Between two targets of a line: slower ones are steps, and stamps that are nearer say nothing [s].
 _SHORTEST, _LONGEST = 0.001, 0.025
