@@ -154,7 +154,8 @@ class PoseFilter:
         dt = now - self._now
         if dt <= 0.0:
             return self._out
-        (before_x, before_y, before_z), (last_x, last_y, last_z), last = self._in, *self._out
+        before_x, before_y, before_z = self._in
+        (last_x, last_y, last_z), last = self._out
         self._in, rotation, turned = self._interpolator.at(now)
         self._now, (x, y, z) = now, self._in
         shift = self._position.correction(

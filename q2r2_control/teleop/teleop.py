@@ -175,7 +175,8 @@ class Teleop:
             if arm.state is ArmState.ENGAGED:
                 self._commanded[name] = pose = se3_of(arm.target(now, around.expected(arm)))
                 hand = arm.filtered_hand
-            targets[name] = ArmTarget(pose, arm.gripper, *arm.slip, arm.sag, hand)
+            slip, slip_angle = arm.slip
+            targets[name] = ArmTarget(pose, arm.gripper, slip, slip_angle, arm.sag, hand)
         return targets
 
     def _carried_targets(self, now: float, around: Surroundings) -> dict[str, ArmTarget]:
@@ -187,13 +188,13 @@ class Teleop:
         expected = {
             name: se3_of(pose) for name, arm in self._arms.items() if (pose := around.expected(arm)) is not None
         }
-        carried, slip, targets = self._carried(now, expected), self._pair.carry.slip, {}
+        carried, (slip, slip_angle), targets = self._carried(now, expected), self._pair.carry.slip, {}
         for name, arm in self._arms.items():
             pose = carried.get(name)
             if pose is not None:
                 self._commanded[name] = pose
             hand = arm.filtered_hand if arm.state is ArmState.ENGAGED else None
-            targets[name] = ArmTarget(pose, arm.gripper, *slip, arm.sag, hand)
+            targets[name] = ArmTarget(pose, arm.gripper, slip, slip_angle, arm.sag, hand)
         return targets
 
     def _carried(self, now: float, expected: dict[str, pin.SE3]) -> Mapping[str, pin.SE3]:
