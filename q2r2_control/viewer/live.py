@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 
 import numpy as np
 from rich.console import Console
-from rich.live import Live
 from rich.markup import escape
 from rich.table import Table
 
@@ -17,17 +15,16 @@ from q2r2_control.config.bindings import BindingSettings
 from q2r2_control.runtime.recorder import Tick
 from q2r2_control.types import Event
 from q2r2_control.viewer.arm_words import next_press, why
+from q2r2_control.viewer.drawing import drawn
 from q2r2_control.viewer.history import tracking_error
 
 _REFRESH_RATE = 6.0  # [Hz]
-# The drawing thread gives the interpreter back to the control loop after this long [s].
-_SWITCH_INTERVAL = 2e-4
 _LIMITS_SHOWN = 4
 _NEAR = 0.01  # a pair with less to spare is coloured [m]
 
 
 class LiveTable:
-    """Shows the newest tick of a run. A separate thread draws; a tick only stores a reference."""
+    """Shows the newest tick of a run. A separate process draws; a tick only stores a reference."""
 
     def __init__(self, title: str, joints: Mapping[str, Collection[str]], bindings: BindingSettings) -> None:
         """``joints``: names of those that move each arm; ``bindings``: what the hands' controls do."""
@@ -52,13 +49,8 @@ class LiveTable:
     @contextmanager
     def shown(self, console: Console) -> Iterator[None]:
         """Show the table on ``console`` for as long as the context lasts."""
-        interval = sys.getswitchinterval()
-        sys.setswitchinterval(_SWITCH_INTERVAL)
-        try:
-            with Live(get_renderable=self.render, console=console, refresh_per_second=_REFRESH_RATE, transient=True):
-                yield
-        finally:
-            sys.setswitchinterval(interval)
+        with drawn(self.render, console, _REFRESH_RATE):
+            yield
 
     def render(self) -> Table:
         """The table at this moment."""

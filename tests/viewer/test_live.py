@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import io
-import sys
 from dataclasses import replace
 
-import pytest
 from rich.console import Console
 
 from q2r2_control.config.bindings import BindingSettings
@@ -56,18 +54,3 @@ def test_it_shows_every_limit_that_was_at_work_since_it_was_drawn_last(robot: Ro
 
 def test_before_the_first_tick_it_says_that_the_run_is_starting() -> None:
     assert "starting" in drawn(LiveTable("demo", JOINTS, BindingSettings()))
-
-
-def test_the_interpreters_switch_interval_is_as_before_after_a_fault() -> None:
-    interval = sys.getswitchinterval()
-    during = []
-
-    def fail() -> None:
-        with LiveTable("demo", JOINTS, BindingSettings()).shown(Console(file=io.StringIO())):
-            during.append(sys.getswitchinterval())
-            raise RuntimeError
-
-    with pytest.raises(RuntimeError):
-        fail()
-    assert during[0] < interval
-    assert sys.getswitchinterval() == interval
