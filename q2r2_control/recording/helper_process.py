@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 import os
-import signal
 import subprocess
 import sys
 import time
@@ -18,6 +17,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from q2r2_control.recording.helper import LONGEST_REASON, LONGEST_TOLD
+from q2r2_control.runtime.process import how_it_ended
 
 _STARTING = 6.0  # times as long a patience with a process that has not taken anything yet: imports take their time
 _LOOKS = 0.1  # between two looks at whether it gets on [s]
@@ -133,5 +133,4 @@ class HelperProcess:
 
     def _how(self, code: int) -> str:
         """How it ended where it said nothing."""
-        how = f"by {signal.Signals(-code).name}" if code < 0 else f"with exit code {code}"
-        return f"the process that {self._what} {'was ended' if code < 0 else 'ended'} {how}"
+        return how_it_ended(f"the process that {self._what}", code)

@@ -120,7 +120,8 @@ class TickPacker:
             asked = target.command
             led.append(asked is not None)
             targets += _NO_POSE if asked is None else pin.SE3ToXYZQUATtuple(asked)
-            hands += _NO_POSE if target.hand is None else pin.SE3ToXYZQUATtuple(target.hand)
+            position, rotation = target.filtered_hand or (_NO_POSE[:3], _NO_POSE[3:])
+            hands += *position, *rotation
         self._numbers.pack_into(
             self._row,
             0,

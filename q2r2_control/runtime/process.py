@@ -1,4 +1,4 @@
-"""Signals and garbage collection of the process that runs a control loop."""
+"""Signals and garbage collection of the process that runs a control loop, and how its helpers ended."""
 
 from __future__ import annotations
 
@@ -36,6 +36,11 @@ def stop_on_signals(stop: Callable[[], None]) -> Iterator[None]:
     finally:
         for number, handler in zip(signals, previous, strict=True):
             signal.signal(number, handler)
+
+
+def how_it_ended(what: str, code: int) -> str:
+    """In words, of a process ``what`` that ended with this exit ``code``, negative: by that signal."""
+    return f"{what} was ended by {signal.Signals(-code).name}" if code < 0 else f"{what} ended with exit code {code}"
 
 
 @contextmanager

@@ -154,7 +154,7 @@ class RunStatistics:
             if pose is not None and engaged[name]:
                 figures.engaged += dt
                 error = _error(pin.SE3ToXYZQUATtuple(tools[name]), pin.SE3ToXYZQUATtuple(pose))
-                if math.isfinite(error[0]):  # else nothing was measured
+                if math.isfinite(sum(error)):  # else nothing was measured
                     figures.ticks += 1
                     figures.position += error[0]
                     figures.rotation += error[1]
@@ -229,7 +229,7 @@ def _error(tool: tuple[float, ...], target: tuple[float, ...]) -> tuple[float, f
     x, y, z, a, b, c, w = tool
     to_x, to_y, to_z, to_a, to_b, to_c, to_w = target
     dx, dy, dz = to_x - x, to_y - y, to_z - z
-    half = math.acos(min(1.0, abs(a * to_a + b * to_b + c * to_c + w * to_w)))  # rounded to 1e-8 rad
+    half = math.acos(min(abs(a * to_a + b * to_b + c * to_c + w * to_w), 1.0))  # to 1e-7 rad; what is no number stays
     return dx * dx + dy * dy + dz * dz, 4.0 * half * half
 
 

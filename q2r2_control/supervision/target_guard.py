@@ -67,10 +67,11 @@ class TargetGuard:
 
     def reset(self, pose: pin.SE3 | None, now: float) -> None:
         """Rest at ``pose``, or at none, from ``now`` [s] on."""
-        self.pose, self._target, self._now = pose, None, now
+        self.pose, self._target, self._now = None, None, now
         if pose is not None:
             position, rotation = floats_of(pose)
             self._at = position, normalized(rotation)
+            self.pose = se3_of(self._at)
         self._linear.stop()
         self._angular.stop()
 

@@ -16,6 +16,8 @@ Then the reference goes on too, by the time that passed, up to 0.1 s; what is co
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from q2r2_control.types import LONGEST_DT, Array
@@ -49,8 +51,8 @@ class TickPacer:
         self.missed_ticks += max(round(gap / self.period) - 1, 0)
         if self._coasts:
             step = min(gap, LONGEST_DT)
-        elif max(map(abs, v.tolist())) * gap + 0.5 * self._fastest * gap * gap <= self._shortest:
-            step = gap  # no joint could use up the shortest way: told in a fifth of the time
+        elif math.hypot(*v.tolist()) * gap + 0.5 * self._fastest * gap * gap <= self._shortest:
+            step = gap  # not even all joints' speeds in one could use up the shortest way: told in a fifth of the time
         else:
             step = min(gap, max(self.period, self._longest(v)))
         self.stretched += gap - step

@@ -150,7 +150,9 @@ class RelativeMotion:
 
     def _turned_tool(self, hand: Quaternion) -> Quaternion:
         """The tool's rotation for that of the hand."""
-        if self._rotation_scale == 1.0:  # M R R0' M' Rtool0 = (M R M') (M R0' M' Rtool0), and the latter is known
+        # Not scaled, M R R0' M' Rtool0 = (M R M') (M R0' M' Rtool0), or Rtool0 M R0' R M' = (Rtool0 M R0' M') (M R M')
+        # in the tool's frame; what does not depend on R is known since the anchor.
+        if self._rotation_scale == 1.0:
             turn, tool = hand, self._turned_back
         else:
             back, tool = self._hand_back, self._tool_rotation

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import codecs
 import os
 import pty
-import select
 import signal
 import subprocess
 import sys
+import termios
+import threading
 import time
 from collections.abc import Iterator
-from contextlib import closing, contextmanager, redirect_stderr
+from contextlib import closing, contextmanager, redirect_stderr, redirect_stdout, suppress
 from typing import Any, TextIO
 
 import pytest
@@ -24,30 +26,36 @@ _DEADLINE = 60.0  # a machine may be slow [s]
 
 
 class Terminal:
-    """What this process writes its errors to, and what has come out of it."""
+    """What this process writes its errors to, and what has come out of it, which a thread reads."""
 
     def __init__(self, reads: int, file: TextIO) -> None:
-        self._reads, self.file, self.text = reads, file, ""
+        self.reads, self.file, self.text = reads, file, ""
+        self._decoder = codecs.getincrementaldecoder("utf-8")()
+        threading.Thread(target=self._read, daemon=True).start()
 
     def read_until(self, expected: str) -> str:
         """All that came before it, and since the last one that was waited for."""
         end = time.monotonic() + _DEADLINE
         while expected not in self.text:
             assert time.monotonic() < end, f"{expected!r} did not come; {self.text!r} did"
-            if select.select([self._reads], [], [], 0.1)[0]:
-                self.text += os.read(self._reads, 65536).decode()
+            time.sleep(0.01)
         before, _, self.text = self.text.partition(expected)
         return before
+
+    def _read(self) -> None:
+        with suppress(OSError):  # when the test is over
+            while data := os.read(self.reads, 4096):
+                self.text += self._decoder.decode(data)
 
 
 @contextmanager
 def a_terminal(monkeypatch: pytest.MonkeyPatch) -> Iterator[Terminal]:
     """Within a test, since pytest gives its parts streams of its own."""
     monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setattr(drawing, "_PATIENCE", _DEADLINE)  # nothing depends on how busy the machine is
     reads, writes = pty.openpty()
     with open(writes, "w", encoding="utf-8") as file, redirect_stderr(file):
         yield Terminal(reads, file)
-    os.close(reads)
 
 
 class Counting:
@@ -77,15 +85,16 @@ def started(monkeypatch: pytest.MonkeyPatch) -> list[subprocess.Popen[bytes]]:
 
 
 def test_a_table_is_drawn_again_and_again_and_wiped_away_at_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    processes = started(monkeypatch)
     with a_terminal(monkeypatch) as terminal:
-        processes = started(monkeypatch)
         with drawn(Counting(), Console(stderr=True), 50.0):
             terminal.read_until("1 times.")
             terminal.read_until("3 times.")
             assert processes[0].poll() is None
         assert processes[0].returncode == 0
         print("the end", file=sys.stderr, flush=True)
-        assert "\x1b[2K" in terminal.read_until("the end"), "lines are cleared"
+        last = terminal.read_until("the end").rpartition("times.")[2]
+        assert last.count("\x1b[2K") >= 5, "all lines are cleared after the last drawing"
 
 
 def test_what_is_printed_comes_above_the_table_whole_and_in_order(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -93,67 +102,129 @@ def test_what_is_printed_comes_above_the_table_whole_and_in_order(monkeypatch: p
         with drawn(Counting(), Console(stderr=True), 50.0):
             terminal.read_until("1 times.")
             print("in two ", end="", file=sys.stderr)
-            print("parts", file=sys.stderr)
+            print("parts\r", file=sys.stderr)
             Console(stderr=True).print("[red]coloured[/]")
+            print("x" * 200, file=sys.stderr)
             print("no whole line", end="", file=sys.stderr)
             terminal.read_until("in two parts")
             terminal.read_until("\x1b[31mcoloured")
+            terminal.read_until("x" * 200)
         terminal.read_until("no whole line")
         assert sys.stderr is terminal.file
 
 
-def test_ctrl_c_is_for_the_run_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_the_terminal_cannot_show_is_shown_as_far_as_it_goes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PYTHONIOENCODING", "ascii")
+    with a_terminal(monkeypatch) as terminal, drawn(Counting(), Console(stderr=True), 50.0):
+        terminal.read_until("1 times.")
+        print("turned by Δ", file=sys.stderr)
+        terminal.read_until("turned by \\u0394")
+        terminal.read_until("times.")
+
+
+def test_ctrl_c_and_what_else_ends_the_run_is_for_the_run_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    processes = started(monkeypatch)
     with a_terminal(monkeypatch) as terminal:
-        processes = started(monkeypatch)
         with drawn(Counting(), Console(stderr=True), 50.0):
             processes[0].send_signal(signal.SIGINT)  # before it has begun
             terminal.read_until("1 times.")
-            processes[0].send_signal(signal.SIGINT)
+            for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+                processes[0].send_signal(number)
             terminal.read_until("3 times.")
         assert processes[0].returncode == 0
 
 
 def test_a_drawing_process_that_is_killed_is_a_line_and_nothing_is_lost(monkeypatch: pytest.MonkeyPatch) -> None:
+    processes = started(monkeypatch)
     with a_terminal(monkeypatch) as terminal:
-        processes = started(monkeypatch)
         with drawn(Counting(), Console(stderr=True), 50.0):
             terminal.read_until("1 times.")
+            processes[0].send_signal(signal.SIGSTOP)
+            print("handed over", file=sys.stderr)
+            time.sleep(0.1)  # most likely; if it is not yet, the test passes all the same
             processes[0].kill()
             terminal.read_until("\x1b[?25h")  # the cursor is there again
-            terminal.read_until("ended by SIGKILL; the run goes on without a table")
+            terminal.read_until("no live table any more: the process that draws it was ended by SIGKILL")
+            terminal.read_until("handed over")
             print("first", file=sys.stderr)
             terminal.read_until("first")
             print("last", file=sys.stderr)
         terminal.read_until("last")
 
 
+def test_a_table_that_cannot_be_made_is_a_line_and_what_is_printed_is_shown(monkeypatch: pytest.MonkeyPatch) -> None:
+    counting = Counting()
+
+    def make() -> Table:
+        if counting.made == 3:
+            raise ValueError("three")
+        return counting()
+
+    with a_terminal(monkeypatch) as terminal, drawn(make, Console(stderr=True), 50.0):
+        terminal.read_until("no live table any more: ValueError: three")
+        print("arms stopped", file=sys.stderr)
+        terminal.read_until("arms stopped")
+
+
 def test_one_that_cannot_begin_is_a_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    with a_terminal(monkeypatch) as terminal:
-        monkeypatch.setattr(sys, "executable", "/no/such/python")
-        with drawn(Counting(), Console(stderr=True), 50.0):
-            terminal.read_until("no live table: ")
-            assert sys.stderr is terminal.file
+    monkeypatch.setattr(sys, "executable", "/no/such/python")
+    with a_terminal(monkeypatch) as terminal, drawn(Counting(), Console(stderr=True), 50.0):
+        terminal.read_until("no live table: ")
+        assert sys.stderr is terminal.file
 
 
-def test_a_terminal_that_is_stopped_keeps_nothing_from_ending(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_terminal_that_its_user_has_stopped_keeps_no_run_from_ending(monkeypatch: pytest.MonkeyPatch) -> None:
+    processes = started(monkeypatch)
     with a_terminal(monkeypatch) as terminal:
-        processes = started(monkeypatch)
-        monkeypatch.setattr(drawing, "_PATIENCE", 0.1)
         with drawn(Counting(), Console(stderr=True), 1000.0):
             terminal.read_until("1 times.")
-            processes[0].send_signal(signal.SIGSTOP)
-        assert processes[0].returncode == -signal.SIGKILL
+            monkeypatch.setattr(drawing, "_PATIENCE", 0.2)
+            termios.tcflow(terminal.file.fileno(), termios.TCOOFF)
+            print("later", file=sys.stderr)
+        assert processes[0].poll() is not None
+        termios.tcflow(terminal.file.fileno(), termios.TCOON)
+        terminal.read_until("later")
 
 
 def test_a_fault_in_the_run_ends_the_drawing_and_leaves_the_streams_as_they_were(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    processes = started(monkeypatch)
     with a_terminal(monkeypatch) as terminal:
-        processes = started(monkeypatch)
-        with pytest.raises(RuntimeError), drawn(Counting(), Console(stderr=True), 50.0):
-            raise RuntimeError
+        kept = []
+
+        def fail() -> None:
+            with drawn(Counting(), Console(stderr=True), 50.0):
+                kept.append(sys.stderr)
+                raise RuntimeError
+
+        with pytest.raises(RuntimeError):
+            fail()
         assert processes[0].returncode == 0
         assert sys.stderr is terminal.file
+        print("afterwards", file=kept[0], flush=True)
+        terminal.file.flush()
+        terminal.read_until("afterwards")
+
+
+def test_what_prints_while_it_is_interrupted_by_what_prints_goes_on() -> None:
+    taken: list[str] = []
+
+    def take(line: str) -> None:
+        taken.append(line)
+        if line == "first":
+            lines.write("second\n")  # as a signal's handler or a finalizer may
+
+    lines = drawing._Lines(sys.stderr, take)
+    writer = threading.Thread(target=lines.write, args=("first\nthird\n",), daemon=True)
+    writer.start()
+    writer.join(_DEADLINE)
+    assert taken == ["first", "second", "third"]
+
+
+def test_a_program_without_standard_output_has_its_table_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    with a_terminal(monkeypatch) as terminal, redirect_stdout(None), drawn(Counting(), Console(stderr=True), 50.0):
+        terminal.read_until("1 times.")
 
 
 def test_a_console_that_is_no_terminal_is_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
