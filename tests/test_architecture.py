@@ -21,6 +21,7 @@ PACKAGE = "q2r2_control"
 # other.
 LEVELS = (
     {"_lazy", "errors", "types"},
+    {"quaternions"},
     {"config"},
     {"robot"},
     {"inputs", "teleop", "control"},

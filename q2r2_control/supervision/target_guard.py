@@ -8,8 +8,7 @@ import numpy as np
 import pinocchio as pin
 
 from q2r2_control.config.teleop import GuardSettings
-from q2r2_control.supervision.tick_pacer import TickPacer
-from q2r2_control.teleop.quaternions import (
+from q2r2_control.quaternions import (
     IDENTITY,
     Vector,
     floats_of,
@@ -18,6 +17,7 @@ from q2r2_control.teleop.quaternions import (
     turn_between,
     turned_by,
 )
+from q2r2_control.supervision.tick_pacer import TickPacer
 from q2r2_control.types import LONGEST_DT, Pose
 
 _REST = 1e-9  # slower than this is at rest [m/s, rad/s]

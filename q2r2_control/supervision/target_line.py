@@ -11,7 +11,7 @@ import math
 
 import pinocchio as pin
 
-from q2r2_control.teleop.quaternions import (
+from q2r2_control.quaternions import (
     Vector,
     floats_of,
     inverse,

@@ -9,6 +9,7 @@ import pinocchio as pin
 
 from q2r2_control.config.bindings import BUTTONS, Action, Gesture
 from q2r2_control.config.teleop import TeleopSettings
+from q2r2_control.quaternions import floats_of
 from q2r2_control.teleop.analog_gripper import AnalogGripper
 from q2r2_control.teleop.arm_states import ArmState, Cause, next_state
 from q2r2_control.teleop.carry import CarriedTools
@@ -16,7 +17,6 @@ from q2r2_control.teleop.gate import PoseGate
 from q2r2_control.teleop.gestures import GestureRecognizer, Press
 from q2r2_control.teleop.hand_motion import HandMotion, Shares
 from q2r2_control.teleop.held_controls import HeldControls
-from q2r2_control.teleop.quaternions import floats_of
 from q2r2_control.teleop.sag import Anchor
 from q2r2_control.teleop.workspace import Workspace
 from q2r2_control.types import Array, Event, HandSample, Pose

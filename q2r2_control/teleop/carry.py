@@ -13,7 +13,7 @@ from collections.abc import Mapping
 import numpy as np
 import pinocchio as pin
 
-from q2r2_control.teleop.quaternions import Vector, floats_of, se3_of
+from q2r2_control.quaternions import Vector, floats_of, se3_of
 from q2r2_control.teleop.workspace import Workspace
 from q2r2_control.types import LONGEST_DT, Array, Pose, pose_of
 

@@ -7,10 +7,10 @@ from typing import Protocol
 
 import pinocchio as pin
 
+from q2r2_control.quaternions import floats_of, se3_of
 from q2r2_control.teleop.arm import ArmTeleop
 from q2r2_control.teleop.arm_states import ArmState, Cause
 from q2r2_control.teleop.carry import GAIN, REMOTE_GAIN, CarriedTools, RelationKeeper
-from q2r2_control.teleop.quaternions import floats_of, se3_of
 from q2r2_control.teleop.remote_arm import RemoteArm
 
 CARRIES = "carries both tools"  # what the arm that leads is told

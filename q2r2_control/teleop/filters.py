@@ -7,7 +7,7 @@ takes the dt of each tick, so neither the headset's rate nor the loop's changes 
 Rotations are filtered as rotations, by their logarithm, so q and -q are the same and nothing is averaged over signs.
 
 All of this runs at every control tick, for vectors of three: sums of three floats cost a tenth of NumPy's calls. So
-positions are three floats in here and rotations four, see :mod:`quaternions`.
+positions are three floats in here and rotations four, see :mod:`q2r2_control.quaternions`.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from collections import deque
 from collections.abc import Sequence
 
 from q2r2_control.config.teleop import FilterSettings
-from q2r2_control.teleop.quaternions import IDENTITY, Quaternion, Vector, normalized, turn_between, turned_by
+from q2r2_control.quaternions import IDENTITY, Quaternion, Vector, normalized, turn_between, turned_by
 from q2r2_control.types import Pose
 
 # Closer samples are merged: over so short a time receipt jitter would look like speed [s].

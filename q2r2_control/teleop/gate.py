@@ -9,7 +9,7 @@ from operator import mul
 import numpy as np
 
 from q2r2_control.config.teleop import GateSettings
-from q2r2_control.teleop.quaternions import Quaternion
+from q2r2_control.quaternions import Quaternion
 from q2r2_control.types import HandSample, Pose
 
 # Beyond this, doubles no longer resolve a tenth of a nanometre, and no tracking system reaches as far [m].

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from q2r2_control.config.teleop import TeleopSettings
+from q2r2_control.quaternions import floats_of
 from q2r2_control.teleop.carry import CarriedTools, CarriedWorkspace
 from q2r2_control.teleop.filters import PoseFilter
 from q2r2_control.teleop.leash import Leash
-from q2r2_control.teleop.quaternions import floats_of
 from q2r2_control.teleop.relative import RelativeMotion
 from q2r2_control.teleop.rest import RestingPose
 from q2r2_control.teleop.speed_limit import SpeedLimit

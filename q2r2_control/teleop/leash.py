@@ -23,7 +23,7 @@ import math
 from typing import NamedTuple
 
 from q2r2_control.config.teleop import LeashSettings
-from q2r2_control.teleop.quaternions import Vector, turn_between, turned_by
+from q2r2_control.quaternions import Vector, turn_between, turned_by
 from q2r2_control.teleop.relative import RelativeMotion
 from q2r2_control.types import Pose
 

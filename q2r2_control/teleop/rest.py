@@ -12,7 +12,7 @@ import math
 from collections import deque
 from collections.abc import Sequence
 
-from q2r2_control.teleop.quaternions import IDENTITY, turn_between, turned_by
+from q2r2_control.quaternions import IDENTITY, turn_between, turned_by
 from q2r2_control.types import Pose
 
 # A hand rests while the mean of its newest samples is this near to that of all since it came to rest, and no sample is

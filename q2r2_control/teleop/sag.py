@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 import pinocchio as pin
 
-from q2r2_control.teleop.quaternions import floats_of
+from q2r2_control.quaternions import floats_of
 from q2r2_control.types import Array, Pose, moved_by
 
 # A tool that is farther from its command does not sag [m], [rad].

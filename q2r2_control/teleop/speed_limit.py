@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable
 
 from q2r2_control.config.teleop import SpeedLimitSettings
-from q2r2_control.teleop.quaternions import normalized, turn_between, turned_by
+from q2r2_control.quaternions import normalized, turn_between, turned_by
 from q2r2_control.types import LONGEST_DT, Pose
 
 

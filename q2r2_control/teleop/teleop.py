@@ -9,11 +9,11 @@ from functools import partial
 import pinocchio as pin
 
 from q2r2_control.config.teleop import TeleopSettings
+from q2r2_control.quaternions import se3_of
 from q2r2_control.teleop.arm import of_controls
 from q2r2_control.teleop.arm_states import FOLLOWING, HOLDING, ArmState, Cause
 from q2r2_control.teleop.both_arms import BothArms, Surroundings
 from q2r2_control.teleop.episode_marks import EpisodeMarks
-from q2r2_control.teleop.quaternions import se3_of
 from q2r2_control.teleop.remote_arm import RemoteArm
 from q2r2_control.types import ArmTarget, Event, HandSample
 

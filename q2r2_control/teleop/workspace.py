@@ -15,7 +15,7 @@ import math
 from itertools import starmap
 
 from q2r2_control.config.teleop import WorkspaceSettings
-from q2r2_control.teleop.quaternions import Vector
+from q2r2_control.quaternions import Vector
 from q2r2_control.types import Pose
 
 _TURNED = 1.5e-3  # the hand has turned, and does not only tremble [m]

@@ -10,8 +10,8 @@ import pinocchio as pin
 import pytest
 
 from q2r2_control.config.teleop import FilterSettings
+from q2r2_control.quaternions import floats_of, se3_of
 from q2r2_control.teleop.filters import PoseFilter
-from q2r2_control.teleop.quaternions import floats_of, se3_of
 from tests.teleop.hands import pose
 
 Path = Callable[[float], pin.SE3]

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from q2r2_control.config.teleop import GateSettings
+from q2r2_control.quaternions import se3_of
 from q2r2_control.teleop.gate import PoseGate
-from q2r2_control.teleop.quaternions import se3_of
 from q2r2_control.types import HandFault
 from tests.teleop.hands import pose, sample
 

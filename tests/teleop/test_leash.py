@@ -14,10 +14,10 @@ import pytest
 from q2r2_control.config import Config, load_config
 from q2r2_control.config.teleop import LeashSettings
 from q2r2_control.pipeline import Pipeline
+from q2r2_control.quaternions import floats_of, se3_of
 from q2r2_control.runtime.recorder import Tick
 from q2r2_control.runtime.run_summary import RunSummary
 from q2r2_control.teleop.leash import Leash
-from q2r2_control.teleop.quaternions import floats_of, se3_of
 from q2r2_control.teleop.relative import RelativeMotion
 from q2r2_control.types import Array
 from tests.support.hands_input import HandsInput

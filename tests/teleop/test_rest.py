@@ -10,8 +10,8 @@ import pinocchio as pin
 import pytest
 
 from q2r2_control.config.teleop import FilterSettings
+from q2r2_control.quaternions import floats_of, rotation_vector, se3_of
 from q2r2_control.teleop.filters import PoseFilter
-from q2r2_control.teleop.quaternions import floats_of, rotation_vector, se3_of
 from q2r2_control.teleop.rest import RestingPose
 from q2r2_control.types import SIDES, Array, HandSample, Pose
 from tests.teleop.hands import PAUSED, Operator, operator, pose

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pinocchio as pin
 
-from q2r2_control.teleop.quaternions import se3_of
+from q2r2_control.quaternions import se3_of
 from q2r2_control.teleop.sag import MOST_SAG, expected, sagged
 from q2r2_control.types import SIDES, Array
 from tests.teleop.hands import Operator, engaged, operator, squeezing, waving

@@ -9,7 +9,7 @@ import pinocchio as pin
 import pytest
 
 from q2r2_control.config.teleop import SpeedLimitSettings
-from q2r2_control.teleop.quaternions import floats_of
+from q2r2_control.quaternions import floats_of
 from q2r2_control.teleop.speed_limit import SpeedLimit
 from tests.teleop.hands import TICK, engaged, pose, waving
 

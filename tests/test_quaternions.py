@@ -8,7 +8,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from q2r2_control.teleop.quaternions import (
+from q2r2_control.quaternions import (
     Quaternion,
     inverse,
     normalized,
