@@ -23,7 +23,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from q2r2_control.control.jit import Held, kernel, lean_kernel
+from q2r2_control.control.jit import Held, borrowed, kernel
 from q2r2_control.control.tasks.frame import ROTATION_LENGTH
 from q2r2_control.types import Array
 
@@ -84,7 +84,7 @@ def step_admittance(held_model: Held, held_data: Held, measured: int, dt: float)
 
     ``measured``: TOUCHED with ``tau`` and ``J`` filled in, NOT_MEASURED for no touch, UNUSABLE to hold the wrench.
     """
-    model, arms = held_model.value, held_data.value
+    model, arms = borrowed(held_model), borrowed(held_data)
     share = 1.0 - np.exp(-dt / model.filter_time) if model.filter_time > 0.0 else 1.0
     for i in range(arms.x.shape[0]):
         if measured == TOUCHED:
@@ -106,7 +106,7 @@ def step_admittance(held_model: Held, held_data: Held, measured: int, dt: float)
                 arms.v[i] = 0.0
 
 
-@lean_kernel
+@kernel
 def _displace(model: AdmittanceModel, part: int, wrench: Array, x: Array, v: Array, dt: float) -> bool:
     """Move three of the six components; whether they are as good as zero and stay so."""
     first = 3 * part
@@ -134,12 +134,12 @@ def _displace(model: AdmittanceModel, part: int, wrench: Array, x: Array, v: Arr
     return still
 
 
-@lean_kernel
+@kernel
 def _length(vector: Array, first: int) -> float:
     return np.sqrt(vector[first] ** 2 + vector[first + 1] ** 2 + vector[first + 2] ** 2)
 
 
-@lean_kernel
+@kernel
 def oscillate(x: float, v: float, frequency: float, damping_ratio: float, dt: float) -> tuple[float, float]:
     """Exact x and v after ``dt`` [s] of  x'' + 2 xi w x' + w^2 x = 0,  w the undamped ``frequency`` [rad/s]."""
     fall = damping_ratio * frequency
@@ -158,7 +158,7 @@ def oscillate(x: float, v: float, frequency: float, damping_ratio: float, dt: fl
     return (cosine + fall * sine) * x + sine * v, (cosine - fall * sine) * v - frequency**2 * sine * x
 
 
-@lean_kernel
+@kernel
 def estimate_wrench(J: Array, tau: Array, member: Array, square: Array, directions: Array, wrench: Array) -> None:
     """Least-squares wrench (6,) for joint torques ``tau`` (nv,) [Nm] of the joints that are ``member`` (nv,).
 
@@ -188,12 +188,12 @@ def estimate_wrench(J: Array, tau: Array, member: Array, square: Array, directio
             wrench[row] += _scale(row) * directions[row, k] * square[k, k]
 
 
-@lean_kernel
+@kernel
 def _scale(row: int) -> float:
     return 1.0 if row < 3 else ROTATION_LENGTH
 
 
-@lean_kernel
+@kernel
 def _diagonalise(square: Array, directions: Array) -> None:
     """Eigenvalues onto the diagonal of a symmetric matrix, eigenvectors into columns of ``directions``.
 
@@ -217,7 +217,7 @@ def _diagonalise(square: Array, directions: Array) -> None:
                 _rotate(square, directions, p, q)
 
 
-@lean_kernel
+@kernel
 def _rotate(square: Array, directions: Array, p: int, q: int) -> None:
     """Bring ``square[p, q]`` to zero by a rotation of rows and columns p and q."""
     if square[p, q] == 0.0:

@@ -17,9 +17,10 @@ from q2r2_control.compliance.impedance_terms import (
     task_inertia,
 )
 from q2r2_control.compliance.joint_dynamics import inverse_dynamics
-from q2r2_control.compliance.small_matrices import factorise, finite, solve_factor, times
+from q2r2_control.compliance.small_matrices import finite, solve_factor, times
+from q2r2_control.control.cholesky import factorise
 from q2r2_control.control.geometry.kinematics import IntArray, place
-from q2r2_control.control.jit import Held, inlined_kernel, kernel, lean_kernel
+from q2r2_control.control.jit import Held, borrowed, inlined_kernel, kernel
 from q2r2_control.control.tasks.frame import rotation_vector, tool_jacobian, tool_pose
 from q2r2_control.types import Array
 
@@ -33,12 +34,13 @@ def impedance_torque(held_model: Held, held_data: Held, change: float) -> int:
 
     Where the state, or what comes of it, is not finite, they are gravity's at the last usable posture.
     """
-    model, data = held_model.value, held_data.value
+    model, data = borrowed(held_model), borrowed(held_data)
     _exchange(data)
     if not (finite(data.inputs[0:2]) and _law(model, data) and finite(data.tau.reshape(1, -1))):
         _gravity(model, data)
         return HELD | _bound(model, data, change)
-    data.usable_q[:] = data.inputs[0]
+    for j in range(data.usable_q.shape[0]):
+        data.usable_q[j] = data.inputs[0, j]
     found = CLIPPED if data.clipped.any() else 0
     if data.repulsion.any():
         found |= REPELLED
@@ -48,7 +50,7 @@ def impedance_torque(held_model: Held, held_data: Held, change: float) -> int:
 @kernel
 def gravity_torque(held_model: Held, held_data: Held) -> None:
     """What bears the arms at rest at ``usable_q`` into ``tau``."""
-    _gravity(held_model.value, held_data.value)
+    _gravity(borrowed(held_model), borrowed(held_data))
 
 
 @inlined_kernel
@@ -64,7 +66,7 @@ def _exchange(data: ImpedanceData) -> None:
             references.a[j] = data.inputs[4, j]
 
 
-@lean_kernel
+@kernel
 def _law(model: ImpedanceModel, data: ImpedanceData) -> bool:
     """The torque of all arms, without bounds, into ``tau``; False where the numbers are too large for that."""
     q, v, references, dynamics = data.inputs[0], data.inputs[1], data.references, data.dynamics
@@ -84,7 +86,7 @@ def _law(model: ImpedanceModel, data: ImpedanceData) -> bool:
     return True
 
 
-@lean_kernel
+@kernel
 def _gravity(model: ImpedanceModel, data: ImpedanceData) -> None:
     place(model.chain, data.usable_q, data.measured.placements)
     still = data.no_motion

@@ -23,7 +23,7 @@ from q2r2_control.compliance.small_matrices import (
     root_times,
     times,
 )
-from q2r2_control.control.jit import lean_kernel
+from q2r2_control.control.jit import kernel
 from q2r2_control.control.tasks.frame import ROTATION_LENGTH
 from q2r2_control.types import Array
 
@@ -66,7 +66,7 @@ class TermScratch(NamedTuple):
         return cls(Scratch.empty(n), np.zeros(n), np.zeros(n), *sixes)
 
 
-@lean_kernel
+@kernel
 def clip_error(error: Array, position: float, rotation: float) -> bool:
     """Make each part of ``error`` (6,) no longer than ``position`` [m], ``rotation`` [rad]; whether it was longer."""
     nearer = position / max(_length(error[:3]), position)
@@ -77,12 +77,12 @@ def clip_error(error: Array, position: float, rotation: float) -> bool:
     return min(nearer, less) < 1.0
 
 
-@lean_kernel
+@kernel
 def _length(vector: Array) -> float:
     return np.sqrt(vector[0] ** 2 + vector[1] ** 2 + vector[2] ** 2)
 
 
-@lean_kernel
+@kernel
 def task_inertia(mobility: Array, scratch: TermScratch, out: Array) -> None:
     """Inertia Lambda (6, 6) that a hand at the tool feels, of its ``mobility`` J M^-1 J' (Khatib 1987, eq. 18).
 
@@ -94,7 +94,7 @@ def task_inertia(mobility: Array, scratch: TermScratch, out: Array) -> None:
     _invert_floored(mobility, 1.0 / _HEAVIEST, scratch, out)
 
 
-@lean_kernel
+@kernel
 def _invert_floored(A: Array, least: float, scratch: TermScratch, out: Array) -> None:
     """Inverse of a symmetric positive semidefinite A (6, 6) whose scaled eigenvalues are raised to ``least``.
 
@@ -119,7 +119,7 @@ def _invert_floored(A: Array, least: float, scratch: TermScratch, out: Array) ->
             out[i, j] *= _METRES[i] * _METRES[j]
 
 
-@lean_kernel
+@kernel
 def damp(stiffness: Array, inertia: Array, damping_ratio: float, rate: Array, scratch: TermScratch) -> None:
     """Make ``rate`` (n,) x' D x', D giving every mode of  inertia x'' + D x' + diag(stiffness) x = 0  the ratio xi.
 
@@ -144,14 +144,14 @@ def damp(stiffness: Array, inertia: Array, damping_ratio: float, rate: Array, sc
         rate[i] *= 2.0 * damping_ratio * root[i]
 
 
-@lean_kernel
+@kernel
 def _scale(inertia: Array, root: Array, out: Array) -> None:
     for i in range(inertia.shape[0]):
         for j in range(inertia.shape[0]):
             out[i, j] = inertia[i, j] / (root[i] * root[j])
 
 
-@lean_kernel
+@kernel
 def _root_times_nearly(A: Array, x: Array, vectors: Array, out: Array) -> None:
     """As :func:`root_times`, of an A that is positive definite but for rounding."""
     n = A.shape[0]
@@ -167,7 +167,7 @@ def _root_times_nearly(A: Array, x: Array, vectors: Array, out: Array) -> None:
             out[i] += share * vectors[i, k]
 
 
-@lean_kernel
+@kernel
 def take_consistent(J: Array, inertia: Array, acceleration: Array, torque: Array, scratch: TermScratch) -> None:
     """Make ``torque`` (n,) tau N tau, which accelerates no tool; ``acceleration`` (6,) is that of tau, J M^-1 tau.
 
@@ -177,7 +177,7 @@ def take_consistent(J: Array, inertia: Array, acceleration: Array, torque: Array
     _take(J, scratch.force, torque)
 
 
-@lean_kernel
+@kernel
 def take_kinematic(J: Array, torque: Array, scratch: TermScratch) -> None:
     """Make ``torque`` (n,) tau N tau, which balances no static force at the tool, J N = 0; needs no inertia.
 
@@ -193,7 +193,7 @@ def take_kinematic(J: Array, torque: Array, scratch: TermScratch) -> None:
     _take(J, scratch.force, torque)
 
 
-@lean_kernel
+@kernel
 def _take(J: Array, force: Array, torque: Array) -> None:
     """Take J' force away from ``torque``."""
     for k in range(J.shape[1]):
@@ -201,7 +201,7 @@ def _take(J: Array, force: Array, torque: Array) -> None:
             torque[k] -= J[i, k] * force[i]
 
 
-@lean_kernel
+@kernel
 def limit_repulsion(limits: PositionLimits, q: Array, v: Array, wanted: Array, out: Array) -> bool:
     """Torque (n,) [Nm] away from position limits into ``out``, of a spring that begins some way before each; if any.
 
@@ -220,7 +220,7 @@ def limit_repulsion(limits: PositionLimits, q: Array, v: Array, wanted: Array, o
     return pushes
 
 
-@lean_kernel
+@kernel
 def bound_torque(tau: Array, last: Array, limit: Array, change: float, saturated: BoolArray, late: BoolArray) -> bool:
     """Make ``last`` (n,) ``tau`` (n,) within +-``limit`` (n,) and no further than ``change`` from it, all [Nm].
 

@@ -14,7 +14,7 @@ import numpy as np
 import pinocchio as pin
 
 from q2r2_control.control.geometry.kinematics import Chain, Placements
-from q2r2_control.control.jit import inlined_kernel, lean_kernel
+from q2r2_control.control.jit import inlined_kernel, kernel
 from q2r2_control.types import Array
 
 
@@ -78,7 +78,7 @@ class Dynamics(NamedTuple):
         )
 
 
-@lean_kernel
+@kernel
 def inverse_dynamics(chain: Chain, bodies: Bodies, placements: Placements, v: Array, a: Array, out: Dynamics) -> None:
     """``out.tau`` that moves joints placed at a posture, at ``v``, with ``a`` (nv,), against gravity; and ``out.M``."""
     for k in range(3):

@@ -29,13 +29,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from q2r2_control.compliance.small_matrices import factorise, finite
+from q2r2_control.compliance.small_matrices import finite
+from q2r2_control.control.cholesky import factorise
 from q2r2_control.control.geometry.closest_points import clamp
 from q2r2_control.control.geometry.collision import CollisionData, CollisionModel, update_placements
 from q2r2_control.control.geometry.kinematics import IntArray
 from q2r2_control.control.geometry.pair_distance import at_least, distance_row, measure
 from q2r2_control.control.geometry.smooth_distance import measure_smooth
-from q2r2_control.control.jit import Held, kernel, lean_kernel
+from q2r2_control.control.jit import Held, borrowed, kernel
 from q2r2_control.types import Array
 
 _LONGEST_PERIOD = 0.002  # T [s]
@@ -94,7 +95,7 @@ def find_near(held_model: Held, held_data: Held) -> tuple[int, int, float]:
 
     Returns how many these are, the closest pair of all and its distance; -1 where q or v is not finite.
     """
-    model, data = held_model.value, held_data.value
+    model, data = borrowed(held_model), borrowed(held_data)
     if not finite(data.measured):
         return -1, 0, np.nan
     update_placements(model.collision, data.collision, data.measured[0])
@@ -120,7 +121,7 @@ def find_near(held_model: Held, held_data: Held) -> tuple[int, int, float]:
 @kernel
 def repulsion_torque(held_model: Held, held_data: Held, count: int) -> float:
     """Add up the torques of the ``count`` pairs found near; returns the energy stored in the wall [J]."""
-    model, data, v = held_model.value, held_data.value, held_data.value.measured[1]
+    model, data, v = borrowed(held_model), borrowed(held_data), borrowed(held_data).measured[1]
     depth, mobility, force = data.depth, data.mobility, data.force
     factorise(data.M)
     total = 0.0
@@ -154,7 +155,7 @@ def repulsion_torque(held_model: Held, held_data: Held, count: int) -> float:
     return energy
 
 
-@lean_kernel
+@kernel
 def _mobility(factor: Array, row: Array, out: Array) -> float:
     """Inverse of the effective mass along ``row``, g' M^-1 g = |L^-1 g|^2 [1/kg]."""
     total = 0.0

@@ -1,4 +1,4 @@
-"""Algebra of small matrices, compiled: products, and of positive definite ones Cholesky factor, inverse and root.
+"""Algebra of small matrices, compiled: products, and of positive definite ones inverse and root.
 
 For six to fourteen rows BLAS and LAPACK take several times as long to call as the work itself takes, most of all for
 eigenvalues. Nothing here raises: a matrix that is not positive definite, or not finite, is said to be none.
@@ -10,7 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from q2r2_control.control.jit import lean_kernel
+from q2r2_control.control.cholesky import factorise
+from q2r2_control.control.jit import kernel
 from q2r2_control.types import Array
 
 # Deviation from convergence from which a series is quicker than steps that square it.
@@ -22,7 +23,7 @@ _MOST_STEPS = 30
 _ROUNDING = 1e-16
 
 
-@lean_kernel
+@kernel
 def finite(rows: Array) -> bool:
     """Sums of squares are finite where all numbers are, and none is so large that it means nothing."""
     total = 0.0
@@ -32,7 +33,7 @@ def finite(rows: Array) -> bool:
     return np.isfinite(total)
 
 
-@lean_kernel
+@kernel
 def times(A: Array, x: Array, out: Array) -> None:
     """A x (n,) of A (n, k) and x (k,)."""
     for i in range(A.shape[0]):
@@ -42,28 +43,7 @@ def times(A: Array, x: Array, out: Array) -> None:
         out[i] = total
 
 
-@lean_kernel
-def factorise(A: Array) -> bool:
-    """Cholesky factor of a symmetric A, read from its upper triangle, into the lower one and the diagonal.
-
-    False where A is not positive definite; A is spoilt then.
-    """
-    for j in range(A.shape[0]):
-        diagonal = A[j, j]
-        for k in range(j):
-            diagonal -= A[j, k] * A[j, k]
-        if not diagonal > 0.0:
-            return False
-        A[j, j] = np.sqrt(diagonal)
-        for i in range(j + 1, A.shape[0]):
-            value = A[j, i]
-            for k in range(j):
-                value -= A[i, k] * A[j, k]
-            A[i, j] = value / A[j, j]
-    return True
-
-
-@lean_kernel
+@kernel
 def invert(A: Array, factor: Array, inverse: Array) -> bool:
     """``inverse`` of a symmetric A, and its Cholesky ``factor``; False where A is not positive definite.
 
@@ -94,7 +74,7 @@ def invert(A: Array, factor: Array, inverse: Array) -> bool:
     return True
 
 
-@lean_kernel
+@kernel
 def solve_factor(factor: Array, B: Array) -> None:
     """L^-1 B (n, k) in place, of the lower triangle and diagonal L of ``factor``."""
     for i in range(B.shape[0]):
@@ -107,7 +87,7 @@ def solve_factor(factor: Array, B: Array) -> None:
             B[i, j] /= factor[i, i]
 
 
-@lean_kernel
+@kernel
 def diagonalise(A: Array, vectors: Array) -> int:
     """Eigenvalues of a symmetric A (n, n) onto its diagonal, and their ``vectors`` (n, n) as columns; returns sweeps.
 
@@ -133,7 +113,7 @@ def diagonalise(A: Array, vectors: Array) -> int:
     return _MOST_STEPS
 
 
-@lean_kernel
+@kernel
 def _rotate(A: Array, vectors: Array, p: int, q: int) -> None:
     """One rotation that makes A[p, q] vanish."""
     ratio = (A[q, q] - A[p, p]) / (2.0 * A[p, q])
@@ -164,7 +144,7 @@ class Scratch(NamedTuple):
         return cls(np.zeros(n * n), np.zeros(n * n), np.zeros(n * n), np.zeros(n), np.zeros(n))
 
 
-@lean_kernel
+@kernel
 def root_times(A: Array, x: Array, scratch: Scratch) -> bool:
     """Make x (n,) X x, X being the symmetric positive definite root of A (n, n), X X = A; A is spoilt.
 
@@ -207,7 +187,7 @@ def root_times(A: Array, x: Array, scratch: Scratch) -> bool:
     return False
 
 
-@lean_kernel
+@kernel
 def _finish_root(M: Array, x: Array, scratch: Scratch) -> None:
     """Make x (n,) M^-1/2 x, of an M near I: the sum of (2k - 1)!! / (2k)!! (I - M)^k x."""
     n, term, turned = M.shape[0], scratch.vector, scratch.turned

@@ -17,11 +17,13 @@ from pathlib import Path
 from typing import Any
 
 import numba
-from numba.core import types
-from numba.experimental import structref
+import numba.extending
+import numpy as np
+import numpy.typing as npt
+from numba import types
 
 _ROOMS = ("control", "compliance")
-_COMPILED = re.compile(r"^@(lean_|inlined_)?kernel|\bNamedTuple\b|\bstructref\b", re.MULTILINE)
+_COMPILED = re.compile(r"^@(inlined_)?kernel|\bNamedTuple\b", re.MULTILINE)
 
 
 def compiled_sources() -> list[Path]:
@@ -49,45 +51,93 @@ _FOLDER = str(_cache_folder())
 
 # Set by Numba at run time, so no type checker knows its members.
 config: Any = numba.config
+extending: Any = numba.extending
 
 
-@structref.register
-class _HeldType(types.StructRef):
-    def preprocess_fields(self, fields: Any) -> Any:
-        return tuple((name, types.unliteral(kind)) for name, kind in fields)
+class _Pointer(types.Type):
+    """Kernels' type of a :class:`Held`."""
+
+    def __init__(self, pointee: Any) -> None:
+        self.pointee = pointee
+        super().__init__(name=f"Held({pointee})")
 
 
-class Held(structref.StructRefProxy):
-    """A named tuple of arrays behind one pointer: made by :func:`hold`, read in a kernel as ``held.value``.
+extending.register_model(_Pointer)(extending.models.OpaqueModel)
+
+
+class Held:
+    """A named tuple of arrays behind one pointer: made by :func:`hold`, read in a kernel by :func:`borrowed`.
 
     Handing a kernel fifty arrays costs more than the work it does; a pointer costs the same for any number.
     """
 
-    value: Any
+    __slots__ = ("address", "kind", "memory", "value")
 
-    def __new__(cls, value: Any) -> Held:
-        held: Held = structref.StructRefProxy.__new__(cls, value)
-        return held
+    def __init__(self, value: Any, memory: npt.NDArray[np.uint8]) -> None:
+        self.value = value  # whose arrays have to stay
+        self.memory = memory
+        self.address = memory.ctypes.data
+        self.kind = _Pointer(numba.typeof(value))
 
 
-structref.define_proxy(Held, _HeldType, ["value"])
+@extending.typeof_impl.register(Held)
+def _kind_of(held: Held, context: Any) -> _Pointer:
+    return held.kind
+
+
+@extending.unbox(_Pointer)
+def _unbox(kind: _Pointer, held: Any, context: Any) -> Any:
+    address = context.pyapi.object_getattr_string(held, "address")
+    pointer = context.pyapi.long_as_voidptr(address)
+    context.pyapi.decref(address)
+    return extending.NativeValue(pointer, is_error=context.pyapi.c_api_error())
+
+
+@extending.intrinsic
+def borrowed(typing_context: Any, held: Any) -> Any:
+    """What is ``held``, in a kernel. No reference is counted: the caller holds it as long as the kernel runs."""
+
+    def read(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        kind = context.get_data_type(held.pointee)
+        return context.unpack_value(builder, held.pointee, builder.bitcast(arguments[0], kind.as_pointer()))
+
+    return held.pointee(held), read
+
+
+@extending.intrinsic
+def _size(typing_context: Any, value: Any) -> Any:
+    """Bytes that a value takes."""
+
+    def count(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        size = context.get_abi_sizeof(context.get_data_type(value))
+        return context.get_constant(types.intp, size)
+
+    return types.intp(value), count
+
+
+@extending.intrinsic
+def _put(typing_context: Any, value: Any, memory: Any) -> Any:
+    """Write a value into an array of bytes."""
+
+    def write(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        to = context.make_array(memory)(context, builder, arguments[1]).data
+        kind = context.get_data_type(value)
+        context.pack_value(builder, value, arguments[0], builder.bitcast(to, kind.as_pointer()))
+
+    return types.void(value, memory), write
 
 
 def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Compile ``function`` at its first call; strict IEEE arithmetic, no Python objects, division by 0 gives inf."""
-    return _compiled(function)
+    """Compile ``function`` at its first call; strict IEEE arithmetic, no Python objects, division by 0 gives inf.
 
-
-def lean_kernel(function: Callable[..., Any]) -> Callable[..., Any]:
-    """A :func:`kernel` that allocates nothing, so that arrays pass through its calls without being counted.
-
-    Counting references to the twenty arrays of a call takes longer than measuring a pair of capsules.
+    It may allocate nothing, so that arrays pass through its calls without being counted: counting references to the
+    twenty arrays of a call takes longer than measuring a pair of capsules.
     """
     return _compiled(function, _nrt=False)
 
 
 def inlined_kernel(function: Callable[..., Any]) -> Callable[..., Any]:
-    """A :func:`lean_kernel` that becomes part of its callers: for a small one that is handed a whole model and data.
+    """A :func:`kernel` that becomes part of its callers: for a small one that is handed a whole model and data.
 
     Passing a hundred arrays that it does not read takes longer than its work.
     """
@@ -105,9 +155,20 @@ def _compiled(function: Callable[..., Any], **options: Any) -> Callable[..., Any
 
 
 @kernel
+def _size_of(value: Any) -> int:
+    return _size(value)
+
+
+@kernel
+def _write(value: Any, memory: npt.NDArray[np.uint8]) -> None:
+    _put(value, memory)
+
+
 def hold(value: Any) -> Held:
-    """Put ``value`` behind a pointer."""
-    return Held(value)
+    """Put ``value``, a named tuple of arrays, numbers and more of its kind, behind a pointer."""
+    memory = np.zeros(_size_of(value), dtype=np.uint8)
+    _write(value, memory)
+    return Held(value, memory)
 
 
 def bound(function: Callable[..., Any], *arguments: Any) -> Callable[..., Any]:

@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
-from q2r2_control.control.jit import Held, kernel, lean_kernel
+from q2r2_control.control.jit import Held, borrowed, kernel
 from q2r2_control.control.kernel_data import KernelData
 from q2r2_control.control.kernel_model import KernelModel
 from q2r2_control.control.safety.joint_limits import next_velocity_box
 from q2r2_control.control.safety.separation_rows import write_separation_rows
 from q2r2_control.control.tasks.frame import add_stretch_damping, add_tool_task, tool_jacobian, wanted_twist
 from q2r2_control.control.tasks.manipulability import add_manipulability
-from q2r2_control.control.tasks.posture import add_hold_task, add_posture_task, project_to_nullspace, pull_to_posture
+from q2r2_control.control.tasks.posture import (
+    add_hold_task,
+    add_posture_task,
+    factor_of_tools,
+    project_to_nullspace,
+    pull_to_posture,
+)
 from q2r2_control.control.tasks.swivel import turn_elbows, write_swivel_rows
 from q2r2_control.control.tasks.task_data import Targets
 
@@ -17,7 +23,7 @@ from q2r2_control.control.tasks.task_data import Targets
 @kernel
 def assemble(held_model: Held, held_targets: Held, held_data: Held, h: float) -> bool:
     """Cost, rows and box of a step of ``h`` [s] from an observed reference; False: a joint is outside its limits."""
-    model, targets, data = held_model.value, held_targets.value, held_data.value
+    model, targets, data = borrowed(held_model), borrowed(held_targets), borrowed(held_data)
     state, tasks = data.safety.state, data.tasks
     tasks.H[:] = 0.0
     tasks.g[:] = 0.0
@@ -28,17 +34,18 @@ def assemble(held_model: Held, held_targets: Held, held_data: Held, h: float) ->
             _follow(model, data, targets, i)
         else:
             add_hold_task(tasks, targets, i, state.q)
-    project_to_nullspace(tasks.J, tasks.posture)
+    factor_of_tools(tasks.J, tasks.tools_factor)
+    project_to_nullspace(tasks.J, tasks.tools_factor, tasks.tools_moved, tasks.posture)
     if model.tasks.has_swivels == 1:
         write_swivel_rows(model.tasks, tasks, targets)
-        project_to_nullspace(tasks.J, tasks.swivel.free)
+        project_to_nullspace(tasks.J, tasks.tools_factor, tasks.tools_moved, tasks.swivel.free)
         turn_elbows(model.tasks, tasks)
     add_posture_task(model.tasks, tasks)
     write_separation_rows(model.safety, data.safety, h)
     return next_velocity_box(model.safety.limits, state.q, state.v, h, data.safety.box)
 
 
-@lean_kernel
+@kernel
 def _follow(model: KernelModel, data: KernelData, targets: Targets, i: int) -> None:
     """Cost of tool ``i`` on the way to its target."""
     tasks, J = data.tasks, data.tasks.J[6 * i : 6 * i + 6]

@@ -7,7 +7,7 @@ import numpy as np
 from q2r2_control.control.geometry.collision import update_placements
 from q2r2_control.control.geometry.kinematics import IntArray
 from q2r2_control.control.geometry.pair_distance import at_least, measure
-from q2r2_control.control.jit import Held, kernel, lean_kernel
+from q2r2_control.control.jit import Held, borrowed, kernel
 from q2r2_control.control.kernel_data import KernelData
 from q2r2_control.control.kernel_model import KernelModel
 from q2r2_control.control.safety.safety_data import SafetyData
@@ -22,7 +22,7 @@ from q2r2_control.types import Array
 @kernel
 def start_reference(held_model: Held, held_data: Held) -> tuple[int, float, int, float, bool]:
     """Observe after a reset: what :func:`_observe` says, and whether the stop is known to keep all apart."""
-    model, data = held_model.value, held_data.value
+    model, data = borrowed(held_model), borrowed(held_data)
     closest, distance, tightest, margin = _observe(model, data)
     return closest, distance, tightest, margin, certify_start(model.safety, data.safety)
 
@@ -33,7 +33,7 @@ def observe_bodies(held_model: Held, held_data: Held, grown: IntArray) -> tuple[
 
     That is what :func:`certify_bodies` says: -1 where the bodies may be as they are.
     """
-    model, data = held_model.value, held_data.value
+    model, data = borrowed(held_model), borrowed(held_data)
     closest, distance, tightest, margin = _observe(model, data)
     return closest, distance, tightest, margin, certify_bodies(model.safety, data.safety, grown)
 
@@ -46,7 +46,7 @@ def move_reference(
 
     Returns its outcome, what :func:`_observe` says of the new state, and the largest violation of a row [rad/s].
     """
-    model, data = held_model.value, held_data.value
+    model, data = borrowed(held_model), borrowed(held_data)
     outcome, slack = apply_safety_filter(model.safety, data.safety, solution, usable, h, share)
     closest, distance, tightest, margin = _observe(model, data)
     return outcome, closest, distance, tightest, margin, slack
@@ -55,7 +55,7 @@ def move_reference(
 @kernel
 def spare_distance(held_model: Held, held_data: Held, pairs: IntArray) -> float:
     """The least that some ``pairs`` (p,) have to spare at the reference [m]: their distance less what they keep."""
-    model, data = held_model.value.safety, held_data.value.safety
+    model, data = borrowed(held_model).safety, borrowed(held_data).safety
     least = np.inf
     for p in pairs:
         if at_least(model.collision, data.collision, p) - model.min_distance[p] < least:
@@ -63,7 +63,7 @@ def spare_distance(held_model: Held, held_data: Held, pairs: IntArray) -> float:
     return least
 
 
-@lean_kernel
+@kernel
 def _observe(model: KernelModel, data: KernelData) -> tuple[int, float, int, float]:
     """Tool poses and distances at the reference.
 
@@ -83,7 +83,7 @@ def _observe(model: KernelModel, data: KernelData) -> tuple[int, float, int, flo
     return closest, safety.distance[closest], tightest, margin
 
 
-@lean_kernel
+@kernel
 def _tightest(model: SafetyModel, data: SafetyData) -> int:
     """The pair with the least margin. What is a lower bound of a distance is measured until the least one is none."""
     while True:

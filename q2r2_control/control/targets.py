@@ -8,7 +8,7 @@ import numpy as np
 import pinocchio as pin
 
 from q2r2_control.config.control import ControllerSettings
-from q2r2_control.control.jit import Held, bound, hold, kernel, lean_kernel
+from q2r2_control.control.jit import Held, borrowed, bound, hold, kernel
 from q2r2_control.control.tasks.frame import rotation_vector
 from q2r2_control.control.tasks.task_data import PoseScratch, Targets
 from q2r2_control.control.tasks.task_model import TaskModel
@@ -91,7 +91,7 @@ def take_targets(held_targets: Held, q: Array, v: Array, dt: float) -> bool:
 
     What is no pose is marked so in ``targets.offered``.
     """
-    targets = held_targets.value
+    targets = borrowed(held_targets)
     all_usable = True
     for i in range(targets.offered.shape[0]):
         if targets.offered[i] == _POSE and _take_pose(targets, i, dt):
@@ -109,7 +109,7 @@ def take_targets(held_targets: Held, q: Array, v: Array, dt: float) -> bool:
     return all_usable
 
 
-@lean_kernel
+@kernel
 def _hold(targets: Targets, i: int, q: Array, v: Array) -> None:
     """A moving arm is braked first and holds where it comes to rest, so that it need not come back."""
     speed = 0.0
@@ -121,7 +121,7 @@ def _hold(targets: Targets, i: int, q: Array, v: Array) -> None:
         targets.latched[i] = 1
 
 
-@lean_kernel
+@kernel
 def _take_pose(targets: Targets, i: int, dt: float) -> bool:
     """Make the offered homogeneous pose the target of arm ``i``; False, and no change, if it is not a finite pose.
 
@@ -154,12 +154,12 @@ def _take_pose(targets: Targets, i: int, dt: float) -> bool:
     return True
 
 
-@lean_kernel
+@kernel
 def _size(vector: Array) -> float:
     return np.sqrt(vector[0] * vector[0] + vector[1] * vector[1] + vector[2] * vector[2])
 
 
-@lean_kernel
+@kernel
 def _times_transposed(A: Array, B: Array, product: Array) -> None:
     """A B' of two 3 by 3 matrices."""
     for i in range(3):
@@ -167,7 +167,7 @@ def _times_transposed(A: Array, B: Array, product: Array) -> None:
             product[i, j] = A[i, 0] * B[j, 0] + A[i, 1] * B[j, 1] + A[i, 2] * B[j, 2]
 
 
-@lean_kernel
+@kernel
 def _checked_pose(pose: Array, scratch: PoseScratch) -> bool:
     """Split a pose (4, 4) into ``scratch``, its rotation made orthonormal; False if not finite or no rotation."""
     rotation, translation, gram = scratch.rotation, scratch.translation, scratch.gram

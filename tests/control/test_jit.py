@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import ast
+import gc
 import shutil
 import subprocess
 import sys
@@ -10,7 +11,7 @@ import numpy as np
 import pytest
 
 from q2r2_control.control import jit
-from q2r2_control.control.jit import bound, hold, kernel
+from q2r2_control.control.jit import borrowed, bound, hold, kernel
 from q2r2_control.types import Array
 
 
@@ -137,9 +138,31 @@ def test_what_is_held_stays_the_callers_own_array() -> None:
     np.testing.assert_array_equal(values, [14.0, 2.0, 4.0])
 
 
+def test_what_is_held_lives_as_long_as_it_is_held_and_no_longer() -> None:
+    values = np.arange(3.0)
+    before = sys.getrefcount(values)
+    held = hold((values,))
+    for _ in range(100):
+        _double_held(held)
+    assert sys.getrefcount(values) == before + 1
+    del held
+    assert sys.getrefcount(values) == before
+
+
+def test_what_is_held_outlives_its_maker() -> None:
+    held = hold((np.ones(100_000),))
+    gc.collect()
+    elsewhere = [np.full(100_000, 5.0) for _ in range(10)]
+    _double_held(held)
+    np.testing.assert_array_equal(held.value[0], 2.0)
+    assert all((array == 5.0).all() for array in elsewhere)
+
+
 @kernel
 def _double_held(held: jit.Held) -> None:
-    held.value[0][:] *= 2.0
+    (values,) = borrowed(held)
+    for i in range(values.shape[0]):
+        values[i] *= 2.0
 
 
 def test_bound_machine_code_is_the_kernel_s_and_has_run_once() -> None:

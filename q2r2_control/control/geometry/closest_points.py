@@ -9,25 +9,25 @@ from __future__ import annotations
 
 import numpy as np
 
-from q2r2_control.control.jit import lean_kernel
+from q2r2_control.control.jit import kernel
 from q2r2_control.types import Array
 
 _TINY = 1e-12
 
 
-@lean_kernel
+@kernel
 def dot(a: Array, b: Array) -> float:
     """Scalar product of two 3-vectors."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-@lean_kernel
+@kernel
 def clamp(value: float, lower: float, upper: float) -> float:
     """``value`` moved into ``[lower, upper]``."""
     return min(max(value, lower), upper)
 
 
-@lean_kernel
+@kernel
 def segment_segment(a0: Array, a1: Array, b0: Array, b1: Array, on_a: Array, on_b: Array) -> float:
     """Distance [m] of segments a0-a1 and b0-b1, each (3,); writes the closest points into ``on_a`` and ``on_b``.
 
@@ -79,7 +79,7 @@ def segment_segment(a0: Array, a1: Array, b0: Array, b1: Array, on_a: Array, on_
     return np.sqrt(square)
 
 
-@lean_kernel
+@kernel
 def _middle_of_overlap(aa: float, ab: float, ar: float, bb: float) -> float:
     """Parameter on a of the middle of what b covers of it, for parallel segments."""
     first = -ar / aa  # of b0 on a
@@ -89,7 +89,7 @@ def _middle_of_overlap(aa: float, ab: float, ar: float, bb: float) -> float:
     return 0.5 * (low + high)
 
 
-@lean_kernel
+@kernel
 def segment_box(a0: Array, a1: Array, half: Array, on_a: Array, on_box: Array, normal: Array) -> float:
     """Signed distance [m] of a segment and a box of half sides ``half``, all in the box frame, (3,).
 
@@ -112,7 +112,7 @@ def segment_box(a0: Array, a1: Array, half: Array, on_a: Array, on_box: Array, n
     return _push_out(a0, a1, half, on_a, on_box, normal)
 
 
-@lean_kernel
+@kernel
 def _slope_along(a0: Array, a1: Array, half: Array, s: float) -> float:
     """Half the derivative of the squared distance at parameter s."""
     slope = 0.0
@@ -123,7 +123,7 @@ def _slope_along(a0: Array, a1: Array, half: Array, s: float) -> float:
     return slope
 
 
-@lean_kernel
+@kernel
 def _minimum_along(a0: Array, a1: Array, half: Array) -> float:
     """Parameter of the minimum; where many share it (a segment along a face) the middle of them.
 
@@ -165,7 +165,7 @@ def _minimum_along(a0: Array, a1: Array, half: Array) -> float:
     return low - low_slope * (high - low) / (high_slope - low_slope)
 
 
-@lean_kernel
+@kernel
 def _push_out(a0: Array, a1: Array, half: Array, on_a: Array, on_box: Array, normal: Array) -> float:
     """Least way out of the box for a segment that enters it.
 
@@ -208,7 +208,7 @@ def _push_out(a0: Array, a1: Array, half: Array, on_a: Array, on_box: Array, nor
     return -best
 
 
-@lean_kernel
+@kernel
 def _depth_across(a0: Array, a1: Array, half: Array, k: int, least: float, normal: Array) -> float:
     """Way out of the box across its edges along axis ``k``; ``normal`` leads from the segment into the box."""
     i, j = (k + 1) % 3, (k + 2) % 3
@@ -228,7 +228,7 @@ def _depth_across(a0: Array, a1: Array, half: Array, k: int, least: float, norma
     return half[i] * abs(x) + half[j] * abs(y) - abs(along)
 
 
-@lean_kernel
+@kernel
 def _across_edge(a0: Array, a1: Array, half: Array, k: int, on_a: Array, on_box: Array, normal: Array) -> None:
     """Where the segment passes the edge along axis ``k`` that it leaves the box across, against ``normal``."""
     i, j = (k + 1) % 3, (k + 2) % 3

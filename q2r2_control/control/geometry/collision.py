@@ -13,7 +13,7 @@ import numpy as np
 import pinocchio as pin
 
 from q2r2_control.control.geometry.kinematics import Chain, IntArray, Placements, chain_of, place
-from q2r2_control.control.jit import lean_kernel
+from q2r2_control.control.jit import kernel
 from q2r2_control.errors import RobotError
 from q2r2_control.robot.robot import Robot
 from q2r2_control.robot.turning_fingers import TurningBody
@@ -198,14 +198,14 @@ def pairs_of(
     return pairs
 
 
-@lean_kernel
+@kernel
 def update_placements(model: CollisionModel, data: CollisionData, q: Array) -> None:
     """Joint frames and geometries in the world at ``q`` (nv,)."""
     place(model.chain, q, data.placements)
     _pose_bodies(model.bodies, data.placements, data.posed)
 
 
-@lean_kernel
+@kernel
 def _pose_bodies(bodies: Bodies, placements: Placements, posed: Posed) -> None:
     """Move every geometry to the world."""
     for g in range(bodies.joint.shape[0]):

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 import pinocchio as pin
 
-from q2r2_control.control.jit import lean_kernel
+from q2r2_control.control.jit import kernel
 from q2r2_control.errors import RobotError
 from q2r2_control.types import Array
 
@@ -70,7 +70,7 @@ def chain_of(model: pin.Model) -> Chain:
     )
 
 
-@lean_kernel
+@kernel
 def place(chain: Chain, q: Array, placements: Placements) -> None:
     """World placement of every joint frame at ``q`` (nv,)."""
     for i in range(1, chain.parent.shape[0]):

@@ -10,7 +10,7 @@ import numpy as np
 
 from q2r2_control.control.geometry.closest_points import dot, segment_box, segment_segment
 from q2r2_control.control.geometry.collision import CollisionData, CollisionModel, Contact
-from q2r2_control.control.jit import inlined_kernel, lean_kernel
+from q2r2_control.control.jit import inlined_kernel, kernel
 from q2r2_control.types import Array
 
 
@@ -58,7 +58,7 @@ def measure_part(model: CollisionModel, data: CollisionData, p: int, start: Arra
     return cores - bodies.radius[first] - bodies.radius[second]
 
 
-@lean_kernel
+@kernel
 def _to_box(start: Array, end: Array, centre: Array, axes: Array, half: Array, contact: Contact) -> float:
     """Signed distance [m] of a segment and a box, of which ``axes`` (3, 3) and ``half`` sides (3,) are given."""
     local = contact.local
@@ -81,7 +81,7 @@ def _to_box(start: Array, end: Array, centre: Array, axes: Array, half: Array, c
     return distance
 
 
-@lean_kernel
+@kernel
 def _to_segment(start: Array, end: Array, other_start: Array, other_end: Array, contact: Contact) -> float:
     """Distance [m] of two segments."""
     distance = segment_segment(start, end, other_start, other_end, contact.first, contact.second)
@@ -93,7 +93,7 @@ def _to_segment(start: Array, end: Array, other_start: Array, other_end: Array, 
     return distance
 
 
-@lean_kernel
+@kernel
 def _any_normal(a0: Array, a1: Array, b0: Array, b1: Array, normal: Array) -> None:
     """A unit normal for segments that touch: across both, or between their middles if they are parallel."""
     between = 0.0
@@ -111,7 +111,7 @@ def _any_normal(a0: Array, a1: Array, b0: Array, b1: Array, normal: Array) -> No
         normal[k] /= size
 
 
-@lean_kernel
+@kernel
 def distance_row(model: CollisionModel, data: CollisionData, p: int, row: Array) -> None:
     """Gradient of pair ``p``'s distance with respect to q into ``row`` (nv,) [m/rad], as measured last."""
     chain, pairs, placements, contact = model.chain, model.pairs, data.placements, data.contact

@@ -17,13 +17,13 @@ import numpy as np
 
 from q2r2_control.control.geometry.closest_points import clamp
 from q2r2_control.control.geometry.collision import CollisionData, CollisionModel, Contact, Posed
-from q2r2_control.control.jit import lean_kernel
+from q2r2_control.control.jit import kernel
 from q2r2_control.types import Array
 
 _HALVINGS = 40
 
 
-@lean_kernel
+@kernel
 def measure_smooth(model: CollisionModel, data: CollisionData, p: int, smoothing: float) -> float:
     """Smooth signed distance [m] of pair ``p``, whose cores are apart; fills ``data.contact`` for the row.
 
@@ -41,7 +41,7 @@ def measure_smooth(model: CollisionModel, data: CollisionData, p: int, smoothing
     return core - bodies.radius[first] - bodies.radius[second]
 
 
-@lean_kernel
+@kernel
 def _segment_segment(a0: Array, a1: Array, b0: Array, b1: Array, smoothing: float, contact: Contact) -> float:
     """D of two segments; the quadratic is strictly convex, so no case is degenerate (compare closest_points.py)."""
     aa = smoothing
@@ -71,7 +71,7 @@ def _segment_segment(a0: Array, a1: Array, b0: Array, b1: Array, smoothing: floa
     return np.sqrt(square)
 
 
-@lean_kernel
+@kernel
 def _segment_box(
     a0: Array, a1: Array, posed: Posed, half: Array, box: int, smoothing: float, contact: Contact
 ) -> float:

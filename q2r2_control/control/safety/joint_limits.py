@@ -29,7 +29,7 @@ import numpy as np
 
 from q2r2_control.control.geometry.closest_points import clamp
 from q2r2_control.control.geometry.kinematics import IntArray
-from q2r2_control.control.jit import lean_kernel
+from q2r2_control.control.jit import kernel
 from q2r2_control.types import Array
 
 # Inward speed per radian outside, and how far inside the return aims so that it ends after finite time.
@@ -63,7 +63,7 @@ class VelocityBox(NamedTuple):
         return cls(np.zeros(nv), np.zeros(nv), np.zeros(nv, dtype=np.int64), np.zeros(nv, dtype=np.int64))
 
 
-@lean_kernel
+@kernel
 def fastest_towards(room: float, v: float, a: float, h: float, longest: float, return_speed: float) -> float:
     """Largest next velocity towards a limit [rad/s] that keeps P, given the ``room`` to it [rad]; see the proof above.
 
@@ -79,7 +79,7 @@ def fastest_towards(room: float, v: float, a: float, h: float, longest: float, r
     return 2.0 * remaining / (c + np.sqrt(c * c + 2.0 * remaining / a))
 
 
-@lean_kernel
+@kernel
 def next_velocity_box(limits: JointLimits, q: Array, v: Array, h: float, box: VelocityBox) -> bool:
     """Fill ``box`` for a step of ``h`` from ``q`` [rad] and ``v`` [rad/s], (nv,) each.
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from q2r2_control.control.geometry.closest_points import clamp
 from q2r2_control.control.geometry.kinematics import IntArray
-from q2r2_control.control.jit import lean_kernel
+from q2r2_control.control.jit import kernel
 from q2r2_control.control.safety.joint_limits import ACCELERATION, NO_LIMIT
 from q2r2_control.control.safety.safety_data import SafetyData
 from q2r2_control.control.safety.safety_model import SafetyModel
@@ -24,7 +24,7 @@ _BISECTIONS = 4
 _ACTIVE = 1e-7  # [rad/s] from a bound
 
 
-@lean_kernel
+@kernel
 def apply_safety_filter(
     model: SafetyModel, data: SafetyData, solution: Array, usable: bool, h: float, share: float
 ) -> tuple[int, float]:
@@ -58,7 +58,7 @@ def apply_safety_filter(
     return outcome, slack
 
 
-@lean_kernel
+@kernel
 def certify_start(model: SafetyModel, data: SafetyData) -> bool:
     """Whether a full stop from the reference as it is keeps all apart; it becomes the stop that is at hand.
 
@@ -76,7 +76,7 @@ def certify_start(model: SafetyModel, data: SafetyData) -> bool:
     return attempt < SHAPES
 
 
-@lean_kernel
+@kernel
 def certify_bodies(model: SafetyModel, data: SafetyData, grown: IntArray) -> int:
     """Whether bodies may be as they are now, some of them having ``grown`` (g,) since the reference was certified.
 
@@ -109,14 +109,14 @@ def certify_bodies(model: SafetyModel, data: SafetyData, grown: IntArray) -> int
     return data.unproven[0]
 
 
-@lean_kernel
+@kernel
 def _keep_stop(data: SafetyData) -> None:
     """The candidate's stop is the one that is at hand."""
     for j in range(data.candidate.v.shape[0]):
         data.certified[j] = data.candidate.deceleration[j]
 
 
-@lean_kernel
+@kernel
 def _largest_certified(model: SafetyModel, data: SafetyData, h: float) -> int:
     """Make the wanted velocities the candidate if they can be certified, else the most of them that can.
 
@@ -144,7 +144,7 @@ def _largest_certified(model: SafetyModel, data: SafetyData, h: float) -> int:
     return REDUCED
 
 
-@lean_kernel
+@kernel
 def _certify_mixture(model: SafetyModel, data: SafetyData, share: float, h: float, together: bool) -> bool:
     """Whether some shape of stop proves a mixture, which becomes the candidate.
 
@@ -160,7 +160,7 @@ def _certify_mixture(model: SafetyModel, data: SafetyData, share: float, h: floa
     return False
 
 
-@lean_kernel
+@kernel
 def _mix(data: SafetyData, share: float, h: float) -> None:
     """Candidate between the certified stop and the wanted velocities."""
     state, candidate = data.state, data.candidate
@@ -170,7 +170,7 @@ def _mix(data: SafetyData, share: float, h: float) -> None:
         candidate.q[j] = state.q[j] + 0.5 * h * (state.v[j] + candidate.v[j])
 
 
-@lean_kernel
+@kernel
 def _note_active(data: SafetyData) -> float:
     """List the limits and pairs that the new velocities meet; returns the largest violation of a row [rad/s]."""
     v, box, rows, active = data.state.v, data.box, data.rows, data.active
@@ -199,7 +199,7 @@ def _note_active(data: SafetyData) -> float:
     return slack
 
 
-@lean_kernel
+@kernel
 def _note_too_close(model: SafetyModel, data: SafetyData) -> None:
     """List the pairs that were too close when nothing could be certified: they hold the arms."""
     active = data.active

@@ -28,7 +28,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from q2r2_control.control.geometry.collision import Bodies, CollisionData, CollisionModel, Pairs, Posed
-from q2r2_control.control.jit import inlined_kernel, lean_kernel
+from q2r2_control.control.jit import inlined_kernel, kernel
 from q2r2_control.control.safety.safety_data import Piece
 from q2r2_control.types import Array
 
@@ -45,7 +45,7 @@ class Gap(NamedTuple):
     then_loose: float
 
 
-@lean_kernel
+@kernel
 def stays_beyond(
     model: CollisionModel, data: CollisionData, p: int, piece: Piece, length: float, threshold: float
 ) -> bool:
@@ -56,7 +56,7 @@ def stays_beyond(
     return stay_beyond(model, data, p, piece, length, piece, 0.0, threshold)
 
 
-@lean_kernel
+@kernel
 def stay_beyond(
     model: CollisionModel,
     data: CollisionData,
@@ -85,7 +85,7 @@ def stay_beyond(
     return True
 
 
-@lean_kernel
+@kernel
 def curvature(pairs: Pairs, p: int, travel: Array, then: Array, share: float) -> float:
     """K_1 + K_2 [m] of ways ``travel`` and a ``share`` of ``then``, (nv,) each.
 
@@ -108,7 +108,7 @@ def curvature(pairs: Pairs, p: int, travel: Array, then: Array, share: float) ->
     return total
 
 
-@lean_kernel
+@kernel
 def _write_edge(bodies: Bodies, posed: Posed, box: int, number: int, out: Array) -> None:
     """Ends of one of a box's four edges along its third axis, into the first two rows of ``out``."""
     for k in range(3):
@@ -121,7 +121,7 @@ def _write_edge(bodies: Bodies, posed: Posed, box: int, number: int, out: Array)
         out[1, k] = middle + half
 
 
-@lean_kernel
+@kernel
 def _gaps(
     model: CollisionModel, data: CollisionData, p: int, side: float, start: Array, end: Array, piece: Piece, then: Piece
 ) -> tuple[Gap, Gap]:
@@ -167,7 +167,7 @@ def _gaps(
     )
 
 
-@lean_kernel
+@kernel
 def _all_open(
     start: Gap, end: Gap, other_start: Gap, other_end: Gap, needed: float, length: float, then_length: float
 ) -> bool:
@@ -195,7 +195,7 @@ def _opens(corner: Gap, other: Gap, needed: float, length: float, then_length: f
     return least + corner.then_loose + other.then_loose >= 0.0
 
 
-@lean_kernel
+@kernel
 def _least_on_the_way(value: float, rate: float, change: float, h: float) -> float:
     """Minimum of value + rate t + change t^2 / 2 over t in [0, h]."""
     least = min(value, value + rate * h + 0.5 * change * h * h)

@@ -42,7 +42,7 @@ import numpy as np
 from q2r2_control.control.geometry.closest_points import segment_segment
 from q2r2_control.control.geometry.collision import CollisionData
 from q2r2_control.control.geometry.pair_distance import at_least, distance_row, measure, measure_part
-from q2r2_control.control.jit import inlined_kernel, lean_kernel
+from q2r2_control.control.jit import inlined_kernel, kernel
 from q2r2_control.control.safety.safety_data import INSTANTS, SafetyData
 from q2r2_control.control.safety.safety_model import SafetyModel
 from q2r2_control.control.safety.separating_plane import curvature
@@ -72,7 +72,7 @@ _STRAIGHT = 1e-5  # [m]
 _CATCH_UP = 50.0
 
 
-@lean_kernel
+@kernel
 def measure_pairs(model: SafetyModel, data: SafetyData) -> int:
     """Measure every pair at the reference; returns the closest one.
 
@@ -110,7 +110,7 @@ def measure_pairs(model: SafetyModel, data: SafetyData) -> int:
     return closest
 
 
-@lean_kernel
+@kernel
 def write_separation_rows(model: SafetyModel, data: SafetyData, h: float) -> None:
     """Rows of the pairs that can bind in a step of ``h`` [s] from the measured reference, of unit norm.
 
@@ -180,7 +180,7 @@ def _tangent(data: SafetyData, row: Array) -> float:
     return change
 
 
-@lean_kernel
+@kernel
 def _lever(number: int, duration: float, h: float) -> float:
     """By s + h / 2 the next speeds lengthen the way until an instant, of the step and of the stop [s]."""
     t = duration * INSTANTS[number] / INSTANTS[-1]
@@ -189,7 +189,7 @@ def _lever(number: int, duration: float, h: float) -> float:
     return max(s, 0.5 * h) + 0.5 * h
 
 
-@lean_kernel
+@kernel
 def _normalise_rows(data: SafetyData) -> None:
     """Give every row unit norm, so that what it lacks is a joint speed."""
     rows = data.rows
@@ -293,7 +293,7 @@ def _append_end_rows(
     return count
 
 
-@lean_kernel
+@kernel
 def _turning(velocities: BodyVelocities, joint: int, other: int) -> float:
     """How fast the link of one joint turns relative to that of another [rad/s]."""
     square = 0.0
@@ -302,7 +302,7 @@ def _turning(velocities: BodyVelocities, joint: int, other: int) -> float:
     return np.sqrt(square)
 
 
-@lean_kernel
+@kernel
 def _way_between(point: Array, other: Array) -> float:
     square = 0.0
     for k in range(3):
@@ -310,7 +310,7 @@ def _way_between(point: Array, other: Array) -> float:
     return np.sqrt(square)
 
 
-@lean_kernel
+@kernel
 def _copy(point: Array, to: Array) -> None:
     for k in range(3):
         to[k] = point[k]

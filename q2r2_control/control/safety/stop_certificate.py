@@ -17,7 +17,7 @@ from __future__ import annotations
 import numpy as np
 
 from q2r2_control.control.geometry.pair_distance import distance_row, measure
-from q2r2_control.control.jit import inlined_kernel, lean_kernel
+from q2r2_control.control.jit import inlined_kernel, kernel
 from q2r2_control.control.safety.safety_data import SafetyData
 from q2r2_control.control.safety.safety_model import SafetyModel
 from q2r2_control.control.safety.separating_plane import stay_beyond, stays_beyond
@@ -29,7 +29,7 @@ _ROUNDING = 1e-12  # [m], and relative
 _STILL = 1e-9  # [m/s]
 
 
-@lean_kernel
+@kernel
 def step_travel(v: float, v_next: float, h: float) -> float:
     """Way a joint travels in a step of constant acceleration, there and back counted."""
     if v * v_next >= 0.0:
@@ -37,7 +37,7 @@ def step_travel(v: float, v_next: float, h: float) -> float:
     return 0.5 * (v * v + v_next * v_next) / (abs(v) + abs(v_next)) * h
 
 
-@lean_kernel
+@kernel
 def certify(model: SafetyModel, data: SafetyData, h: float) -> bool:
     """Whether the step to ``data.candidate`` in ``h`` and the full stop from there keep every pair apart.
 
@@ -69,7 +69,7 @@ def certify(model: SafetyModel, data: SafetyData, h: float) -> bool:
     return True
 
 
-@lean_kernel
+@kernel
 def write_step(data: SafetyData, h: float) -> None:
     """The parabola from the reference to the candidate."""
     v, v_next, piece = data.state.v, data.candidate.v, data.rollout.step
@@ -79,7 +79,7 @@ def write_step(data: SafetyData, h: float) -> None:
         piece.travel[j] = step_travel(v[j], v_next[j], h)
 
 
-@lean_kernel
+@kernel
 def _farthest_travel(data: SafetyData) -> float:
     """The farthest that any joint travels in the step and the stop [rad or m]."""
     farthest = 0.0
@@ -97,7 +97,7 @@ def _has_room(model: SafetyModel, data: SafetyData, p: int, time: float) -> bool
     return data.distance[p] - step - stop >= model.min_distance[p]
 
 
-@lean_kernel
+@kernel
 def _distance_at(model: SafetyModel, data: SafetyData, p: int, i: int, duration: float) -> float:
     """Distance of pair ``p`` at sample ``i`` of the candidate's stop."""
     return measure(model.collision, sample_of(model, data, i, duration), p)
@@ -113,7 +113,7 @@ def _plane_keeps_apart(model: SafetyModel, data: SafetyData, p: int, h: float, d
     return stay_beyond(model.collision, data.collision, p, data.rollout.step, h, data.rollout.stop, duration, threshold)
 
 
-@lean_kernel
+@kernel
 def _step_keeps_apart(model: SafetyModel, data: SafetyData, p: int, h: float, duration: float) -> bool:
     """Prove pair ``p`` apart in the step: from both of its ends by the way, or else from the first by a plane."""
     after, threshold = _distance_at(model, data, p, 0, duration), model.min_distance[p]
@@ -125,7 +125,7 @@ def _step_keeps_apart(model: SafetyModel, data: SafetyData, p: int, h: float, du
     return stays_beyond(model.collision, data.collision, p, data.rollout.step, h, threshold)
 
 
-@lean_kernel
+@kernel
 def _stop_keeps_apart(model: SafetyModel, data: SafetyData, p: int, duration: float) -> bool:
     """Prove pair ``p`` apart along the whole stop, piece by piece."""
     rollout, threshold = data.rollout, model.min_distance[p]
@@ -162,7 +162,7 @@ def _stop_keeps_apart(model: SafetyModel, data: SafetyData, p: int, duration: fl
     return True
 
 
-@lean_kernel
+@kernel
 def _comes_no_closer(model: SafetyModel, data: SafetyData, p: int, duration: float) -> bool:
     """For a pair that is too close already: no sample of the stop is closer than the one before, or closing in.
 

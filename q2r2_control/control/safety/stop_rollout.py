@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from q2r2_control.control.geometry.collision import CollisionData, Posed, update_placements
 from q2r2_control.control.geometry.kinematics import Placements
-from q2r2_control.control.jit import inlined_kernel, lean_kernel
+from q2r2_control.control.jit import inlined_kernel, kernel
 from q2r2_control.control.safety.safety_data import Piece, SafetyData
 from q2r2_control.control.safety.safety_model import SafetyModel
 from q2r2_control.control.safety.stop_shapes import brake
@@ -18,7 +18,7 @@ from q2r2_control.types import Array
 _SAME_TIME = 1e-9
 
 
-@lean_kernel
+@kernel
 def begin_rollout(data: SafetyData) -> float:
     """Forget the samples of the last stop and write the candidate's as one piece; returns how long it takes [s]."""
     candidate, rollout = data.candidate, data.rollout
@@ -43,7 +43,7 @@ def sample_of(model: SafetyModel, data: SafetyData, i: int, duration: float) -> 
     return sample
 
 
-@lean_kernel
+@kernel
 def _place_sample(model: SafetyModel, data: SafetyData, i: int, duration: float, sample: CollisionData) -> None:
     candidate, rollout = data.candidate, data.rollout
     t = duration * i / (rollout.q.shape[0] - 1)
@@ -52,7 +52,7 @@ def _place_sample(model: SafetyModel, data: SafetyData, i: int, duration: float,
     rollout.known[i] = 1.0
 
 
-@lean_kernel
+@kernel
 def write_piece(data: SafetyData, v: Array, start: float, length: float, piece: Piece) -> None:
     """The motion of the candidate's stop from ``start`` on, where its velocities are ``v``, for ``length`` [s].
 

@@ -20,7 +20,7 @@ shape keeps every limit, and none has to be given up for want of room. [] (A joi
 
 from __future__ import annotations
 
-from q2r2_control.control.jit import lean_kernel
+from q2r2_control.control.jit import kernel
 from q2r2_control.control.safety.joint_limits import JointLimits
 from q2r2_control.control.safety.safety_model import SafetyModel
 from q2r2_control.types import Array
@@ -29,7 +29,7 @@ TOGETHER, ARM_BY_ARM, OWN = 0, 1, 2
 SHAPES = 3
 
 
-@lean_kernel
+@kernel
 def write_stop(model: SafetyModel, q: Array, v: Array, shape: int, deceleration: Array) -> None:
     """Write the ``deceleration`` of a stop of the given shape from ``q`` [rad], ``v`` [rad/s], (nv,) each [rad/s^2]."""
     a = model.limits.acceleration
@@ -50,7 +50,7 @@ def write_stop(model: SafetyModel, q: Array, v: Array, shape: int, deceleration:
         deceleration[j] = min(max(shared, _least_deceleration(model.limits, j, q[j], v[j])), a[j])
 
 
-@lean_kernel
+@kernel
 def _least_deceleration(limits: JointLimits, j: int, q: float, v: float) -> float:
     """Least constant deceleration of joint ``j`` that keeps P until it rests; its limit where none does."""
     room = (limits.upper[j] - q if v > 0.0 else q - limits.lower[j]) - limits.longest_step * abs(v)
@@ -59,7 +59,7 @@ def _least_deceleration(limits: JointLimits, j: int, q: float, v: float) -> floa
     return min(0.5 * v * v / room, limits.acceleration[j])
 
 
-@lean_kernel
+@kernel
 def brake(q: Array, v: Array, deceleration: Array, t: float, q_out: Array, v_out: Array) -> None:
     """State of the stop after ``t`` seconds, from (q, v) with decelerations > 0, (nv,) each."""
     for j in range(q.shape[0]):

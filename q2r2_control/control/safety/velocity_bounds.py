@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from q2r2_control.control.geometry.collision import CollisionData, CollisionModel
-from q2r2_control.control.jit import lean_kernel
+from q2r2_control.control.jit import kernel
 from q2r2_control.types import Array
 
 
@@ -34,7 +34,7 @@ class BodyVelocities(NamedTuple):
         return cls(np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((g, 3)), np.zeros(g))
 
 
-@lean_kernel
+@kernel
 def update_body_velocities(model: CollisionModel, data: CollisionData, v: Array, velocities: BodyVelocities) -> None:
     """Velocities of all joint frames and geometries where they are placed, at joint velocities ``v`` (nv,)."""
     chain, bodies, placements, posed = model.chain, model.bodies, data.placements, data.posed
@@ -63,7 +63,7 @@ def update_body_velocities(model: CollisionModel, data: CollisionData, v: Array,
         velocities.swing[g] = np.sqrt(square) * bodies.size[g]
 
 
-@lean_kernel
+@kernel
 def _velocity_at(linear: Array, angular: Array, origin: Array, point: Array, out: Array) -> None:
     """Velocity of ``point`` on a link whose frame at ``origin`` moves; ``out`` may be ``point`` itself."""
     x, y, z = point[0] - origin[0], point[1] - origin[1], point[2] - origin[2]
@@ -72,7 +72,7 @@ def _velocity_at(linear: Array, angular: Array, origin: Array, point: Array, out
     out[2] = linear[2] + angular[0] * y - angular[1] * x
 
 
-@lean_kernel
+@kernel
 def fastest_body(velocities: BodyVelocities) -> float:
     """Bound on the speed of any point of any geometry [m/s]."""
     fastest = 0.0
@@ -84,7 +84,7 @@ def fastest_body(velocities: BodyVelocities) -> float:
     return fastest
 
 
-@lean_kernel
+@kernel
 def fastest_approach(velocities: BodyVelocities, first: int, second: int) -> float:
     """Bound on how fast two geometries close in [m/s]."""
     square = 0.0

@@ -7,7 +7,13 @@ takes a ``TaskModel`` (fixed) and ``TaskData`` (rewritten at each tick).
 
 from q2r2_control.control.tasks.frame import add_stretch_damping, add_tool_task, tool_jacobian, tool_pose, wanted_twist
 from q2r2_control.control.tasks.manipulability import add_manipulability
-from q2r2_control.control.tasks.posture import add_hold_task, add_posture_task, project_to_nullspace, pull_to_posture
+from q2r2_control.control.tasks.posture import (
+    add_hold_task,
+    add_posture_task,
+    factor_of_tools,
+    project_to_nullspace,
+    pull_to_posture,
+)
 from q2r2_control.control.tasks.swivel import turn_elbows, write_swivel_rows
 from q2r2_control.control.tasks.task_data import Targets, TaskData
 from q2r2_control.control.tasks.task_model import TaskModel, tools_of
@@ -21,6 +27,7 @@ __all__ = [
     "add_posture_task",
     "add_stretch_damping",
     "add_tool_task",
+    "factor_of_tools",
     "project_to_nullspace",
     "pull_to_posture",
     "tool_jacobian",

@@ -17,7 +17,7 @@ from __future__ import annotations
 import numpy as np
 
 from q2r2_control.control.geometry.kinematics import Chain, Placements
-from q2r2_control.control.jit import lean_kernel
+from q2r2_control.control.jit import kernel
 from q2r2_control.control.tasks.task_data import Targets, TaskData
 from q2r2_control.control.tasks.task_model import Motion, TaskModel, Tools
 from q2r2_control.types import Array
@@ -25,7 +25,7 @@ from q2r2_control.types import Array
 ROTATION_LENGTH = 0.3  # [m/rad]
 
 
-@lean_kernel
+@kernel
 def tool_pose(placements: Placements, tools: Tools, i: int, rotation: Array, translation: Array) -> None:
     """World pose of tool ``i`` into ``rotation`` (3, 3) and ``translation`` (3,)."""
     joint = tools.joint[i]
@@ -39,7 +39,7 @@ def tool_pose(placements: Placements, tools: Tools, i: int, rotation: Array, tra
             translation[row] += placements.rotation[joint, row, column] * tools.translation[i, column]
 
 
-@lean_kernel
+@kernel
 def tool_jacobian(chain: Chain, placements: Placements, tools: Tools, i: int, translation: Array, J: Array) -> None:
     """Jacobian (6, nv) of tool ``i``: linear, then angular velocity in world axes at the tool's origin."""
     J[:] = 0.0
@@ -62,7 +62,7 @@ def tool_jacobian(chain: Chain, placements: Placements, tools: Tools, i: int, tr
         joint = chain.parent[joint]
 
 
-@lean_kernel
+@kernel
 def rotation_vector(R: Array, out: Array) -> None:
     """Rotation vector [rad] of a rotation matrix (3, 3), angle in [0, pi], through its quaternion of largest part."""
     trace = R[0, 0] + R[1, 1] + R[2, 2]
@@ -91,7 +91,7 @@ def rotation_vector(R: Array, out: Array) -> None:
         out[k] *= factor
 
 
-@lean_kernel
+@kernel
 def approach_speed(error: float, gain: float, deceleration: float) -> float:
     """Speed towards a target ``error`` away: proportional when near, that of constant deceleration when far.
 
@@ -103,7 +103,7 @@ def approach_speed(error: float, gain: float, deceleration: float) -> float:
     return np.sqrt(2.0 * deceleration * error - (deceleration / gain) ** 2)
 
 
-@lean_kernel
+@kernel
 def wanted_twist(motion: Motion, data: TaskData, targets: Targets, i: int) -> None:
     """Twist of tool ``i`` towards its target into ``data.twist``, and the part that the error makes."""
     twist, feedback, feed_forward = data.twist[i], data.feedback[i], targets.feed_forward[i]
@@ -131,7 +131,7 @@ def wanted_twist(motion: Motion, data: TaskData, targets: Targets, i: int) -> No
                 piece[k] *= cap / size
 
 
-@lean_kernel
+@kernel
 def add_tool_task(J: Array, twist: Array, weight: float, H: Array, g: Array) -> None:
     """Add ``weight`` |J v - twist|^2_W of one arm to H (nv, nv) and g (nv,)."""
     nv = g.shape[0]
@@ -151,7 +151,7 @@ def add_tool_task(J: Array, twist: Array, weight: float, H: Array, g: Array) -> 
                 H[j, i] += both
 
 
-@lean_kernel
+@kernel
 def add_stretch_damping(model: TaskModel, data: TaskData, i: int) -> None:
     """Add the damping M of tool ``i``, with the arm's weight, to ``data.H``.
 
@@ -181,7 +181,7 @@ def add_stretch_damping(model: TaskModel, data: TaskData, i: int) -> None:
         far = chain.parent[far]
 
 
-@lean_kernel
+@kernel
 def _stiffness(chain: Chain, placements: Placements, near: int, far: int, J: Array, s: Array) -> float:
     """s' d2x / dq_near dq_far for the linear part of the tool's motion: z_near x J_far, none for a sliding joint."""
     if chain.prismatic[near] == 1:

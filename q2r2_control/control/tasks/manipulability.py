@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from q2r2_control.control.jit import lean_kernel
+from q2r2_control.control.jit import kernel
 from q2r2_control.control.tasks.frame import ROTATION_LENGTH
 from q2r2_control.control.tasks.task_data import TaskData
 from q2r2_control.control.tasks.task_model import TaskModel
@@ -25,7 +25,7 @@ from q2r2_control.control.tasks.task_model import TaskModel
 _DAMPING = 1e-3  # least singular value that counts
 
 
-@lean_kernel
+@kernel
 def add_manipulability(model: TaskModel, data: TaskData, i: int) -> None:
     """Add the gradient of arm ``i``'s log m times the gain to ``data.posture``, no joint beyond the posture's speed."""
     manipulability_gradient(model, data, i)
@@ -39,7 +39,7 @@ def add_manipulability(model: TaskModel, data: TaskData, i: int) -> None:
         posture[j] += factor * gradient[j]
 
 
-@lean_kernel
+@kernel
 def manipulability_gradient(model: TaskModel, data: TaskData, i: int) -> None:
     """Gradient of log m of arm ``i`` into ``data.manipulability.gradient`` (nv,) [1/rad]."""
     _weigh(model, data, i)
@@ -67,7 +67,7 @@ def manipulability_gradient(model: TaskModel, data: TaskData, i: int) -> None:
         far = chain.parent[far]
 
 
-@lean_kernel
+@kernel
 def _weigh(model: TaskModel, data: TaskData, i: int) -> None:
     """(J J')^-1 J into the scratch's weights by Cholesky, the angular rows divided by the length they carry twice."""
     chain, joint, J = model.chain, model.tools.joint[i], data.J[6 * i : 6 * i + 6]
@@ -104,6 +104,6 @@ def _weigh(model: TaskModel, data: TaskData, i: int) -> None:
         far = chain.parent[far]
 
 
-@lean_kernel
+@kernel
 def _row_scale(row: int) -> float:
     return 1.0 if row < 3 else ROTATION_LENGTH

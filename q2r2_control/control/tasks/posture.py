@@ -6,10 +6,9 @@ leaves no tool error. An arm without a target holds its joints by a cost of thei
 
 from __future__ import annotations
 
-import numpy as np
-
+from q2r2_control.control.cholesky import factorise, substitute
 from q2r2_control.control.geometry.closest_points import clamp
-from q2r2_control.control.jit import kernel, lean_kernel
+from q2r2_control.control.jit import kernel
 from q2r2_control.control.tasks.task_data import Targets, TaskData
 from q2r2_control.control.tasks.task_model import TaskModel
 from q2r2_control.types import Array
@@ -20,7 +19,7 @@ HOLD_GAIN = 4.0  # [1/s]
 _PROJECTION_DAMPING = 1e-3
 
 
-@lean_kernel
+@kernel
 def pull_to_posture(model: TaskModel, data: TaskData, targets: Targets, q: Array) -> None:
     """Velocity of every joint from ``q`` (nv,) towards the posture that is asked for, into ``data.posture``."""
     gain, speed = model.posture.gain[0], model.posture.speed
@@ -28,7 +27,7 @@ def pull_to_posture(model: TaskModel, data: TaskData, targets: Targets, q: Array
         data.posture[j] = clamp(gain * (targets.posture[j] - q[j]), -speed, speed)
 
 
-@lean_kernel
+@kernel
 def add_hold_task(data: TaskData, targets: Targets, i: int, q: Array) -> None:
     """Joints of the held arm ``i`` return to where they were latched; the posture pull does not move them."""
     for j in range(q.shape[0]):
@@ -38,7 +37,7 @@ def add_hold_task(data: TaskData, targets: Targets, i: int, q: Array) -> None:
             data.posture[j] = 0.0
 
 
-@lean_kernel
+@kernel
 def add_posture_task(model: TaskModel, data: TaskData) -> None:
     """Add the cost of all joints' distance from ``data.posture``."""
     for j in range(data.posture.shape[0]):
@@ -48,36 +47,29 @@ def add_posture_task(model: TaskModel, data: TaskData) -> None:
 
 
 @kernel
-def project_to_nullspace(J: Array, v: Array) -> None:
-    """Remove from ``v`` (nv,) what moves the tools: v -= J' (J J' + d I)^-1 J v, by Cholesky; J (6n, nv)."""
-    m = J.shape[0]
-    nv = J.shape[1]
-    A = np.empty((m, m))
-    y = np.empty(m)
-    for i in range(m):
-        for j in range(i + 1):
+def factor_of_tools(J: Array, factor: Array) -> None:
+    """``factor`` (6n, 6n) of J J' + d I, by Cholesky, of all tools' Jacobians J (6n, nv)."""
+    for i in range(J.shape[0]):
+        for j in range(i, J.shape[0]):
             total = 0.0
-            for k in range(nv):
+            for k in range(J.shape[1]):
                 total += J[i, k] * J[j, k]
-            A[i, j] = total
-        A[i, i] += _PROJECTION_DAMPING * _PROJECTION_DAMPING
-        total = 0.0
-        for k in range(nv):
-            total += J[i, k] * v[k]
-        y[i] = total
-    for i in range(m):
-        for j in range(i + 1):
-            total = A[i, j]
-            for k in range(j):
-                total -= A[i, k] * A[j, k]
-            A[i, j] = np.sqrt(total) if i == j else total / A[j, j]
-        for k in range(i):
-            y[i] -= A[i, k] * y[k]
-        y[i] /= A[i, i]
-    for i in range(m - 1, -1, -1):
-        for k in range(i + 1, m):
-            y[i] -= A[k, i] * y[k]
-        y[i] /= A[i, i]
-    for j in range(nv):
-        for i in range(m):
-            v[j] -= J[i, j] * y[i]
+            factor[i, j] = total
+        factor[i, i] += _PROJECTION_DAMPING * _PROJECTION_DAMPING
+    factorise(factor)  # positive definite for any finite J
+
+
+@kernel
+def project_to_nullspace(J: Array, factor: Array, moved: Array, v: Array) -> None:
+    """Remove from ``v`` (nv,) what moves the tools: v -= J' (J J' + d I)^-1 J v.
+
+    ``factor``: see :func:`factor_of_tools`; ``moved`` (6n,) is scratch.
+    """
+    for i in range(J.shape[0]):
+        moved[i] = 0.0
+        for k in range(J.shape[1]):
+            moved[i] += J[i, k] * v[k]
+    substitute(factor, moved)
+    for j in range(J.shape[1]):
+        for i in range(J.shape[0]):
+            v[j] -= J[i, j] * moved[i]

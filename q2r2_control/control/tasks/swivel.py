@@ -26,7 +26,7 @@ import numpy as np
 
 from q2r2_control.control.geometry.closest_points import clamp, dot
 from q2r2_control.control.geometry.kinematics import Chain, Placements
-from q2r2_control.control.jit import lean_kernel
+from q2r2_control.control.jit import kernel
 from q2r2_control.control.tasks.task_data import SwivelScratch, Targets, TaskData
 from q2r2_control.control.tasks.task_model import Swivels, TaskModel
 from q2r2_control.types import Array
@@ -56,7 +56,7 @@ def nearest_along(chain: Chain, joint: int) -> float:
     return float((axis @ between - cosine * (other @ between)) / (1.0 - cosine * cosine))
 
 
-@lean_kernel
+@kernel
 def swivel_angle(placements: Placements, swivels: Swivels, i: int, scratch: SwivelScratch) -> tuple[float, float]:
     """Swivel angle of arm ``i`` in (-pi, pi] [rad], and the share of 0 .. 1 to which it is well defined."""
     points, line, offset, reference = scratch.points, scratch.line, scratch.offset, scratch.reference
@@ -84,7 +84,7 @@ def swivel_angle(placements: Placements, swivels: Swivels, i: int, scratch: Swiv
     return angle, clamp(radius / _FULL_RADIUS, 0.0, 1.0) * clamp(sine / _FULL_SINE, 0.0, 1.0)
 
 
-@lean_kernel
+@kernel
 def swivel_row(
     chain: Chain, placements: Placements, swivels: Swivels, i: int, scratch: SwivelScratch
 ) -> tuple[float, float, float]:
@@ -121,7 +121,7 @@ def swivel_row(
     return angle, share, radius * sine
 
 
-@lean_kernel
+@kernel
 def _turned(line: Array, offset: Array) -> float:
     """Replace ``offset``, across the unit vector ``line``, by line x offset / |offset|; returns |offset|."""
     size = np.sqrt(dot(offset, offset))
@@ -132,7 +132,7 @@ def _turned(line: Array, offset: Array) -> float:
     return size
 
 
-@lean_kernel
+@kernel
 def _point_rate(chain: Chain, placements: Placements, joint: int, point: Array, c: int) -> float:
     """Component ``c`` of a point's velocity per velocity of ``joint``, which carries it."""
     axis = placements.axis[joint]
@@ -143,7 +143,7 @@ def _point_rate(chain: Chain, placements: Placements, joint: int, point: Array, 
     return axis[a] * (point[b] - origin[b]) - axis[b] * (point[a] - origin[a])
 
 
-@lean_kernel
+@kernel
 def write_swivel_rows(model: TaskModel, data: TaskData, targets: Targets) -> None:
     """Rows, rates [rad/s times the row's size] and shares of all arms that have the task and follow a target."""
     swivels, scratch, fastest = model.swivels, data.swivel, model.posture.speed
@@ -161,7 +161,7 @@ def write_swivel_rows(model: TaskModel, data: TaskData, targets: Targets) -> Non
         scratch.free[j] = scratch.row[j]
 
 
-@lean_kernel
+@kernel
 def turn_elbows(model: TaskModel, data: TaskData) -> None:
     """Let ``data.posture``, which moves no tool, turn each elbow at its rate, no joint beyond the posture's speed.
 

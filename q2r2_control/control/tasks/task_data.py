@@ -109,6 +109,8 @@ class TaskData(NamedTuple):
     rotation: Array  # (n, 3, 3) of the tools
     translation: Array  # (n, 3) [m]
     J: Array  # (6 n, nv) tool Jacobians, one below the other
+    tools_factor: Array  # (6 n, 6 n) Cholesky factor of J J', damped
+    tools_moved: Array  # (6 n,) scratch
     twist: Array  # (n, 6) wanted [m/s, rad/s]
     feedback: Array  # (n, 6) the part of it that the error makes
     turn: Array  # (3, 3) scratch: rotation from tool to target
@@ -126,6 +128,8 @@ class TaskData(NamedTuple):
             rotation=np.zeros((n, 3, 3)),
             translation=np.zeros((n, 3)),
             J=np.zeros((6 * n, nv)),
+            tools_factor=np.zeros((6 * n, 6 * n)),
+            tools_moved=np.zeros(6 * n),
             twist=np.zeros((n, 6)),
             feedback=np.zeros((n, 6)),
             turn=np.zeros((3, 3)),
