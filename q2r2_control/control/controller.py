@@ -275,9 +275,11 @@ class CartesianController:
     def _advance(self, h: float, share: float, summary: StepSummary) -> bool:
         """One substep, which is a ``share`` of the tick: build, solve, certify and move; whether it was solved."""
         self._live.step(self._objects.load, h)
-        summary.inside &= self._assemble(self._held_model, self._targets.held, self._held_data, h)
+        inside, free = self._assemble(self._held_model, self._targets.held, self._held_data, h)
+        summary.inside &= inside
         count = int(self._rows.used[0])
         self._problem.rows, self._problem.rows_lower = self._rows.matrix[:count], self._rows.lower[:count]
+        self._problem.minimum = self._tasks.minimum if free else None
         solution = self._solver.solve(self._problem)
         limit = self.settings.solve_time_limit
         usable = solution.v is not None and (limit is None or solution.solve_time <= limit)

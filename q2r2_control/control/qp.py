@@ -38,6 +38,7 @@ class QpProblem:
     upper: Array  # (nv,) [rad/s]
     rows: Array  # (m, nv), unit rows
     rows_lower: Array  # (m,) [rad/s]
+    minimum: Array | None = None  # (nv,) of the cost alone, if that keeps box and rows and so is the solution [rad/s]
 
     def softness(self) -> Array:
         """rho (m,): how far each row gives way per unit of its multiplier."""
@@ -56,6 +57,17 @@ class Solver(Protocol):
     """Solves a :class:`QpProblem`; never raises for a numerical reason."""
 
     def solve(self, problem: QpProblem) -> QpSolution: ...
+
+
+class OnlyIfBound:
+    """Asks a solver only where a bound holds the cost's own minimum back."""
+
+    def __init__(self, solver: Solver) -> None:
+        self.solver = solver
+
+    def solve(self, problem: QpProblem) -> QpSolution:
+        """See :class:`Solver`; takes no time of a solver where none is asked."""
+        return self.solver.solve(problem) if problem.minimum is None else QpSolution(problem.minimum, 0.0)
 
 
 class DaqpSolver:
@@ -196,16 +208,16 @@ class QpsolversSolver:
         return QpSolution(v, time.perf_counter() - before)
 
 
-def make_solver(name: str, nv: int, time_limit: float | None) -> Solver:
+def make_solver(name: str, nv: int, time_limit: float | None) -> OnlyIfBound:
     """Solver by its name in the YAML; ``time_limit`` [s] is given to solvers that take one.
 
     Raises :class:`ConfigError` for a solver that is not installed.
     """
     if name == "daqp":
-        return DaqpSolver(nv, time_limit)
+        return OnlyIfBound(DaqpSolver(nv, time_limit))
     if name == "osqp":
-        return OsqpSolver(nv, time_limit)
+        return OnlyIfBound(OsqpSolver(nv, time_limit))
     available = sorted({"daqp", "osqp", *qpsolvers.available_solvers})
     if name not in available:
         raise ConfigError(f"control.solver = {name!r}: not installed; allowed here: {', '.join(available)}")
-    return QpsolversSolver(name)
+    return OnlyIfBound(QpsolversSolver(name))

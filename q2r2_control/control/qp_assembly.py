@@ -18,11 +18,15 @@ from q2r2_control.control.tasks.posture import (
 )
 from q2r2_control.control.tasks.swivel import turn_elbows, write_swivel_rows
 from q2r2_control.control.tasks.task_data import Targets
+from q2r2_control.control.unconstrained import find_minimum
 
 
 @kernel
-def assemble(held_model: Held, held_targets: Held, held_data: Held, h: float) -> bool:
-    """Cost, rows and box of a step of ``h`` [s] from an observed reference; False: a joint is outside its limits."""
+def assemble(held_model: Held, held_targets: Held, held_data: Held, h: float) -> tuple[bool, bool]:
+    """Cost, rows and box of a step of ``h`` [s] from an observed reference.
+
+    Returns whether all joints are within their limits, and what :func:`find_minimum` says.
+    """
     model, targets, data = borrowed(held_model), borrowed(held_targets), borrowed(held_data)
     state, tasks = data.safety.state, data.tasks
     tasks.H[:] = 0.0
@@ -42,7 +46,8 @@ def assemble(held_model: Held, held_targets: Held, held_data: Held, h: float) ->
         turn_elbows(model.tasks, tasks)
     add_posture_task(model.tasks, tasks)
     write_separation_rows(model.safety, data.safety, h)
-    return next_velocity_box(model.safety.limits, state.q, state.v, h, data.safety.box)
+    inside = next_velocity_box(model.safety.limits, state.q, state.v, h, data.safety.box)
+    return inside, find_minimum(data.safety, tasks)
 
 
 @kernel

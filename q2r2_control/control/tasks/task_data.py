@@ -119,6 +119,8 @@ class TaskData(NamedTuple):
     swivel: SwivelScratch
     H: Array  # (nv, nv) of the cost 1/2 v' H v + g' v
     g: Array  # (nv,)
+    minimum: Array  # (nv,) of that cost without bounds [rad/s]
+    factor: Array  # (nv, nv) Cholesky factor of H
 
     @classmethod
     def empty(cls, model: TaskModel, placements: Placements) -> TaskData:
@@ -138,4 +140,6 @@ class TaskData(NamedTuple):
             swivel=SwivelScratch.empty(n, nv),
             H=np.zeros((nv, nv)),
             g=np.zeros(nv),
+            minimum=np.zeros(nv),
+            factor=np.zeros((nv, nv)),
         )
