@@ -73,8 +73,8 @@ class JointWatch:
             self._fail(state)
             return
         q, external = state.q.tolist(), state.q if state.tau_external is None else state.tau_external
-        # The usual case costs a sum of squares; the joint is looked for only where there is something to say.
-        known = math.isfinite(state.q.dot(state.q) + state.v.dot(state.v) + external.dot(external))
+        # The usual case costs one length; the joint is looked for only where there is something to say.
+        known = math.isfinite(math.hypot(*q, *state.v.tolist(), *external.tolist()))
         if not known and (fault := self._unusable(state, external)):
             allowed = self._settings.unusable_time
             if now - self._stamp > allowed:
