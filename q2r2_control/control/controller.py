@@ -104,7 +104,7 @@ class CartesianController:
         """Run every kernel once, so that none is compiled in mid-motion."""
         self.reset(self.robot.home)
         model, data, targets = self._held_model, self._held_data, self._targets.held
-        self._assemble = bound(assemble, model, targets, data, self.settings.max_substep)
+        self._assemble = bound(assemble, model, targets, data, self.settings.max_substep, -1.0)
         self._observe_bodies = bound(observe_bodies, model, data, self._unchanged)
         self._spare = bound(spare_distance, model, data, self._with_others[self._arms[0]])
         self._move = bound(move_reference, model, data, self._solution, False, self.settings.max_substep, 1.0)
@@ -151,14 +151,17 @@ class CartesianController:
         time = min(float(dt), LONGEST_DT) if usable else 0.0
         state = self._state
         self._targets.aim_posture(posture)
-        rejected = self._targets.update(targets, time, state.q, state.v)
-        state.a.fill(0.0)
         summary = StepSummary()
         if time > 0.0:
+            known = self._targets.offer(targets)
             substeps = max(math.ceil(time / self.settings.max_substep - 1e-9), 1)
             for index in range(substeps):
-                if not self._advance(time / substeps, 1.0 / substeps, summary):
+                if not self._advance(time / substeps, 1.0 / substeps, -1.0 if index else time, summary):
                     summary.unsolved |= 1 << index
+            rejected = () if known and summary.usable else self._targets.rejected(targets)
+        else:
+            rejected = self._targets.update(targets, time, state.q, state.v)
+            state.a.fill(0.0)
         report = StepReport(
             status=summary.status(self._apart, usable and dt <= LONGEST_DT, rejected),
             rejected=rejected,
@@ -272,21 +275,25 @@ class CartesianController:
         """Of each joint in the full stop from the reference that is known, (nv,) [rad/s^2]."""
         return self._stop.copy()
 
-    def _advance(self, h: float, share: float, summary: StepSummary) -> bool:
-        """One substep, which is a ``share`` of the tick: build, solve, certify and move; whether it was solved."""
+    def _advance(self, h: float, share: float, tick: float, summary: StepSummary) -> bool:
+        """One substep, which is a ``share`` of the tick: build, solve, certify and move; whether it was solved.
+
+        ``tick``: see :func:`assemble`.
+        """
         self._live.step(self._objects.load, h)
-        inside, free = self._assemble(self._held_model, self._targets.held, self._held_data, h)
+        usable, inside, free = self._assemble(self._held_model, self._targets.held, self._held_data, h, tick)
+        summary.usable &= usable
         summary.inside &= inside
         count = int(self._rows.used[0])
         self._problem.rows, self._problem.rows_lower = self._rows.matrix[:count], self._rows.lower[:count]
         self._problem.minimum = self._tasks.minimum if free else None
         solution = self._solver.solve(self._problem)
         limit = self.settings.solve_time_limit
-        usable = solution.v is not None and (limit is None or solution.solve_time <= limit)
-        if usable:
+        solved = solution.v is not None and (limit is None or solution.solve_time <= limit)
+        if solved:
             self._solution[:] = solution.v
         outcome, self._closest, self._distance, self._tightest, self._margin, slack = self._move(
-            self._held_model, self._held_data, self._solution, usable, h, share
+            self._held_model, self._held_data, self._solution, solved, h, share
         )
         summary.fallback |= outcome != FOLLOWED
         summary.slack = max(summary.slack, slack)
@@ -296,4 +303,4 @@ class CartesianController:
         was_apart, self._apart = self._apart, self._margin >= 0.0
         # A certified stop stays certified. Anything else was proven just now, and if all was apart before, in full.
         self._certified = self._apart and (self._certified if outcome == STOPPED else was_apart)
-        return usable
+        return solved

@@ -7,6 +7,7 @@ from q2r2_control.control.kernel_data import KernelData
 from q2r2_control.control.kernel_model import KernelModel
 from q2r2_control.control.safety.joint_limits import next_velocity_box
 from q2r2_control.control.safety.separation_rows import write_separation_rows
+from q2r2_control.control.targets import take_targets
 from q2r2_control.control.tasks.frame import add_stretch_damping, add_tool_task, tool_jacobian, wanted_twist
 from q2r2_control.control.tasks.manipulability import add_manipulability
 from q2r2_control.control.tasks.posture import (
@@ -22,13 +23,19 @@ from q2r2_control.control.unconstrained import find_minimum
 
 
 @kernel
-def assemble(held_model: Held, held_targets: Held, held_data: Held, h: float) -> tuple[bool, bool]:
+def assemble(held_model: Held, held_targets: Held, held_data: Held, h: float, tick: float) -> tuple[bool, bool, bool]:
     """Cost, rows and box of a step of ``h`` [s] from an observed reference.
 
-    Returns whether all joints are within their limits, and what :func:`find_minimum` says.
+    ``tick`` [s]: the step is the first of such a tick, which begins with what was offered as targets; below 0: it is
+    another one. Returns whether all targets were usable, whether all joints are within their limits, and what
+    :func:`find_minimum` says.
     """
     model, targets, data = borrowed(held_model), borrowed(held_targets), borrowed(held_data)
     state, tasks = data.safety.state, data.tasks
+    usable = True
+    if tick >= 0.0:
+        usable = take_targets(targets, state.q, state.v, tick)
+        state.a[:] = 0.0
     tasks.H[:] = 0.0
     tasks.g[:] = 0.0
     tasks.J[:] = 0.0
@@ -47,7 +54,7 @@ def assemble(held_model: Held, held_targets: Held, held_data: Held, h: float) ->
     add_posture_task(model.tasks, tasks)
     write_separation_rows(model.safety, data.safety, h)
     inside = next_velocity_box(model.safety.limits, state.q, state.v, h, data.safety.box)
-    return inside, find_minimum(data.safety, tasks)
+    return usable, inside, find_minimum(data.safety, tasks)
 
 
 @kernel

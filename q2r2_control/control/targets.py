@@ -39,7 +39,7 @@ class TargetTracker:
         self._pose, self._offered = self._targets.pose, self._targets.offered
         self.held = hold(self._targets)
         nv = len(self._home)
-        self._take = bound(take_targets, self.held, np.zeros(nv), np.zeros(nv), 0.0)
+        self._take = bound(_take_held, self.held, np.zeros(nv), np.zeros(nv), 0.0)
 
     def reset(self, q: Array) -> None:
         """Forget all targets; every arm holds where it is, ``q`` (nv,) [rad]."""
@@ -69,6 +69,12 @@ class TargetTracker:
 
     def update(self, targets: Mapping[str, pin.SE3 | None], dt: float, q: Array, v: Array) -> tuple[str, ...]:
         """Take the targets of one tick; returns the names whose target is not usable, unknown names among them."""
+        known = self.offer(targets)
+        usable = self._take(self.held, q, v, dt)
+        return () if usable and known else self.rejected(targets)
+
+    def offer(self, targets: Mapping[str, pin.SE3 | None]) -> bool:
+        """Write the targets of one tick to where :func:`take_targets` looks; whether every name is an arm's."""
         known = 0
         for i, arm in enumerate(self._arms):
             target = targets.get(arm)
@@ -78,20 +84,25 @@ class TargetTracker:
             else:
                 self._offered[i] = _NONE if target is None else _NO_POSE
             known += arm in targets
-        usable = self._take(self.held, q, v, dt)
-        if usable and known == len(targets):
-            return ()
+        return known == len(targets)
+
+    def rejected(self, targets: Mapping[str, pin.SE3 | None]) -> tuple[str, ...]:
+        """Of what was offered and taken, the names whose target is not usable, unknown names among them."""
         rejected = [arm for arm, offered in zip(self._arms, self._offered, strict=True) if offered == _NO_POSE]
         return (*rejected, *(str(name) for name in targets if name not in self._arms))
 
 
 @kernel
-def take_targets(held_targets: Held, q: Array, v: Array, dt: float) -> bool:
+def _take_held(held_targets: Held, q: Array, v: Array, dt: float) -> bool:
+    return take_targets(borrowed(held_targets), q, v, dt)
+
+
+@kernel
+def take_targets(targets: Targets, q: Array, v: Array, dt: float) -> bool:
     """Make what was offered each arm's target, or hold it where there is nothing usable; False if something was not.
 
     What is no pose is marked so in ``targets.offered``.
     """
-    targets = borrowed(held_targets)
     all_usable = True
     for i in range(targets.offered.shape[0]):
         if targets.offered[i] == _POSE and _take_pose(targets, i, dt):
