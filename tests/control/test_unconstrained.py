@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pinocchio as pin
+import pytest
 
 from q2r2_control import CartesianController, Robot, load_config
+from q2r2_control.control.kernel_data import KernelData
+from q2r2_control.control.kernel_model import kernel_model_of
 from q2r2_control.control.qp import DaqpSolver, OnlyIfBound, QpProblem, QpSolution
+from q2r2_control.control.unconstrained import find_minimum
 from q2r2_control.types import Array
 
 CONFIG = load_config("config/dual_iiwa7.yaml")
@@ -37,6 +42,62 @@ class BothWays:
             assert (problem.minimum <= problem.upper).all()
             assert (problem.rows @ problem.minimum >= problem.rows_lower - 1e-12).all()
         return solution
+
+
+@pytest.fixture
+def data() -> KernelData:
+    """Of a cost whose minimum is 0.1 rad/s for every joint, in a box of 1 rad/s and with one row that it keeps."""
+    robot = Robot.from_config(CONFIG)
+    data, nv = KernelData.empty(kernel_model_of(robot, SETTINGS)), robot.model.nv
+    root = np.random.default_rng(5).normal(size=(nv, nv))
+    data.tasks.H[:] = root @ root.T + np.eye(nv)
+    data.tasks.g[:] = -data.tasks.H @ np.full(nv, 0.1)
+    data.safety.box.lower[:], data.safety.box.upper[:] = -1.0, 1.0
+    data.safety.rows.matrix[0, 3], data.safety.rows.lower[0], data.safety.rows.used[0] = 1.0, 0.05, 1
+    return data
+
+
+def test_a_minimum_within_all_bounds_is_found(data: KernelData) -> None:
+    assert find_minimum(data.safety, data.tasks)
+    np.testing.assert_allclose(data.tasks.minimum, 0.1, atol=1e-12)
+
+
+def _lower(data: KernelData) -> None:
+    data.safety.box.lower[5] = 0.2
+
+
+def _upper(data: KernelData) -> None:
+    data.safety.box.upper[13] = 0.0
+
+
+def _row(data: KernelData) -> None:
+    data.safety.rows.lower[0] = 0.11
+
+
+def _not_finite(data: KernelData) -> None:
+    data.tasks.g[2], data.safety.rows.used[0] = np.nan, 0
+
+
+def _infinite(data: KernelData) -> None:
+    data.safety.box.upper[:], data.tasks.g[0], data.safety.rows.used[0] = np.inf, -np.inf, 0
+
+
+def _flat(data: KernelData) -> None:
+    data.tasks.H[4], data.tasks.H[:, 4] = 0.0, 0.0
+
+
+@pytest.mark.parametrize("change", [_lower, _upper, _row, _not_finite, _infinite, _flat])
+def test_one_bound_that_is_in_the_way_leaves_it_to_the_solver(
+    data: KernelData, change: Callable[[KernelData], None]
+) -> None:
+    change(data)
+    assert not find_minimum(data.safety, data.tasks)
+
+
+def test_a_row_of_an_earlier_tick_does_not_count(data: KernelData) -> None:
+    _row(data)
+    data.safety.rows.used[0] = 0
+    assert find_minimum(data.safety, data.tasks)
 
 
 def circling(home: pin.SE3, t: float, side: float) -> pin.SE3:
