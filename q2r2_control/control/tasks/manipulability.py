@@ -15,8 +15,7 @@ J J' gets a little damping on its diagonal, so that the gradient stays finite wh
 
 from __future__ import annotations
 
-import numpy as np
-
+from q2r2_control.control.cholesky import factorise, substitute
 from q2r2_control.control.jit import kernel
 from q2r2_control.control.tasks.frame import ROTATION_LENGTH
 from q2r2_control.control.tasks.task_data import TaskData
@@ -73,32 +72,20 @@ def _weigh(model: TaskModel, data: TaskData, i: int) -> None:
     chain, joint, J = model.chain, model.tools.joint[i], data.J[6 * i : 6 * i + 6]
     gram, weights = data.manipulability.gram, data.manipulability.weights
     for row in range(6):
-        for k in range(row + 1):
+        for k in range(row, 6):
             gram[row, k] = 0.0
             far = joint
             while far != 0:
                 gram[row, k] += _row_scale(row) * J[row, far - 1] * _row_scale(k) * J[k, far - 1]
                 far = chain.parent[far]
         gram[row, row] += _DAMPING * _DAMPING
-    for row in range(6):
-        for k in range(row + 1):
-            total = gram[row, k]
-            for m in range(k):
-                total -= gram[row, m] * gram[k, m]
-            gram[row, k] = np.sqrt(total) if row == k else total / gram[k, k]
+    factorise(gram)
     far = joint
     while far != 0:
         j = far - 1
         for row in range(6):
-            total = _row_scale(row) * J[row, j]
-            for k in range(row):
-                total -= gram[row, k] * weights[k, j]
-            weights[row, j] = total / gram[row, row]
-        for row in range(5, -1, -1):
-            total = weights[row, j]
-            for k in range(row + 1, 6):
-                total -= gram[k, row] * weights[k, j]
-            weights[row, j] = total / gram[row, row]
+            weights[row, j] = _row_scale(row) * J[row, j]
+        substitute(gram, weights[:, j])
         for row in range(3, 6):
             weights[row, j] /= ROTATION_LENGTH
         far = chain.parent[far]
