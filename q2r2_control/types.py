@@ -150,7 +150,7 @@ class StepReport:
     certified: bool  # a stopping motion that keeps limits and separation is known
     fallback: bool
     slack: float  # largest violation of a separation row of unit norm [rad/s]
-    solve_time: float  # solver's own time [s]
+    solve_time: float  # solver's own time, 0 where none had to be asked [s]
     tightest_pair: tuple[str, str] = ("", "")  # geometry names of the pair with the least margin
     margin: float = math.inf  # its distance less the one that it keeps [m]
     unsolved: int = 0  # bit i: the QP of substep i had no solution, or too late, and the stop went on

@@ -1,7 +1,7 @@
 """Cholesky factors of small positive definite matrices, compiled.
 
 For six to fourteen rows LAPACK takes several times as long to call as the work itself takes. Nothing here raises: a
-matrix that is not positive definite, or not finite, is said to be none.
+matrix that is not positive definite is said to be none.
 """
 
 from __future__ import annotations

@@ -39,8 +39,9 @@ class CartesianController:
     reference is the controller's own state: it follows the targets, not the plant's measurement, so that noise never
     enters it.
 
-    One tick is three calls: :func:`assemble` writes the QP, a solver solves it, :func:`move_reference` takes of the
-    solution what can be certified and moves the reference.
+    One tick is three calls: :func:`assemble` takes the targets, writes the QP and finds the minimum of its cost, a
+    solver solves it where that is not the solution, :func:`move_reference` takes of the solution what can be certified
+    and moves the reference. A ``solver`` that is given, instead of one by its name, is asked at every tick.
     """
 
     def __init__(
@@ -56,7 +57,7 @@ class CartesianController:
         model, data = self._objects.model, self._objects.data
         self._state, self._rows, self._active = data.safety.state, data.safety.rows, data.safety.active
         self._stop, self._tasks = data.safety.certified, data.tasks
-        self._solution = np.zeros(self._nv)  # of the solver, whatever array it gave
+        self._solution = np.zeros(self._nv)  # of the QP, whatever array has it
         self._problem = QpProblem(
             H=data.tasks.H,
             g=data.tasks.g,
@@ -101,7 +102,7 @@ class CartesianController:
         return None if self._live.narrow < 0 else self._names.pair(self._live.narrow)
 
     def _compile(self) -> None:
-        """Run every kernel once, so that none is compiled in mid-motion."""
+        """Run every kernel and the solver once, so that none is compiled or set up in mid-motion."""
         self.reset(self.robot.home)
         model, data, targets = self._held_model, self._held_data, self._targets.held
         self._assemble = bound(assemble, model, targets, data, self.settings.max_substep, -1.0)
@@ -109,6 +110,9 @@ class CartesianController:
         self._spare = bound(spare_distance, model, data, self._with_others[self._arms[0]])
         self._move = bound(move_reference, model, data, self._solution, False, self.settings.max_substep, 1.0)
         self.step({arm: self.tool_pose(arm) for arm in self._arms}, self.settings.max_substep)
+        # A solver is set up at its first problem, and at home there may be none for it.
+        self._problem.minimum = None
+        self._solver.solve(self._problem)
 
     def reset(self, q: Array, v: Array | None = None) -> None:
         """Start anew at joint positions ``q`` [rad] and velocities ``v`` [rad/s], (nv,) each; targets are forgotten.
@@ -158,7 +162,7 @@ class CartesianController:
             for index in range(substeps):
                 if not self._advance(time / substeps, 1.0 / substeps, -1.0 if index else time, summary):
                     summary.unsolved |= 1 << index
-            rejected = () if known and summary.usable else self._targets.rejected(targets)
+            rejected = () if known and summary.targets_usable else self._targets.rejected(targets)
         else:
             rejected = self._targets.update(targets, time, state.q, state.v)
             state.a.fill(0.0)
@@ -282,7 +286,7 @@ class CartesianController:
         """
         self._live.step(self._objects.load, h)
         usable, inside, free = self._assemble(self._held_model, self._targets.held, self._held_data, h, tick)
-        summary.usable &= usable
+        summary.targets_usable &= usable
         summary.inside &= inside
         count = int(self._rows.used[0])
         self._problem.rows, self._problem.rows_lower = self._rows.matrix[:count], self._rows.lower[:count]

@@ -21,6 +21,7 @@ import numba.extending
 import numpy as np
 import numpy.typing as npt
 from numba import types
+from numba.core import cgutils
 
 _ROOMS = ("control", "compliance")
 _COMPILED = re.compile(r"^@(inlined_)?kernel|\bNamedTuple\b", re.MULTILINE)
@@ -49,7 +50,7 @@ def _cache_folder() -> Path:
 _FOLDER = str(_cache_folder())
 
 
-# Set by Numba at run time, so no type checker knows its members.
+# Set by Numba at run time, so no type checker knows its members; nor what is registered with the decorators.
 config: Any = numba.config
 extending: Any = numba.extending
 
@@ -60,6 +61,10 @@ class _Pointer(types.Type):
     def __init__(self, pointee: Any) -> None:
         self.pointee = pointee
         super().__init__(name=f"Held({pointee})")
+
+    @property
+    def key(self) -> Any:
+        return self.pointee  # whose name does not tell of its fields
 
 
 extending.register_model(_Pointer)(extending.models.OpaqueModel)
@@ -79,6 +84,9 @@ class Held:
         self.address = memory.ctypes.data
         self.kind = _Pointer(numba.typeof(value))
 
+    def __reduce__(self) -> Any:
+        return hold, (self.value,)  # a copy has an address of its own
+
 
 @extending.typeof_impl.register(Held)
 def _kind_of(held: Held, context: Any) -> _Pointer:
@@ -87,10 +95,13 @@ def _kind_of(held: Held, context: Any) -> _Pointer:
 
 @extending.unbox(_Pointer)
 def _unbox(kind: _Pointer, held: Any, context: Any) -> Any:
-    address = context.pyapi.object_getattr_string(held, "address")
-    pointer = context.pyapi.long_as_voidptr(address)
-    context.pyapi.decref(address)
-    return extending.NativeValue(pointer, is_error=context.pyapi.c_api_error())
+    builder, python = context.builder, context.pyapi
+    pointer = cgutils.alloca_once_value(builder, context.context.get_constant_null(kind))
+    address = python.object_getattr_string(held, "address")
+    with builder.if_then(cgutils.is_not_null(builder, address)):
+        builder.store(python.long_as_voidptr(address), pointer)
+        python.decref(address)
+    return extending.NativeValue(builder.load(pointer), is_error=python.c_api_error())
 
 
 @extending.intrinsic

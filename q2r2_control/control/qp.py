@@ -6,7 +6,7 @@
 The box is never empty (joint_limits.py) and the rows are soft, so a solution always exists. Rows have unit norm, so
 that a slack is a joint speed. H^-1 along a row is what the cost yields to it: a row alone gives way by the part
 SOFTNESS of what it corrects, however strong the cost. This is DAQP's own notion of softness; the other solvers are
-given the same.
+given the same. Where the cost's own minimum keeps box and rows it is the solution, and no solver has to be asked.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class QpSolution:
     """What a solver found."""
 
     v: Array | None  # (nv,) [rad/s]; None: no solution
-    solve_time: float  # the solver's own measure [s]
+    solve_time: float  # the solver's own measure, 0 where none was asked [s]
 
 
 class Solver(Protocol):
@@ -208,7 +208,7 @@ class QpsolversSolver:
         return QpSolution(v, time.perf_counter() - before)
 
 
-def make_solver(name: str, nv: int, time_limit: float | None) -> OnlyIfBound:
+def make_solver(name: str, nv: int, time_limit: float | None) -> Solver:
     """Solver by its name in the YAML; ``time_limit`` [s] is given to solvers that take one.
 
     Raises :class:`ConfigError` for a solver that is not installed.

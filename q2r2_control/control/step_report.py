@@ -57,7 +57,7 @@ class StepSummary:
 
     def __init__(self) -> None:
         self.fallback = False
-        self.usable = True  # all targets are
+        self.targets_usable = True  # all of them
         self.inside = True  # all joints are within their limits
         self.unsolved = 0  # bit by bit, which substeps had no solution
         self.slack = 0.0

@@ -139,6 +139,12 @@ def test_a_dt_that_is_no_time_moves_nothing_and_says_so(dt: Any) -> None:
     reference = controller.step(crossing(0.0, start), dt)
     np.testing.assert_array_equal(reference.q, controller.robot.home)
     assert reference.report.status is StepStatus.DT_REJECTED
+    for tick in range(50):
+        moving = controller.step(crossing(tick * 0.001, start), 0.001)
+    assert np.abs(moving.a).max() > 1.0
+    reference = controller.step(crossing(0.05, start), dt)
+    np.testing.assert_array_equal(reference.q, moving.q)
+    np.testing.assert_array_equal(reference.a, 0.0)
 
 
 def test_a_dt_above_a_tenth_of_a_second_moves_no_further_than_that() -> None:

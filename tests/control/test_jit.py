@@ -1,11 +1,14 @@
 from __future__ import annotations
 
 import ast
+import copy
 import gc
+import pickle
 import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -152,10 +155,48 @@ def test_what_is_held_lives_as_long_as_it_is_held_and_no_longer() -> None:
 def test_what_is_held_outlives_its_maker() -> None:
     held = hold((np.ones(100_000),))
     gc.collect()
+    # What was freed would be taken by others of its size.
     elsewhere = [np.full(100_000, 5.0) for _ in range(10)]
+    small = [np.full(held.memory.nbytes, 7, dtype=np.uint8) for _ in range(100)]
     _double_held(held)
     np.testing.assert_array_equal(held.value[0], 2.0)
     assert all((array == 5.0).all() for array in elsewhere)
+    assert all((array == 7).all() for array in small)
+
+
+def test_a_copy_of_what_is_held_is_held_elsewhere() -> None:
+    held = hold((np.ones(3),))
+    for other in (copy.deepcopy(held), pickle.loads(pickle.dumps(held))):
+        _double_held(other)
+        np.testing.assert_array_equal(other.value[0], 2.0)
+    np.testing.assert_array_equal(held.value[0], 1.0)
+
+
+class _OneWay(NamedTuple):
+    first: Array
+    second: Array
+
+
+@kernel
+def _first_of(held: jit.Held) -> float:
+    first: float = borrowed(held).first[0]
+    return first
+
+
+def test_tuples_with_one_name_and_other_fields_are_not_mixed_up() -> None:
+    class OtherWay(NamedTuple):
+        second: Array
+        first: Array
+
+    OtherWay.__name__ = OtherWay.__qualname__ = "_OneWay"
+    assert _first_of(hold(_OneWay(first=np.ones(1), second=np.zeros(1)))) == 1.0
+    assert _first_of(hold(OtherWay(first=np.ones(1), second=np.zeros(1)))) == 1.0
+
+
+def test_what_is_not_held_is_an_error_and_no_crash() -> None:
+    double = bound(_double_held, hold((np.ones(3),)))
+    with pytest.raises(AttributeError, match="address"):
+        double(None)
 
 
 @kernel

@@ -79,7 +79,7 @@ def _weigh(model: TaskModel, data: TaskData, i: int) -> None:
                 gram[row, k] += _row_scale(row) * J[row, far - 1] * _row_scale(k) * J[k, far - 1]
                 far = chain.parent[far]
         gram[row, row] += _DAMPING * _DAMPING
-    factorise(gram)
+    factorise(gram)  # positive definite for any finite J
     far = joint
     while far != 0:
         j = far - 1

@@ -56,7 +56,7 @@ def factor_of_tools(J: Array, factor: Array) -> None:
                 total += J[i, k] * J[j, k]
             factor[i, j] = total
         factor[i, i] += _PROJECTION_DAMPING * _PROJECTION_DAMPING
-    factorise(factor)  # positive definite for any finite J
+    factorise(factor)  # positive definite for any finite J; of another, J v is not finite either
 
 
 @kernel
