@@ -157,7 +157,7 @@ def test_what_is_held_outlives_its_maker() -> None:
     gc.collect()
     # What was freed would be taken by others of its size.
     elsewhere = [np.full(100_000, 5.0) for _ in range(10)]
-    small = [np.full(held.memory.nbytes, 7, dtype=np.uint8) for _ in range(100)]
+    small = [np.full(size, 7, dtype=np.uint8) for size in range(8, 256, 8) for _ in range(100)]
     _double_held(held)
     np.testing.assert_array_equal(held.value[0], 2.0)
     assert all((array == 5.0).all() for array in elsewhere)
