@@ -260,6 +260,9 @@ def test_external_torques_come_as_often_as_hands_feel_them_each_with_one_of_the_
         cell.node.destroy_subscription(subscription)
     ticks = [states.index(stamp) for stamp in torques[1:] if stamp in states]
     assert len(ticks) > 30, "a robot's torques are of the tick of its joint states"
-    # One in five of 250 Hz; ticks that a busy machine leaves out make gaps shorter, none longer.
-    assert 3 <= np.median(np.diff(ticks)) <= 5
-    assert np.diff(ticks).max() <= 5
+    # One in five of 250 Hz. Ticks that a busy machine leaves out make gaps shorter; a tick that comes a little early or
+    # late falls to the torque before or after it, which makes one gap longer by that tick and another shorter.
+    gaps = np.diff(ticks)
+    assert 3 <= np.median(gaps) <= 5
+    assert np.mean(gaps) <= 5.1
+    assert gaps.max() <= 6
