@@ -11,7 +11,7 @@ import pytest
 
 from q2r2_control.config import Config
 from q2r2_control.config.teleop import TeleopSettings
-from q2r2_control.control.qp import DaqpSolver, QpProblem, QpSolution
+from q2r2_control.control.qp import QpProblem, QpSolution, Solver, make_solver
 from q2r2_control.errors import ConfigError, PlantError, RecordingError
 from q2r2_control.inputs.scripted import ScriptedInput
 from q2r2_control.judging.judge import judge
@@ -179,20 +179,21 @@ def test_a_run_that_a_fault_ended_ends_by_the_same_fault(tmp_path: Path) -> None
     assert f"a fault ended the run: {fault.value}" in judged.verdict.line
 
 
-class SometimesLate(DaqpSolver):
+class SometimesLate:
     """Has no solution at every seventh problem, as if it had taken too long."""
 
-    count = 0
+    def __init__(self, solver: Solver) -> None:
+        self._solver, self.count = solver, 0
 
     def solve(self, problem: QpProblem) -> QpSolution:
         self.count += 1
-        solution = super().solve(problem)
+        solution = self._solver.solve(problem)
         return QpSolution(None, 1.0) if self.count % 7 == 0 else solution
 
 
 def test_solutions_that_came_too_late_are_too_late_again(tmp_path: Path) -> None:
     loop = pipeline(control=cell().control.model_copy(update={"solve_time_limit": None}))
-    loop.controller._solver = SometimesLate(loop.robot.model.nv, None)
+    loop.controller._solver = SometimesLate(make_solver("daqp", loop.robot.model.nv, None))
     file = file_of(record(tmp_path, loop, 1.2))
     result = replay(file)
     assert result.difference is None
