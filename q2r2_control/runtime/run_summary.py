@@ -144,17 +144,11 @@ class RunStatistics:
 
     def _count_waiting(self) -> None:
         for tick in self._waiting:
-            self._count(*tick)
+            self._count(tick)
         self._waiting.clear()
 
-    def _count(
-        self,
-        dt: float,
-        reference: Reference,
-        targets: dict[str, ArmTarget],
-        tools: dict[str, pin.SE3],
-        engaged: dict[str, bool],
-    ) -> None:
+    def _count(self, tick: _Counted) -> None:
+        dt, reference, targets, tools, engaged = tick
         report = reference.report
         self._ticks += 1
         self._duration += dt
