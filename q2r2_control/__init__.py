@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING
 from q2r2_control._lazy import lazy_exports
 
 if TYPE_CHECKING:
-    from q2r2_control.config import load_config
+    from q2r2_control.config.cell import load_config
     from q2r2_control.config.control import ControllerSettings
     from q2r2_control.control.controller import CartesianController
     from q2r2_control.errors import ConfigError, Q2R2Error
-    from q2r2_control.pipeline import Pipeline
+    from q2r2_control.pipeline.pipeline import Pipeline
     from q2r2_control.robot.robot import Robot
     from q2r2_control.runtime.run_summary import RunSummary
     from q2r2_control.teleop.relative import RelativeMotion

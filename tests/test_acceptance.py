@@ -22,7 +22,7 @@ import pytest
 
 from q2r2_control.config.timeouts import STREAM_TIMEOUT
 from q2r2_control.inputs.headset import HeadsetServer
-from q2r2_control.pipeline import Pipeline
+from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.runtime.recorder import Tick
 from q2r2_control.runtime.run_summary import RunSummary
 from q2r2_control.types import SIDES, Array, HandSample

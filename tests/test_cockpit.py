@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from q2r2_control.inputs.headset import HeadsetServer
-from q2r2_control.pipeline import Pipeline
+from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.runtime.recorder import Tick
 from tests.support.fake_headset import RATE_HZ, FakeHeadset, Sensor
 from tests.support.operator_script import HANDS, START

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from q2r2_control.errors import PlantError
-from q2r2_control.pipeline import Pipeline
+from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.plants.kinematic import KinematicPlant
 from q2r2_control.robot.robot import Robot
 from q2r2_control.runtime import loop_clock

@@ -18,13 +18,13 @@ import numpy as np
 import pinocchio as pin
 
 from q2r2_control.benchmark.feel_hands import SETTLES, Way, reaches, stop, tone, tremor
-from q2r2_control.config import Config
+from q2r2_control.config.cell import Config
 from q2r2_control.config.teleop import FilterSettings
 from q2r2_control.inputs.played import PlayedInput
 from q2r2_control.inputs.sampling import HeadsetSampling
 from q2r2_control.inputs.scripted import HANDS_AT_REST
 from q2r2_control.judging.delay import Track, delays_behind
-from q2r2_control.pipeline import Pipeline
+from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.robot.robot import Robot
 from q2r2_control.runtime.recorder import Tick

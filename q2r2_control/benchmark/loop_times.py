@@ -24,10 +24,11 @@ import numpy.typing as npt
 
 from q2r2_control.benchmark.stage_clock import PHYSICS, STAGES, StageClock
 from q2r2_control.benchmark.tick_times import FEWEST_TICKS
-from q2r2_control.config import Config
+from q2r2_control.config.cell import Config
 from q2r2_control.errors import ConfigError, PlantError
 from q2r2_control.inputs.scripted import ScriptedInput
-from q2r2_control.pipeline import Pipeline, PipelineRun
+from q2r2_control.pipeline.pipeline import Pipeline
+from q2r2_control.pipeline.pipeline_run import PipelineRun
 from q2r2_control.plants.factory import make_plant
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.recording.about import About

@@ -9,7 +9,7 @@ import numpy as np
 
 from q2r2_control.benchmark.peers.base import BenchController
 from q2r2_control.benchmark.timed_run import OwnController, TimedRun, rest_acceleration, timed_run
-from q2r2_control.config import Config
+from q2r2_control.config.cell import Config
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array

@@ -16,7 +16,7 @@ import numpy as np
 import pinocchio as pin
 
 from q2r2_control.benchmark.sliding_stability import chatter_friction
-from q2r2_control.config import Config
+from q2r2_control.config.cell import Config
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.drives.torque import TorqueDrive
 from q2r2_control.errors import ConfigError

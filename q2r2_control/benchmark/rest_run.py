@@ -15,7 +15,7 @@ import pinocchio as pin
 
 from q2r2_control.benchmark.motion_run import own_controller
 from q2r2_control.benchmark.timed_run import Poses, rest_acceleration
-from q2r2_control.config import Config
+from q2r2_control.config.cell import Config
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 

@@ -20,7 +20,7 @@ from trajectory_msgs.msg import JointTrajectory
 
 from q2r2_control.benchmark.command_responses import LatencyReport, Recording, latency_report
 from q2r2_control.benchmark.ros_processes import private_domain, started
-from q2r2_control.config import load_config
+from q2r2_control.config.cell import load_config
 from q2r2_control.errors import Q2R2Error
 from q2r2_control.robot.robot import Robot
 from q2r2_control.ros.base_node import COMMAND_QOS, STREAM_QOS

@@ -16,7 +16,7 @@ from trajectory_msgs.msg import JointTrajectory
 
 from q2r2_control.benchmark.node_load import LoadReport, NodeLoad, speed_ripple, times_of_a_robot
 from q2r2_control.benchmark.ros_processes import private_domain, processor_time, started
-from q2r2_control.config import load_config
+from q2r2_control.config.cell import load_config
 from q2r2_control.errors import Q2R2Error
 from q2r2_control.ros.base_node import STREAM_QOS
 from q2r2_control.ros.launch.processes import NodeProcess, nodes_of

@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from q2r2_control.benchmark.stack_run import Stack, StackFigures
-from q2r2_control.config import Config
+from q2r2_control.config.cell import Config
 from q2r2_control.types import CommandMode
 from q2r2_control.verification.work_motions import WorkMotion
 

@@ -14,9 +14,9 @@ import mujoco
 import numpy as np
 
 from q2r2_control.benchmark.motion_run import arrival_time, nearest_pair, without_pairs
-from q2r2_control.config import Config
+from q2r2_control.config.cell import Config
 from q2r2_control.errors import PlantError
-from q2r2_control.pipeline import Pipeline
+from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.robot.kept_distances import kept_distances
 from q2r2_control.robot.robot import Robot

@@ -16,7 +16,7 @@ import pinocchio as pin
 
 from q2r2_control.benchmark.peers.base import PEERS, BenchController, Setup, build_peers
 from q2r2_control.benchmark.timed_run import OwnController, Poses, RunMetrics, Targets, TimedRun, metrics_of, timed_run
-from q2r2_control.config import Config
+from q2r2_control.config.cell import Config
 from q2r2_control.config.control import ControllerSettings, DistanceSettings
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.errors import ConfigError

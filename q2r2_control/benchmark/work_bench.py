@@ -13,7 +13,7 @@ from typing import Any
 from q2r2_control.benchmark.motion_run import DT, PATIENCE, MotionFigures, own_controller, run_motion, without_pairs
 from q2r2_control.benchmark.peers.base import BenchController, Setup, build_peers
 from q2r2_control.benchmark.peers.leading import Leading
-from q2r2_control.config import Config
+from q2r2_control.config.cell import Config
 from q2r2_control.robot.robot import Robot
 from q2r2_control.verification.work_motions import WorkMotion
 

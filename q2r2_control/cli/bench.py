@@ -29,8 +29,8 @@ from q2r2_control.cli.soak_table import soak_table
 from q2r2_control.cli.stack_table import following_table, safety_table
 from q2r2_control.cli.times_table import motion_table, times_table
 from q2r2_control.cli.work_table import work_table
-from q2r2_control.config import Config, load_config
 from q2r2_control.config.cameras import CameraConfig
+from q2r2_control.config.cell import Config, load_config
 from q2r2_control.errors import ConfigError
 from q2r2_control.types import CommandMode
 from q2r2_control.verification.contact_cells import FINGERS, TABLE_ONLY, with_contact

@@ -15,7 +15,7 @@ from q2r2_control.cli.headset_server import AnnouncedHeadset
 from q2r2_control.cli.output import as_json_text, notice_of_compiling, stderr_console
 from q2r2_control.cli.summary_table import recording_line, summary_table, task_line, verdict_markup
 from q2r2_control.cli.window import check_window, show_window
-from q2r2_control.config import Config
+from q2r2_control.config.cell import Config
 from q2r2_control.config.external import ControllerKind
 from q2r2_control.errors import ConfigError, PlantError, RecordingError
 from q2r2_control.inputs.base import Input
@@ -23,7 +23,7 @@ from q2r2_control.inputs.factory import make_input
 from q2r2_control.inputs.scripted import ScriptedInput
 from q2r2_control.judging.episode_judge import EpisodeJudge
 from q2r2_control.judging.judge import Judged, judge, keep_verdicts
-from q2r2_control.pipeline import Pipeline
+from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.recording.about import About
 from q2r2_control.recording.reader import Recording

@@ -23,7 +23,7 @@ from q2r2_control.cli.tables import (
     pair_table,
     stop_table,
 )
-from q2r2_control.config import load_config
+from q2r2_control.config.cell import load_config
 from q2r2_control.errors import ConfigError
 
 

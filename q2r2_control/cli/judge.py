@@ -17,7 +17,7 @@ from q2r2_control.cli.figure_table import figure_table
 from q2r2_control.cli.options import Json
 from q2r2_control.cli.output import as_json_text, stderr_console
 from q2r2_control.cli.summary_table import verdict_markup
-from q2r2_control.config import load_config
+from q2r2_control.config.cell import load_config
 from q2r2_control.config.judge import JudgeSettings
 from q2r2_control.errors import ConfigError
 from q2r2_control.judging.judge import Judged, judge_all

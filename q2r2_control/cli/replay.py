@@ -14,9 +14,9 @@ from q2r2_control.cli.options import Json, PlantName
 from q2r2_control.cli.output import as_json_text, notice_of_compiling, stderr_console
 from q2r2_control.cli.summary_table import summary_table
 from q2r2_control.cli.window import check_window, show_window
-from q2r2_control.config import Config, load_config
+from q2r2_control.config.cell import Config, load_config
 from q2r2_control.errors import ConfigError
-from q2r2_control.pipeline import Pipeline
+from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.recording.joint_replay import replay_joints
 from q2r2_control.recording.replay import replay as replay_recording
 

@@ -12,10 +12,10 @@ from rich.text import Text
 
 from q2r2_control.cli.options import DEMO_CONFIG, Json, positive
 from q2r2_control.cli.output import as_json_text
-from q2r2_control.config import load_config
-from q2r2_control.ros import watching
+from q2r2_control.config.cell import load_config
 from q2r2_control.ros.launch.processes import nodes_of
-from q2r2_control.ros.watching import Finding
+from q2r2_control.ros.watching.environment import examine_environment
+from q2r2_control.ros.watching.findings import Finding, examine_set
 from q2r2_control.runtime.process import StopRequest, stop_on_signals
 
 _TIME = 4.0  # in which a set is found, and a second publisher too [s]
@@ -36,15 +36,17 @@ def doctor(
     positive("--duration", duration)
     cell = load_config(config)
     expected = [node.name for node in nodes_of(config, "none", separate=True)]
-    facts, findings = watching.examine_environment(os.environ)
+    facts, findings = examine_environment(os.environ)
     nodes: tuple[str, ...] = ()
     others: tuple[str, ...] = ()
     if not any(finding.stops_arms for finding in findings):
+        from q2r2_control.ros.watching.set_listener import watch_set
+
         stop = StopRequest()
         with stop_on_signals(stop.ask):
-            view = watching.watch_set(cell, duration, lambda view: None, lambda: stop.asked)
+            view = watch_set(cell, duration, lambda view: None, lambda: stop.asked)
         nodes, others = tuple(node.name for node in view.nodes), view.others
-        findings += watching.examine_set(view, expected)
+        findings += examine_set(view, expected)
     stops = any(finding.stops_arms for finding in findings)
     if json:
         print(as_json_text({**facts, "nodes": nodes, "others": others, "findings": findings, "stops_arms": stops}))

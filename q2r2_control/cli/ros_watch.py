@@ -14,9 +14,9 @@ from rich.live import Live
 from q2r2_control.cli.options import DEMO_CONFIG, Json, positive
 from q2r2_control.cli.output import as_json_text, stderr_console
 from q2r2_control.cli.ros_set_table import arm_lines, set_tables
-from q2r2_control.config import Config, load_config
-from q2r2_control.ros import watching
+from q2r2_control.config.cell import Config, load_config
 from q2r2_control.ros.launch.processes import check_rclpy
+from q2r2_control.ros.watching.set_view import SetView
 from q2r2_control.runtime.process import StopRequest, stop_on_signals
 
 _ONCE = 3.0  # in which a set is found, and its nodes have spoken several times [s]
@@ -41,10 +41,12 @@ def watch(
     elif once or json:
         duration = _ONCE
     check_rclpy()
+    from q2r2_control.ros.watching.set_listener import watch_set
+
     domain, stop = os.environ.get("ROS_DOMAIN_ID") or "0", StopRequest()
     with stop_on_signals(stop.ask):
         if once or json:
-            view = watching.watch_set(cell, duration, lambda view: None, lambda: stop.asked)
+            view = watch_set(cell, duration, lambda view: None, lambda: stop.asked)
         else:
             view = _watch_live(cell, domain, duration, lambda: stop.asked)
     if json:
@@ -58,19 +60,19 @@ def watch(
     raise typer.Exit(0 if view.nodes else 1)
 
 
-def _watch_live(cell: Config, domain: str, duration: float | None, stop: Callable[[], bool]) -> watching.SetView:
+def _watch_live(cell: Config, domain: str, duration: float | None, stop: Callable[[], bool]) -> SetView:
+    from q2r2_control.ros.watching.set_listener import watch_set
+
     console = stderr_console()
     if not console.is_terminal:
         said: dict[int, str] = {}
 
-        def tell(view: watching.SetView) -> None:
+        def tell(view: SetView) -> None:
             for index, line in enumerate(arm_lines(view)):
                 if said.get(index) != (words := re.sub(r"[\d.]+", "", line)):  # an age changes all the time
                     said[index] = words
                     console.print(line, soft_wrap=True, highlight=False, markup=False)
 
-        return watching.watch_set(cell, duration, tell, stop)
+        return watch_set(cell, duration, tell, stop)
     with Live(console=console, auto_refresh=False, transient=True) as live:
-        return watching.watch_set(
-            cell, duration, lambda view: live.update(set_tables(view, domain), refresh=True), stop
-        )
+        return watch_set(cell, duration, lambda view: live.update(set_tables(view, domain), refresh=True), stop)

@@ -27,7 +27,7 @@ from q2r2_control.cli.options import (
     shows_table,
 )
 from q2r2_control.cli.output import stderr_console
-from q2r2_control.config import load_config
+from q2r2_control.config.cell import load_config
 from q2r2_control.errors import ConfigError
 from q2r2_control.inputs.factory import DEFAULT_TRAJECTORY
 from q2r2_control.inputs.trajectories import TRAJECTORIES

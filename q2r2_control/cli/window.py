@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 
 from q2r2_control.errors import ConfigError
-from q2r2_control.pipeline import Pipeline
+from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.runtime.recorder import Tick
 

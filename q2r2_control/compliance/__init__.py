@@ -4,18 +4,3 @@
 between measured links; ``admittance`` displaces targets by the measured wrench, for arms that take positions. Each
 class has its compiled law beside it in ``*_kernels``; ``impedance_terms`` are the formulas of the impedance.
 """
-
-from q2r2_control.compliance.admittance import Admittance, AdmittanceReport, ArmCompliance
-from q2r2_control.compliance.impedance import ImpedanceController, ImpedanceReport, TorqueCommand
-from q2r2_control.compliance.repulsion import MeasuredSeparation, WallReport
-
-__all__ = [
-    "Admittance",
-    "AdmittanceReport",
-    "ArmCompliance",
-    "ImpedanceController",
-    "ImpedanceReport",
-    "MeasuredSeparation",
-    "TorqueCommand",
-    "WallReport",
-]

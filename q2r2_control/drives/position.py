@@ -8,7 +8,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from q2r2_control.compliance.admittance import Admittance
-from q2r2_control.config import Config
+from q2r2_control.config.cell import Config
 from q2r2_control.drives.base import DriveReport, Openings, ToolTargets, position_command
 from q2r2_control.errors import ConfigError
 from q2r2_control.robot.robot import Robot

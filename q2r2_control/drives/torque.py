@@ -8,7 +8,7 @@ import numpy as np
 
 from q2r2_control.compliance.impedance import ImpedanceController
 from q2r2_control.compliance.repulsion import MeasuredSeparation
-from q2r2_control.config import Config
+from q2r2_control.config.cell import Config
 from q2r2_control.drives.base import DriveReport, Openings, ToolTargets, holding_command, position_command
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, Command, CommandMode, Interval, Reference, RobotState

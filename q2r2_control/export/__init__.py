@@ -7,29 +7,3 @@ finds the pictures that belong to them, ``episodes`` does so for many recordings
 ``thread_policies`` keeps the encoder from going before a control loop. ``bags`` writes episodes as they were recorded.
 ``output`` sees to it that nothing half is left.
 """
-
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
-from q2r2_control._lazy import lazy_exports
-
-if TYPE_CHECKING:
-    from q2r2_control.export.episodes import Episode, Sampling, make_episode, make_episodes
-
-__all__ = [
-    "Episode",
-    "Sampling",
-    "make_episode",
-    "make_episodes",
-]
-
-__getattr__ = lazy_exports(
-    __name__,
-    {
-        "Episode": "episodes",
-        "Sampling": "episodes",
-        "make_episode": "episodes",
-        "make_episodes": "episodes",
-    },
-)

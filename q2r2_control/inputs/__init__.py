@@ -8,17 +8,3 @@ connections in, ``connections`` serves them, ``rate_limits`` bounds what strange
 poses that must not be followed (``frozen_pose``; ``moved_frame`` by ``rigid_motion``), ``samples`` is the queue between
 its thread and the loop, ``statistics``, ``addresses`` and ``headset_check`` are what people see of it.
 """
-
-from q2r2_control.inputs.base import Input
-from q2r2_control.inputs.factory import make_input
-from q2r2_control.inputs.headset import HeadsetServer
-from q2r2_control.inputs.scripted import ScriptedInput
-from q2r2_control.inputs.trajectories import TRAJECTORIES
-
-__all__ = [
-    "TRAJECTORIES",
-    "HeadsetServer",
-    "Input",
-    "ScriptedInput",
-    "make_input",
-]

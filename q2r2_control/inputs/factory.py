@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from q2r2_control.config import Config
+from q2r2_control.config.cell import Config
 from q2r2_control.errors import ConfigError
 from q2r2_control.inputs.base import Input
 from q2r2_control.inputs.hands_watch import HandsWatch

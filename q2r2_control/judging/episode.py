@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from q2r2_control.config import Config
+from q2r2_control.config.cell import Config
 from q2r2_control.config.teleop import Stance
 from q2r2_control.errors import RecordingError
 from q2r2_control.recording import topics as names

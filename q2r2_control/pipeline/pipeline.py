@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 
-from q2r2_control.config import Config
+from q2r2_control.config.cell import Config
 from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.control.controller import CartesianController
-from q2r2_control.drives import make_drive, permitted
+from q2r2_control.drives.base import permitted
+from q2r2_control.drives.factory import make_drive
 from q2r2_control.errors import ConfigError
 from q2r2_control.inputs.base import Input
 from q2r2_control.inputs.factory import make_input

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from q2r2_control.config import Config
+from q2r2_control.config.cell import Config
 from q2r2_control.errors import ConfigError
 from q2r2_control.plants.base import Plant
 from q2r2_control.plants.kinematic import KinematicPlant

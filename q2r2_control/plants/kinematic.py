@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from q2r2_control.config import Config
+from q2r2_control.config.cell import Config
 from q2r2_control.plants.base import GripperMotion, check_command, check_duration, check_joints
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, Command, CommandMode, RobotState

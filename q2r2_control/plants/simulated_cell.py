@@ -9,7 +9,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from q2r2_control.config import Config
+from q2r2_control.config.cell import Config
 from q2r2_control.plants.follower import JointFollower
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.robot.robot import Robot

@@ -11,39 +11,3 @@ common. ``base_recorder`` is what ``recorder`` and ``message_recorder`` share, w
 recorded, ``plant_difference`` where a plant moved to. ``joint_replay`` gives that loop the references alone, as
 ``recorded_way`` leads them.
 """
-
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
-from q2r2_control._lazy import lazy_exports
-
-if TYPE_CHECKING:
-    from q2r2_control.recording.about import About
-    from q2r2_control.recording.episode_spans import EpisodeSpan, read_spans
-    from q2r2_control.recording.files import recordings_in
-    from q2r2_control.recording.reader import Recording
-    from q2r2_control.recording.recorder import Recorder, RecordingSummary
-
-__all__ = [
-    "About",
-    "EpisodeSpan",
-    "Recorder",
-    "Recording",
-    "RecordingSummary",
-    "read_spans",
-    "recordings_in",
-]
-
-__getattr__ = lazy_exports(
-    __name__,
-    {
-        "About": "about",
-        "EpisodeSpan": "episode_spans",
-        "Recorder": "recorder",
-        "Recording": "reader",
-        "RecordingSummary": "recorder",
-        "read_spans": "episode_spans",
-        "recordings_in": "files",
-    },
-)

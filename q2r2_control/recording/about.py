@@ -17,8 +17,8 @@ import yaml
 from q2r2_control.recording.topics import Topics
 
 if TYPE_CHECKING:  # the writer's process does without them
-    from q2r2_control.config import Config
-    from q2r2_control.pipeline import Pipeline
+    from q2r2_control.config.cell import Config
+    from q2r2_control.pipeline.pipeline import Pipeline
 
 FORMAT = "2"  # of topics and fields; another one cannot be replayed
 LOOP, ROS = "loop", "ros"  # sources: one loop's ticks, or what nodes published

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from q2r2_control.config import Config
+from q2r2_control.config.cell import Config
 from q2r2_control.recording import topics as names
 from q2r2_control.recording.about import About, as_yaml, program
 from q2r2_control.recording.encoder import RecordedRobot, TickEncoder

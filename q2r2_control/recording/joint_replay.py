@@ -9,9 +9,10 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 
-from q2r2_control.config import Config
+from q2r2_control.config.cell import Config
 from q2r2_control.errors import PlantError
-from q2r2_control.pipeline import Pipeline, PipelineRun
+from q2r2_control.pipeline.pipeline import Pipeline
+from q2r2_control.pipeline.pipeline_run import PipelineRun
 from q2r2_control.plants.base import Plant
 from q2r2_control.plants.factory import make_plant
 from q2r2_control.recording.comparison import changes

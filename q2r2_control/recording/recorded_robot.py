@@ -7,8 +7,7 @@ from functools import lru_cache
 import numpy as np
 import pinocchio as pin
 
-from q2r2_control.config import Config
-from q2r2_control.config.cell import parse_config
+from q2r2_control.config.cell import Config, parse_config
 from q2r2_control.errors import Q2R2Error, RecordingError
 from q2r2_control.recording.reader import Recording
 from q2r2_control.robot.robot import Robot

@@ -6,13 +6,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from q2r2_control.config import Config
-from q2r2_control.config.cell import parse_config
+from q2r2_control.config.cell import Config, parse_config
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.control.qp import QpProblem, QpSolution, Solver, make_solver
-from q2r2_control.drives import permitted
+from q2r2_control.drives.base import permitted
 from q2r2_control.errors import ConfigError, PlantError, RecordingError
-from q2r2_control.pipeline import Pipeline
+from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.plants.base import Plant
 from q2r2_control.plants.factory import make_plant
 from q2r2_control.recording.about import ROS

@@ -7,7 +7,3 @@ pairs, ``reachability`` and ``model_srdf`` find those that can never meet, and `
 asks of the joints. ``finger_bodies`` makes fingers all that they sweep, ``finger_openings`` knows what of that counts
 at an opening of fingers that slide, ``turning_fingers`` and ``turning_joints`` of those that turn.
 """
-
-from q2r2_control.robot.robot import Arm, PairDistance, Robot
-
-__all__ = ["Arm", "PairDistance", "Robot"]

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 
-from q2r2_control.config import Config
 from q2r2_control.config.arms import HeldObjectConfig
+from q2r2_control.config.cell import Config
 from q2r2_control.errors import ConfigError, RobotError
 from q2r2_control.robot.compose import compose
 from q2r2_control.robot.description import LinkTree, joint_limits, parse_srdf, parse_urdf

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from q2r2_control.control.controller import CartesianController
-from q2r2_control.drives import Drive
+from q2r2_control.drives.base import Drive
 from q2r2_control.supervision.grasp_watch import GraspWatch
 from q2r2_control.supervision.gripper_limiter import REMEMBERED, GripperLimiter
 

@@ -10,8 +10,8 @@ import pinocchio as pin
 from q2r2_control.compliance.admittance import AdmittanceReport
 from q2r2_control.compliance.impedance import ImpedanceReport
 from q2r2_control.compliance.repulsion import WallReport
-from q2r2_control.config import ControllerSettings
-from q2r2_control.drives import DriveReport
+from q2r2_control.config.control import ControllerSettings
+from q2r2_control.drives.base import DriveReport
 from q2r2_control.robot.robot import Robot
 from q2r2_control.runtime.loop_clock import LoopClock
 from q2r2_control.runtime.run_summary import RunStatistics, RunSummary

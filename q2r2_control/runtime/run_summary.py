@@ -12,7 +12,7 @@ import numpy as np
 import pinocchio as pin
 
 from q2r2_control.config.control import ControllerSettings
-from q2r2_control.drives import DriveReport
+from q2r2_control.drives.base import DriveReport
 from q2r2_control.robot.robot import Robot
 from q2r2_control.runtime.histogram import NOTHING_MEASURED, Histogram, Percentiles
 from q2r2_control.runtime.joint_extremes import JointExtremes

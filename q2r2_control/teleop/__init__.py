@@ -6,17 +6,3 @@
 ``gestures`` and ``filters`` turn samples into poses and presses; ``haptics`` tells the operator. ``quaternions`` are
 the rotations of what is worked out at every tick.
 """
-
-from q2r2_control.teleop.arm import ArmTeleop
-from q2r2_control.teleop.arm_states import ArmState
-from q2r2_control.teleop.haptics import HapticPulses
-from q2r2_control.teleop.relative import RelativeMotion
-from q2r2_control.teleop.teleop import Teleop
-
-__all__ = [
-    "ArmState",
-    "ArmTeleop",
-    "HapticPulses",
-    "RelativeMotion",
-    "Teleop",
-]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from q2r2_control.config import Config
+from q2r2_control.config.cell import Config
 from q2r2_control.config.control import ContactPair
 
 TABLE_ONLY = (ContactPair(pair=("*_finger_*", "table")),)

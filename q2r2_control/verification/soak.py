@@ -12,7 +12,7 @@ from typing import Any, Protocol
 import numpy as np
 import pinocchio as pin
 
-from q2r2_control.config import Config
+from q2r2_control.config.cell import Config
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.control.qp import make_solver
 from q2r2_control.errors import ConfigError

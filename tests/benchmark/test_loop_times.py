@@ -9,8 +9,8 @@ import pytest
 
 from q2r2_control.benchmark.loop_times import CASES, _p99_ratio, run_loop_bench
 from q2r2_control.benchmark.stage_clock import STAGES
-from q2r2_control.config import load_config
 from q2r2_control.config.cameras import CameraConfig
+from q2r2_control.config.cell import load_config
 from q2r2_control.errors import ConfigError
 
 CONFIG = load_config("config/dual_iiwa7.yaml")

@@ -17,7 +17,7 @@ from q2r2_control.benchmark.peers.base import (
     is_installed,
     make_peer,
 )
-from q2r2_control.config import load_config
+from q2r2_control.config.cell import load_config
 from q2r2_control.robot.robot import Robot
 
 DT = 0.001

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from q2r2_control.benchmark.rest_run import DT, JOLT, KINDS, STARTED, count_jolts, draw_targets
-from q2r2_control.config import load_config
+from q2r2_control.config.cell import load_config
 from q2r2_control.robot.robot import Robot
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from q2r2_control.benchmark.stack_bench import run_stack_bench
 from q2r2_control.benchmark.stack_run import Stack, StackFigures
-from q2r2_control.config import load_config
+from q2r2_control.config.cell import load_config
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.types import CommandMode, Reference
 from q2r2_control.verification.work_motions import WORK_MOTIONS, carry

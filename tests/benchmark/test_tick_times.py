@@ -11,7 +11,7 @@ import pytest
 from q2r2_control.benchmark.peers.base import INSTALL, PEERS, is_installed
 from q2r2_control.benchmark.tick_times import SCENARIOS, run_bench
 from q2r2_control.benchmark.timed_run import Poses, metrics_of, timed_run
-from q2r2_control.config import load_config
+from q2r2_control.config.cell import load_config
 from q2r2_control.errors import ConfigError
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array

@@ -18,7 +18,7 @@ from typer.testing import CliRunner, Result
 
 from q2r2_control.cli.app import app
 from q2r2_control.cli.progress_lines import ProgressLines
-from q2r2_control.config import load_config
+from q2r2_control.config.cell import load_config
 from q2r2_control.config.resources import find_resource
 from q2r2_control.verification.soak import SoakReport, run_soak
 from tests.support.external_cell import external_text

@@ -24,7 +24,7 @@ from q2r2_control.cli.soak_table import soak_table
 from q2r2_control.cli.stack_table import following_table, safety_table
 from q2r2_control.cli.times_table import motion_table, times_table
 from q2r2_control.cli.work_table import work_table
-from q2r2_control.config import Config
+from q2r2_control.config.cell import Config
 from q2r2_control.types import CommandMode
 from q2r2_control.verification.promises import Margin
 from q2r2_control.verification.soak import SoakReport, Violation

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from q2r2_control.cli.cell_report import check_cell, write_model_pairs
-from q2r2_control.config import load_config
+from q2r2_control.config.cell import load_config
 from q2r2_control.config.resources import find_resource
 from q2r2_control.errors import ConfigError
 from q2r2_control.verification.contact_cells import FINGERS, with_contact

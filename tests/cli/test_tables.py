@@ -10,8 +10,8 @@ from rich.console import Console
 from q2r2_control.cli.cell_report import ArmCheck, JointCheck, KeptPair, PairsWritten, check_cell
 from q2r2_control.cli.summary_table import summary_table
 from q2r2_control.cli.tables import arm_table, pair_reach_table, pair_table
-from q2r2_control.config import load_config
-from q2r2_control.pipeline import Pipeline
+from q2r2_control.config.cell import load_config
+from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.robot.reachability import PairReach
 
 

@@ -10,7 +10,7 @@ import pytest
 from pydantic import ValidationError
 
 from q2r2_control.compliance.admittance import Admittance
-from q2r2_control.config import Config, load_config
+from q2r2_control.config.cell import Config, load_config
 from q2r2_control.config.control import AdmittanceSettings
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.plants.mujoco import MujocoPlant

@@ -10,7 +10,7 @@ import pytest
 from pydantic import ValidationError
 
 from q2r2_control.compliance.impedance import ImpedanceController
-from q2r2_control.config import load_config
+from q2r2_control.config.cell import load_config
 from q2r2_control.config.control import ImpedanceSettings
 from q2r2_control.errors import ConfigError, RobotError
 from q2r2_control.robot.robot import Robot

@@ -7,7 +7,7 @@ import pinocchio as pin
 import pytest
 
 from q2r2_control.compliance.impedance import ImpedanceController
-from q2r2_control.config import load_config
+from q2r2_control.config.cell import load_config
 from q2r2_control.config.control import ImpedanceSettings
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, RobotState

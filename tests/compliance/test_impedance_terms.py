@@ -17,7 +17,7 @@ from q2r2_control.compliance.impedance_terms import (
     take_kinematic,
     task_inertia,
 )
-from q2r2_control.config import load_config
+from q2r2_control.config.cell import load_config
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 from tests.support.arm_dynamics import left_arm

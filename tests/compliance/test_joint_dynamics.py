@@ -9,7 +9,7 @@ import pinocchio as pin
 import pytest
 
 from q2r2_control.compliance.joint_dynamics import Bodies, Dynamics, inverse_dynamics
-from q2r2_control.config import load_config
+from q2r2_control.config.cell import load_config
 from q2r2_control.control.geometry.kinematics import Placements, chain_of, place
 from q2r2_control.robot.robot import Robot
 

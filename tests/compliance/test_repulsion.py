@@ -11,7 +11,7 @@ import pytest
 from pydantic import ValidationError
 
 from q2r2_control.compliance.repulsion import MeasuredSeparation, WallReport
-from q2r2_control.config import load_config
+from q2r2_control.config.cell import load_config
 from q2r2_control.config.control import ControllerSettings, WallSettings
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.robot.finger_openings import collision_model_at

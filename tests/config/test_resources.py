@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from q2r2_control.config import load_config
+from q2r2_control.config.cell import load_config
 from q2r2_control.config.resources import find_resource
 from q2r2_control.errors import ConfigError
 

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from q2r2_control.config import Config, load_config
+from q2r2_control.config.cell import Config, load_config
 from q2r2_control.config.control import ControllerSettings
 from q2r2_control.control.geometry.collision import (
     Bodies,

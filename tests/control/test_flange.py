@@ -12,7 +12,7 @@ import pinocchio as pin
 import pytest
 
 from q2r2_control import CartesianController, Robot, load_config
-from q2r2_control.config import Config
+from q2r2_control.config.cell import Config
 from q2r2_control.types import Array
 from q2r2_control.verification.contract import Contract
 from tests.control.scenarios import Scenario, Targets, into_the_table, same_point

@@ -12,7 +12,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from q2r2_control.config import Config, load_config
+from q2r2_control.config.cell import Config, load_config
 from q2r2_control.config.control import ControllerSettings
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.control.qp import make_solver

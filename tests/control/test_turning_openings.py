@@ -7,7 +7,7 @@ import pinocchio as pin
 import pytest
 
 from q2r2_control import CartesianController, Robot
-from q2r2_control.config import Config
+from q2r2_control.config.cell import Config
 from q2r2_control.robot.finger_openings import collision_model_at
 from q2r2_control.robot.kept_distances import kept_distances
 from q2r2_control.robot.turning_fingers import TurningBody

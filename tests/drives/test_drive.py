@@ -9,9 +9,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from q2r2_control.config import Config
+from q2r2_control.config.cell import Config
 from q2r2_control.errors import ConfigError, PlantError
-from q2r2_control.pipeline import Pipeline
+from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.robot.robot import Robot
 from q2r2_control.runtime.recorder import Tick

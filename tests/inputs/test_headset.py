@@ -17,7 +17,7 @@ from typing import cast
 import numpy as np
 import pytest
 
-from q2r2_control.config import load_config
+from q2r2_control.config.cell import load_config
 from q2r2_control.errors import InputError
 from q2r2_control.inputs.base import Input
 from q2r2_control.inputs.client import MAX_FRAMES_PER_SECOND

@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from q2r2_control.config import load_config
-from q2r2_control.config.cell import Config
+from q2r2_control.config.cell import Config, load_config
 from q2r2_control.config.teleop import Stance
 from q2r2_control.inputs.headset import HeadsetServer
 from q2r2_control.inputs.headset_check import HandMovement, HeadsetCheck, advice, needed_topics, watch_headset

@@ -10,7 +10,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from q2r2_control.config import Config
+from q2r2_control.config.cell import Config
 from q2r2_control.judging.episode import Episode, Frames, Hand, Ticks
 from q2r2_control.recording.reader import Recording
 from q2r2_control.types import Array, Event

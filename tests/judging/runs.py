@@ -14,7 +14,7 @@ from mcap.stream_reader import StreamReader
 from q2r2_control.inputs.played import PlayedInput
 from q2r2_control.inputs.sampling import HeadsetSampling, Sampling
 from q2r2_control.inputs.scripted import HANDS_AT_REST
-from q2r2_control.pipeline import Pipeline
+from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.recording.about import About
 from q2r2_control.recording.mcap_file import MAGIC
 from q2r2_control.recording.recorder import Recorder

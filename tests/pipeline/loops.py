@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from q2r2_control.inputs.scripted import ScriptedInput
-from q2r2_control.pipeline import Pipeline
+from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.runtime.recorder import Tick
 from tests.support.watch import cell, speed
 

@@ -12,7 +12,7 @@ import pinocchio as pin
 import pytest
 
 from q2r2_control.config.teleop import TeleopSettings
-from q2r2_control.pipeline import Pipeline
+from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.robot.robot import Robot
 from q2r2_control.runtime.recorder import Tick
 from q2r2_control.types import Array, HandInputs, HandSample

@@ -11,7 +11,7 @@ import pinocchio as pin
 import pytest
 
 from q2r2_control.inputs.scripted import ScriptedInput
-from q2r2_control.pipeline import Pipeline
+from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.runtime.recorder import Tick
 from q2r2_control.supervision.gripper_limiter import GripperLimiter
 from q2r2_control.types import HandSample

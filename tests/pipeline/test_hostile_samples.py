@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from q2r2_control.inputs.scripted import ScriptedInput
-from q2r2_control.pipeline import Pipeline
+from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.types import SIDES, HandSample
 from tests.support.watch import Watch, cell, speed
 

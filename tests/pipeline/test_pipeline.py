@@ -10,7 +10,7 @@ import pytest
 from q2r2_control.config.control import ContactPair
 from q2r2_control.errors import ConfigError
 from q2r2_control.inputs.scripted import ScriptedInput
-from q2r2_control.pipeline import Pipeline
+from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.runtime.run_summary import RunSummary
 from q2r2_control.types import SIDES
 from tests.pipeline.loops import pipeline

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from q2r2_control.config import Config
+from q2r2_control.config.cell import Config
 from q2r2_control.errors import PlantError
 from q2r2_control.plants.base import Plant
 from q2r2_control.plants.kinematic import KinematicPlant

@@ -9,7 +9,7 @@ import pytest
 import scipy.linalg
 from scipy.integrate import cumulative_trapezoid
 
-from q2r2_control.config import Config
+from q2r2_control.config.cell import Config
 from q2r2_control.config.control import ImpedanceSettings
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.robot.robot import Robot

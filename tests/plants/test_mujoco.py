@@ -7,7 +7,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from q2r2_control.config import Config
+from q2r2_control.config.cell import Config
 from q2r2_control.errors import PlantError
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.robot.robot import Robot

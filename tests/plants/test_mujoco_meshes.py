@@ -12,7 +12,7 @@ import yaml
 from typer.testing import CliRunner
 
 from q2r2_control.cli.app import app
-from q2r2_control.config import Config, load_config
+from q2r2_control.config.cell import Config, load_config
 from q2r2_control.errors import PlantError
 from q2r2_control.plants.mujoco_meshes import load_meshes
 from q2r2_control.plants.mujoco_model import build_model

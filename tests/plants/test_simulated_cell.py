@@ -7,7 +7,7 @@ import pinocchio as pin
 import pytest
 
 from q2r2_control import Robot
-from q2r2_control.config import Config
+from q2r2_control.config.cell import Config
 from q2r2_control.plants.simulated_cell import SimulatedCell
 
 HOLD_AFTER = 0.1  # [s]

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from q2r2_control import Robot
-from q2r2_control.config import Config
+from q2r2_control.config.cell import Config
 from q2r2_control.inputs.messages import Dialect, message_types
 from q2r2_control.recording import topics as names
 from q2r2_control.recording.about import ROS, About, as_yaml

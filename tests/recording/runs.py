@@ -18,7 +18,7 @@ from mcap.stream_reader import StreamReader, get_chunk_data_stream
 
 from q2r2_control.inputs.base import Input
 from q2r2_control.inputs.scripted import ScriptedInput
-from q2r2_control.pipeline import Pipeline
+from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.plants.base import Plant
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.recording.about import About

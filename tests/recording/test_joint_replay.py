@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from q2r2_control.config import Config
+from q2r2_control.config.cell import Config
 from q2r2_control.recording.joint_replay import JointReplay, replay_joints
 from q2r2_control.recording.reader import Recording
 from q2r2_control.recording.recorded_ticks import RecordedTicks

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from q2r2_control.config import Config
+from q2r2_control.config.cell import Config
 from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.control.qp import QpProblem, QpSolution, Solver, make_solver
 from q2r2_control.errors import ConfigError, PlantError, RecordingError

@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 
 from q2r2_control.errors import RecordingError
-from q2r2_control.pipeline import Pipeline
+from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.recording.reader import Recording
 from q2r2_control.recording.recorder import Recorder
 from q2r2_control.recording.replay import replay

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from q2r2_control.config import Config, load_config
+from q2r2_control.config.cell import Config, load_config
 from q2r2_control.robot.compose import ComposedCell, compose
 from q2r2_control.robot.robot import Robot
 

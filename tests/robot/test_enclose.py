@@ -8,7 +8,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from q2r2_control.config import Config
+from q2r2_control.config.cell import Config
 from q2r2_control.errors import RobotError
 from q2r2_control.robot.description import load_description
 from q2r2_control.robot.enclose import enclose_shapes, enclosing_capsule

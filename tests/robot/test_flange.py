@@ -14,7 +14,7 @@ import pytest
 
 from q2r2_control.cli.cell_report import check_cell
 from q2r2_control.cli.tables import arm_table
-from q2r2_control.config import Config, load_config
+from q2r2_control.config.cell import Config, load_config
 from q2r2_control.errors import ConfigError
 from q2r2_control.plants.mujoco_model import build_model
 from q2r2_control.robot.compose import compose

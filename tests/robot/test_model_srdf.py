@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from q2r2_control.config import load_config
+from q2r2_control.config.cell import load_config
 from q2r2_control.config.resources import find_resource
 from q2r2_control.errors import ConfigError
 from q2r2_control.robot.model_srdf import model_srdfs

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from q2r2_control.cli.cell_report import PairsWritten, write_pairs
-from q2r2_control.config import Config, load_config
+from q2r2_control.config.cell import Config, load_config
 from q2r2_control.errors import ConfigError, RobotError
 from q2r2_control.robot.pairs import link_of
 from q2r2_control.robot.reachability import nearest_approaches

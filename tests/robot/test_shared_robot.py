@@ -16,7 +16,7 @@ import yaml
 from typer.testing import CliRunner
 
 from q2r2_control.cli.app import app
-from q2r2_control.config import Config, load_config
+from q2r2_control.config.cell import Config, load_config
 from q2r2_control.errors import ConfigError
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.robot.compose import compose

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from q2r2_control.config import load_config
+from q2r2_control.config.cell import load_config
 from q2r2_control.errors import ConfigError, Q2R2Error, RobotError
 from q2r2_control.robot.compose import compose
 from q2r2_control.robot.description import load_description

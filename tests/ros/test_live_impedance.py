@@ -17,7 +17,7 @@ from rclpy.parameter import Parameter
 from rclpy.parameter_client import AsyncParameterClient
 
 from q2r2_control.compliance.impedance import ImpedanceController
-from q2r2_control.config import ImpedanceSettings
+from q2r2_control.config.control import ImpedanceSettings
 from q2r2_control.ros.base_node import BaseNode
 from q2r2_control.ros.bridge.live_parameters import LiveImpedance
 from q2r2_control.types import RobotState

@@ -19,7 +19,8 @@ pytest.importorskip("rclpy", reason=NEEDS_ROS)
 from std_msgs.msg import Float64MultiArray
 
 from q2r2_control import CartesianController, Robot, load_config
-from q2r2_control.drives import TorqueDrive, make_drive
+from q2r2_control.drives.factory import make_drive
+from q2r2_control.drives.torque import TorqueDrive
 from q2r2_control.robot.kept_distances import kept_distances
 from q2r2_control.ros.base_node import COMMAND_QOS
 from q2r2_control.ros.bridge.joint_messages import PositionArray, TorqueArray

@@ -9,9 +9,9 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from q2r2_control.config import Config
+from q2r2_control.config.cell import Config
 from q2r2_control.inputs.scripted import ScriptedInput
-from q2r2_control.pipeline import Pipeline
+from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.plants.kinematic import KinematicPlant
 from q2r2_control.robot.robot import Robot
 from q2r2_control.runtime.run_summary import EVENTS_KEPT, RunStatistics

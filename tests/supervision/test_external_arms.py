@@ -10,7 +10,8 @@ import pytest
 import yaml
 
 from q2r2_control import CartesianController, Robot, load_config
-from q2r2_control.config import Config, find_resource
+from q2r2_control.config.cell import Config
+from q2r2_control.config.resources import find_resource
 from q2r2_control.config.supervision import SupervisionSettings
 from q2r2_control.supervision.external_arms import ExternalArms, ExternalSettings, settings_for_external_arms
 from q2r2_control.supervision.joint_watch import watch_settings

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pinocchio as pin
 
-from q2r2_control.config import Config, load_config
+from q2r2_control.config.cell import Config, load_config
 
 _TABLE = 0.2  # height of its top [m]
 _FRAME_TO_TIPS = 0.013  # [m]

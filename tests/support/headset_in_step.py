@@ -14,7 +14,7 @@ import pinocchio as pin
 
 from q2r2_control.inputs.factory import hands_watch
 from q2r2_control.inputs.headset import HeadsetServer
-from q2r2_control.pipeline import Pipeline
+from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.runtime.recorder import Tick
 from q2r2_control.types import SIDES, Array, CommandMode, Event, HandSample, HapticFeedback

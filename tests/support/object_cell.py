@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from q2r2_control.config import Config, load_config
+from q2r2_control.config.cell import Config, load_config
 
 TABLE = 0.2  # height of its top [m]
 # A block of the demo, gripped 13 mm above its middle.

@@ -6,8 +6,8 @@ from functools import cache
 
 import numpy as np
 
-from q2r2_control.config import Config, load_config
-from q2r2_control.pipeline import Pipeline
+from q2r2_control.config.cell import Config, load_config
+from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.runtime.recorder import Tick
 from q2r2_control.types import Event
 from q2r2_control.verification.contract import Contract

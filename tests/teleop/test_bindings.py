@@ -11,8 +11,8 @@ import pinocchio as pin
 import pytest
 from pydantic import ValidationError
 
-from q2r2_control.config import load_config
 from q2r2_control.config.bindings import HELD, Action, BindingSettings
+from q2r2_control.config.cell import load_config
 from q2r2_control.errors import ConfigError
 from q2r2_control.teleop.arm_states import is_fault
 from q2r2_control.teleop.held_controls import HeldControls, travel

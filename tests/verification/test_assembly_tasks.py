@@ -8,11 +8,11 @@ from functools import cache
 import numpy as np
 import pytest
 
-from q2r2_control.config import Config, load_config
+from q2r2_control.config.cell import Config, load_config
 from q2r2_control.errors import ConfigError
 from q2r2_control.inputs.scripted import ScriptedInput
 from q2r2_control.inputs.trajectories import trajectory_named
-from q2r2_control.pipeline import Pipeline
+from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.robot.robot import Robot
 from q2r2_control.runtime.recorder import Tick

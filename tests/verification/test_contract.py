@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from q2r2_control.config import ControllerSettings, load_config
+from q2r2_control.config.cell import load_config
+from q2r2_control.config.control import ControllerSettings
 from q2r2_control.robot.kept_distances import kept_distances
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, Reference, StepReport, StepStatus

@@ -8,7 +8,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from q2r2_control.config import load_config
+from q2r2_control.config.cell import load_config
 from q2r2_control.drives.base import position_command
 from q2r2_control.robot.robot import Robot
 from q2r2_control.runtime.recorder import RunStart, Tick

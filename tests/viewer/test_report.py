@@ -8,7 +8,7 @@ import matplotlib.image
 import numpy as np
 import pytest
 
-from q2r2_control.config import Config, load_config
+from q2r2_control.config.cell import Config, load_config
 from q2r2_control.config.control import ControllerSettings
 from q2r2_control.robot.robot import Robot
 from q2r2_control.runtime.run_summary import RunStatistics, RunSummary

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from q2r2_control.errors import ConfigError
-from q2r2_control.pipeline import Pipeline
+from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.types import Event
 from q2r2_control.viewer.sound import (
     ENGAGED,

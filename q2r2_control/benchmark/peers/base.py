@@ -10,7 +10,7 @@ from typing import Protocol
 
 import pinocchio as pin
 
-from q2r2_control.config import Config
+from q2r2_control.config.cell import Config
 from q2r2_control.robot.compose import compose
 from q2r2_control.robot.kept_distances import kept_distances
 from q2r2_control.robot.robot import Robot

@@ -15,10 +15,10 @@ from typing import Any
 
 from std_msgs.msg import Float64MultiArray
 
-from q2r2_control.config import Config
+from q2r2_control.config.cell import Config
 from q2r2_control.config.timeouts import STREAM_TIMEOUT
 from q2r2_control.control.controller import CartesianController
-from q2r2_control.drives import Drive
+from q2r2_control.drives.base import Drive
 from q2r2_control.ros.base_node import LATCHED_QOS, BaseNode
 from q2r2_control.ros.bridge.messages import JointNumbers
 from q2r2_control.ros.bridge.opening_grants import wanted_topic

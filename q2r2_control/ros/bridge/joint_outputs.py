@@ -12,9 +12,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from q2r2_control.config import Config
+from q2r2_control.config.cell import Config
 from q2r2_control.config.timeouts import STREAM_TIMEOUT
-from q2r2_control.drives import Drive, make_drive
+from q2r2_control.drives.base import Drive
+from q2r2_control.drives.factory import make_drive
 from q2r2_control.errors import ConfigError
 from q2r2_control.robot.robot import Robot
 from q2r2_control.ros.base_node import BaseNode

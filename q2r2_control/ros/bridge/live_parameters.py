@@ -12,8 +12,7 @@ from pydantic import BaseModel, ValidationError
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.parameter import Parameter
 
-from q2r2_control.config import ControllerSettings, ImpedanceSettings
-from q2r2_control.config.control import LIVE, LIVE_IMPEDANCE
+from q2r2_control.config.control import LIVE, LIVE_IMPEDANCE, ControllerSettings, ImpedanceSettings
 from q2r2_control.config.teleop import GuardSettings, TeleopSettings
 from q2r2_control.errors import ConfigError
 from q2r2_control.robot.pairs import CLEARANCE

@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 
-from q2r2_control.config import load_config
+from q2r2_control.config.cell import load_config
 from q2r2_control.config.external import GripperSettings, GuardLimits
 from q2r2_control.config.presets import BUILTIN, Mode, Preset, preset_of
 from q2r2_control.config.teleop import GuardSettings, Stance, TeleopSettings

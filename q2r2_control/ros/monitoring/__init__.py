@@ -5,26 +5,3 @@ nodes of the two arms, so that a fault of one pauses the other; ``hand_listeners
 follow them; ``frame_senders`` whether two publish the same frame on /tf; ``command_watch`` whether another node sends
 a node's own joint commands. They are imported when first used.
 """
-
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
-from q2r2_control._lazy import lazy_exports
-
-if TYPE_CHECKING:
-    from q2r2_control.ros.monitoring.arm_link import ArmLink
-    from q2r2_control.ros.monitoring.endpoints import Publishers, WatchedPublisher
-    from q2r2_control.ros.monitoring.hand_listeners import HandListeners
-
-__all__ = ["ArmLink", "HandListeners", "Publishers", "WatchedPublisher"]
-
-__getattr__ = lazy_exports(
-    __name__,
-    {
-        "ArmLink": "arm_link",
-        "HandListeners": "hand_listeners",
-        "Publishers": "endpoints",
-        "WatchedPublisher": "endpoints",
-    },
-)

@@ -21,9 +21,10 @@ from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from std_srvs.srv import SetBool, Trigger
 
-from q2r2_control.config import Config, load_config
+from q2r2_control.config.cell import Config, load_config
 from q2r2_control.control.controller import CartesianController
-from q2r2_control.drives import TorqueDrive, permitted
+from q2r2_control.drives.base import permitted
+from q2r2_control.drives.torque import TorqueDrive
 from q2r2_control.errors import ConfigError
 from q2r2_control.robot.robot import Robot
 from q2r2_control.ros.base_node import ERROR, OK, WARN, run_node

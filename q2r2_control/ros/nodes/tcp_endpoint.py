@@ -14,8 +14,7 @@ from typing import Any
 from geometry_msgs.msg import Twist
 from quest2ros.msg import OVR2ROSHapticFeedback
 
-from q2r2_control.config import load_config
-from q2r2_control.config.cell import HeadsetConfig
+from q2r2_control.config.cell import HeadsetConfig, load_config
 from q2r2_control.config.networks import Network, network_of
 from q2r2_control.config.teleop import GateSettings
 from q2r2_control.errors import ConfigError

@@ -25,7 +25,7 @@ from std_msgs.msg import String
 from tf2_msgs.msg import TFMessage
 from visualization_msgs.msg import Marker
 
-from q2r2_control.config import Config
+from q2r2_control.config.cell import Config
 from q2r2_control.errors import Q2R2Error
 from q2r2_control.inputs.statistics import Arrivals
 from q2r2_control.ros.base_node import STREAM_QOS

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from q2r2_control.config import Config
 from q2r2_control.config.bindings import Action
+from q2r2_control.config.cell import Config
 from q2r2_control.teleop.arm_states import AT_REST, ArmState
 
 SILENT = 2.0  # nodes say what they do twice a second [s]
