@@ -38,12 +38,12 @@ __getattr__ = lazy_exports(
         "CartesianController": "control.controller",
         "ConfigError": "errors",
         "ControllerSettings": "config.control",
-        "Pipeline": "pipeline",
+        "Pipeline": "pipeline.pipeline",
         "Q2R2Error": "errors",
         "RelativeMotion": "teleop.relative",
         "Robot": "robot.robot",
         "RunSummary": "runtime.run_summary",
-        "load_config": "config",
+        "load_config": "config.cell",
     },
 )
 

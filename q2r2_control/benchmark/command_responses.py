@@ -15,7 +15,7 @@ _ANSWER_SHARE = 0.4
 
 
 @dataclass(frozen=True, slots=True)
-class Recording:
+class CommandRecording:
     """Steps of one input and the joint commands meanwhile; times of one clock [s], ascending."""
 
     steps: Sequence[float]  # when each step was published
@@ -49,7 +49,7 @@ class LatencyReport:
         return asdict(self)
 
 
-def latency_report(rate: float, acceleration_limit: Array, recordings: Mapping[str, Recording]) -> LatencyReport:
+def latency_report(rate: float, acceleration_limit: Array, recordings: Mapping[str, CommandRecording]) -> LatencyReport:
     """Latencies by path, of a controller at ``rate`` [Hz] with ``acceleration_limit`` (nv,) [rad/s^2]."""
     transport = 1e3 * np.concatenate(
         [np.subtract(recording.received, recording.sent) for recording in recordings.values()]
@@ -60,7 +60,7 @@ def latency_report(rate: float, acceleration_limit: Array, recordings: Mapping[s
     )
 
 
-def _row(path: str, recording: Recording, acceleration_limit: Array) -> LatencyRow:
+def _row(path: str, recording: CommandRecording, acceleration_limit: Array) -> LatencyRow:
     """Find the first command after each step with an acceleration that only a step causes."""
     times = np.asarray(recording.sent)
     # Ticks may be early or late, so changes of velocity are divided by dt; half the usual dt is the least that counts.

@@ -24,7 +24,7 @@ from q2r2_control.inputs.way_points import minimum_jerk
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.plants.mujoco_contacts import pressing_force
 from q2r2_control.robot.kept_distances import kept_distances
-from q2r2_control.robot.link_roles import Part, Role
+from q2r2_control.robot.link_roles import LinkClass, Role
 from q2r2_control.robot.pairs import link_of, pair_names
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
@@ -45,7 +45,7 @@ PAD_STIFFNESS, METAL_STIFFNESS = 1e5, 1e6
 MOST_DAMPED = 2.0  # damping ratio
 
 
-class Slide(StrEnum):
+class PressSlide(StrEnum):
     """Where a press slides to, as seen from the arm's base."""
 
     AWAY = "away"
@@ -56,7 +56,7 @@ class Slide(StrEnum):
 class PressFigures:
     """One press. Forces are the table's normal force on the hand [N]."""
 
-    slide: Slide
+    slide: PressSlide
     rotor_share: float
     friction: float
     impact_speed: float  # of the tool in the tick before it first touches [m/s]
@@ -81,13 +81,13 @@ class PressFigures:
 
 # Slides with the rotor share and the friction of each: metal on wood, the cell's own, and rubber that grips well.
 PRESSES = (
-    *((Slide.AWAY, 1.0, friction) for friction in (0.3, 0.6, 0.9)),
-    (Slide.TOWARDS, 1.0, 0.9),
-    *((slide, 0.1, 0.9) for slide in Slide),
+    *((PressSlide.AWAY, 1.0, friction) for friction in (0.3, 0.6, 0.9)),
+    (PressSlide.TOWARDS, 1.0, 0.9),
+    *((slide, 0.1, 0.9) for slide in PressSlide),
 )
 
 
-def run_press(config: Config, slide: Slide, rotor_share: float, friction: float) -> PressFigures:
+def run_press(config: Config, slide: PressSlide, rotor_share: float, friction: float) -> PressFigures:
     """Press with the cell of ``config``, in which the left fingers and the table may touch.
 
     Raises :class:`ConfigError` where nothing of that arm may touch the table.
@@ -114,7 +114,7 @@ class _Trace:
     violations: int
 
 
-def _press(robot: Robot, config: Config, slide: Slide) -> _Trace:
+def _press(robot: Robot, config: Config, slide: PressSlide) -> _Trace:
     controller = CartesianController(robot, config.control)
     drive, plant = TorqueDrive(robot, config), MujocoPlant(robot, config)
     contract = Contract(controller, random=np.random.default_rng(0))
@@ -150,7 +150,7 @@ def _press(robot: Robot, config: Config, slide: Slide) -> _Trace:
     return _Trace(force, height, reference_height, behind, q, violations)
 
 
-def _figures(robot: Robot, config: Config, slide: Slide, bound: float, trace: _Trace) -> PressFigures:
+def _figures(robot: Robot, config: Config, slide: PressSlide, bound: float, trace: _Trace) -> PressFigures:
     dt, force, height = 1.0 / config.loop_rate_hz, trace.force, trace.height
     first = int(np.flatnonzero(force > 0.0)[0])
     stays = slice(round((_DOWN + _SETTLED) / dt), round(_SLIDING / dt))
@@ -189,14 +189,14 @@ def _figures(robot: Robot, config: Config, slide: Slide, bound: float, trace: _T
     )
 
 
-def _along(slide: Slide) -> Array:
+def _along(slide: PressSlide) -> Array:
     """Direction (3,) of a slide."""
-    return np.array([1.0 if slide is Slide.AWAY else -1.0, 0.0, 0.0])
+    return np.array([1.0 if slide is PressSlide.AWAY else -1.0, 0.0, 0.0])
 
 
-def _asked(t: float, start: Array, touch: float | None, slide: Slide) -> Array:
+def _asked(t: float, start: Array, touch: float | None, slide: PressSlide) -> Array:
     """Where the tool is asked to be (3,) [m]."""
-    begin, end = _SPAN if slide is Slide.AWAY else _SPAN[::-1]
+    begin, end = _SPAN if slide is PressSlide.AWAY else _SPAN[::-1]
     above = np.array([begin, _Y, _HEIGHT])
     if t < _DOWN:
         return start + minimum_jerk(min(t / _APPROACH, 1.0)) * (above - start)
@@ -215,7 +215,7 @@ def _depth(robot: Robot, config: Config) -> float:
         -float(kept[p])
         for p, pair in enumerate(names)
         if {link_of(name) for name in pair} & {_TABLE}
-        and any(robot.roles[link_of(name)] == Role(Part.FINGER, frozenset({_ARM})) for name in pair)
+        and any(robot.roles[link_of(name)] == Role(LinkClass.FINGER, frozenset({_ARM})) for name in pair)
     ]
     if not depths or max(depths) <= 0.0:
         raise ConfigError(

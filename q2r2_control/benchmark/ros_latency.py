@@ -18,7 +18,7 @@ from quest2ros.msg import OVR2ROSInputs
 from rclpy.executors import SingleThreadedExecutor
 from trajectory_msgs.msg import JointTrajectory
 
-from q2r2_control.benchmark.command_responses import LatencyReport, Recording, latency_report
+from q2r2_control.benchmark.command_responses import CommandRecording, LatencyReport, latency_report
 from q2r2_control.benchmark.ros_processes import private_domain, started
 from q2r2_control.config.cell import load_config
 from q2r2_control.errors import Q2R2Error
@@ -96,7 +96,7 @@ class _Probe:
         self._wait(lambda: self._tool is not None and self._commands, "cartesian_controller's commands")
         self._wait(lambda: self._target.get_subscription_count() > 0, "cartesian_controller's subscription")
 
-    def step_targets(self, duration: float) -> Recording:
+    def step_targets(self, duration: float) -> CommandRecording:
         """Step the target up and down at the tool."""
         assert self._tool is not None
         recording = self._step(self._target, self._tool, duration, lambda: None)
@@ -121,11 +121,13 @@ class _Probe:
             self._send_hand(False, _CHORD)
         self._node.destroy_subscription(subscription)
 
-    def step_hand(self, duration: float) -> Recording:
+    def step_hand(self, duration: float) -> CommandRecording:
         """Step the hand's pose."""
         return self._step(self._hand, _pose(), duration, lambda: self._inputs.publish(OVR2ROSInputs()))
 
-    def _step(self, publisher: Any, begin: PoseStamped, duration: float, beside: Callable[[], None]) -> Recording:
+    def _step(
+        self, publisher: Any, begin: PoseStamped, duration: float, beside: Callable[[], None]
+    ) -> CommandRecording:
         random, message = np.random.default_rng(0), begin
         height = message.pose.position.z
         self._commands.clear()
@@ -140,7 +142,7 @@ class _Probe:
         if not self._commands:
             raise LatencyError(f"no joint command came within {duration:g} s")
         sent, received, v = (list(column) for column in zip(*self._commands, strict=True))
-        return Recording(steps, sent, received, np.array(v))
+        return CommandRecording(steps, sent, received, np.array(v))
 
     def _send_hand(self, pressed: bool, period: float) -> None:
         end = time.monotonic() + period

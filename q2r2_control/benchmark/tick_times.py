@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from q2r2_control.benchmark.peers.base import PEERS, BenchController, Setup, build_peers
+from q2r2_control.benchmark.peers.base import PEERS, BenchController, PeerSettings, build_peers
 from q2r2_control.benchmark.timed_run import OwnController, Poses, RunMetrics, Targets, TimedRun, metrics_of, timed_run
 from q2r2_control.config.cell import Config
 from q2r2_control.config.control import ControllerSettings, DistanceSettings
@@ -78,7 +78,7 @@ def run_bench(
     only_one = {"distances": DistanceSettings(), "pairs": ()}
     settings = config.control.model_copy(update={"solve_time_limit": None, **only_one})
     ours = OwnController(CartesianController(robot, settings))
-    others, notes = build_peers(peers, Setup(robot, config, _DT))
+    others, notes = build_peers(peers, PeerSettings(robot, config, _DT))
     bench = _Bench(robot, settings, ours, others, ticks, progress)
     rows = [row for name, targets in SCENARIOS.items() for row in bench.rows(name, targets)]
     return BenchReport(config.name, len(robot.collision_model.collisionPairs), rows, notes)

@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from q2r2_control.benchmark.motion_run import DT, PATIENCE, MotionFigures, own_controller, run_motion, without_pairs
-from q2r2_control.benchmark.peers.base import BenchController, Setup, build_peers
+from q2r2_control.benchmark.peers.base import BenchController, PeerSettings, build_peers
 from q2r2_control.benchmark.peers.leading import Leading
 from q2r2_control.config.cell import Config
 from q2r2_control.robot.robot import Robot
@@ -55,7 +55,7 @@ def run_work_bench(
     """Run ``motions``, which are made for ``config/dual_iiwa7.yaml``, with ours and with ``peers`` where installed."""
     robot = Robot.from_config(config)
     free = own_controller(without_pairs(config), config, FREE_AIR)
-    others, notes = build_peers(peers, Setup(robot, config, DT))
+    others, notes = build_peers(peers, PeerSettings(robot, config, DT))
     ahead = [Leading(peer, config.control.position_gain) for peer in others]
     controllers: list[BenchController] = [free, own_controller(robot, config), *ahead]
     rows = []

@@ -13,7 +13,7 @@ from q2r2_control.cli.output import stderr_console
 from q2r2_control.errors import ConfigError, RecordingError
 from q2r2_control.export.bags import write_bags
 from q2r2_control.export.csv_tables import write_table, write_tables
-from q2r2_control.export.episodes import FASTEST, Sampling, make_episodes
+from q2r2_control.export.episodes import FASTEST, FrameSampling, make_episodes
 from q2r2_control.export.hdf5 import write_episodes
 from q2r2_control.export.kept_pictures import KeptAs
 from q2r2_control.export.lerobot import require_pyarrow, write_dataset
@@ -54,7 +54,7 @@ def lerobot(
         raise ConfigError("--workers and --ray exclude each other: the cluster has its own")
     require_pyarrow()
     kept = None if no_pictures else KeptAs.VIDEO
-    _export(recordings, Sampling(fps, trim, kept), output, workers, skip_bad, lambda count: write_dataset, ray)
+    _export(recordings, FrameSampling(fps, trim, kept), output, workers, skip_bad, lambda count: write_dataset, ray)
 
 
 @app.command(epilog="Example: q2r2 export hdf5 recordings --output datasets/circle-act --fps 50")
@@ -70,7 +70,7 @@ def hdf5(
     """Make HDF5 files of recordings, a file each, for trainers of ACT. Needs the extra `export`."""
     require_h5py()
     kept = None if no_pictures else KeptAs.PIXELS
-    _export(recordings, Sampling(fps, trim, kept), output, workers, skip_bad, lambda count: write_episodes)
+    _export(recordings, FrameSampling(fps, trim, kept), output, workers, skip_bad, lambda count: write_episodes)
 
 
 @app.command(epilog="Example: q2r2 export csv recordings/20260101-120000-dual_iiwa7 --output circle.csv")
@@ -93,7 +93,7 @@ def csv(
             raise ConfigError(f"--output {output}: for {count} recordings; allowed: a folder, or one recording")
         return write_table
 
-    _export(recordings, Sampling(fps, trim), output, workers, skip_bad, writer)
+    _export(recordings, FrameSampling(fps, trim), output, workers, skip_bad, writer)
 
 
 @app.command(epilog="Example: q2r2 export mcap recordings --output episodes")
@@ -129,7 +129,7 @@ def mcap(
 
 def _export(
     recordings: Sequence[Path],
-    sampling: Sampling,
+    sampling: FrameSampling,
     path: Path,
     workers: int,
     skip_bad: bool,

@@ -39,7 +39,7 @@ from q2r2_control.compliance.impedance_kernels import (
     impedance_torque,
 )
 from q2r2_control.compliance.impedance_terms import BoolArray, PositionLimits
-from q2r2_control.compliance.joint_dynamics import Bodies
+from q2r2_control.compliance.joint_dynamics import LinkInertias
 from q2r2_control.config.control import LIVE_IMPEDANCE, ImpedanceSettings
 from q2r2_control.control.geometry.kinematics import IntArray, chain_of
 from q2r2_control.control.jit import bound, hold
@@ -217,7 +217,7 @@ def _model_of(robot: Robot, settings: ImpedanceSettings) -> ImpedanceModel:
         row[: len(arm.joints)] = arm.joints
     return ImpedanceModel(
         chain=chain_of(robot.model),
-        bodies=Bodies.of(robot.model),
+        bodies=LinkInertias.of(robot.model),
         tools=tools_of(robot),
         joints=joints,
         dofs=np.array([len(arm.joints) for arm in arms]),

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from q2r2_control.compliance.impedance_terms import BoolArray, PositionLimits, TermScratch
-from q2r2_control.compliance.joint_dynamics import Bodies, Dynamics
+from q2r2_control.compliance.joint_dynamics import Dynamics, LinkInertias
 from q2r2_control.control.geometry.kinematics import Chain, IntArray, Placements
 from q2r2_control.control.tasks.task_model import Tools
 from q2r2_control.types import Array
@@ -17,7 +17,7 @@ class ImpedanceModel(NamedTuple):
     """What does not change between ticks; k arms of at most m joints."""
 
     chain: Chain
-    bodies: Bodies  # but for what grippers hold
+    bodies: LinkInertias  # but for what grippers hold
     tools: Tools
     joints: IntArray  # (k, m) of each arm, the first ``dofs`` of a row
     dofs: IntArray  # (k,)

@@ -18,7 +18,7 @@ from q2r2_control.control.jit import inlined_kernel, kernel
 from q2r2_control.types import Array
 
 
-class Bodies(NamedTuple):
+class LinkInertias(NamedTuple):
     """What the joints move, in the frame of each; index 0 is the world. May change between ticks."""
 
     mass: Array  # (n,) [kg]
@@ -28,7 +28,7 @@ class Bodies(NamedTuple):
     gravity: Array  # (3,) [m/s^2]
 
     @classmethod
-    def of(cls, model: pin.Model) -> Bodies:
+    def of(cls, model: pin.Model) -> LinkInertias:
         """Those of a Pinocchio model."""
         n = model.njoints
         bodies = cls(
@@ -79,7 +79,9 @@ class Dynamics(NamedTuple):
 
 
 @kernel
-def inverse_dynamics(chain: Chain, bodies: Bodies, placements: Placements, v: Array, a: Array, out: Dynamics) -> None:
+def inverse_dynamics(
+    chain: Chain, bodies: LinkInertias, placements: Placements, v: Array, a: Array, out: Dynamics
+) -> None:
     """``out.tau`` that moves joints placed at a posture, at ``v``, with ``a`` (nv,), against gravity; and ``out.M``."""
     for k in range(3):
         out.acceleration[0, k] = -bodies.gravity[k]
@@ -130,7 +132,7 @@ def _move(chain: Chain, placements: Placements, i: int, speed: float, accelerati
 
 
 @inlined_kernel
-def _weigh(bodies: Bodies, placements: Placements, i: int, out: Dynamics) -> None:
+def _weigh(bodies: LinkInertias, placements: Placements, i: int, out: Dynamics) -> None:
     """Mass, its moment and inertia of body ``i`` by itself, about the world's origin."""
     R, mass, moment, inertia = placements.rotation[i], bodies.mass[i], out.moment[i], out.inertia[i]
     square = 0.0

@@ -14,7 +14,7 @@ from q2r2_control.errors import ConfigError
 POSE = "geometry_msgs/msg/PoseStamped"
 
 
-class Frame(StrEnum):
+class FrameChoice(StrEnum):
     """Which ``frame_id`` a controller takes."""
 
     BASE = "base"  # exactly the base link of its own description, others are ignored or refused
@@ -37,7 +37,7 @@ class Preset:
     name: str
     topic: str  # of its target, with {ctrl}
     message: str  # type of its target
-    frame: Frame
+    frame: FrameChoice
     rate: float  # that it is driven at [Hz]
     lowest_rate: float  # below which it stops or stutters [Hz]
     hold: Hold
@@ -62,12 +62,12 @@ _CAREFUL = GuardSettings()
 
 _LATCHES = "active; keeps the last target for ever"
 _ALL = (
-    Preset("builtin", "{ctrl}/target_frame", POSE, Frame.BASE, 200.0, 20.0, Hold.SILENCE, _WIDE, "always on"),
+    Preset("builtin", "{ctrl}/target_frame", POSE, FrameChoice.BASE, 200.0, 20.0, Hold.SILENCE, _WIDE, "always on"),
     Preset(
         name="kuka_lbr_clik",
         topic="{ctrl}/target_frame",
         message=POSE,
-        frame=Frame.BASE,
+        frame=FrameChoice.BASE,
         rate=100.0,
         lowest_rate=50.0,
         # Its velocity clamp counts the time since the target last changed: a long pause lets the next one through.
@@ -79,7 +79,7 @@ _ALL = (
         name="kuka_lbr_impedance",
         topic="{ctrl}/target_frame",
         message=POSE,
-        frame=Frame.BASE,
+        frame=FrameChoice.BASE,
         rate=200.0,
         lowest_rate=100.0,
         hold=Hold.REPEAT,
@@ -91,7 +91,7 @@ _ALL = (
         name="fzi",
         topic="{ctrl}/target_frame",
         message=POSE,
-        frame=Frame.BASE,
+        frame=FrameChoice.BASE,
         rate=100.0,
         lowest_rate=50.0,
         hold=Hold.REPEAT,
@@ -102,7 +102,7 @@ _ALL = (
         name="mayr",
         topic="{ctrl}/reference_pose",
         message=POSE,
-        frame=Frame.BASE,
+        frame=FrameChoice.BASE,
         rate=100.0,
         lowest_rate=50.0,
         hold=Hold.REPEAT,
@@ -113,7 +113,7 @@ _ALL = (
         name="crisp",
         topic="{ctrl}/target_pose",
         message=POSE,
-        frame=Frame.IGNORED,
+        frame=FrameChoice.IGNORED,
         rate=100.0,
         lowest_rate=50.0,
         hold=Hold.REPEAT,
@@ -124,7 +124,7 @@ _ALL = (
         name="moveit_servo",
         topic="{ctrl}/pose_target_cmds",
         message=POSE,
-        frame=Frame.ANY,
+        frame=FrameChoice.ANY,
         rate=50.0,
         lowest_rate=10.0,
         hold=Hold.SILENCE,
@@ -136,7 +136,7 @@ _ALL = (
         name="lbr_position",
         topic="{ctrl}/command/joint_position",
         message="lbr_fri_idl/msg/LBRJointPositionCommand",
-        frame=Frame.NONE,
+        frame=FrameChoice.NONE,
         rate=200.0,
         lowest_rate=100.0,
         hold=Hold.REPEAT,
@@ -148,7 +148,7 @@ _ALL = (
         name="forward_position",
         topic="{ctrl}/commands",
         message="std_msgs/msg/Float64MultiArray",
-        frame=Frame.NONE,
+        frame=FrameChoice.NONE,
         rate=200.0,
         lowest_rate=100.0,
         hold=Hold.REPEAT,
@@ -160,7 +160,7 @@ _ALL = (
         name="jtc",
         topic="{ctrl}/joint_trajectory",
         message="trajectory_msgs/msg/JointTrajectory",
-        frame=Frame.NONE,
+        frame=FrameChoice.NONE,
         rate=50.0,
         lowest_rate=20.0,
         hold=Hold.SILENCE,

@@ -20,7 +20,7 @@ from q2r2_control.control.qp import QpProblem, Solver, make_solver
 from q2r2_control.control.qp_assembly import assemble
 from q2r2_control.control.reference import move_reference, observe_bodies, spare_distance, start_reference
 from q2r2_control.control.safety.safety_filter import FOLLOWED, STOPPED
-from q2r2_control.control.step_report import BoundNames, StepSummary
+from q2r2_control.control.step_report import LimitNames, StepSummary
 from q2r2_control.control.targets import TargetTracker
 from q2r2_control.errors import ConfigError, RobotError
 from q2r2_control.robot.pairs import pairs_with_others
@@ -69,7 +69,7 @@ class CartesianController:
         self._fingers = FingerOpenings(robot, self._objects.bodies)
         self._unchanged: IntArray = np.zeros(len(self._objects.bodies.joint), dtype=np.int64)
         self._targets = TargetTracker(model.tasks, self._arms, settings)
-        self._names = BoundNames(robot)
+        self._names = LimitNames(robot)
         self._take_load()
         self._compile()
         self.reset(robot.home)

@@ -22,7 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from q2r2_control.config.control import ControllerSettings
-from q2r2_control.control.geometry.collision import Bodies, Pairs, Posed, bodies_of, pairs_of
+from q2r2_control.control.geometry.collision import CollisionBodies, Pairs, Posed, bodies_of, pairs_of
 from q2r2_control.control.geometry.kinematics import IntArray
 from q2r2_control.control.jit import Held, hold
 from q2r2_control.control.kernel_data import KernelData
@@ -44,7 +44,7 @@ _Counting = frozenset[frozenset[str]]
 
 
 @dataclass(frozen=True, slots=True)
-class Load:
+class HeldObjectModels:
     """The kernels' model and data while some objects are held. State, rows and tasks are the same arrays in all."""
 
     model: Held
@@ -71,15 +71,15 @@ class ObjectLoads:
         if self._arms:
             bodies, self._pairs = _with_objects(robot, model.safety)
             count = len(model.safety.collision.bodies.joint)
-            model = _with_bodies(model, Bodies._make(array[:count] for array in bodies))
+            model = _with_bodies(model, CollisionBodies._make(array[:count] for array in bodies))
         self.model, self.data = model, KernelData.empty(model)
         self.bodies = model.safety.collision.bodies
-        self._loads: dict[_Counting, Load] = {}
+        self._loads: dict[_Counting, HeldObjectModels] = {}
         if self._arms:
             self.bodies = bodies
             self._make_room(len(model.safety.min_distance) + len(self._holders), len(robot.joint_names))
         none: IntArray = np.zeros(0, dtype=np.int64)
-        self._nothing = Load(hold(self.model), hold(self.data), self.model.safety, self.data.safety, none)
+        self._nothing = HeldObjectModels(hold(self.model), hold(self.data), self.model.safety, self.data.safety, none)
         for counting in _every_counting(self._arms):
             self._loads[counting] = self._load(counting)
         self.load = self._nothing
@@ -182,7 +182,7 @@ class ObjectLoads:
         safety = self.data.safety._replace(rows=SeparationRows.empty(pairs, nv), active=ActiveBounds.empty(pairs, nv))
         self.data = self.data._replace(safety=safety)
 
-    def _load(self, counting: _Counting) -> Load:
+    def _load(self, counting: _Counting) -> HeldObjectModels:
         numbers = [pair for pair, holders in enumerate(self._holders) if holders in counting]
         objects: IntArray = np.array(numbers, dtype=np.int64)
         base, goal = self.model.safety, self._goal
@@ -204,7 +204,7 @@ class ObjectLoads:
             rollout=Rollout.empty(collision),
         )
         model, data = self.model._replace(safety=safety), self.data._replace(safety=measured)
-        return Load(hold(model), hold(data), safety, measured, objects)
+        return HeldObjectModels(hold(model), hold(data), safety, measured, objects)
 
 
 def _every_counting(arms: tuple[str, ...]) -> list[_Counting]:
@@ -216,7 +216,7 @@ def _every_counting(arms: tuple[str, ...]) -> list[_Counting]:
     return found
 
 
-def _with_objects(robot: Robot, safety: SafetyModel) -> tuple[Bodies, Pairs]:
+def _with_objects(robot: Robot, safety: SafetyModel) -> tuple[CollisionBodies, Pairs]:
     """The model's bodies and after them those of objects, and all pairs of objects."""
     known, first_body = safety.collision, robot.collision_model.ngeoms
     bodies = bodies_of(robot.objects.geometry)
@@ -228,10 +228,10 @@ def _with_objects(robot: Robot, safety: SafetyModel) -> tuple[Bodies, Pairs]:
     for numbers in (pairs.first, pairs.second):
         numbers[numbers >= first_body] += shift
     joined = (_joined(old, new[first_body:]) for old, new in zip(known.bodies, bodies, strict=True))
-    return Bodies._make(joined), pairs
+    return CollisionBodies._make(joined), pairs
 
 
-def _with_bodies(model: KernelModel, bodies: Bodies) -> KernelModel:
+def _with_bodies(model: KernelModel, bodies: CollisionBodies) -> KernelModel:
     safety = model.safety
     return model._replace(safety=safety._replace(collision=safety.collision._replace(bodies=bodies)))
 

@@ -25,7 +25,7 @@ from dataclasses import replace
 import numpy as np
 
 from q2r2_control.config.control import ControllerSettings
-from q2r2_control.control.held_objects import Load, ObjectLoads
+from q2r2_control.control.held_objects import HeldObjectModels, ObjectLoads
 from q2r2_control.control.kernel_model import KernelModel, priority_of, stop_buffer
 from q2r2_control.control.safety.provable_distances import provable_distances
 from q2r2_control.robot.kept_distances import KeptDistances, kept_distances, too_close_at_home
@@ -81,11 +81,11 @@ class LiveSettings:
         self._distances.restart()
         self._gains.finish()
 
-    def begin(self, load: Load) -> None:
+    def begin(self, load: HeldObjectModels) -> None:
         """After a reset was observed: keep what the posture allows."""
         self._distances.grow(load, np.inf)
 
-    def step(self, load: Load, h: float) -> None:
+    def step(self, load: HeldObjectModels, h: float) -> None:
         """Before a step of ``h`` [s] from an observed reference."""
         self._gains.step(h)
         if self._distances.growing:
@@ -114,13 +114,13 @@ class LiveDistances:
         if self.growing:
             self._write(np.minimum(self._goal, self._least))
 
-    def step(self, load: Load, h: float) -> None:
+    def step(self, load: HeldObjectModels, h: float) -> None:
         self._due -= h
         if self._due <= 0.0:
             self._due = _PERIOD
             self.grow(load, GROWTH * max(_PERIOD, h))
 
-    def grow(self, load: Load, most: float) -> None:
+    def grow(self, load: HeldObjectModels, most: float) -> None:
         """Keep more, by at most ``most`` [m], where the stop at hand proves it."""
         if not self.growing:
             return

@@ -59,7 +59,7 @@ class Solver(Protocol):
     def solve(self, problem: QpProblem) -> QpSolution: ...
 
 
-class OnlyIfBound:
+class SkipIfUnconstrained:
     """Asks a solver only where a bound holds the cost's own minimum back."""
 
     def __init__(self, solver: Solver) -> None:
@@ -214,10 +214,10 @@ def make_solver(name: str, nv: int, time_limit: float | None) -> Solver:
     Raises :class:`ConfigError` for a solver that is not installed.
     """
     if name == "daqp":
-        return OnlyIfBound(DaqpSolver(nv, time_limit))
+        return SkipIfUnconstrained(DaqpSolver(nv, time_limit))
     if name == "osqp":
-        return OnlyIfBound(OsqpSolver(nv, time_limit))
+        return SkipIfUnconstrained(OsqpSolver(nv, time_limit))
     available = sorted({"daqp", "osqp", *qpsolvers.available_solvers})
     if name not in available:
         raise ConfigError(f"control.solver = {name!r}: not installed; allowed here: {', '.join(available)}")
-    return OnlyIfBound(QpsolversSolver(name))
+    return SkipIfUnconstrained(QpsolversSolver(name))

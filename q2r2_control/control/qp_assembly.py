@@ -18,7 +18,7 @@ from q2r2_control.control.tasks.posture import (
     pull_to_posture,
 )
 from q2r2_control.control.tasks.swivel import turn_elbows, write_swivel_rows
-from q2r2_control.control.tasks.task_data import Targets
+from q2r2_control.control.tasks.task_data import TaskTargets
 from q2r2_control.control.unconstrained import find_minimum
 
 
@@ -58,7 +58,7 @@ def assemble(held_model: Held, held_targets: Held, held_data: Held, h: float, ti
 
 
 @kernel
-def _follow(model: KernelModel, data: KernelData, targets: Targets, i: int) -> None:
+def _follow(model: KernelModel, data: KernelData, targets: TaskTargets, i: int) -> None:
     """Cost of tool ``i`` on the way to its target."""
     tasks, J = data.tasks, data.tasks.J[6 * i : 6 * i + 6]
     tool_jacobian(model.tasks.chain, tasks.placements, model.tasks.tools, i, tasks.translation[i], J)

@@ -14,7 +14,7 @@ from q2r2_control.types import StepStatus
 _LIMIT_NAMES = {POSITION: "position", VELOCITY: "velocity", ACCELERATION: "acceleration"}
 
 
-class BoundNames:
+class LimitNames:
     """Names of limits and pairs, by the numbers that kernels know them by."""
 
     def __init__(self, robot: Robot) -> None:

@@ -10,7 +10,7 @@ import pinocchio as pin
 from q2r2_control.config.control import ControllerSettings
 from q2r2_control.control.jit import Held, borrowed, bound, hold, kernel
 from q2r2_control.control.tasks.frame import rotation_vector
-from q2r2_control.control.tasks.task_data import PoseScratch, Targets
+from q2r2_control.control.tasks.task_data import PoseScratch, TaskTargets
 from q2r2_control.control.tasks.task_model import TaskModel
 from q2r2_control.types import Array
 
@@ -30,7 +30,7 @@ class TargetTracker:
 
     def __init__(self, model: TaskModel, arms: tuple[str, ...], settings: ControllerSettings) -> None:
         self._arms, self._home = arms, model.posture.home
-        self._targets = Targets.empty(
+        self._targets = TaskTargets.empty(
             model,
             settings.feed_forward_time,
             _TELEPORT * settings.max_linear_speed,
@@ -98,7 +98,7 @@ def _take_held(held_targets: Held, q: Array, v: Array, dt: float) -> bool:
 
 
 @kernel
-def take_targets(targets: Targets, q: Array, v: Array, dt: float) -> bool:
+def take_targets(targets: TaskTargets, q: Array, v: Array, dt: float) -> bool:
     """Make what was offered each arm's target, or hold it where there is nothing usable; False if something was not.
 
     What is no pose is marked so in ``targets.offered``.
@@ -121,7 +121,7 @@ def take_targets(targets: Targets, q: Array, v: Array, dt: float) -> bool:
 
 
 @kernel
-def _hold(targets: Targets, i: int, q: Array, v: Array) -> None:
+def _hold(targets: TaskTargets, i: int, q: Array, v: Array) -> None:
     """A moving arm is braked first and holds where it comes to rest, so that it need not come back."""
     speed = 0.0
     for j in range(q.shape[0]):
@@ -133,7 +133,7 @@ def _hold(targets: Targets, i: int, q: Array, v: Array) -> None:
 
 
 @kernel
-def _take_pose(targets: Targets, i: int, dt: float) -> bool:
+def _take_pose(targets: TaskTargets, i: int, dt: float) -> bool:
     """Make the offered homogeneous pose the target of arm ``i``; False, and no change, if it is not a finite pose.
 
     A target that moves has its twist smoothed over a time; one that was put elsewhere, faster than any tool, has none.

@@ -12,7 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from q2r2_control.errors import RecordingError
-from q2r2_control.export.episodes import Part, parts_to_export
+from q2r2_control.export.episodes import EpisodePart, parts_to_export
 from q2r2_control.recording.about import ABOUT, CELL, CONCLUSION, CUT_OUT_OF, ROBOT, Conclusion
 from q2r2_control.recording.bag import definitions, qos_text, write_metadata
 from q2r2_control.recording.mcap_file import McapFile
@@ -47,7 +47,7 @@ def write_bags(file: Path, folder: Path) -> int:
     return len(made)
 
 
-def _write(recording: Recording, part: Part, path: Path) -> None:
+def _write(recording: Recording, part: EpisodePart, path: Path) -> None:
     about, span = recording.about, part.span
     start = about.epoch + max(round(span.start * 1e9), 0) if not span.whole else 0
     end = about.epoch + round(span.end * 1e9) if span.end < float("inf") else None

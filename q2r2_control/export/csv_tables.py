@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from q2r2_control.errors import RecordingError
-from q2r2_control.export.episodes import Episode
+from q2r2_control.export.episodes import EpisodeVectors
 
 
 def write_tables(files: Sequence[Path], folder: Path) -> None:
@@ -19,7 +19,7 @@ def write_tables(files: Sequence[Path], folder: Path) -> None:
     first_frame = 0
     tasks: dict[str, int] = {}
     for index, file in enumerate(files):
-        episode = Episode.load(file)
+        episode = EpisodeVectors.load(file)
         path = folder / f"{episode.name}.csv"
         if path.exists():
             raise RecordingError(f"{episode.recording}: two recordings have this name; allowed: each one once")
@@ -29,13 +29,13 @@ def write_tables(files: Sequence[Path], folder: Path) -> None:
 
 def write_table(files: Sequence[Path], path: Path) -> None:
     """Write the one kept episode to a file. Raises :class:`RecordingError` where there are several."""
-    first = Episode.load(files[0])
+    first = EpisodeVectors.load(files[0])
     if len(files) > 1:
         raise RecordingError(f"{first.recording}: has {len(files)} episodes; allowed: a folder as --output, or one")
     _write(first, path, 0, 0, 0)
 
 
-def _write(episode: Episode, path: Path, index: int, first_frame: int, task: int) -> None:
+def _write(episode: EpisodeVectors, path: Path, index: int, first_frame: int, task: int) -> None:
     columns = episode.columns(index, first_frame, task)
     head: list[str] = []
     values: list[list[object]] = []

@@ -32,7 +32,7 @@ _FORMAT = 4  # of kept episodes; another one is made again
 
 
 @dataclass(frozen=True)
-class Sampling:
+class FrameSampling:
     """What becomes frames, and how many."""
 
     fps: int = 30
@@ -45,7 +45,7 @@ class Sampling:
 
 
 @dataclass(frozen=True)
-class Episode:
+class EpisodeVectors:
     """One recording as vectors, (n, size) float32 by feature."""
 
     recording: str  # name of its file
@@ -96,7 +96,7 @@ class Episode:
         unfinished.replace(file)
 
     @classmethod
-    def load(cls, file: Path) -> Episode:
+    def load(cls, file: Path) -> EpisodeVectors:
         """One that was kept."""
         with np.load(file) as kept:
             about = json.loads(str(kept["about"]))
@@ -107,20 +107,22 @@ class Episode:
 
 
 @dataclass(frozen=True)
-class Part:
+class EpisodePart:
     """An episode in a recording that has several; number 0: the whole."""
 
     number: int = 0  # from 1 on
     span: EpisodeSpan = WHOLE
 
 
-def make_episode(file: Path, sampling: Sampling, target: Path | None = None, part: Part | None = None) -> Episode:
+def make_episode(
+    file: Path, sampling: FrameSampling, target: Path | None = None, part: EpisodePart | None = None
+) -> EpisodeVectors:
     """An episode of a recording, whose pictures go beside ``target``, if that is the file it will be kept in.
 
     Raises :class:`RecordingError` that names the file and what is wrong.
     """
     recording = open_recording(file)
-    part = part or Part(0, replace(WHOLE, success=recording.conclusion.success))
+    part = part or EpisodePart(0, replace(WHOLE, success=recording.conclusion.success))
     frames = sample(recording, sampling.fps, sampling.trim, part.span)
     cell, robot = cell_and_robot_of(recording)
     try:
@@ -135,18 +137,18 @@ def make_episode(file: Path, sampling: Sampling, target: Path | None = None, par
         cameras = keep_pictures(recording, used, frames["stamp"].tolist(), sampling.fps, sampling.pictures, target)
     name = recording.file.name
     success = part.span.success
-    return Episode(name, cell.name, task, sampling.fps, labels, notes, vectors, cameras, success, part.number)
+    return EpisodeVectors(name, cell.name, task, sampling.fps, labels, notes, vectors, cameras, success, part.number)
 
 
-def parts_to_export(file: Path) -> list[Part]:
+def parts_to_export(file: Path) -> list[EpisodePart]:
     """The episodes of a recording but those that its operator discarded; of a file that cannot be read the whole."""
     try:
         spans = read_spans(open_recording(file))
     except RecordingError:
-        return [Part()]  # whoever makes an episode of it finds out
+        return [EpisodePart()]  # whoever makes an episode of it finds out
     if spans[0].whole:
-        return [Part(0, spans[0])]
-    return [Part(number, span) for number, span in enumerate(spans, 1) if not span.discarded]
+        return [EpisodePart(0, spans[0])]
+    return [EpisodePart(number, span) for number, span in enumerate(spans, 1) if not span.discarded]
 
 
 @dataclass(frozen=True)
@@ -159,7 +161,7 @@ class Exported:
 
 def make_episodes(
     files: Sequence[Path],
-    sampling: Sampling,
+    sampling: FrameSampling,
     folder: Path,
     *,
     workers: int = 1,
@@ -220,7 +222,7 @@ _IGNORED = (
 )  # Ctrl-C goes to all of a terminal's processes; the first one ends the others
 
 
-def _work(job: tuple[Path, Sampling, Path, Part]) -> str | None:
+def _work(job: tuple[Path, FrameSampling, Path, EpisodePart]) -> str | None:
     """Make one episode unless it is there; returns what was wrong."""
     file, sampling, target, part = job
     if _is_kept(target):
@@ -236,13 +238,13 @@ def _work(job: tuple[Path, Sampling, Path, Part]) -> str | None:
 
 def _is_kept(target: Path) -> bool:
     try:
-        Episode.load(target)
+        EpisodeVectors.load(target)
     except (OSError, ValueError, KeyError, TypeError, EOFError, BadZipFile):
         return False
     return True
 
 
-def _key(file: Path, sampling: Sampling, part: Part) -> str:
+def _key(file: Path, sampling: FrameSampling, part: EpisodePart) -> str:
     """Another one after any change of the recording or of what is asked for."""
     try:
         status = file.stat()

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from q2r2_control.export.episodes import Episode
+from q2r2_control.export.episodes import EpisodeVectors
 from q2r2_control.export.kept_pictures import KeptAs, place_of
 from q2r2_control.export.pixel_files import PICTURES, require_h5py
 
@@ -28,10 +28,10 @@ def write_episodes(files: Sequence[Path], folder: Path) -> None:
     """Write kept episodes into a ``folder`` that is made, as ``episode_0.hdf5`` and so on."""
     folder.mkdir()
     for number, file in enumerate(files):
-        _write(Episode.load(file), file, folder / f"episode_{number}.hdf5")
+        _write(EpisodeVectors.load(file), file, folder / f"episode_{number}.hdf5")
 
 
-def _write(episode: Episode, kept: Path, path: Path) -> None:
+def _write(episode: EpisodeVectors, kept: Path, path: Path) -> None:
     with require_h5py().File(path, "w") as file:
         file.attrs["sim"] = True  # trainers take the action of the same row then
         file.attrs["compress"] = False  # pictures are pixels, however the file packs them

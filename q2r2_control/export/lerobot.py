@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from q2r2_control.errors import ConfigError, RecordingError
-from q2r2_control.export.episodes import Episode
+from q2r2_control.export.episodes import EpisodeVectors
 from q2r2_control.export.kept_pictures import KeptAs, place_of
 from q2r2_control.export.statistics import Statistics, joined, statistics_of
 from q2r2_control.export.video import CODEC, PIXEL_FORMAT, VideoFiles
@@ -54,16 +54,16 @@ def write_dataset(files: Sequence[Path], folder: Path) -> None:
 
     Raises :class:`RecordingError` where they do not have the same features, or are of different cells.
     """
-    writer = _Writer(Episode.load(files[0]), folder)
+    writer = _Writer(EpisodeVectors.load(files[0]), folder)
     for file in files:
-        writer.add(Episode.load(file), file)
+        writer.add(EpisodeVectors.load(file), file)
     writer.close()
 
 
 class _Writer:
     """One dataset, episode by episode."""
 
-    def __init__(self, first: Episode, folder: Path) -> None:
+    def __init__(self, first: EpisodeVectors, folder: Path) -> None:
         self._arrow = require_pyarrow()
         self._first, self._folder = first, folder
         columns, videos = _column_features(first), _video_features(first)
@@ -82,7 +82,7 @@ class _Writer:
         self._data: Any = None  # the file that is being written
         self._files, self._size = 0, 0  # begun, and what is in the last one [bytes]
 
-    def add(self, episode: Episode, file: Path) -> None:
+    def add(self, episode: EpisodeVectors, file: Path) -> None:
         """Write one more episode, which is kept in ``file``."""
         self._check(episode)
         number = len(self._rows)
@@ -137,7 +137,7 @@ class _Writer:
         self._write_json(INFO, self._info())
         self._write_json(SOURCES, self._sources)
 
-    def _check(self, episode: Episode) -> None:
+    def _check(self, episode: EpisodeVectors) -> None:
         first = self._first
         if episode.cell != first.cell:
             raise RecordingError(f"{episode.recording}: of cell {episode.cell}, but {first.recording} of {first.cell}")
@@ -150,7 +150,7 @@ class _Writer:
                 f"{episode.recording}: has not the cameras that {first.recording} has; --no-pictures leaves them out"
             )
 
-    def _add_video(self, camera: str, file: Path, episode: Episode) -> dict[str, Any]:
+    def _add_video(self, camera: str, file: Path, episode: EpisodeVectors) -> dict[str, Any]:
         """Append an episode's video of a camera; returns where it is, as the table of episodes says it."""
         key, videos, source = video_key(camera), self._videos[camera], place_of(file, camera, KeptAs.VIDEO)
         if not videos.fits(source):
@@ -242,7 +242,7 @@ def _place(number: int) -> dict[str, int]:
     return {"chunk_index": number // FILES_PER_CHUNK, "file_index": number % FILES_PER_CHUNK}
 
 
-def _column_features(episode: Episode) -> dict[str, dict[str, Any]]:
+def _column_features(episode: EpisodeVectors) -> dict[str, dict[str, Any]]:
     """As ``info.json`` describes those of the table of frames."""
     vectors = {
         name: {"dtype": "float32", "shape": [len(labels)], "names": list(labels)}
@@ -251,7 +251,7 @@ def _column_features(episode: Episode) -> dict[str, dict[str, Any]]:
     return {**vectors, **{name: {"dtype": kind, "shape": [1], "names": None} for name, kind in _SCALARS.items()}}
 
 
-def _video_features(episode: Episode) -> dict[str, dict[str, Any]]:
+def _video_features(episode: EpisodeVectors) -> dict[str, dict[str, Any]]:
     """As ``info.json`` describes videos."""
     return {
         video_key(camera): {

@@ -65,7 +65,7 @@ class Peer(Protocol):
         ...
 
 
-class Verdict(Enum):
+class Admission(Enum):
     """What becomes of a newcomer."""
 
     ADMIT = "drives from now on, instead of the driver if there is one"
@@ -76,25 +76,25 @@ class Verdict(Enum):
 class Decision(NamedTuple):
     """A verdict, and why: for ``ADMIT`` why the driver lost its place, for ``REFUSE`` why the newcomer gets none."""
 
-    verdict: Verdict
+    verdict: Admission
     reason: str = ""
 
 
 def decide(driver: Peer | None, newcomer: Peer, now: float) -> Decision:
     """What becomes of ``newcomer`` at ``now`` [s], by rules 2 to 4."""
     if driver is None:
-        return Decision(Verdict.ADMIT)
+        return Decision(Admission.ADMIT)
     if now - driver.last_pose > POSES_ALLOWED:
         if newcomer.last_pose > -math.inf:
-            return Decision(Verdict.ADMIT, f"no hand pose for {POSES_ALLOWED:g} s, and {newcomer.peer} sends them")
+            return Decision(Admission.ADMIT, f"no hand pose for {POSES_ALLOWED:g} s, and {newcomer.peer} sends them")
     elif newcomer.host == driver.host and now - driver.last_frame > QUIET_ALLOWED:
         if any(newcomer.registrations) and newcomer.registrations == driver.registrations:
-            return Decision(Verdict.ADMIT, f"no frame for {QUIET_ALLOWED:g} s, and it came back as {newcomer.peer}")
+            return Decision(Admission.ADMIT, f"no frame for {QUIET_ALLOWED:g} s, and it came back as {newcomer.peer}")
     else:
-        return Decision(Verdict.REFUSE, f"{driver.peer} drives")
+        return Decision(Admission.REFUSE, f"{driver.peer} drives")
     if now - newcomer.since > WAIT_ALLOWED:
-        return Decision(Verdict.REFUSE, f"{driver.peer} is connected")
-    return Decision(Verdict.WAIT)
+        return Decision(Admission.REFUSE, f"{driver.peer} is connected")
+    return Decision(Admission.WAIT)
 
 
 def is_allowed(host: str, networks: Sequence[Network] | None) -> bool:

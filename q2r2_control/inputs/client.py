@@ -7,7 +7,7 @@ import socket
 from collections.abc import Mapping
 
 from q2r2_control.errors import ProtocolError
-from q2r2_control.inputs.framing import Frame, FrameDecoder
+from q2r2_control.inputs.framing import FrameDecoder, WireFrame
 from q2r2_control.inputs.messages import HandPose
 from q2r2_control.inputs.rate_limits import RateLimit
 from q2r2_control.inputs.samples import HandTracker
@@ -41,7 +41,7 @@ class Client:
         """Topics with types that it publishes, and topics that it listens to."""
         return self.session.published, self.session.subscribed
 
-    def receive(self, frame: Frame, now: float) -> Reception | None:
+    def receive(self, frame: WireFrame, now: float) -> Reception | None:
         """Take one frame; the hand's message if it was one.
 
         Raises :class:`ProtocolError` when the client breaks the protocol or floods.

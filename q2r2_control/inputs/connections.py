@@ -12,10 +12,10 @@ from functools import partial
 
 from q2r2_control.config.networks import Network
 from q2r2_control.errors import ProtocolError
-from q2r2_control.inputs.admission import Verdict, decide, is_allowed
+from q2r2_control.inputs.admission import Admission, decide, is_allowed
 from q2r2_control.inputs.client import Client
-from q2r2_control.inputs.door import Door
-from q2r2_control.inputs.framing import Frame
+from q2r2_control.inputs.framing import WireFrame
+from q2r2_control.inputs.listener import TcpListener
 from q2r2_control.inputs.messages import AppMessage
 from q2r2_control.inputs.rate_limits import MAX_HOSTS_NAMED, HostLog
 from q2r2_control.inputs.session import log_frame
@@ -35,7 +35,7 @@ class Handlers:
 
     admitted: Callable[[Client], None]  # a client drives from now on
     lost: Callable[[str], None]  # the driver is gone, for a reason
-    receive: Callable[[Client, Frame, float], None]  # a frame of the driver, at a time [s]; may raise ProtocolError
+    receive: Callable[[Client, WireFrame, float], None]  # a frame of the driver, at a time [s]; may raise ProtocolError
     due: Callable[[], Iterable[AppMessage]]  # what to send to the driver
 
 
@@ -44,7 +44,7 @@ class Connections:
 
     def __init__(
         self,
-        door: Door,
+        door: TcpListener,
         allow: Sequence[Network] | None,
         clock: Callable[[], float],
         handlers: Handlers,
@@ -134,9 +134,9 @@ class Connections:
                 continue
             driver = self._driver
             verdict, reason = decide(driver, client, now)
-            if verdict is Verdict.ADMIT:
+            if verdict is Admission.ADMIT:
                 self._admit(client, reason)
-            elif verdict is Verdict.REFUSE or newest[client.host] is not client or still_waiting == MAX_WAITING:
+            elif verdict is Admission.REFUSE or newest[client.host] is not client or still_waiting == MAX_WAITING:
                 assert driver is not None  # without one, everybody is admitted
                 self._refuse(client, reason or f"{driver.peer} is connected", driver.refused_hosts)
             else:

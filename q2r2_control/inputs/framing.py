@@ -17,7 +17,7 @@ KEEPALIVE = bytes(8)  # a frame without destination and payload
 _LENGTH = struct.Struct("<I")
 
 
-class Frame(NamedTuple):
+class WireFrame(NamedTuple):
     """One decoded frame; ``terminated`` tells whether the destination came with a trailing NUL."""
 
     destination: str
@@ -50,7 +50,7 @@ class FrameDecoder:
         """Append what the network delivered."""
         self._buffer += data
 
-    def next_frame(self) -> Frame | None:
+    def next_frame(self) -> WireFrame | None:
         """The next whole frame, or None until more bytes come.
 
         Raises :class:`ProtocolError` for a frame above ``MAX_FRAME_BYTES``, as soon as its length fields say so, and
@@ -82,7 +82,7 @@ class FrameDecoder:
         return int(length)
 
 
-def _frame(name: bytes, payload: bytes) -> Frame:
+def _frame(name: bytes, payload: bytes) -> WireFrame:
     terminated = name.endswith(b"\0")
     try:
         destination = name.removesuffix(b"\0").decode()
@@ -90,4 +90,4 @@ def _frame(name: bytes, payload: bytes) -> Frame:
         raise ProtocolError(f"destination {name[:40]!r} is not UTF-8") from None
     if not destination and payload:
         raise ProtocolError(f"{len(payload)} bytes of payload without a destination")
-    return Frame(destination, payload, terminated)
+    return WireFrame(destination, payload, terminated)

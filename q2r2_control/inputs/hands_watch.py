@@ -7,7 +7,7 @@ from typing import NamedTuple
 from q2r2_control.config.timeouts import STREAM_TIMEOUT
 from q2r2_control.inputs.frozen_pose import FrozenPose
 from q2r2_control.inputs.messages import HandPose
-from q2r2_control.inputs.moved_frame import MovedFrame, Verdict
+from q2r2_control.inputs.moved_frame import MovedFrame, PoseVerdict
 from q2r2_control.inputs.session import Reception
 from q2r2_control.types import SIDES, HandFault, HandInputs
 
@@ -53,15 +53,15 @@ class HandsWatch:
             return [Watched(reception, now)]
         frozen = self._frozen[hand].receive(message, now)
         watched = Watched(reception, now, HandFault.FROZEN if frozen else None)
-        verdict = Verdict.FOLLOW if self._frame is None else self._frame.receive(hand, message, now)
+        verdict = PoseVerdict.FOLLOW if self._frame is None else self._frame.receive(hand, message, now)
         waited, self._waiting = self._waiting, []
         match verdict:
-            case Verdict.FOLLOW:
+            case PoseVerdict.FOLLOW:
                 return [*waited, watched]
-            case Verdict.WAIT:
+            case PoseVerdict.WAIT:
                 self._waiting = [watched]
                 return waited
-            case Verdict.DROP:
+            case PoseVerdict.DROP:
                 return []
-            case Verdict.FAULT:
+            case PoseVerdict.FAULT:
                 return [watched._replace(fault=HandFault.FRAME_MOVED)]

@@ -16,9 +16,9 @@ from q2r2_control.errors import InputError
 from q2r2_control.inputs.addresses import written
 from q2r2_control.inputs.client import Client
 from q2r2_control.inputs.connections import TURN, Connections, Handlers
-from q2r2_control.inputs.door import Door
-from q2r2_control.inputs.framing import Frame
+from q2r2_control.inputs.framing import WireFrame
 from q2r2_control.inputs.hands_watch import HandsWatch, Watched
+from q2r2_control.inputs.listener import TcpListener
 from q2r2_control.inputs.messages import PROP_TOPICS, AppMessage, PropTwist, warm_up
 from q2r2_control.inputs.rate_limits import HostLog, log_writer
 from q2r2_control.inputs.samples import SampleQueue
@@ -74,7 +74,7 @@ class HeadsetServer:
         host, port = self._address
         log = HostLog(log_writer(_LOG))
         try:
-            door = Door(host, port, log)
+            door = TcpListener(host, port, log)
         except (OSError, OverflowError, ValueError) as error:
             raise InputError(f"headset: cannot listen on {written(host, port)}: {error}") from error
         self._address = (host, door.port)
@@ -170,7 +170,7 @@ class HeadsetServer:
             self._client = None
             self._last_disconnect = reason
 
-    def _receive(self, client: Client, frame: Frame, now: float) -> None:
+    def _receive(self, client: Client, frame: WireFrame, now: float) -> None:
         # Locked for each frame, so that a snapshot never waits for a whole burst.
         with self._statistics_lock:
             reception = client.receive(frame, now)

@@ -37,7 +37,7 @@ _CHORD_TIME = 0.04
 _CHORD_SEEN = 0.01  # before a pose that they moved, whoever follows it shall have seen those buttons [s]
 
 
-class Verdict(Enum):
+class PoseVerdict(Enum):
     """What becomes of a pose."""
 
     FOLLOW = "as it is"
@@ -71,13 +71,13 @@ class MovedFrame:
         else:
             self._chords.pop(hand, None)
 
-    def receive(self, hand: str, pose: HandPose, now: float) -> Verdict:
+    def receive(self, hand: str, pose: HandPose, now: float) -> PoseVerdict:
         """Judge a pose."""
         place = Place.of(pose)
         if self._chords or place is None:
             self._ways[hand] = _Way()
             just_now = now - min(self._chords.values(), default=-math.inf) < _CHORD_SEEN
-            return Verdict.DROP if just_now else Verdict.FOLLOW
+            return PoseVerdict.DROP if just_now else PoseVerdict.FOLLOW
         way, other = self._ways[hand], self._ways[_other(hand)]
         if not way.add(place, now):
             self._pairs.clear()
@@ -86,12 +86,12 @@ class MovedFrame:
             self._judge(pair, now)
         if self._suspected is not None:
             if now - self._suspected < _CHORD_TIME:
-                return Verdict.DROP
+                return PoseVerdict.DROP
             self._suspected, self._bad_until = None, now + self._fault_time
         if now < self._bad_until:
-            return Verdict.FAULT
+            return PoseVerdict.FAULT
         waits = way.stands_out and way.is_new and now - other.stamp < _ALIVE
-        return Verdict.WAIT if waits else Verdict.FOLLOW
+        return PoseVerdict.WAIT if waits else PoseVerdict.FOLLOW
 
     def _pair(self, way: _Way, other: _Way, now: float) -> HandPair | None:
         """Both hands, where the one that just came has its counterpart."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import pinocchio as pin
 
-from q2r2_control.inputs.sampling import Sampling
+from q2r2_control.inputs.sampling import SampleTiming
 from q2r2_control.types import HandInputs, HandSample, HapticFeedback
 
 HandPose = Callable[[str, float], pin.SE3]  # hand, time since the first poll [s] -> pose in the input's frame
@@ -24,7 +24,7 @@ class PlayedInput:
     The samples of each hand come about as its ``samplings`` say, and do not depend on when they are polled.
     """
 
-    def __init__(self, pose: HandPose, inputs: HandButtons, samplings: Mapping[str, Sampling]) -> None:
+    def __init__(self, pose: HandPose, inputs: HandButtons, samplings: Mapping[str, SampleTiming]) -> None:
         self._pose, self._inputs = pose, inputs
         self._streams = [self._samples(hand, sampling) for hand, sampling in samplings.items()]
         self._next = [next(stream) for stream in self._streams]
@@ -80,7 +80,7 @@ class PlayedInput:
         """When the next sample comes due in play time [s]; inf where there is no hand."""
         return min((sample.due for sample in self._next), default=math.inf)
 
-    def _samples(self, hand: str, sampling: Sampling) -> Iterator[_Played]:
+    def _samples(self, hand: str, sampling: SampleTiming) -> Iterator[_Played]:
         for t in sampling.times():
             pose = sampling.measured(self._pose(hand, t), t)
             yield _Played(t + sampling.lateness(), hand, pose, self._inputs(hand, t))

@@ -18,7 +18,7 @@ _RECEIPT_JITTER = 0.0015  # [s], scale of an exponential distribution
 _ROTATION_NOISE = math.radians(0.03)
 
 
-class Sampling(Protocol):
+class SampleTiming(Protocol):
     """How the samples of one hand come about. For each of ``times`` ``measured`` is asked first, then ``lateness``."""
 
     def times(self) -> Iterator[float]:
@@ -41,18 +41,18 @@ class EvenSampling:
         self._rate, self._jitter, self._random = rate_hz, jitter, np.random.default_rng(seed)
 
     def times(self) -> Iterator[float]:
-        """See :class:`Sampling`."""
+        """See :class:`SampleTiming`."""
         count = 0
         while True:
             yield count / self._rate
             count += 1
 
     def measured(self, pose: pin.SE3, t: float) -> pin.SE3:
-        """See :class:`Sampling`."""
+        """See :class:`SampleTiming`."""
         return pose
 
     def lateness(self) -> float:
-        """See :class:`Sampling`."""
+        """See :class:`SampleTiming`."""
         return float(self._random.uniform(0.0, self._jitter))
 
 
@@ -80,14 +80,14 @@ class HeadsetSampling:
         self._amplitudes = 0.5 * tremor * np.array([1e-3] * 3 + [math.radians(0.3)] * 3)
 
     def times(self) -> Iterator[float]:
-        """See :class:`Sampling`."""
+        """See :class:`SampleTiming`."""
         t = 0.0
         while True:
             yield t
             t += self._interval()
 
     def measured(self, pose: pin.SE3, t: float) -> pin.SE3:
-        """See :class:`Sampling`."""
+        """See :class:`SampleTiming`."""
         tones = np.sin(2.0 * math.pi * self._frequencies * t + self._phases).sum(axis=1)
         tremor: Array = self._amplitudes * tones
         shift = tremor[:3] + self._random.normal(0.0, self._position_noise, 3)
@@ -95,7 +95,7 @@ class HeadsetSampling:
         return pin.SE3(pin.exp3(turn) @ pose.rotation, pose.translation + shift)
 
     def lateness(self) -> float:
-        """See :class:`Sampling`; short of a sample's period, so that the order is kept."""
+        """See :class:`SampleTiming`; short of a sample's period, so that the order is kept."""
         return min(float(self._random.exponential(_RECEIPT_JITTER)), 0.01)
 
     def _interval(self) -> float:

@@ -9,7 +9,7 @@ import pinocchio as pin
 
 from q2r2_control.errors import ConfigError
 from q2r2_control.inputs.played import PlayedInput
-from q2r2_control.inputs.sampling import EvenSampling, HeadsetSampling, Sampling
+from q2r2_control.inputs.sampling import EvenSampling, HeadsetSampling, SampleTiming
 from q2r2_control.inputs.trajectories import trajectory_named
 from q2r2_control.types import SIDES
 
@@ -58,7 +58,7 @@ class ScriptedInput(PlayedInput):
         self._trajectory = trajectory_named(trajectory)
         self._frequency = frequency_hz
 
-        def sampling(hand: str) -> Sampling:
+        def sampling(hand: str) -> SampleTiming:
             if not human:
                 return EvenSampling(rate_hz, jitter, (seed, SIDES.index(hand)))
             return HeadsetSampling(hand, seed, tremor=True, dropout_probability=_DROPOUT_PROBABILITY)

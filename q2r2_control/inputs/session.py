@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from q2r2_control.errors import ProtocolError
-from q2r2_control.inputs.framing import KEEPALIVE, Frame, encode_frame
+from q2r2_control.inputs.framing import KEEPALIVE, WireFrame, encode_frame
 from q2r2_control.inputs.messages import (
     PROP_TOPICS,
     AppMessage,
@@ -106,7 +106,7 @@ class HeadsetSession:
         self._incomplete = 0
         self.outgoing += HANDSHAKE
 
-    def receive(self, frame: Frame) -> Reception | None:
+    def receive(self, frame: WireFrame) -> Reception | None:
         """Take one frame; the hand's message if it was one. Raises :class:`ProtocolError`: drop the client."""
         if frame.is_keepalive:
             return None
@@ -135,7 +135,7 @@ class HeadsetSession:
         if destination is not None and self.dialect is not None:
             self.outgoing += encode_frame(destination, encode(message, self.dialect))
 
-    def _agree_on_dialect(self, frame: Frame) -> None:
+    def _agree_on_dialect(self, frame: WireFrame) -> None:
         dialect = Dialect.ROS2 if frame.terminated else Dialect.ROS1
         if self.dialect is None:
             self.dialect = dialect
@@ -145,7 +145,7 @@ class HeadsetSession:
                 f"is the {dialect} dialect; earlier ones were {self.dialect}"
             )
 
-    def _data(self, frame: Frame) -> Reception | None:
+    def _data(self, frame: WireFrame) -> Reception | None:
         assert self.dialect is not None  # set by _agree_on_dialect
         name = _topic_name(frame.destination)
         topic = HAND_TOPICS.get(name)
@@ -163,7 +163,7 @@ class HeadsetSession:
         except ProtocolError as error:
             raise ProtocolError(f"{name}: {error}") from error
 
-    def _command(self, frame: Frame) -> None:
+    def _command(self, frame: WireFrame) -> None:
         command = frame.destination
         parameters = _parameters(command, frame.payload)
         match command:

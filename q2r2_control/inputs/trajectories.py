@@ -30,7 +30,7 @@ Path = Callable[[float, float], tuple[Array, Array]]
 
 
 @dataclass(frozen=True)
-class Trajectory:
+class HandTrajectory:
     """What both hands do over time."""
 
     left: Path
@@ -91,7 +91,7 @@ def _rotate(t: float, frequency: float) -> tuple[Array, Array]:
     return np.array([0.0, 0.0, lift]), turn
 
 
-def in_sequence(works: Sequence[HandWork]) -> Trajectory:
+def in_sequence(works: Sequence[HandWork]) -> HandTrajectory:
     """Hands that do one work after the other, and then pause."""
     homes: dict[str, WayPoint] = {hand: (0.0, *HOME[hand], 0.0, 0.0) for hand in SIDES}
     points = {hand: [home] for hand, home in homes.items()}
@@ -103,7 +103,7 @@ def in_sequence(works: Sequence[HandWork]) -> Trajectory:
             points[hand] += [point for point in way if point[0] > points[hand][-1][0]]
             presses[hand] += [begins + t for t in work.presses.get(hand, ())]
         begins += work.duration
-    return Trajectory(
+    return HandTrajectory(
         left=_from_home(points["left"], "left"),
         right=_from_home(points["right"], "right"),
         upper_presses={hand: tuple(times) for hand, times in presses.items()},
@@ -122,15 +122,15 @@ def _from_home(points: Sequence[WayPoint], hand: str) -> Path:
     return displacement
 
 
-TRAJECTORIES: Mapping[str, Trajectory] = {
-    "circle": Trajectory(_circle),
-    "line": Trajectory(_line),
-    "rotate": Trajectory(_rotate),
+TRAJECTORIES: Mapping[str, HandTrajectory] = {
+    "circle": HandTrajectory(_circle),
+    "line": HandTrajectory(_line),
+    "rotate": HandTrajectory(_rotate),
     **{name: in_sequence([work]) for name, work in WORKS.items()},
 }
 
 
-def trajectory_named(name: str) -> Trajectory:
+def trajectory_named(name: str) -> HandTrajectory:
     """One of :data:`TRAJECTORIES`, or several works one after the other, such as ``handover+stack``.
 
     Raises :class:`ConfigError` for any other name.

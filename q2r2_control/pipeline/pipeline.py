@@ -18,10 +18,10 @@ from q2r2_control.plants.base import Plant
 from q2r2_control.plants.factory import check_mode, make_plant
 from q2r2_control.robot.robot import Robot
 from q2r2_control.runtime.loop_clock import LoopClock
+from q2r2_control.runtime.pending_requests import PendingRequests
 from q2r2_control.runtime.process import few_garbage_collections, stop_on_signals
 from q2r2_control.runtime.recorder import Tick
 from q2r2_control.runtime.run_summary import RunSummary
-from q2r2_control.runtime.wishes import Wishes
 from q2r2_control.supervision.joint_watch import watch_settings
 from q2r2_control.supervision.supervisor import Supervisor
 from q2r2_control.supervision.target_stream import StreamSettings
@@ -58,7 +58,7 @@ class Pipeline:
         self.listeners: list[Callable[[Tick], None]] = []
         # A plain flag: unlike the locks of threading.Event, a signal handler can set it in the middle of anything.
         self._stopping = False
-        self.wishes = Wishes()
+        self.requests = PendingRequests()
 
     @classmethod
     def from_config(
@@ -87,7 +87,7 @@ class Pipeline:
 
         Any press of an operator's ends it. How it went is in the events of the run.
         """
-        self.wishes.home = True
+        self.requests.home = True
 
     def change_teleop(self, settings: TeleopSettings) -> None:
         """Other settings of the operator's from the next tick on, without a jump; from any thread.
@@ -95,14 +95,14 @@ class Pipeline:
         What can be changed when: see :meth:`Teleop.change`. Whether it was is in the events of the run; the next run
         begins with the settings of the cell.
         """
-        self.wishes.settings = settings
+        self.requests.settings = settings
 
     def tell(self, line: str) -> None:
         """Let the operator know what became of the recording or of an episode in it; see :mod:`episode_marks`.
 
         From any thread.
         """
-        self.wishes.told_of_recording.append(line)
+        self.requests.told_of_recording.append(line)
 
     def change_control(self, values: Mapping[str, float]) -> None:
         """Other settings of the controller from the next tick on, by name, without a jump; from any thread.
@@ -112,7 +112,7 @@ class Pipeline:
         :class:`ConfigError` for a name or a value that is not allowed at all.
         """
         self.config.control.changed(values)
-        self.wishes.control = dict(values)
+        self.requests.control = dict(values)
 
     def run(self, duration: float | None = None, realtime: bool = True) -> RunSummary:
         """Run for ``duration`` [s], or until :meth:`stop`, Ctrl-C or SIGTERM; the arms are brought to rest first.
@@ -128,7 +128,7 @@ class Pipeline:
                 return self._begin(realtime).until(duration)
         finally:
             self._stopping = False
-            self.wishes.clear()
+            self.requests.clear()
             try:
                 self.input.close()
             finally:

@@ -13,7 +13,7 @@ import numpy as np
 import pinocchio as pin
 
 from q2r2_control.errors import PlantError
-from q2r2_control.runtime.body_changes import BodyChanges
+from q2r2_control.runtime.geometry_updates import GeometryUpdates
 from q2r2_control.runtime.operator_side import OperatorSide
 from q2r2_control.runtime.plant_clock import PlantClock
 from q2r2_control.runtime.recorder import RunRecorder, RunStart, Tick
@@ -56,14 +56,14 @@ class PipelineRun:
         self._supervisor = pipeline.supervisor
         self._supervisor.activate(replace(state, stamp=self._clock.now), self._clock.now)
         self._supervisor.events.clear()
-        self._bodies = BodyChanges(pipeline.controller, pipeline.drive)
+        self._bodies = GeometryUpdates(pipeline.controller, pipeline.drive)
         pipeline.drive.reset(state)
         self._bodies.begin()
         self._grippers: dict[str, float] = {arm: target.gripper for arm, target in self._targets.items()}
         self._openings: dict[str, float] = {}  # measured, that the tick went by
         self._velocity = np.zeros(pipeline.robot.model.nv)
         self._operator = OperatorSide(
-            pipeline.teleop, pipeline.input, self._supervisor, pipeline.controller, pipeline.wishes
+            pipeline.teleop, pipeline.input, self._supervisor, pipeline.controller, pipeline.requests
         )
         pipeline.teleop.marks.recorded = self._recorder.keeps_episodes
 
@@ -154,7 +154,7 @@ class PipelineRun:
         return reference
 
     def limit_grippers(self) -> None:
-        """What the grippers are commanded to; see :meth:`BodyChanges.limit_grippers`."""
+        """What the grippers are commanded to; see :meth:`GeometryUpdates.limit_grippers`."""
         wanted = {arm: target.gripper for arm, target in self._targets.items()}
         self._openings = self._pipeline.plant.gripper_openings()
         self._grippers = self._bodies.limit_grippers(wanted, self._openings, self._clock.now)

@@ -13,7 +13,7 @@ from q2r2_control.recording.encoder import RecordedRobot
 from q2r2_control.recording.helper import reason_of
 from q2r2_control.recording.picture_channel import PictureChannel
 from q2r2_control.recording.topics import Topic
-from q2r2_control.recording.writer import Setup
+from q2r2_control.recording.writer import RingSetup
 from q2r2_control.recording.writer_process import WriterProcess
 from q2r2_control.runtime.folders import new_folder
 from q2r2_control.teleop.episode_marks import RECORDING_ENDED
@@ -57,7 +57,7 @@ class BaseRecorder:
             when = datetime.fromtimestamp(about.epoch * 1e-9)
             folder = new_folder(self._parent, f"{when:%Y%m%d-%H%M%S}-{self._name}", "--record")
             self._path = folder / f"{folder.name}.mcap"
-            self.writer.begin(Setup(self._path.absolute(), about, robot, topics))
+            self.writer.begin(RingSetup(self._path.absolute(), about, robot, topics))
         except (ConfigError, OSError, ValueError) as error:
             self._fail(reason_of(error))
         return self._fault is None

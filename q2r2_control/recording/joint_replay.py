@@ -123,7 +123,7 @@ class _Lead(OperatorSide):
     """Asks for the grippers only; where the joints go, supervision was told."""
 
     def __init__(self, pipeline: JointReplayPipeline) -> None:
-        super().__init__(pipeline.teleop, pipeline.input, pipeline.supervisor, pipeline.controller, pipeline.wishes)
+        super().__init__(pipeline.teleop, pipeline.input, pipeline.supervisor, pipeline.controller, pipeline.requests)
         self._wanted = pipeline.way.grippers
         self._arms = tuple(pipeline.robot.arms)
 

@@ -39,7 +39,7 @@ class ReplayPipeline(Pipeline):
     def _wish_again(self, events: list[Event]) -> None:
         """What a program asked of the run at this tick; both arms were told of it, so it is asked twice."""
         for event in events:
-            self.wishes.take(event.reason, self.teleop.settings)
+            self.requests.take(event.reason, self.teleop.settings)
 
     def _prepare(self, realtime: bool) -> None:
         settings = permitted(self.config.control.model_copy(update={"solve_time_limit": None}), self.drive)

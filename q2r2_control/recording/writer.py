@@ -32,7 +32,7 @@ _NICENESS = 10  # the loop goes first where there are not enough processors
 
 
 @dataclass(frozen=True)
-class Setup:
+class RingSetup:
     """The first record in the ring."""
 
     path: Path  # of the file, in a folder that is there
@@ -60,7 +60,7 @@ def _record(ring: Ring, pictures: PictureSource | None, parent: int) -> None:
             return  # there was no run
         ended = has_ended(parent, _PERIOD)
     setup = pickle.loads(first[0])
-    assert isinstance(setup, Setup)
+    assert isinstance(setup, RingSetup)
     ring.release()
     file = McapFile(setup.path)
     try:
@@ -69,7 +69,7 @@ def _record(ring: Ring, pictures: PictureSource | None, parent: int) -> None:
         file.abandon()
 
 
-def _write(ring: Ring, pictures: PictureSource | None, file: McapFile, setup: Setup, parent: int) -> None:
+def _write(ring: Ring, pictures: PictureSource | None, file: McapFile, setup: RingSetup, parent: int) -> None:
     about, topics = setup.about, setup.topics
     _begin(file, about, topics)
     # Once before the run too, so that what a killed process leaves is a bag.
@@ -109,7 +109,9 @@ def _conclusion() -> dict[str, str]:
     return dict(json.loads(text)) if text else {}
 
 
-def _encoder(setup: Setup, topics: Mapping[int, Topic]) -> Callable[[Sequence[bytes]], Sequence[tuple[Topic, bytes]]]:
+def _encoder(
+    setup: RingSetup, topics: Mapping[int, Topic]
+) -> Callable[[Sequence[bytes]], Sequence[tuple[Topic, bytes]]]:
     """What makes messages of records out of the ring."""
     if setup.robot is None:
         return lambda batch: [(topics[channel_of(record)], record) for record in batch]

@@ -10,7 +10,7 @@ from q2r2_control.recording.about import Conclusion
 from q2r2_control.recording.helper_process import HelperProcess
 from q2r2_control.recording.picture_channel import PictureChannel
 from q2r2_control.recording.ring import Ring, new_memory
-from q2r2_control.recording.writer import Setup
+from q2r2_control.recording.writer import RingSetup
 
 ROOM = 8 << 20  # for ticks that wait to be written [bytes]; one of two arms with seven joints each takes 1.6 kB
 
@@ -39,7 +39,7 @@ class WriterProcess:
         self.pid = self._process.pid
         self._begun = False
 
-    def begin(self, setup: Setup) -> None:
+    def begin(self, setup: RingSetup) -> None:
         """Say what to write, before the first tick is put. Raises :class:`ValueError` where the ring is too small."""
         if not self.ring.put(pickle.dumps(setup)):
             raise ValueError("the ring is not empty")

@@ -45,7 +45,7 @@ class Mounted(NamedTuple):
     is_flat: bool  # on the end of what carries it, and there is a file that can speak of the two
 
 
-class Arm:
+class ArmAssembly:
     """One arm of a model with flange and tool, and which joints and links of them are the arm's."""
 
     def __init__(self, config: ArmConfig, model: Model, packages: Mapping[str, str], side: str) -> None:
@@ -109,7 +109,7 @@ class Arm:
         links = self.mounted[-1].model.links if has_tool else hand_links(self.tree, self.config.gripper.joints)
         return tuple(sorted(map(self.name_in_cell, links)))
 
-    def leave_joints_of(self, others: Sequence[Arm]) -> None:
+    def leave_joints_of(self, others: Sequence[ArmAssembly]) -> None:
         """Give up joints that carry another arm of the model too, such as a torso's, unless ``joints`` names them."""
         if self.config.joints:
             return

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from q2r2_control.config.arms import PoseConfig, RobotConfig, check_models
 from q2r2_control.config.cell import Config
 from q2r2_control.errors import ConfigError
-from q2r2_control.robot.cell_parts import Arm, Model, check_position, load_model
+from q2r2_control.robot.cell_parts import ArmAssembly, Model, check_position, load_model
 from q2r2_control.robot.floor import FLOOR, floor_link
 from q2r2_control.robot.joint_accelerations import set_acceleration_limit
 from q2r2_control.robot.link_roles import KnownParts
@@ -98,23 +98,23 @@ def compose(config: Config) -> ComposedCell:
     )
 
 
-def _arms(config: Config) -> dict[str, Arm]:
+def _arms(config: Config) -> dict[str, ArmAssembly]:
     """Every arm of the cell with the joints that are its own."""
     robot = None
     if config.robot is not None:
         robot = Model(load_model(config.robot, config.packages, "robot"), "")
-    arms: dict[str, Arm] = {}
+    arms: dict[str, ArmAssembly] = {}
     for side in SIDES:
         if side in config.arms:
             made = config.arms[side]
             model = robot or Model(load_model(made, config.packages, f"arms.{side}"), f"{side}_")
-            arms[side] = Arm(made, model, config.packages, side)
+            arms[side] = ArmAssembly(made, model, config.packages, side)
     for arm in arms.values():
         arm.leave_joints_of([other for other in arms.values() if other is not arm and other.model is arm.model])
     return arms
 
 
-def _home(urdf: ET.Element, arms: Mapping[str, Arm]) -> dict[str, float]:
+def _home(urdf: ET.Element, arms: Mapping[str, ArmAssembly]) -> dict[str, float]:
     """Position of every joint that an arm or a gripper moves, those that mimic a finger included."""
     home: dict[str, float] = {}
     owner: dict[str, str] = {}

@@ -17,7 +17,7 @@ import pinocchio as pin
 
 from q2r2_control.robot.description import LinkTree, joint_limits
 from q2r2_control.robot.enclose import capsule_between, enclosing_capsule
-from q2r2_control.robot.finger_openings import FingerBody, Slide
+from q2r2_control.robot.finger_openings import FingerBody, FingerSlide
 from q2r2_control.robot.link_roles import KnownParts, links_moved_by
 from q2r2_control.robot.locking import joint_axis
 from q2r2_control.robot.pairs import link_of
@@ -110,7 +110,7 @@ def _body(arm: str, item: pin.GeometryObject, fingers: list[_Finger]) -> FingerB
         (
             float((point - start) @ along),
             tuple(
-                Slide(float(way.direction @ along), way.home, *way.stroke, way.lower, way.upper)
+                FingerSlide(float(way.direction @ along), way.home, *way.stroke, way.lower, way.upper)
                 for way in ways
                 if way.stroke is not None
             ),

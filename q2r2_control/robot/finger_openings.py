@@ -18,7 +18,7 @@ from q2r2_control.types import ALL_OF_THE_WAY, Array, Interval
 
 
 @dataclass(frozen=True, slots=True)
-class Slide:
+class FingerSlide:
     """A finger joint as it moves one end of a finger along the body's line."""
 
     along: float  # way along the line per way of the joint, -1 .. 1
@@ -51,7 +51,9 @@ class FingerBody:
     arm: str
     name: str  # of the geometry
     length: float  # of its segment [m]
-    ends: tuple[tuple[float, tuple[Slide, ...]], ...]  # along the segment at home [m], and the joints that move them
+    ends: tuple[
+        tuple[float, tuple[FingerSlide, ...]], ...
+    ]  # along the segment at home [m], and the joints that move them
 
     def part(self, interval: Interval) -> tuple[float, float]:
         """Which part of the segment, from 0 its start to 1 its end, the fingers are in at openings in ``interval``."""

@@ -23,7 +23,7 @@ import pinocchio as pin
 from q2r2_control.config.arms import HeldObjectConfig
 from q2r2_control.robot.enclose import capsule_between
 from q2r2_control.robot.floor import FLOOR
-from q2r2_control.robot.link_roles import Part, Role
+from q2r2_control.robot.link_roles import LinkClass, Role
 from q2r2_control.robot.pairs import link_of, pair_names
 from q2r2_control.types import Array
 
@@ -60,7 +60,7 @@ class HeldObjects:
 
     def roles(self) -> dict[str, Role]:
         """What the objects are, by link."""
-        return {held.link: Role(Part.OBJECT, frozenset({arm})) for arm, held in self.by_arm.items()}
+        return {held.link: Role(LinkClass.OBJECT, frozenset({arm})) for arm, held in self.by_arm.items()}
 
 
 def held_objects(
@@ -154,12 +154,16 @@ def _watched(geometry: pin.GeometryModel, roles: Mapping[str, Role], held: HeldO
     """Bodies that those on the object's link are watched against, but for hands that hold, or take, the object."""
     items = geometry.geometryObjects
     # Obstacles all, also those that the hand itself cannot reach: an object reaches farther.
-    found = dict.fromkeys(item.name for item in items if roles[link_of(item.name)].part is Part.OBSTACLE)
+    found = dict.fromkeys(item.name for item in items if roles[link_of(item.name)].part is LinkClass.OBSTACLE)
     for pair in geometry.collisionPairs:
         first, second = items[pair.first], items[pair.second]
         for one, other in ((first, second), (second, first)):
             role = roles[link_of(other.name)]
-            own_hand = held.arm in role.arms and role.part in (Part.FINGER, Part.TOOL)
-            if one.parentJoint == held.joint != other.parentJoint and not own_hand and role.part is not Part.FINGER:
+            own_hand = held.arm in role.arms and role.part in (LinkClass.FINGER, LinkClass.TOOL)
+            if (
+                one.parentJoint == held.joint != other.parentJoint
+                and not own_hand
+                and role.part is not LinkClass.FINGER
+            ):
                 found[other.name] = None
     return list(found)

@@ -10,12 +10,12 @@ import numpy as np
 from q2r2_control.config.control import ControllerSettings
 from q2r2_control.errors import ConfigError
 from q2r2_control.robot.floor import FLOOR
-from q2r2_control.robot.link_roles import Part, Role
+from q2r2_control.robot.link_roles import LinkClass, Role
 from q2r2_control.robot.pairs import link_of, pair_names
 from q2r2_control.robot.robot import PairDistance, Robot
 from q2r2_control.types import Array
 
-_OUTERMOST_FIRST = list(Part)
+_OUTERMOST_FIRST = list(LinkClass)
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,7 +89,7 @@ def pair_class(first: Role, second: Role) -> str:
     """Key of ``control.distances`` for two links."""
     parts = sorted((first.part, second.part), key=_OUTERMOST_FIRST.index)
     same_robot = first.arms & second.arms or not (first.arms and second.arms)
-    if Part.OBSTACLE not in parts and same_robot:
+    if LinkClass.OBSTACLE not in parts and same_robot:
         return "arm_self"
     return f"{parts[0]}_{parts[1]}"
 

@@ -10,7 +10,7 @@ from enum import StrEnum
 from q2r2_control.robot.description import LinkTree, joint_end
 
 
-class Part(StrEnum):
+class LinkClass(StrEnum):
     """What a link is, in the words of ``control.distances``, the outermost first."""
 
     OBJECT = "object"
@@ -49,7 +49,7 @@ class KnownParts:
 class Role:
     """One link. A robot's body may carry several arms, or none."""
 
-    part: Part
+    part: LinkClass
     arms: frozenset[str]
 
 
@@ -59,12 +59,12 @@ def roles_of(tree: LinkTree, own_links: Mapping[str, set[str]], parts: KnownPart
     tools = {link for links in parts.tool_links.values() for link in links}
     obstacles = set(parts.obstacles)
 
-    def part_of(link: str) -> Part:
+    def part_of(link: str) -> LinkClass:
         if link in fingers:
-            return Part.FINGER
+            return LinkClass.FINGER
         if link in tools:
-            return Part.TOOL
-        return Part.OBSTACLE if link in obstacles else Part.ARM
+            return LinkClass.TOOL
+        return LinkClass.OBSTACLE if link in obstacles else LinkClass.ARM
 
     return {
         link: Role(part_of(link), frozenset(arm for arm, links in own_links.items() if link in links))

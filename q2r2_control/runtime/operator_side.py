@@ -11,7 +11,7 @@ import pinocchio as pin
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.inputs.base import Input
 from q2r2_control.runtime.operator_feedback import OperatorFeedback
-from q2r2_control.runtime.wishes import Wishes
+from q2r2_control.runtime.pending_requests import PendingRequests
 from q2r2_control.supervision.supervisor import Supervisor
 from q2r2_control.teleop.arm_states import is_fault
 from q2r2_control.teleop.episode_marks import RECORDING_ENDED
@@ -25,9 +25,14 @@ class OperatorSide:
     """Once a tick: :meth:`poll`, :meth:`targets`, and at its end :meth:`take_events` and ``feedback`` to the hands."""
 
     def __init__(
-        self, teleop: Teleop, source: Input, supervisor: Supervisor, controller: CartesianController, wishes: Wishes
+        self,
+        teleop: Teleop,
+        source: Input,
+        supervisor: Supervisor,
+        controller: CartesianController,
+        requests: PendingRequests,
     ) -> None:
-        self._teleop, self._input, self._supervisor, self._wishes = teleop, source, supervisor, wishes
+        self._teleop, self._input, self._supervisor, self._requests = teleop, source, supervisor, requests
         self._controller = controller
         self._homing = False  # supervision is on the way home
         self.feedback = OperatorFeedback(controller, teleop.hand_of, teleop.settings.haptics, source.send_haptic)
@@ -50,7 +55,7 @@ class OperatorSide:
         commanded: Mapping[str, pin.SE3],
     ) -> dict[str, ArmTarget]:
         """What the operator asks of the arms, handed over to supervision; see :meth:`Teleop.update`."""
-        if self._wishes:
+        if self._requests:
             self._fulfil(now)
         targets = self._teleop.update(samples, tools, now, commanded)
         for arm, target in targets.items():
@@ -76,10 +81,10 @@ class OperatorSide:
         return events
 
     def _fulfil(self, now: float) -> None:
-        home, settings, control = self._wishes.home, self._wishes.settings, self._wishes.control
-        for line in self._wishes.told(self._teleop.settings):
+        home, settings, control = self._requests.home, self._requests.settings, self._requests.control
+        for line in self._requests.told(self._teleop.settings):
             self._teleop.tell(now, line)
-        self._wishes.clear()
+        self._requests.clear()
         if home:
             self._teleop.home(now)
         if settings is not None:

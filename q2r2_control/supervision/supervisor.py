@@ -25,7 +25,7 @@ from q2r2_control.supervision.homing import Homing
 from q2r2_control.supervision.joint_homing import JointWay
 from q2r2_control.supervision.joint_watch import NONE_YET, JointWatch, WatchSettings
 from q2r2_control.supervision.target_stream import Origins, Refusal, StreamSettings
-from q2r2_control.supervision.targets import Targets
+from q2r2_control.supervision.targets import TargetStreams
 from q2r2_control.types import Reference, RobotState
 
 _REST = 1e-4  # of the reference [rad/s]
@@ -64,7 +64,7 @@ class Supervisor:
         self._robot, self._controller, self._external = robot, controller, external
         self._displace = displace
         self._origins = origins or Origins()
-        self._targets = Targets(robot.arms, streams, self._origins)
+        self._targets = TargetStreams(robot.arms, streams, self._origins)
         self._watch = JointWatch(robot.joint_names, robot.velocity_limit, watch, self._origins.joint_states)
         self.homing = Homing(robot, controller, tools_only=external is not None)
         self._stopped: str | None = None  # why it takes a reset

@@ -7,17 +7,17 @@ from collections.abc import Iterable, Sequence
 import pinocchio as pin
 
 from q2r2_control.supervision.sequence_watch import SequenceWatch
-from q2r2_control.supervision.target_line import TargetLine
+from q2r2_control.supervision.target_extrapolator import TargetExtrapolator
 from q2r2_control.supervision.target_stream import Origins, Refusal, StreamSettings, TargetStream
 
 
-class Targets:
+class TargetStreams:
     """One :class:`TargetStream` an arm. Poses are in the world frame, times are receipt times [s]."""
 
     def __init__(self, arms: Iterable[str], settings: StreamSettings, origins: Origins) -> None:
         self._settings, self._origins = settings, origins
         self._streams = {arm: TargetStream(settings) for arm in arms}
-        self._lines = {arm: TargetLine() for arm in self._streams}
+        self._lines = {arm: TargetExtrapolator() for arm in self._streams}
         self._sequences = {arm: SequenceWatch() for arm in self._streams}
         self.ended: dict[str, str] = {}  # arms that hold since their targets ended, with a line that says so
 
@@ -68,7 +68,7 @@ class Targets:
         """Take a target, None for one that was no pose; returns why it is not followed, or None.
 
         ``tools``: see :meth:`TargetStream.offer`; ``number``: of the message at its publisher, None where that is not
-        known; ``forbidden``: why no arm may follow targets now, or None; ``due``: see :meth:`TargetLine.put`.
+        known; ``forbidden``: why no arm may follow targets now, or None; ``due``: see :meth:`TargetExtrapolator.put`.
         """
         stream = self._streams[arm]
         others = None if number is None else self._other_publishers(arm, number, now)

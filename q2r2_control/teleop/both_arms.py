@@ -25,7 +25,7 @@ _ENGAGE, _UNKNOWN, _BOTH_ASK = "engage the arm first", "a tool's pose is not kno
 
 
 @dataclass(slots=True)  # not frozen: that would cost half a microsecond a tick
-class Surroundings:
+class ArmMeasurements:
     """What of the arms themselves counts in one tick; poses are in the world."""
 
     tools: Mapping[str, pin.SE3]  # measured
@@ -97,7 +97,7 @@ class BothArms:
         for arm in self.arms.values():
             arm.change(cause, now, reason)
 
-    def act(self, around: Surroundings, now: float) -> dict[str, list[Press]]:
+    def act(self, around: ArmMeasurements, now: float) -> dict[str, list[Press]]:
         """Do what the hands ask for both arms; returns the presses that are left for each."""
         presses = {name: arm.take_presses(now) for name, arm in self.arms.items()}
         if not any(presses.values()) and not any(arm.grips or arm.chord for arm in self.arms.values()):
@@ -181,7 +181,7 @@ class BothArms:
                 self.remote.end(reason)
         self.carry = None
 
-    def agree(self, around: Surroundings, now: float) -> None:
+    def agree(self, around: ArmMeasurements, now: float) -> None:
         """Go by what the program of the other arm says of carrying, and answer it."""
         remote = self.remote
         if remote is None:
@@ -197,7 +197,7 @@ class BothArms:
         if remote.asked:
             self._answer(arm, remote, around, now)
 
-    def _take_answer(self, arm: ArmTeleop, remote: RemoteArm, around: Surroundings, now: float) -> None:
+    def _take_answer(self, arm: ArmTeleop, remote: RemoteArm, around: ArmMeasurements, now: float) -> None:
         """Carry, if the other program agrees; until it does, this arm goes on following its hand."""
         theirs, ours = remote.answer(now), self._take_up(arm, around)
         if theirs is None and arm.state is ArmState.ENGAGED:
@@ -212,7 +212,7 @@ class BothArms:
         remote.end(problem)
         arm.tell(now, f"not carried: {problem}")
 
-    def _answer(self, arm: ArmTeleop, remote: RemoteArm, around: Surroundings, now: float) -> None:
+    def _answer(self, arm: ArmTeleop, remote: RemoteArm, around: ArmMeasurements, now: float) -> None:
         """Be carried, if nothing is in the way."""
         found: Anchor | str = self._take_up(arm, around)
         if remote.leads:
@@ -227,7 +227,7 @@ class BothArms:
         remote.agree(found.tool)
         self.carry = CarriedMode(arm, remote, found.tool, now)
 
-    def _take_up(self, arm: ArmTeleop, around: Surroundings) -> Anchor | str:
+    def _take_up(self, arm: ArmTeleop, around: ArmMeasurements) -> Anchor | str:
         """Where an arm's tool is when it begins to be carried, or why it may not be."""
         if arm.state is not ArmState.ENGAGED:
             if arm.state not in AT_REST:
@@ -240,7 +240,7 @@ class BothArms:
         target = around.targets.get(arm.arm)
         return _UNKNOWN if target is None else Anchor(target, arm.sag)
 
-    def _begin_carry(self, name: str, around: Surroundings, now: float) -> None:
+    def _begin_carry(self, name: str, around: ArmMeasurements, now: float) -> None:
         """The hand of the arm ``name`` moves both tools."""
         leader, remote = self.arms[name], self.remote
         other = next((arm for arm in self.arms.values() if arm is not leader), None)

@@ -12,7 +12,7 @@ from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.quaternions import se3_of
 from q2r2_control.teleop.arm import of_controls
 from q2r2_control.teleop.arm_states import FOLLOWING, HOLDING, ArmState, Cause
-from q2r2_control.teleop.both_arms import BothArms, Surroundings
+from q2r2_control.teleop.both_arms import ArmMeasurements, BothArms
 from q2r2_control.teleop.episode_marks import EpisodeMarks
 from q2r2_control.teleop.remote_arm import RemoteArm
 from q2r2_control.types import ArmTarget, Event, HandSample
@@ -142,14 +142,14 @@ class Teleop:
                 faults[name] = fault
         if faults:
             self._disengage(faults, now)
-        around = Surroundings(tools, self._commanded, commanded, obstacles or {})
+        around = ArmMeasurements(tools, self._commanded, commanded, obstacles or {})
         self._pair.agree(around, now)
         for arm in self._arms.values():
             if samples or not arm.settled:
                 return self._act(around, now)
         return self._targets(now, around)  # as at most ticks
 
-    def _act(self, around: Surroundings, now: float) -> dict[str, ArmTarget]:
+    def _act(self, around: ArmMeasurements, now: float) -> dict[str, ArmTarget]:
         """Do what the hands ask for; every arm's target after it."""
         presses = self._pair.act(around, now)
         chord = self.aligning
@@ -165,7 +165,7 @@ class Teleop:
         self._pair.swap_hands(presses, now)
         return targets
 
-    def _targets(self, now: float, around: Surroundings) -> dict[str, ArmTarget]:
+    def _targets(self, now: float, around: ArmMeasurements) -> dict[str, ArmTarget]:
         """Of every arm, by its state."""
         if self._pair.carry is not None:
             return self._carried_targets(now, around)
@@ -179,7 +179,7 @@ class Teleop:
             targets[name] = ArmTarget(pose, arm.gripper, slip, slip_angle, arm.sag, hand)
         return targets
 
-    def _carried_targets(self, now: float, around: Surroundings) -> dict[str, ArmTarget]:
+    def _carried_targets(self, now: float, around: ArmMeasurements) -> dict[str, ArmTarget]:
         """Of every arm, while two carry or until one of them was stopped."""
         assert self._pair.carry is not None
         if not self._pair.carry.lasts:

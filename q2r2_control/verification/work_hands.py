@@ -13,7 +13,7 @@ import pinocchio as pin
 
 from q2r2_control.config.teleop import Stance, TeleopSettings
 from q2r2_control.inputs.played import PlayedInput
-from q2r2_control.inputs.sampling import EvenSampling, HeadsetSampling, Sampling
+from q2r2_control.inputs.sampling import EvenSampling, HeadsetSampling, SampleTiming
 from q2r2_control.inputs.scripted import HANDS_AT_REST
 from q2r2_control.inputs.trajectories import PRESS_DURATION
 from q2r2_control.teleop.relative import RelativeMotion
@@ -58,7 +58,7 @@ def _anchored(settings: TeleopSettings, hand: pin.SE3, tool: pin.SE3) -> Relativ
     return motion
 
 
-def _sampling(hand: str, seed: int | None) -> Sampling:
+def _sampling(hand: str, seed: int | None) -> SampleTiming:
     return EvenSampling(_EVEN_RATE) if seed is None else HeadsetSampling(hand, seed, position_noise=_NOISE)
 
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from q2r2_control.benchmark.command_responses import Recording, latency_report
+from q2r2_control.benchmark.command_responses import CommandRecording, latency_report
 
 PERIOD = 0.004  # [s]
 LIMIT = np.array([20.0, 20.0, 20.0, 10.0, 20.0, 20.0, 20.0])  # [rad/s^2]
 
 
-def recording(steps: list[float], delays: list[float | None], noise: float = 0.0) -> Recording:
+def recording(steps: list[float], delays: list[float | None], noise: float = 0.0) -> CommandRecording:
     """Commands every 4 ms for a second; each step makes a joint fast, then slower and slower, after its delay."""
     times = np.arange(0.0, 1.0, PERIOD)
     v = np.zeros((len(times), 7))
@@ -20,7 +20,7 @@ def recording(steps: list[float], delays: list[float | None], noise: float = 0.0
             since = times - step - delay
             v[:, 3] += np.where(since >= -1e-9, LIMIT[3] * PERIOD * np.exp(-np.maximum(since, 0.0) / 0.1), 0.0)
     v += noise * np.random.default_rng(1).normal(size=v.shape)
-    return Recording(steps, times.tolist(), (times + 0.001).tolist(), v)
+    return CommandRecording(steps, times.tolist(), (times + 0.001).tolist(), v)
 
 
 def test_a_latency_is_from_the_step_to_the_receipt_of_its_answer() -> None:

@@ -13,7 +13,7 @@ from q2r2_control.benchmark.peers.base import (
     PEERS,
     WITHOUT_ACCELERATION_LIMIT,
     BenchController,
-    Setup,
+    PeerSettings,
     is_installed,
     make_peer,
 )
@@ -31,7 +31,7 @@ def robot() -> Robot:
 
 @cache
 def peer_of(name: str) -> BenchController:
-    return make_peer(name, Setup(robot(), CONFIG, DT))
+    return make_peer(name, PeerSettings(robot(), CONFIG, DT))
 
 
 @pytest.fixture(params=PEERS)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from q2r2_control import load_config
-from q2r2_control.benchmark.press_run import COMMANDED, Slide, run_press
+from q2r2_control.benchmark.press_run import COMMANDED, PressSlide, run_press
 from q2r2_control.errors import ConfigError
 from q2r2_control.verification.contact_cells import TABLE_ONLY, with_contact
 
@@ -14,10 +14,10 @@ STIFFNESS = CONFIG.impedance.translational_stiffness
 
 
 @pytest.mark.parametrize(
-    ("slide", "rotor_share", "friction"), [(Slide.AWAY, 1.0, 0.6), (Slide.TOWARDS, 0.1, 0.9)], ids=str
+    ("slide", "rotor_share", "friction"), [(PressSlide.AWAY, 1.0, 0.6), (PressSlide.TOWARDS, 0.1, 0.9)], ids=str
 )
 def test_what_is_commanded_into_the_table_presses_as_the_stiffness_says_and_slides_without_losing_contact(
-    slide: Slide, rotor_share: float, friction: float
+    slide: PressSlide, rotor_share: float, friction: float
 ) -> None:
     press = run_press(with_contact(CONFIG, TABLE_ONLY), slide, rotor_share, friction)
     assert press.violations == 0
@@ -38,4 +38,4 @@ def test_what_is_commanded_into_the_table_presses_as_the_stiffness_says_and_slid
 
 def test_a_cell_where_the_fingers_may_not_touch_the_table_is_refused() -> None:
     with pytest.raises(ConfigError, match=r"control\.contact_allowed: nothing of arm left's fingers and table"):
-        run_press(CONFIG, Slide.AWAY, rotor_share=1.0, friction=0.6)
+        run_press(CONFIG, PressSlide.AWAY, rotor_share=1.0, friction=0.6)

@@ -9,7 +9,7 @@ import pinocchio as pin
 import pytest
 
 from q2r2_control.benchmark.motion_run import run_motion
-from q2r2_control.benchmark.peers.base import INSTALL, PEERS, Setup, is_installed, make_peer
+from q2r2_control.benchmark.peers.base import INSTALL, PEERS, PeerSettings, is_installed, make_peer
 from q2r2_control.benchmark.peers.leading import Leading
 from q2r2_control.benchmark.work_bench import WORK_PEERS, run_work_bench
 from q2r2_control.config.cell import load_config
@@ -77,7 +77,7 @@ def test_a_peer_follows_in_free_motion_as_well_as_its_gain_allows(name: str) -> 
     if not is_installed(name):
         pytest.skip(f"{PEERS[name]} is not installed; {INSTALL}")
     robot = Robot.from_config(CONFIG)
-    peer = Leading(make_peer(name, Setup(robot, CONFIG, 0.001)), CONFIG.control.position_gain)
+    peer = Leading(make_peer(name, PeerSettings(robot, CONFIG, 0.001)), CONFIG.control.position_gain)
     figures = run_motion(peer, robot, WORK_MOTIONS["reach-under"])
     # Without the lead it would lag 35 mm at the target's 0.28 m/s.
     assert figures.max_error_mm is not None

@@ -8,7 +8,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from q2r2_control.compliance.joint_dynamics import Bodies, Dynamics, inverse_dynamics
+from q2r2_control.compliance.joint_dynamics import Dynamics, LinkInertias, inverse_dynamics
 from q2r2_control.config.cell import load_config
 from q2r2_control.control.geometry.kinematics import Placements, chain_of, place
 from q2r2_control.robot.robot import Robot
@@ -32,7 +32,7 @@ def _models() -> list[pin.Model]:
 @pytest.mark.parametrize("model", _models(), ids=["iiwa 7", "iiwa 14", "a joint that slides"])
 def test_torque_and_inertia_are_pinocchio_s(model: pin.Model) -> None:
     random, data, chain = np.random.default_rng(0), model.createData(), chain_of(model)
-    bodies, placements, dynamics = Bodies.of(model), Placements.empty(chain), Dynamics.empty(chain)
+    bodies, placements, dynamics = LinkInertias.of(model), Placements.empty(chain), Dynamics.empty(chain)
     for _ in range(50):
         q, v, a = random.uniform(-2.0, 2.0, (3, model.nv))
         place(chain, q, placements)
@@ -45,7 +45,7 @@ def test_torque_and_inertia_are_pinocchio_s(model: pin.Model) -> None:
 def test_another_body_counts_from_the_next_call_on() -> None:
     model = pin.buildModelFromXML(SLIDING)
     chain = chain_of(model)
-    bodies, placements, dynamics = Bodies.of(model), Placements.empty(chain), Dynamics.empty(chain)
+    bodies, placements, dynamics = LinkInertias.of(model), Placements.empty(chain), Dynamics.empty(chain)
     held = pin.Inertia.FromSphere(2.0, 0.1)
     model.inertias[2] = model.inertias[2] + held
     bodies.put(2, model.inertias[2])

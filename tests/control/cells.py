@@ -10,7 +10,7 @@ import numpy as np
 from q2r2_control.config.cell import Config, load_config
 from q2r2_control.config.control import ControllerSettings
 from q2r2_control.control.geometry.collision import (
-    Bodies,
+    CollisionBodies,
     CollisionData,
     CollisionModel,
     Pairs,
@@ -35,7 +35,7 @@ class CellArrays(NamedTuple):
     collision: CollisionModel
 
     @property
-    def bodies(self) -> Bodies:
+    def bodies(self) -> CollisionBodies:
         return self.collision.bodies
 
     @property

@@ -9,7 +9,7 @@ import pytest
 
 from q2r2_control.config.control import ControllerSettings
 from q2r2_control.control.targets import TargetTracker
-from q2r2_control.control.tasks.task_data import Targets
+from q2r2_control.control.tasks.task_data import TaskTargets
 from q2r2_control.types import Array
 from tests.control.cells import kernel_model
 
@@ -25,7 +25,7 @@ def tracker() -> TargetTracker:
     return made
 
 
-def _taken(tracker: TargetTracker) -> Targets:
+def _taken(tracker: TargetTracker) -> TaskTargets:
     return tracker._targets  # kernels read them through ``held``, Python code need not
 
 

@@ -12,7 +12,7 @@ import pytest
 from q2r2_control import CartesianController, Robot, load_config
 from q2r2_control.control.kernel_data import KernelData
 from q2r2_control.control.kernel_model import kernel_model_of
-from q2r2_control.control.qp import DaqpSolver, OnlyIfBound, QpProblem, QpSolution
+from q2r2_control.control.qp import DaqpSolver, QpProblem, QpSolution, SkipIfUnconstrained
 from q2r2_control.control.unconstrained import find_minimum
 from q2r2_control.types import Array
 
@@ -138,7 +138,7 @@ def test_a_solver_is_asked_only_where_there_is_no_such_minimum() -> None:
             asked.append(problem)
             return DaqpSolver(3, None).solve(problem)
 
-    solver, known = OnlyIfBound(Noting()), np.ones(3)
+    solver, known = SkipIfUnconstrained(Noting()), np.ones(3)
     assert solver.solve(problem_of(known)).v is known
     assert not asked
     solution = solver.solve(replace(problem_of(known), minimum=None))

@@ -12,7 +12,7 @@ import numpy.typing as npt
 import pytest
 
 from q2r2_control.errors import ConfigError, RecordingError
-from q2r2_control.export.episodes import Episode, Sampling, make_episode, make_episodes
+from q2r2_control.export.episodes import EpisodeVectors, FrameSampling, make_episode, make_episodes
 from tests.export.runs import Run, contents, record_step
 from tests.recording.runs import RATE
 
@@ -43,7 +43,7 @@ def test_a_step_of_the_hand_is_in_action_and_observation_at_the_stated_frames(ru
     closing = next(i for i, tick in enumerate(run.ticks) if tick.command.grippers["left"] < 1.0)
     assert engaged < target <= command
     # At the loop's own rate each tick is a frame, and this plant is where the reference was a tick before.
-    whole = make_episode(run.file, Sampling(fps=int(RATE)))
+    whole = make_episode(run.file, FrameSampling(fps=int(RATE)))
     y = whole.vectors["action.tool"][:, whole.names["action.tool"].index("left_y")]
     joints = [whole.names["action"].index(name) for name in whole.names["observation.velocity"]]
     assert engaged + int(np.argmax(y[engaged:] > y[engaged] + MOVED)) == target
@@ -53,13 +53,13 @@ def test_a_step_of_the_hand_is_in_action_and_observation_at_the_stated_frames(ru
     assert int(np.argmax(gripper < 1.0)) == closing
     # Ticks are 2 ms apart: frame k is that of command i where i - 1 < k / fps / 2 ms <= i, of state i where it is in
     # i <= ... < i + 1.
-    slow = make_episode(run.file, Sampling(fps=30))
+    slow = make_episode(run.file, FrameSampling(fps=30))
     assert first_moved(slow.vectors["action"][:, joints]) == (command - 1) * 60 // 1000 + 1
     assert first_moved(slow.vectors["observation.state"][:, joints]) == -(-(command + 1) * 60 // 1000)
 
 
 def test_measured_tools_are_those_that_the_loop_measured(run: Run) -> None:
-    episode = make_episode(run.file, Sampling(fps=int(RATE)))
+    episode = make_episode(run.file, FrameSampling(fps=int(RATE)))
     for arm in ("left", "right"):
         at = [episode.names["observation.tool"].index(f"{arm}_{axis}") for axis in "xyz"]
         lived = [tick.tools[arm].translation for tick in run.ticks]
@@ -67,7 +67,7 @@ def test_measured_tools_are_those_that_the_loop_measured(run: Run) -> None:
 
 
 def test_an_episode_knows_its_task_its_cell_and_its_last_frame(run: Run) -> None:
-    episode = make_episode(run.file, Sampling(fps=50))
+    episode = make_episode(run.file, FrameSampling(fps=50))
     assert (episode.task, episode.cell, episode.recording) == ("a test", "dual_iiwa7", run.file.name)
     assert "version" in episode.notes
     columns = episode.columns(index=3, first_frame=100, task=2)
@@ -79,9 +79,9 @@ def test_an_episode_knows_its_task_its_cell_and_its_last_frame(run: Run) -> None
 
 
 def test_an_episode_that_was_kept_is_the_same(run: Run, tmp_path: Path) -> None:
-    episode = make_episode(run.file, Sampling())
+    episode = make_episode(run.file, FrameSampling())
     episode.save(tmp_path / "kept.npz")
-    again = Episode.load(tmp_path / "kept.npz")
+    again = EpisodeVectors.load(tmp_path / "kept.npz")
     assert again.names == episode.names
     for name, values in episode.vectors.items():
         np.testing.assert_array_equal(again.vectors[name], values)
@@ -94,9 +94,9 @@ def test_several_processes_make_the_same_bytes_as_one(run: Run, tmp_path: Path) 
     files = [run.file, Path(shutil.copy(run.file, tmp_path / "copy.mcap"))]
     for workers in (1, 2):
         (tmp_path / str(workers)).mkdir()
-        made = make_episodes(files, Sampling(), tmp_path / str(workers), workers=workers)
+        made = make_episodes(files, FrameSampling(), tmp_path / str(workers), workers=workers)
         assert len(made.kept) == 2
-        assert [Episode.load(file).recording for file in made.kept] == [file.name for file in files]
+        assert [EpisodeVectors.load(file).recording for file in made.kept] == [file.name for file in files]
     assert contents(tmp_path / "1") == contents(tmp_path / "2") != {}
 
 
@@ -109,25 +109,25 @@ def test_an_interrupted_export_goes_on_with_what_it_had(run: Run, tmp_path: Path
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        make_episodes(files, Sampling(), kept, progress=interrupt)
+        make_episodes(files, FrameSampling(), kept, progress=interrupt)
     (first,) = kept.iterdir()
     made_at = first.stat().st_mtime_ns
-    made = make_episodes(files, Sampling(), kept)
+    made = make_episodes(files, FrameSampling(), kept)
     assert made.kept[0] == first
     assert first.stat().st_mtime_ns == made_at
     # Half of a file, as a machine without power may leave it, and other options, are made anew.
     first.write_bytes(first.read_bytes()[:1000])
-    make_episodes(files, Sampling(), kept)
-    assert Episode.load(first).frames == Episode.load(made.kept[1]).frames
-    other = make_episodes(files[:1], Sampling(fps=10), kept)
-    assert Episode.load(other.kept[0]).fps == 10
+    make_episodes(files, FrameSampling(), kept)
+    assert EpisodeVectors.load(first).frames == EpisodeVectors.load(made.kept[1]).frames
+    other = make_episodes(files[:1], FrameSampling(fps=10), kept)
+    assert EpisodeVectors.load(other.kept[0]).fps == 10
 
 
 def test_a_worker_that_is_killed_is_one_line_and_the_next_export_goes_on(run: Run, tmp_path: Path) -> None:
     files = [run.file, *(Path(shutil.copy(run.file, tmp_path / f"copy-{number}.mcap")) for number in range(2))]
     kept = tmp_path / "kept"
     kept.mkdir()
-    *others, last = make_episodes(files, Sampling(), kept).kept
+    *others, last = make_episodes(files, FrameSampling(), kept).kept
     last.unlink()
     made_at = [other.stat().st_mtime_ns for other in others]
     os.mkfifo(last.with_suffix(".unfinished"))  # nobody reads it, so a worker is in the middle of its episode for good
@@ -138,10 +138,10 @@ def test_a_worker_that_is_killed_is_one_line_and_the_next_export_goes_on(run: Ru
                 process.kill()
 
     with pytest.raises(ConfigError, match="a process of --workers was killed") as fault:
-        make_episodes(files, Sampling(), kept, workers=2, progress=kill)
+        make_episodes(files, FrameSampling(), kept, workers=2, progress=kill)
     assert "\n" not in str(fault.value)
     last.with_suffix(".unfinished").unlink()
-    assert make_episodes(files, Sampling(), kept, workers=2).kept == [*others, last]
+    assert make_episodes(files, FrameSampling(), kept, workers=2).kept == [*others, last]
     assert [other.stat().st_mtime_ns for other in others] == made_at
 
 
@@ -152,8 +152,8 @@ def test_a_bad_recording_is_named_or_skipped(workers: int, run: Run, tmp_path: P
     data[data.rindex(ZSTD_MAGIC) + 200] ^= 0xFF
     damaged.write_bytes(data)
     with pytest.raises(RecordingError, match=r"damaged\.mcap: damaged"):
-        make_episodes([damaged, run.file], Sampling(), tmp_path, workers=workers)
-    made = make_episodes([damaged, run.file], Sampling(), tmp_path, workers=workers, skip_bad=True)
+        make_episodes([damaged, run.file], FrameSampling(), tmp_path, workers=workers)
+    made = make_episodes([damaged, run.file], FrameSampling(), tmp_path, workers=workers, skip_bad=True)
     assert len(made.kept) == 1
     (fault,) = made.skipped
     assert "damaged.mcap: damaged" in fault
@@ -162,4 +162,4 @@ def test_a_bad_recording_is_named_or_skipped(workers: int, run: Run, tmp_path: P
 @pytest.mark.parametrize("fps", [0, -30, 1001])
 def test_a_rate_that_no_recording_has_is_refused(fps: int) -> None:
     with pytest.raises(ConfigError, match=rf"--fps {fps}: allowed: 1 \.\. 1000"):
-        Sampling(fps=fps)
+        FrameSampling(fps=fps)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from q2r2_control.config.cameras import CameraConfig
-from q2r2_control.export.episodes import Episode
+from q2r2_control.export.episodes import EpisodeVectors
 from q2r2_control.export.hdf5 import write_episodes
 from q2r2_control.export.kept_pictures import KeptAs, KeptPictures, place_of
 from q2r2_control.export.pixel_files import write_pixels
@@ -22,7 +22,7 @@ h5py = pytest.importorskip("h5py", reason="the extra export is not installed")
 POSITIONS = ("left_A1", "left_gripper")
 
 
-def kept(folder: Path) -> tuple[list[Path], list[Episode]]:
+def kept(folder: Path) -> tuple[list[Path], list[EpisodeVectors]]:
     """Files of two episodes with the pictures of a camera."""
     camera = CameraConfig(position=(1, 0, 1), rpy=(0, 0, 0), width=WIDTH, height=HEIGHT)
     files, episodes = [], []

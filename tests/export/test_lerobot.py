@@ -15,7 +15,7 @@ import pytest
 
 from q2r2_control.errors import ConfigError, RecordingError
 from q2r2_control.export import lerobot
-from q2r2_control.export.episodes import Episode
+from q2r2_control.export.episodes import EpisodeVectors
 from q2r2_control.export.lerobot import require_pyarrow, write_dataset
 from q2r2_control.export.output import Output
 from q2r2_control.export.statistics import statistics_of
@@ -26,10 +26,10 @@ NAMES = {"observation.state": ("left_A1", "left_gripper"), "action": ("left_A1",
 OUTCOMES = {1: True, 2: None, 3: False}
 
 
-def episode(seed: int, frames: int, task: str) -> Episode:
+def episode(seed: int, frames: int, task: str) -> EpisodeVectors:
     random = np.random.default_rng(seed)
     vectors = {name: random.normal(size=(frames, len(labels))).astype(np.float32) for name, labels in NAMES.items()}
-    return Episode(
+    return EpisodeVectors(
         f"run-{seed}.mcap", "two_arms", task, 30, NAMES, {"operator": "Ada"}, vectors, success=OUTCOMES[seed]
     )
 

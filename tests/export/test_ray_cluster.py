@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from q2r2_control.export.episodes import Sampling, make_episodes
+from q2r2_control.export.episodes import FrameSampling, make_episodes
 from q2r2_control.export.lerobot import write_dataset
 from tests.export.runs import contents, record_two
 
@@ -64,7 +64,7 @@ def test_the_dataset_is_the_same_when_a_worker_is_killed_in_the_middle(
     recordings: list[Path], address: str, tmp_path: Path
 ) -> None:
     (tmp_path / "episodes").mkdir()
-    write_dataset(make_episodes(recordings, Sampling(), tmp_path / "episodes").kept, tmp_path / "here")
+    write_dataset(make_episodes(recordings, FrameSampling(), tmp_path / "episodes").kept, tmp_path / "here")
     process = export(recordings, tmp_path / "there", "--ray", address)
     killed = None
     while killed is None and process.poll() is None:

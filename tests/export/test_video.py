@@ -11,7 +11,7 @@ import pytest
 from q2r2_control.config.cameras import CameraConfig
 from q2r2_control.errors import RecordingError
 from q2r2_control.export import video
-from q2r2_control.export.episodes import Episode, Sampling, make_episodes
+from q2r2_control.export.episodes import EpisodeVectors, FrameSampling, make_episodes
 from q2r2_control.export.kept_pictures import KeptAs
 from q2r2_control.export.lerobot import write_dataset
 from q2r2_control.export.statistics import QUANTILES, statistics_of
@@ -77,7 +77,7 @@ def test_the_same_pictures_give_the_same_bytes(tmp_path: Path) -> None:
 
 def test_an_episode_without_the_cameras_of_the_others_is_refused(tmp_path: Path) -> None:
     files, _ = save_with_videos(EPISODES[:1], tmp_path)
-    without: Episode = EPISODES[1]
+    without: EpisodeVectors = EPISODES[1]
     without.save(tmp_path / "without.npz")
     with pytest.raises(RecordingError, match=r"run-2\.mcap: has not the cameras that run-1\.mcap has"):
         write_dataset([*files, tmp_path / "without.npz"], tmp_path / "made")
@@ -91,11 +91,11 @@ def test_recorded_pictures_become_the_same_dataset_with_any_number_of_workers(tm
     files = [file_of(record(tmp_path / "recordings", run, 0.3)) for run in runs]
     for workers in (1, 2):
         (kept := tmp_path / f"kept-{workers}").mkdir()
-        episodes = make_episodes(files, Sampling(20, pictures=KeptAs.VIDEO), kept, workers=workers).kept
+        episodes = make_episodes(files, FrameSampling(20, pictures=KeptAs.VIDEO), kept, workers=workers).kept
         write_dataset(episodes, tmp_path / str(workers))
         made.append(contents(tmp_path / str(workers)))
     assert made[0] == made[1]
-    first = Episode.load(episodes[0])
+    first = EpisodeVectors.load(episodes[0])
     with av.open(str(tmp_path / "1" / "videos" / KEY / "chunk-000" / "file-000.mp4")) as container:
         shown = [frame.to_ndarray(format="rgb24").astype(float) for frame in container.decode(video=0)]
     assert len(shown) == 2 * first.frames

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from q2r2_control.export.episodes import Episode
+from q2r2_control.export.episodes import EpisodeVectors
 from q2r2_control.export.kept_pictures import KeptAs, KeptPictures, place_of
 from q2r2_control.export.pictures import Pixels
 from q2r2_control.export.video import encode
@@ -16,7 +16,7 @@ from q2r2_control.export.video import encode
 CAMERA, WIDTH, HEIGHT = "front", 64, 48
 
 
-def pictures_of(episode: Episode, seed: int) -> list[Pixels]:
+def pictures_of(episode: EpisodeVectors, seed: int) -> list[Pixels]:
     """One for each frame: a smooth pattern, which the encoder keeps, that moves."""
     y, x = np.mgrid[:HEIGHT, :WIDTH]
     patterns = []
@@ -26,7 +26,7 @@ def pictures_of(episode: Episode, seed: int) -> list[Pixels]:
     return patterns
 
 
-def save_with_videos(episodes: Sequence[Episode], folder: Path) -> tuple[list[Path], list[list[Pixels]]]:
+def save_with_videos(episodes: Sequence[EpisodeVectors], folder: Path) -> tuple[list[Path], list[list[Pixels]]]:
     """Keep episodes with the video of a camera, and return their files and pictures."""
     files, pictures = [], []
     for number, episode in enumerate(episodes):

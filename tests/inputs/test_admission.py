@@ -14,7 +14,7 @@ from q2r2_control.inputs.admission import (
     POSES_ALLOWED,
     QUIET_ALLOWED,
     WAIT_ALLOWED,
-    Verdict,
+    Admission,
     decide,
     is_allowed,
 )
@@ -45,38 +45,38 @@ POSING = replace(STRANGER, last_pose=NOW)
 @pytest.mark.parametrize(
     ("driver", "newcomer", "verdict"),
     [
-        pytest.param(None, STRANGER, Verdict.ADMIT, id="nobody drives"),
-        pytest.param(DRIVER, BACK, Verdict.REFUSE, id="same peer, but the driver is heard"),
-        pytest.param(replace(DRIVER, last_frame=NOW - 0.49), BACK, Verdict.REFUSE, id="same peer, a short pause"),
-        pytest.param(QUIET, BACK, Verdict.ADMIT, id="same peer, the driver is quiet"),
-        pytest.param(QUIET, replace(BACK, registrations=({}, {})), Verdict.WAIT, id="same host, not registered yet"),
-        pytest.param(QUIET, replace(BACK, registrations=(REGISTERED[0], {})), Verdict.WAIT, id="half registered"),
+        pytest.param(None, STRANGER, Admission.ADMIT, id="nobody drives"),
+        pytest.param(DRIVER, BACK, Admission.REFUSE, id="same peer, but the driver is heard"),
+        pytest.param(replace(DRIVER, last_frame=NOW - 0.49), BACK, Admission.REFUSE, id="same peer, a short pause"),
+        pytest.param(QUIET, BACK, Admission.ADMIT, id="same peer, the driver is quiet"),
+        pytest.param(QUIET, replace(BACK, registrations=({}, {})), Admission.WAIT, id="same host, not registered yet"),
+        pytest.param(QUIET, replace(BACK, registrations=(REGISTERED[0], {})), Admission.WAIT, id="half registered"),
         pytest.param(
             replace(QUIET, registrations=({}, {})),
             replace(BACK, registrations=({}, {})),
-            Verdict.WAIT,
+            Admission.WAIT,
             id="same host, neither has registered",
         ),
-        pytest.param(QUIET, STRANGER, Verdict.REFUSE, id="another host, the driver is quiet"),
-        pytest.param(QUIET, POSING, Verdict.REFUSE, id="another host with poses, the driver is quiet"),
-        pytest.param(IDLE, POSING, Verdict.ADMIT, id="poses against keepalives"),
-        pytest.param(IDLE, STRANGER, Verdict.WAIT, id="no poses against keepalives"),
-        pytest.param(IDLE, BACK, Verdict.WAIT, id="same peer without poses against keepalives"),
-        pytest.param(replace(IDLE, last_pose=NOW - 4.9), POSING, Verdict.REFUSE, id="poses some seconds ago"),
-        pytest.param(replace(IDLE, last_pose=-math.inf), POSING, Verdict.ADMIT, id="a driver that never sent a pose"),
-        pytest.param(IDLE, replace(STRANGER, since=NOW - 2.1), Verdict.REFUSE, id="waited in vain for poses"),
+        pytest.param(QUIET, STRANGER, Admission.REFUSE, id="another host, the driver is quiet"),
+        pytest.param(QUIET, POSING, Admission.REFUSE, id="another host with poses, the driver is quiet"),
+        pytest.param(IDLE, POSING, Admission.ADMIT, id="poses against keepalives"),
+        pytest.param(IDLE, STRANGER, Admission.WAIT, id="no poses against keepalives"),
+        pytest.param(IDLE, BACK, Admission.WAIT, id="same peer without poses against keepalives"),
+        pytest.param(replace(IDLE, last_pose=NOW - 4.9), POSING, Admission.REFUSE, id="poses some seconds ago"),
+        pytest.param(replace(IDLE, last_pose=-math.inf), POSING, Admission.ADMIT, id="a driver that never sent a pose"),
+        pytest.param(IDLE, replace(STRANGER, since=NOW - 2.1), Admission.REFUSE, id="waited in vain for poses"),
         pytest.param(
-            QUIET, replace(BACK, registrations=({}, {}), since=NOW - 2.1), Verdict.REFUSE, id="waited in vain"
+            QUIET, replace(BACK, registrations=({}, {}), since=NOW - 2.1), Admission.REFUSE, id="waited in vain"
         ),
     ],
 )
 def test_the_place_belongs_to_who_sends_poses_and_a_peer_that_comes_back_takes_its_own(
-    driver: Client | None, newcomer: Client, verdict: Verdict
+    driver: Client | None, newcomer: Client, verdict: Admission
 ) -> None:
     decision = decide(driver, newcomer, NOW)
     assert decision.verdict is verdict
-    if driver is not None and verdict is not Verdict.WAIT:
-        assert (newcomer.peer if verdict is Verdict.ADMIT else driver.peer) in decision.reason
+    if driver is not None and verdict is not Admission.WAIT:
+        assert (newcomer.peer if verdict is Admission.ADMIT else driver.peer) in decision.reason
 
 
 def test_a_driver_that_gives_way_as_quiet_moves_no_arm_any_more() -> None:

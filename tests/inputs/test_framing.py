@@ -7,14 +7,14 @@ import struct
 import pytest
 
 from q2r2_control.errors import ProtocolError
-from q2r2_control.inputs.framing import KEEPALIVE, MAX_FRAME_BYTES, Frame, FrameDecoder, encode_frame
+from q2r2_control.inputs.framing import KEEPALIVE, MAX_FRAME_BYTES, FrameDecoder, WireFrame, encode_frame
 
 # Written by hand from the protocol: length 4, "/abc", length 3, "xyz".
 ABC = b"\x04\x00\x00\x00/abc\x03\x00\x00\x00xyz"
 ABC_NUL = b"\x05\x00\x00\x00/abc\x00\x03\x00\x00\x00xyz"
 
 
-def frames(*chunks: bytes) -> list[Frame]:
+def frames(*chunks: bytes) -> list[WireFrame]:
     decoder = FrameDecoder()
     found = []
     for chunk in chunks:
@@ -26,15 +26,15 @@ def frames(*chunks: bytes) -> list[Frame]:
 
 
 def test_a_frame_is_read_as_written_by_hand() -> None:
-    assert frames(ABC) == [Frame("/abc", b"xyz", terminated=False)]
+    assert frames(ABC) == [WireFrame("/abc", b"xyz", terminated=False)]
 
 
 def test_the_nul_of_a_ros2_destination_is_told_and_taken_off() -> None:
-    assert frames(ABC_NUL) == [Frame("/abc", b"xyz", terminated=True)]
+    assert frames(ABC_NUL) == [WireFrame("/abc", b"xyz", terminated=True)]
 
 
 def test_only_one_nul_is_taken_off() -> None:
-    assert frames(b"\x05\x00\x00\x00abc\x00\x00\x00\x00\x00\x00") == [Frame("abc\0", b"", terminated=True)]
+    assert frames(b"\x05\x00\x00\x00abc\x00\x00\x00\x00\x00\x00") == [WireFrame("abc\0", b"", terminated=True)]
 
 
 def test_eight_zero_bytes_are_a_keepalive() -> None:
@@ -102,6 +102,6 @@ def test_payload_without_destination_is_refused() -> None:
 def test_frames_before_a_fault_are_not_lost() -> None:
     decoder = FrameDecoder()
     decoder.feed(ABC + b"\xff\xff\xff\xff")
-    assert decoder.next_frame() == Frame("/abc", b"xyz", terminated=False)
+    assert decoder.next_frame() == WireFrame("/abc", b"xyz", terminated=False)
     with pytest.raises(ProtocolError):
         decoder.next_frame()

@@ -9,13 +9,13 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from q2r2_control.inputs.sampling import EvenSampling, HeadsetSampling, Sampling
+from q2r2_control.inputs.sampling import EvenSampling, HeadsetSampling, SampleTiming
 from q2r2_control.types import Array
 
 HAND = pin.SE3(pin.exp3(np.array([0.3, -0.2, 0.9])), np.array([0.4, 0.2, 1.1]))
 
 
-def measured(sampling: Sampling, count: int) -> tuple[Array, Array]:
+def measured(sampling: SampleTiming, count: int) -> tuple[Array, Array]:
     """Times (n,) [s] of samples of a hand at rest, and what was added to each (n, 6): position [m], rotation [rad]."""
     times, added = [], []
     for t in islice(sampling.times(), count):

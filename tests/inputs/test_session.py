@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from q2r2_control.errors import ProtocolError
-from q2r2_control.inputs.framing import KEEPALIVE, Frame, FrameDecoder
+from q2r2_control.inputs.framing import KEEPALIVE, FrameDecoder, WireFrame
 from q2r2_control.inputs.messages import PROP_TOPICS, Dialect, PropTwist
 from q2r2_control.inputs.session import (
     MAX_COMMAND_BYTES,
@@ -28,15 +28,15 @@ HAPTIC = "q2r_left_hand_haptic_feedback"
 every_dialect = pytest.mark.parametrize("dialect", list(Dialect))
 
 
-def frame(dialect: Dialect, destination: str, payload: bytes = b"") -> Frame:
-    return Frame(destination, payload, terminated=dialect is Dialect.ROS2)
+def frame(dialect: Dialect, destination: str, payload: bytes = b"") -> WireFrame:
+    return WireFrame(destination, payload, terminated=dialect is Dialect.ROS2)
 
 
-def command(dialect: Dialect, name: str, **parameters: object) -> Frame:
+def command(dialect: Dialect, name: str, **parameters: object) -> WireFrame:
     return frame(dialect, name, json.dumps(parameters).encode() + (b"\0" if dialect is Dialect.ROS2 else b""))
 
 
-def pose(dialect: Dialect, topic: str = "q2r_left_hand_pose") -> Frame:
+def pose(dialect: Dialect, topic: str = "q2r_left_hand_pose") -> WireFrame:
     return frame(dialect, topic, pack_pose(dialect.lower(), POSITION, IDENTITY))
 
 
@@ -76,7 +76,7 @@ def test_the_dialect_is_told_by_the_first_system_command(session: HeadsetSession
 
 @every_dialect
 def test_a_keepalive_tells_no_dialect(session: HeadsetSession, dialect: Dialect) -> None:
-    session.receive(Frame("", b"", terminated=False))
+    session.receive(WireFrame("", b"", terminated=False))
     assert session.dialect is None
     session.receive(command(dialect, "__topic_list"))
     assert session.dialect is dialect

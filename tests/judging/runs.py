@@ -12,7 +12,7 @@ from mcap.records import DataEnd, Footer
 from mcap.stream_reader import StreamReader
 
 from q2r2_control.inputs.played import PlayedInput
-from q2r2_control.inputs.sampling import HeadsetSampling, Sampling
+from q2r2_control.inputs.sampling import HeadsetSampling, SampleTiming
 from q2r2_control.inputs.scripted import HANDS_AT_REST
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.recording.about import About
@@ -71,7 +71,7 @@ def press(hand: str, t: float) -> HandInputs:
     return HandInputs(button_lower=PRESS <= t < PRESS + _PRESSED, button_upper=2.0 <= t < 2.0 + _PRESSED)
 
 
-def headset(hand: str, seed: int) -> Sampling:
+def headset(hand: str, seed: int) -> SampleTiming:
     """Noise and uneven samples, some of them lost, and a hand that trembles."""
     return HeadsetSampling(hand, seed, tremor=True, dropout_probability=0.002)
 
@@ -79,7 +79,7 @@ def headset(hand: str, seed: int) -> Sampling:
 class Thinned:
     """Samples of a headset, without those at times that ``missing`` tells."""
 
-    def __init__(self, inner: Sampling, missing: Callable[[float], bool]) -> None:
+    def __init__(self, inner: SampleTiming, missing: Callable[[float], bool]) -> None:
         self._inner, self._missing = inner, missing
 
     def times(self) -> Iterator[float]:
@@ -95,7 +95,7 @@ class Thinned:
 class Slow:
     """Even samples with the noise of a headset."""
 
-    def __init__(self, inner: Sampling, rate: float) -> None:
+    def __init__(self, inner: SampleTiming, rate: float) -> None:
         self._inner, self._rate = inner, rate
 
     def times(self) -> Iterator[float]:
@@ -141,7 +141,7 @@ def hands(
     seed: int = 0,
     pose: Pose | None = None,
     inputs: Callable[[str, float], HandInputs] = press,
-    sampling: Callable[[str, int], Sampling] = headset,
+    sampling: Callable[[str, int], SampleTiming] = headset,
 ) -> PlayedInput:
     """Hands that do random work unless a ``pose`` is given."""
     return PlayedInput(pose or Work(seed), inputs, {hand: sampling(hand, seed) for hand in SIDES})

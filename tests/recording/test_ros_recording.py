@@ -15,7 +15,7 @@ import yaml
 from q2r2_control.config.cameras import CameraConfig
 from q2r2_control.config.cell import parse_config
 from q2r2_control.errors import RecordingError
-from q2r2_control.export.episodes import Sampling, make_episode
+from q2r2_control.export.episodes import FrameSampling, make_episode
 from q2r2_control.judging.judge import judge
 from q2r2_control.recording import topics as names
 from q2r2_control.recording.episode_spans import read_spans
@@ -166,7 +166,7 @@ def test_a_known_step_is_in_action_and_observation_at_the_frames_of_its_times(no
         for arm in nodes.arms:
             nodes.flags(at - 500, arm, False, wanted=float(place < 60), measured=float(place < 70))
         nodes.tick(at, place, home + step)
-    episode = make_episode(nodes.close(), Sampling(fps=250))
+    episode = make_episode(nodes.close(), FrameSampling(fps=250))
     action, state = (episode.vectors[name] for name in ("action", "observation.state"))
     moved = [int(np.argmax(np.abs(vector[:, 0] - home[0]) > 0.05)) for vector in (action, state)]
     assert moved == [49, 52]

@@ -46,7 +46,7 @@ class BenchController(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
-class Setup:
+class PeerSettings:
     """Our settings in the units of the peers: gains per tick, limits with our margins."""
 
     robot: Robot
@@ -101,7 +101,7 @@ class Setup:
         return {name: value for name, value in home.items() if name not in self.robot.joint_names}
 
 
-def make_peer(name: str, setup: Setup) -> BenchController:
+def make_peer(name: str, setup: PeerSettings) -> BenchController:
     """Build a peer of ``PEERS``. Raises what its package raises."""
     module = importlib.import_module(f"q2r2_control.benchmark.peers.{PEERS[name]}")
     peer: BenchController = module.make(setup, name)
@@ -113,7 +113,7 @@ def is_installed(name: str) -> bool:
     return importlib.util.find_spec(PEERS[name]) is not None
 
 
-def build_peers(names: Sequence[str], setup: Setup) -> tuple[list[BenchController], list[str]]:
+def build_peers(names: Sequence[str], setup: PeerSettings) -> tuple[list[BenchController], list[str]]:
     """The peers that can be built, and a line on each of ``names``: its limitations, or why there is none."""
     peers: list[BenchController] = []
     notes = []

@@ -15,7 +15,7 @@ import mink
 import numpy as np
 import pinocchio as pin
 
-from q2r2_control.benchmark.peers.base import DETECTION_DISTANCE, Setup
+from q2r2_control.benchmark.peers.base import DETECTION_DISTANCE, PeerSettings
 from q2r2_control.plants.mujoco_model import build_model
 from q2r2_control.robot.floor import FLOOR
 from q2r2_control.robot.pairs import pair_names
@@ -29,7 +29,7 @@ class Mink:
         "no acceleration limit; no braking distance to pairs; no pairs of a body and its parent; no certificate"
     )
 
-    def __init__(self, setup: Setup, name: str) -> None:
+    def __init__(self, setup: PeerSettings, name: str) -> None:
         self.name = name
         control, robot = setup.config.control, setup.robot
         bare = setup.config.model_copy(update={"mujoco": setup.config.mujoco.model_copy(update={"objects": {}})})
@@ -109,6 +109,6 @@ def _mujoco_names(urdf: str) -> dict[str, str]:
     return shapes | {f"{FLOOR}_0": FLOOR}  # a plane in the simulation
 
 
-def make(setup: Setup, name: str) -> Mink:
+def make(setup: PeerSettings, name: str) -> Mink:
     """Build it for a cell."""
     return Mink(setup, name)

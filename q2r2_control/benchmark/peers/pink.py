@@ -17,7 +17,7 @@ from pink.barriers import SelfCollisionBarrier
 from pink.limits import AccelerationLimit, ConfigurationLimit, VelocityLimit
 from pink.tasks import FrameTask, PostureTask
 
-from q2r2_control.benchmark.peers.base import NEAREST_ROWS, Setup
+from q2r2_control.benchmark.peers.base import NEAREST_ROWS, PeerSettings
 from q2r2_control.types import Array
 
 
@@ -26,7 +26,7 @@ class Pink:
 
     limitations = "hard limits that can contradict each other; no braking distance to pairs; no certificate"
 
-    def __init__(self, setup: Setup, name: str) -> None:
+    def __init__(self, setup: PeerSettings, name: str) -> None:
         self.name = name
         control = setup.config.control
         self._collision_model = setup.robot.collision_model
@@ -91,6 +91,6 @@ class Pink:
         return self._configuration.q.copy(), v
 
 
-def make(setup: Setup, name: str) -> Pink:
+def make(setup: PeerSettings, name: str) -> Pink:
     """Build it for a cell."""
     return Pink(setup, name)

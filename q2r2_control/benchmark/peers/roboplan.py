@@ -21,7 +21,7 @@ import numpy as np
 import pinocchio as pin
 from roboplan import core, optimal_ik
 
-from q2r2_control.benchmark.peers.base import DETECTION_DISTANCE, NEAREST_ROWS, Setup
+from q2r2_control.benchmark.peers.base import DETECTION_DISTANCE, NEAREST_ROWS, PeerSettings
 from q2r2_control.robot.pairs import link_of, pair_names
 from q2r2_control.robot.robot import Robot
 from q2r2_control.robot.urdf_parts import numbers
@@ -37,7 +37,7 @@ class Roboplan:
 
     limitations = "hard limits that can contradict each other; no braking distance to pairs; no certificate"
 
-    def __init__(self, setup: Setup, name: str) -> None:
+    def __init__(self, setup: PeerSettings, name: str) -> None:
         self.name = name
         robot, control, dt = setup.robot, setup.config.control, setup.dt
         self._scene = core.Scene(robot.name, core.loadUrdfSceneDescriptionFromXml(_description(setup)))
@@ -85,7 +85,7 @@ class Roboplan:
         self.pairs: int = optimal_ik.SelfCollisionBarrier(self._ik, self._scene, dt, every).n_collision_pairs
         self.reset(robot.home)
 
-    def _frame_task(self, setup: Setup, arm: str) -> optimal_ik.FrameTask:
+    def _frame_task(self, setup: PeerSettings, arm: str) -> optimal_ik.FrameTask:
         control = setup.config.control
         options = optimal_ik.FrameTaskOptions(
             task_gain=setup.position_gain,
@@ -118,7 +118,7 @@ class Roboplan:
         return self._q[self._indices], np.zeros(len(self._indices))
 
 
-def _description(setup: Setup) -> str:
+def _description(setup: PeerSettings) -> str:
     """The cell's URDF, its position limits narrowed by our margin, with our bodies as its collision shapes."""
     root = ET.fromstring(setup.robot.urdf)
     for name, lower, upper in zip(setup.robot.joint_names, setup.lower, setup.upper, strict=True):
@@ -160,6 +160,6 @@ def _watch_pairs(scene: core.Scene, robot: Robot) -> None:
     scene.setCollisions([pair for pair in pairs if frozenset(pair) not in watched], False)
 
 
-def make(setup: Setup, name: str) -> Roboplan:
+def make(setup: PeerSettings, name: str) -> Roboplan:
     """Build it for a cell; ``name`` says which pairs get rows."""
     return Roboplan(setup, name)

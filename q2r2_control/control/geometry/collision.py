@@ -20,7 +20,7 @@ from q2r2_control.robot.turning_fingers import TurningBody
 from q2r2_control.types import Array
 
 
-class Bodies(NamedTuple):
+class CollisionBodies(NamedTuple):
     """Collision geometries in their joint's frame.
 
     Start and end of fingers change, radius and size of those that turn too, see :mod:`finger_openings`.
@@ -52,7 +52,7 @@ class CollisionModel(NamedTuple):
     """What does not change with the posture."""
 
     chain: Chain
-    bodies: Bodies
+    bodies: CollisionBodies
     pairs: Pairs
 
 
@@ -64,7 +64,7 @@ class Posed(NamedTuple):
     rotation: Array  # (g, 3, 3)
 
     @classmethod
-    def empty(cls, bodies: Bodies) -> Posed:
+    def empty(cls, bodies: CollisionBodies) -> Posed:
         g = len(bodies.joint)
         return cls(np.zeros((g, 3)), np.zeros((g, 3)), np.zeros((g, 3, 3)))
 
@@ -106,10 +106,10 @@ def collision_model_of(robot: Robot) -> CollisionModel:
     return CollisionModel(chain, bodies, pairs_of(robot.collision_model, chain, bodies, travel, extent))
 
 
-def bodies_of(model: pin.GeometryModel) -> Bodies:
+def bodies_of(model: pin.GeometryModel) -> CollisionBodies:
     """Read capsules, spheres and boxes. Raises :class:`RobotError` for any other shape."""
     count = model.ngeoms
-    bodies = Bodies(
+    bodies = CollisionBodies(
         joint=np.zeros(count, dtype=np.int64),
         box=np.zeros(count, dtype=np.int64),
         start=np.zeros((count, 3)),
@@ -142,14 +142,14 @@ def turning_bodies(robot: Robot) -> list[tuple[int, TurningBody]]:
     return [(numbers[finger.name], finger) for finger in robot.finger_bodies if isinstance(finger, TurningBody)]
 
 
-def farthest_of(bodies: Bodies) -> Array:
+def farthest_of(bodies: CollisionBodies) -> Array:
     """How far segments and boxes reach from the origins of their joints' frames (g,) [m]."""
     ends = np.maximum(np.linalg.norm(bodies.start, axis=1), np.linalg.norm(bodies.end, axis=1))
     return np.asarray(np.linalg.norm(bodies.half, axis=1) + ends)
 
 
 def pairs_of(
-    model: pin.GeometryModel, chain: Chain, bodies: Bodies, travel: Array, extent: Array | None = None
+    model: pin.GeometryModel, chain: Chain, bodies: CollisionBodies, travel: Array, extent: Array | None = None
 ) -> Pairs:
     """Monitored pairs of ``model``; ``travel`` (nv,) is how far each joint can be from zero [rad or m].
 
@@ -206,7 +206,7 @@ def update_placements(model: CollisionModel, data: CollisionData, q: Array) -> N
 
 
 @kernel
-def _pose_bodies(bodies: Bodies, placements: Placements, posed: Posed) -> None:
+def _pose_bodies(bodies: CollisionBodies, placements: Placements, posed: Posed) -> None:
     """Move every geometry to the world."""
     for g in range(bodies.joint.shape[0]):
         joint = bodies.joint[g]

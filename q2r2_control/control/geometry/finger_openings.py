@@ -2,9 +2,9 @@
 
 They are changed in place, where the kernels read them. What was worked out once of all of a sliding finger's way stays:
 its part is nowhere farther from a joint's axis (``Pairs.reach``, ``leverage``) and fits into a ball of that size about
-its own middle (``Bodies.size``), so that every bound made of these holds as it is. A finger that turns has another
-capsule for each interval. ``Pairs.reach`` and ``leverage`` are made of how far any of these is from a joint's axis
-(``collision_model_of``); radius and size change with it.
+its own middle (``CollisionBodies.size``), so that every bound made of these holds as it is. A finger that turns has
+another capsule for each interval. ``Pairs.reach`` and ``leverage`` are made of how far any of these is from a joint's
+axis (``collision_model_of``); radius and size change with it.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from q2r2_control.control.geometry.collision import Bodies, turning_bodies
+from q2r2_control.control.geometry.collision import CollisionBodies, turning_bodies
 from q2r2_control.control.geometry.kinematics import IntArray
 from q2r2_control.errors import RobotError
 from q2r2_control.robot.finger_openings import FingerBody, part_of_segment
@@ -30,7 +30,7 @@ _REMEMBERED = 16
 class FingerOpenings:
     """Between which openings the gripper of each arm may be; all of the way, until something else is set."""
 
-    def __init__(self, robot: Robot, bodies: Bodies) -> None:
+    def __init__(self, robot: Robot, bodies: CollisionBodies) -> None:
         """``bodies`` are those of ``robot``, with fingers that are all of their way."""
         self.intervals: dict[str, Interval] = dict.fromkeys(robot.arms, ALL_OF_THE_WAY)
         self._bodies = bodies
@@ -92,7 +92,7 @@ class FingerOpenings:
 class _Turning:
     """The fingers of one arm that turn, as capsules of their own for each interval."""
 
-    def __init__(self, found: Sequence[tuple[int, TurningBody]], bodies: Bodies) -> None:
+    def __init__(self, found: Sequence[tuple[int, TurningBody]], bodies: CollisionBodies) -> None:
         self._bodies, self._indices = bodies, np.array([index for index, _ in found])
         self._all = self._now()
         self._capsules = lru_cache(maxsize=_REMEMBERED)(TurningSweeps([body for _, body in found]).capsules)

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from q2r2_control.control.geometry.collision import Bodies, CollisionModel
+from q2r2_control.control.geometry.collision import CollisionBodies, CollisionModel
 from q2r2_control.types import Array
 
 # Of half a box's thickness: what its skin takes at most.
@@ -42,7 +42,7 @@ def with_rounded_boxes(model: CollisionModel, depth: Array) -> CollisionModel:
     joined = {
         name: np.concatenate([array, rounded.get(name, array[sources])]) for name, array in bodies._asdict().items()
     }
-    return model._replace(bodies=Bodies(**joined), pairs=pairs._replace(second=second))
+    return model._replace(bodies=CollisionBodies(**joined), pairs=pairs._replace(second=second))
 
 
 def deeper_at_corners(model: CollisionModel, kept: Array) -> Array:

@@ -54,7 +54,7 @@ class Candidate(NamedTuple):
         return cls(np.zeros(nv), np.zeros(nv), np.ones(nv))
 
 
-class Piece(NamedTuple):
+class QuadraticPiece(NamedTuple):
     """How the joints move in a piece of time: D_j(t) = rate t + change t^2 / 2, or anywhere from 0 to ``loose``."""
 
     rate: Array  # (nv,) [rad/s]
@@ -63,7 +63,7 @@ class Piece(NamedTuple):
     travel: Array  # (nv,) total variation [rad]
 
     @classmethod
-    def empty(cls, nv: int) -> Piece:
+    def empty(cls, nv: int) -> QuadraticPiece:
         return cls(np.zeros(nv), np.zeros(nv), np.zeros(nv), np.zeros(nv))
 
 
@@ -80,9 +80,9 @@ class Rollout(NamedTuple):
     known: Array  # (s,) 1 where the sample's bodies are placed
     frame: Array  # (n, 3, 3) rotations of joint frames, scratch
     contact: Contact
-    step: Piece  # from the reference to the candidate
-    stop: Piece  # all of the candidate's stop
-    piece: Piece  # a part of it
+    step: QuadraticPiece  # from the reference to the candidate
+    stop: QuadraticPiece  # all of the candidate's stop
+    piece: QuadraticPiece  # a part of it
     deviation: (
         Array  # (nv,) of each joint from straight on at the reference's velocity at most, see speed_bound [rad or m]
     )
@@ -102,9 +102,9 @@ class Rollout(NamedTuple):
             known=np.zeros(samples),
             frame=Placements.empty(model.chain).rotation,
             contact=Contact.empty(),
-            step=Piece.empty(nv),
-            stop=Piece.empty(nv),
-            piece=Piece.empty(nv),
+            step=QuadraticPiece.empty(nv),
+            stop=QuadraticPiece.empty(nv),
+            piece=QuadraticPiece.empty(nv),
             deviation=np.zeros(nv),
         )
 

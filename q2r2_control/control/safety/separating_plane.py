@@ -27,9 +27,9 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from q2r2_control.control.geometry.collision import Bodies, CollisionData, CollisionModel, Pairs, Posed
+from q2r2_control.control.geometry.collision import CollisionBodies, CollisionData, CollisionModel, Pairs, Posed
 from q2r2_control.control.jit import inlined_kernel, kernel
-from q2r2_control.control.safety.safety_data import Piece
+from q2r2_control.control.safety.safety_data import QuadraticPiece
 from q2r2_control.types import Array
 
 
@@ -47,7 +47,7 @@ class Gap(NamedTuple):
 
 @kernel
 def stays_beyond(
-    model: CollisionModel, data: CollisionData, p: int, piece: Piece, length: float, threshold: float
+    model: CollisionModel, data: CollisionData, p: int, piece: QuadraticPiece, length: float, threshold: float
 ) -> bool:
     """Whether the plane between pair ``p`` proves it beyond ``threshold`` [m] in a ``piece`` of ``length`` [s].
 
@@ -61,9 +61,9 @@ def stay_beyond(
     model: CollisionModel,
     data: CollisionData,
     p: int,
-    piece: Piece,
+    piece: QuadraticPiece,
     length: float,
-    then: Piece,
+    then: QuadraticPiece,
     then_length: float,
     threshold: float,
 ) -> bool:
@@ -109,7 +109,7 @@ def curvature(pairs: Pairs, p: int, travel: Array, then: Array, share: float) ->
 
 
 @kernel
-def _write_edge(bodies: Bodies, posed: Posed, box: int, number: int, out: Array) -> None:
+def _write_edge(bodies: CollisionBodies, posed: Posed, box: int, number: int, out: Array) -> None:
     """Ends of one of a box's four edges along its third axis, into the first two rows of ``out``."""
     for k in range(3):
         middle = posed.start[box, k]
@@ -123,7 +123,14 @@ def _write_edge(bodies: Bodies, posed: Posed, box: int, number: int, out: Array)
 
 @kernel
 def _gaps(
-    model: CollisionModel, data: CollisionData, p: int, side: float, start: Array, end: Array, piece: Piece, then: Piece
+    model: CollisionModel,
+    data: CollisionData,
+    p: int,
+    side: float,
+    start: Array,
+    end: Array,
+    piece: QuadraticPiece,
+    then: QuadraticPiece,
 ) -> tuple[Gap, Gap]:
     """What two corners of one side of a pair, -1 the first's or 1 the second's, add to the gap."""
     chain, pairs, placements, normal = model.chain, model.pairs, data.placements, data.contact.normal

@@ -51,7 +51,7 @@ from q2r2_control.control.safety.velocity_bounds import BodyVelocities, fastest_
 from q2r2_control.types import Array
 
 
-class Moment(NamedTuple):
+class StopTime(NamedTuple):
     """When of the stop a row looks at its pair."""
 
     along: bool  # the pair is measured at the stop's start, and the row follows the tangent to the end
@@ -136,7 +136,7 @@ def write_separation_rows(model: SafetyModel, data: SafetyData, h: float) -> Non
             along = straight and i > 0
             at = data.collision if i == 0 or along else sample_of(model, data, INSTANTS[i], duration)
             distance = measure(model.collision, at, p)
-            moment = Moment(
+            moment = StopTime(
                 along, h, lever, least - model.approach.stop_distance[p], 0.5 * duration + 1.0 / model.approach.gain[0]
             )
             before = count
@@ -210,7 +210,7 @@ def _append_row(
     at: CollisionData,
     p: int,
     distance: float,
-    moment: Moment,
+    moment: StopTime,
     count: int,
 ) -> int:
     """Keep the row if some velocity that the acceleration allows (v +- a h) breaks it; any other cannot bind.
@@ -256,7 +256,7 @@ def _append_end_rows(
     at: CollisionData,
     p: int,
     distance: float,
-    moment: Moment,
+    moment: StopTime,
     count: int,
 ) -> int:
     """Rows at those ends of both bodies of a pair that may soon be as close as its ``distance``.

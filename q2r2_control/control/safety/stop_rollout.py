@@ -8,7 +8,7 @@ from __future__ import annotations
 from q2r2_control.control.geometry.collision import CollisionData, Posed, update_placements
 from q2r2_control.control.geometry.kinematics import Placements
 from q2r2_control.control.jit import inlined_kernel, kernel
-from q2r2_control.control.safety.safety_data import Piece, SafetyData
+from q2r2_control.control.safety.safety_data import QuadraticPiece, SafetyData
 from q2r2_control.control.safety.safety_model import SafetyModel
 from q2r2_control.control.safety.stop_shapes import brake
 from q2r2_control.types import Array
@@ -53,7 +53,7 @@ def _place_sample(model: SafetyModel, data: SafetyData, i: int, duration: float,
 
 
 @kernel
-def write_piece(data: SafetyData, v: Array, start: float, length: float, piece: Piece) -> None:
+def write_piece(data: SafetyData, v: Array, start: float, length: float, piece: QuadraticPiece) -> None:
     """The motion of the candidate's stop from ``start`` on, where its velocities are ``v``, for ``length`` [s].
 
     A joint that comes to rest on the way is no parabola: all that is known of it is from where to where it moves.

@@ -18,7 +18,7 @@ import numpy as np
 
 from q2r2_control.control.geometry.kinematics import Chain, Placements
 from q2r2_control.control.jit import kernel
-from q2r2_control.control.tasks.task_data import Targets, TaskData
+from q2r2_control.control.tasks.task_data import TaskData, TaskTargets
 from q2r2_control.control.tasks.task_model import Motion, TaskModel, Tools
 from q2r2_control.types import Array
 
@@ -104,7 +104,7 @@ def approach_speed(error: float, gain: float, deceleration: float) -> float:
 
 
 @kernel
-def wanted_twist(motion: Motion, data: TaskData, targets: Targets, i: int) -> None:
+def wanted_twist(motion: Motion, data: TaskData, targets: TaskTargets, i: int) -> None:
     """Twist of tool ``i`` towards its target into ``data.twist``, and the part that the error makes."""
     twist, feedback, feed_forward = data.twist[i], data.feedback[i], targets.feed_forward[i]
     for row in range(3):

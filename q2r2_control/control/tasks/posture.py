@@ -9,7 +9,7 @@ from __future__ import annotations
 from q2r2_control.control.cholesky import factorise, substitute
 from q2r2_control.control.geometry.closest_points import clamp
 from q2r2_control.control.jit import kernel
-from q2r2_control.control.tasks.task_data import Targets, TaskData
+from q2r2_control.control.tasks.task_data import TaskData, TaskTargets
 from q2r2_control.control.tasks.task_model import TaskModel
 from q2r2_control.types import Array
 
@@ -20,7 +20,7 @@ _PROJECTION_DAMPING = 1e-3
 
 
 @kernel
-def pull_to_posture(model: TaskModel, data: TaskData, targets: Targets, q: Array) -> None:
+def pull_to_posture(model: TaskModel, data: TaskData, targets: TaskTargets, q: Array) -> None:
     """Velocity of every joint from ``q`` (nv,) towards the posture that is asked for, into ``data.posture``."""
     gain, speed = model.posture.gain[0], model.posture.speed
     for j in range(q.shape[0]):
@@ -28,7 +28,7 @@ def pull_to_posture(model: TaskModel, data: TaskData, targets: Targets, q: Array
 
 
 @kernel
-def add_hold_task(data: TaskData, targets: Targets, i: int, q: Array) -> None:
+def add_hold_task(data: TaskData, targets: TaskTargets, i: int, q: Array) -> None:
     """Joints of the held arm ``i`` return to where they were latched; the posture pull does not move them."""
     for j in range(q.shape[0]):
         if targets.member[i, j] == 1.0:

@@ -27,7 +27,7 @@ import numpy as np
 from q2r2_control.control.geometry.closest_points import clamp, dot
 from q2r2_control.control.geometry.kinematics import Chain, Placements
 from q2r2_control.control.jit import kernel
-from q2r2_control.control.tasks.task_data import SwivelScratch, Targets, TaskData
+from q2r2_control.control.tasks.task_data import SwivelScratch, TaskData, TaskTargets
 from q2r2_control.control.tasks.task_model import Swivels, TaskModel
 from q2r2_control.types import Array
 
@@ -144,7 +144,7 @@ def _point_rate(chain: Chain, placements: Placements, joint: int, point: Array, 
 
 
 @kernel
-def write_swivel_rows(model: TaskModel, data: TaskData, targets: Targets) -> None:
+def write_swivel_rows(model: TaskModel, data: TaskData, targets: TaskTargets) -> None:
     """Rows, rates [rad/s times the row's size] and shares of all arms that have the task and follow a target."""
     swivels, scratch, fastest = model.swivels, data.swivel, model.posture.speed
     scratch.row[:] = 0.0

@@ -21,7 +21,7 @@ class PoseScratch(NamedTuple):
     moved: Array  # (6,)
 
 
-class Targets(NamedTuple):
+class TaskTargets(NamedTuple):
     """What the arms are asked to do."""
 
     member: Array  # (n, nv) 1 where a joint is the arm's
@@ -40,7 +40,9 @@ class Targets(NamedTuple):
     scratch: PoseScratch
 
     @classmethod
-    def empty(cls, model: TaskModel, feed_forward_time: float, teleport_speed: float, teleport_turn: float) -> Targets:
+    def empty(
+        cls, model: TaskModel, feed_forward_time: float, teleport_speed: float, teleport_turn: float
+    ) -> TaskTargets:
         n, nv = model.tools.member.shape
         return cls(
             member=model.tools.member,

@@ -22,7 +22,7 @@ from q2r2_control.drives.base import Drive
 from q2r2_control.ros.base_node import LATCHED_QOS, BaseNode
 from q2r2_control.ros.bridge.messages import JointNumbers
 from q2r2_control.ros.bridge.opening_grants import wanted_topic
-from q2r2_control.runtime.body_changes import BodyChanges
+from q2r2_control.runtime.geometry_updates import GeometryUpdates
 from q2r2_control.supervision.grasp_watch import STALL, GraspWatch
 
 # Until a gripper does what was granted: the answer has to arrive, ten goals a second go out, and it may be slow [s].
@@ -31,7 +31,7 @@ _UNMEASURED = "its fingers are not in the joint states, or nothing is proven whi
 
 
 class GripperLimits:
-    """Fingers, held objects and distances of the controller, for all arms; see :class:`BodyChanges`."""
+    """Fingers, held objects and distances of the controller, for all arms; see :class:`GeometryUpdates`."""
 
     def __init__(
         self,
@@ -47,7 +47,7 @@ class GripperLimits:
         self._grasps = GraspWatch(controller, STALL + _GRIPPER_DELAY)
         self._wanted: dict[str, float] = {}
         self._told: dict[str, tuple[float, float]] = {}
-        self._bodies: BodyChanges | None = None  # while the controller's reference is where the arms are
+        self._bodies: GeometryUpdates | None = None  # while the controller's reference is where the arms are
         self._answers: dict[str, Any] = {}
         for arm in (arm for arm in self._fingers.arms if arm in targets):
             self._answers[arm] = node.create_publisher(Float64MultiArray, f"~/opening/{arm}", LATCHED_QOS)
@@ -74,7 +74,7 @@ class GripperLimits:
     def prepare(self) -> None:
         """The controller was reset; before the drive is."""
         self._grasps.tell_again()
-        self._bodies = BodyChanges(self._controller, self._drive, _GRIPPER_DELAY, self._grasps)
+        self._bodies = GeometryUpdates(self._controller, self._drive, _GRIPPER_DELAY, self._grasps)
 
     def begin(self, now: float) -> None:
         """The drive was reset."""
@@ -106,7 +106,7 @@ class GripperLimits:
             self._answers[arm].publish(Float64MultiArray(data=(wanted, granted)))
 
     def after_step(self) -> None:
-        """See :meth:`BodyChanges.after_step`."""
+        """See :meth:`GeometryUpdates.after_step`."""
         if self._bodies is not None:
             self._bodies.after_step()
 

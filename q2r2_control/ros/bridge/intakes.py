@@ -41,7 +41,7 @@ Take = Callable[[str, pin.SE3 | None, float, int | None, float | None], Refusal 
 
 
 @dataclass(frozen=True, slots=True)
-class Frame:
+class TargetFrame:
     """The frame of target poses."""
 
     name: str
@@ -131,7 +131,7 @@ class TargetIntake:
             self._changed()
 
 
-def _frame_of(node: BaseNode, robot: Robot, arm: str) -> Frame:
+def _frame_of(node: BaseNode, robot: Robot, arm: str) -> TargetFrame:
     """An arm's frame of targets. Raises :class:`ConfigError` for a link that moves."""
     name = node.parameter(
         f"{arm}.target_frame_id",
@@ -140,11 +140,11 @@ def _frame_of(node: BaseNode, robot: Robot, arm: str) -> Frame:
     )
     model = robot.model
     if name == WORLD or not model.existFrame(name, pin.FrameType.BODY):
-        return Frame(name, pin.SE3.Identity())
+        return TargetFrame(name, pin.SE3.Identity())
     frame = model.frames[model.getFrameId(name, pin.FrameType.BODY)]
     if frame.parentJoint != 0:
         raise ConfigError(f"{arm}.target_frame_id = {name!r:.60}: that link moves; allowed: one that does not")
-    return Frame(name, frame.placement.copy())
+    return TargetFrame(name, frame.placement.copy())
 
 
 class JointIntake:

@@ -47,7 +47,7 @@ class Kind(Protocol):
         ...
 
 
-class Trajectory:
+class TrajectoryOutput:
     """JointTrajectory with one point, due after a period: what joint_trajectory_controller calls a setpoint."""
 
     topic: ClassVar[str] = "joint_trajectory"
@@ -152,7 +152,7 @@ class LbrTorque:
 
 
 KINDS: dict[str, Any] = {
-    "trajectory": Trajectory,
+    "trajectory": TrajectoryOutput,
     "float64": PositionArray,
     "joint_state": JointStates,
     "velocity": VelocityArray,

@@ -12,7 +12,7 @@ from q2r2_control.config.teleop import GuardSettings
 from q2r2_control.ros.base_node import LATCHED_QOS, BaseNode
 from q2r2_control.ros.bridge.messages import PoseWriter, time_message
 from q2r2_control.ros.monitoring.endpoints import PublisherCount, WatchedPublisher, node_of
-from q2r2_control.supervision.target_guard import TargetGuard
+from q2r2_control.supervision.pose_rate_limiter import PoseRateLimiter
 from q2r2_control.supervision.target_stream import apart
 
 _GRAPH_PERIOD = 0.1  # of asking the graph for subscribers [s]
@@ -27,9 +27,9 @@ _HELD = 0.15, 0.6  # [m, rad]
 class TargetOutput:
     """Publishes one arm's target to one controller.
 
-    A :class:`TargetGuard` follows the target. It starts at the tool, so engaging moves nothing. When the target ends
-    the guard brakes, and then the last pose is repeated or not, as the preset says. It is never repeated when the tool
-    is elsewhere, nor to a controller that was restarted: both would be a jump.
+    A :class:`PoseRateLimiter` follows the target. It starts at the tool, so engaging moves nothing. When the target
+    ends the limiter brakes, and then the last pose is repeated or not, as the preset says. It is never repeated when
+    the tool is elsewhere, nor to a controller that was restarted: both would be a jump.
     """
 
     def __init__(
@@ -45,7 +45,7 @@ class TargetOutput:
         prefix: str = "",
     ) -> None:
         self.preset = preset
-        self.guard = TargetGuard(guard, 1.0 / rate)
+        self.guard = PoseRateLimiter(guard, 1.0 / rate)
         self._node, self._controller, self._frame = node, controller, frame
         self._publisher = WatchedPublisher(node, PoseStamped, topic, listener_timeout)
         self._topic = self._publisher.topic_name  # as the graph knows it: asked in each tick, without a look at names

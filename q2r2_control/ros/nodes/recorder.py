@@ -66,7 +66,7 @@ class _Waiting(NamedTuple):
     payload: bytes
 
 
-class Recorder(BaseNode):
+class RecorderNode(BaseNode):
     """Writes a file from its start to its end; episodes in it are told by controls of the operator, and by services."""
 
     ticks = True
@@ -226,7 +226,7 @@ def _class_of(name: str) -> Any:
 
 def main() -> int:
     """The executable ``recorder``."""
-    return run_node(Recorder)
+    return run_node(RecorderNode)
 
 
 if __name__ == "__main__":

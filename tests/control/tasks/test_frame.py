@@ -15,7 +15,7 @@ from q2r2_control.control.tasks.frame import (
     tool_pose,
     wanted_twist,
 )
-from q2r2_control.control.tasks.task_data import Targets
+from q2r2_control.control.tasks.task_data import TaskTargets
 from q2r2_control.control.tasks.task_model import Motion, tools_of
 from q2r2_control.types import Array
 from tests.control.cells import NAMES, cell, kernel_data, kernel_model, placed, random_posture
@@ -97,7 +97,7 @@ def test_following_the_approach_speed_asks_for_no_more_than_the_planned_decelera
 
 def _twist(tool: pin.SE3, target: pin.SE3, feed_forward: Array) -> Array:
     model, arm = kernel_model("dual_iiwa7").tasks, 1
-    data, targets = kernel_data("dual_iiwa7", np.zeros(14)).tasks, Targets.empty(model, 1.0, 1.0, 1.0)
+    data, targets = kernel_data("dual_iiwa7", np.zeros(14)).tasks, TaskTargets.empty(model, 1.0, 1.0, 1.0)
     data.rotation[arm], data.translation[arm] = tool.rotation, tool.translation
     targets.rotation[arm], targets.translation[arm] = target.rotation, target.translation
     targets.feed_forward[arm] = feed_forward

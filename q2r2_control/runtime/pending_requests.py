@@ -16,7 +16,7 @@ _CONTROL = "a program changes control: "
 
 
 @dataclass(slots=True)
-class Wishes:
+class PendingRequests:
     """Set from any thread; each is done once, at the next tick."""
 
     home: bool = False

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from q2r2_control.config.teleop import GuardSettings
-from q2r2_control.supervision.target_guard import TargetGuard
+from q2r2_control.supervision.pose_rate_limiter import PoseRateLimiter
 from q2r2_control.supervision.tick_pacer import TickPacer
 from q2r2_control.types import LONGEST_DT, Array
 from tests.teleop.hands import pose
@@ -24,7 +24,7 @@ class Watched:
     """A guard whose every step is checked against its limits."""
 
     def __init__(self, start: pin.SE3 | None = None, period: float = DT) -> None:
-        self.guard, self._period = TargetGuard(LIMITS, period), period
+        self.guard, self._period = PoseRateLimiter(LIMITS, period), period
         self.now = 5.0
         self.guard.reset(start or pose(), self.now)
         self.velocity = np.zeros(3), np.zeros(3)
@@ -91,14 +91,14 @@ def test_what_was_left_to_brake_on_is_not_moved_after_a_gap_in_which_all_came_to
 
 
 def test_without_a_reset_there_is_no_pose() -> None:
-    guard = TargetGuard(LIMITS, DT)
+    guard = PoseRateLimiter(LIMITS, DT)
     assert guard.step(pose(1.0), 1.0) is None
     assert guard.at_rest
 
 
 def test_the_first_pose_is_that_of_the_reset_exactly() -> None:
     start = pose(0.3, -0.2, 0.7, (0.1, 2.0, -0.4))
-    guard = TargetGuard(LIMITS, DT)
+    guard = PoseRateLimiter(LIMITS, DT)
     guard.reset(start, 5.0)
     first = guard.step(start, 5.0 + DT)
     assert first is not None
@@ -215,7 +215,7 @@ def test_a_target_that_stays_is_where_it_ends() -> None:
 
 
 def test_limits_that_are_lowered_in_motion_brake_the_pose_at_the_acceleration_and_count_from_then_on() -> None:
-    guard, now, speed = TargetGuard(LIMITS, DT), 5.0, 0.4
+    guard, now, speed = PoseRateLimiter(LIMITS, DT), 5.0, 0.4
     guard.reset(pose(), now)
     way = np.array([speed * DT, 0.0, 0.0])
     target, velocities = pose(), [0.0]

@@ -29,7 +29,7 @@ class Arrival(NamedTuple):
     peer: str  # with its port
 
 
-class Door:
+class TcpListener:
     """Listens on ``host`` and ``port``. Raises OSError, OverflowError or ValueError where that is not possible.
 
     A host that connects more than ``ANSWERS_PER_SECOND`` is closed without a word, which costs least.

@@ -29,7 +29,7 @@ _LOOKAHEAD = 2.5  # of the time between two: one may be left out, and the next o
 _EVEN, _EVEN_TURN = 1.5e-3, 0.01  # [m], [rad]
 
 
-class TargetLine:
+class TargetExtrapolator:
     """The targets of one stream. Times are those at which targets are due [s]."""
 
     def __init__(self) -> None:

@@ -10,7 +10,7 @@ from q2r2_control.supervision.grasp_watch import GraspWatch
 from q2r2_control.supervision.gripper_limiter import REMEMBERED, GripperLimiter
 
 
-class BodyChanges:
+class GeometryUpdates:
     """Fingers that move, objects that are held, and distances that other settings ask for.
 
     Made before the drive is reset, which begins with the weight of what is held; then :meth:`begin`, and in every tick

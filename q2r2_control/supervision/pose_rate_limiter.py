@@ -24,7 +24,7 @@ _REST = 1e-9  # slower than this is at rest [m/s, rad/s]
 _ZERO: Vector = (0.0, 0.0, 0.0)
 
 
-class TargetGuard:
+class PoseRateLimiter:
     """Follows a target within limits of velocity and acceleration, and comes to rest where there is none.
 
     Within the limits a target that moves steadily is followed without lag: what is limited is the speed relative to

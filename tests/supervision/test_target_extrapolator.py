@@ -10,7 +10,7 @@ import pinocchio as pin
 import pytest
 
 from q2r2_control.benchmark.node_load import speed_ripple
-from q2r2_control.supervision.target_line import TargetLine
+from q2r2_control.supervision.target_extrapolator import TargetExtrapolator
 from q2r2_control.supervision.tick_clock import TickClock
 
 SENDER, LOOP = 0.005, 0.004  # periods [s]
@@ -25,7 +25,7 @@ def circling(t: float) -> pin.SE3:
 
 def played(pose: Callable[[float], pin.SE3], until: float, *, lines: bool, jitter: float = 4e-4) -> list[pin.SE3]:
     """What the loop follows at each tick, where both tick late by up to ``jitter`` [s] and messages take as long."""
-    random, line, clock = np.random.default_rng(0), TargetLine(), TickClock(LOOP)
+    random, line, clock = np.random.default_rng(0), TargetExtrapolator(), TickClock(LOOP)
     sent = [SENDER * k + random.uniform(0.0, jitter) for k in range(int(until / SENDER))]
     received = [t + 5e-4 + random.uniform(0.0, jitter) for t in sent]
     found, taken = [], 0
@@ -64,7 +64,7 @@ def test_a_target_that_rests_is_followed_to_the_bit() -> None:
 
 
 def test_a_step_is_no_motion_that_goes_on() -> None:
-    line, low = TargetLine(), pin.SE3.Identity()
+    line, low = TargetExtrapolator(), pin.SE3.Identity()
     high = pin.SE3(np.eye(3), np.array([0.0, 0.0, 0.002]))
     for k in range(20):
         due = k * SENDER
@@ -75,7 +75,7 @@ def test_a_step_is_no_motion_that_goes_on() -> None:
 
 
 def test_a_motion_goes_on_for_no_longer_than_its_targets_may_be_late() -> None:
-    line, velocity = TargetLine(), np.array([0.3, 0.0, 0.0])
+    line, velocity = TargetExtrapolator(), np.array([0.3, 0.0, 0.0])
     for k in range(10):
         line.put(pin.SE3(np.eye(3), velocity * k * SENDER), k * SENDER)
     end = line.at(9 * SENDER + 1.0)
@@ -85,7 +85,7 @@ def test_a_motion_goes_on_for_no_longer_than_its_targets_may_be_late() -> None:
 
 @pytest.mark.parametrize("stamps", [[0.0] * 10, [5e-6 * k for k in range(10)], [0.1 * k for k in range(10)]])
 def test_stamps_that_say_nothing_let_targets_be_taken_as_they_are(stamps: list[float]) -> None:
-    line = TargetLine()
+    line = TargetExtrapolator()
     for k, stamp in enumerate(stamps):
         target = circling(k * SENDER)
         line.put(target, stamp)
@@ -93,7 +93,7 @@ def test_stamps_that_say_nothing_let_targets_be_taken_as_they_are(stamps: list[f
 
 
 def test_a_new_stream_owes_nothing_to_the_one_before() -> None:
-    line = TargetLine()
+    line = TargetExtrapolator()
     for k in range(5):
         line.put(circling(k * SENDER), k * SENDER)
     line.reset()
