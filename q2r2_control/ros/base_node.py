@@ -26,12 +26,13 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 from std_msgs.msg import String
 
 from q2r2_control.errors import ConfigError, Q2R2Error
-from q2r2_control.ros.executor import TickExecutor
+from q2r2_control.ros.executor import TickExecutor, TickGroup
 from q2r2_control.ros.launch.middleware import set_up_middleware
 from q2r2_control.runtime.process import StopRequest
 from q2r2_control.runtime.scheduling import schedule_process_as_others, schedule_process_first
 
-_NEVER_IDLE = 0.5  # without sleep, after which a process no longer goes first [s]
+# A process that goes first and never sleeps would leave nothing of its processor to others; Linux counts [s].
+_NEVER_IDLE = 0.5
 # Commands, at the receiver: only the newest counts, and it has to arrive.
 COMMAND_QOS = QoSProfile(
     history=HistoryPolicy.KEEP_LAST,
@@ -72,10 +73,11 @@ class BaseNode(Node):
     """
 
     exit_code: int | None = None
-    ticks = False  # whether its messages wait for its timers, see TickExecutor
+    ticks = False  # whether its messages wait for its ticks, see TickExecutor
     priority = 0  # of real time, where it is permitted; 0: as other programs
 
     def __init__(self, name: str, **kwargs: Any) -> None:
+        self.tick_group = TickGroup()
         super().__init__(name, **kwargs)
         what = "of SCHED_FIFO, where the system permits it; 0: as any other program; of nodes in a process the highest"
         self.priority = self.parameter("realtime_priority", self.priority, what, at_least=0, at_most=98)
@@ -99,7 +101,14 @@ class BaseNode(Node):
         """See :class:`rclpy.node.Node`."""
         if isinstance(qos_profile, QoSProfile) and qos_profile.reliability is ReliabilityPolicy.BEST_EFFORT:
             kwargs.setdefault("event_callbacks", SubscriptionEventCallbacks(use_default_callbacks=False))
+        latched = isinstance(qos_profile, QoSProfile) and qos_profile.durability is DurabilityPolicy.TRANSIENT_LOCAL
+        if self.ticks and not latched:
+            kwargs.setdefault("callback_group", self.tick_group)
         return super().create_subscription(msg_type, topic, callback, qos_profile, **kwargs)
+
+    def create_tick(self, period: float, callback: Callable[[], None], clock: Clock | None = None) -> Any:
+        """A timer of ``period`` [s] that runs after the callbacks of all messages that have arrived."""
+        return self.create_timer(period, callback, callback_group=self.tick_group, clock=clock)
 
     def parameter(
         self,
@@ -208,12 +217,9 @@ def run_nodes(makes: Sequence[Callable[[], Node]], args: Sequence[str] | None = 
         # What there is now stays: a collection of all of it would take longer than a tick.
         gc.collect()
         gc.freeze()
-        first = _take_priority(nodes)
+        _take_priority(nodes)
         while rclpy.ok() and not stop.asked and _exit_code(nodes) is None:
             executor.spin_once(timeout_sec=0.1)
-            if first and isinstance(executor, TickExecutor) and executor.awake > _NEVER_IDLE:
-                first = False
-                _yield_priority(nodes)
     except (Q2R2Error, ParameterException) as error:
         print(f"{name}: {error}", file=sys.stderr)
         return 2
@@ -228,24 +234,23 @@ def run_nodes(makes: Sequence[Callable[[], Node]], args: Sequence[str] | None = 
     return _exit_code(nodes) or 0
 
 
-def _take_priority(nodes: Sequence[Any]) -> bool:
-    """From here on nodes tick; what takes long, such as compiling, is done, and did not keep other programs waiting.
-
-    Returns whether the process goes first now.
-    """
+def _take_priority(nodes: Sequence[Any]) -> None:
+    """From here on nodes tick; what takes long, such as compiling, is done, and did not keep other programs waiting."""
     priority = max((getattr(node, "priority", 0) for node in nodes), default=0)
-    if priority and (problem := schedule_process_first(priority)):
+    if not priority:
+        return
+    if problem := schedule_process_first(priority):
         nodes[0].get_logger().info(f"real time: {problem}")
-        return False
-    return priority > 0
+        return
+    import resource  # on Linux, where alone a process goes first
 
+    def give_up(*_: object) -> None:
+        schedule_process_as_others()
+        problem = f"given up, since ticks have left no time to sleep for {_NEVER_IDLE:g} s; allowed: a lower rate"
+        nodes[0].get_logger().warning(f"real time: {problem}")
 
-def _yield_priority(nodes: Sequence[Any]) -> None:
-    """A process that never sleeps and goes first would leave nothing of its processor to other programs."""
-    schedule_process_as_others()
-    nodes[0].get_logger().warning(
-        f"real time: given up, since ticks have left no time to sleep for {_NEVER_IDLE:g} s; allowed: a lower rate"
-    )
+    signal.signal(signal.SIGXCPU, give_up)
+    resource.setrlimit(resource.RLIMIT_RTTIME, (int(1e6 * _NEVER_IDLE), resource.getrlimit(resource.RLIMIT_RTTIME)[1]))
 
 
 def _exit_code(nodes: Sequence[Any]) -> int | None:

@@ -79,7 +79,7 @@ class Busy(BaseNode):
     def __init__(self):
         super().__init__("busy")
         self.begin = time.monotonic()
-        self.create_timer(0.001, self.tick)
+        self.create_tick(0.001, self.tick)
 
     def tick(self):  # which takes twice as long as its period
         end = time.monotonic() + 0.002

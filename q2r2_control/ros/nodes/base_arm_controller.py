@@ -133,7 +133,7 @@ class BaseArmController(BaseNode):
         self._live = LiveArmParameters(self, values.teleop, values.guard, self._change)
         self.create_service(Trigger, "~/pause", self._on_pause)
         self.create_service(Trigger, "~/reset", self._on_reset)
-        self.create_timer(1.0 / values.rate, self.tick)
+        self.create_tick(1.0 / values.rate, self.tick)
         # Without time there are no ticks, and so nothing else that would pause the arm.
         self.create_timer(_TIME_PERIOD, self._watch_time, clock=Clock(clock_type=ClockType.STEADY_TIME))
 

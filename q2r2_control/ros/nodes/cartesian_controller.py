@@ -129,7 +129,7 @@ class CartesianControllerNode(ManagedNode):
         }
         for name, act in services.items():
             self.create_service(Trigger, f"~/{name}", partial(self._serve, act))
-        self.create_timer(self._period, self._tick)
+        self.create_tick(self._period, self._tick)
         # Looks even while /clock stands still.
         self.create_timer(_LOOK_PERIOD, self._look, clock=Clock(clock_type=ClockType.STEADY_TIME))
 

@@ -82,8 +82,8 @@ class MujocoRobot(ManagedNode):
         self._grippers = {arm: self._gripper(arm, stroke) for arm in self._cell.plant.gripper_openings()}
         self.create_service(Trigger, "~/reset", self._reset)
         steady = Clock(clock_type=ClockType.STEADY_TIME)  # the simulation makes its own time, whatever /clock says
-        self.create_timer(self._period, self._tick, clock=steady)
-        self.create_timer(1.0 / tf_rate, self._publish_transforms, clock=steady)
+        self.create_tick(self._period, self._tick, clock=steady)
+        self.create_tick(1.0 / tf_rate, self._publish_transforms, clock=steady)
         self.start_active()
         self.get_logger().info(f"{config.name}: {', '.join(self._robot.joint_names)}")
 

@@ -104,7 +104,7 @@ class RecorderNode(BaseNode):
             self.create_subscription(_class_of(topic.type), heard_on(topic.name), take, qos, raw=True)
         for name, reason in _SERVICES.items():
             self.create_service(Trigger, f"~/{name}", partial(self._serve, reason))
-        self.create_timer(_PERIOD, self._write, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self.create_tick(_PERIOD, self._write, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self._marks.recorded = self._recorder.fault is None
         if self._marks.recorded:
             self.get_logger().info(f"records to {self._recorder.file}")

@@ -87,7 +87,7 @@ class SimulationInput(BaseNode):
         self._not_to_press: set[str] | None = None  # hands; None: that is not decided yet
         self._rewind(self.now)
         self.create_service(Trigger, "~/start", self._on_start)
-        self._timer = self.create_timer(_LONGEST, self._tick)
+        self._timer = self.create_tick(_LONGEST, self._tick)
 
     def health(self) -> tuple[bytes, str, Mapping[str, Any]]:
         """What is played, or which subscriber is missing."""
