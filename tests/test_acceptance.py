@@ -28,6 +28,8 @@ from q2r2_control.runtime.run_summary import RunSummary
 from q2r2_control.types import SIDES, Array, HandSample
 from tests.support.watch import Watch, cell, changes, speed
 
+pytestmark = pytest.mark.slow
+
 CHECKOUT = Path(__file__).resolve().parents[1]
 SESSION = 15.0  # [s]
 # Reasons of events that an overloaded machine causes.

@@ -17,6 +17,8 @@ from tests.support.fake_headset import RATE_HZ, FakeHeadset, Sensor
 from tests.support.operator_script import HANDS, START
 from tests.support.watch import Watch, cell
 
+pytestmark = pytest.mark.slow
+
 BINDINGS = {"trigger": "stop", "grip": "home", "lower_double": "swap_hands"}
 # Of the arrays of a headset's inputs: stick to the right, stick up, index finger, middle finger.
 INDEX, MIDDLE = (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0)

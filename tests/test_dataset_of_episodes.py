@@ -11,6 +11,8 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).resolve().parents[1]
 # These lines install and use the package lerobot, which has tests of its own.
 _ELSEWHERE = ("make ", ".venv-lerobot/")

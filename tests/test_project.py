@@ -127,6 +127,7 @@ def test_every_file_that_the_readme_names_exists() -> None:
         assert (ROOT / path).exists(), path
 
 
+@pytest.mark.slow
 def test_every_command_that_the_readme_names_exists() -> None:
     commands = set(re.findall(r"q2r2 ([a-z]+(?:-[a-z]+)?)", (ROOT / "README.md").read_text()))
     assert commands >= {"demo", "run", "check", "headset-check", "bench"}

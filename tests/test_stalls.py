@@ -26,6 +26,8 @@ from q2r2_control.types import SIDES, Array, Command, HandInputs, HandSample, Ha
 from tests.support.hands_input import HandsInput
 from tests.support.watch import Watch, cell, speed
 
+pytestmark = pytest.mark.slow
+
 CHECKOUT = Path(__file__).resolve().parents[1]
 RATE = 250.0  # [Hz]
 

@@ -8,6 +8,8 @@ from q2r2_control.benchmark import feel_run
 from q2r2_control.benchmark.feel_run import SPEED, FeelFigures, run_feel
 from tests.support.watch import cell
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def measured() -> tuple[FeelFigures, FeelFigures]:

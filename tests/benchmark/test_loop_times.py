@@ -13,6 +13,8 @@ from q2r2_control.config.cameras import CameraConfig
 from q2r2_control.config.cell import load_config
 from q2r2_control.errors import ConfigError
 
+pytestmark = pytest.mark.slow
+
 CONFIG = load_config("config/dual_iiwa7.yaml")
 
 

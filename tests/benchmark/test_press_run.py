@@ -9,6 +9,8 @@ from q2r2_control.benchmark.press_run import COMMANDED, PressSlide, run_press
 from q2r2_control.errors import ConfigError
 from q2r2_control.verification.contact_cells import TABLE_ONLY, with_contact
 
+pytestmark = pytest.mark.slow
+
 CONFIG = load_config("config/dual_iiwa7.yaml")
 STIFFNESS = CONFIG.impedance.translational_stiffness
 

@@ -15,6 +15,8 @@ from q2r2_control.control.controller import CartesianController
 from q2r2_control.types import CommandMode, Reference
 from q2r2_control.verification.work_motions import WORK_MOTIONS, carry
 
+pytestmark = pytest.mark.slow
+
 # At 500 Hz, the lowest rate with one substep a tick, since most of a test's time goes by ticks.
 CONFIG = load_config("config/dual_iiwa7.yaml").model_copy(update={"loop_rate_hz": 500.0})
 BOTH_MODES = pytest.mark.parametrize("mode", ["position", "torque"])

@@ -16,6 +16,8 @@ from q2r2_control.errors import ConfigError
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 
+pytestmark = pytest.mark.slow
+
 CONFIG = load_config("config/dual_iiwa7.yaml")
 DT = 0.001
 

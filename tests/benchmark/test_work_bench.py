@@ -17,6 +17,8 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 from q2r2_control.verification.work_motions import WORK_MOTIONS, motions_named
 
+pytestmark = pytest.mark.slow
+
 CONFIG = load_config("config/dual_iiwa7.yaml")
 
 

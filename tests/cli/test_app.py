@@ -324,6 +324,7 @@ def test_a_fast_run_prints_one_json_object_with_every_figure_and_nothing_else_an
     assert summaries[0] == summaries[1]
 
 
+@pytest.mark.slow
 def test_a_run_by_torque_repeats_itself_too_and_differs_from_one_by_position() -> None:
     arguments = ("run", CELL, "--fast", "--json", "--headless", "--trajectory", "circle", "--duration", "1.8")
     runs = [q2r2(*arguments, "--mode", mode) for mode in ("torque", "torque", "position")]
@@ -348,6 +349,7 @@ def test_without_json_a_run_ends_with_a_readable_summary() -> None:
         assert expected in result.stdout
 
 
+@pytest.mark.slow
 def test_the_demo_leaves_a_picture_and_the_summary_in_a_folder_that_it_names(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -360,6 +362,7 @@ def test_the_demo_leaves_a_picture_and_the_summary_in_a_folder_that_it_names(
     assert json.loads(Path(path).with_name("summary.json").read_text()) == one_object(result.stdout)
 
 
+@pytest.mark.slow
 def test_the_demo_says_of_each_task_whether_it_succeeded_and_so_does_its_exit_code(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -377,6 +380,7 @@ def test_the_demo_says_of_each_task_whether_it_succeeded_and_so_does_its_exit_co
     assert task["reason"].startswith("flat_block: held 95 mm up for 0.0 s")
 
 
+@pytest.mark.slow
 def test_headset_check_shows_a_headset_in_a_process_of_its_own() -> None:
     with process("headset-check", "--port", "0", "--json") as running:
         fake_headset(bound_port(running), 1.5)
@@ -439,6 +443,7 @@ def test_headset_check_says_what_to_look_at_when_nothing_comes() -> None:
         assert expected in result.stderr
 
 
+@pytest.mark.slow
 def test_ctrl_c_brings_the_arms_to_rest_and_ends_a_headset_run_with_its_summary() -> None:
     arguments = ("--input", "headset", "--port", "0", "--plant", "kinematic", "--headless", "--json")
     with process("run", CELL, *arguments) as running:
@@ -452,6 +457,7 @@ def test_ctrl_c_brings_the_arms_to_rest_and_ends_a_headset_run_with_its_summary(
     assert "connection lost" in [event["reason"] for event in summary["events"]]
 
 
+@pytest.mark.slow
 def test_bench_times_every_scenario() -> None:
     report = one_object(q2r2("bench", "--no-peers", "--ticks", "100", "--json").stdout)
     assert {row["ticks"] for row in report["rows"]} == {100}
@@ -461,6 +467,7 @@ def test_bench_times_every_scenario() -> None:
     assert all(row["name"] in table for row in report["rows"])
 
 
+@pytest.mark.slow
 def test_bench_measures_the_work_motions_that_are_asked_for() -> None:
     result = q2r2("bench", "--work", "--no-peers", "--motion", "slide", "--motion", "reach", "--json")
     report = one_object(result.stdout)
@@ -495,6 +502,7 @@ def test_a_soak_that_finds_something_ends_in_1(monkeypatch: pytest.MonkeyPatch) 
     assert not one_object(result.stdout)["passed"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("option", ["--pairs", "--model-pairs"])
 def test_a_search_for_pairs_says_how_far_it_has_got(
     tmp_path: Path, option: str, monkeypatch: pytest.MonkeyPatch

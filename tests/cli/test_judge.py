@@ -87,6 +87,7 @@ def test_a_report_is_one_page_of_all_of_them(recordings: Path, tmp_path: Path) -
         assert f"--output {output}: allowed: a file in a folder that exists" in refused.stderr
 
 
+@pytest.mark.slow
 class TestARunThatIsRecorded:
     OPTIONS = ("--trajectory", "line", "--human", "--seed", "5", "--duration", "3")
 

@@ -8,6 +8,8 @@ import pytest
 
 from tests.cli.test_app import FAST, changed_cell, one_object, q2r2
 
+pytestmark = pytest.mark.slow
+
 OPTIONS = (*FAST[2:], "--duration", "1.5")
 
 

@@ -291,7 +291,7 @@ def test_a_solver_that_never_answers_brings_the_arms_to_rest_along_the_certified
     assert not reference.v.any()
 
 
-@pytest.mark.parametrize("solver", ["daqp", "osqp"])
+@pytest.mark.parametrize("solver", ["daqp", pytest.param("osqp", marks=pytest.mark.slow)])
 def test_every_solver_keeps_the_contract_and_tracks(solver: str) -> None:
     controller = CartesianController(robot_of("iiwa7"), ControllerSettings(solver=solver))
     contract = run(controller, crossing, 1.5, 0.005)
@@ -327,6 +327,7 @@ def test_the_report_names_what_holds_the_arms_back() -> None:
     assert not report.fallback
 
 
+@pytest.mark.slow
 def test_separation_holds_between_ticks_and_along_every_stop_where_the_arms_come_nearest() -> None:
     """Without a buffer to speak of; Coal measures between all ticks, and along the full stop from each."""
     settings = ControllerSettings(distance_buffer=1e-5, separation_gain=20.0)

@@ -96,6 +96,7 @@ def test_a_cache_that_cannot_be_written_is_put_elsewhere(sources: Path, monkeypa
     folder.rmdir()
 
 
+@pytest.mark.slow
 def test_kernels_run_where_no_cache_can_be_written(tmp_path: Path) -> None:
     occupied = tmp_path / "a_file"
     occupied.write_text("")
@@ -134,6 +135,7 @@ def test_division_by_zero_gives_infinity_instead_of_an_exception() -> None:
     assert _one_over(0.0) == np.inf
 
 
+@pytest.mark.slow
 def test_what_is_held_stays_the_callers_own_array() -> None:
     values = np.arange(3.0)
     held = hold((values,))
@@ -142,6 +144,7 @@ def test_what_is_held_stays_the_callers_own_array() -> None:
     np.testing.assert_array_equal(values, [14.0, 2.0, 4.0])
 
 
+@pytest.mark.slow
 def test_what_is_held_lives_as_long_as_it_is_held_and_no_longer() -> None:
     values = np.arange(3.0)
     before = sys.getrefcount(values)
@@ -153,6 +156,7 @@ def test_what_is_held_lives_as_long_as_it_is_held_and_no_longer() -> None:
     assert sys.getrefcount(values) == before
 
 
+@pytest.mark.slow
 def test_what_is_held_outlives_its_maker() -> None:
     held = hold((np.ones(100_000),))
     gc.collect()

@@ -58,6 +58,7 @@ class Run:
         return robot.distance_values(self.q) - kept_distances(robot, self.controller.settings).values
 
 
+@pytest.mark.slow
 def test_arms_that_rest_against_each_other_are_not_pushed_apart_by_a_greater_distance(
     controller: CartesianController,
 ) -> None:
@@ -74,6 +75,7 @@ def test_arms_that_rest_against_each_other_are_not_pushed_apart_by_a_greater_dis
     assert controller.kept_distances.min() > 0.6 * pair.min()  # but no nearer than it is
 
 
+@pytest.mark.slow
 def test_a_pair_keeps_all_of_a_greater_distance_once_it_has_been_opened_and_is_then_held_there(
     controller: CartesianController,
 ) -> None:
@@ -102,6 +104,7 @@ def test_a_distance_grows_no_faster_than_it_may_and_falls_at_once(controller: Ca
     assert controller.kept_distances.max() == NEAR
 
 
+@pytest.mark.slow
 def test_a_distance_that_grows_while_the_arms_rush_at_each_other_is_kept_from_where_it_is_proven(
     controller: CartesianController,
 ) -> None:

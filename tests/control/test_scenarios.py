@@ -149,8 +149,12 @@ def ticks_of(dt: float, jitter: bool) -> Iterator[float]:
 
 # Shorter than a substep, as long as one, and five of them.
 @pytest.mark.parametrize("name", CASES)
-@pytest.mark.parametrize("robot", ROBOTS)
-@pytest.mark.parametrize("dt", [0.001, 0.002, 0.01], ids=lambda dt: f"{1e3 * dt:g} ms")
+@pytest.mark.parametrize(
+    "robot", [pytest.param(name, marks=pytest.mark.slow) if name == "panda" else name for name in ROBOTS]
+)
+@pytest.mark.parametrize(
+    "dt", [0.001, pytest.param(0.002, marks=pytest.mark.slow), 0.01], ids=lambda dt: f"{1e3 * dt:g} ms"
+)
 def test_the_contract_holds_at_every_tick(name: str, robot: str, dt: float) -> None:
     case = CASES[name]
     controller, solver = controller_of(robot)

@@ -110,6 +110,7 @@ def test_less_that_reaches_nearer_is_refused_like_more_and_the_wider_body_stays(
     assert cell.tell(*narrow) is None
 
 
+@pytest.mark.slow
 def test_with_hostile_targets_and_openings_no_finger_is_ever_too_near_wherever_it_really_is(cell: Cell) -> None:
     random = np.random.default_rng(5)
     told = refused = 0

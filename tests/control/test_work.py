@@ -12,6 +12,8 @@ from q2r2_control.benchmark.motion_run import MotionFigures, own_controller, run
 from q2r2_control.verification.contract import Contract
 from q2r2_control.verification.work_motions import WORK_MOTIONS, WorkMotion
 
+pytestmark = pytest.mark.slow
+
 CONFIG = load_config("config/dual_iiwa7.yaml")
 SETTINGS = CONFIG.control.model_copy(update={"solve_time_limit": None})  # no outcome hangs on the clock
 DT = 0.002

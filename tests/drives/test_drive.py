@@ -19,6 +19,8 @@ from q2r2_control.types import SIDES, Array, RobotState
 from tests.support.hands_input import HandsInput
 from tests.support.watch import Watch, assert_torque_bounds, cell
 
+pytestmark = pytest.mark.slow
+
 BLIND = cell().supervision.unusable_time
 ENGAGED = 0.3  # hands that stay where they are have long engaged both arms [s]
 

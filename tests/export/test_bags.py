@@ -17,6 +17,8 @@ from tests.judging.runs import RATE, hands, record_episode
 from tests.judging.test_parts import BINDINGS, DURATION, controls
 from tests.recording.runs import read_elsewhere
 
+pytestmark = pytest.mark.slow
+
 SAID_ONCE = ("/robot_description", "/q2r2/state")
 
 

@@ -12,6 +12,8 @@ from q2r2_control.errors import RecordingError
 from q2r2_control.export.csv_tables import write_table, write_tables
 from tests.export.test_lerobot import EPISODES, NAMES
 
+pytestmark = pytest.mark.slow
+
 HEAD = [
     *(f"{feature}.{name}" for feature, names in NAMES.items() for name in names),
     *("next.done", "next.success", "timestamp", "frame_index", "episode_index", "index", "task_index", "task"),

@@ -16,6 +16,8 @@ from q2r2_control.export.episodes import EpisodeVectors, FrameSampling, make_epi
 from tests.export.runs import Run, contents, record_step
 from tests.recording.runs import RATE
 
+pytestmark = pytest.mark.slow
+
 MOVED = 1e-4  # [m] and [rad]
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"  # begins the data of a chunk
 

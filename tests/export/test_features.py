@@ -15,6 +15,8 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 from tests.support.watch import cell
 
+pytestmark = pytest.mark.slow
+
 COUNT = 60
 
 

@@ -17,6 +17,8 @@ from tests.export.runs import contents
 from tests.export.test_lerobot import EPISODES
 from tests.export.videos import CAMERA, HEIGHT, WIDTH, pictures_of
 
+pytestmark = pytest.mark.slow
+
 h5py = pytest.importorskip("h5py", reason="the extra export is not installed")
 
 POSITIONS = ("left_A1", "left_gripper")

@@ -20,6 +20,8 @@ from q2r2_control.export.lerobot import require_pyarrow, write_dataset
 from q2r2_control.export.output import Output
 from q2r2_control.export.statistics import statistics_of
 
+pytestmark = pytest.mark.slow
+
 NAMES = {"observation.state": ("left_A1", "left_gripper"), "action": ("left_A1", "left_gripper", "right_A1")}
 
 

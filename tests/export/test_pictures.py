@@ -12,6 +12,8 @@ from q2r2_control.export.pictures import pictures_at
 from q2r2_control.recording.reader import Recording
 from tests.export.files import EPOCH, brightness, write_recording
 
+pytestmark = pytest.mark.slow
+
 MS = 1_000_000  # [ns]
 CAMERA = CameraConfig(position=(1, 0, 1), rpy=(0, 0, 0), width=16, height=16, rate=50.0)
 TICKS = [MS * t for t in range(1, 200)]

@@ -17,6 +17,8 @@ from q2r2_control.export.episodes import FrameSampling, make_episodes
 from q2r2_control.export.lerobot import write_dataset
 from tests.export.runs import contents, record_two
 
+pytestmark = pytest.mark.slow
+
 ray = pytest.importorskip("ray", reason="the extra ray is not installed")
 pytest.importorskip("pyarrow", reason="the extra export is not installed")
 

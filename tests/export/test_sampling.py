@@ -14,6 +14,8 @@ from q2r2_control.recording import topics as names
 from q2r2_control.recording.reader import Recording
 from tests.export.files import write_recording
 
+pytestmark = pytest.mark.slow
+
 MS = 1_000_000
 
 

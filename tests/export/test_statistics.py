@@ -7,6 +7,8 @@ import pytest
 
 from q2r2_control.export.statistics import NAMES, QUANTILES, joined, statistics_of
 
+pytestmark = pytest.mark.slow
+
 
 def test_statistics_are_those_of_the_rows() -> None:
     rows = np.random.default_rng(1).permutation(np.arange(1, 201)).reshape(-1, 1) * np.array([[1.0, -2.0]])

@@ -14,7 +14,10 @@ from q2r2_control.export.pictures import Pixels
 from q2r2_control.export.video import encode
 
 pytest.importorskip("av", reason="the extra export is not installed")
-pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="scheduling is told on Linux only")
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(sys.platform != "linux", reason="scheduling is told on Linux only"),
+]
 
 
 def policies() -> set[int]:

@@ -22,6 +22,8 @@ from tests.export.videos import CAMERA, HEIGHT, WIDTH, save_with_videos
 from tests.recording.runs import file_of, pipeline, record
 from tests.support.pictures import needs_opengl
 
+pytestmark = pytest.mark.slow
+
 av = pytest.importorskip("av", reason="the extra export is not installed")
 pyarrow = pytest.importorskip("pyarrow.parquet", reason="the extra export is not installed")
 

@@ -13,6 +13,8 @@ from q2r2_control.teleop.sag import MOST_SAG
 from q2r2_control.types import SIDES, CommandMode
 from tests.support.headset_in_step import InStepRun, Operator
 
+pytestmark = pytest.mark.slow
+
 ANEW = pin.SE3(pin.exp3(np.array([0.0, 0.0, math.radians(120.0)])), np.array([0.4, 0.0, 0.0]))
 STILL = 5e-4  # [m]
 

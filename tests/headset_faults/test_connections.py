@@ -13,6 +13,8 @@ from q2r2_control.types import SIDES, Array
 from tests.support.fake_headset import KEEPALIVE, FakeHeadset
 from tests.support.headset_in_step import PERIOD, InStepRun, Operator
 
+pytestmark = pytest.mark.slow
+
 AWAY = pin.SE3(pin.exp3(np.array([0.2, 1.0, 0.3])), np.array([0.2, -0.1, 0.3]))
 A_TICK = 0.002  # [s]
 

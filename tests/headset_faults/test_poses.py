@@ -12,6 +12,8 @@ import pytest
 from q2r2_control.types import SIDES, Array, HandFault
 from tests.support.headset_in_step import InStepRun, Operator, Sender
 
+pytestmark = pytest.mark.slow
+
 AWAY = pin.SE3(pin.exp3(np.array([0.0, 0.0, 0.5 * math.pi])), np.array([0.3, -0.4, 0.0]))  # 0.5 m and 90 degrees
 STILL = 5e-4  # of a tool, whose hand trembles by the noise of its sensor [m]
 

@@ -26,6 +26,8 @@ from q2r2_control.types import Event, HandInputs, HapticFeedback
 from tests.judging.runs import RATE, Work, hands, killed, loop_of, press
 from tests.support.processes import alive, wait_until
 
+pytestmark = pytest.mark.slow
+
 BINDINGS = {"trigger": "record_toggle", "grip": "record_discard"}
 # One at work, one that its operator discards, one in which nothing moves.
 TOGGLED, GIVEN_UP = (1.0, 2.5, 3.0, 4.0, 6.0), 3.7

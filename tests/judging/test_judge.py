@@ -33,6 +33,8 @@ from tests.judging.runs import (
     without_ticks,
 )
 
+pytestmark = pytest.mark.slow
+
 SEED = 0
 
 

@@ -18,6 +18,8 @@ from q2r2_control.recording.replay import replay
 from q2r2_control.types import HandInputs
 from tests.judging.runs import hands, loop_of, press, record_episode
 
+pytestmark = pytest.mark.slow
+
 BINDINGS = {
     "trigger": "record_toggle",
     "grip": "record_discard",

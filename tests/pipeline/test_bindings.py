@@ -19,6 +19,8 @@ from q2r2_control.types import Array, HandInputs, HandSample
 from tests.support.hands_input import ENGAGED, HandsInput, Path
 from tests.support.watch import Watch, cell
 
+pytestmark = pytest.mark.slow
+
 SPEED, RADIUS = 0.25, 0.08  # of the left hand's circle [m/s], [m]
 HELD_FOR = 0.35  # and let go for as long [s]
 

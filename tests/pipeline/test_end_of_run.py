@@ -50,6 +50,7 @@ class RecordingPlant(KinematicPlant):
         self.closed += 1
 
 
+@pytest.mark.slow
 class TestStop:
     @pytest.mark.parametrize("how", ["stop", "SIGINT", "SIGTERM"])
     def test_in_mid_motion_brakes_first(self, how: str) -> None:
@@ -160,6 +161,7 @@ def assert_braked(loop: Pipeline, watch: Watch, summary: RunSummary) -> None:
     assert not loop.stopping
 
 
+@pytest.mark.slow
 class TestFailure:
     def test_of_a_listener_brakes_first_and_calls_it_no_more(self) -> None:
         loop, calls = pipeline(), []

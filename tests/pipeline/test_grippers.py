@@ -40,6 +40,7 @@ def test_fingers_count_as_wide_as_the_grippers_are_at_every_tick(plant: str) -> 
     assert len(watch.ticks) == len(widest)
 
 
+@pytest.mark.slow
 def test_what_is_gripped_is_part_of_the_tool_until_it_is_put_down() -> None:
     """The flat block of the demo; the contract, objects included, is checked at every tick."""
     flat = {"box": (0.06, 0.04, 0.015), "at": (0.0, 0.0, 0.0085), "mass": 0.1}

@@ -6,11 +6,14 @@ import json
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from q2r2_control.inputs.scripted import ScriptedInput
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.types import SIDES, HandSample
 from tests.support.watch import Watch, cell, speed
+
+pytestmark = pytest.mark.slow
 
 
 class HostileInput:

@@ -17,6 +17,7 @@ from tests.pipeline.loops import pipeline
 from tests.support.watch import Watch, assert_torque_bounds, cell, changes, speed
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("trajectory", "human", "plant", "mode", "millimetres", "degrees"),
     [
@@ -60,6 +61,7 @@ def test_both_arms_follow_within_every_limit(
         assert_torque_bounds(loop, watch.ticks)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", ["position", "torque"])
 def test_two_simulated_runs_are_equal_bit_for_bit_also_on_the_same_pipeline(mode: str) -> None:
     def run(loop: Pipeline) -> tuple[list[bytes], RunSummary]:

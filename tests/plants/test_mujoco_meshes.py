@@ -48,6 +48,7 @@ URDF = """<robot name="rod"><link name="base"/><link name="rod">
 <limit lower="-1" upper="1" velocity="1" effort="1"/></joint></robot>"""
 
 
+@pytest.mark.slow
 def test_a_cell_with_dae_meshes_that_passes_the_check_runs_in_mujoco(tmp_path: Path) -> None:
     file = tmp_path / "kinova.yaml"
     file.write_text(yaml.safe_dump(KINOVA))

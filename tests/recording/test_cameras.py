@@ -28,6 +28,8 @@ from tests.recording.test_writer_process import Script
 from tests.support.pictures import needs_opengl
 from tests.support.processes import alive, wait_until
 
+pytestmark = pytest.mark.slow
+
 FRONT = CameraConfig(position=(1.9, 0.0, 1.0), look_at=(0.4, 0.0, 0.3), width=64, height=48, rate=20.0)
 HAND = CameraConfig(
     link="left_hand_e_base", position=(0.1, 0.0, 0.0), rpy=(0.0, -1.57, 0.0), width=32, height=32, rate=8.0

@@ -19,6 +19,8 @@ from q2r2_control.types import Array
 from tests.recording.runs import RATE, file_of, pipeline, record, rewrite
 from tests.support.watch import Watch, cell
 
+pytestmark = pytest.mark.slow
+
 Change = Callable[[int, Array, Array], None]
 
 

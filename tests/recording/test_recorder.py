@@ -30,6 +30,8 @@ from q2r2_control.runtime.recorder import Tick
 from tests.recording.runs import RATE, file_of, pipeline, read_elsewhere, record, writer_of
 from tests.support.processes import wait_until
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).resolve().parents[2]
 
 

@@ -27,6 +27,8 @@ from tests.recording.runs import RATE, file_of, pipeline, record, rewrite
 from tests.support.object_cell import cell as object_cell
 from tests.support.watch import cell
 
+pytestmark = pytest.mark.slow
+
 BOX = {"x": [0.3, 0.8], "y": [0.0, 0.6], "z": [0.1, 0.7]}
 
 

@@ -28,6 +28,8 @@ from tests.recording.runs import read_elsewhere
 from tests.support.external_cell import external
 from tests.support.watch import cell
 
+pytestmark = pytest.mark.slow
+
 SECOND = 1_000_000_000  # [ns]
 
 

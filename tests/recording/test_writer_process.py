@@ -26,6 +26,8 @@ from q2r2_control.types import HapticFeedback
 from tests.recording.runs import ROOT, file_of, pipeline, read_elsewhere, record, writer_of
 from tests.support.processes import alive, children, wait_until
 
+pytestmark = pytest.mark.slow
+
 WRITTEN_LATER = 60.0  # [s] of simulated time, which a listener ends
 
 

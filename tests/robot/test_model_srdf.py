@@ -30,6 +30,7 @@ def test_every_shipped_file_lists_what_the_program_finds(arm: str) -> None:
         assert _disabled(text) == _disabled(find_resource(f"robots/{name}").read_text(encoding="utf-8"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("arm", ["iiwa7", "iiwa14"])
 def test_every_shipped_file_about_a_flange_lists_what_the_program_finds(arm: str) -> None:
     gripper = load_config(f"config/dual_{arm}.yaml").arms["left"].gripper.model_dump()  # whose fingers are one body

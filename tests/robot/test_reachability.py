@@ -12,6 +12,8 @@ from q2r2_control.robot.pairs import link_of
 from q2r2_control.robot.reachability import nearest_approaches
 from q2r2_control.robot.robot import Robot
 
+pytestmark = pytest.mark.slow
+
 CONFIG = load_config("config/dual_iiwa7.yaml")
 
 

@@ -25,6 +25,8 @@ from q2r2_control.robot.pairs import link_of, pair_names
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Command, CommandMode
 
+pytestmark = pytest.mark.slow
+
 ARM = ("s0", "s1", "e0", "e1", "w0", "w1", "w2")
 LEFT, RIGHT = [f"left_{name}" for name in ARM], [f"right_{name}" for name in ARM]
 

@@ -146,6 +146,7 @@ def moved(chain: Sequence[FingerJoint], ends: Array, at: dict[str, float], trave
     return ends
 
 
+@pytest.mark.slow
 @given(st.lists(joints(), min_size=1, max_size=4), _VECTORS, _VECTORS, st.tuples(st.floats(0, 1), st.floats(0, 1)))
 @settings(max_examples=150, deadline=None)
 def test_any_chain_of_fingers_is_in_its_body_wherever_its_drivers_are(
@@ -210,6 +211,7 @@ def test_without_known_openings_a_body_is_all_that_the_joints_limits_allow(tmp_p
             assert outside(ends, (middle - half, middle + half, float(item.geometry.radius)), radius) <= 0.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("model", "tip", "fingers"),
     [

@@ -15,6 +15,8 @@ from q2r2_control.ros.launch.build import INTERFACES, BuildError, Interfaces, bu
 from tests.ros.conftest import NEEDS_ROS
 from tests.ros.processes import ROOT
 
+pytestmark = pytest.mark.slow
+
 SITE_PACKAGES = Path("lib", f"python{sys.version_info.major}.{sys.version_info.minor}", "site-packages")
 NAMES = ["control_msgs", "quest2ros", "tf2_msgs"]
 

@@ -263,6 +263,7 @@ def test_nodes_whose_worlds_differ_do_not_carry(node: Any, processes: Processes)
     assert right.state["state"] == "idle"
 
 
+@pytest.mark.slow
 @pytest.mark.alone
 def test_simulated_tools_keep_their_relation(domain: int, robot: Robot, processes: Processes) -> None:
     with spun_node(domain) as node:

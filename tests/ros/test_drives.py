@@ -65,6 +65,7 @@ class Recorder:
         self.commands.append(Commanded(info["publication_sequence_number"], measured, q, time.monotonic()))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stall", [0.02, 0.05, 0.1])
 def test_a_controller_that_is_stopped_for_a_while_publishes_no_jump(
     stall: float, robot: Robot, processes: Processes, node: Any

@@ -162,6 +162,7 @@ def test_a_press_against_a_stopped_controller_says_why_nothing_follows_and_what_
     moving.move()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stalls", [STALLS, pytest.param(MORE_STALLS, marks=pytest.mark.soak)], ids=["few", "more"])
 @pytest.mark.parametrize("name", [f"{arm}_arm_controller" for arm in ARMS])
 def test_however_short_an_arm_s_node_stops_either_both_arms_go_on_or_none(

@@ -11,7 +11,7 @@ from tests.ros.conftest import NEEDS_ROS
 from tests.ros.processes import PATIENCE, Processes, skip_if_overloaded
 
 pytest.importorskip("rclpy", reason=NEEDS_ROS)
-pytestmark = [pytest.mark.usefixtures("interfaces"), pytest.mark.alone]
+pytestmark = [pytest.mark.usefixtures("interfaces"), pytest.mark.alone, pytest.mark.slow]
 
 
 def test_the_bench_measures_both_ways_in_and_presses_and_the_load_of_real_nodes(processes: Processes) -> None:

@@ -64,6 +64,7 @@ def bench(domain: int, robot: Robot, tmp_path_factory: pytest.TempPathFactory) -
         running.end_all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(POSES.keys() - ALIKE.keys()))
 def test_targets_keep_the_rules_of_a_controller_in_both_modes_and_its_arm_moves_smoothly(
     name: str, bench: PresetBench, processes: Processes, other_interfaces: dict[str, str]
@@ -83,6 +84,7 @@ def test_targets_keep_the_rules_of_a_controller_in_both_modes_and_its_arm_moves_
     assert rate > 0.5 * POSES[name].lowest_rate
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", JOINTS)
 def test_joint_commands_of_the_built_in_controller_keep_the_rules_of_a_controller_of_joints(
     name: str, bench: PresetBench, processes: Processes, other_interfaces: dict[str, str]

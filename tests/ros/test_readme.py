@@ -67,6 +67,7 @@ def test_the_subclass_in_the_readme_teleoperates_its_arm_in_its_robots_frame(
     assert process.interrupt(PATIENCE) == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "start", [*range(FEW), *(pytest.param(start, marks=pytest.mark.soak) for start in range(FEW, STARTS))]
 )

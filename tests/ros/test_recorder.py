@@ -252,6 +252,7 @@ def verdicts_in(reasons: list[str]) -> list[str]:
     return [reason[:LONGEST_LINE] for reason in reasons if reason.startswith(VERDICT)]
 
 
+@pytest.mark.slow
 @pytest.mark.alone
 @pytest.mark.usefixtures("interfaces")
 def test_a_whole_set_is_recorded_judged_and_ends_at_ctrl_c(node: Any, processes: Processes, tmp_path: Path) -> None:

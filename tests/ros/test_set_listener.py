@@ -128,6 +128,7 @@ def test_what_cannot_be_watched_is_one_line(processes: Processes, arguments: tup
     assert arguments[-1] in line
 
 
+@pytest.mark.slow
 def test_the_doctor_finds_two_inputs_and_an_arm_without_its_robot_and_says_what_helps(
     node: Any, processes: Processes
 ) -> None:

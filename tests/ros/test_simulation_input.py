@@ -155,6 +155,7 @@ def test_the_script_waits_for_an_arm_that_is_not_ready_and_presses_until_it_foll
     assert not any(message.button_lower for message in drained(left["inputs"]))
 
 
+@pytest.mark.slow
 def test_an_arm_that_stops_early_again_and_again_is_not_engaged_for_ever(node: Any, processes: Processes) -> None:
     arm = speaking_arm(node, ready=True, message="ready to engage")
     left = subscribe(node, "left")

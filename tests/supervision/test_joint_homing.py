@@ -85,6 +85,7 @@ def postures(robot: Robot, controller: CartesianController, count: int, seed: in
     return found
 
 
+@pytest.mark.slow
 def test_from_fifty_random_postures_all_joints_come_home_from_all_but_two_at_most(
     robot: Robot, controller: CartesianController
 ) -> None:

@@ -190,6 +190,7 @@ def test_a_hand_that_comes_back_takes_the_target_from_the_tool_at_once(motion: R
     assert (tied.leash.rotation.slip if turning else tied.leash.position.slip) > 0.1
 
 
+@pytest.mark.slow
 def test_tremor_drops_no_slack() -> None:
     tied = Tied(RelativeMotion(), distance=0.1, angle=0.5)
     tied.go(along(0.001), 300)
@@ -332,6 +333,7 @@ def test_an_arm_held_up_follows_the_first_millimetres_back_within_a_quarter_of_a
     assert run.summary.fallback_ticks == run.summary.uncertified_ticks == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", OUT)
 def test_without_a_leash_it_does_not_move_back(name: str) -> None:
     run = loop(name, leash=False)
@@ -348,6 +350,7 @@ def test_dropping_the_slack_makes_no_lurch(name: str) -> None:
     assert run.moved(HELD, HELD + 0.45) > -2.0 * BACK
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", OUT)
 def test_tremor_does_not_make_an_arm_held_up_chatter(name: str) -> None:
     run = loop(name, leash=True, tremor=0.2e-3)

@@ -16,6 +16,8 @@ from q2r2_control.teleop.rest import RestingPose
 from q2r2_control.types import SIDES, Array, HandSample, Pose
 from tests.teleop.hands import PAUSED, Operator, operator, pose
 
+pytestmark = pytest.mark.slow
+
 TICK, PERIOD = 0.004, 1.0 / 75.0  # of the loop and of the samples [s]
 NOISE, TURN_NOISE = 2e-4, 5e-4  # of a headset, standard deviation of each axis [m], [rad]
 

@@ -22,6 +22,8 @@ from q2r2_control.verification.assembly_tasks import TASKS, TaskResult, TaskWatc
 from q2r2_control.verification.touch_watch import TouchWatch
 from tests.support.watch import Watch, assert_torque_bounds
 
+pytestmark = pytest.mark.slow
+
 # What is shown, by mode, and in which ticks: nothing here needs 1 kHz, and the tests have to be fast.
 SHOWN = {CommandMode.POSITION: "meet+grasp+handover+stack", CommandMode.TORQUE: "handover+stack"}
 PERIODS = {CommandMode.POSITION: 0.01, CommandMode.TORQUE: 0.005}  # [s]

@@ -23,6 +23,8 @@ from q2r2_control.verification.fault_injection import FaultySolver
 from q2r2_control.verification.soak import Soak, SoakReport, run_soak
 from tests.support.object_cell import cell
 
+pytestmark = pytest.mark.slow
+
 CONFIG = load_config("config/dual_iiwa7.yaml")
 SETTINGS = CONFIG.control
 SEED = 5
