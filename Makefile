@@ -71,7 +71,7 @@ $(VENV)/.installed-bench: $(VENV)/.installed
 	$(BIN)/python -m pip install --quiet --editable '.[bench]' && touch $@ || true
 
 soak: setup
-	$(BIN)/q2r2 bench --soak
+	$(BIN)/q2r2 soak
 
 clean:
 	rm -rf $(VENV) $(LEROBOT) build install log *.egg-info .mypy_cache .ruff_cache .pytest_cache

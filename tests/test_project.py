@@ -82,8 +82,8 @@ def modules_outside_ros() -> set[Path]:
 
 
 def modules_of_nodes() -> set[Path]:
-    """What needs rclpy: the nodes, and the benchmark that runs them."""
-    return {*ROS.rglob("*.py"), *(ROOT / "q2r2_control" / "benchmark").glob("ros_*.py")}
+    """Modules that need rclpy."""
+    return set(ROS.rglob("*.py"))
 
 
 @pytest.mark.parametrize("dependency", dependencies())

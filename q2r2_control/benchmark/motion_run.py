@@ -7,13 +7,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from q2r2_control.benchmark.motion_measures import rest_acceleration
 from q2r2_control.benchmark.peers.base import BenchController
-from q2r2_control.benchmark.timed_run import OwnController, TimedRun, rest_acceleration, timed_run
+from q2r2_control.benchmark.timed_run import OwnController, TimedRun, timed_run
+from q2r2_control.benchmark.work_motions import WorkMotion
 from q2r2_control.config.cell import Config
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
-from q2r2_control.verification.work_motions import WorkMotion
 
 DT = 0.001  # [s]
 ARRIVED = 0.01  # from the goal [m]

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio as pin
 
+from q2r2_control.benchmark.motion_measures import rest_acceleration
 from q2r2_control.benchmark.peers.base import BenchController
 from q2r2_control.config.control import ControllerSettings
 from q2r2_control.control.controller import CartesianController
@@ -21,7 +22,6 @@ Poses = dict[str, pin.SE3]
 Targets = Callable[[float, Poses], Poses]
 
 WARM_UP = 0.1  # share of the ticks that is not counted in times
-_TAIL = 0.5  # [s]
 _SHORTEST_DT = 1e-9  # a tick that moves nothing [s]
 
 
@@ -126,12 +126,6 @@ def timed_run(
     finally:
         gc.enable()
     return TimedRun(1e6 * times[untimed:done], q[:done], v[:done], asked[:done], failed[:done], dt)
-
-
-def rest_acceleration(v: Array, dt: float) -> float:
-    """RMS over the last 0.5 s of velocities (n, nv) [rad/s], of the acceleration's norm over the joints [rad/s^2]."""
-    a = np.diff(v, axis=0, prepend=0.0)[-round(_TAIL / dt) :] / dt
-    return float(np.sqrt(np.mean(np.sum(a**2, axis=1))))
 
 
 def metrics_of(run: TimedRun, robot: Robot, settings: ControllerSettings) -> RunMetrics:

@@ -13,9 +13,9 @@ from typing import Any
 from q2r2_control.benchmark.motion_run import DT, PATIENCE, MotionFigures, own_controller, run_motion, without_pairs
 from q2r2_control.benchmark.peers.base import BenchController, PeerSettings, build_peers
 from q2r2_control.benchmark.peers.leading import Leading
+from q2r2_control.benchmark.work_motions import WorkMotion
 from q2r2_control.config.cell import Config
 from q2r2_control.robot.robot import Robot
-from q2r2_control.verification.work_motions import WorkMotion
 
 WORK_PEERS = ("roboplan", "roboplan, 10 nearest", "mink")
 FREE_AIR = "free air"

@@ -17,6 +17,7 @@ from q2r2_control.cli.judge import judge, report
 from q2r2_control.cli.replay import replay
 from q2r2_control.cli.ros import app as ros_app
 from q2r2_control.cli.run import run
+from q2r2_control.cli.soak import soak
 
 app = typer.Typer(
     cls=ErrorHandlingGroup,
@@ -32,9 +33,8 @@ app.command(epilog="Example: q2r2 judge recordings --json")(judge)
 app.command(epilog="Example: q2r2 report recordings --output report.html")(report)
 app.command(epilog="Example: q2r2 check config/dual_iiwa7.yaml --pairs dual_iiwa7.srdf")(check)
 app.command("headset-check", epilog="Example: q2r2 headset-check --host 0.0.0.0")(headset_check)
-app.command(epilog="Example: q2r2 bench --ticks 20000, or --work --motion meet --through torque, or --soak --seed 3")(
-    bench
-)
+app.command(epilog="Example: q2r2 bench --ticks 20000, or --work --motion meet")(bench)
+app.command(epilog="Example: q2r2 soak --ticks 100000 --contact")(soak)
 app.add_typer(export_app, name="export")
 app.add_typer(ros_app, name="ros")
 

@@ -17,6 +17,7 @@ from q2r2_control.cli.summary_table import recording_line, summary_table, task_l
 from q2r2_control.cli.window import check_window, show_window
 from q2r2_control.config.cell import Config
 from q2r2_control.config.external import ControllerKind
+from q2r2_control.demo.assembly_tasks import AssemblyTask, TaskResult, TaskWatch
 from q2r2_control.errors import ConfigError, PlantError, RecordingError
 from q2r2_control.inputs.base import Input
 from q2r2_control.inputs.factory import make_input
@@ -33,7 +34,6 @@ from q2r2_control.runtime.run_summary import RunSummary
 from q2r2_control.runtime.scheduling import real_time
 from q2r2_control.supervision.preflight import preflight_faults
 from q2r2_control.teleop.episode_marks import EpisodeMarks
-from q2r2_control.verification.assembly_tasks import AssemblyTask, TaskResult, TaskWatch
 from q2r2_control.viewer.history import History
 from q2r2_control.viewer.live import LiveTable
 from q2r2_control.viewer.report import draw_report

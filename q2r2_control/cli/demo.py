@@ -22,10 +22,10 @@ from q2r2_control.cli.options import (
 )
 from q2r2_control.cli.output import stderr_console
 from q2r2_control.config.cell import load_config
+from q2r2_control.demo.assembly_tasks import ALL_TASKS, TASKS, tasks_named
 from q2r2_control.errors import ConfigError
 from q2r2_control.inputs.trajectories import trajectory_named
 from q2r2_control.types import CommandMode
-from q2r2_control.verification.assembly_tasks import ALL_TASKS, TASKS, tasks_named
 
 _DEFAULT = ["handover", "stack"]
 _ABOUT = "; ".join(f"{task.name}: {task.about}" for task in TASKS.values())

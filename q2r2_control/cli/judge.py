@@ -11,7 +11,6 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import Progress
 from rich.table import Table
-from rich.text import Text
 
 from q2r2_control.cli.figure_table import figure_table
 from q2r2_control.cli.options import Json
@@ -84,8 +83,8 @@ def _table(judged: Sequence[Judged]) -> Table:
     kept = sum(one.verdict.keep for one in judged)
     columns = [column for column in COLUMNS if column.name in _SHOWN]
     headings = tuple(column.heading for column in columns)
-    table = figure_table(f"episodes: {kept} kept, {len(judged) - kept} discarded", "episode", ("verdict", *headings))
-    for one in judged:
-        name = Text(one.figures.name)
-        table.add_row(name, one.verdict.word, *(column.text(one.figures) for column in columns))
-    return table
+    return figure_table(
+        f"episodes: {kept} kept, {len(judged) - kept} discarded",
+        ("episode", "verdict", *headings),
+        ((one.figures.name, one.verdict.word, *(column.text(one.figures) for column in columns)) for one in judged),
+    )

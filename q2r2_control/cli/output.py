@@ -5,13 +5,14 @@ from __future__ import annotations
 import json
 import math
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, is_dataclass
 from typing import Any
 
 import numpy as np
 from rich.console import Console
+from rich.table import Table
 
 _NOTICE_AFTER = 3.0  # [s]
 
@@ -38,6 +39,23 @@ def _jsonable(value: Any) -> Any:
 def stderr_console() -> Console:
     """For what is not a command's result."""
     return Console(stderr=True)
+
+
+def print_report(data: Any, tables: Iterable[Table], json: bool) -> None:
+    """Print a command's result on stdout: ``data`` as one JSON object, or the ``tables``."""
+    if json:
+        print(as_json_text(data))
+        return
+    console = Console()
+    for table in tables:
+        console.print(table)
+
+
+def print_progress(what: str) -> None:
+    """Print a line on stderr, where that is a terminal; a live line would need a thread, which adds to times."""
+    console = stderr_console()
+    if console.is_terminal:
+        console.print(what, highlight=False)
 
 
 @contextmanager

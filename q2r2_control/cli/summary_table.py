@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from rich.markup import escape
 from rich.table import Table
 
+from q2r2_control.demo.assembly_tasks import TaskResult
 from q2r2_control.judging.verdict import Verdict
 from q2r2_control.recording.recorder import RecordingSummary
 from q2r2_control.runtime.histogram import Percentiles
@@ -14,7 +15,6 @@ from q2r2_control.runtime.run_summary import RunSummary
 from q2r2_control.runtime.torque_summary import TorqueSummary
 from q2r2_control.teleop.arm_states import ArmState, is_fault
 from q2r2_control.types import Event
-from q2r2_control.verification.assembly_tasks import TaskResult
 
 
 def summary_table(summary: RunSummary) -> Table:

@@ -8,11 +8,11 @@ from typing import Any, NamedTuple
 import numpy as np
 import pinocchio as pin
 
+from q2r2_control.benchmark.work_motions import ARMS, WORK_MOTIONS
 from q2r2_control.config.control import ControllerSettings
 from q2r2_control.robot.pairs import CLEARANCE
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import ALL_OF_THE_WAY, Array, Interval
-from q2r2_control.verification.work_motions import ARMS, WORK_MOTIONS
 
 
 class Request(NamedTuple):

@@ -10,10 +10,10 @@ import pinocchio as pin
 import pytest
 
 from q2r2_control.benchmark.motion_run import DT, MotionFigures, own_controller, run_motion, without_pairs
+from q2r2_control.benchmark.work_motions import WORK_MOTIONS
 from q2r2_control.config.cell import load_config
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
-from q2r2_control.verification.work_motions import WORK_MOTIONS
 
 CONFIG = load_config("config/dual_iiwa7.yaml")
 SHORT = replace(

@@ -12,7 +12,6 @@ from q2r2_control.benchmark.peers.base import INSTALL, PEERS, is_installed
 from q2r2_control.benchmark.tick_times import SCENARIOS, run_bench
 from q2r2_control.benchmark.timed_run import Poses, metrics_of, timed_run
 from q2r2_control.config.cell import load_config
-from q2r2_control.errors import ConfigError
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 
@@ -117,8 +116,3 @@ def test_peers_that_are_missing_or_broken_cost_a_line_each(monkeypatch: pytest.M
     assert [row.controller for row in report.rows] == ["q2r2_control"] * len(SCENARIOS)
     assert report.notes[0] == f"missing: not installed; {INSTALL}"
     assert report.notes[1].startswith("broken: cannot be built for this cell: ModuleNotFoundError")
-
-
-def test_a_bench_of_too_few_ticks_is_refused() -> None:
-    with pytest.raises(ConfigError, match="ticks = 99: allowed: 100 or more"):
-        run_bench(CONFIG, 99)

@@ -12,10 +12,10 @@ from q2r2_control.benchmark.motion_run import run_motion
 from q2r2_control.benchmark.peers.base import INSTALL, PEERS, PeerSettings, is_installed, make_peer
 from q2r2_control.benchmark.peers.leading import Leading
 from q2r2_control.benchmark.work_bench import WORK_PEERS, run_work_bench
+from q2r2_control.benchmark.work_motions import WORK_MOTIONS, motions_named
 from q2r2_control.config.cell import load_config
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
-from q2r2_control.verification.work_motions import WORK_MOTIONS, motions_named
 
 pytestmark = pytest.mark.slow
 

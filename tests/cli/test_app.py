@@ -25,7 +25,7 @@ from tests.support.external_cell import external_text
 from tests.support.fake_headset import FakeHeadset
 
 CELL = "config/dual_iiwa7.yaml"
-COMMANDS = ("demo", "run", "check", "headset-check", "bench")
+COMMANDS = ("demo", "run", "check", "headset-check", "bench", "soak")
 FAST = ("run", CELL, "--plant", "kinematic", "--fast", "--json", "--headless")
 SUMMARY_KEYS = {
     "ticks",
@@ -148,17 +148,12 @@ def test_the_help_lists_every_command(command: str) -> None:
         ),
         pytest.param(("check", CELL, "--model-pairs", "nowhere"), "nowhere: no such folder", id="no folder"),
         pytest.param(("bench", "--ticks", "0"), "--ticks", id="a benchmark of nothing"),
-        pytest.param(("bench", "--seed", "3"), "--seed", id="a seed of what draws nothing"),
-        pytest.param(("bench", "--soak", "--ros"), "exclude each other", id="two kinds of benchmark"),
-        pytest.param(("bench", "--work", "--soak"), "exclude each other", id="work and hostile ticks at once"),
         pytest.param(
             ("bench", "--work", "--motion", "dance"), "motion 'dance': allowed: carry-", id="an unknown motion"
         ),
         pytest.param(("bench", "--motion", "meet"), "needs --work", id="a motion of what times ticks"),
         pytest.param(("bench", "--work", "--ticks", "200"), "--ticks", id="ticks of motions that have a length"),
-        pytest.param(("bench", "--ros", "--ticks", "200"), "--ticks", id="ticks of what is timed by messages"),
-        pytest.param(("bench", "--duration", "5"), "need --ros", id="a duration of what counts ticks"),
-        pytest.param(("bench", "--ros", "--rate", "5000"), "--rate", id="a rate that the node does not take"),
+        pytest.param(("soak", "--ticks", "0"), "--ticks", id="a soak of nothing"),
     ],
 )
 def test_bad_usage_ends_in_exit_code_2_and_one_line_that_names_it(arguments: tuple[str, ...], named: str) -> None:
@@ -480,13 +475,13 @@ def test_bench_measures_the_work_motions_that_are_asked_for() -> None:
 
 
 def test_a_soak_prints_every_promise_and_ends_in_0_when_all_were_kept() -> None:
-    result = q2r2("bench", "--soak", "--ticks", "400", "--seed", "1", "--json")
+    result = q2r2("soak", "--ticks", "400", "--seed", "1", "--json")
     report = one_object(result.stdout)
     assert report["passed"]
     assert result.exit_code == 0
     assert report["ticks"] == 400
     assert {margin["violations"] for margin in report["margins"]} == {0}
-    table = q2r2("bench", "--soak", "--ticks", "100").stdout
+    table = q2r2("soak", "--ticks", "100").stdout
     assert "acceleration / limit" in table
 
 
@@ -496,8 +491,8 @@ def test_a_soak_that_finds_something_ends_in_1(monkeypatch: pytest.MonkeyPatch) 
         report.margins[0].note(1.0, 7)
         return report
 
-    monkeypatch.setattr("q2r2_control.cli.bench.run_soak", broken)
-    result = q2r2("bench", "--soak", "--ticks", "100", "--json")
+    monkeypatch.setattr("q2r2_control.cli.soak.run_soak", broken)
+    result = q2r2("soak", "--ticks", "100", "--json")
     assert result.exit_code == 1
     assert not one_object(result.stdout)["passed"]
 

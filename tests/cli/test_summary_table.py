@@ -10,10 +10,10 @@ from rich.console import Console
 
 from q2r2_control import Pipeline, RunSummary
 from q2r2_control.cli.summary_table import recording_line, summary_table, task_line
+from q2r2_control.demo.assembly_tasks import TaskResult
 from q2r2_control.recording.recorder import RecordingSummary
 from q2r2_control.runtime.histogram import Percentiles
 from q2r2_control.types import Event
-from q2r2_control.verification.assembly_tasks import TaskResult
 from tests.support.hands_input import HandsInput
 from tests.support.watch import cell
 

@@ -9,8 +9,8 @@ import pytest
 
 from q2r2_control import CartesianController, Robot, load_config
 from q2r2_control.benchmark.motion_run import MotionFigures, own_controller, run_motion, without_pairs
+from q2r2_control.benchmark.work_motions import WORK_MOTIONS, WorkMotion
 from q2r2_control.verification.contract import Contract
-from q2r2_control.verification.work_motions import WORK_MOTIONS, WorkMotion
 
 pytestmark = pytest.mark.slow
 

@@ -9,7 +9,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from q2r2_control.benchmark.node_load import speed_ripple
+from q2r2_control.benchmark.motion_measures import speed_ripple
 from q2r2_control.supervision.target_extrapolator import TargetExtrapolator
 from q2r2_control.supervision.tick_clock import TickClock
 

@@ -1,0 +1,296 @@
+"""What does an operator feel of a filter: how late is the tool, what is left of tremor and noise, how does it stop?
+
+Nothing is taken from the settings: a hand moves in tones, reaches, trembles, rests, and moves and stops, and the tool
+is measured, through samples at a headset's rate, teleoperation, controller and an arm in MuJoCo. Delay and gain of a
+tone come from the least-squares fit of a sine and a cosine to the hand's way and to the tool's. Hands do not move in
+tones: the delay of reaches is that of the highest correlation of velocities, and of a tremor within a band everything
+counts that it does to the tool, in the band or not.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+import pinocchio as pin
+import typer
+
+from q2r2_control.cli.figure_table import record_table
+from q2r2_control.cli.options import DEMO_CONFIG, Json
+from q2r2_control.cli.output import print_progress, print_report
+from q2r2_control.config.cell import Config, load_config
+from q2r2_control.config.teleop import FilterSettings
+from q2r2_control.inputs.played import PlayedInput
+from q2r2_control.inputs.sampling import HeadsetSampling
+from q2r2_control.inputs.scripted import HANDS_AT_REST
+from q2r2_control.inputs.way_points import minimum_jerk
+from q2r2_control.judging.delay import Track, delays_behind
+from q2r2_control.pipeline.pipeline import Pipeline
+from q2r2_control.plants.mujoco import MujocoPlant
+from q2r2_control.robot.robot import Robot
+from q2r2_control.runtime.recorder import Tick
+from q2r2_control.types import Array, HandInputs
+
+Way = Callable[[float], float]  # of a hand along one axis [m], over time [s]
+
+# Filters to compare with the cell's own: one that lets little through, and one that is late by little.
+PRECISION = FilterSettings(smoothing_delay=0.06, min_cutoff=0.8, beta=3.0, rotation_beta=1.0)
+SPEED = FilterSettings(interpolation_delay=0.015, smoothing_delay=0.005, min_cutoff=5.0, beta=30.0, rotation_beta=10.0)
+OTHERS = {"precision": PRECISION, "speed": SPEED}
+
+SETTLES = 0.7  # of every tone and tremor, before it is measured [s]
+ARM, HAND = "left", "left"
+MOTIONS = ((0.5, 0.06), (1.0, 0.04), (2.0, 0.02))  # of a hand that means it [Hz], [m]
+TREMORS = (8.0, 10.0, 12.0)  # [Hz]
+TREMOR = 0.5e-3  # amplitude [m]
+SLOWLY = 0.03  # of a hand that moves and trembles [m/s]
+NOISE = 2e-4  # of the sensor, standard deviation along each axis [m]
+STOP_SPEED, STOP_TIME = 0.3, 0.1  # of a hand that moves on and stops [m/s], and from that speed to rest [s]
+# Reaches, to and fro, each followed by a rest: peaks of 0.16 to 0.63 m/s, which the arm can follow sidewards [m], [s].
+REACHES, REACH_RESTS = ((0.1, 0.6), (0.1, 1.2), (0.2, 0.8), (0.3, 1.0), (0.4, 1.2)), 0.3
+BAND, BAND_RMS = (8.0, 12.0), 1e-3  # of a tremor [Hz], [m]
+_BAND_PERIOD, _BAND_SEED = 4.0, 0  # [s]
+_PRESSED, _BEGINS = (0.2, 0.35), 0.8  # [s]
+_MEASURED = 2.0  # of every tone [s]
+_RESTS, _CRUISES = 3.0, 0.4  # [s]
+_SIDEWARDS, _UP = 1, 2  # axes
+_A_TICK = 0.05  # the longest that there is [s]
+NOTES = (
+    "all from the hand to the measured tool, from samples at 72 to 76 Hz to an arm in MuJoCo, position mode",
+    "filter delay: as its settings say; delays and gains: of a hand that moves at "
+    + ", ".join(f"{frequency:g} Hz, {1e3 * amplitude:g} mm" for frequency, amplitude in MOTIONS),
+    f"tremors of {TREMORS} Hz: {1e3 * TREMOR:g} mm, of a hand at {1e3 * SLOWLY:g} mm/s",
+    "reaches: 0.1 to 0.4 m in 0.6 to 1.2 s of least jerk, by correlation of velocities",
+    f"band: tremor of {BAND[0]:g} to {BAND[1]:g} Hz, {1e3 * BAND_RMS:g} mm RMS, flat; all that it does to the tool",
+    f"noise: RMS of the tool, for {1e6 * NOISE:g} um a sample",
+    f"stop: of a hand at {STOP_SPEED:g} m/s that stops in {STOP_TIME:g} s, until the tool is within 2 mm of its rest",
+)
+
+
+@dataclass(frozen=True, slots=True)
+class FeelFigures:
+    """One filter; delays are from the hand to the measured tool."""
+
+    name: str
+    filter_delay_ms: float  # as the settings say, of the filter alone
+    delays_ms: tuple[float, ...]  # of each of :data:`MOTIONS`
+    gains_db: tuple[float, ...]  # of the same
+    tremors_db: tuple[float, ...]  # of a hand that trembles at :data:`TREMORS` while it moves at :data:`SLOWLY`
+    tremor_at_rest_db: float  # of the middle one, of a hand that rests otherwise
+    reach_delay_ms: float  # over all of :data:`REACHES`
+    worst_reach_delay_ms: float  # of the one that is latest; nan, as of all: the tool does not follow
+    band_db: float  # of a tremor in :data:`BAND`, of a hand that moves at :data:`SLOWLY`
+    band_at_rest_db: float  # of the same, of a hand that rests otherwise
+    noise_um: float  # RMS of the tool in the worst axis, of a hand that rests
+    stop_delay_ms: float  # from the hand's rest to the tool within 2 mm of its own for good
+    overshoot_mm: float  # of the tool, beyond where it comes to rest
+
+
+def run_feel(config: Config) -> list[FeelFigures]:
+    """Measure the cell's filter and :data:`OTHERS`."""
+    filters = {"this cell": config.teleop.filter} | OTHERS
+    plain = config.model_copy(update={"mujoco": config.mujoco.model_copy(update={"objects": {}})})
+    robot = Robot.from_config(plain)
+    plant = MujocoPlant(robot, plain)
+    figures = []
+    for name, settings in filters.items():
+        print_progress(name)
+        figures.append(_measure(name, plain, robot, plant, settings))
+    return figures
+
+
+def _measure(name: str, config: Config, robot: Robot, plant: MujocoPlant, settings: FilterSettings) -> FeelFigures:
+    teleop = config.teleop.model_copy(update={"filter": settings})
+    config = config.model_copy(update={"teleop": teleop})
+
+    def run(way: Way, lasts: float, noise: float = 0.0, axis: int = _UP) -> _Log:
+        log = _Log(way, noise, axis)
+        pipeline = Pipeline(config, robot, log.hands, plant)
+        pipeline.listeners.append(log.take)
+        pipeline.run(_BEGINS + lasts, realtime=False)
+        if not log.reaches(lasts):
+            raise KeyboardInterrupt  # a signal has ended the run early: what is left of it says nothing
+        return log
+
+    def band(speed: float) -> float:
+        trembling = tremor(BAND, BAND_RMS, _BAND_PERIOD, _BAND_SEED, speed)
+        return run(trembling, SETTLES + _BAND_PERIOD, axis=_SIDEWARDS).attenuation(_BAND_PERIOD)
+
+    lasts = SETTLES + _MEASURED
+    motions = [run(tone(*motion), lasts).tone(motion[0]) for motion in MOTIONS]
+    tremors = [run(tone(each, TREMOR, SLOWLY), lasts).tone(each)[1] for each in TREMORS]
+    at_rest = TREMORS[len(TREMORS) // 2]
+    ends = np.cumsum([0.0, *(2.0 * (time + REACH_RESTS) for _, time in REACHES)])
+    reached = run(reaches(REACHES, REACH_RESTS), ends[-1], axis=_SIDEWARDS)
+    noise = run(lambda t: 0.0, _RESTS, NOISE).noise()
+    stop_delay, overshoot = run(stop(STOP_SPEED, STOP_TIME, _CRUISES), _CRUISES + STOP_TIME + 1.5).stop()
+    return FeelFigures(
+        name=name,
+        filter_delay_ms=1e3 * (settings.interpolation_delay + settings.smoothing_delay),
+        delays_ms=tuple(1e3 * delay for delay, _ in motions),
+        gains_db=tuple(gain for _, gain in motions),
+        tremors_db=tuple(tremors),
+        tremor_at_rest_db=run(tone(at_rest, TREMOR), lasts).tone(at_rest)[1],
+        reach_delay_ms=1e3 * reached.delay(0.0, ends[-1]),
+        worst_reach_delay_ms=1e3 * float(np.max([reached.delay(*times) for times in pairwise(ends)])),
+        band_db=band(SLOWLY),
+        band_at_rest_db=band(0.0),
+        noise_um=1e6 * noise,
+        stop_delay_ms=1e3 * stop_delay,
+        overshoot_mm=1e3 * overshoot,
+    )
+
+
+class _Log:
+    """A run in which one hand goes a way along an axis, sampled at a headset's rate, and what the tool does."""
+
+    def __init__(self, way: Way, noise: float, axis: int) -> None:
+        self._way, self._axis = way, axis
+        samplings = {hand: HeadsetSampling(hand, 0, position_noise=noise) for hand in HANDS_AT_REST}
+        self.hands = PlayedInput(self._pose, _buttons, samplings)
+        self._t: list[float] = []
+        self._tool: list[Array] = []
+        self._asked: list[float] = []
+
+    def take(self, tick: Tick) -> None:
+        """Keep a tick's hand and tool."""
+        way = self.hands.hand_pose(HAND, tick.now).translation - HANDS_AT_REST[HAND].translation
+        self._t.append(tick.t - _BEGINS)
+        self._asked.append(float(way[self._axis]))
+        self._tool.append(tick.tools[ARM].translation.copy())
+
+    def reaches(self, lasts: float) -> bool:
+        """Whether it was run for so long [s]."""
+        return bool(self._t) and self._t[-1] > lasts - _A_TICK
+
+    def tone(self, frequency: float) -> tuple[float, float]:
+        """Delay [s] and gain [dB] of a tone."""
+        t, asked, tool = self._from(SETTLES)
+        basis = np.stack((np.sin(2 * np.pi * frequency * t), np.cos(2 * np.pi * frequency * t), np.ones_like(t), t), 1)
+        (hand_sin, hand_cos, *_), (tool_sin, tool_cos, *_) = (
+            np.linalg.lstsq(basis, way, rcond=None)[0] for way in (asked, tool)
+        )
+        turn = complex(hand_sin, hand_cos) / complex(tool_sin, tool_cos)
+        delay = (math.atan2(turn.imag, turn.real) % (2.0 * math.pi)) / (2.0 * math.pi * frequency)
+        return delay, -20.0 * math.log10(abs(turn))
+
+    def noise(self) -> float:
+        """RMS about the mean, of the worst axis [m]."""
+        chosen = np.array(self._t) >= 1.0
+        return float(np.array(self._tool)[chosen].std(axis=0).max())
+
+    def delay(self, begin: float, end: float) -> float:
+        """Of what the hand does between these times [s]."""
+        t, asked, tool = self._from(-math.inf)
+        hand, follower = (Track(t, way[:, None]) for way in (asked, tool))
+        (found,) = delays_behind(hand, [follower], t[(t >= begin) & (t < end)])
+        return math.nan if found is None else found
+
+    def attenuation(self, period: float) -> float:
+        """RMS of all that the tool does over a ``period`` [s] but to move steadily, to that of the hand [dB]."""
+        t, asked, tool = self._from(SETTLES)
+        within = t < SETTLES + period
+        line = np.stack((np.ones_like(t), t), 1)[within]
+        asked_rms, tool_rms = (
+            math.sqrt(np.mean((way - line @ np.linalg.lstsq(line, way, rcond=None)[0]) ** 2))
+            for way in (asked[within], tool[within])
+        )
+        return 20.0 * math.log10(tool_rms / asked_rms)
+
+    def stop(self) -> tuple[float, float]:
+        """When the tool is within 2 mm of its rest for good, after the hand's [s], and how far it went beyond [m]."""
+        t, _, tool = self._from(0.0)
+        ahead = tool - tool[-1]
+        late = t[np.abs(ahead) > 2e-3]
+        return float(late[-1]) - (_CRUISES + STOP_TIME), max(float(ahead.max()), 0.0)
+
+    def _from(self, begin: float) -> tuple[Array, Array, Array]:
+        """Times, and the ways of hand and tool along the axis, each (n,)."""
+        t = np.array(self._t)
+        chosen = t >= begin
+        return t[chosen], np.array(self._asked)[chosen], np.array(self._tool)[chosen, self._axis]
+
+    def _pose(self, hand: str, t: float) -> pin.SE3:
+        home = HANDS_AT_REST[hand]
+        way = self._way(t - _BEGINS) if hand == HAND and t >= _BEGINS else 0.0
+        return pin.SE3(home.rotation, home.translation + way * np.eye(3)[self._axis])
+
+
+def _buttons(hand: str, t: float) -> HandInputs:
+    return HandInputs(button_lower=_PRESSED[0] <= t < _PRESSED[1])
+
+
+def tone(frequency: float, amplitude: float, speed: float = 0.0) -> Way:
+    """A sine [Hz], [m] that grows within the first half of :data:`SETTLES`, on top of a steady motion [m/s]."""
+
+    def way(t: float) -> float:
+        return amplitude * _grown(t) * math.sin(2.0 * math.pi * frequency * t) + speed * t
+
+    return way
+
+
+def tremor(band: tuple[float, float], rms: float, period: float, seed: int, speed: float = 0.0) -> Way:
+    """Noise that is flat within ``band`` [Hz], nothing outside, with this ``rms`` [m], on top of a steady motion [m/s].
+
+    It repeats after ``period`` [s], over which its RMS is exact: the sum of all tones of the band that do, equally
+    large, with phases drawn from ``seed``.
+    """
+    low, high = (round(frequency * period) for frequency in band)
+    turns = 2.0 * math.pi * np.arange(low, high + 1) / period
+    phases = np.random.default_rng(seed).uniform(0.0, 2.0 * math.pi, len(turns))
+    amplitude = rms * math.sqrt(2.0 / len(turns))
+
+    def way(t: float) -> float:
+        return amplitude * _grown(t) * float(np.sin(turns * t + phases).sum()) + speed * t
+
+    return way
+
+
+def stop(speed: float, ramp: float, cruises: float) -> Way:
+    """Speeds up within ``ramp`` [s], goes on until ``cruises`` [s], and stops within ``ramp``."""
+
+    def way(t: float) -> float:
+        up = min(max(t, 0.0), ramp)
+        along = min(max(t - ramp, 0.0), cruises - ramp)
+        down = min(max(t - cruises, 0.0), ramp)
+        return speed * (0.5 * up * up / ramp + along + down - 0.5 * down * down / ramp)
+
+    return way
+
+
+def reaches(lengths_and_times: Sequence[tuple[float, float]], rest: float) -> Way:
+    """Reaches of least jerk (Flash and Hogan 1985) of these lengths [m] and times [s], each to and fro.
+
+    Each is followed by a ``rest`` [s].
+    """
+
+    def way(t: float) -> float:
+        for length, time in lengths_and_times:
+            for to in (True, False):
+                if t < time + rest:
+                    done = minimum_jerk(min(max(t / time, 0.0), 1.0))
+                    return length * (done if to else 1.0 - done)
+                t -= time + rest
+        return 0.0
+
+    return way
+
+
+def _grown(t: float) -> float:
+    share = min(max(t, 0.0) / (0.5 * SETTLES), 1.0)
+    return math.sin(0.5 * math.pi * share) ** 2
+
+
+def main(json: Json = False) -> None:
+    """Print what an operator feels of the cell's filter, of one for precision and of one for speed."""
+    config = load_config(DEMO_CONFIG)
+    figures = run_feel(config)
+    table = record_table(f"{config.name}: what an operator feels of a filter", figures, NOTES)
+    print_report({"cell": config.name, "filters": figures}, (table,), json)
+
+
+if __name__ == "__main__":
+    typer.run(main)

@@ -1,0 +1,118 @@
+"""Do the arms come to rest at constant targets that they cannot reach or get in each other's way at, and how smoothly?
+
+Each tool is asked for a place drawn at random, near where both work or on the other arm's side, until the end. Most of
+these cannot be reached with every distance kept: the arms slide along each other, for seconds, until they rest.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+import pinocchio as pin
+import typer
+
+from q2r2_control.benchmark.motion_measures import JOLT, count_jolts, rest_acceleration
+from q2r2_control.benchmark.motion_run import own_controller
+from q2r2_control.benchmark.timed_run import Poses
+from q2r2_control.cli.figure_table import record_table
+from q2r2_control.cli.options import DEMO_CONFIG, Json
+from q2r2_control.cli.output import print_progress, print_report
+from q2r2_control.config.cell import Config, load_config
+from q2r2_control.robot.robot import Robot
+from q2r2_control.types import Array
+
+RUNS = 50  # of each kind
+DURATION = 30.0  # [s]
+DT = 0.001  # [s]
+AT_REST = 0.1  # RMS of the acceleration over the last 0.5 s, norm over the joints [rad/s^2]
+STARTED = 2.0  # when a slide has begun, and what the targets' jump did is over [s]
+NOTES = (
+    f"targets stay where they are for {DURATION:g} s; most cannot be reached with every distance kept",
+    f"at rest: acceleration, norm over the joints, RMS over the last 0.5 s, below {AT_REST:g} rad/s^2",
+    f"jolts: ticks of a run after {STARTED:g} s in which a joint's acceleration changes by more than {JOLT:g} rad/s^2",
+    "fallback ticks: in which the certified stop was executed, in all runs",
+)
+
+# From the middle between both tools at home, for the left tool; of the right one the second is the other way [m].
+KINDS: dict[str, tuple[Array, Array]] = {
+    "anywhere": (np.array([-0.25, -0.35, -0.3]), np.array([0.25, 0.35, 0.3])),
+    "other side": (np.array([-0.2, -0.35, -0.15]), np.array([0.2, 0.0, 0.3])),
+}
+_TURN = 0.4  # standard deviation of each component of the rotation from home [rad]
+
+
+@dataclass(frozen=True, slots=True)
+class RestFigures:
+    """All runs of one kind."""
+
+    kind: str
+    runs: int
+    at_rest: int  # of these, at the end
+    median_acceleration: float  # RMS over the last 0.5 s, norm over the joints [rad/s^2]
+    worst_acceleration: float
+    jolts: float  # ticks from STARTED on in which a joint's acceleration changes by more than JOLT, in a run
+    most_jolts: int
+    fallback_ticks: int  # of all runs
+
+
+def run_rest(config: Config, seed: int, runs: int = RUNS) -> list[RestFigures]:
+    """Ask for ``runs`` pairs of targets of each kind; the same ones for the same ``seed``."""
+    robot = Robot.from_config(config)
+    controller = own_controller(robot, config)
+    figures = []
+    for number, kind in enumerate(KINDS):
+        random = np.random.default_rng((seed, number))
+        print_progress(f"{kind}: {runs} pairs of targets, {DURATION:g} s each")
+        rest, jolts, fallbacks = np.empty(runs), np.empty(runs, dtype=np.int64), 0
+        for run in range(runs):
+            v = np.empty((round(DURATION / DT), robot.model.nv))
+            targets = draw_targets(robot, kind, random)
+            controller.reset(robot.home)
+            for tick in range(len(v)):
+                v[tick] = controller.step(targets, DT)[1]
+            rest[run], jolts[run] = rest_acceleration(v, DT), count_jolts(v, DT, STARTED)
+            fallbacks += controller.fallbacks
+        figures.append(
+            RestFigures(
+                kind=kind,
+                runs=runs,
+                at_rest=int((rest < AT_REST).sum()),
+                median_acceleration=float(np.median(rest)),
+                worst_acceleration=float(rest.max()),
+                jolts=float(jolts.mean()),
+                most_jolts=int(jolts.max()),
+                fallback_ticks=fallbacks,
+            )
+        )
+    return figures
+
+
+def draw_targets(robot: Robot, kind: str, random: np.random.Generator) -> Poses:
+    """A pose for each tool, turned a little from how it is at home."""
+    home = {arm: robot.tool_pose(robot.home, arm) for arm in robot.arms}
+    middle = np.mean([pose.translation for pose in home.values()], axis=0)
+    targets = {}
+    for arm, pose in home.items():
+        place = random.uniform(*KINDS[kind])
+        if arm != "left":
+            place[1] *= -1.0
+        targets[arm] = pin.SE3(pin.exp3(_TURN * random.normal(size=3)) @ pose.rotation, middle + place)
+    return targets
+
+
+def main(
+    seed: Annotated[int, typer.Option(min=0, help="Of the targets.")] = 0,
+    runs: Annotated[int, typer.Option(min=1, help="Of each kind of targets.")] = RUNS,
+    json: Json = False,
+) -> None:
+    """Ask for constant targets drawn at random, and print how quiet the arms are at the end."""
+    config = load_config(DEMO_CONFIG)
+    figures = run_rest(config, seed, runs)
+    table = record_table(f"{config.name}: constant targets, seed {seed}", figures, NOTES)
+    print_report({"cell": config.name, "seed": seed, "kinds": figures}, (table,), json)
+
+
+if __name__ == "__main__":
+    typer.run(main)

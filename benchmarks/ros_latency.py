@@ -1,0 +1,271 @@
+"""How long does it take from a message on an input topic to the joint command that answers it, through real nodes?
+
+Runs real processes on this machine, in a ROS domain that nothing else uses: the simulated robot, the controller, and
+one arm's teleoperation. The input steps up and down by millimetres at random times; the command that answers a step is
+the first after it with an acceleration that only a step causes.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import numpy as np
+import rclpy
+import typer
+from geometry_msgs.msg import PoseStamped
+from quest2ros.msg import OVR2ROSInputs
+from rclpy.executors import SingleThreadedExecutor
+from trajectory_msgs.msg import JointTrajectory
+
+from q2r2_control.cli.figure_table import figure_table
+from q2r2_control.cli.options import DEMO_CONFIG, Json
+from q2r2_control.cli.output import print_progress, print_report
+from q2r2_control.config.cell import load_config
+from q2r2_control.errors import Q2R2Error
+from q2r2_control.robot.robot import Robot
+from q2r2_control.ros.base_node import COMMAND_QOS, STREAM_QOS
+from q2r2_control.ros.launch.processes import NodeProcess
+from q2r2_control.types import Array
+from ros_processes import private_domain, started
+
+_START_TIMEOUT = 300.0  # kernels may have to be compiled [s]
+_STEP = 0.002  # [m]
+_PAUSES = 0.07, 0.11  # between two steps; shorter than any timeout of a stream [s]
+_PRESS, _CHORD = 0.3, 0.3  # the lower button is held, and what follows its release [s]
+# The shortest delays that the hand's filters allow, so that mostly the nodes are measured.
+_SHORTEST_FILTER = {"interpolation_delay": 0.005, "smoothing_delay": 0.0, "min_cutoff": 100.0, "beta": 1000.0}
+
+
+# Share of the acceleration limit that marks an answer: a step asks for all of it, the one before for a tenth by then.
+_ANSWER_SHARE = 0.4
+
+
+@dataclass(frozen=True, slots=True)
+class CommandRecording:
+    """Steps of one input and the joint commands meanwhile; times of one clock [s], ascending."""
+
+    steps: Sequence[float]  # when each step was published
+    sent: Sequence[float]  # when each command was published, by the middleware's stamps
+    received: Sequence[float]  # and received
+    v: Array  # (n, nv) of the commands [rad/s]
+
+
+@dataclass(frozen=True, slots=True)
+class LatencyRow:
+    """Latencies of one input, from the step until the command was received."""
+
+    path: str  # from which topic to which
+    steps: int
+    missed: int  # not answered before the next step
+    p50_ms: float | None  # None without any answer
+    p99_ms: float | None
+    max_ms: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class LatencyReport:
+    """What was measured."""
+
+    loop_rate_hz: float  # of the controller, as configured
+    transport_p50_ms: float  # of a joint command between two processes, contained in all rows
+    transport_p99_ms: float
+    rows: tuple[LatencyRow, ...]
+
+
+class LatencyError(Q2R2Error):
+    """A node did not start in time; the message says what was waited for."""
+
+
+def measure_latency(config: str, duration: float, rate: float) -> LatencyReport:
+    """Measure for ``duration`` [s] each way, with the controller at ``rate`` [Hz]. Raises :class:`LatencyError`."""
+    cell = load_config(config)
+    limit = Robot.from_config(cell).capped_acceleration(cell.control.acceleration_limit)
+    filters = {f"teleop.filter.{name}": value for name, value in _SHORTEST_FILTER.items()}
+    nodes = [
+        NodeProcess("mujoco_robot", "q2r2_control.ros.nodes.mujoco_robot", {"config": config}),
+        NodeProcess(
+            "cartesian_controller",
+            "q2r2_control.ros.nodes.cartesian_controller",
+            {"config": config, "rate": float(rate)},
+        ),
+    ]
+    arm = NodeProcess("left_arm_controller", "q2r2_control.ros.nodes.left_arm_controller", filters)
+    with private_domain(), started(nodes), _Probe() as probe:
+        print_progress("waiting for the controller")
+        probe.wait_for_tool()
+        print_progress(f"target topic to joint command: {duration:g} s")
+        target = probe.step_targets(duration)
+        with started([arm]):
+            print_progress("waiting for the arm's teleoperation")
+            probe.engage_hand()
+            print_progress(f"hand topic to joint command: {duration:g} s")
+            hand = probe.step_hand(duration)
+    return latency_report(rate, limit, {"target to joint command": target, "hand to joint command": hand})
+
+
+class _Probe:
+    """Publishes steps and records commands. Their times are the middleware's, so a late callback changes none."""
+
+    def __init__(self) -> None:
+        self._context = rclpy.Context()
+        rclpy.init(context=self._context)
+        self._node = rclpy.create_node("latency_probe", context=self._context)
+        self._commands: list[tuple[float, float, list[float]]] = []
+        self._tool: PoseStamped | None = None
+        listen: Any = self._on_command  # rclpy's types know callbacks without the message's stamps only
+        self._node.create_subscription(JointTrajectory, "/joint_trajectory", listen, 1000)
+        self._node.create_subscription(PoseStamped, "/cartesian_controller/safe_target/left", self._on_tool, 1)
+        self._target = self._node.create_publisher(PoseStamped, "/q2r2/left/target_frame", COMMAND_QOS)
+        self._hand = self._node.create_publisher(PoseStamped, "/q2r_left_hand_pose", STREAM_QOS)
+        self._inputs = self._node.create_publisher(OVR2ROSInputs, "/q2r_left_hand_inputs", STREAM_QOS)
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self._node)
+
+    def __enter__(self) -> _Probe:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._executor.shutdown()
+        self._node.destroy_node()
+        self._context.try_shutdown()
+
+    def wait_for_tool(self) -> None:
+        """Wait until the controller is active, has published the tool's pose, and subscribes to targets."""
+        self._wait(lambda: self._tool is not None and self._commands, "cartesian_controller's commands")
+        self._wait(lambda: self._target.get_subscription_count() > 0, "cartesian_controller's subscription")
+
+    def step_targets(self, duration: float) -> CommandRecording:
+        """Step the target up and down at the tool."""
+        assert self._tool is not None
+        recording = self._step(self._target, self._tool, duration, lambda: None)
+        self._node.destroy_publisher(self._target)  # the next one is the arm controller's
+        return recording
+
+    def engage_hand(self) -> None:
+        """Press the lower button until the arm's node publishes targets, and goes on.
+
+        A press that is answered late may meet the next one, which pauses the arm again: so what follows is asked after
+        the buttons rest, and not of what came while they were pressed.
+        """
+        targets: list[PoseStamped] = []
+        subscription = self._node.create_subscription(PoseStamped, "/q2r2/left/target_frame", targets.append, 1)
+        deadline = time.monotonic() + _START_TIMEOUT
+        while not targets:
+            if time.monotonic() > deadline:
+                raise LatencyError(f"left_arm_controller was not engaged within {_START_TIMEOUT:g} s")
+            for pressed, period in ((True, _PRESS), (False, _CHORD)):
+                self._send_hand(pressed, period)
+            targets.clear()
+            self._send_hand(False, _CHORD)
+        self._node.destroy_subscription(subscription)
+
+    def step_hand(self, duration: float) -> CommandRecording:
+        """Step the hand's pose."""
+        return self._step(self._hand, _pose(), duration, lambda: self._inputs.publish(OVR2ROSInputs()))
+
+    def _step(
+        self, publisher: Any, begin: PoseStamped, duration: float, beside: Callable[[], None]
+    ) -> CommandRecording:
+        random, message = np.random.default_rng(0), begin
+        height = message.pose.position.z
+        self._commands.clear()
+        steps: list[float] = []
+        end = time.monotonic() + duration
+        while time.monotonic() < end:
+            beside()
+            message.pose.position.z = height + _STEP * (len(steps) % 2)
+            steps.append(time.time())  # the clock of the middleware's stamps
+            publisher.publish(message)
+            self._spin(random.uniform(*_PAUSES))
+        if not self._commands:
+            raise LatencyError(f"no joint command came within {duration:g} s")
+        sent, received, v = (list(column) for column in zip(*self._commands, strict=True))
+        return CommandRecording(steps, sent, received, np.array(v))
+
+    def _send_hand(self, pressed: bool, period: float) -> None:
+        end = time.monotonic() + period
+        while time.monotonic() < end:
+            self._hand.publish(_pose())
+            self._inputs.publish(OVR2ROSInputs(button_lower=pressed))
+            self._spin(0.02)
+
+    def _wait(self, condition: Callable[[], object], what: str) -> None:
+        deadline = time.monotonic() + _START_TIMEOUT
+        while not condition():
+            if time.monotonic() > deadline:
+                raise LatencyError(f"waited {_START_TIMEOUT:g} s for {what}")
+            self._spin(0.05)
+
+    def _spin(self, period: float) -> None:
+        end = time.monotonic() + period
+        while (left := end - time.monotonic()) > 0.0:
+            self._executor.spin_once(left)
+
+    def _on_command(self, message: JointTrajectory, info: dict[str, int]) -> None:
+        stamps = (1e-9 * info["source_timestamp"], 1e-9 * info["received_timestamp"])
+        self._commands.append((*stamps, list(message.points[0].velocities)))
+
+    def _on_tool(self, message: PoseStamped) -> None:
+        self._tool = message
+
+
+def _pose() -> PoseStamped:
+    message = PoseStamped()
+    message.pose.orientation.w = 1.0
+    return message
+
+
+def latency_report(rate: float, acceleration_limit: Array, recordings: Mapping[str, CommandRecording]) -> LatencyReport:
+    """Latencies by path, of a controller at ``rate`` [Hz] with ``acceleration_limit`` (nv,) [rad/s^2]."""
+    transport = 1e3 * np.concatenate(
+        [np.subtract(recording.received, recording.sent) for recording in recordings.values()]
+    )
+    median, tail = np.percentile(transport, [50.0, 99.0]).tolist()
+    return LatencyReport(
+        rate, median, tail, tuple(_row(path, recording, acceleration_limit) for path, recording in recordings.items())
+    )
+
+
+def _row(path: str, recording: CommandRecording, acceleration_limit: Array) -> LatencyRow:
+    """Find the first command after each step with an acceleration that only a step causes."""
+    times = np.asarray(recording.sent)
+    # Ticks may be early or late, so changes of velocity are divided by dt; half the usual dt is the least that counts.
+    dt = np.diff(times)
+    change = np.abs(np.diff(recording.v, axis=0) / acceleration_limit).max(axis=1)
+    answering = np.concatenate([[False], change > _ANSWER_SHARE * np.maximum(dt, 0.5 * np.median(dt))])
+    latencies = []
+    # The last step is left out: the recording ends before its answer.
+    for step, following in zip(recording.steps[:-1], recording.steps[1:], strict=True):
+        first, last = np.searchsorted(times, [step, following])
+        if len(found := np.flatnonzero(answering[first:last])):
+            latencies.append(1e3 * (recording.received[first + found[0]] - step))
+    counted = len(recording.steps) - 1
+    percentiles = np.percentile(latencies, [50.0, 99.0, 100.0]).tolist() if latencies else (None, None, None)
+    return LatencyRow(path, counted, counted - len(latencies), *percentiles)
+
+
+def main(
+    duration: Annotated[float, typer.Option(min=1, max=3600, help="Of each input [s].")] = 30.0,
+    rate: Annotated[float, typer.Option(min=20, max=1000, help="Of the controller's node [Hz].")] = 250.0,
+    json: Json = False,
+) -> None:
+    """Print latencies from an input topic to the joint command that answers it."""
+    report = measure_latency(DEMO_CONFIG, duration, rate)
+    table = figure_table(
+        f"from an input topic to the joint command that answers it, controller at {rate:g} Hz",
+        ("path", "p50 [ms]", "p99 [ms]", "max [ms]", "steps", "missed"),
+        ((row.path, row.p50_ms, row.p99_ms, row.max_ms, row.steps, row.missed) for row in report.rows),
+        (
+            f"one joint command between two processes: p50 {report.transport_p50_ms:.2f} ms, "
+            f"p99 {report.transport_p99_ms:.2f} ms",
+            "the hand's latency includes an interpolation of 5 ms, the shortest; its filters are off",
+        ),
+    )
+    print_report(report, (table,), json)
+
+
+if __name__ == "__main__":
+    typer.run(main)

@@ -1,0 +1,267 @@
+"""How long does it take from a press until the arm moves, the first time after the nodes are ready and later?
+
+The set is started anew for each first press. The hand goes round a circle all the time, so that an arm that is engaged
+moves at once. A tick of the arm's node ends with its flags, which it publishes for whoever records it.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import numpy as np
+import rclpy
+import typer
+from geometry_msgs.msg import PoseStamped
+from quest2ros.msg import OVR2ROSInputs
+from rclpy.executors import SingleThreadedExecutor
+from std_msgs.msg import Float64MultiArray, String
+from trajectory_msgs.msg import JointTrajectory
+
+from q2r2_control.cli.figure_table import record_table
+from q2r2_control.cli.options import DEMO_CONFIG, Json
+from q2r2_control.cli.output import print_progress, print_report
+from q2r2_control.errors import Q2R2Error
+from q2r2_control.recording.ros_topics import ARM_FIELDS, arm_flags, asked_target
+from q2r2_control.ros.base_node import RECORDED_QOS, STREAM_QOS
+from q2r2_control.ros.launch.processes import nodes_of
+from q2r2_control.types import Array
+from ros_processes import private_domain, started
+
+_LATER = 4  # presses that engage after the first one, at each start
+_TIMEOUT = 300.0  # kernels may have to be compiled [s]
+_HELD = 0.3  # the lower button, and as long after its release: together longer than WATCHED [s]
+_STILL, _REST = 0.005, 0.5  # joints rest when all commands were slower for so long [rad/s], [s]
+_SAMPLE = 1.0 / 75.0  # from one sample of the hand to the next [s]
+_RADIUS, _TURN = 0.03, 2.0  # of the hand's circle [m], [s]
+
+
+WATCHED = 0.5  # after a press [s]
+_MOVES = 0.02  # a joint command that is faster belongs to a motion [rad/s]
+
+
+@dataclass(frozen=True, slots=True)
+class PressRecording:
+    """What followed one press that was to engage an arm at rest; times of one clock [s], ascending."""
+
+    press: float  # when it was published
+    ticks: Sequence[float]  # of the arm's node, when each had ended; some from before the press
+    targets: Sequence[float]  # when each target was published
+    commands: Sequence[float]  # when each joint command was published
+    speeds: Sequence[float]  # of each of these, the fastest joint's [rad/s]
+
+
+@dataclass(frozen=True, slots=True)
+class PressRow:
+    """Presses of one kind. Medians and maxima, in ms from the press; None where none was answered."""
+
+    press: str  # which
+    count: int
+    unanswered: int  # within half a second
+    tick_p50_ms: float | None  # the longest time from one tick of the arm's node to the next, in that half second
+    tick_max_ms: float | None
+    target_p50_ms: float | None  # until the first target
+    target_max_ms: float | None
+    motion_p50_ms: float | None  # until the first joint command that moves
+    motion_max_ms: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class PressReport:
+    """What was measured of presses."""
+
+    starts: int  # of the set of nodes, with one first press each
+    period_ms: float  # from one tick of the arm's node to the next, as a rule
+    rows: tuple[PressRow, ...]
+
+
+class PressError(Q2R2Error):
+    """The nodes did not become ready in time; the message says what was waited for."""
+
+
+def measure_presses(config: str, starts: int) -> PressReport:
+    """Press for the first time and four times more, at each of ``starts`` of the set. Raises :class:`PressError`."""
+    runs = []
+    for number in range(starts):
+        with private_domain(), _Hand() as hand, started(nodes_of(config, "none")):
+            print_progress(f"presses: waiting for the nodes, {number + 1} of {starts}")
+            hand.wait_until_ready()
+            run = [hand.press_to_engage()]
+            for _ in range(_LATER):
+                hand.pause()
+                run.append(hand.press_to_engage())
+            runs.append(run)
+    return press_report(runs)
+
+
+class _Hand:
+    """The left hand, and what its arm's node and the controller answer; times are the middleware's, at the sender."""
+
+    def __init__(self) -> None:
+        self._state: dict[str, Any] = {}
+        self._engaged = self._pressed = False
+        self._ticks: list[float] = []
+        self._targets: list[float] = []
+        self._commands: list[float] = []
+        self._speeds: list[float] = []
+        self._moved = math.inf  # when a command moved a joint last [s] of steady time
+        self._context = rclpy.Context()
+        rclpy.init(context=self._context)
+        self._node = rclpy.create_node("press_probe", context=self._context)
+        listen: Any = self._node.create_subscription  # rclpy's types know callbacks without the message's stamps only
+        listen(Float64MultiArray, arm_flags("left"), self._on_flags, RECORDED_QOS)
+        listen(PoseStamped, asked_target("left"), self._on_target, RECORDED_QOS)
+        listen(JointTrajectory, "/joint_trajectory", self._on_command, STREAM_QOS)
+        self._node.create_subscription(String, "/left_q2r2_arm_controller/state", self._on_state, 10)
+        self._pose = self._node.create_publisher(PoseStamped, "/q2r_left_hand_pose", STREAM_QOS)
+        self._inputs = self._node.create_publisher(OVR2ROSInputs, "/q2r_left_hand_inputs", STREAM_QOS)
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self._node)
+
+    def __enter__(self) -> _Hand:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._executor.shutdown()
+        self._node.destroy_node()
+        self._context.try_shutdown()
+
+    def wait_until_ready(self) -> None:
+        """Wait until the arm's node says that it can be engaged, and the arms rest."""
+        self._state = {}
+        self._moved = time.monotonic()
+
+        def ready() -> bool:
+            rests = time.monotonic() - self._moved > _REST
+            return bool(self._state.get("ready") and not self._engaged and self._ticks and self._commands and rests)
+
+        self._wait(ready, "left_arm_controller to be ready, which says: {message}")
+
+    def press_to_engage(self) -> PressRecording:
+        """Press, and record what follows for as long as is watched."""
+        for times in (self._ticks, self._targets, self._commands, self._speeds):
+            del times[:-1]
+        press = time.time()  # the clock of the middleware's stamps
+        self._press()
+        return PressRecording(
+            press, tuple(self._ticks), tuple(self._targets), tuple(self._commands), tuple(self._speeds)
+        )
+
+    def pause(self) -> None:
+        """Press once more where the arm is engaged, and wait until it can be engaged again."""
+        if self._engaged:
+            self._press()
+        self.wait_until_ready()
+
+    def _press(self) -> None:
+        self._pressed = True
+        self._move(_HELD)
+        self._pressed = False
+        self._move(_HELD)
+
+    def _wait(self, condition: Callable[[], bool], what: str) -> None:
+        deadline = time.monotonic() + _TIMEOUT
+        while not condition():
+            if time.monotonic() > deadline:
+                said = self._state.get("message", "nothing")
+                raise PressError(f"waited {_TIMEOUT:g} s for {what.format(message=said)}")
+            self._move(_SAMPLE)
+
+    def _move(self, period: float) -> None:
+        """Publish samples of the hand for ``period`` [s], and take what comes."""
+        end = time.monotonic() + period
+        while (now := time.monotonic()) < end:
+            self._inputs.publish(OVR2ROSInputs(button_lower=self._pressed))
+            self._pose.publish(_on_circle(now))
+            until = min(now + _SAMPLE, end)
+            while (left := until - time.monotonic()) > 0.0:
+                self._executor.spin_once(left)
+
+    def _on_flags(self, message: Float64MultiArray, info: dict[str, int]) -> None:
+        self._ticks.append(_sent(info))
+        self._engaged = message.data[ARM_FIELDS.index("engaged")] > 0.0
+
+    def _on_target(self, _: PoseStamped, info: dict[str, int]) -> None:
+        self._targets.append(_sent(info))
+
+    def _on_command(self, message: JointTrajectory, info: dict[str, int]) -> None:
+        self._commands.append(_sent(info))
+        self._speeds.append(max(abs(v) for v in message.points[0].velocities))
+        if self._speeds[-1] > _STILL:
+            self._moved = time.monotonic()
+
+    def _on_state(self, message: String) -> None:
+        self._state = json.loads(message.data)
+
+
+def _sent(info: dict[str, int]) -> float:
+    return 1e-9 * info["source_timestamp"]
+
+
+def _on_circle(now: float) -> PoseStamped:
+    """Where the hand is at ``now`` [s] of steady time."""
+    message = PoseStamped()
+    angle = 2.0 * math.pi * now / _TURN
+    message.pose.position.y, message.pose.position.z = _RADIUS * math.cos(angle), _RADIUS * math.sin(angle)
+    message.pose.orientation.w = 1.0
+    return message
+
+
+def press_report(runs: Sequence[Sequence[PressRecording]]) -> PressReport:
+    """Of runs of a set of nodes, each with the recordings of its presses in their order, at least one."""
+    gaps = np.concatenate([np.diff(recording.ticks) for run in runs for recording in run])
+    first, later = [run[0] for run in runs], [recording for run in runs for recording in run[1:]]
+    return PressReport(len(runs), 1e3 * float(np.median(gaps)), (_row("first", first), _row("later", later)))
+
+
+def _row(press: str, recordings: Sequence[PressRecording]) -> PressRow:
+    times = [_times(recording) for recording in recordings]
+    answered = np.array([time for time in times if time is not None]).reshape(-1, 3)
+    unanswered = len(times) - len(answered)
+    if not len(answered):
+        return PressRow(press, len(times), unanswered, *[None] * 6)
+    both = 1e3 * np.stack([np.median(answered, axis=0), answered.max(axis=0)], axis=1)
+    return PressRow(press, len(times), unanswered, *both.ravel().tolist())
+
+
+def _times(recording: PressRecording) -> tuple[float, float, float] | None:
+    """The longest tick, and from the press until the first target and the first motion [s]."""
+    press = recording.press
+    target = _first(np.asarray(recording.targets), press)
+    moving = np.asarray(recording.commands)[np.asarray(recording.speeds) > _MOVES]
+    motion = _first(moving, press)
+    if target is None or motion is None:
+        return None
+    ticks = np.asarray(recording.ticks)
+    # What the press may hold up begins at the tick before it.
+    begin, end = np.searchsorted(ticks, [press, press + WATCHED])
+    longest = float(np.diff(ticks[max(begin - 1, 0) : end + 1]).max(initial=0.0))
+    return longest, target, motion
+
+
+def _first(times: Array, press: float) -> float | None:
+    """How long after the press the first of ``times`` is, where that is watched yet [s]."""
+    after = times[(times >= press) & (times <= press + WATCHED)]
+    return float(after[0] - press) if len(after) else None
+
+
+def main(
+    starts: Annotated[int, typer.Option(min=1, help="Of the set of nodes, with one first press each.")] = 3,
+    json: Json = False,
+) -> None:
+    """Print what follows a press: the longest tick of the arm's node, the first target, the first motion."""
+    report = measure_presses(DEMO_CONFIG, starts)
+    notes = (
+        f"tick: the longest of the arm's node within {WATCHED:g} s of the press; usually {report.period_ms:.1f} ms",
+        "target, motion: from the press until the first target, and until the first joint command that moves",
+    )
+    table = record_table(f"from a press until the arm moves; starts of the nodes: {starts}", report.rows, notes)
+    print_report(report, (table,), json)
+
+
+if __name__ == "__main__":
+    typer.run(main)

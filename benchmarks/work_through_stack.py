@@ -1,0 +1,236 @@
+"""How well do two arms work when hand samples drive them through the whole stack, to arms in MuJoCo?
+
+Everything is as in ``q2r2 run``, but that time is simulated and that the cell has no loose objects, of which no motion
+knows. An error is from where the operator's hand asks the tool to be in that very instant to where the tool is measured
+to be, so that it has all delays in it: of the samples, the filter, the loop and the arm. Beside each motion stands the
+same one with the same samples in free air, where nothing is watched: what is worse than that, the pairs cost.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from dataclasses import dataclass, field, replace
+from typing import Annotated
+
+import mujoco
+import numpy as np
+import typer
+
+from q2r2_control.benchmark.motion_run import arrival_time, nearest_pair, without_pairs
+from q2r2_control.benchmark.work_hands import MOVES, WorkHands
+from q2r2_control.benchmark.work_motions import ARMS, WORK_MOTIONS, WorkMotion, motions_named
+from q2r2_control.cli.figure_table import record_table
+from q2r2_control.cli.options import DEMO_CONFIG, Json
+from q2r2_control.cli.output import print_progress, print_report
+from q2r2_control.config.cell import Config, load_config
+from q2r2_control.errors import PlantError
+from q2r2_control.pipeline.pipeline import Pipeline
+from q2r2_control.plants.mujoco import MujocoPlant
+from q2r2_control.robot.kept_distances import kept_distances
+from q2r2_control.robot.robot import Robot
+from q2r2_control.runtime.recorder import Tick
+from q2r2_control.teleop.arm_states import AT_REST
+from q2r2_control.types import Array, CommandMode, Event
+from q2r2_control.verification.contract import Contract
+
+_TAIL = 0.5  # [s]
+_ROUNDING = 1e-9  # of the ticks' times [s]
+_MARGIN_TICKS = 4  # between postures whose margins are measured
+
+
+@dataclass(frozen=True, slots=True)
+class StackFigures:
+    """One motion through the stack. All but the last four are measured from the end of the approach on."""
+
+    mode: str
+    motion: str
+    done: float  # share of the ticks, 1 unless the run was stopped
+    rms_error_mm: float | None = None  # of the tool with the larger one, until the hands rest
+    max_error_mm: float | None = None  # of either tool, until the hands rest
+    path_error_mm: float | None = None  # as rms_error_mm, from where the hand asked it to be the filter's delay ago
+    end_error_mm: float | None = None  # of either tool, at the end
+    arrival_s: float | None = None  # since the hands began, to within 10 mm of the goal for good; also None: no goal
+    fallback_percent: float | None = None  # of the ticks
+    measured_distance_mm: float | None = None  # of the monitored pairs where the arms were measured, by Coal
+    measured_pair: tuple[str, str] | None = None
+    measured_margin_mm: float | None = None  # least measured distance less the one that the pair keeps
+    reference_distance_mm: float | None = None  # of the reference
+    max_acceleration_ratio: float | None = None  # of the reference, to the limit of the joint
+    max_torque_ratio: float | None = None  # of a motor, to its limit, where it saturates
+    rest_acceleration: float | None = None  # of the reference: RMS over the last 0.5 s, norm over joints [rad/s^2]
+    slip_mm: float = 0.0  # largest, how far the leash moved a target
+    pauses: list[str] = field(default_factory=list)  # why an arm was paused in mid-run
+    stopped: str | None = None  # why the run was stopped before its end
+    broken: dict[str, int] = field(default_factory=dict)  # promises of the controller, and in how many ticks
+
+    @property
+    def passed(self) -> bool:
+        """Whether the motion came to its end, every promise kept at every tick."""
+        return not (self.broken or self.pauses or self.stopped)
+
+
+class Stack:
+    """A cell in MuJoCo, driven in one ``mode``, that hands make go through one work motion after another.
+
+    ``free``: in free air, where no pair is monitored and all bodies pass through each other.
+    """
+
+    def __init__(self, config: Config, mode: CommandMode | str, free: bool = False) -> None:
+        bare = config.mujoco.model_copy(update={"objects": {}})
+        self._config = config.model_copy(update={"mujoco": bare})
+        whole = Robot.from_config(self._config)
+        plant = MujocoPlant(whole, self._config)
+        if free:
+            plant.model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
+        self.robot = without_pairs(self._config) if free else whole
+        self._start = {arm: whole.tool_pose(whole.home, arm) for arm in whole.arms}
+        self._plant, self.mode, self.free = plant, CommandMode(mode), free
+        self._kept = kept_distances(self.robot, self._config.control).values
+
+    def run(self, motion: WorkMotion, seed: int | None = 0) -> StackFigures:
+        """Run ``motion`` from home; ``seed``: of what samples add to the hands' poses, None: nothing."""
+        hands = WorkHands(motion, self._start, self._config.teleop, seed)
+        pipeline = Pipeline(self._config, self.robot, hands, self._plant, self.mode)
+        log = _Log(pipeline, checked=len(self._kept) > 0)
+        ends = MOVES + motion.ends
+        try:
+            summary = pipeline.run(ends, realtime=False)
+        except PlantError as fault:
+            done = min(log.t[-1] / ends, 1.0)
+            return StackFigures(str(self.mode), motion.name, done, stopped=str(fault), broken=log.broken)
+        figures = StackFigures(
+            motion=motion.name,
+            mode=str(self.mode),
+            done=1.0,
+            slip_mm=max(arm.slip_mm_max for arm in summary.arms.values()),
+            pauses=[f"{event.arm}: {event.reason}" for event in summary.events if _pauses(event)],
+            broken=log.broken,
+        )
+        log.cut(MOVES + motion.begins, ends)
+        errors, late, to_goal = _errors(log, hands, pipeline.teleop.delay, ends)
+        moving = np.array(log.t) <= MOVES + motion.rests
+        return replace(
+            self._with_distances(self._with_efforts(figures, log), log),
+            rms_error_mm=_rms_mm(errors[moving]),
+            max_error_mm=1e3 * float(errors[moving].max()),
+            path_error_mm=_rms_mm(late[moving]),
+            end_error_mm=1e3 * float(errors[-1].max()),
+            arrival_s=arrival_time(to_goal, 1.0 / self._config.loop_rate_hz) if motion.has_goal else None,
+        )
+
+    def _with_efforts(self, figures: StackFigures, log: _Log) -> StackFigures:
+        a, tau = np.array(log.a), np.array(log.tau)
+        limit = self.robot.capped_acceleration(self._config.control.acceleration_limit)
+        tail = a[-round(_TAIL * self._config.loop_rate_hz) :]
+        return replace(
+            figures,
+            fallback_percent=100.0 * float(np.mean(log.fallback)),
+            max_acceleration_ratio=float((np.abs(a) / limit).max()),
+            max_torque_ratio=float((np.abs(tau) / self.robot.torque_limit).max()),
+            rest_acceleration=float(np.sqrt(np.mean(np.sum(tail**2, axis=1)))),
+        )
+
+    def _with_distances(self, figures: StackFigures, log: _Log) -> StackFigures:
+        if not len(self._kept):
+            return figures
+        measured, reference = np.array(log.measured), np.array(log.reference)
+        distance, pair = nearest_pair(measured, self.robot)
+        margins = [(self.robot.distance_values(q) - self._kept).min() for q in measured[::_MARGIN_TICKS]]
+        return replace(
+            figures,
+            measured_distance_mm=distance,
+            measured_pair=pair,
+            measured_margin_mm=1e3 * float(min(margins)),
+            reference_distance_mm=nearest_pair(reference, self.robot)[0],
+        )
+
+
+class _Log:
+    """A listener that keeps what figures are made of and, if ``checked``, checks the contract at every tick."""
+
+    def __init__(self, pipeline: Pipeline, checked: bool) -> None:
+        self._pipeline, self._checked = pipeline, checked
+        self._contract: Contract | None = None
+        self.t: list[float] = []  # since the start of the run [s]
+        self.measured: list[Array] = []  # (nv,) [rad]
+        self.reference: list[Array] = []  # (nv,) [rad]
+        self.a: list[Array] = []  # of the reference (nv,) [rad/s^2]
+        self.tau: list[Array] = []  # of the motors (nv,) [Nm]
+        self.tools: list[Array] = []  # measured (arms, 3) [m]
+        self.fallback: list[bool] = []
+        pipeline.listeners.append(self)
+
+    def __call__(self, tick: Tick) -> None:
+        if self._checked:
+            # Not before the first tick: a run may make a controller of its own.
+            self._contract = self._contract or Contract(self._pipeline.controller)
+            self._contract.observe(tick.reference, tick.step)
+        self.t.append(tick.t)
+        self.measured.append(tick.state.q)
+        self.reference.append(tick.reference.q)
+        self.a.append(tick.reference.a)
+        self.tau.append(tick.state.tau)
+        self.tools.append(np.array([tick.tools[arm].translation for arm in ARMS]))
+        self.fallback.append(tick.reference.report.fallback)
+
+    @property
+    def broken(self) -> dict[str, int]:
+        """Promises that the controller broke, each with the number of ticks."""
+        margins = self._contract.margins.values() if self._contract is not None else ()
+        return {margin.name: margin.violations for margin in margins if margin.violations}
+
+    def cut(self, begin: float, end: float) -> None:
+        """Forget the ticks that are not after ``begin`` and up to ``end`` [s]."""
+        first, last = (bisect_right(self.t, time + _ROUNDING) for time in (begin, end))
+        for name in ("t", "measured", "reference", "a", "tau", "tools", "fallback"):
+            setattr(self, name, getattr(self, name)[first:last])
+
+
+def _errors(log: _Log, hands: WorkHands, delay: float, end: float) -> tuple[Array, Array, Array]:
+    """Distances (n, arms) [m] of the measured tools: from where the hands ask them to be at each tick, from where they
+    asked them to be ``delay`` [s] before, and from where they ask them to be at the ``end`` [s].
+    """
+    tools = np.array(log.tools)
+    asked = (
+        [[pose.translation for pose in hands.asked(time).values()] for time in times]
+        for times in (log.t, [t - delay for t in log.t], [end])
+    )
+    now, before, goal = (np.linalg.norm(tools - np.array(places), axis=2) for places in asked)
+    return now, before, goal
+
+
+def _rms_mm(errors: Array) -> float:
+    """Of the tool with the larger one, from errors (n, arms) [m]."""
+    return 1e3 * float(np.sqrt(np.mean(errors**2, axis=0)).max())
+
+
+def _pauses(event: Event) -> bool:
+    return event.destination in AT_REST and event.source not in AT_REST
+
+
+def main(
+    motion: Annotated[list[str] | None, typer.Option(help="Only this one, or those that begin with it.")] = None,
+    mode: Annotated[list[CommandMode] | None, typer.Option(help="How the arms are driven; repeatable.")] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Of what samples add to the hands' poses.")] = 0,
+    json: Json = False,
+) -> None:
+    """Print how well the tools follow and what that takes; exit 1 if a promise was broken or a motion did not end."""
+    config = load_config(DEMO_CONFIG)
+    modes = mode or [CommandMode.POSITION, CommandMode.TORQUE]
+    stacks = [Stack(config, driven, free) for driven in modes for free in (False, True)]
+    found: list[StackFigures] = []
+    for each in motions_named(motion or WORK_MOTIONS):
+        for stack in stacks:
+            place = ", free air" if stack.free else ""
+            print_progress(f"{each.name}, {stack.mode}{place}")
+            figures = stack.run(each, seed)
+            found.append(replace(figures, mode=figures.mode + place))
+        table = record_table(f"{each.name}: {each.about}", found[-len(stacks) :])
+        print_report(None, () if json else (table,), False)
+    if json:
+        print_report({"cell": config.name, "seed": seed, "motions": found}, (), True)
+    raise typer.Exit(0 if all(figures.passed for figures in found) else 1)
+
+
+if __name__ == "__main__":
+    typer.run(main)

@@ -1,0 +1,66 @@
+"""The hands of an operator who makes the arms go through a work motion, as a headset would send them.
+
+Both hands rest, press the lower button to engage, the right one a little later, and then move so that the relative
+motion asks for the tool poses of the motion. What an operator has stands in the way of these poses as it does at work:
+samples are noisy, uneven and late, and filter, leash and gate are between them and the targets.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import pinocchio as pin
+
+from q2r2_control.benchmark.work_motions import WorkMotion
+from q2r2_control.config.teleop import Stance, TeleopSettings
+from q2r2_control.inputs.played import PlayedInput
+from q2r2_control.inputs.sampling import EvenSampling, HeadsetSampling, SampleTiming
+from q2r2_control.inputs.scripted import HANDS_AT_REST
+from q2r2_control.inputs.trajectories import PRESS_DURATION
+from q2r2_control.teleop.relative import RelativeMotion
+from q2r2_control.types import SIDES, HandInputs
+
+# When each hand presses: nobody presses with both at once [s].
+_PRESSES = {"left": 0.2, "right": 0.26}
+# From when on the hands move: half a second after both presses count, however long a chord is waited for [s].
+MOVES = 1.0
+_EVEN_RATE = 75.0  # [Hz]
+_NOISE = 2e-4  # of the sensor, along each axis [m]
+
+
+class WorkHands(PlayedInput):
+    """Both hands in one work motion, which begins at :data:`MOVES` after the first poll. Implements :class:`Input`.
+
+    ``start``: the tools' poses when the arms are engaged, in the world frame. ``settings`` say how hands move arms.
+    Everything that samples add to the hands' poses comes from ``seed``; None: the samples are exact and even.
+    """
+
+    def __init__(
+        self, motion: WorkMotion, start: Mapping[str, pin.SE3], settings: TeleopSettings, seed: int | None = 0
+    ) -> None:
+        self._motion, self._start = motion, dict(start)
+        swapped = settings.stance is not Stance.SIDE_BY_SIDE
+        self._arm_of = dict(zip(SIDES, reversed(SIDES) if swapped else SIDES, strict=True))
+        self._relative = {hand: _anchored(settings, HANDS_AT_REST[hand], start[self._arm_of[hand]]) for hand in SIDES}
+        super().__init__(self._ideal, _buttons, {hand: _sampling(hand, seed) for hand in SIDES})
+
+    def asked(self, t: float) -> dict[str, pin.SE3]:
+        """Where the hands ask the tools to be at ``t`` [s] since the first poll, in the world frame."""
+        return self._motion.targets(min(max(t - MOVES, 0.0), self._motion.ends), self._start)
+
+    def _ideal(self, hand: str, t: float) -> pin.SE3:
+        return self._relative[hand].hand(self.asked(t)[self._arm_of[hand]])
+
+
+def _anchored(settings: TeleopSettings, hand: pin.SE3, tool: pin.SE3) -> RelativeMotion:
+    motion = RelativeMotion.of(settings)
+    motion.anchor(hand, tool)
+    return motion
+
+
+def _sampling(hand: str, seed: int | None) -> SampleTiming:
+    return EvenSampling(_EVEN_RATE) if seed is None else HeadsetSampling(hand, seed, position_noise=_NOISE)
+
+
+def _buttons(hand: str, t: float) -> HandInputs:
+    return HandInputs(button_lower=_PRESSES[hand] <= t < _PRESSES[hand] + PRESS_DURATION)

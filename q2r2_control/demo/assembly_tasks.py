@@ -1,0 +1,107 @@
+"""Small assembly tasks of two arms in simulation, and whether they succeeded, measured by the simulation."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+from q2r2_control.config.cell import Config
+from q2r2_control.demo.part_judges import AllJudges, HandoverJudge, Judge, LiftJudge, StackJudge
+from q2r2_control.demo.touch_watch import Toucher, TouchWatch
+from q2r2_control.errors import ConfigError
+from q2r2_control.plants.mujoco import MujocoPlant
+from q2r2_control.robot.robot import Robot
+from q2r2_control.runtime.recorder import Tick
+
+
+@dataclass(frozen=True, slots=True)
+class TaskResult:
+    """What became of one task."""
+
+    name: str
+    succeeded: bool
+    measured: dict[str, float]  # by what it is, with its unit at the end
+    reason: str  # what fell short; empty where it succeeded
+
+
+@dataclass(frozen=True, slots=True)
+class AssemblyTask:
+    """A task in the cell config/dual_iiwa7.yaml. :data:`q2r2_control.inputs.assembly.WORKS` has its hand motion."""
+
+    name: str
+    about: str
+    parts: tuple[str, ...]
+    judge: Callable[[Config], Judge]
+
+
+def _tower(config: Config, *parts: str) -> StackJudge:
+    return StackJudge({name: config.mujoco.objects[name].size[2] for name in parts})
+
+
+_ALL = (
+    AssemblyTask(
+        "meet",
+        "each hand lifts a block, both meet in the middle, each puts its block back",
+        ("blue_block", "yellow_block"),
+        lambda config: AllJudges({"blue": LiftJudge("blue_block"), "yellow": LiftJudge("yellow_block")}),
+    ),
+    AssemblyTask(
+        "grasp",
+        "a block of 15 mm is taken from the table and put back",
+        ("flat_block",),
+        lambda config: LiftJudge("flat_block"),
+    ),
+    AssemblyTask(
+        "handover",
+        "the left hand gives a bar of 120 mm to the right one, in the air",
+        ("bar",),
+        lambda config: HandoverJudge("bar", Toucher.LEFT_FINGER, Toucher.RIGHT_FINGER),
+    ),
+    AssemblyTask(
+        "stack",
+        "three blocks on each other, one by the left hand and one by the right",
+        ("green_block", "blue_block", "yellow_block"),
+        lambda config: _tower(config, "green_block", "blue_block", "yellow_block"),
+    ),
+)
+TASKS: dict[str, AssemblyTask] = {task.name: task for task in _ALL}
+ALL_TASKS = "all"
+
+
+def tasks_named(names: Iterable[str]) -> tuple[AssemblyTask, ...]:
+    """The tasks of :data:`TASKS` of these names, ``all`` for every one, in its order: so they can follow each other.
+
+    Raises :class:`ConfigError` for a name that is neither.
+    """
+    wanted = set(names)
+    if unknown := sorted(wanted - {*TASKS, ALL_TASKS}):
+        raise ConfigError(f"task {unknown[0]!r:.60}: allowed: {', '.join((*TASKS, ALL_TASKS))}")
+    return tuple(task for name, task in TASKS.items() if name in wanted or ALL_TASKS in wanted)
+
+
+class TaskWatch:
+    """A listener of a run that judges tasks. Raises :class:`ConfigError` for a cell without a task's parts."""
+
+    def __init__(self, tasks: Iterable[AssemblyTask], plant: MujocoPlant, robot: Robot, config: Config) -> None:
+        tasks = tuple(tasks)
+        for task in tasks:
+            if missing := [part for part in task.parts if part not in config.mujoco.objects]:
+                raise ConfigError(f"task {task.name}: {config.name} has no {missing[0]} under mujoco.objects")
+        self._judges = {task.name: task.judge(config) for task in tasks}
+        parts = tuple(part for task in tasks for part in task.parts)
+        self._touches = TouchWatch(plant, robot, parts, tuple(config.mujoco.objects))
+
+    def __call__(self, tick: Tick) -> None:
+        """See what this tick has made of the parts."""
+        parts = self._touches.look(tick.t)
+        for judge in self._judges.values():
+            judge.see(tick.dt, parts)
+
+    def results(self) -> tuple[TaskResult, ...]:
+        """What has become of each task. Arms that touch anything but what they grasp spoil all."""
+        touches = [f"{one} touched {other} at {t:.1f} s" for (one, other), t in self._touches.forbidden.items()]
+        results = []
+        for name, judge in self._judges.items():
+            faults = [*judge.faults(), *touches]
+            results.append(TaskResult(name, not faults, judge.measured(), "; ".join(faults)))
+        return tuple(results)

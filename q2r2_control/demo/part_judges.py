@@ -1,0 +1,217 @@
+"""Judges of work in simulation: they look at what happens to the parts, not at how hands or arms move.
+
+So an operator with a headset is judged like a script.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from itertools import pairwise
+from typing import Protocol
+
+from q2r2_control.demo.touch_watch import FINGERS, PartState, Toucher
+
+HELD_TIME = 1.0  # that a part has to be held, or to rest [s]
+_LIFT = 0.095  # [m]
+_CARRY = 0.1  # [m]
+_FALL = 0.005  # without a finger on it, deeper than a part that is put down [m]
+_PUT_BACK = (0.01, 0.001)  # from where it was, sideways and in height [m]
+_STACKED = (0.01, 0.001)  # from the middle of the part below, sideways and in height [m]
+_UPRIGHT = math.radians(2.0)
+_FINGERS = int(FINGERS)  # an IntFlag takes ten times as long for an "and", and several judges ask at every tick
+
+
+class Judge(Protocol):
+    """Follows one task through a run."""
+
+    def see(self, dt: float, parts: Mapping[str, PartState]) -> None:
+        """Take the state of all parts, ``dt`` [s] after the last."""
+        ...
+
+    def measured(self) -> dict[str, float]:
+        """Figures so far, by what they are, with the unit at the end."""
+        ...
+
+    def faults(self) -> list[str]:
+        """What falls short of success so far."""
+        ...
+
+
+class _Fall:
+    """How deep a part fell without a finger on it."""
+
+    def __init__(self) -> None:
+        self._held_at: float | None = None
+        self.depth = 0.0  # [m]
+
+    def see(self, part: PartState) -> None:
+        height = part.place[2]
+        if part.touched & _FINGERS:
+            self._held_at = height
+        elif self._held_at is not None:
+            self.depth = max(self.depth, self._held_at - height)
+
+    def faults(self) -> list[str]:
+        return [f"fell {1e3 * self.depth:.0f} mm"] if self.depth > _FALL else []
+
+
+class LiftJudge:
+    """A part is lifted, held up for a second and put back to where it lay, without a fall.
+
+    Once it has lain there for a second nobody holds it to this any more: other work may go on with it.
+    """
+
+    def __init__(self, part: str) -> None:
+        self._part = part
+        self._start: tuple[float, float, float] | None = None
+        self._fall = _Fall()
+        self._held = self._longest = self._height = self._lain = 0.0
+        self._away = (0.0, 0.0)  # from the start, sideways and in height [m]
+
+    def see(self, dt: float, parts: Mapping[str, PartState]) -> None:
+        """See :meth:`Judge.see`."""
+        if self._lain >= HELD_TIME:
+            return
+        part = parts[self._part]
+        if self._start is None:
+            self._start = part.place
+        self._away = math.dist(part.place[:2], self._start[:2]), part.place[2] - self._start[2]
+        self._fall.see(part)
+        up = part.touched and not part.touched & ~_FINGERS and self._away[1] >= _LIFT
+        self._held = self._held + dt if up else 0.0
+        self._longest = max(self._longest, self._held)
+        self._height = max(self._height, self._away[1])
+        back = self._longest >= HELD_TIME and self._is_back and not part.touched & _FINGERS
+        self._lain = self._lain + dt if back else 0.0
+
+    @property
+    def _is_back(self) -> bool:
+        return self._away[0] <= _PUT_BACK[0] and abs(self._away[1]) <= _PUT_BACK[1]
+
+    def measured(self) -> dict[str, float]:
+        """See :meth:`Judge.measured`."""
+        return {
+            "lifted_mm": 1e3 * self._height,
+            "held_s": self._longest,
+            "put_back_mm": 1e3 * math.hypot(*self._away),
+            "fall_mm": 1e3 * self._fall.depth,
+        }
+
+    def faults(self) -> list[str]:
+        """See :meth:`Judge.faults`."""
+        faults = self._fall.faults()
+        if self._longest < HELD_TIME:
+            faults.append(f"held {1e3 * _LIFT:.0f} mm up for {self._longest:.1f} s, not {HELD_TIME:g} s")
+        if not self._is_back:
+            faults.append(f"ended {1e3 * math.hypot(*self._away):.0f} mm from where it lay")
+        return [f"{self._part}: {fault}" for fault in faults]
+
+
+class StackJudge:
+    """Parts rest on each other, upright and touched by no finger, for the last second."""
+
+    def __init__(self, parts: Mapping[str, float]) -> None:
+        """``parts``: from the lowest to the highest, with their heights [m]."""
+        self._names = tuple(parts)
+        self._rest = [0.5 * (low + high) for low, high in pairwise(parts.values())]  # from centre to centre [m]
+        self._falls = {name: _Fall() for name in parts}
+        self._stood = self._sideways = self._tilt = 0.0
+
+    def see(self, dt: float, parts: Mapping[str, PartState]) -> None:
+        """See :meth:`Judge.see`."""
+        tower = [parts[name] for name in self._names]
+        for name, fall in self._falls.items():
+            fall.see(parts[name])
+        self._tilt = max(part.tilt for part in tower)
+        self._sideways = max(math.dist(upper.place[:2], lower.place[:2]) for lower, upper in pairwise(tower))
+        gaps = [upper.place[2] - lower.place[2] for lower, upper in pairwise(tower)]
+        off = max(abs(gap - rest) for gap, rest in zip(gaps, self._rest, strict=True))
+        stands = self._sideways <= _STACKED[0] and off <= _STACKED[1] and self._tilt <= _UPRIGHT
+        untouched = not any(part.touched & _FINGERS for part in tower)
+        self._stood = self._stood + dt if stands and untouched else 0.0
+
+    def measured(self) -> dict[str, float]:
+        """See :meth:`Judge.measured`."""
+        return {
+            "stood_s": self._stood,
+            "off_centre_mm": 1e3 * self._sideways,
+            "tilt_deg": math.degrees(self._tilt),
+            "fall_mm": 1e3 * max(fall.depth for fall in self._falls.values()),
+        }
+
+    def faults(self) -> list[str]:
+        """See :meth:`Judge.faults`."""
+        faults = [f"{name}: {fault}" for name, judge in self._falls.items() for fault in judge.faults()]
+        if self._stood < HELD_TIME:
+            tower = " on ".join(reversed(self._names))
+            faults.append(f"{tower} for the last {self._stood:.1f} s, not {HELD_TIME:g} s")
+        return faults
+
+
+class HandoverJudge:
+    """One hand holds a part in the air, then both, then the other one alone, 100 mm away for a second."""
+
+    def __init__(self, part: str, giver: Toucher, taker: Toucher) -> None:
+        self._part, self._giver, self._taker = part, giver, taker
+        self._fall = _Fall()
+        self._by_giver = self._by_both = self._alone = self._longest = self._farthest = 0.0
+        self._given: tuple[float, float, float] | None = None  # where the giver let go
+
+    def see(self, dt: float, parts: Mapping[str, PartState]) -> None:
+        """See :meth:`Judge.see`."""
+        part = parts[self._part]
+        self._fall.see(part)
+        away = 0.0
+        if part.touched == self._giver:
+            self._by_giver += dt
+        elif part.touched == FINGERS and self._by_giver:
+            self._by_both += dt
+            self._given = part.place
+        elif part.touched == self._taker and self._given is not None:
+            away = math.dist(part.place, self._given)
+            self._farthest = max(self._farthest, away)
+        self._alone = self._alone + dt if away >= _CARRY else 0.0
+        self._longest = max(self._longest, self._alone)
+
+    def measured(self) -> dict[str, float]:
+        """See :meth:`Judge.measured`."""
+        return {
+            "held_by_giver_s": self._by_giver,
+            "held_by_both_s": self._by_both,
+            "carried_mm": 1e3 * self._farthest,
+            "held_by_taker_s": self._longest,
+            "fall_mm": 1e3 * self._fall.depth,
+        }
+
+    def faults(self) -> list[str]:
+        """See :meth:`Judge.faults`."""
+        faults = self._fall.faults()
+        if self._longest < HELD_TIME:
+            faults.append(
+                f"held by the taker alone, {1e3 * _CARRY:.0f} mm away, for {self._longest:.1f} s, not {HELD_TIME:g} s"
+            )
+        return [f"{self._part}: {fault}" for fault in faults]
+
+
+class AllJudges:
+    """A task that has to please several judges."""
+
+    def __init__(self, judges: Mapping[str, Judge]) -> None:
+        """``judges`` by what they look at, which their figures are named after."""
+        self._judges = judges
+
+    def see(self, dt: float, parts: Mapping[str, PartState]) -> None:
+        """See :meth:`Judge.see`."""
+        for judge in self._judges.values():
+            judge.see(dt, parts)
+
+    def measured(self) -> dict[str, float]:
+        """See :meth:`Judge.measured`."""
+        return {
+            f"{name}_{what}": value for name, judge in self._judges.items() for what, value in judge.measured().items()
+        }
+
+    def faults(self) -> list[str]:
+        """See :meth:`Judge.faults`."""
+        return [fault for judge in self._judges.values() for fault in judge.faults()]

@@ -1,0 +1,98 @@
+"""The hands of a work motion: they engage both arms as an operator does, and ask for the motion's poses."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from q2r2_control.benchmark.work_hands import MOVES, WorkHands
+from q2r2_control.benchmark.work_motions import ARMS, WORK_MOTIONS
+from q2r2_control.config.teleop import TeleopSettings
+from q2r2_control.inputs.base import Input
+from q2r2_control.teleop.teleop import Teleop
+from q2r2_control.types import SIDES, HandSample
+from tests.teleop.hands import pose
+
+DT = 0.004
+TOOLS = {"left": pose(0.5, 0.25, 0.38, (np.pi, 0.0, 0.0)), "right": pose(0.5, -0.25, 0.38, (0.0, np.pi, 0.0))}
+# The left tool goes 0.2 m ahead and up, at 0.2 m/s; the right one turns.
+SHORT = replace(
+    WORK_MOTIONS["stretch"],
+    name="short",
+    duration=1.0,
+    tilt=(0.0, 0.9),
+    approach=(np.array([TOOLS[arm].translation for arm in ARMS]),),
+    path=lambda t, home: home + 0.2 * t * np.array([[0.6, 0.0, 0.8], [0.0, 0.0, 0.0]]),
+)
+SETTINGS = {
+    "as configured": TeleopSettings(),
+    "mirrored and scaled": TeleopSettings(stance="mirror", position_scale=2.0, rotation_scale=1.5),
+    "reflected, in the tool's frame": TeleopSettings(stance="mirror_reflected", rotation_frame="tool"),
+    "axes of Unity": TeleopSettings(axes=("+z", "-x", "+y")),
+}
+
+
+def played(hands: WorkHands, until: float) -> list[HandSample]:
+    hands.start()
+    return [sample for tick in range(round(until / DT)) for sample in hands.poll(tick * DT)]
+
+
+def test_they_are_an_input() -> None:
+    assert isinstance(WorkHands(SHORT, TOOLS, TeleopSettings()), Input)
+
+
+@pytest.mark.parametrize("settings", SETTINGS.values(), ids=SETTINGS.keys())
+def test_they_engage_both_arms_and_ask_for_the_motion_s_poses(settings: TeleopSettings) -> None:
+    hands, teleop = WorkHands(SHORT, TOOLS, settings), Teleop(settings, SIDES)
+    hands.start()
+    for t in np.arange(0.0, MOVES + SHORT.ends, DT):
+        targets = teleop.update(hands.poll(t), TOOLS, t)
+        if t < 0.1:
+            assert not any(teleop.engaged.values())
+        if t < MOVES:
+            continue
+        assert all(teleop.engaged.values())
+        # The filter lags as long at any speed, once a speed lasts.
+        for arm, asked in hands.asked(t - teleop.delay).items():
+            found = targets[arm].pose
+            assert found is not None
+            assert np.linalg.norm(found.translation - asked.translation) < 4e-3
+            assert np.linalg.norm(pin.log3(found.rotation @ asked.rotation.T)) < 0.025
+    goal = hands.asked(MOVES + SHORT.ends)
+    assert np.linalg.norm(goal["left"].translation - TOOLS["left"].translation) == pytest.approx(0.2)
+
+
+def test_a_press_that_waits_for_a_chord_as_long_as_it_can_engages_before_the_hands_move() -> None:
+    settings = TeleopSettings(chord_window=0.5)
+    hands, teleop = WorkHands(SHORT, TOOLS, settings), Teleop(settings, SIDES)
+    hands.start()
+    for t in np.arange(0.0, MOVES, DT):
+        teleop.update(hands.poll(t), TOOLS, t)
+    assert all(teleop.engaged.values())
+
+
+def test_hands_rest_until_they_have_engaged_and_when_the_motion_is_over() -> None:
+    hands = WorkHands(SHORT, TOOLS, TeleopSettings(), seed=None)
+    samples = [sample for sample in played(hands, MOVES + SHORT.ends) if sample.hand == "left"]
+    first, last = samples[0].position, samples[-1].position
+    assert np.linalg.norm(last - first) == pytest.approx(0.2)
+    for sample in samples:
+        if sample.pose_stamp <= MOVES:
+            np.testing.assert_allclose(sample.position, first, atol=1e-12)
+        if sample.pose_stamp >= MOVES + SHORT.rests:
+            np.testing.assert_allclose(sample.position, last, atol=1e-12)
+
+
+def test_samples_come_as_a_headset_sends_them_the_same_for_the_same_seed() -> None:
+    first, again, other = (played(WorkHands(SHORT, TOOLS, TeleopSettings(), seed), MOVES) for seed in (1, 1, 2))
+    positions = [np.array([sample.position for sample in samples]) for samples in (first, again, other)]
+    np.testing.assert_array_equal(positions[0], positions[1])
+    assert (positions[0][:60] != positions[2][:60]).any()
+    left = [sample for sample in first if sample.hand == "left"]
+    np.testing.assert_allclose(np.array([s.position for s in left]).std(axis=0), 2e-4, rtol=0.4)
+    gaps = [after.pose_stamp - before.pose_stamp for before, after in pairwise(left)]
+    assert np.mean(gaps) == pytest.approx(1.0 / 74.0, rel=0.03)

@@ -1,0 +1,98 @@
+"""Work motions ask for what arms can be asked: from home, without jumps, at bounded speed, with rest at the end."""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from q2r2_control.benchmark.work_motions import ARMS, REST, WORK_MOTIONS, WorkMotion, motions_named
+from q2r2_control.config.cell import load_config
+from q2r2_control.errors import ConfigError
+from q2r2_control.robot.robot import Robot
+from q2r2_control.types import Array
+
+DT = 0.001
+FASTEST, STRONGEST = 0.55, 5.0  # of a target [m/s], [m/s^2]
+
+
+@pytest.fixture(scope="module")
+def start() -> dict[str, pin.SE3]:
+    robot = Robot.from_config(load_config("config/dual_iiwa7.yaml"))
+    return {arm: robot.tool_pose(robot.home, arm) for arm in robot.arms}
+
+
+@pytest.fixture(params=WORK_MOTIONS)
+def motion(request: pytest.FixtureRequest) -> WorkMotion:
+    return WORK_MOTIONS[request.param]
+
+
+def ways(motion: WorkMotion, start: dict[str, pin.SE3]) -> Array:
+    """Positions (n, arms, 3) of the targets at every tick."""
+    ticks = range(round(motion.ends / DT))
+    return np.array([[pose.translation for pose in motion.targets(tick * DT, start).values()] for tick in ticks])
+
+
+def test_targets_begin_at_home_and_move_smoothly_at_bounded_speed(
+    motion: WorkMotion, start: dict[str, pin.SE3]
+) -> None:
+    way = ways(motion, start)
+    v = np.diff(way, axis=0) / DT
+    a = np.diff(v, axis=0) / DT
+    np.testing.assert_allclose(way[0], [start[arm].translation for arm in ARMS], atol=1e-12)
+    assert np.linalg.norm(v, axis=2).max() <= FASTEST
+    assert np.linalg.norm(a, axis=2).max() <= STRONGEST
+
+
+def test_targets_are_still_before_the_motion_and_at_its_end(motion: WorkMotion, start: dict[str, pin.SE3]) -> None:
+    way = ways(motion, start)
+    v = np.diff(way, axis=0) / DT
+    still = np.arange(len(way)) * DT >= motion.ends - REST
+    np.testing.assert_array_equal(way[still], np.broadcast_to(way[-1], way[still].shape))
+    began = round(motion.begins / DT)
+    np.testing.assert_allclose(v[began - 200 : began], 0.0, atol=1e-6)
+    assert np.abs(v[began:]).max() > 0.03
+
+
+def test_tools_point_down_unless_the_motion_tilts_them(motion: WorkMotion, start: dict[str, pin.SE3]) -> None:
+    for t in np.arange(0.0, motion.ends, 0.1):
+        for arm, tilt, pose in zip(ARMS, motion.tilt, motion.targets(t, start).values(), strict=True):
+            turned = pin.log3(pose.rotation @ start[arm].rotation.T)
+            assert np.linalg.norm(turned) <= abs(tilt) + 1e-9
+            if t >= motion.begins:
+                np.testing.assert_allclose(turned, [tilt, 0.0, 0.0], atol=1e-9)
+
+
+@pytest.mark.parametrize(("gap", "speed"), [(0.40, 0.15), (0.20, 0.50), (0.16, 0.04)])
+def test_a_carry_keeps_its_gap_and_has_the_speed_of_its_name(
+    gap: float, speed: float, start: dict[str, pin.SE3]
+) -> None:
+    motion = WORK_MOTIONS[f"carry-{gap:.2f}-{speed:.2f}"]
+    carried = ways(motion, start)[round(motion.begins / DT) :]
+    np.testing.assert_allclose(carried[:, 0] - carried[:, 1], np.tile([0.0, gap, 0.0], (len(carried), 1)), atol=1e-12)
+    # Sideways goes the whole speed, up and down half of it.
+    assert np.abs(np.diff(carried[:, 0, 0])).max() / DT == pytest.approx(speed, rel=1e-3)
+    np.testing.assert_allclose(carried[-1], carried[0], atol=1e-9)
+
+
+def test_targets_depend_on_time_and_on_the_tools_at_the_start_alone(start: dict[str, pin.SE3]) -> None:
+    motion = WORK_MOTIONS["oscillate"]
+    moved = {arm: pin.SE3(pose.rotation, pose.translation + np.array([0.0, 0.0, 0.1])) for arm, pose in start.items()}
+    first, _, again, higher = (motion.targets(*at) for at in ((3.0, start), (1.0, moved), (3.0, start), (3.0, moved)))
+    np.testing.assert_array_equal(first["left"].homogeneous, again["left"].homogeneous)
+    rise = higher["left"].translation - first["left"].translation
+    np.testing.assert_allclose(rise, [0.0, 0.0, 0.1], atol=1e-12)
+
+
+def test_motions_are_found_by_their_names_and_by_what_these_begin_with() -> None:
+    assert [motion.name for motion in motions_named(["swap", "pass", "pass"])] == ["pass", "pass-back", "swap"]
+    assert {motion.name for motion in motions_named(["carry-0.16"])} == {
+        f"carry-0.16-{speed}" for speed in ("0.04", "0.15", "0.30", "0.50")
+    }
+    assert motions_named(WORK_MOTIONS) == tuple(WORK_MOTIONS.values())
+
+
+@pytest.mark.parametrize("name", ["carr", "", "Meet"])
+def test_an_unknown_name_is_an_error_that_lists_what_there_is(name: str) -> None:
+    with pytest.raises(ConfigError, match=f"motion '{name}': allowed: carry-0.40-0.15, .*stretch"):
+        motions_named(["meet", name])

@@ -1,0 +1,149 @@
+"""What the demo shows: two arms that do small assembly work, from samples of hands alone."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from q2r2_control.config.cell import Config, load_config
+from q2r2_control.demo.assembly_tasks import TASKS, TaskResult, TaskWatch, tasks_named
+from q2r2_control.demo.touch_watch import TouchWatch
+from q2r2_control.errors import ConfigError
+from q2r2_control.inputs.scripted import ScriptedInput
+from q2r2_control.inputs.trajectories import trajectory_named
+from q2r2_control.pipeline.pipeline import Pipeline
+from q2r2_control.plants.mujoco import MujocoPlant
+from q2r2_control.robot.robot import Robot
+from q2r2_control.runtime.recorder import Tick
+from q2r2_control.runtime.run_summary import RunSummary
+from q2r2_control.types import CommandMode, HandSample
+from tests.support.watch import Watch, assert_torque_bounds
+
+pytestmark = pytest.mark.slow
+
+# What is shown, by mode, and in which ticks: nothing here needs 1 kHz, and the tests have to be fast.
+SHOWN = {CommandMode.POSITION: "meet+grasp+handover+stack", CommandMode.TORQUE: "handover+stack"}
+PERIODS = {CommandMode.POSITION: 0.01, CommandMode.TORQUE: 0.005}  # [s]
+
+
+@cache
+def coarse(mode: CommandMode = CommandMode.POSITION) -> Config:
+    """The demo's cell, with the control loop slowed down."""
+    config, period = load_config("config/dual_iiwa7.yaml"), PERIODS[mode]
+    control = config.control.model_copy(update={"max_substep": period})
+    return config.model_copy(update={"loop_rate_hz": 1.0 / period, "control": control})
+
+
+class Gripless(ScriptedInput):
+    """Hands that never press a gripper's button."""
+
+    def poll(self, now: float) -> list[HandSample]:
+        return [replace(sample, inputs=replace(sample.inputs, button_upper=False)) for sample in super().poll(now)]
+
+
+@dataclass
+class Played:
+    mode: CommandMode
+    pipeline: Pipeline
+    ticks: list[Tick]
+    summary: RunSummary
+    results: dict[str, TaskResult]
+
+
+def play(
+    names: str, mode: CommandMode, source: type[ScriptedInput] = ScriptedInput, duration: float | None = None
+) -> Played:
+    """Tasks in simulated time, for as long as they last, with the contract checked at every tick."""
+    config = coarse(mode)
+    robot = Robot.from_config(config)
+    plant = MujocoPlant(robot, config)
+    pipeline = Pipeline(config, robot, source(names), plant, mode)
+    watch, tasks = Watch(pipeline), TaskWatch(tasks_named(names.split("+")), plant, robot, config)
+    pipeline.listeners.append(tasks)
+    summary = pipeline.run(duration or trajectory_named(names).duration, realtime=False)
+    return Played(mode, pipeline, watch.ticks, summary, {result.name: result for result in tasks.results()})
+
+
+@pytest.fixture(scope="module", params=list(SHOWN), ids=["by position", "by torque"])
+def played(request: pytest.FixtureRequest) -> Played:
+    return play(SHOWN[request.param], request.param)
+
+
+def test_every_task_succeeds_without_a_touch_that_is_no_grasp(played: Played) -> None:
+    assert "+".join(played.results) == SHOWN[played.mode]
+    reasons = {name: result.reason for name, result in played.results.items() if not result.succeeded}
+    assert reasons == {}
+    handover, stack = (played.results[name].measured for name in ("handover", "stack"))
+    assert handover["held_by_both_s"] > 0.3
+    assert handover["carried_mm"] > 115.0
+    assert stack["off_centre_mm"] < 2.0
+    assert max(handover["fall_mm"], stack["fall_mm"]) < 2.0
+    if played.mode is CommandMode.POSITION:
+        grasp = played.results["grasp"].measured
+        assert grasp["lifted_mm"] > 99.0
+        assert max(grasp["put_back_mm"], grasp["fall_mm"]) < 1.0
+
+
+def test_the_arms_follow_the_hands_within_a_millimetre_and_need_no_fallback(played: Played) -> None:
+    assert played.summary.fallback_ticks == played.summary.uncertified_ticks == played.summary.rejected_targets == 0
+    assert played.summary.at_rest
+    for arm in played.summary.arms.values():
+        assert arm.position_error_mm_rms is not None
+        assert arm.position_error_mm_rms < 1.0
+    if played.mode is CommandMode.TORQUE:
+        assert_torque_bounds(played.pipeline, played.ticks)
+
+
+def test_fingers_work_within_3_mm_of_the_table_and_tools_within_90_mm_of_each_other(played: Played) -> None:
+    assert played.summary.min_distance_mm is not None
+    assert played.summary.min_distance_mm < 3.0
+    gaps = [np.linalg.norm(tick.tools["left"].translation - tick.tools["right"].translation) for tick in played.ticks]
+    assert min(gaps) < 0.091
+
+
+def test_hands_that_never_grip_lift_nothing_and_the_measure_says_so() -> None:
+    held_up_at = 7.0
+    result = play("grasp", CommandMode.POSITION, Gripless, held_up_at).results["grasp"]
+    assert not result.succeeded
+    assert result.measured["lifted_mm"] < 1.0
+    assert result.reason == "flat_block: held 95 mm up for 0.0 s, not 1 s"
+
+
+@pytest.mark.parametrize(
+    ("q", "expected"),
+    [
+        pytest.param([0.0, 1.9, 0.0, -0.3, 0.0, 0.5, 0.0] * 2, ("left", "table"), id="an arm and the table"),
+        pytest.param(
+            [-1.57, 0.9, 0, -0.5, 0, 0.5, 0, 1.57, 0.9, 0, -0.5, 0, 0.5, 0], ("left", "right"), id="both arms"
+        ),
+    ],
+)
+def test_arms_that_touch_what_they_should_not_spoil_the_task_and_are_named(
+    q: list[float], expected: tuple[str, str]
+) -> None:
+    robot = Robot.from_config(coarse())
+    plant = MujocoPlant(robot, coarse())
+    touches = TouchWatch(plant, robot, ("bar",), tuple(coarse().mujoco.objects))
+    touches.look(0.0)
+    assert touches.forbidden == {}
+    plant.reset(np.array(q))
+    assert touches.look(0.5)["bar"].tilt < 1e-6
+    assert any({name.split("_")[0] for name in pair} == set(expected) for pair in touches.forbidden)
+    assert set(touches.forbidden.values()) == {0.5}
+
+
+def test_tasks_come_in_the_order_in_which_they_can_follow_each_other() -> None:
+    assert [task.name for task in tasks_named(["stack", "meet", "stack"])] == ["meet", "stack"]
+    assert tasks_named(["all"]) == tuple(TASKS.values())
+    with pytest.raises(ConfigError, match="task 'juggle': allowed: meet, grasp, handover, stack, all"):
+        tasks_named(["juggle"])
+
+
+def test_a_cell_without_the_parts_of_a_task_is_refused() -> None:
+    bare = coarse().model_copy(update={"mujoco": coarse().mujoco.model_copy(update={"objects": {}})})
+    robot = Robot.from_config(bare)
+    with pytest.raises(ConfigError, match="task grasp: dual_iiwa7 has no flat_block under mujoco"):
+        TaskWatch(tasks_named(["grasp"]), MujocoPlant(robot, bare), robot, bare)

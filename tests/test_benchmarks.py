@@ -1,0 +1,36 @@
+"""The benchmarks outside the package start, and the one that reaches into the loop finds all its stages."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+
+FOLDER = Path(__file__).resolve().parents[1] / "benchmarks"
+SCRIPTS = sorted(file.name for file in FOLDER.glob("*.py") if file.name != "ros_processes.py")
+
+
+def run(script: str, *options: str) -> str:
+    result = subprocess.run([sys.executable, FOLDER / script, *options], capture_output=True, text=True)
+    assert result.returncode == 0, result.stderr
+    return result.stdout
+
+
+@pytest.mark.parametrize("script", SCRIPTS)
+def test_every_benchmark_says_what_it_asks(script: str) -> None:
+    if script.startswith("ros_") and any(find_spec(name) is None for name in ("rclpy", "quest2ros")):
+        pytest.skip("ROS 2 or quest2ros is not installed")
+    assert "--json" in run(script, "--help")
+    assert f"`{script}`" in (FOLDER / "README.md").read_text(encoding="utf-8")
+
+
+@pytest.mark.slow
+def test_the_loop_s_benchmark_times_every_stage() -> None:
+    cases = json.loads(run("loop_times.py", "--ticks", "100", "--rounds", "1", "--record", "--json"))["cases"]
+    assert set(cases) == {"kinematic position", "mujoco position", "mujoco torque"}
+    for stage in ("inputs", "measured state", "teleop", "supervision", "control", "drive", "apply", "physics"):
+        assert all(case[stage]["median_us"] > 0.0 for case in cases.values()), stage
