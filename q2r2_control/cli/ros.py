@@ -64,7 +64,10 @@ def up(
         str | None, typer.Option(metavar="DIR", help="Record what the nodes publish to a new folder in DIR.")
     ] = None,
     separate: Annotated[
-        bool, typer.Option("--separate", help="A process for each arm's node, not one for both, which takes less time.")
+        bool,
+        typer.Option(
+            "--separate", help="A process for each arm: a hand then stops and homes its own arm only."
+        ),
     ] = False,
     task: Task = None,
     operator: Operator = None,

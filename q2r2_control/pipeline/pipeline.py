@@ -155,7 +155,11 @@ class Pipeline:
         self.teleop = Teleop(self.config.teleop, tuple(self.robot.arms))
         watch = watch_settings(self.config.supervision, self.drive.yields)
         self.supervisor = Supervisor(
-            self.robot, self.controller, StreamSettings(), watch, displace=self.drive.displaced
+            self.robot,
+            self.controller,
+            StreamSettings(linked=self.config.teleop.linked),
+            watch,
+            displace=self.drive.displaced,
         )
 
     @property

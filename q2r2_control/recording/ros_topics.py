@@ -49,14 +49,6 @@ def arm_events(arm: str) -> str:
     return f"/q2r2/{arm}/events"
 
 
-def carry_poses(arm: str) -> str:
-    """The topic on which an arm's node sends poses to the other one while both carry, as JSON.
-
-    That of nodes whose ``robot_name`` is ``q2r2``, which it is by default.
-    """
-    return f"/q2r2/{arm}/carry"
-
-
 def asked_target(arm: str) -> str:
     """The topic on which an arm's node says for a recording what it asks for, while it does.
 
@@ -82,7 +74,7 @@ def ros_topics(arms: Sequence[str], cameras: Mapping[str, str]) -> tuple[Topic, 
     types |= {CONTROLLER_TICK: _ARRAY, REFERENCE: "trajectory_msgs/msg/JointTrajectory", RECORDER_EVENTS: _TEXT}
     for arm in arms:
         types |= {target(arm): _POSE, safe_target(arm): _POSE, f"/cartesian_controller/following/{arm}": _BOOL}
-        types |= {arm_flags(arm): _ARRAY, arm_events(arm): _TEXT, carry_poses(arm): _TEXT}
+        types |= {arm_flags(arm): _ARRAY, arm_events(arm): _TEXT}
     types |= {f"/{node}/state": _TEXT for node in (*_NODES, *(f"{arm}_q2r2_arm_controller" for arm in arms))}
     types |= {topic: PICTURE if is_compressed(topic) else _IMAGE for topic in cameras.values()}
     labels = {CONTROLLER_TICK: tick_fields(arms)} | {arm_flags(arm): ARM_FIELDS for arm in arms}
@@ -104,8 +96,6 @@ def is_latched(topic: str) -> bool:
 
 def is_reliable(topic: Topic) -> bool:
     """Whether all of its messages are to arrive, at no one's cost: none that commands, and none of a stream."""
-    if topic.name == carry_poses(_arm_of(topic.name)):
-        return False
     return topic.type in (_ARRAY, _TEXT) or topic.name == REFERENCE or heard_on(topic.name) != topic.name
 
 

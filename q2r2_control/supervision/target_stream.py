@@ -29,6 +29,7 @@ class StreamSettings:
     timeout: float = STREAM_TIMEOUT  # [s]
     engage_distance: float = 0.03  # [m]
     engage_angle: float = 0.3  # [rad]
+    linked: bool = True  # all arms hold when the targets of one cease, see TargetStreams
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,7 +12,12 @@ from q2r2_control.supervision.target_stream import Origins, Refusal, StreamSetti
 
 
 class TargetStreams:
-    """One :class:`TargetStream` an arm. Poses are in the world frame, times are receipt times [s]."""
+    """One :class:`TargetStream` an arm. Poses are in the world frame, times are receipt times [s].
+
+    Linked arms (:attr:`StreamSettings.linked`) are stopped together: where a stream that is followed ceases, or is
+    dropped because two nodes publish it, no arm follows its stream any more. Each needs a stream that begins anew at
+    its tool. A stream that its sender ends with :meth:`release` stops its own arm only: its operator paused it.
+    """
 
     def __init__(self, arms: Iterable[str], settings: StreamSettings, origins: Origins) -> None:
         self._settings, self._origins = settings, origins
@@ -20,6 +25,7 @@ class TargetStreams:
         self._lines = {arm: TargetExtrapolator() for arm in self._streams}
         self._sequences = {arm: SequenceWatch() for arm in self._streams}
         self.ended: dict[str, str] = {}  # arms that hold since their targets ended, with a line that says so
+        self._lines_to_report: list[str] = []
 
     def at(self, now: float) -> dict[str, pin.SE3 | None]:
         """What each arm follows at ``now`` [s], see :mod:`target_line`; None: it holds."""
@@ -37,9 +43,8 @@ class TargetStreams:
 
     def follows_on(self, arm: str, now: float) -> bool:
         """Whether an arm follows its targets, and a target at ``now`` [s] still belongs to them."""
-        stream = self._streams[arm]
-        stream.expire(now)
-        return stream.following
+        self._expire(arm, now)
+        return self._streams[arm].following
 
     def go_on(self, arm: str, pose: pin.SE3, now: float, due: float | None = None) -> bool:
         """Take the next target of a stream that an arm follows. Returns False and changes nothing if it follows none.
@@ -76,6 +81,8 @@ class TargetStreams:
             self._lines[arm].reset()
         refusal = None if pose is None else stream.offer(pose, tools, now)
         if others is not None:
+            if stream.following:
+                self._hold_linked(arm, "are from two publishers")
             stream.drop()
             return others
         if pose is None:
@@ -105,13 +112,28 @@ class TargetStreams:
             stream.reset()
 
     def expire(self, now: float) -> list[str]:
-        """A line for each stream that was followed and has just ended by silence."""
-        lines = []
-        for arm, stream in self._streams.items():
-            if stream.expire(now):
-                self.ended[arm] = f"{arm}: targets{self._origins.targets(arm)} have ceased, the arm holds"
-                lines.append(self.ended[arm])
+        """A line for each arm that followed its targets and holds since the last call because targets ceased."""
+        for arm in self._streams:
+            self._expire(arm, now)
+        lines, self._lines_to_report = self._lines_to_report, []
         return lines
+
+    def _expire(self, arm: str, now: float) -> None:
+        """End the arm's stream if it has run dry."""
+        if self._streams[arm].expire(now):
+            self._record_end(arm, f"{arm}: targets{self._origins.targets(arm)} have ceased, the arm holds")
+            self._hold_linked(arm, "have ceased")
+
+    def _hold_linked(self, ended: str, why: str) -> None:
+        """The arms that follow targets hold as well: one operator moves all, and does not expect one to go on alone."""
+        for arm, stream in self._streams.items():
+            if self._settings.linked and arm != ended and stream.following:
+                stream.drop()
+                self._record_end(arm, f"{arm}: the arm holds because it is linked to {ended}, whose targets {why}")
+
+    def _record_end(self, arm: str, line: str) -> None:
+        self.ended[arm] = line
+        self._lines_to_report.append(line)
 
     def _other_publishers(self, arm: str, number: int, now: float) -> Refusal | None:
         """Says so where an arm's targets came from more than one publisher lately."""

@@ -201,14 +201,6 @@ class ArmTeleop:
         """Move the frame of ``tools``, of this arm and the ``other`` with its ``box``, until the next engagement."""
         self._motion.carry(tools, other, box, now)
 
-    def be_led(self) -> None:
-        """Go by :meth:`led_target` from now on, until this arm is engaged anew."""
-        self._motion.bound_one_tool()
-
-    def led_target(self, target: Pose, expected: Pose | None, now: float) -> Pose:
-        """See :meth:`HandMotion.bounded`."""
-        return self._motion.bounded(target, expected, now)
-
     def _align(self, now: float) -> None:
         self._aligned_at = now
         if self.state is not ArmState.PAUSING or self.chord:  # the other hand's chord does not say what this press is

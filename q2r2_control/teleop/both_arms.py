@@ -11,17 +11,16 @@ import pinocchio as pin
 from q2r2_control.config.bindings import Action, Gesture
 from q2r2_control.config.teleop import Stance, TeleopSettings
 from q2r2_control.teleop.arm import ArmTeleop
-from q2r2_control.teleop.arm_states import AT_REST, FOLLOWING, ArmState, Cause
-from q2r2_control.teleop.carry_mode import CarriedMode, Carrying, CarryMode
+from q2r2_control.teleop.arm_states import AT_REST, ArmState, Cause
+from q2r2_control.teleop.carry_mode import CarryMode
 from q2r2_control.teleop.episode_marks import EpisodeMarks
 from q2r2_control.teleop.gestures import Press
-from q2r2_control.teleop.remote_arm import RemoteArm
 from q2r2_control.teleop.sag import Anchor, anchor_of, expected
 from q2r2_control.types import Pose
 
-PAUSE_FIRST = "pause both arms first"  # why hands are not swapped
 # Why arms do not carry.
-_ENGAGE, _UNKNOWN, _BOTH_ASK = "engage the arm first", "a tool's pose is not known", "both hands ask"
+_ENGAGE, _UNKNOWN = "engage the arm first", "a tool's pose is not known"
+_ALONE = "this program drives one arm only"  # why hands are not swapped, and arms do not carry
 
 
 @dataclass(slots=True)  # not frozen: that would cost half a microsecond a tick
@@ -32,6 +31,7 @@ class ArmMeasurements:
     targets: Mapping[str, pin.SE3]  # the last ones
     commanded: Mapping[str, pin.SE3] | None = None  # by the controller's reference
     obstacles: Mapping[str, str] = field(default_factory=dict)  # arm -> why it may not be engaged
+    in_step: bool = True  # ``commanded`` is of one moment
 
     def anchor(self, arm: str) -> Anchor | None:
         """The tool's pose for an anchor: measured position, commanded orientation. None: not known."""
@@ -58,10 +58,7 @@ class BothArms:
 
     def __init__(self, settings: TeleopSettings, names: Iterable[str]) -> None:
         self.arms = {name: ArmTeleop(name, settings) for name in names}
-        self.carry: Carrying | None = None
-        self.remote: RemoteArm | None = None  # the other one, where another program drives it
-        # Why hands are not swapped where there is one arm only; None: another program drives the other arm, and swaps.
-        self.alone: str | None = "this program drives one arm only"
+        self.carry: CarryMode | None = None
         self.asks_home: str | None = None  # the arm whose hand asked for the way home; None: no hand did
         self.marks = EpisodeMarks()
         self.use(settings)
@@ -115,7 +112,7 @@ class BothArms:
             if begun or any(arm.grips or arm.chord for arm in self.arms.values()):
                 self.change(Cause.PRESS, now, "the way home was interrupted")
         elif (asked_by := self._asked(presses, Action.HOME)) is not None:
-            self.home(now, asked_by, around.obstacles)
+            self.home(now, asked_by, around.obstacles.get(asked_by))
         elif self.carry is not None and (reason := self._ends_carry(presses)) is not None:
             self.end_carry(now, reason)
         elif self.carry is None and (asked_by := self._asked(presses, Action.CARRY)) is not None:
@@ -124,12 +121,11 @@ class BothArms:
             return presses
         return {name: [] for name in self.arms}
 
-    def home(self, now: float, asked_by: str | None, obstacles: Mapping[str, str]) -> None:
+    def home(self, now: float, asked_by: str | None, problem: str | None = None) -> None:
         """Both arms shall go home; the hand of the arm ``asked_by`` has to be there on the way, None: no hand.
 
-        What is in the way is told as an event.
+        A ``problem``, or another thing in the way, becomes an event.
         """
-        problem = next(iter(obstacles.values()), None)
         if self.any_in(ArmState.ALIGNING):
             problem = problem or "an alignment is not over"
         if self.any_in(ArmState.STOPPED):
@@ -149,83 +145,23 @@ class BothArms:
         """If it is asked for, each hand drives the other arm."""
         if not any(presses.values()) or self._asked(presses, Action.SWAP_HANDS) is None:
             return
-        problem = self.alone if len(self.arms) < 2 else None
+        problem = _ALONE if len(self.arms) < 2 else None
         if not self.all_in(AT_REST):
-            problem = PAUSE_FIRST
+            problem = "pause both arms first"
         if problem is None:
-            self.set_swapped(not self.swapped, now)
-            return
+            self.swapped = not self.swapped
+            self.arm_of_hand = {_other(hand): name for hand, name in self.arm_of_hand.items()}
         for arm in self.arms.values():
-            arm.tell(now, f"not swapped: {problem}")
-
-    def set_swapped(self, swapped: bool, now: float) -> None:
-        """Let each hand drive the other arm than by the stance, or the same one; it has to be seen anew before it does.
-
-        An arm that follows a hand is stopped first.
-        """
-        if swapped == self.swapped:
-            return
-        self.swapped = swapped
-        self.arm_of_hand = {_other(hand): name for hand, name in self.arm_of_hand.items()}
-        for arm in self.arms.values():
-            if arm.state in FOLLOWING:
-                arm.change(Cause.FAULT, now, "the hands were swapped")
-            arm.forget()
-            arm.tell(now, f"driven by the {self.hand_of(arm.arm)} hand")
+            if problem is None:
+                arm.forget()  # its hand has to be seen anew before it drives the arm
+            hand = self.hand_of(arm.arm)
+            arm.tell(now, f"driven by the {hand} hand" if problem is None else f"not swapped: {problem}")
 
     def end_carry(self, now: float, reason: str) -> None:
         """If two arms carry, both hold."""
         if self.carry is not None:
             self.carry.end(now, reason)
-            if self.remote is not None:
-                self.remote.end(reason)
         self.carry = None
-
-    def agree(self, around: ArmMeasurements, now: float) -> None:
-        """Go by what the program of the other arm says of carrying, and answer it."""
-        remote = self.remote
-        if remote is None:
-            return
-        (arm,) = self.arms.values()
-        if self.carry is not None:
-            if not remote.agreed:
-                self.end_carry(now, remote.why_ended)
-            elif (problem := remote.problem or remote.silence(now)) is not None:
-                arm.change(Cause.FAULT, now, problem)
-        elif remote.leads:
-            self._take_answer(arm, remote, around, now)
-        if remote.asked:
-            self._answer(arm, remote, around, now)
-
-    def _take_answer(self, arm: ArmTeleop, remote: RemoteArm, around: ArmMeasurements, now: float) -> None:
-        """Carry, if the other program agrees; until it does, this arm goes on following its hand."""
-        theirs, ours = remote.answer(now), self._take_up(arm, around)
-        if theirs is None and arm.state is ArmState.ENGAGED:
-            return
-        if isinstance(theirs, pin.SE3) and isinstance(ours, Anchor) and arm.state is ArmState.ENGAGED:
-            remote.begin(theirs, now)
-            self.carry = CarryMode(arm, remote, {arm.arm: ours.tool, remote.arm: theirs}, now)
-            return
-        problem = theirs if isinstance(theirs, str) else ours if isinstance(ours, str) else _UNKNOWN
-        if arm.state is not ArmState.ENGAGED:
-            problem = _ENGAGE
-        remote.end(problem)
-        arm.tell(now, f"not carried: {problem}")
-
-    def _answer(self, arm: ArmTeleop, remote: RemoteArm, around: ArmMeasurements, now: float) -> None:
-        """Be carried, if nothing is in the way."""
-        found: Anchor | str = self._take_up(arm, around)
-        if remote.leads:
-            arm.tell(now, f"not carried: {_BOTH_ASK}")
-            found = _BOTH_ASK
-        if remote.problem is not None:
-            found = remote.problem
-        if isinstance(found, str):
-            remote.refuse(found)
-            return
-        arm.sag = found.sag
-        remote.agree(found.tool)
-        self.carry = CarriedMode(arm, remote, found.tool, now)
 
     def _take_up(self, arm: ArmTeleop, around: ArmMeasurements) -> Anchor | str:
         """Where an arm's tool is when it begins to be carried, or why it may not be."""
@@ -242,14 +178,14 @@ class BothArms:
 
     def _begin_carry(self, name: str, around: ArmMeasurements, now: float) -> None:
         """The hand of the arm ``name`` moves both tools."""
-        leader, remote = self.arms[name], self.remote
+        leader = self.arms[name]
         other = next((arm for arm in self.arms.values() if arm is not leader), None)
         taken = {arm.arm: self._take_up(arm, around) for arm in (leader, other) if arm is not None}
         problem = next((found for found in taken.values() if isinstance(found, str)), None)
         if leader.state is not ArmState.ENGAGED:
             problem = _ENGAGE
         elif other is None and problem is None:
-            problem = "this program drives one arm only" if remote is None else remote.ask(now)
+            problem = _ALONE
         if problem is not None:
             leader.tell(now, f"not carried: {problem}")
         elif other is not None:

@@ -17,10 +17,9 @@ from q2r2_control.quaternions import Vector, floats_of, se3_of
 from q2r2_control.teleop.workspace import Workspace
 from q2r2_control.types import LONGEST_DT, Array, Pose, pose_of
 
-GAIN = 20.0  # of keeping the relation [1/s]
-# The same where another program tells of one tool. A loop of the first order that is late by T is stable with a gain
-# below pi/(2 T), and T is 0.3 s where the ways there and back are both as late as they may be.
-REMOTE_GAIN = 5.0
+# Of keeping the relation [1/s]. A loop of the first order that is late by T is stable with a gain below pi/(2 T): T may
+# be 0.07 s.
+_GAIN = 20.0
 _MOST = 0.01, 0.05  # that it shifts a target by [m], [rad]
 
 
@@ -71,9 +70,7 @@ class RelationKeeper:
     A target's own velocity is fed forward, so the tool goes where the shift goes, and the loop is of first order.
     """
 
-    def __init__(self, gain: float = GAIN) -> None:
-        """``gain`` [1/s]: far below one over how late the frames are told."""
-        self._gain = gain
+    def __init__(self) -> None:
         self._shift, self._turn = np.zeros(3), np.eye(3)
         self._now: float | None = None
 
@@ -86,7 +83,7 @@ class RelationKeeper:
         """Where the controller's reference has the frame of either tool at ``now`` [s], world frame."""
         dt = 0.0 if self._now is None else min(max(now - self._now, 0.0), LONGEST_DT)
         self._now = now
-        gain = min(self._gain * dt, 1.0)
+        gain = min(_GAIN * dt, 1.0)
         self._shift = _at_most(self._shift + gain * (leading.translation - carried.translation), _MOST[0])
         turn = pin.log3(pin.exp3(gain * pin.log3(leading.rotation @ carried.rotation.T)) @ self._turn)
         self._turn = pin.exp3(_at_most(turn, _MOST[1]))

@@ -36,9 +36,9 @@ class HandMotion:
         self.filtered: Pose | None = None  # the hand's pose that the last target was made of
         # The newest hand pose, and where it would have the tool if nothing had slipped.
         self._newest: tuple[Pose, Pose] | None = None
-        self.bound_one_tool()
+        self._bound_one_tool()
 
-    def bound_one_tool(self) -> None:
+    def _bound_one_tool(self) -> None:
         """Targets are those of this arm's tool from now on, and nothing has slipped."""
         settings, arm = self._settings, self._arm
         self._carried: CarriedTools | None = None
@@ -74,7 +74,7 @@ class HandMotion:
     def anchor(self, hand: Pose, tool: Pose, shares: Shares, now: float) -> None:
         """The newest pose of the ``hand`` and ``tool``, in the world, correspond from now on."""
         if self._carried is not None:
-            self.bound_one_tool()
+            self._bound_one_tool()
         hand = self._rest.begin(hand, now)
         self._filter.reset(hand, now)
         self._rescale(hand, tool, shares)
@@ -110,17 +110,6 @@ class HandMotion:
         if self._shares != shares:
             self._rescale(hand, target, shares)  # from here on, so the target does not jump
             self._leash.anchor_anew()
-        return self._speed.limit(target, now)
-
-    def bounded(self, target: Pose, expected: Pose | None, now: float) -> Pose:
-        """A target that this hand has not made, within the arm's bounds: world frame, at ``now`` [s].
-
-        ``expected``: see :meth:`target`.
-        """
-        if expected is not None:
-            target = self._leash.hold(target, expected)
-        if isinstance(self._workspace, Workspace):
-            target = self._workspace.clip(target[0]), target[1]
         return self._speed.limit(target, now)
 
     def _hand(self, now: float) -> Pose:

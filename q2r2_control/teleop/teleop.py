@@ -14,7 +14,6 @@ from q2r2_control.teleop.arm import of_controls
 from q2r2_control.teleop.arm_states import FOLLOWING, HOLDING, ArmState, Cause
 from q2r2_control.teleop.both_arms import ArmMeasurements, BothArms
 from q2r2_control.teleop.episode_marks import EpisodeMarks
-from q2r2_control.teleop.remote_arm import RemoteArm
 from q2r2_control.types import ArmTarget, Event, HandSample
 
 _BY_HANDS = ArmState.ENGAGED, ArmState.CARRIED
@@ -119,6 +118,7 @@ class Teleop:
         now: float,
         commanded: Mapping[str, pin.SE3] | None = None,
         obstacles: Mapping[str, str] | None = None,
+        in_step: bool = True,
     ) -> dict[str, ArmTarget]:
         """One tick: process the samples and compute every arm's target.
 
@@ -128,6 +128,8 @@ class Teleop:
         Without ``commanded`` the orientation is the last target's, at first the measured one, and there is no sag.
         ``commanded`` is also what the leash is tied to; without it there is none.
         ``obstacles``: why an arm may not be engaged now, for reasons outside of this layer.
+        ``in_step``: whether ``commanded`` has all tools at one moment. While two arms carry, only such poses correct
+        their relation: those of two moments show a motion.
         ``now`` [s] is the clock of the samples' stamps.
         """
         clock_fault = self._clock(now)
@@ -142,8 +144,7 @@ class Teleop:
                 faults[name] = fault
         if faults:
             self._disengage(faults, now)
-        around = ArmMeasurements(tools, self._commanded, commanded, obstacles or {})
-        self._pair.agree(around, now)
+        around = ArmMeasurements(tools, self._commanded, commanded, obstacles or {}, in_step)
         for arm in self._arms.values():
             if samples or not arm.settled:
                 return self._act(around, now)
@@ -188,7 +189,8 @@ class Teleop:
         expected = {
             name: se3_of(pose) for name, arm in self._arms.items() if (pose := around.expected(arm)) is not None
         }
-        carried, (slip, slip_angle), targets = self._carried(now, expected), self._pair.carry.slip, {}
+        carried = self._pair.carry.targets(now, expected, expected if around.in_step else {})
+        (slip, slip_angle), targets = self._pair.carry.slip, {}
         for name, arm in self._arms.items():
             pose = carried.get(name)
             if pose is not None:
@@ -197,64 +199,24 @@ class Teleop:
             targets[name] = ArmTarget(pose, arm.gripper, slip, slip_angle, arm.sag, hand)
         return targets
 
-    def _carried(self, now: float, expected: dict[str, pin.SE3]) -> Mapping[str, pin.SE3]:
-        """Targets of the arms that carry."""
-        carry, remote = self._pair.carry, self._pair.remote
-        if carry is None:
-            return {}
-        if remote is None:
-            return carry.targets(now, expected, expected)
-        (name,) = self._arms
-        tool = expected.get(name)
-        at_once = remote.tools_at_once(name, tool)
-        if remote.leads and remote.pose is not None:
-            expected[remote.arm] = remote.pose
-        targets = carry.targets(now, expected, at_once)
-        # Where no reference is known, the tool counts as at its target.
-        remote.sends = targets.get(remote.arm) if remote.leads else targets.get(name) if tool is None else tool
-        return targets
-
-    def pair_with(self, remote: RemoteArm) -> None:
-        """Carry together with the ``remote`` arm, which another program drives."""
-        self._pair.remote = remote
-
     def home(self, now: float) -> None:
         """Both arms shall go home, because a program says so. What is in the way is told as an event."""
-        self._pair.home(now, None, {})
+        self._pair.home(now, None)
 
     def end_homing(self, now: float, outcome: str, arrived: bool = True) -> None:
         """The way home is over, with this ``outcome``; not ``arrived``: because of a fault."""
         self._pair.change(Cause.HOMED if arrived else Cause.FAULT, now, outcome)
 
-    @property
-    def stopped(self) -> bool:
-        """Whether the operator has stopped the arms."""
-        return self._pair.any_in(ArmState.STOPPED)
-
-    def set_stopped(self, stopped: bool, now: float, reason: str) -> None:
-        """Stop all arms, or take that back, because their operator did so elsewhere."""
-        self._pair.change(Cause.STOP if stopped else Cause.GO_ON, now, reason)
-
-    @property
-    def swapped(self) -> bool:
-        """Whether each hand drives the other arm than by the stance."""
-        return self._pair.swapped
-
-    def set_swapped(self, swapped: bool, now: float) -> None:
-        """Swap the hands, or swap them back, as was asked for elsewhere; an arm that follows one is stopped."""
-        self._pair.set_swapped(swapped, now)
-
-    def allow_swapping(self, problem: str | None) -> None:
-        """Of one arm alone: why its hand may not be swapped for the other arm's now, or None.
-
-        None says that another program drives the other arm, and goes by :attr:`swapped`.
-        """
-        self._pair.alone = problem
-
     def tell(self, now: float, reason: str) -> None:
         """What the operator should know of both arms; what was not done begins with "not"."""
         for arm in self._arms.values():
             arm.tell(now, reason)
+
+    def reset(self, now: float, arm: str, reason: str) -> None:
+        """An arm holds, its hand has to be seen anew before it drives the arm, and a stop of all arms is over."""
+        self.pause(now, reason, arm)
+        self._arms[arm].forget()
+        self._pair.change(Cause.GO_ON, now, reason)
 
     def connection_lost(self, now: float) -> None:
         """The input is lost: every arm that a hand drives stops, and everything received is forgotten."""
@@ -264,10 +226,17 @@ class Teleop:
         for arm in self._arms.values():
             arm.forget()
 
-    def pause(self, now: float, reason: str) -> None:
-        """Every arm holds until a new press, for a reason outside of this layer."""
+    def pause(self, now: float, reason: str, arm: str | None = None) -> None:
+        """Every arm holds until a new press, for a reason outside of this layer.
+
+        With ``arm`` the reason is of that arm: others that follow their hands hold too where they are linked.
+        """
         self._clock(now)
-        self._pair.change(Cause.FAULT, self._now if self._now is not None else 0.0, reason)
+        now = self._now if self._now is not None else 0.0
+        if arm is None or self.homing:
+            self._pair.change(Cause.FAULT, now, reason)
+        elif self._arms[arm].state not in HOLDING:
+            self._stop({arm: reason}, now)
 
     def _clock(self, now: float) -> str | None:
         """Advance the time; returns the fault of a clock that cannot be followed, or None."""
@@ -293,10 +262,14 @@ class Teleop:
                 self._pair.change(Cause.FAULT, now, f"on the way home: {fault}")
             return
         active = {name: fault for name, fault in faults.items() if self._arms[name].state in _LED}
-        for name, fault in active.items():
+        if active:
+            self._stop(active, now)
+
+    def _stop(self, faults: Mapping[str, str], now: float) -> None:
+        """Stop arms for a fault of each, and those that are linked to them."""
+        for name, fault in faults.items():
             self._arms[name].change(Cause.FAULT, now, fault)
-        if active and self._linked:
-            first, fault = next(iter(active.items()))
-            for name, arm in self._arms.items():
-                if name not in active:
-                    arm.change(Cause.FAULT, now, f"linked to {first}: {fault}")
+        first, fault = next(iter(faults.items()))
+        for name, arm in self._arms.items():
+            if self._linked and name not in faults:
+                arm.change(Cause.FAULT, now, f"linked to {first}: {fault}")

@@ -28,7 +28,7 @@ PERIOD = 1.0 / 72.0  # of the hand's messages, as a Quest sends them, and of /tf
 HAND = pin.SE3(pin.exp3(np.array([0.2, -0.4, 0.6])), np.array([0.3, 0.1, 1.0]))
 TOOL = pin.SE3(pin.exp3(np.array([3.0, 0.2, 0.1])), np.array([0.5, 0.25, 0.38]))
 # Longer than by default, so that other load on the machine does not look like a fault.
-PATIENT = {"teleop.gate.timeout": 1.0, "tool_timeout": 1.0, "link_timeout": 3.0, "listener_timeout": 1.0}
+PATIENT = {"teleop.gate.timeout": 1.0, "tool_timeout": 1.0, "listener_timeout": 1.0}
 
 
 def patient(parameters: dict[str, Any]) -> list[str]:
@@ -61,7 +61,7 @@ class ArmRig:
         self.arm, self.node = arm, node
         self.hand, self.tool = HAND, TOOL
         self.lower = self.upper = False
-        self.grip = 0.0
+        self.grip = self.trigger = 0.0
         self.sends_hand = self.sends_tool = self.follows = True
         self.targets: list[PoseStamped] = []
         self.state: dict[str, Any] = {}
@@ -149,7 +149,8 @@ class ArmRig:
         pose, inputs, tf = self._made
         if self.sends_hand:
             pose.publish(stamped_pose(self.hand, "", now))
-            inputs.publish(OVR2ROSInputs(button_upper=self.upper, button_lower=self.lower, press_middle=self.grip))
+            held = {"press_middle": self.grip, "press_index": self.trigger}
+            inputs.publish(OVR2ROSInputs(button_upper=self.upper, button_lower=self.lower, **held))
         if self.sends_tool:
             tf.publish(TFMessage(transforms=[stamped_transform("world", self._frame, self.tool)]))
 

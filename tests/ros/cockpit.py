@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from q2r2_control import Robot
-from tests.ros.arm_rig import ArmRig, ArmRigs
+from tests.ros.arm_rig import ArmRig, ArmRigs, patient
 from tests.ros.cell import PATIENT, Cell, start_controller, start_robot
 from tests.ros.processes import Processes
 from tests.ros.waiting import wait_until
@@ -25,7 +25,8 @@ class Cockpit:
         self.rigs = ArmRigs([self.left, self.right])
         for rig in self.rigs.rigs:
             rig.sends_tool = rig.follows = False
-            rig.start(processes, dict(bindings))
+        processes.start_module("q2r2_control.ros.nodes.arm_controllers", *patient(dict(bindings)))
+        self.rigs.wait(lambda rig: rig.state.get("hand_age") is not None, "its node receives the hand")
         wait_until(lambda: self.cell.state("phase") == "active", "the controller is active")
 
     def go_away(self) -> None:

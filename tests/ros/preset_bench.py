@@ -221,7 +221,6 @@ def start_arm(node: Any, processes: Processes, preset: str, arm: str, mode: str,
         "teleop.gate.timeout": 0.5,
         "teleop.leash.distance": 0.0,  # an arm that lags on an overloaded machine is not held up by an obstacle
         "tool_timeout": 0.5,
-        "link_timeout": 3.0,
         "listener_timeout": 0.5,
     }
     if mode == "raw":

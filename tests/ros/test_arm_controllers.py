@@ -1,96 +1,195 @@
-"""Both arms' nodes in one process: their faults stay told apart, and one process that fails stops both arms."""
+"""Both arms' nodes share one teleoperation: what is for both arms needs no message between nodes."""
 
 from __future__ import annotations
 
 import os
-import signal
 import sys
 import time
 from collections.abc import Iterator
-from functools import partial
 
+import numpy as np
+import pinocchio as pin
 import pytest
 
 from q2r2_control import Robot
 from tests.ros.conftest import NEEDS_ROS, spun_node
 from tests.ros.processes import Processes
-from tests.ros.waiting import call, wait_until
 
 pytest.importorskip("rclpy", reason=NEEDS_ROS)
-pytest.importorskip("quest2ros", reason="needs q2r2 ros build-interfaces")
-pytestmark = [pytest.mark.usefixtures("interfaces"), pytest.mark.alone]
+pytest.importorskip("control_msgs", reason="needs control_msgs: q2r2 ros build-interfaces")
+pytest.importorskip("tf2_msgs", reason="needs tf2_msgs: q2r2 ros build-interfaces")
 
-from q2r2_control.ros.monitoring.hand_listeners import PAUSED_BY_SERVICE  # noqa: E402
-from tests.ros.teleop_nodes import ARMS, TeleopNodes  # noqa: E402
-from tests.ros.teleoperation import Record, Teleoperation, teleoperation  # noqa: E402
+from q2r2_control.errors import ConfigError
+from q2r2_control.ros.monitoring.hand_listeners import PAUSED_BY_SERVICE
+from q2r2_control.ros.nodes.left_arm_controller import LeftArmController
+from q2r2_control.ros.nodes.right_arm_controller import RightArmController
+from q2r2_control.types import Array
+from tests.ros.arm_rig import HOLDING, ArmRigs, offset
+from tests.ros.cockpit import Cockpit
+from tests.ros.waiting import call, wait_until
 
-BOTH = "arm_controllers"
+pytestmark = pytest.mark.alone
+
+BINDINGS = {
+    "teleop.bindings.grip": "home",
+    "teleop.bindings.lower_hold": "stop",
+    "teleop.bindings.upper_hold": "swap_hands",
+    "teleop.bindings.trigger": "carry",
+}
+HOME, STILL = 0.01, 0.005  # [rad]
 
 
 @pytest.fixture(scope="module")
-def running(
-    domain: int, robot: Robot, interfaces: None, tmp_path_factory: pytest.TempPathFactory
-) -> Iterator[Teleoperation]:
-    processes = Processes(tmp_path_factory.mktemp("arm_controllers"), os.environ)
+def started(domain: int, robot: Robot, interfaces: None, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cockpit]:
+    processes = Processes(tmp_path_factory.mktemp("cockpit"), os.environ)
     with spun_node(domain) as node:
-        try:
-            names = ("mujoco_robot", "cartesian_controller", BOTH)
-            with teleoperation(TeleopNodes(node, robot, processes), names) as started:
-                yield started
-        finally:
-            processes.end_all()
+        yield Cockpit(node, robot, processes, BINDINGS)
+        processes.end_all()
 
 
 @pytest.fixture
-def moving(running: Teleoperation) -> Teleoperation:
-    """Both arms follow their hands, whatever state an earlier test has left."""
-    running.restore(BOTH)
-    running.move()
-    return running
+def cockpit(started: Cockpit) -> Iterator[Cockpit]:
+    started.go_away()
+    yield started
+    for arm in ("left", "right"):
+        assert call(started.cell.node, f"/{arm}_q2r2_arm_controller/reset").success
 
 
-@pytest.mark.parametrize("arm", ARMS)
-def test_what_pauses_one_arm_is_said_by_its_node_and_pauses_the_other_as_linked(
-    arm: str, moving: Teleoperation
+def test_what_stops_one_arm_is_said_by_its_node_and_stops_the_linked_one(cockpit: Cockpit) -> None:
+    left, right = cockpit.left, cockpit.right
+    assert call(cockpit.cell.node, "/right_q2r2_arm_controller/pause").success
+    cockpit.rigs.wait(lambda rig: rig.state["state"] == "lost", "both arms are paused")
+    assert right.state["last_event"] == f"lost: {PAUSED_BY_SERVICE}"
+    assert left.state["last_event"] == f"lost: linked to right: {PAUSED_BY_SERVICE}"
+    cockpit.rigs.engage()
+    left.hand = offset(left.hand, (1.0, 0.0, 0.0))
+    cockpit.rigs.wait(lambda rig: rig.state["state"] == "lost", "a jump of one hand pauses both")
+    assert right.state["last_event"].startswith("lost: linked to left: the hand jumped")
+
+
+def test_an_arm_that_its_operator_pauses_stops_alone_and_the_controller_goes_on_with_the_other(
+    cockpit: Cockpit,
 ) -> None:
-    nodes = moving.nodes
-    (other,) = set(ARMS) - {arm}
-    since = time.monotonic()
-    assert call(nodes.node, f"/{arm}_q2r2_arm_controller/pause").success
-    wait_until(lambda: not any(map(nodes.engaged, ARMS)), "both arms are paused")
-    for name, line in ((arm, PAUSED_BY_SERVICE), (other, f"linked to {arm}: ")):
-        nodes.wait_for_diagnosis(since, line)
-        said = [one.line for one in nodes.diagnoses if one.t > since and one.node == f"/{name}_q2r2_arm_controller"]
-        assert any(line in text for text in said)
-        assert name == other or not any("linked" in text for text in said)
+    left, right = cockpit.left, cockpit.right
+    left.press()
+    left.wait(lambda: left.state["state"] == "paused", "the left arm is paused")
+    time.sleep(1.0)  # longer than the controller waits for targets
+    assert right.state["engaged"]
+    rest = cockpit.cell.q
+    right.move((0.0, 0.0, 0.05), 0.5)
+    joints = cockpit.cell.robot.arms
+    wait_until(lambda: np.abs(cockpit.cell.q - rest)[joints["right"].joints].max() > 0.02, "the right arm follows")
+    assert np.abs(cockpit.cell.q - rest)[joints["left"].joints].max() < STILL
 
 
-def test_the_process_killed_stops_both_arms_and_its_restart_moves_none(
-    moving: Teleoperation, record_property: Record
-) -> None:
-    again = partial(moving.move_again, BOTH)
-    stop = moving.measure_stop(f"{BOTH} killed", partial(moving.nodes.kill, BOTH), again, record_property)
-    moving.restore(BOTH)
-    moving.assert_only_a_press_moves(stop)
+def test_the_way_home_that_one_hand_asks_for_is_of_both_and_a_press_of_the_other_ends_it(cockpit: Cockpit) -> None:
+    cockpit.ask_for_home()
+    cockpit.right.press("upper")
+    cockpit.rigs.wait(lambda rig: rig.state["state"] == "paused", "both arms are paused")
+    rest = cockpit.cell.joints.wait_for_rest()
+    assert cockpit.from_home > 2.0 * HOME
+    cockpit.rigs.wait(lambda rig: rig.state["ready"], "they can be engaged")
+    assert call(cockpit.cell.node, "/cartesian_controller/home").success
+    cockpit.rigs.wait(lambda rig: rig.state["last_event"] == "paused: at home", "a service brings both home")
+    assert cockpit.from_home < HOME
+    assert np.abs(cockpit.cell.q - rest).max() > HOME
 
 
-def test_the_process_frozen_stops_both_arms_and_moves_none_when_it_continues(
-    moving: Teleoperation, record_property: Record
-) -> None:
-    nodes = moving.nodes
-    freeze = partial(nodes.signal, BOTH, signal.SIGSTOP)
-    stop = moving.measure_stop(f"{BOTH} frozen", freeze, partial(moving.move_again, BOTH), record_property)
-    time.sleep(max(stop.fault + 1.0 - time.monotonic(), 0.0))
-    woken = nodes.signal(BOTH, signal.SIGCONT)
-    nodes.wait_for_diagnosis(woken, "this node stood still for 1.")
-    moving.assert_only_a_press_moves(stop)
+@pytest.mark.parametrize("by", ["the other hand", "a service"])
+def test_a_stop_of_one_hand_stops_both_arms_until_it_is_taken_back(by: str, cockpit: Cockpit) -> None:
+    cockpit.hold_lower(cockpit.left)
+    cockpit.rigs.wait(lambda rig: rig.state["state"] == "stopped", "both arms are stopped")
+    rest = cockpit.cell.joints.wait_for_rest()
+    cockpit.right.press()
+    cockpit.rigs.move((0.1, 0.0, 0.0), 0.5)
+    assert np.abs(cockpit.cell.q - rest).max() < STILL
+    if by == "a service":
+        assert call(cockpit.cell.node, "/left_q2r2_arm_controller/reset").success
+    else:
+        cockpit.hold_lower(cockpit.right)
+    cockpit.rigs.wait(lambda rig: rig.state["state"] == "paused", "it is taken back for both")
+    assert np.abs(cockpit.cell.q - rest).max() < STILL
+
+
+def test_hands_that_are_swapped_drive_the_other_arm(cockpit: Cockpit) -> None:
+    left, right = cockpit.left, cockpit.right
+    cockpit.rigs.pause()
+    cockpit.hold_upper(left)
+    cockpit.rigs.wait(lambda rig: rig.state["hand"] != rig.arm and rig.state["ready"], "the hands are swapped")
+    rest = cockpit.cell.joints.wait_for_rest()
+    hand = ArmRigs([left])
+    hand.press_until(lambda _: right.state["engaged"], "the left hand engages the right arm")
+    left.move((0.0, 0.0, 0.06), 0.6)
+    joints = cockpit.cell.robot.arms
+    wait_until(lambda: np.abs(cockpit.cell.q - rest)[joints["right"].joints].max() > 0.03, "the right arm follows")
+    assert np.abs(cockpit.cell.q - rest)[joints["left"].joints].max() < STILL
+    hand.press_until(lambda _: right.state["state"] in HOLDING, "and pauses it")
+    cockpit.hold_upper(right)
+    cockpit.rigs.wait(lambda rig: rig.state["hand"] == rig.arm, "the hands are swapped back")
+
+
+def test_one_hand_moves_both_tools_which_keep_their_relation_and_needs_no_other_hand(cockpit: Cockpit) -> None:
+    robot = cockpit.cell.robot
+    cockpit.rigs.move((-0.06, 0.0, -0.05), 0.5)
+    cockpit.cell.joints.wait_for_rest()
+    cockpit.right.press()
+    cockpit.right.sends_hand = False
+    try:
+        cockpit.left.trigger = 1.0
+        cockpit.left.wait(lambda: cockpit.right.state["state"] == "carried", "the right arm is carried")
+        cockpit.left.trigger = 0.0
+        start = cockpit.cell.joints.wait_for_rest()
+        cockpit.cell.forget()
+        cockpit.left.move((0.03, -0.03, -0.05), 1.5, 0.25)
+        errors = np.array([apart(robot, start, q) for q in cockpit.cell.postures])
+        rest = cockpit.cell.joints.wait_for_rest()
+        time.sleep(1.0)
+        print(f"\nrelation of the tools in motion: mean {errors.mean(axis=0)}, most {errors.max(axis=0)} [m, rad]")
+        moved = robot.tool_pose(rest, "right").translation - robot.tool_pose(start, "right").translation
+        assert np.linalg.norm(moved) > 0.03
+        way, turn = apart(robot, start, cockpit.cell.q)
+        assert way < 1e-3
+        assert turn < np.radians(0.5)
+    finally:
+        cockpit.right.sends_hand = True
+    cockpit.left.press()
+    cockpit.rigs.wait(lambda rig: rig.state["state"] == "paused", "a press ends it for both")
+
+
+def apart(robot: Robot, start: Array, q: Array) -> tuple[float, float]:
+    """By how much the relation of the tools differs from that at the start [m], [rad]."""
+    wanted, found = (robot.tool_pose(at, "left").actInv(robot.tool_pose(at, "right")) for at in (start, q))
+    turn = np.linalg.norm(pin.log3(found.rotation.T @ wanted.rotation))
+    return float(np.linalg.norm(found.translation - wanted.translation)), float(turn)
+
+
+@pytest.mark.parametrize("given", ["mirror:=true", "rate:=100.0", "teleop.linked:=false", "mode:=filtered"])
+def test_nodes_that_cannot_be_one_teleoperation_are_refused(given: str, context: object) -> None:
+    left = LeftArmController(context=context)
+    with pytest.raises(ConfigError, match=f"{given.split(':')[0].split('.')[0]}.* differ; allowed: the same in both"):
+        RightArmController(context=context, partner=left, cli_args=["--ros-args", "-p", given])
+    left.destroy_node()
+
+
+def test_a_parameter_of_the_teleoperation_that_is_set_in_one_node_is_set_in_both(context: object) -> None:
+    from rclpy.parameter import Parameter
+
+    left = LeftArmController(context=context)
+    right = RightArmController(context=context, partner=left)
+    for name, value in (("mirror", True), ("teleop.leash.distance", 0.05)):
+        assert right.set_parameters([Parameter(name, value=value)])[0].successful
+        assert left.get_parameter(name).value == value
+    assert left.parameters.teleop == right.parameters.teleop == left.loop.teleop.settings
+    assert (left.hand, right.hand) == ("right", "left")
+    for node in (right, left):
+        node.destroy_node()
 
 
 def test_a_wrong_parameter_of_one_arm_ends_both_in_one_line(processes: Processes) -> None:
     process = processes.start(
         *(sys.executable, "-m", "q2r2_control.ros.nodes.arm_controllers"),
         *("--ros-args", "-p", "right_q2r2_arm_controller:rate:=-1.0"),
-        name=BOTH,
+        name="arm_controllers",
     )
     assert process.wait() == 2
     assert "parameter rate: " in process.output.splitlines()[-1]

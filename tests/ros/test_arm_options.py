@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
-import os
-import time
 from pathlib import Path
 from queue import Queue
 from typing import Any
@@ -32,28 +29,18 @@ def rig(node: Any) -> ArmRig:
     return ArmRig(node)
 
 
-def test_a_cells_yaml_gives_stance_and_scale_and_parameters_change_them(
-    node: Any, processes: Processes, tmp_path: Path
-) -> None:
+def test_a_cells_yaml_gives_stance_and_scale(node: Any, processes: Processes, tmp_path: Path) -> None:
     cell = external() | {"controller": "builtin"}
     del cell["external"]
     cell["teleop"] |= {"stance": "mirror_reflected", "position_scale": 0.5}
     config = tmp_path / "cell.yaml"
     config.write_text(yaml.safe_dump(cell))
     rig = ArmRig(node, "left", hand="right")
-    mirrored = rig.start(processes, {"config": config})
+    rig.start(processes, {"config": config})
     rig.engage()
     rig.move((0.08, 0.12, 0.0))
     assert_same(rig.wait_for_rest(), offset(TOOL, (0.04, -0.06, 0.0)), 1e-3)
     assert rig.state["stance"] == "mirror_reflected"
-    assert mirrored.interrupt() == 0
-    rig.sends_hand = rig.sends_tool = False
-
-    rig = ArmRig(node, "left")
-    rig.start(processes, {"config": config, "mirror": "false", "teleop.position_scale": 2.0})
-    rig.engage()
-    rig.move((0.0, 0.05, 0.0))
-    assert_same(rig.wait_for_rest(), offset(TOOL, (0.0, 0.1, 0.0)), 1e-3)
 
 
 def test_triggers_and_stick_are_bound_by_parameters_and_a_dead_man_is_no_fault_when_it_is_let_go(
@@ -155,13 +142,8 @@ def test_a_gripper_behind_a_topic_gets_its_positions(rig: ArmRig, node: Any, pro
 def test_a_target_that_slips_on_its_leash_is_felt(rig: ArmRig, processes: Processes) -> None:
     rig.follows = False  # as if something were in the way
     rig.start(processes, {"teleop.leash.distance": 0.05})
-    deadline = time.monotonic() + PATIENCE
-    while (0.5, 0.4) not in rig.pulses:  # pulses are not sent again where the machine lost one
-        assert time.monotonic() < deadline, "engaging is felt"
-        if rig.state.get("engaged"):
-            rig.pause()
-        rig.engage()
-        time.sleep(1.0)  # longer than a pulse
+    rig.engage()
+    rig.wait(lambda: (0.0, 0.0) in rig.pulses, "engaging is felt")
     rig.pulses.clear()
     rig.move((0.04, 0.0, 0.0))
     rig.wait_for_rest()
@@ -171,24 +153,3 @@ def test_a_target_that_slips_on_its_leash_is_felt(rig: ArmRig, processes: Proces
     rig.wait(lambda: rig.state["slip"] > 0.06, "the slip is reported")
     assert set(rig.pulses) == {(0.2, 0.2), (0.0, 0.0)}
     assert np.linalg.norm(rig.wait_for_rest().translation - TOOL.translation) < 0.051
-
-
-def test_the_first_line_of_a_press_costs_no_search_for_its_origin(
-    context: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    from q2r2_control.ros import BaseArmController
-
-    for cache in ("modulesbyfile", "_filesbymodname"):  # as in a process that has logged nothing yet
-        monkeypatch.setattr(inspect, cache, {})
-    node = BaseArmController("left", context=context)
-    looked: list[Any] = []
-    realpath = os.path.realpath
-
-    def counted(path: Any, **options: Any) -> Any:
-        looked.append(path)
-        return realpath(path, **options)
-
-    monkeypatch.setattr(os.path, "realpath", counted)
-    node.get_logger().info("engaged: lower button")
-    node.destroy_node()
-    assert len(looked) < 50  # of more than a thousand modules

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from tests.ros.conftest import NEEDS_ROS, spun_node
-from tests.ros.processes import PATIENCE, Processes, RosProcess
+from tests.ros.processes import PATIENCE, Processes
 from tests.ros.waiting import call
 
 pytest.importorskip("rclpy", reason=NEEDS_ROS)
@@ -22,7 +22,7 @@ pytest.importorskip("quest2ros", reason="needs q2r2 ros build-interfaces")
 pytestmark = pytest.mark.usefixtures("interfaces")
 
 from q2r2_control.errors import ConfigError  # noqa: E402
-from q2r2_control.teleop.haptics import CONTACT, GRASP, LIMIT, NEAR  # noqa: E402
+from q2r2_control.teleop.haptics import GRASP, NEAR  # noqa: E402
 from tests.ros.arm_rig import TOOL, ArmRig, assert_same, first, offset, patient, steps  # noqa: E402
 from tests.ros.programs.stalling_arm import STALL  # noqa: E402
 
@@ -153,17 +153,8 @@ def test_without_its_tools_pose_an_arm_is_not_engaged_nor_a_gripper_closed_witho
 
 
 def test_services_and_a_second_publisher_of_targets_pause_the_arm(rig: ArmRig, node: Any, processes: Processes) -> None:
-    from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
     from geometry_msgs.msg import PoseStamped
 
-    errors: Queue[str] = Queue()
-
-    def on_diagnostics(message: Any) -> None:
-        for status in message.status:
-            if status.level == DiagnosticStatus.ERROR:
-                errors.put(f"{status.name}: {status.message}")
-
-    node.create_subscription(DiagnosticArray, "/diagnostics", on_diagnostics, 10)
     rig.start(processes)
     for service in ("pause", "reset"):
         rig.engage()
@@ -175,83 +166,22 @@ def test_services_and_a_second_publisher_of_targets_pause_the_arm(rig: ArmRig, n
     rig.wait(lambda: rig.state["level"] == "error", "the second publisher is reported")
     assert "2 publishers of /q2r2/left/target_frame" in rig.state["message"]
     assert rig.state["state"] == "lost"
-    assert "/left_q2r2_arm_controller: 2 publishers" in errors.get(timeout=PATIENCE)
     rig.press()
     assert rig.state["state"] == "lost"
     node.destroy_publisher(second)
     rig.engage()
 
 
-def test_arms_with_different_mirror_settings_refuse_to_engage_and_a_fault_of_one_pauses_both(
-    node: Any, processes: Processes
-) -> None:
-    left, right = ArmRig(node, "left"), ArmRig(node, "right")
-    left.start(processes)
-    wrong = start_mirrored(right, processes)
-    left.wait(lambda: left.state.get("level") == "error", "the disagreement is reported")
-    assert left.state["message"] == (
-        "this arm is set to side_by_side, the right one to mirror: set mirror alike in both"
-    )
-    left.press()
-    left.wait(lambda: "not engaged: this arm is set to" in left.state["last_event"], "the press is refused")
-    assert wrong.interrupt() == 0
-
-    right.start(processes)
-    right.engage()
-    left.engage()
-    assert right.state["engaged"]
-    left.hand = offset(left.hand, (1.0, 0.0, 0.0))  # a jump, which is a fault of the left hand
-    left.wait(lambda: left.state["state"] == "lost", "the fault pauses its own arm")
-    right.wait(lambda: right.state["state"] == "lost", "and the other")
-    assert right.state["last_event"].startswith("lost: linked to left: the hand jumped")
-
-
-def test_an_alignment_by_the_hand_of_a_paused_arm_pauses_the_other_arm_although_they_are_not_linked(
-    node: Any, processes: Processes
-) -> None:
-    left, right = ArmRig(node, "left"), ArmRig(node, "right")
-    for each in (left, right):
-        each.start(processes, {"teleop.linked": False})
-    right.engage()
-    left.lower = left.upper = True
-    right.wait(lambda: right.state["state"] == "lost", "the alignment pauses the arm")
-    assert right.state["last_event"] == "lost: linked to left: alignment chord"
-    right.wait(lambda: not right.state["ready"], "it may not be engaged meanwhile")
-    right.press()
-    right.wait(lambda: "not engaged: the left arm's hand aligns" in right.state["last_event"], "the press is refused")
-    left.lower = left.upper = False
-    right.engage()
-    assert left.state["state"] == "idle"
-
-
-def start_mirrored(rig: ArmRig, processes: Processes) -> RosProcess:
-    process = processes.start_node(f"{rig.arm}_arm_controller", "mirror:=true")
-    rig.wait(lambda: rig.state.get("stance") == "mirror", "the mirrored arm is there")
-    rig.state = {}
-    return process
-
-
-@pytest.mark.parametrize(
-    ("condition", "pulse"),
-    [
-        ('{"spare_distance": 0.0}', (NEAR.frequency, 0.6)),
-        ('{"joints_at_limit": ["left_A4"]}', LIMIT[:2]),
-        ('{"contact_force": 50.0}', (CONTACT.frequency, 0.8)),
-    ],
-    ids=["near", "limit", "contact"],
-)
-def test_a_hand_feels_what_the_controller_says_of_its_arm(
-    condition: str, pulse: tuple[float, float], rig: ArmRig, node: Any, processes: Processes
-) -> None:
+def test_a_hand_feels_what_the_controller_says_of_its_arm(rig: ArmRig, node: Any, processes: Processes) -> None:
     from std_msgs.msg import String
 
     publisher = node.create_publisher(String, "/cartesian_controller/condition/left", 10)
     rig.start(processes)
     rig.wait(publisher.get_subscription_count, "the node listens")
-    for data in ("no JSON", '{"spare_distance": "near"}', "{}", condition):
+    for data in ("no JSON", '{"spare_distance": "near"}', "{}", '{"spare_distance": 0.0}'):
         publisher.publish(String(data=data))
     rig.wait(lambda: len(rig.pulses) >= 2, "a vibration comes, and its end")
-    assert rig.pulses == [pulse, (0.0, 0.0)]
+    assert rig.pulses == [(NEAR.frequency, 0.6), (0.0, 0.0)]
 
 
 @pytest.mark.parametrize("kind", ["GripperCommand", "ParallelGripperCommand"])
@@ -323,16 +253,11 @@ def test_a_gripper_follows_a_trigger_with_a_few_goals_a_second(rig: ArmRig, proc
 
 BAD_PARAMETERS = {
     "preset:=kuka": "preset = 'kuka': allowed are builtin, kuka_lbr_clik",
-    "mode:=direct": "mode = 'direct': allowed are raw, filtered",
     "preset:=jtc": "preset = 'jtc' with mode = 'raw': it takes joint positions",
     "mirror_reflected:=true": "allowed with mirror = True only",
     "rate:=5.0": "parameter rate = 5: preset builtin needs at least 20",
-    "rate:=fast": "parameter rate: ",
     "teleop.gate.timeout:=9.0": "parameter teleop.gate.timeout: ",
-    "teleop.axes:=[+x,+x,+z]": "parameter teleop.axes = ",
-    "guard.max_velocity:=0.0": "parameter guard.max_velocity = 0.0",
     "teleop.bindings.grip:=dead_man": "lower is pause_toggle and grip is dead_man; allowed: one way to engage",
-    "teleop.bindings.grip:=wave": "parameter teleop.bindings.grip = 'wave'",
 }
 
 
@@ -344,9 +269,3 @@ def test_a_bad_parameter_is_refused_with_one_line(given: str, context: Any) -> N
         LeftArmController(context=context, cli_args=["--ros-args", "-p", given])
     assert BAD_PARAMETERS[given] in str(error.value)
     assert len(str(error.value).splitlines()) == 1
-
-
-def test_a_node_with_a_bad_parameter_ends_with_that_line(processes: Processes) -> None:
-    process = processes.start_node("left_arm_controller", "mode:=direct")
-    assert process.wait() == 2
-    assert process.output == "left_arm_controller.py: mode = 'direct': allowed are raw, filtered\n"

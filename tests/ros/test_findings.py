@@ -31,7 +31,7 @@ def arm(name: str, **values: Any) -> NodeView:
         "state": "idle",
         "ready": True,
         "engaged": False,
-        "sent": {f"/{name}/target": 1, f"/{name}/carry": 0},
+        "sent": {f"/{name}/target": 1},
     }
     return node(f"/{name}_arm", **(given | values))
 
@@ -79,18 +79,6 @@ def test_nothing_is_found_in_a_good_set_nor_where_none_runs() -> None:
             id="two publishers of a target",
         ),
         pytest.param(
-            view(topic("/left/carry", ("/left_arm", "/x"), ("/right_arm",))),
-            "2 publishers of /left/carry: /left_arm, /x",
-            "end all but one",
-            id="two publishers for the arm that is carried",
-        ),
-        pytest.param(
-            view(topic("/q2r_left_hand_pose", ("/hand", "/hand2"), ("/left_arm",))),
-            "2 publishers of /q2r_left_hand_pose",
-            "end all but one",
-            id="two inputs",
-        ),
-        pytest.param(
             view(topic("/positions", ("/x",), ("/robot",))),
             "/robot is commanded by several",
             "end",
@@ -104,12 +92,6 @@ def test_nothing_is_found_in_a_good_set_nor_where_none_runs() -> None:
             "two controllers take /left/target: /controller, /other",
             "end all but one",
             id="two controllers",
-        ),
-        pytest.param(
-            view(topic("/left/target", ("/left_arm",), ("/controller", "/controller"))),
-            "two controllers take /left/target",
-            "end all but one",
-            id="the same controller twice",
         ),
         pytest.param(view(names=("/robot", "/robot")), "2 nodes are called /robot", "end", id="one node twice"),
         pytest.param(view(without="/left_arm"), "the left arm: no node", "start left_arm_controller", id="no arm"),
@@ -134,20 +116,10 @@ def test_nothing_is_found_in_a_good_set_nor_where_none_runs() -> None:
             "/c/reset",
             id="stop",
         ),
-        pytest.param(
-            view(topic("/joint_states", ("/robot",), ("/controller",), "a/msg/A", "b/msg/B")),
-            "2 types",
-            "rename",
-            id="types",
-        ),
     ],
 )
 def test_what_stops_the_arms_is_found_with_its_cure(seen: SetView, what: str, cure: str) -> None:
     assert [one for one in found(seen) if one.stops_arms and what in one.what and cure in one.cure], found(seen)
-
-
-def test_a_recorder_may_listen_to_what_arms_say_while_they_carry() -> None:
-    assert found(view(topic("/left/carry", ("/left_arm",), ("/right_arm", "/recorder")))) == []
 
 
 def test_controllers_of_an_arm_each_may_share_a_topic_of_commands() -> None:

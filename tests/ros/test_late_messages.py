@@ -56,7 +56,7 @@ def test_a_late_target_is_passed_on_as_none_and_reported(context: Any, robot: Ro
     node = BaseNode("intake", context=context)
     intake = TargetIntake(node, robot, lambda: None)
     taken: list[bool] = []
-    intake.subscribe(lambda arm, pose, *_: taken.append(pose is not None))
+    intake.subscribe(lambda arm, pose, *_: taken.append(pose is not None), lambda arm: None)
     targets = Arrivals(node, "/q2r2/left/target_frame")
     for took in (USUAL, USUAL, LATE, USUAL):
         targets.arrive(stamped_pose(pin.SE3.Identity(), "world", 0.0), took)

@@ -144,12 +144,12 @@ def test_controllers_of_joints_get_them_from_the_built_in_one_each_on_its_topic(
         assert parameters[f"{arm}.target_frame_id"] == "bh_robot_base"
 
 
-def test_arms_have_a_process_each_where_that_is_asked_for_or_they_are_not_linked(tmp_path: Path) -> None:
+def test_arms_have_a_process_each_where_that_is_asked_for(tmp_path: Path) -> None:
     assert names(nodes_of(CONFIG, "none"))[2:] == TOGETHER
     assert names(nodes_of(CONFIG, "none", separate=True))[2:] == SEPARATE
     file = tmp_path / "not_linked.yaml"
     file.write_text(yaml.safe_dump(external() | {"teleop": {"linked": False}}))
-    assert names(nodes_of(str(file), "none")) == SEPARATE
+    assert names(nodes_of(str(file), "none")) == TOGETHER  # a stop and an alignment are of both arms
 
 
 def test_a_cell_with_one_arm_has_one_arms_nodes(tmp_path: Path) -> None:

@@ -35,7 +35,7 @@ from q2r2_control.recording.reader import Recording
 from q2r2_control.recording.ros_recording import open_recording
 from q2r2_control.recording.ros_topics import RECORDER_EVENTS
 from q2r2_control.recording.rows import HEAD, channel_of
-from q2r2_control.ros.base_node import COMMAND_QOS, RECORDED_QOS, SENT_COMMAND_QOS, STREAM_QOS
+from q2r2_control.ros.base_node import COMMAND_QOS, RECORDED_QOS, STREAM_QOS
 from q2r2_control.teleop.episode_marks import NO_RECORDING, VERDICT, verdict_line
 from q2r2_control.teleop.haptics import (
     EPISODE_BEGINS,
@@ -145,17 +145,6 @@ def test_messages_are_in_the_file_to_the_byte_and_no_ros_is_needed_to_read_it(
     about = Recording(folder).about
     assert about.notes["task"] == "3: blocks"
     assert Recording(folder).closed
-
-
-def test_what_arms_say_while_they_carry_is_kept_and_no_arm_waits_for_the_recorder(
-    recorder: RunningRecorder, node: Any
-) -> None:
-    topic = "/q2r2/left/carry"
-    publisher = node.create_publisher(String, topic, SENT_COMMAND_QOS)
-    recorder.wait_until_heard(topic, lambda: publisher.publish(String(data="a pose")))
-    (listener,) = node.get_subscriptions_info_by_topic(topic)
-    assert listener.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT
-    recorder.end()
 
 
 def test_pictures_of_a_real_camera_are_kept_as_they_came(node: Any, processes: Processes, tmp_path: Path) -> None:

@@ -107,8 +107,6 @@ def test_the_command_watches_nodes_and_subscribes_to_no_command_and_no_hand(node
     topics = {topic["name"]: topic for topic in found["topics"]}
     assert topics["/q2r2/left/target_frame"]["subscribers"] == []
     assert topics["/q2r_left_hand_pose"]["publishers"] == ["/simulation_input"]
-    carried = topics["/q2r2/left/carry"]
-    assert (carried["publishers"], carried["rate"]) == (["/left_q2r2_arm_controller"], 0.0)
 
 
 def test_a_domain_without_a_set_is_exit_code_1(processes: Processes) -> None:
@@ -118,14 +116,6 @@ def test_a_domain_without_a_set_is_exit_code_1(processes: Processes) -> None:
     assert watch.wait(LONG) == 1
     assert "0 nodes of a set" in watch.output
     assert "no node teleoperates this arm" in watch.output
-
-
-@pytest.mark.parametrize("arguments", [("--duration", "-1"), ("nowhere.yaml",)])
-def test_what_cannot_be_watched_is_one_line(processes: Processes, arguments: tuple[str, ...]) -> None:
-    watch = processes.start(sys.executable, "-m", "q2r2_control", "ros", "watch", *arguments, name="watch")
-    assert watch.wait(LONG) == 2
-    (line,) = watch.output.splitlines()
-    assert arguments[-1] in line
 
 
 @pytest.mark.slow
@@ -155,15 +145,9 @@ def test_the_doctor_finds_two_inputs_and_an_arm_without_its_robot_and_says_what_
     assert "start cartesian_controller" in cures["no built-in controller runs"]
 
 
-@pytest.mark.parametrize(
-    ("variable", "value", "finding"),
-    [
-        ("ROS_DOMAIN_ID", "999", "ROS_DOMAIN_ID is '999'"),
-        ("RMW_IMPLEMENTATION", "rmw_nothing_cpp", "no node can start"),
-    ],
-)
-def test_the_doctor_says_why_no_node_can_start(processes: Processes, variable: str, value: str, finding: str) -> None:
-    doctor = processes.start(sys.executable, "-m", "q2r2_control", "ros", "doctor", name="doctor", **{variable: value})
+def test_the_doctor_says_why_no_node_can_start(processes: Processes) -> None:
+    command = (sys.executable, "-m", "q2r2_control", "ros", "doctor")
+    doctor = processes.start(*command, name="doctor", RMW_IMPLEMENTATION="rmw_nothing_cpp")
     assert doctor.wait(LONG) == 1
     (line,) = (line for line in doctor.output.splitlines() if line.startswith("stops arms"))
-    assert finding in line
+    assert "no node can start" in line

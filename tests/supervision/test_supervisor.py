@@ -35,7 +35,8 @@ class World:
     """A supervisor and arms that are where its references are, as long as they are not blocked."""
 
     def __init__(self, robot: Robot, controller: CartesianController) -> None:
-        self.supervisor = Supervisor(robot, controller, StreamSettings(), watch_settings(STRICT, yields=False))
+        self.streams = StreamSettings()
+        self.supervisor = Supervisor(robot, controller, self.streams, watch_settings(STRICT, yields=False))
         self.q, self.now, self.blocked = robot.home.copy(), 0.0, False
         self.v, self.lag = np.zeros_like(self.q), DT  # [s]
         self.commanded: list[Array | None] = []
@@ -46,8 +47,10 @@ class World:
     def faults(self) -> bool:
         return self.supervisor.fault is not None
 
-    def run(self, seconds: float, target: pin.SE3 | None = None, sees: bool = True) -> None:
-        """Let time pass, with a steady target of the left arm, and with joint states or without."""
+    def run(
+        self, seconds: float, target: pin.SE3 | None = None, sees: bool = True, right: pin.SE3 | None = None
+    ) -> None:
+        """Let time pass, with a steady target of the left arm and the ``right`` one, and with joint states or not."""
         zero = np.zeros_like(self.q)
         for _ in range(round(seconds / DT)):
             self.now += DT
@@ -55,6 +58,8 @@ class World:
                 self.supervisor.take_joint_state(RobotState(self.q, self.v, zero, None, self.now), self.now)
             if target is not None:
                 self.supervisor.take_target("left", target, self.now)
+            if right is not None:
+                self.supervisor.take_target("right", right, self.now)
             reference = self.supervisor.tick(self.now, DT)
             self.commanded.append(None if reference is None else reference.q)
             self.v = zero if reference is None or self.blocked else (reference.q - self.q) / self.lag
@@ -81,6 +86,63 @@ def test_nothing_is_commanded_before_joint_states_are_good_and_at_rest(world: Wo
     assert world.is_in(Phase.ACTIVE)
     first = next(q for q in world.commanded if q is not None)
     assert np.allclose(first, world.q, atol=1e-9)
+
+
+def engage_both(world: World, controller: CartesianController) -> tuple[pin.SE3, pin.SE3]:
+    """Both arms follow; returns where their targets begin."""
+    world.run(0.2)
+    left, right = controller.tool_pose("left"), controller.tool_pose("right")
+    world.run(0.1, left, right=right)
+    assert [world.supervisor.arm_state(arm) for arm in ("left", "right")] == ["following", "following"]
+    return left, right
+
+
+def test_where_the_targets_of_one_linked_arm_cease_both_hold_until_a_stream_of_each_begins_anew(
+    world: World, controller: CartesianController
+) -> None:
+    _, right = engage_both(world, controller)
+    world.run(0.3, right=raised(right, 0.01))
+    assert not world.supervisor.follows("right")
+    assert ["ceased" in line for line in world.supervisor.ended_targets] == [True, True]
+    rest = controller.tool_pose("right")
+    world.run(1.0, right=raised(right, 0.02))  # the stream that goes on
+    assert np.allclose(controller.tool_pose("right").translation, rest.translation, atol=1e-6)
+    world.run(0.2)
+    world.run(0.1, controller.tool_pose("left"), right=controller.tool_pose("right"))
+    assert [world.supervisor.arm_state(arm) for arm in ("left", "right")] == ["following", "following"]
+    assert world.supervisor.ended_targets == []
+
+
+def test_a_target_that_comes_just_after_the_timeout_does_not_hide_that_targets_ceased(
+    world: World, controller: CartesianController
+) -> None:
+    left, right = engage_both(world, controller)
+    for _ in range(3):
+        world.now += 0.07
+        world.supervisor.take_target("right", right, world.now)
+    world.supervisor.take_target("left", left, world.now)
+    assert [world.supervisor.follows(arm) for arm in ("left", "right")] == [True, False]
+
+
+def test_two_publishers_of_one_linked_arm_hold_both(world: World, controller: CartesianController) -> None:
+    left, _ = engage_both(world, controller)
+    for number in (100, 5):
+        world.supervisor.take_target("left", left, world.now, number)
+    assert [world.supervisor.follows(arm) for arm in ("left", "right")] == [False, False]
+
+
+def test_a_stream_that_its_sender_ends_stops_its_own_arm_only(world: World, controller: CartesianController) -> None:
+    _, right = engage_both(world, controller)
+    world.supervisor.release_target("left")
+    world.run(0.5, right=right)
+    assert [world.supervisor.arm_state(arm) for arm in ("left", "right")] == ["holding", "following"]
+
+
+def test_arms_that_are_not_linked_end_their_streams_alone(world: World, controller: CartesianController) -> None:
+    world.streams.linked = False
+    _, right = engage_both(world, controller)
+    world.run(0.5, right=right)
+    assert [world.supervisor.arm_state(arm) for arm in ("left", "right")] == ["holding", "following"]
 
 
 def test_a_loop_that_stood_still_commands_nothing_of_the_past_and_follows_no_target_that_waited(

@@ -47,6 +47,8 @@ class Operator:
         }
     )
     commanded: dict[str, pin.SE3] | None = None
+    in_step: bool = True
+    obstacles: dict[str, str] = field(default_factory=dict)
     lower: set[str] = field(default_factory=set)  # hands that hold the button
     upper: set[str] = field(default_factory=set)
     silent: set[str] = field(default_factory=set)  # hands that send nothing
@@ -73,7 +75,7 @@ class Operator:
             if self.now >= self._next_sample - 1e-9:
                 samples = self.samples()
                 self._next_sample = self.now + PERIOD
-        self.targets = self.teleop.update(samples, self.tools, self.now, self.commanded)
+        self.targets = self.teleop.update(samples, self.tools, self.now, self.commanded, self.obstacles, self.in_step)
         self.events += self.teleop.take_events()
         return self.targets
 

@@ -94,6 +94,12 @@ class TestAStop:
         driver.press(*SIDES)
         assert driver.states == STOPPED
 
+    def test_is_over_for_both_arms_when_one_is_reset(self) -> None:
+        driver = engaged()
+        push(driver, "grip")
+        driver.teleop.reset(driver.now, "left", "the reset service")
+        assert driver.states == PAUSED
+
     def test_that_a_button_is_held_for_is_not_lost_by_a_fault_in_between(self) -> None:
         driver = engaged(upper_hold="stop")
         driver.upper = {"left"}
@@ -119,6 +125,14 @@ class TestTheWayHome:
         assert not any(map(is_fault, driver.events))
         driver.press(*SIDES)
         assert driver.states == ENGAGED
+
+    def test_is_refused_only_for_what_is_in_the_way_of_the_arm_whose_hand_asks(self) -> None:
+        for blocked, states in (("left", PAUSED), ("right", HOMING)):
+            driver = engaged()
+            driver.press(*SIDES)
+            driver.obstacles = {blocked: "no tool pose"}
+            push(driver, "stick_down", hand="left")
+            assert driver.states == states
 
     def test_may_be_asked_for_by_arms_that_were_never_engaged(self) -> None:
         driver = squeezing(bindings=BINDINGS)
@@ -227,27 +241,11 @@ class TestTheHandOfOneArmAlone:
         driver.run(0.1)
         return driver
 
-    def test_is_not_swapped_unless_another_program_drives_the_other_arm(self) -> None:
+    def test_is_not_swapped(self) -> None:
         driver = self.driver()
         push(driver, "stick_left")
         assert [event.reason for event in driver.events] == ["not swapped: this program drives one arm only"]
-        driver.teleop.allow_swapping(None)
-        push(driver, "stick_left")
-        assert driver.teleop.swapped
-        assert driver.teleop.hand_of("left") == "right"
-        driver.press("left")
-        assert driver.states == {"left": "idle"}
-        driver.press("right")
-        assert driver.states == {"left": "engaged"}
-
-    def test_lets_go_of_its_arm_where_hands_are_swapped_elsewhere(self) -> None:
-        driver = self.driver()
-        driver.press("left")
-        driver.teleop.set_swapped(True, driver.now)
-        assert all(targets["left"].pose is None for targets in driver.run(0.2, waving(driver)))
-        assert driver.states == {"left": "lost"}
-        driver.press("right")
-        assert driver.states == {"left": "engaged"}
+        assert driver.teleop.hand_of("left") == "left"
 
 
 class TestAGripperThatFollowsATrigger:

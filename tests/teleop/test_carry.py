@@ -109,6 +109,19 @@ class TestBothTools:
                 assert np.linalg.norm(away) < 0.03 + (0.01 if arm == "right" else 0.0) + 1e-6
         assert driver.targets["left"].slip > 0.15
 
+    @pytest.mark.parametrize("in_step", [True, False])
+    def test_keep_their_relation_by_poses_of_one_moment_only(self, in_step: bool) -> None:
+        driver = carrying()
+        driver.in_step = in_step
+        begin = {arm: driver.targets[arm].pose for arm in SIDES}
+        right = begin["right"]
+        assert right is not None
+        late = pin.SE3(right.rotation, right.translation - np.array([0.0, 0.0, 0.004]))
+        driver.commanded = {"left": begin["left"], "right": late}
+        driver.run(0.2)
+        raised = driver.targets["right"].pose.translation[2] - right.translation[2]  # type: ignore[union-attr]
+        assert raised > 0.003 if in_step else abs(raised) < 1e-9
+
     def test_both_stay_in_their_boxes(self) -> None:
         box = {"x": [0.4, 0.6], "y": [-0.7, 0.7], "z": [0.35, 0.6], "soft_edge": 0.02}
         driver = carrying(workspace={"right": box})

@@ -58,6 +58,34 @@ def test_a_fault_of_the_left_hand_disengages(reason: str, linked: bool) -> None:
     assert driver.states["left"] == "engaged"
 
 
+@pytest.mark.parametrize("linked", [True, False], ids=["linked", "each for itself"])
+def test_what_stops_one_arm_outside_of_this_layer_stops_the_linked_one_once(linked: bool) -> None:
+    driver = engaged(linked=linked)
+    driver.teleop.pause(driver.now, "no tool pose", "left")
+    assert driver.states == (LOST if linked else {"left": "lost", "right": "engaged"})
+    driver.teleop.pause(driver.now, "no tool pose", "left")
+    assert driver.states == (LOST if linked else {"left": "lost", "right": "engaged"})
+    driver.run(0.1)
+    if linked:
+        driver.press("right")
+        driver.teleop.pause(driver.now, "no tool pose, still", "left")
+        assert driver.states == {"left": "lost", "right": "engaged"}
+
+
+def test_a_reset_arm_holds_until_a_press_after_its_hand_was_seen_anew() -> None:
+    driver = engaged(linked=False)
+    driver.teleop.reset(driver.now, "left", "the reset service")
+    assert driver.states == {"left": "lost", "right": "engaged"}
+    driver.silent = {"left"}
+    driver.run(0.1)
+    driver.press("left")
+    assert driver.states["left"] == "lost"
+    driver.silent = set()
+    driver.run(0.1)
+    driver.press("left")
+    assert driver.states == ENGAGED
+
+
 def test_silence_disengages_within_the_timeout_and_a_tick() -> None:
     driver = engaged()
     driver.tick(driver.samples())

@@ -11,8 +11,7 @@ from q2r2_control.ros.bridge.hand_intake import HandIntake
 from q2r2_control.ros.bridge.markers import TargetMarkers
 from q2r2_control.ros.bridge.parameters import ArmParameters
 from q2r2_control.ros.bridge.reports import ArmReport
-from q2r2_control.ros.monitoring.arm_link import ArmLink
-from q2r2_control.teleop.arm_states import AT_REST, ArmState, is_refusal
+from q2r2_control.teleop.arm_states import AT_REST, is_refusal
 from q2r2_control.teleop.haptics import HapticPulses
 from q2r2_control.teleop.sag import sagged
 from q2r2_control.types import ArmTarget, Event
@@ -23,8 +22,8 @@ _MARKER_PERIOD = 0.05  # [s]
 class ArmFeedback:
     """Keeps what was told last."""
 
-    def __init__(self, node: BaseNode, arm: str, values: ArmParameters, link: ArmLink, hand: HandIntake) -> None:
-        self._node, self._link, self._hand = node, link, hand
+    def __init__(self, node: BaseNode, arm: str, values: ArmParameters, hand: HandIntake) -> None:
+        self._node, self._hand = node, hand
         self.haptics = HapticPulses(values.teleop.haptics)
         self.last_event = self.paused = "not engaged yet"  # of all events, and of those that let the arm hold
         self._drawn = TargetMarkers(arm, values.tool_frame, values.world_frame)
@@ -33,18 +32,13 @@ class ArmFeedback:
         self._report = ArmReport(node, arm)
 
     def tell(self, event: Event) -> None:
-        """Report a change of the state: to the log, to the hand as vibrations, and to the other arm."""
+        """Report a change of the state: to the log, and to the hand as vibrations."""
         self.last_event = f"{event.destination}: {event.reason}"
         if event.destination in AT_REST and not is_refusal(event):
             self.paused = self.last_event
         self._node.get_logger().info(self.last_event)
         self.haptics.tell(event)
         self._report.tell(event)
-        if event.destination in (ArmState.ENGAGED, ArmState.CARRIED):
-            self._link.engaged()
-        stopped = event.source not in AT_REST and event.destination is ArmState.LOST
-        if stopped and not self._link.told(event.reason):
-            self._link.report(event.reason)
         self._node.report_health()
 
     def publish(

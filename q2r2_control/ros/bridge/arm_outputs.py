@@ -17,6 +17,7 @@ from q2r2_control.ros.base_node import LATCHED_QOS, BaseNode
 from q2r2_control.ros.bridge.frames import PoseTopic
 from q2r2_control.ros.bridge.parameters import BUILTIN_NODE, ArmParameters
 from q2r2_control.ros.bridge.target_output import TargetOutput, near
+from q2r2_control.teleop.arm_states import ArmState
 from q2r2_control.teleop.sag import MOST_SAG
 
 _POSE = 2  # of moveit_msgs/srv/ServoCommandType
@@ -145,10 +146,17 @@ class ArmOutputs:
         return next((fault for fault in faults if fault), None)
 
     def step(
-        self, target: pin.SE3 | None, tool: pin.SE3 | None, base: pin.SE3 | None, now: float, decided: float
+        self,
+        target: pin.SE3 | None,
+        tool: pin.SE3 | None,
+        base: pin.SE3 | None,
+        now: float,
+        decided: float,
+        state: ArmState,
     ) -> pin.SE3 | None:
         """Send the hand's target, see :meth:`TargetOutput.step`."""
-        return self.first.step(target, tool, pin.SE3.Identity() if self._filtered else base, now, decided)
+        base = pin.SE3.Identity() if self._filtered else base
+        return self.first.step(target, tool, base, now, decided, state=state)
 
     def relay(
         self, engaged: bool, tool: pin.SE3 | None, base: pin.SE3 | None, now: float, decided: float

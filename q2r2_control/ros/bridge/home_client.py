@@ -42,10 +42,10 @@ class HomeClient:
                 if teleop.homing:
                     self._phase = _Phase.UNDER_WAY
                 else:
-                    self._hold.call_async(Trigger.Request())
+                    self._ask_to_hold()
         elif not asked:
             self._phase = _Phase.NONE
-            self._hold.call_async(Trigger.Request())
+            self._ask_to_hold()
         elif said:
             self._phase = _Phase.UNDER_WAY
         elif self._phase is _Phase.UNDER_WAY:
@@ -54,6 +54,10 @@ class HomeClient:
             self._take_answer(teleop, now)
         elif now - self._since > _PATIENCE:
             self._end(teleop, now, outcome or f"not homing: {self._name} did not begin", arrived=bool(outcome))
+
+    def _ask_to_hold(self) -> None:
+        if self._hold is not None:
+            self._hold.call_async(Trigger.Request())
 
     def _ask(self, teleop: Teleop, now: float) -> None:
         if self._home is None:

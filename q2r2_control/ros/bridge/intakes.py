@@ -12,6 +12,7 @@ import numpy as np
 import pinocchio as pin
 from geometry_msgs.msg import PoseStamped
 from sensor_msgs.msg import JointState
+from std_msgs.msg import Empty
 
 from q2r2_control.config.timeouts import STREAM_TIMEOUT
 from q2r2_control.errors import ConfigError
@@ -23,6 +24,7 @@ from q2r2_control.ros.bridge.messages import (
     JointNumbers,
     age,
     delay,
+    ended_topic,
     joint_numbers,
     pose_of_numbers,
     robot_state,
@@ -67,11 +69,13 @@ class TargetIntake:
         self._refused: dict[str, tuple[Refusal, float]] = {}  # why an arm's last target was not used, and when [s]
         self.rejected = dict.fromkeys(robot.arms, 0)
 
-    def subscribe(self, take: Take) -> None:
-        """Pass each target to ``take``."""
+    def subscribe(self, take: Take, release: Callable[[str], None]) -> None:
+        """Pass each target to ``take``, and the arm whose sender ends its stream to ``release``."""
         for arm, topic in self.topics.items():
             on_target = partial(self._on_target, take, arm)
             self._node.create_subscription(PoseStamped, topic, on_target, COMMAND_QOS, raw=True)
+            on_end = partial(self._on_end, release, arm)
+            self._node.create_subscription(Empty, ended_topic(topic), on_end, COMMAND_QOS)
 
     def look(self) -> None:
         """Ask the graph which nodes publish."""
@@ -111,6 +115,9 @@ class TargetIntake:
             self._refuse(arm, Refusal("pose", "not a finite pose with a unit quaternion"))
         else:
             self._refused.pop(arm, None)
+
+    def _on_end(self, release: Callable[[str], None], arm: str, _: Empty) -> None:
+        release(arm)
 
     def _due(self, arm: str, made: int, received: float) -> float | None:
         """When a target is due that was received then [s], by its stamp [ns]; None where the stamp does not say.

@@ -146,6 +146,11 @@ class LiveWatching:
                 setattr(target, field, parameter.value)
 
 
+def is_of_teleop(name: str) -> bool:
+    """Whether a parameter is of the teleoperation that all arms have in common."""
+    return name in _MIRROR or name.startswith("teleop.")
+
+
 def _within(prefix: str, changes: Mapping[str, Any]) -> dict[str, Any]:
     """Of ``changes`` those of names under ``prefix``, without it."""
     begin = f"{prefix}."

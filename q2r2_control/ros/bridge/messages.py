@@ -27,6 +27,11 @@ _UNIT = 1e-3  # a quaternion's norm may be off by this
 _OLDEST = 0.1  # a message waits for the next tick, and no longer: more is a clock that was set [s]
 
 
+def ended_topic(target_topic: str) -> str:
+    """Where the sender of an arm's targets says that it ends the stream in order, because the operator paused."""
+    return f"{target_topic}/ended"
+
+
 def seconds(stamp: Time) -> float:
     """A message's stamp in seconds of its sender's clock."""
     return float(stamp.sec) + 1e-9 * float(stamp.nanosec)

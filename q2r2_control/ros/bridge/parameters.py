@@ -52,7 +52,6 @@ class ArmParameters:
     following_topic: str
     builtin_prefix: str
     tool_timeout: float  # [s]
-    link_timeout: float  # [s]
     listener_timeout: float  # [s]
     rate: float  # [Hz]
     preset: Preset
@@ -61,6 +60,11 @@ class ArmParameters:
     gripper: GripperSettings
     guard: GuardSettings
     teleop: TeleopSettings
+
+    @property
+    def builtin_node(self) -> str:
+        """Name of the built-in controller's node."""
+        return self.following_topic.partition("/following/")[0]
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,7 +121,6 @@ def arm_parameters(node: BaseNode, subclass: ArmDefaults) -> ArmParameters:
             node, "tool_timeout", "an older pose of the tool, or safe target, does not count", 0.01, 2.0
         ),
         listener_timeout=_timeout(node, "listener_timeout", "targets may not be acknowledged", 0.1, 10.0),
-        link_timeout=_timeout(node, "link_timeout", "the other arm's node may be silent", 0.1, 10.0),
         rate=_rate(node, preset, given.rate),
         preset=preset,
         mode=mode,

@@ -6,6 +6,7 @@ import json
 import time
 from collections.abc import Sequence
 from dataclasses import asdict
+from typing import Any
 
 from geometry_msgs.msg import PoseStamped
 from rclpy.node import Node
@@ -80,25 +81,26 @@ class ArmReport:
 class RecorderLink:
     """What the recorder's node says: whether it records, and whether an episode is open, whoever began it."""
 
-    def __init__(self, node: Node, marks: EpisodeMarks) -> None:
-        self._marks = marks
+    def __init__(self, node: Node) -> None:
+        self._state: dict[str, Any] | None = None  # the newest that has not been used
         self._heard = 0.0  # [s] of steady time
         self._served: int | None = None  # services that it has answered
         self._reasons: list[str] = []
         node.create_subscription(String, f"{RECORDER}/state", self._on_state, 10)
 
-    def update(self) -> list[str]:
+    def update(self, marks: EpisodeMarks) -> list[str]:
         """Once a tick, before the teleoperation; returns the reasons of new events that its services told."""
-        if self._marks.recorded and time.monotonic() - self._heard > _PATIENCE:
-            self._marks.recorded = False
+        if (state := self._state) is not None:
+            marks.recorded, marks.open, marks.any = state["records"], state["episode_open"], state["any_episode"]
+            self._state = None
+        if marks.recorded and time.monotonic() - self._heard > _PATIENCE:
+            marks.recorded = False
         reasons, self._reasons = self._reasons, []
         return reasons
 
     def _on_state(self, message: String) -> None:
-        state = json.loads(message.data)
+        self._state = state = json.loads(message.data)
         self._heard = time.monotonic()
-        self._marks.recorded, self._marks.open = state["records"], state["episode_open"]
-        self._marks.any = state["any_episode"]
         if self._served is not None and state["served"] != self._served:
             self._reasons.append(state["served_last"])
         self._served = state["served"]

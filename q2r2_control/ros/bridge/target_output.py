@@ -6,20 +6,23 @@ import math
 
 import pinocchio as pin
 from geometry_msgs.msg import PoseStamped, WrenchStamped
+from std_msgs.msg import Empty
 
-from q2r2_control.config.presets import Hold, Preset
+from q2r2_control.config.presets import BUILTIN, Hold, Preset
 from q2r2_control.config.teleop import GuardSettings
-from q2r2_control.ros.base_node import LATCHED_QOS, BaseNode
-from q2r2_control.ros.bridge.messages import PoseWriter, time_message
+from q2r2_control.ros.base_node import LATCHED_QOS, SENT_COMMAND_QOS, BaseNode
+from q2r2_control.ros.bridge.messages import PoseWriter, ended_topic, time_message
 from q2r2_control.ros.monitoring.endpoints import PublisherCount, WatchedPublisher, node_of
 from q2r2_control.supervision.pose_rate_limiter import PoseRateLimiter
 from q2r2_control.supervision.target_stream import apart
+from q2r2_control.teleop.arm_states import ArmState
 
 _GRAPH_PERIOD = 0.1  # of asking the graph for subscribers [s]
 # After a subscriber appeared the graph is asked at every tick, because it knows an endpoint before it knows its node.
 # Until the node is known nothing is sent: it may be the restarted controller, whose first target must not be a jump.
 # If that takes longer than this, an engaged arm is paused [s].
 _NAME_TIMEOUT = 3.0
+_LAST_ON_ITS_WAY = 0.03  # a stream's last target and its end are on two topics: the end must not overtake it [s]
 # A tool farther from a held target than this was moved by something else: the target is not repeated.
 _HELD = 0.15, 0.6  # [m, rad]
 
@@ -55,6 +58,8 @@ class TargetOutput:
             self._wrench = node.create_publisher(WrenchStamped, preset.zero_wrench.format(ctrl=prefix), LATCHED_QOS)
         self.following = False  # a hand's target
         self.last_sent: pin.SE3 | None = None  # what the controller was asked for last, world frame; None: nothing
+        self._ends = node.create_publisher(Empty, ended_topic(topic), SENT_COMMAND_QOS) if preset is BUILTIN else None
+        self._sent_at = -math.inf  # the last target of a stream that has not ended yet [s]
         self._restarted = False
         self._endpoints: set[bytes] = set()  # of the controller
         self._messages = PoseWriter(frame)
@@ -126,12 +131,15 @@ class TargetOutput:
         now: float,
         decided: float,
         start: pin.SE3 | None = None,
+        state: ArmState = ArmState.ENGAGED,
     ) -> pin.SE3 | None:
         """Publish for ``now`` [s]; returns what was published, in the world frame.
 
         ``target``: where the tool should be, None while paused; ``tool``: where it is; ``base``: the frame in which
         the controller reads its targets. All are in the world frame; the latter two are None while not known.
         ``decided``: see :func:`publish_in_time`; ``start``: where a stream begins, by default at its first target.
+        ``state``: of the arm. The stream goes on while its operator may only begin to pause it, and then ends in order.
+        A stream that stops in any other way has ceased, for which the built-in controller holds linked arms too.
         """
         if self._unknown or self._present(now) > self._listeners:
             return None
@@ -142,18 +150,27 @@ class TargetOutput:
             self._publisher.begin()
             self._send_zero_wrench(now)
         pose = self.guard.step(target, now)
-        if pose is None or base is None or not (self.following or not self.guard.at_rest or self._holds(tool, now)):
+        moves = self.following or not self.guard.at_rest
+        if pose is None or base is None or not (moves or self._holds(tool, state, now)):
+            self._end_stream(state, now)
             return None
         if self.following and self._publisher.waits():
             return pose
         if self._publisher.publish(self._messages.at(base.actInv(pose), now), decided):
-            self.last_sent = pose
+            self.last_sent, self._sent_at = pose, now
         return pose
+
+    def _end_stream(self, state: ArmState, now: float) -> None:
+        """Say that the stream ends where its operator paused the arm; what has ceased says nothing."""
+        if self._ends is None or state is not ArmState.PAUSED:
+            self._sent_at = -math.inf
+        elif _LAST_ON_ITS_WAY < now - self._sent_at < math.inf:
+            self._sent_at = -math.inf
+            self._ends.publish(Empty())
 
     def forget(self, now: float) -> None:
         """Drop the held target; the next target begins a new stream."""
-        self.following = False
-        self.last_sent = None
+        self.following, self.last_sent, self._sent_at = False, None, -math.inf
         self.guard.reset(None, now)
 
     def _present(self, now: float) -> int:
@@ -163,14 +180,15 @@ class TargetOutput:
             self._counted = max(self._publisher.listeners, listed), now
         return self._counted[0]
 
-    def _holds(self, tool: pin.SE3 | None, now: float) -> bool:
+    def _holds(self, tool: pin.SE3 | None, state: ArmState, now: float) -> bool:
         """Whether the last target may be repeated."""
         if self.guard.pose is None:
             return False
         if tool is None or not near(self.guard.pose, tool, *_HELD):
             self.forget(now)
             return False
-        return self.preset.hold is Hold.REPEAT
+        pausing = self.preset is BUILTIN and state is ArmState.PAUSING
+        return self.preset.hold is Hold.REPEAT or pausing
 
     @property
     def _unknown_node(self) -> str:

@@ -55,7 +55,7 @@ def nodes_of(
 ) -> list[NodeProcess]:
     """The processes for a cell's YAML, in the order of their start: one for both arms, one for each other node.
 
-    ``separate``: one for each arm, as in a cell whose arms are not linked: there one arm goes on without the other.
+    ``separate``: one for each arm, each with a teleoperation of its own: what one hand does is for its own arm only.
 
     ``source`` of the hands: scripted, headset or none. ``robot``: mujoco, none, or auto, which is mujoco for
     ``controller: builtin`` only. ``recording``: parameters of the recorder, None without one; it starts first, and so
@@ -76,7 +76,7 @@ def nodes_of(
     elif cell.external.filtered:
         nodes.append(_node("cartesian_controller", config | _relayed(cell.external)))
     arms = [f"{arm}_arm_controller" for arm in SIDES if arm in cell.arms]
-    together = cell.teleop.linked and not separate and len(arms) == len(SIDES)
+    together = not separate and len(arms) == len(SIDES)
     nodes += [_node(name, config) for name in (["arm_controllers"] if together else arms)]
     if source == "scripted":
         nodes.append(NodeProcess("SimulationInput", "q2r2_control.ros.nodes.simulation_input"))

@@ -70,7 +70,7 @@ class CartesianControllerNode(ManagedNode):
         self._output = make_output(output, self, robot, config, self._period)
         self._targets = TargetIntake(self, robot, self.report_health)
         self._joints = JointIntake(self, robot)
-        streams, external = StreamSettings(), ExternalSettings()
+        streams, external = StreamSettings(linked=config.teleop.linked), ExternalSettings()
         watch = watch_settings(config.supervision, self._output.drive.yields)
         # A message with a bad number among good ones is another publisher's: no reason to bridge it.
         watch.unusable_time = 0.0
@@ -118,7 +118,7 @@ class CartesianControllerNode(ManagedNode):
         return self._output.drive.displaced
 
     def _connect(self) -> None:
-        self._targets.subscribe(self._take_target)
+        self._targets.subscribe(self._take_target, self._supervisor.release_target)
         self._joints.subscribe(self._supervisor.take_joint_state, self._grippers.take_joint_state)
         self.create_service(SetBool, "~/pause", self._on_pause)
         services: dict[str, Callable[[], str | None]] = {

@@ -8,8 +8,6 @@ from dataclasses import dataclass
 
 from q2r2_control.ros.watching.set_view import SILENT, ArmView, NodeView, SetView, TopicView
 
-# Topics on which nobody counts a listener: what an arm's node sends to the other one while both carry.
-_OPEN_TO_LISTENERS = "/carry"
 _ONE = "end all but one (a killed one counts for some seconds)"
 # What an arm's node says where something is in the way, and what helps.
 _CURES = (
@@ -17,7 +15,6 @@ _CURES = (
     ("no transform", "start the robot or robot_state_publisher; parameters end_effector_link_name, world_frame_id"),
     ("on /tf", "look at the robot's driver: its transforms have stopped"),
     (" hand ", "start tcp_endpoint and connect the headset, or SimulationInput"),
-    ("set mirror alike", "set the parameter mirror, or teleop.stance of the cell, alike in both arms' nodes"),
     ("publishers of", _ONE),
     ("joint states", "look at the robot's driver, and at joint_states_topic of cartesian_controller"),
 )
@@ -114,7 +111,7 @@ def _takers(view: SetView) -> Iterator[Finding]:
     senders = [node for node in view.nodes if node.arm is not None or node.is_controller]
     counted = {topic for node in senders for topic in node.sent}
     for topic in view.topics:
-        if topic.name not in counted or len(topic.subscribers) < 2 or topic.name.endswith(_OPEN_TO_LISTENERS):
+        if topic.name not in counted or len(topic.subscribers) < 2:
             continue
         names = ", ".join(topic.subscribers)
         if len(controllers.intersection(topic.subscribers)) > 1 or len(set(topic.subscribers)) == 1:

@@ -20,7 +20,7 @@ class StallingArm(LeftArmController):
         super().setup_interfaces()
         self._stalls = False
         signal.signal(signal.SIGUSR1, self._on_signal)
-        outputs: Any = self._outputs
+        outputs: Any = self.outputs
         step = outputs.step
 
         def late(*values: Any) -> Any:

@@ -1,0 +1,136 @@
+"""One tick of teleoperation for the arm nodes of a process, which share one :class:`Teleop`."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+import pinocchio as pin
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+
+from q2r2_control.config.teleop import TeleopSettings
+from q2r2_control.errors import ConfigError
+from q2r2_control.ros.bridge.home_client import HomeClient
+from q2r2_control.ros.bridge.reports import RecorderLink
+from q2r2_control.teleop.arm_states import HOLDING
+from q2r2_control.teleop.teleop import Teleop
+from q2r2_control.types import Event
+
+if TYPE_CHECKING:
+    from q2r2_control.ros.nodes.base_arm_controller import BaseArmController
+
+_TIME_PERIOD = 0.05  # [s]
+
+
+class TickInputs(NamedTuple):
+    """An arm and its controller in one tick; poses are in the world frame."""
+
+    tool: pin.SE3 | None  # measured
+    commanded: pin.SE3 | None  # by the controller's reference, or what is known instead
+    reference: int | None  # the stamp of that reference by the controller's clock [ns]; None: there is none
+    obstacle: str | None  # why the arm may not be engaged
+
+
+class TeleopLoop:
+    """Ticks the node of one arm, or of both: the same object of the package then decides for both at one moment.
+
+    Pausing both arms, the operator's stop, the alignment chord, swapped hands, the way home and two arms that carry
+    therefore need no messages between nodes. Timers and clock are the first node's.
+    """
+
+    def __init__(self) -> None:
+        self.nodes: list[BaseArmController] = []
+        self.teleop: Teleop
+
+    def join(self, node: BaseArmController) -> None:
+        """Teleoperate this node's arm too. Raises :class:`ConfigError` where both arms cannot share one teleoperation.
+
+        Called before the first tick.
+        """
+        ours, first = node.parameters, (self.nodes or [node])[0]
+        theirs = first.parameters
+        for what, differ in (
+            ("teleop, mirror and mirror_reflected", ours.teleop != theirs.teleop),
+            ("rate", ours.rate != theirs.rate),
+            ("mode", ours.mode != theirs.mode),
+            ("following_topic", ours.builtin_node != theirs.builtin_node),
+        ):
+            if differ:
+                raise ConfigError(f"{what}: {first.get_name()} and {node.get_name()} differ; allowed: the same in both")
+        self.nodes.append(node)
+        self.teleop = Teleop(theirs.teleop, [one.arm_name for one in self.nodes])
+
+    def connect(self, node: BaseArmController) -> None:
+        """The node's publishers and subscriptions are there."""
+        if node is not self.nodes[0]:
+            return
+        self._recorder = RecorderLink(node)
+        self._home = HomeClient(node, node.outputs.home_controller)
+        self._ticked = node.now
+        node.create_tick(1.0 / node.parameters.rate, self.tick)
+        # Without time there are no ticks, and so nothing else that would pause the arms.
+        node.create_timer(_TIME_PERIOD, self._watch_time, clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+    def tick(self) -> None:
+        """Process what arrived, and publish where the tools should go."""
+        decided, now, nodes, teleop = time.monotonic(), self.nodes[0].now, self.nodes, self.teleop
+        for reason in self._recorder.update(teleop.marks):
+            for node in nodes:
+                node.feedback.haptics.tell(Event(now, node.arm_name, node.state, node.state, reason))
+        faults = {node.arm_name: node.begin_tick(now) for node in nodes}
+        # Read after the nodes were judged: the process may have been frozen in the middle of this tick. A gap in the
+        # node's own ticks comes first, since it makes others look silent.
+        gap, self._ticked = nodes[0].now - self._ticked, now
+        if gap > teleop.settings.gate.timeout:
+            self._pause(now, f"this node stood still for {gap:.2f} s")
+        for arm, fault in faults.items():
+            if fault is not None:
+                teleop.pause(now, fault, arm)
+        inputs = {node.arm_name: node.inputs for node in nodes}
+        references = {one.reference for one in inputs.values()}
+        targets = teleop.update(
+            [sample for node in nodes for sample in node.take_samples()],
+            {arm: one.tool for arm, one in inputs.items() if one.tool is not None},
+            now,
+            {arm: one.commanded for arm, one in inputs.items() if one.commanded is not None} or None,
+            {arm: one.obstacle for arm, one in inputs.items() if one.obstacle is not None},
+            in_step=len(references) == 1 and None not in references,
+        )
+        going_home = [node.outputs.homing for node in nodes]
+        outcome = next((outcome for _, outcome in going_home if outcome), "")
+        self._home.update(teleop, any(homing for homing, _ in going_home), outcome, now)
+        for node in nodes:
+            if (fault := node.follow(targets[node.arm_name], now, decided)) is not None:
+                teleop.pause(now, fault, node.arm_name)
+        self._publish_events()
+        for node in nodes:
+            node.publish_feedback(now)
+
+    def change(self, settings: TeleopSettings) -> str | None:
+        """See :meth:`Teleop.change`."""
+        return None if settings == self.teleop.settings else self.teleop.change(settings, self.nodes[0].now)
+
+    def others(self, node: BaseArmController) -> Sequence[BaseArmController]:
+        """The other nodes of this loop."""
+        return [one for one in self.nodes if one is not node]
+
+    def _pause(self, now: float, reason: str) -> None:
+        if any(state not in HOLDING for state in self.teleop.states.values()):
+            self.teleop.pause(now, reason)
+
+    def _watch_time(self) -> None:
+        """Pause where simulated time stands still: the hands go on, and must not be followed later."""
+        timeout = self.teleop.settings.gate.timeout
+        if (problem := self.nodes[0].clock_problem(timeout)) is None:
+            return
+        for node in self.nodes:
+            node.refuse(problem)
+        self._pause(self.nodes[0].now, problem)
+        self._publish_events()
+
+    def _publish_events(self) -> None:
+        nodes = {node.arm_name: node for node in self.nodes}
+        for event in self.teleop.take_events():
+            nodes[event.arm].feedback.tell(event)
