@@ -65,9 +65,7 @@ def up(
     ] = None,
     separate: Annotated[
         bool,
-        typer.Option(
-            "--separate", help="A process for each arm: a hand then stops and homes its own arm only."
-        ),
+        typer.Option("--separate", help="A process for each arm: a hand then stops and homes its own arm only."),
     ] = False,
     task: Task = None,
     operator: Operator = None,
