@@ -19,7 +19,6 @@ pytest.importorskip("control_msgs", reason="needs control_msgs: q2r2 ros build-i
 pytest.importorskip("tf2_msgs", reason="needs tf2_msgs: q2r2 ros build-interfaces")
 
 import rclpy
-from rclpy.serialization import serialize_message
 from sensor_msgs.msg import JointState
 
 from q2r2_control.ros.base_node import WARN, BaseNode
@@ -41,8 +40,7 @@ class Arrivals:
         self._number += 1
         received = 1_700_000_000_000_000_000 + self._number * 10_000_000
         times = {"source_timestamp": received - took, "received_timestamp": received}
-        taken = serialize_message(message) if self._subscription.raw else message
-        self._subscription.callback(taken, {"publication_sequence_number": self._number, **times})
+        self._subscription.callback(message, {"publication_sequence_number": self._number, **times})
 
 
 @pytest.fixture

@@ -13,7 +13,7 @@ from q2r2_control.ros.base_node import LATCHED_QOS, SENT_COMMAND_QOS, BaseNode
 from q2r2_control.ros.bridge.arm_conditions import ConditionPublishers
 from q2r2_control.ros.bridge.distance_marker import DistanceMarker
 from q2r2_control.ros.bridge.intakes import TargetIntake
-from q2r2_control.ros.bridge.messages import PoseWriter
+from q2r2_control.ros.bridge.messages import stamped_pose
 from q2r2_control.ros.bridge.reports import TickReport
 from q2r2_control.ros.monitoring.endpoints import publish_in_time
 from q2r2_control.runtime.arm_conditions import ArmConditions
@@ -34,7 +34,6 @@ class ControllerFeedback:
         self._safe_targets = {
             arm: node.create_publisher(PoseStamped, f"~/safe_target/{arm}", SENT_COMMAND_QOS) for arm in targets.topics
         }
-        self._messages = {arm: PoseWriter(targets.frames[arm].name) for arm in targets.topics}
         self._follows: dict[str, bool | None] = dict.fromkeys(targets.topics)
         self._following = {arm: node.create_publisher(Bool, f"~/following/{arm}", LATCHED_QOS) for arm in self._follows}
         self._conditions = ConditionPublishers(node, self._follows, ArmConditions(controller))
@@ -61,8 +60,9 @@ class ControllerFeedback:
     def _publish_safe_targets(self, now: float, decided: float) -> None:
         for arm, publisher in self._safe_targets.items():
             if publisher.get_subscription_count():
-                tool = self._targets.frames[arm].pose.actInv(self._controller.tool_pose(arm))
-                publish_in_time(publisher, self._messages[arm].at(tool, now), decided)
+                frame = self._targets.frames[arm]
+                tool = frame.pose.actInv(self._controller.tool_pose(arm))
+                publish_in_time(publisher, stamped_pose(tool, frame.name, now), decided)
 
     def _show_distance(self) -> None:
         if self._reference is not None and self._distances.get_subscription_count():

@@ -13,10 +13,9 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from tf2_msgs.msg import TFMessage
 
 from q2r2_control.ros.base_node import STREAM_QOS, BaseNode
-from q2r2_control.ros.bridge.messages import are_a_pose, pose_of_numbers
-from q2r2_control.ros.bridge.serialized import MessageReader
+from q2r2_control.ros.bridge.messages import are_a_pose, nanoseconds, pose_of, pose_of_numbers
 from q2r2_control.ros.monitoring.endpoints import Publishers
-from q2r2_control.ros.monitoring.frame_senders import FrameSenders, ReadTransform, frame_reader
+from q2r2_control.ros.monitoring.frame_senders import FrameSenders, ReadTransform, read_transforms
 from q2r2_control.supervision.target_stream import apart
 
 # Two publishers whose poses of a frame differ by more do not tell of the same robot [m], [rad].
@@ -107,7 +106,7 @@ class FrameListener:
 
     def __init__(self, node: Any) -> None:
         self.tree = FrameTree()
-        self._node, self._read = node, frame_reader()
+        self._node = node
         self._senders, self._publishers = FrameSenders(), Publishers(node, ["/tf"])
         self._disagree: dict[str, float] = {}  # frames of which two publishers say different things, and when [s]
         self._told = False
@@ -138,7 +137,7 @@ class FrameListener:
 
     def _take(self, message: bytes, info: Mapping[str, int | None]) -> None:
         received, now, number = self._node.now, time.monotonic(), info["publication_sequence_number"]
-        for transform in self._read(message):
+        for transform in read_transforms(message):
             frame = _name(transform.child_frame_id)
             if self._senders.take(frame, number, now):
                 if self.tree.moves_far(transform):
@@ -147,7 +146,7 @@ class FrameListener:
             self.tree.set(transform, received)
 
     def _take_fixed(self, message: bytes) -> None:
-        for transform in self._read(message):
+        for transform in read_transforms(message):
             self.tree.set(transform, math.inf)
 
     def _tell(self) -> None:
@@ -189,13 +188,10 @@ class PoseTopic:
         self._tree, self._world, self._timeout = tree, world, timeout
         self._newest: tuple[str, int, float] | None = None  # its frame, its stamp [ns], and when it was received [s]
         self._pose: pin.SE3 | None = None  # of the newest, in the message's frame
-        self._reader = MessageReader(PoseStamped)
         self._topic, self._publishers = topic, Publishers(node, [topic])
         self._publishers.look_steadily()
         self.problem: str | None = None
-        node.create_subscription(
-            PoseStamped, topic, lambda message: self._take(message, node.now), STREAM_QOS, raw=True
-        )
+        node.create_subscription(PoseStamped, topic, lambda message: self._take(message, node.now), STREAM_QOS)
 
     def at(self, now: float) -> pin.SE3 | None:
         """The newest pose at ``now`` [s]; None if it is not known, and then ``problem`` says why."""
@@ -230,7 +226,6 @@ class PoseTopic:
         self._newest = None
         return self.problem
 
-    def _take(self, message: bytes, now: float) -> None:
-        if (told := self._reader.read(message)) is not None:
-            self._newest = told.like.header.frame_id, told.stamp, now
-            self._pose = pose_of_numbers(told.values.tolist())
+    def _take(self, message: PoseStamped, now: float) -> None:
+        self._newest = message.header.frame_id, nanoseconds(message.header.stamp), now
+        self._pose = pose_of(message.pose)

@@ -13,6 +13,7 @@ from collections.abc import Mapping
 from functools import lru_cache, partial
 from typing import Any
 
+from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
 from q2r2_control.config.cell import Config
@@ -20,7 +21,6 @@ from q2r2_control.config.timeouts import STREAM_TIMEOUT
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.drives.base import Drive
 from q2r2_control.ros.base_node import LATCHED_QOS, BaseNode
-from q2r2_control.ros.bridge.messages import JointNumbers
 from q2r2_control.ros.bridge.opening_grants import wanted_topic
 from q2r2_control.runtime.geometry_updates import GeometryUpdates
 from q2r2_control.supervision.grasp_watch import STALL, GraspWatch
@@ -66,7 +66,7 @@ class GripperLimits:
         """Of each arm that has an object, whether its gripper holds it."""
         return {} if self._bodies is None else self._bodies.holding
 
-    def take_joint_state(self, message: JointNumbers) -> None:
+    def take_joint_state(self, message: JointState) -> None:
         """Note the fingers of a message of joint states, if there are any."""
         if self._answers:
             self._fingers.take(message, self._node.now)
@@ -147,13 +147,13 @@ class FingerStates:
         }
         self._measured: dict[str, tuple[float, float]] = {}  # arm -> opening, and when it was measured [s]
 
-    def take(self, message: JointNumbers, now: float) -> None:
+    def take(self, message: JointState, now: float) -> None:
         """Note what a message says of fingers; what it says of other joints is not looked at."""
         if len(message.position) != len(message.name):
             return
         for arm, (joints, closed, opened) in self._grippers.items():
-            if columns := _columns(message.name, joints):
-                position = float(message.position[columns].sum()) / len(joints)
+            if columns := _columns(tuple(message.name), joints):
+                position = sum(message.position[column] for column in columns) / len(joints)
                 self._measured[arm] = ((position - closed) / (opened - closed), now)
 
     def openings(self, now: float) -> dict[str, float]:

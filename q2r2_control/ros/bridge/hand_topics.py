@@ -20,9 +20,9 @@ from q2r2_control.ros.bridge.messages import (
     hand_pose,
     hand_pose_message,
     hand_twist,
+    hand_twist_message,
     inputs_message,
 )
-from q2r2_control.ros.bridge.serialized import MessageWriter
 from q2r2_control.ros.monitoring.endpoints import Publishers, node_of
 
 # Reliable, so that any subscriber matches: a best-effort publisher does not match reliable subscribers.
@@ -49,8 +49,6 @@ class HandPublishers:
         self._publishers = {
             topic: node.create_publisher(_TYPES[HAND_TOPICS[topic].kind], topic, PUBLISHED_QOS) for topic in topics
         }
-        self._poses: dict[str, tuple[str | None, MessageWriter]] = {}  # by topic, with the frame
-        self._twist = MessageWriter(Twist())
         self.sent: dict[str, int] = {publisher.topic_name: 0 for publisher in self._publishers.values()}
 
     def publish(self, topic: str, message: HandMessage, frame: str, t: float) -> None:
@@ -58,15 +56,9 @@ class HandPublishers:
         publisher = self._publishers[topic]
         self.sent[publisher.topic_name] += 1
         if isinstance(message, HandPose):
-            last_frame, poses = self._poses.get(topic, (None, self._twist))
-            if frame != last_frame:
-                poses = MessageWriter(hand_pose_message(message, frame, t))
-                self._poses[topic] = frame, poses
-            poses.numbers[:3], poses.numbers[3:] = message.position, message.quaternion
-            publisher.publish(poses.at(t))
+            publisher.publish(hand_pose_message(message, frame, t))
         elif isinstance(message, HandTwist):
-            self._twist.numbers[:3], self._twist.numbers[3:] = message.linear, message.angular
-            publisher.publish(self._twist.at(t))
+            publisher.publish(hand_twist_message(message))
         else:
             publisher.publish(inputs_message(message))
 

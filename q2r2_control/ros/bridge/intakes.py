@@ -21,15 +21,13 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.ros.base_node import COMMAND_QOS, STREAM_QOS, BaseNode
 from q2r2_control.ros.bridge.joint_outputs import joints_of
 from q2r2_control.ros.bridge.messages import (
-    JointNumbers,
     age,
     delay,
     ended_topic,
-    joint_numbers,
-    pose_of_numbers,
+    nanoseconds,
+    pose_of,
     robot_state,
 )
-from q2r2_control.ros.bridge.serialized import MessageReader
 from q2r2_control.ros.monitoring.endpoints import Publishers
 from q2r2_control.supervision.delay_watch import DelayWatch
 from q2r2_control.supervision.target_stream import Refusal
@@ -63,7 +61,6 @@ class TargetIntake:
                 raise ConfigError(f"{arm}.target_topic = {topic!r:.80}: another arm has it; allowed: one of its own")
             self.topics[arm] = topic
         self._publishers = Publishers(node, self.topics.values())
-        self._readers = {arm: MessageReader(PoseStamped) for arm in robot.arms}
         self._delays = {arm: DelayWatch(STREAM_TIMEOUT) for arm in robot.arms}
         self._stamps = {arm: DelayWatch(_LATEST) for arm in robot.arms}  # the delays since targets were made
         self._refused: dict[str, tuple[Refusal, float]] = {}  # why an arm's last target was not used, and when [s]
@@ -73,7 +70,7 @@ class TargetIntake:
         """Pass each target to ``take``, and the arm whose sender ends its stream to ``release``."""
         for arm, topic in self.topics.items():
             on_target = partial(self._on_target, take, arm)
-            self._node.create_subscription(PoseStamped, topic, on_target, COMMAND_QOS, raw=True)
+            self._node.create_subscription(PoseStamped, topic, on_target, COMMAND_QOS)
             on_end = partial(self._on_end, release, arm)
             self._node.create_subscription(Empty, ended_topic(topic), on_end, COMMAND_QOS)
 
@@ -95,14 +92,12 @@ class TargetIntake:
         self._refused = {arm: entry for arm, entry in self._refused.items() if now - entry[1] <= _WARNING_TIME}
         return [f"target of {arm} not used: {refusal.line}" for arm, (refusal, _) in self._refused.items()]
 
-    def _on_target(self, take: Take, arm: str, message: bytes, info: Mapping[str, int | None]) -> None:
-        if (told := self._readers[arm].read(message)) is None:
-            return
-        frame, now, frame_id = self.frames[arm], self._node.now, told.like.header.frame_id
-        pose = pose_of_numbers(told.values.tolist()) if frame_id == frame.name else None
+    def _on_target(self, take: Take, arm: str, message: PoseStamped, info: Mapping[str, int | None]) -> None:
+        frame, now, frame_id = self.frames[arm], self._node.now, message.header.frame_id
+        pose = pose_of(message.pose) if frame_id == frame.name else None
         late = self._delays[arm].take(delay(info), time.monotonic())
         wanted = None if pose is None or late else frame.pose * pose
-        due = self._due(arm, told.stamp, now - age(info))
+        due = self._due(arm, nanoseconds(message.header.stamp), now - age(info))
         refusal = take(arm, wanted, now, info["publication_sequence_number"], due)
         if refusal is not None:
             self._refuse(arm, refusal)
@@ -180,17 +175,16 @@ class JointIntake:
         self._values = np.zeros((3, len(robot.joint_names)))
         self.state: RobotState | None = None  # the newest of all arms
 
-    def subscribe(self, take: Callable[[RobotState | str, float], None], look: Callable[[JointNumbers], None]) -> None:
+    def subscribe(self, take: Callable[[RobotState | str, float], None], look: Callable[[JointState], None]) -> None:
         """Pass each state of all arms, or what is wrong with a message, to ``take``, with the time [s].
 
         ``look`` gets every message as it is first: there may be fingers in it.
         """
         for topic in self._topics:
-            on_message = partial(self._on_message, take, look, topic, MessageReader(JointState))
-            self._node.create_subscription(JointState, topic, on_message, STREAM_QOS, raw=True)
+            on_message = partial(self._on_message, take, look, topic)
+            self._node.create_subscription(JointState, topic, on_message, STREAM_QOS)
         if self._external_topic:
-            on_external = partial(self._on_external, MessageReader(JointState))
-            self._node.create_subscription(JointState, self._external_topic, on_external, STREAM_QOS, raw=True)
+            self._node.create_subscription(JointState, self._external_topic, self._on_external, STREAM_QOS)
 
     @property
     def measures_external_torque(self) -> bool:
@@ -210,19 +204,16 @@ class JointIntake:
     def _on_message(
         self,
         take: Callable[[RobotState | str, float], None],
-        look: Callable[[JointNumbers], None],
+        look: Callable[[JointState], None],
         topic: str,
-        reader: MessageReader,
-        message: bytes,
+        message: JointState,
     ) -> None:
-        if (read := reader.read(message)) is None:
-            return
-        look(told := joint_numbers(read))
+        look(message)
         joints, names = self._joints[topic], self._names[topic]
-        if self._expected[topic].isdisjoint(told.name):
+        if self._expected[topic].isdisjoint(message.name):
             return  # of a gripper or another robot
         now = self._node.now
-        part = robot_state(told, names, now)
+        part = robot_state(message, names, now)
         if isinstance(part, str):
             take(part if len(self._topics) == 1 else f"{topic}: {part}", now)
             return
@@ -242,12 +233,9 @@ class JointIntake:
             else:
                 take(self.state, now)
 
-    def _on_external(self, reader: MessageReader, message: bytes) -> None:
-        if (read := reader.read(message)) is None:
-            return
-        told = joint_numbers(read)
-        columns = {name: index for index, name in enumerate(told.name)}
-        if len(told.effort) == len(told.name) and all(name in columns for name in self._joint_names):
-            torques = np.array([told.effort[columns[name]] for name in self._joint_names])
+    def _on_external(self, message: JointState) -> None:
+        columns = {name: index for index, name in enumerate(message.name)}
+        if len(message.effort) == len(message.name) and all(name in columns for name in self._joint_names):
+            torques = np.array([message.effort[columns[name]] for name in self._joint_names])
             if np.isfinite(torques).all():
                 self._external, self._external_stamp = torques, self._node.now

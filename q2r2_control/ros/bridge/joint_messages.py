@@ -16,7 +16,6 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 from q2r2_control.errors import ConfigError
 from q2r2_control.robot.robot import Robot
 from q2r2_control.ros.bridge.messages import joint_state_message
-from q2r2_control.ros.bridge.serialized import MessageWriter
 from q2r2_control.types import Command, CommandMode, RobotState
 
 NONE = "none"
@@ -43,7 +42,7 @@ class Kind(Protocol):
     def message(self) -> type: ...
 
     def encode(self, command: JointCommand, names: list[str], joints: np.ndarray) -> Any:
-        """A message about the joints with these names and velocity indices; it may be a serialized one."""
+        """A message about the joints with these names and velocity indices."""
         ...
 
 
@@ -57,17 +56,12 @@ class TrajectoryOutput:
 
     def __init__(self, period: float, robot: Robot) -> None:
         self._due = Duration(sec=int(period), nanosec=int(1e9 * (period % 1.0)))
-        self._writers: dict[tuple[str, ...], MessageWriter] = {}
 
-    def encode(self, command: JointCommand, names: list[str], joints: np.ndarray) -> bytes:
+    def encode(self, command: JointCommand, names: list[str], joints: np.ndarray) -> JointTrajectory:
         """See :class:`Kind`. A stamp of 0 means now, whatever the receiver's clock says."""
-        if (writer := self._writers.get(tuple(names))) is None:
-            zeros = [0.0] * len(names)
-            point = JointTrajectoryPoint(positions=zeros, velocities=zeros, time_from_start=self._due)
-            writer = self._writers[tuple(names)] = MessageWriter(JointTrajectory(joint_names=names, points=[point]))
-        q, v = writer.numbers.reshape(2, -1)
-        q[:], v[:] = command.command.q[joints], command.command.v[joints]
-        return writer.at(0.0)
+        q, v = command.command.q[joints].tolist(), command.command.v[joints].tolist()
+        point = JointTrajectoryPoint(positions=q, velocities=v, time_from_start=self._due)
+        return JointTrajectory(joint_names=names, points=[point])
 
 
 class PositionArray:

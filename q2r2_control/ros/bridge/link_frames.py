@@ -9,7 +9,7 @@ import numpy as np
 from geometry_msgs.msg import TransformStamped
 from tf2_msgs.msg import TFMessage
 
-from q2r2_control.ros.bridge.serialized import MessageWriter
+from q2r2_control.ros.bridge.messages import time_message
 
 
 class LinkFrames:
@@ -25,24 +25,29 @@ class LinkFrames:
 
 
 class _Transforms:
-    """Transforms of some bodies, serialized again and again."""
+    """Transforms of some bodies."""
 
     def __init__(self, model: Any, bodies: list[int]) -> None:
         self._bodies, self._parents = np.array(bodies, int), model.body_parentid[bodies]
-        message = TFMessage()
+        self._message = TFMessage()
         for body, parent in zip(bodies, self._parents, strict=True):
             transform = TransformStamped(child_frame_id=model.body(body).name)
             transform.header.frame_id = model.body(parent).name
-            message.transforms.append(transform)
-        self._writer = MessageWriter(message)
+            self._message.transforms.append(transform)
 
-    def at(self, data: Any, t: float) -> bytes:
-        """The message for a ``mujoco.MjData`` at ``t`` [s], for a publisher."""
+    def at(self, data: Any, t: float) -> TFMessage:
+        """The message for a ``mujoco.MjData`` at ``t`` [s]; the same object each time."""
         matrices = data.xmat[self._parents].reshape(-1, 3, 3)
-        numbers = self._writer.numbers.reshape(-1, 7)
-        numbers[:, :3] = np.einsum("nji,nj->ni", matrices, data.xpos[self._bodies] - data.xpos[self._parents])
-        numbers[:, 3:] = _relative(data.xquat[self._parents], data.xquat[self._bodies])
-        return self._writer.at(t)
+        positions = np.einsum("nji,nj->ni", matrices, data.xpos[self._bodies] - data.xpos[self._parents])
+        quaternions = _relative(data.xquat[self._parents], data.xquat[self._bodies])
+        stamp = time_message(t)
+        rows = zip(self._message.transforms, positions.tolist(), quaternions.tolist(), strict=True)
+        for transform, position, quaternion in rows:
+            transform.header.stamp = stamp
+            p, o = transform.transform.translation, transform.transform.rotation
+            p.x, p.y, p.z = position
+            o.x, o.y, o.z, o.w = quaternion
+        return self._message
 
 
 def _relative(parent: Any, child: Any) -> Any:

@@ -10,17 +10,16 @@ import math
 import time
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import Pose, PoseStamped, Twist
+from geometry_msgs.msg import Pose, PoseStamped, Twist, Vector3
 from quest2ros.msg import OVR2ROSInputs
 from sensor_msgs.msg import JointState
 
 from q2r2_control.inputs.messages import HandPose, HandTwist
-from q2r2_control.ros.bridge.serialized import MessageWriter, Numbers
 from q2r2_control.types import Array, HandInputs, HandSample, RobotState
 
 _UNIT = 1e-3  # a quaternion's norm may be off by this
@@ -77,19 +76,6 @@ def stamped_pose(pose: pin.SE3, frame: str, t: float) -> PoseStamped:
     to = message.pose
     _write(pose.translation, pin.Quaternion(pose.rotation).normalized().coeffs(), to.position, to.orientation)
     return message
-
-
-class PoseWriter:
-    """Serializes :func:`stamped_pose` in one frame again and again, for a publisher."""
-
-    def __init__(self, frame: str) -> None:
-        self._writer = MessageWriter(stamped_pose(pin.SE3.Identity(), frame, 0.0))
-
-    def at(self, pose: pin.SE3, t: float) -> bytes:
-        """The message for ``t`` [s]."""
-        numbers = self._writer.numbers
-        numbers[:3], numbers[3:] = pose.translation, pin.Quaternion(pose.rotation).normalized().coeffs()
-        return self._writer.at(t)
 
 
 def pose_of(message: Pose) -> pin.SE3 | None:
@@ -160,6 +146,12 @@ def hand_twist(message: Twist) -> HandTwist:
     return HandTwist(*(np.array([vector.x, vector.y, vector.z]) for vector in (message.linear, message.angular)))
 
 
+def hand_twist_message(twist: HandTwist) -> Twist:
+    """The same as a message."""
+    linear, angular = (Vector3(x=v[0], y=v[1], z=v[2]) for v in (twist.linear.tolist(), twist.angular.tolist()))
+    return Twist(linear=linear, angular=angular)
+
+
 def hand_inputs(message: OVR2ROSInputs) -> HandInputs:
     """Buttons, triggers and stick of one hand."""
     return HandInputs(**{name: getattr(message, name) for name in HandInputs.__slots__})
@@ -178,43 +170,7 @@ def joint_state_message(names: Sequence[str], q: Array, v: Array, tau: Array, t:
     return message
 
 
-class JointNumbers(NamedTuple):
-    """What a serialized JointState says; (n,) each, or empty."""
-
-    name: tuple[str, ...]
-    position: Array
-    velocity: Array
-    effort: Array
-
-
-def joint_numbers(numbers: Numbers) -> JointNumbers:
-    """Those of a JointState."""
-    like, values = numbers.like, numbers.values
-    first = len(like.position)
-    second = first + len(like.velocity)
-    return JointNumbers(tuple(like.name), values[:first], values[first:second], values[second:])
-
-
-class JointStateWriter:
-    """Serializes :func:`joint_state_message` of the same joints again and again, for a publisher."""
-
-    def __init__(self, names: Sequence[str], velocities: bool = True) -> None:
-        """Without ``velocities`` the message has efforts only."""
-        zero, none = np.zeros(len(names)), np.zeros(0)
-        with_or_without = (zero, zero) if velocities else (none, none)
-        self._writer = MessageWriter(joint_state_message(names, *with_or_without, zero, 0.0))
-
-    @property
-    def numbers(self) -> Array:
-        """Positions [rad], velocities [rad/s] and torques [Nm], one after the other, for the caller to set."""
-        return self._writer.numbers
-
-    def at(self, t: float) -> bytes:
-        """The message for ``t`` [s]."""
-        return self._writer.at(t)
-
-
-def robot_state(message: JointState | JointNumbers, names: Sequence[str], t: float) -> RobotState | str:
+def robot_state(message: JointState, names: Sequence[str], t: float) -> RobotState | str:
     """State in the order of ``names``, received at ``t`` [s]; or what is wrong with the message, in one line.
 
     Other joints in the message are ignored. Velocities and torques may be missing as a whole and are then zero.

@@ -11,7 +11,7 @@ from std_msgs.msg import Empty
 from q2r2_control.config.presets import BUILTIN, Hold, Preset
 from q2r2_control.config.teleop import GuardSettings
 from q2r2_control.ros.base_node import LATCHED_QOS, SENT_COMMAND_QOS, BaseNode
-from q2r2_control.ros.bridge.messages import PoseWriter, ended_topic, time_message
+from q2r2_control.ros.bridge.messages import ended_topic, stamped_pose, time_message
 from q2r2_control.ros.monitoring.endpoints import PublisherCount, WatchedPublisher, node_of
 from q2r2_control.supervision.pose_rate_limiter import PoseRateLimiter
 from q2r2_control.supervision.target_stream import apart
@@ -62,7 +62,6 @@ class TargetOutput:
         self._sent_at = -math.inf  # the last target of a stream that has not ended yet [s]
         self._restarted = False
         self._endpoints: set[bytes] = set()  # of the controller
-        self._messages = PoseWriter(frame)
         self._listeners = 0
         self._counted = 0, -math.inf  # subscribers that are present, and when they were counted [s]
         self._unknown = False  # a subscriber's node is not known yet
@@ -156,7 +155,7 @@ class TargetOutput:
             return None
         if self.following and self._publisher.waits():
             return pose
-        if self._publisher.publish(self._messages.at(base.actInv(pose), now), decided):
+        if self._publisher.publish(stamped_pose(base.actInv(pose), self._frame, now), decided):
             self.last_sent, self._sent_at = pose, now
         return pose
 

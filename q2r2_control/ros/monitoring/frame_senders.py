@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from functools import cache, lru_cache
+from collections.abc import Sequence
+from functools import lru_cache
 from typing import NamedTuple
 
+from geometry_msgs.msg import TransformStamped
+from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.serialization import deserialize_message
 from tf2_msgs.msg import TFMessage
 
-from q2r2_control.ros.bridge.serialized import MessageReader
 from q2r2_control.supervision.sequence_watch import SequenceWatch
 
 _KEPT = 16  # messages that one node of a process has read and another may still have to
@@ -50,20 +52,19 @@ class ReadTransform(NamedTuple):
     numbers: Sequence[float]  # position [m] and quaternion x y z w
 
 
-@cache
-def frame_reader() -> Callable[[bytes], Sequence[ReadTransform]]:
-    """A function that reads the transforms in a serialized message; none where it is no message.
+@lru_cache(maxsize=_KEPT)
+def read_transforms(message: bytes) -> Sequence[ReadTransform]:
+    """The transforms in a serialized TFMessage; none where it is no message.
 
     A robot's message has dozens of transforms, fifty times a second; each is read once for all nodes of a process.
     """
-    reader = MessageReader(TFMessage)
+    try:
+        transforms = deserialize_message(message, TFMessage).transforms
+    except rclpy_implementation.RMWError:
+        return ()  # which is some other node's fault
+    return tuple(_read(one) for one in transforms)
 
-    @lru_cache(maxsize=_KEPT)
-    def read(message: bytes) -> Sequence[ReadTransform]:
-        if (told := reader.read(message)) is None:
-            return ()  # which is some other node's fault
-        rows = told.values.reshape(-1, 7).tolist()
-        names = ((one.child_frame_id, one.header.frame_id) for one in told.like.transforms)
-        return tuple(ReadTransform(*both, row) for both, row in zip(names, rows, strict=True))
 
-    return read
+def _read(transform: TransformStamped) -> ReadTransform:
+    p, o = transform.transform.translation, transform.transform.rotation
+    return ReadTransform(transform.child_frame_id, transform.header.frame_id, (p.x, p.y, p.z, o.x, o.y, o.z, o.w))

@@ -33,8 +33,7 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.ros.base_node import LATCHED_QOS, OK, WARN, run_node
 from q2r2_control.ros.bridge.grippers import GripperServer, Stroke
 from q2r2_control.ros.bridge.link_frames import LinkFrames
-from q2r2_control.ros.bridge.messages import JointStateWriter, age, delay, seconds
-from q2r2_control.ros.bridge.serialized import MessageReader, Numbers
+from q2r2_control.ros.bridge.messages import age, delay, joint_state_message, seconds
 from q2r2_control.ros.managed_node import ManagedNode
 from q2r2_control.supervision.delay_watch import DelayWatch
 from q2r2_control.types import Array, RobotState
@@ -89,8 +88,7 @@ class MujocoRobot(ManagedNode):
 
     def _make_publishers(self) -> None:
         self._joint_states = self.create_publisher(JointState, "joint_states", 10)
-        self._measured = JointStateWriter((*self._robot.joint_names, *self._cell.fingers))
-        self._felt = JointStateWriter(self._robot.joint_names, velocities=False)
+        self._measured_names = (*self._robot.joint_names, *self._cell.fingers)
         self._external = self.create_publisher(JointState, "~/external_torque", 10)
         self._tf = self.create_publisher(TFMessage, "/tf", 10)
         self._tf_static = self.create_publisher(TFMessage, "/tf_static", LATCHED_QOS)
@@ -102,9 +100,8 @@ class MujocoRobot(ManagedNode):
     def _make_subscriptions(self) -> None:
         # Each arm may have a sender of its own, and the one's message is not to take the place of the other's.
         commands = QoSProfile(depth=2 * len(self._robot.arms), reliability=ReliabilityPolicy.RELIABLE)
-        trajectory = partial(self._take_trajectory, MessageReader(JointTrajectory))
-        self.create_subscription(JointTrajectory, _TRAJECTORY, trajectory, commands, raw=True)
         for kind, topic, callback in (
+            (JointTrajectory, _TRAJECTORY, self._on_trajectory),
             (JointState, "joint_commands", self._on_joint_state),
             (Float64MultiArray, "position_commands", self._on_positions),
             (Float64MultiArray, "velocity_commands", self._on_velocities),
@@ -121,12 +118,9 @@ class MujocoRobot(ManagedNode):
             lambda fault: self._note(f"{arm}_gripper", fault),
         )
 
-    def _take_trajectory(self, reader: MessageReader, message: bytes, info: Mapping[str, Any]) -> None:
-        if (read := reader.read(message)) is not None and self._may_take(_TRAJECTORY, read.like.joint_names, info):
-            self._on_trajectory(read)
-
     def _take(self, topic: str, callback: Callable[[Any], None], message: Any, info: Mapping[str, Any]) -> None:
-        if self._may_take(topic, getattr(message, "name", ()), info):
+        names = message.joint_names if topic == _TRAJECTORY else getattr(message, "name", ())
+        if self._may_take(topic, names, info):
             callback(message)
 
     def _may_take(self, topic: str, names: Sequence[str], info: Mapping[str, Any]) -> bool:
@@ -143,15 +137,13 @@ class MujocoRobot(ManagedNode):
         self._received = time.monotonic() - min(age(info), self._period)
         return True
 
-    def _on_trajectory(self, read: Numbers) -> None:
-        points = read.like.points
+    def _on_trajectory(self, message: JointTrajectory) -> None:
+        points = message.points
         if len(points) != 1:
             self._note(_TRAJECTORY, f"{len(points)} points; allowed: one, a setpoint of a stream")
             return
-        positions = len(points[0].positions)
-        velocities = read.values[positions : positions + len(points[0].velocities)]
-        due = points[0].time_from_start
-        self._follow(_TRAJECTORY, read.like.joint_names, read.values[:positions], velocities, due)
+        point = points[0]
+        self._follow(_TRAJECTORY, message.joint_names, point.positions, point.velocities, point.time_from_start)
 
     def _on_joint_state(self, message: JointState) -> None:
         self._follow("joint_commands", message.name, message.position, message.velocity)
@@ -202,16 +194,14 @@ class MujocoRobot(ManagedNode):
 
     def _publish_external(self, torques: Array, stamp: float) -> None:
         if self._external.get_subscription_count():
-            self._felt.numbers[:] = torques
-            self._external.publish(self._felt.at(stamp))
+            none = np.zeros(0)
+            self._external.publish(joint_state_message(self._robot.joint_names, none, none, torques, stamp))
 
     def _publish_measured(self, state: RobotState, stamp: float) -> None:
-        cell, joints = self._cell, len(state.q)
-        q, v, tau = self._measured.numbers.reshape(3, -1)
-        q[:joints], q[joints:] = state.q, cell.finger_positions()
-        v[:joints], v[joints:] = state.v, cell.finger_velocities()
-        tau[:joints] = state.tau  # what fingers press with is not measured
-        self._joint_states.publish(self._measured.at(stamp))
+        q = np.concatenate([state.q, self._cell.finger_positions()])
+        v = np.concatenate([state.v, self._cell.finger_velocities()])
+        tau = np.concatenate([state.tau, np.zeros(len(q) - len(state.tau))])  # fingers' efforts are not measured
+        self._joint_states.publish(joint_state_message(self._measured_names, q, v, tau, stamp))
 
     def _publish_transforms(self) -> None:
         self._tf.publish(self._frames.moving.at(self._cell.plant.data, self.now))

@@ -31,7 +31,7 @@ from q2r2_control.inputs.statistics import Arrivals
 from q2r2_control.ros.base_node import STREAM_QOS
 from q2r2_control.ros.launch.middleware import set_up_middleware
 from q2r2_control.ros.monitoring.endpoints import node_of
-from q2r2_control.ros.monitoring.frame_senders import FrameSenders, frame_reader
+from q2r2_control.ros.monitoring.frame_senders import FrameSenders, read_transforms
 from q2r2_control.ros.watching.set_view import NodeView, SetView, TopicView, arm_views
 
 _LOOK_PERIOD = 0.5  # between two looks at the graph [s]
@@ -82,7 +82,6 @@ class SetListener:
     def __init__(self, node: Node, cell: Config) -> None:
         self._node, self._cell = node, cell
         self._senders = FrameSenders()
-        self._frames_of = frame_reader()
         self._said: dict[str, _Said] = {}  # by full name of a node
         self._arrivals: dict[str, Arrivals] = {}
         self._topics: dict[str, tuple[str, ...]] = {}  # with their types
@@ -131,7 +130,7 @@ class SetListener:
     def _hear_frames(self, arrivals: Arrivals, message: bytes, info: Mapping[str, int | None]) -> None:
         _note(arrivals, message)
         now, number = time.monotonic(), info["publication_sequence_number"]
-        for transform in self._frames_of(message):
+        for transform in read_transforms(message):
             self._senders.take(transform.child_frame_id, number, now)
 
     def _is_shown(self, topic: str, members: set[str]) -> bool:
