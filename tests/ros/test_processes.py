@@ -20,26 +20,39 @@ import yaml
 from q2r2_control.ros.launch import executables
 from q2r2_control.ros.launch.processes import SOURCES, NodeProcess, nodes_of
 from tests.ros.conftest import NEEDS_ROS
-from tests.ros.processes import CONFIG, ROOT, Processes, RosProcess
+from tests.ros.processes import CONFIG, PATIENCE, ROOT, Processes, RosProcess
 from tests.support.external_cell import external
 from tests.support.processes import alive, children
 
 pytest.importorskip("rclpy", reason=NEEDS_ROS)
 pytestmark = [pytest.mark.usefixtures("interfaces"), pytest.mark.alone]
 
-# The robot and the controller alone, through the same functions as the command.
+# Two programs instead of nodes, through the same function as the command.
+PROGRAM = """
+import signal, sys, time
+signal.signal(signal.SIGINT, lambda *_: sys.exit(0))
+signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+print("ready", flush=True)
+time.sleep(60.0)
+"""
 PAIR = f"""
 import sys
-from q2r2_control.ros.launch.processes import nodes_of, run_together
-sys.exit(run_together(nodes_of({CONFIG!r}, "none")[:2], lambda line: print(line, flush=True)))
+from q2r2_control.ros.launch.processes import NodeProcess, run_together
+
+class Program(NodeProcess):
+    def command(self):
+        return [sys.executable, "-c", {PROGRAM!r}]
+
+programs = [Program(name, "q2r2_control.ros.nodes.recorder") for name in ("first", "second")]
+sys.exit(run_together(programs, lambda line: print(line, flush=True)))
 """
 
 
 @pytest.fixture
 def pair(processes: Processes) -> RosProcess:
     process = processes.start(sys.executable, "-c", PAIR, name="up")
-    process.wait_for("[cartesian_controller] ")
-    process.wait_for("active: ")
+    for name in ("first", "second"):
+        process.wait_for(f"[{name}] ready")
     return process
 
 
@@ -48,24 +61,31 @@ def test_ctrl_c_ends_every_process(pair: RosProcess) -> None:
     assert len(started) == 2
     assert pair.interrupt(30.0) == 0
     assert not any(map(alive, started))
-    assert "[mujoco_robot] " in pair.output
     assert "[up] all stopped" in pair.output
 
 
 def test_a_process_that_dies_is_reported_and_ends_the_others(pair: RosProcess) -> None:
-    robot, controller = children(pair.pid)
-    os.kill(robot, signal.SIGKILL)
-    assert f"mujoco_robot (process {robot}) ended by SIGKILL" in pair.wait_for("[up] ")
+    first, second = children(pair.pid)
+    os.kill(first, signal.SIGKILL)
+    assert f"first (process {first}) was ended by SIGKILL" in pair.wait_for("[up] ")
     assert pair.wait(30.0) == 1
-    assert not alive(controller)
+    assert not alive(second)
+
+
+def test_a_process_that_does_not_end_is_killed(pair: RosProcess) -> None:
+    _, second = children(pair.pid)
+    os.kill(second, signal.SIGSTOP)
+    assert pair.interrupt(30.0) == 0
+    assert f"second (process {second}) did not end and is killed" in pair.output
+    assert not alive(second)
 
 
 def test_a_set_whose_command_is_killed_ends_by_itself(pair: RosProcess) -> None:
     started = children(pair.pid)
     os.kill(pair.pid, signal.SIGKILL)
-    deadline = time.monotonic() + 10.0
+    deadline = time.monotonic() + PATIENCE
     while any(map(alive, started)):
-        assert time.monotonic() < deadline, "a node has outlived the command"
+        assert time.monotonic() < deadline, "a program has outlived the command"
         time.sleep(0.05)
 
 
@@ -199,30 +219,20 @@ def launch_file(monkeypatch: pytest.MonkeyPatch) -> Any:
     return runpy.run_path(str(ROOT / "launch" / "teleop.launch.py"))
 
 
-@pytest.mark.parametrize("source", SOURCES)
-@pytest.mark.parametrize("preset", ["builtin", "jtc"])
-@pytest.mark.parametrize("folder", ["", "recordings"])
+@pytest.mark.parametrize(
+    ("preset", "source", "folder", "separate"),
+    [("builtin", "scripted", "", "false"), ("builtin", "headset", "recordings", "true"), ("jtc", "none", "", "false")],
+)
 def test_the_launch_file_starts_what_the_command_starts(
-    launch_file: Any, tmp_path: Path, preset: str, source: str, folder: str
+    launch_file: Any, tmp_path: Path, preset: str, source: str, folder: str, separate: str
 ) -> None:
     config = CONFIG if preset == "builtin" else external_cell(tmp_path, preset, "filtered")
-    recording = {"folder": folder} if folder else None
     *arguments, nodes = launch_file["generate_launch_description"]().given[0]
-    assert {argument.given[0]: argument.named["default_value"] for argument in arguments} == {
-        "config": CONFIG,
-        "input": "scripted",
-        "robot": "auto",
-        "record": "",
-        "separate": "false",
-    }
-    given = {"config": config, "input": source, "robot": "auto", "record": folder}
-    actions = nodes.named["function"](given | {"separate": "false"})
-    apart = nodes.named["function"](given | {"separate": "true"})
-    assert [action.named["executable"] for action in apart] == names(
-        nodes_of(config, source, separate=True, recording=recording)
-    )
-    expected = nodes_of(config, source, recording=recording)
-    assert ("recorder" in names(expected)) == bool(folder)
+    given = {argument.given[0]: argument.named["default_value"] for argument in arguments}
+    given |= {"config": config, "input": source, "record": folder, "separate": separate}
+    actions = nodes.named["function"](given)
+    recording = {"folder": folder} if folder else None
+    expected = nodes_of(config, source, separate=separate == "true", recording=recording)
     assert [(action.named["package"], action.named["executable"]) for action in actions] == [
         ("q2r2_control", node.name) for node in expected
     ]
@@ -231,4 +241,3 @@ def test_the_launch_file_starts_what_the_command_starts(
         assert {key: value.given[0] for key, value in parameters.items()} == node.parameters
         assert all(isinstance(value.given[0], value.named["value_type"]) for value in parameters.values())
         assert action.named["on_exit"].named == {"reason": f"{node.name} ended"}
-        assert action.named["output"] == "screen"

@@ -6,20 +6,19 @@ import ctypes
 import importlib.util
 import json
 import os
-import queue
 import signal
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 
 from q2r2_control.config.cell import load_config
 from q2r2_control.config.external import ControllerKind, ExternalConfig
 from q2r2_control.errors import ConfigError, Q2R2Error
-from q2r2_control.runtime.process import StopRequest, stop_on_signals
+from q2r2_control.runtime.process import StopRequest, how_it_ended, stop_on_signals
 from q2r2_control.types import SIDES
 
 SOURCES = ("scripted", "headset", "none")
@@ -118,30 +117,31 @@ def run_together(nodes: Sequence[NodeProcess], say: Callable[[str], None]) -> in
     Ctrl-C or SIGTERM ends all of them: 0. A node that ends by itself is reported at once and ends the others: 1. None
     is restarted. Each is a session of its own, so that Ctrl-C in a terminal reaches it only from here, in order. If
     this process is killed, Linux interrupts them all: arms must not move in a teleoperation that cannot be ended.
-    Raises :class:`UpError`.
+    ``say`` is called by several threads, one at a time. Raises :class:`UpError`.
     """
     _check(nodes)
-    lines: queue.SimpleQueue[str] = queue.SimpleQueue()
-    with _stop_requests() as stop:
-        running: dict[str, subprocess.Popen[str]] = {}
-        readers: list[threading.Thread] = []
+    stop, lock = StopRequest(), threading.Lock()
+    running: dict[str, subprocess.Popen[str]] = {}
+    readers: list[threading.Thread] = []
+
+    def say_alone(line: str) -> None:
+        with lock:
+            say(line)
+
+    with stop_on_signals(stop.ask):
         try:
             for node in nodes:
                 running[node.name] = _start(node)
             for name, process in running.items():  # threads come last, since a process is forked from one thread best
-                readers.append(threading.Thread(target=_read, args=(name, process, lines), daemon=True))
+                readers.append(threading.Thread(target=_read, args=(name, process, say_alone), daemon=True))
                 readers[-1].start()
-            dead = _watch(running, stop, lines, say)
+            dead = _watch(running, stop, say_alone)
         finally:
-            _end(running, lines, say)
+            _end(running, say_alone)
             for reader in readers:
                 reader.join(1.0)
-            _drain(lines, say)
-    if dead is not None:
-        say(f"[up] {dead} ended by itself; all others have been stopped")
-        return 1
-    say("[up] all stopped")
-    return 0
+    say_alone(f"[up] {dead} ended by itself; all others have been stopped" if dead else "[up] all stopped")
+    return 1 if dead else 0
 
 
 def check_rclpy() -> None:
@@ -184,57 +184,32 @@ def _end_with(parent: int) -> None:
         os.kill(os.getpid(), signal.SIGINT)
 
 
-def _read(name: str, process: subprocess.Popen[str], lines: queue.SimpleQueue[str]) -> None:
+def _read(name: str, process: subprocess.Popen[str], say: Callable[[str], None]) -> None:
     assert process.stdout is not None
     for line in process.stdout:
-        lines.put(f"[{name}] {line.rstrip()}")
+        say(f"[{name}] {line.rstrip()}")
 
 
-def _watch(
-    running: Mapping[str, subprocess.Popen[str]],
-    stop: StopRequest,
-    lines: queue.SimpleQueue[str],
-    say: Callable[[str], None],
-) -> str | None:
+def _watch(running: Mapping[str, subprocess.Popen[str]], stop: StopRequest, say: Callable[[str], None]) -> str | None:
     """Wait for the request to stop, or for a process to end by itself; its name."""
     while not stop.asked:
-        _drain(lines, say)
         for name, process in running.items():
             if (code := process.poll()) is not None:
-                how = f"by {signal.Signals(-code).name}" if code < 0 else f"with exit code {code}"
-                say(f"[up] {name} (process {process.pid}) ended {how}; stopping all others")
+                say(f"[up] {how_it_ended(f'{name} (process {process.pid})', code)}; stopping all others")
                 return name
         time.sleep(0.02)
     return None
 
 
-def _end(
-    running: Mapping[str, subprocess.Popen[str]], lines: queue.SimpleQueue[str], say: Callable[[str], None]
-) -> None:
+def _end(running: Mapping[str, subprocess.Popen[str]], say: Callable[[str], None]) -> None:
     """End them one by one, the last started first: the robot runs until the controller has braked it."""
-    for process in reversed(list(running.values())):
+    for name, process in reversed(list(running.items())):
         for number, timeout in _END_TIMEOUTS.items():
             if process.poll() is None:
                 process.send_signal(number)
-            deadline = time.monotonic() + timeout
-            while process.poll() is None and time.monotonic() < deadline:
-                _drain(lines, say)
-                time.sleep(0.02)
-    for name, process in running.items():
+                with suppress(subprocess.TimeoutExpired):
+                    process.wait(timeout)
         if process.poll() is None:
             say(f"[up] {name} (process {process.pid}) did not end and is killed")
             process.kill()
             process.wait()
-
-
-def _drain(lines: queue.SimpleQueue[str], say: Callable[[str], None]) -> None:
-    while not lines.empty():
-        say(lines.get())
-
-
-@contextmanager
-def _stop_requests() -> Iterator[StopRequest]:
-    """What Ctrl-C and SIGTERM set."""
-    stop = StopRequest()
-    with stop_on_signals(stop.ask):
-        yield stop
