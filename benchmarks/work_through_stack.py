@@ -24,14 +24,16 @@ from q2r2_control.cli.options import DEMO_CONFIG, Json
 from q2r2_control.cli.output import print_progress, print_report
 from q2r2_control.config.cell import Config, load_config
 from q2r2_control.errors import PlantError
+from q2r2_control.events import Event
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.robot.kept_distances import kept_distances
 from q2r2_control.robot.robot import Robot
 from q2r2_control.runtime.recorder import Tick
 from q2r2_control.teleop.arm_states import AT_REST
-from q2r2_control.types import Array, CommandMode, Event
+from q2r2_control.types import Array, CommandMode
 from q2r2_control.verification.contract import Contract
+from q2r2_control.wording import sentence
 
 _TAIL = 0.5  # [s]
 _ROUNDING = 1e-9  # of the ticks' times [s]
@@ -103,7 +105,7 @@ class Stack:
             mode=str(self.mode),
             done=1.0,
             slip_mm=max(arm.slip_mm_max for arm in summary.arms.values()),
-            pauses=[f"{event.arm}: {event.reason}" for event in summary.events if _pauses(event)],
+            pauses=[f"{event.arm}: {sentence(event.reason)}" for event in summary.events if _pauses(event)],
             broken=log.broken,
         )
         log.cut(MOVES + motion.begins, ends)

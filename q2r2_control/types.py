@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from enum import StrEnum
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -66,10 +67,10 @@ class HandInputs:
 
 
 class HandFault(StrEnum):
-    """What an input finds wrong with a hand whose pose, by itself, is a pose."""
+    """What an input finds wrong with a hand whose pose, by itself, is a pose: kinds of :mod:`events`."""
 
-    FROZEN = "the hand's pose is frozen"
-    FRAME_MOVED = "both hands moved as one, as when their frame moves: align"
+    FROZEN = "hand_frozen"
+    FRAME_MOVED = "hand_frame_moved"  # both hands moved as one, as when the frame moves that they are measured in
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,13 +139,29 @@ class StepStatus(StrEnum):
     FALLBACK = "fallback"  # the stopping motion was executed instead of the QP's solution
 
 
+class LimitKind(StrEnum):
+    """What holds a step back."""
+
+    POSITION = "position"
+    VELOCITY = "velocity"
+    ACCELERATION = "acceleration"
+    SEPARATION = "separation"
+
+
+class ActiveLimit(NamedTuple):
+    """A limit that was active at a step's solution."""
+
+    kind: LimitKind
+    names: tuple[str, ...]  # of the joint, or of both geometries of a pair
+
+
 @dataclass(slots=True)  # not frozen: that would cost a microsecond a tick
 class StepReport:
     """What one control tick did and why. Distances in metres, joints by name."""
 
     status: StepStatus
     rejected: tuple[str, ...]  # arms whose target was not usable and is held
-    binding: tuple[str, ...]  # limits active at the solution, e.g. "left_A2 velocity", "left_link_5|table"
+    binding: tuple[ActiveLimit, ...]  # limits active at the solution
     closest_pair: tuple[str, str]  # geometry names
     closest_distance: float  # [m]
     certified: bool  # a stopping motion that keeps limits and separation is known
@@ -198,14 +215,3 @@ class ArmTarget:
     def command_for(self, tool: pin.SE3) -> pin.SE3:
         """What is commanded where the tool is at ``tool``, world frame."""
         return tool if self.sag is None else moved_back_by(tool, self.sag)
-
-
-@dataclass(frozen=True, slots=True)
-class Event:
-    """A change of an arm's teleop state."""
-
-    t: float  # [s]
-    arm: str
-    source: str  # state before
-    destination: str  # state after
-    reason: str

@@ -20,7 +20,8 @@ PACKAGE = "q2r2_control"
 # From the bottom to the top. A room imports only from rooms below it; those that share a line are independent of each
 # other.
 LEVELS = (
-    {"_lazy", "errors", "types"},
+    {"_lazy", "errors", "types", "events"},
+    {"wording"},
     {"quaternions"},
     {"config"},
     {"robot"},

@@ -37,7 +37,6 @@ from q2r2_control.teleop.episode_marks import EpisodeMarks
 from q2r2_control.viewer.history import History
 from q2r2_control.viewer.live import LiveTable
 from q2r2_control.viewer.report import draw_report
-from q2r2_control.viewer.sound import SoundKind, sounding
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +58,6 @@ class RunOptions:
     force: bool  # run although q2r2 check finds faults
     real_time: bool  # ask the system for locked memory and SCHED_FIFO
     tasks: tuple[AssemblyTask, ...] = ()  # to be judged
-    sound: SoundKind | None = None  # None: silent
     record: Path | None = None  # folder of recordings
     notes: Mapping[str, str] = field(default_factory=dict)  # by name, for the recording
 
@@ -198,8 +196,6 @@ def _run(pipeline: Pipeline, options: RunOptions, recorder: Recorder | None, con
             stack.enter_context(table.shown(console))
         if options.real_time and (refused := stack.enter_context(real_time())):
             console.print(refused, style="yellow", soft_wrap=True, highlight=False, markup=False)
-        if options.sound is not None:
-            pipeline.listeners.append(stack.enter_context(sounding(options.sound)))
         if recorder is not None:
             cameras = pipeline.config.simulated_cameras
             if cameras and isinstance(pipeline.plant, MujocoPlant):
@@ -207,11 +203,11 @@ def _run(pipeline: Pipeline, options: RunOptions, recorder: Recorder | None, con
             elif cameras:
                 line = f"no pictures are recorded: the {options.plant} plant has none; allowed: --plant mujoco"
                 console.print(line, style="yellow", soft_wrap=True, highlight=False, markup=False)
-            recorder.tell = pipeline.tell
+            recorder.record_outcome = pipeline.record_outcome
             recorder.begin(_about(pipeline, options), pipeline.robot)
             pipeline.listeners.append(recorder)
             if any(map(pipeline.config.teleop.bindings.words_of, EpisodeMarks.actions)):
-                judge_now = EpisodeJudge(lambda: recorder.file, pipeline.tell)
+                judge_now = EpisodeJudge(lambda: recorder.file, pipeline.record_outcome)
                 pipeline.listeners.append(stack.enter_context(judge_now))
         return pipeline.run(options.duration, realtime=not options.fast)
 

@@ -32,7 +32,6 @@ from q2r2_control.errors import ConfigError
 from q2r2_control.inputs.factory import DEFAULT_TRAJECTORY
 from q2r2_control.inputs.trajectories import TRAJECTORIES
 from q2r2_control.types import CommandMode
-from q2r2_control.viewer.sound import SoundKind
 
 
 class InputName(StrEnum):
@@ -60,7 +59,6 @@ def run(
     headless: Headless = False,
     rt: RealTime = False,
     report: Annotated[bool, typer.Option(help="Write plots and a summary to a folder under runs/.")] = False,
-    sound: Annotated[SoundKind | None, typer.Option(help="When engaged, at faults and episodes: how.")] = None,
     record: Record = None,
     task: Task = None,
     operator: Operator = None,
@@ -99,7 +97,6 @@ def run(
         report=report,
         force=force,
         real_time=rt,
-        sound=sound,
         record=None if record is None else Path(record),
         notes=notes,
     )

@@ -8,13 +8,14 @@ from rich.markup import escape
 from rich.table import Table
 
 from q2r2_control.demo.assembly_tasks import TaskResult
+from q2r2_control.events import Event, ReasonKind
 from q2r2_control.judging.verdict import Verdict
 from q2r2_control.recording.recorder import RecordingSummary
 from q2r2_control.runtime.histogram import Percentiles
 from q2r2_control.runtime.run_summary import RunSummary
 from q2r2_control.runtime.torque_summary import TorqueSummary
 from q2r2_control.teleop.arm_states import ArmState, is_fault
-from q2r2_control.types import Event
+from q2r2_control.wording import sentence
 
 
 def summary_table(summary: RunSummary) -> Table:
@@ -57,8 +58,8 @@ def summary_table(summary: RunSummary) -> Table:
         "ticks missed", f"{summary.missed_ticks}, which made the motion {summary.stretched_s:.2f} s late in all"
     )
     for name, event in _last_pauses(summary.events).items():
-        label = f"{name} arm" if event.reason.startswith("not engaged") else f"{name} arm paused by"
-        table.add_row(label, f"[yellow]{escape(event.reason)}[/], at {event.t:.2f} s")
+        label = f"{name} arm" if event.kind is ReasonKind.NOT_ENGAGED else f"{name} arm paused by"
+        table.add_row(label, f"[yellow]{escape(sentence(event.reason))}[/], at {event.t:.2f} s")
     if summary.torque is not None:
         _add_torque(table, summary.torque)
     table.add_row("arms at the end", "at rest" if summary.at_rest else "[red]moving[/]")

@@ -9,9 +9,9 @@ from q2r2_control.control.safety.joint_limits import ACCELERATION, POSITION, VEL
 from q2r2_control.control.safety.safety_data import ActiveBounds
 from q2r2_control.control.safety.safety_filter import SEPARATION
 from q2r2_control.robot.robot import Robot
-from q2r2_control.types import StepStatus
+from q2r2_control.types import ActiveLimit, LimitKind, StepStatus
 
-_LIMIT_NAMES = {POSITION: "position", VELOCITY: "velocity", ACCELERATION: "acceleration"}
+_KINDS = {POSITION: LimitKind.POSITION, VELOCITY: LimitKind.VELOCITY, ACCELERATION: LimitKind.ACCELERATION}
 
 
 class LimitNames:
@@ -23,23 +23,23 @@ class LimitNames:
         both = zip(watched.first.tolist(), watched.second.tolist(), strict=True)
         self._watched = [(names[first], names[second]) for first, second in both]
         self.pairs: list[tuple[str, str]] = []  # those of the cell, and of objects that are held
-        self._last: tuple[bytes, tuple[str, ...]] = b"", ()  # most ticks bind as the one before
-        self._by_kind: dict[int, list[str]] = {
-            kind: [f"{joint} {limit}" for joint in robot.joint_names] for kind, limit in _LIMIT_NAMES.items()
+        self._last: tuple[bytes, tuple[ActiveLimit, ...]] = b"", ()  # most ticks bind as the one before
+        self._by_kind: dict[int, list[ActiveLimit]] = {
+            kind: [ActiveLimit(limit, (joint,)) for joint in robot.joint_names] for kind, limit in _KINDS.items()
         }
         self.take_pairs(())
 
     def take_pairs(self, of_objects: Sequence[tuple[str, str]]) -> None:
         """Go on with the pairs of the cell and those of objects that are held."""
         self.pairs = [*self._watched, *of_objects]
-        self._by_kind[SEPARATION] = ["|".join(pair) for pair in self.pairs]
+        self._by_kind[SEPARATION] = [ActiveLimit(LimitKind.SEPARATION, pair) for pair in self.pairs]
         self._last = b"", ()
 
     def pair(self, number: int) -> tuple[str, str]:
         """Both bodies of a pair; empty names in a cell without pairs."""
         return self.pairs[number] if self.pairs else ("", "")
 
-    def of(self, active: ActiveBounds) -> tuple[str, ...]:
+    def of(self, active: ActiveBounds) -> tuple[ActiveLimit, ...]:
         """Limits and pairs, each once."""
         found = int(active.used[0])
         if not found:

@@ -11,13 +11,14 @@ import numpy.typing as npt
 from q2r2_control.config.cell import Config
 from q2r2_control.config.teleop import Stance
 from q2r2_control.errors import RecordingError
+from q2r2_control.events import Event
 from q2r2_control.recording import topics as names
 from q2r2_control.recording.about import Conclusion
 from q2r2_control.recording.episode_spans import events_of
 from q2r2_control.recording.reader import Recording
 from q2r2_control.recording.recorded_robot import cell_and_robot_of, check_tools, tool_poses
 from q2r2_control.recording.ticks import ChunkTicks, Column, ticks_of
-from q2r2_control.types import SIDES, Array, Event
+from q2r2_control.types import SIDES, Array
 
 FRAME = 0.01  # the time between two frames, at least [s]
 _NANOSECONDS = 1_000_000_000

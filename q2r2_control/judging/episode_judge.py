@@ -12,15 +12,18 @@ from dataclasses import asdict
 from pathlib import Path
 from types import TracebackType
 
+from q2r2_control.events import Event, Reason, ReasonKind
 from q2r2_control.judging.judge_work import LONGEST_MESSAGE, Answer, Question
 from q2r2_control.recording.episode_spans import spans_of
 from q2r2_control.recording.helper import reason_of
 from q2r2_control.recording.helper_process import HelperProcess
 from q2r2_control.runtime.recorder import Tick
-from q2r2_control.teleop.episode_marks import BEGINS, DISCARDED, ENDS, FAILED, SUCCEEDED, verdict_line
-from q2r2_control.types import Event
+from q2r2_control.wording import sentence
 
-_TOLD = (BEGINS, ENDS, DISCARDED, SUCCEEDED, FAILED)
+_OF_EPISODES = {
+    *(ReasonKind.EPISODE_BEGINS, ReasonKind.EPISODE_ENDS, ReasonKind.EPISODE_DISCARDED),
+    *(ReasonKind.EPISODE_SUCCEEDED, ReasonKind.EPISODE_FAILED),
+}
 _LOOKS = 64  # ticks between two looks at whether a verdict is there
 
 _logger = logging.getLogger(__name__)
@@ -32,8 +35,8 @@ class EpisodeJudge:
     The work is done by a process of low priority. It raises nothing: what fails is logged once.
     """
 
-    def __init__(self, file: Callable[[], Path | None], tell: Callable[[str], None], *, timed: bool = True) -> None:
-        """``file``: what is recorded to; ``tell``: is given each verdict, as one line.
+    def __init__(self, file: Callable[[], Path | None], tell: Callable[[Reason], None], *, timed: bool = True) -> None:
+        """``file``: what is recorded to; ``tell``: is given each verdict.
 
         ``timed``: times of events are those of ticks in the file, so only those of an episode have to be read.
         """
@@ -76,7 +79,7 @@ class EpisodeJudge:
 
     def note(self, event: Event) -> None:
         """Learn of an event; one that ends an episode asks for the verdict on it."""
-        if event.reason not in _TOLD:
+        if event.kind not in _OF_EPISODES:
             return
         self._events.append(event)
         number, last = len(spans := spans_of(self._events)), spans[-1]
@@ -107,9 +110,9 @@ class EpisodeJudge:
         for answer in (Answer(**json.loads(line)) for line in lines):
             if spans_of(self._events)[answer.number - 1].discarded:
                 continue  # its operator has been faster
-            line = verdict_line(answer.number, answer.line)
-            _logger.info(line)
-            self._tell(line)
+            verdict = Reason.of(ReasonKind.VERDICT, episode=answer.number, keep=answer.keep, line=answer.line)
+            _logger.info(sentence(verdict))
+            self._tell(verdict)
         if fault := self._process.fault():
             self._fail(fault)
 

@@ -7,13 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
+from q2r2_control.events import ReasonKind
 from q2r2_control.judging.episode import Episode
 from q2r2_control.judging.hands import HandFigures, hand_figures
 from q2r2_control.judging.motion import ArmFigures, arm_figures, idle_share
 from q2r2_control.judging.timing import TimingFigures, timing_figures
 from q2r2_control.teleop.arm_states import is_fault, is_refusal
-
-_LINKED = "linked to "  # begins the reason of an arm that was paused by the other one's fault
+from q2r2_control.wording import sentence
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,9 +89,9 @@ def figures_of(episode: Episode, dropout: float) -> EpisodeFigures:
 def _faults(episode: Episode) -> list[Fault]:
     """Refused presses are none, since nothing moved; nor is the pause of the other arm that follows from a fault."""
     return [
-        Fault(event.t, event.arm, event.reason)
+        Fault(event.t, event.arm, sentence(event.reason))
         for event in episode.events
-        if is_fault(event) and not is_refusal(event) and not event.reason.startswith(_LINKED)
+        if is_fault(event) and not is_refusal(event) and event.kind is not ReasonKind.LINKED
     ]
 
 

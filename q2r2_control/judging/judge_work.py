@@ -47,6 +47,7 @@ class Answer:
     """What became of it."""
 
     number: int
+    keep: bool | None  # None: it could not be judged
     line: str  # keep, discard and why, or why it could not be judged
 
 
@@ -55,10 +56,9 @@ def main(asked: int, answered: int, parent: int) -> None:
     be_nice(_NICENESS)
     for question in _questions(asked, parent):
         try:
-            line = _verdict(question, parent)
+            answer = _answer(question, parent)
         except (Q2R2Error, OSError) as error:
-            line = f"not judged: {reason_of(error)}"
-        answer = Answer(question.number, line[:LONGEST_LINE])
+            answer = _not_judged(question, reason_of(error))
         os.write(answered, json.dumps(vars(answer)).encode() + b"\n")
 
 
@@ -75,19 +75,24 @@ def _questions(asked: int, parent: int) -> Iterator[Question]:
             yield Question(**json.loads(line))
 
 
-def _verdict(question: Question, parent: int) -> str:
+def _answer(question: Question, parent: int) -> Answer:
     until = time.monotonic() + _PATIENCE
     problem = f"it was not written within {_PATIENCE:g} s"
     while time.monotonic() < until:
         try:
             if (episode := written_episode(question)) is not None:
-                return judge_episode(episode).verdict.line
+                verdict = judge_episode(episode).verdict
+                return Answer(question.number, verdict.keep, verdict.line[:LONGEST_LINE])
         except RecordingError as error:  # of a file whose beginning is not written yet, too
             problem = str(error)
         if has_ended(parent, _LOOKS):
             problem = "the run has ended"
             break
-    return f"not judged: {problem}"
+    return _not_judged(question, problem)
+
+
+def _not_judged(question: Question, problem: str) -> Answer:
+    return Answer(question.number, None, f"not judged: {problem}"[:LONGEST_LINE])
 
 
 def written_episode(question: Question) -> Episode | None:

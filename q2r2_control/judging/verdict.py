@@ -12,7 +12,7 @@ _MM, _MS, _PERCENT, _DEGREES = 1e3, 1e3, 1e2, 57.29577951308232
 
 
 @dataclass(frozen=True, slots=True)
-class Reason:
+class Rejection:
     """Why an episode is discarded."""
 
     name: str  # of the threshold, or of what no threshold says: never_engaged, damaged, ended_by, operator
@@ -23,7 +23,7 @@ class Reason:
 class Verdict:
     """Kept, or discarded for all of the ``reasons``."""
 
-    reasons: tuple[Reason, ...]
+    reasons: tuple[Rejection, ...]
 
     @property
     def keep(self) -> bool:
@@ -46,7 +46,7 @@ def verdict_of(figures: EpisodeFigures, settings: JudgeSettings) -> Verdict:
     """Hold an episode's numbers to thresholds; a number that is None is not judged."""
     reasons = list(_unreadable(figures, settings))
     if not figures.engaged_s > 0.0:
-        return Verdict((*reasons, Reason("never_engaged", "no arm was ever engaged")))
+        return Verdict((*reasons, Rejection("never_engaged", "no arm was ever engaged")))
     found = _Limits(settings, reasons)
     _add_hands(found, figures)
     _add_arms(found, figures)
@@ -65,21 +65,21 @@ def verdict_of(figures: EpisodeFigures, settings: JudgeSettings) -> Verdict:
         first = figures.faults[0]
         also = f", and {len(figures.faults) - 1} more" if len(figures.faults) > 1 else ""
         what = f"fault: {first.arm} arm at {first.t:.2f} s: {first.reason}{also} (at most {settings.max_faults})"
-        reasons.append(Reason("max_faults", what))
+        reasons.append(Rejection("max_faults", what))
     return Verdict(tuple(reasons))
 
 
-def _unreadable(figures: EpisodeFigures, settings: JudgeSettings) -> Iterator[Reason]:
+def _unreadable(figures: EpisodeFigures, settings: JudgeSettings) -> Iterator[Rejection]:
     if figures.discarded:
-        yield Reason("operator", "its operator discarded it")
+        yield Rejection("operator", "its operator discarded it")
     if figures.success is False and not settings.keep_failed:
-        yield Reason("keep_failed", "it failed, as its operator or task says")
+        yield Rejection("keep_failed", "it failed, as its operator or task says")
     if figures.ended_by is not None:
-        yield Reason("ended_by", f"a fault ended the run: {figures.ended_by}")
+        yield Rejection("ended_by", f"a fault ended the run: {figures.ended_by}")
     if figures.damage is not None:
-        yield Reason("damaged", f"after {figures.duration_s:.2f} s {figures.damage}")
+        yield Rejection("damaged", f"after {figures.duration_s:.2f} s {figures.damage}")
     elif settings.needs_end and not figures.timing.ended:
-        yield Reason("needs_end", "the recording has no end: its process was killed, or the disk was full")
+        yield Rejection("needs_end", "the recording has no end: its process was killed, or the disk was full")
 
 
 def _add_hands(found: _Limits, figures: EpisodeFigures) -> None:
@@ -113,7 +113,7 @@ def _add_arms(found: _Limits, figures: EpisodeFigures) -> None:
 class _Limits:
     """Adds a reason for every number beyond its threshold."""
 
-    def __init__(self, settings: JudgeSettings, reasons: list[Reason]) -> None:
+    def __init__(self, settings: JudgeSettings, reasons: list[Rejection]) -> None:
         self._settings, self._reasons = settings, reasons
 
     def above(self, name: str, what: str, value: float | None, scale: float, unit: str) -> None:
@@ -130,4 +130,4 @@ class _Limits:
 
     def _add(self, name: str, what: str, value: float, limit: float, scale: float, unit: str, bound: str) -> None:
         with_unit = f"{scale * value:.1f} {unit}".strip()
-        self._reasons.append(Reason(name, f"{what} {with_unit} ({bound} {scale * limit:.4g})"))
+        self._reasons.append(Rejection(name, f"{what} {with_unit} ({bound} {scale * limit:.4g})"))

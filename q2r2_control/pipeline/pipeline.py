@@ -11,6 +11,7 @@ from q2r2_control.control.controller import CartesianController
 from q2r2_control.drives.base import permitted
 from q2r2_control.drives.factory import make_drive
 from q2r2_control.errors import ConfigError
+from q2r2_control.events import Reason
 from q2r2_control.inputs.base import Input
 from q2r2_control.inputs.factory import make_input
 from q2r2_control.pipeline.pipeline_run import PipelineRun
@@ -97,12 +98,9 @@ class Pipeline:
         """
         self.requests.settings = settings
 
-    def tell(self, line: str) -> None:
-        """Let the operator know what became of the recording or of an episode in it; see :mod:`episode_marks`.
-
-        From any thread.
-        """
-        self.requests.told_of_recording.append(line)
+    def record_outcome(self, reason: Reason) -> None:
+        """Let the operator know what became of the recording or of an episode in it; from any thread."""
+        self.requests.of_recording.append(reason)
 
     def change_control(self, values: Mapping[str, float]) -> None:
         """Other settings of the controller from the next tick on, by name, without a jump; from any thread.

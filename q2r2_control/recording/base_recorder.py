@@ -8,6 +8,7 @@ from datetime import datetime
 from pathlib import Path
 
 from q2r2_control.errors import ConfigError
+from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.recording.about import About, Conclusion
 from q2r2_control.recording.encoder import RecordedRobot
 from q2r2_control.recording.helper import reason_of
@@ -16,7 +17,6 @@ from q2r2_control.recording.topics import Topic
 from q2r2_control.recording.writer import RingSetup
 from q2r2_control.recording.writer_process import WriterProcess
 from q2r2_control.runtime.folders import new_folder
-from q2r2_control.teleop.episode_marks import RECORDING_ENDED
 
 PATIENCE = 10.0  # for a disk that hangs, at the end of a run [s]
 
@@ -32,7 +32,7 @@ class BaseRecorder:
         self._fault: str | None = None
         self._path: Path | None = None
         self.writer: WriterProcess | None = None
-        self.tell: Callable[[str], None] = lambda line: None  # lets the operator know of the failure
+        self.record_outcome: Callable[[Reason], None] = lambda reason: None  # lets the operator know of the failure
         try:
             self.writer = WriterProcess(room, channel)
         except (OSError, ValueError) as error:
@@ -82,4 +82,4 @@ class BaseRecorder:
         if self._fault is None:
             self._fault = f"{self._path}: {reason}" if self._path is not None else reason
             _logger.warning("recording ended, the run goes on: %s", self._fault)
-            self.tell(f"{RECORDING_ENDED}{self._fault}")
+            self.record_outcome(Reason.of(ReasonKind.RECORDING_ENDED, text=self._fault))

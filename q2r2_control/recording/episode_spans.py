@@ -8,12 +8,12 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
 from q2r2_control.errors import RecordingError
+from q2r2_control.events import Event, ReasonKind
 from q2r2_control.recording import topics as names
 from q2r2_control.recording.about import LOOP
 from q2r2_control.recording.reader import RecordedChunk, Recording
 from q2r2_control.recording.rows import sequence_of, text_of
-from q2r2_control.teleop.episode_marks import BEGINS, DISCARDED, ENDS, FAILED, MARK, SUCCEEDED, EpisodeMarks
-from q2r2_control.types import Event
+from q2r2_control.teleop.episode_marks import EpisodeMarks
 
 
 @dataclass(frozen=True)
@@ -46,19 +46,19 @@ def spans_of(events: Iterable[Event], run_succeeded: bool | None = None) -> list
     marks: list[float] = []  # outside of episodes too, since a run without any is one
     for event in events:
         is_open = bool(spans) and spans[-1].end == math.inf
-        if event.reason == BEGINS and not is_open:
+        if event.kind is ReasonKind.EPISODE_BEGINS and not is_open:
             spans.append(EpisodeSpan(event.t))
-        elif event.reason == ENDS and is_open:
+        elif event.kind is ReasonKind.EPISODE_ENDS and is_open:
             spans[-1] = replace(spans[-1], end=event.t)
-        elif event.reason == DISCARDED and spans:
+        elif event.kind is ReasonKind.EPISODE_DISCARDED and spans:
             spans[-1] = replace(spans[-1], end=min(spans[-1].end, event.t), discarded=True)
-        elif event.reason in (SUCCEEDED, FAILED):
-            success = event.reason == SUCCEEDED
+        elif event.kind in (ReasonKind.EPISODE_SUCCEEDED, ReasonKind.EPISODE_FAILED):
+            success = event.kind is ReasonKind.EPISODE_SUCCEEDED
             if spans:
                 spans[-1] = replace(spans[-1], end=min(spans[-1].end, event.t), success=success)
             else:
                 whole = replace(whole, success=success)
-        elif event.reason == MARK:
+        elif event.kind is ReasonKind.MARK:
             marks.append(event.t)
     return [replace(span, marks=tuple(t for t in marks if span.start <= t <= span.end)) for span in spans or [whole]]
 
@@ -69,7 +69,7 @@ def events_of_ticks(chunk: RecordedChunk) -> dict[int, list[Event]]:
     Raises :class:`ValueError`, :class:`KeyError` and :class:`TypeError` for what is no such thing.
     """
     return {
-        sequence_of(record): [Event(**event) for event in json.loads(text_of(record)).get("events", ())]
+        sequence_of(record): [Event.from_json(event) for event in json.loads(text_of(record)).get("events", ())]
         for record in chunk.texts.get(names.STATE, ())
     }
 

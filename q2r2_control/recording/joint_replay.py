@@ -25,6 +25,7 @@ from q2r2_control.runtime.operator_side import OperatorSide
 from q2r2_control.runtime.recorder import Tick
 from q2r2_control.runtime.run_summary import RunSummary
 from q2r2_control.types import ArmTarget, HandSample, HapticFeedback
+from q2r2_control.wording import limit_name
 
 _FOLLOWED = 0.01  # how near a reference is followed that nothing holds back [rad]
 _REASONS = 4  # that are told of one time
@@ -195,7 +196,7 @@ class _Watch:
         if self._way.refused is None and away <= _FOLLOWED:
             self.farthest = max(self.farthest, away)
             return
-        reason = self._way.refused or ", ".join(tick.reference.report.binding) or "it catches up"
+        reason = self._way.refused or ", ".join(map(limit_name, tick.reference.report.binding)) or "it catches up"
         at = recorded.now - self._start
         if self._last != self._number - 1:
             self.held_back.append(HeldBack(at, at, 0, 0.0, []))

@@ -12,7 +12,6 @@ import math
 import struct
 from array import array
 from collections.abc import Sequence
-from dataclasses import asdict
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -182,7 +181,7 @@ def _state_text(tick: Tick) -> str:
         "holding": tick.holding,
     }
     if tick.events:
-        words["events"] = [asdict(event) for event in tick.events]
+        words["events"] = [event.as_json() for event in tick.events]
     return json.dumps(words)
 
 

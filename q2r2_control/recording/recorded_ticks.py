@@ -9,12 +9,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from q2r2_control.errors import RecordingError
+from q2r2_control.events import Event
 from q2r2_control.recording import topics as names
 from q2r2_control.recording.episode_spans import events_of_ticks
 from q2r2_control.recording.packing import HAND_FAULTS, NOT_MEASURED
 from q2r2_control.recording.reader import RecordedChunk, Recording
 from q2r2_control.runtime.recorder import RunStart
-from q2r2_control.types import SIDES, Array, Event, HandInputs, HandSample, RobotState
+from q2r2_control.types import SIDES, Array, HandInputs, HandSample, RobotState
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,6 +11,7 @@ from q2r2_control.control.controller import CartesianController
 from q2r2_control.control.qp import QpProblem, QpSolution, Solver, make_solver
 from q2r2_control.drives.base import permitted
 from q2r2_control.errors import ConfigError, PlantError, RecordingError
+from q2r2_control.events import Event
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.plants.base import Plant
 from q2r2_control.plants.factory import make_plant
@@ -22,7 +23,7 @@ from q2r2_control.recording.recorded_ticks import NoMoreTicksError, RecordedTick
 from q2r2_control.robot.robot import Robot
 from q2r2_control.runtime.loop_clock import LoopClock
 from q2r2_control.runtime.run_summary import RunSummary
-from q2r2_control.types import Array, Command, CommandMode, Event, HandSample, HapticFeedback, RobotState
+from q2r2_control.types import Array, Command, CommandMode, HandSample, HapticFeedback, RobotState
 
 
 class ReplayPipeline(Pipeline):
@@ -39,7 +40,7 @@ class ReplayPipeline(Pipeline):
     def _wish_again(self, events: list[Event]) -> None:
         """What a program asked of the run at this tick; both arms were told of it, so it is asked twice."""
         for event in events:
-            self.requests.take(event.reason, self.teleop.settings)
+            self.requests.repeat(event.reason, self.teleop.settings)
 
     def _prepare(self, realtime: bool) -> None:
         settings = permitted(self.config.control.model_copy(update={"solve_time_limit": None}), self.drive)

@@ -9,13 +9,14 @@ from __future__ import annotations
 import json
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from q2r2_control.config.timeouts import STREAM_TIMEOUT
+from q2r2_control.events import Event
 from q2r2_control.inputs.messages import Dialect, message_types
 from q2r2_control.recording import topics as names
 from q2r2_control.recording.about import About
@@ -33,7 +34,7 @@ from q2r2_control.recording.ros_topics import (
 from q2r2_control.recording.rows import Rows, text_record
 from q2r2_control.recording.topics import SAMPLE_FIELDS, Topics
 from q2r2_control.robot.robot import Robot
-from q2r2_control.types import SIDES, Array, Event
+from q2r2_control.types import SIDES, Array
 
 _SAME = 1e-6  # times of one tick may differ by their rounding [s]
 _NANOSECONDS = 1_000_000_000
@@ -130,7 +131,7 @@ class RosTicks:
     def _on_event(self, message: Any, time: int) -> None:
         event = json.loads(message.data)
         self._events.append(
-            Event(**event | {"t": (time - self._epoch) / _NANOSECONDS})
+            Event.from_json(event | {"t": (time - self._epoch) / _NANOSECONDS})
         )  # its sender's clock is another
 
     def _on_hand(self, side: int, message: Any, time: int) -> None:
@@ -243,7 +244,7 @@ class RosTicks:
 
     def _state(self, number: int, time: int, events: Sequence[Event]) -> bytes:
         channel = self._topics.by_name[names.STATE].channel
-        return text_record(channel, number, time, json.dumps({"events": [asdict(event) for event in events]}))
+        return text_record(channel, number, time, json.dumps({"events": [event.as_json() for event in events]}))
 
 
 def _pose(message: Any) -> Array:

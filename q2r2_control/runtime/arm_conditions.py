@@ -12,10 +12,9 @@ from q2r2_control.compliance.admittance_kernels import estimate_wrench
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.control.tasks.task_model import tools_of
 from q2r2_control.teleop.haptics import ArmCondition
-from q2r2_control.types import RobotState, StepReport
+from q2r2_control.types import LimitKind, RobotState, StepReport
 
 _LIMIT_LASTS = 0.5  # a joint counts as at its limit for so long after it last was: limits bind on and off [s]
-_LIMIT = " position"  # ends the names of position limits in a report
 
 
 class ArmConditions:
@@ -36,9 +35,9 @@ class ArmConditions:
 
     def note(self, report: StepReport, now: float) -> None:
         """Remember which limits held up a step; of every tick."""
-        for name in report.binding:
-            if name.endswith(_LIMIT):
-                self._limited[name.removesuffix(_LIMIT)] = now
+        for kind, names in report.binding:
+            if kind is LimitKind.POSITION:
+                self._limited[names[0]] = now
 
     def look(self, state: RobotState, now: float) -> Mapping[str, ArmCondition]:
         """Of every arm, at ``now``."""

@@ -9,14 +9,15 @@ from dataclasses import replace
 import pinocchio as pin
 
 from q2r2_control.control.controller import CartesianController
+from q2r2_control.events import Event, Reason, ReasonKind
 from q2r2_control.inputs.base import Input
 from q2r2_control.runtime.operator_feedback import OperatorFeedback
 from q2r2_control.runtime.pending_requests import PendingRequests
 from q2r2_control.supervision.supervisor import Supervisor
 from q2r2_control.teleop.arm_states import is_fault
-from q2r2_control.teleop.episode_marks import RECORDING_ENDED
 from q2r2_control.teleop.teleop import Teleop
-from q2r2_control.types import ArmTarget, Event, HandSample
+from q2r2_control.types import ArmTarget, HandSample
+from q2r2_control.wording import event_line, sentence
 
 _logger = logging.getLogger(__name__)
 
@@ -63,7 +64,9 @@ class OperatorSide:
             if command is None:
                 self._supervisor.release_target(arm)
             elif refusal := self._supervisor.take_target(arm, command, now, measured=tools[arm]):
-                self._teleop.pause(now, refusal.line)  # or the operator would think that the arm follows
+                self._teleop.pause(
+                    now, Reason.of(ReasonKind.OTHER, text=refusal.line)
+                )  # or the operator would think that the arm follows
         self._go_home(now)
         return targets
 
@@ -74,36 +77,39 @@ class OperatorSide:
             return events  # as at most ticks
         events = [replace(event, t=event.t - start) for event in events]
         for event in events:
-            if is_fault(event) and not event.reason.startswith(RECORDING_ENDED):  # which the recorder has logged
-                _logger.warning("%s arm: %s", event.arm, event.reason)
-            else:
-                _logger.debug("%s arm: %s -> %s: %s", event.arm, event.source, event.destination, event.reason)
+            if is_fault(event) and event.kind is not ReasonKind.RECORDING_ENDED:  # which the recorder has logged
+                _logger.warning("%s arm: %s", event.arm, sentence(event.reason))
+            elif _logger.isEnabledFor(logging.DEBUG):
+                _logger.debug("%s arm: %s -> %s", event.arm, event.source, event_line(event))
         return events
 
     def _fulfil(self, now: float) -> None:
         home, settings, control = self._requests.home, self._requests.settings, self._requests.control
-        for line in self._requests.told(self._teleop.settings):
-            self._teleop.tell(now, line)
+        for reason in self._requests.reasons(self._teleop.settings):
+            self._teleop.record_event(now, reason)
         self._requests.clear()
         if home:
             self._teleop.home(now)
         if settings is not None:
             problem = self._teleop.change(settings, now)
-            self._tell_change("settings", problem, now)
+            self._record_change(ReasonKind.SETTINGS_CHANGED, problem, now)
             if problem is None:
                 self.feedback.scale(settings.haptics.strength)
         if control is not None:
-            self._tell_change("control", self._controller.change(control), now)
+            refused = self._controller.change(control)
+            problem = None if refused is None else Reason.of(ReasonKind.CONTROL_REFUSED, text=refused)
+            self._record_change(ReasonKind.CONTROL_CHANGED, problem, now)
 
-    def _tell_change(self, what: str, problem: str | None, now: float) -> None:
-        self._teleop.tell(now, f"{what} changed" if problem is None else f"not changed: {problem}")
+    def _record_change(self, changed: ReasonKind, problem: Reason | None, now: float) -> None:
+        outcome = Reason(changed) if problem is None else Reason(ReasonKind.NOT_CHANGED, cause=problem)
+        self._teleop.record_event(now, outcome)
 
     def _go_home(self, now: float) -> None:
         """Begin and end the way home as the operator asks, and tell the operator how it ended."""
         asked, supervisor = self._teleop.homing, self._supervisor
         if asked and not self._homing:
             if refusal := supervisor.go_home():
-                self._teleop.end_homing(now, f"not homing: {refusal}", arrived=False)
+                self._teleop.end_homing(now, Reason(ReasonKind.NOT_HOMING, cause=_in_words(refusal)), arrived=False)
             else:
                 self._homing = True
         elif self._homing and not asked:
@@ -111,4 +117,9 @@ class OperatorSide:
             supervisor.homing.end()
         elif self._homing and not supervisor.homing.active:
             self._homing = False
-            self._teleop.end_homing(now, supervisor.homing.outcome or "the way home was ended")
+            outcome = supervisor.homing.outcome
+            self._teleop.end_homing(now, Reason(ReasonKind.HOMING_ENDED) if outcome is None else _in_words(outcome))
+
+
+def _in_words(text: str) -> Reason:
+    return Reason.of(ReasonKind.OTHER, text=text)

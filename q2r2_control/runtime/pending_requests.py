@@ -1,18 +1,13 @@
-"""What a program asks of a run that goes on, and how an event tells it, so that a replay can ask the same."""
+"""What a program asks of a run that goes on, and the events that record it, so that a replay can ask the same."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 from q2r2_control.config.teleop import TeleopSettings
-from q2r2_control.teleop.episode_marks import VERDICT
-
-_HOME = "a program asks for the way home"
-_CHANGE = "a program changes settings: "
-_CONTROL = "a program changes control: "
+from q2r2_control.events import Reason, ReasonKind
 
 
 @dataclass(slots=True)
@@ -22,39 +17,39 @@ class PendingRequests:
     home: bool = False
     settings: TeleopSettings | None = None
     control: Mapping[str, float] | None = None  # of the controller, by name
-    told_of_recording: list[str] = field(default_factory=list)  # verdicts on episodes, and why it ended
+    of_recording: list[Reason] = field(default_factory=list)  # verdicts on episodes, and why it ended
 
     def __bool__(self) -> bool:
         """Whether anything is asked for."""
-        return self.home or self.settings is not None or self.control is not None or bool(self.told_of_recording)
+        return self.home or self.settings is not None or self.control is not None or bool(self.of_recording)
 
     def clear(self) -> None:
         """Ask for nothing any more."""
         self.home, self.settings, self.control = False, None, None
-        self.told_of_recording.clear()
+        self.of_recording.clear()
 
-    def told(self, current: TeleopSettings) -> Iterator[str]:
-        """A line for each wish; settings by what is not as it is in the ``current`` ones."""
+    def reasons(self, current: TeleopSettings) -> Iterator[Reason]:
+        """One for each request; settings by what is not as it is in the ``current`` ones."""
         if self.home:
-            yield _HOME
+            yield Reason(ReasonKind.HOME_REQUESTED)
         if self.settings is not None:
             changed = _difference(current.model_dump(mode="json"), self.settings.model_dump(mode="json"))
-            yield _CHANGE + json.dumps(changed)
+            yield Reason.of(ReasonKind.SETTINGS_REQUESTED, changes=changed)
         if self.control is not None:
-            yield _CONTROL + json.dumps(dict(self.control))
-        yield from self.told_of_recording
+            yield Reason.of(ReasonKind.CONTROL_REQUESTED, changes=dict(self.control))
+        yield from self.of_recording
 
-    def take(self, line: str, current: TeleopSettings) -> None:
-        """Wish what such a line tells; any other is none. Raises :class:`ValueError` for settings that are none."""
-        if line == _HOME:
+    def repeat(self, reason: Reason, current: TeleopSettings) -> None:
+        """Request what a recorded ``reason`` says was requested. Raises ValueError for settings that are none."""
+        if reason.kind is ReasonKind.HOME_REQUESTED:
             self.home = True
-        elif line.startswith(_CONTROL):
-            self.control = json.loads(line.removeprefix(_CONTROL))
-        elif line.startswith(_CHANGE):
-            changed = json.loads(line.removeprefix(_CHANGE))
-            self.settings = TeleopSettings.model_validate(_merged(current.model_dump(mode="json"), changed))
-        elif line.startswith(VERDICT) and line not in self.told_of_recording:
-            self.told_of_recording.append(line)
+        elif reason.kind is ReasonKind.CONTROL_REQUESTED:
+            self.control = reason.detail["changes"]
+        elif reason.kind is ReasonKind.SETTINGS_REQUESTED:
+            changed = _merged(current.model_dump(mode="json"), reason.detail["changes"])
+            self.settings = TeleopSettings.model_validate(changed)
+        elif reason.kind is ReasonKind.VERDICT and reason not in self.of_recording:
+            self.of_recording.append(reason)
 
 
 def _difference(old: Mapping[str, Any], new: Mapping[str, Any]) -> dict[str, Any]:

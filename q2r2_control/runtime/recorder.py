@@ -12,11 +12,12 @@ from q2r2_control.compliance.impedance import ImpedanceReport
 from q2r2_control.compliance.repulsion import WallReport
 from q2r2_control.config.control import ControllerSettings
 from q2r2_control.drives.base import DriveReport
+from q2r2_control.events import Event
 from q2r2_control.robot.robot import Robot
 from q2r2_control.runtime.loop_clock import LoopClock
 from q2r2_control.runtime.run_summary import RunStatistics, RunSummary
 from q2r2_control.supervision.tick_pacer import TickPacer
-from q2r2_control.types import ArmTarget, Command, Event, HandSample, Reference, RobotState
+from q2r2_control.types import ArmTarget, Command, HandSample, Reference, RobotState
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,11 +13,13 @@ import pinocchio as pin
 
 from q2r2_control.config.control import ControllerSettings
 from q2r2_control.drives.base import DriveReport
+from q2r2_control.events import Event
 from q2r2_control.robot.robot import Robot
 from q2r2_control.runtime.histogram import NOTHING_MEASURED, Histogram, Percentiles
 from q2r2_control.runtime.joint_extremes import JointExtremes
 from q2r2_control.runtime.torque_summary import TorqueStatistics, TorqueSummary
-from q2r2_control.types import ArmTarget, Array, Event, HandSample, Reference
+from q2r2_control.types import ArmTarget, Array, HandSample, Reference
+from q2r2_control.wording import sentence
 
 EVENTS_KEPT = 10_000  # the newest ones; a broken button can cause more
 _REST = 1e-3  # [rad/s]
@@ -77,10 +79,7 @@ class RunSummary:
     def as_json(self) -> dict[str, Any]:
         """Data for ``json.dumps``."""
         data = asdict(self)
-        data["events"] = [
-            {"t": event.t, "arm": event.arm, "from": event.source, "to": event.destination, "reason": event.reason}
-            for event in self.events
-        ]
+        data["events"] = [event.as_json() | {"reason": sentence(event.reason)} for event in self.events]
         return data
 
 

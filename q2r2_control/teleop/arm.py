@@ -9,6 +9,7 @@ import pinocchio as pin
 
 from q2r2_control.config.bindings import BUTTONS, Action, Gesture
 from q2r2_control.config.teleop import TeleopSettings
+from q2r2_control.events import Event, Reason, ReasonKind
 from q2r2_control.quaternions import floats_of
 from q2r2_control.teleop.analog_gripper import AnalogGripper
 from q2r2_control.teleop.arm_states import ArmState, Cause, next_state
@@ -19,7 +20,7 @@ from q2r2_control.teleop.hand_motion import HandMotion, Shares
 from q2r2_control.teleop.held_controls import HeldControls
 from q2r2_control.teleop.sag import Anchor
 from q2r2_control.teleop.workspace import Workspace
-from q2r2_control.types import Array, Event, HandSample, Pose
+from q2r2_control.types import Array, HandSample, Pose
 
 OPEN, CLOSED = 1.0, 0.0
 _WHOLE: Shares = (1.0, 1.0)
@@ -45,7 +46,7 @@ class ArmTeleop:
         self._presses: list[Press] = []
         self._gripped: bool | None = None  # the dead man was just held, or let go
         self._aligned_at = 0.0
-        self._obstacle: str | None = None
+        self._obstacle: Reason | None = None
 
     def _use(self, settings: TeleopSettings) -> None:
         self._bindings = settings.bindings
@@ -78,7 +79,7 @@ class ArmTeleop:
         """What the hand's triggers and stick are held for."""
         return self._held.actions
 
-    def receive(self, sample: HandSample, now: float) -> str | None:
+    def receive(self, sample: HandSample, now: float) -> Reason | None:
         """Process one sample of this arm's hand; returns the fault that forbids to follow it any longer, or None."""
         self._presses += self._gestures.receive(sample.inputs, sample.inputs_stamp, now)
         held = self.held
@@ -95,15 +96,15 @@ class ArmTeleop:
             return None  # realigning makes the pose jump, and the arm is not following
         return fault
 
-    def watchdog(self, now: float) -> str | None:
+    def watchdog(self, now: float) -> Reason | None:
         """The fault of a stream that has stopped, or None."""
         if self._gate.stale(now):
-            return f"no pose for {self._timeout:g} s"
+            return Reason.of(ReasonKind.POSE_SILENT, timeout=self._timeout)
         if self._gestures.stale(now, self._timeout):
-            return f"no button data for {self._timeout:g} s"
+            return Reason.of(ReasonKind.INPUTS_SILENT, timeout=self._timeout)
         return None
 
-    def change(self, cause: Cause, now: float, reason: str) -> None:
+    def change(self, cause: Cause, now: float, reason: Reason) -> None:
         """Follow a cause from outside of this arm: any but those that engage, which need the tool.
 
         Presses that began before do not count.
@@ -115,8 +116,8 @@ class ArmTeleop:
         if self.state is ArmState.STOPPED:
             self._analog.forget()
 
-    def tell(self, now: float, reason: str) -> None:
-        """What the operator should know while the state stays; what was not done begins with "not"."""
+    def record_event(self, now: float, reason: Reason) -> None:
+        """What the operator should know while the state stays."""
         self.events.append(Event(now, self.arm, self.state, self.state, reason))
 
     @property
@@ -129,7 +130,7 @@ class ArmTeleop:
         presses = self._presses + self._gestures.due(now)
         self._presses = []
         if (stuck := self._gestures.take_stuck(now)) is not None:
-            self.tell(now, f"not engaged: {stuck}")
+            self.record_event(now, Reason(ReasonKind.NOT_ENGAGED, cause=stuck))
         return presses
 
     @property
@@ -153,7 +154,7 @@ class ArmTeleop:
         anchor: Callable[[], Anchor | None],
         now: float,
         chord: bool,
-        obstacle: str | None = None,
+        obstacle: Reason | None = None,
     ) -> None:
         """Change the state by this hand's gestures, and by chords.
 
@@ -162,13 +163,13 @@ class ArmTeleop:
         """
         self._obstacle = obstacle
         if self._gripped is False:
-            self._go(Cause.LET_GO, now, "dead man let go")
+            self._go(Cause.LET_GO, now, Reason(ReasonKind.DEAD_MAN_RELEASED))
         if chord:
             self._align(now)
         elif self.state is ArmState.ALIGNING and self._gate.pose is not None and self._gate.stamp >= self._aligned_at:
-            self._engage(Cause.ALIGNED, anchor(), now, "aligned anew")
+            self._engage(Cause.ALIGNED, anchor(), now, Reason(ReasonKind.ALIGNED))
         elif self._gripped:
-            self._engage(Cause.ENGAGE, anchor(), now, "dead man held")
+            self._engage(Cause.ENGAGE, anchor(), now, Reason(ReasonKind.DEAD_MAN_HELD))
         self._gripped = None
         for press in presses:
             self._press(press, anchor, now)
@@ -204,13 +205,13 @@ class ArmTeleop:
     def _align(self, now: float) -> None:
         self._aligned_at = now
         if self.state is not ArmState.PAUSING or self.chord:  # the other hand's chord does not say what this press is
-            self._go(Cause.CHORD, now, "alignment chord")
+            self._go(Cause.CHORD, now, Reason(ReasonKind.ALIGNMENT_CHORD))
 
     def _press(self, press: Press, anchor: Callable[[], Anchor | None], now: float) -> None:
         control, gesture = press
         action = self._bindings.action_of(control, gesture)
         pauses = self._bindings.action_of(control, Gesture.TAP) is Action.PAUSE_TOGGLE
-        reason = f"{control} button" if control in BUTTONS else control
+        reason = pressed(control)
         if gesture is Gesture.DOWN:
             if pauses:
                 self._go(Cause.PAUSE_BEGINS, now, reason)
@@ -221,26 +222,26 @@ class ArmTeleop:
         elif action is Action.PAUSE_TOGGLE:
             self._engage(Cause.ENGAGE, anchor(), now, reason)
 
-    def _engage(self, cause: Cause, anchor: Anchor | None, now: float, reason: str) -> None:
+    def _engage(self, cause: Cause, anchor: Anchor | None, now: float, reason: Reason) -> None:
         """Engage where ``cause`` would, if nothing is in the way; else say what is."""
         if next_state(self.state, cause) is self.state:
             return
         obstacle = self._obstacle or self.watchdog(now)
         if self._has_dead_man and Action.DEAD_MAN not in self.held:
-            obstacle = obstacle or "the dead man is not held"
+            obstacle = obstacle or Reason(ReasonKind.DEAD_MAN_NOT_HELD)
         if self._gate.pose is None:
             obstacle = obstacle or self._gate.problem
         elif anchor is None or not np.isfinite(anchor.tool.homogeneous).all():
-            obstacle = obstacle or "the tool's pose is not known"
+            obstacle = obstacle or Reason(ReasonKind.TOOL_UNKNOWN)
         else:
             self.sag = anchor.sag
             self._motion.anchor(self._gate.pose, floats_of(anchor.tool), self._shares(), now)
         if obstacle is None:
             self._go(cause, now, reason)
         elif self.state is ArmState.ALIGNING:
-            self._go(Cause.NOT_ALIGNED, now, f"not engaged: {obstacle}")
+            self._go(Cause.NOT_ALIGNED, now, Reason(ReasonKind.NOT_ENGAGED, cause=obstacle))
         else:
-            self.tell(now, f"not engaged: {obstacle}")
+            self.record_event(now, Reason(ReasonKind.NOT_ENGAGED, cause=obstacle))
 
     def _shares(self) -> Shares:
         """Of the scales, by what is held."""
@@ -250,11 +251,16 @@ class ArmTeleop:
         share = self._precision if Action.PRECISION in held else 1.0
         return 0.0 if Action.TRANSLATION_LOCK in held else share, 0.0 if Action.ROTATION_LOCK in held else share
 
-    def _go(self, cause: Cause, now: float, reason: str) -> None:
+    def _go(self, cause: Cause, now: float, reason: Reason) -> None:
         state = next_state(self.state, cause)
         if state is not self.state:
             self.events.append(Event(now, self.arm, self.state, state, reason))
             self.state = state
+
+
+def pressed(control: str) -> Reason:
+    """That a control of a hand was used."""
+    return Reason.of(ReasonKind.PRESSED, control=f"{control} button" if control in BUTTONS else control)
 
 
 def of_controls(settings: TeleopSettings) -> tuple[object, ...]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from enum import StrEnum
 from typing import NamedTuple
 
-from q2r2_control.types import Event
+from q2r2_control.events import REFUSALS, Event
 
 
 class ArmState(StrEnum):
@@ -93,7 +93,7 @@ def next_state(state: ArmState, cause: Cause) -> ArmState:
 
 def is_refusal(event: Event) -> bool:
     """Whether an operator wanted something that was not done: nothing changed."""
-    return event.source == event.destination and event.reason.startswith("not ")
+    return event.kind in REFUSALS and event.source == event.destination
 
 
 def is_fault(event: Event) -> bool:

@@ -10,7 +10,8 @@ import pinocchio as pin
 
 from q2r2_control.config.bindings import Action, Gesture
 from q2r2_control.config.teleop import Stance, TeleopSettings
-from q2r2_control.teleop.arm import ArmTeleop
+from q2r2_control.events import Reason, ReasonKind
+from q2r2_control.teleop.arm import ArmTeleop, pressed
 from q2r2_control.teleop.arm_states import AT_REST, ArmState, Cause
 from q2r2_control.teleop.carry_mode import CarryMode
 from q2r2_control.teleop.episode_marks import EpisodeMarks
@@ -19,8 +20,8 @@ from q2r2_control.teleop.sag import Anchor, anchor_of, expected
 from q2r2_control.types import Pose
 
 # Why arms do not carry.
-_ENGAGE, _UNKNOWN = "engage the arm first", "a tool's pose is not known"
-_ALONE = "this program drives one arm only"  # why hands are not swapped, and arms do not carry
+_ENGAGE, _UNKNOWN = Reason(ReasonKind.ENGAGE_FIRST), Reason(ReasonKind.TOOL_UNKNOWN)
+_ALONE = Reason(ReasonKind.ONE_ARM)  # why hands are not swapped, and arms do not carry
 
 
 @dataclass(slots=True)  # not frozen: that would cost half a microsecond a tick
@@ -30,7 +31,7 @@ class ArmMeasurements:
     tools: Mapping[str, pin.SE3]  # measured
     targets: Mapping[str, pin.SE3]  # the last ones
     commanded: Mapping[str, pin.SE3] | None = None  # by the controller's reference
-    obstacles: Mapping[str, str] = field(default_factory=dict)  # arm -> why it may not be engaged
+    obstacles: Mapping[str, Reason] = field(default_factory=dict)  # arm -> why it may not be engaged
     in_step: bool = True  # ``commanded`` is of one moment
 
     def anchor(self, arm: str) -> Anchor | None:
@@ -89,7 +90,7 @@ class BothArms:
         """Whether every arm is in one of these states."""
         return all(arm.state in states for arm in self.arms.values())
 
-    def change(self, cause: Cause, now: float, reason: str) -> None:
+    def change(self, cause: Cause, now: float, reason: Reason) -> None:
         """Follow a cause that is for every arm."""
         for arm in self.arms.values():
             arm.change(cause, now, reason)
@@ -101,7 +102,7 @@ class BothArms:
             return presses  # as at most ticks
         for action in self.marks.actions:
             if (name := self._asked(presses, action)) is not None:
-                self.arms[name].tell(now, self.marks.take(action))
+                self.arms[name].record_event(now, Reason(self.marks.apply(action)))
         if self._asked(presses, Action.STOP) is not None:
             cause = Cause.GO_ON if self.all_in({ArmState.STOPPED}) else Cause.STOP
             self.change(cause, now, self._reason(Action.STOP))
@@ -110,7 +111,7 @@ class BothArms:
         elif self.any_in(ArmState.HOMING):
             begun = any(press.gesture is Gesture.DOWN for listed in presses.values() for press in listed)
             if begun or any(arm.grips or arm.chord for arm in self.arms.values()):
-                self.change(Cause.PRESS, now, "the way home was interrupted")
+                self.change(Cause.PRESS, now, Reason(ReasonKind.HOMING_INTERRUPTED))
         elif (asked_by := self._asked(presses, Action.HOME)) is not None:
             self.home(now, asked_by, around.obstacles.get(asked_by))
         elif self.carry is not None and (reason := self._ends_carry(presses)) is not None:
@@ -121,25 +122,27 @@ class BothArms:
             return presses
         return {name: [] for name in self.arms}
 
-    def home(self, now: float, asked_by: str | None, problem: str | None = None) -> None:
+    def home(self, now: float, asked_by: str | None, problem: Reason | None = None) -> None:
         """Both arms shall go home; the hand of the arm ``asked_by`` has to be there on the way, None: no hand.
 
         A ``problem``, or another thing in the way, becomes an event.
         """
         if self.any_in(ArmState.ALIGNING):
-            problem = problem or "an alignment is not over"
+            problem = problem or Reason(ReasonKind.ALIGNING)
         if self.any_in(ArmState.STOPPED):
-            problem = problem or "stopped"
+            problem = problem or self._stopped()
         if self.carry is not None:
-            problem = problem or "two arms carry"
+            problem = problem or Reason(ReasonKind.CARRYING)
         if problem is None and asked_by is not None:
             problem = self.arms[asked_by].watchdog(now)
         self.asks_home = asked_by
         for arm in self.arms.values():
             if problem is not None:
-                arm.tell(now, f"not homing: {problem}")
+                arm.record_event(now, Reason(ReasonKind.NOT_HOMING, cause=problem))
             else:
-                arm.change(Cause.HOME, now, "way home" if asked_by is None else self._reason(Action.HOME))
+                arm.change(
+                    Cause.HOME, now, Reason(ReasonKind.HOMING) if asked_by is None else self._reason(Action.HOME)
+                )
 
     def swap_hands(self, presses: Mapping[str, Sequence[Press]], now: float) -> None:
         """If it is asked for, each hand drives the other arm."""
@@ -147,7 +150,7 @@ class BothArms:
             return
         problem = _ALONE if len(self.arms) < 2 else None
         if not self.all_in(AT_REST):
-            problem = "pause both arms first"
+            problem = Reason(ReasonKind.PAUSE_FIRST)
         if problem is None:
             self.swapped = not self.swapped
             self.arm_of_hand = {_other(hand): name for hand, name in self.arm_of_hand.items()}
@@ -155,24 +158,25 @@ class BothArms:
             if problem is None:
                 arm.forget()  # its hand has to be seen anew before it drives the arm
             hand = self.hand_of(arm.arm)
-            arm.tell(now, f"driven by the {hand} hand" if problem is None else f"not swapped: {problem}")
+            driven = Reason.of(ReasonKind.DRIVEN_BY, hand=hand)
+            arm.record_event(now, driven if problem is None else Reason(ReasonKind.NOT_SWAPPED, cause=problem))
 
-    def end_carry(self, now: float, reason: str) -> None:
+    def end_carry(self, now: float, reason: Reason) -> None:
         """If two arms carry, both hold."""
         if self.carry is not None:
             self.carry.end(now, reason)
         self.carry = None
 
-    def _take_up(self, arm: ArmTeleop, around: ArmMeasurements) -> Anchor | str:
+    def _take_up(self, arm: ArmTeleop, around: ArmMeasurements) -> Anchor | Reason:
         """Where an arm's tool is when it begins to be carried, or why it may not be."""
         if arm.state is not ArmState.ENGAGED:
             if arm.state not in AT_REST:
-                return f"the other arm is {arm.state}"
+                return Reason.of(ReasonKind.OTHER_ARM_BUSY, state=str(arm.state))
             if arm.arm in around.obstacles:
                 return around.obstacles[arm.arm]
             return around.anchor(arm.arm) or _UNKNOWN
         if around.lag(arm) >= (self._leash.distance or math.inf):
-            return "a tool is held up on the way to its target"
+            return Reason(ReasonKind.TOOL_HELD_UP)
         target = around.targets.get(arm.arm)
         return _UNKNOWN if target is None else Anchor(target, arm.sag)
 
@@ -181,26 +185,26 @@ class BothArms:
         leader = self.arms[name]
         other = next((arm for arm in self.arms.values() if arm is not leader), None)
         taken = {arm.arm: self._take_up(arm, around) for arm in (leader, other) if arm is not None}
-        problem = next((found for found in taken.values() if isinstance(found, str)), None)
+        problem = next((found for found in taken.values() if isinstance(found, Reason)), None)
         if leader.state is not ArmState.ENGAGED:
             problem = _ENGAGE
         elif other is None and problem is None:
             problem = _ALONE
         if problem is not None:
-            leader.tell(now, f"not carried: {problem}")
+            leader.record_event(now, Reason(ReasonKind.NOT_CARRIED, cause=problem))
         elif other is not None:
             anchors = {arm: found for arm, found in taken.items() if isinstance(found, Anchor)}
             other.sag = anchors[other.arm].sag
             self.carry = CarryMode(leader, other, {arm: anchor.tool for arm, anchor in anchors.items()}, now)
 
-    def _ends_carry(self, presses: Mapping[str, Sequence[Press]]) -> str | None:
+    def _ends_carry(self, presses: Mapping[str, Sequence[Press]]) -> Reason | None:
         """What of this tick's controls ends it, or None."""
         if any(arm.chord for arm in self.arms.values()):
-            return "alignment chord"
+            return Reason(ReasonKind.ALIGNMENT_CHORD)
         for control, gesture in (press for listed in presses.values() for press in listed):
             pauses = self._bindings.action_of(control, Gesture.TAP) is Action.PAUSE_TOGGLE
             if (pauses and gesture is Gesture.DOWN) or self._bindings.action_of(control, gesture) is Action.CARRY:
-                return control
+                return pressed(control)
         return None
 
     def _refuse_while_stopped(self, presses: Mapping[str, Sequence[Press]], now: float) -> None:
@@ -210,7 +214,7 @@ class BothArms:
         }
         for name, actions in wanted.items():
             if set(actions) - set(self.marks.actions):
-                self.arms[name].tell(now, f"not engaged: stopped, {self._bindings.words_of(Action.STOP)} goes on")
+                self.arms[name].record_event(now, Reason(ReasonKind.NOT_ENGAGED, cause=self._stopped()))
 
     def _asked(self, presses: Mapping[str, Sequence[Press]], action: Action) -> str | None:
         """The arm whose hand asked for ``action``, or None."""
@@ -219,8 +223,11 @@ class BothArms:
                 return name
         return None
 
-    def _reason(self, action: Action) -> str:
-        return f"{action} ({self._bindings.words_of(action)})"
+    def _reason(self, action: Action) -> Reason:
+        return Reason.of(ReasonKind.COMMANDED, action=str(action), control=self._bindings.words_of(action))
+
+    def _stopped(self) -> Reason:
+        return Reason.of(ReasonKind.STOPPED, control=self._bindings.words_of(Action.STOP))
 
 
 def _other(side: str) -> str:

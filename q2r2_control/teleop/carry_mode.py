@@ -6,6 +6,7 @@ from collections.abc import Mapping
 
 import pinocchio as pin
 
+from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.quaternions import floats_of, se3_of
 from q2r2_control.teleop.arm import ArmTeleop
 from q2r2_control.teleop.arm_states import ArmState, Cause
@@ -26,14 +27,14 @@ class CarryMode:
         self._box = follower.workspace()
         follower.change(Cause.CARRY, now, carried_by(leader.arm))
         leader.lead(self._tools, follower.arm, self._box, now)
-        leader.tell(now, CARRIES)
+        leader.record_event(now, Reason(ReasonKind.CARRY_BEGAN))
 
     @property
     def lasts(self) -> bool:
         """Whether both arms still carry."""
         return self._leader.state is ArmState.ENGAGED and self._follower.state is ArmState.CARRIED
 
-    def end(self, now: float, reason: str) -> None:
+    def end(self, now: float, reason: Reason) -> None:
         """Whichever arm still follows holds."""
         for arm in (self._leader, self._follower):
             arm.change(Cause.CARRY_ENDS, now, reason)
@@ -61,6 +62,6 @@ class CarryMode:
         return self._leader.slip
 
 
-def carried_by(leader: str) -> str:
+def carried_by(leader: str) -> Reason:
     """Why an arm is carried."""
-    return f"carries with the {leader} arm"
+    return Reason.of(ReasonKind.CARRIED_BY, arm=leader)

@@ -3,27 +3,12 @@
 from __future__ import annotations
 
 from q2r2_control.config.bindings import Action
+from q2r2_control.events import ReasonKind
 
-BEGINS, ENDS, DISCARDED, MARK = "episode begins", "episode ends", "episode discarded", "mark"
-SUCCEEDED, FAILED = "episode succeeded", "episode failed"
-VERDICT = "verdict on episode "  # with its number, and a line of what is to become of it
-RECORDING_ENDED = "not recorded any more: "  # and why
-NO_RECORDING = "not recorded: this run has no recording"
-_OUTCOMES = {Action.RECORD_SUCCESS: SUCCEEDED, Action.RECORD_FAILURE: FAILED}
-_NONE_YET = "not discarded: no episode has begun"
-
-
-def verdict_line(number: int, line: str) -> str:
-    """What tells the verdict on an episode; ``line`` begins with ``keep`` or ``discard``."""
-    return f"{VERDICT}{number}: {line}"
-
-
-def is_kept(reason: str) -> bool | None:
-    """Of an event's reason: whether it tells that an episode is kept, or is not; None: it tells no such thing."""
-    if not reason.startswith(VERDICT):
-        return None
-    word = reason.removeprefix(VERDICT).partition(": ")[2]
-    return True if word.startswith("keep") else False if word.startswith("discard") else None
+_OUTCOMES = {
+    Action.RECORD_SUCCESS: ReasonKind.EPISODE_SUCCEEDED,
+    Action.RECORD_FAILURE: ReasonKind.EPISODE_FAILED,
+}
 
 
 class EpisodeMarks:
@@ -42,26 +27,26 @@ class EpisodeMarks:
         self.open = False  # whether an episode has begun and not ended
         self.any = False  # whether there is an episode that could be discarded
 
-    def take(self, action: Action) -> str:
-        """Follow a control; returns the event's reason. What became of an episode ends it."""
+    def apply(self, action: Action) -> ReasonKind:
+        """Follow a control; returns the event's kind. What became of an episode ends it."""
         if not self.recorded:
-            return NO_RECORDING
+            return ReasonKind.NO_RECORDING
         if action is Action.RECORD_MARK:
-            return MARK
+            return ReasonKind.MARK
         if action is Action.RECORD_DISCARD:
             self.open = False
             any_episode, self.any = self.any, False
-            return DISCARDED if any_episode else _NONE_YET
+            return ReasonKind.EPISODE_DISCARDED if any_episode else ReasonKind.NO_EPISODE
         if action in _OUTCOMES:
             self.open = False
             return _OUTCOMES[action]
         self.open = not self.open
         self.any = True
-        return BEGINS if self.open else ENDS
+        return ReasonKind.EPISODE_BEGINS if self.open else ReasonKind.EPISODE_ENDS
 
-    def follow(self, reason: str) -> None:
-        """Learn of an event that was told elsewhere, by its ``reason``."""
-        if reason in (SUCCEEDED, FAILED):
+    def follow(self, kind: ReasonKind) -> None:
+        """Follow an event that happened elsewhere."""
+        if kind in _OUTCOMES.values():
             self.open = False
-        elif reason in (BEGINS, ENDS, DISCARDED):
-            self.open, self.any = reason == BEGINS, reason != DISCARDED
+        elif kind in (ReasonKind.EPISODE_BEGINS, ReasonKind.EPISODE_ENDS, ReasonKind.EPISODE_DISCARDED):
+            self.open, self.any = kind is ReasonKind.EPISODE_BEGINS, kind is not ReasonKind.EPISODE_DISCARDED

@@ -9,6 +9,7 @@ from operator import mul
 import numpy as np
 
 from q2r2_control.config.teleop import GateSettings
+from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.quaternions import Quaternion
 from q2r2_control.types import HandSample, Pose
 
@@ -33,59 +34,60 @@ class PoseGate:
         # The newest pose, in the input's frame; None when there is none or the newest was not usable.
         self.pose: Pose | None = None
         self.stamp = -math.inf  # receipt time of the newest pose [s], usable or not; -inf before the first
-        self._problem = ""
+        self._problem: Reason | None = None
         self._way: deque[tuple[float, Pose]] = deque()  # the first is _SPEED_WINDOW old, or the oldest
 
     @property
-    def problem(self) -> str | None:
+    def problem(self) -> Reason | None:
         """Why no arm may be anchored to the newest pose, None where it may."""
-        return None if self.pose is not None else self._problem or "the newest pose is not usable"
+        return None if self.pose is not None else self._problem or Reason(ReasonKind.NO_POSE)
 
     def reset(self) -> None:
         """Forget everything received."""
         self.pose = None
         self.stamp = -math.inf
-        self._problem = ""
+        self._problem = None
         self._way.clear()
 
     def stale(self, now: float) -> bool:
         """Whether no pose was received for ``timeout``."""
         return now - self.stamp > self.settings.timeout
 
-    def receive(self, sample: HandSample, now: float) -> tuple[bool, str | None]:
+    def receive(self, sample: HandSample, now: float) -> tuple[bool, Reason | None]:
         """Process one sample; returns whether its pose is new and usable, and what forbids to follow it, or None.
 
         A pose after a jump is usable, since an arm may be anchored to it, but must not be followed.
         """
         stamp = min(float(sample.pose_stamp), now)
         if math.isnan(stamp):
-            return False, "a pose without a receipt time"
+            return False, Reason(ReasonKind.POSE_WITHOUT_STAMP)
         if stamp < self.stamp or stamp == -math.inf:
             return False, None
-        pose, self._problem = (None, str(sample.fault)) if sample.fault else (_pose_of(sample), "")
+        self._problem = None if sample.fault is None else Reason(ReasonKind(sample.fault.value))
+        pose = _pose_of(sample) if self._problem is None else None
         previous, gap = self.pose, stamp - self.stamp
         self.pose, self.stamp = pose, stamp
         if pose is None:
             self._way.clear()
-            return False, self._problem or "a pose that is not finite or not a rotation"
+            return False, self._problem or Reason(ReasonKind.POSE_UNUSABLE)
         jump = None if previous is None else self._jump(previous, pose, gap)
         if jump is not None:
             self._way.clear()  # no speed is taken across it
         return True, jump or self._speed(pose, stamp)
 
-    def _jump(self, previous: Pose, pose: Pose, gap: float) -> str | None:
+    def _jump(self, previous: Pose, pose: Pose, gap: float) -> Reason | None:
         limits = self.settings
         if gap > limits.timeout:
-            return f"no pose for {gap:.3f} s"
+            return Reason.of(ReasonKind.POSE_GAP, gap=gap)
         distance = math.dist(pose[0], previous[0])
         if distance > limits.max_jump:
-            return f"the hand jumped {distance:.3f} m"
+            return Reason.of(ReasonKind.HAND_JUMPED, distance=distance)
         angle = _angle(previous[1], pose[1])
         if angle > limits.max_rotation_jump:
-            return f"the hand's rotation jumped {angle:.2f} rad"
+            return Reason.of(ReasonKind.HAND_ROTATION_JUMPED, angle=angle)
         return None
 
-    def _speed(self, pose: Pose, stamp: float) -> str | None:
+    def _speed(self, pose: Pose, stamp: float) -> Reason | None:
         """What is wrong with the hand's mean speed over the last ``_SPEED_WINDOW`` or a little more, or None."""
         way = self._way
         way.append((stamp, pose))
@@ -97,10 +99,10 @@ class PoseGate:
             return None
         speed = math.dist(pose[0], start[0]) / time
         if speed > self.settings.max_speed:
-            return f"the hand moved at {speed:.1f} m/s"
+            return Reason.of(ReasonKind.HAND_TOO_FAST, speed=speed)
         angular_speed = _angle(start[1], pose[1]) / time
         if angular_speed > self.settings.max_angular_speed:
-            return f"the hand turned at {angular_speed:.0f} rad/s"
+            return Reason.of(ReasonKind.HAND_TURNS_TOO_FAST, speed=angular_speed)
         return None
 
 

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 from q2r2_control.config.bindings import BUTTONS, HELD, LASTING, Action, Gesture
 from q2r2_control.config.teleop import TeleopSettings
+from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.teleop.held_controls import is_held
 from q2r2_control.types import HandInputs
 
@@ -109,13 +110,13 @@ class GestureRecognizer:
             found = [press for press in found if press.control not in BUTTONS]
         return found
 
-    def take_stuck(self, now: float) -> str | None:
-        """One line, returned once, if controls do nothing since they are held for long from the first reading on."""
+    def take_stuck(self, now: float) -> Reason | None:
+        """The reason, returned once, if controls do nothing since they are held for long from the first reading on."""
         if self._told_stuck or self._first == -math.inf or now - self._first <= _STUCK_AFTER:
             return None
         stuck = [name for name, control in self._controls.items() if control.down and not control.seen_up]
         self._told_stuck = True
-        return f"{' and '.join(stuck)} held since the hand was first heard of: let go first" if stuck else None
+        return Reason.of(ReasonKind.CONTROLS_HELD, controls=stuck) if stuck else None
 
     def due(self, now: float) -> list[Press]:
         """Gestures that are over because time has passed."""

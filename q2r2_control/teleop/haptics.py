@@ -7,10 +7,9 @@ from collections.abc import Iterable
 from typing import NamedTuple
 
 from q2r2_control.config.teleop import HapticSettings
+from q2r2_control.events import Event, ReasonKind
 from q2r2_control.teleop.arm_states import ArmState, is_fault
-from q2r2_control.teleop.carry_mode import CARRIES
-from q2r2_control.teleop.episode_marks import BEGINS, DISCARDED, ENDS, FAILED, MARK, SUCCEEDED, is_kept
-from q2r2_control.types import Event, HapticFeedback
+from q2r2_control.types import HapticFeedback
 
 
 class Pulse(NamedTuple):
@@ -68,14 +67,14 @@ _BEGINS = {
     ArmState.HOMING: HOMING,
     ArmState.STOPPED: STOPPED,
 }
-_TOLD = {
-    CARRIES: ENGAGED,
-    BEGINS: EPISODE_BEGINS,
-    MARK: EPISODE_BEGINS,
-    ENDS: EPISODE_ENDS,
-    SUCCEEDED: EPISODE_ENDS,
-    FAILED: EPISODE_DISCARDED,
-    DISCARDED: EPISODE_DISCARDED,
+_WHILE_STATE_STAYS = {
+    ReasonKind.CARRY_BEGAN: ENGAGED,
+    ReasonKind.EPISODE_BEGINS: EPISODE_BEGINS,
+    ReasonKind.MARK: EPISODE_BEGINS,
+    ReasonKind.EPISODE_ENDS: EPISODE_ENDS,
+    ReasonKind.EPISODE_SUCCEEDED: EPISODE_ENDS,
+    ReasonKind.EPISODE_FAILED: EPISODE_DISCARDED,
+    ReasonKind.EPISODE_DISCARDED: EPISODE_DISCARDED,
 }
 
 _SLIP_STEP = 0.02  # the target slips by this between two pulses [m]
@@ -115,10 +114,10 @@ class HapticPulses:
         if is_fault(event):
             self._want(FAULT)
         elif event.source == event.destination:
-            if (pulse := _TOLD.get(event.reason)) is not None:
+            if (pulse := _WHILE_STATE_STAYS.get(event.kind)) is not None:
                 self._want(pulse)
-            elif (kept := is_kept(event.reason)) is not None:
-                self._want(EPISODE_KEPT if kept else EPISODE_REJECTED)
+            elif event.kind is ReasonKind.VERDICT and (keep := event.reason.detail["keep"]) is not None:
+                self._want(EPISODE_KEPT if keep else EPISODE_REJECTED)
         elif event.destination in _BEGINS:
             self._want(_BEGINS[ArmState(event.destination)])
         elif event.source in (ArmState.ENGAGED, ArmState.CARRIED, ArmState.HOMING):

@@ -9,12 +9,13 @@ from functools import partial
 import pinocchio as pin
 
 from q2r2_control.config.teleop import TeleopSettings
+from q2r2_control.events import Event, Reason, ReasonKind
 from q2r2_control.quaternions import se3_of
 from q2r2_control.teleop.arm import of_controls
 from q2r2_control.teleop.arm_states import FOLLOWING, HOLDING, ArmState, Cause
 from q2r2_control.teleop.both_arms import ArmMeasurements, BothArms
 from q2r2_control.teleop.episode_marks import EpisodeMarks
-from q2r2_control.types import ArmTarget, Event, HandSample
+from q2r2_control.types import ArmTarget, HandSample
 
 _BY_HANDS = ArmState.ENGAGED, ArmState.CARRIED
 _LED = FOLLOWING - {ArmState.CARRIED}  # by their own hand, which does not move an arm that is carried
@@ -47,7 +48,7 @@ class Teleop:
         self._linked, self._stall = settings.linked, settings.gate.timeout
         self.delay = settings.filter.interpolation_delay + settings.filter.smoothing_delay
 
-    def change(self, settings: TeleopSettings, now: float) -> str | None:
+    def change(self, settings: TeleopSettings, now: float) -> Reason | None:
         """Other settings from now on, without a jump; returns why that is not possible now, or None.
 
         Which hand drives an arm, which way its axes go and what its controls mean may change only while the arms hold.
@@ -55,9 +56,9 @@ class Teleop:
         before = self.settings
         turned = (before.stance, before.axes) != (settings.stance, settings.axes)
         if self._pair.carry is not None:
-            return "two arms carry"
+            return Reason(ReasonKind.CARRYING)
         if (turned or of_controls(before) != of_controls(settings)) and not self._pair.all_in(HOLDING):
-            return "stance, axes and controls may be changed while both arms hold"
+            return Reason(ReasonKind.ARMS_MUST_HOLD)
         self._use(settings)
         self._pair.use(settings)
         for name, arm in self._arms.items():
@@ -117,7 +118,7 @@ class Teleop:
         tools: Mapping[str, pin.SE3],
         now: float,
         commanded: Mapping[str, pin.SE3] | None = None,
-        obstacles: Mapping[str, str] | None = None,
+        obstacles: Mapping[str, Reason] | None = None,
         in_step: bool = True,
     ) -> dict[str, ArmTarget]:
         """One tick: process the samples and compute every arm's target.
@@ -134,7 +135,7 @@ class Teleop:
         """
         clock_fault = self._clock(now)
         now = self._now if self._now is not None else 0.0
-        faults: dict[str, str] = {}
+        faults: dict[str, Reason] = {}
         for sample in samples:
             name = self._pair.arm_of_hand.get(sample.hand)
             if name is not None and (fault := self._arms[name].receive(sample, now)):
@@ -184,7 +185,7 @@ class Teleop:
         """Of every arm, while two carry or until one of them was stopped."""
         assert self._pair.carry is not None
         if not self._pair.carry.lasts:
-            self._pair.end_carry(now, "the other arm was stopped")
+            self._pair.end_carry(now, Reason(ReasonKind.CARRY_ENDED))
             return self._targets(now, around)
         expected = {
             name: se3_of(pose) for name, arm in self._arms.items() if (pose := around.expected(arm)) is not None
@@ -203,16 +204,16 @@ class Teleop:
         """Both arms shall go home, because a program says so. What is in the way is told as an event."""
         self._pair.home(now, None)
 
-    def end_homing(self, now: float, outcome: str, arrived: bool = True) -> None:
+    def end_homing(self, now: float, outcome: Reason, arrived: bool = True) -> None:
         """The way home is over, with this ``outcome``; not ``arrived``: because of a fault."""
         self._pair.change(Cause.HOMED if arrived else Cause.FAULT, now, outcome)
 
-    def tell(self, now: float, reason: str) -> None:
-        """What the operator should know of both arms; what was not done begins with "not"."""
+    def record_event(self, now: float, reason: Reason) -> None:
+        """What the operator should know of both arms."""
         for arm in self._arms.values():
-            arm.tell(now, reason)
+            arm.record_event(now, reason)
 
-    def reset(self, now: float, arm: str, reason: str) -> None:
+    def reset(self, now: float, arm: str, reason: Reason) -> None:
         """An arm holds, its hand has to be seen anew before it drives the arm, and a stop of all arms is over."""
         self.pause(now, reason, arm)
         self._arms[arm].forget()
@@ -222,11 +223,13 @@ class Teleop:
         """The input is lost: every arm that a hand drives stops, and everything received is forgotten."""
         self._clock(now)
         if not self.homing or self._pair.asks_home is not None:
-            self._pair.change(Cause.FAULT, self._now if self._now is not None else 0.0, "connection lost")
+            self._pair.change(
+                Cause.FAULT, self._now if self._now is not None else 0.0, Reason(ReasonKind.CONNECTION_LOST)
+            )
         for arm in self._arms.values():
             arm.forget()
 
-    def pause(self, now: float, reason: str, arm: str | None = None) -> None:
+    def pause(self, now: float, reason: Reason, arm: str | None = None) -> None:
         """Every arm holds until a new press, for a reason outside of this layer.
 
         With ``arm`` the reason is of that arm: others that follow their hands hold too where they are linked.
@@ -238,38 +241,38 @@ class Teleop:
         elif self._arms[arm].state not in HOLDING:
             self._stop({arm: reason}, now)
 
-    def _clock(self, now: float) -> str | None:
+    def _clock(self, now: float) -> Reason | None:
         """Advance the time; returns the fault of a clock that cannot be followed, or None."""
         last = self._now
         if not math.isfinite(now):
-            return "the clock is not finite"
+            return Reason(ReasonKind.CLOCK_NOT_FINITE)
         if last is not None and last - self._stall <= now <= last:
             return None
         self._now = now
         if last is None or 0.0 < now - last <= self._stall:
             return None
         if now > last:
-            return f"the control loop stalled for {now - last:.3f} s"
+            return Reason.of(ReasonKind.LOOP_STALLED, duration=now - last)
         for arm in self._arms.values():
             arm.forget()
-        return f"the clock went back by {last - now:.3f} s"
+        return Reason.of(ReasonKind.CLOCK_WENT_BACK, duration=last - now)
 
-    def _disengage(self, faults: Mapping[str, str], now: float) -> None:
+    def _disengage(self, faults: Mapping[str, Reason], now: float) -> None:
         """Stop the arms whose hand has a fault; that of a hand whose arm holds anyway has no effect."""
         if self.homing:
             fault = faults.get(self._pair.asks_home) if self._pair.asks_home is not None else None
             if fault:
-                self._pair.change(Cause.FAULT, now, f"on the way home: {fault}")
+                self._pair.change(Cause.FAULT, now, Reason(ReasonKind.HOMING_FAULT, cause=fault))
             return
         active = {name: fault for name, fault in faults.items() if self._arms[name].state in _LED}
         if active:
             self._stop(active, now)
 
-    def _stop(self, faults: Mapping[str, str], now: float) -> None:
+    def _stop(self, faults: Mapping[str, Reason], now: float) -> None:
         """Stop arms for a fault of each, and those that are linked to them."""
         for name, fault in faults.items():
             self._arms[name].change(Cause.FAULT, now, fault)
         first, fault = next(iter(faults.items()))
         for name, arm in self._arms.items():
             if self._linked and name not in faults:
-                arm.change(Cause.FAULT, now, f"linked to {first}: {fault}")
+                arm.change(Cause.FAULT, now, Reason.of(ReasonKind.LINKED, cause=fault, arm=first))

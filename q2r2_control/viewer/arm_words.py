@@ -7,17 +7,19 @@ from collections.abc import Collection
 import numpy as np
 
 from q2r2_control.config.bindings import Action, BindingSettings
+from q2r2_control.events import REFUSALS, Event
 from q2r2_control.runtime.recorder import Tick
 from q2r2_control.teleop.arm_states import ArmState
-from q2r2_control.types import Event
+from q2r2_control.types import ActiveLimit, LimitKind
 from q2r2_control.viewer.history import tracking_error
+from q2r2_control.wording import sentence
 
 # A tool nearer to its target than this follows; what holds it back beyond that is said [m], [rad].
 _FOLLOWS, _TURNED = 0.005, 0.05
-_POSITION, _VELOCITY = " position", " velocity"
+_HELD_BY = {LimitKind.POSITION: "at its limit", LimitKind.VELOCITY: "as fast as it may turn"}
 
 
-def why(tick: Tick, arm: str, joints: Collection[str], binding: Collection[str], last: Event | None) -> str:
+def why(tick: Tick, arm: str, joints: Collection[str], binding: Collection[ActiveLimit], last: Event | None) -> str:
     """Why ``arm``, whose joints have these names, is where it is.
 
     ``binding``: limits and pairs that held the last steps back, as in a report; ``last``: its last event.
@@ -29,7 +31,7 @@ def why(tick: Tick, arm: str, joints: Collection[str], binding: Collection[str],
     if not tick.engaged[arm]:
         if last is None:
             return "not engaged yet"
-        return last.reason if last.reason.startswith("not ") else f"{tick.states[arm]}: {last.reason}"
+        return sentence(last.reason) if last.kind in REFUSALS else f"{tick.states[arm]}: {sentence(last.reason)}"
     distance, angle = tracking_error(tick, arm)
     if not (distance > _FOLLOWS or angle > _TURNED):
         return "goes with the other arm" if tick.states[arm] == ArmState.CARRIED else "follows the hand"
@@ -59,17 +61,16 @@ def next_press(tick: Tick, arm: str, bindings: BindingSettings) -> str:
     return ", ".join(f"{control} {what}" for control, what in bound if control is not None)
 
 
-def _held_by(tick: Tick, arm: str, joints: Collection[str], binding: Collection[str]) -> str | None:
+def _held_by(tick: Tick, arm: str, joints: Collection[str], binding: Collection[ActiveLimit]) -> str | None:
     """The pair or limit of an arm that is nearest to what moves the tool, if any is at work."""
     report = tick.reference.report
-    pairs = [name for name in binding if "|" in name and any(part.startswith(f"{arm}_") for part in name.split("|"))]
-    tightest = "|".join(report.tightest_pair)
-    if tightest in pairs:
+    pairs = [limit.names for limit in binding if limit.kind is LimitKind.SEPARATION]
+    pairs = [pair for pair in pairs if any(body.startswith(f"{arm}_") for body in pair)]
+    if report.tightest_pair in pairs:
         return f"held by {' | '.join(report.tightest_pair)}, {1e3 * report.margin:.0f} mm to spare"
     if pairs:
-        return f"held by {' | '.join(pairs[0].split('|'))}"
-    for kind, words in ((_POSITION, "at its limit"), (_VELOCITY, "as fast as it may turn")):
-        limited = [name.removesuffix(kind) for name in binding if name.endswith(kind)]
-        if mine := [name for name in limited if name in joints]:
+        return f"held by {' | '.join(pairs[0])}"
+    for kind, words in _HELD_BY.items():
+        if mine := [limit.names[0] for limit in binding if limit.kind is kind and limit.names[0] in joints]:
             return f"{mine[0]} {words}"
     return None

@@ -12,11 +12,13 @@ from rich.markup import escape
 from rich.table import Table
 
 from q2r2_control.config.bindings import BindingSettings
+from q2r2_control.events import Event
 from q2r2_control.runtime.recorder import Tick
-from q2r2_control.types import Event
+from q2r2_control.types import ActiveLimit
 from q2r2_control.viewer.arm_words import next_press, why
 from q2r2_control.viewer.drawing import drawn
 from q2r2_control.viewer.history import tracking_error
+from q2r2_control.wording import limit_name
 
 _REFRESH_RATE = 6.0  # [Hz]
 _LIMITS_SHOWN = 4
@@ -32,7 +34,8 @@ class LiveTable:
         self._last: dict[str, Event] = {}  # of each arm
         self._newest: Tick | None = None
         self._count = 0
-        self._binding: dict[str, None] = {}
+        self._binding: dict[ActiveLimit, None] = {}
+        self._repelled: dict[str, None] = {}
         self._drawn = (time.monotonic(), 0)
 
     def __call__(self, tick: Tick) -> None:
@@ -42,7 +45,7 @@ class LiveTable:
         if tick.reference.report.binding:
             self._binding.update(dict.fromkeys(tick.reference.report.binding))
         if tick.impedance is not None and tick.impedance.repelled:
-            self._binding.update(dict.fromkeys(f"{joint} pushed off its limit" for joint in tick.impedance.repelled))
+            self._repelled.update(dict.fromkeys(tick.impedance.repelled))
         for event in tick.events:
             self._last[event.arm] = event
 
@@ -64,6 +67,7 @@ class LiveTable:
         for arm in arms:
             table.add_column(arm, justify="right", min_width=18)
         binding, self._binding = list(self._binding), {}
+        repelled, self._repelled = list(self._repelled), {}
         for name, values in _arm_rows(tick, arms):
             table.add_row(name, *values)
         words = [why(tick, arm, self._joints[arm], binding, self._last.get(arm)) for arm in arms]
@@ -71,13 +75,14 @@ class LiveTable:
         table.add_row("next press", *(next_press(tick, arm, self._bindings) for arm in arms))
         table.add_section()
         report = tick.reference.report
+        names = [*map(limit_name, binding), *(f"{joint} pushed off its limit" for joint in repelled)]
         colour = "yellow" if report.margin < _NEAR else "default"
         rows = {
             "time, loop": (f"{tick.t:.1f} s", f"{rate:.0f} Hz, {1e6 * tick.compute_time:.0f} us a tick"),
             "nearest pair": (f"{1e3 * report.closest_distance:.1f} mm", " | ".join(report.closest_pair)),
             "tightest pair": (f"[{colour}]{1e3 * report.margin:.1f} mm to spare[/]", " | ".join(report.tightest_pair)),
             "status": (str(report.status), "a stop is certified" if report.certified else "[red]no certified stop[/]"),
-            "limits at work": (str(len(binding)), _some(binding)),
+            "limits at work": (str(len(names)), _some(names)),
         }
         for arm, pair in tick.held_grippers.items():
             rows[f"{arm} gripper"] = ("[yellow]held[/]", " | ".join(pair))

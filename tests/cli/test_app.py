@@ -312,7 +312,7 @@ def test_a_fast_run_prints_one_json_object_with_every_figure_and_nothing_else_an
     assert all(arm.keys() >= ARM_KEYS for arm in summaries[0]["arms"].values())
     assert summaries[0]["tick_us"].keys() == {"p50", "p99", "max"}
     assert summaries[0]["arms"]["left"]["engaged_s"] > 1.0
-    assert summaries[0]["events"][0].keys() == {"t", "arm", "from", "to", "reason"}
+    assert summaries[0]["events"][0].keys() == {"t", "arm", "from", "to", "kind", "detail", "reason"}
     for summary in summaries:
         for timing in ("tick_us", "loop_rate_hz"):
             del summary[timing]
@@ -449,7 +449,7 @@ def test_ctrl_c_brings_the_arms_to_rest_and_ends_a_headset_run_with_its_summary(
     summary = one_object(stdout)
     assert summary["at_rest"]
     assert summary["arms"]["left"]["engaged_s"] > 0.5
-    assert "connection lost" in [event["reason"] for event in summary["events"]]
+    assert "connection_lost" in [event["kind"] for event in summary["events"]]
 
 
 @pytest.mark.slow

@@ -11,9 +11,10 @@ from rich.console import Console
 from q2r2_control import Pipeline, RunSummary
 from q2r2_control.cli.summary_table import recording_line, summary_table, task_line
 from q2r2_control.demo.assembly_tasks import TaskResult
+from q2r2_control.events import Event, Reason, ReasonKind
 from q2r2_control.recording.recorder import RecordingSummary
 from q2r2_control.runtime.histogram import Percentiles
-from q2r2_control.types import Event
+from q2r2_control.wording import sentence
 from tests.support.hands_input import HandsInput
 from tests.support.watch import cell
 
@@ -35,18 +36,19 @@ def text_of(summary: RunSummary) -> str:
 def test_an_arm_that_was_paused_by_something_else_than_its_button_is_named_with_the_reason(
     summary: RunSummary,
 ) -> None:
-    reason = "the control loop stood still for 0.40 s"
+    reason, press = Reason.of(ReasonKind.LOOP_STALLED, duration=0.4), Reason.of(ReasonKind.PRESSED, control="lower")
     paused = Event(4.07, "left", "engaged", "lost", reason)
-    pressed = Event(4.5, "right", "pausing", "paused", "lower button")
+    pressed = Event(4.5, "right", "pausing", "paused", press)
     text = text_of(replace(summary, events=[*summary.events, paused, pressed]))
     (row,) = (line for line in text.splitlines() if "left arm paused by" in line)
-    assert f"{reason}, at 4.07 s" in row
+    assert f"{sentence(reason)}, at 4.07 s" in row
     assert "right arm paused by" not in text
-    again = Event(5.0, "left", "paused", "engaged", "lower button")
+    again = Event(5.0, "left", "paused", "engaged", press)
     assert "paused by" not in text_of(replace(summary, events=[paused, again]))
-    refused = Event(6.0, "left", "paused", "paused", "not engaged: no pose for 0.15 s")
+    refusal = Reason(ReasonKind.NOT_ENGAGED, cause=Reason(ReasonKind.TOOL_UNKNOWN))
+    refused = Event(6.0, "left", "paused", "paused", refusal)
     text = text_of(replace(summary, events=[again, refused]))
-    assert "not engaged: no pose for 0.15 s, at 6.00 s" in text
+    assert f"{sentence(refusal)}, at 6.00 s" in text
 
 
 def test_missed_ticks_are_told(summary: RunSummary) -> None:

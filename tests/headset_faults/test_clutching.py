@@ -70,7 +70,7 @@ def test_an_alignment_by_one_hand_moves_no_arm_although_the_arms_are_not_linked(
 
     run = InStepRun(script, linked=False)
     assert run.reasons("lost") == []
-    assert run.reasons("aligning") == ["alignment chord"] * len(engaged)
+    assert run.reasons("aligning") == ["alignment_chord"] * len(engaged)
     assert {arm for arm, state in run.ticks[-1].states.items() if state == "engaged"} == set(engaged)
     for arm in SIDES:
         assert np.linalg.norm(run.tool(arm) - run.tool(arm)[0], axis=1).max() < STILL

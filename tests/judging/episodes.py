@@ -11,9 +11,10 @@ from typing import Any, cast
 import numpy as np
 
 from q2r2_control.config.cell import Config
+from q2r2_control.events import Event
 from q2r2_control.judging.episode import Episode, Frames, Hand, Ticks
 from q2r2_control.recording.reader import Recording
-from q2r2_control.types import Array, Event
+from q2r2_control.types import Array
 from tests.support.watch import cell
 
 DT = 0.002  # of the loop [s]

@@ -12,6 +12,8 @@ from pathlib import Path
 import pytest
 
 from q2r2_control.config.teleop import TeleopSettings
+from q2r2_control.events import Event, Reason
+from q2r2_control.events import ReasonKind as K
 from q2r2_control.judging.episode_judge import EpisodeJudge
 from q2r2_control.judging.judge import judge
 from q2r2_control.judging.judge_work import Question, written_episode
@@ -20,9 +22,8 @@ from q2r2_control.recording.reader import Recording
 from q2r2_control.recording.recorder import Recorder
 from q2r2_control.recording.replay import replay
 from q2r2_control.runtime.recorder import Tick
-from q2r2_control.teleop.episode_marks import BEGINS, DISCARDED, ENDS, VERDICT
 from q2r2_control.teleop.haptics import EPISODE_KEPT, EPISODE_REJECTED
-from q2r2_control.types import Event, HandInputs, HapticFeedback
+from q2r2_control.types import HandInputs, HapticFeedback
 from tests.judging.runs import RATE, Work, hands, killed, loop_of, press
 from tests.support.processes import alive, wait_until
 
@@ -33,6 +34,7 @@ BINDINGS = {"trigger": "record_toggle", "grip": "record_discard"}
 TOGGLED, GIVEN_UP = (1.0, 2.5, 3.0, 4.0, 6.0), 3.7
 VERDICTS_BY = {2.8: 1, 3.9: 1, 6.3: 2}  # [s]
 DURATION = 7.0
+BEGINS, ENDS, DISCARDED = K.EPISODE_BEGINS, K.EPISODE_ENDS, K.EPISODE_DISCARDED
 RESTS = 3.6  # the hands, from then on [s]
 
 
@@ -47,7 +49,7 @@ class PatientRun:
     """A recorded run in simulated time, in which verdicts are waited for at some times."""
 
     def __init__(self, folder: Path, before: Callable[[EpisodeJudge], None] = lambda judge: None) -> None:
-        self.told: list[str] = []
+        self.told: list[Reason] = []
         self.felt: list[HapticFeedback] = []
         work = Work(5)
         source = hands(pose=lambda hand, t: work(hand, min(t, RESTS)), inputs=controls)
@@ -66,9 +68,9 @@ class PatientRun:
         assert recorder.file is not None
         self.file = recorder.file
 
-    def _tell(self, line: str) -> None:
-        self.told.append(line)
-        self.loop.tell(line)
+    def _tell(self, reason: Reason) -> None:
+        self.told.append(reason)
+        self.loop.record_outcome(reason)
 
     def _patient(self, tick: Tick) -> None:
         for due in [due for due in self._due if tick.t >= due]:
@@ -90,7 +92,10 @@ def test_each_verdict_is_the_one_that_it_gets_after_the_run(run: PatientRun) -> 
     after = judge(Recording(run.file))
     lines = [one.verdict.line for one in after]
     assert lines[1] == "discard: its operator discarded it"
-    assert run.told == [f"{VERDICT}1: {lines[0]}", f"{VERDICT}3: {lines[2]}"]  # the operator knows the other one
+    assert run.told == [
+        Reason.of(K.VERDICT, episode=number, keep=keep, line=lines[number - 1])
+        for number, keep in ((1, True), (3, False))
+    ]  # the operator knows the other one
     assert lines[0] == "keep"
     assert lines[2].startswith("discard: idle: no engaged arm moves")
 
@@ -112,18 +117,18 @@ def test_none_is_judged_before_all_of_it_is_written(run: PatientRun, tmp_path: P
 
 
 def test_one_that_is_discarded_before_its_verdict_is_there_gets_none(run: PatientRun) -> None:
-    told: list[str] = []
+    told: list[Reason] = []
     with EpisodeJudge(lambda: run.file, told.append) as judge_now:
-        for t, reason in ((1.0, BEGINS), (2.5, ENDS), (2.6, DISCARDED), (4.0, BEGINS), (6.0, ENDS)):
-            judge_now.note(Event(t, "left", "", "", reason))
+        for t, kind in zip((1.0, 2.5, 2.6, 4.0, 6.0), (BEGINS, ENDS, DISCARDED, BEGINS, ENDS), strict=True):
+            judge_now.note(Event(t, "left", "", "", Reason(kind)))
 
         def answered() -> bool:
             judge_now.look()
             return bool(told)
 
         wait_until(answered)
-    (line,) = told
-    assert line.startswith(f"{VERDICT}2: discard: idle")
+    (verdict,) = told
+    assert (verdict.detail["episode"], verdict.detail["keep"]) == (2, False)
 
 
 def test_its_process_ends_with_the_run(run: PatientRun) -> None:

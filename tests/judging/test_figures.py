@@ -9,12 +9,14 @@ import numpy as np
 import pytest
 
 from q2r2_control.config.teleop import Stance
+from q2r2_control.events import Event, Reason, ReasonKind
 from q2r2_control.judging.delay import delays
 from q2r2_control.judging.figures import figures_of
 from q2r2_control.judging.hands import hand_figures
 from q2r2_control.judging.motion import arm_figures, idle_share
 from q2r2_control.judging.timing import timing_figures
-from q2r2_control.types import Array, Event
+from q2r2_control.types import Array
+from q2r2_control.wording import sentence
 from tests.judging.episodes import DT, episode, frame_times
 from tests.support.watch import cell
 
@@ -227,15 +229,17 @@ class TestTiming:
 
 
 def test_faults_are_pauses_that_no_operator_asked_for_each_once() -> None:
+    jumped = Reason.of(ReasonKind.HAND_JUMPED, distance=0.3)
+    pressed, refused = Reason.of(ReasonKind.PRESSED, control="lower button"), Reason(ReasonKind.NOT_ENGAGED)
     events = [
-        Event(0.5, "left", "paused", "engaged", "lower button"),
-        Event(1.0, "left", "engaged", "lost", "the hand jumped 0.300 m"),
-        Event(1.0, "right", "engaged", "lost", "linked to left: the hand jumped 0.300 m"),
-        Event(2.0, "left", "paused", "paused", "not engaged: no pose for 0.15 s"),
-        Event(3.0, "right", "pausing", "paused", "lower button"),
+        Event(0.5, "left", "paused", "engaged", pressed),
+        Event(1.0, "left", "engaged", "lost", jumped),
+        Event(1.0, "right", "engaged", "lost", Reason.of(ReasonKind.LINKED, cause=jumped, arm="left")),
+        Event(2.0, "left", "paused", "paused", refused),
+        Event(3.0, "right", "pausing", "paused", pressed),
     ]
     (fault,) = figures_of(episode(events=events), DROPOUT).faults
-    assert (fault.t, fault.arm, fault.reason) == (1.0, "left", "the hand jumped 0.300 m")
+    assert (fault.t, fault.arm, fault.reason) == (1.0, "left", sentence(jumped))
 
 
 def test_distances_that_are_none_are_not_the_nearest() -> None:

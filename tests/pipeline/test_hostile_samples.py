@@ -67,9 +67,9 @@ def test_ten_thousand_ticks_of_hostile_samples_break_no_limit_and_raise_nothing(
     assert summary.at_rest
     assert len(watch.engagements("left")) >= 5, "valid samples are followed"
     assert max(map(speed, watch.ticks)) > 0.3
-    reasons = " ".join(event.reason for event in summary.events)
-    for fault in ("not finite", "jumped", "connection lost", "alignment chord"):
-        assert fault in reasons
+    assert {event.kind for event in summary.events} >= {
+        *("pose_unusable", "hand_jumped", "connection_lost", "alignment_chord")
+    }
     for arm in SIDES:
         for index in watch.engagements(arm):
             tick = watch.ticks[index]

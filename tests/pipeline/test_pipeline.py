@@ -42,7 +42,7 @@ def test_both_arms_follow_within_every_limit(
     assert summary.fallback_ticks == summary.uncertified_ticks == summary.rejected_targets == 0
     assert summary.at_rest
     for arm in SIDES:
-        assert changes(summary.events, arm) == [("idle", "engaged", "lower button")]
+        assert changes(summary.events, arm) == [("idle", "engaged", "pressed")]
         figures = summary.arms[arm]
         assert figures.engaged_s == pytest.approx(2.4 - 0.68, abs=0.05)
         assert figures.position_error_mm_rms is not None

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Iterable
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +12,7 @@ import numpy as np
 
 from q2r2_control import Robot
 from q2r2_control.config.cell import Config
+from q2r2_control.events import Event, Reason, ReasonKind
 from q2r2_control.inputs.messages import Dialect, message_types
 from q2r2_control.recording import topics as names
 from q2r2_control.recording.about import ROS, About, as_yaml
@@ -25,7 +25,7 @@ from q2r2_control.recording.ros_topics import (
     ros_topics,
     tick_fields,
 )
-from q2r2_control.types import Array, Event
+from q2r2_control.types import Array
 from tests.support.watch import cell
 
 PERIOD = 4_000_000  # of ticks [ns]
@@ -105,11 +105,13 @@ class NodesOnFile:
     def hand(self, at: int, hand: str, x: float) -> None:
         self.put(names.hand_pose(hand), at, _pose(self.epoch + at, x))
 
-    def event(self, at: int, reason: str, arm: str | None = "left", source: str = "", destination: str = "") -> None:
+    def event(
+        self, at: int, kind: ReasonKind, arm: str | None = "left", source: str = "", destination: str = ""
+    ) -> None:
         """Of an arm, or of the recorder's services."""
         topic = RECORDER_EVENTS if arm is None else arm_events(arm)
-        event = Event(123.0, arm or "", source, destination, reason)  # its sender's clock is not used
-        self.put(topic, at, _make("std_msgs/msg/String", json.dumps(asdict(event))))
+        event = Event(123.0, arm or "", source, destination, Reason(kind))  # its sender's clock is not used
+        self.put(topic, at, _make("std_msgs/msg/String", json.dumps(event.as_json())))
 
 
 def _make(kind: str, *values: Any) -> Any:

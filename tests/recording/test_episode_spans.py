@@ -6,11 +6,12 @@ import math
 
 import pytest
 
+from q2r2_control.events import Event, Reason
+from q2r2_control.events import ReasonKind as K
 from q2r2_control.recording.episode_spans import EpisodeSpan, spans_of
-from q2r2_control.types import Event
 
-BEGINS, ENDS, DISCARDED, MARK = "episode begins", "episode ends", "episode discarded", "mark"
-SUCCEEDED, FAILED = "episode succeeded", "episode failed"
+BEGINS, ENDS, DISCARDED, MARK = K.EPISODE_BEGINS, K.EPISODE_ENDS, K.EPISODE_DISCARDED, K.MARK
+SUCCEEDED, FAILED = K.EPISODE_SUCCEEDED, K.EPISODE_FAILED
 
 CASES = {
     "none at all: the whole run": ([], [(-math.inf, math.inf, False)]),
@@ -24,17 +25,17 @@ CASES = {
         [(1.0, BEGINS), (2.0, ENDS), (2.5, DISCARDED), (3.0, BEGINS), (4.0, ENDS)],
         [(1.0, 2.0, True), (3.0, 4.0, False)],
     ),
-    "other events": ([(0.5, "lower button"), (1.0, BEGINS), (1.5, "no pose for 0.15 s")], [(1.0, math.inf, False)]),
+    "other events": ([(0.5, K.PRESSED), (1.0, BEGINS), (1.5, K.POSE_SILENT)], [(1.0, math.inf, False)]),
 }
 
 
-def events(*told: tuple[float, str]) -> list[Event]:
-    return [Event(t, "left", "engaged", "engaged", reason) for t, reason in told]
+def events(*told: tuple[float, K]) -> list[Event]:
+    return [Event(t, "left", "engaged", "engaged", Reason(kind)) for t, kind in told]
 
 
 @pytest.mark.parametrize(("told", "expected"), CASES.values(), ids=CASES)
 def test_episodes_are_where_the_operator_says(
-    told: list[tuple[float, str]], expected: list[tuple[float, float, bool]]
+    told: list[tuple[float, K]], expected: list[tuple[float, float, bool]]
 ) -> None:
     assert spans_of(events(*told)) == [EpisodeSpan(*values) for values in expected]
 
@@ -58,7 +59,7 @@ OUTCOMES = {
 
 
 @pytest.mark.parametrize(("told", "expected"), OUTCOMES.values(), ids=OUTCOMES)
-def test_success_and_failure_are(told: list[tuple[float, str]], expected: list[tuple[float, bool | None]]) -> None:
+def test_success_and_failure_are(told: list[tuple[float, K]], expected: list[tuple[float, bool | None]]) -> None:
     assert [(span.end, span.success) for span in spans_of(events(*told))] == expected
 
 

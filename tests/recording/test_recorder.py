@@ -62,7 +62,7 @@ def test_every_topic_opens_with_rosbags_in_another_process(tmp_path: Path, recor
     assert commands["last"] - commands["first"] == pytest.approx(1e9 * (ticks[-1].t - ticks[0].t), abs=1000)
     states = [json.loads(text) for text in found["/q2r2/state"]["texts"]]
     events = [event for state in states for event in state.get("events", ())]
-    assert [event["reason"] for event in events] == ["lower button", "lower button"]
+    assert [event["kind"] for event in events] == ["pressed", "pressed"]
 
 
 def test_the_filtered_hand_is_recorded_that_each_target_is_made_of(recorded: tuple[Path, list[Tick]]) -> None:

@@ -25,6 +25,7 @@ from q2r2_control.runtime.recorder import Tick
 from q2r2_control.types import HandFault, HandSample, RobotState
 from tests.recording.runs import RATE, file_of, pipeline, record, rewrite
 from tests.support.object_cell import cell as object_cell
+from tests.support.reasons import kinds
 from tests.support.watch import cell
 
 pytestmark = pytest.mark.slow
@@ -92,9 +93,12 @@ def test_what_a_program_asked_of_the_run_is_asked_again(tmp_path: Path) -> None:
     result = replay(file_of(record(tmp_path, loop, 1.6)))
     assert result.summary is not None
     told = [event.reason for event in result.summary.events if event.arm == "left"]
-    assert told[1].startswith('a program changes settings: {"position_scale": 0.3')
-    control = 'a program changes control: {"min_distance": 0.03, "position_gain": 4.0}'
-    assert told[2:7] == ["settings changed", control, "control changed", "a program asks for the way home", "way home"]
+    assert told[1].detail["changes"]["position_scale"] == 0.3
+    assert told[3].detail["changes"] == {"min_distance": 0.03, "position_gain": 4.0}
+    assert [reason.kind for reason in told[1:7]] == [
+        *("settings_requested", "settings_changed", "control_requested", "control_changed"),
+        *("home_requested", "homing"),
+    ]
     assert (result.difference, result.ended_by, result.notes) == (None, None, [])
 
 
@@ -138,8 +142,7 @@ def test_lost_connections_and_numbers_that_are_none_are_replayed(tmp_path: Path)
     result = replay(file_of(record(tmp_path, pipeline(source=FaultyHands("circle")), 1.2)))
     assert result.difference is None
     assert result.summary is not None
-    reasons = [event.reason for event in result.summary.events if event.destination == "lost"]
-    assert any("not finite" in reason for reason in reasons)
+    assert "pose_unusable" in [event.kind for event in result.summary.events if event.destination == "lost"]
 
 
 class FrozenHands(ScriptedInput):
@@ -154,8 +157,8 @@ def test_a_fault_that_the_input_found_is_replayed(tmp_path: Path) -> None:
     result = replay(file_of(record(tmp_path, pipeline(source=FrozenHands("circle")), 1.2)))
     assert result.difference is None
     assert result.summary is not None
-    lost = [event.reason for event in result.summary.events if event.destination == "lost"]
-    assert lost == [HandFault.FROZEN, f"linked to left: {HandFault.FROZEN}"]
+    lost = [kinds(event.reason) for event in result.summary.events if event.destination == "lost"]
+    assert lost == ["hand_frozen", "linked: hand_frozen"]
 
 
 class LosesItsSensors(KinematicPlant):

@@ -15,6 +15,7 @@ import yaml
 from q2r2_control.config.cameras import CameraConfig
 from q2r2_control.config.cell import parse_config
 from q2r2_control.errors import RecordingError
+from q2r2_control.events import ReasonKind as K
 from q2r2_control.export.episodes import FrameSampling, make_episode
 from q2r2_control.judging.judge import judge
 from q2r2_control.recording import topics as names
@@ -99,7 +100,7 @@ def test_a_tick_has_the_reference_of_its_time_and_what_had_been_received_by_then
 
 def test_a_tick_whose_reference_was_lost_counts_as_lost_and_what_happened_in_it_does_not(nodes: NodesOnFile) -> None:
     play(nodes, 10)
-    nodes.event(15 * PERIOD - 1000, "mark")
+    nodes.event(15 * PERIOD - 1000, K.MARK)
     lost = nodes.topics.pop(names.REFERENCE)
     with pytest.raises(KeyError):
         nodes.tick(15 * PERIOD, 11, np.array(nodes.robot.home))
@@ -125,12 +126,12 @@ def test_nothing_is_a_tick_before_the_joints_and_the_arms_flags_are_known(nodes:
 
 
 def test_episodes_are_those_that_arms_and_services_tell_of(nodes: NodesOnFile) -> None:
-    for at, reason, arm in (
-        *((20, "episode begins", "left"), (60, "mark", "right"), (80, "episode ends", "right")),
-        *((100, "episode begins", None), (120, "episode discarded", None)),
+    for at, kind, arm in (
+        *((20, K.EPISODE_BEGINS, "left"), (60, K.MARK, "right"), (80, K.EPISODE_ENDS, "right")),
+        *((100, K.EPISODE_BEGINS, None), (120, K.EPISODE_DISCARDED, None)),
     ):
         play(nodes, 15, first=at - 15, index=at)
-        nodes.event(at * PERIOD, reason, arm)
+        nodes.event(at * PERIOD, kind, arm)
     play(nodes, 10, first=130, index=200)
     recording = open_recording(nodes.close())
     first, second = read_spans(recording)
@@ -143,8 +144,8 @@ def test_episodes_are_those_that_arms_and_services_tell_of(nodes: NodesOnFile) -
 
 
 def test_episodes_are_found_where_no_controller_was_active(nodes: NodesOnFile) -> None:
-    nodes.event(PERIOD, "episode begins")
-    nodes.event(5 * PERIOD, "episode ends", None)
+    nodes.event(PERIOD, K.EPISODE_BEGINS)
+    nodes.event(5 * PERIOD, K.EPISODE_ENDS, None)
     (span,) = read_spans(open_recording(nodes.close()))
     assert (span.start, span.end) == (pytest.approx(0.004), pytest.approx(0.02))
 

@@ -126,7 +126,7 @@ def test_a_full_disk_ends_the_recording_and_not_the_run_and_leaves_what_fits(
     felt: list[HapticFeedback] = []
 
     def full_disk(recorder: Recorder) -> Iterator[None]:
-        recorder.tell = loop.tell
+        recorder.record_outcome = loop.record_outcome
         pids.append(writer_of(recorder).pid)
         for _ in range(50):
             yield

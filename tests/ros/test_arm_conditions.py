@@ -12,7 +12,7 @@ import pytest
 
 from q2r2_control import CartesianController, Robot
 from q2r2_control.runtime.arm_conditions import ArmConditions
-from q2r2_control.types import SIDES, RobotState
+from q2r2_control.types import SIDES, ActiveLimit, LimitKind, RobotState
 from tests.ros.conftest import NEEDS_ROS
 from tests.ros.waiting import wait_until
 
@@ -35,7 +35,8 @@ def test_nearness_limits_and_contact_of_each_arm_are_told_as_they_are(node: Any,
     frame = robot.arms["left"].frame_id
     J = pin.computeFrameJacobian(robot.model, data, robot.home, frame, pin.LOCAL_WORLD_ALIGNED)
     felt = RobotState(q=robot.home, v=zero, tau=zero, tau_external=J[:3].T @ PUSH, stamp=0.0)
-    report = replace(controller.step({}, 0.004).report, binding=("left_A4 position", "right_A2 velocity"))
+    binding = ActiveLimit(LimitKind.POSITION, ("left_A4",)), ActiveLimit(LimitKind.VELOCITY, ("right_A2",))
+    report = replace(controller.step({}, 0.004).report, binding=binding)
     now = 0.0
 
     def comes(state: RobotState) -> bool:

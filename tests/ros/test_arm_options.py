@@ -58,7 +58,7 @@ def test_triggers_and_stick_are_bound_by_parameters_and_a_dead_man_is_no_fault_w
     rig.pulses.clear()
     rig.grip = 0.0
     rig.wait(lambda: rig.state["state"] == "paused", "the arm is paused")
-    assert rig.state["last_event"] == "paused: dead man let go"
+    assert rig.state["last_event_kind"] == "dead_man_released"
     rig.wait(lambda: len(rig.pulses) == 2, "it is felt")
     assert rig.pulses[0] == PAUSED[:2]
 

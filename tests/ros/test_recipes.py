@@ -107,7 +107,7 @@ def test_a_simulation_input_that_holds_the_lower_button_from_its_first_message_i
     rig = ArmRig(node)
     rig.lower = True
     rig.start(processes)
-    rig.wait(lambda: "lower held since the hand was first heard of: let go first" in rig.state["last_event"], "is told")
+    rig.wait(lambda: rig.state["last_event_kind"] == "controls_held", "is told")
     assert not rig.state["engaged"]
     rig.lower = False
     rig.engage()

@@ -14,6 +14,7 @@ from typing import Any
 
 import pytest
 
+from q2r2_control.events import Event, ReasonKind
 from tests.ros.conftest import NEEDS_ROS
 from tests.ros.processes import CONFIG, Processes
 
@@ -36,7 +37,6 @@ from q2r2_control.recording.ros_recording import open_recording
 from q2r2_control.recording.ros_topics import RECORDER_EVENTS
 from q2r2_control.recording.rows import HEAD, channel_of
 from q2r2_control.ros.base_node import COMMAND_QOS, RECORDED_QOS, STREAM_QOS
-from q2r2_control.teleop.episode_marks import NO_RECORDING, VERDICT, verdict_line
 from q2r2_control.teleop.haptics import (
     EPISODE_BEGINS,
     EPISODE_DISCARDED,
@@ -171,7 +171,7 @@ def test_a_hand_and_services_tell_of_episodes_and_each_learns_of_the_others(
     rig = ArmRig(node)
     rig.start(processes, {"teleop.bindings.grip": "record_toggle"})
     squeeze(rig)
-    rig.wait(lambda: NO_RECORDING in rig.state["last_event"], "without a recorder nothing is recorded")
+    rig.wait(lambda: rig.state["last_event_kind"] == ReasonKind.NO_RECORDING, "without a recorder nothing is recorded")
     recorder = RunningRecorder(node, processes, tmp_path / "recordings")
     wait_until(lambda: node.count_subscribers("/recorder/state") > 1, "the arm's node listens to the recorder")
     for _ in range(3):
@@ -237,8 +237,8 @@ def note_frequency(frequencies: list[float], pulse: OVR2ROSHapticFeedback) -> No
     frequencies.append(round(pulse.frequency, 3))
 
 
-def verdicts_in(reasons: list[str]) -> list[str]:
-    return [reason[:LONGEST_LINE] for reason in reasons if reason.startswith(VERDICT)]
+def verdicts_in(events: list[Event]) -> list[str]:
+    return [event.reason.detail["line"] for event in events if event.kind is ReasonKind.VERDICT]
 
 
 @pytest.mark.slow
@@ -252,10 +252,11 @@ def test_a_whole_set_is_recorded_judged_and_ends_at_ctrl_c(node: Any, processes:
     for arm in ("left", "right"):
         process.wait_for(f"[{arm}_q2r2_arm_controller]", 120.0)
     process.wait_for("engaged: ", 120.0)
-    told: list[str] = []
+    told: list[Event] = []
     felt_by: dict[str, list[float]] = {"left": [], "right": []}
-    take = partial(json.loads, object_hook=lambda event: event["reason"])
-    node.create_subscription(String, RECORDER_EVENTS, lambda event: told.append(take(event.data)), RECORDED_QOS)
+    node.create_subscription(
+        String, RECORDER_EVENTS, lambda event: told.append(Event.from_json(json.loads(event.data))), RECORDED_QOS
+    )
     for hand, frequencies in felt_by.items():
         topic = f"/q2r_{hand}_hand_haptic_feedback"
         node.create_subscription(OVR2ROSHapticFeedback, topic, partial(note_frequency, frequencies), COMMAND_QOS)
@@ -270,7 +271,7 @@ def test_a_whole_set_is_recorded_judged_and_ends_at_ctrl_c(node: Any, processes:
     recording = open_recording(file)
     (judged,) = judge(recording)
     assert judged.figures.timing.ended
-    assert verdicts_in(told) == [verdict_line(1, judged.verdict.line)[:LONGEST_LINE]]
+    assert verdicts_in(told) == [judged.verdict.line[:LONGEST_LINE]]
     assert judged.figures.timing.ticks > 100
     assert max(figures.engaged_s for figures in judged.figures.arms.values()) > 0.0
     assert recording.about.notes["operator"] == "Ada"

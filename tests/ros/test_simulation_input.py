@@ -180,7 +180,7 @@ def test_an_arm_that_a_person_pauses_is_not_engaged_again(node: Any, processes: 
     arm["engaged"] = True
     rest = left["pose"].get(timeout=PATIENCE).pose.position.x
     wait_until(lambda: left["pose"].get(timeout=PATIENCE).pose.position.x > rest + 0.01, "the hand moves")
-    arm |= {"engaged": False, "last_event": "lost: the pause service"}
+    arm |= {"engaged": False, "last_event": "", "last_event_kind": "pause_service"}
     time.sleep(0.5)
     drained(left["inputs"])
     time.sleep(2.5)

@@ -11,6 +11,7 @@ from typing import ClassVar
 import numpy as np
 import pytest
 
+from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.inputs.headset import HeadsetServer
 from q2r2_control.inputs.scripted import ScriptedInput
 from q2r2_control.pipeline.pipeline import Pipeline
@@ -181,7 +182,7 @@ def test_a_refused_press_is_felt_as_a_fault_is() -> None:
     hands = FeltHands()
     loop = Pipeline.from_config(cell(), input=hands, plant="kinematic")
     loop.listeners.append(
-        lambda tick: loop.teleop.pause(tick.now, "as if something had failed") if tick.t > 0.5 else None
+        lambda tick: loop.teleop.pause(tick.now, Reason(ReasonKind.CONNECTION_LOST)) if tick.t > 0.5 else None
     )
     loop.run(0.6, realtime=False)
     assert hands.by("left", FAULT) == [1.0]

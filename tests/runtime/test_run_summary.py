@@ -10,12 +10,13 @@ import pinocchio as pin
 import pytest
 
 from q2r2_control.config.cell import Config
+from q2r2_control.events import Event, Reason, ReasonKind
 from q2r2_control.inputs.scripted import ScriptedInput
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.plants.kinematic import KinematicPlant
 from q2r2_control.robot.robot import Robot
 from q2r2_control.runtime.run_summary import EVENTS_KEPT, RunStatistics
-from q2r2_control.types import ArmTarget, Event, Reference, StepReport, StepStatus
+from q2r2_control.types import ArmTarget, Reference, StepReport, StepStatus
 from tests.support.watch import cell
 
 # What scripts and dashboards rely on.
@@ -109,9 +110,9 @@ def test_a_run_s_json_has_every_key_that_others_read() -> None:
         else:
             assert isinstance(data[key], expected), key
     assert all(set(figures) == ARM_KEYS for figures in data["arms"].values())
-    assert [(event["arm"], event["from"], event["to"], event["reason"]) for event in data["events"]] == [
-        ("left", "idle", "engaged", "lower button"),
-        ("right", "idle", "engaged", "lower button"),
+    assert [(event["arm"], event["from"], event["to"], event["kind"]) for event in data["events"]] == [
+        ("left", "idle", "engaged", "pressed"),
+        ("right", "idle", "engaged", "pressed"),
     ]
     assert data["events"][0]["t"] == pytest.approx(0.68, abs=0.05)
 
@@ -211,7 +212,9 @@ def test_whether_the_run_ended_at_rest(statistics: RunStatistics, speed: float, 
 
 
 def test_a_broken_button_cannot_fill_the_memory(statistics: RunStatistics) -> None:
-    statistics.events.extend(Event(float(i), "left", "a", "b", "c") for i in range(EVENTS_KEPT + 10))
+    statistics.events.extend(
+        Event(float(i), "left", "a", "b", Reason(ReasonKind.OTHER)) for i in range(EVENTS_KEPT + 10)
+    )
     events = statistics.summary(1.0).events
     assert len(events) == EVENTS_KEPT
     assert events[-1].t == EVENTS_KEPT + 9

@@ -12,15 +12,17 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 import numpy as np
 import pinocchio as pin
 
+from q2r2_control.events import Event
 from q2r2_control.inputs.factory import hands_watch
 from q2r2_control.inputs.headset import HeadsetServer
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.runtime.recorder import Tick
-from q2r2_control.types import SIDES, Array, CommandMode, Event, HandSample, HapticFeedback
+from q2r2_control.types import SIDES, Array, CommandMode, HandSample, HapticFeedback
 from tests.support.fake_headset import FakeHeadset
 from tests.support.headset_server import eventually
 from tests.support.operator_script import START
+from tests.support.reasons import kinds
 from tests.support.watch import Watch, cell
 
 PERIOD = 1.0 / 72.0  # of samples [s]
@@ -217,8 +219,8 @@ class InStepRun:
         return [event for tick in self.ticks for event in tick.events]
 
     def reasons(self, destination: str) -> list[str]:
-        """Why arms came to a state, or what they were refused in it."""
-        return [event.reason for event in self.events if event.destination == destination]
+        """The kinds of why arms came to a state, or what they were refused in it."""
+        return [kinds(event.reason) for event in self.events if event.destination == destination]
 
 
 class NoCatchUp:

@@ -7,10 +7,11 @@ from functools import cache
 import numpy as np
 
 from q2r2_control.config.cell import Config, load_config
+from q2r2_control.events import Event
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.runtime.recorder import Tick
-from q2r2_control.types import Event
 from q2r2_control.verification.contract import Contract
+from tests.support.reasons import kinds
 
 CELL = "config/dual_iiwa7.yaml"
 
@@ -62,5 +63,5 @@ def speed(tick: Tick) -> float:
 
 
 def changes(events: list[Event], arm: str) -> list[tuple[str, str, str]]:
-    """State changes of ``arm``: from, to, reason."""
-    return [(str(event.source), str(event.destination), event.reason) for event in events if event.arm == arm]
+    """State changes of ``arm``: from, to, and the kinds of the reason."""
+    return [(str(event.source), str(event.destination), kinds(event.reason)) for event in events if event.arm == arm]

@@ -11,8 +11,9 @@ import numpy as np
 import pinocchio as pin
 
 from q2r2_control.config.teleop import TeleopSettings
+from q2r2_control.events import Event, Reason
 from q2r2_control.teleop.teleop import Teleop
-from q2r2_control.types import SIDES, ArmTarget, Array, Event, HandInputs, HandSample
+from q2r2_control.types import SIDES, ArmTarget, Array, HandInputs, HandSample
 
 TICK = 0.001
 PERIOD = 0.013  # of the hands' samples [s]
@@ -48,7 +49,7 @@ class Operator:
     )
     commanded: dict[str, pin.SE3] | None = None
     in_step: bool = True
-    obstacles: dict[str, str] = field(default_factory=dict)
+    obstacles: dict[str, Reason] = field(default_factory=dict)
     lower: set[str] = field(default_factory=set)  # hands that hold the button
     upper: set[str] = field(default_factory=set)
     silent: set[str] = field(default_factory=set)  # hands that send nothing

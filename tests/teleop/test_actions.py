@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 
 from q2r2_control.config.teleop import TeleopSettings
+from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.teleop.arm_states import is_fault, is_refusal
 from q2r2_control.types import SIDES, HandInputs
+from tests.support.reasons import kinds
 from tests.teleop.hands import (
     ENGAGED,
     HOMING,
@@ -62,7 +64,7 @@ class TestAStop:
         driver.press(*SIDES)
         driver.press(*SIDES, button="upper")
         assert driver.states == STOPPED
-        assert {event.reason for event in driver.events if is_refusal(event)} == {"not engaged: stopped, grip goes on"}
+        assert {kinds(event.reason) for event in driver.events if is_refusal(event)} == {"not_engaged: stopped"}
         assert [driver.targets[arm].gripper for arm in SIDES] == [1.0, 1.0]
         assert_holds(driver)
         push(driver, "grip", hand="right")
@@ -97,14 +99,14 @@ class TestAStop:
     def test_is_over_for_both_arms_when_one_is_reset(self) -> None:
         driver = engaged()
         push(driver, "grip")
-        driver.teleop.reset(driver.now, "left", "the reset service")
+        driver.teleop.reset(driver.now, "left", Reason(ReasonKind.RESET_SERVICE))
         assert driver.states == PAUSED
 
     def test_that_a_button_is_held_for_is_not_lost_by_a_fault_in_between(self) -> None:
         driver = engaged(upper_hold="stop")
         driver.upper = {"left"}
         driver.run(0.3)
-        driver.teleop.pause(driver.now, "linked to right: something")
+        driver.teleop.pause(driver.now, Reason(ReasonKind.TOOL_UNKNOWN))
         assert driver.states == LOST
         driver.run(0.5)
         assert driver.states == STOPPED
@@ -118,10 +120,10 @@ class TestTheWayHome:
         assert driver.states == HOMING
         assert driver.teleop.homing
         assert_holds(driver)  # the hands lead nothing
-        driver.teleop.end_homing(driver.now, "at home")
+        driver.teleop.end_homing(driver.now, Reason(ReasonKind.HOMING_ARRIVED))
         driver.run(0.1)
         assert driver.states == PAUSED
-        assert {event.reason for event in driver.events[-2:]} == {"at home"}
+        assert {event.kind for event in driver.events[-2:]} == {ReasonKind.HOMING_ARRIVED}
         assert not any(map(is_fault, driver.events))
         driver.press(*SIDES)
         assert driver.states == ENGAGED
@@ -130,7 +132,7 @@ class TestTheWayHome:
         for blocked, states in (("left", PAUSED), ("right", HOMING)):
             driver = engaged()
             driver.press(*SIDES)
-            driver.obstacles = {blocked: "no tool pose"}
+            driver.obstacles = {blocked: Reason(ReasonKind.TOOL_UNKNOWN)}
             push(driver, "stick_down", hand="left")
             assert driver.states == states
 
@@ -171,7 +173,7 @@ class TestTheWayHome:
         driver.silent = set(SIDES)
         driver.run(0.2)
         assert driver.states == LOST
-        assert {event.reason for event in driver.events[-2:]} == {"on the way home: no pose for 0.15 s"}
+        assert {kinds(event.reason) for event in driver.events[-2:]} == {"homing_fault: pose_silent"}
 
     def test_that_no_hand_asked_for_needs_none(self) -> None:
         driver = squeezing(bindings=BINDINGS)
@@ -197,7 +199,7 @@ class TestTheWayHome:
         )
         driver.run(0.1)
         assert driver.states == IDLE
-        assert {event.reason for event in driver.events} == {"not homing: no pose for 0.15 s"}
+        assert {kinds(event.reason) for event in driver.events} == {"not_homing: pose_silent"}
 
 
 class TestSwappedHands:
@@ -211,14 +213,13 @@ class TestSwappedHands:
             driver.press(left)
             assert driver.states == {"left": "engaged", "right": "paused"}
             driver.press(left)
-        assert {event.reason for event in driver.events if event.source == event.destination} == {
-            f"driven by the {hand} hand" for hand in SIDES
-        }
+        told = [event.reason for event in driver.events if event.kind is ReasonKind.DRIVEN_BY]
+        assert {reason.detail["hand"] for reason in told} == set(SIDES)
 
     def test_do_not_jump(self) -> None:
         driver = engaged()
         driver.hands["right"] = pose(1.0, -1.0, 1.0, (1.0, 0.0, 0.0))
-        driver.teleop.pause(driver.now, "test")
+        driver.teleop.pause(driver.now, Reason(ReasonKind.TOOL_UNKNOWN))
         push(driver, "stick_left")
         driver.press(*SIDES)
         assert driver.states == ENGAGED
@@ -232,7 +233,7 @@ class TestSwappedHands:
         push(driver, "stick_left")
         assert driver.states == ENGAGED
         assert driver.teleop.hand_of("left") == "left"
-        assert {event.reason for event in driver.events if is_refusal(event)} == {"not swapped: pause both arms first"}
+        assert {kinds(event.reason) for event in driver.events if is_refusal(event)} == {"not_swapped: pause_first"}
 
 
 class TestTheHandOfOneArmAlone:
@@ -244,7 +245,7 @@ class TestTheHandOfOneArmAlone:
     def test_is_not_swapped(self) -> None:
         driver = self.driver()
         push(driver, "stick_left")
-        assert [event.reason for event in driver.events] == ["not swapped: this program drives one arm only"]
+        assert [kinds(event.reason) for event in driver.events] == ["not_swapped: one_arm"]
         assert driver.teleop.hand_of("left") == "left"
 
 

@@ -139,7 +139,7 @@ class TestADeadMan:
         driver.tick(driver.samples())
         assert driver.states == PAUSED
         assert all(target.pose is None for target in driver.targets.values())
-        assert {event.reason for event in driver.events} == {"dead man held", "dead man let go"}
+        assert {event.kind for event in driver.events} == {"dead_man_held", "dead_man_released"}
         assert not any(map(is_fault, driver.events))
 
     def test_of_one_hand_is_no_fault_of_the_other(self) -> None:

@@ -12,7 +12,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.types import SIDES, HandSample
+from tests.support.reasons import kinds
 from tests.teleop.hands import (
     ENGAGED,
     IDLE,
@@ -30,13 +32,12 @@ from tests.teleop.hands import (
 )
 
 FAULTS: dict[str, Callable[[HandSample], HandSample]] = {
-    "pose for 0.15 s": lambda s: spoilt(s, pose_stamp=10.29),
-    "button data for 0.15 s": lambda s: spoilt(s, inputs_stamp=10.29),
-    "not finite or not a rotation": lambda s: spoilt(s, position=np.array([np.nan, 0.0, 0.0])),
-    "not a rotation": lambda s: spoilt(s, quaternion=np.zeros(4)),
-    "jumped 1": lambda s: spoilt(s, position=s.position + 1.0),
-    "rotation jumped": lambda s: spoilt(s, quaternion=np.array([1.0, 0.0, 0.0, 0.0])),
-    "without a receipt time": lambda s: spoilt(s, pose_stamp=math.nan),
+    "pose_silent": lambda s: spoilt(s, pose_stamp=10.29),
+    "inputs_silent": lambda s: spoilt(s, inputs_stamp=10.29),
+    "pose_unusable": lambda s: spoilt(s, position=np.array([np.nan, 0.0, 0.0])),
+    "hand_jumped": lambda s: spoilt(s, position=s.position + 1.0),
+    "hand_rotation_jumped": lambda s: spoilt(s, quaternion=np.array([1.0, 0.0, 0.0, 0.0])),
+    "pose_without_stamp": lambda s: spoilt(s, pose_stamp=math.nan),
 }
 
 
@@ -49,7 +50,7 @@ def test_a_fault_of_the_left_hand_disengages(reason: str, linked: bool) -> None:
     assert_smooth(history)
     assert driver.states == (LOST if linked else {"left": "lost", "right": "engaged"})
     last = [event for event in driver.events if event.destination == "lost"]
-    assert reason in last[0].reason
+    assert last[0].kind == reason
     assert [event.arm for event in last] == (["left", "right"] if linked else ["left"])
     driver.alter = lambda s: s
     if linked:
@@ -61,20 +62,20 @@ def test_a_fault_of_the_left_hand_disengages(reason: str, linked: bool) -> None:
 @pytest.mark.parametrize("linked", [True, False], ids=["linked", "each for itself"])
 def test_what_stops_one_arm_outside_of_this_layer_stops_the_linked_one_once(linked: bool) -> None:
     driver = engaged(linked=linked)
-    driver.teleop.pause(driver.now, "no tool pose", "left")
+    driver.teleop.pause(driver.now, Reason(ReasonKind.TOOL_UNKNOWN), "left")
     assert driver.states == (LOST if linked else {"left": "lost", "right": "engaged"})
-    driver.teleop.pause(driver.now, "no tool pose", "left")
+    driver.teleop.pause(driver.now, Reason(ReasonKind.TOOL_UNKNOWN), "left")
     assert driver.states == (LOST if linked else {"left": "lost", "right": "engaged"})
     driver.run(0.1)
     if linked:
         driver.press("right")
-        driver.teleop.pause(driver.now, "no tool pose, still", "left")
+        driver.teleop.pause(driver.now, Reason(ReasonKind.TOOL_UNKNOWN), "left")
         assert driver.states == {"left": "lost", "right": "engaged"}
 
 
 def test_a_reset_arm_holds_until_a_press_after_its_hand_was_seen_anew() -> None:
     driver = engaged(linked=False)
-    driver.teleop.reset(driver.now, "left", "the reset service")
+    driver.teleop.reset(driver.now, "left", Reason(ReasonKind.RESET_SERVICE))
     assert driver.states == {"left": "lost", "right": "engaged"}
     driver.silent = {"left"}
     driver.run(0.1)
@@ -139,7 +140,7 @@ def test_a_lost_connection_pauses_every_arm_and_wants_fresh_poses_and_a_new_pres
     driver.run(0.2, waving(driver))
     driver.teleop.connection_lost(driver.now)
     assert driver.states == LOST
-    assert {event.reason for event in driver.teleop.take_events()} == {"connection lost"}
+    assert {event.kind for event in driver.teleop.take_events()} == {"connection_lost"}
     driver.lower = set(SIDES)
     assert_holds(driver)
     driver.lower = set()
@@ -151,9 +152,9 @@ def test_a_lost_connection_pauses_every_arm_and_wants_fresh_poses_and_a_new_pres
 @pytest.mark.parametrize(
     ("alter", "reason"),
     [
-        (lambda s: spoilt(s, pose_stamp=9.0), "no pose for 0.15 s"),
-        (lambda s: spoilt(s, pose_stamp=-math.inf), "no pose for 0.15 s"),
-        (lambda s: spoilt(s, quaternion=np.zeros(4)), "the newest pose is not usable"),
+        (lambda s: spoilt(s, pose_stamp=9.0), "pose_silent"),
+        (lambda s: spoilt(s, pose_stamp=-math.inf), "pose_silent"),
+        (lambda s: spoilt(s, quaternion=np.zeros(4)), "no_pose"),
     ],
     ids=["stale", "never received", "not usable"],
 )
@@ -163,7 +164,7 @@ def test_engaging_is_refused_when_poses_are(alter: Callable[[HandSample], HandSa
     driver.run(0.3)
     driver.press(*SIDES)
     assert driver.states == IDLE
-    assert [event.reason for event in driver.events] == [f"not engaged: {reason}"] * 2
+    assert [kinds(event.reason) for event in driver.events] == [f"not_engaged: {reason}"] * 2
 
 
 @pytest.mark.parametrize("tools", [{}, dict.fromkeys(SIDES, pose(math.nan))], ids=["missing", "not finite"])
@@ -172,7 +173,7 @@ def test_engaging_is_refused_when_the_tools_pose_is(tools: dict[str, pin.SE3]) -
     driver.tools = tools
     driver.engage()
     assert driver.states == IDLE
-    assert {event.reason for event in driver.events} == {"not engaged: the tool's pose is not known"}
+    assert {kinds(event.reason) for event in driver.events} == {"not_engaged: tool_unknown"}
 
 
 def test_silence_during_a_chord_disengages_for_good() -> None:

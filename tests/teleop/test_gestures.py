@@ -8,6 +8,7 @@ import pytest
 
 from q2r2_control.config.bindings import HELD, Gesture
 from q2r2_control.config.teleop import TeleopSettings
+from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.teleop.gestures import GestureRecognizer, Press
 from q2r2_control.types import HandInputs
 
@@ -90,7 +91,7 @@ def test_controls_that_are_held_from_the_first_reading_on_are_told_once_after_a_
         now = 0.1 * step
         found.receive(HandInputs(button_lower=True), now, now)
         told = found.take_stuck(now)
-        assert told == ("lower held since the hand was first heard of: let go first" if step == 11 else None), now
+        assert told == (Reason.of(ReasonKind.CONTROLS_HELD, controls=["lower"]) if step == 11 else None), now
     found.forget()
     found.receive(HandInputs(), 3.0, 3.0)
     found.receive(HandInputs(button_lower=True), 3.1, 3.1)

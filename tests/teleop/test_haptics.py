@@ -8,6 +8,8 @@ from pathlib import Path
 import pytest
 
 from q2r2_control.config.teleop import HapticSettings
+from q2r2_control.events import Event, Reason
+from q2r2_control.events import ReasonKind as K
 from q2r2_control.teleop.haptics import (
     CONTACT,
     ENGAGED,
@@ -28,28 +30,42 @@ from q2r2_control.teleop.haptics import (
     HapticPulses,
     Pulse,
 )
-from q2r2_control.types import Event, HapticFeedback
+from q2r2_control.types import HapticFeedback
 
+
+def press(source: str, destination: str) -> Event:
+    return event(source, destination, Reason.of(K.PRESSED, control="lower button"))
+
+
+def event(source: str, destination: str, reason: Reason | K) -> Event:
+    return Event(1.0, "left", source, destination, reason if isinstance(reason, Reason) else Reason(reason))
+
+
+def verdict(keep: bool) -> Reason:
+    return Reason.of(K.VERDICT, episode=2, keep=keep, line="")
+
+
+JUMPED = event("engaged", "lost", K.HAND_JUMPED)
 EVENTS = {
-    "engaging": (("paused", "engaged", "lower button"), ENGAGED),
-    "pausing": (("engaged", "pausing", "lower button"), PAUSED),
-    "the alignment chord": (("engaged", "aligning", "alignment chord"), PAUSED),
-    "a fault": (("engaged", "lost", "no pose for 0.15 s"), FAULT),
-    "a refused press": (("paused", "paused", "not engaged: the tool's pose is not known"), FAULT),
-    "an alignment that ends unengaged": (("aligning", "lost", "not engaged: the newest pose is not usable"), FAULT),
-    "the way home": (("paused", "homing", "home (grip)"), HOMING),
-    "the end of the way home": (("homing", "paused", "at home"), PAUSED),
-    "both arms carry, for the one that leads": (("engaged", "engaged", "carries both tools"), ENGAGED),
-    "both arms carry, for the other one": (("paused", "carried", "carries with the left arm"), ENGAGED),
-    "the end of carrying": (("carried", "paused", "grip"), PAUSED),
-    "an episode that begins": (("engaged", "engaged", "episode begins"), EPISODE_BEGINS),
-    "an episode that begins while the arm is lost": (("lost", "lost", "episode begins"), EPISODE_BEGINS),
-    "an episode that is kept": (("paused", "paused", "verdict on episode 2: keep"), EPISODE_KEPT),
-    "one that is not": (("lost", "lost", "verdict on episode 3: discard: idle"), EPISODE_REJECTED),
-    "an episode that ends": (("engaged", "engaged", "episode ends"), EPISODE_ENDS),
-    "an episode that is discarded": (("paused", "paused", "episode discarded"), EPISODE_DISCARDED),
-    "what an engaged arm refuses": (("engaged", "engaged", "not carried: stopped"), FAULT),
-    "a stop": (("engaged", "stopped", "stop (grip)"), STOPPED),
+    "engaging": (press("paused", "engaged"), ENGAGED),
+    "pausing": (press("engaged", "pausing"), PAUSED),
+    "the alignment chord": (event("engaged", "aligning", K.ALIGNMENT_CHORD), PAUSED),
+    "a fault": (event("engaged", "lost", K.POSE_SILENT), FAULT),
+    "a refused press": (event("paused", "paused", K.NOT_ENGAGED), FAULT),
+    "an alignment that ends unengaged": (event("aligning", "lost", K.NOT_ENGAGED), FAULT),
+    "the way home": (event("paused", "homing", K.COMMANDED), HOMING),
+    "the end of the way home": (event("homing", "paused", K.HOMING_ARRIVED), PAUSED),
+    "both arms carry, for the one that leads": (event("engaged", "engaged", K.CARRY_BEGAN), ENGAGED),
+    "both arms carry, for the other one": (event("paused", "carried", K.CARRIED_BY), ENGAGED),
+    "the end of carrying": (event("carried", "paused", K.PRESSED), PAUSED),
+    "an episode that begins": (event("engaged", "engaged", K.EPISODE_BEGINS), EPISODE_BEGINS),
+    "an episode that begins while the arm is lost": (event("lost", "lost", K.EPISODE_BEGINS), EPISODE_BEGINS),
+    "an episode that is kept": (event("paused", "paused", verdict(True)), EPISODE_KEPT),
+    "one that is not": (event("lost", "lost", verdict(False)), EPISODE_REJECTED),
+    "an episode that ends": (event("engaged", "engaged", K.EPISODE_ENDS), EPISODE_ENDS),
+    "an episode that is discarded": (event("paused", "paused", K.EPISODE_DISCARDED), EPISODE_DISCARDED),
+    "what an engaged arm refuses": (event("engaged", "engaged", K.NOT_CARRIED), FAULT),
+    "a stop": (event("engaged", "stopped", K.COMMANDED), STOPPED),
 }
 
 
@@ -57,10 +73,10 @@ def feedback(pulse: Pulse) -> HapticFeedback:
     return HapticFeedback("left", pulse.frequency, pulse.amplitude)
 
 
-@pytest.mark.parametrize(("event", "pulse"), EVENTS.values(), ids=EVENTS)
-def test_an_event_is_felt_once_and_ends(event: tuple[str, str, str], pulse: Pulse) -> None:
+@pytest.mark.parametrize(("happens", "pulse"), EVENTS.values(), ids=EVENTS)
+def test_an_event_is_felt_once_and_ends(happens: Event, pulse: Pulse) -> None:
     haptics = HapticPulses()
-    haptics.tell(Event(1.0, "left", *event))
+    haptics.tell(happens)
     assert haptics.at(1.0, "left") == feedback(pulse)
     assert haptics.at(1.0 + 0.9 * pulse.duration, "left") is None
     assert haptics.at(1.01 + pulse.duration, "left") == HapticFeedback("left", 0.0, 0.0)
@@ -69,7 +85,7 @@ def test_an_event_is_felt_once_and_ends(event: tuple[str, str, str], pulse: Puls
 
 def test_a_pause_that_is_complete_is_not_felt_again() -> None:
     haptics = HapticPulses()
-    haptics.tell(Event(1.0, "left", "pausing", "paused", "lower button"))
+    haptics.tell(press("pausing", "paused"))
     assert haptics.at(1.0, "left") is None
 
 
@@ -87,7 +103,7 @@ def test_slipping_is_felt_at_every_stretch_of_it_and_anew_after_engaging() -> No
 
 def test_a_weaker_vibration_does_not_cut_a_stronger_one_short() -> None:
     haptics = HapticPulses()
-    haptics.tell(Event(1.0, "left", "engaged", "lost", "the hand jumped"))
+    haptics.tell(JUMPED)
     assert haptics.at(1.0, "left") == feedback(FAULT)
     haptics.slip(1.0, 0.0)
     assert haptics.at(1.1, "left") is None
@@ -148,20 +164,20 @@ def test_a_joint_at_its_limit_and_a_grasp_are_each_felt_once_for_as_long_as_they
 
 def test_two_vibrations_are_felt_as_two_and_a_fault_waits_for_none() -> None:
     haptics = HapticPulses()
-    haptics.tell(Event(1.0, "left", "paused", "engaged", "lower button"))
+    haptics.tell(press("paused", "engaged"))
     first = felt(haptics, 1.0, 1.0 + ENGAGED.duration + 0.002)
     assert [one.amplitude for one in first] == [ENGAGED.amplitude, 0.0]
     haptics.limits(["left_A4"])
     assert felt(haptics, 1.09, 1.12) == []
     assert felt(haptics, 1.12, 1.2)[0] == feedback(LIMIT)
-    haptics.tell(Event(1.2, "left", "engaged", "lost", "the hand jumped"))
+    haptics.tell(JUMPED)
     assert haptics.at(1.21, "left") == feedback(FAULT)
 
 
 @pytest.mark.parametrize(("strength", "expected"), [(0.5, [0.5 * FAULT.amplitude, 0.0]), (0.0, [])])
 def test_the_strength_of_all_is_a_setting_and_0_sends_nothing(strength: float, expected: list[float]) -> None:
     haptics = HapticPulses(HapticSettings(strength=strength))
-    haptics.tell(Event(1.0, "left", "engaged", "lost", "the hand jumped"))
+    haptics.tell(JUMPED)
     assert [sent.amplitude for sent in felt(haptics, 1.0, 2.0)] == expected
 
 

@@ -32,9 +32,7 @@ def test_it_starts_idle_and_the_first_press_of_the_lower_button_engages_that_arm
     driver.engage("left")
     assert driver.states == {"left": "engaged", "right": "idle"}
     assert driver.teleop.engaged == {"left": True, "right": False}
-    assert [(e.arm, e.source, e.destination, e.reason) for e in driver.events] == [
-        ("left", "idle", "engaged", "lower button")
-    ]
+    assert [(e.arm, e.source, e.destination, e.kind) for e in driver.events] == [("left", "idle", "engaged", "pressed")]
 
 
 def test_a_target_tells_the_hand_that_it_is_made_of_and_none_while_the_arm_holds() -> None:

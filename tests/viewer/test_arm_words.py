@@ -7,10 +7,12 @@ from dataclasses import replace
 import pytest
 
 from q2r2_control.config.bindings import BindingSettings
+from q2r2_control.events import Event, Reason, ReasonKind
 from q2r2_control.robot.robot import Robot
 from q2r2_control.runtime.recorder import Tick
-from q2r2_control.types import ArmTarget, Event
+from q2r2_control.types import ActiveLimit, ArmTarget, LimitKind
 from q2r2_control.viewer.arm_words import next_press, why
+from q2r2_control.wording import SENTENCES
 from tests.viewer.test_history import robot, tick_at
 
 __all__ = ["robot"]
@@ -18,7 +20,19 @@ __all__ = ["robot"]
 JOINTS = ("left_A2", "left_A4")
 
 
-def words(tick: Tick, *binding: str, last: Event | None = None) -> str:
+def position(joint: str) -> ActiveLimit:
+    return ActiveLimit(LimitKind.POSITION, (joint,))
+
+
+def velocity(joint: str) -> ActiveLimit:
+    return ActiveLimit(LimitKind.VELOCITY, (joint,))
+
+
+def pair(*bodies: str) -> ActiveLimit:
+    return ActiveLimit(LimitKind.SEPARATION, bodies)
+
+
+def words(tick: Tick, *binding: ActiveLimit, last: Event | None = None) -> str:
     return why(tick, "left", JOINTS, binding, last)
 
 
@@ -26,19 +40,19 @@ def words(tick: Tick, *binding: str, last: Event | None = None) -> str:
     ("binding", "expected"),
     [
         ((), "catches up"),
-        (("right_A4 position", "right_link_1_0|right_link_5_0"), "catches up"),
-        (("left_A4 acceleration",), "catches up"),
-        (("left_A4 position", "left_A2 velocity"), "left_A4 at its limit"),
-        (("left_A2 velocity",), "left_A2 as fast as it may turn"),
-        (("left_A2 velocity", "left_hand_0|table_0"), "held by left_hand_0 | table_0"),
+        ((position("right_A4"), pair("right_link_1_0", "right_link_5_0")), "catches up"),
+        ((ActiveLimit(LimitKind.ACCELERATION, ("left_A4",)),), "catches up"),
+        ((position("left_A4"), velocity("left_A2")), "left_A4 at its limit"),
+        ((velocity("left_A2"),), "left_A2 as fast as it may turn"),
+        ((velocity("left_A2"), pair("left_hand_0", "table_0")), "held by left_hand_0 | table_0"),
         (
-            ("left_hand_0|table_0", "left_link_5_0|right_link_5_0"),
+            (pair("left_hand_0", "table_0"), pair("left_link_5_0", "right_link_5_0")),
             "held by left_link_5_0 | right_link_5_0, 82 mm to spare",
         ),
     ],
 )
 def test_an_arm_that_is_away_from_its_target_is_held_by_what_is_at_work_on_it(
-    robot: Robot, binding: tuple[str, ...], expected: str
+    robot: Robot, binding: tuple[ActiveLimit, ...], expected: str
 ) -> None:
     assert words(tick_at(robot, 1.0), *binding) == expected
 
@@ -46,29 +60,32 @@ def test_an_arm_that_is_away_from_its_target_is_held_by_what_is_at_work_on_it(
 def test_an_arm_that_is_at_its_target_follows_whatever_is_at_work(robot: Robot) -> None:
     tick = tick_at(robot, 1.0)
     targets = {arm: ArmTarget(pose, 1.0) for arm, pose in tick.tools.items()}
-    assert words(replace(tick, targets=targets), "left_A2 velocity") == "follows the hand"
+    assert words(replace(tick, targets=targets), velocity("left_A2")) == "follows the hand"
 
 
 @pytest.mark.parametrize(
-    ("source", "destination", "reason", "expected"),
+    ("source", "destination", "kind", "expected"),
     [
-        ("engaged", "lost", "no pose for 0.15 s", "lost: no pose for 0.15 s"),
-        ("pausing", "paused", "lower button", "paused: lower button"),
-        ("paused", "paused", "not engaged: no pose for 0.15 s", "not engaged: no pose for 0.15 s"),
+        ("engaged", "lost", ReasonKind.CONNECTION_LOST, "lost: connection lost"),
+        ("aligning", "engaged", ReasonKind.ALIGNED, "engaged: aligned anew"),
+        ("paused", "paused", ReasonKind.NO_RECORDING, SENTENCES[ReasonKind.NO_RECORDING]),
     ],
 )
 def test_an_arm_that_is_not_engaged_says_what_stopped_it(
-    robot: Robot, source: str, destination: str, reason: str, expected: str
+    robot: Robot, source: str, destination: str, kind: ReasonKind, expected: str
 ) -> None:
     paused = replace(tick_at(robot, 1.0, engaged=False), states={"left": destination, "right": "idle"})
-    assert words(paused, last=Event(0.5, "left", source, destination, reason)) == expected
+    assert words(paused, last=Event(0.5, "left", source, destination, Reason(kind))) == expected
 
 
 def test_before_its_first_event_and_while_aligning_it_says_so_too(robot: Robot) -> None:
     paused = tick_at(robot, 1.0, engaged=False)
     assert words(paused) == "not engaged yet"
     aligning = replace(paused, states={"left": "aligning", "right": "aligning"})
-    assert words(aligning, last=Event(0.5, "left", "engaged", "aligning", "alignment chord")) == "aligning"
+    assert (
+        words(aligning, last=Event(0.5, "left", "engaged", "aligning", Reason(ReasonKind.ALIGNMENT_CHORD)))
+        == "aligning"
+    )
     assert words(replace(paused, following=False)) == "the run ends"
     assert press(aligning) == "release both buttons to go on"
 

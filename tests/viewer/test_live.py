@@ -9,6 +9,7 @@ from rich.console import Console
 
 from q2r2_control.config.bindings import BindingSettings
 from q2r2_control.robot.robot import Robot
+from q2r2_control.types import ActiveLimit, LimitKind
 from q2r2_control.viewer.live import LiveTable
 from tests.viewer.test_history import robot, tick_at
 
@@ -45,7 +46,7 @@ def test_it_names_what_holds_a_gripper(robot: Robot) -> None:
 def test_it_shows_every_limit_that_was_at_work_since_it_was_drawn_last(robot: Robot) -> None:
     table = LiveTable("demo", JOINTS, BindingSettings())
     tick = tick_at(robot, 0.0)
-    report = replace(tick.reference.report, binding=("left_A2 velocity",))
+    report = replace(tick.reference.report, binding=(ActiveLimit(LimitKind.VELOCITY, ("left_A2",)),))
     table(replace(tick, reference=replace(tick.reference, report=report)))
     table(tick)
     assert "left_A2 velocity" in drawn(table)

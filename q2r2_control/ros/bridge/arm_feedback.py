@@ -5,6 +5,7 @@ from __future__ import annotations
 import pinocchio as pin
 from visualization_msgs.msg import Marker
 
+from q2r2_control.events import Event
 from q2r2_control.ros.base_node import BaseNode
 from q2r2_control.ros.bridge.grippers import GripperClient
 from q2r2_control.ros.bridge.hand_intake import HandIntake
@@ -14,7 +15,8 @@ from q2r2_control.ros.bridge.reports import ArmReport
 from q2r2_control.teleop.arm_states import AT_REST, is_refusal
 from q2r2_control.teleop.haptics import HapticPulses
 from q2r2_control.teleop.sag import sagged
-from q2r2_control.types import ArmTarget, Event
+from q2r2_control.types import ArmTarget
+from q2r2_control.wording import event_line
 
 _MARKER_PERIOD = 0.05  # [s]
 
@@ -25,7 +27,8 @@ class ArmFeedback:
     def __init__(self, node: BaseNode, arm: str, values: ArmParameters, hand: HandIntake) -> None:
         self._node, self._hand = node, hand
         self.haptics = HapticPulses(values.teleop.haptics)
-        self.last_event = self.paused = "not engaged yet"  # of all events, and of those that let the arm hold
+        self.last_line, self.last_kind = "not engaged yet", ""  # of the last event; the kind of its first cause
+        self.paused = "not engaged yet"  # by the last event that let the arm hold
         self._drawn = TargetMarkers(arm, values.tool_frame, values.world_frame)
         self._markers = node.create_publisher(Marker, "/visualization_marker", 10)
         self._shown = 0.0
@@ -33,10 +36,10 @@ class ArmFeedback:
 
     def tell(self, event: Event) -> None:
         """Report a change of the state: to the log, and to the hand as vibrations."""
-        self.last_event = f"{event.destination}: {event.reason}"
+        self.last_line, self.last_kind = event_line(event), str(event.reason.root.kind)
         if event.destination in AT_REST and not is_refusal(event):
-            self.paused = self.last_event
-        self._node.get_logger().info(self.last_event)
+            self.paused = self.last_line
+        self._node.get_logger().info(self.last_line)
         self.haptics.tell(event)
         self._report.tell(event)
         self._node.report_health()

@@ -8,6 +8,7 @@ from typing import Any
 from rclpy.node import Node
 from std_srvs.srv import Trigger
 
+from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.teleop.teleop import Teleop
 
 _PATIENCE = 2.0  # with an answer, and until the controller says that it is on its way [s]
@@ -53,7 +54,7 @@ class HomeClient:
         elif self._phase is _Phase.ASKED:
             self._take_answer(teleop, now)
         elif now - self._since > _PATIENCE:
-            self._end(teleop, now, outcome or f"not homing: {self._name} did not begin", arrived=bool(outcome))
+            self._end(teleop, now, outcome or f"{self._name} did not begin", arrived=bool(outcome))
 
     def _ask_to_hold(self) -> None:
         if self._hold is not None:
@@ -61,9 +62,9 @@ class HomeClient:
 
     def _ask(self, teleop: Teleop, now: float) -> None:
         if self._home is None:
-            self._end(teleop, now, "not homing: this arm's controller has no way home", arrived=False)
+            self._end(teleop, now, "this arm's controller has no way home", arrived=False)
         elif not self._home.service_is_ready():
-            self._end(teleop, now, f"not homing: there is no service {self._name}/home", arrived=False)
+            self._end(teleop, now, f"there is no service {self._name}/home", arrived=False)
         else:
             self._phase, self._since = _Phase.ASKED, now
             self._answer = self._home.call_async(Trigger.Request())
@@ -74,11 +75,12 @@ class HomeClient:
             if answer.success:
                 self._phase, self._since = _Phase.ACCEPTED, now
             else:
-                self._end(teleop, now, f"not homing: {answer.message}", arrived=False)
+                self._end(teleop, now, f"{answer.message}", arrived=False)
         elif now - self._since > _PATIENCE:
             self._home.remove_pending_request(self._answer)
-            self._end(teleop, now, f"not homing: {self._name}/home does not answer", arrived=False)
+            self._end(teleop, now, f"{self._name}/home does not answer", arrived=False)
 
     def _end(self, teleop: Teleop, now: float, outcome: str, arrived: bool) -> None:
         self._phase, self._answer = _Phase.NONE, None
-        teleop.end_homing(now, outcome, arrived)
+        reason = Reason.of(ReasonKind.OTHER, text=outcome)
+        teleop.end_homing(now, reason if arrived else Reason(ReasonKind.NOT_HOMING, cause=reason), arrived)

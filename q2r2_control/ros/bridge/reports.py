@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Sequence
-from dataclasses import asdict
 from typing import Any
 
 from geometry_msgs.msg import PoseStamped
@@ -13,12 +12,13 @@ from rclpy.node import Node
 from std_msgs.msg import Float64MultiArray, String
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
+from q2r2_control.events import Event, Reason
 from q2r2_control.recording.ros_topics import CONTROLLER_TICK, RECORDER, arm_events, arm_flags, asked_target
 from q2r2_control.recording.topics import REFERENCE, WORLD
 from q2r2_control.ros.base_node import RECORDED_QOS
 from q2r2_control.ros.bridge.messages import stamped_pose, time_message
 from q2r2_control.teleop.episode_marks import EpisodeMarks
-from q2r2_control.types import ArmTarget, Event, Reference, StepStatus
+from q2r2_control.types import ArmTarget, Reference, StepStatus
 
 _STATUSES = tuple(StepStatus)
 _PATIENCE = 2.0  # with a recorder that says nothing [s]
@@ -67,7 +67,7 @@ class ArmReport:
 
     def tell(self, event: Event) -> None:
         """Publish an event."""
-        self._events.publish(String(data=json.dumps(asdict(event))))
+        self._events.publish(String(data=json.dumps(event.as_json())))
 
     def publish(self, engaged: bool, target: ArmTarget, opening: float, now: float) -> None:
         """Publish the numbers of ``ARM_FIELDS`` at ``now`` [s], and the target in the world, where there is one."""
@@ -85,11 +85,11 @@ class RecorderLink:
         self._state: dict[str, Any] | None = None  # the newest that has not been used
         self._heard = 0.0  # [s] of steady time
         self._served: int | None = None  # services that it has answered
-        self._reasons: list[str] = []
+        self._reasons: list[Reason] = []
         node.create_subscription(String, f"{RECORDER}/state", self._on_state, 10)
 
-    def update(self, marks: EpisodeMarks) -> list[str]:
-        """Once a tick, before the teleoperation; returns the reasons of new events that its services told."""
+    def update(self, marks: EpisodeMarks) -> list[Reason]:
+        """Once a tick, before the teleoperation; returns the reasons of new events of its services."""
         if (state := self._state) is not None:
             marks.recorded, marks.open, marks.any = state["records"], state["episode_open"], state["any_episode"]
             self._state = None
@@ -102,5 +102,5 @@ class RecorderLink:
         self._state = state = json.loads(message.data)
         self._heard = time.monotonic()
         if self._served is not None and state["served"] != self._served:
-            self._reasons.append(state["served_last"])
+            self._reasons.append(Reason.from_json(state["served_last"]))
         self._served = state["served"]

@@ -12,11 +12,11 @@ from rclpy.clock_type import ClockType
 
 from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.errors import ConfigError
+from q2r2_control.events import Event, Reason, ReasonKind
 from q2r2_control.ros.bridge.home_client import HomeClient
 from q2r2_control.ros.bridge.reports import RecorderLink
 from q2r2_control.teleop.arm_states import HOLDING
 from q2r2_control.teleop.teleop import Teleop
-from q2r2_control.types import Event
 
 if TYPE_CHECKING:
     from q2r2_control.ros.nodes.base_arm_controller import BaseArmController
@@ -30,7 +30,7 @@ class TickInputs(NamedTuple):
     tool: pin.SE3 | None  # measured
     commanded: pin.SE3 | None  # by the controller's reference, or what is known instead
     reference: int | None  # the stamp of that reference by the controller's clock [ns]; None: there is none
-    obstacle: str | None  # why the arm may not be engaged
+    obstacle: Reason | None  # why the arm may not be engaged
 
 
 class TeleopLoop:
@@ -84,7 +84,7 @@ class TeleopLoop:
         # node's own ticks comes first, since it makes others look silent.
         gap, self._ticked = nodes[0].now - self._ticked, now
         if gap > teleop.settings.gate.timeout:
-            self._pause(now, f"this node stood still for {gap:.2f} s")
+            self._pause(now, Reason.of(ReasonKind.NODE_STALLED, duration=gap))
         for arm, fault in faults.items():
             if fault is not None:
                 teleop.pause(now, fault, arm)
@@ -108,7 +108,7 @@ class TeleopLoop:
         for node in nodes:
             node.publish_feedback(now)
 
-    def change(self, settings: TeleopSettings) -> str | None:
+    def change(self, settings: TeleopSettings) -> Reason | None:
         """See :meth:`Teleop.change`."""
         return None if settings == self.teleop.settings else self.teleop.change(settings, self.nodes[0].now)
 
@@ -116,15 +116,16 @@ class TeleopLoop:
         """The other nodes of this loop."""
         return [one for one in self.nodes if one is not node]
 
-    def _pause(self, now: float, reason: str) -> None:
+    def _pause(self, now: float, reason: Reason) -> None:
         if any(state not in HOLDING for state in self.teleop.states.values()):
             self.teleop.pause(now, reason)
 
     def _watch_time(self) -> None:
         """Pause where simulated time stands still: the hands go on, and must not be followed later."""
         timeout = self.teleop.settings.gate.timeout
-        if (problem := self.nodes[0].clock_problem(timeout)) is None:
+        if (line := self.nodes[0].clock_problem(timeout)) is None:
             return
+        problem = Reason.of(ReasonKind.OTHER, text=line)
         for node in self.nodes:
             node.refuse(problem)
         self._pause(self.nodes[0].now, problem)

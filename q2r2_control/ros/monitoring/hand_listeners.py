@@ -12,12 +12,12 @@ from typing import Any
 from rclpy.node import Node
 from std_msgs.msg import String
 
+from q2r2_control.events import ReasonKind
 from q2r2_control.ros.monitoring.endpoints import node_of
 
 _PERIOD = 0.1  # of asking the graph [s]
 _DISCOVERY = 1.0  # the graph knows one endpoint of a node before another, by less than this [s]
 _SILENT = 2.0  # nodes say what they do twice a second [s]
-PAUSED_BY_SERVICE = "the pause service"  # the reason that arms give
 _STARTING = "has not said yet what it does"
 
 
@@ -80,7 +80,10 @@ class HandListeners:
 
     def paused_by_a_person(self) -> bool:
         """Whether some arm's ``~/pause`` was called."""
-        return any(_is_arm(state) and PAUSED_BY_SERVICE in state["last_event"] for state, _ in self._states.values())
+        return any(
+            _is_arm(state) and state.get("last_event_kind") == ReasonKind.PAUSE_SERVICE
+            for state, _ in self._states.values()
+        )
 
     def _on_state(self, name: str, message: String) -> None:
         try:

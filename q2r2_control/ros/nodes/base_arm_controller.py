@@ -17,6 +17,7 @@ from q2r2_control.config.bindings import Action
 from q2r2_control.config.presets import BUILTIN
 from q2r2_control.config.teleop import GuardSettings, TeleopSettings
 from q2r2_control.errors import ConfigError
+from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.ros.base_node import ERROR, OK, WARN, BaseNode, run_nodes
 from q2r2_control.ros.bridge.arm_conditions import listen_to_condition
 from q2r2_control.ros.bridge.arm_feedback import ArmFeedback
@@ -29,11 +30,11 @@ from q2r2_control.ros.bridge.opening_grants import OpeningGrants
 from q2r2_control.ros.bridge.parameters import ArmDefaults, ArmParameters, arm_parameters
 from q2r2_control.ros.bridge.target_output import near
 from q2r2_control.ros.bridge.teleop_loop import TeleopLoop, TickInputs
-from q2r2_control.ros.monitoring.hand_listeners import PAUSED_BY_SERVICE
 from q2r2_control.teleop.arm import OPEN
 from q2r2_control.teleop.arm_states import AT_REST, HOLDING, ArmState
 from q2r2_control.teleop.sag import MOST_SAG
 from q2r2_control.types import SIDES, ArmTarget, HandSample
+from q2r2_control.wording import sentence
 
 _WITHOUT_HAND = ArmState.CARRIED, ArmState.HOMING  # where the arm's hand need not be there
 
@@ -104,7 +105,8 @@ class BaseArmController(BaseNode):
         self.loop.join(self)
         self._has_analog_gripper = self.parameters.teleop.bindings.words_of(Action.GRIPPER_ANALOG) is not None
         self._target, self._sent = ArmTarget(None, OPEN), None
-        self._refusal: tuple[bytes, str] | None = WARN, "has not begun yet"  # where time stands still it never does
+        not_begun = _in_words("has not begun yet")
+        self._refusal: tuple[bytes, Reason] | None = WARN, not_begun  # where time stands still it never does
         self.inputs = TickInputs(None, None, None, None)
 
     def setup_interfaces(self) -> None:
@@ -147,24 +149,28 @@ class BaseArmController(BaseNode):
         """The upper button was pressed."""
         self.gripper.toggle(self.now)
 
-    def begin_tick(self, now: float) -> str | None:
+    def begin_tick(self, now: float) -> Reason | None:
         """Renew :attr:`inputs` at ``now`` [s]; returns why the arm has to hold, its hand aside, or None."""
         tool, base, controlled = self.current_pose(), self._base(), self._safe_target.at(now)
         obstacle = self._obstacle(tool, base)
         silence = None if self.state in _WITHOUT_HAND else self._hand.silence(now)
-        self._refusal = obstacle or (None if silence is None else (WARN, silence))
+        self._refusal = obstacle or (None if silence is None else (WARN, _in_words(silence)))
         reference = None if controlled is None else self._safe_target.stamp
         commanded = None if tool is None else self._commanded(tool, controlled)
         self._base_pose = base
         self.inputs = TickInputs(tool, commanded, reference, None if obstacle is None else obstacle[1])
-        fault = self.outputs.take_fault(now) or (None if self._refusal is None else self._refusal[1])
-        return None if self.state in HOLDING else fault
+        line = self.outputs.take_fault(now)
+        if self.state in HOLDING:
+            return None
+        if line is not None:
+            return _in_words(line)
+        return None if self._refusal is None else self._refusal[1]
 
     def take_samples(self) -> list[HandSample]:
         """All samples of the hand since the last call, oldest first."""
         return self._hand.take()
 
-    def follow(self, target: ArmTarget, now: float, decided: float) -> str | None:
+    def follow(self, target: ArmTarget, now: float, decided: float) -> Reason | None:
         """Publish the ``target`` of this tick, and command the gripper; returns why the arm has to hold, or None.
 
         ``decided``: see :func:`publish_in_time`.
@@ -181,13 +187,13 @@ class BaseArmController(BaseNode):
         elif toggled:
             self.toggle_gripper()
         self.gripper.check(now)
-        return fault
+        return None if fault is None else _in_words(fault)
 
     def publish_feedback(self, now: float) -> None:
         """What the operator feels and sees of this tick."""
         self.feedback.publish(self.engaged, self._target, self._sent, self.inputs.tool, self.gripper, self.hand, now)
 
-    def refuse(self, problem: str) -> None:
+    def refuse(self, problem: Reason) -> None:
         """The arm may not be engaged until the next tick."""
         self._refusal = ERROR, problem
 
@@ -226,16 +232,18 @@ class BaseArmController(BaseNode):
             "slip": round(self._target.slip, 4),
             "slip_angle": round(self._target.slip_angle, 4),
             "gripper": self.gripper.state,
-            "last_event": self.feedback.last_event,
+            "last_event": self.feedback.last_line,
+            "last_event_kind": self.feedback.last_kind,
         }
         if self._refusal is not None:
-            return *self._refusal, values
+            level, reason = self._refusal
+            return level, sentence(reason), values | {"kind": str(reason.kind)}
         for problem in (self.gripper.problem, self.outputs.gripper_held, self.outputs.advice, self._frames.advice):
             if problem is not None:
                 return WARN, problem, values
         if self.state in AT_REST:
             return OK, f"ready to engage ({self.feedback.paused})", values  # whatever refused an earlier press is over
-        return OK, self.feedback.last_event, values
+        return OK, self.feedback.last_line, values
 
     def _base(self) -> pin.SE3 | None:
         """The frame that targets are published in, in the world frame."""
@@ -244,16 +252,17 @@ class BaseArmController(BaseNode):
         placement = self._frames.tree.find(self.parameters.base_frame, self.parameters.world_frame)
         return None if placement is None else placement.pose
 
-    def _obstacle(self, tool: pin.SE3 | None, base: pin.SE3 | None) -> tuple[bytes, str] | None:
+    def _obstacle(self, tool: pin.SE3 | None, base: pin.SE3 | None) -> tuple[bytes, Reason] | None:
         """Why the arm may not be engaged now, its hand aside, with the level of the diagnostics."""
         values = self.parameters
         if (line := self.outputs.conflict or self._frames.conflict(values.tool_frame)) is not None:
-            return ERROR, line
+            return ERROR, _in_words(line)
         if tool is None:
-            return WARN, f"the tool's pose is not known: {self._tool.problem or 'current_pose() gives none'}"
+            why = self._tool.problem or "current_pose() gives none"
+            return WARN, _in_words(f"the tool's pose is not known: {why}")
         if base is None:
-            return WARN, f"no transform from {values.base_frame} to {values.world_frame} on /tf"
-        return None if (line := self.outputs.unready) is None else (WARN, line)
+            return WARN, _in_words(f"no transform from {values.base_frame} to {values.world_frame} on /tf")
+        return None if (line := self.outputs.unready) is None else (WARN, _in_words(line))
 
     def _commanded(self, tool: pin.SE3, reference: pin.SE3 | None) -> pin.SE3:
         """The commanded tool pose: the leash is measured from it, and an anchor takes its orientation and the sag.
@@ -272,7 +281,7 @@ class BaseArmController(BaseNode):
             self.parameters = replace(self.parameters, teleop=settings, guard=guard)
             self.feedback.haptics.strength = settings.haptics.strength
             self.outputs.limit(guard)
-        return problem
+        return None if problem is None else sentence(problem)
 
     def _share_parameters(self, parameters: Sequence[Parameter]) -> None:
         """The nodes of one teleoperation have one value of its parameters."""
@@ -283,13 +292,13 @@ class BaseArmController(BaseNode):
                 node.set_parameters_atomically(changed)
 
     def _on_pause(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        self.loop.teleop.pause(self.now, PAUSED_BY_SERVICE, self.arm_name)
+        self.loop.teleop.pause(self.now, Reason(ReasonKind.PAUSE_SERVICE), self.arm_name)
         response.success, response.message = True, f"{self.arm_name} is paused"
         return response
 
     def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """Drop all that was received, the held target and a stop of the operator's; a press engages again."""
-        self.loop.teleop.reset(self.now, self.arm_name, "the reset service")
+        self.loop.teleop.reset(self.now, self.arm_name, Reason(ReasonKind.RESET_SERVICE))
         self.outputs.forget(self.now)
         response.success, response.message = True, f"{self.arm_name} is reset"
         return response
@@ -307,6 +316,10 @@ def run_arms(left: Callable[..., BaseArmController], right: Callable[..., BaseAr
         return made[0]
 
     return run_nodes([make_left, lambda: right(partner=made[0])])
+
+
+def _in_words(text: str) -> Reason:
+    return Reason.of(ReasonKind.OTHER, text=text)
 
 
 def _rounded(duration: float) -> float | None:

@@ -12,7 +12,6 @@ import json
 import sys
 import time
 from collections.abc import Mapping
-from dataclasses import asdict
 from functools import partial
 from importlib import import_module
 from pathlib import Path
@@ -27,6 +26,7 @@ from std_srvs.srv import Trigger
 
 from q2r2_control.config.cell import Config, load_config
 from q2r2_control.errors import ConfigError
+from q2r2_control.events import Event, Reason, ReasonKind
 from q2r2_control.judging.episode_judge import EpisodeJudge
 from q2r2_control.recording.about import ROS, About, as_yaml, program
 from q2r2_control.recording.message_recorder import ROOM, ROOM_WITH_PICTURES, MessageRecorder
@@ -35,22 +35,16 @@ from q2r2_control.recording.topics import Topic
 from q2r2_control.robot.robot import Robot
 from q2r2_control.ros.base_node import ERROR, LATCHED_QOS, OK, RECORDED_QOS, WARN, BaseNode, run_node
 from q2r2_control.ros.bridge.messages import age
-from q2r2_control.teleop.episode_marks import (
-    BEGINS,
-    DISCARDED,
-    ENDS,
-    FAILED,
-    MARK,
-    NO_RECORDING,
-    RECORDING_ENDED,
-    SUCCEEDED,
-    EpisodeMarks,
-)
-from q2r2_control.types import Event
+from q2r2_control.teleop.episode_marks import EpisodeMarks
+from q2r2_control.wording import sentence
 
 _SERVICES = {
-    **{"start": BEGINS, "stop": ENDS, "discard": DISCARDED},
-    **{"success": SUCCEEDED, "failure": FAILED, "mark": MARK},
+    "start": ReasonKind.EPISODE_BEGINS,
+    "stop": ReasonKind.EPISODE_ENDS,
+    "discard": ReasonKind.EPISODE_DISCARDED,
+    "success": ReasonKind.EPISODE_SUCCEEDED,
+    "failure": ReasonKind.EPISODE_FAILED,
+    "mark": ReasonKind.MARK,
 }
 _PERIOD = 0.02  # between two looks at what has arrived [s]
 _STREAM_QOS = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -90,7 +84,8 @@ class RecorderNode(BaseNode):
         self._judge = EpisodeJudge(lambda: self._recorder.file, self._tell, timed=False)
         robot = Robot.from_config(config)
         self._marks = EpisodeMarks()
-        self._served, self._served_last = 0, ""
+        self._served = 0
+        self._served_last: Reason | None = None
         self._waiting: list[_Waiting] = []
         self._events = self.create_publisher(String, RECORDER_EVENTS, RECORDED_QOS)
         topics = ros_topics(tuple(robot.arms), cameras)
@@ -102,8 +97,8 @@ class RecorderNode(BaseNode):
             qos = LATCHED_QOS if is_latched(topic.name) else RECORDED_QOS if is_reliable(topic) else _STREAM_QOS
             take = partial(self._take, topic, topic.name in told)
             self.create_subscription(_class_of(topic.type), heard_on(topic.name), take, qos, raw=True)
-        for name, reason in _SERVICES.items():
-            self.create_service(Trigger, f"~/{name}", partial(self._serve, reason))
+        for name, kind in _SERVICES.items():
+            self.create_service(Trigger, f"~/{name}", partial(self._serve, kind))
         self.create_tick(_PERIOD, self._write, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self._marks.recorded = self._recorder.fault is None
         if self._marks.recorded:
@@ -132,9 +127,9 @@ class RecorderNode(BaseNode):
         number, sent = info["publication_sequence_number"] or 0, info["source_timestamp"]
         self._waiting.append(_Waiting(received, topic, number, sent, bytes(payload)))
         if told:
-            reason = json.loads(deserialize_message(payload, String).data)["reason"]
-            self._marks.follow(reason)
-            self._judge.note(self._event(reason))
+            event = Event.from_json(json.loads(deserialize_message(payload, String).data))
+            self._marks.follow(event.kind)
+            self._judge.note(self._event(event.reason))
             self.report_health()
 
     def _day(self) -> int:
@@ -154,39 +149,39 @@ class RecorderNode(BaseNode):
         if self._marks.recorded and self._recorder.fault is not None:
             self._marks.recorded = False
             self.get_logger().error(f"nothing is recorded any more: {self._recorder.fault}")
-            self._tell(f"{RECORDING_ENDED}{self._recorder.fault}")
+            self._tell(Reason.of(ReasonKind.RECORDING_ENDED, text=self._recorder.fault))
 
     def _put(self, messages: list[_Waiting]) -> None:
         for received, topic, number, sent, payload in sorted(messages, key=lambda one: one.received):
             self._recorder.put(topic, number, received, sent, payload)
 
-    def _serve(self, reason: str, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    def _serve(self, kind: ReasonKind, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """Tell an event of the recording, unless it makes no sense now."""
-        refusal = self._refusal(reason)
-        response.success, response.message = refusal is None, refusal or reason
+        refusal, reason = self._refusal(kind), Reason(kind)
+        response.success, response.message = refusal is None, refusal or sentence(reason)
         if refusal is None:
-            self._marks.follow(reason)
+            self._marks.follow(kind)
             self._judge.note(self._event(reason))
             self._tell(reason)
         return response
 
-    def _event(self, reason: str) -> Event:
+    def _event(self, reason: Reason) -> Event:
         return Event(self._day() * 1e-9, "", "", "", reason)
 
-    def _tell(self, reason: str) -> None:
+    def _tell(self, reason: Reason) -> None:
         """Let the recording, and through the arms' nodes both hands, know of an event that no hand told."""
         self._served, self._served_last = self._served + 1, reason
-        self._events.publish(String(data=json.dumps(asdict(self._event(reason)))))
+        self._events.publish(String(data=json.dumps(self._event(reason).as_json())))
         self.report_health()
 
-    def _refusal(self, reason: str) -> str | None:
+    def _refusal(self, kind: ReasonKind) -> str | None:
         if not self._marks.recorded:
-            return f"{NO_RECORDING}: {self._recorder.fault}"
-        if reason == BEGINS and self._marks.open:
+            return f"{sentence(Reason(ReasonKind.NO_RECORDING))}: {self._recorder.fault}"
+        if kind is ReasonKind.EPISODE_BEGINS and self._marks.open:
             return "an episode has begun and not ended"
-        if reason == ENDS and not self._marks.open:
+        if kind is ReasonKind.EPISODE_ENDS and not self._marks.open:
             return "no episode has begun"
-        return "no episode has begun" if reason == DISCARDED and not self._marks.any else None
+        return "no episode has begun" if kind is ReasonKind.EPISODE_DISCARDED and not self._marks.any else None
 
     def health(self) -> tuple[bytes, str, Mapping[str, Any]]:
         """What is recorded where, what was lost, and whether an episode is open, which arms' nodes read here."""
@@ -199,7 +194,7 @@ class RecorderNode(BaseNode):
             "episode_open": self._marks.open,
             "any_episode": self._marks.any,
             "served": self._served,
-            "served_last": self._served_last,
+            "served_last": None if self._served_last is None else self._served_last.as_json(),
         }
         if recorder.fault is not None:
             return ERROR, f"nothing is recorded any more: {recorder.fault}", values

@@ -18,6 +18,7 @@ from q2r2_control.config.cell import HeadsetConfig, load_config
 from q2r2_control.config.networks import Network, network_of
 from q2r2_control.config.teleop import GateSettings
 from q2r2_control.errors import ConfigError
+from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.inputs.addresses import access_lines, written
 from q2r2_control.inputs.hands_watch import HandsWatch, Watched
 from q2r2_control.inputs.headset import HeadsetServer
@@ -28,6 +29,7 @@ from q2r2_control.ros.base_node import OK, STREAM_QOS, WARN, BaseNode, run_node
 from q2r2_control.ros.bridge.hand_topics import HandPublishers
 from q2r2_control.ros.bridge.messages import hand_twist
 from q2r2_control.types import SIDES, HandFault, HapticFeedback
+from q2r2_control.wording import sentence
 
 _SERVER_LOG = logging.getLogger("q2r2_control.inputs.headset")
 
@@ -117,7 +119,9 @@ class TcpEndpoint(BaseNode):
             before, self._faults[reception.hand] = self._faults[reception.hand], watched.fault
             if watched.fault is not None:
                 if before is not watched.fault:
-                    self.get_logger().warning(f"{reception.hand} hand: {watched.fault}; its poses are left out")
+                    self.get_logger().warning(
+                        f"{reception.hand} hand: {sentence(Reason(ReasonKind(watched.fault)))}; its poses are left out"
+                    )
                 return
         frame = self._frames[reception.hand] or (message.frame_id if isinstance(message, HandPose) else "")
         self._publishers_of_hands.publish(reception.topic, message, frame, self.now)
