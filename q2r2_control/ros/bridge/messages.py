@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import Pose, PoseStamped, Twist, Vector3
+from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion, Twist, Vector3
 from quest2ros.msg import OVR2ROSInputs
 from sensor_msgs.msg import JointState
 
@@ -63,18 +63,16 @@ def time_message(t: float) -> Time:
 
 def pose_message(pose: pin.SE3) -> Pose:
     """A pose with a unit quaternion, x y z w."""
-    message = Pose()
-    _write(pose.translation, pin.Quaternion(pose.rotation).normalized().coeffs(), message.position, message.orientation)
-    return message
+    x, y, z = pose.translation.tolist()
+    qx, qy, qz, qw = pin.Quaternion(pose.rotation).normalized().coeffs().tolist()
+    return Pose(position=Point(x=x, y=y, z=z), orientation=Quaternion(x=qx, y=qy, z=qz, w=qw))
 
 
 def stamped_pose(pose: pin.SE3, frame: str, t: float) -> PoseStamped:
     """A pose in ``frame`` at ``t`` [s]."""
-    message = PoseStamped()
+    message = PoseStamped(pose=pose_message(pose))
     message.header.frame_id = frame
     message.header.stamp = time_message(t)
-    to = message.pose
-    _write(pose.translation, pin.Quaternion(pose.rotation).normalized().coeffs(), to.position, to.orientation)
     return message
 
 
@@ -84,13 +82,8 @@ def pose_of(message: Pose) -> pin.SE3 | None:
     return pose_of_numbers((p.x, p.y, p.z, o.x, o.y, o.z, o.w))
 
 
-def pose_numbers(pose: pin.SE3) -> tuple[float, ...]:
-    """Position and quaternion x y z w, of those that have no message of their own."""
-    return tuple(pin.SE3ToXYZQUATtuple(pose))
-
-
 def pose_of_numbers(numbers: Sequence[float]) -> pin.SE3 | None:
-    """The pose of :func:`pose_numbers`; None as in :func:`pose_of`."""
+    """The pose of a position and a quaternion x y z w; None as in :func:`pose_of`."""
     if not are_a_pose(numbers):
         return None
     pose = np.array(numbers)
@@ -208,10 +201,3 @@ def _order(given: tuple[str, ...], names: tuple[str, ...]) -> Array | str:
 def _quaternion(message: Pose) -> Array:
     orientation = message.orientation
     return np.array([orientation.x, orientation.y, orientation.z, orientation.w])
-
-
-def _write(position: Array, quaternion: Array, to_position: object, to_quaternion: object) -> None:
-    for name, value in zip("xyz", position.tolist(), strict=True):
-        setattr(to_position, name, value)
-    for name, value in zip("xyzw", quaternion.tolist(), strict=True):
-        setattr(to_quaternion, name, value)
