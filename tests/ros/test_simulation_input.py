@@ -80,20 +80,6 @@ def test_poses_inputs_and_twists_are_the_scripts_own(node: Any, processes: Proce
     assert_a_part_of(np.hstack([linear, angular]), np.array([[*m.linear, *m.angular] for m in motions]), 1e-6)
 
 
-def test_a_mode_publishes_only_its_topics(node: Any, processes: Processes) -> None:
-    left, right = subscribe(node, "left"), subscribe(node, "right")
-    start(processes, side="left", mode="teleop")
-    start(processes, side="right", mode="velocity")
-    for queue in (left["pose"], left["inputs"], right["twist"]):
-        queue.get(timeout=PATIENCE)
-    published = {
-        f"{hand} {suffix}": len(node.get_publishers_info_by_topic(f"/q2r_{hand}_hand_{suffix}"))
-        for hand in ("left", "right")
-        for suffix in left
-    }
-    assert {name for name, count in published.items() if count} == {"left pose", "left inputs", "right twist"}
-
-
 def test_the_script_waits_until_both_hands_are_listened_to(node: Any, processes: Processes) -> None:
     states = States(node, "simulation_input")
     left = subscribe(node, "left")
