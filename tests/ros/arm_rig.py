@@ -205,18 +205,14 @@ class ArmRigs:
             rig.sends_hand = True
 
     def press_until(self, condition: Callable[[ArmRig], Any], what: str) -> None:
-        """Press again where a press had no effect for long: an overloaded machine loses one now and then."""
-        deadline = time.monotonic() + PATIENCE
-        while rigs := [rig for rig in self.rigs if not condition(rig)]:
-            assert time.monotonic() < deadline, f"{rigs[0].arm}: waited until {what}; state {rigs[0].state}"
-            for rig in rigs:
-                rig.lower = True
-            time.sleep(0.15)
-            for rig in rigs:
-                rig.lower = False
-            patience = time.monotonic() + 3.0
-            while not all(map(condition, rigs)) and time.monotonic() < patience:
-                time.sleep(0.01)
+        """Press the lower buttons of those for which ``condition`` does not hold yet, and wait until it does."""
+        rigs = [rig for rig in self.rigs if not condition(rig)]
+        for rig in rigs:
+            rig.lower = True
+        time.sleep(0.15)
+        for rig in rigs:
+            rig.lower = False
+        self.wait(condition, what)
 
 
 def stamped_transform(parent: str, child: str, pose: pin.SE3) -> TransformStamped:

