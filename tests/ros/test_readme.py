@@ -26,7 +26,6 @@ from tests.ros.arm_rig import TOOL, ArmRig, assert_same, first, offset, patient,
 from tests.ros.joint_recorder import JointRecorder  # noqa: E402
 from tests.ros.waiting import wait_until  # noqa: E402
 
-FEW, STARTS = 3, 10  # of the command in the README
 MOVED = 0.05  # [rad]
 
 
@@ -68,10 +67,7 @@ def test_the_subclass_in_the_readme_teleoperates_its_arm_in_its_robots_frame(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "start", [*range(FEW), *(pytest.param(start, marks=pytest.mark.soak) for start in range(FEW, STARTS))]
-)
-def test_the_command_in_the_readme_moves_both_arms(start: int, node: Any, robot: Robot, processes: Processes) -> None:
+def test_the_command_in_the_readme_moves_both_arms(node: Any, robot: Robot, processes: Processes) -> None:
     command = re.search(r"`q2r2 (ros up \S+ --input scripted)`", (ROOT / "README.md").read_text())
     assert command is not None
     joints = JointRecorder(robot)
