@@ -18,14 +18,20 @@ from tests.ros.waiting import wait_until
 class Cockpit:
     """Two hands that drive the simulated arms through their nodes."""
 
-    def __init__(self, node: Any, robot: Robot, processes: Processes, bindings: Mapping[str, str]) -> None:
+    def __init__(
+        self, node: Any, robot: Robot, processes: Processes, bindings: Mapping[str, str], apart: bool = False
+    ) -> None:
+        """``apart``: each arm's node is a process of its own."""
         nodes = start_robot(processes), start_controller(processes, *PATIENT)
         self.cell = Cell(node, robot, *nodes, targets="/not_used/{arm}")  # the arms' nodes publish targets
         self.left, self.right = ArmRig(node, "left"), ArmRig(node, "right")
         self.rigs = ArmRigs([self.left, self.right])
         for rig in self.rigs.rigs:
             rig.sends_tool = rig.follows = False
-        processes.start_module("q2r2_control.ros.nodes.arm_controllers", *patient(dict(bindings)))
+        names = ("left_arm_controller", "right_arm_controller") if apart else ("arm_controllers",)
+        self.arms = [
+            processes.start_module(f"q2r2_control.ros.nodes.{name}", *patient(dict(bindings))) for name in names
+        ]
         self.rigs.wait(lambda rig: rig.state.get("hand_age") is not None, "its node receives the hand")
         wait_until(lambda: self.cell.state("phase") == "active", "the controller is active")
 

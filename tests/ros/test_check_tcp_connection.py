@@ -42,27 +42,15 @@ def left_hand_publishing(node: Any) -> Iterator[None]:
 def test_it_shows_values_rate_and_age_and_tells_a_timeout(node: Any, processes: Processes) -> None:
     states = States(node, "check_tcp_connection")
     check = processes.start_module(MODULE)
-    terminal = {"FORCE_COLOR": "1", "TERM": "xterm", "COLUMNS": "140"}
-    table = processes.start_module(MODULE, "--ros-args", "-r", "__node:=table", **terminal)
     with left_hand_publishing(node):
-        pose = check.wait_for("s old: 1.00 2.00 -3.00 m, quaternion 0.00 0.00 0.00 -1.00")
-        assert re.fullmatch(r"q2r_left_hand_pose: \d+ messages, \d+ Hz, \d\.\d\d s old: .*", pose)
-        assert check.wait_for("s old: 0.50 0.00 0.00 m/s").startswith("q2r_left_hand_twist: ")
-        assert check.wait_for("held: lower, triggers 0.8 0.0").startswith("q2r_left_hand_inputs: ")
-        check.wait_for("q2r_right_hand_pose: timeout, nothing yet")
+        check.wait_for("s old: 1.00 2.00 -3.00 m, quaternion 0.00 0.00 0.00 -1.00")
+        check.wait_for("held: lower, triggers 0.8 0.0")
         state = states.wait_for("timeout, nothing for 2 s: q2r_right_hand_pose")
         assert state["level"] == "warn"
         assert state["rate_hz"]["q2r_left_hand_pose"] > 0.0
-        assert "q2r_left_hand_pose" in table.wait_for("1.00 2.00 -3.00 m")
-        # The left hand's lines may have said so too, before the table's process had found the publishers.
-        wait_until(
-            lambda: any("right_hand" in x and "timeout  nothing yet" in x for x in table.output.splitlines()),
-            "the table says that the right hand never came",
-        )
     wait_until(lambda: re.search(r"q2r_left_hand_pose: timeout, \d+ messages", check.output), "a timeout of the pose")
-    assert "q2r_left_hand_pose" in table.wait_for("timeout  1.00 2.00 -3.00 m")
     assert states.wait_for("q2r_left_hand_pose")["level"] == "error"
-    assert (check.interrupt(), table.interrupt()) == (0, 0)
+    assert check.interrupt() == 0
 
 
 def test_after_its_duration_the_exit_code_says_whether_anything_arrives(node: Any, processes: Processes) -> None:
