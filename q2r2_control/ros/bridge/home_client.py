@@ -27,16 +27,16 @@ class HomeClient:
 
     def update(self, teleop: Teleop, said: bool, outcome: str, now: float) -> None:
         """Once a tick; ``said``: whether the controller says that it goes home, ``outcome``: how the last way ended."""
-        begins, self._said = said and not self._said, said
-        if self._since is None and begins and not teleop.homing:  # whoever has called the service
+        asked, begins, self._said = teleop.homing, said and not self._said, said
+        if self._since is None and begins and not asked:  # whoever has called the service
             teleop.home(now)
             if teleop.homing:
                 self._answer, self._since, self._seen = None, now, True
             else:
                 self._call_hold()
-        elif self._since is None and teleop.homing:
+        elif self._since is None and asked:
             self._call_home(teleop, now)
-        elif self._since is not None and not teleop.homing:
+        elif self._since is not None and not asked:
             self._since = None
             self._call_hold()
         elif self._since is not None:
