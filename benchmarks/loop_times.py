@@ -196,9 +196,9 @@ def main(
     }
     table = figure_table(
         f"{config.name}: one tick of the live loop at {config.loop_rate_hz:g} Hz, {rounds} runs of {ticks} ticks each",
-        ("stage", *(f"{name}, {figure} [us]" for name in found for figure in ("median", "p99"))),
+        ("median / p99", *(f"{name} [us]" for name in found)),
         (
-            (what, *(figure for rows in found.values() for figure in (rows[what].median_us, rows[what].p99_us)))
+            (what, *(f"{rows[what].median_us:.0f} / {rows[what].p99_us:.0f}" for rows in found.values()))
             for what in next(iter(found.values()))
         ),
         NOTES,

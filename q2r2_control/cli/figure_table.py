@@ -1,4 +1,4 @@
-"""The one table of figures that commands and benchmarks print."""
+"""The one table that commands and benchmarks print."""
 
 from __future__ import annotations
 
@@ -16,18 +16,22 @@ Cell = Text | str | float | None
 def figure_table(
     title: str, columns: Sequence[str], rows: Iterable[Sequence[Cell]], notes: Sequence[str] = ()
 ) -> Table:
-    """A table whose first column holds names, and all others figures; ``notes`` are lines below it.
+    """A table of figures and names under headings; ``notes`` are lines below it.
 
-    Each heading's unit, which follows its last space, stands in a second line. A row of one cell is the heading of the
-    rows below it.
+    A heading's unit, which follows its last space, stands in a second line. A column with a unit or with numbers keeps
+    to the right and is never cut; others go on in the next line. A row of one cell is the heading of the rows below.
     """
-    table = Table(title=Text(title), title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
-    table.add_column(columns[0], overflow="fold")
-    for column in columns[1:]:
+    rows = [tuple(row) for row in rows]
+    look: Any = {"box": box.SIMPLE_HEAD, "padding": (0, 1, 0, 0), "pad_edge": False, "min_width": len(title)}
+    table = Table(title=Text(title), title_justify="left", **look)
+    for index, column in enumerate(columns):
         name, _, unit = column.rpartition(" ")
-        table.add_column(Text(f"{name}\n{unit}"), justify="right", no_wrap=True)
+        numbers = any(isinstance(row[index], int | float) for row in rows if len(row) > index)
+        figures = index > 0 and (numbers or unit.startswith(("[", "/")))
+        heading = Text(f"{name}\n{unit}" if figures else column)
+        table.add_column(heading, justify="right" if figures else "left", no_wrap=figures, overflow="fold")
     for row in rows:
-        table.add_row(*map(_shown, row), style="bold" if len(row) == 1 else None)
+        table.add_row(*map(_shown, row), style="bold" if len(row) == 1 < len(columns) else None)
     if notes:
         table.caption, table.caption_justify = Text("\n".join(notes)), "left"
     return table

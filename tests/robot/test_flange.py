@@ -13,7 +13,7 @@ import pinocchio as pin
 import pytest
 
 from q2r2_control.cli.cell_report import check_cell
-from q2r2_control.cli.tables import arm_table
+from q2r2_control.cli.check import arm_table
 from q2r2_control.config.cell import Config, load_config
 from q2r2_control.errors import ConfigError
 from q2r2_control.plants.mujoco_model import build_model
