@@ -171,16 +171,3 @@ def test_an_arm_that_a_person_pauses_is_not_engaged_again(node: Any, processes: 
     drained(left["inputs"])
     time.sleep(2.5)
     assert not any(message.button_lower for message in drained(left["inputs"]))
-
-
-def test_a_bad_parameter_is_one_line(processes: Processes) -> None:
-    complaints = {
-        "side:=up": "parameter side: 'up': allowed are left, right, both",
-        "trajectory:=spiral": "parameter trajectory: 'spiral': allowed are circle, line",
-        "rate:=0.0": "allowed is 1 .. 250",
-    }
-    started = [processes.start_module(MODULE, "--ros-args", "-p", parameter) for parameter in complaints]
-    for process, complaint in zip(started, complaints.values(), strict=True):
-        assert process.wait(3.0 * PATIENCE) == 2
-        (line,) = process.output.splitlines()
-        assert complaint in line
