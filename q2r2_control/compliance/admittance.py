@@ -4,7 +4,7 @@ In the tick it stands between teleop and control:  target -> Admittance.update -
 every limit and distance whatever is asked of it, so the displacement needs no bounds but those for the operator's
 sake. Only the QP sees the displaced target: recordings and the teleop layer go on with the operator's own.
 
-The law and its reasons stand in admittance_kernels.py. What the tool shows is the admittance in series with the servos
+The law and its reasons stand in admittance_law.py. What the tool shows is the admittance in series with the servos
 below it: a tool held by soft servos moves by their own give besides. Against a stiff body the loop closes through QP
 and servos with their delay: with the defaults a simulated arm leans quietly on 10 kN/m, and on 30 kN/m with twice the
 damping ratio or four times the mass. What the tool carries without its model knowing counts as a push downwards.
@@ -19,19 +19,13 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio as pin
 
-from q2r2_control.compliance.admittance_kernels import (
-    NOT_MEASURED,
-    TOUCHED,
-    UNUSABLE,
-    AdmittanceData,
-    AdmittanceModel,
-    step_admittance,
-)
+from q2r2_control.compliance.admittance_law import estimate_wrench, oscillate, rest_displacement, stop_at_limit
 from q2r2_control.config.control import AdmittanceSettings
-from q2r2_control.control.jit import hold
-from q2r2_control.control.tasks.task_model import tools_of
-from q2r2_control.robot.robot import Robot
+from q2r2_control.robot.robot import Arm, Robot
 from q2r2_control.types import Array, RobotState
+
+# Below it a displacement counts as over [m, rad, per second].
+_NOTHING = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,17 +50,14 @@ class Admittance:
     def __init__(self, robot: Robot, settings: AdmittanceSettings | None = None) -> None:
         self.settings = settings or AdmittanceSettings()
         self._model, self._data = robot.model, robot.model.createData()
-        self._frames = {name: arm.frame_id for name, arm in robot.arms.items()}
-        self._kernel_data = AdmittanceData.empty(len(robot.arms), robot.model.nv)
-        self._held_model, self._held_data = hold(_model_of(robot, self.settings)), hold(self._kernel_data)
-        # The kernel runs once here, so that it is not compiled in mid-motion.
-        step_admittance(self._held_model, self._held_data, NOT_MEASURED, 0.001)
+        self._arms: dict[str, Arm] = dict(robot.arms)
         self.reset()
 
     def reset(self) -> None:
         """Forget wrenches and displacements."""
-        for array in (self._kernel_data.wrench, self._kernel_data.x, self._kernel_data.v):
-            array[:] = 0.0
+        self._wrench = {arm: np.zeros(6) for arm in self._arms}  # after the low-pass [N, Nm]
+        self._x = {arm: np.zeros(6) for arm in self._arms}  # displacement [m, rad]
+        self._v = {arm: np.zeros(6) for arm in self._arms}  # [m/s, rad/s]
         self._rejected = False
 
     def update(self, targets: Mapping[str, pin.SE3 | None], state: RobotState, dt: float) -> dict[str, pin.SE3 | None]:
@@ -80,44 +71,50 @@ class Admittance:
         Torques or a posture that are not finite hold the last wrench; a dt that is not positive and finite moves
         nothing; the report says so. A target that is not finite stays so, for the controller to refuse.
         """
-        self._rejected = True
-        if math.isfinite(dt) and dt > 0.0:
-            measured = self._measure(state)
-            self._rejected = measured == UNUSABLE
-            self._kernel_data.follows[:] = [targets.get(name) is not None for name in self._frames]
-            step_admittance(self._held_model, self._held_data, measured, float(dt))
+        self._rejected = not (math.isfinite(dt) and dt > 0.0)
+        if not self._rejected:
+            self._filter_wrenches(state, dt)
+            for arm in self._arms:
+                self._displace(arm, targets.get(arm) is not None, dt)
         displaced = dict(targets)
-        for x, name in zip(self._kernel_data.x, self._frames, strict=True):
-            target = targets.get(name)
+        for arm, x in self._x.items():
+            target = targets.get(arm)
             if target is not None and x.any():
-                displaced[name] = pin.SE3(pin.exp3(x[3:]) @ target.rotation, target.translation + x[:3])
+                displaced[arm] = pin.SE3(pin.exp3(x[3:]) @ target.rotation, target.translation + x[:3])
         return displaced
 
     def report(self) -> AdmittanceReport:
         """Of the last update."""
-        arms = zip(self._frames, self._kernel_data.wrench.copy(), self._kernel_data.x.copy(), strict=True)
-        return AdmittanceReport({name: ArmCompliance(wrench, x) for name, wrench, x in arms}, self._rejected)
+        arms = {arm: ArmCompliance(self._wrench[arm].copy(), x.copy()) for arm, x in self._x.items()}
+        return AdmittanceReport(arms, self._rejected)
 
-    def _measure(self, state: RobotState) -> int:
+    def _filter_wrenches(self, state: RobotState, dt: float) -> None:
+        """Let every arm's wrench approach the measured one, or none where nothing is measured."""
         tau, q = state.tau_external, state.q
-        if tau is None:
-            return NOT_MEASURED
-        if not (math.isfinite(tau.sum()) and math.isfinite(q.sum())):
-            return UNUSABLE
-        self._kernel_data.tau[:] = tau
-        pin.computeJointJacobians(self._model, self._data, q)
-        for J, frame in zip(self._kernel_data.J, self._frames.values(), strict=True):
-            J[:] = pin.getFrameJacobian(self._model, self._data, frame, pin.LOCAL_WORLD_ALIGNED).reshape(J.shape)
-        return TOUCHED
+        if tau is not None:
+            self._rejected = not (math.isfinite(tau.sum()) and math.isfinite(q.sum()))
+            if self._rejected:
+                return
+            pin.computeJointJacobians(self._model, self._data, q)
+        time = self.settings.filter_time
+        share = 1.0 - math.exp(-dt / time) if time > 0.0 else 1.0
+        for name, arm in self._arms.items():
+            estimate = np.zeros(6)
+            if tau is not None:
+                J = pin.getFrameJacobian(self._model, self._data, arm.frame_id, pin.LOCAL_WORLD_ALIGNED)
+                estimate = estimate_wrench(J[:, arm.joints], tau[arm.joints])
+            self._wrench[name] += share * (estimate - self._wrench[name])
 
-
-def _model_of(robot: Robot, settings: AdmittanceSettings) -> AdmittanceModel:
-    return AdmittanceModel(
-        stiffness=np.array([settings.stiffness, settings.rotation_stiffness]),
-        inertia=np.array([settings.mass, settings.inertia]),
-        dead_band=np.array([settings.force_dead_band, settings.torque_dead_band]),
-        limit=np.array([settings.max_displacement, settings.max_rotation]),
-        damping_ratio=settings.damping_ratio,
-        filter_time=settings.filter_time,
-        member=tools_of(robot).member,
-    )
+    def _displace(self, arm: str, follows: bool, dt: float) -> None:
+        """Move one arm's displacement by ``dt``; it ends at once where the arm follows no target."""
+        law, wrench, x, v, pushed = self.settings, self._wrench[arm], self._x[arm], self._v[arm], False
+        linear = (slice(0, 3), law.stiffness, law.mass, law.force_dead_band, law.max_displacement)
+        angular = (slice(3, 6), law.rotation_stiffness, law.inertia, law.torque_dead_band, law.max_rotation)
+        for part, stiffness, inertia, dead_band, limit in (linear, angular):
+            rest = rest_displacement(wrench[part], dead_band, stiffness, limit)
+            away, v[part] = oscillate(x[part] - rest, v[part], math.sqrt(stiffness / inertia), law.damping_ratio, dt)
+            x[part], v[part] = stop_at_limit(rest + away, v[part], limit)
+            pushed |= bool(rest.any())
+        over = not pushed and np.abs(x).max() < _NOTHING and np.abs(v).max() < _NOTHING
+        if over or not follows:
+            x[:], v[:] = 0.0, 0.0

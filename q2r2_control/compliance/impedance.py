@@ -27,23 +27,20 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+import pinocchio as pin
 from pydantic import ValidationError
 
-from q2r2_control.compliance.impedance_data import ImpedanceData, ImpedanceModel
-from q2r2_control.compliance.impedance_kernels import (
-    BOUNDED,
-    CLIPPED,
-    HELD,
-    REPELLED,
-    gravity_torque,
-    impedance_torque,
+from q2r2_control.compliance.impedance_law import (
+    BoolArray,
+    PositionLimits,
+    ToolMotions,
+    bound_torque,
+    clip_errors,
+    limit_repulsion,
+    plausible,
+    springs_torque,
 )
-from q2r2_control.compliance.impedance_terms import BoolArray, PositionLimits
-from q2r2_control.compliance.joint_dynamics import LinkInertias
 from q2r2_control.config.control import LIVE_IMPEDANCE, ImpedanceSettings
-from q2r2_control.control.geometry.kinematics import IntArray, chain_of
-from q2r2_control.control.jit import bound, hold
-from q2r2_control.control.tasks.task_model import tools_of
 from q2r2_control.errors import ConfigError, RobotError
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import LONGEST_DT, Array, Reference, RobotState
@@ -87,17 +84,26 @@ class ImpedanceController:
         self._payloads = {arm: held for arm, held in robot.objects.by_arm.items() if held.config.mass > 0.0}
         self._borne = dict.fromkeys(self._payloads, 0.0)  # share of each payload's mass
         self._wanted_borne = dict(self._borne)
-        model = _model_of(robot, self.settings)
-        self._bodies, self._data = model.bodies, ImpedanceData.empty(model)
-        self._inputs = self._data.inputs.reshape(-1)  # a view
-        self._held_model, self._held_data = hold(model), hold(self._data)
-        self._data.springs[:] = [getattr(self.settings, name) for name in LIVE_IMPEDANCE]
-        self._wanted_springs = self._data.springs.copy()  # at the end of a ramp
-        self._ramp_rate = np.zeros_like(self._wanted_springs)
+        self._frames = [arm.frame_id for arm in robot.arms.values()]
+        self._position_limits = PositionLimits(
+            lower=robot.position_lower,
+            upper=robot.position_upper,
+            stiffness=self.settings.limit_stiffness,
+            damping=self.settings.limit_damping,
+            distance=self.settings.limit_distance,
+        )
+        # A copy, to which payloads are added, with what is computed of the measured and of the wanted posture.
+        self._model = robot.model.copy()
+        self._measured, self._wanted = self._model.createData(), self._model.createData()
+        k, nv = len(self._arms), self._model.nv
+        member = np.array([np.isin(np.arange(nv), arm.joints) for arm in robot.arms.values()], dtype=np.float64)
+        self._tools = ToolMotions(np.zeros((k, 6, nv)), np.zeros((k, 6)), np.zeros((k, 6)), member)
+        self._clipped = np.zeros(k, dtype=np.bool_)
+        values = [float(getattr(self.settings, name)) for name in LIVE_IMPEDANCE]
+        self._springs = np.tile(values, (len(self._arms), 1))  # in force
+        self._wanted_springs = self._springs.copy()  # at the end of a ramp
+        self._ramp_rate = np.zeros_like(self._springs)
         self._ramping = False
-        # Every kernel runs once here, so that none is compiled in mid-motion.
-        self._gravity_torque = bound(gravity_torque, self._held_model, self._held_data)
-        self._impedance_torque = bound(impedance_torque, self._held_model, self._held_data, 0.0)
         self._begin(robot.home)
 
     def reset(self, state: RobotState) -> None:
@@ -109,25 +115,20 @@ class ImpedanceController:
         q = np.array(state.q, dtype=np.float64)
         if q.shape != self._limit.shape or not np.isfinite(q).all():
             raise RobotError(f"impedance reset: q = {q!s:.80}: expected {len(self._limit)} finite numbers")
-        self._data.springs[:] = self._wanted_springs
+        self._springs[:] = self._wanted_springs
         self._ramping = False
         if self._borne != self._wanted_borne:
             self._bear(1.0)
         self._begin(q)
 
     def _begin(self, q: Array) -> None:
-        data = self._data
-        data.references.due_q[:], data.references.due_v[:] = q, 0.0
-        data.usable_q[:] = q
-        data.bounded[:] = np.minimum(np.maximum(self.gravity(q), -self._limit), self._limit)
+        self._due = (q, np.zeros_like(q))  # posture and speed of the reference that is due now
+        self._usable_q = q  # the newest measured posture that was of use
+        self._commanded: Array = np.minimum(np.maximum(self.gravity(q), -self._limit), self._limit)
 
     def gravity(self, q: Array) -> Array:
         """Torque (nv,) that bears the arms, with what they hold, at a posture ``q`` (nv,) [rad], [Nm]."""
-        data = self._data
-        usable, data.usable_q[:] = data.usable_q.copy(), q
-        self._gravity_torque(self._held_model, self._held_data)
-        data.usable_q[:] = usable
-        return data.tau.copy()
+        return np.array(pin.computeGeneralizedGravity(self._model, self._measured, q))
 
     def set_holding(self, holding: Mapping[str, bool]) -> None:
         """Of each arm whose gripper has an object, whether it is held and its mass to be borne."""
@@ -143,7 +144,7 @@ class ImpedanceController:
             if self._borne[arm] > 0.0:
                 inertias[held.joint] = inertias[held.joint] + held.inertia(self._borne[arm])
         for joint, inertia in inertias.items():
-            self._bodies.put(joint, inertia)
+            self._model.inertias[joint] = inertia
 
     def change(self, values: Mapping[str, float], arm: str | None = None) -> None:
         """Go by other stiffness and damping of one arm or of all, by name as in ``LIVE_IMPEDANCE``.
@@ -167,13 +168,13 @@ class ImpedanceController:
         for name, value in values.items():
             column = LIVE_IMPEDANCE.index(name)
             self._wanted_springs[changed, column] = value
-            way = self._wanted_springs[changed, column] - self._data.springs[changed, column]
+            way = self._wanted_springs[changed, column] - self._springs[changed, column]
             self._ramp_rate[changed, column] = np.abs(way) / self.settings.ramp_time
         self._ramping = True
 
     def in_force(self, arm: str) -> dict[str, float]:
         """What of ``LIVE_IMPEDANCE`` an arm goes by now."""
-        return dict(zip(LIVE_IMPEDANCE, self._data.springs[self._arms.index(arm)].tolist(), strict=True))
+        return dict(zip(LIVE_IMPEDANCE, self._springs[self._arms.index(arm)].tolist(), strict=True))
 
     def step(self, reference: Reference, state: RobotState, dt: float, extra: Array | None = None) -> TorqueCommand:
         """Torques for a tick of ``dt`` [s] that begins at ``state`` and ends when ``reference`` is due.
@@ -188,53 +189,73 @@ class ImpedanceController:
             self._ramp(time)
         if self._borne != self._wanted_borne:
             self._bear(time / _PAYLOAD_TIME)
-        data = self._data
-        added = data.no_motion if extra is None else extra
-        np.concatenate((state.q, state.v, reference.q, reference.v, reference.a, added), out=self._inputs)
+        wanted_q, wanted_v, a = self._next_reference(reference)
+        torque = None
+        if plausible(state.q, state.v) and (extra is None or plausible(extra)):
+            torque = self._law(state.q, state.v, wanted_q, wanted_v, a)
+        if torque is None:
+            torque, report = self.gravity(self._usable_q), ImpedanceReport({}, (), (), (), (), held=True)
+        else:
+            self._usable_q = state.q
+            repulsion = limit_repulsion(self._position_limits, state.q, state.v, wanted_q)
+            torque = torque + repulsion if extra is None else torque + repulsion + extra
+            report = ImpedanceReport(
+                errors=dict(zip(self._arms, self._tools.error.copy(), strict=True)),
+                clipped=_those(self._arms, self._clipped),
+                saturated=(),
+                rate_limited=(),
+                repelled=_those(self.robot.joint_names, repulsion),
+                held=False,
+            )
         change = self.settings.torque_rate_limit * time
-        found = self._impedance_torque(self._held_model, self._held_data, change)
-        held, joints = bool(found & HELD), self.robot.joint_names
-        report = ImpedanceReport(
-            errors={} if held else dict(zip(self._arms, data.errors.copy(), strict=True)),
-            clipped=_those(self._arms, data.clipped) if found & CLIPPED else (),
-            saturated=_those(joints, data.saturated) if found & BOUNDED else (),
-            rate_limited=_those(joints, data.rate_limited) if found & BOUNDED else (),
-            repelled=_those(joints, data.repulsion) if found & REPELLED else (),
-            held=held,
-        )
-        return TorqueCommand(data.bounded.copy(), report)
+        self._commanded, saturated, late = bound_torque(torque, self._commanded, self._limit, change)
+        report.saturated, report.rate_limited = (_those(self.robot.joint_names, which) for which in (saturated, late))
+        return TorqueCommand(self._commanded, report)
+
+    def _next_reference(self, newest: Reference) -> tuple[Array, Array, Array]:
+        """Posture and speed that are due now, and the acceleration that leads to the ``newest``, which is kept."""
+        (wanted_q, wanted_v), at_rest = self._due, np.zeros(len(self._limit))
+        if not plausible(newest.q, newest.v, newest.a):
+            self._due = (wanted_q, at_rest)
+            return wanted_q, wanted_v, at_rest
+        self._due = (newest.q, newest.v)
+        return wanted_q, wanted_v, newest.a
+
+    def _law(self, q: Array, v: Array, wanted_q: Array, wanted_v: Array, a: Array) -> Array | None:
+        """Torque (nv,) of springs, postures and feed-forward, without bounds; None where no number comes of it."""
+        model, measured, settings = self._model, self._measured, self.settings
+        self._update_tools(q, wanted_q, wanted_v)
+        self._clipped = clip_errors(self._tools.error, settings.max_position_error, settings.max_rotation_error)
+        M, M_inverse = pin.crba(model, measured, q), pin.computeMinverse(model, measured, q)
+        consistent = settings.nullspace_projector == "consistent"
+        try:
+            springs = springs_torque(
+                self._tools, v, wanted_q - q, wanted_v - v, M, M_inverse, self._springs, consistent
+            )
+        except np.linalg.LinAlgError:
+            return None
+        tau: Array = pin.rnea(model, measured, q, v, a) + springs
+        return tau if np.isfinite(tau).all() else None
+
+    def _update_tools(self, q: Array, wanted_q: Array, wanted_v: Array) -> None:
+        """Measured Jacobians, wanted twists, and the ways from measured to wanted poses."""
+        model, measured, wanted, tools = self._model, self._measured, self._wanted, self._tools
+        pin.computeJointJacobians(model, measured, q)
+        pin.forwardKinematics(model, wanted, wanted_q, wanted_v)
+        for i, frame in enumerate(self._frames):
+            tools.J[i] = pin.getFrameJacobian(model, measured, frame, pin.LOCAL_WORLD_ALIGNED)
+            tools.wanted_twist[i] = pin.getFrameVelocity(model, wanted, frame, pin.LOCAL_WORLD_ALIGNED).vector
+            here = pin.updateFramePlacement(model, measured, frame)
+            there = pin.updateFramePlacement(model, wanted, frame)
+            tools.error[i, :3] = there.translation - here.translation
+            tools.error[i, 3:] = pin.log3(there.rotation @ here.rotation.T)
 
     def _ramp(self, time: float) -> None:
-        reach, springs = self._ramp_rate * time, self._data.springs
+        reach, springs = self._ramp_rate * time, self._springs
         springs[:] += np.minimum(np.maximum(self._wanted_springs - springs, -reach), reach)
         self._ramping = bool((springs != self._wanted_springs).any())
 
 
-def _model_of(robot: Robot, settings: ImpedanceSettings) -> ImpedanceModel:
-    arms = list(robot.arms.values())
-    joints = np.zeros((len(arms), max(len(arm.joints) for arm in arms)), dtype=np.int64)
-    for row, arm in zip(joints, arms, strict=True):
-        row[: len(arm.joints)] = arm.joints
-    return ImpedanceModel(
-        chain=chain_of(robot.model),
-        bodies=LinkInertias.of(robot.model),
-        tools=tools_of(robot),
-        joints=joints,
-        dofs=np.array([len(arm.joints) for arm in arms]),
-        torque_limit=settings.torque_scale * robot.torque_limit,
-        limits=PositionLimits(
-            lower=robot.position_lower,
-            upper=robot.position_upper,
-            stiffness=settings.limit_stiffness,
-            damping=settings.limit_damping,
-            distance=settings.limit_distance,
-        ),
-        max_position_error=settings.max_position_error,
-        max_rotation_error=settings.max_rotation_error,
-        consistent=settings.nullspace_projector == "consistent",
-    )
-
-
-def _those(names: tuple[str, ...], which: IntArray | BoolArray | Array) -> tuple[str, ...]:
+def _those(names: tuple[str, ...], which: BoolArray | Array) -> tuple[str, ...]:
     """The names at which ``which`` is not 0."""
-    return tuple(names[index] for index in np.flatnonzero(which))
+    return tuple(names[index] for index in np.flatnonzero(which)) if which.any() else ()

@@ -29,7 +29,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from q2r2_control.compliance.small_matrices import finite
 from q2r2_control.control.cholesky import factorise
 from q2r2_control.control.geometry.closest_points import clamp
 from q2r2_control.control.geometry.collision import CollisionData, CollisionModel, update_placements
@@ -96,7 +95,7 @@ def find_near(held_model: Held, held_data: Held) -> tuple[int, int, float]:
     Returns how many these are, the closest pair of all and its distance; -1 where q or v is not finite.
     """
     model, data = borrowed(held_model), borrowed(held_data)
-    if not finite(data.measured):
+    if not np.isfinite(data.measured.sum()):
         return -1, 0, np.nan
     update_placements(model.collision, data.collision, data.measured[0])
     count, closest, least = 0, 0, np.inf

@@ -24,7 +24,7 @@ from numba import types
 from numba.core import cgutils
 
 _ROOMS = ("control", "compliance")
-_COMPILED = re.compile(r"^@(inlined_)?kernel|\bNamedTuple\b", re.MULTILINE)
+_COMPILED = re.compile(r"^@(inlined_|numpy_)?kernel|\bNamedTuple\b", re.MULTILINE)
 
 
 def compiled_sources() -> list[Path]:
@@ -153,6 +153,11 @@ def inlined_kernel(function: Callable[..., Any]) -> Callable[..., Any]:
     Passing a hundred arrays that it does not read takes longer than its work.
     """
     return _compiled(function, _nrt=False, forceinline=True)
+
+
+def numpy_kernel(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Compile a function of NumPy that may allocate: for a few large steps in a tick that BLAS and LAPACK do."""
+    return _compiled(function)
 
 
 def _compiled(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:

@@ -8,9 +8,8 @@ from collections.abc import Mapping
 import numpy as np
 import pinocchio as pin
 
-from q2r2_control.compliance.admittance_kernels import estimate_wrench
+from q2r2_control.compliance.admittance_law import estimate_wrench
 from q2r2_control.control.controller import CartesianController
-from q2r2_control.control.tasks.task_model import tools_of
 from q2r2_control.teleop.haptics import ArmCondition
 from q2r2_control.types import LimitKind, RobotState, StepReport
 
@@ -25,12 +24,6 @@ class ArmConditions:
         self._controller, self._robot = controller, robot
         self._data = robot.model.createData()
         self._joints = {arm: {robot.joint_names[j] for j in robot.arms[arm].joints} for arm in robot.arms}
-        nv = robot.model.nv
-        self._member = dict(zip(robot.arms, tools_of(robot).member, strict=True))
-        self._J, self._tau, self._wrench = np.zeros((6, nv)), np.zeros(nv), np.zeros(6)
-        self._scratch = np.zeros((6, 6)), np.zeros((6, 6))
-        # What is compiled is loaded now, not in a tick.
-        estimate_wrench(self._J, self._tau, self._tau, *self._scratch, self._wrench)
         self._limited: dict[str, float] = {}  # when a joint last was at its position limit [s]
 
     def note(self, report: StepReport, now: float) -> None:
@@ -53,8 +46,7 @@ class ArmConditions:
         """As an admittance estimates it [N]; None where nothing is measured."""
         if state.tau_external is None or not np.isfinite((state.tau_external, state.q)).all():
             return None
-        frame, wrench = self._robot.arms[arm].frame_id, self._wrench
-        self._J[:] = pin.computeFrameJacobian(self._robot.model, self._data, state.q, frame, pin.LOCAL_WORLD_ALIGNED)
-        self._tau[:] = state.tau_external
-        estimate_wrench(self._J, self._tau, self._member[arm], *self._scratch, wrench)
+        chosen = self._robot.arms[arm]
+        J = pin.computeFrameJacobian(self._robot.model, self._data, state.q, chosen.frame_id, pin.LOCAL_WORLD_ALIGNED)
+        wrench = estimate_wrench(J[:, chosen.joints], state.tau_external[chosen.joints])
         return math.hypot(*wrench[:3].tolist())

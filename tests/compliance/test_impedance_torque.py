@@ -1,4 +1,4 @@
-"""The compiled law of the impedance against its formulas, written out with NumPy and Pinocchio."""
+"""The torque of the impedance against its formulas, written out with NumPy and Pinocchio."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ from tests.support.poses import pose_error
 from tests.support.torque_loop import reference
 
 ROBOT = Robot.from_config(load_config("config/dual_iiwa7.yaml"))
-METRES = np.array([1.0, 1.0, 1.0, 0.3, 0.3, 0.3])
 
 
 def damping(stiffness: Array, inertia: Array, ratio: float) -> Array:
@@ -41,13 +40,12 @@ def arm_torque(
     error = pose_error(ROBOT.tool_pose(q_wanted, arm), ROBOT.tool_pose(q, arm))
     for part, most in ((slice(3), settings.max_position_error), (slice(3, 6), settings.max_rotation_error)):
         error[part] *= min(1.0, most / float(np.linalg.norm(error[part])))
-    values, vectors = np.linalg.eigh(J @ np.linalg.solve(M, J.T) * np.outer(METRES, METRES))
-    inertia = np.diag(METRES) @ vectors @ np.diag(1.0 / np.maximum(values, 1e-3)) @ vectors.T @ np.diag(METRES)
+    inertia = np.linalg.inv(J @ np.linalg.solve(M, J.T))
     K = np.repeat([settings.translational_stiffness, settings.rotational_stiffness], 3)
-    K_posture = np.full(7, settings.nullspace_stiffness)
+    K_posture = settings.nullspace_stiffness
     force = K * error + damping(K, inertia, settings.damping_ratio) @ (J_wanted @ v_wanted[joints] - J @ v[joints])
     posture = K_posture * (q_wanted - q)[joints]
-    posture += damping(K_posture, M, settings.nullspace_damping_ratio) @ (v_wanted - v)[joints]
+    posture += 2.0 * settings.nullspace_damping_ratio * np.sqrt(K_posture * np.diag(M)) * (v_wanted - v)[joints]
     if settings.nullspace_projector == "consistent":
         N = np.eye(7) - J.T @ inertia @ J @ np.linalg.inv(M)
     else:
@@ -77,6 +75,6 @@ def test_the_torque_is_that_of_the_formulas(projector: str, spread: float) -> No
         for arm, found in ROBOT.arms.items():
             expected[found.joints] += arm_torque(arm, settings, (q_wanted, v_wanted), (q, v))
         expected = np.clip(expected, -ROBOT.torque_limit, ROBOT.torque_limit)
-        np.testing.assert_allclose(command.tau, expected, rtol=1e-9, atol=1e-9 * np.abs(expected).max())
+        np.testing.assert_allclose(command.tau, expected, rtol=1e-7, atol=1e-7 * np.abs(expected).max())
         clipped += len(command.report.clipped)
     assert clipped > 10 if spread > 0.1 else clipped == 0
