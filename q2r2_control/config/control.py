@@ -141,6 +141,9 @@ class ControllerSettings(BaseModel):
         0.0, ge=0, le=10, description="posture speed per relative rise of manipulability; 0: off [rad/s]"
     )
     stretch_gain: float = Field(10.0, gt=0, le=200, description="highest gain of a stretched-out arm [1/s]")
+    tasks: dict[str, dict[str, Any]] = Field(
+        {}, description="tasks of other packages, by their entry point's name, with the settings of each"
+    )
 
     def without_contact(self) -> ControllerSettings:
         """The same, for modes in which nothing gives way: there ``contact_allowed`` allows nothing."""

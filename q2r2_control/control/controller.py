@@ -22,6 +22,8 @@ from q2r2_control.control.reference import move_reference, observe_bodies, spare
 from q2r2_control.control.safety.safety_filter import FOLLOWED, STOPPED
 from q2r2_control.control.step_report import LimitNames, StepSummary
 from q2r2_control.control.targets import TargetTracker
+from q2r2_control.control.tasks.external import load_tasks
+from q2r2_control.control.unconstrained import find_held_minimum
 from q2r2_control.errors import ConfigError, RobotError
 from q2r2_control.robot.pairs import pairs_with_others
 from q2r2_control.robot.robot import Robot
@@ -69,6 +71,7 @@ class CartesianController:
         self._fingers = FingerOpenings(robot, self._objects.bodies)
         self._unchanged: IntArray = np.zeros(len(self._objects.bodies.joint), dtype=np.int64)
         self._targets = TargetTracker(model.tasks, self._arms, settings)
+        self._external_tasks = load_tasks(robot, settings.tasks)
         self._names = LimitNames(robot)
         self._take_load()
         self._compile()
@@ -109,6 +112,8 @@ class CartesianController:
         self._observe_bodies = bound(observe_bodies, model, data, self._unchanged)
         self._spare = bound(spare_distance, model, data, self._with_others[self._arms[0]])
         self._move = bound(move_reference, model, data, self._solution, False, self.settings.max_substep, 1.0)
+        if self._external_tasks:
+            self._find_minimum = bound(find_held_minimum, data)
         self.step({arm: self.tool_pose(arm) for arm in self._arms}, self.settings.max_substep)
         # A solver is set up at its first problem, and at home there may be none for it.
         self._problem.minimum = None
@@ -286,6 +291,8 @@ class CartesianController:
         """
         self._live.step(self._objects.load, h)
         usable, inside, free = self._assemble(self._held_model, self._targets.held, self._held_data, h, tick)
+        if self._external_tasks:
+            free = self._apply_external_costs()
         summary.targets_usable &= usable
         summary.inside &= inside
         count = int(self._rows.used[0])
@@ -308,3 +315,12 @@ class CartesianController:
         # A certified stop stays certified. Anything else was proven just now, and if all was apart before, in full.
         self._certified = self._apart and (self._certified if outcome == STOPPED else was_apart)
         return solved
+
+    def _apply_external_costs(self) -> bool:
+        """Cost of the tasks of other packages; whether the whole cost's minimum is within the box and all rows."""
+        for task in self._external_tasks:
+            H, g = task.cost(self._state.q.copy(), self._state.v.copy())
+            if np.isfinite(H).all() and np.isfinite(g).all():
+                self._tasks.H[:] += H
+                self._tasks.g[:] += g
+        return bool(self._find_minimum(self._held_data))

@@ -6,15 +6,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from q2r2_control.config.control import EQUAL, ControllerSettings, check_priority
+from q2r2_control.config.control import ControllerSettings, check_priority
 from q2r2_control.control.geometry.collision import CollisionModel, collision_model_of, turning_bodies
-from q2r2_control.control.geometry.kinematics import Chain, Placements, place
 from q2r2_control.control.geometry.rounded_boxes import deepest, with_rounded_boxes
 from q2r2_control.control.safety.joint_limits import JointLimits
 from q2r2_control.control.safety.safety_model import Approach, SafetyModel
-from q2r2_control.control.tasks.swivel import nearest_along, swivel_angle
-from q2r2_control.control.tasks.task_data import SwivelScratch
-from q2r2_control.control.tasks.task_model import Motion, Posture, Priority, Swivels, TaskModel, tools_of
+from q2r2_control.control.tasks.task_model import TaskModel, task_model_of
 from q2r2_control.errors import ConfigError
 from q2r2_control.robot.kept_distances import KeptDistances, kept_distances
 from q2r2_control.robot.pairs import pair_names
@@ -37,6 +34,11 @@ class KernelModel(NamedTuple):
     safety: SafetyModel
     tasks: TaskModel
 
+    @property
+    def live(self) -> tuple[Array, ...]:
+        """Gains, speeds and weights, which may change between ticks."""
+        return (*self.tasks.live, self.safety.approach.gain)
+
 
 def kernel_model_of(robot: Robot, settings: ControllerSettings) -> KernelModel:
     """Arrays of a robot's joints, tools, pairs and limits.
@@ -46,7 +48,7 @@ def kernel_model_of(robot: Robot, settings: ControllerSettings) -> KernelModel:
     """
     check_priority(settings.priority, tuple(robot.arms))
     safety = _safety_model(robot, settings)
-    return KernelModel(safety, _task_model(robot, settings, safety))
+    return KernelModel(safety, task_model_of(robot, settings, safety.collision.chain))
 
 
 def _safety_model(robot: Robot, settings: ControllerSettings) -> SafetyModel:
@@ -95,60 +97,3 @@ def _check_depths(robot: Robot, collision: CollisionModel, kept: KeptDistances) 
 def stop_buffer(min_distance: Array, settings: ControllerSettings) -> Array:
     """How much farther from each other pairs stop in the QP (p,) [m]."""
     return np.minimum(settings.distance_buffer, np.maximum(0.5 * min_distance, _LEAST_BUFFER))
-
-
-def _task_model(robot: Robot, settings: ControllerSettings, safety: SafetyModel) -> TaskModel:
-    chain, tools = safety.collision.chain, tools_of(robot)
-    swivels = _swivels(robot, chain)
-    return TaskModel(
-        chain=chain,
-        tools=tools,
-        motion=Motion(
-            gain=np.array([settings.position_gain, settings.rotation_gain]),
-            deceleration=np.array([settings.linear_deceleration, settings.angular_deceleration]),
-            full_speed=np.array([settings.max_linear_speed, settings.max_angular_speed]),
-            stretch_gain=np.array([settings.stretch_gain]),
-        ),
-        posture=Posture(
-            home=np.array(robot.home, dtype=np.float64),
-            gain=np.array([settings.posture_gain]),
-            speed=settings.posture_speed,
-        ),
-        manipulability_gain=settings.manipulability_gain,
-        swivels=swivels,
-        has_swivels=int(swivels.gain.any()),
-        priority=priority_of(robot, settings),
-    )
-
-
-def priority_of(robot: Robot, settings: ControllerSettings) -> Priority:
-    """The weights of the arms' costs; ``settings.priority`` names an arm, or none."""
-    n, nv = len(robot.arms), robot.model.nv
-    priority = Priority(np.ones(n), np.full(nv, settings.posture_weight))
-    if settings.priority == EQUAL:
-        return priority
-    first = robot.arms[settings.priority].joints
-    for i, (name, arm) in enumerate(robot.arms.items()):
-        if name == settings.priority:
-            continue
-        priority.weight[i] = settings.yield_weight
-        # A joint that also moves the arm with priority keeps its full cost.
-        priority.posture_weight[np.setdiff1d(arm.joints, first)] = settings.yield_weight * settings.posture_weight
-    return priority
-
-
-def _swivels(robot: Robot, chain: Chain) -> Swivels:
-    """The arms' swivel tasks; without an angle of its own, a task keeps that of the home posture."""
-    n, nv = len(robot.arms), robot.model.nv
-    swivels, placements, scratch = Swivels.none(n), Placements.empty(chain), SwivelScratch.empty(n, nv)
-    place(chain, np.array(robot.home, dtype=np.float64), placements)
-    for i, arm in enumerate(robot.arms.values()):
-        if arm.swivel is None:
-            continue
-        swivels.gain[i] = arm.swivel.gain
-        for k, name in enumerate((arm.swivel.shoulder, arm.swivel.elbow, arm.swivel.wrist)):
-            swivels.joint[i, k] = robot.model.getJointId(name)
-            swivels.along[i, k] = nearest_along(chain, int(swivels.joint[i, k]))
-        at_home, _ = swivel_angle(placements, swivels, i, scratch)
-        swivels.angle[i] = at_home if arm.swivel.angle is None else arm.swivel.angle
-    return swivels

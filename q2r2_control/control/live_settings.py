@@ -26,8 +26,9 @@ import numpy as np
 
 from q2r2_control.config.control import ControllerSettings
 from q2r2_control.control.held_objects import HeldObjectModels, ObjectLoads
-from q2r2_control.control.kernel_model import KernelModel, priority_of, stop_buffer
+from q2r2_control.control.kernel_model import KernelModel, stop_buffer
 from q2r2_control.control.safety.provable_distances import provable_distances
+from q2r2_control.control.tasks.task_model import task_model_of
 from q2r2_control.robot.kept_distances import KeptDistances, kept_distances, too_close_at_home
 from q2r2_control.robot.pairs import CLEARANCE
 from q2r2_control.robot.robot import Robot
@@ -136,23 +137,19 @@ class LiveDistances:
 
 
 class LiveGains:
-    """The kernels' gains, speeds and weights."""
+    """The kernels' gains, speeds and weights: what ``KernelModel.live`` says."""
 
     def __init__(self, robot: Robot, model: KernelModel, settings: ControllerSettings) -> None:
-        tasks, motion = model.tasks, model.tasks.motion
-        self._robot = robot
-        # In the order of _gains_of; whatever is held, the kernels read these arrays.
-        self._arrays = (
-            *(motion.gain, motion.deceleration, motion.full_speed, motion.stretch_gain),
-            *(tasks.posture.gain, model.safety.approach.gain),
-            *(tasks.priority.weight, tasks.priority.posture_weight),
-        )
-        self._ends = np.cumsum([len(values) for values in self._arrays])[:-1]
-        self._goal, self._left = _gains_of(robot, settings), 0.0
+        self._robot, self._model = robot, model
+        self._goal, self._left = self._live_of(settings), 0.0
+
+    def _live_of(self, settings: ControllerSettings) -> tuple[Array, ...]:
+        tasks = task_model_of(self._robot, settings, self._model.tasks.chain)
+        return (*tasks.live, np.array([settings.separation_gain]))
 
     def aim(self, settings: ControllerSettings) -> None:
-        goal = _gains_of(self._robot, settings)
-        if not np.array_equal(goal, self._goal):
+        goal = self._live_of(settings)
+        if not all(np.array_equal(values, before) for values, before in zip(goal, self._goal, strict=True)):
             self._goal, self._left = goal, _RAMP_TIME
 
     def finish(self) -> None:
@@ -163,20 +160,5 @@ class LiveGains:
         if not self._left:
             return
         share, self._left = min(h / self._left, 1.0), max(self._left - h, 0.0)
-        for values, goal in zip(self._arrays, np.split(self._goal, self._ends), strict=True):
+        for values, goal in zip(self._model.live, self._goal, strict=True):
             values[:] = goal if share == 1.0 else values + share * (goal - values)
-
-
-def _gains_of(robot: Robot, settings: ControllerSettings) -> Array:
-    """In the order of the kernels' arrays."""
-    priority = priority_of(robot, settings)
-    return np.array(
-        [
-            *(settings.position_gain, settings.rotation_gain),
-            *(settings.linear_deceleration, settings.angular_deceleration),
-            *(settings.max_linear_speed, settings.max_angular_speed),
-            settings.stretch_gain,
-            *(settings.posture_gain, settings.separation_gain),
-            *(*priority.weight, *priority.posture_weight),
-        ]
-    )

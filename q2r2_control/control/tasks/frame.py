@@ -14,15 +14,40 @@ gain is at most k. M vanishes at the target.
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING, NamedTuple
+
 import numpy as np
 
+from q2r2_control.config.control import ControllerSettings
 from q2r2_control.control.geometry.kinematics import Chain, Placements
 from q2r2_control.control.jit import kernel
-from q2r2_control.control.tasks.task_data import TaskData, TaskTargets
-from q2r2_control.control.tasks.task_model import Motion, TaskModel, Tools
+from q2r2_control.control.tasks.tools import Tools
 from q2r2_control.types import Array
 
+if TYPE_CHECKING:  # these are made of what this module defines
+    from q2r2_control.control.tasks.task_data import TaskData, TaskTargets
+    from q2r2_control.control.tasks.task_model import TaskModel
+
 ROTATION_LENGTH = 0.3  # [m/rad]
+
+
+class Motion(NamedTuple):
+    """How a tool approaches its target, linear then angular; all of it may change between ticks."""
+
+    gain: Array  # (2,) [1/s]
+    deceleration: Array  # (2,) [m/s^2, rad/s^2]
+    full_speed: Array  # (2,) [m/s, rad/s]
+    stretch_gain: Array  # (1,) k [1/s]
+
+
+def motion_of(settings: ControllerSettings) -> Motion:
+    """The part of the settings that says how tools move."""
+    return Motion(
+        gain=np.array([settings.position_gain, settings.rotation_gain]),
+        deceleration=np.array([settings.linear_deceleration, settings.angular_deceleration]),
+        full_speed=np.array([settings.max_linear_speed, settings.max_angular_speed]),
+        stretch_gain=np.array([settings.stretch_gain]),
+    )
 
 
 @kernel

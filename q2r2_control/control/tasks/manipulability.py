@@ -15,13 +15,32 @@ J J' gets a little damping on its diagonal, so that the gradient stays finite wh
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
 from q2r2_control.control.cholesky import factorise, substitute
 from q2r2_control.control.jit import kernel
 from q2r2_control.control.tasks.frame import ROTATION_LENGTH
-from q2r2_control.control.tasks.task_data import TaskData
-from q2r2_control.control.tasks.task_model import TaskModel
+from q2r2_control.types import Array
+
+if TYPE_CHECKING:  # these are made of what this module defines
+    from q2r2_control.control.tasks.task_data import TaskData
+    from q2r2_control.control.tasks.task_model import TaskModel
 
 _DAMPING = 1e-3  # least singular value that counts
+
+
+class ManipulabilityScratch(NamedTuple):
+    """Arrays of the manipulability's gradient."""
+
+    gram: Array  # (6, 6)
+    weights: Array  # (6, nv) (J J')^-1 J
+    gradient: Array  # (nv,)
+
+    @classmethod
+    def empty(cls, nv: int) -> ManipulabilityScratch:
+        return cls(np.zeros((6, 6)), np.zeros((6, nv)), np.zeros(nv))
 
 
 @kernel

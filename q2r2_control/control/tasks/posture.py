@@ -6,17 +6,39 @@ leaves no tool error. An arm without a target holds its joints by a cost of thei
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from q2r2_control.config.control import ControllerSettings
 from q2r2_control.control.cholesky import factorise, substitute
 from q2r2_control.control.geometry.closest_points import clamp
 from q2r2_control.control.jit import kernel
-from q2r2_control.control.tasks.task_data import TaskData, TaskTargets
-from q2r2_control.control.tasks.task_model import TaskModel
+from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
+
+if TYPE_CHECKING:  # these are made of what this module defines
+    from q2r2_control.control.tasks.task_data import TaskData, TaskTargets
+    from q2r2_control.control.tasks.task_model import TaskModel
 
 # A held arm is not pushed about by the other one's task, but may give way to recover separation.
 _HOLD_WEIGHT = 300.0
 HOLD_GAIN = 4.0  # [1/s]
 _PROJECTION_DAMPING = 1e-3
+
+
+class Posture(NamedTuple):
+    """Where joints go that the tools leave free."""
+
+    home: Array  # (nv,) [rad]
+    gain: Array  # (1,), which may change between ticks [1/s]
+    speed: float  # at most [rad/s]
+
+
+def posture_of(robot: Robot, settings: ControllerSettings) -> Posture:
+    """Home, and how fast joints go there."""
+    home = np.array(robot.home, dtype=np.float64)
+    return Posture(home=home, gain=np.array([settings.posture_gain]), speed=settings.posture_speed)
 
 
 @kernel

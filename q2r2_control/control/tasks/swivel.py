@@ -21,15 +21,19 @@ manipulability, which have their say as it fades out.
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from q2r2_control.control.geometry.closest_points import clamp, dot
-from q2r2_control.control.geometry.kinematics import Chain, Placements
+from q2r2_control.control.geometry.kinematics import Chain, IntArray, Placements, place
 from q2r2_control.control.jit import kernel
-from q2r2_control.control.tasks.task_data import SwivelScratch, TaskData, TaskTargets
-from q2r2_control.control.tasks.task_model import Swivels, TaskModel
+from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
+
+if TYPE_CHECKING:  # these are made of what this module defines
+    from q2r2_control.control.tasks.task_data import TaskData, TaskTargets
+    from q2r2_control.control.tasks.task_model import TaskModel
 
 # Below these the task fades out: |p|, and |l|, the sine of the angle between the line and V.
 _FULL_RADIUS = 0.05  # [m]
@@ -37,6 +41,66 @@ _FULL_SINE = 0.2
 _TINY = 1e-9
 # Keeps the velocity finite where the nullspace does not turn the elbow.
 _DAMPING = 1e-6
+
+
+class Swivels(NamedTuple):
+    """The swivel task of each arm. A point is on its joint's axis, ``along`` it from the joint's origin."""
+
+    joint: IntArray  # (n, 3) joints of shoulder, elbow, wrist
+    along: Array  # (n, 3) [m]
+    angle: Array  # (n,) wanted [rad]
+    gain: Array  # (n,) [1/s]; 0: no task
+
+    @classmethod
+    def none(cls, n: int) -> Swivels:
+        return cls(np.zeros((n, 3), dtype=np.int64), np.zeros((n, 3)), np.zeros(n), np.zeros(n))
+
+
+class SwivelScratch(NamedTuple):
+    """Vectors of one arm's swivel, and the row of each arm."""
+
+    points: Array  # (3, 3) S, E, W
+    line: Array  # (3,) w
+    offset: Array  # (3,) p, then t_p
+    reference: Array  # (3,) l, then t_l
+    by_elbow: Array  # (3,) dpsi / de
+    by_wrist: Array  # (3,) dpsi / d(W - S)
+    row: Array  # (nv,) of all arms
+    free: Array  # (nv,) its part in the tools' nullspace
+    rate: Array  # (n,)
+    share: Array  # (n,)
+
+    @classmethod
+    def empty(cls, n: int, nv: int) -> SwivelScratch:
+        return cls(
+            points=np.zeros((3, 3)),
+            line=np.zeros(3),
+            offset=np.zeros(3),
+            reference=np.zeros(3),
+            by_elbow=np.zeros(3),
+            by_wrist=np.zeros(3),
+            row=np.zeros(nv),
+            free=np.zeros(nv),
+            rate=np.zeros(n),
+            share=np.zeros(n),
+        )
+
+
+def swivels_of(robot: Robot, chain: Chain) -> Swivels:
+    """The arms' swivel tasks; without an angle of its own, a task keeps that of the home posture."""
+    n, nv = len(robot.arms), robot.model.nv
+    swivels, placements, scratch = Swivels.none(n), Placements.empty(chain), SwivelScratch.empty(n, nv)
+    place(chain, np.array(robot.home, dtype=np.float64), placements)
+    for i, arm in enumerate(robot.arms.values()):
+        if arm.swivel is None:
+            continue
+        swivels.gain[i] = arm.swivel.gain
+        for k, name in enumerate((arm.swivel.shoulder, arm.swivel.elbow, arm.swivel.wrist)):
+            swivels.joint[i, k] = robot.model.getJointId(name)
+            swivels.along[i, k] = nearest_along(chain, int(swivels.joint[i, k]))
+        at_home, _ = swivel_angle(placements, swivels, i, scratch)
+        swivels.angle[i] = at_home if arm.swivel.angle is None else arm.swivel.angle
+    return swivels
 
 
 def nearest_along(chain: Chain, joint: int) -> float:

@@ -7,6 +7,8 @@ from typing import NamedTuple
 import numpy as np
 
 from q2r2_control.control.geometry.kinematics import IntArray, Placements
+from q2r2_control.control.tasks.manipulability import ManipulabilityScratch
+from q2r2_control.control.tasks.swivel import SwivelScratch
 from q2r2_control.control.tasks.task_model import TaskModel
 from q2r2_control.types import Array
 
@@ -59,48 +61,6 @@ class TaskTargets(NamedTuple):
             teleport_speed=teleport_speed,
             teleport_turn=teleport_turn,
             scratch=PoseScratch(np.zeros((3, 3)), np.zeros(3), np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(6)),
-        )
-
-
-class ManipulabilityScratch(NamedTuple):
-    """Arrays of the manipulability's gradient."""
-
-    gram: Array  # (6, 6)
-    weights: Array  # (6, nv) (J J')^-1 J
-    gradient: Array  # (nv,)
-
-    @classmethod
-    def empty(cls, nv: int) -> ManipulabilityScratch:
-        return cls(np.zeros((6, 6)), np.zeros((6, nv)), np.zeros(nv))
-
-
-class SwivelScratch(NamedTuple):
-    """Vectors of one arm's swivel, and the row of each arm."""
-
-    points: Array  # (3, 3) S, E, W
-    line: Array  # (3,) w
-    offset: Array  # (3,) p, then t_p
-    reference: Array  # (3,) l, then t_l
-    by_elbow: Array  # (3,) dpsi / de
-    by_wrist: Array  # (3,) dpsi / d(W - S)
-    row: Array  # (nv,) of all arms
-    free: Array  # (nv,) its part in the tools' nullspace
-    rate: Array  # (n,)
-    share: Array  # (n,)
-
-    @classmethod
-    def empty(cls, n: int, nv: int) -> SwivelScratch:
-        return cls(
-            points=np.zeros((3, 3)),
-            line=np.zeros(3),
-            offset=np.zeros(3),
-            reference=np.zeros(3),
-            by_elbow=np.zeros(3),
-            by_wrist=np.zeros(3),
-            row=np.zeros(nv),
-            free=np.zeros(nv),
-            rate=np.zeros(n),
-            share=np.zeros(n),
         )
 
 

@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 
 from q2r2_control.control.tasks.frame import (
     ROTATION_LENGTH,
+    Motion,
     add_tool_task,
     approach_speed,
     rotation_vector,
@@ -16,7 +17,7 @@ from q2r2_control.control.tasks.frame import (
     wanted_twist,
 )
 from q2r2_control.control.tasks.task_data import TaskTargets
-from q2r2_control.control.tasks.task_model import Motion, tools_of
+from q2r2_control.control.tasks.tools import tools_of
 from q2r2_control.types import Array
 from tests.control.cells import NAMES, cell, kernel_data, kernel_model, placed, random_posture
 

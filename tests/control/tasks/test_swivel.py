@@ -13,9 +13,7 @@ from q2r2_control.config.cell import Config, load_config
 from q2r2_control.config.control import ControllerSettings
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.control.geometry.kinematics import Placements, place
-from q2r2_control.control.tasks.swivel import nearest_along, swivel_angle, swivel_row
-from q2r2_control.control.tasks.task_data import SwivelScratch
-from q2r2_control.control.tasks.task_model import Swivels
+from q2r2_control.control.tasks.swivel import Swivels, SwivelScratch, nearest_along, swivel_angle, swivel_row
 from q2r2_control.errors import ConfigError
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array

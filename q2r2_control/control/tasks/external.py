@@ -1,0 +1,47 @@
+"""Tasks of other packages: costs on the next joint velocities, written in NumPy and found by their name.
+
+A package names its task as an entry point of the group ``q2r2_control.tasks``; a cell's YAML asks for it, with its
+settings, under ``control.tasks``. Its cost is added to those of the built-in tasks before the QP is solved. Limits,
+separation and the certificate do not depend on costs, so no task can break them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from importlib.metadata import entry_points
+from typing import Any, Protocol
+
+from q2r2_control.errors import ConfigError
+from q2r2_control.robot.robot import Robot
+from q2r2_control.types import Array
+
+GROUP = "q2r2_control.tasks"
+
+
+class Task(Protocol):
+    """Made of the robot and the task's settings: ``make(robot, **settings)``."""
+
+    def cost(self, q: Array, v: Array) -> tuple[Array, Array]:
+        """H (nv, nv), symmetric and positive semidefinite, and g (nv,) of the cost 1/2 v+' H v+ + g' v+.
+
+        ``v+`` are the next joint velocities, ``q`` [rad] and ``v`` [rad/s] the reference's posture and velocities now,
+        (nv,) each. The weight of a tool's error is 1 [s^2/m^2], that of the posture 1e-3. Called at every substep: keep
+        it under 20 us. A cost with a number that is not finite is not used.
+        """
+        ...
+
+
+def load_tasks(robot: Robot, wanted: Mapping[str, Mapping[str, Any]]) -> tuple[Task, ...]:
+    """The tasks that the settings ask for. Raises :class:`ConfigError` for an unknown one and for bad settings."""
+    if not wanted:
+        return ()
+    installed = {entry.name: entry for entry in entry_points(group=GROUP)}
+    tasks: list[Task] = []
+    for name, settings in wanted.items():
+        if name not in installed:
+            raise ConfigError(f"control.tasks.{name}: installed tasks: {', '.join(sorted(installed)) or 'none'}")
+        try:
+            tasks.append(installed[name].load()(robot, **settings))
+        except (TypeError, ValueError) as error:
+            raise ConfigError(f"control.tasks.{name}: {error}") from error
+    return tuple(tasks)
