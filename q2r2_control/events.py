@@ -23,7 +23,6 @@ class ReasonKind(StrEnum):
     CARRY_ENDED = "carry_ended"
     HANDS_SWAPPED = "hands_swapped"
     DRIVEN_BY = "driven_by"
-    STOPPED_ELSEWHERE = "stopped_elsewhere"
     RESET_SERVICE = "reset_service"
     PAUSE_SERVICE = "pause_service"
 
@@ -92,11 +91,19 @@ class ReasonKind(StrEnum):
     ENGAGE_FIRST = "engage_first"
     PAUSE_FIRST = "pause_first"
     ONE_ARM = "one_arm"
-    BOTH_ASK = "both_ask"
     OTHER_ARM_BUSY = "other_arm_busy"
     TOOL_HELD_UP = "tool_held_up"
     ARMS_MUST_HOLD = "arms_must_hold"
     CONTROL_REFUSED = "control_refused"
+
+    # Obstacles that ROS nodes find; their text is in the detail.
+    NO_SUBSCRIBER = "no_subscriber"  # of an arm's targets
+    NO_TOOL_POSE = "no_tool_pose"
+    NO_TRANSFORM = "no_transform"
+    HAND_SILENT = "hand_silent"
+    SEVERAL_PUBLISHERS = "several_publishers"
+    CONTROLLER_REFUSES = "controller_refuses"
+    BAD_JOINT_STATES = "bad_joint_states"
 
     OTHER = "other"  # a sentence made elsewhere, which nothing decides by
 

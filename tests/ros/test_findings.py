@@ -105,13 +105,13 @@ def test_nothing_is_found_in_a_good_set_nor_where_none_runs() -> None:
             id="no clock",
         ),
         pytest.param(
-            view(arm("left", ready=False, message="/left/target has no subscriber")),
+            view(arm("left", ready=False, message="/left/target has no subscriber", kind="no_subscriber")),
             "the left arm: /left/target has no subscriber",
             "start the arm's controller",
             id="an arm that is not ready",
         ),
         pytest.param(
-            view(arm("left", ready=False, message="/c is stopped: by hand; call /c/reset")),
+            view(arm("left", ready=False, message="/c is stopped: by hand; call /c/reset", kind="controller_refuses")),
             "/c is stopped",
             "/c/reset",
             id="stop",

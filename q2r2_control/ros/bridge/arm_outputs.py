@@ -13,6 +13,7 @@ from std_msgs.msg import Bool, String
 
 from q2r2_control.config.presets import BUILTIN, Mode
 from q2r2_control.config.teleop import GuardSettings
+from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.ros.base_node import LATCHED_QOS, BaseNode
 from q2r2_control.ros.bridge.frames import PoseTopic
 from q2r2_control.ros.bridge.parameters import BUILTIN_NODE, ArmParameters
@@ -93,15 +94,17 @@ class ArmOutputs:
         return next((line for output in self._all if (line := output.conflict)), None)
 
     @property
-    def unready(self) -> str | None:
+    def unready(self) -> Reason | None:
         """Why the arm may not be engaged yet."""
-        if unready := next((line for output in self._all if (line := output.unready)), None):
-            return unready
+        if line := next((line for output in self._all if (line := output.unready)), None):
+            return Reason.of(ReasonKind.NO_SUBSCRIBER, text=line)
         if self._last is not None and not self._has_safe_target:
-            return self._safe_target.problem
-        if self._follows is not None and (unready := self._follows.unready):
-            return unready
-        return None if self._command_type is None else self._command_type.unready
+            line = self._safe_target.problem
+        if line is None and self._follows is not None:
+            line = self._follows.unready
+        if line is None and self._command_type is not None:
+            line = self._command_type.unready
+        return None if line is None else Reason.of(ReasonKind.CONTROLLER_REFUSES, text=line)
 
     @property
     def builtin(self) -> str | None:

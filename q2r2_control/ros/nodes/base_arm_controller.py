@@ -154,7 +154,9 @@ class BaseArmController(BaseNode):
         tool, base, controlled = self.current_pose(), self._base(), self._safe_target.at(now)
         obstacle = self._obstacle(tool, base)
         silence = None if self.state in _WITHOUT_HAND else self._hand.silence(now)
-        self._refusal = obstacle or (None if silence is None else (WARN, _in_words(silence)))
+        self._refusal = obstacle or (
+            None if silence is None else (WARN, Reason.of(ReasonKind.HAND_SILENT, text=silence))
+        )
         reference = None if controlled is None else self._safe_target.stamp
         commanded = None if tool is None else self._commanded(tool, controlled)
         self._base_pose = base
@@ -256,13 +258,13 @@ class BaseArmController(BaseNode):
         """Why the arm may not be engaged now, its hand aside, with the level of the diagnostics."""
         values = self.parameters
         if (line := self.outputs.conflict or self._frames.conflict(values.tool_frame)) is not None:
-            return ERROR, _in_words(line)
+            return ERROR, Reason.of(ReasonKind.SEVERAL_PUBLISHERS, text=line)
         if tool is None:
             why = self._tool.problem or "current_pose() gives none"
-            return WARN, _in_words(f"the tool's pose is not known: {why}")
+            return WARN, Reason.of(ReasonKind.NO_TOOL_POSE, text=why)
         if base is None:
-            return WARN, _in_words(f"no transform from {values.base_frame} to {values.world_frame} on /tf")
-        return None if (line := self.outputs.unready) is None else (WARN, _in_words(line))
+            return WARN, Reason.of(ReasonKind.NO_TRANSFORM, frame=values.base_frame, world=values.world_frame)
+        return None if (unready := self.outputs.unready) is None else (WARN, unready)
 
     def _commanded(self, tool: pin.SE3, reference: pin.SE3 | None) -> pin.SE3:
         """The commanded tool pose: the leash is measured from it, and an anchor takes its orientation and the sag.

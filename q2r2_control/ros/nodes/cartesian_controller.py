@@ -26,6 +26,7 @@ from q2r2_control.control.controller import CartesianController
 from q2r2_control.drives.base import permitted
 from q2r2_control.drives.torque import TorqueDrive
 from q2r2_control.errors import ConfigError
+from q2r2_control.events import ReasonKind
 from q2r2_control.robot.robot import Robot
 from q2r2_control.ros.base_node import ERROR, OK, WARN, run_node
 from q2r2_control.ros.bridge.controller_feedback import ControllerFeedback
@@ -231,6 +232,8 @@ class CartesianControllerNode(ManagedNode):
             values["qp_status"] = str(report.status)
             values["closest_pair"] = "|".join(report.closest_pair)
             values["closest_distance_m"] = round(report.closest_distance, 4)
+        if supervisor.state_fault is not None:
+            values["kind"] = str(ReasonKind.BAD_JOINT_STATES)
         level, line = self._judge()
         return level, line, values
 

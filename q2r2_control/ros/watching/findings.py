@@ -6,18 +6,23 @@ from collections import Counter
 from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
 
+from q2r2_control.events import ReasonKind
 from q2r2_control.ros.watching.set_view import SILENT, ArmView, NodeView, SetView, TopicView
+from q2r2_control.teleop.arm_states import ArmState
 
 _ONE = "end all but one (a killed one counts for some seconds)"
-# What an arm's node says where something is in the way, and what helps.
-_CURES = (
-    ("has no subscriber", "start the arm's controller, or set the arm's preset or ctrl_prefix to the one that runs"),
-    ("no transform", "start the robot or robot_state_publisher; parameters end_effector_link_name, world_frame_id"),
-    ("on /tf", "look at the robot's driver: its transforms have stopped"),
-    (" hand ", "start tcp_endpoint and connect the headset, or SimulationInput"),
-    ("publishers of", _ONE),
-    ("joint states", "look at the robot's driver, and at joint_states_topic of cartesian_controller"),
-)
+# What helps, by the kind of what is in the way.
+_CURES = {
+    ReasonKind.NO_SUBSCRIBER: "start the arm's controller, or set preset or ctrl_prefix to the one that runs",
+    ReasonKind.NO_TOOL_POSE: (
+        "start the robot or robot_state_publisher, or look whether its transforms have stopped; parameters "
+        "end_effector_link_name, world_frame_id"
+    ),
+    ReasonKind.NO_TRANSFORM: "start what publishes that frame; parameters base_frame_id, world_frame_id",
+    ReasonKind.HAND_SILENT: "start tcp_endpoint and connect the headset, or SimulationInput",
+    ReasonKind.SEVERAL_PUBLISHERS: _ONE,
+    ReasonKind.BAD_JOINT_STATES: "look at the robot's driver, and at joint_states_topic of cartesian_controller",
+}
 _SEE = "docs/ros.md, What moves an arm, and what stops it"
 
 
@@ -80,7 +85,7 @@ def _node_findings(nodes: Iterable[NodeView]) -> Iterator[Finding]:
             cure = "start what publishes /clock, or start the node without use_sim_time"
             yield error(f"{node.name}: {node.clock_problem}", cure)
         elif node.level == "error" and node.arm is None:
-            yield error(f"{node.name}: {node.message}", _cure(node.message))
+            yield error(f"{node.name}: {node.message}", _cure(node, node.message))
 
 
 def _senders(view: SetView) -> Iterator[Finding]:
@@ -136,7 +141,7 @@ def _arm_findings(arms: Iterable[ArmView], nodes: Iterable[NodeView]) -> Iterato
         if node is None:
             yield error(f"the {arm.name} arm: {arm.why}", f"start {arm.name}_arm_controller, or q2r2 ros up")
         elif not (node.age > SILENT or node.clock_problem or node.values.get("ready") or node.values.get("engaged")):
-            yield error(f"the {arm.name} arm: {arm.why}", _cure(arm.why))
+            yield error(f"the {arm.name} arm: {arm.why}", _cure(node, arm.why))
 
 
 def _publishers(view: SetView, base: str) -> tuple[str, ...]:
@@ -144,5 +149,9 @@ def _publishers(view: SetView, base: str) -> tuple[str, ...]:
     return tuple(dict.fromkeys(name for topic in found for name in topic.publishers))
 
 
-def _cure(line: str) -> str:
-    return next((cure for text, cure in _CURES if text in line), line if "/reset" in line or "call " in line else _SEE)
+def _cure(node: NodeView, line: str) -> str:
+    """By the kind of what a node reports; a controller that refuses, and a stop, say themselves what helps."""
+    kind = node.values.get("kind")
+    if kind == ReasonKind.CONTROLLER_REFUSES or node.values.get("state") == ArmState.STOPPED:
+        return line
+    return next((cure for known, cure in _CURES.items() if known == kind), _SEE)
