@@ -28,7 +28,7 @@ PERIOD = 1.0 / 72.0  # of the hand's messages, as a Quest sends them, and of /tf
 HAND = pin.SE3(pin.exp3(np.array([0.2, -0.4, 0.6])), np.array([0.3, 0.1, 1.0]))
 TOOL = pin.SE3(pin.exp3(np.array([3.0, 0.2, 0.1])), np.array([0.5, 0.25, 0.38]))
 # Longer than by default, so that other load on the machine does not look like a fault.
-PATIENT = {"teleop.gate.timeout": 1.0, "tool_timeout": 1.0, "listener_timeout": 1.0}
+PATIENT = {"teleop.gate.timeout": 2.0, "tool_timeout": 2.0, "listener_timeout": 3.0}
 
 
 def patient(parameters: dict[str, Any]) -> list[str]:
@@ -63,6 +63,7 @@ class ArmRig:
         self.lower = self.upper = False
         self.grip = self.trigger = 0.0
         self.sends_hand = self.sends_tool = self.follows = True
+        self.sent = 0  # messages of the hand, since a button was pressed or let go
         self.targets: list[PoseStamped] = []
         self.state: dict[str, Any] = {}
         self.levels: Counter[str] = Counter()
@@ -102,10 +103,7 @@ class ArmRig:
 
     def press(self, button: str = "lower") -> None:
         """A press that is no chord."""
-        setattr(self, button, True)
-        time.sleep(0.2)
-        setattr(self, button, False)
-        time.sleep(0.1)
+        ArmRigs([self]).press(button)
 
     def engage(self) -> None:
         """Press until the arm follows."""
@@ -151,6 +149,7 @@ class ArmRig:
             pose.publish(stamped_pose(self.hand, "", now))
             held = {"press_middle": self.grip, "press_index": self.trigger}
             inputs.publish(OVR2ROSInputs(button_upper=self.upper, button_lower=self.lower, **held))
+            self.sent += 1
         if self.sends_tool:
             tf.publish(TFMessage(transforms=[stamped_transform("world", self._frame, self.tool)]))
 
@@ -207,12 +206,18 @@ class ArmRigs:
     def press_until(self, condition: Callable[[ArmRig], Any], what: str) -> None:
         """Press the lower buttons of those for which ``condition`` does not hold yet, and wait until it does."""
         rigs = [rig for rig in self.rigs if not condition(rig)]
-        for rig in rigs:
-            rig.lower = True
-        time.sleep(0.15)
-        for rig in rigs:
-            rig.lower = False
+        ArmRigs(rigs).press()
         self.wait(condition, what)
+
+    def press(self, button: str = "lower") -> None:
+        """A press that is no chord, of all hands: it is held, and let go, for some messages at least."""
+        for held in (True, False):
+            for rig in self.rigs:
+                setattr(rig, button, held)
+            for rig in self.rigs:
+                rig.sent = 0
+            time.sleep(0.2)
+            self.wait(lambda rig: rig.sent > 3, "it is sent")
 
 
 def stamped_transform(parent: str, child: str, pose: pin.SE3) -> TransformStamped:

@@ -25,6 +25,7 @@ class Operator:
         self.online = True
         self.moves = False
         self._lower: frozenset[str] = frozenset()
+        self._sent = 0  # samples since that has changed
         self._address = address
         self._angle = self._rate = 0.0
         self._angles: deque[tuple[float, float]] = deque(maxlen=int(60.0 * RATE_HZ))  # when [s], and the angle
@@ -44,10 +45,11 @@ class Operator:
 
     def press(self, *hands: str) -> None:
         """The lower buttons of these hands, which engage and pause."""
-        self._lower = frozenset(hands)
-        time.sleep(PRESS)
-        self._lower = frozenset()
-        time.sleep(0.1)
+        for held in (frozenset(hands), frozenset[str]()):
+            self._lower, self._sent = held, 0
+            time.sleep(PRESS)
+            while self._sent <= 3:  # this program may have had no processor
+                time.sleep(0.01)
 
     def rest(self, at: float | None = None) -> None:
         """Put both hands at rest where they were at that time [s], or at the start; no arm may follow meanwhile."""
@@ -71,6 +73,7 @@ class Operator:
             for hand in HANDS:
                 headset.send(headset.pose(hand, self._position(hand), (0.0, 0.0, 0.0, 1.0)))
                 headset.send(headset.inputs(hand, lower=hand in self._lower))
+            self._sent += 1
 
     def _move(self, dt: float) -> None:
         full = SPEED / RADIUS

@@ -10,7 +10,7 @@ from typing import Any
 from q2r2_control.ros.base_node import run_node
 from q2r2_control.ros.nodes.left_arm_controller import LeftArmController
 
-STALL = 1.5  # more than the timeouts of the tests' arm rig [s]
+STALL = 3.0  # more than the timeouts of the tests' arm rig [s]
 
 
 class StallingArm(LeftArmController):
