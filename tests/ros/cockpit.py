@@ -38,7 +38,8 @@ class Cockpit:
     def go_away(self) -> None:
         """Both arms are moved a way from home by their hands."""
         self.rigs.engage()
-        self.rigs.move((0.1, 0.0, 0.08), 1.0)
+        if self.from_home < 0.1:
+            self.rigs.move((0.1, 0.0, 0.08), 1.0)
         states = lambda: [rig.state for rig in self.rigs.rigs]  # noqa: E731
         wait_until(lambda: self.from_home > 0.1, "the arms are away from home", states)
 

@@ -138,7 +138,8 @@ def test_a_button_that_was_held_from_the_first_message_on_engages_nothing_until_
     rig.start(processes)
     rig.wait(lambda: "lower held since the hand was first heard of: let go first" in rig.state["last_event"], "is told")
     assert not rig.state["engaged"]
-    rig.lower = False
+    rig.lower, rig.sent = False, 0
+    rig.wait(lambda: rig.sent > 3, "it is let go")
     rig.engage()
 
 
