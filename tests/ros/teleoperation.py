@@ -12,6 +12,7 @@ import signal
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -144,7 +145,7 @@ class Teleoperation:
         record(what, line)
         print(f"\n{what}: {line}")
         assert self.joints.fastest(stop.fault) < FAST
-        return stop
+        return replace(stop, posture=self.joints.wait_for_rest(), t=time.monotonic())
 
     def assert_only_a_press_moves(self, stop: Stop) -> None:
         """Nothing has moved since the stop; a press moves nothing either, but from then on the arms follow."""
