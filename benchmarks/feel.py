@@ -31,7 +31,7 @@ from q2r2_control.judging.delay import Track, delays_behind
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.robot.robot import Robot
-from q2r2_control.runtime.recorder import Tick
+from q2r2_control.summary.tick import Tick
 from q2r2_control.types import Array, HandInputs
 
 Way = Callable[[float], float]  # of a hand along one axis [m], over time [s]

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from q2r2_control.errors import ConfigError, Q2R2Error
     from q2r2_control.pipeline.pipeline import Pipeline
     from q2r2_control.robot.robot import Robot
-    from q2r2_control.runtime.run_summary import RunSummary
+    from q2r2_control.summary.run_summary import RunSummary
     from q2r2_control.teleop.relative import RelativeMotion
 
 __all__ = [
@@ -42,7 +42,7 @@ __getattr__ = lazy_exports(
         "Q2R2Error": "errors",
         "RelativeMotion": "teleop.relative",
         "Robot": "robot.robot",
-        "RunSummary": "runtime.run_summary",
+        "RunSummary": "summary.run_summary",
         "load_config": "config.cell",
     },
 )

@@ -14,8 +14,8 @@ from q2r2_control.errors import PlantError
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.plants.kinematic import KinematicPlant
 from q2r2_control.robot.robot import Robot
-from q2r2_control.runtime import loop_clock
-from q2r2_control.runtime.recorder import Tick
+from q2r2_control.pipeline import loop_clock
+from q2r2_control.summary.tick import Tick
 from q2r2_control.types import Array, Command, RobotState
 from tests.support.hands_input import HandsInput
 from tests.support.watch import Watch, cell, speed

@@ -29,9 +29,9 @@ from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.recording.about import About
 from q2r2_control.recording.reader import Recording
 from q2r2_control.recording.recorder import Recorder, RecordingSummary
-from q2r2_control.runtime.folders import new_folder
-from q2r2_control.runtime.run_summary import RunSummary
-from q2r2_control.runtime.scheduling import real_time
+from q2r2_control.process.folders import new_folder
+from q2r2_control.summary.run_summary import RunSummary
+from q2r2_control.process.scheduling import real_time
 from q2r2_control.supervision.preflight import preflight_faults
 from q2r2_control.teleop.episode_marks import EpisodeMarks
 from q2r2_control.viewer.history import History

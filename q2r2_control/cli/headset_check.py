@@ -12,7 +12,7 @@ from q2r2_control.cli.options import DEMO_CONFIG, Json, positive
 from q2r2_control.cli.output import as_json_text, stderr_console
 from q2r2_control.config.cell import load_config
 from q2r2_control.inputs.headset_check import watch_headset
-from q2r2_control.runtime.process import StopRequest, stop_on_signals
+from q2r2_control.process.signals import StopRequest, stop_on_signals
 from q2r2_control.viewer.headset_table import HeadsetDisplay, headset_table
 
 

@@ -7,7 +7,7 @@ import time
 from q2r2_control.errors import ConfigError
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.plants.mujoco import MujocoPlant
-from q2r2_control.runtime.recorder import Tick
+from q2r2_control.summary.tick import Tick
 
 _PERIOD = 1.0 / 30.0  # [s]
 

@@ -11,7 +11,7 @@ from q2r2_control.demo.touch_watch import Toucher, TouchWatch
 from q2r2_control.errors import ConfigError
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.robot.robot import Robot
-from q2r2_control.runtime.recorder import Tick
+from q2r2_control.summary.tick import Tick
 
 
 @dataclass(frozen=True, slots=True)

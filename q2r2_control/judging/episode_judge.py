@@ -17,7 +17,7 @@ from q2r2_control.judging.judge_work import LONGEST_MESSAGE, Answer, Question
 from q2r2_control.recording.episode_spans import spans_of
 from q2r2_control.recording.helper import reason_of
 from q2r2_control.recording.helper_process import HelperProcess
-from q2r2_control.runtime.recorder import Tick
+from q2r2_control.summary.tick import Tick
 from q2r2_control.wording import sentence
 
 _OF_EPISODES = {

@@ -18,11 +18,11 @@ from q2r2_control.pipeline.pipeline_run import PipelineRun
 from q2r2_control.plants.base import Plant
 from q2r2_control.plants.factory import check_mode, make_plant
 from q2r2_control.robot.robot import Robot
-from q2r2_control.runtime.loop_clock import LoopClock
-from q2r2_control.runtime.pending_requests import PendingRequests
-from q2r2_control.runtime.process import few_garbage_collections, stop_on_signals
-from q2r2_control.runtime.recorder import Tick
-from q2r2_control.runtime.run_summary import RunSummary
+from q2r2_control.pipeline.loop_clock import LoopClock
+from q2r2_control.pipeline.pending_requests import PendingRequests
+from q2r2_control.process.signals import few_garbage_collections, stop_on_signals
+from q2r2_control.summary.tick import Tick
+from q2r2_control.summary.run_summary import RunSummary
 from q2r2_control.supervision.joint_watch import watch_settings
 from q2r2_control.supervision.supervisor import Supervisor
 from q2r2_control.supervision.target_stream import StreamSettings

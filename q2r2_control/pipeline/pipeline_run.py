@@ -13,11 +13,12 @@ import numpy as np
 import pinocchio as pin
 
 from q2r2_control.errors import PlantError
-from q2r2_control.runtime.geometry_updates import GeometryUpdates
-from q2r2_control.runtime.operator_side import OperatorSide
-from q2r2_control.runtime.plant_clock import PlantClock
-from q2r2_control.runtime.recorder import RunRecorder, RunStart, Tick
-from q2r2_control.runtime.run_summary import RunSummary
+from q2r2_control.loop.geometry_updates import GeometryUpdates
+from q2r2_control.pipeline.operator_side import OperatorSide
+from q2r2_control.pipeline.plant_clock import PlantClock
+from q2r2_control.pipeline.run_recorder import RunRecorder
+from q2r2_control.summary.tick import RunStart, Tick
+from q2r2_control.summary.run_summary import RunSummary
 from q2r2_control.supervision.supervisor import Phase
 from q2r2_control.supervision.tick_pacer import TickPacer
 from q2r2_control.teleop.arm import OPEN

@@ -16,7 +16,7 @@ from q2r2_control.recording.picture_channel import PictureChannel
 from q2r2_control.recording.topics import Topic
 from q2r2_control.recording.writer import RingSetup
 from q2r2_control.recording.writer_process import WriterProcess
-from q2r2_control.runtime.folders import new_folder
+from q2r2_control.process.folders import new_folder
 
 PATIENCE = 10.0  # for a disk that hangs, at the end of a run [s]
 

@@ -19,7 +19,7 @@ from q2r2_control.recording.helper_process import HelperProcess
 from q2r2_control.recording.picture_channel import PictureChannel
 from q2r2_control.recording.ring import Ring, new_memory
 from q2r2_control.recording.topics import Topics, picture
-from q2r2_control.runtime.recorder import Tick
+from q2r2_control.summary.tick import Tick
 
 ROOM = 128 << 10  # for copies that wait [bytes]; of the shipped cell, some seconds of a camera at 30 Hz
 _ROUNDING = 1e-6  # of a period: what is due but for the rounding of times is due

@@ -18,7 +18,7 @@ from q2r2_control.recording.reader import RecordedChunk
 from q2r2_control.recording.rows import Rows, log_time, text_of
 from q2r2_control.recording.topics import Topic, Topics
 from q2r2_control.robot.robot import Robot
-from q2r2_control.runtime.recorder import Tick
+from q2r2_control.summary.tick import Tick
 
 _BATCH = 64
 _AXES = ("x", "y", "z", "w")

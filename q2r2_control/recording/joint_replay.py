@@ -20,10 +20,10 @@ from q2r2_control.recording.recorded_ticks import RecordedTicks
 from q2r2_control.recording.recorded_way import RecordedWay
 from q2r2_control.recording.replay import opened
 from q2r2_control.robot.robot import Robot
-from q2r2_control.runtime.loop_clock import LoopClock
-from q2r2_control.runtime.operator_side import OperatorSide
-from q2r2_control.runtime.recorder import Tick
-from q2r2_control.runtime.run_summary import RunSummary
+from q2r2_control.pipeline.loop_clock import LoopClock
+from q2r2_control.pipeline.operator_side import OperatorSide
+from q2r2_control.summary.tick import Tick
+from q2r2_control.summary.run_summary import RunSummary
 from q2r2_control.types import ArmTarget, HandSample, HapticFeedback
 from q2r2_control.wording import limit_name
 

@@ -23,7 +23,7 @@ from q2r2_control.recording.topics import FLAGS, GRIPPERS, SAMPLE_FIELDS, START,
 from q2r2_control.types import SIDES, Array, CommandMode, HandFault, HandInputs, HandSample, RobotState, StepStatus
 
 if TYPE_CHECKING:  # the writer's process does without the loop's modules
-    from q2r2_control.runtime.recorder import Tick
+    from q2r2_control.summary.tick import Tick
 
 NOT_MEASURED = -math.inf  # in place of the opening of a gripper that the plant does not measure
 COMMAND_MODES, STATUSES = tuple(CommandMode), tuple(StepStatus)

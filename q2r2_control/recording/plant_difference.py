@@ -10,7 +10,7 @@ import pinocchio as pin
 
 from q2r2_control.recording.recorded_ticks import RecordedTicks
 from q2r2_control.robot.robot import Robot
-from q2r2_control.runtime.recorder import Tick
+from q2r2_control.summary.tick import Tick
 
 
 @dataclass(frozen=True, slots=True)

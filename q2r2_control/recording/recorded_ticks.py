@@ -14,7 +14,7 @@ from q2r2_control.recording import topics as names
 from q2r2_control.recording.episode_spans import events_of_ticks
 from q2r2_control.recording.packing import HAND_FAULTS, NOT_MEASURED
 from q2r2_control.recording.reader import RecordedChunk, Recording
-from q2r2_control.runtime.recorder import RunStart
+from q2r2_control.summary.tick import RunStart
 from q2r2_control.types import SIDES, Array, HandInputs, HandSample, RobotState
 
 

@@ -26,7 +26,7 @@ from q2r2_control.recording.picture_channel import PictureChannel
 from q2r2_control.recording.topics import Topics
 from q2r2_control.recording.writer_process import ROOM
 from q2r2_control.robot.robot import Robot
-from q2r2_control.runtime.recorder import Tick
+from q2r2_control.summary.tick import Tick
 
 _LOOKS = 64  # ticks between two looks at whether the writer lives
 _MOST_WAITING = 4  # ticks that may wait to be packed

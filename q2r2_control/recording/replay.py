@@ -21,8 +21,8 @@ from q2r2_control.recording.plant_difference import ArmDifference, PlantDifferen
 from q2r2_control.recording.reader import Recording
 from q2r2_control.recording.recorded_ticks import NoMoreTicksError, RecordedTick, RecordedTicks
 from q2r2_control.robot.robot import Robot
-from q2r2_control.runtime.loop_clock import LoopClock
-from q2r2_control.runtime.run_summary import RunSummary
+from q2r2_control.pipeline.loop_clock import LoopClock
+from q2r2_control.summary.run_summary import RunSummary
 from q2r2_control.types import Array, Command, CommandMode, HandSample, HapticFeedback, RobotState
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from q2r2_control.config.bindings import Action, BindingSettings
 from q2r2_control.events import REFUSALS, Event
-from q2r2_control.runtime.recorder import Tick
+from q2r2_control.summary.tick import Tick
 from q2r2_control.teleop.arm_states import ArmState
 from q2r2_control.types import ActiveLimit, LimitKind
 from q2r2_control.viewer.history import tracking_error

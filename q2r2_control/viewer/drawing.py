@@ -25,7 +25,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from q2r2_control.runtime.process import how_it_ended
+from q2r2_control.process.signals import how_it_ended
 
 _PROGRAM = """
 import json, sys

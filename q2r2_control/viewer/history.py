@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from q2r2_control.robot.robot import Robot
-from q2r2_control.runtime.recorder import Tick
+from q2r2_control.summary.tick import Tick
 from q2r2_control.types import Array
 
 _FIRST_INTERVAL = 0.01  # between rows, as long as they fit [s]

@@ -13,7 +13,7 @@ from rich.table import Table
 
 from q2r2_control.config.bindings import BindingSettings
 from q2r2_control.events import Event
-from q2r2_control.runtime.recorder import Tick
+from q2r2_control.summary.tick import Tick
 from q2r2_control.types import ActiveLimit
 from q2r2_control.viewer.arm_words import next_press, why
 from q2r2_control.viewer.drawing import drawn

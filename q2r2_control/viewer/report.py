@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from q2r2_control.runtime.run_summary import RunSummary
+from q2r2_control.summary.run_summary import RunSummary
 from q2r2_control.types import Array
 from q2r2_control.viewer.history import History
 from q2r2_control.viewer.plot_style import COLOURS, LINE_STYLES, MARGIN_COLOUR, draw_limit

@@ -14,7 +14,7 @@ from q2r2_control.errors import ConfigError, PlantError
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.robot.robot import Robot
-from q2r2_control.runtime.recorder import Tick
+from q2r2_control.summary.tick import Tick
 from q2r2_control.types import SIDES, Array, RobotState
 from tests.support.hands_input import HandsInput
 from tests.support.watch import Watch, assert_torque_bounds, cell

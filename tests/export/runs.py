@@ -11,7 +11,7 @@ import pinocchio as pin
 
 from q2r2_control.inputs.played import PlayedInput
 from q2r2_control.inputs.sampling import EvenSampling
-from q2r2_control.runtime.recorder import Tick
+from q2r2_control.summary.tick import Tick
 from q2r2_control.types import SIDES, HandInputs
 from tests.recording.runs import file_of, pipeline, record
 from tests.support.watch import Watch

@@ -21,7 +21,7 @@ from q2r2_control.recording.about import About
 from q2r2_control.recording.reader import Recording
 from q2r2_control.recording.recorder import Recorder
 from q2r2_control.recording.replay import replay
-from q2r2_control.runtime.recorder import Tick
+from q2r2_control.summary.tick import Tick
 from q2r2_control.teleop.haptics import EPISODE_KEPT, EPISODE_REJECTED
 from q2r2_control.types import HandInputs, HapticFeedback
 from tests.judging.runs import RATE, Work, hands, killed, loop_of, press

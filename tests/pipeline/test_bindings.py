@@ -14,7 +14,7 @@ import pytest
 from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.robot.robot import Robot
-from q2r2_control.runtime.recorder import Tick
+from q2r2_control.summary.tick import Tick
 from q2r2_control.types import Array, HandInputs, HandSample
 from tests.support.hands_input import ENGAGED, HandsInput, Path
 from tests.support.watch import Watch, cell

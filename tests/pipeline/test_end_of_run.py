@@ -23,7 +23,7 @@ from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.pipeline.pipeline_run import STOPPING
 from q2r2_control.plants.kinematic import KinematicPlant
 from q2r2_control.robot.robot import Robot
-from q2r2_control.runtime.run_summary import RunSummary
+from q2r2_control.summary.run_summary import RunSummary
 from q2r2_control.types import SIDES, Command
 from tests.pipeline.loops import pipeline, when_moving
 from tests.support.watch import Watch, assert_torque_bounds, cell, speed

@@ -12,7 +12,7 @@ import pytest
 
 from q2r2_control.inputs.scripted import ScriptedInput
 from q2r2_control.pipeline.pipeline import Pipeline
-from q2r2_control.runtime.recorder import Tick
+from q2r2_control.summary.tick import Tick
 from q2r2_control.supervision.gripper_limiter import GripperLimiter
 from q2r2_control.types import HandSample
 from tests.support.object_cell import cell as object_cell

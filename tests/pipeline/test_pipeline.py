@@ -11,7 +11,7 @@ from q2r2_control.config.control import ContactPair
 from q2r2_control.errors import ConfigError
 from q2r2_control.inputs.scripted import ScriptedInput
 from q2r2_control.pipeline.pipeline import Pipeline
-from q2r2_control.runtime.run_summary import RunSummary
+from q2r2_control.summary.run_summary import RunSummary
 from q2r2_control.types import SIDES
 from tests.pipeline.loops import pipeline
 from tests.support.watch import Watch, assert_torque_bounds, cell, changes, speed

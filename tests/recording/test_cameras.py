@@ -21,7 +21,7 @@ from q2r2_control.recording.camera_process import CameraProcess
 from q2r2_control.recording.reader import Picture, Recording
 from q2r2_control.recording.recorder import Recorder
 from q2r2_control.recording.replay import replay
-from q2r2_control.runtime.recorder import Tick
+from q2r2_control.summary.tick import Tick
 from tests.recording.runs import RATE, file_of, pipeline, read_elsewhere, record
 from tests.recording.test_recorder import run_program
 from tests.recording.test_writer_process import Script

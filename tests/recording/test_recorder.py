@@ -26,7 +26,7 @@ from q2r2_control.recording.reader import Recording
 from q2r2_control.recording.recorder import Recorder
 from q2r2_control.recording.replay import replay
 from q2r2_control.recording.topics import Topics, filtered_hand, target
-from q2r2_control.runtime.recorder import Tick
+from q2r2_control.summary.tick import Tick
 from tests.recording.runs import RATE, file_of, pipeline, read_elsewhere, record, writer_of
 from tests.support.processes import wait_until
 

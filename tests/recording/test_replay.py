@@ -21,7 +21,7 @@ from q2r2_control.recording.recorder import Recorder
 from q2r2_control.recording.replay import replay
 from q2r2_control.recording.rows import HEAD
 from q2r2_control.robot.robot import Robot
-from q2r2_control.runtime.recorder import Tick
+from q2r2_control.summary.tick import Tick
 from q2r2_control.types import HandFault, HandSample, RobotState
 from tests.recording.runs import RATE, file_of, pipeline, record, rewrite
 from tests.support.object_cell import cell as object_cell

@@ -20,7 +20,7 @@ from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.recording.reader import Recording
 from q2r2_control.recording.recorder import Recorder
 from q2r2_control.recording.replay import replay
-from q2r2_control.runtime.recorder import Tick
+from q2r2_control.summary.tick import Tick
 from q2r2_control.teleop.haptics import FAULT
 from q2r2_control.types import HapticFeedback
 from tests.recording.runs import ROOT, file_of, pipeline, read_elsewhere, record, writer_of

@@ -17,7 +17,7 @@ from q2r2_control.inputs.factory import hands_watch
 from q2r2_control.inputs.headset import HeadsetServer
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.plants.mujoco import MujocoPlant
-from q2r2_control.runtime.recorder import Tick
+from q2r2_control.summary.tick import Tick
 from q2r2_control.types import SIDES, Array, CommandMode, HandSample, HapticFeedback
 from tests.support.fake_headset import FakeHeadset
 from tests.support.headset_server import eventually

@@ -9,7 +9,7 @@ import numpy as np
 from q2r2_control.config.cell import Config, load_config
 from q2r2_control.events import Event
 from q2r2_control.pipeline.pipeline import Pipeline
-from q2r2_control.runtime.recorder import Tick
+from q2r2_control.summary.tick import Tick
 from q2r2_control.verification.contract import Contract
 from tests.support.reasons import kinds
 

@@ -9,7 +9,7 @@ import pytest
 from q2r2_control.config.bindings import BindingSettings
 from q2r2_control.events import Event, Reason, ReasonKind
 from q2r2_control.robot.robot import Robot
-from q2r2_control.runtime.recorder import Tick
+from q2r2_control.summary.tick import Tick
 from q2r2_control.types import ActiveLimit, ArmTarget, LimitKind
 from q2r2_control.viewer.arm_words import next_press, why
 from q2r2_control.wording import SENTENCES

@@ -11,7 +11,7 @@ import pytest
 from q2r2_control.config.cell import load_config
 from q2r2_control.drives.base import position_command
 from q2r2_control.robot.robot import Robot
-from q2r2_control.runtime.recorder import RunStart, Tick
+from q2r2_control.summary.tick import RunStart, Tick
 from q2r2_control.types import ArmTarget, Reference, RobotState, StepReport, StepStatus
 from q2r2_control.viewer.history import History, tracking_error
 

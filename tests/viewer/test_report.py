@@ -11,7 +11,7 @@ import pytest
 from q2r2_control.config.cell import Config, load_config
 from q2r2_control.config.control import ControllerSettings
 from q2r2_control.robot.robot import Robot
-from q2r2_control.runtime.run_summary import RunStatistics, RunSummary
+from q2r2_control.summary.run_summary import RunStatistics, RunSummary
 from q2r2_control.viewer.history import History
 from q2r2_control.viewer.report import draw_report
 from tests.viewer.test_history import tick_at

@@ -19,7 +19,7 @@ from q2r2_control.teleop.haptics import ArmCondition
 from q2r2_control.types import RobotState, StepReport
 
 if TYPE_CHECKING:  # arms' nodes have no controller, and need not wait for its kernels
-    from q2r2_control.runtime.arm_conditions import ArmConditions
+    from q2r2_control.loop.arm_conditions import ArmConditions
 
 _PERIOD = 0.04  # [s]
 

@@ -16,7 +16,7 @@ from q2r2_control.ros.bridge.intakes import TargetIntake
 from q2r2_control.ros.bridge.messages import stamped_pose
 from q2r2_control.ros.bridge.reports import TickReport
 from q2r2_control.ros.monitoring.endpoints import publish_in_time
-from q2r2_control.runtime.arm_conditions import ArmConditions
+from q2r2_control.loop.arm_conditions import ArmConditions
 from q2r2_control.types import Reference, RobotState
 
 _MARKER_PERIOD = 0.1  # [s]

@@ -22,7 +22,7 @@ from q2r2_control.control.controller import CartesianController
 from q2r2_control.drives.base import Drive
 from q2r2_control.ros.base_node import LATCHED_QOS, BaseNode
 from q2r2_control.ros.bridge.opening_grants import wanted_topic
-from q2r2_control.runtime.geometry_updates import GeometryUpdates
+from q2r2_control.loop.geometry_updates import GeometryUpdates
 from q2r2_control.supervision.grasp_watch import STALL, GraspWatch
 
 # Until a gripper does what was granted: the answer has to arrive, ten goals a second go out, and it may be slow [s].

@@ -18,7 +18,7 @@ from dataclasses import dataclass, field
 from q2r2_control.config.cell import load_config
 from q2r2_control.config.external import ControllerKind, ExternalConfig
 from q2r2_control.errors import ConfigError, Q2R2Error
-from q2r2_control.runtime.process import StopRequest, how_it_ended, stop_on_signals
+from q2r2_control.process.signals import StopRequest, how_it_ended, stop_on_signals
 from q2r2_control.types import SIDES
 
 SOURCES = ("scripted", "headset", "none")

@@ -15,9 +15,9 @@ from q2r2_control.config.control import ControllerSettings
 from q2r2_control.drives.base import DriveReport
 from q2r2_control.events import Event
 from q2r2_control.robot.robot import Robot
-from q2r2_control.runtime.histogram import NOTHING_MEASURED, Histogram, Percentiles
-from q2r2_control.runtime.joint_extremes import JointExtremes
-from q2r2_control.runtime.torque_summary import TorqueStatistics, TorqueSummary
+from q2r2_control.summary.histogram import NOTHING_MEASURED, Histogram, Percentiles
+from q2r2_control.summary.joint_extremes import JointExtremes
+from q2r2_control.summary.torque_summary import TorqueStatistics, TorqueSummary
 from q2r2_control.types import ArmTarget, Array, HandSample, Reference
 from q2r2_control.wording import sentence
 

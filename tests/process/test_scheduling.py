@@ -10,7 +10,7 @@ import threading
 
 import pytest
 
-from q2r2_control.runtime.scheduling import real_time, schedule_process_as_others, schedule_process_first
+from q2r2_control.process.scheduling import real_time, schedule_process_as_others, schedule_process_first
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="only asked for on Linux")
 

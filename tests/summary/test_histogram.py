@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from q2r2_control.runtime.histogram import NOTHING_MEASURED, Histogram, Percentiles
+from q2r2_control.summary.histogram import NOTHING_MEASURED, Histogram, Percentiles
 
 
 @pytest.mark.parametrize("size", [1, 2, 10, 99, 101, 5000])

@@ -11,8 +11,8 @@ import pinocchio as pin
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.events import Event, Reason, ReasonKind
 from q2r2_control.inputs.base import Input
-from q2r2_control.runtime.operator_feedback import OperatorFeedback
-from q2r2_control.runtime.pending_requests import PendingRequests
+from q2r2_control.pipeline.operator_feedback import OperatorFeedback
+from q2r2_control.pipeline.pending_requests import PendingRequests
 from q2r2_control.supervision.supervisor import Supervisor
 from q2r2_control.teleop.arm_states import is_fault
 from q2r2_control.teleop.teleop import Teleop

@@ -15,7 +15,7 @@ from q2r2_control.inputs.scripted import ScriptedInput
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.plants.kinematic import KinematicPlant
 from q2r2_control.robot.robot import Robot
-from q2r2_control.runtime.run_summary import EVENTS_KEPT, RunStatistics
+from q2r2_control.summary.run_summary import EVENTS_KEPT, RunStatistics
 from q2r2_control.types import ArmTarget, Reference, StepReport, StepStatus
 from tests.support.watch import cell
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from q2r2_control.runtime import loop_clock
-from q2r2_control.runtime.loop_clock import LoopClock
+from q2r2_control.pipeline import loop_clock
+from q2r2_control.pipeline.loop_clock import LoopClock
 
 PERIOD = 0.01
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 
-from q2r2_control.runtime.histogram import Histogram
+from q2r2_control.summary.histogram import Histogram
 
 _SHORTEST_DT = 1e-6  # [s]
 

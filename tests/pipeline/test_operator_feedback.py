@@ -16,7 +16,7 @@ from q2r2_control.inputs.headset import HeadsetServer
 from q2r2_control.inputs.scripted import ScriptedInput
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.plants.mujoco import MujocoPlant
-from q2r2_control.runtime.recorder import Tick
+from q2r2_control.summary.tick import Tick
 from q2r2_control.teleop.haptics import CONTACT, ENGAGED, FAULT, GRASP, LIMIT, NEAR, PAUSED, SLIP, Pulse
 from q2r2_control.types import Array, HapticFeedback
 from tests.support.fake_headset import RATE_HZ, FakeHeadset, Sensor

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from q2r2_control.robot.robot import Robot
-from q2r2_control.runtime.joint_extremes import JointExtremes
+from q2r2_control.summary.joint_extremes import JointExtremes
 from q2r2_control.types import Reference, StepReport, StepStatus
 from tests.support.watch import cell
 

@@ -10,7 +10,7 @@ import numpy as np
 from q2r2_control.config.teleop import HapticSettings
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.events import Event
-from q2r2_control.runtime.arm_conditions import ArmConditions
+from q2r2_control.loop.arm_conditions import ArmConditions
 from q2r2_control.supervision.grasp_watch import Grip
 from q2r2_control.teleop.haptics import HapticPulses
 from q2r2_control.types import ArmTarget, HapticFeedback, RobotState, StepReport

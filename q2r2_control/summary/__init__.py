@@ -1,0 +1,1 @@
+"""A tick's record, and the figures of a whole run."""

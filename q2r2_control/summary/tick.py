@@ -1,0 +1,54 @@
+"""The record of one tick, which listeners get."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import pinocchio as pin
+
+from q2r2_control.compliance.admittance import AdmittanceReport
+from q2r2_control.compliance.impedance import ImpedanceReport
+from q2r2_control.compliance.repulsion import WallReport
+from q2r2_control.types import ArmTarget, Command, HandSample, Reference, RobotState
+from q2r2_control.events import Event
+
+
+@dataclass(frozen=True, slots=True)
+class RunStart:
+    """Where a run began, by the clock of its loop and by its plant."""
+
+    now: float  # [s]
+    state: RobotState
+
+
+@dataclass(frozen=True, slots=True)
+class Tick:
+    """All that one tick took and did, for the listeners."""
+
+    t: float  # since the start of the run [s]
+    start: RunStart
+    now: float  # by the loop's own clock, the one of the samples' stamps [s]
+    dt: float  # that passed since the last tick [s]
+    step: float  # by which the reference moved, less than dt where motion is stretched after a late tick [s]
+    following: bool  # False: the run ends, and input and targets do not count any more
+    connected: bool  # whether the input was
+    samples: list[HandSample]
+    targets: dict[str, ArmTarget]  # as the operator asks for them, whatever an admittance makes of them
+    engaged: dict[str, bool]
+    states: dict[str, str]  # of the teleop layer, or STOPPING
+    reference: Reference
+    state: RobotState  # measured before the tick's command
+    openings: dict[str, float]  # of the grippers, measured before the tick's command
+    tools: dict[str, pin.SE3]  # measured tool poses, world frame
+    command: Command  # given to the plant
+    events: list[Event]  # of the arms' teleoperation
+    grippers: dict[str, float]  # openings measured after the plant has advanced
+    compute_time: float  # [s]
+    impedance: ImpedanceReport | None = None  # of torque mode
+    wall: WallReport | None = None  # of torque mode
+    admittance: AdmittanceReport | None = None  # of position mode, where it is enabled
+    # arm -> pair of bodies that keeps its gripper from being commanded as wanted
+    held_grippers: dict[str, tuple[str, str]] = field(default_factory=dict)
+    holding: dict[str, bool] = field(
+        default_factory=dict
+    )  # of arms whose grippers have an object, whether they hold it
