@@ -23,8 +23,8 @@ import pytest
 from q2r2_control.config.timeouts import STREAM_TIMEOUT
 from q2r2_control.inputs.headset import HeadsetServer
 from q2r2_control.pipeline.pipeline import Pipeline
-from q2r2_control.summary.tick import Tick
 from q2r2_control.summary.run_summary import RunSummary
+from q2r2_control.summary.tick import Tick
 from q2r2_control.types import SIDES, Array, HandSample
 from tests.support.watch import Watch, cell, changes, speed
 

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from q2r2_control.errors import PlantError
+from q2r2_control.pipeline import loop_clock
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.plants.kinematic import KinematicPlant
 from q2r2_control.robot.robot import Robot
-from q2r2_control.pipeline import loop_clock
 from q2r2_control.summary.tick import Tick
 from q2r2_control.types import Array, Command, RobotState
 from tests.support.hands_input import HandsInput

@@ -26,12 +26,12 @@ from q2r2_control.judging.episode_judge import EpisodeJudge
 from q2r2_control.judging.judge import Judged, judge, keep_verdicts
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.plants.mujoco import MujocoPlant
+from q2r2_control.process.folders import new_folder
+from q2r2_control.process.scheduling import real_time
 from q2r2_control.recording.about import About
 from q2r2_control.recording.reader import Recording
 from q2r2_control.recording.recorder import Recorder, RecordingSummary
-from q2r2_control.process.folders import new_folder
 from q2r2_control.summary.run_summary import RunSummary
-from q2r2_control.process.scheduling import real_time
 from q2r2_control.supervision.preflight import preflight_faults
 from q2r2_control.teleop.episode_marks import EpisodeMarks
 from q2r2_control.viewer.history import History

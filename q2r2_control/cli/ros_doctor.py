@@ -13,10 +13,10 @@ from rich.text import Text
 from q2r2_control.cli.options import DEMO_CONFIG, Json, positive
 from q2r2_control.cli.output import as_json_text
 from q2r2_control.config.cell import load_config
+from q2r2_control.process.signals import StopRequest, stop_on_signals
 from q2r2_control.ros.launch.processes import nodes_of
 from q2r2_control.ros.watching.environment import examine_environment
 from q2r2_control.ros.watching.findings import Finding, examine_set
-from q2r2_control.process.signals import StopRequest, stop_on_signals
 
 _TIME = 4.0  # in which a set is found, and a second publisher too [s]
 

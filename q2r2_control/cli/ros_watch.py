@@ -15,9 +15,9 @@ from q2r2_control.cli.options import DEMO_CONFIG, Json, positive
 from q2r2_control.cli.output import as_json_text, stderr_console
 from q2r2_control.cli.ros_set_table import arm_lines, set_tables
 from q2r2_control.config.cell import Config, load_config
+from q2r2_control.process.signals import StopRequest, stop_on_signals
 from q2r2_control.ros.launch.processes import check_rclpy
 from q2r2_control.ros.watching.set_view import SetView
-from q2r2_control.process.signals import StopRequest, stop_on_signals
 
 _ONCE = 3.0  # in which a set is found, and its nodes have spoken several times [s]
 

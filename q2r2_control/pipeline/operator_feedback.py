@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable
 from itertools import cycle
 
 import numpy as np
 
 from q2r2_control.config.teleop import HapticSettings
 from q2r2_control.control.controller import CartesianController
-from q2r2_control.events import Event
 from q2r2_control.loop.arm_conditions import ArmConditions
+from q2r2_control.summary.tick import Tick
 from q2r2_control.supervision.grasp_watch import Grip
 from q2r2_control.teleop.haptics import HapticPulses
-from q2r2_control.types import ArmTarget, HapticFeedback, RobotState, StepReport
+from q2r2_control.types import HapticFeedback
 
 _PERIOD = 0.02  # of looking at more of an arm than its events [s]
 
@@ -45,39 +45,24 @@ class OperatorFeedback:
         for pulses in self._pulses.values():
             pulses.strength = strength
 
-    def update(
-        self,
-        now: float,
-        events: Iterable[Event],
-        targets: Mapping[str, ArmTarget],
-        report: StepReport,
-        state: RobotState,
-        grippers: Mapping[str, float],
-        openings: Mapping[str, float],
-    ) -> None:
-        """Look at one tick: ``grippers`` are commanded openings, ``openings`` those measured."""
-        for event in events:
+    def update(self, tick: Tick) -> None:
+        """Send the vibrations of one tick."""
+        now = tick.now
+        for event in tick.events:
             self._pulses[event.arm].tell(event)
-        self._conditions.note(report, now)
+        self._conditions.note(tick.reference.report, now)
         self._due = max(self._due, now - _PERIOD + self._wait)  # each arm once at most
         while now >= self._due:
             self._due += self._wait
-            self._look(next(self._turns), now, targets, state, grippers, openings)
+            self._inspect(next(self._turns), tick)
         for arm, pulses in self._pulses.items():
             if not pulses.idle and (feedback := pulses.at(now, self._hand_of(arm))) is not None:
                 self._send(feedback)
 
-    def _look(
-        self,
-        arm: str,
-        now: float,
-        targets: Mapping[str, ArmTarget],
-        state: RobotState,
-        grippers: Mapping[str, float],
-        openings: Mapping[str, float],
-    ) -> None:
-        pulses = self._pulses[arm]
-        pulses.slip(targets[arm].slip, targets[arm].slip_angle)
-        pulses.notice(self._conditions.look_at(arm, state, now))
-        if arm in grippers and arm in openings:
-            pulses.grasps(self._grips[arm].look(grippers[arm], openings[arm], now))
+    def _inspect(self, arm: str, tick: Tick) -> None:
+        pulses, target = self._pulses[arm], tick.targets[arm]
+        pulses.slip(target.slip, target.slip_angle)
+        pulses.notice(self._conditions.look_at(arm, tick.state, tick.now))
+        commanded, opening = tick.command.grippers.get(arm), tick.openings.get(arm)
+        if commanded is not None and opening is not None:
+            pulses.grasps(self._grips[arm].look(commanded, opening, tick.now))

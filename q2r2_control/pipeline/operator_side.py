@@ -48,25 +48,12 @@ class OperatorSide:
             self._teleop.connection_lost(now)
         return samples
 
-    def targets(
-        self,
-        samples: list[HandSample],
-        tools: Mapping[str, pin.SE3],
-        now: float,
-        commanded: Mapping[str, pin.SE3],
-    ) -> dict[str, ArmTarget]:
-        """What the operator asks of the arms, handed over to supervision; see :meth:`Teleop.update`."""
+    def targets(self, samples: list[HandSample], tools: Mapping[str, pin.SE3], now: float) -> dict[str, ArmTarget]:
+        """The operator's targets for the arms; see :meth:`Teleop.update`."""
         if self._requests:
             self._fulfil(now)
+        commanded = {arm: self._controller.tool_pose(arm) for arm in tools}
         targets = self._teleop.update(samples, tools, now, commanded)
-        for arm, target in targets.items():
-            command = target.command
-            if command is None:
-                self._supervisor.release_target(arm)
-            elif refusal := self._supervisor.take_target(arm, command, now, measured=tools[arm]):
-                self._teleop.pause(
-                    now, Reason.of(ReasonKind.OTHER, text=refusal.line)
-                )  # or the operator would think that the arm follows
         self._go_home(now)
         return targets
 

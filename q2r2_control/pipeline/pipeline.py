@@ -1,33 +1,61 @@
-"""What a cell's loop is made of, how it is run, and what a program may ask of a run that goes on."""
+"""The in-process loop of a cell: input -> teleop -> control -> plant at every tick, and rest at its end."""
 
 from __future__ import annotations
 
+import logging
 import math
+import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
 
 from q2r2_control.config.cell import Config
 from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.drives.base import permitted
 from q2r2_control.drives.factory import make_drive
-from q2r2_control.errors import ConfigError
-from q2r2_control.events import Reason
+from q2r2_control.errors import ConfigError, PlantError
+from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.inputs.base import Input
 from q2r2_control.inputs.factory import make_input
-from q2r2_control.pipeline.pipeline_run import PipelineRun
+from q2r2_control.loop.control_loop import ControlLoop, LoopStep
+from q2r2_control.pipeline.loop_clock import LoopClock
+from q2r2_control.pipeline.operator_side import OperatorSide
+from q2r2_control.pipeline.pending_requests import PendingRequests
+from q2r2_control.pipeline.plant_clock import PlantClock
+from q2r2_control.pipeline.run_recorder import RunRecorder
 from q2r2_control.plants.base import Plant
 from q2r2_control.plants.factory import check_mode, make_plant
-from q2r2_control.robot.robot import Robot
-from q2r2_control.pipeline.loop_clock import LoopClock
-from q2r2_control.pipeline.pending_requests import PendingRequests
 from q2r2_control.process.signals import few_garbage_collections, stop_on_signals
-from q2r2_control.summary.tick import Tick
+from q2r2_control.robot.robot import Robot
 from q2r2_control.summary.run_summary import RunSummary
+from q2r2_control.summary.tick import RunStart, Tick
 from q2r2_control.supervision.joint_watch import watch_settings
-from q2r2_control.supervision.supervisor import Supervisor
+from q2r2_control.supervision.supervisor import Phase, Supervisor
 from q2r2_control.supervision.target_stream import StreamSettings
+from q2r2_control.teleop.arm import OPEN
 from q2r2_control.teleop.teleop import Teleop
-from q2r2_control.types import CommandMode
+from q2r2_control.types import LONGEST_DT, ArmTarget, CommandMode, HandSample, RobotState
+
+STOPPING = "stopping"  # state of every arm while the run ends
+# Added to the time that full braking takes; an arm that still recovers into its limits is not waited for longer.
+_STOP_ALLOWANCE = 1.0  # [s]
+_REST = 1e-6  # of the reference [rad/s]
+
+_logger = logging.getLogger(__name__)
+
+
+@dataclass(slots=True)
+class _Measured:
+    """What came in for one tick."""
+
+    samples: list[HandSample]
+    state: RobotState
+    openings: dict[str, float]  # of the grippers, 0 closed .. 1 fully open
+    tools: dict[str, pin.SE3]  # world frame
 
 
 class Pipeline:
@@ -55,11 +83,12 @@ class Pipeline:
         self.plant = plant
         self.drive = make_drive(check_mode(mode, plant), robot, config, CommandMode.POSITION in plant.modes)
         self.controller = CartesianController(robot, permitted(config.control, self.drive))
-        self._begin_anew()
+        self._data = robot.model.createData()
         self.listeners: list[Callable[[Tick], None]] = []
         # A plain flag: unlike the locks of threading.Event, a signal handler can set it in the middle of anything.
         self._stopping = False
         self.requests = PendingRequests()
+        self._set_up()
 
     @classmethod
     def from_config(
@@ -78,6 +107,16 @@ class Pipeline:
         """
         robot = Robot.from_config(config)
         return cls(config, robot, make_input(input, config), make_plant(plant, robot, config), mode)
+
+    @property
+    def supervisor(self) -> Supervisor:
+        """The supervisor of this run."""
+        return self.loop.supervisor
+
+    @property
+    def stopping(self) -> bool:
+        """Whether :meth:`stop` was called, until the run has ended."""
+        return self._stopping
 
     def stop(self) -> None:
         """Bring the arms to rest and end the run, or the next one if none runs; from any thread or signal handler."""
@@ -123,7 +162,8 @@ class Pipeline:
         try:
             self.input.start()
             with stop_on_signals(self.stop), few_garbage_collections():
-                return self._begin(realtime).until(duration)
+                self._begin(realtime)
+                return self._run_until(math.inf if duration is None else duration)
         finally:
             self._stopping = False
             self.requests.clear()
@@ -132,6 +172,14 @@ class Pipeline:
             finally:
                 self.plant.close()
 
+    def make_clock(self, realtime: bool) -> LoopClock:
+        """The clock of a run, which begins now; a replay has one of its own."""
+        return LoopClock(1.0 / self.config.loop_rate_hz, realtime)
+
+    def make_operator(self) -> OperatorSide:
+        """The side of a run that asks for motion; a replay of joints has one of its own."""
+        return OperatorSide(self.teleop, self.input, self.supervisor, self.controller, self.requests)
+
     def _prepare(self, realtime: bool) -> None:
         """Nothing of an earlier run may move an arm: every run starts paused and with open grippers, as the plant."""
         # Whether a solution is late depends on the machine; a repeatable run must not.
@@ -139,28 +187,147 @@ class Pipeline:
         settings = permitted(self.config.control.model_copy(update=changes), self.drive)
         if settings != self.controller.settings:
             self.controller = CartesianController(self.robot, settings)
-        self._begin_anew()
+        self._set_up()
 
-    def _begin(self, realtime: bool) -> PipelineRun:
-        """Every run is made here, so that a benchmark can put its clocks into it."""
-        return PipelineRun(self, realtime)
-
-    def make_clock(self, realtime: bool) -> LoopClock:
-        """The clock of a run, which begins now; a replay has one of its own."""
-        return LoopClock(1.0 / self.config.loop_rate_hz, realtime)
-
-    def _begin_anew(self) -> None:
+    def _set_up(self) -> None:
         self.teleop = Teleop(self.config.teleop, tuple(self.robot.arms))
         watch = watch_settings(self.config.supervision, self.drive.yields)
-        self.supervisor = Supervisor(
-            self.robot,
-            self.controller,
-            StreamSettings(linked=self.config.teleop.linked),
-            watch,
-            displace=self.drive.displaced,
-        )
+        streams = StreamSettings(linked=self.config.teleop.linked)
+        self.loop = ControlLoop(self.controller, self.drive, 1.0 / self.config.loop_rate_hz, streams, watch)
 
-    @property
-    def stopping(self) -> bool:
-        """Whether :meth:`stop` was called, until the run has ended."""
-        return self._stopping
+    def _begin(self, realtime: bool) -> None:
+        """Every run begins here, so that a benchmark can put its clocks into it."""
+        self._following = True
+        self._targets = {arm: ArmTarget(None, OPEN) for arm in self.robot.arms}
+        self._grippers = {arm: target.gripper for arm, target in self._targets.items()}  # commanded
+        self.plant.reset()
+        self._state = self.plant.state()  # the newest one
+        self._clock = self.make_clock(realtime)
+        self._start = RunStart(self._clock.now, self._state)
+        self._plant_clock = PlantClock(self._state)
+        self.loop.activate(self._state, self._clock.now)
+        self.supervisor.events.clear()
+        self._recorder = RunRecorder(self.robot, self.config.control, self.listeners, self.stop)
+        self._operator = self.make_operator()
+        self.teleop.marks.recorded = self._recorder.keeps_episodes
+
+    def _run_until(self, duration: float) -> RunSummary:
+        """Tick until ``duration`` [s] is over or a stop is asked for, then until the arms are at rest."""
+        try:
+            while not (self._clock.after(duration) or self._stopping):
+                self.tick()
+                if self.supervisor.phase is not Phase.ACTIVE:
+                    raise PlantError(self.supervisor.fault or "the arms were stopped")
+        except BaseException:
+            # The arms come first, whatever failed. What failed may fail again; the first fault tells more.
+            with suppress(Exception):
+                self._bring_to_rest()
+            raise
+        self._bring_to_rest()
+        if fault := self.supervisor.state_fault:
+            raise PlantError(fault)
+        return self._recorder.summary(self._clock, self.loop.pacer)
+
+    def _bring_to_rest(self) -> None:
+        """Tick without input and targets until all stands still; no fault of an input can prevent it."""
+        self._following = False
+        self._targets = {arm: ArmTarget(None, target.gripper) for arm, target in self._targets.items()}
+        self.supervisor.stop("the run has ended")
+        self.supervisor.events.clear()
+        try:
+            velocity = np.abs(self.tick().reference.v)
+            deadline = self._clock.now + float((velocity / self.loop.acceleration_limit).max()) + _STOP_ALLOWANCE
+            while (velocity.max() > _REST or not self.drive.at_rest(self._state)) and self._clock.now < deadline:
+                velocity = np.abs(self.tick().reference.v)
+        finally:
+            # From the last state that came: a plant that has lost its sensors still takes commands.
+            command = self.drive.last_command(self._state, self._grippers)
+            if command is not None:
+                self.plant.apply(command)
+
+    def tick(self) -> Tick:
+        """The way of the data, once: sample -> target -> reference -> command -> state."""
+        gap = self._clock.wait()
+        dt, now = self.loop.pace(gap), self._clock.now
+        began = time.perf_counter()
+        measured = self._measure(now)
+        step = self._control(measured, now, dt)
+        assert step.command is not None  # the plant is the loop's own
+        self.plant.apply(step.command)
+        compute_time = time.perf_counter() - began
+        self._recorder.add_latency(measured.samples, self._clock.read())
+        # A plant that is simulated lets no more time pass at once, as if the computer had stood still.
+        advance = min(gap, LONGEST_DT)
+        self.plant.advance(advance)
+        self._plant_clock.give(advance)
+        return self._record(gap, dt, measured, step, compute_time)
+
+    def _measure(self, now: float) -> _Measured:
+        """The samples of the hands, and where the plant is."""
+        samples = self._operator.poll(now) if self._following else []
+        state = self._state = self.plant.state()
+        seen, passed = self._plant_clock.stamped(state, now)
+        self.loop.observe(seen, now, passed)
+        return _Measured(samples, state, self.plant.gripper_openings(), self._measured_tools(state))
+
+    def _measured_tools(self, state: RobotState) -> dict[str, pin.SE3]:
+        """Measured tool poses, world frame."""
+        model = self.robot.model
+        pin.forwardKinematics(model, self._data, state.q)
+        return {
+            name: pin.updateFramePlacement(model, self._data, arm.frame_id).copy()
+            for name, arm in self.robot.arms.items()
+        }
+
+    def _control(self, measured: _Measured, now: float, dt: float) -> LoopStep:
+        """From measurements to a command. While a run ends, the operator asks for nothing."""
+        poses: dict[str, pin.SE3 | None] = {}
+        if self._following:
+            self._targets = self._operator.targets(measured.samples, measured.tools, now)
+            poses = {arm: target.command for arm, target in self._targets.items()}
+        wanted = {arm: target.gripper for arm, target in self._targets.items()}
+        step = self.loop.step(measured.state, poses, now, dt, wanted, measured.openings)
+        self._grippers = step.grippers
+        for refusal in step.refusals.values():
+            # Or the operator would think that the arm follows.
+            self.teleop.pause(now, Reason.of(ReasonKind.OTHER, text=refusal.line))
+        for line in self.supervisor.events:
+            _logger.warning(line)
+        self.supervisor.events.clear()
+        return step
+
+    def _record(self, gap: float, dt: float, measured: _Measured, step: LoopStep, compute_time: float) -> Tick:
+        """Make the tick's record, and hand it to the summary, the hands and the listeners."""
+        assert step.reference is not None
+        assert step.command is not None
+        teleop, now, following = self.teleop, self._clock.now, self._following
+        tick = Tick(
+            t=now - self._clock.start,
+            start=self._start,
+            now=now,
+            dt=gap,
+            step=dt,
+            following=following,
+            connected=self._operator.connected,
+            samples=measured.samples,
+            targets=self._targets,
+            engaged=teleop.engaged if following else dict.fromkeys(self._targets, False),
+            states={arm: str(value) if following else STOPPING for arm, value in teleop.states.items()},
+            reference=step.reference,
+            state=measured.state,
+            openings=measured.openings,
+            tools=measured.tools,
+            command=step.command,
+            events=self._operator.take_events(self._clock.start),
+            grippers=self.plant.gripper_openings(),
+            held_grippers=dict(self.loop.held_grippers),
+            holding=self.loop.holding,
+            compute_time=compute_time,
+            impedance=step.report.impedance,
+            wall=step.report.wall,
+            admittance=step.report.admittance,
+        )
+        if following:
+            self._operator.feedback.update(tick)
+        self._recorder.add(tick)
+        return tick

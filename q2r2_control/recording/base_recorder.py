@@ -9,6 +9,7 @@ from pathlib import Path
 
 from q2r2_control.errors import ConfigError
 from q2r2_control.events import Reason, ReasonKind
+from q2r2_control.process.folders import new_folder
 from q2r2_control.recording.about import About, Conclusion
 from q2r2_control.recording.encoder import RecordedRobot
 from q2r2_control.recording.helper import reason_of
@@ -16,7 +17,6 @@ from q2r2_control.recording.picture_channel import PictureChannel
 from q2r2_control.recording.topics import Topic
 from q2r2_control.recording.writer import RingSetup
 from q2r2_control.recording.writer_process import WriterProcess
-from q2r2_control.process.folders import new_folder
 
 PATIENCE = 10.0  # for a disk that hangs, at the end of a run [s]
 

@@ -16,8 +16,8 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 
-from q2r2_control.recording.helper import LONGEST_REASON, LONGEST_TOLD
 from q2r2_control.process.signals import how_it_ended
+from q2r2_control.recording.helper import LONGEST_REASON, LONGEST_TOLD
 
 _STARTING = 6.0  # times as long a patience with a process that has not taken anything yet: imports take their time
 _LOOKS = 0.1  # between two looks at whether it gets on [s]

@@ -11,8 +11,9 @@ import pinocchio as pin
 
 from q2r2_control.config.cell import Config
 from q2r2_control.errors import PlantError
+from q2r2_control.pipeline.loop_clock import LoopClock
+from q2r2_control.pipeline.operator_side import OperatorSide
 from q2r2_control.pipeline.pipeline import Pipeline
-from q2r2_control.pipeline.pipeline_run import PipelineRun
 from q2r2_control.plants.base import Plant
 from q2r2_control.plants.factory import make_plant
 from q2r2_control.recording.comparison import changes
@@ -20,10 +21,8 @@ from q2r2_control.recording.recorded_ticks import RecordedTicks
 from q2r2_control.recording.recorded_way import RecordedWay
 from q2r2_control.recording.replay import opened
 from q2r2_control.robot.robot import Robot
-from q2r2_control.pipeline.loop_clock import LoopClock
-from q2r2_control.pipeline.operator_side import OperatorSide
-from q2r2_control.summary.tick import Tick
 from q2r2_control.summary.run_summary import RunSummary
+from q2r2_control.summary.tick import Tick
 from q2r2_control.types import ArmTarget, HandSample, HapticFeedback
 from q2r2_control.wording import limit_name
 
@@ -109,15 +108,10 @@ class JointReplayPipeline(Pipeline):
         """See :meth:`Pipeline.make_clock`: ticks take what the recorded ones took."""
         return _Clock(1.0 / self.config.loop_rate_hz, self.way)
 
-    def _begin(self, realtime: bool) -> PipelineRun:
-        return _Run(self, realtime)
-
-
-class _Run(PipelineRun):
-    def __init__(self, pipeline: JointReplayPipeline, realtime: bool) -> None:
-        super().__init__(pipeline, realtime)
-        self._operator = _Lead(pipeline)
-        self._supervisor.lead(pipeline.way)
+    def make_operator(self) -> OperatorSide:
+        """See :meth:`Pipeline.make_operator`: nobody asks for anything but grippers, the joints are led."""
+        self.supervisor.lead(self.way)
+        return _Lead(self)
 
 
 class _Lead(OperatorSide):
@@ -133,7 +127,6 @@ class _Lead(OperatorSide):
         samples: list[HandSample],
         tools: Mapping[str, pin.SE3],
         now: float,
-        commanded: Mapping[str, pin.SE3],
     ) -> dict[str, ArmTarget]:
         """See :meth:`OperatorSide.targets`."""
         return {arm: ArmTarget(None, self._wanted.get(arm, 1.0)) for arm in self._arms}

@@ -12,6 +12,7 @@ from q2r2_control.control.qp import QpProblem, QpSolution, Solver, make_solver
 from q2r2_control.drives.base import permitted
 from q2r2_control.errors import ConfigError, PlantError, RecordingError
 from q2r2_control.events import Event
+from q2r2_control.pipeline.loop_clock import LoopClock
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.plants.base import Plant
 from q2r2_control.plants.factory import make_plant
@@ -21,7 +22,6 @@ from q2r2_control.recording.plant_difference import ArmDifference, PlantDifferen
 from q2r2_control.recording.reader import Recording
 from q2r2_control.recording.recorded_ticks import NoMoreTicksError, RecordedTick, RecordedTicks
 from q2r2_control.robot.robot import Robot
-from q2r2_control.pipeline.loop_clock import LoopClock
 from q2r2_control.summary.run_summary import RunSummary
 from q2r2_control.types import Array, Command, CommandMode, HandSample, HapticFeedback, RobotState
 

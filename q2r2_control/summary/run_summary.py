@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -12,21 +11,19 @@ import numpy as np
 import pinocchio as pin
 
 from q2r2_control.config.control import ControllerSettings
-from q2r2_control.drives.base import DriveReport
 from q2r2_control.events import Event
 from q2r2_control.robot.robot import Robot
 from q2r2_control.summary.histogram import NOTHING_MEASURED, Histogram, Percentiles
 from q2r2_control.summary.joint_extremes import JointExtremes
+from q2r2_control.summary.tick import Tick
 from q2r2_control.summary.torque_summary import TorqueStatistics, TorqueSummary
-from q2r2_control.types import ArmTarget, Array, HandSample, Reference
+from q2r2_control.types import ArmTarget, Array, HandSample
 from q2r2_control.wording import sentence
 
 EVENTS_KEPT = 10_000  # the newest ones; a broken button can cause more
 _REST = 1e-3  # [rad/s]
 # Ticks wait for as many: counted one after the other each takes a third of the time, since the first warms the caches.
 _BATCH = 16
-# A tick's dt, reference, targets, measured tools, and which arms are engaged.
-_Counted = tuple[float, Reference, dict[str, ArmTarget], dict[str, pin.SE3], dict[str, bool]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,6 +96,34 @@ class _ArmFigures:
     yielded: float = 0.0  # largest [m]
     yielded_angle: float = 0.0  # largest [rad]
 
+    def count(self, name: str, tick: Tick) -> None:
+        """Add one tick of the arm ``name``."""
+        if (target := tick.targets.get(name)) is not None:
+            self._count_target(name, target, tick)
+        if (pair := tick.held_grippers.get(name)) is not None:
+            self.held += tick.dt
+            self.held_by = pair
+        if (holds := tick.holding.get(name)) is not None:
+            self.object_held = (self.object_held or 0.0) + (tick.dt if holds else 0.0)
+        if tick.admittance is not None:
+            displacement = tick.admittance.arms[name].displacement
+            self.yielded = max(self.yielded, math.hypot(*displacement[:3]))
+            self.yielded_angle = max(self.yielded_angle, math.hypot(*displacement[3:]))
+
+    def _count_target(self, name: str, target: ArmTarget, tick: Tick) -> None:
+        if self.gripper != target.gripper:
+            self.gripper_changes += self.gripper is not None
+            self.gripper = target.gripper
+        self.slip = max(self.slip, target.slip)
+        self.slip_angle = max(self.slip_angle, target.slip_angle)
+        if target.pose is not None and tick.engaged[name]:
+            self.engaged += tick.dt
+            position, rotation = _error(pin.SE3ToXYZQUATtuple(tick.tools[name]), pin.SE3ToXYZQUATtuple(target.pose))
+            if math.isfinite(position + rotation):  # else nothing was measured
+                self.ticks += 1
+                self.position += position
+                self.rotation += rotation
+
 
 @dataclass(slots=True)
 class RunStatistics:
@@ -106,7 +131,7 @@ class RunStatistics:
 
     robot: Robot
     control: ControllerSettings
-    tick: Histogram = field(default_factory=lambda: Histogram(1e-3))
+    compute_times: Histogram = field(default_factory=lambda: Histogram(1e-3))
     latency: Histogram = field(default_factory=lambda: Histogram(1e-3))
     events: deque[Event] = field(default_factory=lambda: deque(maxlen=EVENTS_KEPT))
     _arms: dict[str, _ArmFigures] = field(init=False)
@@ -120,24 +145,19 @@ class RunStatistics:
     _uncertified: int = 0
     _rejected: int = 0
     _newest_v: Array | None = None
-    _waiting: list[_Counted] = field(default_factory=list)
+    _waiting: list[Tick] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         self._arms = {name: _ArmFigures() for name in self.robot.arms}
         self._torque = TorqueStatistics.of(tuple(self.robot.arms))
         self._extremes = JointExtremes(self.robot, self.control)
 
-    def add(
-        self,
-        dt: float,
-        reference: Reference,
-        targets: dict[str, ArmTarget],
-        tools: dict[str, pin.SE3],
-        engaged: dict[str, bool],
-    ) -> None:
-        """Take one tick, which nobody may change any more; ``tools`` are the poses measured before its command."""
-        self._newest_v = reference.v
-        self._waiting.append((dt, reference, targets, tools, engaged))
+    def add(self, tick: Tick) -> None:
+        """Count one tick, which nobody may change any more."""
+        self._newest_v = tick.reference.v
+        self.compute_times.add(tick.compute_time)
+        self.events.extend(tick.events)
+        self._waiting.append(tick)
         if len(self._waiting) == _BATCH:
             self._count_waiting()
 
@@ -146,60 +166,25 @@ class RunStatistics:
             self._count(tick)
         self._waiting.clear()
 
-    def _count(self, tick: _Counted) -> None:
-        dt, reference, targets, tools, engaged = tick
-        report = reference.report
+    def _count(self, tick: Tick) -> None:
+        report = tick.reference.report
         self._ticks += 1
-        self._duration += dt
-        self._extremes.add(reference)
+        self._duration += tick.dt
+        self._extremes.add(tick.reference)
         if report.closest_distance < self._distance:
             self._distance, self._pair = report.closest_distance, report.closest_pair
         self._fallback += report.fallback
         self._uncertified += not report.certified
         self._rejected += len(report.rejected)
-        for name, target in targets.items():
-            figures, pose = self._arms[name], target.pose
-            if figures.gripper != target.gripper:
-                figures.gripper_changes += figures.gripper is not None
-                figures.gripper = target.gripper
-            if target.slip > figures.slip:
-                figures.slip = target.slip
-            if target.slip_angle > figures.slip_angle:
-                figures.slip_angle = target.slip_angle
-            if pose is not None and engaged[name]:
-                figures.engaged += dt
-                error = _error(pin.SE3ToXYZQUATtuple(tools[name]), pin.SE3ToXYZQUATtuple(pose))
-                if math.isfinite(sum(error)):  # else nothing was measured
-                    figures.ticks += 1
-                    figures.position += error[0]
-                    figures.rotation += error[1]
+        for name, figures in self._arms.items():
+            figures.count(name, tick)
+        if tick.impedance is not None and tick.wall is not None:
+            self._torque.add(tick.dt, tick.impedance, tick.wall)
 
     def add_latency(self, samples: list[HandSample], now: float) -> None:
         """Count the time from the receipt of a tick's newest sample to its command, sent at ``now`` [s]."""
         if samples:
             self.latency.add(now - max(max(sample.pose_stamp, sample.inputs_stamp) for sample in samples))
-
-    def add_drive(self, dt: float, report: DriveReport) -> None:
-        """Count one tick's impedance and wall, or its admittance."""
-        if report.impedance is not None and report.wall is not None:
-            self._torque.add(dt, report.impedance, report.wall)
-        if report.admittance is not None:
-            for name, arm in report.admittance.arms.items():
-                figures = self._arms[name]
-                figures.yielded = max(figures.yielded, math.hypot(*arm.displacement[:3]))
-                figures.yielded_angle = max(figures.yielded_angle, math.hypot(*arm.displacement[3:]))
-
-    def add_held_grippers(self, dt: float, held: Mapping[str, tuple[str, str]]) -> None:
-        """Count one tick's grippers that were held, each with the pair of bodies that held it."""
-        for name, pair in held.items():
-            self._arms[name].held += dt
-            self._arms[name].held_by = pair
-
-    def add_holding(self, dt: float, holding: Mapping[str, bool]) -> None:
-        """Count one tick's grippers that have an object, and hold it or not."""
-        for name, holds in holding.items():
-            figures = self._arms[name]
-            figures.object_held = (figures.object_held or 0.0) + (dt if holds else 0.0)
 
     def summary(
         self,
@@ -219,7 +204,7 @@ class RunStatistics:
             ticks=self._ticks,
             duration_s=self._duration,
             loop_rate_hz=self._ticks / wall_time if wall_time > 0 else 0.0,
-            tick_us=self.tick.percentiles().scaled(1e3),
+            tick_us=self.compute_times.percentiles().scaled(1e3),
             lateness_us=lateness.scaled(1e3),
             input_to_command_ms=self.latency.percentiles(),
             arms={name: _arm_summary(figures) for name, figures in self._arms.items()},

@@ -9,8 +9,8 @@ import pinocchio as pin
 from q2r2_control.compliance.admittance import AdmittanceReport
 from q2r2_control.compliance.impedance import ImpedanceReport
 from q2r2_control.compliance.repulsion import WallReport
-from q2r2_control.types import ArmTarget, Command, HandSample, Reference, RobotState
 from q2r2_control.events import Event
+from q2r2_control.types import ArmTarget, Command, HandSample, Reference, RobotState
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,9 +21,9 @@ class RunStart:
     state: RobotState
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)  # not frozen, as all that every tick makes anew
 class Tick:
-    """All that one tick took and did, for the listeners."""
+    """All that came in and went out in one tick, for the listeners; nobody changes it."""
 
     t: float  # since the start of the run [s]
     start: RunStart

@@ -40,7 +40,9 @@ def settings_for_external_arms(config: Config) -> Config:
         name: arm.model_copy(update={"swivel": arm.swivel.model_copy(update={"gain": 0.0})})
         for name, arm in config.arms.items()
     }
-    return config.model_copy(update={"arms": arms, "control": config.control.model_copy(update=_FOLLOW)})
+    control = config.control.model_copy(update=_FOLLOW)
+    stiff = config.admittance.model_copy(update={"enabled": False})  # compliance is the other controller's
+    return config.model_copy(update={"arms": arms, "control": control, "admittance": stiff})
 
 
 class ExternalArms:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Protocol
+
 import pinocchio as pin
 
 from q2r2_control.control.controller import CartesianController
@@ -9,6 +11,46 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.supervision.joint_homing import ARRIVED, HELD_UP, JointHoming, JointWay
 from q2r2_control.supervision.tool_homing import ToolHoming
 from q2r2_control.types import Array, Reference
+
+
+class LedWay(Protocol):
+    """A way that all arms are led along; the controller follows as its promises allow."""
+
+    @property
+    def outcome(self) -> str | None:
+        """How it ended, or None while it goes on."""
+        ...
+
+    def targets(self, last: Reference | None, dt: float) -> dict[str, pin.SE3 | None]:
+        """What each tool is asked for after another ``dt`` [s] from the ``last`` reference, None: before the first."""
+        ...
+
+    def end(self) -> None:
+        """Lead nothing any more."""
+        ...
+
+
+class LedJoints:
+    """Asks no tool for anything: the controller holds the joint positions of a :class:`JointWay`."""
+
+    def __init__(self, controller: CartesianController, way: JointWay) -> None:
+        self._controller, self._way = controller, way
+        self._arms = tuple(controller.robot.arms)
+
+    @property
+    def outcome(self) -> str | None:
+        """See :attr:`LedWay.outcome`."""
+        return self._way.outcome
+
+    def targets(self, last: Reference | None, dt: float) -> dict[str, pin.SE3 | None]:
+        """See :meth:`LedWay.targets`."""
+        if last is not None:
+            self._controller.hold_at(self._way.step(last.q, last.v, dt))
+        return dict.fromkeys(self._arms)
+
+    def end(self) -> None:
+        """See :meth:`LedWay.end`."""
+        self._controller.hold_at(None)
 
 
 class Homing:
@@ -20,7 +62,7 @@ class Homing:
     def __init__(self, robot: Robot, controller: CartesianController, tools_only: bool) -> None:
         self._robot, self._controller, self._tools_only = robot, controller, tools_only
         self._home = {arm: robot.tool_pose(robot.home, arm) for arm in robot.arms}
-        self._way: ToolHoming | JointWay | None = None
+        self._way: LedWay | None = None
         self.outcome: str | None = None  # how the last way home ended, where it did by itself
 
     @property
@@ -31,7 +73,10 @@ class Homing:
     def begin(self) -> None:
         """Begin the way home."""
         self.outcome = None
-        self._way = ToolHoming(self._tools(), self._home) if self._tools_only else self.way_to(self._robot.home)
+        if self._tools_only:
+            self._way = ToolHoming(self._home, self._controller.tool_pose)
+        else:
+            self.follow(self.way_to(self._robot.home))
 
     def way_to(self, q: Array) -> JointHoming:
         """A way of all joints to ``q`` (nv,) [rad]."""
@@ -39,24 +84,15 @@ class Homing:
 
     def follow(self, way: JointWay) -> None:
         """Lead the joints along ``way`` until it has an outcome."""
-        self._way = way
+        self._way = LedJoints(self._controller, way)
 
     def targets(self, last: Reference | None, dt: float) -> dict[str, pin.SE3 | None]:
-        """What each tool is asked for after another ``dt`` [s] from the ``last`` reference, None: before the first.
-
-        Where joints are led no tool is asked for anything, and the controller is told which joint positions to hold.
-        """
-        if isinstance(self._way, ToolHoming):
-            return self._way.targets(dt)
-        if self._way is not None and last is not None:
-            self._controller.hold_at(self._way.step(last.q, last.v, dt))
-        return dict.fromkeys(self._robot.arms)
+        """See :meth:`LedWay.targets`; no way: nothing is asked for."""
+        return dict.fromkeys(self._robot.arms) if self._way is None else self._way.targets(last, dt)
 
     def check(self, reference: Reference) -> str | None:
         """End the way where it has an outcome at the tick's ``reference``; returns that, or None."""
-        if self._way is None:
-            return None
-        outcome = self._way.outcome(self._tools()) if isinstance(self._way, ToolHoming) else self._way.outcome
+        outcome = None if self._way is None else self._way.outcome
         if outcome == HELD_UP:
             outcome = f"held up by {' | '.join(reference.report.tightest_pair)}"
         elif outcome == ARRIVED:
@@ -68,8 +104,8 @@ class Homing:
 
     def end(self) -> None:
         """The arms hold where they come to rest."""
-        if self._way is not None and not isinstance(self._way, ToolHoming):
-            self._controller.hold_at(None)
+        if self._way is not None:
+            self._way.end()
         self._way = None
 
     def hold(self) -> str | None:
@@ -78,6 +114,3 @@ class Homing:
             self.end()
             self.outcome = "the way home was interrupted"
         return None
-
-    def _tools(self) -> dict[str, pin.SE3]:
-        return {arm: self._controller.tool_pose(arm) for arm in self._robot.arms}

@@ -124,14 +124,12 @@ class Supervisor:
         pose: pin.SE3 | None,
         now: float,
         number: int | None = None,
-        measured: pin.SE3 | None = None,
         due: float | None = None,
     ) -> Refusal | None:
         """A target in the world frame, or None for one that was no pose; returns why it is not followed, or None.
 
-        ``number`` is the one among its publisher's messages, where the middleware tells; ``measured`` the tool's pose
-        at the measured state, which is computed where it is needed and not given; ``due``: when the target is to be
-        reached [s], None: at once, and until the next one comes.
+        ``number`` is the one among its publisher's messages, where the middleware tells; ``due``: when the
+        target is to be reached [s], None: at once, and until the next one comes.
         """
         plain = number is None and pose is not None and self.no_targets is None
         if plain and self._targets.go_on(arm, pose, now, due):
@@ -140,7 +138,7 @@ class Supervisor:
         if not self._targets.follows_on(arm, now):
             tools.append(self._controller.tool_pose(arm))
             if self._external is None and self._watch.state is not None:
-                tools.append(self._robot.tool_pose(self._watch.state.q, arm) if measured is None else measured)
+                tools.append(self._robot.tool_pose(self._watch.state.q, arm))
         return self._targets.take(arm, pose, tools, now, number, self.no_targets, due)
 
     def release_target(self, arm: str) -> None:

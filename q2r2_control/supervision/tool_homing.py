@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import numpy as np
 import pinocchio as pin
+
+from q2r2_control.supervision.joint_homing import ARRIVED
+from q2r2_control.types import Reference
 
 _LINEAR_SPEED, _ANGULAR_SPEED = 0.1, 0.3  # [m/s], [rad/s]
 _ARRIVED, _TURNED = 0.003, 0.01  # [m], [rad]
@@ -15,33 +18,41 @@ _PATIENCE = 5.0  # after the targets have arrived [s]
 class ToolHoming:
     """Targets on a straight line from where the tools are to where they are at home, all arms at once.
 
+    Implements :class:`LedWay`.
+
     The QP keeps limits and distances on the way, and the posture's pull brings the elbows home; where it holds the
     tools up the homing ends there.
     """
 
-    def __init__(self, start: Mapping[str, pin.SE3], home: Mapping[str, pin.SE3]) -> None:
-        self._start, self._home = dict(start), dict(home)
-        self._duration = max(self._needed(arm) for arm in start)
+    def __init__(self, home: Mapping[str, pin.SE3], tool_pose: Callable[[str], pin.SE3]) -> None:
+        """``tool_pose``: where the controller's reference has an arm's tool."""
+        self._home, self._tool_pose = dict(home), tool_pose
+        self._start = {arm: tool_pose(arm) for arm in home}
+        self._duration = max(self._needed(arm) for arm in home)
         self._time = 0.0
 
-    def targets(self, dt: float) -> dict[str, pin.SE3 | None]:
+    def targets(self, last: Reference | None, dt: float) -> dict[str, pin.SE3 | None]:
         """Where the tools have to be after another ``dt`` [s]."""
         self._time += dt
         share = min(self._time / self._duration, 1.0)
         return {arm: _between(start, self._home[arm], share) for arm, start in self._start.items()}
 
-    def outcome(self, tools: Mapping[str, pin.SE3]) -> str | None:
+    @property
+    def outcome(self) -> str | None:
         """How the homing ended, or None while it goes on."""
         if self._time < self._duration:
             return None
         far = []
-        for arm, tool in tools.items():
-            error = tool.actInv(self._home[arm])
+        for arm, home in self._home.items():
+            error = self._tool_pose(arm).actInv(home)
             if np.linalg.norm(error.translation) > _ARRIVED or np.linalg.norm(pin.log3(error.rotation)) > _TURNED:
                 far.append(arm)
         if not far:
-            return "at home"
+            return ARRIVED
         return f"held up: {', '.join(far)}" if self._time > self._duration + _PATIENCE else None
+
+    def end(self) -> None:
+        """Nothing was set in the controller that would last."""
 
     def _needed(self, arm: str) -> float:
         start, home = self._start[arm], self._home[arm]

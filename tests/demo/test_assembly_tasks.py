@@ -17,8 +17,8 @@ from q2r2_control.inputs.trajectories import trajectory_named
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.robot.robot import Robot
-from q2r2_control.summary.tick import Tick
 from q2r2_control.summary.run_summary import RunSummary
+from q2r2_control.summary.tick import Tick
 from q2r2_control.types import CommandMode, HandSample
 from tests.support.watch import Watch, assert_torque_bounds
 

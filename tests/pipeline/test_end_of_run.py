@@ -19,8 +19,7 @@ import pytest
 from q2r2_control.errors import InputError
 from q2r2_control.inputs.headset import HeadsetServer
 from q2r2_control.inputs.scripted import ScriptedInput
-from q2r2_control.pipeline.pipeline import Pipeline
-from q2r2_control.pipeline.pipeline_run import STOPPING
+from q2r2_control.pipeline.pipeline import STOPPING, Pipeline
 from q2r2_control.plants.kinematic import KinematicPlant
 from q2r2_control.robot.robot import Robot
 from q2r2_control.summary.run_summary import RunSummary

@@ -26,7 +26,6 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
 from q2r2_control.ros.base_node import LATCHED_QOS, STREAM_QOS
-from q2r2_control.ros.bridge.gripper_limits import without_proof
 from q2r2_control.ros.bridge.grippers import GripperClient
 from q2r2_control.ros.bridge.opening_grants import OpeningGrants
 from tests.ros.cell import NODE_RATE, PATIENT, STILL, Cell, Stream, changed_cell, start_controller
@@ -111,23 +110,6 @@ def _stop_and_reset(cell: Cell) -> None:
     wait_until(lambda: cell.state("phase") == "stopped", "the arms are stopped")
     assert cell.call("/cartesian_controller/reset").success
     wait_until(lambda: cell.state("phase") == "active", "the arms are active")
-
-
-@pytest.mark.parametrize(
-    ("told", "wanted", "granted"),
-    [
-        pytest.param(None, 0.3, 0.3, id="anything where nothing was asked for"),
-        pytest.param((0.8, 0.8), 0.0, 0.0, id="anything to one that was not held"),
-        pytest.param((1.0, 0.4), 1.0, 0.4, id="no farther open to one that was held while opening"),
-        pytest.param((1.0, 0.4), 0.1, 0.1, id="less open to that one"),
-        pytest.param((0.0, 0.6), 0.0, 0.6, id="no farther closed to one that was held while closing"),
-        pytest.param((0.0, 0.6), 0.9, 0.9, id="less closed to that one"),
-    ],
-)
-def test_while_the_arms_do_not_move_a_gripper_that_was_held_goes_back_only(
-    told: tuple[float, float] | None, wanted: float, granted: float
-) -> None:
-    assert without_proof(wanted, told) == granted
 
 
 def test_a_closed_gripper_goes_where_an_open_one_could_not_and_opens_there_as_far_as_is_proven(cell: Cell) -> None:

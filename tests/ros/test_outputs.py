@@ -103,8 +103,8 @@ def test_torques_that_are_sent_contain_the_wall_between_measured_links(node: Any
     assert isinstance(drive, TorqueDrive)
     channel = Channel(list(robot.joint_names), np.arange(len(q)), publisher)
     output = JointOutput(drive, TorqueArray(0.004, robot), [channel])
-    output.activate(state)
-    output.send(reference, state, 0.004, 0.0, trusted=True, decided=time.monotonic())
+    drive.reset(state)
+    output.send(drive.command(reference, state, {}, 0.004), state, 0.0, decided=time.monotonic())
     torque = np.array(taken.get(timeout=PATIENCE).data)
     wall = drive.report.wall
     assert wall is not None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -16,7 +17,8 @@ from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.plants.kinematic import KinematicPlant
 from q2r2_control.robot.robot import Robot
 from q2r2_control.summary.run_summary import EVENTS_KEPT, RunStatistics
-from q2r2_control.types import ArmTarget, Reference, StepReport, StepStatus
+from q2r2_control.summary.tick import RunStart, Tick
+from q2r2_control.types import ArmTarget, Command, CommandMode, Reference, RobotState, StepReport, StepStatus
 from tests.support.watch import cell
 
 # What scripts and dashboards rely on.
@@ -65,36 +67,55 @@ def statistics() -> RunStatistics:
     return RunStatistics(Robot.from_config(cell()), cell().control)
 
 
-def add(statistics: RunStatistics, *, error: pin.SE3 | None = None, gripper: float = 1.0, **changes: object) -> None:
-    """One tick of 1 ms at home, both arms engaged when there is an ``error`` of the tool against its target."""
-    reference = Reference(statistics.robot.home, np.zeros(14), np.zeros(14), REPORT)
-    target = None if error is None else pin.SE3.Identity()
-    tools = {arm: error or pin.SE3.Identity() for arm in statistics.robot.arms}
-    statistics.add(
-        0.001,
-        replace(reference, **changes),  # type: ignore[arg-type]
-        {arm: ArmTarget(target, gripper) for arm in tools},
-        tools,
-        dict.fromkeys(tools, error is not None),
+def add(
+    statistics: RunStatistics, *, error: pin.SE3 | None = None, target: ArmTarget | None = None, **changes: Any
+) -> None:
+    """One tick of 1 ms at home, both arms engaged when there is an ``error`` of the tool against its target.
+
+    ``changes``: of the tick's record, or of its reference.
+    """
+    robot, zero = statistics.robot, np.zeros(14)
+    motion = {name: changes.pop(name) for name in ("q", "v", "a", "report") if name in changes}
+    reference = replace(Reference(robot.home, zero, zero, REPORT), **motion)
+    state = RobotState(robot.home, zero, zero, None, 0.0)
+    tools = {arm: error or pin.SE3.Identity() for arm in robot.arms}
+    target = target or ArmTarget(None if error is None else pin.SE3.Identity(), 1.0)
+    tick = Tick(
+        t=0.0,
+        start=RunStart(0.0, state),
+        now=0.0,
+        dt=0.001,
+        step=0.001,
+        following=True,
+        connected=True,
+        samples=[],
+        targets=dict.fromkeys(tools, target),
+        engaged=dict.fromkeys(tools, error is not None),
+        states={},
+        reference=reference,
+        state=state,
+        openings={},
+        tools=tools,
+        command=Command(CommandMode.POSITION, robot.home, zero, zero, {}),
+        events=[],
+        grippers={},
+        compute_time=1e-4,
     )
+    statistics.add(replace(tick, **changes))
 
 
-def test_the_largest_slip_of_an_engagement_is_told(statistics: RunStatistics) -> None:
-    reference = Reference(statistics.robot.home, np.zeros(14), np.zeros(14), REPORT)
-    tools = {arm: pin.SE3.Identity() for arm in statistics.robot.arms}
+def test_the_largest_slip_of_an_engagement_is_reported(statistics: RunStatistics) -> None:
     for slip, angle in ((0.0, 0.0), (0.2, np.pi / 6), (0.05, np.pi / 3), (0.0, 0.0)):
-        targets = {"left": ArmTarget(pin.SE3.Identity(), 1.0, slip, angle), "right": ArmTarget(None, 1.0)}
-        statistics.add(0.001, reference, targets, tools, {"left": True, "right": False})
+        add(statistics, target=ArmTarget(pin.SE3.Identity(), 1.0, slip, angle))
     figures = statistics.summary(1.0).arms
     assert figures["left"].slip_mm_max == pytest.approx(200.0)
     assert figures["left"].slip_deg_max == pytest.approx(60.0)
-    assert figures["right"].slip_mm_max == figures["right"].slip_deg_max == 0.0
 
 
-def test_how_long_a_gripper_was_held_is_told_with_the_last_pair_that_did(statistics: RunStatistics) -> None:
+def test_how_long_a_gripper_was_held_is_reported_with_the_last_pair_that_did(statistics: RunStatistics) -> None:
     for pair in (("left_finger", "table"), ("left_finger", "right_link_5")):
-        statistics.add_held_grippers(0.25, {"left": pair})
-    statistics.add_held_grippers(0.25, {})
+        add(statistics, held_grippers={"left": pair}, dt=0.25)
+    add(statistics, dt=0.25)
     figures = statistics.summary(1.0).arms
     assert (figures["left"].gripper_held_s, figures["left"].gripper_held_by) == (0.5, ("left_finger", "right_link_5"))
     assert (figures["right"].gripper_held_s, figures["right"].gripper_held_by) == (0.0, None)
@@ -169,7 +190,7 @@ def test_errors_are_root_mean_squares_over_the_engaged_ticks(statistics: RunStat
 
 def test_a_gripper_s_changes_are_counted_not_its_first_opening(statistics: RunStatistics) -> None:
     for gripper in (0.0, 0.0, 1.0, 1.0, 0.0):
-        add(statistics, gripper=gripper)
+        add(statistics, target=ArmTarget(None, gripper))
     assert statistics.summary(1.0).arms["right"].gripper_changes == 2
 
 

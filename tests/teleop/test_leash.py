@@ -15,8 +15,8 @@ from q2r2_control.config.cell import Config, load_config
 from q2r2_control.config.teleop import LeashSettings
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.quaternions import floats_of, se3_of
-from q2r2_control.summary.tick import Tick
 from q2r2_control.summary.run_summary import RunSummary
+from q2r2_control.summary.tick import Tick
 from q2r2_control.teleop.leash import Leash
 from q2r2_control.teleop.relative import RelativeMotion
 from q2r2_control.types import Array

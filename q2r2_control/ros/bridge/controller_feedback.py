@@ -9,6 +9,7 @@ from std_msgs.msg import Bool
 from visualization_msgs.msg import Marker
 
 from q2r2_control.control.controller import CartesianController
+from q2r2_control.loop.arm_conditions import ArmConditions
 from q2r2_control.ros.base_node import LATCHED_QOS, SENT_COMMAND_QOS, BaseNode
 from q2r2_control.ros.bridge.arm_conditions import ConditionPublishers
 from q2r2_control.ros.bridge.distance_marker import DistanceMarker
@@ -16,7 +17,6 @@ from q2r2_control.ros.bridge.intakes import TargetIntake
 from q2r2_control.ros.bridge.messages import stamped_pose
 from q2r2_control.ros.bridge.reports import TickReport
 from q2r2_control.ros.monitoring.endpoints import publish_in_time
-from q2r2_control.loop.arm_conditions import ArmConditions
 from q2r2_control.types import Reference, RobotState
 
 _MARKER_PERIOD = 0.1  # [s]

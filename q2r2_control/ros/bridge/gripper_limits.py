@@ -19,35 +19,24 @@ from std_msgs.msg import Float64MultiArray
 from q2r2_control.config.cell import Config
 from q2r2_control.config.timeouts import STREAM_TIMEOUT
 from q2r2_control.control.controller import CartesianController
-from q2r2_control.drives.base import Drive
+from q2r2_control.loop.control_loop import ControlLoop
 from q2r2_control.ros.base_node import LATCHED_QOS, BaseNode
 from q2r2_control.ros.bridge.opening_grants import wanted_topic
-from q2r2_control.loop.geometry_updates import GeometryUpdates
-from q2r2_control.supervision.grasp_watch import STALL, GraspWatch
 
 # Until a gripper does what was granted: the answer has to arrive, ten goals a second go out, and it may be slow [s].
-_GRIPPER_DELAY = 0.3
+GRIPPER_DELAY = 0.3
 _UNMEASURED = "its fingers are not in the joint states, or nothing is proven while the arms are stopped"
 
 
 class GripperLimits:
-    """Fingers, held objects and distances of the controller, for all arms; see :class:`GeometryUpdates`."""
+    """Asks the control loop for openings, and answers with those that it grants."""
 
-    def __init__(
-        self,
-        node: BaseNode,
-        config: Config,
-        controller: CartesianController,
-        drive: Drive,
-        targets: Mapping[str, str],
-    ) -> None:
+    def __init__(self, node: BaseNode, config: Config, loop: ControlLoop, targets: Mapping[str, str]) -> None:
         """``targets``: topic of the targets of each arm whose gripper may ask."""
-        self._node, self._controller, self._drive = node, controller, drive
-        self._fingers = FingerStates(config, controller)
-        self._grasps = GraspWatch(controller, STALL + _GRIPPER_DELAY)
-        self._wanted: dict[str, float] = {}
-        self._told: dict[str, tuple[float, float]] = {}
-        self._bodies: GeometryUpdates | None = None  # while the controller's reference is where the arms are
+        self._node, self._loop = node, loop
+        self._fingers = FingerStates(config, loop.controller)
+        self.wanted: dict[str, float] = {}  # arm -> opening, 0 closed .. 1 fully open
+        self._answered: dict[str, tuple[float, float]] = {}
         self._answers: dict[str, Any] = {}
         for arm in (arm for arm in self._fingers.arms if arm in targets):
             self._answers[arm] = node.create_publisher(Float64MultiArray, f"~/opening/{arm}", LATCHED_QOS)
@@ -57,58 +46,26 @@ class GripperLimits:
     @property
     def held(self) -> dict[str, str]:
         """Arm -> what keeps its gripper from the wanted opening."""
-        pairs = {} if self._bodies is None else self._bodies.held_grippers
-        held = {arm: _UNMEASURED for arm, (wanted, granted) in self._told.items() if granted != wanted}
-        return held | {arm: f"{'|'.join(pair)} would come too close" for arm, pair in pairs.items()}
+        openings = self._loop.granted_openings.items()
+        held = {arm: _UNMEASURED for arm, (wanted, granted) in openings if granted != wanted}
+        pairs = self._loop.held_grippers.items()
+        return held | {arm: f"{'|'.join(pair)} would come too close" for arm, pair in pairs}
 
-    @property
-    def holding(self) -> dict[str, bool]:
-        """Of each arm that has an object, whether its gripper holds it."""
-        return {} if self._bodies is None else self._bodies.holding
+    def openings(self, now: float) -> dict[str, float]:
+        """See :meth:`FingerStates.openings`."""
+        return self._fingers.openings(now)
 
     def take_joint_state(self, message: JointState) -> None:
-        """Note the fingers of a message of joint states, if there are any."""
+        """Keep the fingers of a message of joint states, if there are any."""
         if self._answers:
             self._fingers.take(message, self._node.now)
 
-    def prepare(self) -> None:
-        """The controller was reset; before the drive is."""
-        self._grasps.tell_again()
-        self._bodies = GeometryUpdates(self._controller, self._drive, _GRIPPER_DELAY, self._grasps)
-
-    def begin(self, now: float) -> None:
-        """The drive was reset."""
-        assert self._bodies is not None
-        granted = {arm: granted for arm, (_, granted) in self._told.items()}
-        self._bodies.resume(granted, self._fingers.openings(now), now)
-        self._bodies.begin()
-
-    def limit(self, active: bool, now: float) -> None:
-        """Answer what was asked for, before a step.
-
-        An inactive controller moves no arm and proves nothing: it grants what it is asked for then, for instance to let
-        go of something, but no gripper that was held goes on in that direction because the arms were stopped.
-        """
-        if not active:
-            self._bodies = None
-        if not self._wanted:
-            return
-        if self._bodies is not None:
-            granted = self._bodies.limit_grippers(self._wanted, self._fingers.openings(now), now)
-        else:
-            granted = {arm: without_proof(wanted, self._told.get(arm)) for arm, wanted in self._wanted.items()}
-        for arm, opening in granted.items():
-            self._answer(arm, self._wanted[arm], opening)
-
-    def _answer(self, arm: str, wanted: float, granted: float) -> None:
-        if self._told.get(arm) != (wanted, granted):
-            self._told[arm] = wanted, granted
-            self._answers[arm].publish(Float64MultiArray(data=(wanted, granted)))
-
-    def after_step(self) -> None:
-        """See :meth:`GeometryUpdates.after_step`."""
-        if self._bodies is not None:
-            self._bodies.after_step()
+    def answer(self) -> None:
+        """Publish what the loop has granted, where that is new."""
+        for arm, answer in self._loop.granted_openings.items():
+            if self._answered.get(arm) != answer:
+                self._answered[arm] = answer
+                self._answers[arm].publish(Float64MultiArray(data=answer))
 
     def _on_wanted(self, arm: str, message: Float64MultiArray) -> None:
         told = list(message.data)
@@ -117,20 +74,12 @@ class GripperLimits:
             self._node.get_logger().warning(f"{arm}: openings {told!s:.60} not used; allowed: {allowed}")
             return
         wanted, commanded = told
-        if arm not in self._wanted and commanded == commanded:
+        if arm not in self.wanted and commanded == commanded:
             # Asked for before this node began, maybe long ago: the gripper is where it was commanded to be, and stays.
-            self._answer(arm, wanted, commanded)
-            if self._bodies is not None:
-                now = self._node.now
-                self._bodies.resume({arm: commanded}, self._fingers.openings(now), now)
-        self._wanted[arm] = wanted
-
-
-def without_proof(wanted: float, told: tuple[float, float] | None) -> float:
-    """What is granted while the arms do not move; ``told`` is what was wanted and granted before."""
-    if told is None or told[0] == told[1]:
-        return wanted
-    return min(wanted, told[1]) if told[0] > told[1] else max(wanted, told[1])
+            now = self._node.now
+            self._loop.resume_gripper(arm, wanted, commanded, self.openings(now), now)
+            self.answer()
+        self.wanted[arm] = wanted
 
 
 class FingerStates:

@@ -22,7 +22,7 @@ from q2r2_control.ros.base_node import BaseNode
 from q2r2_control.ros.bridge.joint_messages import KINDS, NONE, JointCommand, Kind
 from q2r2_control.ros.monitoring.command_watch import CommandWatch
 from q2r2_control.ros.monitoring.endpoints import WatchedPublisher
-from q2r2_control.types import CommandMode, Reference, RobotState
+from q2r2_control.types import Command, CommandMode, RobotState
 
 _ARM = "{arm}"  # where an arm's name goes in a topic
 
@@ -48,18 +48,9 @@ class JointOutput:
         """What tells whether another node sends such commands."""
         return CommandWatch(node, self._kind.message, [channel.publisher.topic_name for channel in self._channels])
 
-    def activate(self, state: RobotState) -> None:
-        """Begin anew at a measured state."""
+    def send(self, command: Command, state: RobotState, t: float, decided: float) -> None:
+        """Send a command of the tick at ``t`` [s] of the node's clock; ``decided``: see :func:`publish_in_time`."""
         if self._channels:
-            self.drive.reset(state)
-
-    def send(self, reference: Reference, state: RobotState, dt: float, t: float, trusted: bool, decided: float) -> None:
-        """Command the reference that is due ``dt`` [s] from now, at ``t`` [s] of the node's clock.
-
-        ``trusted``: see :meth:`Drive.command`; ``decided``: see :func:`publish_in_time`.
-        """
-        if self._channels:
-            command = self.drive.command(reference, state, {}, dt, trusted)
             self._publish(JointCommand(command, state, t), decided)
 
     @property

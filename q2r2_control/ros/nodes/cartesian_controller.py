@@ -15,7 +15,6 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
-import numpy as np
 import pinocchio as pin
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
@@ -27,10 +26,11 @@ from q2r2_control.drives.base import permitted
 from q2r2_control.drives.torque import TorqueDrive
 from q2r2_control.errors import ConfigError
 from q2r2_control.events import ReasonKind
+from q2r2_control.loop.control_loop import ControlLoop
 from q2r2_control.robot.robot import Robot
 from q2r2_control.ros.base_node import ERROR, OK, WARN, run_node
 from q2r2_control.ros.bridge.controller_feedback import ControllerFeedback
-from q2r2_control.ros.bridge.gripper_limits import GripperLimits
+from q2r2_control.ros.bridge.gripper_limits import GRIPPER_DELAY, GripperLimits
 from q2r2_control.ros.bridge.intakes import JointIntake, TargetIntake
 from q2r2_control.ros.bridge.joint_outputs import NONE, make_output, output_name
 from q2r2_control.ros.bridge.live_parameters import LiveControl, LiveImpedance, LiveWatching
@@ -38,10 +38,9 @@ from q2r2_control.ros.executor import TickExecutor
 from q2r2_control.ros.managed_node import ManagedNode
 from q2r2_control.supervision.external_arms import ExternalArms, ExternalSettings, settings_for_external_arms
 from q2r2_control.supervision.joint_watch import watch_settings
-from q2r2_control.supervision.supervisor import Displace, Phase, Supervisor
+from q2r2_control.supervision.supervisor import Phase
 from q2r2_control.supervision.target_stream import Origins, Refusal, StreamSettings
 from q2r2_control.supervision.tick_clock import TickClock
-from q2r2_control.supervision.tick_pacer import TickPacer
 from q2r2_control.types import LONGEST_DT, Reference
 
 _LONGEST_STOP = 3.0  # [s]
@@ -54,7 +53,7 @@ _SAFE_TARGET_PERIOD = 0.008  # [s]
 
 
 class CartesianControllerNode(ManagedNode):
-    """Feeds a :class:`Supervisor` from its topics and publishes the reference that comes of it."""
+    """Feeds a :class:`ControlLoop` from its topics and publishes its commands."""
 
     ticks = True
     priority = 40  # nothing may delay a joint command; below drivers, which ros2_control runs at 50
@@ -78,25 +77,25 @@ class CartesianControllerNode(ManagedNode):
         self._watching = LiveWatching(self, streams, watch, external)
         if isinstance(self._output.drive, TorqueDrive):
             self._live_impedance = LiveImpedance(self, self._output.drive.impedance)
+        self._require_external_torque(config)
         self._controller = CartesianController(robot, permitted(config.control, self._output.drive))
         self._live = LiveControl(self, self._controller)
-        # Another controller's arms are judged with fingers all of their way.
-        asking = self._targets.topics if output != NONE else {}
-        self._grippers = GripperLimits(self, config, self._controller, self._output.drive, asking)
-        self._supervisor = Supervisor(
-            robot,
+        self._loop = ControlLoop(
             self._controller,
+            self._output.drive,
+            self._period,
             streams,
             watch,
-            Origins(self._joints.source, self._targets.source),
-            ExternalArms(robot, self._controller, external, streams, watch) if output == NONE else None,
-            displace=self._displacement(config) if output != NONE else None,
+            origins=Origins(self._joints.source, self._targets.source),
+            external=ExternalArms(robot, self._controller, external, streams, watch) if output == NONE else None,
+            gripper_delay=GRIPPER_DELAY,
+            owns_plant=False,
         )
-        limit = robot.velocity_limit * config.control.velocity_scale
-        acceleration = robot.capped_acceleration(config.control.acceleration_limit)
-        self._pacer = TickPacer(self._period, limit, acceleration, self._output.drive.coasts)
+        self._supervisor = self._loop.supervisor
+        # Another controller's arms are judged with fingers all of their way.
+        asking = self._targets.topics if output != NONE else {}
+        self._grippers = GripperLimits(self, config, self._loop, asking)
         self._clock_of_ticks = TickClock(self._period)
-        self._velocity = np.zeros(robot.model.nv)  # of the last reference [rad/s]
         self._reference: Reference | None = None
         self._commanding = False
         self._advances = 0  # ticks that have gone by some time
@@ -109,18 +108,17 @@ class CartesianControllerNode(ManagedNode):
         self.start_active()
         self.get_logger().info(f"{config.name}: {', '.join(robot.arms)}; waits for joint states")
 
-    def _displacement(self, config: Config) -> Displace | None:
-        """The drive's own, where the cell has an admittance. Raises :class:`ConfigError` where nothing is measured."""
+    def _require_external_torque(self, config: Config) -> None:
+        """An admittance needs it. Raises :class:`ConfigError` where nothing is measured."""
         if not config.admittance.enabled or self._output.drive.yields:
-            return None
+            return
         if not self._joints.measures_external_torque:
             raise ConfigError("admittance.enabled = true: set the parameter external_torque_topic, which it needs")
         self._joints.needs_external_torque = True
-        return self._output.drive.displaced
 
     def _connect(self) -> None:
         self._targets.subscribe(self._take_target, self._supervisor.release_target)
-        self._joints.subscribe(self._supervisor.take_joint_state, self._grippers.take_joint_state)
+        self._joints.subscribe(self._loop.observe, self._grippers.take_joint_state)
         self.create_service(SetBool, "~/pause", self._on_pause)
         services: dict[str, Callable[[], str | None]] = {
             "home": self._supervisor.go_home,
@@ -146,7 +144,7 @@ class CartesianControllerNode(ManagedNode):
         now = self._clock_of_ticks.at(self.now)
         # A late tick is no jump; a clock that was set back moves nothing.
         gap = now - self._last_tick
-        dt = self._pacer.step(gap, self._velocity)
+        dt = self._loop.pace(gap)
         if gap > LONGEST_DT:
             self._supervisor.stalled(gap, now)
         self._last_tick = now
@@ -160,21 +158,16 @@ class CartesianControllerNode(ManagedNode):
         # Commands that the arms do not follow are not for a receiver that has just come.
         if fault := self._output.listener_fault(self._supervisor.off_reference):
             self._supervisor.let_go(fault, now)
-        was_active = self._supervisor.phase is Phase.ACTIVE
-        self._grippers.limit(self._supervisor.phase in (Phase.ACTIVE, Phase.BRAKING), now)
-        reference, state = self._supervisor.tick(now, dt), self._joints.state
-        if not was_active and self._supervisor.phase is Phase.ACTIVE and state is not None:
-            self._grippers.prepare()
-            self._output.activate(state)
-            self._grippers.begin(now)
-        self._grippers.after_step()
-        if reference is not None and state is not None:
-            self._output.send(reference, state, dt, now, self._supervisor.trusted, decided)
-            self._reference, self._velocity = reference, reference.v
-            self._feedback.publish(reference, state, now, dt, decided)
+        state, openings = self._joints.state, self._grippers.openings(now)
+        step = self._loop.step(state, {}, now, dt, self._grippers.wanted, openings)
+        self._grippers.answer()
+        if step.reference is not None and step.command is not None and state is not None:
+            self._output.send(step.command, state, now, decided)
+            self._reference = step.reference
+            self._feedback.publish(step.reference, state, now, dt, decided)
         elif self._commanding and state is not None:
             self._output.end(state, now)
-        self._commanding = reference is not None
+        self._commanding = step.reference is not None
         self._tell_events()
 
     def _tell_events(self) -> None:
@@ -211,7 +204,7 @@ class CartesianControllerNode(ManagedNode):
             "lifecycle": self.lifecycle_state,
             "homing_ended": supervisor.homing.outcome or "",
             "loop_rate_hz": round(self._ticks / max(wall - self._reported_at, 1e-9), 1),
-            "missed_ticks": self._pacer.missed_ticks,
+            "missed_ticks": self._loop.pacer.missed_ticks,
             "sent": self._output.sent,
         }
         self._ticks, self._reported_at = 0, wall
@@ -223,7 +216,7 @@ class CartesianControllerNode(ManagedNode):
             values[f"{arm}_targets_rejected"] = rejected
             values[f"{arm}_targets_from"] = self._targets.publishers(arm)
             values[f"{arm}_gripper_held_by"] = self._grippers.held.get(arm, "")
-        for arm, holds in self._grippers.holding.items():
+        for arm, holds in self._loop.holding.items():
             values[f"{arm}_holds_object"] = holds
         if self._reference is not None:
             report = self._reference.report

@@ -1,0 +1,184 @@
+"""One tick of control, from measured joints and targets to a command: the same for the pipeline and the ROS node."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import pinocchio as pin
+
+from q2r2_control.control.controller import CartesianController
+from q2r2_control.drives.base import Drive, DriveReport
+from q2r2_control.loop.geometry_updates import GeometryUpdates
+from q2r2_control.supervision.external_arms import ExternalArms
+from q2r2_control.supervision.grasp_watch import STALL, GraspWatch
+from q2r2_control.supervision.gripper_limiter import REMEMBERED
+from q2r2_control.supervision.joint_watch import WatchSettings
+from q2r2_control.supervision.supervisor import Phase, Supervisor
+from q2r2_control.supervision.target_stream import Origins, Refusal, StreamSettings
+from q2r2_control.supervision.tick_pacer import TickPacer
+from q2r2_control.types import Array, Command, Reference, RobotState
+
+_PROVEN = Phase.ACTIVE, Phase.BRAKING  # in other phases no opening of a gripper is proven
+
+
+@dataclass(slots=True)
+class LoopStep:
+    """The result of one tick."""
+
+    reference: Reference | None  # None: nothing is commanded
+    command: Command | None  # for the plant; None: nothing is commanded
+    grippers: dict[str, float]  # commanded openings, 0 closed .. 1 fully open
+    trusted: bool  # whether the command may go by the measured state
+    report: DriveReport
+    refusals: dict[str, Refusal] = field(default_factory=dict)  # arm -> why its target is not followed
+
+
+class ControlLoop:
+    """Supervision, controller, grippers and drive, in the order that one tick needs.
+
+    In each tick: :meth:`pace`, :meth:`observe` for each measured state that came, and :meth:`step`. Times are the
+    caller's [s]. What an arm's gripper holds, and how far its fingers are open, is known before the controller's step,
+    since the step has to be proven with them.
+    """
+
+    def __init__(
+        self,
+        controller: CartesianController,
+        drive: Drive,
+        period: float,
+        streams: StreamSettings,
+        watch: WatchSettings,
+        *,
+        origins: Origins | None = None,
+        external: ExternalArms | None = None,
+        gripper_delay: float = 0.0,
+        owns_plant: bool = True,
+    ) -> None:
+        """``period`` [s] of the commands; ``gripper_delay`` [s]: until a gripper gets its command, at most.
+
+        ``owns_plant``: commands go on while the arms are stopped. Otherwise whatever else holds them is left alone.
+        """
+        robot = controller.robot
+        self.controller, self.drive, self._owns_plant = controller, drive, owns_plant
+        self.supervisor = Supervisor(robot, controller, streams, watch, origins, external, drive.displaced)
+        self.acceleration_limit: Array = robot.capped_acceleration(controller.settings.acceleration_limit)
+        velocity_limit = robot.velocity_limit * controller.settings.velocity_scale
+        self.pacer = TickPacer(period, velocity_limit, self.acceleration_limit, drive.coasts)
+        self._delay = max(gripper_delay, REMEMBERED)
+        self._grasps = GraspWatch(controller, STALL + gripper_delay)
+        self._geometry: GeometryUpdates | None = None  # while the controller's reference is where the arms are
+        self._granted: dict[str, tuple[float, float]] = {}  # arm -> opening that was wanted, and that was granted
+        self._velocity = np.zeros(robot.model.nv)  # of the last reference [rad/s]
+
+    @property
+    def held_grippers(self) -> dict[str, tuple[str, str]]:
+        """Arm -> pair of bodies that keeps its gripper from being commanded as wanted."""
+        return {} if self._geometry is None else self._geometry.held_grippers
+
+    @property
+    def holding(self) -> dict[str, bool]:
+        """Of each arm that has an object, whether its gripper holds it."""
+        return {} if self._geometry is None else self._geometry.holding
+
+    @property
+    def granted_openings(self) -> dict[str, tuple[float, float]]:
+        """Arm -> opening that was wanted last, and that was granted."""
+        return self._granted
+
+    def pace(self, gap: float) -> float:
+        """Time [s] for the reference to move by, ``gap`` [s] after the last tick; see :meth:`TickPacer.step`."""
+        return self.pacer.step(gap, self._velocity)
+
+    def observe(self, state: RobotState | str, now: float, passed: float = 0.0) -> None:
+        """Let supervision see a measured state, or the reason why there is none; see :meth:`JointWatch.take`."""
+        self.supervisor.take_joint_state(state, now, passed)
+
+    def activate(self, state: RobotState, now: float) -> None:
+        """Start at once at ``state``, at which the arms are known to be at rest. Raises :class:`Q2R2Error`."""
+        self.supervisor.activate(replace(state, stamp=now), now)
+        self._begin(state, {}, now)
+
+    def resume_gripper(
+        self, arm: str, wanted: float, commanded: float, openings: Mapping[str, float], now: float
+    ) -> None:
+        """Let a gripper that was ``commanded`` to an opening by another program stay as it is."""
+        self._granted[arm] = wanted, commanded
+        if self._geometry is not None:
+            self._geometry.resume({arm: commanded}, openings, now)
+
+    def step(
+        self,
+        state: RobotState | None,
+        targets: Mapping[str, pin.SE3 | None],
+        now: float,
+        dt: float,
+        grippers: Mapping[str, float],
+        openings: Mapping[str, float],
+    ) -> LoopStep:
+        """Move on by ``dt`` [s].
+
+        ``state`` is the newest measured one, which was observed; ``targets`` are tool poses in the world frame, None:
+        the arm holds. An arm whose targets come as messages is not among them: :meth:`Supervisor.take_target` has got
+        those. ``grippers`` are wanted openings, ``openings`` the measured ones, 0 closed .. 1 fully open.
+        """
+        supervisor = self.supervisor
+        refusals = self._update_targets(targets, now)
+        commanded = self.limit_grippers(grippers, openings, now)
+        was_inactive = supervisor.phase is Phase.INACTIVE
+        reference = supervisor.tick(now, dt)
+        if was_inactive and supervisor.phase is Phase.ACTIVE and state is not None:
+            self._begin(state, openings, now)
+        if reference is None and self._owns_plant:
+            reference = self.controller.step({}, dt)  # the rest of the arms' motion
+        if self._geometry is not None:
+            self._geometry.after_step()
+        trusted = supervisor.state_fault is None if self._owns_plant else supervisor.trusted
+        command = None
+        if reference is not None and state is not None:
+            self._velocity = reference.v
+            command = self.drive.command(reference, state, commanded, dt, trusted)
+        return LoopStep(reference, command, commanded, trusted, self.drive.report, refusals)
+
+    def limit_grippers(
+        self, wanted: Mapping[str, float], measured: Mapping[str, float], now: float
+    ) -> dict[str, float]:
+        """The openings to be commanded; see :meth:`GeometryUpdates.limit_grippers`.
+
+        While the arms do not move, nothing is proven: a gripper gets what it wants, for instance to let go of
+        something. But one that was held does not go on in that direction because the arms were stopped.
+        """
+        if not self._owns_plant and self.supervisor.phase not in _PROVEN:
+            self._geometry = None
+        if self._geometry is not None:
+            commanded = self._geometry.limit_grippers(wanted, measured, now)
+        else:
+            commanded = {arm: without_proof(opening, self._granted.get(arm)) for arm, opening in wanted.items()}
+        for arm, opening in commanded.items():
+            self._granted[arm] = wanted[arm], opening
+        return commanded
+
+    def _update_targets(self, targets: Mapping[str, pin.SE3 | None], now: float) -> dict[str, Refusal]:
+        refusals = {}
+        for arm, pose in targets.items():
+            if pose is None:
+                self.supervisor.release_target(arm)
+            elif refusal := self.supervisor.take_target(arm, pose, now):
+                refusals[arm] = refusal
+        return refusals
+
+    def _begin(self, state: RobotState, openings: Mapping[str, float], now: float) -> None:
+        """The controller was reset at ``state``: bodies and drive begin there too."""
+        self._grasps.tell_again()
+        self._geometry = GeometryUpdates(self.controller, self.drive, self._delay, self._grasps)
+        self.drive.reset(state)
+        self._geometry.resume({arm: granted for arm, (_, granted) in self._granted.items()}, openings, now)
+        self._geometry.begin()
+
+
+def without_proof(wanted: float, before: tuple[float, float] | None) -> float:
+    """The opening that is granted while the arms do not move; ``before``: wanted and granted before."""
+    if before is None or before[0] == before[1]:
+        return wanted
+    return min(wanted, before[1]) if before[0] > before[1] else max(wanted, before[1])

@@ -1,0 +1,106 @@
+"""One tick of control: when the arms are commanded, which targets are refused, what grippers are granted."""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from q2r2_control.control.controller import CartesianController
+from q2r2_control.drives.factory import make_drive
+from q2r2_control.loop.control_loop import ControlLoop, LoopStep, without_proof
+from q2r2_control.robot.robot import Robot
+from q2r2_control.supervision.joint_watch import watch_settings
+from q2r2_control.supervision.supervisor import Phase
+from q2r2_control.supervision.target_stream import StreamSettings
+from q2r2_control.types import CommandMode, RobotState
+from tests.support.watch import cell
+
+DT = 0.004
+
+
+class Arms:
+    """Both arms at home, as another program's plant measures them."""
+
+    def __init__(self, owns_plant: bool) -> None:
+        config, robot = cell(), Robot.from_config(cell())
+        drive = make_drive(CommandMode.POSITION, robot, config)
+        controller = CartesianController(robot, config.control)
+        self.loop = ControlLoop(
+            controller, drive, DT, StreamSettings(), watch_settings(config.supervision, False), owns_plant=owns_plant
+        )
+        self.home, self.now = robot.home, 0.0
+
+    @property
+    def state(self) -> RobotState:
+        zero = np.zeros_like(self.home)
+        return RobotState(self.home, zero, zero, None, self.now)
+
+    def tick(self, target: pin.SE3 | None = None) -> LoopStep:
+        self.now += DT
+        self.loop.observe(self.state, self.now, DT)
+        return self.loop.step(self.state, {"left": target}, self.now, DT, {"left": 1.0}, {})
+
+
+def test_arms_of_another_program_are_commanded_once_they_were_seen_at_rest_and_not_after_a_stop() -> None:
+    arms = Arms(owns_plant=False)
+    assert arms.tick().command is None
+    while arms.loop.supervisor.phase is not Phase.ACTIVE:
+        assert arms.tick().command is None
+    assert arms.tick().command is not None
+    arms.loop.supervisor.stop("enough")
+    for _ in range(10):
+        step = arms.tick()
+    assert arms.loop.supervisor.arm_state("left") == "stopped"
+    assert step.command is None
+
+
+def test_a_plant_of_its_own_is_commanded_on_while_the_arms_are_stopped() -> None:
+    arms = Arms(owns_plant=True)
+    arms.loop.activate(arms.state, arms.now)
+    arms.loop.supervisor.stop("enough")
+    for _ in range(10):
+        step = arms.tick()
+    assert arms.loop.supervisor.phase is Phase.STOPPED
+    assert step.command is not None
+    assert np.array_equal(step.command.q, arms.home)
+
+
+def test_a_target_far_from_its_tool_is_refused_and_moves_nothing() -> None:
+    arms = Arms(owns_plant=True)
+    arms.loop.activate(arms.state, arms.now)
+    tool = arms.loop.controller.tool_pose("left")
+    step = arms.tick(tool * pin.SE3(np.eye(3), np.array([0.0, 0.0, 0.2])))
+    assert set(step.refusals) == {"left"}
+    assert step.reference is not None
+    assert np.abs(step.reference.v).max() < 1e-9
+    assert arms.tick(None).refusals == {}
+    assert arms.tick(tool).refusals == {}
+
+
+def test_a_state_that_cannot_be_believed_is_no_state_to_push_by() -> None:
+    arms = Arms(owns_plant=True)
+    arms.loop.activate(arms.state, arms.now)
+    assert arms.tick().trusted
+    arms.home = np.full_like(arms.home, np.nan)
+    while arms.loop.supervisor.state_fault is None:
+        step = arms.tick()
+        assert arms.now < 1.0
+    assert not step.trusted
+
+
+@pytest.mark.parametrize(
+    ("before", "wanted", "granted"),
+    [
+        pytest.param(None, 0.3, 0.3, id="anything where nothing was asked for"),
+        pytest.param((0.8, 0.8), 0.0, 0.0, id="anything to one that was not held"),
+        pytest.param((1.0, 0.4), 1.0, 0.4, id="no farther open to one that was held while opening"),
+        pytest.param((1.0, 0.4), 0.1, 0.1, id="less open to that one"),
+        pytest.param((0.0, 0.6), 0.0, 0.6, id="no farther closed to one that was held while closing"),
+        pytest.param((0.0, 0.6), 0.9, 0.9, id="less closed to that one"),
+    ],
+)
+def test_while_the_arms_do_not_move_a_gripper_that_was_held_goes_back_only(
+    before: tuple[float, float] | None, wanted: float, granted: float
+) -> None:
+    assert without_proof(wanted, before) == granted
