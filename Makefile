@@ -45,7 +45,8 @@ test-ros-slow: setup
 soak-ros: setup
 	$(BIN)/python -m pytest tests/ros -m soak
 
-# The real package, whose loader reads what q2r2 export lerobot writes. It takes some gigabytes, so it has an environment of its own.
+# q2r2 export lerobot with the package that it needs. That takes some gigabytes, so it has an environment of its own.
+# All in one call of pip, which chooses the torch and torchvision that lerobot allows.
 LEROBOT := .venv-lerobot
 
 test-lerobot: $(LEROBOT)/.installed
@@ -54,7 +55,7 @@ test-lerobot: $(LEROBOT)/.installed
 $(LEROBOT)/.installed: pyproject.toml setup.py
 	$(PYTHON) -m venv $(LEROBOT)
 	$(LEROBOT)/bin/python -m pip install --quiet --upgrade pip
-	$(LEROBOT)/bin/python -m pip install --quiet --editable '.[export]' lerobot==0.4.4 'pytest>=8' 'hypothesis>=6.100'
+	$(LEROBOT)/bin/python -m pip install --quiet --editable '.[lerobot,ray]' 'pytest>=8' 'hypothesis>=6.100'
 	touch $@
 
 lint: setup

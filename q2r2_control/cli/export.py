@@ -12,13 +12,12 @@ from rich.progress import Progress
 from q2r2_control.cli.output import stderr_console
 from q2r2_control.errors import ConfigError, RecordingError
 from q2r2_control.export.bags import write_bags
-from q2r2_control.export.csv_tables import write_table, write_tables
-from q2r2_control.export.episodes import FASTEST, FrameSampling, make_episodes
-from q2r2_control.export.hdf5 import write_episodes
-from q2r2_control.export.kept_pictures import KeptAs
-from q2r2_control.export.lerobot import require_pyarrow, write_dataset
+from q2r2_control.export.csv_tables import write_table, write_tables, write_vectors
+from q2r2_control.export.episodes import FASTEST, FrameSampling
+from q2r2_control.export.hdf5 import gather_files, require_h5py, write_file
+from q2r2_control.export.kept_episodes import Write, keep_episodes
+from q2r2_control.export.lerobot import join_shards, require_lerobot, write_shard
 from q2r2_control.export.output import Output
-from q2r2_control.export.pixel_files import require_h5py
 from q2r2_control.recording.files import recordings_in
 
 app = typer.Typer(rich_markup_mode=None, help="Recordings of q2r2 run --record as datasets to train on.")
@@ -46,15 +45,15 @@ def lerobot(
         str | None, typer.Option(metavar="ADDRESS", help="Of a Ray cluster that makes the episodes: HOST:PORT or auto.")
     ] = None,
 ) -> None:
-    """Make a LeRobotDataset v3.0 of recordings: an episode each, with a video of each camera.
+    """Make a LeRobotDataset of recordings: an episode each, with a video of each camera.
 
-    Needs the extra `export`; with --ray, whose workers see the same files, the extra `ray` as well.
+    Needs the extra `lerobot`; with --ray, whose workers see the same files, the extra `ray` as well.
     """
     if ray is not None and workers != 1:
         raise ConfigError("--workers and --ray exclude each other: the cluster has its own")
-    require_pyarrow()
-    kept = None if no_pictures else KeptAs.VIDEO
-    _export(recordings, FrameSampling(fps, trim, kept), output, workers, skip_bad, lambda count: write_dataset, ray)
+    require_lerobot()
+    sampling = FrameSampling(fps, trim, pictures=not no_pictures)
+    _export(recordings, sampling, output, workers, skip_bad, write_shard, join_shards, ray)
 
 
 @app.command(epilog="Example: q2r2 export hdf5 recordings --output datasets/circle-act --fps 50")
@@ -69,8 +68,8 @@ def hdf5(
 ) -> None:
     """Make HDF5 files of recordings, a file each, for trainers of ACT. Needs the extra `export`."""
     require_h5py()
-    kept = None if no_pictures else KeptAs.PIXELS
-    _export(recordings, FrameSampling(fps, trim, kept), output, workers, skip_bad, lambda count: write_episodes)
+    sampling = FrameSampling(fps, trim, pictures=not no_pictures)
+    _export(recordings, sampling, output, workers, skip_bad, write_file, gather_files)
 
 
 @app.command(epilog="Example: q2r2 export csv recordings/20260101-120000-dual_iiwa7 --output circle.csv")
@@ -85,15 +84,11 @@ def csv(
     skip_bad: SkipBad = False,
 ) -> None:
     """Make tables of recordings: a line a frame, the columns of the dataset of q2r2 export lerobot."""
-
-    def writer(count: int) -> Callable[[Sequence[Path], Path], None]:
-        if output.suffix != ".csv":
-            return write_tables
-        if count > 1:
-            raise ConfigError(f"--output {output}: for {count} recordings; allowed: a folder, or one recording")
-        return write_table
-
-    _export(recordings, FrameSampling(fps, trim), output, workers, skip_bad, writer)
+    one_file = output.suffix == ".csv"
+    if one_file and (count := len(recordings_in(recordings))) > 1:
+        raise ConfigError(f"--output {output}: for {count} recordings; allowed: a folder, or one recording")
+    join = write_table if one_file else write_tables
+    _export(recordings, FrameSampling(fps, trim), output, workers, skip_bad, write_vectors, join)
 
 
 @app.command(epilog="Example: q2r2 export mcap recordings --output episodes")
@@ -133,19 +128,21 @@ def _export(
     path: Path,
     workers: int,
     skip_bad: bool,
-    writer_for: Callable[[int], Callable[[Sequence[Path], Path], None]],
+    write: Write,
+    join: Callable[[Sequence[Path], Path], None],
     ray: str | None = None,
 ) -> None:
+    """``write`` keeps each episode, and ``join`` makes the output of what was kept."""
     console = stderr_console()
     output = Output(path)
     files = recordings_in(recordings)
-    writer = writer_for(len(files))
     try:
         with Progress(console=console, disable=not console.is_terminal, transient=True) as progress:
             bar = progress.add_task("recordings", total=len(files))
-            made = make_episodes(
+            made = keep_episodes(
                 files,
                 sampling,
+                write,
                 output.episodes(),
                 workers=workers,
                 ray=ray,
@@ -158,7 +155,7 @@ def _export(
         console.print(f"skipped: {fault}", style="yellow", soft_wrap=True, highlight=False, markup=False)
     if not made.kept:
         raise RecordingError("none of the recordings can be exported")
-    output.write(lambda target: writer(made.kept, target))
+    output.write(lambda target: join(made.kept, target))
     whole = len(made.kept) + len(made.skipped) == len(files)
     count = f"{len(made.kept)} of" if whole else f"{len(made.kept)} episodes of"
     print(f"{path}: {count} {len(files)} recordings at {sampling.fps} frames per second")

@@ -7,12 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from q2r2_control.errors import ConfigError
 from q2r2_control.export.episodes import EpisodeVectors
-from q2r2_control.export.kept_pictures import KeptAs, place_of
-from q2r2_control.export.pixel_files import PICTURES, require_h5py
 
 _AHEAD = 1  # frames by which actions are
 # Name in the file, name of the feature, unit of a joint.
@@ -22,16 +22,20 @@ _DATA = (
     ("action", "action", "rad"),
 )
 _OPENING, _OPENING_UNIT = "_gripper", "0 closed .. 1 open"
+_COMPRESSION = 1  # of gzip's levels, the fastest
 
 
-def write_episodes(files: Sequence[Path], folder: Path) -> None:
-    """Write kept episodes into a ``folder`` that is made, as ``episode_0.hdf5`` and so on."""
-    folder.mkdir()
-    for number, file in enumerate(files):
-        _write(EpisodeVectors.load(file), file, folder / f"episode_{number}.hdf5")
+def require_h5py() -> Any:
+    """The module h5py. Raises :class:`ConfigError` where it is not installed."""
+    try:
+        import h5py
+    except ImportError as error:
+        raise ConfigError("export hdf5 needs h5py: pip install 'q2r2_control[export]'") from error
+    return h5py
 
 
-def _write(episode: EpisodeVectors, kept: Path, path: Path) -> None:
+def write_file(episode: EpisodeVectors, path: Path) -> None:
+    """Write one episode."""
     with require_h5py().File(path, "w") as file:
         file.attrs["sim"] = True  # trainers take the action of the same row then
         file.attrs["compress"] = False  # pictures are pixels, however the file packs them
@@ -51,7 +55,17 @@ def _write(episode: EpisodeVectors, kept: Path, path: Path) -> None:
             data.attrs["names"] = list(labels)
             data.attrs["units"] = [_OPENING_UNIT if label.endswith(_OPENING) else unit for label in labels]
         images = file.create_group("observations/images")
-        for camera in episode.cameras:
-            with require_h5py().File(place_of(kept, camera, KeptAs.PIXELS)) as source:
-                source.copy(PICTURES, images, name=camera)
-            images[camera].attrs["axes"] = ["frame", "row", "column", "r g b"]
+        for camera, pictures in episode.cameras.items():
+            # Each picture is packed by itself, so that one can be read without the others.
+            packing = {"chunks": (1, *pictures.size), "compression": "gzip", "compression_opts": _COMPRESSION}
+            data = images.create_dataset(camera, (episode.frames, *pictures.size), "uint8", **packing)
+            data.attrs["axes"] = ["frame", "row", "column", "r g b"]
+            for number, pixels in enumerate(pictures):
+                data[number] = pixels
+
+
+def gather_files(files: Sequence[Path], folder: Path) -> None:
+    """Move kept episodes into a ``folder`` that is made, as ``episode_0.hdf5`` and so on."""
+    folder.mkdir()
+    for number, file in enumerate(files):
+        file.replace(folder / f"episode_{number}.hdf5")

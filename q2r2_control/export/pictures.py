@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -19,11 +20,26 @@ _OLDEST = 2  # periods of the camera: one picture may be lost
 _NANOSECONDS = 1_000_000_000
 
 
-def pictures_at(recording: Recording, name: str, camera: CameraConfig, stamps: Sequence[int]) -> Iterator[Pixels]:
-    """The picture of each frame of a camera ``name``; ``stamps`` are the frames' times of day [ns], ascending.
+@dataclass(frozen=True)
+class CameraFrames:
+    """Pictures of one camera, one for each frame of an episode."""
 
-    Raises :class:`RecordingError` where there is none that is at most two of the camera's periods old.
-    """
+    recording: Recording
+    name: str
+    config: CameraConfig
+    stamps: Sequence[int]  # times of day of the frames [ns], ascending
+
+    @property
+    def size(self) -> tuple[int, int, int]:
+        """Rows, columns and colours of a picture."""
+        return (self.config.height, self.config.width, 3)
+
+    def __iter__(self) -> Iterator[Pixels]:
+        """Raises :class:`RecordingError` for a frame whose newest picture is older than two of the camera's periods."""
+        return _pictures_at(self.recording, self.name, self.config, self.stamps)
+
+
+def _pictures_at(recording: Recording, name: str, camera: CameraConfig, stamps: Sequence[int]) -> Iterator[Pixels]:
     pictures = recording.pictures(name)
     newest: Picture | None = None
     coming = next(pictures, None)

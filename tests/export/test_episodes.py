@@ -1,25 +1,24 @@
-"""A recorded run becomes the episode that was lived, once, by however many processes."""
+"""A recorded run becomes the episode that was lived."""
 
 from __future__ import annotations
 
-import os
-import shutil
-from multiprocessing import active_children
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 import pytest
 
-from q2r2_control.errors import ConfigError, RecordingError
-from q2r2_control.export.episodes import EpisodeVectors, FrameSampling, make_episode, make_episodes
-from tests.export.runs import Run, contents, record_step
-from tests.recording.runs import RATE
+from q2r2_control.config.cameras import CameraConfig
+from q2r2_control.errors import ConfigError
+from q2r2_control.export.episodes import FrameSampling, make_episode
+from tests.export.runs import Run, record_step
+from tests.export.vectors import CAMERA, HEIGHT, WIDTH
+from tests.recording.runs import RATE, file_of, pipeline, record
+from tests.support.pictures import needs_opengl
 
 pytestmark = pytest.mark.slow
 
 MOVED = 1e-4  # [m] and [rad]
-ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"  # begins the data of a chunk
 
 
 @pytest.fixture(scope="module")
@@ -72,93 +71,17 @@ def test_an_episode_knows_its_task_its_cell_and_its_last_frame(run: Run) -> None
     episode = make_episode(run.file, FrameSampling(fps=50))
     assert (episode.task, episode.cell, episode.recording) == ("a test", "dual_iiwa7", run.file.name)
     assert "version" in episode.notes
-    columns = episode.columns(index=3, first_frame=100, task=2)
-    assert np.flatnonzero(columns["next.done"]).tolist() == [episode.frames - 1]
-    np.testing.assert_array_equal(columns["timestamp"], np.float32(np.arange(episode.frames) / 50))
-    assert columns["index"].tolist() == list(range(100, 100 + episode.frames))
-    assert set(columns["episode_index"]) == {3}
-    assert set(columns["task_index"]) == {2}
+    assert np.flatnonzero(episode.outcome()["next.done"]).tolist() == [episode.frames - 1]
 
 
-def test_an_episode_that_was_kept_is_the_same(run: Run, tmp_path: Path) -> None:
-    episode = make_episode(run.file, FrameSampling())
-    episode.save(tmp_path / "kept.npz")
-    again = EpisodeVectors.load(tmp_path / "kept.npz")
-    assert again.names == episode.names
-    for name, values in episode.vectors.items():
-        np.testing.assert_array_equal(again.vectors[name], values)
-    assert [again.recording, again.cell, again.task, again.fps, again.notes] == [
-        *(episode.recording, episode.cell, episode.task, episode.fps, episode.notes)
-    ]
-
-
-def test_several_processes_make_the_same_bytes_as_one(run: Run, tmp_path: Path) -> None:
-    files = [run.file, Path(shutil.copy(run.file, tmp_path / "copy.mcap"))]
-    for workers in (1, 2):
-        (tmp_path / str(workers)).mkdir()
-        made = make_episodes(files, FrameSampling(), tmp_path / str(workers), workers=workers)
-        assert len(made.kept) == 2
-        assert [EpisodeVectors.load(file).recording for file in made.kept] == [file.name for file in files]
-    assert contents(tmp_path / "1") == contents(tmp_path / "2") != {}
-
-
-def test_an_interrupted_export_goes_on_with_what_it_had(run: Run, tmp_path: Path) -> None:
-    files = [run.file, Path(shutil.copy(run.file, tmp_path / "copy.mcap"))]
-    kept = tmp_path / "kept"
-    kept.mkdir()
-
-    def interrupt(done: int) -> None:
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        make_episodes(files, FrameSampling(), kept, progress=interrupt)
-    (first,) = kept.iterdir()
-    made_at = first.stat().st_mtime_ns
-    made = make_episodes(files, FrameSampling(), kept)
-    assert made.kept[0] == first
-    assert first.stat().st_mtime_ns == made_at
-    # Half of a file, as a machine without power may leave it, and other options, are made anew.
-    first.write_bytes(first.read_bytes()[:1000])
-    make_episodes(files, FrameSampling(), kept)
-    assert EpisodeVectors.load(first).frames == EpisodeVectors.load(made.kept[1]).frames
-    other = make_episodes(files[:1], FrameSampling(fps=10), kept)
-    assert EpisodeVectors.load(other.kept[0]).fps == 10
-
-
-def test_a_worker_that_is_killed_is_one_line_and_the_next_export_goes_on(run: Run, tmp_path: Path) -> None:
-    files = [run.file, *(Path(shutil.copy(run.file, tmp_path / f"copy-{number}.mcap")) for number in range(2))]
-    kept = tmp_path / "kept"
-    kept.mkdir()
-    *others, last = make_episodes(files, FrameSampling(), kept).kept
-    last.unlink()
-    made_at = [other.stat().st_mtime_ns for other in others]
-    os.mkfifo(last.with_suffix(".unfinished"))  # nobody reads it, so a worker is in the middle of its episode for good
-
-    def kill(done: int) -> None:
-        if done == len(others):
-            for process in active_children():
-                process.kill()
-
-    with pytest.raises(ConfigError, match="a process of --workers was killed") as fault:
-        make_episodes(files, FrameSampling(), kept, workers=2, progress=kill)
-    assert "\n" not in str(fault.value)
-    last.with_suffix(".unfinished").unlink()
-    assert make_episodes(files, FrameSampling(), kept, workers=2).kept == [*others, last]
-    assert [other.stat().st_mtime_ns for other in others] == made_at
-
-
-@pytest.mark.parametrize("workers", [1, 2])
-def test_a_bad_recording_is_named_or_skipped(workers: int, run: Run, tmp_path: Path) -> None:
-    damaged = tmp_path / "damaged.mcap"
-    data = bytearray(run.file.read_bytes())
-    data[data.rindex(ZSTD_MAGIC) + 200] ^= 0xFF
-    damaged.write_bytes(data)
-    with pytest.raises(RecordingError, match=r"damaged\.mcap: damaged"):
-        make_episodes([damaged, run.file], FrameSampling(), tmp_path, workers=workers)
-    made = make_episodes([damaged, run.file], FrameSampling(), tmp_path, workers=workers, skip_bad=True)
-    assert len(made.kept) == 1
-    (fault,) = made.skipped
-    assert "damaged.mcap: damaged" in fault
+def test_an_episode_has_the_pictures_of_its_frames(tmp_path: Path) -> None:
+    needs_opengl()
+    camera = CameraConfig(position=(1.9, 0, 1), look_at=(0.4, 0, 0.3), width=WIDTH, height=HEIGHT, rate=20.0)
+    file = file_of(record(tmp_path, pipeline("circle", "mujoco", cameras={CAMERA: camera}), 0.3))
+    assert not make_episode(file, FrameSampling(20)).cameras
+    episode = make_episode(file, FrameSampling(20, pictures=True))
+    shown = list(episode.cameras[CAMERA])
+    assert (len(shown), shown[0].shape) == (episode.frames, episode.cameras[CAMERA].size)
 
 
 @pytest.mark.parametrize("fps", [0, -30, 1001])

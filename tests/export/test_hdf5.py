@@ -8,59 +8,57 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from q2r2_control.config.cameras import CameraConfig
 from q2r2_control.export.episodes import EpisodeVectors
-from q2r2_control.export.hdf5 import write_episodes
-from q2r2_control.export.kept_pictures import KeptAs, KeptPictures, place_of
-from q2r2_control.export.pixel_files import write_pixels
+from q2r2_control.export.hdf5 import gather_files, write_file
 from tests.export.runs import contents
-from tests.export.test_lerobot import EPISODES
-from tests.export.videos import CAMERA, HEIGHT, WIDTH, pictures_of
-
-pytestmark = pytest.mark.slow
+from tests.export.vectors import CAMERA, EPISODES, HEIGHT, WIDTH, with_pictures
 
 h5py = pytest.importorskip("h5py", reason="the extra export is not installed")
 
 POSITIONS = ("left_A1", "left_gripper")
 
 
-def kept(folder: Path) -> tuple[list[Path], list[EpisodeVectors]]:
-    """Files of two episodes with the pictures of a camera."""
-    camera = CameraConfig(position=(1, 0, 1), rpy=(0, 0, 0), width=WIDTH, height=HEIGHT)
-    files, episodes = [], []
-    for number, plain in enumerate(EPISODES[:2]):
-        names = {"observation.state": POSITIONS, "observation.velocity": POSITIONS[:1], "action": POSITIONS}
-        vectors = {
-            name: plain.vectors["action"][:, : len(labels)] * (1 + at)
-            for at, (name, labels) in enumerate(names.items())
-        }
-        cameras = {CAMERA: KeptPictures(WIDTH, HEIGHT, {})}
-        episode, file = replace(plain, names=names, vectors=vectors, cameras=cameras), folder / f"{number}.npz"
-        write_pixels(pictures_of(episode, number), episode.frames, camera, place_of(file, CAMERA, KeptAs.PIXELS))
-        episode.save(file)
-        files.append(file)
-        episodes.append(episode)
-    return files, episodes
+def act_episodes() -> list[EpisodeVectors]:
+    """Two episodes with the features that ACT asks for, and the pictures of a camera."""
+    names = {"observation.state": POSITIONS, "observation.velocity": POSITIONS[:1], "action": POSITIONS}
+    return [
+        replace(
+            with_pictures(plain, number),
+            names=names,
+            vectors={
+                name: plain.vectors["action"][:, : len(labels)] * (1 + at)
+                for at, (name, labels) in enumerate(names.items())
+            },
+        )
+        for number, plain in enumerate(EPISODES[:2])
+    ]
+
+
+def export(episodes: list[EpisodeVectors], folder: Path) -> Path:
+    """Write episodes and return the folder in which they end."""
+    folder.mkdir()
+    files = [folder / str(number) for number in range(len(episodes))]
+    for episode, file in zip(episodes, files, strict=True):
+        write_file(episode, file)
+    gather_files(files, folder / "made")
+    return folder / "made"
 
 
 def test_each_episode_is_a_file_with_positions_velocities_pictures_and_the_next_action(tmp_path: Path) -> None:
-    files, episodes = kept(tmp_path)
-    write_episodes(files, tmp_path / "made")
+    made = export(episodes := act_episodes(), tmp_path / "out")
     for number, episode in enumerate(episodes):
-        with h5py.File(tmp_path / "made" / f"episode_{number}.hdf5") as file:
+        with h5py.File(made / f"episode_{number}.hdf5") as file:
             np.testing.assert_array_equal(file["observations/qpos"], episode.vectors["observation.state"])
             np.testing.assert_array_equal(file["observations/qvel"], episode.vectors["observation.velocity"])
             actions = episode.vectors["action"]
             np.testing.assert_array_equal(file["action"][:-1], actions[1:])
             np.testing.assert_array_equal(file["action"][-1], actions[-1])
-            np.testing.assert_array_equal(file[f"observations/images/{CAMERA}"], pictures_of(episode, number))
+            np.testing.assert_array_equal(file[f"observations/images/{CAMERA}"], list(episode.cameras[CAMERA]))
             assert file[f"observations/images/{CAMERA}"].chunks == (1, HEIGHT, WIDTH, 3)
 
 
 def test_a_file_says_what_its_numbers_are(tmp_path: Path) -> None:
-    files, _ = kept(tmp_path)
-    write_episodes(files, tmp_path / "made")
-    with h5py.File(tmp_path / "made" / "episode_0.hdf5") as file:
+    with h5py.File(export(act_episodes(), tmp_path / "out") / "episode_0.hdf5") as file:
         assert list(file["observations/qpos"].attrs["names"]) == list(POSITIONS)
         assert list(file["observations/qpos"].attrs["units"]) == ["rad", "0 closed .. 1 open"]
         assert list(file["observations/qvel"].attrs["units"]) == ["rad/s"]
@@ -70,7 +68,5 @@ def test_a_file_says_what_its_numbers_are(tmp_path: Path) -> None:
 
 
 def test_the_same_episodes_give_the_same_bytes(tmp_path: Path) -> None:
-    files, _ = kept(tmp_path)
-    for name in ("one", "two"):
-        write_episodes(files, tmp_path / name)
-    assert contents(tmp_path / "one") == contents(tmp_path / "two")
+    one, two = (contents(export(act_episodes(), tmp_path / name)) for name in ("one", "two"))
+    assert one == two

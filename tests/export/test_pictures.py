@@ -8,7 +8,7 @@ import pytest
 
 from q2r2_control.config.cameras import CameraConfig
 from q2r2_control.errors import RecordingError
-from q2r2_control.export.pictures import pictures_at
+from q2r2_control.export.pictures import CameraFrames
 from q2r2_control.recording.reader import Recording
 from tests.export.files import EPOCH, brightness, write_recording
 
@@ -24,7 +24,7 @@ def shown(path: Path, taken: list[int], frames: list[int]) -> list[int]:
     pictures = {"front": [MS * time for time in taken]}
     file = write_recording(path / "a.mcap", TICKS, cameras={"front": CAMERA}, pictures=pictures)
     stamps = [EPOCH + MS * time for time in frames]
-    return [round(float(pixels.mean())) for pixels in pictures_at(Recording(file), "front", CAMERA, stamps)]
+    return [round(float(pixels.mean())) for pixels in CameraFrames(Recording(file), "front", CAMERA, stamps)]
 
 
 def test_a_frame_has_the_newest_picture_at_or_before_it(tmp_path: Path) -> None:
@@ -51,4 +51,4 @@ def test_a_picture_of_another_size_is_damage(tmp_path: Path) -> None:
     file = write_recording(tmp_path / "a.mcap", TICKS, cameras={"front": CAMERA}, pictures={"front": [MS]})
     larger = CAMERA.model_copy(update={"width": 32})
     with pytest.raises(RecordingError, match=r"a\.mcap: damaged: a picture of camera front has a size"):
-        next(pictures_at(Recording(file), "front", larger, [EPOCH + MS]))
+        next(iter(CameraFrames(Recording(file), "front", larger, [EPOCH + MS])))

@@ -1,4 +1,4 @@
-"""A Ray cluster makes the same dataset, also when one of its workers is killed."""
+"""A Ray cluster makes the same episodes, also when one of its workers is killed."""
 
 from __future__ import annotations
 
@@ -13,16 +13,29 @@ from pathlib import Path
 
 import pytest
 
-from q2r2_control.export.episodes import FrameSampling, make_episodes
-from q2r2_control.export.lerobot import write_dataset
+from q2r2_control.export.csv_tables import write_vectors
+from q2r2_control.export.episodes import FrameSampling
+from q2r2_control.export.kept_episodes import keep_episodes
 from tests.export.runs import contents, record_two
 
 pytestmark = pytest.mark.slow
 
 ray = pytest.importorskip("ray", reason="the extra ray is not installed")
-pytest.importorskip("pyarrow", reason="the extra export is not installed")
 
 ROOT = Path(__file__).resolve().parents[2]
+PROGRAM = """
+import sys
+from pathlib import Path
+from q2r2_control.errors import Q2R2Error
+from q2r2_control.export.csv_tables import write_vectors
+from q2r2_control.export.episodes import FrameSampling
+from q2r2_control.export.kept_episodes import keep_episodes
+address, folder, *files = sys.argv[1:]
+try:
+    keep_episodes([Path(file) for file in files], FrameSampling(), write_vectors, Path(folder), ray=address)
+except Q2R2Error as error:
+    sys.exit(str(error))
+"""
 
 
 @pytest.fixture(scope="module")
@@ -47,9 +60,9 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     return list(record_two(tmp_path_factory.mktemp("recordings")))
 
 
-def export(recordings: list[Path], out: Path, *options: str) -> subprocess.Popen[str]:
-    arguments = ["export", "lerobot", *map(str, recordings), "--output", str(out), *options]
-    command = [sys.executable, "-m", "q2r2_control", *arguments]
+def export(recordings: list[Path], folder: Path, address: str) -> subprocess.Popen[str]:
+    folder.mkdir()
+    command = [sys.executable, "-c", PROGRAM, address, str(folder), *map(str, recordings)]
     return subprocess.Popen(command, cwd=ROOT, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
 
 
@@ -57,17 +70,17 @@ def worker() -> int | None:
     """A process of the cluster that makes an episode now."""
     for folder in Path("/proc").iterdir():
         with suppress(OSError):
-            if folder.name.isdigit() and (folder / "cmdline").read_bytes().startswith(b"ray::_work"):
+            if folder.name.isdigit() and (folder / "cmdline").read_bytes().startswith(b"ray::_keep"):
                 return int(folder.name)
     return None
 
 
-def test_the_dataset_is_the_same_when_a_worker_is_killed_in_the_middle(
+def test_the_episodes_are_the_same_when_a_worker_is_killed_in_the_middle(
     recordings: list[Path], address: str, tmp_path: Path
 ) -> None:
-    (tmp_path / "episodes").mkdir()
-    write_dataset(make_episodes(recordings, FrameSampling(), tmp_path / "episodes").kept, tmp_path / "here")
-    process = export(recordings, tmp_path / "there", "--ray", address)
+    (tmp_path / "here").mkdir()
+    keep_episodes(recordings, FrameSampling(), write_vectors, tmp_path / "here")
+    process = export(recordings, tmp_path / "there", address)
     killed = None
     while killed is None and process.poll() is None:
         killed = worker()
@@ -84,13 +97,10 @@ def test_a_bad_recording_and_a_cluster_that_is_not_there_are_one_line(
 ) -> None:
     bad = tmp_path / "bad.mcap"
     bad.write_bytes(b"no recording")
-    process = export([*recordings, bad], tmp_path / "out", "--ray", address)
-    _, errors = process.communicate(timeout=300)
-    assert process.returncode == 2
-    assert errors.startswith(f"q2r2: {bad}: not an MCAP file")
-    assert len(errors.splitlines()) == 1
-    process = export(recordings, tmp_path / "out", "--ray", "127.0.0.1:1")
-    _, errors = process.communicate(timeout=300)
-    assert process.returncode == 2
-    assert errors.startswith("q2r2: --ray 127.0.0.1:1: Connection refused; allowed: a running cluster, ")
-    assert len(errors.splitlines()) == 1
+    for files, to, line in (
+        ([*recordings, bad], address, f"{bad}: not an MCAP file"),
+        (recordings, "127.0.0.1:1", "--ray 127.0.0.1:1: Connection refused; allowed: a running cluster, "),
+    ):
+        _, errors = export(files, tmp_path / to, to).communicate(timeout=300)
+        assert errors.startswith(line)
+        assert len(errors.splitlines()) == 1

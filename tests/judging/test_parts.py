@@ -10,7 +10,9 @@ import pytest
 
 from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.events import ReasonKind
-from q2r2_control.export.episodes import EpisodeVectors, FrameSampling, make_episode, make_episodes
+from q2r2_control.export.csv_tables import load_vectors, write_vectors
+from q2r2_control.export.episodes import FrameSampling, make_episode
+from q2r2_control.export.kept_episodes import keep_episodes
 from q2r2_control.judging.episode import read_episode
 from q2r2_control.judging.judge import Judged, judge
 from q2r2_control.judging.page import page_of
@@ -103,12 +105,12 @@ def test_frames_are_of_the_ticks_that_they_were_of(file: Path, judged: list[Judg
 
 
 def test_those_that_are_kept_become_episodes_of_a_dataset_with_frames_of_their_own(file: Path, tmp_path: Path) -> None:
-    made = make_episodes([file], FrameSampling(fps=50), tmp_path)
+    made = keep_episodes([file], FrameSampling(fps=50), write_vectors, tmp_path)
     assert made.skipped == []
-    episodes = [EpisodeVectors.load(kept) for kept in made.kept]
+    episodes = [load_vectors(kept) for kept in made.kept]
     assert [episode.name for episode in episodes] == [f"{file.stem}-1", f"{file.stem}-3"]
     assert [episode.success for episode in episodes] == [True, None]
-    succeeded = [np.flatnonzero(episode.columns(0, 0, 0)["next.success"]).tolist() for episode in episodes]
+    succeeded = [np.flatnonzero(episode.outcome()["next.success"]).tolist() for episode in episodes]
     assert succeeded == [[episodes[0].frames - 1], []]
     assert episodes[0].frames == pytest.approx(75, abs=2)
     assert episodes[1].frames >= 100  # and until the arms are at rest
@@ -117,7 +119,7 @@ def test_those_that_are_kept_become_episodes_of_a_dataset_with_frames_of_their_o
         state = episode.vectors["observation.state"]
         near = whole.vectors["observation.state"][round((began - 0.05) * 250) : round((began + 0.05) * 250)]
         assert np.abs(near - state[0]).max(axis=1).min() < 1e-9
-    again = make_episodes([file], FrameSampling(fps=50), tmp_path)
+    again = keep_episodes([file], FrameSampling(fps=50), write_vectors, tmp_path)
     assert again.kept == made.kept
 
 

@@ -1,0 +1,102 @@
+"""Episodes of many recordings, written one by one by several processes, and kept until all are through."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from q2r2_control.errors import ConfigError, RecordingError
+from q2r2_control.export.episodes import EpisodePart, EpisodeVectors, FrameSampling, make_episode, parts_to_export
+from q2r2_control.export.workers import here, in_processes, on_ray
+
+Write = Callable[[EpisodeVectors, Path], None]  # an episode as a new file or folder; importable, for other processes
+_Job = tuple[Path, FrameSampling, EpisodePart, Write, Path]
+_FORMAT = 5  # of kept episodes; those of another one are made again
+
+
+@dataclass(frozen=True)
+class Exported:
+    """What became of recordings."""
+
+    kept: list[Path]  # episodes, in the order of their recordings
+    skipped: list[str]  # what was wrong with the others, a line each
+
+
+def keep_episodes(
+    files: Sequence[Path],
+    sampling: FrameSampling,
+    write: Write,
+    folder: Path,
+    *,
+    workers: int = 1,
+    ray: str | None = None,
+    skip_bad: bool = False,
+    progress: Callable[[int], None] = lambda done: None,
+) -> Exported:
+    """``write`` the episodes of recordings into ``folder``; those that are there already are not made again.
+
+    Those that an operator discarded while recording are left out. The same comes out for any number of ``workers``, and
+    of a cluster at the address ``ray``. ``progress`` is called with how many are through. Raises the
+    :class:`RecordingError` of the first bad recording unless ``skip_bad``, and :class:`ConfigError` where nothing can
+    be written.
+    """
+    jobs: list[_Job] = [
+        (file, sampling, part, write, folder / _key(file, sampling, part, write))
+        for file in files
+        for part in parts_to_export(file)
+    ]
+    if ray is not None:
+        mapping = on_ray(ray, _keep)
+    else:
+        mapping = in_processes(workers, _keep) if min(workers, len(jobs)) > 1 else here(_keep)
+    exported = Exported([], [])
+    with mapping as run:
+        for done, (job, fault) in enumerate(zip(jobs, run(jobs), strict=True), start=1):
+            if fault is not None and not skip_bad:
+                raise RecordingError(fault)
+            if fault is None:
+                exported.kept.append(job[-1])
+            else:
+                exported.skipped.append(fault)
+            progress(done)
+    return exported
+
+
+def _keep(job: _Job) -> str | None:
+    """Write one episode unless it is there, where a whole one only ever is; returns what was wrong."""
+    file, sampling, part, write, target = job
+    if target.exists():
+        return None
+    unfinished = target.with_suffix(".unfinished")
+    try:
+        write(make_episode(file, sampling, part), unfinished)
+        _flush(unfinished)
+        unfinished.replace(target)
+    except RecordingError as error:
+        return str(error)
+    except OSError as error:
+        raise ConfigError(f"--output {target.parent}: {error.strerror or error}") from error
+    return None
+
+
+def _flush(written: Path) -> None:
+    """Bring what was written to the disk, so that no half of it is kept where power fails."""
+    for path in (written, *written.rglob("*")):
+        if path.is_file():
+            with path.open("rb") as stream:
+                os.fsync(stream.fileno())
+
+
+def _key(file: Path, sampling: FrameSampling, part: EpisodePart, write: Write) -> str:
+    """Another one after any change of the recording or of what is asked for."""
+    try:
+        status = file.stat()
+    except OSError as error:
+        raise RecordingError(f"{file}: cannot be read: {error.strerror}") from error
+    made_of = [str(file.resolve()), status.st_size, status.st_mtime_ns, asdict(sampling), part.number]
+    identity = json.dumps([*made_of, write.__module__, _FORMAT])
+    return hashlib.sha256(identity.encode()).hexdigest()[:24]

@@ -1,0 +1,165 @@
+"""LeRobot's own loader reads what is exported: every number, every picture, and what is said of them.
+
+Run by ``make test-lerobot``, in an environment of its own.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import threading
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("lerobot", reason="make test-lerobot installs it")
+
+import pyarrow.parquet
+import torch
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+from q2r2_control.export.episodes import EpisodeVectors
+from q2r2_control.export.lerobot import SOURCES, join_shards, video_key, write_shard
+from q2r2_control.export.pictures import Pixels
+from tests.export.runs import contents
+from tests.export.vectors import CAMERA, EPISODES, HEIGHT, NAMES, WIDTH, with_pictures
+
+FPS = 30
+KEY = video_key(CAMERA)
+SEEN = [with_pictures(episode, number) for number, episode in enumerate(EPISODES)]
+SPANS = [(0, 40), (40, 65), (65, 125)]  # frames of the episodes
+BACKEND = "pyav"  # the default, torchcodec, needs the libraries of FFmpeg, which no wheel brings
+
+
+def export(episodes: Sequence[EpisodeVectors], folder: Path) -> Path:
+    """Write a dataset of each episode, join them, and return the folder of the whole."""
+    folder.mkdir()
+    shards = [folder / str(number) for number in range(len(episodes))]
+    for episode, shard in zip(episodes, shards, strict=True):
+        write_shard(episode, shard)
+    join_shards(shards, folder / "whole")
+    return folder / "whole"
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Of three episodes, without pictures."""
+    return export(EPISODES, tmp_path_factory.mktemp("vectors") / "made")
+
+
+@pytest.fixture(scope="module")
+def film(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Of the same episodes with a camera."""
+    return export(SEEN, tmp_path_factory.mktemp("pictures") / "made")
+
+
+def rows_of(folder: Path) -> list[dict[str, object]]:
+    """What is said of each episode."""
+    (file,) = (folder / "meta" / "episodes").rglob("*.parquet")
+    rows: list[dict[str, object]] = pyarrow.parquet.read_table(file).to_pylist()
+    return rows
+
+
+def test_info_names_every_number_and_says_what_is_in_it(dataset: Path) -> None:
+    info = json.loads((dataset / "meta" / "info.json").read_text())
+    assert (info["codebase_version"], info["fps"], info["robot_type"]) == ("v3.0", FPS, "two_arms")
+    assert (info["total_episodes"], info["total_frames"], info["total_tasks"]) == (3, 125, 2)
+    assert info["splits"] == {"train": "0:3"}
+    for name, labels in NAMES.items():
+        assert info["features"][name] == {"dtype": "float32", "shape": [len(labels)], "names": list(labels)}
+    for name in ("next.done", "next.success"):
+        assert info["features"][name] == {"dtype": "bool", "shape": [1], "names": None}
+
+
+def test_every_episode_has_its_frames_its_task_and_its_recording(dataset: Path) -> None:
+    rows = rows_of(dataset)
+    assert [(row["dataset_from_index"], row["dataset_to_index"]) for row in rows] == SPANS
+    assert [row["tasks"] for row in rows] == [["stack"], ["circle"], ["stack"]]
+    sources = json.loads((dataset / SOURCES).read_text())
+    assert [(one["episode_index"], one["recording"], one["success"], one["operator"]) for one in sources] == [
+        (0, "run-1.mcap", True, "Ada"),
+        (1, "run-2.mcap", None, "Ada"),
+        (2, "run-3.mcap", False, "Ada"),
+    ]
+
+
+def test_statistics_are_those_of_all_frames(dataset: Path) -> None:
+    found = json.loads((dataset / "meta" / "stats.json").read_text())["action"]
+    everything = np.concatenate([episode.vectors["action"] for episode in EPISODES]).astype(np.float64)
+    assert found["count"] == [125]
+    for name in ("min", "max", "mean", "std"):
+        np.testing.assert_allclose(found[name], getattr(everything, name)(axis=0), atol=1e-5)
+
+
+def test_the_loader_reads_every_frame_and_its_neighbours(dataset: Path) -> None:
+    ahead = [(index + 1) / FPS for index in range(4)]
+    loaded = LeRobotDataset("q2r2/test", root=dataset, delta_timestamps={"action": ahead})
+    assert (loaded.num_episodes, loaded.num_frames, loaded.fps) == (3, 125, FPS)
+    item = loaded[41]
+    assert item["task"] == "circle"
+    np.testing.assert_array_equal(item["action"].numpy(), EPISODES[1].vectors["action"][2:6])
+    assert loaded[64]["action_is_pad"].all()
+
+
+def test_batches_come_out_of_a_dataloader_with_the_ends_and_the_successes(dataset: Path) -> None:
+    batches = list(torch.utils.data.DataLoader(LeRobotDataset("q2r2/test", root=dataset), batch_size=50))
+    assert [len(batch["index"]) for batch in batches] == [50, 50, 25]
+    for name in NAMES:
+        found = torch.cat([batch[name] for batch in batches]).numpy()
+        np.testing.assert_array_equal(found, np.concatenate([episode.vectors[name] for episode in EPISODES]))
+    done, success = (torch.cat([batch[name] for batch in batches]).flatten() for name in ("next.done", "next.success"))
+    assert torch.nonzero(done).flatten().tolist() == [39, 64, 124]
+    assert torch.nonzero(success).flatten().tolist() == [39]
+
+
+def test_one_episode_of_them_can_be_loaded(dataset: Path) -> None:
+    loaded = LeRobotDataset("q2r2/test", root=dataset, episodes=[1])
+    assert (len(loaded), int(loaded[0]["index"])) == (25, 40)
+
+
+def test_the_loader_gives_every_frame_its_picture(film: Path) -> None:
+    spans = [(row[f"videos/{KEY}/from_timestamp"], row[f"videos/{KEY}/to_timestamp"]) for row in rows_of(film)]
+    for found, frames in zip(spans, SPANS, strict=True):
+        assert found == pytest.approx([frame / FPS for frame in frames], abs=1e-4)
+    loaded = LeRobotDataset("q2r2/test", root=film, delta_timestamps={KEY: [-1 / FPS, 0.0]}, video_backend=BACKEND)
+    expected: list[Pixels] = [pixels for episode in SEEN for pixels in episode.cameras[CAMERA]]
+    for index in (1, 39, 41, 64, 66, 124):
+        found = loaded[index][KEY].numpy().transpose(0, 2, 3, 1) * 255
+        for pixels, wanted in zip(found, expected[index - 1 : index + 1], strict=True):
+            assert pixels.shape == (HEIGHT, WIDTH, 3)
+            assert np.abs(pixels - wanted).mean() < 6, index
+
+
+def test_the_same_episodes_give_the_same_bytes_also_over_what_was_begun(film: Path, tmp_path: Path) -> None:
+    (tmp_path / "again").mkdir()
+    shards = [tmp_path / "again" / str(number) for number in range(len(SEEN))]
+    for episode, shard in zip(SEEN, shards, strict=True):
+        shard.mkdir()
+        (shard / "half").touch()
+        write_shard(episode, shard)
+    join_shards(shards, tmp_path / "whole")
+    assert contents(tmp_path / "whole") == contents(film)
+
+
+def test_while_a_video_is_encoded_no_thread_goes_before_a_control_loop(tmp_path: Path) -> None:
+    seen: set[int] = set()
+    over = threading.Event()
+
+    def watch() -> None:
+        while not over.wait(0.001):
+            for thread in os.listdir("/proc/self/task"):
+                try:
+                    seen.add(os.sched_getscheduler(int(thread)))
+                except OSError:
+                    continue  # it has ended
+
+    watcher = threading.Thread(target=watch)
+    watcher.start()
+    try:
+        write_shard(SEEN[0], tmp_path / "made")
+    finally:
+        over.set()
+        watcher.join()
+    assert seen == {os.SCHED_OTHER}
