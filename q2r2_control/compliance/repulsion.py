@@ -27,7 +27,7 @@ from q2r2_control.compliance.repulsion_kernels import RepulsionData, RepulsionMo
 from q2r2_control.config.control import ControllerSettings, WallSettings
 from q2r2_control.control.geometry.collision import collision_model_of
 from q2r2_control.control.geometry.finger_openings import FingerOpenings
-from q2r2_control.control.jit import bound, hold
+from q2r2_control.control.jit import bound, pointer_to
 from q2r2_control.robot.kept_distances import kept_distances
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, Interval
@@ -79,13 +79,13 @@ class MeasuredSeparation:
         self._fingers = FingerOpenings(robot, collision.bodies)
         self._kernel_data = RepulsionData.empty(model)
         self._measured = self._kernel_data.measured.reshape(-1)  # a view
-        self._held_model, self._held_data = hold(model), hold(self._kernel_data)
+        self._model_pointer, self._data_pointer = pointer_to(model), pointer_to(self._kernel_data)
         names = [geometry.name for geometry in robot.collision_model.geometryObjects]
         indices = zip(pairs.first.tolist(), pairs.second.tolist(), strict=True)
         self._pair_names = [(names[first], names[second]) for first, second in indices]
         # Every kernel runs once here, so that none is compiled in mid-motion.
-        self._find_near = bound(find_near, self._held_model, self._held_data)
-        self._repulsion_torque = bound(repulsion_torque, self._held_model, self._held_data, 0)
+        self._find_near = bound(find_near, self._model_pointer, self._data_pointer)
+        self._repulsion_torque = bound(repulsion_torque, self._model_pointer, self._data_pointer, 0)
         self._no_torque = np.zeros(robot.model.nv)
         self._no_torque.flags.writeable = False
 
@@ -123,9 +123,9 @@ class MeasuredSeparation:
 
     def _find(self, q: Array, v: Array) -> tuple[int, int, float]:
         np.concatenate((q, v), out=self._measured)
-        found: tuple[int, int, float] = self._find_near(self._held_model, self._held_data)
+        found: tuple[int, int, float] = self._find_near(self._model_pointer, self._data_pointer)
         return found
 
     def _press(self, count: int) -> float:
         self._kernel_data.M[:] = pin.crba(self._model, self._data, self._kernel_data.measured[0])
-        return float(self._repulsion_torque(self._held_model, self._held_data, count))
+        return float(self._repulsion_torque(self._model_pointer, self._data_pointer, count))

@@ -35,7 +35,7 @@ from q2r2_control.control.geometry.collision import CollisionData, CollisionMode
 from q2r2_control.control.geometry.kinematics import IntArray
 from q2r2_control.control.geometry.pair_distance import at_least, distance_row, measure
 from q2r2_control.control.geometry.smooth_distance import measure_smooth
-from q2r2_control.control.jit import Held, borrowed, kernel
+from q2r2_control.control.jit import KernelPointer, kernel, pointee
 from q2r2_control.types import Array
 
 _LONGEST_PERIOD = 0.002  # T [s]
@@ -89,12 +89,12 @@ class RepulsionData(NamedTuple):
 
 
 @kernel
-def find_near(held_model: Held, held_data: Held) -> tuple[int, int, float]:
+def find_near(model_pointer: KernelPointer, data_pointer: KernelPointer) -> tuple[int, int, float]:
     """Depths and gradients of the pairs in the shell or just outside.
 
     Returns how many these are, the closest pair of all and its distance; -1 where q or v is not finite.
     """
-    model, data = borrowed(held_model), borrowed(held_data)
+    model, data = pointee(model_pointer), pointee(data_pointer)
     if not np.isfinite(data.measured.sum()):
         return -1, 0, np.nan
     update_placements(model.collision, data.collision, data.measured[0])
@@ -118,9 +118,9 @@ def find_near(held_model: Held, held_data: Held) -> tuple[int, int, float]:
 
 
 @kernel
-def repulsion_torque(held_model: Held, held_data: Held, count: int) -> float:
+def repulsion_torque(model_pointer: KernelPointer, data_pointer: KernelPointer, count: int) -> float:
     """Add up the torques of the ``count`` pairs found near; returns the energy stored in the wall [J]."""
-    model, data, v = borrowed(held_model), borrowed(held_data), borrowed(held_data).measured[1]
+    model, data, v = pointee(model_pointer), pointee(data_pointer), pointee(data_pointer).measured[1]
     depth, mobility, force = data.depth, data.mobility, data.force
     factorise(data.M)
     total = 0.0

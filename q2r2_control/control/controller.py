@@ -23,7 +23,7 @@ from q2r2_control.control.safety.safety_filter import FOLLOWED, STOPPED
 from q2r2_control.control.step_report import LimitNames, StepSummary
 from q2r2_control.control.targets import TargetTracker
 from q2r2_control.control.tasks.external import load_tasks
-from q2r2_control.control.unconstrained import find_held_minimum
+from q2r2_control.control.unconstrained import find_minimum_anew
 from q2r2_control.errors import ConfigError, RobotError
 from q2r2_control.robot.pairs import pairs_with_others
 from q2r2_control.robot.robot import Robot
@@ -73,7 +73,7 @@ class CartesianController:
         self._targets = TargetTracker(model.tasks, self._arms, settings)
         self._external_tasks = load_tasks(robot, settings.tasks)
         self._names = LimitNames(robot)
-        self._take_load()
+        self._use_load()
         self._compile()
         self.reset(robot.home)
 
@@ -107,13 +107,13 @@ class CartesianController:
     def _compile(self) -> None:
         """Run every kernel and the solver once, so that none is compiled or set up in mid-motion."""
         self.reset(self.robot.home)
-        model, data, targets = self._held_model, self._held_data, self._targets.held
+        model, data, targets = self._model_pointer, self._data_pointer, self._targets.pointer
         self._assemble = bound(assemble, model, targets, data, self.settings.max_substep, -1.0)
         self._observe_bodies = bound(observe_bodies, model, data, self._unchanged)
         self._spare = bound(spare_distance, model, data, self._with_others[self._arms[0]])
         self._move = bound(move_reference, model, data, self._solution, False, self.settings.max_substep, 1.0)
         if self._external_tasks:
-            self._find_minimum = bound(find_held_minimum, data)
+            self._find_minimum = bound(find_minimum_anew, data)
         self.step({arm: self.tool_pose(arm) for arm in self._arms}, self.settings.max_substep)
         # A solver is set up at its first problem, and at home there may be none for it.
         self._problem.minimum = None
@@ -131,10 +131,10 @@ class CartesianController:
         state.v[:] = 0.0 if v is None else self._checked("v", v)
         self._fingers.set_all({})
         self._objects.clear()
-        self._take_load()
+        self._use_load()
         self._live.restart()
         self._targets.reset(state.q)
-        observed = start_reference(self._held_model, self._held_data)
+        observed = start_reference(self._model_pointer, self._data_pointer)
         self._closest, self._distance, self._tightest, self._margin, proven = observed
         self._apart = self._margin >= 0.0
         self._certified = proven and self._apart
@@ -212,11 +212,11 @@ class CartesianController:
         interval, before = self._fingers.checked(arm, least, greatest), self._fingers.intervals[arm]
         if interval == before:
             return None
-        blocked = self._look_again(self._fingers.set(arm, interval))
+        blocked = self._observe_again(self._fingers.set(arm, interval))
         if blocked < 0:
             return None
         self._fingers.set(arm, before)
-        self._look_again(self._unchanged)
+        self._observe_again(self._unchanged)
         return self._names.pair(blocked)
 
     @property
@@ -234,13 +234,13 @@ class CartesianController:
 
         Raises :class:`RobotError` for an arm that has no object.
         """
-        if not self._objects.tell(arm, holds):
+        if not self._objects.set_holding(arm, holds):
             return
-        self._take_load()
-        self._look_again(self._unchanged)
+        self._use_load()
+        self._observe_again(self._unchanged)
         self._objects.begin()
-        self._take_load()
-        self._look_again(self._unchanged)
+        self._use_load()
+        self._observe_again(self._unchanged)
 
     @property
     def holding(self) -> dict[str, bool]:
@@ -252,17 +252,17 @@ class CartesianController:
         """What every pair of ``Robot.objects`` keeps now (pairs,) [m]; minus infinity while it does not count."""
         return self._objects.kept()
 
-    def _take_load(self) -> None:
+    def _use_load(self) -> None:
         """Go on with the kernels' model and data of what is held now."""
         load = self._objects.load
-        self._held_model, self._held_data = load.model, load.data
-        self._names.take_pairs([self._objects.pair_names[pair] for pair in load.objects])
+        self._model_pointer, self._data_pointer = load.model, load.data
+        self._names.set_pairs([self._objects.pair_names[pair] for pair in load.objects])
         self._active.used[0] = 0  # pairs are numbered anew
         self._with_others = {arm: pairs_with_others(self._names.pairs, self.robot.roles, arm) for arm in self._arms}
 
-    def _look_again(self, grown: IntArray) -> int:
+    def _observe_again(self, grown: IntArray) -> int:
         """Observe with bodies that have changed; returns the pair in the way of those that have ``grown``, or -1."""
-        observed = self._observe_bodies(self._held_model, self._held_data, grown)
+        observed = self._observe_bodies(self._model_pointer, self._data_pointer, grown)
         self._closest, self._distance, self._tightest, self._margin, blocked = observed
         self._apart = self._margin >= 0.0
         return int(blocked)
@@ -277,7 +277,7 @@ class CartesianController:
 
         At the reference, and less what each pair keeps.
         """
-        return float(self._spare(self._held_model, self._held_data, self._with_others[arm]))
+        return float(self._spare(self._model_pointer, self._data_pointer, self._with_others[arm]))
 
     @property
     def stop_deceleration(self) -> Array:
@@ -290,7 +290,7 @@ class CartesianController:
         ``tick``: see :func:`assemble`.
         """
         self._live.step(self._objects.load, h)
-        usable, inside, free = self._assemble(self._held_model, self._targets.held, self._held_data, h, tick)
+        usable, inside, free = self._assemble(self._model_pointer, self._targets.pointer, self._data_pointer, h, tick)
         if self._external_tasks:
             free = self._apply_external_costs()
         summary.targets_usable &= usable
@@ -304,7 +304,7 @@ class CartesianController:
         if solved:
             self._solution[:] = solution.v
         outcome, self._closest, self._distance, self._tightest, self._margin, slack = self._move(
-            self._held_model, self._held_data, self._solution, solved, h, share
+            self._model_pointer, self._data_pointer, self._solution, solved, h, share
         )
         summary.fallback |= outcome != FOLLOWED
         summary.slack = max(summary.slack, slack)
@@ -323,4 +323,4 @@ class CartesianController:
             if np.isfinite(H).all() and np.isfinite(g).all():
                 self._tasks.H[:] += H
                 self._tasks.g[:] += g
-        return bool(self._find_minimum(self._held_data))
+        return bool(self._find_minimum(self._data_pointer))

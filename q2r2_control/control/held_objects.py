@@ -22,9 +22,9 @@ import numpy as np
 import numpy.typing as npt
 
 from q2r2_control.config.control import ControllerSettings
-from q2r2_control.control.geometry.collision import CollisionBodies, Pairs, Posed, bodies_of, pairs_of
+from q2r2_control.control.geometry.collision import BodyPlacements, CollisionBodies, Pairs, bodies_of, pairs_of
 from q2r2_control.control.geometry.kinematics import IntArray
-from q2r2_control.control.jit import Held, hold
+from q2r2_control.control.jit import KernelPointer, pointer_to
 from q2r2_control.control.kernel_data import KernelData
 from q2r2_control.control.kernel_model import KernelModel, stop_buffer
 from q2r2_control.control.safety.provable_distances import provable_distances
@@ -47,8 +47,8 @@ _Counting = frozenset[frozenset[str]]
 class HeldObjectModels:
     """The kernels' model and data while some objects are held. State, rows and tasks are the same arrays in all."""
 
-    model: Held
-    data: Held
+    model: KernelPointer
+    data: KernelPointer
     safety: SafetyModel
     measured: SafetyData
     objects: IntArray  # numbers, among all pairs of objects, of those that count; the last pairs of the model
@@ -79,12 +79,14 @@ class ObjectLoads:
             self.bodies = bodies
             self._make_room(len(model.safety.min_distance) + len(self._holders), len(robot.joint_names))
         none: IntArray = np.zeros(0, dtype=np.int64)
-        self._nothing = HeldObjectModels(hold(self.model), hold(self.data), self.model.safety, self.data.safety, none)
+        self._nothing = HeldObjectModels(
+            pointer_to(self.model), pointer_to(self.data), self.model.safety, self.data.safety, none
+        )
         for counting in _every_counting(self._arms):
             self._loads[counting] = self._load(counting)
         self.load = self._nothing
 
-    def tell(self, arm: str, holds: bool) -> bool:
+    def set_holding(self, arm: str, holds: bool) -> bool:
         """Take it that an arm's gripper holds its object, or does not; whether that is new.
 
         A pair that begins to count has to :meth:`begin` then, once it was measured with the new :attr:`load`. Raises
@@ -197,14 +199,14 @@ class ObjectLoads:
             collision=collision, approach=approach, min_distance=_joined(base.min_distance, goal.values[objects])
         )
         measured = self.data.safety._replace(
-            collision=self.data.safety.collision._replace(posed=Posed.empty(self.bodies)),
+            collision=self.data.safety.collision._replace(posed=BodyPlacements.empty(self.bodies)),
             velocities=BodyVelocities.empty(collision),
             distance=np.zeros(len(safety.min_distance)),
             near=np.zeros(len(safety.min_distance), dtype=np.int64),
             rollout=Rollout.empty(collision),
         )
         model, data = self.model._replace(safety=safety), self.data._replace(safety=measured)
-        return HeldObjectModels(hold(model), hold(data), safety, measured, objects)
+        return HeldObjectModels(pointer_to(model), pointer_to(data), safety, measured, objects)
 
 
 def _every_counting(arms: tuple[str, ...]) -> list[_Counting]:

@@ -56,11 +56,11 @@ extending: Any = numba.extending
 
 
 class _Pointer(types.Type):
-    """Kernels' type of a :class:`Held`."""
+    """Kernels' type of a :class:`KernelPointer`."""
 
     def __init__(self, pointee: Any) -> None:
         self.pointee = pointee
-        super().__init__(name=f"Held({pointee})")
+        super().__init__(name=f"KernelPointer({pointee})")
 
     @property
     def key(self) -> Any:
@@ -70,8 +70,8 @@ class _Pointer(types.Type):
 extending.register_model(_Pointer)(extending.models.OpaqueModel)
 
 
-class Held:
-    """A named tuple of arrays behind one pointer: made by :func:`hold`, read in a kernel by :func:`borrowed`.
+class KernelPointer:
+    """A named tuple of arrays behind one pointer: made by :func:`pointer_to`, read in a kernel by :func:`pointee`.
 
     Handing a kernel fifty arrays costs more than the work it does; a pointer costs the same for any number.
     """
@@ -85,19 +85,19 @@ class Held:
         self.kind = _Pointer(numba.typeof(value))
 
     def __reduce__(self) -> Any:
-        return hold, (self.value,)  # a copy has an address of its own
+        return pointer_to, (self.value,)  # a copy has an address of its own
 
 
-@extending.typeof_impl.register(Held)
-def _kind_of(held: Held, context: Any) -> _Pointer:
-    return held.kind
+@extending.typeof_impl.register(KernelPointer)
+def _kind_of(pointer: KernelPointer, context: Any) -> _Pointer:
+    return pointer.kind
 
 
 @extending.unbox(_Pointer)
-def _unbox(kind: _Pointer, held: Any, context: Any) -> Any:
+def _unbox(kind: _Pointer, boxed: Any, context: Any) -> Any:
     builder, python = context.builder, context.pyapi
     pointer = cgutils.alloca_once_value(builder, context.context.get_constant_null(kind))
-    address = python.object_getattr_string(held, "address")
+    address = python.object_getattr_string(boxed, "address")
     with builder.if_then(cgutils.is_not_null(builder, address)):
         builder.store(python.long_as_voidptr(address), pointer)
         python.decref(address)
@@ -105,14 +105,14 @@ def _unbox(kind: _Pointer, held: Any, context: Any) -> Any:
 
 
 @extending.intrinsic
-def borrowed(typing_context: Any, held: Any) -> Any:
-    """What is ``held``, in a kernel. No reference is counted: the caller holds it as long as the kernel runs."""
+def pointee(typing_context: Any, pointer: Any) -> Any:
+    """The named tuple behind ``pointer``, in a kernel. No reference is counted: the caller keeps the pointer."""
 
     def read(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        kind = context.get_data_type(held.pointee)
-        return context.unpack_value(builder, held.pointee, builder.bitcast(arguments[0], kind.as_pointer()))
+        kind = context.get_data_type(pointer.pointee)
+        return context.unpack_value(builder, pointer.pointee, builder.bitcast(arguments[0], kind.as_pointer()))
 
-    return held.pointee(held), read
+    return pointer.pointee(pointer), read
 
 
 @extending.intrinsic
@@ -180,18 +180,18 @@ def _write(value: Any, memory: npt.NDArray[np.uint8]) -> None:
     _put(value, memory)
 
 
-def hold(value: Any) -> Held:
+def pointer_to(value: Any) -> KernelPointer:
     """Put ``value``, a named tuple of arrays, numbers and more of its kind, behind a pointer."""
     memory = np.zeros(_size_of(value), dtype=np.uint8)
     _write(value, memory)
-    return Held(value, memory)
+    return KernelPointer(value, memory)
 
 
 def bound(function: Callable[..., Any], *arguments: Any) -> Callable[..., Any]:
     """A kernel's machine code for arguments of the types of these, with which it runs once.
 
-    A kernel looks at the type of each argument at each call, which for a :class:`Held` takes longer than a small
-    kernel's work. What is returned does not look: hand it arguments of exactly these types, and arrays of their layout.
+    A kernel looks at the type of each argument at each call, which for a :class:`KernelPointer` takes longer than
+    a small kernel's work. What is returned does not look: hand it arguments of exactly these types and layouts.
     """
     function(*arguments)
     # Set by Numba at run time too.

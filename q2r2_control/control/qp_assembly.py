@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
-from q2r2_control.control.jit import Held, borrowed, kernel
+from q2r2_control.control.jit import KernelPointer, kernel, pointee
 from q2r2_control.control.kernel_data import KernelData
 from q2r2_control.control.kernel_model import KernelModel
 from q2r2_control.control.safety.joint_limits import next_velocity_box
 from q2r2_control.control.safety.separation_rows import write_separation_rows
-from q2r2_control.control.targets import take_targets
-from q2r2_control.control.tasks.frame import add_stretch_damping, add_tool_task, tool_jacobian, wanted_twist
-from q2r2_control.control.tasks.manipulability import add_manipulability
+from q2r2_control.control.targets import update_targets
+from q2r2_control.control.tasks.frame import (
+    accumulate_stretch_damping,
+    accumulate_tool_cost,
+    tool_jacobian,
+    wanted_twist,
+)
+from q2r2_control.control.tasks.manipulability import pull_to_manipulability
 from q2r2_control.control.tasks.posture import (
-    add_hold_task,
-    add_posture_task,
+    accumulate_hold_cost,
+    accumulate_posture_cost,
     factor_of_tools,
     project_to_nullspace,
     pull_to_posture,
@@ -23,18 +28,20 @@ from q2r2_control.control.unconstrained import find_minimum
 
 
 @kernel
-def assemble(held_model: Held, held_targets: Held, held_data: Held, h: float, tick: float) -> tuple[bool, bool, bool]:
+def assemble(
+    model_pointer: KernelPointer, targets_pointer: KernelPointer, data_pointer: KernelPointer, h: float, tick: float
+) -> tuple[bool, bool, bool]:
     """Cost, rows and box of a step of ``h`` [s] from an observed reference.
 
     ``tick`` [s]: the step is the first of such a tick, which begins with what was offered as targets; below 0: it is
     another one. Returns whether all targets were usable, whether all joints are within their limits, and what
     :func:`find_minimum` says.
     """
-    model, targets, data = borrowed(held_model), borrowed(held_targets), borrowed(held_data)
+    model, targets, data = pointee(model_pointer), pointee(targets_pointer), pointee(data_pointer)
     state, tasks = data.safety.state, data.tasks
     usable = True
     if tick >= 0.0:
-        usable = take_targets(targets, state.q, state.v, tick)
+        usable = update_targets(targets, state.q, state.v, tick)
         state.a[:] = 0.0
     tasks.H[:] = 0.0
     tasks.g[:] = 0.0
@@ -44,14 +51,14 @@ def assemble(held_model: Held, held_targets: Held, held_data: Held, h: float, ti
         if targets.follows[i] == 1:
             _follow(model, data, targets, i)
         else:
-            add_hold_task(tasks, targets, i, state.q)
+            accumulate_hold_cost(tasks, targets, i, state.q)
     factor_of_tools(tasks.J, tasks.tools_factor)
     project_to_nullspace(tasks.J, tasks.tools_factor, tasks.tools_moved, tasks.posture)
     if model.tasks.has_swivels == 1:
         write_swivel_rows(model.tasks, tasks, targets)
         project_to_nullspace(tasks.J, tasks.tools_factor, tasks.tools_moved, tasks.swivel.free)
         turn_elbows(model.tasks, tasks)
-    add_posture_task(model.tasks, tasks)
+    accumulate_posture_cost(model.tasks, tasks)
     write_separation_rows(model.safety, data.safety, h)
     inside = next_velocity_box(model.safety.limits, state.q, state.v, h, data.safety.box)
     return usable, inside, find_minimum(data.safety, tasks)
@@ -63,7 +70,7 @@ def _follow(model: KernelModel, data: KernelData, targets: TaskTargets, i: int) 
     tasks, J = data.tasks, data.tasks.J[6 * i : 6 * i + 6]
     tool_jacobian(model.tasks.chain, tasks.placements, model.tasks.tools, i, tasks.translation[i], J)
     wanted_twist(model.tasks.motion, tasks, targets, i)
-    add_tool_task(J, tasks.twist[i], model.tasks.priority.weight[i], tasks.H, tasks.g)
-    add_stretch_damping(model.tasks, tasks, i)
+    accumulate_tool_cost(J, tasks.twist[i], model.tasks.priority.weight[i], tasks.H, tasks.g)
+    accumulate_stretch_damping(model.tasks, tasks, i)
     if model.tasks.manipulability_gain > 0.0:
-        add_manipulability(model.tasks, tasks, i)
+        pull_to_manipulability(model.tasks, tasks, i)

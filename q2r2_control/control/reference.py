@@ -7,7 +7,7 @@ import numpy as np
 from q2r2_control.control.geometry.collision import update_placements
 from q2r2_control.control.geometry.kinematics import IntArray
 from q2r2_control.control.geometry.pair_distance import at_least, measure
-from q2r2_control.control.jit import Held, borrowed, kernel
+from q2r2_control.control.jit import KernelPointer, kernel, pointee
 from q2r2_control.control.kernel_data import KernelData
 from q2r2_control.control.kernel_model import KernelModel
 from q2r2_control.control.safety.safety_data import SafetyData
@@ -20,42 +20,44 @@ from q2r2_control.types import Array
 
 
 @kernel
-def start_reference(held_model: Held, held_data: Held) -> tuple[int, float, int, float, bool]:
+def start_reference(model_pointer: KernelPointer, data_pointer: KernelPointer) -> tuple[int, float, int, float, bool]:
     """Observe after a reset: what :func:`_observe` says, and whether the stop is known to keep all apart."""
-    model, data = borrowed(held_model), borrowed(held_data)
+    model, data = pointee(model_pointer), pointee(data_pointer)
     closest, distance, tightest, margin = _observe(model, data)
     return closest, distance, tightest, margin, certify_start(model.safety, data.safety)
 
 
 @kernel
-def observe_bodies(held_model: Held, held_data: Held, grown: IntArray) -> tuple[int, float, int, float, int]:
+def observe_bodies(
+    model_pointer: KernelPointer, data_pointer: KernelPointer, grown: IntArray
+) -> tuple[int, float, int, float, int]:
     """Observe with bodies that were changed, some ``grown`` (g,): what :func:`_observe` says, and the pair in the way.
 
     That is what :func:`certify_bodies` says: -1 where the bodies may be as they are.
     """
-    model, data = borrowed(held_model), borrowed(held_data)
+    model, data = pointee(model_pointer), pointee(data_pointer)
     closest, distance, tightest, margin = _observe(model, data)
     return closest, distance, tightest, margin, certify_bodies(model.safety, data.safety, grown)
 
 
 @kernel
 def move_reference(
-    held_model: Held, held_data: Held, solution: Array, usable: bool, h: float, share: float
+    model_pointer: KernelPointer, data_pointer: KernelPointer, solution: Array, usable: bool, h: float, share: float
 ) -> tuple[int, int, float, int, float, float]:
     """One step of ``h`` [s] with the solver's next velocities (nv,), as far as :func:`apply_safety_filter` takes them.
 
     Returns its outcome, what :func:`_observe` says of the new state, and the largest violation of a row [rad/s].
     """
-    model, data = borrowed(held_model), borrowed(held_data)
+    model, data = pointee(model_pointer), pointee(data_pointer)
     outcome, slack = apply_safety_filter(model.safety, data.safety, solution, usable, h, share)
     closest, distance, tightest, margin = _observe(model, data)
     return outcome, closest, distance, tightest, margin, slack
 
 
 @kernel
-def spare_distance(held_model: Held, held_data: Held, pairs: IntArray) -> float:
+def spare_distance(model_pointer: KernelPointer, data_pointer: KernelPointer, pairs: IntArray) -> float:
     """The least that some ``pairs`` (p,) have to spare at the reference [m]: their distance less what they keep."""
-    model, data = borrowed(held_model).safety, borrowed(held_data).safety
+    model, data = pointee(model_pointer).safety, pointee(data_pointer).safety
     least = np.inf
     for p in pairs:
         if at_least(model.collision, data.collision, p) - model.min_distance[p] < least:

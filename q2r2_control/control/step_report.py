@@ -27,9 +27,9 @@ class LimitNames:
         self._by_kind: dict[int, list[ActiveLimit]] = {
             kind: [ActiveLimit(limit, (joint,)) for joint in robot.joint_names] for kind, limit in _KINDS.items()
         }
-        self.take_pairs(())
+        self.set_pairs(())
 
-    def take_pairs(self, of_objects: Sequence[tuple[str, str]]) -> None:
+    def set_pairs(self, of_objects: Sequence[tuple[str, str]]) -> None:
         """Go on with the pairs of the cell and those of objects that are held."""
         self.pairs = [*self._watched, *of_objects]
         self._by_kind[SEPARATION] = [ActiveLimit(LimitKind.SEPARATION, pair) for pair in self.pairs]

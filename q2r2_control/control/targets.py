@@ -8,7 +8,7 @@ import numpy as np
 import pinocchio as pin
 
 from q2r2_control.config.control import ControllerSettings
-from q2r2_control.control.jit import Held, borrowed, bound, hold, kernel
+from q2r2_control.control.jit import KernelPointer, bound, kernel, pointee, pointer_to
 from q2r2_control.control.tasks.frame import rotation_vector
 from q2r2_control.control.tasks.task_data import PoseScratch, TaskTargets
 from q2r2_control.control.tasks.task_model import TaskModel
@@ -37,9 +37,9 @@ class TargetTracker:
             _TELEPORT * settings.max_angular_speed,
         )
         self._pose, self._offered = self._targets.pose, self._targets.offered
-        self.held = hold(self._targets)
+        self.pointer = pointer_to(self._targets)
         nv = len(self._home)
-        self._take = bound(_take_held, self.held, np.zeros(nv), np.zeros(nv), 0.0)
+        self._update = bound(_update_through_pointer, self.pointer, np.zeros(nv), np.zeros(nv), 0.0)
 
     def reset(self, q: Array) -> None:
         """Forget all targets; every arm holds where it is, ``q`` (nv,) [rad]."""
@@ -70,11 +70,11 @@ class TargetTracker:
     def update(self, targets: Mapping[str, pin.SE3 | None], dt: float, q: Array, v: Array) -> tuple[str, ...]:
         """Take the targets of one tick; returns the names whose target is not usable, unknown names among them."""
         known = self.offer(targets)
-        usable = self._take(self.held, q, v, dt)
+        usable = self._update(self.pointer, q, v, dt)
         return () if usable and known else self.rejected(targets)
 
     def offer(self, targets: Mapping[str, pin.SE3 | None]) -> bool:
-        """Write the targets of one tick to where :func:`take_targets` looks; whether every name is an arm's."""
+        """Write the targets of one tick to where :func:`update_targets` looks; whether every name is an arm's."""
         known = 0
         for i, arm in enumerate(self._arms):
             target = targets.get(arm)
@@ -93,19 +93,19 @@ class TargetTracker:
 
 
 @kernel
-def _take_held(held_targets: Held, q: Array, v: Array, dt: float) -> bool:
-    return take_targets(borrowed(held_targets), q, v, dt)
+def _update_through_pointer(targets_pointer: KernelPointer, q: Array, v: Array, dt: float) -> bool:
+    return update_targets(pointee(targets_pointer), q, v, dt)
 
 
 @kernel
-def take_targets(targets: TaskTargets, q: Array, v: Array, dt: float) -> bool:
+def update_targets(targets: TaskTargets, q: Array, v: Array, dt: float) -> bool:
     """Make what was offered each arm's target, or hold it where there is nothing usable; False if something was not.
 
     What is no pose is marked so in ``targets.offered``.
     """
     all_usable = True
     for i in range(targets.offered.shape[0]):
-        if targets.offered[i] == _POSE and _take_pose(targets, i, dt):
+        if targets.offered[i] == _POSE and _update_pose(targets, i, dt):
             continue
         if targets.offered[i] == _NONE:
             if targets.follows[i] == 1:
@@ -133,7 +133,7 @@ def _hold(targets: TaskTargets, i: int, q: Array, v: Array) -> None:
 
 
 @kernel
-def _take_pose(targets: TaskTargets, i: int, dt: float) -> bool:
+def _update_pose(targets: TaskTargets, i: int, dt: float) -> bool:
     """Make the offered homogeneous pose the target of arm ``i``; False, and no change, if it is not a finite pose.
 
     A target that moves has its twist smoothed over a time; one that was put elsewhere, faster than any tool, has none.

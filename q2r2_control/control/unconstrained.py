@@ -8,7 +8,7 @@ that a solver takes to begin.
 from __future__ import annotations
 
 from q2r2_control.control.cholesky import factorise, substitute
-from q2r2_control.control.jit import Held, borrowed, kernel
+from q2r2_control.control.jit import KernelPointer, kernel, pointee
 from q2r2_control.control.kernel_data import KernelData
 from q2r2_control.control.safety.safety_data import SafetyData
 from q2r2_control.control.tasks.task_data import TaskData
@@ -40,7 +40,7 @@ def find_minimum(safety: SafetyData, tasks: TaskData) -> bool:
 
 
 @kernel
-def find_held_minimum(held_data: Held) -> bool:
+def find_minimum_anew(data_pointer: KernelPointer) -> bool:
     """:func:`find_minimum`, after the cost has been changed from outside of the kernels."""
-    data: KernelData = borrowed(held_data)
+    data: KernelData = pointee(data_pointer)
     return find_minimum(data.safety, data.tasks)

@@ -245,7 +245,7 @@ def test_it_is_watched_against_obstacles_that_its_hand_alone_cannot_reach() -> N
 def test_the_kernels_see_the_same_types_whatever_is_held(controller: CartesianController) -> None:
     loads: dict[Any, Any] = controller._objects._loads
     kinds = {(numba.typeof(load.model), numba.typeof(load.data)) for load in loads.values()}
-    assert kinds == {(numba.typeof(controller._held_model), numba.typeof(controller._held_data))}
+    assert kinds == {(numba.typeof(controller._model_pointer), numba.typeof(controller._data_pointer))}
 
 
 def test_an_arm_without_an_object_is_refused_by_name() -> None:

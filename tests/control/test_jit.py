@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from q2r2_control.control import jit
-from q2r2_control.control.jit import borrowed, bound, hold, kernel
+from q2r2_control.control.jit import bound, kernel, pointee, pointer_to
 from q2r2_control.types import Array
 
 
@@ -138,7 +138,7 @@ def test_division_by_zero_gives_infinity_instead_of_an_exception() -> None:
 @pytest.mark.slow
 def test_what_is_held_stays_the_callers_own_array() -> None:
     values = np.arange(3.0)
-    held = hold((values,))
+    held = pointer_to((values,))
     values[0] = 7.0
     _double_held(held)
     np.testing.assert_array_equal(values, [14.0, 2.0, 4.0])
@@ -148,7 +148,7 @@ def test_what_is_held_stays_the_callers_own_array() -> None:
 def test_what_is_held_lives_as_long_as_it_is_held_and_no_longer() -> None:
     values = np.arange(3.0)
     before = sys.getrefcount(values)
-    held = hold((values,))
+    held = pointer_to((values,))
     for _ in range(100):
         _double_held(held)
     assert sys.getrefcount(values) == before + 1
@@ -158,7 +158,7 @@ def test_what_is_held_lives_as_long_as_it_is_held_and_no_longer() -> None:
 
 @pytest.mark.slow
 def test_what_is_held_outlives_its_maker() -> None:
-    held = hold((np.ones(100_000),))
+    held = pointer_to((np.ones(100_000),))
     gc.collect()
     # What was freed would be taken by others of its size.
     elsewhere = [np.full(100_000, 5.0) for _ in range(10)]
@@ -170,7 +170,7 @@ def test_what_is_held_outlives_its_maker() -> None:
 
 
 def test_a_copy_of_what_is_held_is_held_elsewhere() -> None:
-    held = hold((np.ones(3),))
+    held = pointer_to((np.ones(3),))
     for other in (copy.deepcopy(held), pickle.loads(pickle.dumps(held))):
         _double_held(other)
         np.testing.assert_array_equal(other.value[0], 2.0)
@@ -189,23 +189,23 @@ def test_tuples_with_one_name_and_other_fields_are_not_mixed_up() -> None:
 
 
 def test_what_is_not_held_is_an_error_and_no_crash() -> None:
-    double = bound(_double_held, hold((np.ones(3),)))
+    double = bound(_double_held, pointer_to((np.ones(3),)))
     with pytest.raises(AttributeError, match="address"):
         double(None)
 
 
 @kernel
-def _double_held(held: jit.Held) -> None:
-    (values,) = borrowed(held)
+def _double_held(held: jit.KernelPointer) -> None:
+    (values,) = pointee(held)
     for i in range(values.shape[0]):
         values[i] *= 2.0
 
 
 def test_bound_machine_code_is_the_kernel_s_and_has_run_once() -> None:
     values = np.ones(3)
-    double = bound(_double_held, hold((values,)))
+    double = bound(_double_held, pointer_to((values,)))
     np.testing.assert_array_equal(values, [2.0, 2.0, 2.0])
     others = np.arange(3.0)
-    double(hold((others,)))
+    double(pointer_to((others,)))
     np.testing.assert_array_equal(others, [0.0, 2.0, 4.0])
     assert bound(_one_over, 2.0)(4.0) == 0.25

@@ -18,7 +18,7 @@ def test_the_template_compiles_and_sees_what_changes_in_the_model(tmp_path: Path
     found: dict[str, Any] = {"__name__": "spring"}
     exec(compile(template, str(source), "exec"), found)
     found["model"].stiffness[0] = 10.0
-    assert found["torque"](found["held"], found["q"], found["tau"])
+    assert found["torque"](found["pointer"], found["q"], found["tau"])
     np.testing.assert_allclose(found["tau"], -1.0)
     found["q"][3] = np.nan
-    assert not found["torque"](found["held"], found["q"], found["tau"])
+    assert not found["torque"](found["pointer"], found["q"], found["tau"])

@@ -43,7 +43,7 @@ class Run:
         controller.reset(start)
         self.contract = Contract(controller, start, sample_all=sample_all)
 
-    def tell(self, arm: str, least: float, greatest: float) -> tuple[str, str] | None:
+    def set_opening(self, arm: str, least: float, greatest: float) -> tuple[str, str] | None:
         refused = self.controller.set_opening(arm, least, greatest)
         self.contract.set_openings(self.controller.openings)
         return refused
@@ -64,7 +64,7 @@ def test_a_closed_gripper_gets_beside_a_block_where_one_that_may_open_does_not(c
     run.drive(BESIDE, 2.0)
     assert height(controller) > BESIDE.translation[2] + 0.01
     run = Run(controller)
-    assert run.tell("left", 0.0, 0.0) is None
+    assert run.set_opening("left", 0.0, 0.0) is None
     run.drive(BESIDE, 2.0)
     assert height(controller) == pytest.approx(BESIDE.translation[2], abs=5e-4)
 
@@ -73,19 +73,19 @@ def test_beside_the_block_it_may_open_as_far_as_the_block_allows_and_above_it_at
     controller: CartesianController,
 ) -> None:
     run = Run(controller)
-    run.tell("left", 0.0, 0.0)
+    run.set_opening("left", 0.0, 0.0)
     run.drive(BESIDE, 2.0)
     for opening in (1.0, 0.6):
-        pair = run.tell("left", 0.0, opening)
+        pair = run.set_opening("left", 0.0, opening)
         assert pair is not None
         assert "block_0" in pair
         assert any("left_hand_e_finger" in name for name in pair)
         assert controller.openings["left"] == (0.0, 0.0)
-    assert run.tell("left", 0.0, 0.4) is None
+    assert run.set_opening("left", 0.0, 0.4) is None
     reference = run.drive(BESIDE, 0.1)
     assert reference.report.closest_distance == pytest.approx(closest_by_coal(controller, reference.q), abs=2e-6)
     run.drive(ABOVE, 1.5)
-    assert run.tell("left", *ALL_OF_THE_WAY) is None
+    assert run.set_opening("left", *ALL_OF_THE_WAY) is None
     run.drive(ABOVE, 0.1)
 
 
@@ -112,23 +112,23 @@ def test_an_arm_at_speed_may_not_open_where_there_is_room_but_none_to_stop(contr
     robot = controller.robot
     kept = kept_distances(robot, SETTINGS).values
     run = Run(controller)
-    run.tell("left", 0.0, 0.0)
+    run.set_opening("left", 0.0, 0.0)
     run.drive(BESIDE, 1.2)
     run = Run(controller, run.drive(at(0.05, 0.006), 1.2).q)
-    run.tell("left", 0.0, 0.0)
+    run.set_opening("left", 0.0, 0.0)
     answers = []
     for _ in range(150):
         reference = run.drive(at(0.4, 0.006), DT)
         q, v = reference.q, reference.v
         room = bool((robot.distance_values(q) >= kept).all())
-        accepted = run.tell("left", *ALL_OF_THE_WAY) is None
+        accepted = run.set_opening("left", *ALL_OF_THE_WAY) is None
         answers.append((room, accepted))
         stop = controller.stop_deceleration
         for time in np.linspace(0.0, float((np.abs(v) / stop).max()), 20) if accepted else ():
             moving = np.minimum(time, np.abs(v) / stop)
             braked = q + v * moving - 0.5 * np.sign(v) * stop * moving**2
             assert (robot.distance_values(braked) >= kept - 2e-6).all()
-        run.tell("left", 0.0, 0.0)
+        run.set_opening("left", 0.0, 0.0)
     assert answers.count((True, True)) > 10
     assert answers.count((True, False)) > 3
     assert answers.count((False, False)) > 3

@@ -33,7 +33,7 @@ class Cell:
         self.controller.reset(self.robot.home)
         self.contract, self.q = Contract(self.controller, self.robot.home), self.robot.home
 
-    def tell(self, least: float, greatest: float, arm: str = "left") -> tuple[str, str] | None:
+    def set_opening(self, least: float, greatest: float, arm: str = "left") -> tuple[str, str] | None:
         refused = self.controller.set_opening(arm, least, greatest)
         self.contract.set_openings(self.controller.openings)
         return refused
@@ -64,19 +64,19 @@ def cell(tmp_path_factory: pytest.TempPathFactory) -> Cell:
 
 def test_an_open_gripper_may_not_close_into_the_table_and_may_where_there_is_room(cell: Cell) -> None:
     cell.start()
-    assert cell.tell(1.0, 1.0) is None
+    assert cell.set_opening(1.0, 1.0) is None
     cell.drive({"left": above_table(0.006)}, 900)
     # The closed fingers' tips would be 8 mm inside the table.
     assert cell.spare({"left": 1.0, "right": 1.0}) > 0.0 > cell.spare({"left": 0.0, "right": 1.0})
     for least in (0.0, 0.3):
-        pair = cell.tell(least, 1.0)
+        pair = cell.set_opening(least, 1.0)
         assert pair is not None
         assert "table_0" in pair
         assert any("_tip" in name for name in pair)
         assert cell.controller.openings["left"] == (1.0, 1.0)
-    assert cell.tell(0.95, 1.0) is None
+    assert cell.set_opening(0.95, 1.0) is None
     cell.drive({"left": above_table(0.06)}, 600)
-    assert cell.tell(*ALL_OF_THE_WAY) is None
+    assert cell.set_opening(*ALL_OF_THE_WAY) is None
     cell.drive({"left": above_table(0.06)}, 10)
 
 
@@ -90,7 +90,7 @@ def test_less_that_reaches_nearer_is_refused_like_more_and_the_wider_body_stays(
         reach[interval] = max(max(start @ direction, end @ direction) + radius for start, end, radius in capsules)
     assert reach[narrow] > reach[wide] + 0.0007
     cell.start()
-    assert cell.tell(*wide) is None
+    assert cell.set_opening(*wide) is None
     home = cell.controller.tool_pose("left")
     data = cell.robot.model.createData()
     pin.forwardKinematics(cell.robot.model, data, cell.robot.home)
@@ -99,15 +99,15 @@ def test_less_that_reaches_nearer_is_refused_like_more_and_the_wider_body_stays(
     low, high = (pin.SE3(tilt @ home.rotation, np.array([0.5, 0.25, height])) for height in (0.15, 0.3))
     cell.drive({"left": high}, 500)
     cell.drive({"left": low}, 900)
-    pair = cell.tell(*narrow)
+    pair = cell.set_opening(*narrow)
     assert pair is not None
     assert "table_0" in pair
     assert cell.controller.openings["left"] == wide
-    assert cell.tell(0.3, 0.4) is None  # much less is within
+    assert cell.set_opening(0.3, 0.4) is None  # much less is within
     assert cell.spare_of_bodies(cell.controller.openings) >= -COAL
-    assert cell.tell(*wide) is None
+    assert cell.set_opening(*wide) is None
     cell.drive({"left": high}, 200)
-    assert cell.tell(*narrow) is None
+    assert cell.set_opening(*narrow) is None
 
 
 @pytest.mark.slow
@@ -129,7 +129,7 @@ def test_with_hostile_targets_and_openings_no_finger_is_ever_too_near_wherever_i
                 low, high = np.sort(random.random(2)).tolist()
                 least, greatest = ((low, high), (low, 1.0), (0.0, high), ALL_OF_THE_WAY)[random.integers(4)]
                 told += 1
-                refused += cell.tell(least, greatest, arm) is not None
+                refused += cell.set_opening(least, greatest, arm) is not None
             cell.drive(goals)
             if tick % 8 == 0:
                 for choice in ((0, 0), (1, 1), (0, 1)):
@@ -145,9 +145,9 @@ def test_with_hostile_targets_and_openings_no_finger_is_ever_too_near_wherever_i
 
 def test_an_opening_that_is_refused_leaves_every_number_as_it_was(cell: Cell) -> None:
     cell.start()
-    assert cell.tell(1.0, 1.0) is None
+    assert cell.set_opening(1.0, 1.0) is None
     cell.drive({"left": above_table(0.006)}, 900)
     before = cell.controller.step({}, 0.0).report
-    assert cell.tell(0.0, 1.0) is not None
+    assert cell.set_opening(0.0, 1.0) is not None
     after = cell.controller.step({}, 0.0).report
     assert (after.closest_distance, after.margin) == (before.closest_distance, before.margin)

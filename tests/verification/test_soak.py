@@ -121,13 +121,13 @@ def test_objects_gripped_and_let_go_at_any_moment_break_no_promise() -> None:
 
 
 def test_fingers_that_open_without_a_proof_are_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    real = CartesianController._look_again
+    real = CartesianController._observe_again
 
     def accepted(self: CartesianController, grown: Any) -> int:
         real(self, grown)
         return -1
 
-    monkeypatch.setattr(CartesianController, "_look_again", accepted)
+    monkeypatch.setattr(CartesianController, "_observe_again", accepted)
     report = run_soak(CONFIG, 5000, 1)
     assert report.openings > 100
     assert report.openings_refused == 0

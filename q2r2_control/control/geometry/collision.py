@@ -56,7 +56,7 @@ class CollisionModel(NamedTuple):
     pairs: Pairs
 
 
-class Posed(NamedTuple):
+class BodyPlacements(NamedTuple):
     """Geometries in the world, written by :func:`update_placements`."""
 
     start: Array  # (g, 3)
@@ -64,7 +64,7 @@ class Posed(NamedTuple):
     rotation: Array  # (g, 3, 3)
 
     @classmethod
-    def empty(cls, bodies: CollisionBodies) -> Posed:
+    def empty(cls, bodies: CollisionBodies) -> BodyPlacements:
         g = len(bodies.joint)
         return cls(np.zeros((g, 3)), np.zeros((g, 3)), np.zeros((g, 3, 3)))
 
@@ -87,12 +87,12 @@ class CollisionData(NamedTuple):
     """A posture as :func:`update_placements` writes it, and scratch to measure a pair there."""
 
     placements: Placements
-    posed: Posed
+    posed: BodyPlacements
     contact: Contact
 
     @classmethod
     def empty(cls, model: CollisionModel) -> CollisionData:
-        return cls(Placements.empty(model.chain), Posed.empty(model.bodies), Contact.empty())
+        return cls(Placements.empty(model.chain), BodyPlacements.empty(model.bodies), Contact.empty())
 
 
 def collision_model_of(robot: Robot) -> CollisionModel:
@@ -206,7 +206,7 @@ def update_placements(model: CollisionModel, data: CollisionData, q: Array) -> N
 
 
 @kernel
-def _pose_bodies(bodies: CollisionBodies, placements: Placements, posed: Posed) -> None:
+def _pose_bodies(bodies: CollisionBodies, placements: Placements, posed: BodyPlacements) -> None:
     """Move every geometry to the world."""
     for g in range(bodies.joint.shape[0]):
         joint = bodies.joint[g]

@@ -16,7 +16,7 @@ from __future__ import annotations
 import numpy as np
 
 from q2r2_control.control.geometry.closest_points import clamp
-from q2r2_control.control.geometry.collision import CollisionData, CollisionModel, Contact, Posed
+from q2r2_control.control.geometry.collision import BodyPlacements, CollisionData, CollisionModel, Contact
 from q2r2_control.control.jit import kernel
 from q2r2_control.types import Array
 
@@ -73,7 +73,7 @@ def _segment_segment(a0: Array, a1: Array, b0: Array, b1: Array, smoothing: floa
 
 @kernel
 def _segment_box(
-    a0: Array, a1: Array, posed: Posed, half: Array, box: int, smoothing: float, contact: Contact
+    a0: Array, a1: Array, posed: BodyPlacements, half: Array, box: int, smoothing: float, contact: Contact
 ) -> float:
     """D of a segment and a box. The slope of D^2 rises strictly with s, so halving finds its zero."""
     axes, centre, local = posed.rotation[box], posed.start[box], contact.local

@@ -157,7 +157,7 @@ def wanted_twist(motion: Motion, data: TaskData, targets: TaskTargets, i: int) -
 
 
 @kernel
-def add_tool_task(J: Array, twist: Array, weight: float, H: Array, g: Array) -> None:
+def accumulate_tool_cost(J: Array, twist: Array, weight: float, H: Array, g: Array) -> None:
     """Add ``weight`` |J v - twist|^2_W of one arm to H (nv, nv) and g (nv,)."""
     nv = g.shape[0]
     square = weight * ROTATION_LENGTH * ROTATION_LENGTH
@@ -177,7 +177,7 @@ def add_tool_task(J: Array, twist: Array, weight: float, H: Array, g: Array) -> 
 
 
 @kernel
-def add_stretch_damping(model: TaskModel, data: TaskData, i: int) -> None:
+def accumulate_stretch_damping(model: TaskModel, data: TaskData, i: int) -> None:
     """Add the damping M of tool ``i``, with the arm's weight, to ``data.H``.
 
     For joint k between the base and joint j, d2x / dq_k dq_j = z_k x J_j (linear part). For the angular part, whose

@@ -44,7 +44,7 @@ class ManipulabilityScratch(NamedTuple):
 
 
 @kernel
-def add_manipulability(model: TaskModel, data: TaskData, i: int) -> None:
+def pull_to_manipulability(model: TaskModel, data: TaskData, i: int) -> None:
     """Add the gradient of arm ``i``'s log m times the gain to ``data.posture``, no joint beyond the posture's speed."""
     manipulability_gradient(model, data, i)
     posture, gradient = data.posture, data.manipulability.gradient

@@ -50,7 +50,7 @@ def pull_to_posture(model: TaskModel, data: TaskData, targets: TaskTargets, q: A
 
 
 @kernel
-def add_hold_task(data: TaskData, targets: TaskTargets, i: int, q: Array) -> None:
+def accumulate_hold_cost(data: TaskData, targets: TaskTargets, i: int, q: Array) -> None:
     """Joints of the held arm ``i`` return to where they were latched; the posture pull does not move them."""
     for j in range(q.shape[0]):
         if targets.member[i, j] == 1.0:
@@ -60,7 +60,7 @@ def add_hold_task(data: TaskData, targets: TaskTargets, i: int, q: Array) -> Non
 
 
 @kernel
-def add_posture_task(model: TaskModel, data: TaskData) -> None:
+def accumulate_posture_cost(model: TaskModel, data: TaskData) -> None:
     """Add the cost of all joints' distance from ``data.posture``."""
     for j in range(data.posture.shape[0]):
         weight = model.priority.posture_weight[j]

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from q2r2_control.control.tasks.frame import (
     ROTATION_LENGTH,
     Motion,
-    add_tool_task,
+    accumulate_tool_cost,
     approach_speed,
     rotation_vector,
     tool_jacobian,
@@ -142,7 +142,7 @@ def test_a_tool_task_is_the_weighted_square_of_its_twist_error() -> None:
     J, twist = random.normal(size=(6, 14)), random.normal(size=6)
     J[:, 7:] = 0.0
     H, g = np.zeros((14, 14)), np.zeros(14)
-    add_tool_task(J, twist, 0.1, H, g)
+    accumulate_tool_cost(J, twist, 0.1, H, g)
     W = np.diag([1.0] * 3 + [ROTATION_LENGTH**2] * 3)
     np.testing.assert_allclose(H, 0.1 * J.T @ W @ J, atol=1e-12)
     np.testing.assert_allclose(g, -0.1 * J.T @ W @ twist, atol=1e-12)

@@ -10,7 +10,7 @@ from q2r2_control.config.cell import load_config
 from q2r2_control.config.control import ControllerSettings
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.control.tasks.frame import ROTATION_LENGTH
-from q2r2_control.control.tasks.manipulability import add_manipulability, manipulability_gradient
+from q2r2_control.control.tasks.manipulability import manipulability_gradient, pull_to_manipulability
 from q2r2_control.control.tasks.task_data import TaskData
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
@@ -58,7 +58,7 @@ def test_where_the_arm_is_stretched_out_the_addition_is_finite_and_bounded() -> 
     model = kernel_model("dual_iiwa7").tasks._replace(manipulability_gain=10.0)
     for offset in (0.0, 1e-12, 1e-6, 1e-3):
         data = task_data("dual_iiwa7", np.full(14, offset))
-        add_manipulability(model, data, 0)
+        pull_to_manipulability(model, data, 0)
         assert np.isfinite(data.posture).all()
         assert np.abs(data.posture).max() <= model.posture.speed * (1 + 1e-12)
         assert not data.posture[7:].any()
