@@ -118,13 +118,6 @@ def test_the_dead_band_ends_without_a_step_and_soon_leaves_the_whole_force() -> 
     assert lost[forces >= 14.0].max() < 0.02 * 14.0 + 0.02
 
 
-def test_noise_of_the_torque_sensors_moves_nothing() -> None:
-    random, admittance = np.random.default_rng(51), Admittance(ROBOT)
-    for _ in range(3000):
-        noisy = _state(ROBOT.home, random.normal(0.0, 0.1, len(REST)))
-        assert admittance.update(GOALS, noisy, DT) == GOALS
-
-
 def test_the_motion_does_not_depend_on_how_time_is_cut_into_ticks() -> None:
     random, push = np.random.default_rng(52), _touch(_wrench(1, 15.0))
     settings = AdmittanceSettings(damping_ratio=0.3, filter_time=0.0)
@@ -154,15 +147,6 @@ def test_any_wrench_at_any_tick_keeps_the_displacement_inside_its_limits() -> No
         assert size[1] <= DEFAULT.max_rotation + 1e-9
         farthest = np.maximum(farthest, size)
     np.testing.assert_allclose(farthest, [DEFAULT.max_displacement, DEFAULT.max_rotation], rtol=1e-6)
-
-
-def test_from_its_limit_it_sets_off_at_once_when_the_force_falls() -> None:
-    admittance = Admittance(ROBOT)
-    at_limit = _displaced(admittance, _touch(_wrench(0, 2000.0)), 3000)[-1]
-    np.testing.assert_allclose(at_limit, _wrench(0, DEFAULT.max_displacement), atol=1e-6)
-    back = np.array(_displaced(admittance, _touch(_wrench(0, 20.0)), 300))[:, 0]
-    # The low-pass needs 50 ms to come down from 2000 N, the virtual mass the rest.
-    assert back[150] < DEFAULT.max_displacement - 0.02
 
 
 def test_the_limit_takes_the_speed_with_which_it_is_met() -> None:

@@ -11,7 +11,6 @@ import pytest
 
 from q2r2_control import CartesianController, Robot
 from q2r2_control.control.held_objects import ObjectLoads
-from q2r2_control.errors import RobotError
 from q2r2_control.types import Array, Reference
 from q2r2_control.verification.contract import Contract
 from q2r2_control.wording import limit_name
@@ -234,22 +233,7 @@ def test_once_it_is_let_go_no_report_names_a_pair_of_it_even_if_no_time_passes(
     assert controller.step({}, 0.0).report.binding == ()
 
 
-def test_it_is_watched_against_obstacles_that_its_hand_alone_cannot_reach() -> None:
-    config = CELL.model_copy(update={"floor": -0.9})
-    robot = Robot.from_config(config)
-    monitored = [(pair.name_a, pair.name_b) for pair in robot.distances(robot.home)]
-    assert not any("floor" in "".join(pair) and "hand" in "".join(pair) for pair in monitored)
-    assert any("floor" in "".join(pair) for pair in robot.objects.pair_names())
-
-
 def test_the_kernels_see_the_same_types_whatever_is_held(controller: CartesianController) -> None:
     loads: dict[Any, Any] = controller._objects._loads
     kinds = {(numba.typeof(load.model), numba.typeof(load.data)) for load in loads.values()}
     assert kinds == {(numba.typeof(controller._model_pointer), numba.typeof(controller._data_pointer))}
-
-
-def test_an_arm_without_an_object_is_refused_by_name() -> None:
-    lonely = cell(BLOCK)
-    controller = CartesianController(Robot.from_config(lonely), lonely.control)
-    with pytest.raises(RobotError, match="arm 'right': its gripper has no object; those that have one: left"):
-        controller.set_holding("right", True)

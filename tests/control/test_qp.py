@@ -11,7 +11,6 @@ from q2r2_control.control.qp import (
     OsqpSolver,
     QpProblem,
     QpsolversSolver,
-    SkipIfUnconstrained,
     Solver,
     make_solver,
 )
@@ -138,12 +137,3 @@ def test_an_unknown_solver_is_answered_with_what_is_installed() -> None:
         make_solver("simplex", NV, None)
     for name in ("daqp", "osqp", *qpsolvers.available_solvers):
         assert name in str(error.value)
-
-
-@pytest.mark.parametrize(("name", "kind"), [("daqp", DaqpSolver), ("osqp", OsqpSolver)])
-@pytest.mark.parametrize("time_limit", [None, 0.1], ids=["without time limit", "with time limit"])
-def test_a_solver_is_made_by_its_name(name: str, kind: type, time_limit: float | None) -> None:
-    solver = make_solver(name, NV, time_limit)
-    assert isinstance(solver, SkipIfUnconstrained)
-    assert isinstance(solver.solver, kind)
-    _solved(solver, _problem(np.random.default_rng(35), 4))

@@ -117,15 +117,6 @@ def test_the_feed_forward_of_a_moving_target_becomes_its_twist(tracker: TargetTr
     np.testing.assert_array_equal(_taken(tracker).feed_forward[1], 0.0)
 
 
-def test_the_feed_forward_rises_with_the_same_time_constant_for_every_dt(tracker: TargetTracker) -> None:
-    twist = np.array([0.2, 0.0, 0.0, 0.0, 0.0, 0.0])
-    for dt in (0.0005, 0.001, 0.002, 0.005):
-        tracker.reset(STILL)
-        for tick in range(1 + round(0.02 / dt)):
-            tracker.update({"left": _moved(_pose(), twist, tick * dt)}, dt, STILL, STILL)
-        assert _taken(tracker).feed_forward[0, 0] == pytest.approx(0.2 * (1.0 - np.exp(-1.0)), rel=1e-9)
-
-
 TELEPORTS = {
     "by half a metre": _pose(None, np.array([1.0, 0.0, 0.4])),
     "by half a turn": _pose(pin.exp3(np.array([0.0, 0.0, 3.0]))),

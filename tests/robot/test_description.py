@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from q2r2_control.errors import ConfigError, RobotError
-from q2r2_control.robot.description import LinkTree, joint_limits, load_description, parse_urdf
+from q2r2_control.robot.description import joint_limits, load_description, parse_urdf
 
 GOOD = """<robot name="two">
   <link name="base"/>
@@ -90,12 +90,6 @@ def test_a_joint_without_end_gets_two_turns_each_way() -> None:
     assert joint is not None
     assert joint.get("type") == "revolute"
     assert joint_limits(joint) == (-4 * math.pi, 4 * math.pi)
-
-
-def test_a_chain_lists_the_movable_joints_from_the_root() -> None:
-    tree = LinkTree(load_description("iiwa7").urdf, "iiwa7")
-    assert tree.root == "link_0"
-    assert [joint.get("name") for joint in tree.chain("link_ee")] == [f"A{number}" for number in range(1, 8)]
 
 
 @pytest.mark.parametrize(

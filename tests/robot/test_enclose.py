@@ -59,16 +59,6 @@ def test_every_vertex_is_inside_its_capsule(kind: str) -> None:
     assert _reach(points, start, end).max() <= radius
 
 
-@pytest.mark.parametrize(
-    ("kind", "smallest"),
-    [("a rod", 0.0102), ("a ball", 0.101), ("a brick", 0.118)],
-    ids=["a rod's own radius", "a ball's own radius", "half a brick's end diagonal"],
-)
-def test_the_capsule_fits_closely(kind: str, smallest: float) -> None:
-    radius, _, _ = enclosing_capsule(_cloud(kind))
-    assert radius < smallest
-
-
 def _geometry(model: str) -> pin.GeometryModel:
     text = ET.tostring(load_description(model).urdf, encoding="unicode")
     return pin.buildGeomFromUrdfString(pin.buildModelFromXML(text), text, pin.GeometryType.COLLISION)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import xml.etree.ElementTree as ET
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +11,6 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from q2r2_control.cli.cell_report import check_cell
-from q2r2_control.cli.check import arm_table
 from q2r2_control.config.cell import Config, load_config
 from q2r2_control.errors import ConfigError
 from q2r2_control.plants.mujoco_model import build_model
@@ -49,11 +46,6 @@ def test_the_tool_is_moved_outwards_by_the_thickness_and_not_turned(
     plain, moved = (Robot.from_config(one_arm(tool=tool, flange=given)) for given in ({}, flange))
     expected = plain.tool_pose(POSTURE, "left") * pin.SE3(np.eye(3), np.array([0.0, 0.0, thickness]))
     np.testing.assert_allclose(moved.tool_pose(POSTURE, "left").homogeneous, expected.homogeneous, atol=1e-12)
-
-
-def test_without_a_tool_the_end_of_the_flange_is_what_moves() -> None:
-    assert compose(one_arm(flange=TOUCH)).tool_frames == {"left": "left_media_flange_end"}
-    assert one_arm(flange=TOUCH, tool={"link": "link_ee"}).named_tool_frame("left") is None
 
 
 def test_the_body_of_each_flange_is_watched_against_all_that_its_arm_can_meet() -> None:
@@ -157,9 +149,6 @@ def test_a_flange_of_one_s_own_is_a_urdf_whose_last_link_or_frame_carries_the_to
             id="an unknown name",
         ),
         pytest.param(
-            {"flange": {"model": "media_touch"}}, "robots/media_flange_touch_pneumatic.urdf", id="and the known ones"
-        ),
-        pytest.param(
             {"flange": TOUCH | {"frame": "tip"}}, "no such link; allowed: media_flange", id="an unknown frame"
         ),
         pytest.param({"flange": {"model": "iiwa7"}}, "occur in the arm as well", id="a flange with the arm's names"),
@@ -171,20 +160,3 @@ def test_a_bad_flange_ends_in_one_line_that_names_key_value_and_what_is_allowed(
     assert line in str(error.value)
     assert "arms.left.flange" in str(error.value)
     assert "\n" not in str(error.value)
-
-
-def test_check_names_the_flange() -> None:
-    for flange, text in ((TOUCH, "media_flange_touch_pneumatic"), (CYLINDER, "30 mm thick, radius 50 mm")):
-        arm = check_cell(one_arm(flange=flange)).arms[0]
-        assert arm.flange == text
-        assert f"iiwa7, flange {text}, tool none" in str(arm_table(arm).title)
-    plain = check_cell(one_arm()).arms[0]
-    assert plain.flange is None
-    assert "flange" not in str(arm_table(plain).title)
-
-
-def test_the_shipped_cells_have_none() -> None:
-    for cell in ("dual_iiwa7", "dual_iiwa14"):
-        config = load_config(f"config/{cell}.yaml")
-        assert all(arm.flange.is_none for arm in config.arms.values())
-        assert "media_flange" not in ET.canonicalize(compose(config).urdf)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -66,13 +65,6 @@ def test_the_cell_s_file_replaces_the_limits_of_the_joints_that_it_names() -> No
     assert robot.acceleration_limit.tolist() == [8.65, 4.0, 5.69, 12.0, 11.78, 13.76, 13.17]
 
 
-def test_the_cell_s_file_gives_limits_to_a_model_that_has_none() -> None:
-    panda: dict[str, Any] = {"model": "example-robot-data:panda", "home": [0, 0, 0, -1, 0, 1, 0]}
-    robot = Robot.from_config(one_arm(**panda, acceleration_limit={"panda_joint3": 7.5}))
-    assert robot.acceleration_limit.tolist() == [np.inf, np.inf, 7.5, *[np.inf] * 4]
-    assert robot.capped_acceleration(10.0).tolist() == [10.0, 10.0, 7.5, *[10.0] * 4]
-
-
 @pytest.mark.parametrize("name", ["A8", "left_A2", "flange", "finger_joint_1"])
 def test_a_joint_that_is_none_of_the_arm_is_named_with_those_that_are(name: str) -> None:
     cell = one_arm(tool={"model": "hand_e"}, acceleration_limit={name: 4.0})
@@ -80,10 +72,6 @@ def test_a_joint_that_is_none_of_the_arm_is_named_with_those_that_are(name: str)
         Robot.from_config(cell)
     line = f"arms.left.acceleration_limit.{name}: no joint of the arm; allowed: A1, A2, A3, A4, A5, A6, A7"
     assert str(error.value) == line
-
-
-def test_both_arms_of_a_cell_have_their_own(dual_iiwa7: Robot) -> None:
-    assert dual_iiwa7.acceleration_limit.tolist() == IIWA7 * 2
 
 
 def test_what_the_cell_s_file_says_replaces_all_that_the_model_says_of_a_joint(tmp_path: Path) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
 import pytest
 
 from q2r2_control.config.control import ControllerSettings
@@ -34,10 +33,6 @@ def kept(robot: Robot, **settings: Any) -> dict[frozenset[str], float]:
         frozenset((link_of(pair.name_a), link_of(pair.name_b))): float(value)
         for pair, value in zip(pairs, found.values, strict=True)
     }
-
-
-def test_without_more_ado_all_pairs_keep_the_same_distance(dual_iiwa: Robot) -> None:
-    assert set(kept(dual_iiwa, min_distance=0.03).values()) == {0.03}
 
 
 @pytest.mark.parametrize(
@@ -93,14 +88,6 @@ def test_a_pair_that_is_named_keeps_what_is_said_there_whatever_its_class_says(d
     assert found[frozenset(("left_link_5", "right_link_5"))] == 0.07, "bodies by the names that reports have"
     assert found[frozenset(("right_link_6", "table"))] == BY_CLASS["arm_obstacle"]
     assert found[frozenset(("left_link_5", "right_link_6"))] == BY_CLASS["arm_arm"]
-
-
-def test_each_pair_knows_which_key_says_how_far(dual_iiwa: Robot) -> None:
-    settings = {"distances": {"arm_arm": 0.03}, "pairs": [{"pair": ["*_link_7", "floor"], "distance": 0.04}]}
-    found = kept_distances(dual_iiwa, ControllerSettings.model_validate(settings))
-    expected = {"min_distance": 0.02, "distances.arm_arm": 0.03, "pairs[0]": 0.04}
-    assert set(found.keys) == set(expected)
-    np.testing.assert_array_equal(found.values, [expected[key] for key in found.keys])
 
 
 @pytest.mark.parametrize(

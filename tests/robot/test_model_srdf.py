@@ -46,26 +46,9 @@ def test_of_a_flange_without_a_model_no_file_can_speak() -> None:
         model_srdfs(one_arm(flange={"thickness": 0.02, "radius": 0.05}), CLEARANCE, SAMPLES)
 
 
-def test_no_other_file_is_shipped() -> None:
-    shipped = {file.name for file in find_resource("robots/iiwa7.urdf").parent.glob("*.srdf")}
-    arms = [f"{stack}iiwa{size}.srdf" for stack in ("", "hand_e_on_") for size in (7, 14)]
-    flanges = [f"{tool}{TOUCH}_on_iiwa{size}.srdf" for tool in ("", "hand_e_on_") for size in (7, 14)]
-    assert shipped == {"hand_e.srdf", *arms, *flanges}
-
-
 def test_what_a_file_beside_the_model_says_now_is_not_believed(tmp_path: Path) -> None:
     (tmp_path / "arm.urdf").write_bytes(find_resource("robots/iiwa7.urdf").read_bytes())
     (tmp_path / "arm.srdf").write_text('<robot><disable_default_collisions link="link_0"/></robot>')
     made = model_srdfs(one_arm(model=str(tmp_path / "arm.urdf")), CLEARANCE, SAMPLES)
     assert made.keys() == {"arm.srdf"}
     assert _disabled(made["arm.srdf"]) == _disabled(find_resource("robots/iiwa7.srdf").read_text(encoding="utf-8"))
-
-
-def test_the_search_says_how_far_it_has_got() -> None:
-    told: list[tuple[str, int, int]] = []
-    model_srdfs(one_arm(), CLEARANCE, 100, progress=lambda what, done, total: told.append((what, done, total)))
-    by_phase = {what: [done for name, done, _ in told if name == what] for what, _, _ in told}
-    assert by_phase.keys() == {"random postures", "pairs followed downhill"}
-    for what, done in by_phase.items():
-        total = next(total for name, _, total in told if name == what)
-        assert done == list(range(1, total + 1))

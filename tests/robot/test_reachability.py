@@ -7,9 +7,8 @@ import pytest
 
 from q2r2_control.cli.cell_report import PairsWritten, write_pairs
 from q2r2_control.config.cell import Config, load_config
-from q2r2_control.errors import ConfigError, RobotError
+from q2r2_control.errors import ConfigError
 from q2r2_control.robot.pairs import link_of
-from q2r2_control.robot.reachability import nearest_approaches
 from q2r2_control.robot.robot import Robot
 
 pytestmark = pytest.mark.slow
@@ -47,13 +46,6 @@ def test_the_elbow_of_one_arm_stays_watched_against_the_other_arm(found: PairsWr
         assert frozenset(("left_link_4", f"right_{other}")) in watched
 
 
-def test_more_samples_do_not_change_the_nearest_approach(found: PairsWritten) -> None:
-    thorough = {(p.link_a, p.link_b): p.nearest for p in nearest_approaches(Robot.from_config(CONFIG), 4000, 2)}
-    for pair in (*found.never, *found.watched):
-        if thorough[pair.link_a, pair.link_b] > 0.0:
-            assert pair.nearest == pytest.approx(thorough[pair.link_a, pair.link_b], abs=0.003)
-
-
 def test_a_file_that_exists_is_not_replaced(tmp_path: Path) -> None:
     file = tmp_path / "cell.srdf"
     file.write_text("mine")
@@ -66,11 +58,6 @@ def test_a_file_that_exists_is_not_replaced(tmp_path: Path) -> None:
 def test_a_clearance_that_is_no_more_than_what_is_kept_is_refused(tmp_path: Path, clearance: float) -> None:
     with pytest.raises(ConfigError, match=r"clearance = .* allowed: above control.min_distance, 0.02, up to 1"):
         write_pairs(CONFIG, tmp_path / "cell.srdf", 200, clearance)
-
-
-def test_too_few_samples_are_refused() -> None:
-    with pytest.raises(RobotError, match="samples = 10: allowed: 100 or more"):
-        nearest_approaches(Robot.from_config(CONFIG), 10, 0)
 
 
 @pytest.mark.parametrize(

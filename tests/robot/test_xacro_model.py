@@ -8,10 +8,9 @@ from pathlib import Path
 import pytest
 
 from q2r2_control.config.cell import load_config
-from q2r2_control.errors import ConfigError, Q2R2Error, RobotError
+from q2r2_control.errors import ConfigError, Q2R2Error
 from q2r2_control.robot.compose import compose
 from q2r2_control.robot.description import load_description
-from q2r2_control.robot.xacro_model import expand_xacro
 
 MAIN = """<robot name="arm" xmlns:xacro="http://www.ros.org/wiki/xacro">
   <xacro:arg name="robot_name" default="lbr"/>
@@ -69,26 +68,6 @@ def test_arguments_have_the_defaults_of_the_file_and_an_srdf_beside_it_belongs_t
     assert description.srdf is not None
 
 
-def test_packages_are_found_through_the_ros_environment_too(
-    package: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "share").mkdir()
-    (tmp_path / "share" / "my_arm").symlink_to(package)
-    monkeypatch.setenv("AMENT_PREFIX_PATH", str(tmp_path))
-    assert load_description(MODEL).name == "arm"
-
-
-def test_xacro_finds_packages_as_before_afterwards(package: Path) -> None:
-    from xacro import substitution_args
-
-    before = substitution_args._eval_find
-    expand_xacro(package / "urdf" / "arm.urdf.xacro", {}, {"my_arm": str(package)})
-    with pytest.raises(RobotError):
-        expand_xacro(package / "urdf" / "arm.urdf.xacro", {}, {})
-    assert substitution_args._eval_find is before
-    assert substitution_args._eval_dict["find"] is before
-
-
 @pytest.mark.parametrize(
     ("file", "old", "new", "says"),
     [
@@ -113,11 +92,6 @@ def test_what_xacro_cannot_expand_ends_in_one_line_that_names_the_file(
     assert says in str(error.value)
     assert "arm.urdf.xacro" in str(error.value)
     assert "\n" not in str(error.value)
-
-
-def test_an_argument_that_the_file_does_not_have_is_refused(package: Path) -> None:
-    with pytest.raises(ConfigError, match=r"xacro_args.robot_nam: .* no such argument; allowed: robot_name, with_tip"):
-        load_description(MODEL, {"robot_nam": "lbr"}, {"my_arm": str(package)})
 
 
 def test_arguments_of_a_model_that_is_no_xacro_are_refused() -> None:

@@ -112,14 +112,6 @@ def test_segments_are_as_far_apart_as_their_closest_points(kind: Callable[[np.ra
         assert swapped == pytest.approx(distance, abs=tolerance)
 
 
-def test_parallel_segments_meet_in_the_middle_of_their_overlap() -> None:
-    on_a, on_b = np.zeros(3), np.zeros(3)
-    distance = segment_segment(*np.array([[0.0, 0, 0], [1, 0, 0], [0.5, 0.3, 0], [3, 0.3, 0]]), on_a, on_b)
-    assert distance == pytest.approx(0.3)
-    np.testing.assert_allclose(on_a, [0.75, 0, 0])
-    np.testing.assert_allclose(on_b, [0.75, 0.3, 0])
-
-
 class BoxAnswer(NamedTuple):
     distance: float
     on_a: Array
@@ -206,12 +198,6 @@ def test_special_positions_of_a_segment_and_a_box(a0: list[float], a1: list[floa
         answer = _to_box(np.array(start), np.array(end), half)
         assert answer.distance == pytest.approx(expected, abs=1e-9)
         _assert_witnesses(answer, np.array(start), np.array(end), half)
-
-
-def test_a_segment_along_a_face_meets_it_in_the_middle() -> None:
-    half = np.array([0.4, 0.2, 0.3])
-    answer = _to_box([-1.0, 0.0, 0.5], [0.8, 0.0, 0.5], half)
-    np.testing.assert_allclose(answer.on_a, np.array([0.0, 0.0, 0.5]), atol=1e-9)
 
 
 def test_a_segment_that_enters_a_box_leaves_it_by_the_shortest_way_of_all_directions() -> None:

@@ -56,24 +56,6 @@ def test_slides_and_oblique_axes_are_where_pinocchio_puts_them() -> None:
     assert chain_of(model).prismatic.tolist() == [0, 0, 1, 0, 1, 0]
 
 
-def test_branches_start_from_their_own_parent() -> None:
-    model, random = pin.Model(), np.random.default_rng(5)
-
-    def offset() -> pin.SE3:
-        return pin.SE3(pin.exp3(random.normal(size=3)), random.normal(size=3))
-
-    base = model.addJoint(0, pin.JointModelRZ(), offset(), "base")
-    left = model.addJoint(base, pin.JointModelRX(), offset(), "left")
-    model.addJoint(base, pin.JointModelRY(), offset(), "right")
-    model.addJoint(left, pin.JointModelPZ(), offset(), "left_slide")
-    _assert_equals_pinocchio(model, [random.uniform(-2, 2, 4) for _ in range(10)])
-
-
-@pytest.mark.parametrize("joint", [pin.JointModelRY, pin.JointModelPY], ids=["a hinge", "a slide"])
-def test_a_single_joint_is_a_chain_too(joint: Callable[[], object]) -> None:
-    _assert_equals_pinocchio(_model(joint()), [np.array([0.7])])
-
-
 UNSUPPORTED: dict[str, Callable[[], object]] = {
     "a floating base": pin.JointModelFreeFlyer,
     "a ball joint": pin.JointModelSpherical,

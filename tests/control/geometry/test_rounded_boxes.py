@@ -47,7 +47,3 @@ def test_above_the_face_of_a_box_nothing_changes() -> None:
 def test_the_cores_of_pairs_with_a_depth_are_that_much_farther_apart() -> None:
     rounded = deepest(ROUNDED, ROUNDED.bodies.radius) - deepest(MODEL, MODEL.bodies.radius)
     np.testing.assert_allclose(rounded[TOUCHING], DEPTH)
-
-
-def test_without_any_depth_the_model_is_the_same() -> None:
-    assert with_rounded_boxes(MODEL, np.full(len(NAMES), -0.02)) is MODEL

@@ -131,12 +131,6 @@ def test_the_wanted_twist_never_exceeds_the_speed_limits() -> None:
         assert np.linalg.norm(twist[3:]) <= MOTION.full_speed[1] + 1e-12
 
 
-def test_at_the_target_only_the_targets_own_motion_is_wanted() -> None:
-    tool, _ = _poses(np.random.default_rng(25))
-    moving = np.array([0.1, -0.2, 0.3, 0.4, -0.5, 0.6])
-    np.testing.assert_allclose(_twist(tool, tool, moving), moving, atol=1e-12)
-
-
 def test_a_tool_task_is_the_weighted_square_of_its_twist_error() -> None:
     random = np.random.default_rng(26)
     J, twist = random.normal(size=(6, 14)), random.normal(size=6)

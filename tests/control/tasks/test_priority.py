@@ -10,11 +10,9 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from q2r2_control.config.cell import load_config
 from q2r2_control.config.control import ControllerSettings
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.errors import ConfigError
-from q2r2_control.robot.robot import Robot
 from q2r2_control.verification.contract import Contract
 from tests.control.scenarios import SCENARIOS, Scenario, Targets, circle
 from tests.control.test_contract import robot_of, run
@@ -70,13 +68,6 @@ def test_arms_of_which_one_gives_way_come_to_rest(name: str, duration: float, pr
     contract = run(controller_of(priority), SCENARIOS[name], duration, 0.005)
     assert contract.tail_acceleration() < 0.1
     assert contract.fallback_share < 0.01
-
-
-def test_of_equal_arms_neither_reaches_a_place_that_both_want() -> None:
-    controller = controller_of("equal")
-    run(controller, both_in_the_middle, 4.0, 0.005)
-    reached = errors(controller, both_in_the_middle(0.0, starts(controller)))
-    assert min(reached.values()) > 0.05
 
 
 @pytest.mark.parametrize("priority", ["left", "right"])
@@ -140,11 +131,3 @@ def test_where_the_arms_are_far_apart_priority_changes_nothing() -> None:
 def test_a_priority_that_is_no_arm_of_the_cell_is_refused(name: str) -> None:
     with pytest.raises(ConfigError, match=f"control.priority = '{name}': allowed here: equal, left, right"):
         CartesianController(robot_of("iiwa7"), ControllerSettings(priority=name))
-
-
-def test_a_cell_with_one_arm_takes_no_other_one_s_priority() -> None:
-    config = load_config("config/dual_iiwa7.yaml")
-    robot = Robot.from_config(config.model_copy(update={"arms": {"left": config.arms["left"]}}))
-    CartesianController(robot, ControllerSettings(priority="left"))
-    with pytest.raises(ConfigError, match=r"= .right.: allowed here: equal, left$"):
-        CartesianController(robot, ControllerSettings(priority="right"))

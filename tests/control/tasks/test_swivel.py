@@ -82,15 +82,6 @@ def test_the_angle_is_that_between_the_planes_through_the_line_up_and_to_the_elb
             assert 0.0 < share <= 1.0
 
 
-def test_a_raised_elbow_is_at_zero_and_one_that_hangs_at_half_a_turn() -> None:
-    arrays = cell("dual_iiwa7")
-    q = arrays.robot.home.copy()
-    q[:7] = [0.2, 0.5, 0.0, -1.5, 0.0, 0.8, 0.0]
-    assert angle_at(arrays, q, 0)[0] == pytest.approx(0.0, abs=1e-9)
-    q[:7] = [0.2, 1.8, 0.0, 1.5, 0.0, 0.8, 0.0]
-    assert abs(angle_at(arrays, q, 0)[0]) == pytest.approx(np.pi, abs=1e-9)
-
-
 @pytest.mark.parametrize("name", ["dual_iiwa7", "dual_panda"])
 def test_the_row_is_the_gradient_of_the_angle(name: str) -> None:
     arrays, random, step = cell(name), np.random.default_rng(32), 1e-6
@@ -172,14 +163,6 @@ def _shaped(robot: Robot) -> CartesianController:
     return CartesianController(robot, ControllerSettings(manipulability_gain=0.5))
 
 
-def test_an_arm_that_holds_keeps_its_elbow() -> None:
-    controller = controller_of(0.7)
-    controller.reset(controller.robot.home)
-    for _ in range(100):
-        reference = controller.step({"right": controller.tool_pose("right")}, 0.005)
-    np.testing.assert_allclose(reference.q[:7], controller.robot.home[:7], atol=1e-6)
-
-
 def test_only_an_arm_that_has_the_task_turns_its_elbow() -> None:
     data = configured(angle=0.7).model_dump()
     data["arms"]["right"]["swivel"]["gain"] = 2.0
@@ -207,7 +190,3 @@ def test_joints_that_cannot_be_a_swivel_are_named(swivel: dict[str, str], says: 
     with pytest.raises(ConfigError) as caught:
         Robot.from_config(configured(gain=1.0, **swivel))
     assert str(caught.value).startswith(says)
-
-
-def test_joints_of_a_swivel_that_is_off_are_not_looked_at() -> None:
-    assert all(arm.swivel is None for arm in Robot.from_config(configured(elbow="A9")).arms.values())
