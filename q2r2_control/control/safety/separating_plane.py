@@ -27,7 +27,13 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from q2r2_control.control.geometry.collision import CollisionBodies, CollisionData, CollisionModel, Pairs, Posed
+from q2r2_control.control.geometry.collision import (
+    BodyPlacements,
+    CollisionBodies,
+    CollisionData,
+    CollisionModel,
+    Pairs,
+)
 from q2r2_control.control.jit import inlined_kernel, kernel
 from q2r2_control.control.safety.safety_data import QuadraticPiece
 from q2r2_control.types import Array
@@ -109,7 +115,7 @@ def curvature(pairs: Pairs, p: int, travel: Array, then: Array, share: float) ->
 
 
 @kernel
-def _write_edge(bodies: CollisionBodies, posed: Posed, box: int, number: int, out: Array) -> None:
+def _write_edge(bodies: CollisionBodies, posed: BodyPlacements, box: int, number: int, out: Array) -> None:
     """Ends of one of a box's four edges along its third axis, into the first two rows of ``out``."""
     for k in range(3):
         middle = posed.start[box, k]

@@ -5,7 +5,7 @@ The instants are spaced evenly in time, so that samples which one pair needs ser
 
 from __future__ import annotations
 
-from q2r2_control.control.geometry.collision import CollisionData, Posed, update_placements
+from q2r2_control.control.geometry.collision import BodyPlacements, CollisionData, update_placements
 from q2r2_control.control.geometry.kinematics import Placements
 from q2r2_control.control.jit import inlined_kernel, kernel
 from q2r2_control.control.safety.safety_data import QuadraticPiece, SafetyData
@@ -36,7 +36,7 @@ def sample_of(model: SafetyModel, data: SafetyData, i: int, duration: float) -> 
     """The bodies at sample ``i`` of the candidate's stop."""
     rollout = data.rollout
     placements = Placements(rollout.frame, rollout.translation[i], rollout.axis[i])
-    posed = Posed(rollout.start[i], rollout.end[i], rollout.rotation[i])
+    posed = BodyPlacements(rollout.start[i], rollout.end[i], rollout.rotation[i])
     sample = CollisionData(placements, posed, rollout.contact)
     if rollout.known[i] == 0.0:
         _place_sample(model, data, i, duration, sample)
