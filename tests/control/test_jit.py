@@ -38,7 +38,7 @@ def sources(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         "control/safety/stop_certificate.py",
         "control/kernel_data.py",
         "control/jit.py",
-        "compliance/impedance_kernels.py",
+        "compliance/impedance_law.py",
     ],
 )
 def test_an_edit_of_a_compiled_source_leaves_yesterdays_machine_code_behind(sources: Path, name: str) -> None:
