@@ -122,8 +122,8 @@ class ImpedanceController:
         self._begin(q)
 
     def _begin(self, q: Array) -> None:
-        self._due = (q, np.zeros_like(q))  # posture and speed of the reference that is due now
-        self._usable_q = q  # the newest measured posture that was of use
+        self._due = (q.copy(), np.zeros_like(q))  # posture and speed of the reference that is due now
+        self._usable_q = q.copy()  # the newest measured posture that was of use
         self._commanded: Array = np.minimum(np.maximum(self.gravity(q), -self._limit), self._limit)
 
     def gravity(self, q: Array) -> Array:
@@ -196,7 +196,7 @@ class ImpedanceController:
         if torque is None:
             torque, report = self.gravity(self._usable_q), ImpedanceReport({}, (), (), (), (), held=True)
         else:
-            self._usable_q = state.q
+            self._usable_q = state.q.copy()
             repulsion = limit_repulsion(self._position_limits, state.q, state.v, wanted_q)
             torque = torque + repulsion if extra is None else torque + repulsion + extra
             report = ImpedanceReport(
@@ -210,7 +210,7 @@ class ImpedanceController:
         change = self.settings.torque_rate_limit * time
         self._commanded, saturated, late = bound_torque(torque, self._commanded, self._limit, change)
         report.saturated, report.rate_limited = (_those(self.robot.joint_names, which) for which in (saturated, late))
-        return TorqueCommand(self._commanded, report)
+        return TorqueCommand(self._commanded.copy(), report)
 
     def _next_reference(self, newest: Reference) -> tuple[Array, Array, Array]:
         """Posture and speed that are due now, and the acceleration that leads to the ``newest``, which is kept."""
@@ -218,7 +218,7 @@ class ImpedanceController:
         if not plausible(newest.q, newest.v, newest.a):
             self._due = (wanted_q, at_rest)
             return wanted_q, wanted_v, at_rest
-        self._due = (newest.q, newest.v)
+        self._due = (newest.q.copy(), newest.v.copy())
         return wanted_q, wanted_v, newest.a
 
     def _law(self, q: Array, v: Array, wanted_q: Array, wanted_v: Array, a: Array) -> Array | None:

@@ -141,6 +141,16 @@ class TestController:
         np.testing.assert_allclose(last, gravity(robot, q), atol=1e-9)
         assert not controller.step(reference(robot.home), good, DT).report.held
 
+    def test_arrays_that_their_owner_writes_anew_change_nothing_that_is_kept(self, robot: Robot) -> None:
+        controller = ImpedanceController(robot, SETTINGS)
+        state, newest = at(robot.home.copy()), reference(robot.home.copy())
+        controller.reset(state)
+        command = controller.step(newest, state, DT)
+        for array in (state.q, newest.q, command.tau):
+            array[:] = np.nan
+        command = controller.step(reference(robot.home), at(robot.home), DT)
+        np.testing.assert_allclose(command.tau, gravity(robot, robot.home), atol=1e-9)
+
     @pytest.mark.parametrize("magnitude", [1e10, 1e160, 1e300])
     def test_absurd_numbers_lead_to_bounded_torque(self, robot: Robot, magnitude: float) -> None:
         controller = ImpedanceController(robot, SETTINGS)
