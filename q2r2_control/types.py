@@ -196,7 +196,7 @@ class ArmTarget:
     gripper: float  # opening, 0 closed .. 1 fully open
     slip: float = 0.0  # how far the target has slipped along with a tool held up, since engaging [m]
     slip_angle: float = 0.0  # the same of the rotation [rad]
-    sag: Array | None = None  # (3,) of the tool when the arm was engaged, see teleop.sag [m]; None: none
+    offset: Array | None = None  # (3,) of the tool, see teleop.steady_state_offset [m]; None: none
     filtered_hand: Pose | None = None  # the pose of its hand, filtered, that the target is made of
 
     @property
@@ -214,4 +214,4 @@ class ArmTarget:
 
     def command_for(self, tool: pin.SE3) -> pin.SE3:
         """What is commanded where the tool is at ``tool``, world frame."""
-        return tool if self.sag is None else moved_back_by(tool, self.sag)
+        return tool if self.offset is None else moved_back_by(tool, self.offset)

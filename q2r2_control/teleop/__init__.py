@@ -2,7 +2,7 @@
 
 ``teleop`` drives all arms, ``both_arms`` does what is for both and ``arm`` what is for one, by the table of
 ``arm_states``. ``hand_motion`` makes targets of a hand's poses: ``relative`` maps its motion to that of the tool,
-``carry`` to that of two, ``leash`` keeps a target near its tool, and ``sag`` its command where it was. ``gate``,
-``gestures`` and ``filters`` turn samples into poses and presses; ``haptics`` tells the operator. ``quaternions`` are
-the rotations of what is worked out at every tick.
+``carry`` to that of two, ``leash`` keeps a target near its tool, and ``steady_state_offset`` its command
+where it was. ``gate``, ``gestures`` and ``filters`` turn samples into poses and presses; ``haptics`` makes the hands
+vibrate.
 """

@@ -18,7 +18,7 @@ from q2r2_control.teleop.gate import PoseGate
 from q2r2_control.teleop.gestures import GestureRecognizer, Press
 from q2r2_control.teleop.hand_motion import HandMotion, Shares
 from q2r2_control.teleop.held_controls import HeldControls
-from q2r2_control.teleop.sag import Anchor
+from q2r2_control.teleop.steady_state_offset import Anchor
 from q2r2_control.teleop.workspace import Workspace
 from q2r2_control.types import Array, HandSample, Pose
 
@@ -36,7 +36,7 @@ class ArmTeleop:
         self.arm = arm
         self.state = ArmState.IDLE
         self.gripper = OPEN
-        self.sag: Array | None = None  # of the tool when the arm was last engaged (3,) [m]; None: none
+        self.offset: Array | None = None  # of the tool when the arm was last engaged (3,) [m]; None: none
         self.events: list[Event] = []
         self._settings, self._precision = settings, settings.precision_scale
         self._timeout = settings.gate.timeout
@@ -234,7 +234,7 @@ class ArmTeleop:
         elif anchor is None or not np.isfinite(anchor.tool.homogeneous).all():
             obstacle = obstacle or Reason(ReasonKind.TOOL_UNKNOWN)
         else:
-            self.sag = anchor.sag
+            self.offset = anchor.offset
             self._motion.anchor(self._gate.pose, floats_of(anchor.tool), self._shares(), now)
         if obstacle is None:
             self._go(cause, now, reason)

@@ -16,7 +16,7 @@ from q2r2_control.teleop.arm_states import AT_REST, ArmState, Cause
 from q2r2_control.teleop.carry_mode import CarryMode
 from q2r2_control.teleop.episode_marks import EpisodeMarks
 from q2r2_control.teleop.gestures import Press
-from q2r2_control.teleop.sag import Anchor, anchor_of, expected
+from q2r2_control.teleop.steady_state_offset import Anchor, anchor_of, expected
 from q2r2_control.types import Pose
 
 # Why arms do not carry.
@@ -46,7 +46,7 @@ class ArmMeasurements:
     def expected(self, arm: ArmTeleop) -> Pose | None:
         """Where the tool of an arm that follows is to be measured, by what is commanded. None: not known."""
         commanded = None if self.commanded is None else self.commanded.get(arm.arm)
-        return None if commanded is None else expected(commanded, arm.sag)
+        return None if commanded is None else expected(commanded, arm.offset)
 
     def lag(self, arm: ArmTeleop) -> float:
         """From where the controller has a tool to its last target [m]."""
@@ -178,7 +178,7 @@ class BothArms:
         if around.lag(arm) >= (self._leash.distance or math.inf):
             return Reason(ReasonKind.TOOL_HELD_UP)
         target = around.targets.get(arm.arm)
-        return _UNKNOWN if target is None else Anchor(target, arm.sag)
+        return _UNKNOWN if target is None else Anchor(target, arm.offset)
 
     def _begin_carry(self, name: str, around: ArmMeasurements, now: float) -> None:
         """The hand of the arm ``name`` moves both tools."""
@@ -194,7 +194,7 @@ class BothArms:
             leader.record_event(now, Reason(ReasonKind.NOT_CARRIED, cause=problem))
         elif other is not None:
             anchors = {arm: found for arm, found in taken.items() if isinstance(found, Anchor)}
-            other.sag = anchors[other.arm].sag
+            other.offset = anchors[other.arm].offset
             self.carry = CarryMode(leader, other, {arm: anchor.tool for arm, anchor in anchors.items()}, now)
 
     def _ends_carry(self, presses: Mapping[str, Sequence[Press]]) -> Reason | None:

@@ -125,8 +125,8 @@ class Teleop:
 
         ``tools``: measured tool poses in the world frame. ``commanded``: tool poses of the controller's reference; when
         engaging, the position anchors to the measured tool and the orientation to the commanded one. How far the tool
-        is from its command then is the targets' sag, see :mod:`sag`: what they command begins at ``commanded``.
-        Without ``commanded`` the orientation is the last target's, at first the measured one, and there is no sag.
+        is from its command then is the targets' :mod:`steady_state_offset`: their commands begin at ``commanded``.
+        Without ``commanded`` the orientation is the last target's, at first the measured one, and the offset is none.
         ``commanded`` is also what the leash is tied to; without it there is none.
         ``obstacles``: why an arm may not be engaged now, for reasons outside of this layer.
         ``in_step``: whether ``commanded`` has all tools at one moment. While two arms carry, only such poses correct
@@ -178,7 +178,7 @@ class Teleop:
                 self._commanded[name] = pose = se3_of(arm.target(now, around.expected(arm)))
                 hand = arm.filtered_hand
             slip, slip_angle = arm.slip
-            targets[name] = ArmTarget(pose, arm.gripper, slip, slip_angle, arm.sag, hand)
+            targets[name] = ArmTarget(pose, arm.gripper, slip, slip_angle, arm.offset, hand)
         return targets
 
     def _carried_targets(self, now: float, around: ArmMeasurements) -> dict[str, ArmTarget]:
@@ -197,7 +197,7 @@ class Teleop:
             if pose is not None:
                 self._commanded[name] = pose
             hand = arm.filtered_hand if arm.state is ArmState.ENGAGED else None
-            targets[name] = ArmTarget(pose, arm.gripper, slip, slip_angle, arm.sag, hand)
+            targets[name] = ArmTarget(pose, arm.gripper, slip, slip_angle, arm.offset, hand)
         return targets
 
     def home(self, now: float) -> None:

@@ -26,7 +26,7 @@ _NEAR = 0.01  # a pair with less to spare is coloured [m]
 
 
 class LiveTable:
-    """Shows the newest tick of a run. A separate process draws; a tick only stores a reference."""
+    """Shows the newest tick of a run. A thread draws; a tick only stores a reference."""
 
     def __init__(self, title: str, joints: Mapping[str, Collection[str]], bindings: BindingSettings) -> None:
         """``joints``: names of those that move each arm; ``bindings``: what the hands' controls do."""

@@ -9,7 +9,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from q2r2_control.teleop.sag import MOST_SAG
+from q2r2_control.teleop.steady_state_offset import MAX_OFFSET
 from q2r2_control.types import SIDES, CommandMode
 from tests.support.headset_in_step import InStepRun, Operator
 
@@ -187,7 +187,7 @@ def test_an_arm_that_was_pushed_away_is_engaged_there_and_does_not_spring_back()
 
     run = InStepRun(script, mode=CommandMode.TORQUE)
     first = run.ticks[run.watch.engagements("left")[0]].tools["left"].translation
-    assert math.dist(first, run.ticks[0].tools["left"].translation) > MOST_SAG[0]
+    assert math.dist(first, run.ticks[0].tools["left"].translation) > MAX_OFFSET[0]
     assert math.dist(run.tool("left")[-1], first) < 0.005
 
 

@@ -1,19 +1,17 @@
-"""What is drawn by another process, on a real terminal: a pair of a pseudo-terminal."""
+"""What a thread draws on a real terminal: a pair of a pseudo-terminal."""
 
 from __future__ import annotations
 
 import codecs
 import os
 import pty
-import signal
-import subprocess
 import sys
 import termios
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import closing, contextmanager, redirect_stderr, redirect_stdout, suppress
-from typing import Any, TextIO
+from contextlib import closing, contextmanager, redirect_stderr, suppress
+from typing import TextIO
 
 import pytest
 from rich.console import Console
@@ -71,27 +69,11 @@ class Counting:
         return table
 
 
-def started(monkeypatch: pytest.MonkeyPatch) -> list[subprocess.Popen[bytes]]:
-    """The processes that are started from now on."""
-    found: list[subprocess.Popen[bytes]] = []
-
-    class Noted(subprocess.Popen[bytes]):
-        def __init__(self, *arguments: Any, **options: Any) -> None:
-            super().__init__(*arguments, **options)
-            found.append(self)
-
-    monkeypatch.setattr(drawing.subprocess, "Popen", Noted)
-    return found
-
-
 def test_a_table_is_drawn_again_and_again_and_wiped_away_at_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
-    processes = started(monkeypatch)
     with a_terminal(monkeypatch) as terminal:
         with drawn(Counting(), Console(stderr=True), 50.0):
             terminal.read_until("1 times.")
             terminal.read_until("3 times.")
-            assert processes[0].poll() is None
-        assert processes[0].returncode == 0
         print("the end", file=sys.stderr, flush=True)
         last = terminal.read_until("the end").rpartition("times.")[2]
         assert last.count("\x1b[2K") >= 5, "all lines are cleared after the last drawing"
@@ -113,45 +95,6 @@ def test_what_is_printed_comes_above_the_table_whole_and_in_order(monkeypatch: p
         assert sys.stderr is terminal.file
 
 
-def test_what_the_terminal_cannot_show_is_shown_as_far_as_it_goes(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("PYTHONIOENCODING", "ascii")
-    with a_terminal(monkeypatch) as terminal, drawn(Counting(), Console(stderr=True), 50.0):
-        terminal.read_until("1 times.")
-        print("turned by Δ", file=sys.stderr)
-        terminal.read_until("turned by \\u0394")
-        terminal.read_until("times.")
-
-
-def test_ctrl_c_and_what_else_ends_the_run_is_for_the_run_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    processes = started(monkeypatch)
-    with a_terminal(monkeypatch) as terminal:
-        with drawn(Counting(), Console(stderr=True), 50.0):
-            processes[0].send_signal(signal.SIGINT)  # before it has begun
-            terminal.read_until("1 times.")
-            for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-                processes[0].send_signal(number)
-            terminal.read_until("3 times.")
-        assert processes[0].returncode == 0
-
-
-def test_a_drawing_process_that_is_killed_is_a_line_and_nothing_is_lost(monkeypatch: pytest.MonkeyPatch) -> None:
-    processes = started(monkeypatch)
-    with a_terminal(monkeypatch) as terminal:
-        with drawn(Counting(), Console(stderr=True), 50.0):
-            terminal.read_until("1 times.")
-            processes[0].send_signal(signal.SIGSTOP)
-            print("handed over", file=sys.stderr)
-            time.sleep(0.1)  # most likely; if it is not yet, the test passes all the same
-            processes[0].kill()
-            terminal.read_until("\x1b[?25h")  # the cursor is there again
-            terminal.read_until("no live table any more: the process that draws it was ended by SIGKILL")
-            terminal.read_until("handed over")
-            print("first", file=sys.stderr)
-            terminal.read_until("first")
-            print("last", file=sys.stderr)
-        terminal.read_until("last")
-
-
 def test_a_table_that_cannot_be_made_is_a_line_and_what_is_printed_is_shown(monkeypatch: pytest.MonkeyPatch) -> None:
     counting = Counting()
 
@@ -166,22 +109,13 @@ def test_a_table_that_cannot_be_made_is_a_line_and_what_is_printed_is_shown(monk
         terminal.read_until("arms stopped")
 
 
-def test_one_that_cannot_begin_is_a_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys, "executable", "/no/such/python")
-    with a_terminal(monkeypatch) as terminal, drawn(Counting(), Console(stderr=True), 50.0):
-        terminal.read_until("no live table: ")
-        assert sys.stderr is terminal.file
-
-
 def test_a_terminal_that_its_user_has_stopped_keeps_no_run_from_ending(monkeypatch: pytest.MonkeyPatch) -> None:
-    processes = started(monkeypatch)
     with a_terminal(monkeypatch) as terminal:
         with drawn(Counting(), Console(stderr=True), 1000.0):
             terminal.read_until("1 times.")
             monkeypatch.setattr(drawing, "_PATIENCE", 0.2)
             termios.tcflow(terminal.file.fileno(), termios.TCOOFF)
             print("later", file=sys.stderr)
-        assert processes[0].poll() is not None
         termios.tcflow(terminal.file.fileno(), termios.TCOON)
         terminal.read_until("later")
 
@@ -189,7 +123,6 @@ def test_a_terminal_that_its_user_has_stopped_keeps_no_run_from_ending(monkeypat
 def test_a_fault_in_the_run_ends_the_drawing_and_leaves_the_streams_as_they_were(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    processes = started(monkeypatch)
     with a_terminal(monkeypatch) as terminal:
         kept = []
 
@@ -200,7 +133,6 @@ def test_a_fault_in_the_run_ends_the_drawing_and_leaves_the_streams_as_they_were
 
         with pytest.raises(RuntimeError):
             fail()
-        assert processes[0].returncode == 0
         assert sys.stderr is terminal.file
         print("afterwards", file=kept[0], flush=True)
         terminal.file.flush()
@@ -222,15 +154,8 @@ def test_what_prints_while_it_is_interrupted_by_what_prints_goes_on() -> None:
     assert taken == ["first", "second", "third"]
 
 
-def test_a_program_without_standard_output_has_its_table_too(monkeypatch: pytest.MonkeyPatch) -> None:
-    with a_terminal(monkeypatch) as terminal, redirect_stdout(None), drawn(Counting(), Console(stderr=True), 50.0):
-        terminal.read_until("1 times.")
-
-
-def test_a_console_that_is_no_terminal_is_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    processes = started(monkeypatch)
+def test_a_console_that_is_no_terminal_is_left_alone() -> None:
     counting, console = Counting(), Console(file=open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115
     with closing(console.file), drawn(counting, console, 1000.0):
         pass
-    assert not processes
     assert counting.made == 0

@@ -14,7 +14,7 @@ from q2r2_control.ros.bridge.parameters import ArmParameters
 from q2r2_control.ros.bridge.reports import ArmReport
 from q2r2_control.teleop.arm_states import AT_REST, is_refusal
 from q2r2_control.teleop.haptics import HapticPulses
-from q2r2_control.teleop.sag import sagged
+from q2r2_control.teleop.steady_state_offset import with_offset
 from q2r2_control.types import ArmTarget
 from q2r2_control.wording import event_line
 
@@ -64,6 +64,6 @@ class ArmFeedback:
             self._shown = now
             if not self._markers.get_subscription_count():
                 return
-            asked = None if sent is None else sagged(sent, target.sag)  # where the tool is to be
+            asked = None if sent is None else with_offset(sent, target.offset)  # where the tool is to be
             for marker in self._drawn.at(asked, tool, engaged, now):
                 self._markers.publish(marker)

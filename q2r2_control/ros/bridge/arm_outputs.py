@@ -19,7 +19,7 @@ from q2r2_control.ros.bridge.frames import PoseTopic
 from q2r2_control.ros.bridge.parameters import BUILTIN_NODE, ArmParameters
 from q2r2_control.ros.bridge.target_output import TargetOutput, near
 from q2r2_control.teleop.arm_states import ArmState
-from q2r2_control.teleop.sag import MOST_SAG
+from q2r2_control.teleop.steady_state_offset import MAX_OFFSET
 
 _POSE = 2  # of moveit_msgs/srv/ServoCommandType
 # What the built-in controller says of an arm that takes a stream of targets, and what helps where it takes none.
@@ -170,11 +170,11 @@ class ArmOutputs:
         safe, fault = self._safe_target.at(now), None
         self._has_safe_target = safe is not None
         if not self._relaying and engaged:
-            self._relaying = safe is not None and tool is not None and near(safe, tool, *MOST_SAG)
+            self._relaying = safe is not None and tool is not None and near(safe, tool, *MAX_OFFSET)
             if not self._relaying:
                 fault = self._safe_target.problem or f"{self._safe_topic} is not where the tool is"
         self._relaying = self._relaying and safe is not None
-        # A stream starts at the measured tool: the safe target may differ from it by the arm's sag.
+        # A stream starts at the measured tool: the safe target may differ from it by the arm's steady-state offset.
         self._last.step(safe if self._relaying else None, tool, base, now, decided, start=tool)
         return fault
 

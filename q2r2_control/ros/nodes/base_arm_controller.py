@@ -32,7 +32,7 @@ from q2r2_control.ros.bridge.target_output import near
 from q2r2_control.ros.bridge.teleop_loop import TeleopLoop, TickInputs
 from q2r2_control.teleop.arm import OPEN
 from q2r2_control.teleop.arm_states import AT_REST, HOLDING, ArmState
-from q2r2_control.teleop.sag import MOST_SAG
+from q2r2_control.teleop.steady_state_offset import MAX_OFFSET
 from q2r2_control.types import SIDES, ArmTarget, HandSample
 from q2r2_control.wording import sentence
 
@@ -267,7 +267,7 @@ class BaseArmController(BaseNode):
         return None if (unready := self.outputs.unready) is None else (WARN, unready)
 
     def _commanded(self, tool: pin.SE3, reference: pin.SE3 | None) -> pin.SE3:
-        """The commanded tool pose: the leash is measured from it, and an anchor takes its orientation and the sag.
+        """The commanded tool pose: the leash is measured from it, and an anchor takes its orientation and the offset.
 
         Another controller's is not known. Then the leash is measured from the tool, and the last target is what that
         controller holds while the arm is paused.
@@ -275,7 +275,7 @@ class BaseArmController(BaseNode):
         if self.engaged:
             return self._target.command_for(tool) if reference is None else reference
         reference = reference or self.outputs.first.last_sent
-        return reference if reference is not None and near(reference, tool, *MOST_SAG) else tool
+        return reference if reference is not None and near(reference, tool, *MAX_OFFSET) else tool
 
     def _change(self, settings: TeleopSettings, guard: GuardSettings) -> str | None:
         problem = self.loop.change(settings)

@@ -6,7 +6,7 @@ import numpy as np
 import pinocchio as pin
 
 from q2r2_control.quaternions import se3_of
-from q2r2_control.teleop.sag import MOST_SAG, expected, sagged
+from q2r2_control.teleop.steady_state_offset import MAX_OFFSET, expected, with_offset
 from q2r2_control.types import SIDES, Array
 from tests.teleop.hands import Operator, engaged, operator, squeezing, waving
 
@@ -44,19 +44,21 @@ def test_the_target_begins_at_the_tool_and_the_command_where_it_was() -> None:
 
 def test_where_a_tool_hangs_is_the_same_in_floats() -> None:
     tool = operator().tools["right"]
-    for sag in (np.array([0.005, 0.01, -0.02]), None):
-        np.testing.assert_allclose(se3_of(expected(tool, sag)).homogeneous, sagged(tool, sag).homogeneous, atol=1e-15)
+    for offset in (np.array([0.005, 0.01, -0.02]), None):
+        np.testing.assert_allclose(
+            se3_of(expected(tool, offset)).homogeneous, with_offset(tool, offset).homogeneous, atol=1e-15
+        )
 
 
 def test_a_tool_that_is_farther_from_its_command_was_pushed_there_and_the_command_begins_at_it() -> None:
-    driver = hanging(operator(), np.array([0.0, 1.01 * MOST_SAG[0], 0.0]))
+    driver = hanging(operator(), np.array([0.0, 1.01 * MAX_OFFSET[0], 0.0]))
     driver.engage()
     np.testing.assert_allclose(command(driver), driver.tools["left"].translation, atol=1e-9)
 
 
 def test_each_engagement_goes_by_the_sag_that_there_is_then_and_changed_settings_do_not() -> None:
     driver = hanging(engaged())
-    assert driver.targets["left"].sag is None
+    assert driver.targets["left"].offset is None
     changed = driver.settings.model_copy(update={"position_scale": 0.5})
     assert driver.teleop.change(changed, driver.now) is None
     driver.run(0.1)
