@@ -62,6 +62,7 @@ lint: setup
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	$(BIN)/lint-imports
 
 bench: $(VENV)/.installed-bench
 	$(BIN)/q2r2 bench
@@ -75,4 +76,4 @@ soak: setup
 	$(BIN)/q2r2 soak
 
 clean:
-	rm -rf $(VENV) $(LEROBOT) build install log *.egg-info .mypy_cache .ruff_cache .pytest_cache
+	rm -rf $(VENV) $(LEROBOT) build install log *.egg-info .mypy_cache .ruff_cache .pytest_cache .import_linter_cache

@@ -32,11 +32,8 @@ pytestmark = pytest.mark.slow
 
 CHECKOUT = Path(__file__).resolve().parents[1]
 SESSION = 15.0  # [s]
-# Reasons of events that an overloaded machine causes.
-STARVED = ("loop_stalled", "pose_silent", "pose_gap", "inputs_silent", "hand_jumped", "connection_lost")
 # A tick that stretches the motion by more than this is no measure of tracking, nor is the time until it is made up [s].
 LATE, MADE_UP = 0.005, 0.5
-ATTEMPTS = 3
 
 
 class ClockedServer(HeadsetServer):
@@ -111,17 +108,11 @@ def live(plant: str) -> Iterator[Live]:
 @pytest.fixture(scope="module")
 def session(tmp_path_factory: pytest.TempPathFactory) -> Live:
     """The whole session: both hands move, pause, the left one turns by 120 degrees, resume, close the grippers."""
-    for attempt in range(ATTEMPTS):
-        log = tmp_path_factory.mktemp("session") / "sent.jsonl"
-        with live("mujoco") as run:
-            headset = run.headset("--dialect", "ros2", "--duration", str(SESSION), "--log", str(log))
-            assert headset.wait(SESSION + 60.0) == 0
-        run.sent = [json.loads(line) for line in log.read_text(encoding="utf-8").splitlines()]
-        assert run.summary is not None
-        end = run.sent[-1]["t"] - run.server.times[0]
-        starved = [event for event in run.summary.events if event.t < end and event.reason.root.kind in STARVED]
-        if not starved or attempt == ATTEMPTS - 1:
-            break
+    log = tmp_path_factory.mktemp("session") / "sent.jsonl"
+    with live("mujoco") as run:
+        headset = run.headset("--dialect", "ros2", "--duration", str(SESSION), "--log", str(log))
+        assert headset.wait() == 0
+    run.sent = [json.loads(line) for line in log.read_text(encoding="utf-8").splitlines()]
     return run
 
 
@@ -184,8 +175,6 @@ class TestSession:
                         turns.append(_norm(pin.log3(got.rotation @ (turn @ tool.rotation).T)))
                 index += 1
         assert max(travelled) > 0.19, "circles of 0.1 m radius"
-        if not shifts:
-            pytest.skip("the machine was so busy that every stretch of motion was late")
         assert root_mean_square(shifts) < 5e-3
         assert np.degrees(root_mean_square(turns)) < 1.0
 
@@ -233,24 +222,10 @@ class Cut:
 
 
 def moving_headset(run: Live, dialect: str) -> subprocess.Popen[bytes]:
-    """A client whose hands move both arms; another one if an overloaded machine paused an arm before both moved."""
-
-    def moving() -> bool:
-        return all(run.watch.ticks[-1].engaged.values()) and speed(run.watch.ticks[-1]) > 0.1
-
-    def over() -> bool:
-        engaged_before = any(tick.engaged["left"] for tick in run.watch.ticks[begin:])
-        return headset.poll() is not None or (engaged_before and not any(run.watch.ticks[-1].engaged.values()))
-
-    for _ in range(ATTEMPTS):
-        begin = len(run.watch.ticks)
-        headset = run.headset("--script", "circle", "--dialect", dialect, "--duration", "20")
-        run.wait_for("motion", lambda: moving() or over())
-        if moving():
-            return headset
-        headset.kill()
-        headset.wait()
-    raise AssertionError(f"both arms never moved, {ATTEMPTS} times")
+    """A client whose hands move both arms."""
+    headset = run.headset("--script", "circle", "--dialect", dialect, "--duration", "20")
+    run.wait_for("motion", lambda: all(run.watch.ticks[-1].engaged.values()) and speed(run.watch.ticks[-1]) > 0.1)
+    return headset
 
 
 @pytest.fixture(scope="module")

@@ -8,9 +8,14 @@ import pytest
 
 from q2r2_control.ros.watching.environment import PACKAGES, examine_environment
 from tests.ros.processes import ROOT
-from tests.test_architecture import ROS_PACKAGES
 
 ROS = ROOT / "q2r2_control" / "ros"
+ROS_PACKAGES = {
+    *("rclpy", "launch", "launch_ros", "ament_index_python", "domain_coordinator", "quest2ros"),
+    *("rcl_interfaces", "rosgraph_msgs", "builtin_interfaces", "action_msgs", "std_srvs", "tf2_msgs"),
+    *("control_msgs", "diagnostic_msgs", "geometry_msgs", "sensor_msgs", "std_msgs", "trajectory_msgs"),
+    "visualization_msgs",
+}
 INTERFACES = {file.parent.name for file in ROS.glob("interfaces/*/package.xml")}
 
 
