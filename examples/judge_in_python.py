@@ -1,0 +1,28 @@
+"""Judge recordings in Python: python examples/judge_in_python.py [RECORDINGS...]; without any, it records one."""
+
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+from q2r2_control.config.judge import JudgeSettings
+from q2r2_control.judging.judge import judge_all
+from q2r2_control.recording.files import recordings_in
+
+
+def record(folder: str) -> Path:
+    """Two seconds of scripted hands, as fast as the machine can."""
+    command = [sys.executable, "-m", "q2r2_control", "run", "config/dual_iiwa7.yaml", "--headless", "--fast"]
+    subprocess.run([*command, "--duration", "2", "--record", folder], check=True, stdout=subprocess.DEVNULL)
+    return Path(folder)
+
+
+with tempfile.TemporaryDirectory() as folder:
+    given = [Path(path) for path in sys.argv[1:]] or [record(folder)]
+    # Thresholds of your own; without them those of the recorded cell count.
+    settings = JudgeSettings(max_position_error_rms=0.02, max_idle_share=0.95)
+    for judged in judge_all(recordings_in(given), settings):
+        print(f"{judged.figures.name}: {judged.verdict.line}")
+        for name, arm in judged.figures.arms.items():
+            error = arm.position_error_mm_rms
+            print(f"  {name} arm: {'never engaged' if error is None else f'tracking error {error:.1f} mm RMS'}")

@@ -1,0 +1,46 @@
+"""Each script in examples/ runs as it stands, without a screen."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+SCRIPTS = sorted((ROOT / "examples").glob("*.py"))
+ROS = "external_controller.py"  # the one that needs it
+
+
+def run(script: Path, *arguments: str, **environment: str) -> str:
+    """What a script prints."""
+    done = subprocess.run(
+        [sys.executable, str(script), *arguments],
+        cwd=ROOT,
+        env={**os.environ, "PYTHONPATH": str(ROOT), **environment},
+        capture_output=True,
+        text=True,
+        timeout=600,
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.mark.parametrize("script", [script for script in SCRIPTS if script.name != ROS], ids=lambda script: script.stem)
+def test_an_example_runs_and_prints_what_came_of_it(script: Path, tmp_path: Path) -> None:
+    pictures = [tmp_path / "picture.png"] if "PICTURE" in script.read_text() else []
+    assert run(script, *map(str, pictures)).strip()
+    assert all(picture.stat().st_size > 10_000 for picture in pictures)
+
+
+def test_a_controller_of_ones_own_answers_a_target_in_ros() -> None:
+    coordinator = pytest.importorskip("domain_coordinator", reason="ROS 2 is not installed")
+    pytest.importorskip("rclpy", reason="ROS 2 is not installed")
+    with coordinator.domain_id() as domain:
+        assert run(ROOT / "examples" / ROS, "--once", ROS_DOMAIN_ID=str(domain)).startswith("target 50.0 mm away")
+
+
+def test_an_example_is_short() -> None:
+    assert {script.name: lines for script in SCRIPTS if (lines := len(script.read_text().splitlines())) > 60} == {}
