@@ -13,16 +13,13 @@ from pathlib import Path
 
 from q2r2_control.errors import RecordingError
 from q2r2_control.export.episodes import EpisodePart, parts_to_export
-from q2r2_control.recording.about import ABOUT, CELL, CONCLUSION, CUT_OUT_OF, ROBOT, Conclusion
-from q2r2_control.recording.bag import definitions, qos_text, write_metadata
-from q2r2_control.recording.mcap_file import McapFile
+from q2r2_control.recording.about import CUT_OUT_OF, Conclusion
+from q2r2_control.recording.bag import BagWriter
 from q2r2_control.recording.reader import Recording
 from q2r2_control.recording.ros_recording import open_recording
 from q2r2_control.recording.ros_topics import is_latched
 from q2r2_control.recording.rows import at_time, channel_of, log_time
-from q2r2_control.recording.topics import PICTURE, STATE, Topic
-
-_Message = tuple[Topic, bytes]
+from q2r2_control.recording.topics import STATE, Topic
 
 
 def write_bags(file: Path, folder: Path) -> int:
@@ -51,31 +48,17 @@ def _write(recording: Recording, part: EpisodePart, path: Path) -> None:
     about, span = recording.about, part.span
     start = about.epoch + max(round(span.start * 1e9), 0) if not span.whole else 0
     end = about.epoch + round(span.end * 1e9) if span.end < float("inf") else None
-    conclusion = Conclusion(span.success, recording.conclusion.ended_by if end is None else None).texts()
-    topics = list(recording.declared_topics())
+    conclusion = Conclusion(span.success, recording.conclusion.ended_by if end is None else None)
+    topics = recording.declared_topics
     notes = {**about.notes, CUT_OUT_OF: recording.file.name, "episode": str(part.number)}
-    file = McapFile(path)
-    try:
-        file.add_topics(topics, definitions(topics), qos_text())
-        file.add_metadata(ABOUT, replace(about, notes=notes).texts())
-        for name, kind, text in ((CELL, "application/yaml", about.cell), (ROBOT, "application/xml", about.robot)):
-            file.add_attachment(name, kind, text, about.epoch)
-        file.begin()
-        for messages in _within(recording, {topic.channel: topic for topic in topics}, start, end):
-            pictures = [message for message in messages if message[0].type == PICTURE]
-            file.add([message for message in messages if message[0].type != PICTURE])
-            file.flush()
-            if pictures:
-                file.add_apart(pictures)
-        if conclusion:
-            file.add_metadata(CONCLUSION, conclusion)
-        file.close()
-    finally:
-        file.abandon()
-    write_metadata(path, topics, file.counts, file.first_time, file.last_time, {**notes, **conclusion})
+    with BagWriter(path, topics.values(), replace(about, notes=notes)) as bag:
+        for records in _within(recording, topics, start, end):
+            bag.write(records)
+            bag.flush()
+        bag.close(conclusion)
 
 
-def _within(recording: Recording, topics: dict[int, Topic], start: int, end: int | None) -> Iterator[list[_Message]]:
+def _within(recording: Recording, topics: dict[int, Topic], start: int, end: int | None) -> Iterator[list[bytes]]:
     """The messages from ``start`` to ``end`` [ns] of day, chunk by chunk.
 
     At the start there is what lasts of what was said before.
@@ -90,9 +73,9 @@ def _within(recording: Recording, topics: dict[int, Topic], start: int, end: int
                 if is_latched(topic.name) or topic.name == STATE:
                     lasting[topic.channel] = at_time(record, start)
             elif end is None or time <= end:
-                inside.append((topic, record))
+                inside.append(record)
         if inside and not begun:
             begun = True
-            inside = [(topics[channel], record) for channel, record in lasting.items()] + inside
+            inside = [*lasting.values(), *inside]
         if inside:
             yield inside

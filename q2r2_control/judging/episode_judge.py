@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import math
-import os
+from collections import deque
 from collections.abc import Callable
-from contextlib import suppress
-from dataclasses import asdict
 from pathlib import Path
 from types import TracebackType
 
 from q2r2_control.events import Event, Reason, ReasonKind
-from q2r2_control.judging.judge_work import LONGEST_MESSAGE, Answer, Question
+from q2r2_control.judging.judge_work import Answer, Question
 from q2r2_control.recording.episode_spans import spans_of
-from q2r2_control.recording.helper import reason_of
-from q2r2_control.recording.helper_process import HelperProcess
+from q2r2_control.recording.helper_process import HelperProcess, reason_of
 from q2r2_control.summary.tick import Tick
 from q2r2_control.wording import sentence
 
@@ -43,26 +39,19 @@ class EpisodeJudge:
         self._file, self._tell, self._timed = file, tell, timed
         self._events: list[Event] = []
         self._asked: Question | None = None
-        self._count, self._rest = 0, b""
+        self._count = 0
+        self._answers: deque[Answer] = deque()
         self._process: HelperProcess | None = None
         self._started = False
-        self._questions = self._answers = -1
 
     def start(self) -> None:
         """Start the process, which takes some milliseconds, unless the first question shall."""
         self._started = True
-        asked, self._questions = os.pipe()
-        self._answers, answered = os.pipe()
-        for end in (self._questions, self._answers):
-            os.set_blocking(end, False)
         try:
             work = "q2r2_control.judging.judge_work"
-            self._process = HelperProcess("judges episodes", work, (asked, answered), lambda: (0,))
+            self._process = HelperProcess("judges episodes", work, self._answers.append)
         except OSError as error:
             self._fail(reason_of(error))
-        finally:
-            os.close(asked)
-            os.close(answered)
 
     @property
     def pid(self) -> int | None:
@@ -93,39 +82,27 @@ class EpisodeJudge:
         if question == self._asked:
             return
         self._asked = question
-        if self._process is None:
-            return
-        try:
-            os.write(self._questions, json.dumps(asdict(question)).encode() + b"\n")
-        except OSError as error:
-            self._fail(reason_of(error))
+        if self._process is not None:
+            self._process.send(question)
 
     def look(self) -> None:
         """Tell the verdicts that are there."""
-        if self._process is None:
-            return
-        with suppress(BlockingIOError):
-            self._rest += os.read(self._answers, LONGEST_MESSAGE)
-        *lines, self._rest = self._rest.split(b"\n")
-        for answer in (Answer(**json.loads(line)) for line in lines):
+        while self._answers:
+            answer = self._answers.popleft()
             if spans_of(self._events)[answer.number - 1].discarded:
                 continue  # its operator has been faster
             verdict = Reason.of(ReasonKind.VERDICT, episode=answer.number, keep=answer.keep, line=answer.line)
             _logger.info(sentence(verdict))
             self._tell(verdict)
-        if fault := self._process.fault():
-            self._fail(fault)
+        if self._process is not None and self._process.fault is not None:
+            self._fail(self._process.fault)
 
     def close(self) -> None:
         """End the process, whatever it does; it is not started any more."""
         self._started = True
         if self._process is not None:
-            self._process.end()
+            self._process.kill()
             self._process = None
-        for end in (self._questions, self._answers):
-            if end >= 0:
-                os.close(end)
-        self._questions = self._answers = -1
 
     def __enter__(self) -> EpisodeJudge:
         self.start()
@@ -138,6 +115,4 @@ class EpisodeJudge:
 
     def _fail(self, reason: str) -> None:
         _logger.warning("episodes are not judged before the run ends: %s", reason)
-        if self._process is not None:
-            self._process.end()
-            self._process = None
+        self._process = None

@@ -5,12 +5,10 @@ It reads what the recorder has written by then, so it waits until an episode is 
 
 from __future__ import annotations
 
-import json
 import os
-import select
-import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,11 +17,10 @@ from q2r2_control.judging.episode import Episode, read_episode
 from q2r2_control.judging.judge import judge_episode
 from q2r2_control.judging.parts import part_of, parts_of
 from q2r2_control.recording.episode_spans import EpisodeSpan
-from q2r2_control.recording.helper import be_nice, has_ended, reason_of
+from q2r2_control.recording.helper_process import reason_of
 from q2r2_control.recording.ros_recording import open_recording
 
 LONGEST_LINE = 300  # of a verdict [characters]
-LONGEST_MESSAGE = 4096  # that a pipe takes at once [bytes]
 _NICENESS = 10  # as the writer: the loop goes first
 _LOOKS = 0.3  # between two looks at the file, which grows twice a second [s]
 _PATIENCE = 30.0  # with a recorder that is behind [s]
@@ -51,43 +48,31 @@ class Answer:
     line: str  # keep, discard and why, or why it could not be judged
 
 
-def main(asked: int, answered: int, parent: int) -> None:
-    """Answer each line that is a question, read from ``asked``, by one on ``answered``, until the run has ended."""
-    be_nice(_NICENESS)
-    for question in _questions(asked, parent):
+def main(requests: Iterator[Question], answer: Callable[[Answer], None]) -> None:
+    """Answer each question with the verdict on its episode."""
+    run = os.getppid()
+    with suppress(OSError):
+        os.nice(_NICENESS)
+    for question in requests:
         try:
-            answer = _answer(question, parent)
+            found = _answer(question, run)
         except (Q2R2Error, OSError) as error:
-            answer = _not_judged(question, reason_of(error))
-        os.write(answered, json.dumps(vars(answer)).encode() + b"\n")
+            found = _not_judged(question, reason_of(error))
+        answer(found)
 
 
-def _questions(asked: int, parent: int) -> Iterator[Question]:
-    rest = b""
-    while not has_ended(parent, 0.0):
-        if asked not in select.select([asked, sys.stdin], [], [], 1.0)[0]:
-            continue
-        data = os.read(asked, LONGEST_MESSAGE)
-        if not data:
-            return
-        *lines, rest = (rest + data).split(b"\n")
-        for line in lines:
-            yield Question(**json.loads(line))
-
-
-def _answer(question: Question, parent: int) -> Answer:
+def _answer(question: Question, run: int) -> Answer:
+    """``run``: the process that asks, as long as there is somebody to answer."""
     until = time.monotonic() + _PATIENCE
     problem = f"it was not written within {_PATIENCE:g} s"
-    while time.monotonic() < until:
+    while time.monotonic() < until and os.getppid() == run:
         try:
             if (episode := written_episode(question)) is not None:
                 verdict = judge_episode(episode).verdict
                 return Answer(question.number, verdict.keep, verdict.line[:LONGEST_LINE])
         except RecordingError as error:  # of a file whose beginning is not written yet, too
             problem = str(error)
-        if has_ended(parent, _LOOKS):
-            problem = "the run has ended"
-            break
+        time.sleep(_LOOKS)
     return _not_judged(question, problem)
 
 

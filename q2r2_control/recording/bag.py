@@ -1,22 +1,32 @@
-"""What makes a folder with an MCAP file a bag of rosbag2: definitions of types, and metadata.yaml, version 9.
+"""A bag of rosbag2: an MCAP file, written by the package ``mcap``, and the ``metadata.yaml`` beside it, version 9.
 
-Written by hand, since the package is to run without ROS; the rules are those of rosbag2_storage in ROS 2 Jazzy
-(https://github.com/ros2/rosbag2, metadata_io.cpp). Types and their hashes are from rosbags.
+The metadata are written here, since the package is to run without ROS; the rules are those of rosbag2_storage in ROS 2
+Jazzy (https://github.com/ros2/rosbag2, metadata_io.cpp). Types and their hashes are from rosbags.
 """
 
 from __future__ import annotations
 
+import json
 import os
+from collections import Counter
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from pathlib import Path
+from types import TracebackType
 from typing import Any
 
 import yaml
+from mcap.data_stream import RecordBuilder
+from mcap.records import DataEnd, Footer
+from mcap.writer import MCAP0_MAGIC, Writer
 
 from q2r2_control.inputs.messages import Dialect, message_types
+from q2r2_control.recording.about import ABOUT, CELL, CONCLUSION, FIELDS, ROBOT, About, Conclusion
+from q2r2_control.recording.rows import HEAD
 from q2r2_control.recording.topics import Topic
 
 METADATA_FILE = "metadata.yaml"
+_LARGEST_CHUNK = 4 << 20  # [bytes]
 _VERSION = 9
 _FOREVER = {"sec": 9223372036, "nsec": 854775807}
 _QOS = {
@@ -32,18 +42,94 @@ _QOS = {
 }
 
 
-def qos_text() -> str:
-    """How the topics would be offered, as rosbag2 notes it at each topic."""
-    return str(yaml.safe_dump([_QOS], sort_keys=False)).strip()
+class BagWriter:
+    """Writes a bag, as a context that :meth:`close` makes whole.
+
+    Without that the file has no index, but all that was flushed. After a fault, such as a full disk, it has the end
+    that readers look for; after a kill it just ends, which ``mcap recover`` mends.
+    """
+
+    def __init__(self, path: Path, topics: Iterable[Topic], about: About) -> None:
+        """Create the file ``path``. Raises :class:`OSError`, as all methods do."""
+        self._path, self._topics, self._about = path, tuple(topics), about
+        self._counts: Counter[int] = Counter()  # messages of each channel
+        self._first = self._last = about.epoch  # times of messages [ns]
+        self._stream = path.open("xb")
+        self._whole = 0  # bytes that were flushed
+        self._writer = Writer(self._stream, chunk_size=_LARGEST_CHUNK)
+        self._writer.start("ros2", "q2r2_control")
+        self._writer.add_metadata(ABOUT, about.texts())
+        labels = {topic.name: topic.labels for topic in self._topics if topic.labels}
+        for name, kind, text in (
+            (CELL, "application/yaml", about.cell),
+            (ROBOT, "application/xml", about.robot),
+            (FIELDS, "application/json", json.dumps(labels)),
+        ):
+            self._writer.add_attachment(about.epoch, about.epoch, name, kind, text.encode())
+        self._channels = self._register()
+        self.flush()
+
+    def write(self, records: Iterable[bytes]) -> None:
+        """Write whole records of messages, in the order of time; the file has them after :meth:`flush`."""
+        for record in records:
+            _, _, channel, sequence, time, published = HEAD.unpack_from(record)
+            self._writer.add_message(self._channels[channel], time, record[HEAD.size :], published, sequence)
+            self._first = min(self._first, time) if self._counts else time
+            self._last = max(self._last, time)
+            self._counts[channel] += 1
+
+    def flush(self) -> None:
+        """Write what was added, as one chunk."""
+        self._writer.flush()
+        self._whole = self._stream.tell()
+
+    def close(self, conclusion: Conclusion) -> None:
+        """Write what is left, the ``conclusion``, the index and ``metadata.yaml``."""
+        self.flush()
+        texts = conclusion.texts()
+        if texts:
+            self._writer.add_metadata(CONCLUSION, texts)
+        self._writer.finish()
+        self._stream.close()
+        notes = {**self._about.notes, **texts}
+        _write_metadata(self._path, self._topics, self._counts, self._first, self._last, notes)
+
+    def __enter__(self) -> BagWriter:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        with suppress(OSError):  # the same again
+            self._stream.close()
+        if error is not None:
+            self._end_after_fault()
+
+    def _register(self) -> dict[int, int]:
+        """Declare the topics; returns the number of each one's channel in the file."""
+        store = message_types(Dialect.ROS2)
+        qos = {"offered_qos_profiles": str(yaml.safe_dump([_QOS], sort_keys=False)).strip()}
+        schemas: dict[str, int] = {}
+        for kind in dict.fromkeys(topic.type for topic in self._topics):
+            definition, _ = store.generate_msgdef(kind, ros_version=2)
+            schemas[kind] = self._writer.register_schema(kind, "ros2msg", definition.encode())
+        return {
+            topic.channel: self._writer.register_channel(topic.name, "cdr", schemas[topic.type], qos)
+            for topic in self._topics
+        }
+
+    def _end_after_fault(self) -> None:
+        """Cut off what was written in part, and write the end of a file without an index."""
+        end = RecordBuilder()
+        DataEnd(0).write(end)
+        Footer(summary_start=0, summary_offset_start=0, summary_crc=0).write(end)
+        with suppress(OSError):
+            os.truncate(self._path, self._whole)
+            with self._path.open("ab") as stream:
+                stream.write(end.end() + MCAP0_MAGIC)
 
 
-def definitions(topics: Iterable[Topic]) -> dict[str, str]:
-    """The definition of each type, with those of the types in it, in the format ros2msg."""
-    store = message_types(Dialect.ROS2)
-    return {topic.type: store.generate_msgdef(topic.type, ros_version=2)[0] for topic in topics}
-
-
-def write_metadata(
+def _write_metadata(
     file: Path, topics: Iterable[Topic], counts: Mapping[int, int], first: int, last: int, custom: Mapping[str, str]
 ) -> None:
     """Write metadata.yaml beside ``file``, whose messages are from ``first`` to ``last`` [ns]. Raises OSError."""

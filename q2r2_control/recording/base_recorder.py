@@ -12,13 +12,12 @@ from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.process.folders import new_folder
 from q2r2_control.recording.about import About, Conclusion
 from q2r2_control.recording.encoder import RecordedRobot
-from q2r2_control.recording.helper import reason_of
-from q2r2_control.recording.picture_channel import PictureChannel
+from q2r2_control.recording.helper_process import HelperProcess, reason_of
 from q2r2_control.recording.topics import Topic
-from q2r2_control.recording.writer import RingSetup
-from q2r2_control.recording.writer_process import WriterProcess
+from q2r2_control.recording.writer import MessageBatch, RecordingSetup, TickBatch, Written
+from q2r2_control.process.folders import new_folder
 
-PATIENCE = 10.0  # for a disk that hangs, at the end of a run [s]
+PATIENCE = 10.0  # with a disk that hangs, at the end of a run [s]
 
 _logger = logging.getLogger(__name__)
 
@@ -26,27 +25,21 @@ _logger = logging.getLogger(__name__)
 class BaseRecorder:
     """Raises nothing: what fails is logged once, and the run goes on."""
 
-    def __init__(self, parent: Path, name: str, room: int, channel: PictureChannel | None = None) -> None:
+    def __init__(self, parent: Path, name: str, room: int) -> None:
         """Start the process; ``room`` [bytes] is for what waits to be written."""
         self._parent, self._name = parent, name
-        self._fault: str | None = None
-        self._path: Path | None = None
-        self.writer: WriterProcess | None = None
+        self.fault: str | None = None  # why nothing more is recorded
+        self.file: Path | None = None  # that is written; None while there is none
+        self.written = Written()
+        self.writer: HelperProcess | None = None
         self.record_outcome: Callable[[Reason], None] = lambda reason: None  # lets the operator know of the failure
         try:
-            self.writer = WriterProcess(room, channel)
-        except (OSError, ValueError) as error:
+            self.writer = HelperProcess("writes it", "q2r2_control.recording.writer", self._on_written, room)
+        except OSError as error:
             self._fail(reason_of(error))
 
-    @property
-    def fault(self) -> str | None:
-        """Why nothing more is recorded."""
-        return self._fault
-
-    @property
-    def file(self) -> Path | None:
-        """What is written; None while there is no file."""
-        return self._path
+    def _on_written(self, written: Written) -> None:
+        self.written = written
 
     def _open(self, about: About, robot: RecordedRobot | None, topics: tuple[Topic, ...]) -> bool:
         """Have the file of a run begun that begins at ``about.epoch``; whether that was possible."""
@@ -56,30 +49,38 @@ class BaseRecorder:
             # The time of day, so that recordings are listed in their order.
             when = datetime.fromtimestamp(about.epoch * 1e-9)
             folder = new_folder(self._parent, f"{when:%Y%m%d-%H%M%S}-{self._name}", "--record")
-            self._path = folder / f"{folder.name}.mcap"
-            self.writer.begin(RingSetup(self._path.absolute(), about, robot, topics))
-        except (ConfigError, OSError, ValueError) as error:
+        except (ConfigError, OSError) as error:
             self._fail(reason_of(error))
-        return self._fault is None
+            return False
+        self.file = folder / f"{folder.name}.mcap"
+        self.writer.send(RecordingSetup(self.file.absolute(), about, topics, robot))
+        return True
 
-    def _end(self, conclusion: Conclusion) -> int:
-        """Let all be written, with ``conclusion`` as the last; returns how many records are in the file."""
+    def _send(self, batch: TickBatch | MessageBatch, *, wait: bool = False) -> bool:
+        """Have a batch written; False where there is no room for it now. ``wait`` for room."""
+        if self.writer is None or self.fault is not None:
+            return False
+        sent = self.writer.send(batch, sum(map(len, batch[0])), wait=wait)
+        self._check_writer()
+        return sent
+
+    def _end(self, conclusion: Conclusion) -> None:
+        """Let all be written, with ``conclusion`` as the last."""
         if self.writer is None:
-            return 0
-        if fault := self.writer.finish(PATIENCE, conclusion):
-            self._fail(fault)
-        return self.writer.ring.written
+            return
+        if self.file is not None:
+            self.writer.send(conclusion)
+        self.writer.finish(PATIENCE)
+        self._check_writer()
 
-    def _look(self) -> bool:
-        """Whether the writer has ended."""
-        assert self.writer is not None
-        if fault := self.writer.fault():
-            self._fail(fault)
-        return fault is not None
+    def _check_writer(self) -> None:
+        """Find out whether the writer has failed."""
+        if self.writer is not None and self.writer.fault is not None:
+            self._fail(self.writer.fault)
 
     def _fail(self, reason: str) -> None:
         """Log the first failure in one line; nothing more is recorded."""
-        if self._fault is None:
-            self._fault = f"{self._path}: {reason}" if self._path is not None else reason
-            _logger.warning("recording ended, the run goes on: %s", self._fault)
-            self.record_outcome(Reason.of(ReasonKind.RECORDING_ENDED, text=self._fault))
+        if self.fault is None:
+            self.fault = f"{self.file}: {reason}" if self.file is not None else reason
+            _logger.warning("recording ended, the run goes on: %s", self.fault)
+            self.record_outcome(Reason.of(ReasonKind.RECORDING_ENDED, text=self.fault))

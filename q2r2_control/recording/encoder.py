@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from operator import itemgetter
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -186,10 +187,8 @@ def _pose_columns(poses: Array) -> dict[str, Array]:
     return {"position": poses[:, :3], "quaternion": poses[:, 3:]}
 
 
-def in_order(blocks: Iterable[Block]) -> list[tuple[Topic, bytes]]:
-    """All messages of a batch, tick by tick, since readers without an index expect them in order of time."""
-    placed = [
-        (at, block.topic, record) for block in blocks for at, record in zip(block.at, block.records(), strict=True)
-    ]
-    placed.sort(key=lambda message: message[0])
-    return [(topic, record) for _, topic, record in placed]
+def in_order(blocks: Iterable[Block]) -> list[bytes]:
+    """The records of all messages of a batch, tick by tick, since readers without an index expect that order."""
+    placed = [(at, record) for block in blocks for at, record in zip(block.at, block.records(), strict=True)]
+    placed.sort(key=itemgetter(0))
+    return [record for _, record in placed]

@@ -1,136 +1,183 @@
-"""A process beside the loop, as the run sees it: started anew, told to end by its standard input, heard on its output.
+"""A process beside the loop, which gets requests on its standard input and answers on its standard output.
 
-A process and not a thread, which would take Python's interpreter from the loop for milliseconds; started anew and not
-forked, since a fork of a process with threads (numba, MuJoCo, BLAS) may hang. Not by ``multiprocessing``, which imports
-the caller's main module once more.
+A process and not a thread, which would take Python's interpreter from the loop for milliseconds. It is started by
+``subprocess``: ``multiprocessing`` would import the caller's main module in it, which for the command line takes longer
+than all that the writer imports.
 """
 
 from __future__ import annotations
 
-import json
 import os
+import pickle
+import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import suppress
+from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
+from queue import SimpleQueue
+from threading import Lock, Thread
+from typing import Any
 
 from q2r2_control.process.signals import how_it_ended
-from q2r2_control.recording.helper import LONGEST_REASON, LONGEST_TOLD
 
-_STARTING = 6.0  # times as long a patience with a process that has not taken anything yet: imports take their time
-_LOOKS = 0.1  # between two looks at whether it gets on [s]
-# Signals first, since a Ctrl-C may come at once; modules are looked for where this process looks.
-_PROGRAM = """\
-import signal
-for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-    signal.signal(number, signal.SIG_IGN)
-import json, sys
-sys.path[:] = json.loads(sys.argv[1])
-from q2r2_control.recording.helper import run
-run(sys.argv[2], *map(int, sys.argv[3:]))
-"""
+_LOOKS = 0.1  # between two looks at whether it gets on, at its end [s]
+_AFTER_KILL = 1.0  # for what handles the last answer [s]
+_NO_ROOM = 1e-3  # between two attempts to send [s]
+
+
+@dataclass(frozen=True)
+class HelperFault:
+    """The last answer of a process that failed."""
+
+    reason: str  # one line
 
 
 class HelperProcess:
-    """Begins with its imports at once. To be ended by :meth:`last_words` and :meth:`end`."""
+    """Starts at once. To be ended by :meth:`finish` or :meth:`kill`; it ends with this process, however that does.
+
+    Two threads pass requests and answers on, so neither :meth:`send` nor the process waits for the other.
+    """
 
     def __init__(
-        self, what: str, module: str, fds: Sequence[int], progress: Callable[[], Sequence[int]], **environment: str
+        self, what: str, module: str, on_answer: Callable[[Any], None], room: int = 1 << 20, **environment: str
     ) -> None:
-        """Call ``module.main`` in a process with the open ``fds`` and the number of this process as its arguments.
+        """Call ``module.main(requests, answer)`` in a new process. Raises :class:`OSError`.
 
-        ``what`` it does, for faults. ``progress`` are numbers that change while it gets on, zeros before it begins.
-        ``environment``: variables that it has where this process has not. Raises :class:`OSError`.
+        ``what`` it does, for faults. ``on_answer`` gets each answer, in a thread of its own. ``room`` [bytes] is for
+        requests that wait. ``environment``: variables of the process, where this one does not have them.
         """
-        self._what, self._progress = what, progress
-        arguments = [json.dumps([*map(str, sys.path)]), module, *map(str, (*fds, os.getpid()))]
-        variables: Mapping[str, str] = {**environment, **os.environ}
+        self._what, self._on_answer, self._room = what, on_answer, room
+        paths = {"PYTHONPATH": os.pathsep.join(map(os.path.abspath, sys.path))}
         self._process = subprocess.Popen(
-            [sys.executable, "-P", "-c", _PROGRAM, *arguments],
+            [sys.executable, "-P", "-c", f"from {__name__} import run_helper; run_helper({module!r})"],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
-            pass_fds=fds,
-            bufsize=0,
-            env=variables,
+            env=environment | os.environ | paths,
             process_group=0,  # a terminal's Ctrl-C is for the run
         )
-        assert self._process.stdin is not None
-        assert self._process.stdout is not None
-        self._input, self._output = self._process.stdin, self._process.stdout
-        os.set_blocking(self._output.fileno(), False)
         self.pid = self._process.pid
+        self.fault: str | None = None  # why it has ended before it was to, or without doing all
+        self._ending = self._killed = False
+        self._queue: SimpleQueue[tuple[Any, int] | None] = SimpleQueue()
+        self._lock = Lock()
+        self._put = self._sent = 0  # bytes of requests, since the beginning
+        self._moved = time.monotonic()  # when it last took or answered something
+        self._listener = Thread(target=self._listen, daemon=True)
+        Thread(target=self._feed, daemon=True).start()
+        self._listener.start()
 
     @property
     def alive(self) -> bool:
-        """Whether it has not ended yet."""
-        return self._process.poll() is None
+        """Whether it may answer yet."""
+        return self._listener.is_alive()
 
-    def fault(self) -> str | None:
-        """Why it has ended before it was told to; None while it has not. Does not wait."""
-        said = self._output.read(LONGEST_REASON)
-        if said is None or (not said and self._process.poll() is None):  # nothing yet, or not quite ended
-            return None
-        return said.decode(errors="replace") if said else self._how(self._process.returncode)
+    def send(self, request: Any, size: int = 0, *, wait: bool = False) -> bool:
+        """Queue a request, which is pickled; False where there is no room for its ``size`` [bytes] now.
 
-    def last_words(self, patience: float, late: str, told: bytes = b"") -> str | None:
-        """Let it do what there is, and end. Returns why it did not, or None; ``late`` if it stops getting on.
-
-        That is for ``patience`` [s] in which no other work kept it off the processors. It is ``told`` some bytes,
-        which :func:`helper.told` gives it.
+        ``wait`` for room, unless the process ends.
         """
-        with suppress(OSError):  # one that has ended already says so below
-            os.write(self._input.fileno(), told[:LONGEST_TOLD])
-        self._input.close()
-        reached, waited = self._progress(), 0.0
-        looked, worked = time.monotonic(), self._processor_time()
-        while (code := self._code_within(_LOOKS)) is None:  # its exit takes its time too, after its last words
-            before, looked = (looked, worked), time.monotonic()
-            worked = self._processor_time()
-            # One that is ready to run has to wait for a processor, but for the time that it has had of one. Nor does it
-            # count that this process had none between two looks.
-            idle = min(looked - before[0], 2.0 * _LOOKS)
-            waited += max(worked - before[1], 0.0) if self._is_ready_to_run() else idle
-            if (now_reached := self._progress()) != reached:
-                reached, waited = now_reached, 0.0
-            elif waited >= (patience if any(reached) else _STARTING * patience):
-                return late
-        said = self._output.read(LONGEST_REASON)
-        if said:
-            return said.decode(errors="replace")
-        return self._how(code) if code else None
+        while self.alive:
+            with self._lock:
+                if self._put + size - self._sent <= self._room:
+                    self._put += size
+                    self._queue.put((request, size))
+                    return True
+            if not wait or size > self._room:
+                return False
+            time.sleep(_NO_ROOM)
+        return False
 
-    def end(self) -> None:
-        """Kill it if it is there yet."""
-        if self._process.poll() is None:
-            self._process.kill()
-            self._process.wait()
-        self._input.close()
-        self._output.close()
+    def finish(self, patience: float) -> None:
+        """Wait until it has done what was sent, and has ended.
 
-    def _code_within(self, timeout: float) -> int | None:
-        """Its exit code; None where it has not ended within that [s]."""
-        try:
-            return self._process.wait(timeout)
-        except subprocess.TimeoutExpired:
-            return None
+        One that neither takes nor answers anything for ``patience`` [s] is killed, and has a fault. Time in which other
+        programs keep it off the processors does not count.
+        """
+        self._ending = True
+        self._queue.put(None)
+        self._moved = time.monotonic()
+        while self._listener.is_alive():
+            self._listener.join(_LOOKS)
+            if self._is_ready_to_run():
+                self._moved = time.monotonic()
+            elif self._listener.is_alive() and time.monotonic() - self._moved > patience:
+                self.fault = f"the process that {self._what} did nothing for {patience:g} s"
+                self.kill()
+
+    def kill(self) -> None:
+        """End it, whatever it does; without a fault."""
+        self._killed = True
+        self._process.kill()
+        self._queue.put(None)
+        self._listener.join(_AFTER_KILL)
 
     def _is_ready_to_run(self) -> bool:
-        """Whether one of its threads runs or could; only Linux tells that."""
-        return any(stat.rpartition(")")[2].split()[0] == "R" for stat in self._of_threads("stat"))
+        """Whether one of its threads runs or could; only Linux says that."""
+        with suppress(OSError):  # of a thread that has ended
+            states = [file.read_text() for file in Path(f"/proc/{self.pid}/task").glob("*/stat")]
+            return any(state.rpartition(")")[2].split()[0] == "R" for state in states)
+        return False
 
-    def _processor_time(self) -> float:
-        """Of all its threads that there are [s]; only Linux tells that."""
-        return 1e-9 * sum(int(text.split()[0]) for text in self._of_threads("schedstat"))
+    def _feed(self) -> None:
+        stream = self._process.stdin
+        assert stream is not None
+        with suppress(OSError):  # of a process that has ended
+            while (entry := self._queue.get()) is not None:
+                request, size = entry
+                pickle.dump(request, stream)
+                stream.flush()
+                self._sent += size
+                self._moved = time.monotonic()
+        with suppress(OSError):
+            stream.close()
 
-    def _of_threads(self, name: str) -> Iterator[str]:
-        """What the system says of each thread in the file ``name``."""
-        for file in Path(f"/proc/{self.pid}/task").glob(f"*/{name}"):
-            with suppress(OSError):  # a thread that has ended
-                yield file.read_text()
+    def _listen(self) -> None:
+        stream, fault = self._process.stdout, None
+        assert stream is not None
+        with suppress(EOFError, pickle.UnpicklingError):
+            while fault is None:
+                answer = pickle.load(stream)
+                self._moved = time.monotonic()
+                if isinstance(answer, HelperFault):
+                    fault = answer.reason
+                else:
+                    self._on_answer(answer)
+        code = self._process.wait()
+        stream.close()
+        if fault is None and not self._killed and (code or not self._ending):
+            fault = how_it_ended(f"the process that {self._what}", code)
+        self.fault = self.fault or fault
 
-    def _how(self, code: int) -> str:
-        """How it ended where it said nothing."""
-        return how_it_ended(f"the process that {self._what}", code)
+
+def run_helper(module: str) -> None:
+    """Inside the process: call ``module.main``; what goes wrong is the last answer."""
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):  # for the run, which ends this process
+        signal.signal(number, signal.SIG_IGN)
+    try:
+        import_module(module).main(_requests(), _answer)
+    except Exception as error:
+        _answer(HelperFault(reason_of(error)))
+
+
+def _requests() -> Iterator[Any]:
+    """All that the run sends; ends when the run has ended, also where it was killed."""
+    with suppress(EOFError, pickle.UnpicklingError):
+        while True:
+            yield pickle.load(sys.stdin.buffer)
+
+
+def _answer(answer: Any) -> None:
+    with suppress(BrokenPipeError):  # of a run that was killed
+        pickle.dump(answer, sys.stdout.buffer)
+        sys.stdout.buffer.flush()
+
+
+def reason_of(error: BaseException) -> str:
+    """One line that says what went wrong."""
+    reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error) or repr(error)
+    return " ".join(reason.split())

@@ -2,17 +2,29 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
+from typing import NamedTuple
 
 from q2r2_control.recording.about import About, Conclusion
 from q2r2_control.recording.base_recorder import BaseRecorder
 from q2r2_control.recording.rows import message_record
 from q2r2_control.recording.topics import Topic
+from q2r2_control.recording.writer import MessageBatch
 
 ROOM = 8 << 20  # for messages that wait to be written [bytes]; both arms' nodes send some 0.6 MB a second
 ROOM_WITH_PICTURES = 64 << 20  # of cameras, which have a megabyte each where they are not compressed
-_LOOKS = 64  # messages between two looks at whether the writer lives
 _LAST_NUMBER = 2**32 - 1
+
+
+class ReceivedMessage(NamedTuple):
+    """A message of a ROS topic."""
+
+    received: int  # [ns] of day
+    topic: Topic
+    number: int  # at its sender
+    sent: int  # [ns] of day, by its sender's clock
+    payload: bytes  # CDR
 
 
 class MessageRecorder(BaseRecorder):
@@ -29,33 +41,20 @@ class MessageRecorder(BaseRecorder):
         self._begun = self._open(about, None, topics)
         self._last = about.epoch
 
-    def put(self, topic: Topic, number: int, received: int, sent: int, payload: bytes) -> None:
-        """Take a message: its ``number`` at its sender, when it was received and sent [ns of day], and its CDR.
+    def record(self, messages: Iterable[ReceivedMessage]) -> None:
+        """Have messages written, in the order of their receipt.
 
         One that was received before the last one counts as received with it, since a file is in the order of time.
         """
-        self.count += 1
-        if self._fault is not None or self.writer is None or not self._begun:
-            return
-        self._last = max(received, self._last)
-        record = message_record(topic.channel, number & _LAST_NUMBER, self._last, max(sent, 0), payload)
-        try:
-            if not self.writer.ring.put(record):
-                self.overflows += 1
-        except ValueError:  # larger than all of the room
-            self.overflows += 1
-        if self.count % _LOOKS == 0:
-            self.look()
-
-    def look(self) -> None:
-        """Find out whether the writer has failed."""
-        if self.writer is not None and self._fault is None:
-            self._look()
-
-    @property
-    def written(self) -> int:
-        """How many messages are in the file."""
-        return 0 if self.writer is None else self.writer.ring.written
+        records = []
+        for message in sorted(messages, key=lambda one: one.received):
+            self.count += 1
+            self._last = max(message.received, self._last)
+            number, sent = message.number & _LAST_NUMBER, max(message.sent, 0)
+            records.append(message_record(message.topic.channel, number, self._last, sent, message.payload))
+        self._check_writer()
+        if records and self._begun and self.fault is None and not self._send(MessageBatch(records)):
+            self.overflows += len(records)
 
     def finish(self) -> None:
         """Write what there is, and close the file."""

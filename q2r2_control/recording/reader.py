@@ -6,18 +6,19 @@ import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 from mcap.exceptions import EndOfFile, McapError
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Chunk, DataEnd, McapRecord, Metadata, MetadataIndex, Schema
-from mcap.stream_reader import StreamReader, get_chunk_data_stream
+from mcap.stream_reader import StreamReader, breakup_chunk, get_chunk_data_stream
+from mcap.writer import MCAP0_MAGIC
 from zstandard import ZstdError
 
 from q2r2_control.errors import RecordingError
 from q2r2_control.recording.about import ABOUT, CELL, CONCLUSION, CUT_OUT_OF, ROBOT, About, Conclusion
-from q2r2_control.recording.mcap_file import MAGIC
 from q2r2_control.recording.rows import HEAD, MESSAGE, Rows, jpeg_of
 from q2r2_control.recording.topics import PICTURE, Topic, picture
 
@@ -74,17 +75,19 @@ class Recording:
                         _, _, _, tick, time, _ = HEAD.unpack_from(data, at)
                         yield Picture(time, tick, jpeg_of(data[at:end]))
 
-    def declared_topics(self) -> Iterator[Topic]:
-        """All topics that are in the file."""
+    @cached_property
+    def declared_topics(self) -> dict[int, Topic]:
+        """All topics that are in the file, by channel; none before its first messages."""
         types: dict[int, str] = {}
+        found: dict[int, Topic] = {}
         with self._faults():
-            for record in self._records():
+            chunk = next((record for record in self._records() if isinstance(record, Chunk)), None)
+            for record in breakup_chunk(chunk, validate_crc=True) if chunk is not None else ():
                 if isinstance(record, Schema):
                     types[record.id] = record.name
                 elif isinstance(record, Channel):
-                    yield Topic(record.id, record.topic, types[record.schema_id])
-                elif isinstance(record, Chunk):
-                    return
+                    found[record.id] = Topic(record.id, record.topic, types[record.schema_id])
+        return found
 
     def messages(self) -> Iterator[list[bytes]]:
         """The records of all messages as they are, chunk by chunk."""
@@ -104,10 +107,9 @@ class Recording:
 
     def _chunk_data(self) -> Iterator[bytes]:
         """The messages of each chunk."""
+        self._check_topics()
         for record in self._records():
-            if isinstance(record, Channel):
-                self._check(record)
-            elif isinstance(record, Chunk) and record.message_end_time >= self.since:
+            if isinstance(record, Chunk) and record.message_end_time >= self.since:
                 stream, size = get_chunk_data_stream(record, validate_crc=True)
                 yield stream.read(size)
             elif isinstance(record, DataEnd):
@@ -143,7 +145,7 @@ class Recording:
         if len(end) != _FOOTER.size:
             return 0
         opcode, length, summary, _, _, magic = _FOOTER.unpack(end)
-        return int(summary) if opcode == Opcode.FOOTER and length == _FOOTER_LENGTH and magic == MAGIC else 0
+        return int(summary) if opcode == Opcode.FOOTER and length == _FOOTER_LENGTH and magic == MCAP0_MAGIC else 0
 
     def _records(self, start: int = 0) -> Iterator[McapRecord]:
         """All from the beginning, or from a record that starts at ``start``."""
@@ -180,10 +182,11 @@ class Recording:
         except ValueError as error:
             raise RecordingError(f"{self.file}: {_line(error)}") from error
 
-    def _check(self, channel: Channel) -> None:
-        known = self.topics.by_channel.get(channel.id)
-        if known is None or known.name != channel.topic:
-            raise ValueError(f"unknown topic {channel.topic}")
+    def _check_topics(self) -> None:
+        for topic in self.declared_topics.values():
+            known = self.topics.by_channel.get(topic.channel)
+            if known is None or known.name != topic.name:
+                raise ValueError(f"unknown topic {topic.name}")
 
     def _split(self, data: bytes) -> RecordedChunk:
         """The messages of a chunk by topic."""
@@ -202,14 +205,15 @@ class Recording:
 
 
 def messages_in(data: bytes) -> Iterator[tuple[int, int, int]]:
-    """Channel, begin and end of each message."""
+    """Channel, begin and end of each message of a chunk."""
     at = 0
     while at < len(data):
         opcode, length, channel, *_ = HEAD.unpack_from(data, at)
         end = at + _OPCODE_AND_LENGTH + length
-        if opcode != MESSAGE or end > len(data):
+        if end > len(data):
             raise ValueError("a chunk that does not end with a message")
-        yield channel, at, end
+        if opcode == MESSAGE:  # and not the schema or the channel of one
+            yield channel, at, end
         at = end
 
 

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-from mcap.records import Channel
-
 from q2r2_control.config.cell import parse_config
 from q2r2_control.config.external import ControllerKind
 from q2r2_control.errors import RecordingError
@@ -27,10 +25,6 @@ def open_recording(path: Path) -> Recording:
 
 class RosRecording(Recording):
     """Raises :class:`RecordingError` for any other recording, and where another controller moved the arms."""
-
-    def __init__(self, path: Path) -> None:
-        super().__init__(path)
-        self._channels: dict[int, str] = {}
 
     def chunks(self) -> Iterator[RecordedChunk]:
         """See :meth:`Recording.chunks`."""
@@ -65,15 +59,14 @@ class RosRecording(Recording):
         with self._faults():
             for data in self._chunk_data():
                 for channel, at, end in messages_in(data):
-                    if self._channels[channel] == topic:
+                    if self.declared_topics[channel].name == topic:
                         _, _, _, number, time, _ = HEAD.unpack_from(data, at)
                         yield Picture(time, number, jpeg_of(data[at:end]))
 
-    def _check(self, channel: Channel) -> None:
+    def _check_topics(self) -> None:
         """Any topic may be in it."""
-        self._channels[channel.id] = channel.topic
 
     def _messages(self, data: bytes) -> Iterator[Message]:
         for channel, at, end in messages_in(data):
             time = HEAD.unpack_from(data, at)[4]
-            yield Message(self._channels[channel], time, data[at + HEAD.size : end])
+            yield Message(self.declared_topics[channel].name, time, data[at + HEAD.size : end])

@@ -12,10 +12,9 @@ from PIL import Image
 
 from q2r2_control.config.cameras import CameraConfig
 from q2r2_control.recording import topics as names
-from q2r2_control.recording.about import ABOUT, CELL, ROBOT, About, as_yaml
-from q2r2_control.recording.bag import definitions, qos_text
+from q2r2_control.recording.about import About, Conclusion, as_yaml
+from q2r2_control.recording.bag import BagWriter
 from q2r2_control.recording.encoder import Block, in_order
-from q2r2_control.recording.mcap_file import McapFile
 from q2r2_control.recording.rows import picture_record
 from tests.support.watch import cell
 
@@ -68,12 +67,7 @@ def write_recording(
         {"task": "to count"},
     )
     topics = about.topics()
-    file = McapFile(path)
-    file.add_topics(topics.all, definitions(topics.all), qos_text())
-    file.add_metadata(ABOUT, about.texts())
-    file.add_attachment(CELL, "application/yaml", about.cell, EPOCH)
-    file.add_attachment(ROBOT, "application/xml", about.robot, EPOCH)
-    file.begin()
+    bag = BagWriter(path, topics.all, about)
     count = len(times)
     at = np.arange(count)
     unit = np.tile((0.0, 0.0, 0.0, 1.0), (count, 1))
@@ -120,12 +114,12 @@ def write_recording(
             first, last = np.searchsorted(block.at, (begin, begin + CHUNK))
             if first < last:
                 inside.append(Block(block.topic, block.at[first:last], block.rows[first:last]))
-        file.add(in_order(inside))
-        file.flush()
+        bag.write(in_order(inside))
+        bag.flush()
     for name, taken in (pictures or {}).items():
         shown = topics.by_name[names.picture(name)]
         for number, time in enumerate(taken):
             jpeg = plain_jpeg(config.cameras[name], brightness(number))
-            file.add_apart([(shown, picture_record(shown.channel, number, EPOCH + time, name, jpeg))])
-    file.close()
+            bag.write([picture_record(shown.channel, number, EPOCH + time, name, jpeg)])
+    bag.close(Conclusion())
     return path

@@ -10,13 +10,13 @@ import pinocchio as pin
 from mcap.data_stream import RecordBuilder
 from mcap.records import DataEnd, Footer
 from mcap.stream_reader import StreamReader
+from mcap.writer import MCAP0_MAGIC
 
 from q2r2_control.inputs.played import PlayedInput
 from q2r2_control.inputs.sampling import HeadsetSampling, SampleTiming
 from q2r2_control.inputs.scripted import HANDS_AT_REST
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.recording.about import About
-from q2r2_control.recording.mcap_file import MAGIC
 from q2r2_control.recording.recorder import Recorder
 from q2r2_control.recording.rows import HEAD
 from q2r2_control.types import SIDES, HandInputs, HandSample
@@ -180,7 +180,7 @@ def killed(file: Path, target: Path, ticks: int) -> Path:
             record.write(builder)
     DataEnd(0).write(builder)
     Footer(summary_start=0, summary_offset_start=0, summary_crc=0).write(builder)
-    target.write_bytes(MAGIC + builder.end() + MAGIC)
+    target.write_bytes(MCAP0_MAGIC + builder.end() + MCAP0_MAGIC)
     return target
 
 

@@ -16,7 +16,7 @@ from q2r2_control.events import Event, Reason, ReasonKind
 from q2r2_control.inputs.messages import Dialect, message_types
 from q2r2_control.recording import topics as names
 from q2r2_control.recording.about import ROS, About, as_yaml
-from q2r2_control.recording.message_recorder import ROOM, MessageRecorder
+from q2r2_control.recording.message_recorder import ROOM, MessageRecorder, ReceivedMessage
 from q2r2_control.recording.ros_topics import (
     CONTROLLER_TICK,
     RECORDER_EVENTS,
@@ -63,7 +63,9 @@ class NodesOnFile:
     def put(self, topic: str, at: int, message: Any) -> None:
         payload = bytes(STORE.serialize_cdr(message, self.topics[topic].type))
         self._number += 1
-        self.recorder.put(self.topics[topic], self._number, self.epoch + at, self.epoch + at, payload)
+        self.recorder.record(
+            [ReceivedMessage(self.epoch + at, self.topics[topic], self._number, self.epoch + at, payload)]
+        )
 
     def joint_states(self, at: int, q: Array, extra: Iterable[str] = ("left_finger_joint_1",)) -> None:
         """Joints in another order than the robot's, and some that are not its own."""

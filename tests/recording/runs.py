@@ -15,6 +15,7 @@ import zstandard
 from mcap.data_stream import RecordBuilder
 from mcap.records import Chunk, DataEnd, Footer, McapRecord, Metadata, MetadataIndex
 from mcap.stream_reader import StreamReader, get_chunk_data_stream
+from mcap.writer import MCAP0_MAGIC
 
 from q2r2_control.inputs.base import Input
 from q2r2_control.inputs.scripted import ScriptedInput
@@ -22,9 +23,8 @@ from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.plants.base import Plant
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.recording.about import About
-from q2r2_control.recording.mcap_file import MAGIC
-from q2r2_control.recording.recorder import Recorder, RecordingSummary
-from q2r2_control.recording.writer_process import ROOM, WriterProcess
+from q2r2_control.recording.helper_process import HelperProcess
+from q2r2_control.recording.recorder import ROOM, Recorder, RecordingSummary
 from tests.support.watch import cell
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -101,7 +101,7 @@ def record(
     return recorder.summary
 
 
-def writer_of(recorder: Recorder) -> WriterProcess:
+def writer_of(recorder: Recorder) -> HelperProcess:
     assert recorder.writer is not None
     return recorder.writer
 
@@ -116,7 +116,7 @@ def file_of(summary: RecordingSummary) -> Path:
 
 def rewrite(file: Path, target: Path, change: Callable[[bytearray], None]) -> Path:
     """A copy whose messages were changed, with checksums that fit, and an end of the run that is found."""
-    written, builder = bytearray(MAGIC), RecordBuilder()
+    written, builder = bytearray(MCAP0_MAGIC), RecordBuilder()
     places: dict[str, int] = {}
     summary = 0
     with file.open("rb") as stream:
@@ -144,5 +144,5 @@ def rewrite(file: Path, target: Path, change: Callable[[bytearray], None]) -> Pa
             written += builder.end()
             if isinstance(record, DataEnd):
                 summary = len(written)
-    target.write_bytes(written + MAGIC)
+    target.write_bytes(written + MCAP0_MAGIC)
     return target

@@ -17,7 +17,7 @@ from PIL import Image
 from q2r2_control.config.cameras import CameraConfig
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.plants.mujoco import MujocoPlant
-from q2r2_control.recording.camera_process import CameraProcess
+from q2r2_control.recording.camera_recorder import CameraRecorder
 from q2r2_control.recording.reader import Picture, Recording
 from q2r2_control.recording.recorder import Recorder
 from q2r2_control.recording.replay import replay
@@ -41,7 +41,7 @@ def loop_with(**cameras: CameraConfig) -> Pipeline:
     return pipeline("circle", "mujoco", cameras=cameras)
 
 
-def cameras_of(recorder: Recorder) -> CameraProcess:
+def cameras_of(recorder: Recorder) -> CameraRecorder:
     assert recorder.cameras is not None
     return recorder.cameras
 
@@ -113,7 +113,7 @@ def test_pictures_that_are_not_taken_in_time_are_lost_and_counted(tmp_path: Path
     def stopped_for_a_while(recorder: Recorder) -> Iterator[None]:
         pid = cameras_of(recorder).pid
         os.kill(pid, signal.SIGSTOP)
-        while cameras_of(recorder).due < 400:  # more than there is room for
+        while cameras_of(recorder).due < 1200:  # more than there is room for
             yield
         os.kill(pid, signal.SIGCONT)
         taken.append(cameras_of(recorder).due)
@@ -139,7 +139,7 @@ def test_pictures_that_are_due_between_two_ticks_are_lost_and_counted(tmp_path: 
     assert summary.pictures + summary.lost_pictures == int(observed.times[-1] * 240.0 + 1e-6) + 1
 
 
-def test_when_the_run_is_killed_the_pictures_that_wait_are_taken_and_the_file_is_closed(tmp_path: Path) -> None:
+def test_when_the_run_is_killed_its_processes_end_and_the_file_is_closed(tmp_path: Path) -> None:
     needs_opengl()
     program = """
         import os, signal, sys
@@ -160,10 +160,8 @@ def test_when_the_run_is_killed_the_pictures_that_wait_are_taken_and_the_file_is
     helpers = [int(pid) for pid in result.stdout.split()]
     wait_until(lambda: not any(map(alive, helpers)))
     (file,) = tmp_path.glob("*/*.mcap")
-    recording = Recording(file)
-    assert recording.closed
-    # The newest copy may not have been seen.
-    assert len(list(recording.pictures("front"))) >= 0.8 * FRONT.rate - 1
+    assert Recording(file).closed
+    assert replay(file).difference is None
 
 
 def test_when_the_process_that_takes_pictures_is_killed_the_recording_goes_on(
@@ -174,7 +172,7 @@ def test_when_the_process_that_takes_pictures_is_killed_the_recording_goes_on(
     def killed(recorder: Recorder) -> Iterator[None]:
         while cameras_of(recorder).due < 4:
             yield
-        wait_until(lambda: cameras_of(recorder).ring.written)
+        wait_until(lambda: recorder.written.messages)
         os.kill(cameras_of(recorder).pid, signal.SIGKILL)
         wait_until(lambda: not alive(cameras_of(recorder).pid))
         while not caplog.records:

@@ -11,7 +11,6 @@ import textwrap
 import time
 import tracemalloc
 from dataclasses import replace as changed
-from functools import partial
 from itertools import count
 from pathlib import Path
 
@@ -26,9 +25,9 @@ from q2r2_control.recording.reader import Recording
 from q2r2_control.recording.recorder import Recorder
 from q2r2_control.recording.replay import replay
 from q2r2_control.recording.topics import Topics, filtered_hand, target
+from q2r2_control.recording.writer import TickBatch
 from q2r2_control.summary.tick import Tick
 from tests.recording.runs import RATE, file_of, pipeline, read_elsewhere, record, writer_of
-from tests.support.processes import wait_until
 
 pytestmark = pytest.mark.slow
 
@@ -152,33 +151,6 @@ def test_two_processes_that_record_at_once_get_a_folder_each(tmp_path: Path, mon
         assert replay(file).difference is None
 
 
-def test_ticks_with_samples_of_hands_are_packed_later_and_all_are_there_at_any_end(
-    tmp_path: Path, recorded: tuple[Path, list[Tick]], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    packed: list[int] = []
-    pack = TickPacker.pack
-
-    def noted(packer: TickPacker, number: int, tick: Tick) -> bytes:
-        packed.append(number)
-        return pack(packer, number, tick)
-
-    monkeypatch.setattr(TickPacker, "pack", noted)
-    loop, ticks = pipeline("circle", "mujoco"), recorded[1]
-    (busy,) = [tick for tick in ticks if tick.t > 1.0 and tick.samples][:1]
-    (calm,) = [tick for tick in ticks if tick.t > 1.0 and not tick.samples][:1]
-    counts = []
-    with Recorder(tmp_path, "busy", waits=True) as recorder:
-        recorder.begin(About.of(loop, False, {}), loop.robot)
-        for number, tick in enumerate([calm, busy, calm, *[busy] * 10]):
-            recorder(changed(tick, now=tick.start.now + 1e-3 * number))
-            counts.append(len(packed))
-    # At most four wait, such as where samples come as often as ticks.
-    assert counts == [1, 1, 3, 3, 3, 3, 7, 7, 7, 7, 11, 11, 11]
-    assert packed == list(range(13))
-    assert recorder.summary.ticks == 13
-    assert recorder.summary.lost_ticks == 0
-
-
 class Broken(TickPacker):
     def __init__(self) -> None:
         pass
@@ -193,7 +165,7 @@ def test_a_recorder_that_fails_inside_does_not_end_the_run(
 ) -> None:
     def spoil(recorder: Recorder) -> None:
         if side == "the writer's":
-            writer_of(recorder).ring.put(b"no tick")
+            writer_of(recorder).send(TickBatch([b"no tick"]))
         else:
             recorder._packer = Broken()
 
@@ -218,13 +190,11 @@ def test_memory_is_flat_however_long_a_run_is(tmp_path: Path, recorded: tuple[Pa
         for number in range(24000):
             recorder(changed(tick, now=tick.start.now + 1e-3 * number))
             if number % 6000 == 5999:
-                behind = number - 1000
-                wait_until(partial(lambda least: writer.ring.written > least, behind))
                 held.append((tracemalloc.get_traced_memory()[0], resident(writer.pid)))
         tracemalloc.stop()
     assert recorder.summary.lost_ticks == 0
     for now, then in zip(held[-1], held[0], strict=True):
-        # What waits for the next chunk is some megabytes at any time; the ticks in between are 28 as they are packed.
+        # At most 8 MB wait at any time; the ticks in between are 28 as they are packed.
         assert now - then < 14e6
 
 

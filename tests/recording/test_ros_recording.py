@@ -182,7 +182,12 @@ def test_what_a_killed_writer_leaves_opens_and_has_no_end(nodes: NodesOnFile) ->
     play(nodes, 250)
     recorder = nodes.recorder
     assert recorder.writer is not None
-    wait_for(lambda: recorder.written > 0)
+
+    def written() -> bool:
+        nodes.hand(260 * PERIOD, "left", 0.0)  # a file grows when a message comes
+        return recorder.written.messages > 0
+
+    wait_for(written)
     os.kill(recorder.writer.pid, signal.SIGKILL)
     recorder.finish()
     assert "SIGKILL" in str(recorder.fault)
@@ -200,7 +205,7 @@ def test_messages_without_room_are_lost_and_counted(tmp_path: Path) -> None:
     assert nodes.recorder.overflows > 0
     os.kill(nodes.recorder.writer.pid, signal.SIGCONT)
     nodes.close()
-    assert nodes.recorder.written == nodes.recorder.count - nodes.recorder.overflows
+    assert nodes.recorder.written.messages == nodes.recorder.count - nodes.recorder.overflows
 
 
 def test_a_replay_is_refused_in_one_line(nodes: NodesOnFile) -> None:

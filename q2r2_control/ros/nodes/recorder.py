@@ -15,7 +15,7 @@ from collections.abc import Mapping
 from functools import partial
 from importlib import import_module
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
@@ -29,7 +29,7 @@ from q2r2_control.errors import ConfigError
 from q2r2_control.events import Event, Reason, ReasonKind
 from q2r2_control.judging.episode_judge import EpisodeJudge
 from q2r2_control.recording.about import ROS, About, as_yaml, program
-from q2r2_control.recording.message_recorder import ROOM, ROOM_WITH_PICTURES, MessageRecorder
+from q2r2_control.recording.message_recorder import ROOM, ROOM_WITH_PICTURES, MessageRecorder, ReceivedMessage
 from q2r2_control.recording.ros_topics import RECORDER_EVENTS, arm_events, heard_on, is_latched, is_reliable, ros_topics
 from q2r2_control.recording.topics import Topic
 from q2r2_control.robot.robot import Robot
@@ -48,16 +48,6 @@ _SERVICES = {
 }
 _PERIOD = 0.02  # between two looks at what has arrived [s]
 _STREAM_QOS = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)
-
-
-class _Waiting(NamedTuple):
-    """A message that waits until all that came before it have been taken."""
-
-    received: int  # [ns] of day
-    topic: Topic
-    number: int
-    sent: int  # [ns] of day, by its sender's clock
-    payload: bytes
 
 
 class RecorderNode(BaseNode):
@@ -86,7 +76,7 @@ class RecorderNode(BaseNode):
         self._marks = EpisodeMarks()
         self._served = 0
         self._served_last: Reason | None = None
-        self._waiting: list[_Waiting] = []
+        self._waiting: list[ReceivedMessage] = []
         self._events = self.create_publisher(String, RECORDER_EVENTS, RECORDED_QOS)
         topics = ros_topics(tuple(robot.arms), cameras)
         self._begun = time.monotonic_ns()
@@ -125,7 +115,7 @@ class RecorderNode(BaseNode):
         """Keep a message until :meth:`_write`; ``told``: it is an arm's event, which may be about an episode."""
         received = self._day() - round(age(info) * 1e9)
         number, sent = info["publication_sequence_number"] or 0, info["source_timestamp"]
-        self._waiting.append(_Waiting(received, topic, number, sent, bytes(payload)))
+        self._waiting.append(ReceivedMessage(received, topic, number, sent, bytes(payload)))
         if told:
             event = Event.from_json(json.loads(deserialize_message(payload, String).data))
             self._marks.follow(event.kind)
@@ -142,18 +132,13 @@ class RecorderNode(BaseNode):
         Topics are taken one after the other: of what came since, an older message may not have been taken yet.
         """
         until, self._looked = self._looked, self._day()
-        self._put([one for one in self._waiting if one.received <= until])
+        self._recorder.record([one for one in self._waiting if one.received <= until])
         self._waiting = [one for one in self._waiting if one.received > until]
-        self._recorder.look()
         self._judge.look()
         if self._marks.recorded and self._recorder.fault is not None:
             self._marks.recorded = False
             self.get_logger().error(f"nothing is recorded any more: {self._recorder.fault}")
             self._tell(Reason.of(ReasonKind.RECORDING_ENDED, text=self._recorder.fault))
-
-    def _put(self, messages: list[_Waiting]) -> None:
-        for received, topic, number, sent, payload in sorted(messages, key=lambda one: one.received):
-            self._recorder.put(topic, number, received, sent, payload)
 
     def _serve(self, kind: ReasonKind, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """Tell an event of the recording, unless it makes no sense now."""
@@ -205,12 +190,13 @@ class RecorderNode(BaseNode):
     def close(self) -> None:
         """Write what there is, and say what became of it."""
         self._judge.close()
-        self._put(self._waiting)
+        self._recorder.record(self._waiting)
         self._recorder.finish()
         recorder = self._recorder
-        lost = recorder.count - recorder.written
+        lost = recorder.count - recorder.written.messages
         if recorder.file is not None:
-            self.get_logger().info(f"{recorder.file}: {recorder.written} messages" + (f", {lost} lost" if lost else ""))
+            written = f"{recorder.file}: {recorder.written.messages} messages"
+            self.get_logger().info(written + (f", {lost} lost" if lost else ""))
 
 
 def _class_of(name: str) -> Any:

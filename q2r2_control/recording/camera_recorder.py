@@ -1,0 +1,99 @@
+"""Takes the pictures of a recording, in a process of its own.
+
+The loop only copies where everything is, and that at ticks at which a picture is due. Pictures are drawn of those
+copies whenever there is time, since copies are small and may wait.
+"""
+
+from __future__ import annotations
+
+import math
+import pickle
+from collections.abc import Callable, Mapping
+from threading import Event
+
+from q2r2_control.config.cameras import CameraConfig
+from q2r2_control.plants.mujoco import MujocoPlant
+from q2r2_control.recording.camera_process import CameraSetup, PictureRequest
+from q2r2_control.recording.helper_process import HelperProcess
+from q2r2_control.recording.topics import Topics, picture
+from q2r2_control.summary.tick import Tick
+
+ROOM = 128 << 10  # for copies that wait [bytes]; of the shipped cell, some seconds of a camera at 30 Hz
+_ROUNDING = 1e-6  # of a period: what is due but for the rounding of times is due
+_READY = 10.0  # for the process to be ready, before the run [s]
+
+
+class CameraRecorder:
+    """Its process begins with its imports at once. To be ended by :meth:`finish`."""
+
+    def __init__(self, write: Callable[[bytes], None], room: int = ROOM) -> None:
+        """``write`` gets the record of each picture, in another thread; ``room`` [bytes] is for copies that wait.
+
+        Raises :class:`OSError` where there can be no such process.
+        """
+        self._write, self._ready = write, Event()
+        self._process = HelperProcess(
+            "takes pictures",
+            "q2r2_control.recording.camera_process",
+            self._on_answer,
+            room,
+            MUJOCO_GL="egl",  # MuJoCo's own choice needs a display
+            LP_NUM_THREADS="1",  # without a graphics card, one processor stays the loop's
+        )
+        self.pid = self._process.pid
+        self.due = 0  # pictures that should be there by now
+        self._plant: MujocoPlant | None = None  # None: not begun
+        self._names: list[str] = []
+        self._rates: list[float] = []
+        self._last: list[int] = []  # number of each one's last picture
+        self._next = -math.inf  # when a picture is due, since the start of the run [s]
+
+    def _on_answer(self, record: bytes) -> None:
+        if record:
+            self._write(record)
+        else:
+            self._ready.set()
+
+    @property
+    def fault(self) -> str | None:
+        """Why no more pictures are taken."""
+        return self._process.fault
+
+    def prepare(self, plant: MujocoPlant, cameras: Mapping[str, CameraConfig], topics: Topics) -> None:
+        """Make ready for pictures of ``plant``, for messages of ``topics``; waits for that, some seconds at most."""
+        channels = {name: topics.by_name[picture(name)].channel for name in cameras}
+        self._process.send(CameraSetup(pickle.dumps(plant.model), dict(cameras), channels))
+        waited = 0.0
+        while self._process.alive and waited < _READY and not self._ready.wait(0.1):
+            waited += 0.1
+        self._plant, self._names = plant, list(cameras)
+        self._rates = [camera.rate for camera in cameras.values()]
+        self._last = [-1] * len(cameras)
+
+    def take_pictures(self, number: int, tick: Tick, epoch: int, *, wait: bool) -> None:
+        """Have those pictures taken that are due at a tick, the ``number``-th; ``wait`` for room, or lose them.
+
+        ``epoch``: time of day at which the run began [ns].
+        """
+        since = tick.now - tick.start.now
+        if self._plant is None or since < self._next:
+            return
+        # Picture k is due at k / rate.
+        newest = [math.floor(since * rate + _ROUNDING) for rate in self._rates]
+        chosen = [name for name, now, last in zip(self._names, newest, self._last, strict=True) if now > last]
+        request = PictureRequest(number, epoch + round(since * 1e9), chosen, self._plant.observed_qpos.tobytes())
+        self._process.send(request, len(request.qpos), wait=wait)
+        self.due += sum(newest) - sum(self._last)
+        self._last = newest
+        pairs = zip(newest, self._rates, strict=True)
+        self._next = min((last + 1 - _ROUNDING) / rate for last, rate in pairs)
+
+    def finish(self, patience: float) -> None:
+        """Let it take the pictures that wait, and end.
+
+        One that does nothing for ``patience`` [s] is killed, and one that has not begun at once.
+        """
+        if self._plant is not None and patience > 0.0:
+            self._process.finish(patience)
+        else:
+            self._process.kill()
