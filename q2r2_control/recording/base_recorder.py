@@ -15,7 +15,6 @@ from q2r2_control.recording.encoder import RecordedRobot
 from q2r2_control.recording.helper_process import HelperProcess, reason_of
 from q2r2_control.recording.topics import Topic
 from q2r2_control.recording.writer import MessageBatch, RecordingSetup, TickBatch, Written
-from q2r2_control.process.folders import new_folder
 
 PATIENCE = 10.0  # with a disk that hangs, at the end of a run [s]
 
