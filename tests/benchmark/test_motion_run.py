@@ -98,14 +98,6 @@ def test_a_controller_that_is_too_slow_to_wait_for_says_how_far_it_got(robot: Ro
     assert figures == MotionFigures("short", "standing", figures.done)
 
 
-def test_ours_passes_where_there_is_a_way_and_keeps_its_distance(robot: Robot) -> None:
-    figures = run_motion(own_controller(robot, CONFIG), robot, WORK_MOTIONS["pass"])
-    assert figures.arrival_s is not None
-    assert figures.min_distance_mm is not None
-    assert figures.min_distance_mm >= 1e3 * CONFIG.control.min_distance
-    assert figures.fallback_percent is not None
-
-
 def test_free_air_follows_what_the_pairs_forbid() -> None:
     free = without_pairs(CONFIG)
     figures = run_motion(own_controller(free, CONFIG), Robot.from_config(CONFIG), WORK_MOTIONS["slide"])

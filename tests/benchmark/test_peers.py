@@ -48,11 +48,6 @@ def home() -> dict[str, pin.SE3]:
     return {arm: robot().tool_pose(robot().home, arm) for arm in robot().arms}
 
 
-def test_a_peer_has_a_name_and_says_what_it_cannot_keep(peer: BenchController) -> None:
-    assert peer.name in PEERS
-    assert "certificate" in peer.limitations
-
-
 def test_a_peer_at_its_targets_stays_there(peer: BenchController) -> None:
     for _ in range(20):
         q, v = peer.step(home(), DT)
@@ -85,15 +80,6 @@ def test_velocities_are_those_of_the_positions(peer: BenchController) -> None:
         before = q
 
 
-def test_a_peer_that_holds_stands_where_it_was(peer: BenchController) -> None:
-    goals = {arm: pin.SE3(pose.rotation, pose.translation + 0.1) for arm, pose in home().items()}
-    for _ in range(10):
-        q, _ = peer.step(goals, DT)
-    held, v = peer.hold()
-    np.testing.assert_array_equal(held, q)
-    assert not v.any()
-
-
 @pytest.mark.parametrize("name", [name for name in PEERS if name not in WITHOUT_ACCELERATION_LIMIT])
 def test_a_peer_with_an_acceleration_limit_starts_as_slowly_as_we_do(name: str) -> None:
     pytest.importorskip(PEERS[name])
@@ -104,20 +90,3 @@ def test_a_peer_with_an_acceleration_limit_starts_as_slowly_as_we_do(name: str) 
     # roboplan's solver tolerance, 1e-6 rad in a tick, is a tenth of what the limit allows.
     limit = robot().capped_acceleration(CONFIG.control.acceleration_limit)
     assert (np.abs(v) <= 1.25 * limit * DT).all()
-
-
-def test_roboplan_watches_exactly_our_pairs() -> None:
-    pytest.importorskip("roboplan")
-    assert peer_of("roboplan").pairs == len(robot().collision_model.collisionPairs)  # type: ignore[attr-defined]
-
-
-def test_mink_watches_our_pairs_but_those_of_a_body_and_its_parent() -> None:
-    pytest.importorskip("mink")
-    pairs = robot().collision_model.collisionPairs
-    joints = [
-        [robot().collision_model.geometryObjects[index].parentJoint for index in (pair.first, pair.second)]
-        for pair in pairs
-    ]
-    neighbours = sum(robot().model.parents[max(both)] == min(both) for both in joints)
-    assert neighbours > 0
-    assert peer_of("mink").pairs == len(pairs) - neighbours  # type: ignore[attr-defined]

@@ -12,7 +12,6 @@ import pytest
 from q2r2_control.benchmark.work_hands import MOVES, WorkHands
 from q2r2_control.benchmark.work_motions import ARMS, WORK_MOTIONS
 from q2r2_control.config.teleop import TeleopSettings
-from q2r2_control.inputs.base import Input
 from q2r2_control.teleop.teleop import Teleop
 from q2r2_control.types import SIDES, HandSample
 from tests.teleop.hands import pose
@@ -39,10 +38,6 @@ SETTINGS = {
 def played(hands: WorkHands, until: float) -> list[HandSample]:
     hands.start()
     return [sample for tick in range(round(until / DT)) for sample in hands.poll(tick * DT)]
-
-
-def test_they_are_an_input() -> None:
-    assert isinstance(WorkHands(SHORT, TOOLS, TeleopSettings()), Input)
 
 
 @pytest.mark.parametrize("settings", SETTINGS.values(), ids=SETTINGS.keys())

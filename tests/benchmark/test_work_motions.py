@@ -54,15 +54,6 @@ def test_targets_are_still_before_the_motion_and_at_its_end(motion: WorkMotion, 
     assert np.abs(v[began:]).max() > 0.03
 
 
-def test_tools_point_down_unless_the_motion_tilts_them(motion: WorkMotion, start: dict[str, pin.SE3]) -> None:
-    for t in np.arange(0.0, motion.ends, 0.1):
-        for arm, tilt, pose in zip(ARMS, motion.tilt, motion.targets(t, start).values(), strict=True):
-            turned = pin.log3(pose.rotation @ start[arm].rotation.T)
-            assert np.linalg.norm(turned) <= abs(tilt) + 1e-9
-            if t >= motion.begins:
-                np.testing.assert_allclose(turned, [tilt, 0.0, 0.0], atol=1e-9)
-
-
 @pytest.mark.parametrize(("gap", "speed"), [(0.40, 0.15), (0.20, 0.50), (0.16, 0.04)])
 def test_a_carry_keeps_its_gap_and_has_the_speed_of_its_name(
     gap: float, speed: float, start: dict[str, pin.SE3]
@@ -73,15 +64,6 @@ def test_a_carry_keeps_its_gap_and_has_the_speed_of_its_name(
     # Sideways goes the whole speed, up and down half of it.
     assert np.abs(np.diff(carried[:, 0, 0])).max() / DT == pytest.approx(speed, rel=1e-3)
     np.testing.assert_allclose(carried[-1], carried[0], atol=1e-9)
-
-
-def test_targets_depend_on_time_and_on_the_tools_at_the_start_alone(start: dict[str, pin.SE3]) -> None:
-    motion = WORK_MOTIONS["oscillate"]
-    moved = {arm: pin.SE3(pose.rotation, pose.translation + np.array([0.0, 0.0, 0.1])) for arm, pose in start.items()}
-    first, _, again, higher = (motion.targets(*at) for at in ((3.0, start), (1.0, moved), (3.0, start), (3.0, moved)))
-    np.testing.assert_array_equal(first["left"].homogeneous, again["left"].homogeneous)
-    rise = higher["left"].translation - first["left"].translation
-    np.testing.assert_allclose(rise, [0.0, 0.0, 0.1], atol=1e-12)
 
 
 def test_motions_are_found_by_their_names_and_by_what_these_begin_with() -> None:

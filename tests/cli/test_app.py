@@ -92,15 +92,9 @@ def fake_headset(port: int, duration: float) -> None:
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_the_help_of_every_command_has_an_example(command: str) -> None:
-    result = q2r2(command, "--help")
-    assert result.exit_code == 0
-    assert f"Example: q2r2 {command}" in result.stdout
-
-
-@pytest.mark.parametrize("command", COMMANDS)
-def test_the_help_lists_every_command(command: str) -> None:
+def test_the_help_lists_every_command_whose_own_has_an_example(command: str) -> None:
     assert f"\n  {command} " in q2r2("--help").stdout
+    assert f"Example: q2r2 {command}" in q2r2(command, "--help").stdout
 
 
 @pytest.mark.parametrize(
@@ -111,17 +105,12 @@ def test_the_help_lists_every_command(command: str) -> None:
         pytest.param(("run",), "CONFIG", id="run without a config"),
         pytest.param(("run", "nowhere.yaml"), "nowhere.yaml: no such file", id="a file that does not exist"),
         pytest.param(("run", CELL, "--input", "mind"), "'mind'", id="an unknown input"),
-        pytest.param(("run", CELL, "--plant", "granite"), "'granite'", id="an unknown plant"),
-        pytest.param(("run", CELL, "--mode", "speed"), "'speed'", id="an unknown mode"),
         pytest.param(
             ("run", CELL, "--plant", "kinematic", "--mode", "torque", "--duration", "1"),
             "mode torque: KinematicPlant follows position, velocity commands only",
             id="torque of a plant that has none",
         ),
-        pytest.param(("run", CELL, "--duration", "soon"), "--duration", id="a duration that is no number"),
         pytest.param(("run", CELL, "--duration", "nan"), "--duration nan: allowed", id="a duration that is not finite"),
-        pytest.param(("run", CELL, "--duration", "-1"), "--duration -1: allowed", id="a negative duration"),
-        pytest.param(("demo", "--duration", "0"), "--duration 0: allowed", id="a demo of no duration"),
         pytest.param(("demo", "juggle"), "task 'juggle': allowed: meet, grasp", id="a task that no demo has"),
         pytest.param(("demo", "--fast", "--rt"), "exclude each other", id="a demo in simulated real time"),
         pytest.param(("run", CELL, "--fast"), "--fast needs --duration", id="simulated time without an end"),
@@ -136,9 +125,6 @@ def test_the_help_lists_every_command(command: str) -> None:
             id="a trajectory of a headset",
         ),
         pytest.param(("run", CELL, "--port", "0"), "--port", id="a port for a script"),
-        pytest.param(("run", CELL, "--input", "headset", "--port", "70000"), "--port", id="a port that does not exist"),
-        pytest.param(("run", CELL, "--trajectory", "zigzag"), "'zigzag'", id="an unknown trajectory"),
-        pytest.param(("run", CELL, "--seed", "-1"), "--seed", id="a negative seed"),
         pytest.param(("run", CELL, "--viewer", "--headless"), "--viewer", id="a window and none"),
         pytest.param(("headset-check", "--host", "no such host"), "no such host", id="a host that cannot be bound"),
         pytest.param(("headset-check", "--duration", "inf"), "--duration inf", id="a check without end"),
@@ -153,7 +139,6 @@ def test_the_help_lists_every_command(command: str) -> None:
         ),
         pytest.param(("bench", "--motion", "meet"), "needs --work", id="a motion of what times ticks"),
         pytest.param(("bench", "--work", "--ticks", "200"), "--ticks", id="ticks of motions that have a length"),
-        pytest.param(("soak", "--ticks", "0"), "--ticks", id="a soak of nothing"),
     ],
 )
 def test_bad_usage_ends_in_exit_code_2_and_one_line_that_names_it(arguments: tuple[str, ...], named: str) -> None:
@@ -163,12 +148,6 @@ def test_bad_usage_ends_in_exit_code_2_and_one_line_that_names_it(arguments: tup
     assert result.stderr.count("\n") == 1
     assert result.stderr.startswith("q2r2: ")
     assert named in result.stderr
-
-
-def test_a_window_of_a_plant_that_has_none_is_refused() -> None:
-    result = q2r2("run", CELL, "--plant", "kinematic", "--viewer", "--duration", "1")
-    assert result.exit_code == 2
-    assert "--viewer: the kinematic plant has no window" in result.stderr
 
 
 def changed_cell(folder: Path, old: str, new: str) -> str:
@@ -286,12 +265,6 @@ def test_check_shows_for_each_joint_what_gravity_and_a_full_stop_ask_of_it() -> 
     assert 0.0 < joint["gravity"] < joint["stop"] < 1.0
 
 
-def test_check_lists_the_floor_with_the_obstacles(tmp_path: Path) -> None:
-    file = changed_cell(tmp_path, "floor: 0.0 ", "floor: -0.125 ")
-    assert "0 0 -0.125" in q2r2("check", file).stdout
-    assert one_object(q2r2("check", file, "--json").stdout)["floor"] == -0.125
-
-
 @pytest.mark.parametrize("command", ["check", "run", "headset-check"])
 def test_a_wrong_key_ends_in_one_line_that_names_file_key_and_what_is_allowed(tmp_path: Path, command: str) -> None:
     result = q2r2(command, changed_cell(tmp_path, "obstacles:", "obstructions:"))
@@ -324,15 +297,6 @@ def test_a_run_by_torque_repeats_itself_too_and_differs_from_one_by_position() -
     errors = [one_object(run.stdout)["arms"]["left"]["position_error_mm_rms"] for run in runs]
     assert errors[0] == errors[1] != errors[2]
     assert 0.0 < errors[0] < 2.0
-
-
-def test_another_seed_makes_another_run() -> None:
-    arguments = (*FAST, "--duration", "1.6", "--human", "--trajectory", "circle")
-    errors = [
-        one_object(q2r2(*arguments, "--seed", seed).stdout)["arms"]["left"]["position_error_mm_rms"]
-        for seed in ("1", "2")
-    ]
-    assert errors[0] != errors[1]
 
 
 def test_without_json_a_run_ends_with_a_readable_summary() -> None:

@@ -18,10 +18,3 @@ def test_a_line_is_printed_now_and_then_also_where_nobody_watches() -> None:
     assert out.getvalue().splitlines() == [
         f"pairs followed downhill: {done:,} of 10,000" for done in (3_000, 6_000, 9_000)
     ]
-
-
-def test_what_is_quickly_done_prints_nothing() -> None:
-    out = io.StringIO()
-    progress = ProgressLines(Console(file=out), period=3.0, clock=lambda: 2.9)
-    progress("random postures", 1, 1)
-    assert out.getvalue() == ""

@@ -74,12 +74,6 @@ def test_rt_says_in_one_line_what_the_system_refuses_and_runs(monkeypatch: pytes
     assert "real time" not in q2r2(*options).stderr
 
 
-def test_rt_and_simulated_time_exclude_each_other() -> None:
-    result = q2r2(*FAST, "--duration", "0.1", "--rt")
-    assert (result.exit_code, result.stdout) == (2, "")
-    assert result.stderr == "q2r2: --rt and --fast exclude each other, since simulated time is never late\n"
-
-
 CAMERAS = "cameras: {front: {position: [1.9, 0, 1], look_at: [0.4, 0, 0.3], width: 32, height: 32, rate: 50}}"
 
 
