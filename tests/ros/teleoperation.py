@@ -37,6 +37,7 @@ ANCHORED = 0.005  # a tool whose hand rests moves no farther [m]
 # When hands move at 0.3 m/s the fastest joint turns at 0.9: a jump to an old target would be faster [rad/s].
 FAST = 1.7
 AWHILE = 0.5  # in which something would have moved if anything did [s]
+TIMEOUTS = PATIENT | {"teleop.gate.timeout": 1.0}  # less than a node is frozen for
 ENDPOINT = "tcp_endpoint"
 NAMES = ("mujoco_robot", "cartesian_controller", "arm_controllers", ENDPOINT)
 
@@ -67,7 +68,7 @@ class Teleoperation:
         parameters = {
             "mujoco_robot": (f"config:={CONFIG}", f"rate:={RATE}", "max_jump:=1.0"),  # it makes jumps, to be seen
             "cartesian_controller": (f"config:={CONFIG}", f"rate:={RATE}", *cell.PATIENT),
-            "arm_controllers": (f"rate:={RATE}", *(f"{key}:={value}" for key, value in PATIENT.items())),
+            "arm_controllers": (f"rate:={RATE}", *(f"{key}:={value}" for key, value in TIMEOUTS.items())),
             ENDPOINT: (f"port:={self._port}",),
         }
         self._running[name] = process = self._processes.start_node(name, *parameters[name])

@@ -69,7 +69,7 @@ def test_a_frozen_node_stops_both_arms_and_moves_none_when_it_continues(
 ) -> None:
     fault = moving.signal(name, signal.SIGSTOP)
     stop = moving.measure_stop(f"{name} frozen", fault, record_property)
-    time.sleep(max(fault + 3.5 - time.monotonic(), 0.0))
+    time.sleep(max(fault + 2.0 - time.monotonic(), 0.0))
     woken = moving.signal(name, signal.SIGCONT)
     moving.wait_for_diagnosis(woken, FROZEN[name])
     moving.assert_only_a_press_moves(stop)
