@@ -105,6 +105,33 @@ class ReasonKind(StrEnum):
     CONTROLLER_REFUSES = "controller_refuses"
     BAD_JOINT_STATES = "bad_joint_states"
 
+    # What supervision finds.
+    NO_STATES_YET = "no_states_yet"
+    STATES_SILENT = "states_silent"
+    STATE_NOT_FINITE = "state_not_finite"
+    STATE_JUMPED = "state_jumped"
+    JOINT_STATES = "joint_states"  # are not good, for the cause
+    OFF_REFERENCE = "off_reference"
+    TOO_CLOSE = "too_close"
+    LEFT_BEHIND = "left_behind"
+    RUN_ENDED = "run_ended"
+    STOP_SERVICE = "stop_service"
+    ACTIVATED = "activated"
+    HOMING_OUTCOME = "homing_outcome"
+    CONTROLLER_PHASE = "controller_phase"  # in which it follows no targets
+    CONTROLLER_PAUSED = "controller_paused"
+    ARMS_HOMING = "arms_homing"
+    ARMS_BRAKING = "arms_braking"
+    STREAM_BEGINS_AWAY = "stream_begins_away"  # from the tool
+    STREAM_GOES_ON_AWAY = "stream_goes_on_away"
+    PUBLISHER_CHANGED = "publisher_changed"
+    TWO_PUBLISHERS = "two_publishers"
+    TARGETS_CEASED = "targets_ceased"
+    TARGETS_LINKED = "targets_linked"  # hold because those of the other arm do, for the cause
+    TARGET_LATE = "target_late"
+    TARGET_FRAME = "target_frame"
+    TARGET_NOT_A_POSE = "target_not_a_pose"
+
     OTHER = "other"  # a sentence made elsewhere, which nothing decides by
 
 

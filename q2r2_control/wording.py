@@ -10,6 +10,10 @@ from q2r2_control.events import Event, Reason, ReasonKind
 from q2r2_control.types import ActiveLimit, LimitKind
 
 _K = ReasonKind
+_AWAY = (
+    "{distance:.3f} m and {angle:.2f} rad from the tool; to be followed it has to begin anew "
+    "within {engage_distance:g} m and {engage_angle:g} rad"
+)
 # Fields are those of the reason's detail; ``cause`` is the sentence of its cause.
 SENTENCES: dict[ReasonKind, str] = {
     _K.PRESSED: "{control}",
@@ -65,7 +69,7 @@ SENTENCES: dict[ReasonKind, str] = {
     _K.HAND_TOO_FAST: "the hand moved at {speed:.1f} m/s",
     _K.HAND_TURNS_TOO_FAST: "the hand turned at {speed:.0f} rad/s",
     _K.CONNECTION_LOST: "connection lost",
-    _K.LOOP_STALLED: "the control loop stalled for {duration:.3f} s",
+    _K.LOOP_STALLED: "the control loop stood still for {duration:.3f} s",
     _K.NODE_STALLED: "this node stood still for {duration:.2f} s",
     _K.CLOCK_NOT_FINITE: "the clock is not finite",
     _K.CLOCK_WENT_BACK: "the clock went back by {duration:.3f} s",
@@ -90,6 +94,34 @@ SENTENCES: dict[ReasonKind, str] = {
     _K.SEVERAL_PUBLISHERS: "{text}",
     _K.CONTROLLER_REFUSES: "{text}",
     _K.BAD_JOINT_STATES: "{text}",
+    _K.NO_STATES_YET: "no joint states yet{source}",
+    _K.STATES_SILENT: "no joint states{source} for {age:.3f} s; allowed: {timeout:g}",
+    _K.STATE_NOT_FINITE: "measured {quantity} of {joint} = {value}; allowed: finite numbers",
+    _K.STATE_JUMPED: "{joint} jumped by {distance:.3f} rad",
+    _K.JOINT_STATES: "joint states: {cause}",
+    _K.OFF_REFERENCE: "{joint} is {deviation:.3f} rad from its reference for {time:.1f} s; "
+    "allowed: {allowed:g} rad for {allowed_time:g} s",
+    _K.TOO_CLOSE: "measured: {pair} are {distance:.4f} m apart; "
+    "allowed: {allowed:.4f}, {key} {kept:g} less distance_tolerance {tolerance:g}",
+    _K.LEFT_BEHIND: "{arm}: the tool is {distance:.3f} m and {angle:.2f} rad from where it was led; "
+    "begins anew where it is",
+    _K.RUN_ENDED: "the run has ended",
+    _K.STOP_SERVICE: "stopped by ~/stop; ~/reset activates again",
+    _K.ACTIVATED: "active: the reference starts at the measured posture",
+    _K.HOMING_OUTCOME: "homing ended: {cause}",
+    _K.CONTROLLER_PHASE: "the controller is {phase}",
+    _K.CONTROLLER_PAUSED: "the controller is paused",
+    _K.ARMS_HOMING: "the arms are on their way home",
+    _K.ARMS_BRAKING: "the arms are braking",
+    _K.STREAM_BEGINS_AWAY: "the stream begins " + _AWAY,
+    _K.STREAM_GOES_ON_AWAY: "the stream goes on " + _AWAY,
+    _K.PUBLISHER_CHANGED: "another publisher took over{source}; the targets have to begin anew",
+    _K.TWO_PUBLISHERS: "two publishers at a time{source}; allowed: one",
+    _K.TARGETS_CEASED: "{arm}: targets{source} have ceased, the arm holds",
+    _K.TARGETS_LINKED: "{arm}: the arm holds because it is linked to {other}: {cause}",
+    _K.TARGET_LATE: "{late:.2f} s late; its sender or this node stood still",
+    _K.TARGET_FRAME: "frame_id {frame!r}; allowed: {allowed!r}",
+    _K.TARGET_NOT_A_POSE: "not a finite pose with a unit quaternion",
     _K.OTHER: "{text}",
 }
 _LIMITS = {LimitKind.POSITION: "position", LimitKind.VELOCITY: "velocity", LimitKind.ACCELERATION: "acceleration"}

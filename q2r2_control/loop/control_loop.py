@@ -10,13 +10,14 @@ import pinocchio as pin
 
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.drives.base import Drive, DriveReport
+from q2r2_control.events import Reason
 from q2r2_control.loop.geometry_updates import GeometryUpdates
 from q2r2_control.supervision.external_arms import ExternalArms
 from q2r2_control.supervision.grasp_watch import STALL, GraspWatch
 from q2r2_control.supervision.gripper_limiter import REMEMBERED
 from q2r2_control.supervision.joint_watch import WatchSettings
 from q2r2_control.supervision.supervisor import Phase, Supervisor
-from q2r2_control.supervision.target_stream import Origins, Refusal, StreamSettings
+from q2r2_control.supervision.target_stream import Origins, StreamSettings
 from q2r2_control.supervision.tick_pacer import TickPacer
 from q2r2_control.types import Array, Command, Reference, RobotState
 
@@ -32,7 +33,7 @@ class LoopStep:
     grippers: dict[str, float]  # commanded openings, 0 closed .. 1 fully open
     trusted: bool  # whether the command may go by the measured state
     report: DriveReport
-    refusals: dict[str, Refusal] = field(default_factory=dict)  # arm -> why its target is not followed
+    refusals: dict[str, Reason] = field(default_factory=dict)  # arm -> why its target is not followed
 
 
 class ControlLoop:
@@ -91,9 +92,9 @@ class ControlLoop:
         """Time [s] for the reference to move by, ``gap`` [s] after the last tick; see :meth:`TickPacer.step`."""
         return self.pacer.step(gap, self._velocity)
 
-    def observe(self, state: RobotState | str, now: float, passed: float = 0.0) -> None:
+    def observe(self, state: RobotState | Reason, now: float, passed: float = 0.0) -> None:
         """Let supervision see a measured state, or the reason why there is none; see :meth:`JointWatch.take`."""
-        self.supervisor.take_joint_state(state, now, passed)
+        self.supervisor.update_state(state, now, passed)
 
     def activate(self, state: RobotState, now: float) -> None:
         """Start at once at ``state``, at which the arms are known to be at rest. Raises :class:`Q2R2Error`."""
@@ -159,12 +160,12 @@ class ControlLoop:
             self._granted[arm] = wanted[arm], opening
         return commanded
 
-    def _update_targets(self, targets: Mapping[str, pin.SE3 | None], now: float) -> dict[str, Refusal]:
+    def _update_targets(self, targets: Mapping[str, pin.SE3 | None], now: float) -> dict[str, Reason]:
         refusals = {}
         for arm, pose in targets.items():
             if pose is None:
                 self.supervisor.release_target(arm)
-            elif refusal := self.supervisor.take_target(arm, pose, now):
+            elif refusal := self.supervisor.update_target(arm, pose, now):
                 refusals[arm] = refusal
         return refusals
 

@@ -96,7 +96,7 @@ class OperatorSide:
         asked, supervisor = self._teleop.homing, self._supervisor
         if asked and not self._homing:
             if refusal := supervisor.go_home():
-                self._teleop.end_homing(now, Reason(ReasonKind.NOT_HOMING, cause=_in_words(refusal)), arrived=False)
+                self._teleop.end_homing(now, Reason(ReasonKind.NOT_HOMING, cause=refusal), arrived=False)
             else:
                 self._homing = True
         elif self._homing and not asked:
@@ -105,8 +105,4 @@ class OperatorSide:
         elif self._homing and not supervisor.homing.active:
             self._homing = False
             outcome = supervisor.homing.outcome
-            self._teleop.end_homing(now, Reason(ReasonKind.HOMING_ENDED) if outcome is None else _in_words(outcome))
-
-
-def _in_words(text: str) -> Reason:
-    return Reason.of(ReasonKind.OTHER, text=text)
+            self._teleop.end_homing(now, outcome or Reason(ReasonKind.HOMING_ENDED))

@@ -39,6 +39,7 @@ from q2r2_control.supervision.target_stream import StreamSettings
 from q2r2_control.teleop.arm import OPEN
 from q2r2_control.teleop.teleop import Teleop
 from q2r2_control.types import LONGEST_DT, ArmTarget, CommandMode, HandSample, RobotState
+from q2r2_control.wording import sentence
 
 STOPPING = "stopping"  # state of every arm while the run ends
 # Added to the time that full braking takes; an arm that still recovers into its limits is not waited for longer.
@@ -217,7 +218,8 @@ class Pipeline:
             while not (self._clock.after(duration) or self._stopping):
                 self.tick()
                 if self.supervisor.phase is not Phase.ACTIVE:
-                    raise PlantError(self.supervisor.fault or "the arms were stopped")
+                    fault = self.supervisor.fault
+                    raise PlantError("the arms were stopped" if fault is None else sentence(fault))
         except BaseException:
             # The arms come first, whatever failed. What failed may fail again; the first fault tells more.
             with suppress(Exception):
@@ -225,14 +227,14 @@ class Pipeline:
             raise
         self._bring_to_rest()
         if fault := self.supervisor.state_fault:
-            raise PlantError(fault)
+            raise PlantError(sentence(fault))
         return self._recorder.summary(self._clock, self.loop.pacer)
 
     def _bring_to_rest(self) -> None:
         """Tick without input and targets until all stands still; no fault of an input can prevent it."""
         self._following = False
         self._targets = {arm: ArmTarget(None, target.gripper) for arm, target in self._targets.items()}
-        self.supervisor.stop("the run has ended")
+        self.supervisor.stop(Reason(ReasonKind.RUN_ENDED))
         self.supervisor.events.clear()
         try:
             velocity = np.abs(self.tick().reference.v)
@@ -290,9 +292,9 @@ class Pipeline:
         self._grippers = step.grippers
         for refusal in step.refusals.values():
             # Or the operator would think that the arm follows.
-            self.teleop.pause(now, Reason.of(ReasonKind.OTHER, text=refusal.line))
-        for line in self.supervisor.events:
-            _logger.warning(line)
+            self.teleop.pause(now, refusal)
+        for reason in self.supervisor.events:
+            _logger.warning(sentence(reason))
         self.supervisor.events.clear()
         return step
 

@@ -14,8 +14,9 @@ import numpy as np
 import numpy.typing as npt
 
 from q2r2_control.control.tasks.posture import HOLD_GAIN
+from q2r2_control.events import ReasonKind
 from q2r2_control.recording.recorded_ticks import RecordedTick, RecordedTicks
-from q2r2_control.supervision.joint_homing import ARRIVED, JointHoming
+from q2r2_control.supervision.joint_homing import JointHoming
 from q2r2_control.types import LONGEST_DT, Array
 
 _CATCH_UP = 0.3  # [rad/s]
@@ -25,7 +26,7 @@ _ROUNDING = 1e-6  # of a velocity limit
 class RecordedWay:
     """First to the first reference, from rest, then tick by tick along all. Implements :class:`JointWay`."""
 
-    outcome: str | None = None  # a way that others end
+    outcome: ReasonKind | None = None  # a way that others end
 
     def __init__(
         self, ticks: RecordedTicks, names: tuple[str, ...], limit: Array, way_to: Callable[[Array], JointHoming]
@@ -88,10 +89,11 @@ class RecordedWay:
                 return None
             self._approach = self._way_to(first.reference_q)
         at = self._approach.step(q, v, dt)
-        if self._approach.outcome == ARRIVED:
+        if self._approach.outcome is ReasonKind.HOMING_ARRIVED:
             self._accepted = first.reference_q
         elif self._approach.outcome is not None:
-            self.fault = f"the first reference was not reached: {self._approach.outcome}"
+            no_way = self._approach.outcome is ReasonKind.HOMING_NO_WAY
+            self.fault = f"the first reference was not reached: {'no free way was found' if no_way else 'held up'}"
         return at
 
     def _fault_of(self, tick: RecordedTick) -> str | None:

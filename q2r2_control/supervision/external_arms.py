@@ -15,6 +15,7 @@ import pinocchio as pin
 
 from q2r2_control.config.cell import Config
 from q2r2_control.control.controller import CartesianController
+from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.robot.kept_distances import kept_distances
 from q2r2_control.robot.pairs import pair_names
 from q2r2_control.robot.robot import Robot
@@ -82,8 +83,8 @@ class ExternalArms:
                 self._held[arm] = self._controller.tool_pose(arm)
         return {arm: self._held.get(arm, pose) for arm, pose in wanted.items()}
 
-    def left_behind(self, state: RobotState, holding: Iterable[str], now: float) -> str | None:
-        """One line where the tool of a ``holding`` arm has been away from its reference's for too long, else None.
+    def left_behind(self, state: RobotState, holding: Iterable[str], now: float) -> Reason | None:
+        """A reason where the tool of a ``holding`` arm has been away from its reference's for too long, else None.
 
         Nothing moves that arm, and it could not be engaged: a stream has to begin where tool and reference both are.
         """
@@ -95,20 +96,22 @@ class ExternalArms:
             if near or arm not in holding or arm not in self._near_at:
                 self._near_at[arm] = now
             elif now - self._near_at[arm] > self._watch.deviation_time:
-                return (
-                    f"{arm}: the tool is {way:.3f} m and {turn:.2f} rad from where it was led; begins anew where it is"
-                )
+                return Reason.of(ReasonKind.LEFT_BEHIND, arm=arm, distance=way, angle=turn)
         return None
 
-    def too_close(self, state: RobotState) -> str | None:
-        """One line where a measured pair is closer than allowed, else None."""
+    def too_close(self, state: RobotState) -> Reason | None:
+        """A reason where a measured pair is closer than allowed, else None."""
         distances, kept = self._robot.distance_values(state.q), self._controller.kept_distances
         if (distances - kept).min(initial=np.inf) >= -self._settings.tolerance:
             return None
         tightest = int(np.argmin(distances - kept))
         least, tolerance = kept[tightest], self._settings.tolerance
-        names = "|".join(pair_names(self._robot.collision_model)[tightest])
-        return (
-            f"measured: {names} are {distances[tightest]:.4f} m apart; allowed: {least - tolerance:.4f}, "
-            f"{self._keys[tightest]} {least:g} less distance_tolerance {tolerance:g}"
+        return Reason.of(
+            ReasonKind.TOO_CLOSE,
+            pair="|".join(pair_names(self._robot.collision_model)[tightest]),
+            distance=float(distances[tightest]),
+            allowed=float(least - tolerance),
+            key=self._keys[tightest],
+            kept=float(least),
+            tolerance=tolerance,
         )

@@ -7,8 +7,9 @@ from typing import Protocol
 import pinocchio as pin
 
 from q2r2_control.control.controller import CartesianController
+from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.robot.robot import Robot
-from q2r2_control.supervision.joint_homing import ARRIVED, HELD_UP, JointHoming, JointWay
+from q2r2_control.supervision.joint_homing import JointHoming, JointWay
 from q2r2_control.supervision.tool_homing import ToolHoming
 from q2r2_control.types import Array, Reference
 
@@ -17,7 +18,7 @@ class LedWay(Protocol):
     """A way that all arms are led along; the controller follows as its promises allow."""
 
     @property
-    def outcome(self) -> str | None:
+    def outcome(self) -> ReasonKind | None:
         """How it ended, or None while it goes on."""
         ...
 
@@ -38,7 +39,7 @@ class LedJoints:
         self._arms = tuple(controller.robot.arms)
 
     @property
-    def outcome(self) -> str | None:
+    def outcome(self) -> ReasonKind | None:
         """See :attr:`LedWay.outcome`."""
         return self._way.outcome
 
@@ -63,7 +64,7 @@ class Homing:
         self._robot, self._controller, self._tools_only = robot, controller, tools_only
         self._home = {arm: robot.tool_pose(robot.home, arm) for arm in robot.arms}
         self._way: LedWay | None = None
-        self.outcome: str | None = None  # how the last way home ended, where it did by itself
+        self.outcome: Reason | None = None  # how the last way home ended, where it did by itself
 
     @property
     def active(self) -> bool:
@@ -90,17 +91,15 @@ class Homing:
         """See :meth:`LedWay.targets`; no way: nothing is asked for."""
         return dict.fromkeys(self._robot.arms) if self._way is None else self._way.targets(last, dt)
 
-    def check(self, reference: Reference) -> str | None:
+    def check(self, reference: Reference) -> Reason | None:
         """End the way where it has an outcome at the tick's ``reference``; returns that, or None."""
-        outcome = None if self._way is None else self._way.outcome
-        if outcome == HELD_UP:
-            outcome = f"held up by {' | '.join(reference.report.tightest_pair)}"
-        elif outcome == ARRIVED:
-            outcome = "at home"
-        if outcome:
-            self.end()
-            self.outcome = outcome
-        return outcome
+        kind = None if self._way is None else self._way.outcome
+        if kind is None:
+            return None
+        self.end()
+        by = {"by": " | ".join(reference.report.tightest_pair)} if kind is ReasonKind.HOMING_HELD_UP else {}
+        self.outcome = Reason(kind, by)
+        return self.outcome
 
     def end(self) -> None:
         """The arms hold where they come to rest."""
@@ -108,9 +107,9 @@ class Homing:
             self._way.end()
         self._way = None
 
-    def hold(self) -> str | None:
+    def hold(self) -> Reason | None:
         """End the way home as :meth:`end` does. Returns why that is not possible: never, so None."""
         if self.active:
             self.end()
-            self.outcome = "the way home was interrupted"
+            self.outcome = Reason(ReasonKind.HOMING_INTERRUPTED)
         return None

@@ -18,10 +18,10 @@ from typing import Protocol
 
 import numpy as np
 
+from q2r2_control.events import ReasonKind
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 
-ARRIVED, HELD_UP = "arrived", "held up"  # outcomes
 _SPEED = 0.3  # of the fastest joint [rad/s]
 _SLOWED, _WAITED = 0.09, 0.12  # by how much the arms lag behind where the way is slowed, and where it waits [rad]
 _PASSED, _ARRIVED = 0.1, 0.003  # how near the arms come to a way point, and to the goal [rad]
@@ -38,7 +38,7 @@ _INSIDE = 0.02  # of joint limits [rad]
 class JointWay(Protocol):
     """Leads all joints; the controller follows as its promises allow."""
 
-    outcome: str | None  # how it ended
+    outcome: ReasonKind | None  # how it ended
 
     def step(self, q: Array, v: Array, dt: float) -> Array | None:
         """Where the joints shall be (nv,) after another ``dt`` [s], with the reference at ``q`` and ``v`` (nv,).
@@ -62,7 +62,7 @@ class JointHoming:
         self._share = 0.0  # of the leg
         self._least_left = np.inf  # of the way to the next point, of the joint that has the most [rad]
         self._waited = 0.0  # without progress [s]
-        self.outcome: str | None = None  # how it ended
+        self.outcome: ReasonKind | None = None  # how it ended
 
     def step(self, q: Array, v: Array, dt: float) -> Array | None:
         """See :meth:`JointWay.step`."""
@@ -83,7 +83,7 @@ class JointHoming:
         for _ in range(_SAMPLES_A_TICK):
             found = next(search, None)
             if found is None:
-                self.outcome = "no free way was found"
+                self.outcome = ReasonKind.HOMING_NO_WAY
                 return
             if found:
                 self._points = list(found)
@@ -106,9 +106,9 @@ class JointHoming:
             self._points.pop(0)
             self._leg, self._share = goal, 0.0
             self._least_left, self._waited = np.inf, 0.0
-            self.outcome = ARRIVED if last else None
+            self.outcome = ReasonKind.HOMING_ARRIVED if last else None
         elif self._waited > _PATIENCE:
-            self.outcome = HELD_UP
+            self.outcome = ReasonKind.HOMING_HELD_UP
 
     def _ways(self, start: Array) -> Iterator[tuple[Array, ...]]:
         """Samples one way after the other: an empty tuple after each sample, and the way points of one that is free."""

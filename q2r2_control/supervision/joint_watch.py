@@ -13,13 +13,13 @@ from operator import sub
 import numpy as np
 
 from q2r2_control.config.supervision import SupervisionSettings
+from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.types import Array, RobotState
 
 # Above what the joints may move between two states: noise, and stamps that a busy machine spreads.
 _JUMP_ALLOWANCE, _JUMP_TIME = 0.05, 0.02  # [rad], [s]
 # What counts as rest during the time that states have to be good before they are believed [rad].
 _REST = 0.01
-NONE_YET = "no joint states yet"
 
 
 @dataclass(slots=True)
@@ -58,28 +58,26 @@ class JointWatch:
         self._names, self._velocity_limit, self._settings = names, velocity_limit, settings
         self._source = source  # where states come from, as " from /node", or ""
         self.state: RobotState | None = None  # the newest that was good
-        self.fault: str | None = NONE_YET
+        self.fault: Reason | None = Reason.of(ReasonKind.NO_STATES_YET, source="")
         self._q: list[float] = []  # of that state [rad]
         self._still_since, self._still_at = math.inf, self._q
         self._near_at: float | None = None
 
-    def take(self, state: RobotState | str, now: float, passed: float = 0.0) -> None:
-        """Look at a state, or at what is wrong with it.
+    def observe(self, state: RobotState | Reason, now: float, passed: float = 0.0) -> None:
+        """Judge a state, or what is wrong with it.
 
         ``passed`` [s] since the state before, by the clock of a plant that has one of its own: a simulated plant makes
         up for a late tick after it.
         """
-        if isinstance(state, str):
+        if isinstance(state, Reason):
             self._fail(state)
             return
         q, external = state.q.tolist(), state.q if state.tau_external is None else state.tau_external
         # The usual case costs one length; the joint is looked for only where there is something to say.
         known = math.isfinite(math.hypot(*q, *state.v.tolist(), *external.tolist()))
         if not known and (fault := self._unusable(state, external)):
-            allowed = self._settings.unusable_time
-            if now - self._stamp > allowed:
-                bridged = f" for more than {1e3 * allowed:g} ms" if allowed else ""
-                self._fail(f"{fault}{bridged}; allowed: finite numbers")
+            if now - self._stamp > self._settings.unusable_time:
+                self._fail(fault)
             return
         (last, last_q), (self.state, self._q) = (self.state, self._q), (state, q)
         if last is None or self._still_since == math.inf:
@@ -97,17 +95,18 @@ class JointWatch:
         fresh = now - self._stamp <= self._settings.timeout
         return fresh and now - self._still_since >= self._settings.settle_time
 
-    def check(self, now: float) -> str | None:
+    def check(self, now: float) -> Reason | None:
         """What is wrong now, or None."""
         if self.fault is not None:
             return self.fault
         # A clock that was set back would let lost states look fresh for as long.
-        if not -self._settings.timeout <= (age := now - self._stamp) <= self._settings.timeout:
-            self._fail(f"no joint states{self._source()} for {age:.3f} s; allowed: {self._settings.timeout:g}")
+        timeout, age = self._settings.timeout, now - self._stamp
+        if not -timeout <= age <= timeout:
+            self._fail(Reason.of(ReasonKind.STATES_SILENT, age=age, timeout=timeout, source=self._source()))
         return self.fault
 
-    def deviates(self, reference: Array, now: float) -> str | None:
-        """One line where the arms have been too far from ``reference`` for too long, else None."""
+    def deviates(self, reference: Array, now: float) -> Reason | None:
+        """A reason where the arms have been too far from ``reference`` for too long, else None."""
         assert self.state is not None
         allowed = self._settings.deviation
         if self._near_at is None or _all_within(self._q, reference.tolist(), allowed):
@@ -117,9 +116,13 @@ class JointWatch:
         if now - self._near_at <= self._settings.deviation_time:
             return None
         worst = int(deviation.argmax())
-        return (
-            f"{self._names[worst]} is {deviation[worst]:.3f} rad from its reference for {now - self._near_at:.1f} s; "
-            f"allowed: {allowed:g} rad for {self._settings.deviation_time:g} s"
+        return Reason.of(
+            ReasonKind.OFF_REFERENCE,
+            joint=self._names[worst],
+            deviation=float(deviation[worst]),
+            time=now - self._near_at,
+            allowed=allowed,
+            allowed_time=self._settings.deviation_time,
         )
 
     def accept(self) -> None:
@@ -136,15 +139,20 @@ class JointWatch:
     def _stamp(self) -> float:
         return -math.inf if self.state is None else self.state.stamp
 
-    def _unusable(self, state: RobotState, external: Array) -> str | None:
+    def _unusable(self, state: RobotState, external: Array) -> Reason | None:
         for what, values in (("position", state.q), ("velocity", state.v), ("external torque", external)):
             if not np.isfinite(values).all():
                 worst = int(np.flatnonzero(~np.isfinite(values))[0])
-                return f"measured {what} of {self._names[worst]} = {values[worst]}"
+                return Reason.of(
+                    ReasonKind.STATE_NOT_FINITE,
+                    quantity=what,
+                    joint=self._names[worst],
+                    value=str(values[worst]),
+                )
         return None
 
-    def _jump(self, q: list[float], last: list[float], time: float) -> str | None:
-        """What to say of a joint that moved farther than it can in ``time`` [s], else None."""
+    def _jump(self, q: list[float], last: list[float], time: float) -> Reason | None:
+        """The fault of a joint that moved farther than it can in ``time`` [s], else None."""
         if _all_within(q, last, _JUMP_ALLOWANCE):
             return None
         moved = np.abs(np.subtract(q, last))
@@ -152,12 +160,12 @@ class JointWatch:
         if not (moved > reach).any():
             return None
         worst = int((moved - reach).argmax())
-        return f"{self._names[worst]} jumped by {moved[worst]:.3f} rad"
+        return Reason.of(ReasonKind.STATE_JUMPED, joint=self._names[worst], distance=float(moved[worst]))
 
     def _begin(self, q: list[float], now: float) -> None:
         self._still_since, self._still_at = now, q
 
-    def _fail(self, fault: str) -> None:
+    def _fail(self, fault: Reason) -> None:
         self._still_since = math.inf
         # The first fault tells most; before the first good state the newest does.
         if self.fault is None or self.state is None:

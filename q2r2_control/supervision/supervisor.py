@@ -19,12 +19,13 @@ import numpy as np
 import pinocchio as pin
 
 from q2r2_control.control.controller import CartesianController
+from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.robot.robot import Robot
 from q2r2_control.supervision.external_arms import ExternalArms
 from q2r2_control.supervision.homing import Homing
 from q2r2_control.supervision.joint_homing import JointWay
-from q2r2_control.supervision.joint_watch import NONE_YET, JointWatch, WatchSettings
-from q2r2_control.supervision.target_stream import Origins, Refusal, StreamSettings
+from q2r2_control.supervision.joint_watch import JointWatch, WatchSettings
+from q2r2_control.supervision.target_stream import Origins, StreamSettings
 from q2r2_control.supervision.targets import TargetStreams
 from q2r2_control.types import Reference, RobotState
 
@@ -67,21 +68,22 @@ class Supervisor:
         self._targets = TargetStreams(robot.arms, streams, self._origins)
         self._watch = JointWatch(robot.joint_names, robot.velocity_limit, watch, self._origins.joint_states)
         self.homing = Homing(robot, controller, tools_only=external is not None)
-        self._stopped: str | None = None  # why it takes a reset
+        self._stopped: Reason | None = None  # why it takes a reset
         self._last: Reference | None = None
         self.phase = Phase.INACTIVE
         self.paused = False
-        self.events: list[str] = []  # what happened, for the log; its writer clears them
+        self.events: list[Reason] = []  # for the log; its writer clears them
 
     @property
-    def fault(self) -> str | None:
+    def fault(self) -> Reason | None:
         """Why nothing is commanded, or why the arms brake."""
-        if self._stopped is None and self._watch.fault == NONE_YET:
-            return NONE_YET + self._origins.joint_states()
-        return self._stopped or self._watch.fault
+        fault = self._stopped or self._watch.fault
+        if fault is not None and fault.kind is ReasonKind.NO_STATES_YET:
+            return Reason.of(fault.kind, source=self._origins.joint_states())
+        return fault
 
     @property
-    def state_fault(self) -> str | None:
+    def state_fault(self) -> Reason | None:
         """Why the newest measured state cannot be believed, or None."""
         return self._watch.fault
 
@@ -107,25 +109,26 @@ class Supervisor:
         return self._targets.age(arm, now)
 
     @property
-    def ended_targets(self) -> list[str]:
-        """A line for each arm that holds since its targets ended."""
+    def ended_targets(self) -> list[Reason]:
+        """One for each arm that holds since its targets ended."""
         return list(self._targets.ended.values())
 
-    def take_joint_state(self, state: RobotState | str, now: float, passed: float = 0.0) -> None:
-        """A joint state, or what is wrong with it; ``passed`` [s]: see :meth:`JointWatch.take`."""
+    def update_state(self, state: RobotState | Reason, now: float, passed: float = 0.0) -> None:
+        """A joint state, or what is wrong with it; ``passed`` [s]: see :meth:`JointWatch.observe`."""
         before = self._watch.fault
-        self._watch.take(state, now, passed)
-        if self.phase is Phase.INACTIVE and self._watch.fault not in (None, before):
-            self.events.append(f"joint states: {self._watch.fault}")
+        self._watch.observe(state, now, passed)
+        fault = self._watch.fault
+        if self.phase is Phase.INACTIVE and fault is not None and fault != before:
+            self.events.append(Reason(ReasonKind.JOINT_STATES, cause=fault))
 
-    def take_target(
+    def update_target(
         self,
         arm: str,
         pose: pin.SE3 | None,
         now: float,
         number: int | None = None,
         due: float | None = None,
-    ) -> Refusal | None:
+    ) -> Reason | None:
         """A target in the world frame, or None for one that was no pose; returns why it is not followed, or None.
 
         ``number`` is the one among its publisher's messages, where the middleware tells; ``due``: when the
@@ -139,20 +142,20 @@ class Supervisor:
             tools.append(self._controller.tool_pose(arm))
             if self._external is None and self._watch.state is not None:
                 tools.append(self._robot.tool_pose(self._watch.state.q, arm))
-        return self._targets.take(arm, pose, tools, now, number, self.no_targets, due)
+        return self._targets.offer(arm, pose, tools, now, number, self.no_targets, due)
 
     def release_target(self, arm: str) -> None:
         """The sender of an arm's targets ended them: the arm holds, and the next target begins a stream."""
         self._targets.release(arm)
 
     @property
-    def no_targets(self) -> str | None:
+    def no_targets(self) -> Reason | None:
         """Why no arm may follow targets now, or None."""
         if self.phase is not Phase.ACTIVE:
-            return f"the controller is {self.phase}"
+            return Reason.of(ReasonKind.CONTROLLER_PHASE, phase=str(self.phase))
         if self.paused:
-            return "the controller is paused"
-        return "the arms are on their way home" if self.homing.active else None
+            return Reason(ReasonKind.CONTROLLER_PAUSED)
+        return Reason(ReasonKind.ARMS_HOMING) if self.homing.active else None
 
     def tick(self, now: float, dt: float) -> Reference | None:
         """Move on by ``dt`` [s]; the reference to be commanded, or None."""
@@ -165,13 +168,13 @@ class Supervisor:
         if self.phase is Phase.STOPPED:
             return None
         if self.phase is Phase.ACTIVE and fault is not None:
-            self._brake(f"joint states: {fault}")
+            self._brake(Reason(ReasonKind.JOINT_STATES, cause=fault))
         reference = self._step(self._wanted(now, dt), dt)
         self._last = reference
         if self.phase is Phase.ACTIVE:
             self._compare(reference, now)
             if outcome := self.homing.check(reference):
-                self.events.append(f"homing ended: {outcome}")
+                self.events.append(Reason(ReasonKind.HOMING_OUTCOME, cause=outcome))
         elif float(np.abs(reference.v).max()) <= _REST:
             self.phase = Phase.INACTIVE if self._stopped is None else Phase.STOPPED
         return reference
@@ -214,8 +217,8 @@ class Supervisor:
         """
         if self.phase not in (Phase.ACTIVE, Phase.BRAKING):
             return
-        fault = f"the control loop stood still for {duration:.2f} s"
-        self._watch.take(fault, now)
+        fault = Reason.of(ReasonKind.LOOP_STALLED, duration=duration)
+        self._watch.observe(fault, now)
         self._brake(fault)
         self.phase = Phase.INACTIVE if self._stopped is None else Phase.STOPPED
 
@@ -229,7 +232,7 @@ class Supervisor:
             return False  # none is, as in most ticks, which this tells in a third of the time
         return bool(((np.abs(state.q - self._last.q) > _OFF_REFERENCE) & (np.abs(state.v) < _STILL)).any())
 
-    def let_go(self, fault: str, now: float) -> None:
+    def let_go(self, fault: Reason, now: float) -> None:
         """Nothing takes the commands, or something else than before, and the reference may have gone on meanwhile.
 
         Then nothing more is commanded, not even the way to rest, which would be a jump to the new receiver.
@@ -238,23 +241,23 @@ class Supervisor:
             self.start_over(fault, now)
             self.phase = Phase.INACTIVE
 
-    def start_over(self, fault: str, now: float) -> None:
+    def start_over(self, fault: Reason, now: float) -> None:
         """The arms do not go where the reference goes: brake, and be activated anew where the arms are then."""
         if self.phase is Phase.ACTIVE:
-            self._watch.take(fault, now)
+            self._watch.observe(fault, now)
             self._brake(fault)
 
-    def stop(self, why: str) -> None:
+    def stop(self, why: Reason) -> None:
         """Brake, and command nothing until :meth:`reset`."""
         self._stopped = why
         self._brake(why)
         if self.phase is Phase.INACTIVE:
             self.phase = Phase.STOPPED
 
-    def reset(self) -> str | None:
+    def reset(self) -> Reason | None:
         """Forget faults, stop, pause and all targets. Returns why that is not possible now, or None."""
         if self.phase is Phase.BRAKING:
-            return "the arms are braking"
+            return Reason(ReasonKind.ARMS_BRAKING)
         self._stopped, self.paused = None, False
         self._targets.reset()
         self.homing.end()
@@ -262,10 +265,12 @@ class Supervisor:
             self.phase = Phase.INACTIVE
         return None
 
-    def go_home(self) -> str | None:
+    def go_home(self) -> Reason | None:
         """Begin the way home. Returns why that is not possible now, or None."""
-        if self.phase is not Phase.ACTIVE or self.paused:
-            return "the controller is paused" if self.paused else f"the controller is {self.phase}"
+        if self.paused:
+            return Reason(ReasonKind.CONTROLLER_PAUSED)
+        if self.phase is not Phase.ACTIVE:
+            return Reason.of(ReasonKind.CONTROLLER_PHASE, phase=str(self.phase))
         self._forget_targets()
         self.homing.begin()
         return None
@@ -292,9 +297,9 @@ class Supervisor:
         self._watch.accept()
         self._last = None
         self.phase = Phase.ACTIVE
-        self.events.append("active: the reference starts at the measured posture")
+        self.events.append(Reason(ReasonKind.ACTIVATED))
 
-    def _brake(self, why: str) -> None:
+    def _brake(self, why: Reason) -> None:
         self._forget_targets()
         self.events.append(why)
         if self.phase is Phase.ACTIVE:

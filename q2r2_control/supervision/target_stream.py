@@ -12,11 +12,11 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import pinocchio as pin
 
 from q2r2_control.config.timeouts import STREAM_TIMEOUT
+from q2r2_control.events import Reason, ReasonKind
 
 # A jump that no hand makes between two messages: a new stream begins [m], [rad].
 _JUMP, _TURN = 0.05, 0.25
@@ -38,13 +38,6 @@ class Origins:
 
     joint_states: Callable[[], str] = lambda: ""
     targets: Callable[[str], str] = lambda arm: ""
-
-
-class Refusal(NamedTuple):
-    """Why a target is not followed."""
-
-    kind: str
-    line: str
 
 
 class TargetStream:
@@ -87,8 +80,8 @@ class TargetStream:
         """Whether the last target came within the timeout."""
         return now - self.stamp <= self._settings.timeout
 
-    def offer(self, pose: pin.SE3, tools: Sequence[pin.SE3], now: float) -> str | None:
-        """Take a target; returns why it is not followed, or None.
+    def offer(self, pose: pin.SE3, tools: Sequence[pin.SE3], now: float) -> Reason | None:
+        """Offer a target; returns why it is not followed, or None.
 
         ``tools`` are the poses that count as the tool's: the reference's, and the measured one where it is known. An
         arm that was pushed away from its reference is engaged where it is. An arm that follows a stream needs none.
@@ -106,10 +99,12 @@ class TargetStream:
         if begins and near:
             self.pose = pose
             return None
-        began = "begins" if begins else "goes on"
-        return (
-            f"the stream {began} {distance:.3f} m and {angle:.2f} rad from the tool; to be followed it has to begin "
-            f"anew within {self._settings.engage_distance:g} m and {self._settings.engage_angle:g} rad"
+        return Reason.of(
+            ReasonKind.STREAM_BEGINS_AWAY if begins else ReasonKind.STREAM_GOES_ON_AWAY,
+            distance=distance,
+            angle=angle,
+            engage_distance=self._settings.engage_distance,
+            engage_angle=self._settings.engage_angle,
         )
 
 

@@ -6,9 +6,10 @@ from collections.abc import Iterable, Sequence
 
 import pinocchio as pin
 
+from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.supervision.sequence_watch import SequenceWatch
 from q2r2_control.supervision.target_extrapolator import TargetExtrapolator
-from q2r2_control.supervision.target_stream import Origins, Refusal, StreamSettings, TargetStream
+from q2r2_control.supervision.target_stream import Origins, StreamSettings, TargetStream
 
 
 class TargetStreams:
@@ -24,8 +25,8 @@ class TargetStreams:
         self._streams = {arm: TargetStream(settings) for arm in arms}
         self._lines = {arm: TargetExtrapolator() for arm in self._streams}
         self._sequences = {arm: SequenceWatch() for arm in self._streams}
-        self.ended: dict[str, str] = {}  # arms that hold since their targets ended, with a line that says so
-        self._lines_to_report: list[str] = []
+        self.ended: dict[str, Reason] = {}  # arms that hold since their targets ended
+        self._newly_ended: list[Reason] = []
 
     def at(self, now: float) -> dict[str, pin.SE3 | None]:
         """What each arm follows at ``now`` [s], see :mod:`target_line`; None: it holds."""
@@ -49,7 +50,7 @@ class TargetStreams:
     def go_on(self, arm: str, pose: pin.SE3, now: float, due: float | None = None) -> bool:
         """Take the next target of a stream that an arm follows. Returns False and changes nothing if it follows none.
 
-        What :meth:`take` does at most ticks, where nothing forbids it and its message has no number.
+        What :meth:`offer` does at most ticks, where nothing forbids it and its message has no number.
         """
         if not self._streams[arm].goes_on(pose, now):
             return False
@@ -60,17 +61,17 @@ class TargetStreams:
         """Time since the last target of an arm that was a pose [s]."""
         return now - self._streams[arm].stamp
 
-    def take(
+    def offer(
         self,
         arm: str,
         pose: pin.SE3 | None,
         tools: Sequence[pin.SE3],
         now: float,
         number: int | None,
-        forbidden: str | None,
+        forbidden: Reason | None,
         due: float | None = None,
-    ) -> Refusal | None:
-        """Take a target, None for one that was no pose; returns why it is not followed, or None.
+    ) -> Reason | None:
+        """Offer a target, None for one that was no pose; returns why it is not followed, or None.
 
         ``tools``: see :meth:`TargetStream.offer`; ``number``: of the message at its publisher, None where that is not
         known; ``forbidden``: why no arm may follow targets now, or None; ``due``: see :meth:`TargetExtrapolator.put`.
@@ -82,19 +83,18 @@ class TargetStreams:
         refusal = None if pose is None else stream.offer(pose, tools, now)
         if others is not None:
             if stream.following:
-                self._hold_linked(arm, "are from two publishers")
+                self._hold_linked(arm, others)
             stream.drop()
             return others
         if pose is None:
             return None
         if forbidden is not None:
             stream.drop()
-            return Refusal("stream", forbidden)
+            return forbidden
         if refusal is None:
             self._lines[arm].put(pose, due)
             self.ended.pop(arm, None)
-            return None
-        return Refusal("stream", refusal)
+        return refusal
 
     def release(self, arm: str) -> None:
         """The sender ended the arm's stream: it holds, and the next target begins a stream."""
@@ -111,36 +111,36 @@ class TargetStreams:
         for stream in self._streams.values():
             stream.reset()
 
-    def expire(self, now: float) -> list[str]:
-        """A line for each arm that followed its targets and holds since the last call because targets ceased."""
+    def expire(self, now: float) -> list[Reason]:
+        """One for each arm that followed its targets and holds since the last call because targets ceased."""
         for arm in self._streams:
             self._expire(arm, now)
-        lines, self._lines_to_report = self._lines_to_report, []
-        return lines
+        ended, self._newly_ended = self._newly_ended, []
+        return ended
 
     def _expire(self, arm: str, now: float) -> None:
         """End the arm's stream if it has run dry."""
         if self._streams[arm].expire(now):
-            self._record_end(arm, f"{arm}: targets{self._origins.targets(arm)} have ceased, the arm holds")
-            self._hold_linked(arm, "have ceased")
+            self._record_end(arm, self._reason(ReasonKind.TARGETS_CEASED, arm))
+            self._hold_linked(arm, self.ended[arm])
 
-    def _hold_linked(self, ended: str, why: str) -> None:
+    def _hold_linked(self, ended: str, why: Reason) -> None:
         """The arms that follow targets hold as well: one operator moves all, and does not expect one to go on alone."""
         for arm, stream in self._streams.items():
             if self._settings.linked and arm != ended and stream.following:
                 stream.drop()
-                self._record_end(arm, f"{arm}: the arm holds because it is linked to {ended}, whose targets {why}")
+                self._record_end(arm, Reason.of(ReasonKind.TARGETS_LINKED, cause=why, arm=arm, other=ended))
 
-    def _record_end(self, arm: str, line: str) -> None:
-        self.ended[arm] = line
-        self._lines_to_report.append(line)
+    def _record_end(self, arm: str, reason: Reason) -> None:
+        self.ended[arm] = reason
+        self._newly_ended.append(reason)
 
-    def _other_publishers(self, arm: str, number: int, now: float) -> Refusal | None:
+    def _other_publishers(self, arm: str, number: int, now: float) -> Reason | None:
         """Says so where an arm's targets came from more than one publisher lately."""
         breaks = self._sequences[arm].take(number, now, self._settings.timeout)
         if breaks == 0:
             return None
-        if breaks == 1:
-            line = f"another publisher took over{self._origins.targets(arm)}; the targets have to begin anew"
-            return Refusal("took over", line)
-        return Refusal("publishers", f"two publishers at a time{self._origins.targets(arm)}; allowed: one")
+        return self._reason(ReasonKind.PUBLISHER_CHANGED if breaks == 1 else ReasonKind.TWO_PUBLISHERS, arm)
+
+    def _reason(self, kind: ReasonKind, arm: str) -> Reason:
+        return Reason.of(kind, arm=arm, source=self._origins.targets(arm))

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 import pinocchio as pin
 
-from q2r2_control.supervision.joint_homing import ARRIVED
+from q2r2_control.events import ReasonKind
 from q2r2_control.types import Reference
 
 _LINEAR_SPEED, _ANGULAR_SPEED = 0.1, 0.3  # [m/s], [rad/s]
@@ -38,7 +38,7 @@ class ToolHoming:
         return {arm: _between(start, self._home[arm], share) for arm, start in self._start.items()}
 
     @property
-    def outcome(self) -> str | None:
+    def outcome(self) -> ReasonKind | None:
         """How the homing ended, or None while it goes on."""
         if self._time < self._duration:
             return None
@@ -48,8 +48,8 @@ class ToolHoming:
             if np.linalg.norm(error.translation) > _ARRIVED or np.linalg.norm(pin.log3(error.rotation)) > _TURNED:
                 far.append(arm)
         if not far:
-            return ARRIVED
-        return f"held up: {', '.join(far)}" if self._time > self._duration + _PATIENCE else None
+            return ReasonKind.HOMING_ARRIVED
+        return ReasonKind.HOMING_HELD_UP if self._time > self._duration + _PATIENCE else None
 
     def end(self) -> None:
         """Nothing was set in the controller that would last."""

@@ -18,8 +18,9 @@ from rich.text import Text
 
 # A terminal that its user has stopped takes nothing more, and must not keep a run from ending [s].
 _PATIENCE = 2.0
-# Drawing takes milliseconds of Python at a time. The loop gets the interpreter back within this time [s].
-_SWITCH_INTERVAL = 2e-4
+# Drawing takes milliseconds of Python at a time. The loop gets the interpreter back within this time, as it has to
+# after each kernel of a tick [s].
+_SWITCH_INTERVAL = 2e-5
 
 
 @contextmanager

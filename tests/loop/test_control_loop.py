@@ -8,6 +8,7 @@ import pytest
 
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.drives.factory import make_drive
+from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.loop.control_loop import ControlLoop, LoopStep, without_proof
 from q2r2_control.robot.robot import Robot
 from q2r2_control.supervision.joint_watch import watch_settings
@@ -48,7 +49,7 @@ def test_arms_of_another_program_are_commanded_once_they_were_seen_at_rest_and_n
     while arms.loop.supervisor.phase is not Phase.ACTIVE:
         assert arms.tick().command is None
     assert arms.tick().command is not None
-    arms.loop.supervisor.stop("enough")
+    arms.loop.supervisor.stop(Reason(ReasonKind.STOP_SERVICE))
     for _ in range(10):
         step = arms.tick()
     assert arms.loop.supervisor.arm_state("left") == "stopped"
@@ -58,7 +59,7 @@ def test_arms_of_another_program_are_commanded_once_they_were_seen_at_rest_and_n
 def test_a_plant_of_its_own_is_commanded_on_while_the_arms_are_stopped() -> None:
     arms = Arms(owns_plant=True)
     arms.loop.activate(arms.state, arms.now)
-    arms.loop.supervisor.stop("enough")
+    arms.loop.supervisor.stop(Reason(ReasonKind.STOP_SERVICE))
     for _ in range(10):
         step = arms.tick()
     assert arms.loop.supervisor.phase is Phase.STOPPED

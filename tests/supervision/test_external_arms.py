@@ -13,11 +13,13 @@ from q2r2_control import CartesianController, Robot, load_config
 from q2r2_control.config.cell import Config
 from q2r2_control.config.resources import find_resource
 from q2r2_control.config.supervision import SupervisionSettings
+from q2r2_control.events import ReasonKind
 from q2r2_control.supervision.external_arms import ExternalArms, ExternalSettings, settings_for_external_arms
 from q2r2_control.supervision.joint_watch import watch_settings
 from q2r2_control.supervision.supervisor import Phase, Supervisor
 from q2r2_control.supervision.target_stream import StreamSettings
 from q2r2_control.types import Array, Reference, RobotState
+from tests.support.reasons import kinds
 
 NO_CLOCK = {"solve_time_limit": None}  # whether a solution is late depends on the machine
 
@@ -81,7 +83,7 @@ class World:
         zero, reference = np.zeros_like(self.robot.home), None
         for q in postures:
             self.now += DT
-            self.supervisor.take_joint_state(RobotState(q, zero, zero, None, self.now), self.now)
+            self.supervisor.update_state(RobotState(q, zero, zero, None, self.now), self.now)
             reference = self.supervisor.tick(self.now, DT)
         return reference
 
@@ -110,11 +112,11 @@ def test_measured_arms_that_come_too_close_stop_the_reference_and_are_named(worl
     world.show(postures + postures[-1:] * round(0.5 / DT))
     assert world.supervisor.phase is Phase.STOPPED
     (event,) = world.supervisor.events
-    pair, distance = event.split(" are ")
-    assert pair.startswith("measured: left_link_")
-    assert pair.endswith("|post_0")
+    assert event.kind is ReasonKind.TOO_CLOSE
+    assert event.detail["pair"].startswith("left_link_")
+    assert event.detail["pair"].endswith("|post_0")
     # The first state that is too close counts: the next one is nearer by no more than the elbow moves meanwhile.
-    assert MIN_DISTANCE - TOLERANCE - 1e-3 < float(distance.split(" m")[0]) <= MIN_DISTANCE - TOLERANCE
+    assert MIN_DISTANCE - TOLERANCE - 1e-3 < event.detail["distance"] <= MIN_DISTANCE - TOLERANCE
 
 
 def test_a_tool_that_is_not_where_its_reference_is_starts_over(world: World) -> None:
@@ -124,7 +126,7 @@ def test_a_tool_that_is_not_where_its_reference_is_starts_over(world: World) -> 
     world.show(steps + [moved] * round(0.4 / DT))
     assert world.supervisor.events == []
     world.show([moved] * round(0.4 / DT))
-    assert "left: the tool is 0.0" in world.supervisor.events[0]
+    assert kinds(world.supervisor.events[0]) == "left_behind"
     world.show([moved] * 50)
     assert world.supervisor.phase is Phase.ACTIVE
     tool = world.robot.tool_pose(moved, "left").translation
@@ -144,10 +146,10 @@ def test_the_way_home_leads_the_tools_until_they_are_there_and_takes_no_targets(
         q = reference.q  # the other controller follows at once
         if not world.supervisor.homing.active:
             break
-        refusal = world.supervisor.take_target("left", world.controller.tool_pose("left"), world.now)
+        refusal = world.supervisor.update_target("left", world.controller.tool_pose("left"), world.now)
         assert refusal is not None
-    assert world.supervisor.events == ["homing ended: at home"]
-    assert world.supervisor.homing.outcome == "at home"
+    assert list(map(kinds, world.supervisor.events)) == ["homing_outcome: homing_arrived"]
+    assert kinds(world.supervisor.homing.outcome) == "homing_arrived"
     for arm in world.robot.arms:
         home, tool = (world.robot.tool_pose(posture, arm).translation for posture in (world.robot.home, q))
         assert np.linalg.norm(tool - home) < 3e-3

@@ -7,6 +7,7 @@ import pytest
 
 from q2r2_control import CartesianController, Robot, load_config
 from q2r2_control.config.supervision import SupervisionSettings
+from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.robot.kept_distances import kept_distances
 from q2r2_control.supervision.joint_homing import JointHoming
 from q2r2_control.supervision.joint_watch import watch_settings
@@ -14,6 +15,7 @@ from q2r2_control.supervision.supervisor import Supervisor
 from q2r2_control.supervision.target_stream import StreamSettings
 from q2r2_control.types import Array, Reference, RobotState
 from q2r2_control.verification.contract import Contract
+from tests.support.reasons import kinds
 
 NO_CLOCK = {"solve_time_limit": None}  # whether a solution is late depends on the machine
 
@@ -49,7 +51,7 @@ class World:
 
     def tick(self) -> Reference:
         self.now += DT
-        self.supervisor.take_joint_state(self.state, self.now)
+        self.supervisor.update_state(self.state, self.now)
         reference = self.supervisor.tick(self.now, DT)
         assert reference is not None
         if self.contract is not None:
@@ -69,7 +71,8 @@ class World:
         assert self.supervisor.go_home() is None
         while self.now < LONGEST and self.supervisor.homing.active:
             self.tick()
-        return next((line for line in self.supervisor.events if line.startswith("homing ended")), "it goes on")
+        ended = [event for event in self.supervisor.events if event.kind is ReasonKind.HOMING_OUTCOME]
+        return kinds(ended[0].cause) if ended else "it goes on"
 
 
 def postures(robot: Robot, controller: CartesianController, count: int, seed: int) -> list[Array]:
@@ -93,10 +96,10 @@ def test_from_fifty_random_postures_all_joints_come_home_from_all_but_two_at_mos
     for q in postures(robot, controller, POSTURES, seed=0):
         world = World(robot, controller, q)
         ends.append(world.go_home())
-        if ends[-1] == "homing ended: at home":
+        if ends[-1] == "homing_arrived":
             assert np.abs(world.state.q - robot.home).max() < 0.004
         assert world.fastest < 0.45
-    assert ends.count("homing ended: at home") >= REACHED, ends
+    assert ends.count("homing_arrived") >= REACHED, ends
 
 
 def test_the_contract_holds_at_every_tick_of_the_way(robot: Robot, controller: CartesianController) -> None:
@@ -112,10 +115,10 @@ def test_a_motion_is_braked_before_the_way_home_begins_and_the_arms_stay_there(
     for step in range(100):
         raised = tool.copy()
         raised.translation += np.array([0.0, 0.0, 0.3 * DT * step])
-        world.supervisor.take_target("left", raised, world.now)
+        world.supervisor.update_target("left", raised, world.now)
         world.tick()
     assert world.fastest > 0.3
-    assert world.go_home() == "homing ended: at home"
+    assert world.go_home() == "homing_arrived"
     world.run(1.0)
     assert np.abs(world.state.q - robot.home).max() < 0.01
     assert np.abs(world.state.v).max() < 1e-3
@@ -134,7 +137,7 @@ def test_it_can_be_interrupted_and_the_arms_come_to_rest_where_they_are(
     if how == "pause":
         world.supervisor.pause(True)
     elif how == "stop":
-        world.supervisor.stop("as asked")
+        world.supervisor.stop(Reason(ReasonKind.STOP_SERVICE))
     else:
         world.supervisor.reset()
     for _ in range(round(1.5 / DT)):
@@ -170,7 +173,7 @@ def test_while_no_way_is_known_the_arms_stand_still_and_a_tick_looks_at_two_samp
         assert np.array_equal(at, q)
         assert counting.asked - before <= 3  # with the room where the way begins, once
         ticks += 1
-    assert homing.outcome == "no free way was found"
+    assert homing.outcome is ReasonKind.HOMING_NO_WAY
     assert ticks > 100
 
 
@@ -186,7 +189,7 @@ def test_an_arm_that_is_held_up_is_waited_for_and_then_it_says_so(robot: Robot) 
         farthest = max(farthest, float(np.abs(at - q).max()))
         if homing.outcome is not None:
             break
-    assert homing.outcome == "held up"
+    assert homing.outcome is ReasonKind.HOMING_HELD_UP
     assert 0.05 < farthest < 0.13  # or it would set off fast when it is free again
 
 

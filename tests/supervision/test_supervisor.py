@@ -8,10 +8,12 @@ import pytest
 
 from q2r2_control import CartesianController, Robot, load_config
 from q2r2_control.config.supervision import SupervisionSettings
+from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.supervision.joint_watch import watch_settings
 from q2r2_control.supervision.supervisor import Phase, Supervisor
 from q2r2_control.supervision.target_stream import StreamSettings, TargetStream
 from q2r2_control.types import Array, RobotState
+from tests.support.reasons import kinds
 
 NO_CLOCK = {"solve_time_limit": None}  # whether a solution is late depends on the machine
 
@@ -55,11 +57,11 @@ class World:
         for _ in range(round(seconds / DT)):
             self.now += DT
             if sees:
-                self.supervisor.take_joint_state(RobotState(self.q, self.v, zero, None, self.now), self.now)
+                self.supervisor.update_state(RobotState(self.q, self.v, zero, None, self.now), self.now)
             if target is not None:
-                self.supervisor.take_target("left", target, self.now)
+                self.supervisor.update_target("left", target, self.now)
             if right is not None:
-                self.supervisor.take_target("right", right, self.now)
+                self.supervisor.update_target("right", right, self.now)
             reference = self.supervisor.tick(self.now, DT)
             self.commanded.append(None if reference is None else reference.q)
             self.v = zero if reference is None or self.blocked else (reference.q - self.q) / self.lag
@@ -103,7 +105,7 @@ def test_where_the_targets_of_one_linked_arm_cease_both_hold_until_a_stream_of_e
     _, right = engage_both(world, controller)
     world.run(0.3, right=raised(right, 0.01))
     assert not world.supervisor.follows("right")
-    assert ["ceased" in line for line in world.supervisor.ended_targets] == [True, True]
+    assert [reason.root.kind for reason in world.supervisor.ended_targets] == ["targets_ceased"] * 2
     rest = controller.tool_pose("right")
     world.run(1.0, right=raised(right, 0.02))  # the stream that goes on
     assert np.allclose(controller.tool_pose("right").translation, rest.translation, atol=1e-6)
@@ -119,15 +121,15 @@ def test_a_target_that_comes_just_after_the_timeout_does_not_hide_that_targets_c
     left, right = engage_both(world, controller)
     for _ in range(3):
         world.now += 0.07
-        world.supervisor.take_target("right", right, world.now)
-    world.supervisor.take_target("left", left, world.now)
+        world.supervisor.update_target("right", right, world.now)
+    world.supervisor.update_target("left", left, world.now)
     assert [world.supervisor.follows(arm) for arm in ("left", "right")] == [True, False]
 
 
 def test_two_publishers_of_one_linked_arm_hold_both(world: World, controller: CartesianController) -> None:
     left, _ = engage_both(world, controller)
     for number in (100, 5):
-        world.supervisor.take_target("left", left, world.now, number)
+        world.supervisor.update_target("left", left, world.now, number)
     assert [world.supervisor.follows(arm) for arm in ("left", "right")] == [False, False]
 
 
@@ -157,7 +159,7 @@ def test_a_loop_that_stood_still_commands_nothing_of_the_past_and_follows_no_tar
     waited = controller.tool_pose("left")
     world.now += 1.0
     world.supervisor.stalled(1.0, world.now)
-    assert world.supervisor.fault == "the control loop stood still for 1.00 s"
+    assert world.supervisor.fault == Reason.of(ReasonKind.LOOP_STALLED, duration=1.0)
     world.run(0.05, raised(waited, 0.01))
     assert world.commanded[before:] == [None] * (len(world.commanded) - before)
     world.run(1.0, raised(waited, 0.01))
@@ -183,9 +185,8 @@ def test_lost_joint_states_brake_the_arms_and_their_return_moves_nothing(
     assert world.is_in(Phase.ACTIVE)
     assert not world.faults()
     assert np.allclose(world.q, rest, atol=1e-9)
-    assert [event for event in world.supervisor.events if "no joint states for" in event] == world.supervisor.events[
-        1:2
-    ]
+    assert [kinds(event) for event in world.supervisor.events].count("joint_states: states_silent") == 1
+    assert kinds(world.supervisor.events[1]) == "joint_states: states_silent"
 
 
 def test_arms_that_do_not_follow_their_reference_are_stopped_until_a_reset(
@@ -197,7 +198,7 @@ def test_arms_that_do_not_follow_their_reference_are_stopped_until_a_reset(
     world.blocked = True
     world.run(2.0, raised(tool, 0.2))
     assert world.is_in(Phase.STOPPED)
-    assert "from its reference" in str(world.supervisor.fault)
+    assert kinds(world.supervisor.fault) == "off_reference"
     world.run(1.0)
     assert world.is_in(Phase.STOPPED)
     assert world.supervisor.reset() is None
@@ -215,7 +216,7 @@ def test_homing_ends_at_home_and_takes_no_targets(world: World, robot: Robot, co
     world.run(1.0, raised(tool, 0.1))
     assert world.supervisor.go_home() is None
     world.run(4.0, raised(tool, 0.1))
-    assert "homing ended: at home" in world.supervisor.events
+    assert "homing_outcome: homing_arrived" in map(kinds, world.supervisor.events)
     assert np.linalg.norm(controller.tool_pose("left").translation - tool.translation) < 3e-3
     assert world.supervisor.arm_state("left") == "holding"
 
@@ -236,7 +237,10 @@ def test_a_stream_that_was_followed_goes_on_anywhere_and_after_a_silence_only_fr
     assert stream.offer(raised(TOOL, 0.2), [], 0.1) is None
     assert stream.pose is not None
     assert stream.pose.translation[2] == TOOL.translation[2] + 0.2
-    assert "begins 0.200 m" in (stream.offer(raised(TOOL, 0.2), [TOOL], 0.5) or "")
+    refusal = stream.offer(raised(TOOL, 0.2), [TOOL], 0.5)
+    assert kinds(refusal) == "stream_begins_away"
+    assert refusal is not None
+    assert refusal.detail["distance"] == pytest.approx(0.2)
     assert not stream.following
 
 
@@ -246,9 +250,8 @@ def test_targets_are_followed_no_longer_than_nothing_forbids_it(world: World, co
     world.run(0.1, tool)
     assert world.supervisor.follows("left")
     world.supervisor.paused = True
-    refusal = world.supervisor.take_target("left", tool, world.now)
-    assert refusal is not None
-    assert refusal.line == "the controller is paused"
+    refusal = world.supervisor.update_target("left", tool, world.now)
+    assert kinds(refusal) == "controller_paused"
     assert not world.supervisor.follows("left")
 
 
@@ -290,7 +293,7 @@ def test_arms_that_nothing_moves_are_noticed_and_a_new_receiver_gets_no_command_
     assert last is not None
     assert 0.05 < np.abs(last - world.q).max() < 0.15
     assert world.supervisor.off_reference
-    world.supervisor.let_go("somebody new takes the commands", world.now)
+    world.supervisor.let_go(Reason(ReasonKind.OTHER), world.now)
     assert world.is_in(Phase.INACTIVE)
     began = len(world.commanded)
     world.run(0.5, raised(tool, 0.06))

@@ -16,6 +16,7 @@ from std_msgs.msg import Empty
 
 from q2r2_control.config.timeouts import STREAM_TIMEOUT
 from q2r2_control.errors import ConfigError
+from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.robot.compose import WORLD
 from q2r2_control.robot.robot import Robot
 from q2r2_control.ros.base_node import COMMAND_QOS, STREAM_QOS, BaseNode
@@ -30,14 +31,14 @@ from q2r2_control.ros.bridge.messages import (
 )
 from q2r2_control.ros.monitoring.endpoints import Publishers
 from q2r2_control.supervision.delay_watch import DelayWatch
-from q2r2_control.supervision.target_stream import Refusal
 from q2r2_control.types import Array, RobotState
+from q2r2_control.wording import sentence
 
 _LATEST = 0.02  # that a target is received, later than others after the time of its stamp, for that to say anything [s]
 _WARNING_TIME = 1.0  # refused targets are reported for this long [s]
 # Takes an arm's target in the world frame, or None if it is no pose, the time [s], the message's number, and when the
 # target is due [s], or None.
-Take = Callable[[str, pin.SE3 | None, float, int | None, float | None], Refusal | None]
+Take = Callable[[str, pin.SE3 | None, float, int | None, float | None], Reason | None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +64,7 @@ class TargetIntake:
         self._publishers = Publishers(node, self.topics.values())
         self._delays = {arm: DelayWatch(STREAM_TIMEOUT) for arm in robot.arms}
         self._stamps = {arm: DelayWatch(_LATEST) for arm in robot.arms}  # the delays since targets were made
-        self._refused: dict[str, tuple[Refusal, float]] = {}  # why an arm's last target was not used, and when [s]
+        self._refused: dict[str, tuple[Reason, float]] = {}  # why an arm's last target was not used, and when [s]
         self.rejected = dict.fromkeys(robot.arms, 0)
 
     def subscribe(self, take: Take, release: Callable[[str], None]) -> None:
@@ -90,7 +91,7 @@ class TargetIntake:
         """A line for each arm whose targets were refused lately."""
         now = self._node.now
         self._refused = {arm: entry for arm, entry in self._refused.items() if now - entry[1] <= _WARNING_TIME}
-        return [f"target of {arm} not used: {refusal.line}" for arm, (refusal, _) in self._refused.items()]
+        return [f"target of {arm} not used: {sentence(refusal)}" for arm, (refusal, _) in self._refused.items()]
 
     def _on_target(self, take: Take, arm: str, message: PoseStamped, info: Mapping[str, int | None]) -> None:
         frame, now, frame_id = self.frames[arm], self._node.now, message.header.frame_id
@@ -102,12 +103,11 @@ class TargetIntake:
         if refusal is not None:
             self._refuse(arm, refusal)
         elif late:
-            self._refuse(arm, Refusal("late", f"{late:.2f} s late; its sender or this node stood still"))
+            self._refuse(arm, Reason.of(ReasonKind.TARGET_LATE, late=late))
         elif frame_id != frame.name:
-            fault = f"frame_id {frame_id!r:.40}; allowed: {frame.name!r}"
-            self._refuse(arm, Refusal("frame", fault))
+            self._refuse(arm, Reason.of(ReasonKind.TARGET_FRAME, frame=frame_id[:40], allowed=frame.name))
         elif pose is None:
-            self._refuse(arm, Refusal("pose", "not a finite pose with a unit quaternion"))
+            self._refuse(arm, Reason(ReasonKind.TARGET_NOT_A_POSE))
         else:
             self._refused.pop(arm, None)
 
@@ -123,13 +123,13 @@ class TargetIntake:
         known = stamp > 0.0 and stamps.take(received - stamp, received) == 0.0
         return stamp + stamps.usual if known else None
 
-    def _refuse(self, arm: str, refusal: Refusal) -> None:
+    def _refuse(self, arm: str, refusal: Reason) -> None:
         """Log why targets are not used: once for each kind of fault, until a target is used again or none comes."""
         self.rejected[arm] += 1
         before = self._refused.get(arm)
         self._refused[arm] = (refusal, self._node.now)
         if before is None or before[0].kind != refusal.kind:
-            self._node.get_logger().warning(f"target of {arm} not used: {refusal.line}")
+            self._node.get_logger().warning(f"target of {arm} not used: {sentence(refusal)}")
             self._changed()
 
 
@@ -175,7 +175,7 @@ class JointIntake:
         self._values = np.zeros((3, len(robot.joint_names)))
         self.state: RobotState | None = None  # the newest of all arms
 
-    def subscribe(self, take: Callable[[RobotState | str, float], None], look: Callable[[JointState], None]) -> None:
+    def subscribe(self, take: Callable[[RobotState | Reason, float], None], look: Callable[[JointState], None]) -> None:
         """Pass each state of all arms, or what is wrong with a message, to ``take``, with the time [s].
 
         ``look`` gets every message as it is first: there may be fingers in it.
@@ -203,7 +203,7 @@ class JointIntake:
 
     def _on_message(
         self,
-        take: Callable[[RobotState | str, float], None],
+        take: Callable[[RobotState | Reason, float], None],
         look: Callable[[JointState], None],
         topic: str,
         message: JointState,
@@ -215,7 +215,8 @@ class JointIntake:
         now = self._node.now
         part = robot_state(message, names, now)
         if isinstance(part, str):
-            take(part if len(self._topics) == 1 else f"{topic}: {part}", now)
+            text = part if len(self._topics) == 1 else f"{topic}: {part}"
+            take(Reason.of(ReasonKind.OTHER, text=text), now)
             return
         self._stamps[topic] = now
         oldest = min(self._stamps.values())
@@ -229,7 +230,7 @@ class JointIntake:
             external = None if silent else self._external
             self.state = RobotState(q=q, v=v, tau=tau, tau_external=external, stamp=oldest)
             if silent and self.needs_external_torque:
-                take(f"no external torques on {self._external_topic}", now)
+                take(Reason.of(ReasonKind.OTHER, text=f"no external torques on {self._external_topic}"), now)
             else:
                 take(self.state, now)
 

@@ -25,7 +25,7 @@ from q2r2_control.control.controller import CartesianController
 from q2r2_control.drives.base import permitted
 from q2r2_control.drives.torque import TorqueDrive
 from q2r2_control.errors import ConfigError
-from q2r2_control.events import ReasonKind
+from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.loop.control_loop import ControlLoop
 from q2r2_control.robot.robot import Robot
 from q2r2_control.ros.base_node import ERROR, OK, WARN, run_node
@@ -39,9 +39,10 @@ from q2r2_control.ros.managed_node import ManagedNode
 from q2r2_control.supervision.external_arms import ExternalArms, ExternalSettings, settings_for_external_arms
 from q2r2_control.supervision.joint_watch import watch_settings
 from q2r2_control.supervision.supervisor import Phase
-from q2r2_control.supervision.target_stream import Origins, Refusal, StreamSettings
+from q2r2_control.supervision.target_stream import Origins, StreamSettings
 from q2r2_control.supervision.tick_clock import TickClock
 from q2r2_control.types import LONGEST_DT, Reference
+from q2r2_control.wording import sentence
 
 _LONGEST_STOP = 3.0  # [s]
 _QUIET = 0.3  # nobody else commands the arms for so long before this node does [s]
@@ -120,7 +121,7 @@ class CartesianControllerNode(ManagedNode):
         self._targets.subscribe(self._take_target, self._supervisor.release_target)
         self._joints.subscribe(self._loop.observe, self._grippers.take_joint_state)
         self.create_service(SetBool, "~/pause", self._on_pause)
-        services: dict[str, Callable[[], str | None]] = {
+        services: dict[str, Callable[[], Reason | None]] = {
             "home": self._supervisor.go_home,
             "hold": self._supervisor.homing.hold,
             "reset": self._supervisor.reset,
@@ -134,8 +135,8 @@ class CartesianControllerNode(ManagedNode):
 
     def _take_target(
         self, arm: str, pose: pin.SE3 | None, now: float, number: int | None, due: float | None
-    ) -> Refusal | None:
-        return self._supervisor.take_target(arm, pose, now, number, due=due)
+    ) -> Reason | None:
+        return self._supervisor.update_target(arm, pose, now, number, due=due)
 
     def _tick(self) -> None:
         decided = time.monotonic()
@@ -157,7 +158,7 @@ class CartesianControllerNode(ManagedNode):
         self._advances += 1
         # Commands that the arms do not follow are not for a receiver that has just come.
         if fault := self._output.listener_fault(self._supervisor.off_reference):
-            self._supervisor.let_go(fault, now)
+            self._supervisor.let_go(_in_words(fault), now)
         state, openings = self._joints.state, self._grippers.openings(now)
         step = self._loop.step(state, {}, now, dt, self._grippers.wanted, openings)
         self._grippers.answer()
@@ -174,7 +175,7 @@ class CartesianControllerNode(ManagedNode):
         if not self._supervisor.events:
             return
         for event in self._supervisor.events:
-            self.get_logger().warning(event)
+            self.get_logger().warning(sentence(event))
         self._supervisor.events.clear()
         self.report_health()
 
@@ -188,13 +189,14 @@ class CartesianControllerNode(ManagedNode):
         self.report_health()  # arms that listen must not wait for the next time
         return _answer(response, None)
 
-    def _serve(self, act: Callable[[], str | None], request: Any, response: Any) -> Any:
-        refusal = act() if self.is_active or act == self._stop else f"{_DEACTIVATED}: {_CURE}"
+    def _serve(self, act: Callable[[], Reason | None], request: Any, response: Any) -> Any:
+        active = self.is_active or act == self._stop
+        refusal = act() if active else _in_words(f"{_DEACTIVATED}: {_CURE}")
         self.report_health()
         return _answer(response, refusal)
 
-    def _stop(self) -> str | None:
-        self._supervisor.stop("stopped by ~/stop; ~/reset activates again")
+    def _stop(self) -> Reason | None:
+        self._supervisor.stop(Reason(ReasonKind.STOP_SERVICE))
         return None
 
     def health(self) -> tuple[bytes, str, Mapping[str, Any]]:
@@ -202,7 +204,7 @@ class CartesianControllerNode(ManagedNode):
         values: dict[str, Any] = {
             "phase": supervisor.phase,
             "lifecycle": self.lifecycle_state,
-            "homing_ended": supervisor.homing.outcome or "",
+            "homing_ended": "" if supervisor.homing.outcome is None else sentence(supervisor.homing.outcome),
             "loop_rate_hz": round(self._ticks / max(wall - self._reported_at, 1e-9), 1),
             "missed_ticks": self._loop.pacer.missed_ticks,
             "sent": self._output.sent,
@@ -232,10 +234,10 @@ class CartesianControllerNode(ManagedNode):
 
     def _judge(self) -> tuple[bytes, str]:
         if not self.is_active:
-            return WARN, self._supervisor.fault or _CURE
+            return WARN, _CURE if self._supervisor.fault is None else sentence(self._supervisor.fault)
         if self._supervisor.fault is not None:
-            return ERROR, self._supervisor.fault
-        ended = self._supervisor.ended_targets
+            return ERROR, sentence(self._supervisor.fault)
+        ended = list(map(sentence, self._supervisor.ended_targets))
         if faults := self._targets.faults():
             return WARN, "; ".join(faults + ended)
         return OK, "; ".join(["paused" if self._supervisor.paused else "active", *ended])
@@ -246,14 +248,15 @@ class CartesianControllerNode(ManagedNode):
         if (other := self._others.commander(_QUIET)) is not None:
             return other
         if (refusal := self._supervisor.reset()) is not None:
-            return refusal
+            return sentence(refusal)
         settle = float(self.get_parameter("settle_time").value)
         active = self._tick_until(lambda: self._supervisor.phase is Phase.ACTIVE, settle + _LONGEST_ACTIVATION)
-        problem = None if active else self._supervisor.fault or "the arms do not stand still"
+        fault = self._supervisor.fault
+        problem = None if active else "the arms do not stand still" if fault is None else sentence(fault)
         # Nothing was commanded yet: that begins with the next tick.
         if (problem := self._others.commander(_QUIET) or problem) is not None:
-            self._supervisor.let_go(problem, self.now)
-            self._supervisor.stop(_CURE)
+            self._supervisor.let_go(_in_words(problem), self.now)
+            self._supervisor.stop(_in_words(_CURE))
             return problem
         self._others.end()
         return None
@@ -274,7 +277,7 @@ class CartesianControllerNode(ManagedNode):
         self._come_to_rest("ending", spin)
 
     def _come_to_rest(self, why: str, go_on: Callable[[], None]) -> None:
-        self._supervisor.stop(why)
+        self._supervisor.stop(_in_words(why))
         deadline = last = time.monotonic()
         deadline += _LONGEST_STOP
         advances = self._advances
@@ -306,9 +309,13 @@ class CartesianControllerNode(ManagedNode):
         return fulfilled
 
 
-def _answer(response: Any, refusal: str | None) -> Any:
-    response.success, response.message = refusal is None, refusal or "done"
+def _answer(response: Any, refusal: Reason | None) -> Any:
+    response.success, response.message = refusal is None, "done" if refusal is None else sentence(refusal)
     return response
+
+
+def _in_words(text: str) -> Reason:
+    return Reason.of(ReasonKind.OTHER, text=text)
 
 
 def main() -> int:
