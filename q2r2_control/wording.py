@@ -96,7 +96,8 @@ SENTENCES: dict[ReasonKind, str] = {
     _K.BAD_JOINT_STATES: "{text}",
     _K.NO_STATES_YET: "no joint states yet{source}",
     _K.STATES_SILENT: "no joint states{source} for {age:.3f} s; allowed: {timeout:g}",
-    _K.STATE_NOT_FINITE: "measured {quantity} of {joint} = {value}; allowed: finite numbers",
+    _K.STATE_NOT_FINITE: "measured {quantity} of {joint} = {value} for more than {bridged:g} ms; "
+    "allowed: finite numbers",
     _K.STATE_JUMPED: "{joint} jumped by {distance:.3f} rad",
     _K.JOINT_STATES: "joint states: {cause}",
     _K.OFF_REFERENCE: "{joint} is {deviation:.3f} rad from its reference for {time:.1f} s; "

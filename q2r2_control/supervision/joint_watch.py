@@ -148,6 +148,7 @@ class JointWatch:
                     quantity=what,
                     joint=self._names[worst],
                     value=str(values[worst]),
+                    bridged=1e3 * self._settings.unusable_time,
                 )
         return None
 
