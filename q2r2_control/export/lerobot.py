@@ -8,7 +8,6 @@ from __future__ import annotations
 import ctypes
 import json
 import os
-import resource
 import shutil
 import sys
 from collections.abc import Iterator, Sequence
@@ -130,6 +129,8 @@ def _renounce_real_time() -> None:
     """
     if sys.platform != "linux":
         return
+    import resource
+
     resource.setrlimit(resource.RLIMIT_RTPRIO, (0, 0))
     libc = ctypes.CDLL(None)
     header = (ctypes.c_uint32 * 2)(_CAPABILITY_VERSION, 0)
