@@ -25,7 +25,7 @@ from q2r2_control.cli.output import print_progress, print_report
 from q2r2_control.config.cell import Config, load_config
 from q2r2_control.inputs.scripted import ScriptedInput
 from q2r2_control.pipeline.pipeline import Pipeline
-from q2r2_control.plants.factory import make_plant
+from q2r2_control.plants.base import make_plant
 from q2r2_control.recording.about import About
 from q2r2_control.recording.recorder import Recorder
 from q2r2_control.robot.robot import Robot

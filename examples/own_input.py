@@ -3,12 +3,13 @@
 import numpy as np
 
 from q2r2_control import Pipeline, load_config
-from q2r2_control.types import HandInputs, HandSample, HapticFeedback
+from q2r2_control.types import DeviceControls, HandInputs, HandSample, HapticFeedback
 
 
 class SwingingHands:
     """Two hands that press the lower button once, which engages the arms, and then swing."""
 
+    controls = DeviceControls(buttons=("button_lower", "button_upper"), axes=())
     connected = True
 
     def start(self) -> None:

@@ -9,7 +9,7 @@ from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 
-from q2r2_control.ros.launch.processes import ROBOTS, SOURCES, nodes_of
+from q2r2_control.ros.launch.processes import ROBOTS, nodes_of
 
 
 def generate_launch_description():
@@ -17,7 +17,7 @@ def generate_launch_description():
     return LaunchDescription(
         [
             DeclareLaunchArgument("config", default_value="config/dual_iiwa7.yaml", description="YAML of the cell"),
-            DeclareLaunchArgument("input", default_value="scripted", choices=list(SOURCES), description="of the hands"),
+            DeclareLaunchArgument("input", default_value="scripted", description="an installed input, or none"),
             DeclareLaunchArgument(
                 "robot", default_value="auto", choices=list(ROBOTS), description="auto: mujoco for controller: builtin"
             ),

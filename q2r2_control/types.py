@@ -66,6 +66,20 @@ class HandInputs:
     press_middle: float = 0.0
 
 
+@dataclass(frozen=True, slots=True)
+class DeviceControls:
+    """The buttons and axes that each hand of an input device has, by the names of :class:`HandInputs`."""
+
+    buttons: tuple[str, ...]
+    axes: tuple[str, ...]
+
+
+QUEST_CONTROLS = DeviceControls(
+    buttons=("button_upper", "button_lower"),
+    axes=("thumb_stick_horizontal", "thumb_stick_vertical", "press_index", "press_middle"),
+)
+
+
 class HandFault(StrEnum):
     """What an input finds wrong with a hand whose pose, by itself, is a pose: kinds of :mod:`events`."""
 

@@ -14,6 +14,7 @@ from q2r2_control.config.control import ContactPair
 from q2r2_control.config.external import describe
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.errors import ConfigError
+from q2r2_control.plugins import INPUTS, PLANTS, check_installed, load_class
 from q2r2_control.robot.kept_distances import kept_distances
 from q2r2_control.robot.model_srdf import model_srdfs
 from q2r2_control.robot.reachability import PairReach, Progress, nearest_approaches, srdf_of
@@ -107,6 +108,8 @@ def check_cell(config: Config, compiling: AbstractContextManager[None] | None = 
 
     Raises :class:`Q2R2Error` where the cell cannot be built.
     """
+    config.teleop.bindings.check_device(load_class(INPUTS, config.input).controls)
+    check_installed(PLANTS, config.plant)
     robot = Robot.from_config(config)
     with compiling or nullcontext():
         # With what may touch too, so that every name and number is checked; what is kept is that of position mode.

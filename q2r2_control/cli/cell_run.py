@@ -19,8 +19,7 @@ from q2r2_control.config.cell import Config
 from q2r2_control.config.external import ControllerKind
 from q2r2_control.demo.assembly_tasks import AssemblyTask, TaskResult, TaskWatch
 from q2r2_control.errors import ConfigError, PlantError, RecordingError
-from q2r2_control.inputs.base import Input
-from q2r2_control.inputs.factory import make_input
+from q2r2_control.inputs.base import Input, make_input
 from q2r2_control.inputs.scripted import ScriptedInput
 from q2r2_control.judging.episode_judge import EpisodeJudge
 from q2r2_control.judging.judge import Judged, judge, keep_verdicts

@@ -9,8 +9,7 @@ from rich.console import Console
 
 from q2r2_control.config.cell import Config, HeadsetConfig
 from q2r2_control.inputs.addresses import access_lines, written
-from q2r2_control.inputs.factory import hands_watch
-from q2r2_control.inputs.headset import HeadsetServer
+from q2r2_control.inputs.headset import HeadsetServer, watch_of
 
 Host = Annotated[
     str | None, typer.Option(help="Address to bind, instead of the config's; 0.0.0.0: every network, :: IPv6 too.")
@@ -23,7 +22,7 @@ class AnnouncedHeadset(HeadsetServer):
 
     def __init__(self, config: Config, console: Console) -> None:
         headset = config.headset
-        super().__init__(headset.host, headset.port, allow=headset.networks, watch=hands_watch(config))
+        super().__init__(headset.host, headset.port, allow=headset.networks, watch=watch_of(config))
         self._headset, self._console = headset, console
 
     def start(self) -> None:

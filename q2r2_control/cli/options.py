@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import sys
-from enum import StrEnum
 from typing import Annotated
 
 import typer
@@ -36,13 +35,6 @@ def notes_of(task: str | None, operator: str | None, record: str | None) -> dict
         if record is None:
             raise ConfigError(f"--{name} needs --record")
     return notes
-
-
-class PlantName(StrEnum):
-    """What moves."""
-
-    MUJOCO = "mujoco"
-    KINEMATIC = "kinematic"
 
 
 def positive(option: str, value: float) -> float:

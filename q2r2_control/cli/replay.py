@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from q2r2_control.cli.options import Json, PlantName
+from q2r2_control.cli.options import Json
 from q2r2_control.cli.output import as_json_text, notice_of_compiling, stderr_console
 from q2r2_control.cli.summary_table import summary_table
 from q2r2_control.cli.window import check_window, show_window
@@ -34,7 +34,8 @@ def replay(
         str | None, typer.Option(metavar="CONFIG", help="Another cell's YAML than the recorded one.")
     ] = None,
     plant: Annotated[
-        PlantName | None, typer.Option(help="Let it move, and measure it; without, what was measured is again.")
+        str | None,
+        typer.Option(metavar="NAME", help="Let it move, and measure it; otherwise nothing moves."),
     ] = None,
     joints: Annotated[
         bool, typer.Option("--joints", help="Send the recorded joint references to the plant; exit 1 if any is held.")
@@ -62,7 +63,7 @@ def replay(
     if not joints:
         _replay(Path(file), cell, plant, compare, json, prepare)
     elif plant is None:
-        raise ConfigError("--joints needs --plant mujoco or --plant kinematic, which follow the references")
+        raise ConfigError("--joints needs --plant, such as mujoco or kinematic, which follow the references")
     elif compare:
         raise ConfigError("--joints and --compare exclude each other: it says by itself what was not followed")
     else:

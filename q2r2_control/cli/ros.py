@@ -19,14 +19,6 @@ app.command(epilog="Example: q2r2 ros watch config/dual_iiwa7.yaml --once")(watc
 app.command(epilog="Example: q2r2 ros doctor config/dual_iiwa7.yaml")(doctor)
 
 
-class HandSource(StrEnum):
-    """Where the hands' topics come from."""
-
-    SCRIPTED = "scripted"
-    HEADSET = "headset"
-    NONE = "none"
-
-
 class RobotSource(StrEnum):
     """What moves."""
 
@@ -54,8 +46,9 @@ def build_interfaces_command(
 def up(
     config: Annotated[str, typer.Argument(metavar="CONFIG", help="YAML of the cell.")],
     input: Annotated[
-        HandSource, typer.Option(help="SimulationInput, tcp_endpoint, or neither: another node sends the hands.")
-    ] = HandSource.SCRIPTED,
+        str | None,
+        typer.Option(metavar="NAME", help="An installed input, or none: another node sends the hands."),
+    ] = None,
     robot: Annotated[
         RobotSource,
         typer.Option(help="Simulated, or one that is there; auto: mujoco for controller: builtin."),
@@ -78,5 +71,5 @@ def up(
     """
     notes = notes_of(task, operator, record)
     recording = None if record is None else {"folder": record, **notes}
-    nodes = nodes_of(config, input.value, robot.value, recording, separate)
+    nodes = nodes_of(config, input, robot.value, recording, separate)
     raise typer.Exit(run_together(nodes, lambda line: print(line, flush=True)))

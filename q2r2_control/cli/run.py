@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
@@ -16,7 +15,6 @@ from q2r2_control.cli.options import (
     Human,
     Json,
     Operator,
-    PlantName,
     RealTime,
     Record,
     Seed,
@@ -29,22 +27,20 @@ from q2r2_control.cli.options import (
 from q2r2_control.cli.output import stderr_console
 from q2r2_control.config.cell import load_config
 from q2r2_control.errors import ConfigError
-from q2r2_control.inputs.factory import DEFAULT_TRAJECTORY
+from q2r2_control.inputs.scripted import DEFAULT_TRAJECTORY
 from q2r2_control.inputs.trajectories import TRAJECTORIES
+from q2r2_control.plugins import INPUTS, check_installed
 from q2r2_control.types import CommandMode
-
-
-class InputName(StrEnum):
-    """Where hand samples come from."""
-
-    SCRIPTED = "scripted"
-    HEADSET = "headset"
 
 
 def run(
     config: ConfigFile,
-    input: Annotated[InputName, typer.Option(help="Where hand samples come from.")] = InputName.SCRIPTED,
-    plant: Annotated[PlantName, typer.Option(help="What moves.")] = PlantName.MUJOCO,
+    input: Annotated[
+        str | None, typer.Option(metavar="NAME", help="An installed input; without it, the cell's.")
+    ] = None,
+    plant: Annotated[
+        str | None, typer.Option(metavar="NAME", help="An installed plant; without it, the cell's.")
+    ] = None,
     mode: Annotated[CommandMode, typer.Option(help="What the plant gets; torque: arms that yield.")] = (
         CommandMode.POSITION
     ),
@@ -72,20 +68,23 @@ def run(
     """
     scripted_only = {"--trajectory": trajectory is not None, "--human": human, "--fast": fast, "--seed": seed != 0}
     headset_only = {"--host": host is not None, "--port": port is not None}
-    unfit = headset_only if input is InputName.SCRIPTED else scripted_only
+    cell = load_config(config)
+    source = input or cell.input
+    check_installed(INPUTS, source)
+    unfit = ({} if source == "scripted" else scripted_only) | ({} if source == "headset" else headset_only)
     for option, given in unfit.items():
         if given:
-            raise ConfigError(f"{option} cannot be used with --input {input.value}")
+            raise ConfigError(f"{option} cannot be used with --input {source}")
     if fast and duration is None:
         raise ConfigError("--fast needs --duration, since simulated time has no end of its own")
     if fast and rt:
         raise ConfigError("--rt and --fast exclude each other, since simulated time is never late")
     notes = notes_of(task, operator, record)
-    cell = with_address(load_config(config), host, port)
+    cell = with_address(cell, host, port)
     options = RunOptions(
         name=cell.name,
-        input=input.value,
-        plant=plant.value,
+        input=source,
+        plant=plant or cell.plant,
         mode=mode.value,
         duration=None if duration is None else positive("--duration", duration),
         fast=fast,

@@ -8,6 +8,9 @@ from typing import NamedTuple
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from q2r2_control.errors import ConfigError
+from q2r2_control.types import DeviceControls
+
 
 class Action(StrEnum):
     """What a hand can do with its controls."""
@@ -71,6 +74,17 @@ BUTTONS = ("lower", "upper")
 TRIGGERS = ("trigger", "grip")
 HELD = (*TRIGGERS, "stick_up", "stick_down", "stick_left", "stick_right")
 CONTROLS = (*BUTTONS, *HELD)
+# The button or axis of a device that each control is.
+_DEVICE_NAMES = {
+    "lower": "button_lower",
+    "upper": "button_upper",
+    "trigger": "press_index",
+    "grip": "press_middle",
+    "stick_up": "thumb_stick_vertical",
+    "stick_down": "thumb_stick_vertical",
+    "stick_left": "thumb_stick_horizontal",
+    "stick_right": "thumb_stick_horizontal",
+}
 _WORDS = {Gesture.TAP: "", Gesture.HOLD: " held", Gesture.DOUBLE: " tapped twice"}
 _SUFFIXES = {Gesture.TAP: "", Gesture.HOLD: "_hold", Gesture.DOUBLE: "_double"}
 
@@ -170,6 +184,19 @@ class BindingSettings(BaseModel):
             for other in self.bound():
                 if other.control == control and other.gesture is not Gesture.TAP:
                     raise ValueError(f"{control} is {action} and {other.field} is {other.action}; allowed: one of them")
+
+    def check_device(self, controls: DeviceControls) -> None:
+        """Raise :class:`ConfigError` for a binding to a control that an input device does not have."""
+        names = (*controls.buttons, *controls.axes)
+        for binding in self.bound():
+            name = _DEVICE_NAMES[binding.control]
+            if name not in names:
+                has = (
+                    ", ".join(control for control, its in _DEVICE_NAMES.items() if its in names) or "no control at all"
+                )
+                raise ConfigError(
+                    f"teleop.bindings.{binding.field} = {binding.action}: this input has no {name}; allowed: {has}"
+                )
 
     def bound(self) -> Iterator[Binding]:
         """All that is bound, control by control."""

@@ -129,6 +129,8 @@ class Config(CellModel):
     )
     supervision: SupervisionSettings = SupervisionSettings()
     loop_rate_hz: float = Field(1000.0, ge=50, le=2000, description="control loop [Hz]")
+    input: str = Field("scripted", min_length=1, description="name of what brings hand samples, where none is given")
+    plant: str = Field("mujoco", min_length=1, description="name of what moves, where none is given")
     controller: ControllerKind = Field(ControllerKind.BUILTIN, description="builtin, or external: for q2r2 ros up")
     external: ExternalConfig | None = Field(None, description="controllers of others; with controller: external")
     control: ControllerSettings = ControllerSettings()

@@ -4,15 +4,20 @@ from __future__ import annotations
 
 from typing import Protocol, runtime_checkable
 
-from q2r2_control.types import HandSample, HapticFeedback
+from q2r2_control.config.cell import Config
+from q2r2_control.plugins import INPUTS, load_class
+from q2r2_control.types import DeviceControls, HandSample, HapticFeedback
 
 
 @runtime_checkable
 class Input(Protocol):
     """A source of hand samples, polled once per control tick by the loop's own thread.
 
-    Order of use: ``start``, then ``poll`` and ``send_haptic`` in any order, then ``close``.
+    Order of use: ``start``, then ``poll`` and ``send_haptic`` in any order, then ``close``. An input that is found by
+    its name has a class method ``from_config(config)`` as well.
     """
+
+    controls: DeviceControls  # the buttons and axes that its samples have
 
     @property
     def connected(self) -> bool:
@@ -38,3 +43,11 @@ class Input(Protocol):
     def close(self) -> None:
         """Release every resource; may be called twice."""
         ...
+
+
+def make_input(source: Input | str, config: Config) -> Input:
+    """The input called ``source``, or ``source`` itself. Raises :class:`ConfigError` for an unknown name."""
+    if not isinstance(source, str):
+        return source
+    made: Input = load_class(INPUTS, source).from_config(config)
+    return made

@@ -11,6 +11,7 @@ from contextlib import suppress
 
 import numpy as np
 
+from q2r2_control.config.cell import Config
 from q2r2_control.config.networks import Network
 from q2r2_control.errors import InputError
 from q2r2_control.inputs.addresses import written
@@ -24,9 +25,15 @@ from q2r2_control.inputs.rate_limits import HostLog, log_writer
 from q2r2_control.inputs.samples import SampleQueue
 from q2r2_control.inputs.session import topic_of
 from q2r2_control.inputs.statistics import HeadsetStatistics
-from q2r2_control.types import SIDES, HandSample, HapticFeedback
+from q2r2_control.types import QUEST_CONTROLS, SIDES, HandSample, HapticFeedback
 
 _LOG = logging.getLogger(__name__)
+
+
+def watch_of(config: Config) -> HandsWatch:
+    """The faults of a headset's hands that a cell wants to be found."""
+    headset = config.headset
+    return HandsWatch(headset.frozen_time, headset.watch_frame, config.teleop.gate.timeout)
 
 
 class HeadsetServer:
@@ -40,6 +47,8 @@ class HeadsetServer:
     Where a ``listener`` is given, each message goes only to it, at once and in the receiving thread, and :meth:`poll`
     returns nothing: this is for forwarding messages one by one, but for those with a fault.
     """
+
+    controls = QUEST_CONTROLS
 
     def __init__(
         self,
@@ -65,6 +74,12 @@ class HeadsetServer:
         self._last_client: Client | None = None
         self._connections_made = 0
         self._last_disconnect: str | None = None
+
+    @classmethod
+    def from_config(cls, config: Config) -> HeadsetServer:
+        """As the cell's block ``headset`` says."""
+        headset = config.headset
+        return cls(headset.host, headset.port, allow=headset.networks, watch=watch_of(config))
 
     def start(self) -> None:
         """Listen. Raises :class:`InputError` when host and port cannot be bound, or when already started."""

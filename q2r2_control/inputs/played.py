@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import pinocchio as pin
 
 from q2r2_control.inputs.sampling import SampleTiming
-from q2r2_control.types import HandInputs, HandSample, HapticFeedback
+from q2r2_control.types import QUEST_CONTROLS, HandInputs, HandSample, HapticFeedback
 
 HandPose = Callable[[str, float], pin.SE3]  # hand, time since the first poll [s] -> pose in the input's frame
 HandButtons = Callable[[str, float], HandInputs]  # hand, time since the first poll [s]
@@ -23,6 +23,8 @@ class PlayedInput:
 
     The samples of each hand come about as its ``samplings`` say, and do not depend on when they are polled.
     """
+
+    controls = QUEST_CONTROLS
 
     def __init__(self, pose: HandPose, inputs: HandButtons, samplings: Mapping[str, SampleTiming]) -> None:
         self._pose, self._inputs = pose, inputs

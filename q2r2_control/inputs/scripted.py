@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import pinocchio as pin
 
+from q2r2_control.config.cell import Config
 from q2r2_control.errors import ConfigError
 from q2r2_control.inputs.played import PlayedInput
 from q2r2_control.inputs.sampling import EvenSampling, HeadsetSampling, SampleTiming
@@ -21,6 +22,9 @@ HANDS_AT_REST = {
 _DROPOUT_PROBABILITY = 0.005
 # Half a central difference of the ideal pose [s].
 _DIFFERENCE = 1e-4
+
+
+DEFAULT_TRAJECTORY = "meet"
 
 
 class ScriptedInput(PlayedInput):
@@ -64,6 +68,11 @@ class ScriptedInput(PlayedInput):
             return HeadsetSampling(hand, seed, tremor=True, dropout_probability=_DROPOUT_PROBABILITY)
 
         super().__init__(self._ideal, self._trajectory.inputs, {hand: sampling(hand) for hand in hands})
+
+    @classmethod
+    def from_config(cls, config: Config) -> ScriptedInput:
+        """The default trajectory."""
+        return cls(DEFAULT_TRAJECTORY)
 
     def hand_twist(self, hand: str, t: float) -> pin.Motion:
         """How ``hand`` ideally moves at ``t`` [s], in the axes that its poses have [m/s, rad/s]."""

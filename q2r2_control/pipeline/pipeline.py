@@ -19,16 +19,14 @@ from q2r2_control.drives.base import permitted
 from q2r2_control.drives.factory import make_drive
 from q2r2_control.errors import ConfigError, PlantError
 from q2r2_control.events import Reason, ReasonKind
-from q2r2_control.inputs.base import Input
-from q2r2_control.inputs.factory import make_input
+from q2r2_control.inputs.base import Input, make_input
 from q2r2_control.loop.control_loop import ControlLoop, LoopStep
 from q2r2_control.pipeline.loop_clock import LoopClock
 from q2r2_control.pipeline.operator_side import OperatorSide
 from q2r2_control.pipeline.pending_requests import PendingRequests
 from q2r2_control.pipeline.plant_clock import PlantClock
 from q2r2_control.pipeline.run_recorder import RunRecorder
-from q2r2_control.plants.base import Plant
-from q2r2_control.plants.factory import check_mode, make_plant
+from q2r2_control.plants.base import Plant, check_mode, make_plant
 from q2r2_control.process.signals import few_garbage_collections, stop_on_signals
 from q2r2_control.robot.robot import Robot
 from q2r2_control.summary.run_summary import RunSummary
@@ -78,6 +76,7 @@ class Pipeline:
         plant: Plant,
         mode: CommandMode | str = CommandMode.POSITION,
     ) -> None:
+        config.teleop.bindings.check_device(input.controls)
         self.config = config
         self.robot = robot
         self.input = input
@@ -96,18 +95,20 @@ class Pipeline:
         cls,
         config: Config,
         *,
-        input: Input | str = "scripted",
-        plant: Plant | str = "mujoco",
+        input: Input | str | None = None,
+        plant: Plant | str | None = None,
         mode: CommandMode | str = CommandMode.POSITION,
     ) -> Pipeline:
-        """Build a pipeline with an input (``scripted``, ``headset``) and a plant (``mujoco``, ``kinematic``).
+        """Build a pipeline with an input (such as ``headset``) and a plant (such as ``kinematic``).
 
-        Either may also be an object of one's own. ``mode``: the plant gets joint positions (``position``), velocities
-        (``velocity``), or the torques of a Cartesian impedance (``torque``). Raises :class:`ConfigError` for an unknown
-        name, and for a mode that the plant does not have.
+        Either is the name of an entry point, see :mod:`q2r2_control.plugins`, or an object of one's own; None: the one
+        that the cell names. ``mode``: the plant gets joint positions (``position``), velocities (``velocity``), or the
+        torques of a Cartesian impedance (``torque``). Raises :class:`ConfigError` for an unknown name, for a mode that
+        the plant does not have, and for a binding to a control that the input does not have.
         """
         robot = Robot.from_config(config)
-        return cls(config, robot, make_input(input, config), make_plant(plant, robot, config), mode)
+        source = make_input(config.input if input is None else input, config)
+        return cls(config, robot, source, make_plant(config.plant if plant is None else plant, robot, config), mode)
 
     @property
     def supervisor(self) -> Supervisor:
@@ -134,8 +135,10 @@ class Pipeline:
         """Other settings of the operator's from the next tick on, without a jump; from any thread.
 
         What can be changed when: see :meth:`Teleop.change`. Whether it was is in the events of the run; the next run
-        begins with the settings of the cell.
+        begins with the settings of the cell. Raises :class:`ConfigError` for a binding to a control that the input
+        does not have.
         """
+        settings.bindings.check_device(self.input.controls)
         self.requests.settings = settings
 
     def record_outcome(self, reason: Reason) -> None:

@@ -8,7 +8,8 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 
 from q2r2_control.config.cell import Config
-from q2r2_control.errors import PlantError
+from q2r2_control.errors import ConfigError, PlantError
+from q2r2_control.plugins import PLANTS, load_class
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, Command, CommandMode, RobotState
 
@@ -22,7 +23,8 @@ class Plant(Protocol):
 
     One tick: ``apply`` says where the plant has to be at the end of the tick, ``advance`` lets that time pass,
     ``state`` says where it got. On hardware, where time passes by itself, ``advance`` is where a plant waits for the
-    next measurement. A new plant stands at home with open grippers, and stays there until a command comes.
+    next measurement. A new plant stands at home with open grippers, and stays there until a command comes. A plant
+    that is found by its name has a class method ``from_config(robot, config)`` as well.
     """
 
     modes: tuple[CommandMode, ...]  # of the commands that this plant follows
@@ -57,6 +59,22 @@ class Plant(Protocol):
     def close(self) -> None:
         """Give back every resource; may be called twice."""
         ...
+
+
+def make_plant(plant: Plant | str, robot: Robot, config: Config) -> Plant:
+    """The plant called ``plant``, or ``plant`` itself. Raises :class:`ConfigError` for an unknown name."""
+    if not isinstance(plant, str):
+        return plant
+    made: Plant = load_class(PLANTS, plant).from_config(robot, config)
+    return made
+
+
+def check_mode(mode: CommandMode | str, plant: Plant) -> CommandMode:
+    """``mode`` as one that ``plant`` follows. Raises :class:`ConfigError` for any other."""
+    if mode not in plant.modes:
+        allowed = ", ".join(plant.modes)
+        raise ConfigError(f"mode {mode!s:.40}: {type(plant).__name__} follows {allowed} commands only")
+    return CommandMode(mode)
 
 
 def check_command(command: Command, robot: Robot, modes: tuple[CommandMode, ...]) -> None:

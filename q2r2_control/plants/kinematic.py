@@ -20,6 +20,11 @@ class KinematicPlant:
         self._grippers = GripperMotion(config)
         self.reset()
 
+    @classmethod
+    def from_config(cls, robot: Robot, config: Config) -> KinematicPlant:
+        """The plant of a cell."""
+        return cls(robot, config)
+
     def reset(self, q: Array | None = None) -> None:
         """See :meth:`Plant.reset`."""
         posture = self._robot.home if q is None else q

@@ -95,6 +95,11 @@ class MujocoPlant:
         self.reset()
         self._gains: ServoGains = self._tuned(config)
 
+    @classmethod
+    def from_config(cls, robot: Robot, config: Config) -> MujocoPlant:
+        """The plant of a cell. Raises :class:`PlantError` where MuJoCo cannot model it."""
+        return cls(robot, config)
+
     def reset(self, q: Array | None = None) -> None:
         """See :meth:`Plant.reset`. Loose objects go back to their places, pushes end."""
         posture = self._robot.home if q is None else q

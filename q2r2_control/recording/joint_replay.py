@@ -14,8 +14,7 @@ from q2r2_control.errors import PlantError
 from q2r2_control.pipeline.loop_clock import LoopClock
 from q2r2_control.pipeline.operator_side import OperatorSide
 from q2r2_control.pipeline.pipeline import Pipeline
-from q2r2_control.plants.base import Plant
-from q2r2_control.plants.factory import make_plant
+from q2r2_control.plants.base import Plant, make_plant
 from q2r2_control.recording.comparison import changes
 from q2r2_control.recording.recorded_ticks import RecordedTicks
 from q2r2_control.recording.recorded_way import RecordedWay
@@ -23,7 +22,7 @@ from q2r2_control.recording.replay import opened
 from q2r2_control.robot.robot import Robot
 from q2r2_control.summary.run_summary import RunSummary
 from q2r2_control.summary.tick import Tick
-from q2r2_control.types import ArmTarget, HandSample, HapticFeedback
+from q2r2_control.types import QUEST_CONTROLS, ArmTarget, HandSample, HapticFeedback
 from q2r2_control.wording import limit_name
 
 _FOLLOWED = 0.01  # how near a reference is followed that nothing holds back [rad]
@@ -152,6 +151,8 @@ class _Clock(LoopClock):
 
 class _NoHands:
     """Nobody. Implements :class:`Input`."""
+
+    controls = QUEST_CONTROLS
 
     connected = False
 

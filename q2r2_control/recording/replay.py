@@ -14,8 +14,7 @@ from q2r2_control.errors import ConfigError, PlantError, RecordingError
 from q2r2_control.events import Event
 from q2r2_control.pipeline.loop_clock import LoopClock
 from q2r2_control.pipeline.pipeline import Pipeline
-from q2r2_control.plants.base import Plant
-from q2r2_control.plants.factory import make_plant
+from q2r2_control.plants.base import Plant, make_plant
 from q2r2_control.recording.about import ROS
 from q2r2_control.recording.comparison import Comparison, changes
 from q2r2_control.recording.plant_difference import ArmDifference, PlantDifference
@@ -23,7 +22,7 @@ from q2r2_control.recording.reader import Recording
 from q2r2_control.recording.recorded_ticks import NoMoreTicksError, RecordedTick, RecordedTicks
 from q2r2_control.robot.robot import Robot
 from q2r2_control.summary.run_summary import RunSummary
-from q2r2_control.types import Array, Command, CommandMode, HandSample, HapticFeedback, RobotState
+from q2r2_control.types import QUEST_CONTROLS, Array, Command, CommandMode, HandSample, HapticFeedback, RobotState
 
 
 class ReplayPipeline(Pipeline):
@@ -158,6 +157,8 @@ class _Clock(LoopClock):
 
 class _Input:
     """The samples of the recorded tick. Implements :class:`Input`."""
+
+    controls = QUEST_CONTROLS
 
     def __init__(self, ticks: RecordedTicks, tell: Callable[[list[Event]], None]) -> None:
         self._ticks, self._tell = ticks, tell

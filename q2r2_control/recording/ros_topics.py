@@ -20,7 +20,7 @@ from q2r2_control.types import SIDES
 CONTROLLER_TICK = "/cartesian_controller/tick"
 RECORDER = "/recorder"
 RECORDER_EVENTS = f"{RECORDER}/events"
-_NODES = ("mujoco_robot", "cartesian_controller", "tcp_endpoint", "simulation_input", "recorder")
+_NODES = ("mujoco_robot", "cartesian_controller", "tcp_endpoint", "simulation_input", "hand_input", "recorder")
 
 # `index` counts the ticks that moved the reference, `dt` is since the last of them; `rejected` is of each arm.
 TICK_FIELDS = (

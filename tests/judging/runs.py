@@ -19,7 +19,7 @@ from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.recording.about import About
 from q2r2_control.recording.recorder import Recorder
 from q2r2_control.recording.rows import HEAD
-from q2r2_control.types import SIDES, HandInputs, HandSample
+from q2r2_control.types import QUEST_CONTROLS, SIDES, HandInputs, HandSample
 from tests.recording.runs import file_of, rewrite
 from tests.support.watch import cell
 
@@ -113,6 +113,8 @@ class Slow:
 
 class Held:
     """An input whose samples the loop gets later than they were received."""
+
+    controls = QUEST_CONTROLS
 
     def __init__(self, inner: PlayedInput, delay: float) -> None:
         self._inner, self._delay, self._waiting = inner, delay, list[HandSample]()

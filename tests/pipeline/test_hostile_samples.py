@@ -10,7 +10,7 @@ import pytest
 
 from q2r2_control.inputs.scripted import ScriptedInput
 from q2r2_control.pipeline.pipeline import Pipeline
-from q2r2_control.types import SIDES, HandSample
+from q2r2_control.types import QUEST_CONTROLS, SIDES, HandSample
 from tests.support.watch import Watch, cell, speed
 
 pytestmark = pytest.mark.slow
@@ -18,6 +18,8 @@ pytestmark = pytest.mark.slow
 
 class HostileInput:
     """A hand that moves normally and presses buttons, with invalid samples in between."""
+
+    controls = QUEST_CONTROLS
 
     def __init__(self, seed: int) -> None:
         self._random = np.random.default_rng(seed)

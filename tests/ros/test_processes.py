@@ -18,7 +18,7 @@ import pytest
 import yaml
 
 from q2r2_control.ros.launch import executables
-from q2r2_control.ros.launch.processes import SOURCES, NodeProcess, nodes_of
+from q2r2_control.ros.launch.processes import NO_INPUT, NodeProcess, nodes_of
 from tests.ros.conftest import NEEDS_ROS
 from tests.ros.processes import CONFIG, PATIENCE, ROOT, Processes, RosProcess
 from tests.support.external_cell import external
@@ -182,7 +182,7 @@ def test_a_cell_with_one_arm_has_one_arms_nodes(tmp_path: Path) -> None:
 
 def test_every_node_of_a_set_is_an_executable(tmp_path: Path) -> None:
     scripts: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
-    for source in SOURCES:
+    for source in ("scripted", "headset", NO_INPUT):
         sets = (nodes_of(CONFIG, source, "mujoco", {"folder": "recordings"}, separate) for separate in (True, False))
         for node in itertools.chain(*sets):
             module, _, function = scripts[node.name].partition(":")

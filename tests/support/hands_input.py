@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from q2r2_control.types import SIDES, Array, HandInputs, HandSample, HapticFeedback
+from q2r2_control.types import QUEST_CONTROLS, SIDES, Array, HandInputs, HandSample, HapticFeedback
 
 PERIOD = 1.0 / 75.0  # [s]
 PRESSED, RELEASED = 0.1, 0.2  # [s]
@@ -17,6 +17,8 @@ Path = Callable[[float], Array]  # time [s] -> (6,) position [m] and rotation ve
 
 class HandsInput:
     """Both hands along paths of position and rotation vector; a hand without one stays where it is."""
+
+    controls = QUEST_CONTROLS
 
     connected = True
 

@@ -13,12 +13,11 @@ import numpy as np
 import pinocchio as pin
 
 from q2r2_control.events import Event
-from q2r2_control.inputs.factory import hands_watch
-from q2r2_control.inputs.headset import HeadsetServer
+from q2r2_control.inputs.headset import HeadsetServer, watch_of
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.summary.tick import Tick
-from q2r2_control.types import SIDES, Array, CommandMode, HandSample, HapticFeedback
+from q2r2_control.types import QUEST_CONTROLS, SIDES, Array, CommandMode, HandSample, HapticFeedback
 from tests.support.fake_headset import FakeHeadset
 from tests.support.headset_server import eventually
 from tests.support.operator_script import START
@@ -133,11 +132,13 @@ class Operator:
 class HeadsetInStep:
     """The input of a run: the server, and the operator that the script plays."""
 
+    controls = QUEST_CONTROLS
+
     def __init__(self, script: Script, mujoco: Mapping[str, object], **teleop: object) -> None:
         changed = cell().teleop.model_validate({**cell().teleop.model_dump(), **teleop})
         softer = cell().mujoco.model_copy(update=mujoco)
         self.config = cell().model_copy(update={"teleop": changed, "mujoco": softer, "loop_rate_hz": 500.0})
-        self.server = HeadsetServer(port=0, clock=lambda: self.now, watch=hands_watch(self.config))
+        self.server = HeadsetServer(port=0, clock=lambda: self.now, watch=watch_of(self.config))
         self.now = 0.0
         self.over = False
         self.plant: MujocoPlant | None = None

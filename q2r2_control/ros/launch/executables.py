@@ -14,6 +14,7 @@ from importlib import import_module
 MODULES = {
     "tcp_endpoint": "tcp_endpoint",
     "SimulationInput": "simulation_input",
+    "hand_input": "hand_input",
     "CheckTCPconnection": "check_tcp_connection",
     "cartesian_controller": "cartesian_controller",
     "mujoco_robot": "mujoco_robot",
@@ -38,6 +39,7 @@ def _executable(name: str) -> Callable[[], int]:
 
 tcp_endpoint = _executable("tcp_endpoint")
 simulation_input = _executable("SimulationInput")
+hand_input = _executable("hand_input")
 check_tcp_connection = _executable("CheckTCPconnection")
 cartesian_controller = _executable("cartesian_controller")
 mujoco_robot = _executable("mujoco_robot")

@@ -18,10 +18,11 @@ from dataclasses import dataclass, field
 from q2r2_control.config.cell import load_config
 from q2r2_control.config.external import ControllerKind, ExternalConfig
 from q2r2_control.errors import ConfigError, Q2R2Error
+from q2r2_control.plugins import INPUTS, check_installed
 from q2r2_control.process.signals import StopRequest, how_it_ended, stop_on_signals
 from q2r2_control.types import SIDES
 
-SOURCES = ("scripted", "headset", "none")
+NO_INPUT = "none"  # another node sends the hands
 ROBOTS = ("auto", "mujoco", "none")
 # Time for a process to end, after SIGINT and then after SIGTERM; SIGKILL follows [s].
 _END_TIMEOUTS = {signal.SIGINT: 5.0, signal.SIGTERM: 3.0}
@@ -47,7 +48,7 @@ class NodeProcess:
 
 def nodes_of(
     path: str,
-    source: str = "scripted",
+    source: str | None = None,
     robot: str = "auto",
     recording: Mapping[str, str] | None = None,
     separate: bool = False,
@@ -56,14 +57,16 @@ def nodes_of(
 
     ``separate``: one for each arm, each with a teleoperation of its own: what one hand does is for its own arm only.
 
-    ``source`` of the hands: scripted, headset or none. ``robot``: mujoco, none, or auto, which is mujoco for
-    ``controller: builtin`` only. ``recording``: parameters of the recorder, None without one; it starts first, and so
-    ends last. Raises :class:`ConfigError`.
+    ``source`` of the hands: an installed input, "none", or None for the cell's. ``robot``: mujoco, none, or auto, which
+    is mujoco for ``controller: builtin`` only. ``recording``: parameters of the recorder, None without one; it starts
+    first, and so ends last. Raises :class:`ConfigError`.
     """
-    for name, value, allowed in (("input", source, SOURCES), ("robot", robot, ROBOTS)):
-        if value not in allowed:
-            raise ConfigError(f"{name} = {value!r:.60}: allowed are {', '.join(allowed)}")
+    if robot not in ROBOTS:
+        raise ConfigError(f"robot = {robot!r:.60}: allowed are {', '.join(ROBOTS)}")
     cell = load_config(path)
+    source = source or cell.input
+    if source != NO_INPUT:
+        check_installed(INPUTS, source)
     config: dict[str, str | float] = {"config": path}
     nodes = [] if recording is None else [_node("recorder", {**config, **recording})]
     felt: dict[str, str | float] = {}
@@ -81,6 +84,8 @@ def nodes_of(
         nodes.append(NodeProcess("SimulationInput", "q2r2_control.ros.nodes.simulation_input"))
     elif source == "headset":
         nodes.append(_node("tcp_endpoint", config))
+    elif source != NO_INPUT:
+        nodes.append(_node("hand_input", config | {"input": source}))
     return nodes
 
 
