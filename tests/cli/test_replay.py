@@ -66,7 +66,7 @@ def test_joints_are_sent_to_a_plant_and_followed(recorded: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (("--joints",), "--joints needs --plant mujoco or --plant kinematic"),
+        (("--joints",), "--joints needs --plant, such as mujoco or kinematic"),
         (("--joints", "--plant", "kinematic", "--compare"), "--joints and --compare exclude each other"),
         (("--viewer",), "--viewer: without --plant there is no window; allowed: --plant mujoco"),
         (("--plant", "kinematic", "--viewer"), "--viewer: the kinematic plant has no window"),

@@ -154,8 +154,8 @@ def test_a_duration_that_is_no_time_is_refused(duration: float) -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"input": "mouse"}, "input 'mouse': allowed are scripted, headset"),
-        ({"plant": "gazebo"}, "plant 'gazebo': allowed are mujoco, kinematic"),
+        ({"input": "mouse"}, "input 'mouse': allowed are headset, scripted"),
+        ({"plant": "gazebo"}, "plant 'gazebo': allowed are kinematic, mujoco"),
         ({"mode": "jerk"}, "mode jerk: MujocoPlant follows position, velocity, torque commands only"),
         (
             {"plant": "kinematic", "mode": "torque"},
