@@ -1,4 +1,10 @@
-"""Your own input device: anything that knows where two hands are can move the arms."""
+"""Your own input device: anything that knows where two hands are can move the arms.
+
+An installed package names it, so that a YAML and the commands find it, and has a class method ``from_config(config)``:
+
+    [project.entry-points."q2r2_control.inputs"]
+    swing = "my_package:SwingingHands"
+"""
 
 import numpy as np
 
@@ -11,6 +17,7 @@ class SwingingHands:
 
     controls = DeviceControls(buttons=("button_lower", "button_upper"), axes=())
     connected = True
+    controls = DeviceControls(buttons=("button_lower", "button_upper"), axes=())
 
     def start(self) -> None:
         """Open the device here."""

@@ -1,4 +1,7 @@
-"""Your own plant: a robot behind your own driver; here one that follows with a lag of 5 ms."""
+"""Your own plant: a robot behind your own driver; here one that follows with a lag of 5 ms.
+
+An installed package names it, so that the commands find it: [project.entry-points."q2r2_control.plants"].
+"""
 
 import numpy as np
 
