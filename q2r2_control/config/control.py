@@ -116,7 +116,7 @@ class ControllerSettings(BaseModel):
     )
     distance_buffer: float = Field(
         0.002,
-        gt=0,
+        ge=1e-4,
         le=0.05,
         description="the QP aims to stop this much earlier, but half a pair's distance at most [m]",
     )

@@ -20,6 +20,7 @@ from q2r2_control.control.qp import QpProblem, Solver, make_solver
 from q2r2_control.control.qp_assembly import assemble
 from q2r2_control.control.reference import move_reference, observe_bodies, spare_distance, start_reference
 from q2r2_control.control.safety.safety_filter import FOLLOWED, STOPPED
+from q2r2_control.control.safety.safety_model import ROUNDING
 from q2r2_control.control.step_report import LimitNames, StepSummary
 from q2r2_control.control.targets import TargetTracker
 from q2r2_control.control.tasks.external import load_tasks
@@ -136,7 +137,7 @@ class CartesianController:
         self._targets.reset(state.q)
         observed = start_reference(self._model_pointer, self._data_pointer)
         self._closest, self._distance, self._tightest, self._margin, proven = observed
-        self._apart = self._margin >= 0.0
+        self._apart = self._margin >= -ROUNDING
         self._certified = proven and self._apart
         self._live.begin(self._objects.load)
 
@@ -264,7 +265,7 @@ class CartesianController:
         """Observe with bodies that have changed; returns the pair in the way of those that have ``grown``, or -1."""
         observed = self._observe_bodies(self._model_pointer, self._data_pointer, grown)
         self._closest, self._distance, self._tightest, self._margin, blocked = observed
-        self._apart = self._margin >= 0.0
+        self._apart = self._margin >= -ROUNDING
         return int(blocked)
 
     def tool_pose(self, arm: str) -> pin.SE3:
@@ -311,7 +312,7 @@ class CartesianController:
         summary.solve_time += solution.solve_time
         if self._objects.growing:
             self._objects.grow(h)
-        was_apart, self._apart = self._apart, self._margin >= 0.0
+        was_apart, self._apart = self._apart, self._margin >= -ROUNDING
         # A certified stop stays certified. Anything else was proven just now, and if all was apart before, in full.
         self._certified = self._apart and (self._certified if outcome == STOPPED else was_apart)
         return solved

@@ -14,7 +14,7 @@ from q2r2_control.control.jit import kernel
 from q2r2_control.control.safety.joint_limits import ACCELERATION, NO_LIMIT
 from q2r2_control.control.safety.safety_data import SafetyData
 from q2r2_control.control.safety.safety_model import SafetyModel
-from q2r2_control.control.safety.stop_certificate import certify
+from q2r2_control.control.safety.stop_certificate import certify, is_too_close
 from q2r2_control.control.safety.stop_shapes import SHAPES, brake, write_stop
 from q2r2_control.types import Array
 
@@ -92,7 +92,7 @@ def certify_bodies(model: SafetyModel, data: SafetyData, grown: IntArray) -> int
     for p in range(pairs.first.shape[0]):
         if grown[pairs.first[p]] == 1 or grown[pairs.second[p]] == 1:
             any_grown = True
-            if data.distance[p] < model.min_distance[p]:
+            if is_too_close(model, data, p):
                 return p
     if not any_grown:
         return -1
@@ -124,7 +124,7 @@ def _largest_certified(model: SafetyModel, data: SafetyData, h: float) -> int:
     """
     too_close = False
     for p in range(data.distance.shape[0]):
-        too_close |= data.distance[p] < model.min_distance[p]
+        too_close |= is_too_close(model, data, p)
     brake(data.state.q, data.state.v, data.certified, h, data.candidate.q, data.braked)
     if _certify_mixture(model, data, 1.0, h, too_close):
         _keep_stop(data)
@@ -204,7 +204,7 @@ def _note_too_close(model: SafetyModel, data: SafetyData) -> None:
     """List the pairs that were too close when nothing could be certified: they hold the arms."""
     active = data.active
     for p in range(data.distance.shape[0]):
-        if data.distance[p] < model.min_distance[p] and active.used[0] < active.kind.shape[0]:
+        if is_too_close(model, data, p) and active.used[0] < active.kind.shape[0]:
             active.kind[active.used[0]] = SEPARATION
             active.subject[active.used[0]] = p
             active.used[0] += 1

@@ -9,6 +9,10 @@ from q2r2_control.control.geometry.kinematics import IntArray
 from q2r2_control.control.safety.joint_limits import JointLimits
 from q2r2_control.types import Array
 
+# A pair that is closer than its distance by less than this is not too close: a difference of distances has no more
+# digits. Its proof then is that it comes no closer than it is, see stop_certificate.py.
+ROUNDING = 1e-9  # [m]
+
 
 class Approach(NamedTuple):
     """How pairs may approach each other in the QP."""

@@ -10,6 +10,10 @@ relative to the other. One sample with distance d proves d - S. Of pairs that sh
 their bodies are at the reference (speed_bound.py), enough for most. Where it is not, the plane between the bodies
 proves a piece of the motion, with the direction of it (separating_plane.py): the stop is walked through in pieces as
 long as can be proven, each from a sample of its own.
+
+**Rounding.** A motion that is proven to end exactly at a pair's distance may end 1e-16 m below it. That is no
+penetration. Within ROUNDING below its distance a pair keeps its full proof, with the distance that it has now as the
+one to keep. So rounding never leads into recovery, where a pair is only sampled.
 """
 
 from __future__ import annotations
@@ -19,14 +23,16 @@ import numpy as np
 from q2r2_control.control.geometry.pair_distance import distance_row, measure
 from q2r2_control.control.jit import inlined_kernel, kernel
 from q2r2_control.control.safety.safety_data import SafetyData
-from q2r2_control.control.safety.safety_model import SafetyModel
+from q2r2_control.control.safety.safety_model import ROUNDING, SafetyModel
 from q2r2_control.control.safety.separating_plane import stay_beyond, stays_beyond
 from q2r2_control.control.safety.speed_bound import least_distance, way, write_deviations
 from q2r2_control.control.safety.stop_rollout import begin_rollout, sample_of, write_piece
 
-# A pair that starts closer than its distance may not come closer; this is rounding only.
-_ROUNDING = 1e-12  # [m], and relative
+# Distances of a pair that is too close are compared to this.
+_CLOSER = 1e-12  # [m], and relative
 _STILL = 1e-9  # [m/s]
+# The gap along a plane differs from the distance that it is made of by this much.
+_LAST_DIGITS = 1e-14  # [m]
 
 
 @kernel
@@ -43,7 +49,7 @@ def certify(model: SafetyModel, data: SafetyData, h: float) -> bool:
 
     ``data.distance`` holds distances at the reference, or lower bounds of them; a bound that does not suffice is
     replaced by the distance. ``data.velocities`` are those at the reference, of the bodies as they are now. A pair that
-    is closer than its distance already must not come closer at the step's end and during the stop. Where a pair fails,
+    is too close already must not come closer at the step's end and during the stop. Where a pair fails,
     ``data.unproven`` says which.
     """
     distance = data.distance
@@ -52,21 +58,35 @@ def certify(model: SafetyModel, data: SafetyData, h: float) -> bool:
     farthest = _farthest_travel(data)
     time = write_deviations(model, data, h, duration)
     for p in range(distance.shape[0]):
-        threshold = model.min_distance[p]
-        if distance[p] - model.collision.pairs.leverage[p] * farthest >= threshold:
+        if distance[p] - model.collision.pairs.leverage[p] * farthest >= model.min_distance[p]:
             continue  # no joint travels farther, so the way is no longer
         if _has_room(model, data, p, time):
             continue
         data.unproven[0] = p
-        if distance[p] < threshold:
+        if is_too_close(model, data, p):
             if not _comes_no_closer(model, data, p, duration):
                 return False
-            continue
-        if _plane_keeps_apart(model, data, p, h, duration):
-            continue
-        if not (_step_keeps_apart(model, data, p, h, duration) and _stop_keeps_apart(model, data, p, duration)):
+        elif not _keeps_apart(model, data, p, h, duration):
             return False
     return True
+
+
+@inlined_kernel
+def is_too_close(model: SafetyModel, data: SafetyData, p: int) -> bool:
+    """Whether pair ``p``, whose distance at the reference is exact where this matters, is in penetration."""
+    return data.distance[p] < model.min_distance[p] - ROUNDING
+
+
+@kernel
+def _keeps_apart(model: SafetyModel, data: SafetyData, p: int, h: float, duration: float) -> bool:
+    """Prove pair ``p`` apart in the step and in the stop: with one plane, or else piece by piece."""
+    data.distance[p] = measure(model.collision, data.collision, p)
+    threshold = min(model.min_distance[p], data.distance[p] - _LAST_DIGITS)
+    if stay_beyond(model.collision, data.collision, p, data.rollout.step, h, data.rollout.stop, duration, threshold):
+        return True
+    if not _step_keeps_apart(model, data, p, h, duration, threshold):
+        return False
+    return _stop_keeps_apart(model, data, p, duration, threshold)
 
 
 @kernel
@@ -103,20 +123,12 @@ def _distance_at(model: SafetyModel, data: SafetyData, p: int, i: int, duration:
     return measure(model.collision, sample_of(model, data, i, duration), p)
 
 
-@inlined_kernel
-def _plane_keeps_apart(model: SafetyModel, data: SafetyData, p: int, h: float, duration: float) -> bool:
-    """Prove pair ``p`` apart in the step and in the stop by the plane at the reference, without a sample."""
-    threshold = model.min_distance[p]
-    data.distance[p] = measure(model.collision, data.collision, p)
-    if data.distance[p] < threshold:
-        return False
-    return stay_beyond(model.collision, data.collision, p, data.rollout.step, h, data.rollout.stop, duration, threshold)
-
-
 @kernel
-def _step_keeps_apart(model: SafetyModel, data: SafetyData, p: int, h: float, duration: float) -> bool:
+def _step_keeps_apart(
+    model: SafetyModel, data: SafetyData, p: int, h: float, duration: float, threshold: float
+) -> bool:
     """Prove pair ``p`` apart in the step: from both of its ends by the way, or else from the first by a plane."""
-    after, threshold = _distance_at(model, data, p, 0, duration), model.min_distance[p]
+    after = _distance_at(model, data, p, 0, duration)
     if after < threshold:
         return False
     if 0.5 * (data.distance[p] + after - way(model, p, data.rollout.step.travel)) >= threshold:
@@ -126,9 +138,9 @@ def _step_keeps_apart(model: SafetyModel, data: SafetyData, p: int, h: float, du
 
 
 @kernel
-def _stop_keeps_apart(model: SafetyModel, data: SafetyData, p: int, duration: float) -> bool:
+def _stop_keeps_apart(model: SafetyModel, data: SafetyData, p: int, duration: float, threshold: float) -> bool:
     """Prove pair ``p`` apart along the whole stop, piece by piece."""
-    rollout, threshold = data.rollout, model.min_distance[p]
+    rollout = data.rollout
     last = rollout.q.shape[0] - 1
     stride = last
     i = 0
@@ -174,14 +186,14 @@ def _comes_no_closer(model: SafetyModel, data: SafetyData, p: int, duration: flo
     last = data.rollout.q.shape[0] - 1
     for i in range(last + 1):
         now = _distance_at(model, data, p, i, duration)
-        if now < before - _ROUNDING:
+        if now < before - _CLOSER:
             return False
         before = now
         distance_row(model.collision, sample_of(model, data, i, duration), p, row)
         rate = 0.0
         for j in range(row.shape[0]):
             v = data.rollout.v[i, j]
-            if i == last and abs(candidate.v[j]) >= (1.0 - _ROUNDING) * duration * candidate.deceleration[j]:
+            if i == last and abs(candidate.v[j]) >= (1.0 - _CLOSER) * duration * candidate.deceleration[j]:
                 v = np.sign(candidate.v[j]) * candidate.deceleration[j] * duration / last
             rate += row[j] * v
         if rate < -_STILL:
