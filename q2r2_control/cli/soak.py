@@ -59,7 +59,8 @@ def _rows(report: SoakReport) -> Iterator[tuple[Cell, ...]]:
 
 def _notes(report: SoakReport, options: str) -> Iterator[str]:
     yield (
-        f"{report.segments} segments, {report.resets} resets, {report.solver_faults} ticks with a failing solver, "
+        f"{report.segments} segments, {report.resets} resets, {report.solver_faults} ticks with a failing solver "
+        f"({report.attacks} with one that works against the arms), "
         f"{report.fallbacks} stops ({report.fallbacks_healthy} with a healthy solver), "
         f"{report.openings} openings of grippers ({report.openings_refused} refused), "
         f"{report.grasps} grasps and releases, {report.changes} changes of settings"

@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from q2r2_control.config.control import ControllerSettings
+from q2r2_control.control.safety.safety_model import ROUNDING
 from q2r2_control.robot.kept_distances import kept_by_objects, kept_distances
 from q2r2_control.robot.pairs import pair_names
 from q2r2_control.robot.robot import Robot
@@ -26,6 +27,7 @@ _NEWEST = 5000  # ticks whose accelerations are kept
 _ROUNDING = 4.0 * np.finfo(np.float64).eps  # of a difference, relative to the numbers
 _BETWEEN_SHARE, _BETWEEN_SAMPLES = 0.02, 4  # share of the ticks that are sampled, and postures in each
 _STOP_SHARE, _STOP_SAMPLES = 0.005, 41
+_NEAR, _NEAR_SHARE = 1e-3, 10.0  # with less margin [m] so many times as many ticks are sampled
 
 
 class Checked(Protocol):
@@ -102,7 +104,7 @@ class Contract:
         self._slow = self._excess == 0.0
         margins = self._measured.margins(q)
         self._from_rest = not v.any()
-        self._apart = (margins >= 0.0) & self._from_rest
+        self._apart = (margins >= -ROUNDING) & self._from_rest
         # Whether a certificate has to be known from now on. A start at rest with all apart is its own.
         self._certain = self._from_rest and bool(self._apart.all())
         self._least = float(margins.min(initial=np.inf)) if self._certain else -np.inf
@@ -294,6 +296,8 @@ class Contract:
     def _sample(self, q: Array, v: Array, stop: Array, h: float, report: StepReport) -> None:
         """Measure distances that the controller did not measure itself."""
         draw = 0.0 if self._sample_all else self._random.random()
+        if report.margin < _NEAR:
+            draw /= _NEAR_SHARE
         if draw < _BETWEEN_SHARE:
             values, kept = self._measured.values(q), self._measured.kept
             margins = self._measured.less_kept(values)

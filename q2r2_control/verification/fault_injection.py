@@ -1,4 +1,4 @@
-"""What a soak feeds to a controller: segments of hostile targets, uneven ticks, failing solvers and bad starts."""
+"""What a soak feeds to a controller: segments of hostile targets, uneven ticks, hostile solvers and bad starts."""
 
 from __future__ import annotations
 
@@ -13,10 +13,13 @@ from q2r2_control.control.qp import QpProblem, QpSolution, Solver
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 from q2r2_control.verification.adversary import Adversary, Stream
+from q2r2_control.verification.worst_solver import ATTACKS, WorstSolver
 
 # Solver failures after which the certified stop is due. A solution of absurd numbers is cut to the limits instead.
 STOPPING_FAULTS = ("none", "nan", "one_nan", "infinite", "late")
 FAULTS = (*STOPPING_FAULTS, "absurd", "noise")
+_ATTACK_SHARES = (0.7, 0.2, 0.1)
+_FAULTY, _ATTACKED = 0.2, 0.3  # share of the segments whose solver fails, or works against the arms
 _TIMINGS = {  # share of the segments
     "1 ms": 0.42,
     "1 ms, jittering": 0.20,
@@ -33,19 +36,26 @@ _DEEPEST = -0.03  # distance of a pair at a start in penetration [m]
 
 
 class FaultySolver:
-    """A real solver that fails as :attr:`fault` says: one of ``FAULTS``, or None for a healthy one.
+    """A real solver that fails as :attr:`fault` says: one of ``FAULTS`` or ``ATTACKS``, or None for a healthy one.
 
-    Its solve times are made up, so that no outcome depends on the load of the machine.
+    Its solve times are made up, so that no outcome depends on the load of the machine. ``worst`` answers while
+    :attr:`fault` is an attack; ``q`` (nv,) [rad] and ``kept`` (p,) [m] are what it aims by.
     """
 
-    def __init__(self, inner: Solver, random: np.random.Generator | None = None) -> None:
+    def __init__(
+        self, inner: Solver, random: np.random.Generator | None = None, worst: WorstSolver | None = None
+    ) -> None:
         self._inner, self._random = inner, np.random.default_rng(0) if random is None else random
+        self._worst = worst
         self.fault: str | None = None
+        self.q, self.kept = np.zeros(0), np.zeros(0)
 
     def solve(self, problem: QpProblem) -> QpSolution:
         """See :class:`Solver`."""
+        if self.fault in ATTACKS and self._worst is not None:
+            return QpSolution(self._worst.answer(self.fault, problem, self.q, self.kept), 0.0)
         v, nv = self._inner.solve(problem).v, len(problem.g)
-        if self.fault is None:
+        if self.fault is None or self.fault in ATTACKS:
             return QpSolution(v, 0.0)
         if self.fault == "one_nan":
             broken = np.zeros(nv) if v is None else np.array(v)
@@ -79,13 +89,14 @@ class Segment:
     ticks: int
     start: Start | None  # None: goes on from where the last segment ended
     fault: str | None
-    fault_period: int  # the solver fails in every other period [ticks]
+    fault_period: int  # the solver fails in every other period, an attack lasts [ticks]
     stream: Stream
     dt: Callable[[], Any]
 
     def fault_at(self, tick: int) -> str | None:
         """How the solver fails in a tick of this segment."""
-        return self.fault if (tick // self.fault_period) % 2 == 0 else None
+        lasts = self.fault in ATTACKS or (tick // self.fault_period) % 2 == 0
+        return self.fault if lasts else None
 
     def __str__(self) -> str:
         start = "" if self.start is None else f", from {self.start.name}"
@@ -106,12 +117,19 @@ def segments(robot: Robot, kept: Array, random: np.random.Generator) -> Iterator
             timing=timing,
             ticks=int(np.exp(random.uniform(np.log(20), np.log(longest)))),
             start=start,
-            fault=str(random.choice(FAULTS)) if random.random() < 0.2 else None,
+            fault=_fault(random),
             fault_period=int(random.integers(1, 150)),
             stream=adversary.stream(name),
             dt=_ticks(timing, random),
         )
         start = starts.draw(str(random.choice(_STARTS))) if random.random() < 0.3 else None
+
+
+def _fault(random: np.random.Generator) -> str | None:
+    share = random.random()
+    if share < _ATTACKED:
+        return str(random.choice(ATTACKS, p=_ATTACK_SHARES))
+    return str(random.choice(FAULTS)) if share < _ATTACKED + _FAULTY else None
 
 
 def _ticks(timing: str, random: np.random.Generator) -> Callable[[], Any]:

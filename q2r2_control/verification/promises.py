@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
+from q2r2_control.control.safety.safety_model import ROUNDING
+
 RELATIVE = 1e-9  # to which the contract promises limits
 COAL = 2e-6  # how exactly Coal measures a capsule from a box [m]
 
@@ -22,7 +24,7 @@ PROMISES = {  # key: name, unit, and what its value has to be
     "deceleration": ("deceleration of the stop / limit", "", "<=", 1.0 + RELATIVE),
     "jump": ("travel in a tick / what v allows", "", "<=", 1.0),
     "parabola": ("off constant acceleration or the stop", "rad", "<=", 1e-11),
-    "distance": ("distance - kept distance, at ticks", "m", ">=", 0.0),
+    "distance": ("distance - kept distance, at ticks", "m", ">=", -ROUNDING),
     "between": ("distance - kept distance, between ticks", "m", ">=", -COAL),
     "stop": ("distance - kept distance, full stops", "m", ">=", -COAL),
     "stop_position": ("room to position limits, full stops", "rad", ">=", -RELATIVE),

@@ -23,6 +23,7 @@ from q2r2_control.verification.adversary import HostileChanges, HostileGrasps, H
 from q2r2_control.verification.contract import Checked, Contract, time_of
 from q2r2_control.verification.fault_injection import STOPPING_FAULTS, FaultySolver, Segment, segments
 from q2r2_control.verification.promises import Margin
+from q2r2_control.verification.worst_solver import ATTACKS, WorstSolver
 
 FEWEST_TICKS = 100
 _SETTLED = 0.1  # share of the ticks after which memory should have stopped growing
@@ -31,6 +32,7 @@ _COUNTED = (
     "segments",
     "resets",
     "solver_faults",
+    "attacks",
     "openings",
     "openings_refused",
     "grasps",
@@ -82,7 +84,8 @@ class SoakReport:
     simulated_s: float
     segments: int
     resets: int
-    solver_faults: int  # ticks
+    solver_faults: int  # ticks, attacks among them
+    attacks: int  # ticks with a solver that works against the arms
     openings: int  # of grippers that were told
     openings_refused: int
     grasps: int  # of objects, and releases
@@ -113,7 +116,9 @@ def run_soak(config: Config, ticks: int, seed: int, progress: Callable[[str], No
     robot = Robot.from_config(config)
     settings = config.control.model_copy(update={"solve_time_limit": config.control.solve_time_limit or 0.005})
     # The solver gets no time limit: a soak that finds something has to find it again.
-    solver = FaultySolver(make_solver(settings.solver, robot.model.nv, None), np.random.default_rng([seed, 1]))
+    inner = make_solver(settings.solver, robot.model.nv, None)
+    worst = WorstSolver(robot, np.random.default_rng([seed, 6]))
+    solver = FaultySolver(inner, np.random.default_rng([seed, 1]), worst)
     controller = CartesianController(robot, settings, solver=solver)
     return Soak(config.name, controller, solver, seed, progress).run(ticks)
 
@@ -184,7 +189,7 @@ class Soak:
     def _tick(self, tick: int, segment: Segment, since: int) -> None:
         fault, dt = segment.fault_at(since), segment.dt()
         request = segment.stream(since, self._q)
-        self._solver.fault = fault
+        self._solver.fault, self._solver.q, self._solver.kept = fault, self._q, self._controller.kept_distances
         self._tell_opening()
         self._tell_holding()
         if (values := self._changes.draw()) is not None:
@@ -205,6 +210,7 @@ class Soak:
         self._q, self._v = reference.q, reference.v
         self._simulated += time_of(dt)
         self._counts["solver_faults"] += fault is not None
+        self._counts["attacks"] += fault in ATTACKS
         self._counts["fallbacks"] += reference.report.fallback
         self._counts["fallbacks_healthy"] += reference.report.fallback and fault is None
 

@@ -331,7 +331,7 @@ def test_the_report_names_what_holds_the_arms_back() -> None:
 @pytest.mark.slow
 def test_separation_holds_between_ticks_and_along_every_stop_where_the_arms_come_nearest() -> None:
     """Without a buffer to speak of; Coal measures between all ticks, and along the full stop from each."""
-    settings = ControllerSettings(distance_buffer=1e-5, separation_gain=20.0)
+    settings = ControllerSettings(distance_buffer=1e-4, separation_gain=20.0)
     controller = CartesianController(robot_of("iiwa7"), settings)
     contract = Contract(controller, sample_all=True)
     start = {arm: controller.tool_pose(arm) for arm in controller.robot.arms}

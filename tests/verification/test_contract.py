@@ -88,7 +88,7 @@ def test_a_broken_promise_is_raised_with_its_name_its_value_and_what_is_allowed(
         ("velocity", {"v": one(10.0)}, {}),
         ("position", {"q": one(4.0)}, {}),
         ("not_finite", {"a": one(np.nan)}, {}),
-        ("distance", {}, {"margin": -1e-12}),
+        ("distance", {}, {"margin": -2e-9}),
         ("uncertified", {}, {"certified": False}),
         ("unreported", {}, {"rejected": ()}),
         ("refused", {}, {"rejected": ("left", "right")}),
