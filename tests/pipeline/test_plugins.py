@@ -28,6 +28,7 @@ class Pedal:
 
     def start(self):
         self._hands = ScriptedInput("circle")
+        self._hands.start()
 
     def poll(self, now):
         samples = self._hands.poll(now)
