@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV   := .venv
 BIN    := $(VENV)/bin
 
-.PHONY: setup demo test test-slow test-ros test-ros-slow test-lerobot lint bench soak soak-ros clean
+.PHONY: setup demo test test-slow test-ros test-ros-slow test-lerobot lint bench docs picture soak soak-ros clean
 .DEFAULT_GOAL := setup
 
 setup: $(VENV)/.installed
@@ -71,6 +71,16 @@ bench: $(VENV)/.installed-bench
 # The peers to compare with. Where they cannot be had, the bench says so and does without.
 $(VENV)/.installed-bench: $(VENV)/.installed
 	$(BIN)/python -m pip install --quiet --editable '.[bench]' && touch $@ || true
+
+# Pages under build/site, with the API's own docstrings.
+docs: setup
+	$(BIN)/python -m pip install --quiet --editable '.[docs]'
+	$(BIN)/python docs/make_reference.py
+	$(BIN)/mkdocs build --strict
+
+# The README's moving picture, docs/demo.webp.
+picture: setup
+	MUJOCO_GL=$${MUJOCO_GL:-egl} $(BIN)/python docs/moving_picture.py
 
 soak: setup
 	$(BIN)/q2r2 soak

@@ -1,4 +1,4 @@
-"""The README's commands for ROS and its port of another robot work as they stand there."""
+"""The README's command for ROS and the documented port of another robot work as they stand there."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from tests.ros.waiting import wait_until  # noqa: E402
 MOVED = 0.05  # [rad]
 
 
-def test_the_subclass_in_the_readme_teleoperates_its_arm_in_its_robots_frame(
+def test_the_documented_subclass_teleoperates_its_arm_in_its_robots_frame(
     node: Any, processes: Processes, tmp_path: Path
 ) -> None:
     from tf2_msgs.msg import TFMessage
@@ -44,7 +44,7 @@ def test_the_subclass_in_the_readme_teleoperates_its_arm_in_its_robots_frame(
     topic = "/bh_robot/right_arm_clik_controller/target_frame"
     rig = ArmRig(node, "right", topic=topic, tool_frame="right_arm_link_ee", robot="bh_robot")
     rig.follows = False
-    code, _ = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+    (code,) = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "ros.md").read_text(), re.DOTALL)
     (file := tmp_path / "right_arm.py").write_text(code)
     arguments = patient({"world_frame_id": "world", "teleop.leash.distance": 0.0})
     process = processes.start(sys.executable, str(file), *arguments, name="right_arm")

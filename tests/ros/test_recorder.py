@@ -81,7 +81,7 @@ class RunningRecorder:
         """The newest message in the file, which is being written; empty while there is none."""
         try:
             recording = open_recording(self._folder)
-            (channel,) = [one.channel for one in recording.declared_topics() if one.name == topic]
+            (channel,) = [one.channel for one in recording.declared_topics.values() if one.name == topic]
             records = [record for chunk in recording.messages() for record in chunk if channel_of(record) == channel]
         except RecordingError:  # in the middle of a write
             return b""

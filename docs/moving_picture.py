@@ -1,0 +1,52 @@
+"""Draw docs/demo.webp, the README's moving picture: the demo's hand-over and stack as MuJoCo simulates them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import mujoco
+from PIL import Image
+
+from q2r2_control import Pipeline, load_config
+from q2r2_control.inputs.scripted import ScriptedInput
+from q2r2_control.inputs.trajectories import trajectory_named
+from q2r2_control.plants.mujoco import MujocoPlant
+from q2r2_control.summary.tick import Tick
+
+ROOT = Path(__file__).resolve().parents[1]
+TASKS = "handover+stack"
+WIDTH, HEIGHT = 480, 300
+SPEED, RATE = 4.0, 10.0  # of the playback, in pictures a second
+
+
+def camera() -> mujoco.MjvCamera:
+    view = mujoco.MjvCamera()
+    view.lookat, view.distance, view.azimuth, view.elevation = (0.45, 0.0, 0.4), 1.9, 150.0, -22.0
+    return view
+
+
+def main() -> None:
+    pipeline = Pipeline.from_config(
+        load_config(ROOT / "config" / "dual_iiwa7.yaml"), input=ScriptedInput(TASKS), plant="mujoco", mode="torque"
+    )
+    plant = pipeline.plant
+    assert isinstance(plant, MujocoPlant)
+    plant.model.vis.quality.shadowsize = 1024  # of 8192, which takes long without a graphics card
+    renderer, view = mujoco.Renderer(plant.model, HEIGHT, WIDTH), camera()
+    pictures: list[Image.Image] = []
+
+    def draw(tick: Tick) -> None:
+        if tick.t * RATE / SPEED >= len(pictures):
+            renderer.update_scene(plant.data, view)
+            pictures.append(Image.fromarray(renderer.render()))
+
+    pipeline.listeners.append(draw)
+    pipeline.run(trajectory_named(TASKS).duration, realtime=False)
+    first, *rest = pictures
+    file = ROOT / "docs" / "demo.webp"
+    first.save(file, save_all=True, append_images=rest, duration=round(1e3 / RATE), loop=0, quality=60, method=4)
+    print(f"{file}: {len(pictures)} pictures, {file.stat().st_size / 1e6:.1f} MB")
+
+
+if __name__ == "__main__":
+    main()
