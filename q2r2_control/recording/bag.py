@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import os
+import sys
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
@@ -56,7 +57,8 @@ class BagWriter:
         self._first = self._last = about.epoch  # times of messages [ns]
         self._stream = path.open("xb")
         self._whole = 0  # bytes that were flushed
-        self._writer = Writer(self._stream, chunk_size=_LARGEST_CHUNK)
+        # The writer would end a chunk between two messages of one tick, which replay needs in one.
+        self._writer, self._unflushed = Writer(self._stream, chunk_size=sys.maxsize), 0
         self._writer.start("ros2", "q2r2_control")
         self._writer.add_metadata(ABOUT, about.texts())
         labels = {topic.name: topic.labels for topic in self._topics if topic.labels}
@@ -70,17 +72,21 @@ class BagWriter:
         self.flush()
 
     def write(self, records: Iterable[bytes]) -> None:
-        """Write whole records of messages, in the order of time; the file has them after :meth:`flush`."""
+        """Write records of messages of whole ticks, in the order of time; the file has them after :meth:`flush`."""
         for record in records:
             _, _, channel, sequence, time, published = HEAD.unpack_from(record)
             self._writer.add_message(self._channels[channel], time, record[HEAD.size :], published, sequence)
             self._first = min(self._first, time) if self._counts else time
             self._last = max(self._last, time)
             self._counts[channel] += 1
+            self._unflushed += len(record)
+        if self._unflushed > _LARGEST_CHUNK:
+            self.flush()
 
     def flush(self) -> None:
         """Write what was added, as one chunk."""
         self._writer.flush()
+        self._unflushed = 0
         self._whole = self._stream.tell()
 
     def close(self, conclusion: Conclusion) -> None:

@@ -12,7 +12,7 @@ from q2r2_control.config.cell import Config
 from q2r2_control.recording.joint_replay import JointReplay, replay_joints
 from q2r2_control.recording.reader import Recording
 from q2r2_control.recording.recorded_ticks import RecordedTicks
-from q2r2_control.recording.rows import HEAD
+from q2r2_control.recording.rows import HEAD, MESSAGE
 from q2r2_control.recording.topics import REFERENCE
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
@@ -44,8 +44,8 @@ def edited(file: Path, target: Path, change: Change) -> Path:
     def change_chunk(chunk: bytearray) -> None:
         at = 0
         while at < len(chunk):
-            _, length, channel, number, *_ = HEAD.unpack_from(chunk, at)
-            if channel == topic.channel:
+            opcode, length, channel, number, *_ = HEAD.unpack_from(chunk.ljust(at + HEAD.size), at)
+            if opcode == MESSAGE and channel == topic.channel:
                 row = np.frombuffer(chunk, dtype=dtype, count=1, offset=at)[0]
                 change(number, row["positions"], row["velocities"])
             at += 9 + length

@@ -19,7 +19,7 @@ from q2r2_control.plants.kinematic import KinematicPlant
 from q2r2_control.recording.reader import Recording
 from q2r2_control.recording.recorder import Recorder
 from q2r2_control.recording.replay import replay
-from q2r2_control.recording.rows import HEAD
+from q2r2_control.recording.rows import HEAD, MESSAGE
 from q2r2_control.robot.robot import Robot
 from q2r2_control.summary.tick import Tick
 from q2r2_control.types import HandFault, HandSample, RobotState
@@ -217,8 +217,8 @@ def flip(file: Path, target: Path, topic: str, label: str) -> Path:
     def change(chunk: bytearray) -> None:
         at = 0
         while at < len(chunk) and not flipped:
-            _, length, channel, number, *_ = HEAD.unpack_from(chunk, at)
-            if channel == row.channel and number >= 1.0 * RATE:
+            opcode, length, channel, number, *_ = HEAD.unpack_from(chunk.ljust(at + HEAD.size), at)
+            if opcode == MESSAGE and channel == row.channel and number >= 1.0 * RATE:
                 chunk[at + begin + 1] ^= 1
                 flipped.append(number)
             at += 9 + length
