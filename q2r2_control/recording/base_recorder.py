@@ -14,7 +14,7 @@ from q2r2_control.recording.about import About, Conclusion
 from q2r2_control.recording.encoder import RecordedRobot
 from q2r2_control.recording.helper_process import HelperProcess, reason_of
 from q2r2_control.recording.topics import Topic
-from q2r2_control.recording.writer import MessageBatch, RecordingSetup, TickBatch, Written
+from q2r2_control.recording.writer import FLUSH_PERIOD, MessageBatch, RecordingSetup, TickBatch, Written
 
 PATIENCE = 10.0  # with a disk that hangs, at the end of a run [s]
 
@@ -33,7 +33,8 @@ class BaseRecorder:
         self.writer: HelperProcess | None = None
         self.record_outcome: Callable[[Reason], None] = lambda reason: None  # lets the operator know of the failure
         try:
-            self.writer = HelperProcess("writes it", "q2r2_control.recording.writer", self._on_written, room)
+            module = "q2r2_control.recording.writer"
+            self.writer = HelperProcess("writes it", module, self._on_written, room, idle=FLUSH_PERIOD)
         except OSError as error:
             self._fail(reason_of(error))
 

@@ -18,7 +18,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from queue import SimpleQueue
+from queue import Empty, SimpleQueue
 from threading import Lock, Thread
 from typing import Any
 
@@ -43,14 +43,21 @@ class HelperProcess:
     """
 
     def __init__(
-        self, what: str, module: str, on_answer: Callable[[Any], None], room: int = 1 << 20, **environment: str
+        self,
+        what: str,
+        module: str,
+        on_answer: Callable[[Any], None],
+        room: int = 1 << 20,
+        idle: float | None = None,
+        **environment: str,
     ) -> None:
         """Call ``module.main(requests, answer)`` in a new process. Raises :class:`OSError`.
 
         ``what`` it does, for faults. ``on_answer`` gets each answer, in a thread of its own. ``room`` [bytes] is for
-        requests that wait. ``environment``: variables of the process, where this one does not have them.
+        requests that wait. The process gets a request None when no other has come for ``idle`` [s]. ``environment``:
+        variables of the process, where this one does not have them.
         """
-        self._what, self._on_answer, self._room = what, on_answer, room
+        self._what, self._on_answer, self._room, self._idle = what, on_answer, room, idle
         paths = {"PYTHONPATH": os.pathsep.join(map(os.path.abspath, sys.path))}
         self._process = subprocess.Popen(
             [sys.executable, "-P", "-c", f"from {__name__} import run_helper; run_helper({module!r})"],
@@ -127,7 +134,7 @@ class HelperProcess:
         stream = self._process.stdin
         assert stream is not None
         with suppress(OSError):  # of a process that has ended
-            while (entry := self._queue.get()) is not None:
+            while (entry := self._next_request()) is not None:
                 request, size = entry
                 pickle.dump(request, stream)
                 stream.flush()
@@ -135,6 +142,13 @@ class HelperProcess:
                 self._moved = time.monotonic()
         with suppress(OSError):
             stream.close()
+
+    def _next_request(self) -> tuple[Any, int] | None:
+        """The next one and its size, once there is one; None at the end."""
+        try:
+            return self._queue.get(timeout=self._idle)
+        except Empty:
+            return None, 0
 
     def _listen(self) -> None:
         stream, fault = self._process.stdout, None

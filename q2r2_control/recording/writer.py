@@ -18,7 +18,7 @@ from q2r2_control.recording.bag import BagWriter
 from q2r2_control.recording.encoder import RecordedRobot, TickEncoder, in_order
 from q2r2_control.recording.topics import Topic
 
-_FLUSH_PERIOD = 0.5  # of the file; what is lost at most where this process is killed [s]
+FLUSH_PERIOD = 0.5  # of the file; what is lost at most where this process is killed [s]
 _NICENESS = 10  # the loop goes first where there are not enough processors
 
 
@@ -55,13 +55,13 @@ def main(requests: Iterator[Any], answer: Callable[[Written], None]) -> None:
     """Write one recording. Raises :class:`OSError`, with a file that has what was written before."""
     with suppress(OSError):
         os.nice(_NICENESS)
-    setup = next(requests, None)
-    if setup is None:
+    setup = next((request for request in requests if request is not None), None)
+    if not isinstance(setup, RecordingSetup):
         return  # there was no run
     about = setup.about
     encoder = TickEncoder(setup.robot, about.topics(), about.epoch) if setup.robot is not None else None
     received, conclusion = Written(), Conclusion()
-    due = time.monotonic() + _FLUSH_PERIOD
+    due = time.monotonic() + FLUSH_PERIOD
     with BagWriter(setup.path, setup.topics, about) as bag:
         for request in requests:
             if isinstance(request, Conclusion):
@@ -69,13 +69,13 @@ def main(requests: Iterator[Any], answer: Callable[[Written], None]) -> None:
             elif isinstance(request, MessageBatch):
                 bag.write(request.records)
                 received = received._replace(messages=received.messages + len(request.records))
-            else:
+            elif isinstance(request, TickBatch):
                 assert encoder is not None
                 bag.write(in_order(encoder.encode(request.ticks)))
                 received = received._replace(ticks=received.ticks + len(request.ticks))
             if time.monotonic() >= due:
                 bag.flush()
                 answer(received)
-                due = time.monotonic() + _FLUSH_PERIOD
+                due = time.monotonic() + FLUSH_PERIOD
         bag.close(conclusion)
     answer(received)

@@ -18,7 +18,7 @@ from q2r2_control.inputs.scripted import HANDS_AT_REST
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.recording.about import About
 from q2r2_control.recording.recorder import Recorder
-from q2r2_control.recording.rows import HEAD
+from q2r2_control.recording.rows import HEAD, MESSAGE
 from q2r2_control.types import QUEST_CONTROLS, SIDES, HandInputs, HandSample
 from tests.recording.runs import file_of, rewrite
 from tests.support.watch import cell
@@ -189,9 +189,9 @@ def killed(file: Path, target: Path, ticks: int) -> Path:
 def _keep(content: bytearray, keeps: Callable[[int], bool]) -> None:
     kept, begin = bytearray(), 0
     while begin < len(content):
-        _, length, _, number, *_ = HEAD.unpack_from(content, begin)
+        opcode, length, _, number, *_ = HEAD.unpack_from(content, begin)
         end = begin + 9 + length
-        if keeps(number):
+        if opcode != MESSAGE or keeps(number):
             kept += content[begin:end]
         begin = end
     content[:] = kept

@@ -182,12 +182,7 @@ def test_what_a_killed_writer_leaves_opens_and_has_no_end(nodes: NodesOnFile) ->
     play(nodes, 250)
     recorder = nodes.recorder
     assert recorder.writer is not None
-
-    def written() -> bool:
-        nodes.hand(260 * PERIOD, "left", 0.0)  # a file grows when a message comes
-        return recorder.written.messages > 0
-
-    wait_for(written)
+    wait_for(lambda: recorder.written.messages > 0)
     os.kill(recorder.writer.pid, signal.SIGKILL)
     recorder.finish()
     assert "SIGKILL" in str(recorder.fault)
