@@ -21,7 +21,7 @@ IMPORTS = {
     **{"pin": "pinocchio", "example-robot-data-loaders": "example_robot_data", "PyYAML": "yaml", "pin-pink": "pink"},
     "pillow": "PIL",
 }
-WITH_OTHERS = {"coal", "glfw"}  # come with pin and with mujoco
+WITH_OTHERS = {"coal", "glfw", "datasets"}  # come with pin, mujoco and lerobot
 NODES = set(ROS.rglob("*.py"))
 OTHERS = set((ROOT / "q2r2_control").rglob("*.py")) - NODES
 
@@ -60,7 +60,7 @@ def test_every_dependency_is_imported_by_the_package(dependency: str) -> None:
 
 
 def test_everything_that_is_imported_outside_ros_is_a_dependency() -> None:
-    optional = modules("bench", "xacro", "export", "ray")
+    optional = modules("bench", "xacro", "export", "lerobot", "ray")
     assert imported(OTHERS) - modules() - optional - WITH_OTHERS == set()
 
 

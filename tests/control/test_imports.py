@@ -14,7 +14,7 @@ PACKAGE = Path(q2r2_control.__file__).parent
 MAY_IMPORT = {
     "config": {"config"},
     "control/geometry": {"robot"},
-    "control/tasks": {"control/geometry", "robot"},
+    "control/tasks": {"config", "control/geometry", "robot"},
     "control/safety": {"control/geometry"},
     "compliance": {"config", "control/geometry", "control/tasks", "robot"},
 }
