@@ -330,7 +330,7 @@ def test_the_report_names_what_holds_the_arms_back() -> None:
 
 @pytest.mark.slow
 def test_separation_holds_between_ticks_and_along_every_stop_where_the_arms_come_nearest() -> None:
-    """Without a buffer to speak of; Coal measures between all ticks, and along the full stop from each."""
+    """With the least buffer; Coal measures between all ticks, and along the full stop from each."""
     settings = ControllerSettings(distance_buffer=1e-4, separation_gain=20.0)
     controller = CartesianController(robot_of("iiwa7"), settings)
     contract = Contract(controller, sample_all=True)
@@ -339,4 +339,4 @@ def test_separation_holds_between_ticks_and_along_every_stop_where_the_arms_come
         contract.check(controller.step(crossing(0.0, start), settings.max_substep), settings.max_substep)
     for promise in ("distance", "between", "stop"):
         assert contract.margins[promise].checked == 500
-        assert contract.margins[promise].worst < 2e-4, "the arms come near"
+        assert contract.margins[promise].worst < 3e-4, "the arms come near"

@@ -106,9 +106,10 @@ def test_three_thousand_hostile_ticks_break_no_promise(seed: int) -> None:
     assert report.passed
     assert report.resets > 1
     assert report.solver_faults > 0
+    assert report.attacks > 100
     assert report.openings > 100
     distances = next(margin for margin in report.margins if margin.name == "distance - kept distance, at ticks")
-    assert distances.checked > 1000
+    assert distances.checked > 500
 
 
 def test_objects_gripped_and_let_go_at_any_moment_break_no_promise() -> None:
