@@ -81,8 +81,8 @@ class RunningRecorder:
         """The newest message in the file, which is being written; empty while there is none."""
         try:
             recording = open_recording(self._folder)
-            (channel,) = [one.channel for one in recording.declared_topics.values() if one.name == topic]
-            records = [record for chunk in recording.messages() for record in chunk if channel_of(record) == channel]
+            channels = [one.channel for one in recording.declared_topics.values() if one.name == topic]
+            records = [record for chunk in recording.messages() for record in chunk if channel_of(record) in channels]
         except RecordingError:  # in the middle of a write
             return b""
         return records[-1][HEAD.size :] if records else b""
