@@ -122,8 +122,7 @@ class ReasonKind(StrEnum):
     CONTROLLER_PAUSED = "controller_paused"
     ARMS_HOMING = "arms_homing"
     ARMS_BRAKING = "arms_braking"
-    STREAM_BEGINS_AWAY = "stream_begins_away"  # from the tool
-    STREAM_GOES_ON_AWAY = "stream_goes_on_away"
+    STREAM_AWAY = "stream_away"  # from the tool, where it begins or goes on
     PUBLISHER_CHANGED = "publisher_changed"
     TWO_PUBLISHERS = "two_publishers"
     TARGETS_CEASED = "targets_ceased"

@@ -100,7 +100,7 @@ class TargetStream:
             self.pose = pose
             return None
         return Reason.of(
-            ReasonKind.STREAM_BEGINS_AWAY if begins else ReasonKind.STREAM_GOES_ON_AWAY,
+            ReasonKind.STREAM_AWAY,
             distance=distance,
             angle=angle,
             engage_distance=self._settings.engage_distance,

@@ -137,7 +137,7 @@ def bad_target(kind: str, pose: pin.SE3) -> PoseStamped:
     [
         ("wrong frame", "frame_id 'elsewhere'"),
         ("not a number", "not a finite pose"),
-        ("far from the tool", "the stream begins 0.1"),
+        ("far from the tool", "the stream is 0.1"),
     ],
 )
 def test_a_bad_target_moves_nothing_and_is_reported_once(cell: Cell, kind: str, said: str) -> None:

@@ -95,7 +95,7 @@ def test_the_stream_that_is_left_is_followed_once_it_begins_anew(
     wait_until(lambda: "two publishers at a time" in str(cell.state("message")), "two publishers are reported")
     second.interrupt()
     stream.poses["left"] = shifted(stream.poses["left"], 0.0, 0.0, 0.02)
-    wait_until(lambda: "the stream goes on" in str(cell.state("message")), "one publisher is left")
+    wait_until(lambda: "the stream is" in str(cell.state("message")), "one publisher is left")
     assert cell.state("left_state") == "holding"
     stream.poses["left"] = shifted(cell.tool("left"), 0.0, 0.0, 0.2)
     time.sleep(0.1)

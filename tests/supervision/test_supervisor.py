@@ -238,7 +238,7 @@ def test_a_stream_that_was_followed_goes_on_anywhere_and_after_a_silence_only_fr
     assert stream.pose is not None
     assert stream.pose.translation[2] == TOOL.translation[2] + 0.2
     refusal = stream.offer(raised(TOOL, 0.2), [TOOL], 0.5)
-    assert kinds(refusal) == "stream_begins_away"
+    assert kinds(refusal) == "stream_away"
     assert refusal is not None
     assert refusal.detail["distance"] == pytest.approx(0.2)
     assert not stream.following
