@@ -41,7 +41,7 @@ test-ros: setup
 test-ros-slow: setup
 	$(BIN)/python -m pytest tests/ros -m 'slow and not soak'
 
-# With those: the README's command started ten times, and each arm's node stalled fifty times.
+# What .ci/run leaves out.
 soak-ros: setup
 	$(BIN)/python -m pytest tests/ros -m soak
 
