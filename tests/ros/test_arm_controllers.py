@@ -52,6 +52,8 @@ def cockpit(started: Cockpit) -> Iterator[Cockpit]:
     yield started
     for arm in ("left", "right"):
         assert call(started.cell.node, f"/{arm}_q2r2_arm_controller/reset").success
+    # The next press goes to arms that say they are not engaged, so an older state must not stand there.
+    started.rigs.wait(lambda rig: not rig.state["engaged"], "both arms are reset")
 
 
 def test_what_stops_one_arm_is_said_by_its_node_and_stops_the_linked_one(cockpit: Cockpit) -> None:
