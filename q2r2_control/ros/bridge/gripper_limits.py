@@ -9,6 +9,7 @@ they count as all of their way, for which nothing needs to be known. So they do 
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Mapping
 from functools import lru_cache, partial
 from typing import Any
@@ -25,6 +26,8 @@ from q2r2_control.ros.bridge.opening_grants import wanted_topic
 
 # Until a gripper does what was granted: the answer has to arrive, ten goals a second go out, and it may be slow [s].
 GRIPPER_DELAY = 0.3
+# Until the message of a publisher that was there before this node has arrived, on a busy machine too [s].
+_DISCOVERY = 1.0
 _UNMEASURED = "its fingers are not in the joint states, or nothing is proven while the arms are stopped"
 
 
@@ -36,6 +39,7 @@ class GripperLimits:
         self._node, self._loop = node, loop
         self._fingers = FingerStates(config, loop.controller)
         self.wanted: dict[str, float] = {}  # arm -> opening, 0 closed .. 1 fully open
+        self._began = time.monotonic()
         self._answered: dict[str, tuple[float, float]] = {}
         self._answers: dict[str, Any] = {}
         for arm in (arm for arm in self._fingers.arms if arm in targets):
@@ -59,6 +63,15 @@ class GripperLimits:
         """Keep the fingers of a message of joint states, if there are any."""
         if self._answers:
             self._fingers.take(message, self._node.now)
+
+    def awaits(self, now: float) -> bool:
+        """Whether the opening of a measured gripper may have been commanded, and is not known here yet.
+
+        Its fingers would count as all of their way: arms that rest near something with closed grippers would back off.
+        """
+        if time.monotonic() - self._began > _DISCOVERY:
+            return False
+        return any(arm in self._answers and arm not in self.wanted for arm in self.openings(now))
 
     def answer(self) -> None:
         """Publish what the loop has granted, where that is new."""

@@ -156,6 +156,8 @@ class CartesianControllerNode(ManagedNode):
 
     def _advance(self, now: float, dt: float, decided: float) -> None:
         self._advances += 1
+        if self._supervisor.phase is Phase.INACTIVE and self._grippers.awaits(now):
+            return
         # Commands that the arms do not follow are not for a receiver that has just come.
         if fault := self._output.listener_fault(self._supervisor.off_reference):
             self._supervisor.let_go(_in_words(fault), now)
