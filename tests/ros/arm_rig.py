@@ -66,6 +66,7 @@ class ArmRig:
         self.sent = 0  # messages of the hand, since a button was pressed or let go
         self.targets: list[PoseStamped] = []
         self.state: dict[str, Any] = {}
+        self.ready_states = 0  # in a row
         self.levels: Counter[str] = Counter()
         self.pulses: list[tuple[float, float]] = []
         self._frame = tool_frame or f"{arm}_tool_frame"
@@ -160,6 +161,8 @@ class ArmRig:
 
     def _on_state(self, message: String) -> None:
         self.state = json.loads(message.data)
+        ready = self.state["ready"] and self.state["level"] == "ok"
+        self.ready_states = self.ready_states + 1 if ready else 0
         self.levels[self.state["level"]] += 1
 
 
@@ -175,9 +178,15 @@ class ArmRigs:
             rig.wait(partial(condition, rig), f"{rig.arm}: {what}")
 
     def engage(self) -> None:
-        """Press until all follow."""
-        self.wait(lambda rig: rig.state.get("level") == "ok", "nothing keeps the arm from being engaged")
+        """Press when all say that they are ready; an older state may be out of date."""
+        self.wait_until_ready(1)
         self.press_until(lambda rig: rig.state.get("engaged"), "the arm is engaged")
+
+    def wait_until_ready(self, states: int) -> None:
+        """Wait until all have said so in that many states in a row, from now on."""
+        for rig in self.rigs:
+            rig.ready_states = 0
+        self.wait(lambda rig: rig.ready_states >= states, "nothing keeps the arm from being engaged")
 
     def pause(self) -> None:
         """Press until all are paused."""

@@ -92,7 +92,8 @@ class StrictControllers:
         return all(f"first target of {rig.arm}" in output for rig in rigs.rigs)
 
     def engage(self, rigs: ArmRigs) -> None:
-        """Engage; returns when targets arrive."""
+        """Engage once nothing has changed for a while, since controllers come and go; returns when targets arrive."""
+        rigs.wait_until_ready(3)
         rigs.engage()
         wait_until(lambda: self.receives_targets(rigs), "targets arrive")
 

@@ -123,6 +123,27 @@ def test_a_tool_on_a_topic_is_engaged_where_it_is_and_paused_when_the_topic_ends
     rig.wait(lambda: "/left/current_pose from /test is silent" in rig.state["message"], "the reason is reported")
 
 
+def test_an_arm_is_not_engaged_while_the_built_in_controllers_tool_is_elsewhere(
+    rig: ArmRig, node: Any, processes: Processes
+) -> None:
+    from geometry_msgs.msg import PoseStamped
+
+    safe = offset(TOOL, (0.0, 0.0, 0.15))  # as with a tool_frame that is not the cell's
+    publisher = node.create_publisher(PoseStamped, "/cartesian_controller/safe_target/left", 10)
+    now = node.get_clock().now
+    timer = node.create_timer(0.01, lambda: publisher.publish(stamped_pose(safe, "world", 1e-9 * now().nanoseconds)))
+    node.create_subscription(PoseStamped, "/theirs/target_frame", lambda _: None, 10)
+    rig.start(processes, {"mode": "filtered", "preset": "fzi", "target_topic": "/theirs/target_frame"})
+    rig.wait(lambda: rig.state.get("kind") == "controller_refuses", "the arm is not ready")
+    assert "is not where the tool is" in rig.state["message"]
+    rig.press()
+    rig.wait(lambda: rig.state["last_event_kind"] == "controller_refuses", "the press is refused")
+    assert not rig.targets
+    safe = TOOL
+    rig.engage()
+    node.destroy_timer(timer)
+
+
 def test_a_gripper_behind_a_topic_gets_its_positions(rig: ArmRig, node: Any, processes: Processes) -> None:
     from std_msgs.msg import Float64MultiArray
 

@@ -79,7 +79,7 @@ class ArmOutputs:
         self._command_type: CommandType | None = None
         if preset.command_type is not None:
             self._command_type = CommandType(node, preset.command_type.format(ctrl=values.prefix))
-        self._has_safe_target = False  # of the built-in controller
+        self._safe_problem: str | None = self._safe_target.problem  # why the relay could not begin now
         self._relaying = False
 
     def limit(self, guard: GuardSettings) -> None:
@@ -98,8 +98,8 @@ class ArmOutputs:
         """Why the arm may not be engaged yet."""
         if line := next((line for output in self._all if (line := output.unready)), None):
             return Reason.of(ReasonKind.NO_SUBSCRIBER, text=line)
-        if self._last is not None and not self._has_safe_target:
-            line = self._safe_target.problem
+        if self._last is not None and not self._relaying:
+            line = self._safe_problem
         if line is None and self._follows is not None:
             line = self._follows.unready
         if line is None and self._command_type is not None:
@@ -168,11 +168,11 @@ class ArmOutputs:
         if self._last is None:
             return None
         safe, fault = self._safe_target.at(now), None
-        self._has_safe_target = safe is not None
+        self._safe_problem = self._safe_target.problem if safe is None else None
+        if safe is not None and tool is not None and not near(safe, tool, *MAX_OFFSET):
+            self._safe_problem = f"{self._safe_topic} is not where the tool is: the arm moves, or tool_frame is wrong"
         if not self._relaying and engaged:
-            self._relaying = safe is not None and tool is not None and near(safe, tool, *MAX_OFFSET)
-            if not self._relaying:
-                fault = self._safe_target.problem or f"{self._safe_topic} is not where the tool is"
+            self._relaying, fault = self._safe_problem is None and tool is not None, self._safe_problem
         self._relaying = self._relaying and safe is not None
         # A stream starts at the measured tool: the safe target may differ from it by the arm's steady-state offset.
         self._last.step(safe if self._relaying else None, tool, base, now, decided, start=tool)
