@@ -1,0 +1,111 @@
+"""The swivel of an arm's elbow about the line from shoulder to wrist: a task that YAML names ``swivel``.
+
+With shoulder S, elbow E, wrist W, w = (W - S) / |W - S|, e = E - S and V pointing up, the elbow's offset from the line
+is p = e - (w'e) w and that of V is l = V - (w'V) w. The swivel angle is the angle from l to p about w,
+
+    psi = atan2(w'(V x p), V'p)
+
+(Kreutz-Delgado, Long, Seraji, Int. J. Robotics Research 11(5), 1992). With t_p = w x p / |p| and t_l = w x l / |l|,
+
+    dpsi = t_p'de / |p| + ((w'V) / |l| t_l - (w'e) / |p| t_p)' dw',    dw' = d(W - S) / |W - S|.
+
+It is not defined for a stretched arm (p = 0) nor for a wrist straight above or below the shoulder (l = 0). The cost
+fades out towards both.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import pinocchio as pin
+
+from q2r2_control.robot.robot import Robot
+from q2r2_control.types import Array
+
+_UP = np.array([0.0, 0.0, 1.0])
+# Below these the cost fades out: |p| [m], and |l|, the sine of the angle between the line and V.
+_FULL_RADIUS, _FULL_SINE = 0.05, 0.2
+_TINY = 1e-6
+_DAMPING = 1e-6  # of the projection into the nullspace of the tool's motion
+
+
+class ElbowSwivel:
+    """Turns elbows towards their angles, in the nullspace of the tools: a tool pays nothing for its elbow."""
+
+    def __init__(
+        self,
+        robot: Robot,
+        angles: Mapping[str, float | None],
+        joints: Sequence[str] = ("A2", "A4", "A6"),
+        gain: float = 2.0,
+        weight: float = 0.1,
+    ) -> None:
+        """``angles`` [rad]: of each arm that has the task, 0: elbow up; None: as at home.
+
+        ``joints``: at shoulder, elbow and wrist, without the arm's prefix. ``gain``: swivel speed per radian [1/s].
+        Raises :class:`ValueError` for an arm or a joint that is not there, and for numbers that are not positive.
+        """
+        if len(joints) != 3 or not (gain > 0.0 and weight > 0.0):
+            raise ValueError("allowed: three joints, and a gain and a weight above 0")
+        self._robot, self._gain, self._weight = robot, gain, weight
+        self._data = robot.model.createData()
+        self._joints = {arm: [_joint(robot, arm, name) for name in joints] for arm in angles}
+        self._angles = {
+            arm: self.angle(arm, robot.home) if angle is None else float(angle) for arm, angle in angles.items()
+        }
+
+    def angle(self, arm: str, q: Array) -> float:
+        """Swivel angle of an arm at a posture ``q`` (nv,), in (-pi, pi] [rad]."""
+        pin.computeJointJacobians(self._robot.model, self._data, q)
+        return self._swivel(arm)[0]
+
+    def cost(self, q: Array, v: Array) -> tuple[Array, Array]:
+        """See :class:`Task`."""
+        nv = self._robot.model.nv
+        H, g = np.zeros((nv, nv)), np.zeros(nv)
+        pin.computeJointJacobians(self._robot.model, self._data, q)
+        for arm, wanted in self._angles.items():
+            angle, share, row = self._swivel(arm)
+            row = self._without_tool_motion(arm, row)
+            error = math.remainder(wanted - angle, 2.0 * math.pi)
+            H += share * self._weight * np.outer(row, row)
+            g -= share * self._weight * self._gain * error * row
+        return H, g
+
+    def _swivel(self, arm: str) -> tuple[float, float, Array]:
+        """Angle [rad], the share of 0 .. 1 to which it is defined, and its gradient (nv,)."""
+        model, data = self._robot.model, self._data
+        S, E, W = (data.oMi[joint].translation for joint in self._joints[arm])
+        J_S, J_E, J_W = (
+            pin.getJointJacobian(model, data, joint, pin.LOCAL_WORLD_ALIGNED)[:3] for joint in self._joints[arm]
+        )
+        length = math.dist(W, S)
+        w, e = (W - S) / max(length, _TINY), E - S
+        p, reference = e - (w @ e) * w, _UP - (w @ _UP) * w
+        radius, sine = math.hypot(*p), math.hypot(*reference)
+        if min(radius, sine, length) < _TINY:
+            return 0.0, 0.0, np.zeros(model.nv)
+        about_w = pin.skew(w)
+        t_p, t_l = about_w @ p / radius, about_w @ reference / sine
+        by_wrist = (w @ _UP / sine * t_l - w @ e / radius * t_p) / length
+        row = t_p / radius @ (J_E - J_S) + by_wrist @ (J_W - J_S)
+        share = min(radius / _FULL_RADIUS, 1.0) * min(sine / _FULL_SINE, 1.0)
+        # V = (0, 0, 1): V x p = (-p_y, p_x, 0)
+        return math.atan2(w[1] * p[0] - w[0] * p[1], p[2]), share, row
+
+    def _without_tool_motion(self, arm: str, row: Array) -> Array:
+        frame = self._robot.arms[arm].frame_id
+        J = pin.getFrameJacobian(self._robot.model, self._data, frame, pin.LOCAL_WORLD_ALIGNED)
+        return row - J.T @ np.linalg.solve(J @ J.T + _DAMPING * np.eye(6), J @ row)
+
+
+def _joint(robot: Robot, arm: str, name: str) -> int:
+    """Number of an arm's joint in the model. Raises :class:`ValueError`."""
+    if arm not in robot.arms:
+        raise ValueError(f"angles: no arm {arm!r:.40}; allowed: {', '.join(robot.arms)}")
+    own = {robot.joint_names[j].removeprefix(f"{arm}_"): int(j) + 1 for j in robot.arms[arm].joints}
+    if name not in own:
+        raise ValueError(f"joints: {arm} has no joint {name!r:.40}; allowed: {', '.join(own)}")
+    return own[name]
