@@ -18,7 +18,7 @@ pytest.importorskip("rclpy", reason=NEEDS_ROS)
 
 from geometry_msgs.msg import PoseStamped
 
-from q2r2_control.ros.monitoring.endpoints import WatchedPublisher
+from q2r2_control.ros.monitoring.endpoints import WatchedPublisher, node_of
 
 TIMEOUT = 0.5  # longer than an acknowledgement takes on an overloaded machine [s]
 LISTENER = """
@@ -86,3 +86,17 @@ def test_a_listener_that_ended_before_the_stream_is_not_reported(
     publisher.begin()
     assert Stream(publisher, 100.0).run(3.0 * TIMEOUT) is None
     assert publisher.listeners == 1  # as the graph says
+
+
+def test_a_node_that_was_frozen_until_the_graph_had_lost_it_is_known_when_it_comes_back(
+    node: Any, listener: RosProcess
+) -> None:
+    def nodes() -> list[str | None]:
+        return [node_of(info) for info in node.get_subscriptions_info_by_topic("/watched")]
+
+    node.create_publisher(PoseStamped, "/watched", 1)
+    wait_until(lambda: nodes() == ["/listener"], "the listener and its name are found")
+    os.kill(listener.pid, signal.SIGSTOP)
+    wait_until(lambda: nodes() == [], "the graph has lost it")
+    os.kill(listener.pid, signal.SIGCONT)
+    wait_until(lambda: nodes() == ["/listener"], "it is found again")

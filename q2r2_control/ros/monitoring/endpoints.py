@@ -26,11 +26,17 @@ _ASKED = 0.02  # after all was acknowledged, it is asked again [s]
 _LIFESPAN = SENT_COMMAND_QOS.lifespan.nanoseconds * 1e-9  # [s]
 
 
+# By the number of an endpoint, which is unique. A node that the graph has lost, such as one that was frozen or
+# unreachable for longer than its lease, comes back with the same endpoints, and Fast DDS never learns their node again.
+_known: dict[bytes, str] = {}
+
+
 def node_of(endpoint: Any) -> str | None:
-    """Full name of the node that an endpoint of the graph belongs to; None while the graph does not know it yet."""
-    if endpoint.node_name.startswith("_NODE_NAME_"):  # as rcl puts it
-        return None
-    return f"{endpoint.node_namespace.rstrip('/')}/{endpoint.node_name}"
+    """Full name of the node that an endpoint of the graph belongs to; None while it was never known."""
+    number = bytes(endpoint.endpoint_gid)
+    if not endpoint.node_name.startswith("_NODE_NAME_"):  # as rcl puts it
+        _known[number] = f"{endpoint.node_namespace.rstrip('/')}/{endpoint.node_name}"
+    return _known.get(number)
 
 
 class Publishers:
