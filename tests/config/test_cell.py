@@ -35,7 +35,6 @@ from tests.config.cell_files import CELL, changed, fault, loaded, shipped
         "teleop.filter.cutoff",
         "teleop.gate.jump",
         "teleop.leash.length",
-        "arms.left.swivel.shoulders",
         "mujoco.step",
         "mujoco.objects.blue_block.weight",
     ],

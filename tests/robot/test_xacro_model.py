@@ -55,7 +55,7 @@ def test_a_cell_names_arguments_and_packages_and_gets_the_expanded_arm(package: 
         f"    model: {MODEL}\n    xacro_args: {{robot_name: med7, with_tip: true}}\n    home: [0, 0]\n"
     )
     cell = compose(load_config(tmp_path / "cell.yaml"))
-    assert cell.arm_joints == {"left": ("left_med7_A1", "left_med7_A2")}
+    assert list(cell.home) == ["left_med7_A1", "left_med7_A2"]
     assert cell.tool_frames == {"left": "left_tip"}
     assert str(package / "meshes" / "link.stl") in cell.urdf
     assert 'xyz="0 0 0.30000000000000004"' in cell.urdf
