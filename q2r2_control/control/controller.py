@@ -12,8 +12,9 @@ import pinocchio as pin
 from q2r2_control.config.control import ControllerSettings
 from q2r2_control.control.geometry.finger_openings import FingerOpenings
 from q2r2_control.control.geometry.kinematics import IntArray
-from q2r2_control.control.held_objects import ObjectLoads
-from q2r2_control.control.jit import bound
+from q2r2_control.control.held_objects import ObjectPairs
+from q2r2_control.control.jit import bound, pointer_to
+from q2r2_control.control.kernel_data import KernelData
 from q2r2_control.control.kernel_model import kernel_model_of
 from q2r2_control.control.live_settings import LiveSettings
 from q2r2_control.control.qp import QpProblem, Solver, make_solver
@@ -55,9 +56,11 @@ class CartesianController:
         self._nv = robot.model.nv
         self._arms = tuple(robot.arms)
         self._solver = solver or make_solver(settings.solver, self._nv, settings.solve_time_limit)
-        self._objects = ObjectLoads(robot, settings, kernel_model_of(robot, settings))
-        self._live = LiveSettings(robot, settings, self._objects)
-        model, data = self._objects.model, self._objects.data
+        model = kernel_model_of(robot, settings)
+        data = KernelData.empty(model)
+        self._model_pointer, self._data_pointer = pointer_to(model), pointer_to(data)
+        self._objects = ObjectPairs(robot, settings, model, data)
+        self._live = LiveSettings(robot, settings, model, data, self._objects)
         self._state, self._rows, self._active = data.safety.state, data.safety.rows, data.safety.active
         self._stop, self._tasks = data.safety.certified, data.tasks
         self._solution = np.zeros(self._nv)  # of the QP, whatever array has it
@@ -69,12 +72,12 @@ class CartesianController:
             rows=self._rows.matrix[:0],
             rows_lower=self._rows.lower[:0],
         )
-        self._fingers = FingerOpenings(robot, self._objects.bodies)
-        self._unchanged: IntArray = np.zeros(len(self._objects.bodies.joint), dtype=np.int64)
+        self._fingers = FingerOpenings(robot, model.safety.collision.bodies)
+        self._unchanged: IntArray = np.zeros(len(model.safety.collision.bodies.joint), dtype=np.int64)
         self._targets = TargetTracker(model.tasks, self._arms, settings)
         self._external_tasks = load_tasks(robot, settings.tasks)
         self._names = LimitNames(robot)
-        self._use_load()
+        self._with_others = {arm: pairs_with_others(self._names.pairs, robot.roles, arm) for arm in self._arms}
         self._compile()
         self.reset(robot.home)
 
@@ -132,14 +135,14 @@ class CartesianController:
         state.v[:] = 0.0 if v is None else self._checked("v", v)
         self._fingers.set_all({})
         self._objects.clear()
-        self._use_load()
+        self._active.used[0] = 0
         self._live.restart()
         self._targets.reset(state.q)
         observed = start_reference(self._model_pointer, self._data_pointer)
         self._closest, self._distance, self._tightest, self._margin, proven = observed
         self._apart = self._margin >= -ROUNDING
         self._certified = proven and self._apart
-        self._live.begin(self._objects.load)
+        self._live.begin()
 
     def _checked(self, name: str, values: Array) -> Array:
         array = np.array(values, dtype=np.float64)
@@ -237,10 +240,9 @@ class CartesianController:
         """
         if not self._objects.set_holding(arm, holds):
             return
-        self._use_load()
+        self._active.used[0] = 0  # what it names may not count any more
         self._observe_again(self._unchanged)
         self._objects.begin()
-        self._use_load()
         self._observe_again(self._unchanged)
 
     @property
@@ -251,15 +253,7 @@ class CartesianController:
     @property
     def object_distances(self) -> Array:
         """What every pair of ``Robot.objects`` keeps now (pairs,) [m]; minus infinity while it does not count."""
-        return self._objects.kept()
-
-    def _use_load(self) -> None:
-        """Go on with the kernels' model and data of what is held now."""
-        load = self._objects.load
-        self._model_pointer, self._data_pointer = load.model, load.data
-        self._names.set_pairs([self._objects.pair_names[pair] for pair in load.objects])
-        self._active.used[0] = 0  # pairs are numbered anew
-        self._with_others = {arm: pairs_with_others(self._names.pairs, self.robot.roles, arm) for arm in self._arms}
+        return self._objects.kept.copy()
 
     def _observe_again(self, grown: IntArray) -> int:
         """Observe with bodies that have changed; returns the pair in the way of those that have ``grown``, or -1."""
@@ -290,7 +284,7 @@ class CartesianController:
 
         ``tick``: see :func:`assemble`.
         """
-        self._live.step(self._objects.load, h)
+        self._live.step(h)
         usable, inside, free = self._assemble(self._model_pointer, self._targets.pointer, self._data_pointer, h, tick)
         if self._external_tasks:
             free = self._apply_external_costs()

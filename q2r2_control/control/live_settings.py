@@ -25,7 +25,8 @@ from dataclasses import replace
 import numpy as np
 
 from q2r2_control.config.control import ControllerSettings
-from q2r2_control.control.held_objects import HeldObjectModels, ObjectLoads
+from q2r2_control.control.held_objects import ObjectPairs
+from q2r2_control.control.kernel_data import KernelData
 from q2r2_control.control.kernel_model import KernelModel, stop_buffer
 from q2r2_control.control.safety.provable_distances import provable_distances
 from q2r2_control.control.tasks.task_model import task_model_of
@@ -42,10 +43,12 @@ _RAMP_TIME = 0.5  # of gains [s]
 class LiveSettings:
     """What of one controller's settings is in force, on its way to what was asked for."""
 
-    def __init__(self, robot: Robot, settings: ControllerSettings, objects: ObjectLoads) -> None:
+    def __init__(
+        self, robot: Robot, settings: ControllerSettings, model: KernelModel, data: KernelData, objects: ObjectPairs
+    ) -> None:
         self._robot, self._objects = robot, objects
-        self._distances = LiveDistances(robot, settings, objects)
-        self._gains = LiveGains(robot, objects.model, settings)
+        self._distances = LiveDistances(robot, settings, model, data)
+        self._gains = LiveGains(robot, model, settings)
         self.settings = settings
 
     @property
@@ -82,22 +85,22 @@ class LiveSettings:
         self._distances.restart()
         self._gains.finish()
 
-    def begin(self, load: HeldObjectModels) -> None:
+    def begin(self) -> None:
         """After a reset was observed: keep what the posture allows."""
-        self._distances.grow(load, np.inf)
+        self._distances.grow(np.inf)
 
-    def step(self, load: HeldObjectModels, h: float) -> None:
+    def step(self, h: float) -> None:
         """Before a step of ``h`` [s] from an observed reference."""
         self._gains.step(h)
         if self._distances.growing:
-            self._distances.step(load, h)
+            self._distances.step(h)
 
 
 class LiveDistances:
     """What monitored pairs keep, and what they are to keep."""
 
-    def __init__(self, robot: Robot, settings: ControllerSettings, objects: ObjectLoads) -> None:
-        self._objects, self._settings = objects, settings
+    def __init__(self, robot: Robot, settings: ControllerSettings, model: KernelModel, data: KernelData) -> None:
+        self._safety, self._data, self._settings = model.safety, data.safety, settings
         self._goal = self._least = kept_distances(robot, settings).values  # least: without any change
         self.kept = self._goal
         self.growing, self._due = False, 0.0
@@ -115,17 +118,17 @@ class LiveDistances:
         if self.growing:
             self._write(np.minimum(self._goal, self._least))
 
-    def step(self, load: HeldObjectModels, h: float) -> None:
+    def step(self, h: float) -> None:
         self._due -= h
         if self._due <= 0.0:
             self._due = _PERIOD
-            self.grow(load, GROWTH * max(_PERIOD, h))
+            self.grow(GROWTH * max(_PERIOD, h))
 
-    def grow(self, load: HeldObjectModels, most: float) -> None:
+    def grow(self, most: float) -> None:
         """Keep more, by at most ``most`` [m], where the stop at hand proves it."""
         if not self.growing:
             return
-        lasting = provable_distances(load.safety, load.measured)[: len(self._goal)]
+        lasting = provable_distances(self._safety, self._data)[: len(self._goal)]
         room = lasting - stop_buffer(self._goal, self._settings)
         self._write(np.maximum(self.kept, np.minimum(np.minimum(self._goal, self.kept + most), room)))
 
@@ -133,7 +136,8 @@ class LiveDistances:
         self.growing = bool((kept < self._goal).any())
         if not np.array_equal(kept, self.kept):
             self.kept = kept
-            self._objects.write_monitored(kept, kept + stop_buffer(kept, self._settings))
+            self._safety.min_distance[: len(kept)] = kept
+            self._safety.approach.stop_distance[: len(kept)] = kept + stop_buffer(kept, self._settings)
 
 
 class LiveGains:

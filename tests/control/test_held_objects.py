@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
-
-import numba
 import numpy as np
 import pinocchio as pin
 import pytest
 
 from q2r2_control import CartesianController, Robot
-from q2r2_control.control.held_objects import ObjectLoads
+from q2r2_control.control.held_objects import ObjectPairs
 from q2r2_control.types import Array, Reference
 from q2r2_control.verification.contract import Contract
 from q2r2_control.wording import limit_name
@@ -159,7 +156,7 @@ def test_begun_with_its_full_distance_an_object_would_break_the_contract(
     controller: CartesianController, at_grip: Array, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """So what the tests above rely on can be seen to fail."""
-    monkeypatch.setattr(ObjectLoads, "begin", lambda self: False)
+    monkeypatch.setattr(ObjectPairs, "begin", lambda self: None)
     large = cell({"box": (0.04, 0.04, 0.08), "at": (0.0, 0.0, 0.013)})
     controller = CartesianController(Robot.from_config(large), large.control)
     run = Run(controller, at_grip)
@@ -231,9 +228,3 @@ def test_once_it_is_let_go_no_report_names_a_pair_of_it_even_if_no_time_passes(
     else:
         controller.set_holding("left", False)
     assert controller.step({}, 0.0).report.binding == ()
-
-
-def test_the_kernels_see_the_same_types_whatever_is_held(controller: CartesianController) -> None:
-    loads: dict[Any, Any] = controller._objects._loads
-    kinds = {(numba.typeof(load.model), numba.typeof(load.data)) for load in loads.values()}
-    assert kinds == {(numba.typeof(controller._model_pointer), numba.typeof(controller._data_pointer))}

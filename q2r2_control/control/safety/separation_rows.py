@@ -91,8 +91,11 @@ def measure_pairs(model: SafetyModel, data: SafetyData) -> int:
     horizon = 2.0 / approach.gain[0] + 0.5 * duration
     fastest = 2.0 * fastest_body(data.velocities)
     for p in range(pairs.first.shape[0]):
-        distance[p] = at_least(collision, data.collision, p)
         data.near[p] = 0
+        if model.min_distance[p] == -np.inf:  # of an object that is not held
+            distance[p] = np.inf
+            continue
+        distance[p] = at_least(collision, data.collision, p)
         # The fastest that the pair can close in after this step. Farther than twice what the gain needs for that, and
         # the way of the stop, a row would bind at very low leverage: it would add comfort, and safety needs none.
         always = approach.stop_distance[p] + approach.contact_zone[p] + horizon * pairs.leverage[p] * surge
