@@ -3,7 +3,7 @@
     tau = J' (K e + D e') + N (K_n (q_r - q) + D_n (v_r - v)) + M(q) a_r + C(q, v) v + g(q) + joint-limit repulsion
 
 e is the way from the measured tool to that of the reference, e' the difference of their twists, D and D_n the damping
-of :func:`damp`, N a nullspace projector. Hogan 1985, Albu-Schaeffer et al. 2003.
+of :func:`inertia_and_damping`, N a nullspace projector. Hogan 1985, Albu-Schaeffer et al. 2003.
 
 **Feed-forward M a_r.** Seen from the tool an arm weighs what its rotors weigh geared up, 20 to 140 kg for a robot of
 22 kg. Without feed-forward the spring would have to give the force for every acceleration and would have to yield for
@@ -98,7 +98,6 @@ class ImpedanceController:
                 distance=settings.limit_distance,
             ),
             largest_error=np.array([settings.max_position_error, settings.max_rotation_error]),
-            consistent=int(settings.nullspace_projector == "consistent"),
         )
         values = [float(getattr(settings, name)) for name in LIVE_IMPEDANCE]
         self._springs = np.tile(values, (len(self._arms), 1))  # in force

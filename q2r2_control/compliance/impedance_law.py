@@ -24,8 +24,6 @@ ABSURD = 1e9  # no number that a robot or a controller sends is as large; square
 # No direction of a tool counts for more than this [kg]. An arm whose rotors weigh most of it stays below a fifth of it
 # in every posture that it works in.
 _HEAVIEST = 1000.0
-# A direction in which the Jacobian is smaller is one in which the arm cannot move its tool [m/rad].
-_LEAST_MOTION = 0.05
 
 
 class PositionLimits(NamedTuple):
@@ -92,16 +90,6 @@ def consistent_force(inertia: Array, J: Array, M_inverse: Array, torque: Array) 
 
 
 @numpy_kernel
-def kinematic_force(J: Array, torque: Array) -> Array:
-    """Force F (6,) so that torque - J' F is N torque, which balances no force at the tool; needs no inertia.
-
-    N = I - J' J'^+ with the inverse of J J', whose eigenvalues are raised near a singular posture.
-    """
-    values, vectors = np.linalg.eigh(J @ J.T)
-    return vectors @ ((vectors.T @ (J @ torque)) / np.maximum(values, _LEAST_MOTION**2))
-
-
-@numpy_kernel
 def posture_torque(inertia: Array, way: Array, speed: Array, stiffness: float, damping_ratio: float) -> Array:
     """Torque (n,) towards a posture that is ``way`` (n,) [rad] off and moves by ``speed`` (n,) [rad/s] faster.
 
@@ -118,7 +106,6 @@ class ImpedanceModel(NamedTuple):
     tools: Tools  # of k arms
     limits: PositionLimits
     largest_error: Array  # (2,) [m, rad]
-    consistent: int  # 1: the dynamically consistent nullspace, 0: the kinematic one
 
 
 class ImpedanceData(NamedTuple):
@@ -181,10 +168,7 @@ def impedance_torque(model_pointer: KernelPointer, data_pointer: KernelPointer) 
         force = stiffness * data.error[i] + values[2] * (damping @ (data.wanted_twist[i] - J @ v))
         posture = posture_torque(own_inertia, wanted_q - q, wanted_v - v, values[3], values[4])
         posture *= model.tools.member[i]
-        if model.consistent == 1:
-            force -= consistent_force(inertia, J, M_inverse, posture)
-        else:
-            force -= kinematic_force(J, posture)
+        force -= consistent_force(inertia, J, M_inverse, posture)
         data.torque[:] += posture + J.T @ force
     data.repulsion[:] = limit_repulsion(model.limits, q, v, wanted_q)
     data.torque[:] += data.repulsion

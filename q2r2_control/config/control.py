@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
@@ -195,9 +195,6 @@ class ImpedanceSettings(BaseModel):
     damping_ratio: float = Field(1.0, ge=0.1, le=2, description="of every mode of the tool; 1: no overshoot")
     nullspace_stiffness: float = Field(50.0, gt=0, le=500, description="towards the reference's posture [Nm/rad]")
     nullspace_damping_ratio: float = Field(1.0, ge=0.1, le=2, description="of the posture's motion")
-    nullspace_projector: Literal["consistent", "kinematic"] = Field(
-        "consistent", description="consistent: exact where the model is; kinematic: needs no masses"
-    )
     max_position_error: float = Field(0.1, gt=0, le=1, description="a longer way from the reference is clipped [m]")
     max_rotation_error: float = Field(0.5, gt=0, le=3, description="a wider turn from the reference is clipped [rad]")
     limit_distance: float = Field(0.1, gt=0, le=0.5, description="joints are repelled nearer to a limit [rad]")

@@ -100,7 +100,6 @@ def test_a_misspelt_key_is_named_before_the_one_that_is_missing_for_it(tmp_path:
         ("impedance.translational_stiffness", -1, "greater than 0"),
         ("impedance.rotational_stiffness", 0, "greater than 0"),
         ("impedance.damping_ratio", 0, "greater than or equal to 0.1"),
-        ("impedance.nullspace_projector", "none", "'consistent' or 'kinematic'"),
         ("impedance.torque_rate_limit", math.inf, "finite number"),
         ("impedance.wall.stiffness", 0, "greater than 0"),
         ("impedance.wall.maximum_force", -400, "greater than 0"),

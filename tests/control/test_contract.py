@@ -292,7 +292,9 @@ def test_a_solver_that_never_answers_brings_the_arms_to_rest_along_the_certified
     assert not reference.v.any()
 
 
-@pytest.mark.parametrize("solver", ["daqp", pytest.param("osqp", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "solver", ["daqp", pytest.param("osqp", marks=[pytest.mark.slow, pytest.mark.filterwarnings("ignore")])]
+)
 def test_every_solver_keeps_the_contract_and_tracks(solver: str) -> None:
     controller = CartesianController(robot_of("iiwa7"), ControllerSettings(solver=solver))
     contract = run(controller, crossing, 1.5, 0.005)

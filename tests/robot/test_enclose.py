@@ -92,10 +92,9 @@ def _one(shape: coal.CollisionGeometry, parent_joint: int) -> pin.GeometryModel:
 @pytest.mark.parametrize(
     "shape",
     [
-        coal.Cylinder(0.1, 1.0), coal.Cylinder(0.5, 0.02), coal.Cylinder(0.1, 0.2), coal.Ellipsoid(0.1, 0.3, 0.2),
-        coal.Ellipsoid(0.2, 0.2, 0.2), coal.Ellipsoid(0.5, 0.01, 0.4), coal.Box(0.1, 0.2, 0.3),
+        coal.Cylinder(0.1, 1.0), coal.Cylinder(0.5, 0.02), coal.Cylinder(0.1, 0.2), coal.Box(0.1, 0.2, 0.3),
     ],
-    ids=["post", "round table top", "tin", "ellipsoid", "ball-like ellipsoid", "flat ellipsoid", "box"],
+    ids=["post", "round table top", "tin", "box"],
 )  # fmt: skip
 def test_a_primitive_lies_inside_what_replaces_it(shape: coal.CollisionGeometry, parent_joint: int) -> None:
     geometry = _one(shape, parent_joint)
@@ -116,8 +115,6 @@ def _surface(shape: coal.CollisionGeometry) -> Array:
     random = np.random.default_rng(3)
     ball = random.normal(size=(2000, 3))
     ball /= np.linalg.norm(ball, axis=1, keepdims=True)
-    if isinstance(shape, coal.Ellipsoid):
-        return np.asarray(ball * shape.radii)
     if isinstance(shape, coal.Box):
         return np.asarray(np.sign(ball) * shape.halfSide)
     angle = random.uniform(0, 2 * np.pi, 2000)
