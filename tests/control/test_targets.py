@@ -77,12 +77,6 @@ def test_a_target_that_is_no_pose_is_named_and_the_last_one_stays(
     assert np.isfinite(taken.feed_forward).all()
 
 
-@pytest.mark.parametrize("bad", UNUSABLE.values(), ids=UNUSABLE.keys())
-def test_an_arm_that_never_had_a_usable_target_holds(tracker: TargetTracker, bad: Callable[[], Any]) -> None:
-    assert tracker.update({"right": bad()}, 0.001, STILL, STILL) == ("right",)
-    assert _taken(tracker).follows.tolist() == [0, 0]
-
-
 def test_a_target_of_an_arm_that_is_not_there_is_named(tracker: TargetTracker) -> None:
     assert tracker.update({"left": _pose(), "third": _pose()}, 0.001, STILL, STILL) == ("third",)
 

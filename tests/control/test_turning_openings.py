@@ -141,13 +141,3 @@ def test_with_hostile_targets_and_openings_no_finger_is_ever_too_near_wherever_i
                 assert cell.spare_of_bodies(cell.controller.openings) >= -COAL
     assert told > 500
     assert refused > 50
-
-
-def test_an_opening_that_is_refused_leaves_every_number_as_it_was(cell: Cell) -> None:
-    cell.start()
-    assert cell.set_opening(1.0, 1.0) is None
-    cell.drive({"left": above_table(0.006)}, 900)
-    before = cell.controller.step({}, 0.0).report
-    assert cell.set_opening(0.0, 1.0) is not None
-    after = cell.controller.step({}, 0.0).report
-    assert (after.closest_distance, after.margin) == (before.closest_distance, before.margin)

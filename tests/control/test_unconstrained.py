@@ -94,12 +94,6 @@ def test_one_bound_that_is_in_the_way_leaves_it_to_the_solver(
     assert not find_minimum(data.safety, data.tasks)
 
 
-def test_a_row_of_an_earlier_tick_does_not_count(data: KernelData) -> None:
-    _row(data)
-    data.safety.rows.used[0] = 0
-    assert find_minimum(data.safety, data.tasks)
-
-
 def circling(home: pin.SE3, t: float, side: float) -> pin.SE3:
     """A tool that goes round and, farther on, into the other arm and out of it again."""
     pose = home.copy()

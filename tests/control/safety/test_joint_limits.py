@@ -205,11 +205,3 @@ def test_a_joint_beyond_its_velocity_limit_slows_down_as_fast_as_it_may() -> Non
     too_fast = velocities[:-1] > 1.5 + 0.02
     np.testing.assert_allclose(np.diff(velocities, axis=0)[too_fast], -0.02, atol=1e-12)
     assert (velocities[200:] <= 1.5 + EXACT).all()
-
-
-def test_a_range_too_narrow_to_move_in_keeps_the_joint_still() -> None:
-    still = np.zeros(1)
-    bounds = Bounds(still, still.copy(), np.ones(1), np.full(1, 10.0), 0.002)
-    box = _box(still, still, bounds, 0.001)
-    assert box.inside
-    np.testing.assert_allclose([box.lower[0], box.upper[0]], 0.0, atol=1e-12)
