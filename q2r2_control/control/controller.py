@@ -24,7 +24,7 @@ from q2r2_control.control.safety.safety_filter import FOLLOWED, STOPPED
 from q2r2_control.control.safety.safety_model import ROUNDING
 from q2r2_control.control.step_report import LimitNames, StepSummary
 from q2r2_control.control.targets import TargetTracker
-from q2r2_control.control.tasks.external import load_tasks
+from q2r2_control.control.tasks.external import add_costs, load_tasks
 from q2r2_control.control.unconstrained import find_minimum_anew
 from q2r2_control.errors import ConfigError, RobotError
 from q2r2_control.robot.pairs import pairs_with_others
@@ -157,8 +157,7 @@ class CartesianController:
         stays, and the report names the arm. A dt that is not in (0, 0.1] s moves nothing, or no more than 0.1 s.
 
         ``posture`` (nv,) [rad] is what arms that follow a target take as far as their tools leave them free to; without
-        it that is home. Where something else moves the arms it is what was measured, so that the reference's elbows
-        are where the arms' are. One that is not nv finite numbers is not used: the last one stays.
+        it that is home. One that is not nv finite numbers is not used: the last one stays.
         """
         usable = isinstance(dt, _NUMBER) and math.isfinite(dt) and dt > 0.0
         time = min(float(dt), LONGEST_DT) if usable else 0.0
@@ -202,14 +201,11 @@ class CartesianController:
     def set_opening(self, arm: str, least: float, greatest: float) -> tuple[str, str] | None:
         """Say that the gripper of ``arm`` is, and stays, between two openings, 0 closed .. 1 fully open.
 
-        Its fingers count as what they sweep between these, from the next step on. A finger's body that is within what
-        it was is always accepted, as with less for fingers that slide. One that is not, as with more, or with less for
-        fingers that turn, is accepted if every pair keeps its distance with it, at the reference and on a certified
-        stop from there; else nothing changes, and the pair that is in the way is returned. What was accepted before
-        then still holds, so a gripper may be commanded to what was accepted, and to nothing else. An end of the
-        interval at 0 or 1 is that of the joints' travel. Until something is said, and after :meth:`reset`, fingers are
-        all of their way, for which nothing needs to be known; so are those of an arm whose config tells no open and
-        closed position.
+        Its fingers count as what they sweep between these, from the next step on. Bodies within what they were are
+        always accepted. Others are if every pair keeps its distance with them, at the reference and on a certified stop
+        from there; else nothing changes, and the pair that is in the way is returned. So a gripper may be commanded to
+        what was accepted, and to nothing else. Until something is said, and after :meth:`reset`, fingers are all of
+        their way.
 
         Raises :class:`RobotError` for a name that is no arm's and for numbers that are no interval.
         """
@@ -231,10 +227,9 @@ class CartesianController:
     def set_holding(self, arm: str, holds: bool) -> None:
         """Say that the gripper of ``arm`` holds its object from the next step on, or that it does not.
 
-        The object of the cell's YAML then is part of the tool. It may touch, or overlap, what is near when it is
-        gripped: each of its pairs begins with the distance that there is and keeps more as it gets more, until it keeps
-        its own (:attr:`object_distances`). So it is always accepted, and proven with the stop that is known; nothing
-        moves for it. Until something is said, and after :meth:`reset`, nothing is held.
+        The object of the cell's YAML then is part of the tool. Each of its pairs begins with the distance that there is
+        and keeps more as it gets more, until it keeps its own (:attr:`object_distances`): so it is always accepted, and
+        nothing moves for it. Until something is said, and after :meth:`reset`, nothing is held.
 
         Raises :class:`RobotError` for an arm that has no object.
         """
@@ -287,7 +282,8 @@ class CartesianController:
         self._live.step(h)
         usable, inside, free = self._assemble(self._model_pointer, self._targets.pointer, self._data_pointer, h, tick)
         if self._external_tasks:
-            free = self._apply_external_costs()
+            add_costs(self._external_tasks, self._tasks.H, self._tasks.g, self._state.q, self._state.v)
+            free = self._find_minimum(self._data_pointer)
         summary.targets_usable &= usable
         summary.inside &= inside
         count = int(self._rows.used[0])
@@ -310,12 +306,3 @@ class CartesianController:
         # A certified stop stays certified. Anything else was proven just now, and if all was apart before, in full.
         self._certified = self._apart and (self._certified if outcome == STOPPED else was_apart)
         return solved
-
-    def _apply_external_costs(self) -> bool:
-        """Cost of the tasks of other packages; whether the whole cost's minimum is within the box and all rows."""
-        for task in self._external_tasks:
-            H, g = task.cost(self._state.q.copy(), self._state.v.copy())
-            if np.isfinite(H).all() and np.isfinite(g).all():
-                self._tasks.H[:] += H
-                self._tasks.g[:] += g
-        return bool(self._find_minimum(self._data_pointer))

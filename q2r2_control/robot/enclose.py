@@ -26,12 +26,11 @@ from q2r2_control.types import Array
 _ROUNDING = 1e-6
 
 
-def enclose_shapes(geometry: pin.GeometryModel) -> tuple[str, ...]:
+def enclose_shapes(geometry: pin.GeometryModel) -> None:
     """Replace in place every shape that is not a capsule, a sphere or a box fixed in the world; names and pairs stay.
 
-    Returns the names of the replaced objects. Raises :class:`RobotError` for a shape without extent or without bounds.
+    Raises :class:`RobotError` for a shape without extent or without bounds.
     """
-    replaced = []
     for item in geometry.geometryObjects:
         fixed_box = isinstance(item.geometry, coal.Box) and item.parentJoint == 0
         if fixed_box or isinstance(item.geometry, coal.Capsule | coal.Sphere):
@@ -41,8 +40,6 @@ def enclose_shapes(geometry: pin.GeometryModel) -> tuple[str, ...]:
         item.geometry = shape
         item.meshPath = ""
         item.meshScale = np.ones(3)
-        replaced.append(item.name)
-    return tuple(replaced)
 
 
 def enclosing_capsule(points: Array) -> tuple[float, Array, Array]:
