@@ -84,14 +84,6 @@ def test_hands_driven_at_each_other_end_at_the_distance_that_fingers_keep(contro
     assert all("finger" in name for name in reference.report.closest_pair)
 
 
-def test_two_hands_can_hold_a_bar_of_120_mm_at_both_ends(controller: CartesianController) -> None:
-    """Each of them 30 mm of it."""
-    goal = facing(0.06)
-    driven(controller, goal, 6.0)
-    for arm, pose in goal.items():
-        np.testing.assert_allclose(controller.tool_pose(arm).homogeneous, pose.homogeneous, atol=2e-3)
-
-
 def test_the_nearest_pair_and_the_tightest_one_are_told_apart(controller: CartesianController) -> None:
     """Fingers 12 mm above the table have more to spare than wrists 22 mm from each other."""
     height = TABLE + FRAME_TO_TIPS + 0.012

@@ -139,10 +139,3 @@ def test_a_solver_is_asked_only_where_there_is_no_such_minimum() -> None:
     assert len(asked) == 1
     assert solution.v is not None
     np.testing.assert_allclose(solution.v, known)
-
-
-def test_a_solver_is_set_up_before_the_first_step_that_needs_it() -> None:
-    solver = BothWays(14)
-    CartesianController(Robot.from_config(CONFIG), SETTINGS, solver=solver)
-    assert solver.bound == 1, "asked once without a minimum, though at home there is one"
-    assert solver.deviations

@@ -123,13 +123,6 @@ def test_a_model_of_a_ros_package_and_its_meshes_are_found_through_the_environme
     assert isinstance(description.srdf, ET.Element)
 
 
-def test_meshes_beside_the_file_become_absolute(tmp_path: Path) -> None:
-    (tmp_path / "tip.stl").write_text("solid")
-    (tmp_path / "arm.urdf").write_text(GOOD.replace('<sphere radius="0.1"/>', '<mesh filename="tip.stl"/>'))
-    description = load_description(str(tmp_path / "arm.urdf"))
-    assert [element.get("filename") for element in description.urdf.iter("mesh")] == [str(tmp_path / "tip.stl")]
-
-
 def test_a_file_that_is_not_text_is_refused(tmp_path: Path) -> None:
     (tmp_path / "arm.urdf").write_bytes(b"\xff\xfe\x00binary")
     with pytest.raises(RobotError, match="cannot be read"):

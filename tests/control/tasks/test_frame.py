@@ -99,17 +99,6 @@ def _poses(random: np.random.Generator) -> tuple[pin.SE3, pin.SE3]:
     return tool, target
 
 
-def test_a_tool_that_moves_with_the_wanted_twist_reaches_its_target() -> None:
-    random, dt = np.random.default_rng(23), 0.01
-    for _ in range(4):
-        tool, target = _poses(random)
-        for _ in range(600):
-            twist = _twist(tool, target, np.zeros(6))
-            tool = pin.SE3(pin.exp3(twist[3:] * dt) @ tool.rotation, tool.translation + twist[:3] * dt)
-        assert np.linalg.norm(tool.translation - target.translation) < 1e-6
-        assert np.linalg.norm(pin.log3(tool.rotation.T @ target.rotation)) < 1e-6
-
-
 def test_the_wanted_twist_never_exceeds_the_speed_limits() -> None:
     random = np.random.default_rng(24)
     for _ in range(200):
