@@ -19,6 +19,7 @@ from q2r2_control.verification.fault_injection import FaultySolver
 from q2r2_control.wording import limit_name
 from tests.control.scenarios import SCENARIOS, circle, crossing
 from tests.control.test_scenarios import controller_of, in_penetration, robot_of
+from tests.support.driven import Driven
 
 
 def iiwa7s() -> CartesianController:
@@ -27,22 +28,11 @@ def iiwa7s() -> CartesianController:
     return controller
 
 
-def run(
-    controller: CartesianController,
-    scenario: Any,
-    duration: float,
-    dt: float,
-    q: Array | None = None,
-    v: Array | None = None,
-) -> Contract:
-    """Run a scenario and assert the contract at every tick."""
-    q = controller.robot.home if q is None else q
-    controller.reset(q, v)
-    contract = Contract(controller, q, v)
-    start = {arm: controller.tool_pose(arm) for arm in controller.robot.arms}
-    for tick in range(round(duration / dt)):
-        contract.check(controller.step(scenario(tick * dt, start), dt), dt)
-    return contract
+def run(controller: CartesianController, scenario: Any, duration: float, dt: float, **start: Array) -> Contract:
+    """Run a scenario from a ``start`` q and v and assert the contract at every tick."""
+    driven = Driven(controller, dt=dt, **start)
+    driven.drive(duration, scenario)
+    return driven.contract
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ import pytest
 from q2r2_control.config.cell import Config, load_config
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.robot.robot import Robot
-from q2r2_control.verification.contract import Contract
+from tests.support.driven import Driven
 
 SHAPES = {
     "box": [0.1, 0.1, 0.5],
@@ -30,12 +30,10 @@ def _with(shape: str, position: list[float]) -> CartesianController:
 def test_a_tool_pushed_into_an_obstacle_stops_before_it_and_rests(shape: str) -> None:
     controller = _with(shape, [0.65, 0.1, 0.55])
     robot = controller.robot
-    contract = Contract(controller, robot.home)
+    run = Driven(controller, dt=0.005)
     goal = {arm: robot.tool_pose(robot.home, arm) for arm in robot.arms}
     goal["left"].translation = np.array([0.65, 0.1, 0.5])
-    for _ in range(800):
-        reference = controller.step(goal, 0.005)
-        contract.check(reference, 0.005)
+    reference, contract = run.drive(4.0, goal), run.contract
     assert "post" in "|".join(reference.report.closest_pair)
     assert reference.report.closest_distance < 0.03, "it goes as near as it may"
     assert contract.tail_acceleration() < 0.1
