@@ -109,22 +109,6 @@ def test_the_dead_band_ends_without_a_step_and_soon_leaves_the_whole_force() -> 
     assert lost[forces >= 14.0].max() < 0.02 * 14.0 + 0.02
 
 
-def test_the_motion_does_not_depend_on_how_time_is_cut_into_ticks() -> None:
-    random, push = np.random.default_rng(52), _touch(_wrench(1, 15.0))
-    settings = AdmittanceSettings(damping_ratio=0.3, filter_time=0.0)
-    steady, jittery, rough = (Admittance(ROBOT, settings) for _ in range(3))
-    _displaced(steady, push, 600)
-    ticks = random.uniform(0.001, 0.01, 400)
-    ticks = ticks[: int(np.searchsorted(np.cumsum(ticks), 0.59))]
-    for dt in (*ticks, 0.6 - ticks.sum()):
-        jittery.update(GOALS, push, float(dt))
-    _displaced(rough, push, 6, 0.1)
-    for other in (jittery, rough):
-        np.testing.assert_allclose(
-            other.report().arms["left"].displacement, steady.report().arms["left"].displacement, atol=1e-12
-        )
-
-
 def test_any_wrench_at_any_tick_keeps_the_displacement_inside_its_limits() -> None:
     random, admittance = np.random.default_rng(53), Admittance(ROBOT, AdmittanceSettings(damping_ratio=0.1))
     farthest = np.zeros(2)
@@ -294,17 +278,6 @@ def test_pushed_in_mujoco_the_tool_moves_by_the_wrench_over_the_stiffness_and_th
             give = J @ J.T @ push / SOFT
             assert loop.measured(GOALS)[axis] == pytest.approx(expected + give[axis], rel=0.05)
     np.testing.assert_allclose(x, 0.0, atol=1e-4)
-
-
-def test_ticks_of_one_to_ten_milliseconds_keep_the_contract_and_end_at_rest() -> None:
-    ticks = np.random.default_rng(54).uniform(0.001, 0.01, 600)
-    loop, seen = _Loop(_plant(), Admittance(ROBOT)), []
-    for tick, x in enumerate(loop.run(GOALS, iter(ticks.tolist()))):
-        if tick == 0:
-            loop.plant.push("left", np.array([15.0, -10.0, 20.0, 1.0, 2.0, -1.0]), 60.0)
-        seen.append(x)
-    assert np.abs(seen[-1]).max() > 0.01
-    assert np.abs(np.array(seen[-100:]) - seen[-1]).max() < 1e-5
 
 
 def test_leaning_on_a_body_of_ten_kilonewtons_per_metre_it_comes_to_rest() -> None:

@@ -18,6 +18,7 @@ from q2r2_control.robot.kept_distances import kept_distances
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, Command, CommandMode
 from tests.control.cells import cell, random_posture
+from tests.support.coal_distances import coal_distances
 
 ROBOT = cell("dual_iiwa7").robot
 SHELL = ControllerSettings().min_distance
@@ -91,12 +92,10 @@ def test_the_report_names_what_presses_and_the_closest_pair() -> None:
 def test_fingers_press_at_the_openings_that_were_set() -> None:
     random, separation = np.random.default_rng(4), MeasuredSeparation(ROBOT, ControllerSettings(), WallSettings())
     closed = collision_model_at(ROBOT.collision_model, ROBOT.finger_bodies, {"left": (0.0, 0.1)})
-    data, distances = ROBOT.model.createData(), closed.createData()
     farther = 0
     for q, report in [_postures()[i] for i in random.choice(len(_postures()), 60, replace=False)]:
         separation.set_openings({"left": (0.0, 0.1)})
-        pin.computeDistances(ROBOT.model, data, closed, distances, q)
-        by_coal = min(result.min_distance for result in distances.distanceResults)
+        by_coal = float(coal_distances(ROBOT, closed, q).min())
         assert separation.update(q, REST).closest_distance == pytest.approx(by_coal, abs=2e-6)
         farther += by_coal > report.closest_distance + 1e-4
         separation.set_openings({})

@@ -10,6 +10,7 @@ from q2r2_control import CartesianController, Robot
 from q2r2_control.control.held_objects import ObjectPairs
 from q2r2_control.types import Array
 from q2r2_control.wording import limit_name
+from tests.support.coal_distances import coal_distances
 from tests.support.driven import Driven
 from tests.support.object_cell import BLOCK, GRIP, at, cell
 
@@ -44,12 +45,8 @@ def counting(controller: CartesianController) -> Array:
 
 def object_distances(controller: CartesianController, q: Array) -> Array:
     """Of every pair of objects, by Coal [m]."""
-    robot = controller.robot
-    model = robot.objects.geometry
-    data, geometry = robot.model.createData(), model.createData()
-    pin.computeDistances(robot.model, data, model, geometry, q)
-    values = [result.min_distance for result in geometry.distanceResults]
-    return np.array(values[len(values) - len(robot.objects.holders) :])
+    objects = controller.robot.objects
+    return coal_distances(controller.robot, objects.geometry, q)[-len(objects.holders) :]
 
 
 def test_with_nothing_held_every_bit_of_the_motion_is_that_of_a_cell_without_objects(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pinocchio as pin
 import pytest
 
 from q2r2_control import CartesianController, Robot
@@ -12,6 +11,7 @@ from q2r2_control.robot.finger_openings import collision_model_at
 from q2r2_control.robot.kept_distances import kept_distances
 from q2r2_control.types import ALL_OF_THE_WAY, Array
 from tests.support.block_cell import ABOVE, BESIDE, CELL, SETTINGS, at
+from tests.support.coal_distances import coal_distances
 from tests.support.driven import Driven
 
 DT = 0.002
@@ -30,9 +30,7 @@ def controller(robot: Robot) -> CartesianController:
 def closest_by_coal(controller: CartesianController, q: Array) -> float:
     robot = controller.robot
     model = collision_model_at(robot.collision_model, robot.finger_bodies, controller.openings)
-    data, geometry = robot.model.createData(), model.createData()
-    pin.computeDistances(robot.model, data, model, geometry, q)
-    return min(result.min_distance for result in geometry.distanceResults)
+    return float(coal_distances(robot, model, q).min())
 
 
 def height(controller: CartesianController) -> float:
