@@ -11,6 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import StrEnum
 
+import mujoco
 import numpy as np
 import pinocchio as pin
 import typer
@@ -24,7 +25,6 @@ from q2r2_control.drives.torque import TorqueDrive
 from q2r2_control.errors import ConfigError
 from q2r2_control.inputs.way_points import minimum_jerk
 from q2r2_control.plants.mujoco import MujocoPlant
-from q2r2_control.plants.mujoco_contacts import pressing_force
 from q2r2_control.robot.kept_distances import kept_distances
 from q2r2_control.robot.link_roles import LinkClass, Role
 from q2r2_control.robot.pairs import link_of, pair_names
@@ -138,9 +138,7 @@ def _press(robot: Robot, config: Config, slide: PressSlide) -> _Trace:
         reference_height[i] = controller.tool_pose(_ARM).translation[2]
         plant.apply(drive.command(reference, state, {_ARM: 0.0}, dt))
         plant.advance(dt)
-        force[i] = pressing_force(
-            plant.model, plant.data, lambda link: link.startswith(_ARM), lambda link: link == _TABLE
-        )
+        force[i] = _pressing_force(plant)
         if touch is None and force[i] > 0.0:
             touch = height[i]
     plant.close()
@@ -148,6 +146,18 @@ def _press(robot: Robot, config: Config, slide: PressSlide) -> _Trace:
         raise ConfigError(f"obstacles.{_TABLE}: not reached by arm {_ARM}; allowed: as in config/dual_iiwa7.yaml")
     violations = sum(margin.violations for margin in contract.margins.values())
     return _Trace(force, height, reference_height, behind, violations)
+
+
+def _pressing_force(plant: MujocoPlant) -> float:
+    """Sum of the normal forces [N] of all contacts between the arm and the table."""
+    model, data, total, wrench = plant.model, plant.data, 0.0, np.zeros(6)
+    for i in range(data.ncon):
+        geoms = data.contact[i].geom1, data.contact[i].geom2
+        first, second = sorted((model.body(model.geom_bodyid[geom]).name for geom in geoms), key=_TABLE.__eq__)
+        if first.startswith(_ARM) and second == _TABLE:
+            mujoco.mj_contactForce(model, data, i, wrench)
+            total += float(wrench[0])
+    return total
 
 
 def _figures(config: Config, slide: PressSlide, bound: float, trace: _Trace) -> PressFigures:

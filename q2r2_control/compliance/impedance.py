@@ -3,7 +3,7 @@
     tau = J' (K e + D e') + N (K_n (q_r - q) + D_n (v_r - v)) + M(q) a_r + C(q, v) v + g(q) + joint-limit repulsion
 
 e is the way from the measured tool to that of the reference, e' the difference of their twists, D and D_n the damping
-of :func:`damp`, N a nullspace projector. Hogan 1985, Albu-Schaeffer et al. 2003.
+of :func:`inertia_and_damping`, N a nullspace projector. Hogan 1985, Albu-Schaeffer et al. 2003.
 
 **Feed-forward M a_r.** Seen from the tool an arm weighs what its rotors weigh geared up, 20 to 140 kg for a robot of
 22 kg. Without feed-forward the spring would have to give the force for every acceleration and would have to yield for
@@ -22,9 +22,9 @@ reference of the tick before, which is due now, while the acceleration is the on
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import compress
 
 import numpy as np
 import pinocchio as pin
@@ -32,15 +32,17 @@ from pydantic import ValidationError
 
 from q2r2_control.compliance.impedance_law import (
     BoolArray,
+    ImpedanceData,
+    ImpedanceModel,
     PositionLimits,
-    ToolMotions,
     bound_torque,
-    clip_errors,
-    limit_repulsion,
+    impedance_torque,
     plausible,
-    springs_torque,
 )
 from q2r2_control.config.control import LIVE_IMPEDANCE, ImpedanceSettings
+from q2r2_control.control.geometry.kinematics import chain_of
+from q2r2_control.control.jit import bound, pointer_to
+from q2r2_control.control.tasks.tools import tools_of
 from q2r2_control.errors import ConfigError, RobotError
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import LONGEST_DT, Array, Reference, RobotState
@@ -84,23 +86,27 @@ class ImpedanceController:
         self._payloads = {arm: held for arm, held in robot.objects.by_arm.items() if held.config.mass > 0.0}
         self._borne = dict.fromkeys(self._payloads, 0.0)  # share of each payload's mass
         self._wanted_borne = dict(self._borne)
-        self._frames = [arm.frame_id for arm in robot.arms.values()]
-        self._position_limits = PositionLimits(
-            lower=robot.position_lower,
-            upper=robot.position_upper,
-            stiffness=self.settings.limit_stiffness,
-            damping=self.settings.limit_damping,
-            distance=self.settings.limit_distance,
+        settings = self.settings
+        model = ImpedanceModel(
+            chain=chain_of(robot.model),
+            tools=tools_of(robot),
+            limits=PositionLimits(
+                lower=robot.position_lower,
+                upper=robot.position_upper,
+                stiffness=settings.limit_stiffness,
+                damping=settings.limit_damping,
+                distance=settings.limit_distance,
+            ),
+            largest_error=np.array([settings.max_position_error, settings.max_rotation_error]),
         )
-        # A copy, to which payloads are added, with what is computed of the measured and of the wanted posture.
-        self._model = robot.model.copy()
-        self._measured, self._wanted = self._model.createData(), self._model.createData()
-        k, nv = len(self._arms), self._model.nv
-        member = np.array([np.isin(np.arange(nv), arm.joints) for arm in robot.arms.values()], dtype=np.float64)
-        self._tools = ToolMotions(np.zeros((k, 6, nv)), np.zeros((k, 6)), np.zeros((k, 6)), member)
-        self._clipped = np.zeros(k, dtype=np.bool_)
-        values = [float(getattr(self.settings, name)) for name in LIVE_IMPEDANCE]
+        values = [float(getattr(settings, name)) for name in LIVE_IMPEDANCE]
         self._springs = np.tile(values, (len(self._arms), 1))  # in force
+        self._kernel_data = ImpedanceData.empty(model, self._springs)
+        self._pointers = pointer_to(model), pointer_to(self._kernel_data)
+        self._impedance_torque = bound(impedance_torque, *self._pointers)
+        # A copy, to which payloads are added.
+        self._model = robot.model.copy()
+        self._pinocchio_data = self._model.createData()
         self._wanted_springs = self._springs.copy()  # at the end of a ramp
         self._ramp_rate = np.zeros_like(self._springs)
         self._ramping = False
@@ -122,13 +128,13 @@ class ImpedanceController:
         self._begin(q)
 
     def _begin(self, q: Array) -> None:
-        self._due = (q.copy(), np.zeros_like(q))  # posture and speed of the reference that is due now
+        self._due = np.stack((q, np.zeros_like(q)))  # posture and speed of the reference that is due now
         self._usable_q = q.copy()  # the newest measured posture that was of use
         self._commanded: Array = np.minimum(np.maximum(self.gravity(q), -self._limit), self._limit)
 
     def gravity(self, q: Array) -> Array:
         """Torque (nv,) that bears the arms, with what they hold, at a posture ``q`` (nv,) [rad], [Nm]."""
-        return np.array(pin.computeGeneralizedGravity(self._model, self._measured, q))
+        return np.array(pin.computeGeneralizedGravity(self._model, self._pinocchio_data, q))
 
     def set_holding(self, holding: Mapping[str, bool]) -> None:
         """Of each arm whose gripper has an object, whether it is held and its mass to be borne."""
@@ -183,72 +189,52 @@ class ImpedanceController:
         held. Where the state, or what comes of it, is not finite, the last gravity torque is held, since a spring
         about an unknown posture could push anywhere. A dt that is not in (0, 0.1] s counts as 0 or as 0.1 s.
         """
-        usable = isinstance(dt, int | float | np.floating) and math.isfinite(dt) and dt > 0.0
-        time = min(float(dt), LONGEST_DT) if usable else 0.0
+        time = min(float(dt), LONGEST_DT) if dt > 0.0 else 0.0
         if self._ramping:
             self._ramp(time)
         if self._borne != self._wanted_borne:
             self._bear(time / _PAYLOAD_TIME)
-        wanted_q, wanted_v, a = self._next_reference(reference)
-        torque = None
-        if plausible(state.q, state.v) and (extra is None or plausible(extra)):
-            torque = self._law(state.q, state.v, wanted_q, wanted_v, a)
-        if torque is None:
-            torque, report = self.gravity(self._usable_q), ImpedanceReport({}, (), (), (), (), held=True)
-        else:
+        a = self._next_reference(reference)
+        usable = plausible(state.q, state.v) and (extra is None or plausible(extra))
+        if usable and self._law(state, a):
+            data = self._kernel_data
             self._usable_q = state.q.copy()
-            repulsion = limit_repulsion(self._position_limits, state.q, state.v, wanted_q)
-            torque = torque + repulsion if extra is None else torque + repulsion + extra
+            torque = data.torque if extra is None else data.torque + extra
             report = ImpedanceReport(
-                errors=dict(zip(self._arms, self._tools.error.copy(), strict=True)),
-                clipped=_those(self._arms, self._clipped),
+                errors=dict(zip(self._arms, data.error.copy(), strict=True)),
+                clipped=_those(self._arms, data.clipped),
                 saturated=(),
                 rate_limited=(),
-                repelled=_those(self.robot.joint_names, repulsion),
+                repelled=_those(self.robot.joint_names, data.repulsion),
                 held=False,
             )
+        else:
+            torque, report = self.gravity(self._usable_q), ImpedanceReport({}, (), (), (), (), held=True)
         change = self.settings.torque_rate_limit * time
         self._commanded, saturated, late = bound_torque(torque, self._commanded, self._limit, change)
         report.saturated, report.rate_limited = (_those(self.robot.joint_names, which) for which in (saturated, late))
         return TorqueCommand(self._commanded.copy(), report)
 
-    def _next_reference(self, newest: Reference) -> tuple[Array, Array, Array]:
-        """Posture and speed that are due now, and the acceleration that leads to the ``newest``, which is kept."""
-        (wanted_q, wanted_v), at_rest = self._due, np.zeros(len(self._limit))
+    def _next_reference(self, newest: Reference) -> Array:
+        """Let posture and speed that are due now be wanted, keep the ``newest``, and return its acceleration."""
+        wanted, due = self._kernel_data.wanted, self._due
+        wanted[:] = due
         if not plausible(newest.q, newest.v, newest.a):
-            self._due = (wanted_q, at_rest)
-            return wanted_q, wanted_v, at_rest
-        self._due = (newest.q.copy(), newest.v.copy())
-        return wanted_q, wanted_v, newest.a
+            due[1] = 0.0
+            return np.zeros(len(self._limit))
+        due[0], due[1] = newest.q, newest.v
+        return newest.a
 
-    def _law(self, q: Array, v: Array, wanted_q: Array, wanted_v: Array, a: Array) -> Array | None:
-        """Torque (nv,) of springs, postures and feed-forward, without bounds; None where no number comes of it."""
-        model, measured, settings = self._model, self._measured, self.settings
-        self._update_tools(q, wanted_q, wanted_v)
-        self._clipped = clip_errors(self._tools.error, settings.max_position_error, settings.max_rotation_error)
-        M, M_inverse = pin.crba(model, measured, q), pin.computeMinverse(model, measured, q)
-        consistent = settings.nullspace_projector == "consistent"
+    def _law(self, state: RobotState, a: Array) -> bool:
+        """Torque of springs, postures and feed-forward, without bounds; False where no number comes of it."""
+        model, pinocchio_data, data = self._model, self._pinocchio_data, self._kernel_data
+        data.measured[0], data.measured[1] = state.q, state.v
+        data.torque[:] = pin.rnea(model, pinocchio_data, state.q, state.v, a)
+        data.M[:] = pin.crba(model, pinocchio_data, state.q)
         try:
-            springs = springs_torque(
-                self._tools, v, wanted_q - q, wanted_v - v, M, M_inverse, self._springs, consistent
-            )
+            return bool(self._impedance_torque(*self._pointers))
         except np.linalg.LinAlgError:
-            return None
-        tau: Array = pin.rnea(model, measured, q, v, a) + springs
-        return tau if np.isfinite(tau).all() else None
-
-    def _update_tools(self, q: Array, wanted_q: Array, wanted_v: Array) -> None:
-        """Measured Jacobians, wanted twists, and the ways from measured to wanted poses."""
-        model, measured, wanted, tools = self._model, self._measured, self._wanted, self._tools
-        pin.computeJointJacobians(model, measured, q)
-        pin.forwardKinematics(model, wanted, wanted_q, wanted_v)
-        for i, frame in enumerate(self._frames):
-            tools.J[i] = pin.getFrameJacobian(model, measured, frame, pin.LOCAL_WORLD_ALIGNED)
-            tools.wanted_twist[i] = pin.getFrameVelocity(model, wanted, frame, pin.LOCAL_WORLD_ALIGNED).vector
-            here = pin.updateFramePlacement(model, measured, frame)
-            there = pin.updateFramePlacement(model, wanted, frame)
-            tools.error[i, :3] = there.translation - here.translation
-            tools.error[i, 3:] = pin.log3(there.rotation @ here.rotation.T)
+            return False
 
     def _ramp(self, time: float) -> None:
         reach, springs = self._ramp_rate * time, self._springs
@@ -258,4 +244,4 @@ class ImpedanceController:
 
 def _those(names: tuple[str, ...], which: BoolArray | Array) -> tuple[str, ...]:
     """The names at which ``which`` is not 0."""
-    return tuple(names[index] for index in np.flatnonzero(which)) if which.any() else ()
+    return tuple(compress(names, which.tolist()))

@@ -12,7 +12,10 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from q2r2_control.control.jit import numpy_kernel
+from q2r2_control.control.geometry.kinematics import Chain, Placements, place
+from q2r2_control.control.jit import KernelPointer, numpy_kernel, pointee
+from q2r2_control.control.tasks.frame import rotation_vector, tool_jacobian, tool_pose
+from q2r2_control.control.tasks.tools import Tools
 from q2r2_control.types import Array
 
 BoolArray = npt.NDArray[np.bool_]
@@ -21,8 +24,6 @@ ABSURD = 1e9  # no number that a robot or a controller sends is as large; square
 # No direction of a tool counts for more than this [kg]. An arm whose rotors weigh most of it stays below a fifth of it
 # in every posture that it works in.
 _HEAVIEST = 1000.0
-# A direction in which the Jacobian is smaller is one in which the arm cannot move its tool [m/rad].
-_LEAST_MOTION = 0.05
 
 
 class PositionLimits(NamedTuple):
@@ -89,56 +90,105 @@ def consistent_force(inertia: Array, J: Array, M_inverse: Array, torque: Array) 
 
 
 @numpy_kernel
-def kinematic_force(J: Array, torque: Array) -> Array:
-    """Force F (6,) so that torque - J' F is N torque, which balances no force at the tool; needs no inertia.
-
-    N = I - J' J'^+ with the inverse of J J', whose eigenvalues are raised near a singular posture.
-    """
-    values, vectors = np.linalg.eigh(J @ J.T)
-    return vectors @ ((vectors.T @ (J @ torque)) / np.maximum(values, _LEAST_MOTION**2))
-
-
-@numpy_kernel
-def posture_torque(M: Array, way: Array, speed: Array, stiffness: float, damping_ratio: float) -> Array:
+def posture_torque(inertia: Array, way: Array, speed: Array, stiffness: float, damping_ratio: float) -> Array:
     """Torque (n,) towards a posture that is ``way`` (n,) [rad] off and moves by ``speed`` (n,) [rad/s] faster.
 
-    Each joint's damping has the ratio for the inertia that it moves by itself.
+    Each joint's damping has the ratio for the ``inertia`` (n,) that it moves by itself.
     """
-    damping = 2.0 * damping_ratio * np.sqrt(stiffness * np.diag(M))
+    damping = 2.0 * damping_ratio * np.sqrt(stiffness * inertia)
     return stiffness * way + damping * speed
 
 
-class ToolMotions(NamedTuple):
-    """The tools of k arms, measured and wanted; joints that move no part of an arm have zeros in its J."""
+class ImpedanceModel(NamedTuple):
+    """What does not change between ticks."""
 
+    chain: Chain
+    tools: Tools  # of k arms
+    limits: PositionLimits
+    largest_error: Array  # (2,) [m, rad]
+
+
+class ImpedanceData(NamedTuple):
+    """One tick's measurement, and arrays written anew."""
+
+    measured: Array  # (2, nv) q and v
+    wanted: Array  # (2, nv) q and v of the reference that is due now
+    springs: Array  # (k, 5) values of ``LIVE_IMPEDANCE``
+    M: Array  # (nv, nv) inertia
+    torque: Array  # (nv,) that of inverse dynamics comes in, that of the law goes out [Nm]
     J: Array  # (k, 6, nv) measured
-    error: Array  # (k, 6) way to the wanted pose [m, rad]
+    error: Array  # (k, 6) clipped way to the wanted pose [m, rad]
+    clipped: BoolArray  # (k,) arms whose way was longer
+    repulsion: Array  # (nv,) from position limits [Nm]
     wanted_twist: Array  # (k, 6)
-    member: Array  # (k, nv) 1 for joints of the arm
+    wanted_rotation: Array  # (k, 3, 3) of the tools
+    wanted_translation: Array  # (k, 3) [m]
+    rotation: Array  # (3, 3) scratch: of a measured tool
+    translation: Array  # (3,) [m]
+    placements: Placements  # scratch
+
+    @classmethod
+    def empty(cls, model: ImpedanceModel, springs: Array) -> ImpedanceData:
+        """Arrays of the sizes that ``model`` needs."""
+        k, nv = model.tools.member.shape
+        return cls(
+            measured=np.zeros((2, nv)),
+            wanted=np.zeros((2, nv)),
+            springs=springs,
+            M=np.eye(nv),
+            torque=np.zeros(nv),
+            J=np.zeros((k, 6, nv)),
+            error=np.zeros((k, 6)),
+            clipped=np.zeros(k, dtype=np.bool_),
+            repulsion=np.zeros(nv),
+            wanted_twist=np.zeros((k, 6)),
+            wanted_rotation=np.zeros((k, 3, 3)),
+            wanted_translation=np.zeros((k, 3)),
+            rotation=np.zeros((3, 3)),
+            translation=np.zeros(3),
+            placements=Placements.empty(model.chain),
+        )
 
 
 @numpy_kernel
-def springs_torque(
-    tools: ToolMotions, v: Array, way: Array, speed: Array, M: Array, M_inverse: Array, springs: Array, consistent: bool
-) -> Array:
-    """Torque (nv,) of all arms' springs and postures: the sum of J' (K e + D e') + N posture.
+def impedance_torque(model_pointer: KernelPointer, data_pointer: KernelPointer) -> bool:
+    """Add the springs, the sum of J' (K e + D e') + N posture, and the limits' repulsion to ``data.torque``.
 
-    ``way`` (nv,) [rad] and ``speed`` (nv,) [rad/s] of the joints are wanted less measured ones, ``springs`` (k, 5) the
-    values of ``LIVE_IMPEDANCE``. Raises LinAlgError where numbers are not finite.
+    False where that is not finite; raises LinAlgError where the numbers that make it are not.
     """
-    total = np.zeros_like(v)
-    for i in range(len(springs)):
-        J, values = tools.J[i], springs[i]
+    model, data = pointee(model_pointer), pointee(data_pointer)
+    q, v, wanted_q, wanted_v = data.measured[0], data.measured[1], data.wanted[0], data.wanted[1]
+    _update_tools(model, data)
+    data.clipped[:] = clip_errors(data.error, model.largest_error[0], model.largest_error[1])
+    M_inverse, own_inertia = np.linalg.inv(data.M), np.diag(data.M)
+    for i in range(len(data.springs)):
+        J, values = data.J[i], data.springs[i]
         stiffness = np.repeat(values[:2], 3)
         inertia, damping = inertia_and_damping(J @ M_inverse @ J.T, stiffness)
-        force = stiffness * tools.error[i] + values[2] * (damping @ (tools.wanted_twist[i] - J @ v))
-        posture = tools.member[i] * posture_torque(M, way, speed, values[3], values[4])
-        if consistent:
-            force -= consistent_force(inertia, J, M_inverse, posture)
-        else:
-            force -= kinematic_force(J, posture)
-        total += posture + J.T @ force
-    return total
+        force = stiffness * data.error[i] + values[2] * (damping @ (data.wanted_twist[i] - J @ v))
+        posture = posture_torque(own_inertia, wanted_q - q, wanted_v - v, values[3], values[4])
+        posture *= model.tools.member[i]
+        force -= consistent_force(inertia, J, M_inverse, posture)
+        data.torque[:] += posture + J.T @ force
+    data.repulsion[:] = limit_repulsion(model.limits, q, v, wanted_q)
+    data.torque[:] += data.repulsion
+    return np.isfinite(data.torque).all()
+
+
+@numpy_kernel
+def _update_tools(model: ImpedanceModel, data: ImpedanceData) -> None:
+    """Measured Jacobians, wanted twists, and the ways from measured to wanted poses."""
+    place(model.chain, data.wanted[0], data.placements)
+    for i in range(len(data.J)):
+        tool_pose(data.placements, model.tools, i, data.wanted_rotation[i], data.wanted_translation[i])
+        tool_jacobian(model.chain, data.placements, model.tools, i, data.wanted_translation[i], data.J[i])
+        data.wanted_twist[i] = data.J[i] @ data.wanted[1]
+    place(model.chain, data.measured[0], data.placements)
+    for i in range(len(data.J)):
+        tool_pose(data.placements, model.tools, i, data.rotation, data.translation)
+        tool_jacobian(model.chain, data.placements, model.tools, i, data.translation, data.J[i])
+        data.error[i, :3] = data.wanted_translation[i] - data.translation
+        rotation_vector(data.wanted_rotation[i] @ data.rotation.T, data.error[i, 3:])
 
 
 @numpy_kernel

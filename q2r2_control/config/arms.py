@@ -136,16 +136,6 @@ class GripperConfig(CellModel):
         return self
 
 
-class SwivelConfig(CellModel):
-    """Where an arm's elbow is, about the line from shoulder to wrist. Names are joints of the arm's model."""
-
-    shoulder: str = Field("A2", description="joint in the shoulder")
-    elbow: str = Field("A4", description="joint in the elbow")
-    wrist: str = Field("A6", description="joint in the wrist")
-    angle: Angle | None = Field(None, description="0: elbow up, turning about that line [rad]; none: as at home")
-    gain: float = Field(0.0, ge=0, le=20, description="swivel speed per radian from the angle [1/s]; 0: off")
-
-
 class RobotConfig(CellModel):
     """One model that several arms are parts of. Its links and joints keep their names."""
 
@@ -174,7 +164,6 @@ class ArmConfig(CellModel):
     acceleration_limit: Annotated[dict[str, Acceleration], BeforeValidator(_by_joint)] = Field(
         default_factory=dict, description="of joints, by name, in place of the model's [rad/s^2]"
     )
-    swivel: SwivelConfig = SwivelConfig()
 
     @model_validator(mode="after")
     def _has_one_tip(self) -> ArmConfig:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
@@ -97,7 +97,7 @@ class ControllerSettings(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
-    solver: str = Field("daqp", description="daqp, osqp, or the name of any solver that qpsolvers has installed")
+    solver: str = Field("daqp", description="daqp, or the name of any solver that qpsolvers has installed")
     solve_time_limit: float | None = Field(
         None, gt=0, le=0.1, description="a later solution counts as failed [s]; none: runs do not depend on the clock"
     )
@@ -137,9 +137,6 @@ class ControllerSettings(BaseModel):
     posture_gain: float = Field(1.0, ge=0, le=20, description="pull towards the home posture [1/s]")
     posture_speed: float = Field(0.5, gt=0, le=3, description="of that pull, at most [rad/s]")
     posture_weight: float = Field(1e-3, gt=0, le=1, description="against the tool task's 1; also regularises")
-    manipulability_gain: float = Field(
-        0.0, ge=0, le=10, description="posture speed per relative rise of manipulability; 0: off [rad/s]"
-    )
     stretch_gain: float = Field(10.0, gt=0, le=200, description="highest gain of a stretched-out arm [1/s]")
     tasks: dict[str, dict[str, Any]] = Field(
         {}, description="tasks of other packages, by their entry point's name, with the settings of each"
@@ -198,9 +195,6 @@ class ImpedanceSettings(BaseModel):
     damping_ratio: float = Field(1.0, ge=0.1, le=2, description="of every mode of the tool; 1: no overshoot")
     nullspace_stiffness: float = Field(50.0, gt=0, le=500, description="towards the reference's posture [Nm/rad]")
     nullspace_damping_ratio: float = Field(1.0, ge=0.1, le=2, description="of the posture's motion")
-    nullspace_projector: Literal["consistent", "kinematic"] = Field(
-        "consistent", description="consistent: exact where the model is; kinematic: needs no masses"
-    )
     max_position_error: float = Field(0.1, gt=0, le=1, description="a longer way from the reference is clipped [m]")
     max_rotation_error: float = Field(0.5, gt=0, le=3, description="a wider turn from the reference is clipped [rad]")
     limit_distance: float = Field(0.1, gt=0, le=0.5, description="joints are repelled nearer to a limit [rad]")

@@ -12,8 +12,9 @@ import pinocchio as pin
 from q2r2_control.config.control import ControllerSettings
 from q2r2_control.control.geometry.finger_openings import FingerOpenings
 from q2r2_control.control.geometry.kinematics import IntArray
-from q2r2_control.control.held_objects import ObjectLoads
-from q2r2_control.control.jit import bound
+from q2r2_control.control.held_objects import ObjectPairs
+from q2r2_control.control.jit import bound, pointer_to
+from q2r2_control.control.kernel_data import KernelData
 from q2r2_control.control.kernel_model import kernel_model_of
 from q2r2_control.control.live_settings import LiveSettings
 from q2r2_control.control.qp import QpProblem, Solver, make_solver
@@ -23,7 +24,7 @@ from q2r2_control.control.safety.safety_filter import FOLLOWED, STOPPED
 from q2r2_control.control.safety.safety_model import ROUNDING
 from q2r2_control.control.step_report import LimitNames, StepSummary
 from q2r2_control.control.targets import TargetTracker
-from q2r2_control.control.tasks.external import load_tasks
+from q2r2_control.control.tasks.external import add_costs, load_tasks
 from q2r2_control.control.unconstrained import find_minimum_anew
 from q2r2_control.errors import ConfigError, RobotError
 from q2r2_control.robot.pairs import pairs_with_others
@@ -55,9 +56,11 @@ class CartesianController:
         self._nv = robot.model.nv
         self._arms = tuple(robot.arms)
         self._solver = solver or make_solver(settings.solver, self._nv, settings.solve_time_limit)
-        self._objects = ObjectLoads(robot, settings, kernel_model_of(robot, settings))
-        self._live = LiveSettings(robot, settings, self._objects)
-        model, data = self._objects.model, self._objects.data
+        model = kernel_model_of(robot, settings)
+        data = KernelData.empty(model)
+        self._model_pointer, self._data_pointer = pointer_to(model), pointer_to(data)
+        self._objects = ObjectPairs(robot, settings, model, data)
+        self._live = LiveSettings(robot, settings, model, data, self._objects)
         self._state, self._rows, self._active = data.safety.state, data.safety.rows, data.safety.active
         self._stop, self._tasks = data.safety.certified, data.tasks
         self._solution = np.zeros(self._nv)  # of the QP, whatever array has it
@@ -69,12 +72,12 @@ class CartesianController:
             rows=self._rows.matrix[:0],
             rows_lower=self._rows.lower[:0],
         )
-        self._fingers = FingerOpenings(robot, self._objects.bodies)
-        self._unchanged: IntArray = np.zeros(len(self._objects.bodies.joint), dtype=np.int64)
+        self._fingers = FingerOpenings(robot, model.safety.collision.bodies)
+        self._unchanged: IntArray = np.zeros(len(model.safety.collision.bodies.joint), dtype=np.int64)
         self._targets = TargetTracker(model.tasks, self._arms, settings)
         self._external_tasks = load_tasks(robot, settings.tasks)
         self._names = LimitNames(robot)
-        self._use_load()
+        self._with_others = {arm: pairs_with_others(self._names.pairs, robot.roles, arm) for arm in self._arms}
         self._compile()
         self.reset(robot.home)
 
@@ -132,14 +135,14 @@ class CartesianController:
         state.v[:] = 0.0 if v is None else self._checked("v", v)
         self._fingers.set_all({})
         self._objects.clear()
-        self._use_load()
+        self._active.used[0] = 0
         self._live.restart()
         self._targets.reset(state.q)
         observed = start_reference(self._model_pointer, self._data_pointer)
         self._closest, self._distance, self._tightest, self._margin, proven = observed
         self._apart = self._margin >= -ROUNDING
         self._certified = proven and self._apart
-        self._live.begin(self._objects.load)
+        self._live.begin()
 
     def _checked(self, name: str, values: Array) -> Array:
         array = np.array(values, dtype=np.float64)
@@ -154,8 +157,7 @@ class CartesianController:
         stays, and the report names the arm. A dt that is not in (0, 0.1] s moves nothing, or no more than 0.1 s.
 
         ``posture`` (nv,) [rad] is what arms that follow a target take as far as their tools leave them free to; without
-        it that is home. Where something else moves the arms it is what was measured, so that the reference's elbows
-        are where the arms' are. One that is not nv finite numbers is not used: the last one stays.
+        it that is home. One that is not nv finite numbers is not used: the last one stays.
         """
         usable = isinstance(dt, _NUMBER) and math.isfinite(dt) and dt > 0.0
         time = min(float(dt), LONGEST_DT) if usable else 0.0
@@ -199,14 +201,11 @@ class CartesianController:
     def set_opening(self, arm: str, least: float, greatest: float) -> tuple[str, str] | None:
         """Say that the gripper of ``arm`` is, and stays, between two openings, 0 closed .. 1 fully open.
 
-        Its fingers count as what they sweep between these, from the next step on. A finger's body that is within what
-        it was is always accepted, as with less for fingers that slide. One that is not, as with more, or with less for
-        fingers that turn, is accepted if every pair keeps its distance with it, at the reference and on a certified
-        stop from there; else nothing changes, and the pair that is in the way is returned. What was accepted before
-        then still holds, so a gripper may be commanded to what was accepted, and to nothing else. An end of the
-        interval at 0 or 1 is that of the joints' travel. Until something is said, and after :meth:`reset`, fingers are
-        all of their way, for which nothing needs to be known; so are those of an arm whose config tells no open and
-        closed position.
+        Its fingers count as what they sweep between these, from the next step on. Bodies within what they were are
+        always accepted. Others are if every pair keeps its distance with them, at the reference and on a certified stop
+        from there; else nothing changes, and the pair that is in the way is returned. So a gripper may be commanded to
+        what was accepted, and to nothing else. Until something is said, and after :meth:`reset`, fingers are all of
+        their way.
 
         Raises :class:`RobotError` for a name that is no arm's and for numbers that are no interval.
         """
@@ -228,19 +227,17 @@ class CartesianController:
     def set_holding(self, arm: str, holds: bool) -> None:
         """Say that the gripper of ``arm`` holds its object from the next step on, or that it does not.
 
-        The object of the cell's YAML then is part of the tool. It may touch, or overlap, what is near when it is
-        gripped: each of its pairs begins with the distance that there is and keeps more as it gets more, until it keeps
-        its own (:attr:`object_distances`). So it is always accepted, and proven with the stop that is known; nothing
-        moves for it. Until something is said, and after :meth:`reset`, nothing is held.
+        The object of the cell's YAML then is part of the tool. Each of its pairs begins with the distance that there is
+        and keeps more as it gets more, until it keeps its own (:attr:`object_distances`): so it is always accepted, and
+        nothing moves for it. Until something is said, and after :meth:`reset`, nothing is held.
 
         Raises :class:`RobotError` for an arm that has no object.
         """
         if not self._objects.set_holding(arm, holds):
             return
-        self._use_load()
+        self._active.used[0] = 0  # what it names may not count any more
         self._observe_again(self._unchanged)
         self._objects.begin()
-        self._use_load()
         self._observe_again(self._unchanged)
 
     @property
@@ -251,15 +248,7 @@ class CartesianController:
     @property
     def object_distances(self) -> Array:
         """What every pair of ``Robot.objects`` keeps now (pairs,) [m]; minus infinity while it does not count."""
-        return self._objects.kept()
-
-    def _use_load(self) -> None:
-        """Go on with the kernels' model and data of what is held now."""
-        load = self._objects.load
-        self._model_pointer, self._data_pointer = load.model, load.data
-        self._names.set_pairs([self._objects.pair_names[pair] for pair in load.objects])
-        self._active.used[0] = 0  # pairs are numbered anew
-        self._with_others = {arm: pairs_with_others(self._names.pairs, self.robot.roles, arm) for arm in self._arms}
+        return self._objects.kept.copy()
 
     def _observe_again(self, grown: IntArray) -> int:
         """Observe with bodies that have changed; returns the pair in the way of those that have ``grown``, or -1."""
@@ -290,10 +279,11 @@ class CartesianController:
 
         ``tick``: see :func:`assemble`.
         """
-        self._live.step(self._objects.load, h)
+        self._live.step(h)
         usable, inside, free = self._assemble(self._model_pointer, self._targets.pointer, self._data_pointer, h, tick)
         if self._external_tasks:
-            free = self._apply_external_costs()
+            add_costs(self._external_tasks, self._tasks.H, self._tasks.g, self._state.q, self._state.v)
+            free = self._find_minimum(self._data_pointer)
         summary.targets_usable &= usable
         summary.inside &= inside
         count = int(self._rows.used[0])
@@ -316,12 +306,3 @@ class CartesianController:
         # A certified stop stays certified. Anything else was proven just now, and if all was apart before, in full.
         self._certified = self._apart and (self._certified if outcome == STOPPED else was_apart)
         return solved
-
-    def _apply_external_costs(self) -> bool:
-        """Cost of the tasks of other packages; whether the whole cost's minimum is within the box and all rows."""
-        for task in self._external_tasks:
-            H, g = task.cost(self._state.q.copy(), self._state.v.copy())
-            if np.isfinite(H).all() and np.isfinite(g).all():
-                self._tasks.H[:] += H
-                self._tasks.g[:] += g
-        return bool(self._find_minimum(self._data_pointer))

@@ -52,9 +52,11 @@ def kernel_model_of(robot: Robot, settings: ControllerSettings) -> KernelModel:
 
 
 def _safety_model(robot: Robot, settings: ControllerSettings) -> SafetyModel:
-    kept = kept_distances(robot, settings)
-    min_distance = kept.values
-    collision = with_rounded_boxes(collision_model_of(robot), -min_distance)
+    kept, objects = kept_distances(robot, settings), len(robot.objects.holders)
+    min_distance = np.append(kept.values, np.full(objects, -np.inf))  # nothing is held yet
+    contact_speed = np.append(kept.contact_speed, np.full(objects, np.inf))
+    depth = np.append(-kept.values, np.zeros(objects))
+    collision = with_rounded_boxes(collision_model_of(robot, robot.objects.geometry), depth)
     _check_depths(robot, collision, kept)
     arm = np.full(robot.model.nv, len(robot.arms), dtype=np.int64)
     for i, joints in enumerate(robot.arms.values()):
@@ -72,8 +74,8 @@ def _safety_model(robot: Robot, settings: ControllerSettings) -> SafetyModel:
         approach=Approach(
             stop_distance=min_distance + stop_buffer(min_distance, settings),
             gain=np.array([settings.separation_gain]),
-            contact_speed=kept.contact_speed,
-            contact_zone=np.where(np.isfinite(kept.contact_speed), _CONTACT_ZONE - min_distance, 0.0),
+            contact_speed=contact_speed,
+            contact_zone=np.where(np.isfinite(contact_speed), _CONTACT_ZONE - min_distance, 0.0),
             recovery_speed=settings.separation_recovery_speed,
         ),
         min_distance=min_distance,
@@ -86,7 +88,7 @@ def _check_depths(robot: Robot, collision: CollisionModel, kept: KeptDistances) 
     radius = collision.bodies.radius.copy()
     for number, finger in turning_bodies(robot):
         radius[number] = finger.radius
-    allowed = _DEEPEST * deepest(collision, radius)
+    allowed = _DEEPEST * deepest(collision, radius)[: len(kept.values)]
     for p in np.flatnonzero(-kept.values > allowed):
         names = " and ".join(pair_names(robot.collision_model)[p])
         raise ConfigError(

@@ -25,11 +25,12 @@ from dataclasses import replace
 import numpy as np
 
 from q2r2_control.config.control import ControllerSettings
-from q2r2_control.control.held_objects import HeldObjectModels, ObjectLoads
+from q2r2_control.control.held_objects import ObjectPairs
+from q2r2_control.control.kernel_data import KernelData
 from q2r2_control.control.kernel_model import KernelModel, stop_buffer
 from q2r2_control.control.safety.provable_distances import provable_distances
 from q2r2_control.control.tasks.task_model import task_model_of
-from q2r2_control.robot.kept_distances import KeptDistances, kept_distances, too_close_at_home
+from q2r2_control.robot.kept_distances import kept_distances, too_close_at_home
 from q2r2_control.robot.pairs import CLEARANCE
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
@@ -42,25 +43,25 @@ _RAMP_TIME = 0.5  # of gains [s]
 class LiveSettings:
     """What of one controller's settings is in force, on its way to what was asked for."""
 
-    def __init__(self, robot: Robot, settings: ControllerSettings, objects: ObjectLoads) -> None:
+    def __init__(
+        self, robot: Robot, settings: ControllerSettings, model: KernelModel, data: KernelData, objects: ObjectPairs
+    ) -> None:
         self._robot, self._objects = robot, objects
-        self._distances = LiveDistances(robot, settings, objects)
-        self._gains = LiveGains(robot, objects.model, settings)
+        self._safety, self._data = model.safety, data.safety
+        self._gains = LiveGains(robot, model, settings)
+        self._goal = self._least = kept_distances(robot, settings).values  # least: without any change
+        self._growing, self._due = False, 0.0
         self.settings = settings
-
-    @property
-    def kept(self) -> Array:
-        """What every monitored pair keeps now (p,) [m]; another array whenever something of it has changed."""
-        return self._distances.kept
+        self.kept = self._goal  # by every monitored pair now (p,) [m]; another array whenever something has changed
 
     @property
     def narrow(self) -> int:
         """The pair that keeps the least of what it was asked for, or -1 where all keep all of it."""
-        return self._distances.narrow
+        return int(np.argmax(self._goal - self.kept)) if self._growing else -1
 
     def change(self, settings: ControllerSettings) -> str | None:
         """Go to ``settings``, which differ in ``LIVE`` only; returns why not, and changes nothing then, or None."""
-        before, kept = self.settings.min_distance, kept_distances(self._robot, settings)
+        before, goal = self.settings.min_distance, kept_distances(self._robot, settings)
         if settings.min_distance > before:
             if settings.min_distance > CLEARANCE:
                 return (
@@ -68,72 +69,49 @@ class LiveSettings:
                     f"{CLEARANCE:g}, since pairs that always stay farther apart are not watched"
                 )
             # Arms at home then keep all of it, and rest.
-            room = replace(kept, values=kept.values + stop_buffer(kept.values, settings))
+            room = replace(goal, values=goal.values + stop_buffer(goal.values, settings))
             if faults := too_close_at_home(self._robot, room):
                 return f"min_distance = {settings.min_distance:g} m: {faults[0]} with distance_buffer"
         self.settings = settings
-        self._distances.aim(kept, settings)
+        self._goal, self._due = goal.values, 0.0
+        self._write(np.minimum(self.kept, self._goal))
         self._objects.change(settings)
         self._gains.aim(settings)
         return None
 
     def restart(self) -> None:
         """Before a reset is observed: begin with what does not depend on where that is."""
-        self._distances.restart()
+        self._due = 0.0
+        if self._growing:
+            self._write(np.minimum(self._goal, self._least))
         self._gains.finish()
 
-    def begin(self, load: HeldObjectModels) -> None:
+    def begin(self) -> None:
         """After a reset was observed: keep what the posture allows."""
-        self._distances.grow(load, np.inf)
+        self._grow(np.inf)
 
-    def step(self, load: HeldObjectModels, h: float) -> None:
+    def step(self, h: float) -> None:
         """Before a step of ``h`` [s] from an observed reference."""
         self._gains.step(h)
-        if self._distances.growing:
-            self._distances.step(load, h)
+        if self._growing:
+            self._due -= h
+            if self._due <= 0.0:
+                self._due = _PERIOD
+                self._grow(GROWTH * max(_PERIOD, h))
 
-
-class LiveDistances:
-    """What monitored pairs keep, and what they are to keep."""
-
-    def __init__(self, robot: Robot, settings: ControllerSettings, objects: ObjectLoads) -> None:
-        self._objects, self._settings = objects, settings
-        self._goal = self._least = kept_distances(robot, settings).values  # least: without any change
-        self.kept = self._goal
-        self.growing, self._due = False, 0.0
-
-    @property
-    def narrow(self) -> int:
-        return int(np.argmax(self._goal - self.kept)) if self.growing else -1
-
-    def aim(self, goal: KeptDistances, settings: ControllerSettings) -> None:
-        self._goal, self._settings, self._due = goal.values, settings, 0.0
-        self._write(np.minimum(self.kept, self._goal))
-
-    def restart(self) -> None:
-        self._due = 0.0
-        if self.growing:
-            self._write(np.minimum(self._goal, self._least))
-
-    def step(self, load: HeldObjectModels, h: float) -> None:
-        self._due -= h
-        if self._due <= 0.0:
-            self._due = _PERIOD
-            self.grow(load, GROWTH * max(_PERIOD, h))
-
-    def grow(self, load: HeldObjectModels, most: float) -> None:
+    def _grow(self, most: float) -> None:
         """Keep more, by at most ``most`` [m], where the stop at hand proves it."""
-        if not self.growing:
-            return
-        lasting = provable_distances(load.safety, load.measured)[: len(self._goal)]
-        room = lasting - stop_buffer(self._goal, self._settings)
-        self._write(np.maximum(self.kept, np.minimum(np.minimum(self._goal, self.kept + most), room)))
+        if self._growing:
+            lasting = provable_distances(self._safety, self._data)[: len(self._goal)]
+            room = lasting - stop_buffer(self._goal, self.settings)
+            self._write(np.maximum(self.kept, np.minimum(np.minimum(self._goal, self.kept + most), room)))
 
     def _write(self, kept: Array) -> None:
-        self.growing = bool((kept < self._goal).any())
+        self._growing = bool((kept < self._goal).any())
         if not np.array_equal(kept, self.kept):
             self.kept = kept
-            self._objects.write_monitored(kept, kept + stop_buffer(kept, self._settings))
+            self._safety.min_distance[: len(kept)] = kept
+            self._safety.approach.stop_distance[: len(kept)] = kept + stop_buffer(kept, self.settings)
 
 
 class LiveGains:

@@ -5,21 +5,19 @@
 
 The box is never empty (joint_limits.py) and the rows are soft, so a solution always exists. Rows have unit norm, so
 that a slack is a joint speed. H^-1 along a row is what the cost yields to it: a row alone gives way by the part
-SOFTNESS of what it corrects, however strong the cost. This is DAQP's own notion of softness; the other solvers are
-given the same. Where the cost's own minimum keeps box and rows it is the solution, and no solver has to be asked.
+SOFTNESS of what it corrects, however strong the cost. This is DAQP's own notion of softness; other solvers are given
+the same. Where the cost's own minimum keeps box and rows it is the solution, and no solver has to be asked.
 """
 
 from __future__ import annotations
 
 import time
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Protocol
 
 import daqp
 import numpy as np
-import osqp
 import qpsolvers
-from scipy import sparse
 
 from q2r2_control.errors import ConfigError
 from q2r2_control.types import Array
@@ -107,79 +105,6 @@ class DaqpSolver:
         return QpSolution(v if flag in self._OPTIMAL else None, info["setup_time"] + info["solve_time"])
 
 
-class OsqpSolver:
-    """OSQP (Stellato et al., Math. Prog. Comp. 2020), set up once and warm-started: the slack is a variable per row.
-
-    The problem's structure must not change between ticks, so rows are padded to a capacity that grows when needed.
-    """
-
-    def __init__(self, nv: int, time_limit: float | None) -> None:
-        self._nv = nv
-        # 0 would stop OSQP at once.
-        self._time_limit = time_limit or _UNBOUNDED
-        self._capacity = 0
-        self._solver: Any = None
-
-    def solve(self, problem: QpProblem) -> QpSolution:
-        nv, m = self._nv, len(problem.rows_lower)
-        if self._solver is None or m > self._capacity:
-            self._set_up(max(16, 2 * m))
-        upper_triangle = problem.H.T[np.tril_indices(nv)]  # column by column of the upper triangle
-        self._matrix[:m], self._matrix[m:] = problem.rows, 0.0
-        self._lower[:nv], self._upper[:nv] = problem.lower, problem.upper
-        self._lower[nv : nv + m], self._lower[nv + m : nv + self._capacity] = problem.rows_lower, -_UNBOUNDED
-        self._cost[:nv] = problem.g
-        self._slack_cost[:m] = 1.0 / problem.softness()
-        try:
-            self._solver.update(
-                Px=np.concatenate([upper_triangle, self._slack_cost]),
-                Ax=self._values(),
-                q=self._cost,
-                l=self._lower,
-                u=self._upper,
-            )
-            result = self._solver.solve(raise_error=False)
-        except osqp.OSQPException:
-            return self._failed(0.0)
-        # Rows that contradict each other take many iterations; the last one is good, and still has to be certified.
-        solved = result.info.status_val in (
-            osqp.SolverStatus.OSQP_SOLVED,
-            osqp.SolverStatus.OSQP_SOLVED_INACCURATE,
-            osqp.SolverStatus.OSQP_MAX_ITER_REACHED,
-        )
-        if not (solved and np.isfinite(result.x).all()):
-            return self._failed(result.info.run_time)
-        return QpSolution(np.asarray(result.x[:nv], dtype=np.float64), result.info.run_time)
-
-    def _failed(self, run_time: float) -> QpSolution:
-        """What is kept between ticks may be spoilt: start anew at the next."""
-        self._solver = None
-        return QpSolution(None, run_time)
-
-    def _values(self) -> Array:
-        """Non-zeros of the constraint matrix by columns: identity over rows for v, then row and s >= 0 for each s."""
-        box = np.vstack([np.ones(self._nv), self._matrix]).T.ravel()
-        return np.concatenate([box, np.ones(2 * self._capacity)])
-
-    def _set_up(self, capacity: int) -> None:
-        nv = self._nv
-        self._capacity = capacity
-        self._matrix = np.ones((capacity, nv))
-        self._cost = np.zeros(nv + capacity)
-        self._slack_cost = np.full(capacity, 1.0 / SOFTNESS)
-        self._lower = np.concatenate([np.full(nv + capacity, -_UNBOUNDED), np.zeros(capacity)])
-        self._upper = np.full(nv + 2 * capacity, _UNBOUNDED)
-        dense = np.triu(np.ones((nv, nv)))
-        P = sparse.block_diag([dense, sparse.eye(capacity) / SOFTNESS], format="csc")
-        A = sparse.bmat(
-            [[sparse.eye(nv), None], [self._matrix, sparse.eye(capacity)], [None, sparse.eye(capacity)]], format="csc"
-        )
-        A.sort_indices()
-        self._solver = osqp.OSQP()
-        settings = {"eps_abs": 1e-7, "eps_rel": 1e-7, "max_iter": 4000, "polishing": True, "verbose": False}
-        self._solver.setup(P, self._cost, A, self._lower, self._upper, time_limit=self._time_limit, **settings)
-
-
 class QpsolversSolver:
     """Any other solver through qpsolvers, with the slack as extra variables."""
 
@@ -215,9 +140,7 @@ def make_solver(name: str, nv: int, time_limit: float | None) -> Solver:
     """
     if name == "daqp":
         return SkipIfUnconstrained(DaqpSolver(nv, time_limit))
-    if name == "osqp":
-        return SkipIfUnconstrained(OsqpSolver(nv, time_limit))
-    available = sorted({"daqp", "osqp", *qpsolvers.available_solvers})
+    available = sorted({"daqp", *qpsolvers.available_solvers})
     if name not in available:
         raise ConfigError(f"control.solver = {name!r}: not installed; allowed here: {', '.join(available)}")
     return SkipIfUnconstrained(QpsolversSolver(name))

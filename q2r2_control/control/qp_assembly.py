@@ -14,7 +14,6 @@ from q2r2_control.control.tasks.frame import (
     tool_jacobian,
     wanted_twist,
 )
-from q2r2_control.control.tasks.manipulability import pull_to_manipulability
 from q2r2_control.control.tasks.posture import (
     accumulate_hold_cost,
     accumulate_posture_cost,
@@ -22,7 +21,6 @@ from q2r2_control.control.tasks.posture import (
     project_to_nullspace,
     pull_to_posture,
 )
-from q2r2_control.control.tasks.swivel import turn_elbows, write_swivel_rows
 from q2r2_control.control.tasks.task_data import TaskTargets
 from q2r2_control.control.unconstrained import find_minimum
 
@@ -54,10 +52,6 @@ def assemble(
             accumulate_hold_cost(tasks, targets, i, state.q)
     factor_of_tools(tasks.J, tasks.tools_factor)
     project_to_nullspace(tasks.J, tasks.tools_factor, tasks.tools_moved, tasks.posture)
-    if model.tasks.has_swivels == 1:
-        write_swivel_rows(model.tasks, tasks, targets)
-        project_to_nullspace(tasks.J, tasks.tools_factor, tasks.tools_moved, tasks.swivel.free)
-        turn_elbows(model.tasks, tasks)
     accumulate_posture_cost(model.tasks, tasks)
     write_separation_rows(model.safety, data.safety, h)
     inside = next_velocity_box(model.safety.limits, state.q, state.v, h, data.safety.box)
@@ -72,5 +66,3 @@ def _follow(model: KernelModel, data: KernelData, targets: TaskTargets, i: int) 
     wanted_twist(model.tasks.motion, tasks, targets, i)
     accumulate_tool_cost(J, tasks.twist[i], model.tasks.priority.weight[i], tasks.H, tasks.g)
     accumulate_stretch_damping(model.tasks, tasks, i)
-    if model.tasks.manipulability_gain > 0.0:
-        pull_to_manipulability(model.tasks, tasks, i)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 from q2r2_control.control.geometry.collision import collision_model_of
 from q2r2_control.control.safety.joint_limits import ACCELERATION, POSITION, VELOCITY
 from q2r2_control.control.safety.safety_data import ActiveBounds
@@ -18,22 +16,18 @@ class LimitNames:
     """Names of limits and pairs, by the numbers that kernels know them by."""
 
     def __init__(self, robot: Robot) -> None:
-        names = [geometry.name for geometry in robot.collision_model.geometryObjects]
-        watched = collision_model_of(robot).pairs  # the model's own know boxes that may be touched by other numbers
-        both = zip(watched.first.tolist(), watched.second.tolist(), strict=True)
-        self._watched = [(names[first], names[second]) for first, second in both]
-        self.pairs: list[tuple[str, str]] = []  # those of the cell, and of objects that are held
+        geometry = robot.objects.geometry
+        names = [item.name for item in geometry.geometryObjects]
+        pairs = collision_model_of(
+            robot, geometry
+        ).pairs  # the kernels' know boxes that may be touched by other numbers
+        both = zip(pairs.first.tolist(), pairs.second.tolist(), strict=True)
+        self.pairs = [(names[first], names[second]) for first, second in both]  # of the cell, and then of objects
         self._last: tuple[bytes, tuple[ActiveLimit, ...]] = b"", ()  # most ticks bind as the one before
         self._by_kind: dict[int, list[ActiveLimit]] = {
             kind: [ActiveLimit(limit, (joint,)) for joint in robot.joint_names] for kind, limit in _KINDS.items()
         }
-        self.set_pairs(())
-
-    def set_pairs(self, of_objects: Sequence[tuple[str, str]]) -> None:
-        """Go on with the pairs of the cell and those of objects that are held."""
-        self.pairs = [*self._watched, *of_objects]
         self._by_kind[SEPARATION] = [ActiveLimit(LimitKind.SEPARATION, pair) for pair in self.pairs]
-        self._last = b"", ()
 
     def pair(self, number: int) -> tuple[str, str]:
         """Both bodies of a pair; empty names in a cell without pairs."""

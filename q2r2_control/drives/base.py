@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 import pinocchio as pin
@@ -28,34 +28,19 @@ class DriveReport:
     admittance: AdmittanceReport | None = None
 
 
-class Drive(Protocol):
+class Drive(ABC):
     """One mode of driving a plant. What stops the arms is not decided here but in ``supervision``."""
 
     mode: CommandMode
     report: DriveReport  # of the last tick
-    yields: bool  # whether arms that are pushed leave the reference by design
-    coasts: bool  # whether a plant goes on moving by the last command while none comes
+    yields = False  # whether arms that are pushed leave the reference by design
+    coasts = False  # whether a plant goes on moving by the last command while none comes
 
+    @abstractmethod
     def reset(self, state: RobotState) -> None:
         """Start anew, at rest at the measured ``state``. Raises :class:`Q2R2Error` where that cannot be."""
-        ...
 
-    def set_openings(self, openings: Mapping[str, Interval]) -> None:
-        """Between which openings each arm's gripper is, as the controller has accepted it."""
-        ...
-
-    def set_holding(self, holding: Mapping[str, bool]) -> None:
-        """Of each arm whose gripper has an object, whether it is held."""
-        ...
-
-    def set_kept_distances(self, kept: Array) -> None:
-        """How far apart every pair stays from now on, (p,) [m], as the controller's settings were changed."""
-        ...
-
-    def displaced(self, targets: ToolTargets, state: RobotState, dt: float) -> ToolTargets:
-        """The tool targets that the controller is to follow in a tick of ``dt`` [s]."""
-        ...
-
+    @abstractmethod
     def command(
         self, reference: Reference, state: RobotState, grippers: Openings, dt: float, trusted: bool = True
     ) -> Command:
@@ -64,15 +49,27 @@ class Drive(Protocol):
         ``trusted`` is False where ``state`` is out of date or not to be believed, and for the last command before there
         are no more: what pushes according to the state must not push then.
         """
-        ...
+
+    def set_openings(self, openings: Mapping[str, Interval]) -> None:  # noqa: B027
+        """Between which openings each arm's gripper is, as the controller has accepted it."""
+
+    def set_holding(self, holding: Mapping[str, bool]) -> None:  # noqa: B027
+        """Of each arm whose gripper has an object, whether it is held."""
+
+    def set_kept_distances(self, kept: Array) -> None:  # noqa: B027
+        """How far apart every pair stays from now on, (p,) [m], as the controller's settings were changed."""
+
+    def displaced(self, targets: ToolTargets, state: RobotState, dt: float) -> ToolTargets:
+        """The tool targets that the controller is to follow in a tick of ``dt`` [s]."""
+        return targets
 
     def at_rest(self, state: RobotState) -> bool:
         """Whether the arms stand still, given that the reference does."""
-        ...
+        return True
 
     def last_command(self, state: RobotState, grippers: Openings) -> Command | None:
         """What holds the arms when no more commands come; None: the last one does."""
-        ...
+        return None
 
 
 def permitted(settings: ControllerSettings, drive: Drive) -> ControllerSettings:

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 
 import numpy as np
 
 from q2r2_control.compliance.admittance import Admittance
 from q2r2_control.config.cell import Config
-from q2r2_control.drives.base import DriveReport, Openings, ToolTargets, position_command
+from q2r2_control.drives.base import Drive, DriveReport, Openings, ToolTargets, position_command
 from q2r2_control.errors import ConfigError
 from q2r2_control.robot.robot import Robot
-from q2r2_control.types import Array, Command, CommandMode, Interval, Reference, RobotState
+from q2r2_control.types import Array, Command, CommandMode, Reference, RobotState
 
 # Velocity mode: how fast the measured position is brought back to the reference [1/s]. A plant that answers with a
 # delay T is stable below about 1 / T; at 10 /s that leaves 100 ms.
@@ -21,12 +20,10 @@ FEEDBACK_GAIN = 10.0
 _FRESH_TICKS = 3
 
 
-class PositionDrive:
+class PositionDrive(Drive):
     """The reference is the command. With the admittance enabled, what the tools feel displaces their targets."""
 
     mode = CommandMode.POSITION
-    yields = False
-    coasts = False
 
     def __init__(self, robot: Robot, config: Config) -> None:
         self.admittance = Admittance(robot, config.admittance) if config.admittance.enabled else None
@@ -41,15 +38,6 @@ class PositionDrive:
             raise ConfigError("admittance.enabled = true: allowed with a plant that measures external torque only")
         self.admittance.reset()
 
-    def set_openings(self, openings: Mapping[str, Interval]) -> None:
-        """See :meth:`Drive.set_openings`: nothing here has bodies."""
-
-    def set_holding(self, holding: Mapping[str, bool]) -> None:
-        """See :meth:`Drive.set_holding`: the plant's own servos bear it."""
-
-    def set_kept_distances(self, kept: Array) -> None:
-        """See :meth:`Drive.set_kept_distances`: nothing here has bodies."""
-
     def displaced(self, targets: ToolTargets, state: RobotState, dt: float) -> ToolTargets:
         """See :meth:`Drive.displaced`."""
         if self.admittance is None:
@@ -63,14 +51,6 @@ class PositionDrive:
     ) -> Command:
         """See :meth:`Drive.command`: what was measured does not matter."""
         return position_command(reference, grippers)
-
-    def at_rest(self, state: RobotState) -> bool:
-        """See :meth:`Drive.at_rest`: the plant's own servos follow."""
-        return True
-
-    def last_command(self, state: RobotState, grippers: Openings) -> Command | None:
-        """See :meth:`Drive.last_command`: a position holds by itself."""
-        return None
 
 
 class VelocityDrive(PositionDrive):

@@ -9,14 +9,14 @@ import numpy as np
 from q2r2_control.compliance.impedance import ImpedanceController
 from q2r2_control.compliance.repulsion import MeasuredSeparation
 from q2r2_control.config.cell import Config
-from q2r2_control.drives.base import DriveReport, Openings, ToolTargets, holding_command, position_command
+from q2r2_control.drives.base import Drive, DriveReport, Openings, holding_command, position_command
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, Command, CommandMode, Interval, Reference, RobotState
 
 _STILL = 1e-2  # of an arm on its spring [rad/s]
 
 
-class TorqueDrive:
+class TorqueDrive(Drive):
     """Turns references into torques. Targets stay as they are: the spring is the compliance.
 
     **Without a state to trust.** A spring about a posture that was measured long ago could push anywhere. A plant with
@@ -27,7 +27,6 @@ class TorqueDrive:
 
     mode = CommandMode.TORQUE
     yields = True
-    coasts = False
 
     def __init__(self, robot: Robot, config: Config, has_servos: bool = True) -> None:
         self.impedance = ImpedanceController(robot, config.impedance)
@@ -53,10 +52,6 @@ class TorqueDrive:
     def set_kept_distances(self, kept: Array) -> None:
         """See :meth:`Drive.set_kept_distances`: the wall begins there."""
         self.wall.set_kept_distances(kept)
-
-    def displaced(self, targets: ToolTargets, state: RobotState, dt: float) -> ToolTargets:
-        """See :meth:`Drive.displaced`."""
-        return targets
 
     def command(
         self, reference: Reference, state: RobotState, grippers: Openings, dt: float, trusted: bool = True

@@ -7,13 +7,12 @@ from dataclasses import dataclass
 
 import mujoco
 import numpy as np
-import numpy.typing as npt
 
 from q2r2_control.config.cell import Config
 from q2r2_control.errors import PlantError
 from q2r2_control.plants.base import GripperMotion, check_command, check_duration, check_joints
 from q2r2_control.plants.mujoco_model import build_model, settle_mimics
-from q2r2_control.plants.mujoco_view import Camera, Window, take_picture
+from q2r2_control.plants.mujoco_view import Window
 from q2r2_control.plants.servo import ReferenceLine, ServoGains, servo_gains
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, Command, CommandMode, RobotState
@@ -201,10 +200,6 @@ class MujocoPlant:
             return False
         self._window.sync()
         return True
-
-    def render(self, width: int, height: int, camera: Camera | None = None) -> npt.NDArray[np.uint8]:
-        """Picture (height, width, 3), r g b, of the cell now. Raises :class:`PlantError` where OpenGL is missing."""
-        return take_picture(self.model, self.data, width, height, camera or Camera())
 
     def close(self) -> None:
         """See :meth:`Plant.close`."""

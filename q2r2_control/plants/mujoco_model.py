@@ -8,14 +8,15 @@ from __future__ import annotations
 
 import xml.etree.ElementTree as ET
 from itertools import combinations
+from pathlib import Path
 
+import coal
 import mujoco
 import numpy as np
 
 from q2r2_control.config.cell import Config, MujocoConfig
 from q2r2_control.errors import PlantError
 from q2r2_control.plants.mujoco_cameras import add_cameras
-from q2r2_control.plants.mujoco_meshes import is_readable, load_meshes
 from q2r2_control.plants.mujoco_obstacles import (
     FRICTION_IMPEDANCE,
     PAD_PRIORITY,
@@ -42,6 +43,9 @@ _PAD_FRICTION = (1.0, TORSION, ROLLING)
 # them, which is small in a finger, and with its usual 0.02 s the grip would sink millimetres into what it holds.
 _PAD_STIFFNESS = (0.004, 1.0)
 
+# Of meshes that MuJoCo reads by itself.
+_FORMATS = (".stl", ".obj", ".msh")
+
 # A finger servo gives its full force at this part of the stroke.
 _FINGER_SERVO_BAND = 0.05
 
@@ -54,7 +58,7 @@ def build_model(robot: Robot, config: Config) -> mujoco.MjModel:
     try:
         spec = mujoco.MjSpec.from_string(_readable_urdf(robot.urdf))
         spec.modelname = robot.name
-        load_meshes(spec)
+        _load_meshes(spec)
         _correct_inertias(spec)
         _set_solver(spec, config.mujoco)
         _set_shapes(spec, _capsules(robot.urdf))
@@ -82,12 +86,32 @@ def _readable_urdf(urdf: str) -> str:
     for link in root.findall("link"):
         for visual in link.findall("visual"):
             mesh = visual.find("geometry/mesh")
-            if mesh is not None and not is_readable(mesh.get("filename", "")):
+            if mesh is not None and not _is_readable(mesh.get("filename", "")):
                 link.remove(visual)
     for joint in root.findall("joint"):
         for mimic in joint.findall("mimic"):
             joint.remove(mimic)
     return ET.tostring(root, encoding="unicode")
+
+
+def _is_readable(file: str) -> bool:
+    return Path(file).suffix.lower() in _FORMATS
+
+
+def _load_meshes(spec: mujoco.MjSpec) -> None:
+    """Read every mesh of ``spec`` that MuJoCo cannot, such as DAE, by Coal; their scale stays the mesh's."""
+    for mesh in spec.meshes:
+        if _is_readable(mesh.file):
+            continue
+        try:
+            read = coal.MeshLoader().load(mesh.file, np.ones(3))
+        except (ValueError, RuntimeError) as error:
+            reason = " ".join(str(error).split())[-200:]
+            raise PlantError(f"{mesh.file}: neither MuJoCo nor Coal can read it: {reason}") from error
+        triangles = [read.tri_indices(index) for index in range(read.num_tris)]
+        mesh.uservert = np.asarray(read.vertices(), dtype=float).ravel()
+        mesh.userface = np.array([[corner[0], corner[1], corner[2]] for corner in triangles], dtype=int).ravel()
+        mesh.file = ""
 
 
 def _capsules(urdf: str) -> set[str]:

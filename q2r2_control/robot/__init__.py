@@ -5,5 +5,5 @@
 sees, with the checked joints and the models of ``pinocchio_models``; ``enclose`` and ``pairs`` make its collision
 pairs, ``reachability`` and ``model_srdf`` find those that can never meet, and ``stop_torque`` says what a full stop
 asks of the joints. ``finger_bodies`` makes fingers all that they sweep, ``finger_openings`` knows what of that counts
-at an opening of fingers that slide, ``turning_fingers`` and ``turning_joints`` of those that turn.
+at an opening of fingers that slide, ``turning_fingers`` of those that turn.
 """

@@ -91,10 +91,6 @@ class ArmAssembly:
                 return mounted.model.name_in_cell(name)
         return self.model.name_in_cell(name)
 
-    def joint_names(self) -> tuple[str, ...]:
-        """The arm's own joints, as they are called in the cell."""
-        return tuple(self.name_in_cell(joint.get("name", "")) for joint in self.joints)
-
     def finger_names(self) -> tuple[str, ...]:
         """The joints that the gripper drives, as they are called in the cell."""
         return tuple(map(self.name_in_cell, self.config.gripper.joints))

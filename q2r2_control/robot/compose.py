@@ -36,8 +36,6 @@ class ComposedCell:
     urdf: str
     srdf: str
     tool_frames: dict[str, str]  # link that the operator moves
-    arm_joints: dict[str, tuple[str, ...]]  # the arm's own, from the world to the tool frame, in that order
-    prefixes: dict[str, str]  # of the names of the arm's model
     home: dict[str, float]  # every movable joint's position: arms at home, grippers open
     obstacles: tuple[str, ...]  # link names
     parts: KnownParts  # what its links are
@@ -85,8 +83,6 @@ def compose(config: Config) -> ComposedCell:
         urdf=ET.tostring(urdf, encoding="unicode"),
         srdf=ET.tostring(srdf, encoding="unicode"),
         tool_frames={side: arm.name_in_cell(arm.frame) for side, arm in arms.items()},
-        arm_joints={side: arm.joint_names() for side, arm in arms.items()},
-        prefixes={side: arm.model.prefix for side, arm in arms.items()},
         home=home,
         obstacles=tuple(config.obstacles),
         parts=KnownParts(

@@ -26,12 +26,11 @@ from q2r2_control.types import Array
 _ROUNDING = 1e-6
 
 
-def enclose_shapes(geometry: pin.GeometryModel) -> tuple[str, ...]:
+def enclose_shapes(geometry: pin.GeometryModel) -> None:
     """Replace in place every shape that is not a capsule, a sphere or a box fixed in the world; names and pairs stay.
 
-    Returns the names of the replaced objects. Raises :class:`RobotError` for a shape without extent or without bounds.
+    Raises :class:`RobotError` for a shape without extent or without bounds.
     """
-    replaced = []
     for item in geometry.geometryObjects:
         fixed_box = isinstance(item.geometry, coal.Box) and item.parentJoint == 0
         if fixed_box or isinstance(item.geometry, coal.Capsule | coal.Sphere):
@@ -41,8 +40,6 @@ def enclose_shapes(geometry: pin.GeometryModel) -> tuple[str, ...]:
         item.geometry = shape
         item.meshPath = ""
         item.meshScale = np.ones(3)
-        replaced.append(item.name)
-    return tuple(replaced)
 
 
 def enclosing_capsule(points: Array) -> tuple[float, Array, Array]:
@@ -80,8 +77,6 @@ def _cached_capsule(points: bytes) -> tuple[float, Array, Array]:
 def _enclosing_shape(shape: coal.CollisionGeometry, name: str, fixed: bool) -> tuple[coal.CollisionGeometry, pin.SE3]:
     if isinstance(shape, coal.Cylinder):
         return _around_cylinder(float(shape.radius), float(shape.halfLength), fixed), pin.SE3.Identity()
-    if isinstance(shape, coal.Ellipsoid):
-        return _around_ellipsoid(np.asarray(shape.radii, dtype=float))
     vertices = _vertices(shape, name)
     radius, start, end = _cached_capsule(vertices.tobytes())
     return capsule_between(radius, start, end)
@@ -148,14 +143,6 @@ def _around_cylinder(radius: float, half_length: float, box_allowed: bool) -> co
     if box_allowed and 8 * radius**2 * half_length < volume(best):
         return coal.Box(2 * radius, 2 * radius, 2 * half_length)
     return coal.Capsule(best + _ROUNDING, 2 * half_segment(best))
-
-
-def _around_ellipsoid(radii: Array) -> tuple[coal.CollisionGeometry, pin.SE3]:
-    """A capsule along the longest axis with the middle radius r: the end of an ellipsoid curves at least as much."""
-    order = np.argsort(radii)
-    axis = np.eye(3)[order[2]]
-    length = float(radii[order[2]] - radii[order[1]])
-    return capsule_between(float(radii[order[1]]) + _ROUNDING, -length * axis, length * axis)
 
 
 def capsule_between(radius: float, start: Array, end: Array) -> tuple[coal.CollisionGeometry, pin.SE3]:

@@ -7,8 +7,7 @@ known says finger_openings.py of those that slide, turning_fingers.py of those t
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping
 from itertools import product
 
 import coal
@@ -17,35 +16,19 @@ import pinocchio as pin
 
 from q2r2_control.robot.description import LinkTree, joint_limits
 from q2r2_control.robot.enclose import capsule_between, enclosing_capsule
-from q2r2_control.robot.finger_openings import FingerBody, FingerSlide
+from q2r2_control.robot.finger_openings import FingerBody
 from q2r2_control.robot.link_roles import KnownParts, links_moved_by
 from q2r2_control.robot.locking import joint_axis
 from q2r2_control.robot.pairs import link_of
-from q2r2_control.robot.turning_fingers import TurningBody
-from q2r2_control.robot.turning_joints import finger_joint, turns
+from q2r2_control.robot.turning_fingers import FingerJoint, TurningBody
 from q2r2_control.types import ALL_OF_THE_WAY, Array
 
 _ON_ONE_LINE = 1e-9  # [m]
-
-
-@dataclass(frozen=True, slots=True)
-class _Way:
-    """What one finger joint moves a link by."""
-
-    direction: Array  # (3,) unit vector
-    home: float  # [m]
-    lower: float
-    upper: float
-    stroke: tuple[float, float] | None  # positions of the closed and the open gripper [m], where they are known
-
-    @property
-    def ends(self) -> tuple[Array, Array]:
-        """From home to both ends (3,) [m]."""
-        return (self.lower - self.home) * self.direction, (self.upper - self.home) * self.direction
+_KINDS = {"revolute", "prismatic"}  # of joints
 
 
 # Both ends of a shape as it was drawn (2, 3) [m] and what moves them.
-_Finger = tuple[Array, list[_Way]]
+_Finger = tuple[Array, tuple[FingerJoint, ...]]
 
 
 def sweep_fingers(
@@ -64,20 +47,21 @@ def sweep_fingers(
         swept: dict[str, list[_Finger] | None] = {}
         for item in geometry.geometryObjects:
             chain = _chain(tree, link_of(item.name), links)
-            if turns(chain):
-                turning = tuple(finger_joint(model, tree, joint, home, joints, stroke) for joint in chain)
-                body = TurningBody(arm, item.name, _ends(item), float(item.geometry.radius), turning)
+            kinds = {joint.get("type", "") for joint in chain}
+            if not chain or not kinds <= _KINDS:
+                continue
+            moving = tuple(finger_joint(model, tree, joint, home, joints, stroke) for joint in chain)
+            if "revolute" in kinds:
+                body = TurningBody(arm, item.name, _ends(item), float(item.geometry.radius), moving)
                 start, end, radius = body.capsule(ALL_OF_THE_WAY)
                 item.geometry, item.placement = capsule_between(radius, start, end)
                 bodies += [body] if stroke is not None else []
-            elif chain and all(joint.get("type") == "prismatic" for joint in chain):
-                ways = [_way(model, joint, home, stroke) for joint in chain]
+            else:
                 drawn = _ends(item)
-                swept[item.name] = [(drawn, ways)] if _sweep(item, ways) else None
+                swept[item.name] = [(drawn, moving)] if _sweep(item, moving) else None
         for name, fingers in _merge(geometry, swept).items():
-            sliding = fingers and _body(arm, geometry.geometryObjects[geometry.getGeometryId(name)], fingers)
-            if sliding:
-                bodies.append(sliding)
+            if fingers and stroke is not None:
+                bodies += _bodies(arm, geometry.geometryObjects[geometry.getGeometryId(name)], fingers)
     return tuple(bodies)
 
 
@@ -89,36 +73,70 @@ def _chain(tree: LinkTree, link: str, links: set[str]) -> list[ET.Element]:
     return [joint for joint in tree.chain(link) if id(joint) in moving]
 
 
-def _way(model: pin.Model, joint: ET.Element, home: Mapping[str, float], stroke: tuple[float, float] | None) -> _Way:
+def finger_joint(
+    model: pin.Model,
+    tree: LinkTree,
+    joint: ET.Element,
+    home: Mapping[str, float],
+    driven: Collection[str],
+    stroke: tuple[float, float] | None,
+) -> FingerJoint:
+    """A joint of a finger that is locked at ``home`` in ``model``.
+
+    ``driven`` are the joints that the gripper moves from closed to open, which is its ``stroke`` [m or rad]. Without
+    one, any joint that mimics none may be anywhere in its limits. One that mimics is where that puts it, also where
+    the joint that it follows is at the end of its travel.
+    """
     name = joint.get("name", "")
-    frame = model.frames[model.getFrameId(name, pin.FrameType.FIXED_JOINT)]
-    mimic = joint.find("mimic")
-    if stroke is not None and mimic is not None:
-        multiplier, offset = float(mimic.get("multiplier", "1")), float(mimic.get("offset", "0"))
-        stroke = multiplier * stroke[0] + offset, multiplier * stroke[1] + offset
-    return _Way(frame.placement.rotation @ joint_axis(joint), home.get(name, 0.0), *joint_limits(joint), stroke)
+    driver, multiplier, offset = _driver(tree, joint, driven if stroke is not None else ())
+    lower, upper = joint_limits(driver)
+    closed, opened = (lower, upper) if stroke is None else stroke
+    before, beyond = (lower, upper) if opened >= closed else (upper, lower)
+    placement = model.frames[model.getFrameId(name, pin.FrameType.FIXED_JOINT)].placement
+    axis: Array = placement.rotation @ joint_axis(joint)
+    return FingerJoint(
+        slides=joint.get("type") == "prismatic",
+        axis=np.asarray(axis),
+        point=np.array(placement.translation),
+        home=home.get(name, 0.0),
+        closed=multiplier * closed + offset,
+        open=multiplier * opened + offset,
+        before=multiplier * before + offset,
+        beyond=multiplier * beyond + offset,
+        driver=driver.get("name", ""),
+    )
 
 
-def _body(arm: str, item: pin.GeometryObject, fingers: list[_Finger]) -> FingerBody | None:
-    """A swept body as it depends on the opening; None where no opening tells where its fingers are."""
+def _driver(tree: LinkTree, joint: ET.Element, driven: Collection[str]) -> tuple[ET.Element, float, float]:
+    """The joint that another one follows in the end, itself if none, and multiplier and offset of its position.
+
+    A joint that the gripper drives is its own driver, whatever it mimics.
+    """
+    movable, multiplier, offset, seen = tree.movable(), 1.0, 0.0, {joint.get("name", "")}
+    while joint.get("name", "") not in driven and (mimic := joint.find("mimic")) is not None:
+        leader = mimic.get("joint", "")
+        if leader not in movable or leader in seen:
+            break
+        seen.add(leader)
+        offset += multiplier * float(mimic.get("offset", "0"))
+        multiplier *= float(mimic.get("multiplier", "1"))
+        joint = movable[leader]
+    return joint, multiplier, offset
+
+
+def _bodies(arm: str, item: pin.GeometryObject, fingers: list[_Finger]) -> list[FingerBody]:
+    """A swept body as it depends on the opening; none where it has no length."""
     start, end = _ends(item)
     length = float(np.linalg.norm(end - start))
-    if length <= _ON_ONE_LINE or any(way.stroke is None for _, ways in fingers for way in ways):
-        return None
+    if length <= _ON_ONE_LINE:
+        return []
     along = (end - start) / length
-    ends = [
-        (
-            float((point - start) @ along),
-            tuple(
-                FingerSlide(float(way.direction @ along), way.home, *way.stroke, way.lower, way.upper)
-                for way in ways
-                if way.stroke is not None
-            ),
-        )
-        for drawn, ways in fingers
+    ends = tuple(
+        (float((point - start) @ along), tuple((float(joint.axis @ along), joint) for joint in joints))
+        for drawn, joints in fingers
         for point in drawn
-    ]
-    return FingerBody(arm, item.name, length, tuple(ends))
+    )
+    return [FingerBody(arm, item.name, length, ends)]
 
 
 def _ends(item: pin.GeometryObject) -> Array:
@@ -128,10 +146,10 @@ def _ends(item: pin.GeometryObject) -> Array:
     return np.array([item.placement.translation - along, item.placement.translation + along])
 
 
-def _sweep(item: pin.GeometryObject, ways: list[_Way]) -> bool:
+def _sweep(item: pin.GeometryObject, joints: tuple[FingerJoint, ...]) -> bool:
     """Make a shape what it sweeps; whether all of its segment moves along one line."""
-    moves = product(*(way.ends for way in ways))
-    points = np.array([end + moved for moved in [np.sum(move, axis=0) for move in moves] for end in _ends(item)])
+    ways = [[(end - joint.home) * joint.axis for end in (joint.before, joint.beyond)] for joint in joints]
+    points = np.array([end + np.sum(move, axis=0) for move in product(*ways) for end in _ends(item)])
     radius, line = float(item.geometry.radius), _line_of(points)
     on_one_line = line is not None
     if line is None:

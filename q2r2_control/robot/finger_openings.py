@@ -13,35 +13,8 @@ from dataclasses import dataclass
 import pinocchio as pin
 
 from q2r2_control.robot.enclose import capsule_between
-from q2r2_control.robot.turning_fingers import TurningBody, TurningSweeps
+from q2r2_control.robot.turning_fingers import FingerJoint, TurningBody, TurningSweeps
 from q2r2_control.types import ALL_OF_THE_WAY, Array, Interval
-
-
-@dataclass(frozen=True, slots=True)
-class FingerSlide:
-    """A finger joint as it moves one end of a finger along the body's line."""
-
-    along: float  # way along the line per way of the joint, -1 .. 1
-    home: float  # position of the joint where the body was drawn [m]
-    closed: float  # positions of the closed and of the open gripper [m]
-    open: float
-    lower: float  # limits of the joint [m]
-    upper: float
-
-    def way(self, interval: Interval) -> tuple[float, float]:
-        """Least and greatest way along the line, from home, at openings in ``interval`` [m].
-
-        An interval that begins at 0 begins at the end of the joint's travel, which may be beyond the closed gripper; so
-        at 1 and the open one.
-        """
-        before_closed, beyond_open = (self.lower, self.upper) if self.open > self.closed else (self.upper, self.lower)
-        first = before_closed if interval[0] <= 0.0 else self._position(interval[0])
-        last = beyond_open if interval[1] >= 1.0 else self._position(interval[1])
-        ways = self.along * (first - self.home), self.along * (last - self.home)
-        return min(ways), max(ways)
-
-    def _position(self, opening: float) -> float:
-        return self.closed + opening * (self.open - self.closed)
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,9 +24,8 @@ class FingerBody:
     arm: str
     name: str  # of the geometry
     length: float  # of its segment [m]
-    ends: tuple[
-        tuple[float, tuple[FingerSlide, ...]], ...
-    ]  # along the segment at home [m], and the joints that move them
+    # Places along the segment at home [m], and the joints that move each, with the part of their way along the line.
+    ends: tuple[tuple[float, tuple[tuple[float, FingerJoint], ...]], ...]
 
     def part(self, interval: Interval) -> tuple[float, float]:
         """Which part of the segment, from 0 its start to 1 its end, the fingers are in at openings in ``interval``."""
@@ -62,9 +34,9 @@ class FingerBody:
         least, greatest = self.length, 0.0
         for at, slides in self.ends:
             lowest = highest = at
-            for slide in slides:
-                down, up = slide.way(interval)
-                lowest, highest = lowest + down, highest + up
+            for along, joint in slides:
+                ways = [along * (position - joint.home) for position in joint.travel(interval)]
+                lowest, highest = lowest + min(ways), highest + max(ways)
             least, greatest = min(least, lowest), max(greatest, highest)
         return max(least / self.length, 0.0), min(greatest / self.length, 1.0)
 

@@ -11,7 +11,7 @@ import xml.etree.ElementTree as ET
 from collections.abc import Mapping
 from itertools import combinations
 
-from q2r2_control.config.arms import ArmConfig, PoseConfig, SwivelConfig
+from q2r2_control.config.arms import ArmConfig, PoseConfig
 from q2r2_control.config.cell import Config
 from q2r2_control.errors import ConfigError
 from q2r2_control.robot.cell_parts import load_flange, load_model, name_of_stack
@@ -81,7 +81,7 @@ def _alone(config: Config, arm: ArmConfig) -> Config:
     """A cell of nothing but ``arm``, upright, its tool flat on its last link."""
     flat = {"link": None, "mount": PoseConfig()}
     tool = arm.tool if arm.tool.model is None else arm.tool.model_copy(update=flat)
-    changes = {"tip": arm.named_tip, "mount": PoseConfig(), "tool": tool, "swivel": SwivelConfig()}
+    changes = {"tip": arm.named_tip, "mount": PoseConfig(), "tool": tool}
     alone = arm.model_copy(update=changes)
     return config.model_copy(update={"arms": {_SIDE: alone}, "obstacles": {}, "floor": None, "srdf": None})
 

@@ -44,12 +44,13 @@ def nearest_approaches(robot: Robot, samples: int, seed: int, progress: Progress
     """
     if samples < 100:
         raise RobotError(f"samples = {samples}: allowed: 100 or more")
-    search = _Search(robot, np.random.default_rng(seed))
-    postures = search.random.uniform(robot.position_lower, robot.position_upper, (samples, robot.model.nv))
+    postures = np.random.default_rng(seed).uniform(
+        robot.position_lower, robot.position_upper, (samples, robot.model.nv)
+    )
     names = pair_names(robot.collision_model)
     distances = np.zeros((samples, len(names)))
     for i, q in enumerate(postures):
-        distances[i] = search.all_distances(q)
+        distances[i] = robot.distance_values(q)
         if progress is not None:
             progress("random postures", i + 1, samples)
     nearest: dict[tuple[str, str], float] = {}
@@ -57,7 +58,7 @@ def nearest_approaches(robot: Robot, samples: int, seed: int, progress: Progress
         starts = np.argsort(distances[:, p])[:_STARTS]
         least = float(distances[starts[0], p])
         if least > 0.0:
-            least = min(search.downhill(p, postures[i]) for i in starts)
+            least = min(_downhill(robot, p, postures[i]) for i in starts)
         links = (link_of(a), link_of(b))
         nearest[links] = min(nearest.get(links, np.inf), least)
         if progress is not None:
@@ -91,25 +92,13 @@ def srdf_text(name: str, comment: str, pairs: Iterable[tuple[str, str, str]], li
     return '<?xml version="1.0"?>\n' + ET.tostring(root, encoding="unicode") + "\n"
 
 
-class _Search:
-    """Pinocchio's models of one robot, and random steps in them."""
+def _downhill(robot: Robot, p: int, q: Array) -> float:
+    """Least distance of pair ``p`` going downhill from ``q`` inside the limits."""
+    data, geometry_data = robot.model.createData(), robot.collision_model.createData()
 
-    def __init__(self, robot: Robot, random: np.random.Generator) -> None:
-        self.random = random
-        self._robot = robot
-        self._model, self._geometry = robot.model, robot.collision_model
-        self._data, self._geometry_data = self._model.createData(), self._geometry.createData()
+    def distance(posture: Array) -> float:
+        pin.updateGeometryPlacements(robot.model, data, robot.collision_model, geometry_data, posture)
+        return float(pin.computeDistance(robot.collision_model, geometry_data, p).min_distance)
 
-    def all_distances(self, q: Array) -> list[float]:
-        pin.computeDistances(self._model, self._data, self._geometry, self._geometry_data, q)
-        return [result.min_distance for result in self._geometry_data.distanceResults]
-
-    def downhill(self, p: int, q: Array) -> float:
-        """Least distance of pair ``p`` going downhill from ``q`` inside the limits."""
-
-        def distance(posture: Array) -> float:
-            pin.updateGeometryPlacements(self._model, self._data, self._geometry, self._geometry_data, posture)
-            return float(pin.computeDistance(self._geometry, self._geometry_data, p).min_distance)
-
-        bounds = list(zip(self._robot.position_lower, self._robot.position_upper, strict=True))
-        return float(minimize(distance, q, method="L-BFGS-B", bounds=bounds, options={"maxiter": _STEPS}).fun)
+    bounds = list(zip(robot.position_lower, robot.position_upper, strict=True))
+    return float(minimize(distance, q, method="L-BFGS-B", bounds=bounds, options={"maxiter": _STEPS}).fun)

@@ -35,17 +35,6 @@ from q2r2_control.types import Array
 
 
 @dataclass(frozen=True, slots=True)
-class Swivel:
-    """Where the elbow should be, about the line from shoulder to wrist."""
-
-    shoulder: str  # joint names
-    elbow: str
-    wrist: str
-    angle: float | None  # [rad]; None: as at home
-    gain: float  # [1/s]
-
-
-@dataclass(frozen=True, slots=True)
 class Arm:
     """One arm: the frame the operator moves and the joints that move it."""
 
@@ -53,7 +42,6 @@ class Arm:
     tool_frame: str  # link name
     frame_id: int  # of the tool frame in ``Robot.model``
     joints: np.ndarray  # velocity indices from base to tool; a joint that several arms hang on is in each of them
-    swivel: Swivel | None = None  # None: the elbow is free
     finger_joints: tuple[str, ...] = ()  # that its gripper drives
     stroke: float = 0.0  # of each of them, from closed to open [m or rad]; 0: not known
     finger_way: float = 0.0  # how far that moves a finger [m]; 0: not known
@@ -135,9 +123,6 @@ class Robot:
         cell = compose(config)
         urdf = parse_urdf(cell.urdf, cell.name)
         robot = cls(urdf, parse_srdf(cell.srdf, cell.name), cell.tool_frames, cell.home, cell.name, cell.parts)
-        for name, arm in robot.arms.items():
-            swivel = _swivel(config, name, cell.arm_joints[name], cell.prefixes[name])
-            robot.arms[name] = replace(arm, swivel=swivel)
         robot._add_objects(config)
         return robot
 
@@ -234,24 +219,6 @@ def _finger_way(arm: Arm, bodies: Iterable[FingerBody | TurningBody]) -> float:
 
 def _length(stroke: tuple[float, float] | None) -> float:
     return 0.0 if stroke is None else abs(stroke[1] - stroke[0])
-
-
-def _swivel(config: Config, arm: str, joints: Sequence[str], prefix: str) -> Swivel | None:
-    """An arm's swivel task with the names that its joints have in the cell; raises :class:`ConfigError`."""
-    wanted = next(made.swivel for side, made in config.arms.items() if side == arm)
-    if wanted.gain == 0.0:
-        return None
-    places = []
-    for key in ("shoulder", "elbow", "wrist"):
-        name = getattr(wanted, key)
-        if prefix + name not in joints:
-            allowed = ", ".join(joint.removeprefix(prefix) for joint in joints)
-            raise ConfigError(f"arms.{arm}.swivel.{key} = {name!r:.60}: no joint of the arm; allowed: {allowed}")
-        places.append(joints.index(prefix + name))
-    if not places[0] < places[1] < places[2]:
-        raise ConfigError(f"arms.{arm}.swivel: expected shoulder, elbow, wrist in the order of the arm's joints")
-    shoulder, elbow, wrist = (joints[place] for place in places)
-    return Swivel(shoulder, elbow, wrist, wanted.angle, wanted.gain)
 
 
 def _text_of(path_or_text: str | os.PathLike[str], name_of_text: str) -> tuple[str, str, Path | None]:

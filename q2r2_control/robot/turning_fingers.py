@@ -59,6 +59,12 @@ class FingerJoint:
     beyond: float
     driver: str  # the joint that it mimics, or itself
 
+    def travel(self, interval: Interval) -> tuple[float, float]:
+        """Positions at both ends of ``interval``; an end at 0 or 1 is that of the travel, beyond the gripper's."""
+        first = self.before if interval[0] <= 0.0 else self.closed + interval[0] * (self.open - self.closed)
+        last = self.beyond if interval[1] >= 1.0 else self.closed + interval[1] * (self.open - self.closed)
+        return first, last
+
 
 class Capsules(NamedTuple):
     """One for each of some bodies, in the frame of the link that carries the hand."""

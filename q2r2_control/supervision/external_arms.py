@@ -25,7 +25,7 @@ from q2r2_control.types import Array, Reference, RobotState
 
 _REST = 0.01  # a held arm's joints are slower before its tool's pose is taken [rad/s]
 # How fast the reference's elbows follow the measured ones [1/s], [rad/s].
-_FOLLOW = {"posture_gain": 10.0, "posture_speed": 1.5, "manipulability_gain": 0.0}
+_FOLLOW = {"posture_gain": 10.0, "posture_speed": 1.5}
 
 
 @dataclass(slots=True)
@@ -37,13 +37,9 @@ class ExternalSettings:
 
 def settings_for_external_arms(config: Config) -> Config:
     """The cell's configuration with elbows that are free to follow."""
-    arms = {
-        name: arm.model_copy(update={"swivel": arm.swivel.model_copy(update={"gain": 0.0})})
-        for name, arm in config.arms.items()
-    }
     control = config.control.model_copy(update=_FOLLOW)
     stiff = config.admittance.model_copy(update={"enabled": False})  # compliance is the other controller's
-    return config.model_copy(update={"arms": arms, "control": control, "admittance": stiff})
+    return config.model_copy(update={"control": control, "admittance": stiff})
 
 
 class ExternalArms:

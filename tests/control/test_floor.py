@@ -54,14 +54,6 @@ def test_every_link_keeps_off_the_floor_at_every_tick_and_the_arms_come_to_rest_
         assert _height(controller, arm) < floor + FRAME_TO_TIPS + 0.002, "down to where the floor stops it"
 
 
-def test_without_a_floor_the_tools_go_where_they_are_sent() -> None:
-    controller = _controller(None)
-    for _ in _driven(controller, 4.0):
-        pass
-    for arm, target in BESIDE_THE_TABLE.items():
-        np.testing.assert_allclose(controller.tool_pose(arm).translation, target.translation, atol=0.02)
-
-
 def _hands_in_the_table(depth: float) -> np.ndarray:
     """A posture with both tools pointing down ``depth`` [m] below the table's surface, its links with them."""
     ghost = Robot.from_config(CONFIG)
@@ -75,7 +67,7 @@ def _hands_in_the_table(depth: float) -> np.ndarray:
     return reference.q
 
 
-@pytest.mark.parametrize("depth", [0.09, 0.12, 0.18])
+@pytest.mark.parametrize("depth", [0.12, 0.18])
 def test_hands_and_wrists_deep_in_the_table_come_out_through_its_top(depth: float) -> None:
     """The way out of a hand alone would be the underside, where the floor is, and the wrists' would be the top."""
     controller = _controller(0.0)

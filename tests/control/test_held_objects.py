@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Any
-
-import numba
 import numpy as np
 import pinocchio as pin
 import pytest
 
 from q2r2_control import CartesianController, Robot
-from q2r2_control.control.held_objects import ObjectLoads
-from q2r2_control.types import Array, Reference
-from q2r2_control.verification.contract import Contract
+from q2r2_control.control.held_objects import ObjectPairs
+from q2r2_control.types import Array
 from q2r2_control.wording import limit_name
+from tests.support.coal_distances import coal_distances
+from tests.support.driven import Driven
 from tests.support.object_cell import BLOCK, GRIP, at, cell
 
 DT = 0.002
@@ -30,25 +28,10 @@ def controller(robot: Robot) -> CartesianController:
     return CartesianController(robot, CELL.control)
 
 
-class Run:
-    """A controller at home, or at rest elsewhere, its contract checked at every tick."""
-
-    def __init__(self, controller: CartesianController, q: Array | None = None, sample_all: bool = False) -> None:
-        self.controller, start = controller, controller.robot.home if q is None else q
-        controller.reset(start)
-        self.contract = Contract(controller, start, sample_all=sample_all)
-
-    def drive(self, seconds: float, left: pin.SE3 | None = None, right: pin.SE3 | None = None) -> Reference:
-        for _ in range(round(seconds / DT)):
-            reference = self.controller.step({"left": left, "right": right}, DT)
-            self.contract.check(reference, DT)
-        return reference
-
-
 @pytest.fixture(scope="module")
 def at_grip(controller: CartesianController) -> Array:
     """The left tool at rest where it grips a block on the table (nv,) [rad]."""
-    return Run(controller).drive(2.5, at(GRIP)).q
+    return Driven(controller).drive(2.5, {"left": at(GRIP)}).q
 
 
 def height(controller: CartesianController, arm: str = "left") -> float:
@@ -62,12 +45,8 @@ def counting(controller: CartesianController) -> Array:
 
 def object_distances(controller: CartesianController, q: Array) -> Array:
     """Of every pair of objects, by Coal [m]."""
-    robot = controller.robot
-    model = robot.objects.geometry
-    data, geometry = robot.model.createData(), model.createData()
-    pin.computeDistances(robot.model, data, model, geometry, q)
-    values = [result.min_distance for result in geometry.distanceResults]
-    return np.array(values[len(values) - len(robot.objects.holders) :])
+    objects = controller.robot.objects
+    return coal_distances(controller.robot, objects.geometry, q)[-len(objects.holders) :]
 
 
 def test_with_nothing_held_every_bit_of_the_motion_is_that_of_a_cell_without_objects(
@@ -88,7 +67,7 @@ def test_with_nothing_held_every_bit_of_the_motion_is_that_of_a_cell_without_obj
 def test_a_block_on_the_table_is_gripped_and_let_go_without_a_motion(
     controller: CartesianController, at_grip: Array
 ) -> None:
-    run = Run(controller, at_grip)
+    run = Driven(controller, at_grip)
     for holds in (True, False):
         controller.set_holding("left", holds)
         reference = run.drive(0.2)
@@ -98,32 +77,32 @@ def test_a_block_on_the_table_is_gripped_and_let_go_without_a_motion(
 def test_it_is_lifted_at_once_and_put_down_to_the_quarter_of_a_millimetre(
     controller: CartesianController, at_grip: Array
 ) -> None:
-    run = Run(controller, at_grip)
+    run = Driven(controller, at_grip)
     controller.set_holding("left", True)
     assert -0.001 < counting(controller).min() < 0.0
-    run.drive(0.5, at(GRIP + 0.02))
+    run.drive(0.5, {"left": at(GRIP + 0.02)})
     assert height(controller) == pytest.approx(GRIP + 0.02, abs=5e-4)
     assert counting(controller).min() == 0.0
-    reference = run.drive(1.5, at(GRIP - 0.03))
+    reference = run.drive(1.5, {"left": at(GRIP - 0.03)})
     assert height(controller) == pytest.approx(GRIP + 0.00025, abs=2e-4)
     assert any("left_object" in name for name in reference.report.closest_pair)
     assert reference.report.certified
     controller.set_holding("left", False)
-    run.drive(1.0, at(GRIP - 0.015))
+    run.drive(1.0, {"left": at(GRIP - 0.015)})
     assert height(controller) == pytest.approx(GRIP - 0.015, abs=5e-4)
 
 
 def test_one_that_is_drawn_too_large_may_overlap_the_table_as_it_is_gripped_and_no_more(robot: Robot) -> None:
     large = cell({"box": (0.04, 0.04, 0.08), "at": (0.0, 0.0, 0.013)})
     controller = CartesianController(Robot.from_config(large), large.control)
-    run = Run(controller)
-    start = run.drive(2.5, at(GRIP)).q
+    run = Driven(controller)
+    start = run.drive(2.5, {"left": at(GRIP)}).q
     controller.set_holding("left", True)
     assert counting(controller).min() == pytest.approx(-0.01025, abs=5e-4)
     assert np.abs(run.drive(0.2).q - start).max() < 1e-4
-    run.drive(0.5, at(GRIP - 0.01))
+    run.drive(0.5, {"left": at(GRIP - 0.01)})
     assert height(controller) > GRIP - 0.001
-    run.drive(0.5, at(GRIP + 0.03))
+    run.drive(0.5, {"left": at(GRIP + 0.03)})
     assert counting(controller).min() == 0.0
 
 
@@ -159,10 +138,10 @@ def test_begun_with_its_full_distance_an_object_would_break_the_contract(
     controller: CartesianController, at_grip: Array, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """So what the tests above rely on can be seen to fail."""
-    monkeypatch.setattr(ObjectLoads, "begin", lambda self: False)
+    monkeypatch.setattr(ObjectPairs, "begin", lambda self: None)
     large = cell({"box": (0.04, 0.04, 0.08), "at": (0.0, 0.0, 0.013)})
     controller = CartesianController(Robot.from_config(large), large.control)
-    run = Run(controller, at_grip)
+    run = Driven(controller, at_grip)
     controller.set_holding("left", True)
     with pytest.raises(AssertionError, match="kept distance"):
         run.drive(0.1)
@@ -174,9 +153,9 @@ def test_a_hand_that_drives_a_held_bar_into_the_other_arm_stops_at_its_distance(
     others = np.array([any("right_" in name for name in pair) for pair in controller.robot.objects.pair_names()])
     nearest = []
     for holds in (False, True):
-        run = Run(controller)
+        run = Driven(controller)
         controller.set_holding("left", holds)
-        reference = run.drive(2.5, at(0.55, -0.1))
+        reference = run.drive(2.5, {"left": at(0.55, -0.1)})
         nearest.append(float(object_distances(controller, reference.q)[others].min()))
     assert nearest[0] < 0.0
     assert 0.02 - 1e-6 < nearest[1] < 0.03
@@ -185,27 +164,27 @@ def test_a_hand_that_drives_a_held_bar_into_the_other_arm_stops_at_its_distance(
 def test_two_held_blocks_are_kept_apart_and_one_that_both_hold_leaves_them_free(
     controller: CartesianController,
 ) -> None:
-    run = Run(controller)
+    run = Driven(controller)
     for arm in ("left", "right"):
         controller.set_holding(arm, True)
     both = np.array([len(holders) == 2 for holders in controller.robot.objects.holders])
     assert np.isfinite(controller.object_distances[both]).all()
-    reference = run.drive(3.0, at(0.45, 0.0), at(0.45, 0.0))
+    reference = run.drive(3.0, {"left": at(0.45, 0.0), "right": at(0.45, 0.0)})
     assert object_distances(controller, reference.q)[both].min() > -1e-6
     bar = cell({"box": (0.02, 0.2, 0.02)}, {"box": (0.02, 0.2, 0.02)})
     controller = CartesianController(Robot.from_config(bar), bar.control)
-    run = Run(controller)
-    tilted = [
-        pin.SE3(pin.exp3(np.array([tilt, 0.0, 0.0])) @ at(0.0).rotation, np.array([0.5, y, 0.45]))
-        for tilt, y in ((-0.4, 0.06), (0.4, -0.06))
-    ]
-    run.drive(2.5, *tilted)
+    run = Driven(controller)
+    tilted = {
+        arm: pin.SE3(pin.exp3(np.array([tilt, 0.0, 0.0])) @ at(0.0).rotation, np.array([0.5, y, 0.45]))
+        for arm, tilt, y in (("left", -0.4, 0.06), ("right", 0.4, -0.06))
+    }
+    run.drive(2.5, tilted)
     for arm in ("left", "right"):
         controller.set_holding(arm, True)
     both = np.array([len(holders) == 2 for holders in controller.robot.objects.holders])
     assert not np.isfinite(controller.object_distances[both]).any()
     assert np.isfinite(controller.object_distances[~both]).all()
-    run.drive(0.2, *tilted)
+    run.drive(0.2, tilted)
 
 
 def test_a_reset_forgets_what_is_held(controller: CartesianController) -> None:
@@ -221,19 +200,13 @@ def test_a_reset_forgets_what_is_held(controller: CartesianController) -> None:
 def test_once_it_is_let_go_no_report_names_a_pair_of_it_even_if_no_time_passes(
     forget: str, controller: CartesianController, at_grip: Array
 ) -> None:
-    run = Run(controller, at_grip)
+    run = Driven(controller, at_grip)
     controller.set_holding("left", True)
-    run.drive(0.5, at(GRIP + 0.02))
-    binding = run.drive(1.5, at(GRIP - 0.03)).report.binding
+    run.drive(0.5, {"left": at(GRIP + 0.02)})
+    binding = run.drive(1.5, {"left": at(GRIP - 0.03)}).report.binding
     assert any("left_object" in limit_name(limit) for limit in binding), "the block is held back by the table"
     if forget == "reset":
         controller.reset(at_grip)
     else:
         controller.set_holding("left", False)
     assert controller.step({}, 0.0).report.binding == ()
-
-
-def test_the_kernels_see_the_same_types_whatever_is_held(controller: CartesianController) -> None:
-    loads: dict[Any, Any] = controller._objects._loads
-    kinds = {(numba.typeof(load.model), numba.typeof(load.data)) for load in loads.values()}
-    assert kinds == {(numba.typeof(controller._model_pointer), numba.typeof(controller._data_pointer))}

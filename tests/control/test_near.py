@@ -11,14 +11,13 @@ import pytest
 from q2r2_control import CartesianController, Robot, load_config
 from q2r2_control.robot.kept_distances import kept_distances
 from q2r2_control.types import Reference
-from q2r2_control.verification.contract import Contract
+from tests.support.driven import Driven
 
 CONFIG = load_config("config/dual_iiwa7.yaml")
 SETTINGS = CONFIG.control.model_copy(update={"solve_time_limit": None})  # no outcome hangs on the clock
 TABLE = 0.2  # height of its top [m]
 FRAME_TO_TIPS = 0.013  # [m]
 DOWN = pin.rpy.rpyToMatrix(np.pi, 0.0, np.pi)  # as at home
-DT = 0.002
 
 
 @pytest.fixture(scope="module")
@@ -28,11 +27,8 @@ def controller() -> CartesianController:
 
 def driven(controller: CartesianController, goal: Mapping[str, pin.SE3], seconds: float) -> Reference:
     """From home towards ``goal``, to rest."""
-    controller.reset(controller.robot.home)
-    contract = Contract(controller, random=np.random.default_rng(1))
-    for _ in range(round(seconds / DT)):
-        reference = controller.step(dict(goal), DT)
-        contract.check(reference, DT)
+    run = Driven(controller, random=np.random.default_rng(1))
+    reference, contract = run.drive(seconds, goal), run.contract
     assert contract.tail_acceleration() < 0.1
     assert contract.fallbacks == contract.uncertified == 0
     return reference
@@ -82,14 +78,6 @@ def test_hands_driven_at_each_other_end_at_the_distance_that_fingers_keep(contro
     assert least is not None
     assert least <= reference.report.closest_distance <= 1.6 * least
     assert all("finger" in name for name in reference.report.closest_pair)
-
-
-def test_two_hands_can_hold_a_bar_of_120_mm_at_both_ends(controller: CartesianController) -> None:
-    """Each of them 30 mm of it."""
-    goal = facing(0.06)
-    driven(controller, goal, 6.0)
-    for arm, pose in goal.items():
-        np.testing.assert_allclose(controller.tool_pose(arm).homogeneous, pose.homogeneous, atol=2e-3)
 
 
 def test_the_nearest_pair_and_the_tightest_one_are_told_apart(controller: CartesianController) -> None:

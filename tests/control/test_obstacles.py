@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-import pinocchio as pin
 import pytest
 
 from q2r2_control.config.cell import Config, load_config
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.robot.robot import Robot
-from q2r2_control.verification.contract import Contract
-from q2r2_control.wording import limit_name
+from tests.support.driven import Driven
 
 SHAPES = {
     "box": [0.1, 0.1, 0.5],
@@ -32,12 +30,10 @@ def _with(shape: str, position: list[float]) -> CartesianController:
 def test_a_tool_pushed_into_an_obstacle_stops_before_it_and_rests(shape: str) -> None:
     controller = _with(shape, [0.65, 0.1, 0.55])
     robot = controller.robot
-    contract = Contract(controller, robot.home)
+    run = Driven(controller, dt=0.005)
     goal = {arm: robot.tool_pose(robot.home, arm) for arm in robot.arms}
     goal["left"].translation = np.array([0.65, 0.1, 0.5])
-    for _ in range(800):
-        reference = controller.step(goal, 0.005)
-        contract.check(reference, 0.005)
+    reference, contract = run.drive(4.0, goal), run.contract
     assert "post" in "|".join(reference.report.closest_pair)
     assert reference.report.closest_distance < 0.03, "it goes as near as it may"
     assert contract.tail_acceleration() < 0.1
@@ -45,24 +41,3 @@ def test_a_tool_pushed_into_an_obstacle_stops_before_it_and_rests(shape: str) ->
     assert contract.uncertified == 0
     # The shapes of the cell lie inside what is watched: Coal measures them.
     assert min(pair.distance for pair in robot.distances(reference.q)) >= 0.02 - 1e-5
-
-
-def test_the_elbow_keeps_its_distance_where_the_tool_is_nowhere_near() -> None:
-    free = CartesianController(Robot.from_config(CELL))
-    robot = free.robot
-    goal = {"left": robot.tool_pose(robot.home, "left")}
-    goal["left"].translation = np.array([0.3, 0.75, 0.45])
-    for _ in range(800):
-        reference = free.step(goal, 0.005)
-    data = robot.model.createData()
-    pin.forwardKinematics(robot.model, data, reference.q)
-    elbow = pin.updateFramePlacement(robot.model, data, robot.model.getFrameId("left_link_4", pin.FrameType.BODY))
-    controller = _with("sphere", elbow.translation.tolist())
-    contract = Contract(controller, robot.home)
-    held_back = set()
-    for _ in range(800):
-        reference = controller.step(goal, 0.005)
-        contract.check(reference, 0.005)
-        held_back |= {name for name in map(limit_name, reference.report.binding) if "post" in name}
-    assert any(link in name for name in held_back for link in ("link_3", "link_4", "link_5"))
-    assert contract.fallback_share < 0.01

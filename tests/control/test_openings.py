@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import numpy as np
-import pinocchio as pin
 import pytest
 
 from q2r2_control import CartesianController, Robot
 from q2r2_control.errors import RobotError
 from q2r2_control.robot.finger_openings import collision_model_at
 from q2r2_control.robot.kept_distances import kept_distances
-from q2r2_control.types import ALL_OF_THE_WAY, Array, Reference
-from q2r2_control.verification.contract import Contract
+from q2r2_control.types import ALL_OF_THE_WAY, Array
 from tests.support.block_cell import ABOVE, BESIDE, CELL, SETTINGS, at
+from tests.support.coal_distances import coal_distances
+from tests.support.driven import Driven
 
 DT = 0.002
 
@@ -30,29 +30,7 @@ def controller(robot: Robot) -> CartesianController:
 def closest_by_coal(controller: CartesianController, q: Array) -> float:
     robot = controller.robot
     model = collision_model_at(robot.collision_model, robot.finger_bodies, controller.openings)
-    data, geometry = robot.model.createData(), model.createData()
-    pin.computeDistances(robot.model, data, model, geometry, q)
-    return min(result.min_distance for result in geometry.distanceResults)
-
-
-class Run:
-    """A controller at home, or at rest elsewhere, its contract checked at every tick from there."""
-
-    def __init__(self, controller: CartesianController, q: Array | None = None, sample_all: bool = False) -> None:
-        self.controller, start = controller, controller.robot.home if q is None else q
-        controller.reset(start)
-        self.contract = Contract(controller, start, sample_all=sample_all)
-
-    def set_opening(self, arm: str, least: float, greatest: float) -> tuple[str, str] | None:
-        refused = self.controller.set_opening(arm, least, greatest)
-        self.contract.set_openings(self.controller.openings)
-        return refused
-
-    def drive(self, goal: pin.SE3, seconds: float) -> Reference:
-        for _ in range(round(seconds / DT)):
-            reference = self.controller.step({"left": goal}, DT)
-            self.contract.check(reference, DT)
-        return reference
+    return float(coal_distances(robot, model, q).min())
 
 
 def height(controller: CartesianController) -> float:
@@ -60,21 +38,21 @@ def height(controller: CartesianController) -> float:
 
 
 def test_a_closed_gripper_gets_beside_a_block_where_one_that_may_open_does_not(controller: CartesianController) -> None:
-    run = Run(controller)
-    run.drive(BESIDE, 2.0)
+    run = Driven(controller)
+    run.drive(2.0, {"left": BESIDE})
     assert height(controller) > BESIDE.translation[2] + 0.01
-    run = Run(controller)
+    run = Driven(controller)
     assert run.set_opening("left", 0.0, 0.0) is None
-    run.drive(BESIDE, 2.0)
+    run.drive(2.0, {"left": BESIDE})
     assert height(controller) == pytest.approx(BESIDE.translation[2], abs=5e-4)
 
 
 def test_beside_the_block_it_may_open_as_far_as_the_block_allows_and_above_it_at_will(
     controller: CartesianController,
 ) -> None:
-    run = Run(controller)
+    run = Driven(controller)
     run.set_opening("left", 0.0, 0.0)
-    run.drive(BESIDE, 2.0)
+    run.drive(2.0, {"left": BESIDE})
     for opening in (1.0, 0.6):
         pair = run.set_opening("left", 0.0, opening)
         assert pair is not None
@@ -82,11 +60,11 @@ def test_beside_the_block_it_may_open_as_far_as_the_block_allows_and_above_it_at
         assert any("left_hand_e_finger" in name for name in pair)
         assert controller.openings["left"] == (0.0, 0.0)
     assert run.set_opening("left", 0.0, 0.4) is None
-    reference = run.drive(BESIDE, 0.1)
+    reference = run.drive(0.1, {"left": BESIDE})
     assert reference.report.closest_distance == pytest.approx(closest_by_coal(controller, reference.q), abs=2e-6)
-    run.drive(ABOVE, 1.5)
+    run.drive(1.5, {"left": ABOVE})
     assert run.set_opening("left", *ALL_OF_THE_WAY) is None
-    run.drive(ABOVE, 0.1)
+    run.drive(0.1, {"left": ABOVE})
 
 
 def test_an_opening_that_is_refused_leaves_every_bit_of_the_motion_as_it_was(robot: Robot) -> None:
@@ -111,14 +89,14 @@ def test_an_arm_at_speed_may_not_open_where_there_is_room_but_none_to_stop(contr
     """Towards the block with the gripper closed, asked at every tick; Coal looks at stops from what is accepted."""
     robot = controller.robot
     kept = kept_distances(robot, SETTINGS).values
-    run = Run(controller)
+    run = Driven(controller)
     run.set_opening("left", 0.0, 0.0)
-    run.drive(BESIDE, 1.2)
-    run = Run(controller, run.drive(at(0.05, 0.006), 1.2).q)
+    run.drive(1.2, {"left": BESIDE})
+    run = Driven(controller, run.drive(1.2, {"left": at(0.05, 0.006)}).q)
     run.set_opening("left", 0.0, 0.0)
     answers = []
     for _ in range(150):
-        reference = run.drive(at(0.4, 0.006), DT)
+        reference = run.drive(DT, {"left": at(0.4, 0.006)})
         q, v = reference.q, reference.v
         room = bool((robot.distance_values(q) >= kept).all())
         accepted = run.set_opening("left", *ALL_OF_THE_WAY) is None

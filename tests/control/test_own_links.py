@@ -7,7 +7,6 @@ import pinocchio as pin
 import pytest
 
 from q2r2_control import CartesianController, Robot, load_config
-from q2r2_control.supervision.preflight import preflight_faults
 
 CONFIG = load_config("config/dual_iiwa7.yaml")
 SETTINGS = CONFIG.control.model_copy(update={"solve_time_limit": None})  # no outcome hangs on the clock
@@ -19,26 +18,6 @@ A6 = 5
 @pytest.fixture(scope="module")
 def controller() -> CartesianController:
     return CartesianController(Robot.from_config(CONFIG), SETTINGS)
-
-
-def test_a_hand_bent_to_15_mm_from_the_forearm_is_too_close_and_not_certified(controller: CartesianController) -> None:
-    robot = controller.robot
-    bent = robot.home.copy()
-    bent[A6] = robot.position_upper[A6]
-    controller.reset(bent)
-    report = controller.step({}, 1e-3).report
-    assert report.closest_pair == HAND_AND_FOREARM
-    assert report.closest_distance == pytest.approx(0.0153, abs=2e-4)
-    assert not report.certified
-
-
-def test_a_cell_whose_home_bends_the_hand_that_far_is_not_to_be_run(monkeypatch: pytest.MonkeyPatch) -> None:
-    robot = Robot.from_config(CONFIG)
-    bent = robot.home.copy()
-    bent[A6] = robot.position_upper[A6] - SETTINGS.position_margin
-    monkeypatch.setattr(robot, "home", bent)
-    (fault,) = preflight_faults(robot, SETTINGS, None)
-    assert " and ".join(HAND_AND_FOREARM) + " are 16.0 mm apart" in fault
 
 
 def test_a_target_that_bends_the_hand_to_the_forearm_is_followed_to_the_distance_that_is_kept(

@@ -8,7 +8,6 @@ import qpsolvers
 
 from q2r2_control.control.qp import (
     DaqpSolver,
-    OsqpSolver,
     QpProblem,
     QpsolversSolver,
     Solver,
@@ -21,7 +20,6 @@ pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")
 NV = 14
 ROUTES: dict[str, Callable[[], Solver]] = {
     "daqp": lambda: DaqpSolver(NV, None),
-    "osqp kept set up": lambda: OsqpSolver(NV, None),
     "osqp through qpsolvers": lambda: QpsolversSolver("osqp"),
     "daqp through qpsolvers": lambda: QpsolversSolver("daqp"),
 }
@@ -82,42 +80,21 @@ def test_every_route_finds_the_same_minimum(route: str, rows: int, conflicting: 
         np.testing.assert_allclose(_solved(solver, problem), expected, rtol=0, atol=tolerance)
 
 
-@pytest.mark.parametrize("route", ROUTES)
-def test_rows_that_contradict_each_other_still_leave_a_solution_in_the_box(route: str) -> None:
-    random, solver = np.random.default_rng(29), ROUTES[route]()
-    for rows in (1, 10, 30):
-        problem = _problem(random, rows, conflicting=True)
-        v = _solved(solver, problem)
-        assert _violation(problem, v) > 0.1
-        assert (problem.lower - 1e-2 <= v).all()
-        assert (v <= problem.upper + 1e-2).all()
-
-
-@pytest.mark.parametrize("route", ["daqp", "osqp kept set up"])
-def test_the_number_of_rows_may_rise_and_fall_from_tick_to_tick(route: str) -> None:
-    random, solver, reference = np.random.default_rng(30), ROUTES[route](), ROUTES["daqp through qpsolvers"]()
+def test_the_number_of_rows_may_rise_and_fall_from_tick_to_tick() -> None:
+    random, solver, reference = np.random.default_rng(30), ROUTES["daqp"](), ROUTES["daqp through qpsolvers"]()
     for rows in (0, 5, 0, 16, 17, 3, 60, 1, 60, 0):
         problem = _problem(random, rows)
         np.testing.assert_allclose(_solved(solver, problem), _solved(reference, problem), rtol=0, atol=1e-4)
 
 
-@pytest.mark.parametrize("route", ["daqp", "osqp kept set up"])
 @pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3], ids="cost times {:g}".format)
-def test_a_row_alone_gives_way_by_the_same_part_however_strong_the_cost(route: str, scale: float) -> None:
+def test_a_row_alone_gives_way_by_the_same_part_however_strong_the_cost(scale: float) -> None:
     row = np.zeros((1, NV))
     row[0, :2] = 0.6, 0.8
     wide = np.full(NV, 10.0)
     problem = QpProblem(scale * np.eye(NV), np.zeros(NV), -wide, wide, row, np.ones(1))
-    v = _solved(ROUTES[route](), problem)
+    v = _solved(ROUTES["daqp"](), problem)
     assert _violation(problem, v) == pytest.approx(1e-5, rel=0.1)
-
-
-@pytest.mark.parametrize("route", ["daqp", "osqp kept set up"])
-def test_a_box_of_one_point_is_that_point(route: str) -> None:
-    problem = _problem(np.random.default_rng(31), 5)
-    point = np.linspace(-1.0, 1.0, NV)
-    pinned = QpProblem(problem.H, problem.g, point, point.copy(), problem.rows, problem.rows_lower)
-    np.testing.assert_allclose(_solved(ROUTES[route](), pinned), point, atol=1e-6)
 
 
 @pytest.mark.parametrize("route", ROUTES)

@@ -20,26 +20,17 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, StepStatus
 from q2r2_control.verification.contract import Contract
 from q2r2_control.verification.fault_injection import STOPPING_FAULTS, FaultySolver
+from tests.control.cells import pandas
 from tests.control.scenarios import SCENARIOS, Scenario, back_inwards, circle, crossing
 
 DURATION = 2.0  # [s]
 FAULT_PERIOD, FAULT_SHARE = 0.2, 0.2  # a faulty solver fails at the end of every period [s]
-PANDA_HOME = [0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785]
 Start = Callable[[Robot], tuple[Array, Array]]
-
-
-def _pandas() -> Config:
-    arms = {
-        side: {"model": "example-robot-data:panda", "mount": {"position": [0.0, y, 0.0]}, "home": PANDA_HOME}
-        for side, y in (("left", 0.4), ("right", -0.4))
-    }
-    table = {"shape": "box", "size": [0.8, 1.6, 0.04], "position": [0.75, 0.0, 0.0]}
-    return Config.model_validate({"name": "pandas", "arms": arms, "obstacles": {"table": table}})
 
 
 ROBOTS: dict[str, Callable[[], Config]] = {
     "iiwa7": lambda: load_config("config/dual_iiwa7.yaml"),
-    "panda": _pandas,
+    "panda": pandas,
 }
 
 

@@ -48,22 +48,6 @@ def test_it_is_the_least_of_the_arm_s_pairs_with_others_less_what_they_keep(
     assert len(seen) > 60  # the arms differ from each other, and the postures do
 
 
-def test_asking_changes_nothing_of_the_motion(robot: Robot, controller: CartesianController) -> None:
-    def motion(asks: bool) -> Array:
-        controller.reset(robot.home)
-        tools = {arm: controller.tool_pose(arm) for arm in robot.arms}
-        for arm, side in (("left", -1.0), ("right", 1.0)):
-            tools[arm].translation += np.array([0.1, 0.2 * side, 0.1])
-        rows = []
-        for _ in range(200):
-            rows.append(controller.step(tools, 0.004).q)
-            if asks:
-                assert all(np.isfinite(controller.spare_distance(arm)) for arm in robot.arms)
-        return np.array(rows)
-
-    assert np.array_equal(motion(asks=False), motion(asks=True))
-
-
 def test_an_object_that_is_held_is_part_of_its_arm() -> None:
     cell = object_cell(BLOCK, BLOCK)
     controller = CartesianController(Robot.from_config(cell), cell.control)

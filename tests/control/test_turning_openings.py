@@ -11,8 +11,9 @@ from q2r2_control.config.cell import Config
 from q2r2_control.robot.finger_openings import collision_model_at
 from q2r2_control.robot.kept_distances import kept_distances
 from q2r2_control.robot.turning_fingers import TurningBody
-from q2r2_control.types import ALL_OF_THE_WAY, Array, Interval
+from q2r2_control.types import ALL_OF_THE_WAY, Interval
 from q2r2_control.verification.contract import Contract
+from tests.support.coal_distances import coal_distances
 from tests.support.turning_hand import RealHands, above_table, turning_cell
 
 DT = 0.002
@@ -51,10 +52,7 @@ class Cell:
     def spare_of_bodies(self, openings: dict[str, Interval]) -> float:
         """The same of the fingers' bodies."""
         model = collision_model_at(self.robot.collision_model, self.robot.finger_bodies, openings)
-        data, geometry = self.robot.model.createData(), model.createData()
-        pin.computeDistances(self.robot.model, data, model, geometry, self.q)
-        values: Array = np.array([result.min_distance for result in geometry.distanceResults])
-        return float((values - self.kept).min())
+        return float((coal_distances(self.robot, model, self.q) - self.kept).min())
 
 
 @pytest.fixture(scope="module")
@@ -141,13 +139,3 @@ def test_with_hostile_targets_and_openings_no_finger_is_ever_too_near_wherever_i
                 assert cell.spare_of_bodies(cell.controller.openings) >= -COAL
     assert told > 500
     assert refused > 50
-
-
-def test_an_opening_that_is_refused_leaves_every_number_as_it_was(cell: Cell) -> None:
-    cell.start()
-    assert cell.set_opening(1.0, 1.0) is None
-    cell.drive({"left": above_table(0.006)}, 900)
-    before = cell.controller.step({}, 0.0).report
-    assert cell.set_opening(0.0, 1.0) is not None
-    after = cell.controller.step({}, 0.0).report
-    assert (after.closest_distance, after.margin) == (before.closest_distance, before.margin)

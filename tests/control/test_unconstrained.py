@@ -94,12 +94,6 @@ def test_one_bound_that_is_in_the_way_leaves_it_to_the_solver(
     assert not find_minimum(data.safety, data.tasks)
 
 
-def test_a_row_of_an_earlier_tick_does_not_count(data: KernelData) -> None:
-    _row(data)
-    data.safety.rows.used[0] = 0
-    assert find_minimum(data.safety, data.tasks)
-
-
 def circling(home: pin.SE3, t: float, side: float) -> pin.SE3:
     """A tool that goes round and, farther on, into the other arm and out of it again."""
     pose = home.copy()
@@ -145,10 +139,3 @@ def test_a_solver_is_asked_only_where_there_is_no_such_minimum() -> None:
     assert len(asked) == 1
     assert solution.v is not None
     np.testing.assert_allclose(solution.v, known)
-
-
-def test_a_solver_is_set_up_before_the_first_step_that_needs_it() -> None:
-    solver = BothWays(14)
-    CartesianController(Robot.from_config(CONFIG), SETTINGS, solver=solver)
-    assert solver.bound == 1, "asked once without a minimum, though at home there is one"
-    assert solver.deviations

@@ -130,16 +130,6 @@ def test_an_admittance_on_a_plant_that_measures_no_external_torque_is_refused() 
         loop.run(0.1, realtime=False)
 
 
-def test_in_torque_mode_an_admittance_is_not_used() -> None:
-    config = configured(admittance={"enabled": True})
-    loop, watch = pushed(config, "torque", np.array([0.0, 20.0, 0.0, 0.0, 0.0, 0.0]), ENGAGED, 1.0)
-    summary = loop.run(1.2, realtime=False)
-    assert all(tick.admittance is None for tick in watch.ticks)
-    assert summary.arms["left"].yielded_mm_max == 0.0
-    # The spring's own give, F / K.
-    assert way(watch, "left").max() == pytest.approx(20.0 / config.impedance.translational_stiffness, rel=0.1)
-
-
 class BlindPlant(MujocoPlant):
     """A simulated cell whose sensors fail: ``broken`` is what one joint is said to be at."""
 

@@ -7,7 +7,6 @@ import pytest
 
 from q2r2_control.config.cell import Config
 from q2r2_control.errors import PlantError
-from q2r2_control.plants.base import Plant
 from q2r2_control.plants.kinematic import KinematicPlant
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import CommandMode
@@ -17,10 +16,6 @@ from tests.plants.conftest import hold
 @pytest.fixture
 def plant(robot: Robot, config: Config) -> KinematicPlant:
     return KinematicPlant(robot, config)
-
-
-def test_it_is_a_plant(plant: KinematicPlant) -> None:
-    assert isinstance(plant, Plant)
 
 
 def test_it_stands_at_home_with_open_grippers_until_told_otherwise(plant: KinematicPlant, robot: Robot) -> None:
@@ -85,12 +80,3 @@ def test_reset_forgets_command_time_and_grippers(plant: KinematicPlant, robot: R
 def test_torque_mode_is_refused_with_what_is_allowed(plant: KinematicPlant, robot: Robot) -> None:
     with pytest.raises(PlantError, match=r"torque.*follows position, velocity commands only"):
         plant.apply(replace(hold(robot.home), mode=CommandMode.TORQUE))
-
-
-@pytest.mark.parametrize("dt", [float("nan"), float("inf"), -0.001, 1.5])
-def test_an_impossible_time_is_refused_and_nothing_moves(plant: KinematicPlant, robot: Robot, dt: float) -> None:
-    plant.apply(hold(robot.home + 0.1))
-    with pytest.raises(PlantError, match=r"allowed: 0 \.\. 1 s"):
-        plant.advance(dt)
-    np.testing.assert_array_equal(plant.state().q, robot.home)
-    assert plant.state().stamp == 0

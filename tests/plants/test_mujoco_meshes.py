@@ -14,7 +14,6 @@ from typer.testing import CliRunner
 from q2r2_control.cli.app import app
 from q2r2_control.config.cell import Config, load_config
 from q2r2_control.errors import PlantError
-from q2r2_control.plants.mujoco_meshes import load_meshes
 from q2r2_control.plants.mujoco_model import build_model
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
@@ -93,10 +92,3 @@ def test_a_mesh_that_nobody_can_read_is_named_in_one_line(tmp_path: Path) -> Non
     with pytest.raises(PlantError, match=r"wedge\.dae: neither MuJoCo nor Coal can read it") as error:
         build_model(robot, config)
     assert "\n" not in str(error.value)
-
-
-def test_formats_that_mujoco_reads_are_left_to_it() -> None:
-    spec = mujoco.MjSpec()
-    spec.add_mesh(name="part", file="part.STL")
-    load_meshes(spec)
-    assert spec.meshes[0].file == "part.STL"

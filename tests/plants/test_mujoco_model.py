@@ -74,21 +74,6 @@ def test_joint_and_torque_limits_are_the_robots(plant: MujocoPlant, robot: Robot
         )
 
 
-def test_capsules_are_capsules_of_the_urdfs_size(plant: MujocoPlant, urdf: ET.Element) -> None:
-    declared = {capsule.get("name") for capsule in urdf.iterfind("link/collision_checking/capsule")}
-    assert len(declared) == 2 * (7 + 1 + 2 * 5)
-    for collision in urdf.iterfind("link/collision"):
-        if collision.get("name") not in declared:
-            continue
-        cylinder = collision.find("geometry/cylinder")
-        assert cylinder is not None
-        geom = plant.model.geom(collision.get("name"))
-        assert geom.type[0] == mujoco.mjtGeom.mjGEOM_CAPSULE
-        np.testing.assert_allclose(
-            geom.size[:2], (float(cylinder.get("radius", "0")), float(cylinder.get("length", "0")) / 2)
-        )
-
-
 def test_drawings_and_envelopes_touch_nothing_and_fingers_do(plant: MujocoPlant) -> None:
     names = {plant.model.geom(index).name for index in range(plant.model.ngeom)}
     assert {"left_link_3_ring", "left_hand_e_finger_1_tip_1_envelope", "right_hand_e_finger_2_contact"} <= names

@@ -9,8 +9,7 @@ import pytest
 from q2r2_control.config.cell import Config, load_config
 from q2r2_control.robot.compose import ComposedCell, compose
 from q2r2_control.robot.robot import Robot
-
-PANDA_HOME = [0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785]
+from tests.control.cells import pandas
 
 
 def one_arm(**arm: Any) -> Config:
@@ -35,9 +34,4 @@ def dual_iiwa7_cell() -> ComposedCell:
 
 @pytest.fixture(scope="session")
 def dual_panda() -> Robot:
-    arms = {
-        side: {"model": "example-robot-data:panda", "mount": {"position": [0.0, y, 0.0]}, "home": PANDA_HOME}
-        for side, y in (("left", 0.4), ("right", -0.4))
-    }
-    table = {"shape": "box", "size": [0.8, 1.6, 0.04], "position": [0.75, 0.0, 0.0]}
-    return Robot.from_config(Config.model_validate({"name": "pandas", "arms": arms, "obstacles": {"table": table}}))
+    return Robot.from_config(pandas())

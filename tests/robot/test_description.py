@@ -26,15 +26,12 @@ GOOD = """<robot name="two">
     ("old", "new", "complaint"),
     [
         pytest.param(GOOD, "", "not XML", id="nothing at all"),
-        pytest.param(GOOD, "arm", "not XML", id="text that is not XML"),
         pytest.param(GOOD, "<sdf/>", "<sdf>", id="another format"),
         pytest.param("</robot>", "", "not XML", id="cut off"),
         pytest.param('radius="0.1"', 'radius="nan"', "radius = 'nan'", id="not a number"),
-        pytest.param('radius="0.1"', 'radius="1e400"', "radius = '1e400'", id="infinite by overflow"),
         pytest.param('radius="0.1"', 'radius="0,1"', "radius = '0,1'", id="a comma for the decimal point"),
         pytest.param('radius="0.1"', 'radius="1_0"', "radius = '1_0'", id="a number to Python only"),
         pytest.param('radius="0.1"', 'radius="-0.1"', "more than 0", id="a negative radius"),
-        pytest.param('radius="0.1"', 'radius=""', "radius = ''", id="an empty number"),
         pytest.param('xyz="0 0 1"', 'xyz="0 1"', "3 finite number", id="a vector of two"),
         pytest.param('xyz="0 0 1"', 'xyz="0 0 0"', "axis", id="an axis without direction"),
         pytest.param('value="1"', 'value="-1"', "0 or more", id="a negative mass"),
@@ -124,13 +121,6 @@ def test_a_model_of_a_ros_package_and_its_meshes_are_found_through_the_environme
     description = load_description("package://my_arm/arm.urdf")
     assert [element.get("filename") for element in description.urdf.iter("mesh")] == [str(mesh)]
     assert isinstance(description.srdf, ET.Element)
-
-
-def test_meshes_beside_the_file_become_absolute(tmp_path: Path) -> None:
-    (tmp_path / "tip.stl").write_text("solid")
-    (tmp_path / "arm.urdf").write_text(GOOD.replace('<sphere radius="0.1"/>', '<mesh filename="tip.stl"/>'))
-    description = load_description(str(tmp_path / "arm.urdf"))
-    assert [element.get("filename") for element in description.urdf.iter("mesh")] == [str(tmp_path / "tip.stl")]
 
 
 def test_a_file_that_is_not_text_is_refused(tmp_path: Path) -> None:

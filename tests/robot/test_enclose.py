@@ -67,13 +67,12 @@ def _geometry(model: str) -> pin.GeometryModel:
 @pytest.mark.parametrize("model", ["panda", "ur5", "xarm7"])
 def test_the_capsules_of_a_real_arm_hold_every_vertex_of_its_meshes(model: str) -> None:
     meshes, enclosed = _geometry(f"example-robot-data:{model}"), _geometry(f"example-robot-data:{model}")
-    replaced = enclose_shapes(enclosed)
+    enclose_shapes(enclosed)
     checked = 0
     for before, after in zip(meshes.geometryObjects, enclosed.geometryObjects, strict=True):
         assert before.name == after.name
         if not isinstance(before.geometry, coal.BVHModelBase):
             continue
-        assert before.name in replaced
         points = np.array([before.placement.act(vertex) for vertex in before.geometry.vertices()])
         half = np.array([0.0, 0.0, after.geometry.halfLength])
         ends = after.placement.act(-half), after.placement.act(half)
@@ -92,10 +91,9 @@ def _one(shape: coal.CollisionGeometry, parent_joint: int) -> pin.GeometryModel:
 @pytest.mark.parametrize(
     "shape",
     [
-        coal.Cylinder(0.1, 1.0), coal.Cylinder(0.5, 0.02), coal.Cylinder(0.1, 0.2), coal.Ellipsoid(0.1, 0.3, 0.2),
-        coal.Ellipsoid(0.2, 0.2, 0.2), coal.Ellipsoid(0.5, 0.01, 0.4), coal.Box(0.1, 0.2, 0.3),
+        coal.Cylinder(0.1, 1.0), coal.Cylinder(0.5, 0.02), coal.Cylinder(0.1, 0.2), coal.Box(0.1, 0.2, 0.3),
     ],
-    ids=["post", "round table top", "tin", "ellipsoid", "ball-like ellipsoid", "flat ellipsoid", "box"],
+    ids=["post", "round table top", "tin", "box"],
 )  # fmt: skip
 def test_a_primitive_lies_inside_what_replaces_it(shape: coal.CollisionGeometry, parent_joint: int) -> None:
     geometry = _one(shape, parent_joint)
@@ -116,8 +114,6 @@ def _surface(shape: coal.CollisionGeometry) -> Array:
     random = np.random.default_rng(3)
     ball = random.normal(size=(2000, 3))
     ball /= np.linalg.norm(ball, axis=1, keepdims=True)
-    if isinstance(shape, coal.Ellipsoid):
-        return np.asarray(ball * shape.radii)
     if isinstance(shape, coal.Box):
         return np.asarray(np.sign(ball) * shape.halfSide)
     angle = random.uniform(0, 2 * np.pi, 2000)
@@ -128,7 +124,7 @@ def _surface(shape: coal.CollisionGeometry) -> Array:
 def test_capsules_spheres_and_fixed_boxes_are_left_alone() -> None:
     for shape in (coal.Capsule(0.1, 0.4), coal.Sphere(0.1), coal.Box(1.0, 1.0, 1.0)):
         geometry = _one(shape, 0)
-        assert enclose_shapes(geometry) == ()
+        enclose_shapes(geometry)
         assert geometry.geometryObjects[0].geometry == shape
 
 

@@ -64,15 +64,6 @@ def finger_at(robot: Robot, joint: str, position: float, points: Array) -> Array
     return np.array([local.act(point) for point in points])
 
 
-def test_the_hand_e_is_as_wide_as_it_is_open() -> None:
-    robot = Robot.from_config(HAND_E)
-    tips = [body for body in robot.finger_bodies if body.arm == "left"][:4]
-    for body in tips:
-        for opening in (0.0, 0.5, 1.0):
-            start, end = ends_at(robot, body.name, (opening, opening))
-            assert np.linalg.norm(end - start) == pytest.approx(2 * (0.012 + 0.025 * opening), abs=1e-9)
-
-
 def test_the_hand_e_holds_both_fingers_at_each_opening_of_the_interval() -> None:
     robot = Robot.from_config(HAND_E)
     # Both ends of the capsules that robots/hand_e.urdf draws around a tip, in the link of their finger.

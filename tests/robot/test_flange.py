@@ -5,15 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import coal
-import mujoco
 import numpy as np
 import pinocchio as pin
 import pytest
 
 from q2r2_control.config.cell import Config, load_config
 from q2r2_control.errors import ConfigError
-from q2r2_control.plants.mujoco_model import build_model
 from q2r2_control.robot.compose import compose
 from q2r2_control.robot.description import load_description
 from q2r2_control.robot.pairs import link_of, pair_names
@@ -62,23 +59,6 @@ def test_the_body_of_each_flange_is_watched_against_all_that_its_arm_can_meet() 
     assert not {pair for pair in new if pair & {"right_media_flange"} and pair & {"right_link_5", "right_link_2"}}
 
 
-def test_the_body_of_a_cylinder_is_watched_and_enclosed() -> None:
-    robot = Robot.from_config(with_flange(CYLINDER))
-    for link in ("table", "floor", "right_link_5", "right_flange_body"):
-        assert frozenset(("left_flange_body", link)) in watched(robot)
-    geometry = robot.collision_model
-    body = geometry.geometryObjects[geometry.getGeometryId("left_flange_body_0")]
-    assert isinstance(body.geometry, coal.Capsule | coal.Sphere)
-    end = robot.model.frames[robot.model.getFrameId("left_flange_end", pin.FrameType.BODY)].placement
-    half = getattr(body.geometry, "halfLength", 0.0)
-    angle = np.linspace(0.0, 2.0 * np.pi, 60)
-    for z in (-0.03, 0.0):
-        rim = np.array([0.05 * np.cos(angle), 0.05 * np.sin(angle), np.full(60, z)])
-        local = [body.placement.actInv(end.act(point)) for point in rim.T]
-        distance = [np.linalg.norm(p - [0.0, 0.0, np.clip(p[2], -half, half)]) for p in local]
-        assert max(distance) <= body.geometry.radius * (1.0 + 1e-9)
-
-
 def test_the_sphere_of_the_touch_flange_encloses_its_drawing_and_what_link_7_does_not() -> None:
     """Outline of the published mesh, from the end of the plain flanges, z outwards: radius at height [m]."""
     outline = {-0.045: 0.055, -0.026: 0.0582, 0.0: 0.0553, 0.026: 0.0329}
@@ -96,24 +76,6 @@ def test_the_sphere_of_the_touch_flange_encloses_its_drawing_and_what_link_7_doe
 def test_the_arm_carries_the_flange_s_mass(flange: dict[str, Any], mass: float) -> None:
     plain, heavier = (Robot.from_config(one_arm(flange=given)).model for given in ({}, flange))
     assert heavier.inertias[7].mass - plain.inertias[7].mass == pytest.approx(mass)
-
-
-@pytest.mark.parametrize("flange", [TOUCH, CYLINDER], ids=["a model", "sizes"])
-def test_it_is_part_of_the_simulated_cell_where_nothing_of_an_arm_touches_itself_at_home(
-    flange: dict[str, Any],
-) -> None:
-    config = with_flange(flange)
-    robot = Robot.from_config(config)
-    model = build_model(robot, config)
-    data = mujoco.MjData(model)
-    for name, position in zip(robot.joint_names, robot.home, strict=True):
-        data.joint(name).qpos = position
-    mujoco.mj_forward(model, data)
-    body = robot.arms["left"].tool_frame.replace("tool_frame", "media_flange" if "model" in flange else "flange_body")
-    assert model.body(body).id > 0
-    arms = {i for i in range(model.nbody) if model.body(i).name.startswith(("left_", "right_"))}
-    touching = [{int(model.geom_bodyid[g]) for g in contact.geom} for contact in data.contact]
-    assert not [pair for pair in touching if pair <= arms]
 
 
 def test_pairs_known_of_tool_and_arm_are_not_believed_with_a_flange_between_them_that_no_file_knows() -> None:

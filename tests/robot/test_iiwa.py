@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import coal
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -126,15 +125,6 @@ def test_rotors_reach_the_model_with_their_gear(robot: Robot, name: str) -> None
     np.testing.assert_allclose(robot.model.rotorInertia, sheet.rotor)
     np.testing.assert_allclose(robot.model.rotorGearRatio, sheet.gear)
     np.testing.assert_allclose(robot.model.armature, np.array(sheet.rotor) * np.square(sheet.gear))
-
-
-def test_every_link_is_a_capsule_for_coal_and_the_last_a_sphere(robot: Robot) -> None:
-    shapes = {item.name: item.geometry for item in robot.collision_model.geometryObjects}
-    del shapes["floor_0"]
-    assert {name: type(shape) for name, shape in shapes.items()} == {
-        **{f"left_link_{index}_0": coal.Capsule for index in range(7)},
-        "left_link_7_0": coal.Sphere,
-    }
 
 
 @pytest.mark.parametrize(

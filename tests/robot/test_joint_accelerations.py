@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -72,11 +70,3 @@ def test_a_joint_that_is_none_of_the_arm_is_named_with_those_that_are(name: str)
         Robot.from_config(cell)
     line = f"arms.left.acceleration_limit.{name}: no joint of the arm; allowed: A1, A2, A3, A4, A5, A6, A7"
     assert str(error.value) == line
-
-
-def test_what_the_cell_s_file_says_replaces_all_that_the_model_says_of_a_joint(tmp_path: Path) -> None:
-    (tmp_path / "rod.urdf").write_text(rod('acceleration="4.5" deceleration="3" drake:acceleration="2"'))
-    model = str(tmp_path / "rod.urdf")
-    assert Robot.from_config(one_arm(model=model, home=[0.0])).acceleration_limit.tolist() == [2.0]
-    faster = one_arm(model=model, home=[0.0], acceleration_limit={"hinge": 8.0})
-    assert Robot.from_config(faster).acceleration_limit.tolist() == [8.0]

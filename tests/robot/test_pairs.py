@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import coal
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -108,17 +107,6 @@ def test_pairs_that_cannot_move_or_are_neighbours_are_not_watched(dual_iiwa: Rob
 def test_neither_bare_fingers_nor_the_bare_hand_are_watched_because_their_envelopes_are(dual_iiwa: Robot) -> None:
     hands = {link for pair in _links(dual_iiwa) for link in pair if "hand_e" in link}
     assert hands == {f"{side}_{link}" for side in ("left", "right") for link in ("hand_e_envelope", FINGERS)}
-
-
-@pytest.mark.parametrize("cell", ["dual_iiwa7", "dual_panda"])
-def test_every_watched_shape_has_a_kernel(cell: str, request: pytest.FixtureRequest) -> None:
-    robot: Robot = request.getfixturevalue(cell)
-    objects = robot.collision_model.geometryObjects
-    for pair in robot.collision_model.collisionPairs:
-        shapes = [objects[pair.first], objects[pair.second]]
-        assert sum(isinstance(item.geometry, coal.Box) for item in shapes) <= 1
-        for item in shapes:
-            assert isinstance(item.geometry, coal.Capsule | coal.Sphere) or item.parentJoint == 0
 
 
 @pytest.mark.parametrize("cell", ["dual_iiwa7", "dual_panda"])

@@ -8,7 +8,6 @@ import xml.etree.ElementTree as ET
 from pathlib import Path
 from typing import Any
 
-import mujoco
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -18,7 +17,6 @@ from typer.testing import CliRunner
 from q2r2_control.cli.app import app
 from q2r2_control.config.cell import Config, load_config
 from q2r2_control.errors import ConfigError
-from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.robot.compose import compose
 from q2r2_control.robot.description import load_description
 from q2r2_control.robot.pairs import link_of, pair_names
@@ -165,22 +163,6 @@ def test_a_joint_that_one_arm_names_moves_the_tools_of_both() -> None:
 
 
 @pytest.mark.parametrize("name", ["baxter", "tiago"])
-def test_mujoco_has_the_same_masses_where_they_can_be_felt(
-    name: str, folder: Path, request: pytest.FixtureRequest
-) -> None:
-    robot: Robot = request.getfixturevalue(name)
-    plant = MujocoPlant(robot, load_config(folder / f"{name}.yaml"))
-    index = [plant.model.joint(joint).dofadr[0] for joint in robot.joint_names]
-    gravity = pin.computeGeneralizedGravity(robot.model, robot.model.createData(), robot.home)
-    np.testing.assert_allclose(plant.data.qfrc_bias[index], gravity, atol=1e-3)
-    inertia = np.zeros((plant.model.nv, plant.model.nv))
-    mujoco.mj_fullM(plant.model, plant.data, inertia)
-    expected = pin.crba(robot.model, robot.model.createData(), robot.home)
-    expected = np.triu(expected) + np.triu(expected, 1).T
-    np.testing.assert_allclose(inertia[np.ix_(index, index)], expected, atol=1e-4)
-
-
-@pytest.mark.parametrize("name", ["baxter", "tiago"])
 def test_a_user_can_check_it_and_run_it(name: str, folder: Path) -> None:
     file = str(folder / f"{name}.yaml")
     checked = CliRunner().invoke(app, ["check", file, "--json"])
@@ -204,7 +186,7 @@ def test_each_arm_can_carry_a_tool_whose_names_are_told_apart() -> None:
     composed = compose(Config.model_validate(cell))
     assert composed.tool_frames == {"left": "left_tool_frame", "right": "right_tool_frame"}
     assert composed.parts.finger_joints["right"] == ("right_finger_joint_1", "right_finger_joint_2")
-    assert composed.arm_joints["right"] == tuple(RIGHT)
+    assert set(RIGHT) <= set(composed.home)
 
 
 def _changed(path: str, value: object) -> Config:

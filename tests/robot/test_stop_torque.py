@@ -60,16 +60,6 @@ def test_gravity_that_is_more_than_a_joint_has_is_told_apart_from_a_stop(robot: 
     assert stop_torques(robot, FAST, postures=1000)[0].gravity.share_over == 0.0
 
 
-def test_each_arm_is_judged_by_its_own_joints(dual_iiwa: Robot) -> None:
-    left, right = stop_torques(dual_iiwa, np.full(14, 10.0), postures=1000)
-    for arm, stop in (("left", left), ("right", right)):
-        assert stop.arm == arm
-        assert stop.stop.joint == f"{arm}_A2"
-        assert len(stop.stop.posture) == len(stop.joints) == 7
-        assert (stop.stop.ratio > 1.0) == (dual_iiwa.name == "dual_iiwa7")
-        assert (stop.stop.share_over > 0.0) == (dual_iiwa.name == "dual_iiwa7")
-
-
 def test_no_full_stop_at_the_limits_of_the_shipped_cells_asks_for_more_than_a_joint_has(dual_iiwa: Robot) -> None:
     """Nor with their models' own limits, which a higher control.acceleration_limit lets hold."""
     for acceleration in (dual_iiwa.capped_acceleration(10.0), dual_iiwa.acceleration_limit):

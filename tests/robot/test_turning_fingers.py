@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import xml.etree.ElementTree as ET
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import product
-from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
@@ -16,8 +14,6 @@ from hypothesis import strategies as st
 
 from q2r2_control.control.geometry.collision import collision_model_of
 from q2r2_control.control.geometry.finger_openings import FingerOpenings
-from q2r2_control.robot.description import load_description
-from q2r2_control.robot.enclose import enclose_shapes
 from q2r2_control.robot.finger_openings import collision_model_at
 from q2r2_control.robot.robot import Robot
 from q2r2_control.robot.turning_fingers import (
@@ -195,56 +191,6 @@ def test_several_bodies_at_once_are_what_each_is_alone_within_what_the_samples_l
         np.testing.assert_allclose(together.start[row], start, atol=5e-4)
         np.testing.assert_allclose(together.end[row], end, atol=5e-4)
         assert together.radius[row] == pytest.approx(radius, abs=1e-4)
-
-
-def test_without_known_openings_a_body_is_all_that_the_joints_limits_allow(tmp_path: Path) -> None:
-    cell = Robot.from_config(turning_cell(tmp_path))
-    plain = Robot.from_urdf(cell.urdf, {arm.name: arm.tool_frame for arm in cell.arms.values()})
-    assert plain.finger_bodies == ()
-    real = RealHands(cell)
-    for name in real.fingers:
-        item = plain.collision_model.geometryObjects[plain.collision_model.getGeometryId(name)]
-        half = item.geometry.halfLength * item.placement.rotation[:, 2]
-        middle = item.placement.translation
-        for opening in np.linspace(0.0, 1.0, 41).tolist():
-            ends, radius = real.ends("left", name, opening)
-            assert outside(ends, (middle - half, middle + half, float(item.geometry.radius)), radius) <= 0.0
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("model", "tip", "fingers"),
-    [
-        ("so101", "gripper_frame_link", ("gripper",)),
-        ("z1", "gripperStator", ("jointGripper",)),
-    ],
-)
-def test_grippers_that_turn_of_other_robots_are_held_too(model: str, tip: str, fingers: tuple[str, ...]) -> None:
-    """The URDF's own shapes at the joints' own positions, by Pinocchio, in bodies of intervals of the travel."""
-    description = load_description(f"example-robot-data:{model}")
-    robot = Robot.from_urdf(ET.tostring(description.urdf, encoding="unicode"), {"left": tip})
-    full = pin.buildModelFromXML(robot.urdf)
-    geometry = pin.buildGeomFromUrdfString(full, robot.urdf, pin.GeometryType.COLLISION)
-    enclose_shapes(geometry)
-    data, geometry_data = full.createData(), geometry.createData()
-    moving = [item.name for item in geometry.geometryObjects if full.names[item.parentJoint] in fingers]
-    assert moving
-    q = pin.neutral(full)
-    for share in np.linspace(0.0, 1.0, 41):
-        for name in fingers:
-            index = full.joints[full.getJointId(name)].idx_q
-            q[index] = (1.0 - share) * full.lowerPositionLimit[index] + share * full.upperPositionLimit[index]
-        pin.updateGeometryPlacements(full, data, geometry, geometry_data, q)
-        for name in moving:
-            body = robot.collision_model.geometryObjects[robot.collision_model.getGeometryId(name)]
-            carrier = data.oMi[full.getJointId(robot.model.names[body.parentJoint])]
-            number = geometry.getGeometryId(name)
-            shape, placement = geometry.geometryObjects[number].geometry, carrier.actInv(geometry_data.oMg[number])
-            half = getattr(shape, "halfLength", 0.0) * placement.rotation[:, 2]
-            ends = np.array([placement.translation - half, placement.translation + half])
-            own = body.geometry.halfLength * body.placement.rotation[:, 2]
-            capsule = body.placement.translation - own, body.placement.translation + own, float(body.geometry.radius)
-            assert outside(ends, capsule, float(shape.radius)) <= 1e-9
 
 
 def test_no_second_derivative_by_two_joints_exceeds_its_bound() -> None:

@@ -55,7 +55,7 @@ def test_a_cell_names_arguments_and_packages_and_gets_the_expanded_arm(package: 
         f"    model: {MODEL}\n    xacro_args: {{robot_name: med7, with_tip: true}}\n    home: [0, 0]\n"
     )
     cell = compose(load_config(tmp_path / "cell.yaml"))
-    assert cell.arm_joints == {"left": ("left_med7_A1", "left_med7_A2")}
+    assert list(cell.home) == ["left_med7_A1", "left_med7_A2"]
     assert cell.tool_frames == {"left": "left_tip"}
     assert str(package / "meshes" / "link.stl") in cell.urdf
     assert 'xyz="0 0 0.30000000000000004"' in cell.urdf
@@ -73,12 +73,9 @@ def test_arguments_have_the_defaults_of_the_file_and_an_srdf_beside_it_belongs_t
     [
         ("arm.urdf.xacro", "</robot>", "", "arm.urdf.xacro: xacro cannot expand it: no element found"),
         ("hinge.xacro", "${reach}", "${reech}", "name 'reech' is not defined"),
-        ("hinge.xacro", "${0.1 * 3}", "${1 / 0}", "division by zero"),
         ("hinge.xacro", "</robot>", "", "hinge.xacro)"),
         ("arm.urdf.xacro", "my_arm", "your_arm", "package 'your_arm': not found in the key packages"),
-        ("arm.urdf.xacro", "hinge.xacro", "knee.xacro", "knee.xacro"),
         ("arm.urdf.xacro", "$(arg with_tip)", "$(arg tip)", "Undefined substitution argument tip"),
-        ("arm.urdf.xacro", 'parent="base"/>', "/>", "Undefined parameters [parent]"),
         ("hinge.xacro", 'lower="-1"', 'lower="${reach}m"', "<limit> has lower = '0.30000000000000004m'"),
     ],
 )

@@ -63,7 +63,7 @@ def segment_segment(a0: Array, a1: Array, b0: Array, b1: Array, on_a: Array, on_
         if determinant > 1e-14 * aa * bb:
             s = clamp((ab * br - ar * bb) / determinant, 0.0, 1.0)
         else:
-            s = _middle_of_overlap(aa, ab, ar, bb)
+            s = _middle_of_overlap(aa, ab, ar)
         t = (ab * s + br) / bb
         if t < 0.0:
             t = 0.0
@@ -80,7 +80,7 @@ def segment_segment(a0: Array, a1: Array, b0: Array, b1: Array, on_a: Array, on_
 
 
 @kernel
-def _middle_of_overlap(aa: float, ab: float, ar: float, bb: float) -> float:
+def _middle_of_overlap(aa: float, ab: float, ar: float) -> float:
     """Parameter on a of the middle of what b covers of it, for parallel segments."""
     first = -ar / aa  # of b0 on a
     second = (ab - ar) / aa  # of b1 on a

@@ -95,15 +95,19 @@ class CollisionData(NamedTuple):
         return cls(Placements.empty(model.chain), BodyPlacements.empty(model.bodies), Contact.empty())
 
 
-def collision_model_of(robot: Robot) -> CollisionModel:
-    """Joints, geometries and monitored pairs of a robot. Raises :class:`RobotError` for what no kernel handles."""
-    chain, bodies = chain_of(robot.model), bodies_of(robot.collision_model)
+def collision_model_of(robot: Robot, geometry: pin.GeometryModel | None = None) -> CollisionModel:
+    """Joints, bodies and pairs of a robot, or of a ``geometry`` that begins with the robot's.
+
+    Raises :class:`RobotError` for what no kernel handles.
+    """
+    geometry = robot.collision_model if geometry is None else geometry
+    chain, bodies = chain_of(robot.model), bodies_of(geometry)
     travel = np.maximum(np.abs(robot.position_lower), np.abs(robot.position_upper))
     extent = farthest_of(bodies)
     for number, finger in turning_bodies(robot):
         # Its capsules of other intervals are not within the one of all of the way.
         extent[number] = max(extent[number], finger.extent)
-    return CollisionModel(chain, bodies, pairs_of(robot.collision_model, chain, bodies, travel, extent))
+    return CollisionModel(chain, bodies, pairs_of(geometry, chain, bodies, travel, extent))
 
 
 def bodies_of(model: pin.GeometryModel) -> CollisionBodies:

@@ -30,5 +30,5 @@ class SafetyModel(NamedTuple):
     collision: CollisionModel
     limits: JointLimits
     approach: Approach
-    min_distance: Array  # (p,) of every pair [m]
+    min_distance: Array  # (p,) of every pair [m]; minus infinity: it does not count now
     arm: IntArray  # (nv,) number of the arm that a joint belongs to; joints of none share the last number

@@ -7,9 +7,11 @@ separation and the certificate do not depend on costs, so no task can break them
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib.metadata import entry_points
 from typing import Any, Protocol
+
+import numpy as np
 
 from q2r2_control.errors import ConfigError
 from q2r2_control.robot.robot import Robot
@@ -45,3 +47,12 @@ def load_tasks(robot: Robot, wanted: Mapping[str, Mapping[str, Any]]) -> tuple[T
         except (TypeError, ValueError) as error:
             raise ConfigError(f"control.tasks.{name}: {error}") from error
     return tuple(tasks)
+
+
+def add_costs(tasks: Sequence[Task], H: Array, g: Array, q: Array, v: Array) -> None:
+    """Add to the cost H (nv, nv), g (nv,) that of each task at ``q`` and ``v``, unless it is not finite."""
+    for task in tasks:
+        own_H, own_g = task.cost(q.copy(), v.copy())
+        if np.isfinite(own_H).all() and np.isfinite(own_g).all():
+            H += own_H
+            g += own_g

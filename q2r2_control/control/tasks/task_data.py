@@ -7,8 +7,6 @@ from typing import NamedTuple
 import numpy as np
 
 from q2r2_control.control.geometry.kinematics import IntArray, Placements
-from q2r2_control.control.tasks.manipulability import ManipulabilityScratch
-from q2r2_control.control.tasks.swivel import SwivelScratch
 from q2r2_control.control.tasks.task_model import TaskModel
 from q2r2_control.types import Array
 
@@ -77,8 +75,6 @@ class TaskData(NamedTuple):
     feedback: Array  # (n, 6) the part of it that the error makes
     turn: Array  # (3, 3) scratch: rotation from tool to target
     posture: Array  # (nv,) wanted where the tools leave joints free [rad/s]
-    manipulability: ManipulabilityScratch
-    swivel: SwivelScratch
     H: Array  # (nv, nv) of the cost 1/2 v' H v + g' v
     g: Array  # (nv,)
     minimum: Array  # (nv,) of that cost without bounds [rad/s]
@@ -98,8 +94,6 @@ class TaskData(NamedTuple):
             feedback=np.zeros((n, 6)),
             turn=np.zeros((3, 3)),
             posture=np.zeros(nv),
-            manipulability=ManipulabilityScratch.empty(nv),
-            swivel=SwivelScratch.empty(n, nv),
             H=np.zeros((nv, nv)),
             g=np.zeros(nv),
             minimum=np.zeros(nv),

@@ -9,7 +9,6 @@ from q2r2_control.control.geometry.kinematics import Chain
 from q2r2_control.control.tasks.frame import Motion, motion_of
 from q2r2_control.control.tasks.posture import Posture, posture_of
 from q2r2_control.control.tasks.priority import Priority, priority_of
-from q2r2_control.control.tasks.swivel import Swivels, swivels_of
 from q2r2_control.control.tasks.tools import Tools, tools_of
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
@@ -22,9 +21,6 @@ class TaskModel(NamedTuple):
     tools: Tools
     motion: Motion
     posture: Posture
-    manipulability_gain: float  # [rad/s]; 0: off
-    swivels: Swivels
-    has_swivels: int  # 1: some arm has a swivel task
     priority: Priority
 
     @property
@@ -35,14 +31,10 @@ class TaskModel(NamedTuple):
 
 def task_model_of(robot: Robot, settings: ControllerSettings, chain: Chain) -> TaskModel:
     """The models of all tasks."""
-    swivels = swivels_of(robot, chain)
     return TaskModel(
         chain=chain,
         tools=tools_of(robot),
         motion=motion_of(settings),
         posture=posture_of(robot, settings),
-        manipulability_gain=settings.manipulability_gain,
-        swivels=swivels,
-        has_swivels=int(swivels.gain.any()),
         priority=priority_of(robot, settings),
     )

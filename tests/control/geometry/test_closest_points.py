@@ -3,7 +3,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
-import coal
 import numpy as np
 import numpy.typing as npt
 import pytest
@@ -221,43 +220,3 @@ def test_a_segment_that_enters_a_box_leaves_it_by_the_shortest_way_of_all_direct
         assert _to_box(a0 + 1.0001 * out, a1 + 1.0001 * out, half).distance >= 0.0
     assert entered > 200
     assert across > 20
-
-
-def test_the_depth_grows_from_nothing_where_a_segment_begins_to_cut_an_edge() -> None:
-    half = np.array([0.4, 0.2, 0.3])
-    for depth in (-1e-3, -1e-6, 1e-6, 1e-3):
-        corner = np.array([0.4, 0.0, 0.3]) - depth * np.array([1.0, 0.0, 1.0]) / np.sqrt(2.0)
-        along = np.array([1.0, 0.0, -1.0])
-        assert _to_box(corner - along, corner + along, half).distance == pytest.approx(-depth, abs=1e-9)
-
-
-@pytest.mark.parametrize("side", [1.0, -1.0], ids=["from above", "from below"])
-@pytest.mark.parametrize("depth", [0.05, 0.0, -0.05], ids=["before", "touching", "inside"])
-def test_the_normal_points_from_the_segment_into_the_box_before_and_after_contact(side: float, depth: float) -> None:
-    half = np.array([0.4, 0.2, 0.3])
-    z = side * (0.3 + depth)
-    answer = _to_box([0.0, 0.0, z], [0.1, 0.0, z], half)
-    np.testing.assert_allclose(answer.normal, np.array([0.0, 0.0, -side]), atol=1e-9)
-
-
-def _coal_distance(a0: Array, a1: Array, radius: float, half: Array) -> float:
-    length = np.linalg.norm(a1 - a0)
-    z = (a1 - a0) / length
-    x = np.cross(z, np.eye(3)[np.argmin(np.abs(z))])
-    x /= np.linalg.norm(x)
-    placement = coal.Transform3s(np.column_stack([x, np.cross(z, x), z]), 0.5 * (a0 + a1))
-    capsule, box = coal.Capsule(radius, length), coal.Box(*(2 * half))
-    return float(
-        coal.distance(capsule, placement, box, coal.Transform3s(), coal.DistanceRequest(), coal.DistanceResult())
-    )
-
-
-def test_coal_agrees_on_capsules_and_boxes_until_the_capsules_axis_enters() -> None:
-    penetrating = 0
-    for a0, a1, half in _boxes_and_segments(500):
-        if _nearest_along(a0, a1, half) < 1e-3:
-            continue
-        ours = _to_box(a0, a1, half).distance - 0.15
-        penetrating += ours < 0.0
-        assert ours == pytest.approx(_coal_distance(a0, a1, 0.15, half), abs=1e-4)
-    assert penetrating > 50

@@ -90,45 +90,6 @@ def test_rows_are_the_gradients_of_the_distances(seed: int, name: str) -> None:
     assert outside + penetrating > 0.5 * len(arrays.pairs.first)
 
 
-def _towards_contact(arrays: CellArrays, random: np.random.Generator, depth: float) -> tuple[Array, int]:
-    """A posture in which a pair is ``depth`` from contact, found by following its row; and that pair."""
-    while True:
-        q, p = random_posture(arrays.robot, random), int(random.integers(len(arrays.pairs.first)))
-        for _ in range(60):
-            row = _row(arrays, q, p)
-            square = float(row @ row)
-            miss = depth - distances(arrays, q[None])[0, p]
-            if abs(miss) < 1e-9 or square < 1e-6:
-                break
-            q = q + np.clip(row * miss / square, -0.2, 0.2)
-        if abs(depth - distances(arrays, q[None])[0, p]) < 1e-6 and depth > _core_distance(arrays)[p] + 2e-3:
-            return q, p
-
-
-@pytest.mark.parametrize("depth", [0.02, 1e-4, -1e-4, -0.02], ids="{} m".format)
-@pytest.mark.parametrize("name", ["dual_iiwa7", "dual_panda"])
-def test_following_the_row_parts_a_pair_just_before_and_just_after_contact(name: str, depth: float) -> None:
-    arrays, random = cell(name), np.random.default_rng(10)
-    for _ in range(10):
-        q, p = _towards_contact(arrays, random, depth)
-        row = _row(arrays, q, p)
-        apart = distances(arrays, np.array([q - 1e-5 * row, q, q + 1e-5 * row]))[:, p]
-        assert apart[0] < apart[1] < apart[2]
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_a_joint_that_moves_both_bodies_or_neither_changes_no_distance(name: str) -> None:
-    arrays, random = cell(name), np.random.default_rng(11)
-    for _ in range(5):
-        q = random_posture(arrays.robot, random)
-        before = distances(arrays, q[None])[0]
-        for j in range(len(q)):
-            moved = q.copy()
-            moved[j] += 0.3
-            unmoved = ~(arrays.pairs.joint == j + 1).any(axis=1)
-            np.testing.assert_allclose(distances(arrays, moved[None])[0, unmoved], before[unmoved], atol=1e-12)
-
-
 def _way_bound(arrays: CellArrays, way: Array) -> Array:
     """S (p,) of stop_certificate.py for joint ways (nv,)."""
     padded = np.concatenate([[0.0], way])
@@ -146,23 +107,6 @@ def test_no_distance_changes_by_more_than_the_reach_times_the_joints_ways(seed: 
     comparable = np.minimum(here, there) > _core_distance(arrays) + 1e-9
     excess = np.abs(here - there) - _way_bound(arrays, np.abs(other - q))
     assert excess[comparable].max() <= 1e-12
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_no_point_of_a_body_is_farther_from_a_joints_axis_than_its_reach(name: str) -> None:
-    arrays, random = cell(name), np.random.default_rng(12)
-    for _ in range(5):
-        placements, posed, _ = placed(arrays, random_posture(arrays.robot, random))
-        for p in range(len(arrays.pairs.first)):
-            for joint, sign, reach in zip(
-                arrays.pairs.joint[p], arrays.pairs.sign[p], arrays.pairs.reach[p], strict=True
-            ):
-                if joint == 0:
-                    continue
-                body = arrays.pairs.second[p] if sign > 0 else arrays.pairs.first[p]
-                for point in (posed.start[body], posed.end[body]):
-                    offset = point - placements.translation[joint]
-                    assert np.linalg.norm(np.cross(placements.axis[joint], offset)) <= reach + 1e-12
 
 
 SLIDING = """<robot name="slide"><link name="base"><collision><origin xyz="0.9 0 0"/>

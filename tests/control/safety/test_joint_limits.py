@@ -187,29 +187,3 @@ def test_a_joint_outside_returns_without_a_jump_at_bounded_speed(choose: Choice,
     assert (side * velocities[:-1][while_outside] <= EXACT).all()
     if choose is _outwards and side > 0.0:
         assert (-velocities[1:][while_outside] <= RETURN_SPEED + EXACT).all(), "no faster inward than asked for"
-
-
-def test_a_joint_too_fast_to_stop_in_time_brakes_fully_and_comes_back() -> None:
-    bounds = _wide_bounds()
-    v = np.linspace(1.0, 1.5, JOINTS)
-    overshoot = v**2 / 20 - 0.03
-    positions, velocities = _recover(np.full(JOINTS, 1.97), v, bounds, _outwards, 3.0)
-    np.testing.assert_array_less(positions.max(axis=0) - 2.0, overshoot + 1e-5)
-    braking = velocities[:-1] > bounds.acceleration * bounds.longest
-    np.testing.assert_allclose(np.diff(velocities, axis=0)[braking], -0.02, atol=1e-12)
-
-
-def test_a_joint_beyond_its_velocity_limit_slows_down_as_fast_as_it_may() -> None:
-    bounds = _wide_bounds()
-    _, velocities = _recover(np.zeros(JOINTS), np.linspace(1.6, 3.0, JOINTS), bounds, _outwards, 1.0)
-    too_fast = velocities[:-1] > 1.5 + 0.02
-    np.testing.assert_allclose(np.diff(velocities, axis=0)[too_fast], -0.02, atol=1e-12)
-    assert (velocities[200:] <= 1.5 + EXACT).all()
-
-
-def test_a_range_too_narrow_to_move_in_keeps_the_joint_still() -> None:
-    still = np.zeros(1)
-    bounds = Bounds(still, still.copy(), np.ones(1), np.full(1, 10.0), 0.002)
-    box = _box(still, still, bounds, 0.001)
-    assert box.inside
-    np.testing.assert_allclose([box.lower[0], box.upper[0]], 0.0, atol=1e-12)

@@ -77,16 +77,6 @@ def test_a_hand_at_rest_whose_arm_moves_may_come_closer_while_that_stops(shape: 
     assert moved > 100
 
 
-def test_what_a_step_from_rest_adds_counts() -> None:
-    random, robot = np.random.default_rng(63), cell("dual_iiwa7").robot
-    apart = share_no_joint("dual_iiwa7")
-    for _ in range(40):
-        v_next = random.uniform(-1, 1, 14) * ACCELERATION * H
-        for shape in (TOGETHER, OWN):
-            motion = motion_of("dual_iiwa7", random_posture(robot, random), np.zeros(14), v_next, shape)
-            assert (bounds_of("dual_iiwa7", motion) <= least_along("dual_iiwa7", motion) + 1e-12)[apart].all()
-
-
 @pytest.mark.parametrize("speed", [0.01, 0.1], ids=["a stop as short as the step", "a long stop"])
 def test_the_bound_holds_and_leaves_little_room_where_joints_stop_together(speed: float) -> None:
     random, robot = np.random.default_rng(64), cell("dual_iiwa7").robot

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from q2r2_control.control.safety.joint_limits import next_velocity_box
 from q2r2_control.control.safety.safety_data import VelocityBox
-from q2r2_control.control.safety.stop_shapes import ARM_BY_ARM, OWN, SHAPES, TOGETHER, brake, write_stop
+from q2r2_control.control.safety.stop_shapes import ARM_BY_ARM, SHAPES, TOGETHER, brake, write_stop
 from q2r2_control.types import Array
 from tests.control.cells import cell, kernel_model
 
@@ -83,10 +83,6 @@ def test_arm_by_arm_each_arm_stops_in_the_time_of_its_own_slowest_joint(seed: in
     for arm in cell("dual_iiwa7").robot.arms.values():
         slowest = np.max(np.abs(v[arm.joints]) / MODEL.limits.acceleration[arm.joints])
         np.testing.assert_allclose(times[arm.joints], slowest, rtol=1e-12)
-
-
-def test_on_its_own_every_joint_brakes_at_its_limit() -> None:
-    np.testing.assert_array_equal(_decelerations(HOME, _random_velocities(3), OWN), MODEL.limits.acceleration)
 
 
 @pytest.mark.parametrize("shape", range(SHAPES), ids=["together", "arm by arm", "own"])

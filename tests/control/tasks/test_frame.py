@@ -84,18 +84,6 @@ def test_the_approach_speed_is_continuous_and_so_is_its_slope(gain: float, decel
         assert (after - here) / step == pytest.approx((here - before) / step, rel=1e-3)
 
 
-@pytest.mark.parametrize("error", [0.001, 0.05, 0.2, 2.0], ids="from {} m".format)
-def test_following_the_approach_speed_asks_for_no_more_than_the_planned_deceleration(error: float) -> None:
-    gain, deceleration, dt = 8.0, 2.0, 1e-4
-    speeds = []
-    while error > 1e-6:
-        speeds.append(approach_speed(error, gain, deceleration))
-        error -= speeds[-1] * dt
-    braking = -np.diff(speeds) / dt
-    assert braking.max() <= deceleration * 1.01
-    assert braking.min() >= 0.0
-
-
 def _twist(tool: pin.SE3, target: pin.SE3, feed_forward: Array) -> Array:
     model, arm = kernel_model("dual_iiwa7").tasks, 1
     data, targets = kernel_data("dual_iiwa7", np.zeros(14)).tasks, TaskTargets.empty(model, 1.0, 1.0, 1.0)
@@ -109,17 +97,6 @@ def _twist(tool: pin.SE3, target: pin.SE3, feed_forward: Array) -> Array:
 def _poses(random: np.random.Generator) -> tuple[pin.SE3, pin.SE3]:
     tool, target = (pin.SE3(pin.exp3(random.normal(size=3)), random.uniform(-1, 1, 3)) for _ in range(2))
     return tool, target
-
-
-def test_a_tool_that_moves_with_the_wanted_twist_reaches_its_target() -> None:
-    random, dt = np.random.default_rng(23), 0.01
-    for _ in range(4):
-        tool, target = _poses(random)
-        for _ in range(600):
-            twist = _twist(tool, target, np.zeros(6))
-            tool = pin.SE3(pin.exp3(twist[3:] * dt) @ tool.rotation, tool.translation + twist[:3] * dt)
-        assert np.linalg.norm(tool.translation - target.translation) < 1e-6
-        assert np.linalg.norm(pin.log3(tool.rotation.T @ target.rotation)) < 1e-6
 
 
 def test_the_wanted_twist_never_exceeds_the_speed_limits() -> None:

@@ -1,0 +1,16 @@
+"""Distances as Coal measures them, which no kernel of ours has a part in."""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+
+from q2r2_control.robot.robot import Robot
+from q2r2_control.types import Array
+
+
+def coal_distances(robot: Robot, geometry: pin.GeometryModel, q: Array) -> Array:
+    """Of every pair of ``geometry`` (pairs,) [m] at ``q`` (nv,)."""
+    data, distances = robot.model.createData(), geometry.createData()
+    pin.computeDistances(robot.model, data, geometry, distances, q)
+    return np.array([result.min_distance for result in distances.distanceResults])
