@@ -44,28 +44,10 @@ class ArmOutputs:
         self._last: TargetOutput | None = None
         if self._filtered:
             topic = BUILTIN.topic.format(ctrl=values.builtin_prefix)
-            self.first = TargetOutput(
-                node,
-                BUILTIN,
-                BUILTIN_NODE,
-                topic,
-                values.world_frame,
-                BUILTIN.guard,
-                values.listener_timeout,
-                values.rate,
-            )
+            self.first = TargetOutput(node, values, BUILTIN, BUILTIN_NODE, topic, values.world_frame, BUILTIN.guard)
         if not self._filtered or (preset.takes_poses and preset is not BUILTIN):
-            theirs = TargetOutput(
-                node,
-                preset,
-                values.controller,
-                values.target_topic,
-                values.base_frame,
-                values.guard,
-                values.listener_timeout,
-                values.rate,
-                values.prefix,
-            )
+            terms = values.controller, values.target_topic, values.base_frame, values.guard
+            theirs = TargetOutput(node, values, preset, *terms)
             if self._filtered:
                 self._last = theirs
             else:
@@ -104,7 +86,7 @@ class ArmOutputs:
             line = self._follows.unready
         if line is None and self._command_type is not None:
             line = self._command_type.unready
-        return None if line is None else Reason.of(ReasonKind.CONTROLLER_REFUSES, text=line)
+        return _refused(line)
 
     @property
     def builtin(self) -> str | None:
@@ -137,7 +119,7 @@ class ArmOutputs:
         """What the user has to do by hand."""
         return None if self._command_type is None else self._command_type.advice
 
-    def take_fault(self, now: float) -> str | None:
+    def take_fault(self, now: float) -> Reason | None:
         """Check the controllers; returns once why the arm has to pause because of one."""
         faults = [output.take_fault(now) for output in reversed(self._all)]
         if self._last is not None and faults[0] is not None:
@@ -146,7 +128,7 @@ class ArmOutputs:
             self._command_type.step(self._all[-1].starts, now)
         if self._follows is not None:
             faults += [self._safe_target.take_silence(now), self._follows.refusal(self.first.following, now)]
-        return next((fault for fault in faults if fault), None)
+        return _refused(next((fault for fault in faults if fault), None))
 
     def step(
         self,
@@ -163,7 +145,7 @@ class ArmOutputs:
 
     def relay(
         self, engaged: bool, tool: pin.SE3 | None, base: pin.SE3 | None, now: float, decided: float
-    ) -> str | None:
+    ) -> Reason | None:
         """Pass on the safe target of the built-in controller; returns why the arm has to pause."""
         if self._last is None:
             return None
@@ -176,7 +158,7 @@ class ArmOutputs:
         self._relaying = self._relaying and safe is not None
         # A stream starts at the measured tool: the safe target may differ from it by the arm's steady-state offset.
         self._last.step(safe if self._relaying else None, tool, base, now, decided, start=tool)
-        return fault
+        return _refused(fault)
 
     def forget(self, now: float) -> None:
         """Drop all held targets."""
@@ -286,3 +268,7 @@ class CommandType:
         if self._answer is not None and self._client is not None:
             self._client.remove_pending_request(self._answer)
         self._answer = None
+
+
+def _refused(line: str | None) -> Reason | None:
+    return None if line is None else Reason.of(ReasonKind.CONTROLLER_REFUSES, text=line)

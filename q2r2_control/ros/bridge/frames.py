@@ -166,7 +166,6 @@ class ToolFrame:
     def __init__(self, node: BaseNode, tree: FrameTree, frame: str, world: str, timeout: float) -> None:
         self._tree, self._frame, self._world, self._timeout = tree, frame, world, timeout
         self._publishers = Publishers(node, ["/tf"])
-        self._publishers.look_steadily()
         self.problem: str | None = None
 
     def at(self, now: float) -> pin.SE3 | None:
@@ -189,7 +188,6 @@ class PoseTopic:
         self._newest: tuple[str, int, float] | None = None  # its frame, its stamp [ns], and when it was received [s]
         self._pose: pin.SE3 | None = None  # of the newest, in the message's frame
         self._topic, self._publishers = topic, Publishers(node, [topic])
-        self._publishers.look_steadily()
         self.problem: str | None = None
         node.create_subscription(PoseStamped, topic, lambda message: self._take(message, node.now), STREAM_QOS)
 

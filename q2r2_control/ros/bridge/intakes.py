@@ -75,10 +75,6 @@ class TargetIntake:
             on_end = partial(self._on_end, release, arm)
             self._node.create_subscription(Empty, ended_topic(topic), on_end, COMMAND_QOS)
 
-    def look(self) -> None:
-        """Ask the graph which nodes publish."""
-        self._publishers.look()
-
     def publishers(self, arm: str) -> str:
         """Nodes that publish an arm's targets."""
         return self._publishers.of(self.topics[arm])
@@ -191,10 +187,6 @@ class JointIntake:
         """Whether there is a topic of external torques."""
         return bool(self._external_topic)
 
-    def look(self) -> None:
-        """Ask the graph which nodes publish."""
-        self._publishers.look()
-
     def source(self) -> str:
         """The publishers of the oldest joint states, for the middle of a sentence."""
         topic = min(self._stamps, key=lambda name: self._stamps[name])
@@ -216,7 +208,7 @@ class JointIntake:
         part = robot_state(message, names, now)
         if isinstance(part, str):
             text = part if len(self._topics) == 1 else f"{topic}: {part}"
-            take(Reason.of(ReasonKind.OTHER, text=text), now)
+            take(Reason.of(ReasonKind.BAD_JOINT_STATES, text=text), now)
             return
         self._stamps[topic] = now
         oldest = min(self._stamps.values())
@@ -230,7 +222,7 @@ class JointIntake:
             external = None if silent else self._external
             self.state = RobotState(q=q, v=v, tau=tau, tau_external=external, stamp=oldest)
             if silent and self.needs_external_torque:
-                take(Reason.of(ReasonKind.OTHER, text=f"no external torques on {self._external_topic}"), now)
+                take(Reason.of(ReasonKind.BAD_JOINT_STATES, text=f"no external torques on {self._external_topic}"), now)
             else:
                 take(self.state, now)
 

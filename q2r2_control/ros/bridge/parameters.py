@@ -24,17 +24,21 @@ _NONE = 0.0  # stands for no number; no field that may be none allows zero
 
 @dataclass(frozen=True, slots=True)
 class ArmDefaults:
-    """What a subclass of :class:`BaseArmController` passes to its constructor."""
+    """Defaults of an arm's parameters: of the constructor of :class:`BaseArmController`, then of the cell."""
 
     arm_name: str  # left or right
-    robot_name: str
-    mirror: bool
+    ctrl_prefix: str
     base_frame_id: str
     end_effector_link_name: str
-    ctrl_prefix: str
     gripper_action_topic: str
-    filter_window_size: int | None = None
+    teleop: TeleopSettings
     preset: str = BUILTIN.name
+    mode: Mode = Mode.RAW
+    rate: float | None = None
+    target_topic: str = ""
+    world_frame_id: str = ""
+    gripper: GripperSettings = field(default_factory=GripperSettings)
+    limits: GuardLimits = field(default_factory=GuardLimits)
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,32 +71,15 @@ class ArmParameters:
         return self.following_topic.partition("/following/")[0]
 
 
-@dataclass(frozen=True, slots=True)
-class _Defaults:
-    """Defaults of the parameters, of the cell or of the subclass."""
-
-    ctrl_prefix: str
-    base_frame_id: str
-    end_effector_link_name: str
-    gripper_action_topic: str
-    teleop: TeleopSettings
-    preset: str = BUILTIN.name
-    mode: Mode = Mode.RAW
-    rate: float | None = None
-    target_topic: str = ""
-    world_frame_id: str = ""
-    gripper: GripperSettings = field(default_factory=GripperSettings)
-    limits: GuardLimits = field(default_factory=GuardLimits)
-
-
-def arm_parameters(node: BaseNode, subclass: ArmDefaults) -> ArmParameters:
+def arm_parameters(node: BaseNode, given: ArmDefaults) -> ArmParameters:
     """Declare all parameters and check them together. Raises :class:`ConfigError` for what is not allowed.
 
-    Defaults are the cell's where the parameter ``config`` names one, and else the subclass's.
+    Defaults are the cell's where the parameter ``config`` names one, and else the ones that are ``given``.
     """
-    arm, declare = subclass.arm_name, node.parameter
+    arm, declare = given.arm_name, node.parameter
     config = declare("config", "", 'YAML of the cell, whose teleop and external are defaults of these; "": none')
-    given = _of_cell(subclass, config) if config else _of_subclass(subclass)
+    if config:
+        given = _of_cell(given, config)
     preset, mode = preset_of(
         declare("preset", given.preset, "terms of the controller that is driven, by its name"),
         declare("mode", given.mode.value, "raw: the hand's target; filtered: through the built-in controller"),
@@ -136,49 +123,41 @@ def _timeout(node: BaseNode, name: str, description: str, at_least: float, at_mo
     return float(value)
 
 
-def _of_subclass(subclass: ArmDefaults) -> _Defaults:
-    teleop = TeleopSettings(stance=Stance.MIRROR if subclass.mirror else Stance.SIDE_BY_SIDE)
-    if subclass.filter_window_size is not None:
-        # A mean over n samples of a 75 Hz headset comes (n - 1) / 2 periods late.
-        delay = min(max((subclass.filter_window_size - 1) / 2 / 75.0, 0.0), 0.2)
-        teleop = teleop.model_copy(update={"filter": teleop.filter.model_copy(update={"smoothing_delay": delay})})
-    return _Defaults(
-        subclass.ctrl_prefix,
-        subclass.base_frame_id,
-        subclass.end_effector_link_name,
-        subclass.gripper_action_topic,
-        teleop,
-        preset=subclass.preset,
-    )
+def teleop_defaults(mirror: bool, filter_window_size: int | None) -> TeleopSettings:
+    """What Quest2ROS2's two arguments of an arm's constructor ask for."""
+    teleop = TeleopSettings(stance=Stance.MIRROR if mirror else Stance.SIDE_BY_SIDE)
+    if filter_window_size is None:
+        return teleop
+    # A mean over n samples of a 75 Hz headset comes (n - 1) / 2 periods late.
+    delay = min(max((filter_window_size - 1) / 2 / 75.0, 0.0), 0.2)
+    return teleop.model_copy(update={"filter": teleop.filter.model_copy(update={"smoothing_delay": delay})})
 
 
-def _of_cell(subclass: ArmDefaults, path: str) -> _Defaults:
-    """The cell's, and the subclass's where the cell says nothing."""
-    cell, side = load_config(path), subclass.arm_name
-    arm = next((arm for name, arm in cell.arms.items() if name == side), None)
-    if arm is None:
+def _of_cell(given: ArmDefaults, path: str) -> ArmDefaults:
+    """The cell's, and the ones given where the cell says nothing."""
+    cell, side = load_config(path), given.arm_name
+    if side not in cell.arms:
         raise ConfigError(f"parameter config: {path} has no arm {side}; allowed: {', '.join(cell.arms)}")
-    given = replace(_of_subclass(subclass), teleop=cell.teleop)
-    if (tool_frame := cell.named_tool_frame(side)) is not None:
-        given = replace(given, end_effector_link_name=tool_frame)
+    tool_frame = cell.named_tool_frame(side) or given.end_effector_link_name
+    given = replace(given, teleop=cell.teleop, end_effector_link_name=tool_frame)
     if cell.external is None:
         return given
     external, theirs = cell.external, cell.external.arm(side)
-    given = replace(
+    takes_poses = external.terms.takes_poses  # else rate and topic are those of joint commands, of another node
+    return replace(
         given,
         preset=external.preset,
         mode=external.mode,
         ctrl_prefix=theirs.ctrl_prefix,
         base_frame_id=theirs.base_frame,
         world_frame_id=external.world_frame or "",
-        end_effector_link_name=theirs.tool_frame or given.end_effector_link_name,
+        end_effector_link_name=theirs.tool_frame or tool_frame,
         gripper_action_topic=theirs.gripper.topic or given.gripper_action_topic,
         gripper=theirs.gripper.settings(),
         limits=external.limits,
+        rate=external.rate if takes_poses else None,
+        target_topic=(theirs.target_topic or "") if takes_poses else "",
     )
-    if not external.terms.takes_poses:
-        return given  # rate and topic are those of joint commands, which another node sends
-    return replace(given, rate=external.rate, target_topic=theirs.target_topic or "")
 
 
 def _rate(node: BaseNode, preset: Preset, wanted: float | None) -> float:

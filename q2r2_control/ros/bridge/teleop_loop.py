@@ -125,7 +125,7 @@ class TeleopLoop:
         timeout = self.teleop.settings.gate.timeout
         if (line := self.nodes[0].clock_problem(timeout)) is None:
             return
-        problem = Reason.of(ReasonKind.OTHER, text=line)
+        problem = Reason.in_words(line)
         for node in self.nodes:
             node.refuse(problem)
         self._pause(self.nodes[0].now, problem)

@@ -17,7 +17,7 @@ from q2r2_control.ros.base_node import SENT_COMMAND_QOS
 
 _MAX_AGE = 0.1  # of the graph's answer, before it is asked again [s]
 _COUNT_AGE = 0.05  # of a number of publishers [s]
-_PERIOD = 1.0  # of asking the graph where no other code asks [s]
+_PERIOD = 0.5  # of asking the graph where no other code asks [s]
 _NO_WAIT = Duration(nanoseconds=0)
 # A subscriber may take 5 ms to acknowledge, longer than the period of a fast stream. So messages are left out every
 # _CHECK seconds, until the one before has been acknowledged, or for at most _GAP seconds.
@@ -44,15 +44,8 @@ class Publishers:
         self._node = node
         self._names: dict[str, str] = dict.fromkeys(topics, "")
         self._asked_at = dict.fromkeys(self._names, -math.inf)
-
-    def look_steadily(self) -> None:
-        """Ask the graph by a timer, for a node that has no other occasion."""
-        self._node.create_timer(_PERIOD, self.look, clock=Clock(clock_type=ClockType.STEADY_TIME))
-
-    def look(self) -> None:
-        """Ask the graph about all topics."""
-        for topic in self._names:
-            self._ask(topic)
+        # While /clock stands still, too.
+        node.create_timer(_PERIOD, self._look, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def of(self, topic: str) -> str:
         """Full names of the nodes that publish on ``topic``, or of the last ones that did; "" if there were none."""
@@ -64,6 +57,10 @@ class Publishers:
         """The same for the middle of a sentence: " from /node", or "" if there were none."""
         names = self.of(topic)
         return f" from {names}" if names else ""
+
+    def _look(self) -> None:
+        for topic in self._names:
+            self._ask(topic)
 
     def _ask(self, topic: str) -> None:
         self._asked_at[topic] = time.monotonic()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -24,8 +24,8 @@ _STARTING = "has not said yet what it does"
 class HandListeners:
     """The nodes that listen to some topics of hands. Those that say on ``~/state`` which hand they follow are arms."""
 
-    def __init__(self, node: Node, topics: Mapping[str, str]) -> None:
-        """``topics``: hand -> the topic of its buttons."""
+    def __init__(self, node: Node, topics: Sequence[str]) -> None:
+        """``topics``: of buttons."""
         self._node, self._topics = node, topics
         self._asked_at = 0.0
         self._unnamed_since = math.inf  # the graph knows a listener and not its node yet [s]
@@ -41,7 +41,7 @@ class HandListeners:
         self._asked_at = now
         names = {
             node_of(endpoint)
-            for topic in self._topics.values()
+            for topic in self._topics
             for endpoint in self._node.get_subscriptions_info_by_topic(topic)
         }
         self._unnamed_since = min(self._unnamed_since, now) if None in names else math.inf

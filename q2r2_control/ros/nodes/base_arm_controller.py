@@ -27,7 +27,7 @@ from q2r2_control.ros.bridge.grippers import GripperClient
 from q2r2_control.ros.bridge.hand_intake import HandIntake
 from q2r2_control.ros.bridge.live_parameters import LiveArmParameters, is_of_teleop
 from q2r2_control.ros.bridge.opening_grants import OpeningGrants
-from q2r2_control.ros.bridge.parameters import ArmDefaults, ArmParameters, arm_parameters
+from q2r2_control.ros.bridge.parameters import ArmDefaults, ArmParameters, arm_parameters, teleop_defaults
 from q2r2_control.ros.bridge.target_output import near
 from q2r2_control.ros.bridge.teleop_loop import TeleopLoop, TickInputs
 from q2r2_control.teleop.arm import OPEN
@@ -75,13 +75,11 @@ class BaseArmController(BaseNode):
         self.arm_name, self.robot_name = arm_name, robot_name
         self.defaults = ArmDefaults(
             arm_name=arm_name,
-            robot_name=robot_name,
-            mirror=mirror,
+            ctrl_prefix=ctrl_prefix or f"/{robot_name}/{arm_name}",
             base_frame_id=base_frame_id,
             end_effector_link_name=end_effector_link_name or f"{arm_name}_tool_frame",
-            ctrl_prefix=ctrl_prefix or f"/{robot_name}/{arm_name}",
             gripper_action_topic=gripper_action_topic or f"/{robot_name}/{arm_name}_gripper/gripper_cmd",
-            filter_window_size=filter_window_size,
+            teleop=teleop_defaults(mirror, filter_window_size),
             preset=preset,
         )
         self._partner = partner
@@ -105,8 +103,9 @@ class BaseArmController(BaseNode):
         self.loop.join(self)
         self._has_analog_gripper = self.parameters.teleop.bindings.words_of(Action.GRIPPER_ANALOG) is not None
         self._target, self._sent = ArmTarget(None, OPEN), None
-        not_begun = _in_words("has not begun yet")
-        self._refusal: tuple[bytes, Reason] | None = WARN, not_begun  # where time stands still it never does
+        # Until the first tick, which where time stands still never comes.
+        not_begun = Reason.of(ReasonKind.NO_TOOL_POSE, text="the node has not begun yet")
+        self._refusal: tuple[bytes, Reason] | None = WARN, not_begun
         self.inputs = TickInputs(None, None, None, None)
 
     def setup_interfaces(self) -> None:
@@ -154,19 +153,16 @@ class BaseArmController(BaseNode):
         tool, base, controlled = self.current_pose(), self._base(), self._safe_target.at(now)
         obstacle = self._obstacle(tool, base)
         silence = None if self.state in _WITHOUT_HAND else self._hand.silence(now)
-        self._refusal = obstacle or (
-            None if silence is None else (WARN, Reason.of(ReasonKind.HAND_SILENT, text=silence))
-        )
+        silent = None if silence is None else (WARN, Reason.of(ReasonKind.HAND_SILENT, text=silence))
+        self._refusal = obstacle or silent
         reference = None if controlled is None else self._safe_target.stamp
         commanded = None if tool is None else self._commanded(tool, controlled)
         self._base_pose = base
         self.inputs = TickInputs(tool, commanded, reference, None if obstacle is None else obstacle[1])
-        line = self.outputs.take_fault(now)
+        fault = self.outputs.take_fault(now)
         if self.state in HOLDING:
             return None
-        if line is not None:
-            return _in_words(line)
-        return None if self._refusal is None else self._refusal[1]
+        return fault or (None if self._refusal is None else self._refusal[1])
 
     def take_samples(self) -> list[HandSample]:
         """All samples of the hand since the last call, oldest first."""
@@ -189,7 +185,7 @@ class BaseArmController(BaseNode):
         elif toggled:
             self.toggle_gripper()
         self.gripper.check(now)
-        return None if fault is None else _in_words(fault)
+        return fault
 
     def publish_feedback(self, now: float) -> None:
         """What the operator feels and sees of this tick."""
@@ -318,10 +314,6 @@ def run_arms(left: Callable[..., BaseArmController], right: Callable[..., BaseAr
         return made[0]
 
     return run_nodes([make_left, lambda: right(partner=made[0])])
-
-
-def _in_words(text: str) -> Reason:
-    return Reason.of(ReasonKind.OTHER, text=text)
 
 
 def _rounded(duration: float) -> float | None:

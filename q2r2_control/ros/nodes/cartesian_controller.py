@@ -9,15 +9,12 @@ namespace an arm (``/left/joint_states``) both work. With output ``none`` anothe
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
 import pinocchio as pin
-from rclpy.clock import Clock
-from rclpy.clock_type import ClockType
 from std_srvs.srv import SetBool, Trigger
 
 from q2r2_control.config.cell import Config, load_config
@@ -28,7 +25,7 @@ from q2r2_control.errors import ConfigError
 from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.loop.control_loop import ControlLoop
 from q2r2_control.robot.robot import Robot
-from q2r2_control.ros.base_node import ERROR, OK, WARN, run_node
+from q2r2_control.ros.base_node import ERROR, OK, WARN
 from q2r2_control.ros.bridge.controller_feedback import ControllerFeedback
 from q2r2_control.ros.bridge.gripper_limits import GRIPPER_DELAY, GripperLimits
 from q2r2_control.ros.bridge.intakes import JointIntake, TargetIntake
@@ -49,7 +46,6 @@ _QUIET = 0.3  # nobody else commands the arms for so long before this node does 
 _LONGEST_ACTIVATION = 2.0  # besides the settle time [s]
 _DEACTIVATED = "deactivated"
 _CURE = "ros2 lifecycle set /cartesian_controller activate takes over where the arms are"
-_LOOK_PERIOD = 0.5  # between two looks at the graph [s]
 _SAFE_TARGET_PERIOD = 0.008  # [s]
 
 
@@ -130,8 +126,6 @@ class CartesianControllerNode(ManagedNode):
         for name, act in services.items():
             self.create_service(Trigger, f"~/{name}", partial(self._serve, act))
         self.create_tick(self._period, self._tick)
-        # Looks even while /clock stands still.
-        self.create_timer(_LOOK_PERIOD, self._look, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def _take_target(
         self, arm: str, pose: pin.SE3 | None, now: float, number: int | None, due: float | None
@@ -160,7 +154,7 @@ class CartesianControllerNode(ManagedNode):
             return
         # Commands that the arms do not follow are not for a receiver that has just come.
         if fault := self._output.listener_fault(self._supervisor.off_reference):
-            self._supervisor.let_go(_in_words(fault), now)
+            self._supervisor.let_go(Reason.in_words(fault), now)
         state, openings = self._joints.state, self._grippers.openings(now)
         step = self._loop.step(state, {}, now, dt, self._grippers.wanted, openings)
         self._grippers.answer()
@@ -181,11 +175,6 @@ class CartesianControllerNode(ManagedNode):
         self._supervisor.events.clear()
         self.report_health()
 
-    def _look(self) -> None:
-        """Remember who publishes what."""
-        self._targets.look()
-        self._joints.look()
-
     def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         self._supervisor.pause(request.data)
         self.report_health()  # arms that listen must not wait for the next time
@@ -193,7 +182,7 @@ class CartesianControllerNode(ManagedNode):
 
     def _serve(self, act: Callable[[], Reason | None], request: Any, response: Any) -> Any:
         active = self.is_active or act == self._stop
-        refusal = act() if active else _in_words(f"{_DEACTIVATED}: {_CURE}")
+        refusal = act() if active else Reason.in_words(f"{_DEACTIVATED}: {_CURE}")
         self.report_health()
         return _answer(response, refusal)
 
@@ -257,8 +246,8 @@ class CartesianControllerNode(ManagedNode):
         problem = None if active else "the arms do not stand still" if fault is None else sentence(fault)
         # Nothing was commanded yet: that begins with the next tick.
         if (problem := self._others.commander(_QUIET) or problem) is not None:
-            self._supervisor.let_go(_in_words(problem), self.now)
-            self._supervisor.stop(_in_words(_CURE))
+            self._supervisor.let_go(Reason.in_words(problem), self.now)
+            self._supervisor.stop(Reason.in_words(_CURE))
             return problem
         self._others.end()
         return None
@@ -279,7 +268,7 @@ class CartesianControllerNode(ManagedNode):
         self._come_to_rest("ending", spin)
 
     def _come_to_rest(self, why: str, go_on: Callable[[], None]) -> None:
-        self._supervisor.stop(_in_words(why))
+        self._supervisor.stop(Reason.in_words(why))
         deadline = last = time.monotonic()
         deadline += _LONGEST_STOP
         advances = self._advances
@@ -314,16 +303,3 @@ class CartesianControllerNode(ManagedNode):
 def _answer(response: Any, refusal: Reason | None) -> Any:
     response.success, response.message = refusal is None, "done" if refusal is None else sentence(refusal)
     return response
-
-
-def _in_words(text: str) -> Reason:
-    return Reason.of(ReasonKind.OTHER, text=text)
-
-
-def main() -> int:
-    """The executable ``cartesian_controller``."""
-    return run_node(CartesianControllerNode)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

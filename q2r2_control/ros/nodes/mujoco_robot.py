@@ -9,7 +9,6 @@ the arms brake, and after ``hold_after`` they stand on their position servos, wh
 from __future__ import annotations
 
 import math
-import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -30,7 +29,7 @@ from q2r2_control.config.timeouts import STREAM_TIMEOUT
 from q2r2_control.errors import ConfigError
 from q2r2_control.plants.simulated_cell import JointSetpoint, SimulatedCell
 from q2r2_control.robot.robot import Robot
-from q2r2_control.ros.base_node import LATCHED_QOS, OK, WARN, run_node
+from q2r2_control.ros.base_node import LATCHED_QOS, OK, WARN
 from q2r2_control.ros.bridge.grippers import GripperServer, Stroke
 from q2r2_control.ros.bridge.link_frames import LinkFrames
 from q2r2_control.ros.bridge.messages import age, delay, joint_state_message, seconds
@@ -236,12 +235,3 @@ class MujocoRobot(ManagedNode):
     def close(self) -> None:
         """Give the plant back."""
         self._cell.plant.close()
-
-
-def main() -> int:
-    """The executable ``mujoco_robot``."""
-    return run_node(MujocoRobot)
-
-
-if __name__ == "__main__":
-    sys.exit(main())
