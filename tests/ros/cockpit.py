@@ -29,9 +29,7 @@ class Cockpit:
         for rig in self.rigs.rigs:
             rig.sends_tool = rig.follows = False
         names = ("left_arm_controller", "right_arm_controller") if apart else ("arm_controllers",)
-        self.arms = [
-            processes.start_module(f"q2r2_control.ros.nodes.{name}", *patient(dict(bindings))) for name in names
-        ]
+        self.arms = [processes.start_node(name, *patient(bindings)) for name in names]
         self.rigs.wait(lambda rig: rig.state.get("hand_age") is not None, "its node receives the hand")
         wait_until(lambda: self.cell.state("phase") == "active", "the controller is active")
 

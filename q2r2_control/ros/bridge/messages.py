@@ -155,11 +155,10 @@ def inputs_message(inputs: HandInputs) -> OVR2ROSInputs:
     return OVR2ROSInputs(**{name: getattr(inputs, name) for name in HandInputs.__slots__})
 
 
-def joint_state_message(names: Sequence[str], q: Array, v: Array, tau: Array, t: float, frame: str = "") -> JointState:
+def joint_state_message(names: Sequence[str], q: Array, v: Array, tau: Array, t: float) -> JointState:
     """Joint positions [rad], velocities [rad/s] and torques [Nm] at ``t`` [s]."""
     message = JointState(name=list(names), position=q.tolist(), velocity=v.tolist(), effort=tau.tolist())
     message.header.stamp = time_message(t)
-    message.header.frame_id = frame
     return message
 
 

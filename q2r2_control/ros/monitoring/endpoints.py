@@ -83,10 +83,6 @@ class PublisherCount:
             self._asked_at, self._count = now, self._node.count_publishers(self._topic)
         return self._count
 
-    def ask_anew(self) -> None:
-        """A message shows that there is one: the next count is the graph's of then."""
-        self._asked_at = -math.inf
-
 
 def publish_in_time(publisher: Any, message: Any, decided: float) -> bool:
     """Publish what was decided on at ``decided`` [s] of the steady clock, unless its lifespan is over since then.

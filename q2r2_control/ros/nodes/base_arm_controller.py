@@ -23,7 +23,7 @@ from q2r2_control.ros.bridge.arm_conditions import listen_to_condition
 from q2r2_control.ros.bridge.arm_feedback import ArmFeedback
 from q2r2_control.ros.bridge.arm_outputs import ArmOutputs
 from q2r2_control.ros.bridge.frames import FrameListener, PoseTopic, ToolFrame
-from q2r2_control.ros.bridge.grippers import GripperClient
+from q2r2_control.ros.bridge.gripper_client import GripperClient
 from q2r2_control.ros.bridge.hand_intake import HandIntake
 from q2r2_control.ros.bridge.live_parameters import LiveArmParameters, is_of_teleop
 from q2r2_control.ros.bridge.opening_grants import OpeningGrants
@@ -236,7 +236,7 @@ class BaseArmController(BaseNode):
         if self._refusal is not None:
             level, reason = self._refusal
             return level, sentence(reason), values | {"kind": str(reason.kind)}
-        for problem in (self.gripper.problem, self.outputs.gripper_held, self.outputs.advice, self._frames.advice):
+        for problem in (self.gripper.problem, self.outputs.gripper_held, self.outputs.advice):
             if problem is not None:
                 return WARN, problem, values
         if self.state in AT_REST:

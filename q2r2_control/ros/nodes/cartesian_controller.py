@@ -30,7 +30,7 @@ from q2r2_control.ros.bridge.controller_feedback import ControllerFeedback
 from q2r2_control.ros.bridge.gripper_limits import GRIPPER_DELAY, GripperLimits
 from q2r2_control.ros.bridge.intakes import JointIntake, TargetIntake
 from q2r2_control.ros.bridge.joint_outputs import NONE, make_output, output_name
-from q2r2_control.ros.bridge.live_parameters import LiveControl, LiveImpedance, LiveWatching
+from q2r2_control.ros.bridge.live_parameters import make_control_live, make_impedance_live, make_watching_live
 from q2r2_control.ros.executor import TickExecutor
 from q2r2_control.ros.managed_node import ManagedNode
 from q2r2_control.supervision.external_arms import ExternalArms, ExternalSettings, settings_for_external_arms
@@ -71,12 +71,12 @@ class CartesianControllerNode(ManagedNode):
         watch = watch_settings(config.supervision, self._output.drive.yields)
         # A message with a bad number among good ones is another publisher's: no reason to bridge it.
         watch.unusable_time = 0.0
-        self._watching = LiveWatching(self, streams, watch, external)
+        make_watching_live(self, streams, watch, external)
         if isinstance(self._output.drive, TorqueDrive):
-            self._live_impedance = LiveImpedance(self, self._output.drive.impedance)
+            make_impedance_live(self, self._output.drive.impedance)
         self._require_external_torque(config)
         self._controller = CartesianController(robot, permitted(config.control, self._output.drive))
-        self._live = LiveControl(self, self._controller)
+        make_control_live(self, self._controller)
         self._loop = ControlLoop(
             self._controller,
             self._output.drive,

@@ -30,7 +30,7 @@ from q2r2_control.errors import ConfigError
 from q2r2_control.plants.simulated_cell import JointSetpoint, SimulatedCell
 from q2r2_control.robot.robot import Robot
 from q2r2_control.ros.base_node import LATCHED_QOS, OK, WARN
-from q2r2_control.ros.bridge.grippers import GripperServer, Stroke
+from q2r2_control.ros.bridge.gripper_server import GripperServer, Stroke
 from q2r2_control.ros.bridge.link_frames import LinkFrames
 from q2r2_control.ros.bridge.messages import age, delay, joint_state_message, seconds
 from q2r2_control.ros.managed_node import ManagedNode

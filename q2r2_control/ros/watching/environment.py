@@ -18,13 +18,7 @@ from q2r2_control.ros.watching.findings import Finding, error, warning
 
 # What the nodes import, besides the packages under ``interfaces``.
 PACKAGES = (
-    *(
-        "rclpy",
-        "builtin_interfaces",
-        "diagnostic_msgs",
-        "geometry_msgs",
-        "rcl_interfaces",
-    ),
+    *("rclpy", "builtin_interfaces", "diagnostic_msgs", "geometry_msgs", "rcl_interfaces"),
     *("sensor_msgs", "std_msgs", "std_srvs", "trajectory_msgs", "visualization_msgs"),
 )
 _GREATEST_DOMAIN = 232

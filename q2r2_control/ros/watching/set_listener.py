@@ -12,7 +12,7 @@ import math
 import os
 import time
 from collections import defaultdict, deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -31,7 +31,6 @@ from q2r2_control.inputs.statistics import Arrivals
 from q2r2_control.ros.base_node import STREAM_QOS
 from q2r2_control.ros.launch.middleware import set_up_middleware
 from q2r2_control.ros.monitoring.endpoints import node_of
-from q2r2_control.ros.monitoring.frame_senders import FrameSenders, read_transforms
 from q2r2_control.ros.watching.set_view import NodeView, SetView, TopicView, arm_views
 
 _LOOK_PERIOD = 0.5  # between two looks at the graph [s]
@@ -81,7 +80,6 @@ class SetListener:
 
     def __init__(self, node: Node, cell: Config) -> None:
         self._node, self._cell = node, cell
-        self._senders = FrameSenders()
         self._said: dict[str, _Said] = {}  # by full name of a node
         self._arrivals: dict[str, Arrivals] = {}
         self._topics: dict[str, tuple[str, ...]] = {}  # with their types
@@ -111,8 +109,7 @@ class SetListener:
         )
         members = {node.name for node in nodes}
         topics = tuple(self._topic(name, now) for name in sorted(self._topics) if self._is_shown(name, members))
-        shared = self._senders.shared(now)
-        return SetView(nodes, topics, self._names, arm_views(nodes, self._cell), shared)
+        return SetView(nodes, topics, self._names, arm_views(nodes, self._cell))
 
     def _listen(self, topic: str) -> None:
         if topic in self._arrivals or not self._publishers[topic]:
@@ -124,14 +121,7 @@ class SetListener:
             self._node.create_subscription(String, topic, said.take, STREAM_QOS)
         elif (kind := _HEARD.get(base)) is not None and self._topics[topic] == (_type_name(kind),):
             self._arrivals[topic] = arrivals = Arrivals()
-            hear = partial(self._hear_frames if topic == "/tf" else _note, arrivals)
-            self._node.create_subscription(kind, topic, hear, STREAM_QOS, raw=True)
-
-    def _hear_frames(self, arrivals: Arrivals, message: bytes, info: Mapping[str, int | None]) -> None:
-        _note(arrivals, message)
-        now, number = time.monotonic(), info["publication_sequence_number"]
-        for transform in read_transforms(message):
-            self._senders.take(transform.child_frame_id, number, now)
+            self._node.create_subscription(kind, topic, partial(_note, arrivals), STREAM_QOS, raw=True)
 
     def _is_shown(self, topic: str, members: set[str]) -> bool:
         """Whether some node of the set awaits it, or sends it and somebody counts or takes it.

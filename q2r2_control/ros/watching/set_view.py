@@ -95,7 +95,6 @@ class SetView:
     topics: tuple[TopicView, ...]
     names: tuple[str, ...]  # of all nodes in the domain, one that runs twice twice
     arms: tuple[ArmView, ...]
-    shared_frames: tuple[str, ...] = ()  # that two publishers send on /tf
 
     @property
     def others(self) -> tuple[str, ...]:
