@@ -13,6 +13,7 @@ from std_msgs.msg import Bool, String
 
 from q2r2_control.config.presets import BUILTIN, Mode
 from q2r2_control.config.teleop import GuardSettings
+from q2r2_control.errors import ConfigError
 from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.ros.base_node import LATCHED_QOS, BaseNode
 from q2r2_control.ros.bridge.frames import PoseTopic
@@ -113,11 +114,6 @@ class ArmOutputs:
     def sent(self) -> dict[str, int]:
         """How many targets went out on each topic."""
         return {output.topic: output.sent for output in self._all}
-
-    @property
-    def advice(self) -> str | None:
-        """What the user has to do by hand."""
-        return None if self._command_type is None else self._command_type.advice
 
     def take_fault(self, now: float) -> Reason | None:
         """Check the controllers; returns once why the arm has to pause because of one."""
@@ -224,50 +220,32 @@ class FollowWatch:
 class CommandType:
     """Tells MoveIt Servo that targets are poses, after each of its starts: it takes none before. Never waits.
 
-    Without moveit_msgs the service cannot be called. Then ``advice`` says what the user has to call, and engaging is
-    the user's decision.
+    Raises :class:`ConfigError` where moveit_msgs cannot be imported.
     """
 
     def __init__(self, node: BaseNode, service: str) -> None:
-        self._service, self._client = service, None
-        self.advice: str | None = None
         try:
             self._kind: Any = import_module("moveit_msgs.srv").ServoCommandType
-        except ImportError:
-            self.advice = f"moveit_msgs cannot be imported: call {service} with {_POSE} yourself"
-            return
-        self._client = node.create_client(self._kind, service)
-        self._starts, self._agreed = -1, False
-        self._asked = float("-inf")
-        self._answer: Any = None  # future
+        except ImportError as error:
+            raise ConfigError(f"{service} is a service of moveit_msgs, which cannot be imported: {error}") from None
+        self._service, self._client = service, node.create_client(self._kind, service)
+        self._starts, self._agreed, self._asked = -1, False, -math.inf
+        self._answer: Any = None  # future of the last call
 
     @property
     def unready(self) -> str | None:
         """One line while the service has not agreed to poses."""
-        if self._client is None or self._agreed:
-            return None
-        return f"{self._service} has not agreed to poses yet"
+        return None if self._agreed else f"{self._service} has not agreed to poses yet"
 
     def step(self, starts: int, now: float) -> None:
         """Call the service if that is due; ``starts``: how often the controller has appeared."""
-        if self._client is None:
-            return
         if starts != self._starts:
-            self._starts, self._agreed, self._asked = starts, False, float("-inf")
-            self._drop_answer()
+            self._starts, self._agreed, self._asked, self._answer = starts, False, -math.inf, None
         if self._answer is not None and self._answer.done():
-            self._agreed = bool(self._answer.result().success)
-            self._answer = None
+            self._agreed, self._answer = bool(self._answer.result().success), None
         if not self._agreed and now - self._asked > _RETRY and self._client.service_is_ready():
-            self._drop_answer()
             self._asked = now
             self._answer = self._client.call_async(self._kind.Request(command_type=_POSE))
-
-    def _drop_answer(self) -> None:
-        """A late answer belongs to an earlier call."""
-        if self._answer is not None and self._client is not None:
-            self._client.remove_pending_request(self._answer)
-        self._answer = None
 
 
 def _refused(line: str | None) -> Reason | None:

@@ -79,17 +79,11 @@ class TargetOutput:
         return self._publisher.sent
 
     @property
-    def others(self) -> int:
-        """Publishers of the same topic besides this one."""
-        return max(0, self._publishers.count - 1)
-
-    @property
     def conflict(self) -> str | None:
         """One line if there are other publishers of the same topic."""
-        others = self.others
-        if others == 0:
+        if (count := self._publishers.count) <= 1:
             return None
-        return f"{others + 1} publishers of {self.topic}, allowed is one (a killed one counts for some seconds)"
+        return f"{count} publishers of {self.topic}, allowed is one (a killed one counts for some seconds)"
 
     @property
     def unready(self) -> str | None:

@@ -91,7 +91,7 @@ class TeleopLoop:
         inputs = {node.arm_name: node.inputs for node in nodes}
         references = {one.reference for one in inputs.values()}
         targets = teleop.update(
-            [sample for node in nodes for sample in node.take_samples()],
+            [sample for node in nodes for sample in node.intake.take()],
             {arm: one.tool for arm, one in inputs.items() if one.tool is not None},
             now,
             {arm: one.commanded for arm, one in inputs.items() if one.commanded is not None} or None,
@@ -105,8 +105,6 @@ class TeleopLoop:
             if (fault := node.follow(targets[node.arm_name], now, decided)) is not None:
                 teleop.pause(now, fault, node.arm_name)
         self._publish_events()
-        for node in nodes:
-            node.publish_feedback(now)
 
     def change(self, settings: TeleopSettings) -> Reason | None:
         """See :meth:`Teleop.change`."""

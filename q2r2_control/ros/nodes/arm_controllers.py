@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
-from q2r2_control.ros.nodes.base_arm_controller import BaseArmController, run_arms
+from q2r2_control.ros.base_node import run_nodes
+from q2r2_control.ros.nodes.base_arm_controller import BaseArmController
 
 
 class LeftArmController(BaseArmController):
@@ -19,6 +21,20 @@ class RightArmController(BaseArmController):
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("right", **kwargs)
+
+
+def run_arms(left: Callable[..., BaseArmController], right: Callable[..., BaseArmController]) -> int:
+    """Main function of an executable of both arms, whose nodes share one teleoperation; see :func:`run_node`.
+
+    Each argument is a class of nodes that passes keyword arguments on, or makes such a node.
+    """
+    made: list[BaseArmController] = []
+
+    def make_left() -> BaseArmController:
+        made.append(left())
+        return made[0]
+
+    return run_nodes([make_left, lambda: right(partner=made[0])])
 
 
 def run_both_arms() -> int:

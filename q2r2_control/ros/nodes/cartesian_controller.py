@@ -17,11 +17,10 @@ from typing import Any
 import pinocchio as pin
 from std_srvs.srv import SetBool, Trigger
 
-from q2r2_control.config.cell import Config, load_config
+from q2r2_control.config.cell import load_config
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.drives.base import permitted
 from q2r2_control.drives.torque import TorqueDrive
-from q2r2_control.errors import ConfigError
 from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.loop.control_loop import ControlLoop
 from q2r2_control.robot.robot import Robot
@@ -66,7 +65,8 @@ class CartesianControllerNode(ManagedNode):
         self._period = 1.0 / rate
         self._output = make_output(output, self, robot, config, self._period)
         self._targets = TargetIntake(self, robot, self.report_health)
-        self._joints = JointIntake(self, robot)
+        feels = config.admittance.enabled and not self._output.drive.yields
+        self._joints = JointIntake(self, robot, needs_external_torque=feels)
         streams, external = StreamSettings(linked=config.teleop.linked), ExternalSettings()
         watch = watch_settings(config.supervision, self._output.drive.yields)
         # A message with a bad number among good ones is another publisher's: no reason to bridge it.
@@ -74,7 +74,6 @@ class CartesianControllerNode(ManagedNode):
         make_watching_live(self, streams, watch, external)
         if isinstance(self._output.drive, TorqueDrive):
             make_impedance_live(self, self._output.drive.impedance)
-        self._require_external_torque(config)
         self._controller = CartesianController(robot, permitted(config.control, self._output.drive))
         make_control_live(self, self._controller)
         self._loop = ControlLoop(
@@ -104,14 +103,6 @@ class CartesianControllerNode(ManagedNode):
         self._connect()
         self.start_active()
         self.get_logger().info(f"{config.name}: {', '.join(robot.arms)}; waits for joint states")
-
-    def _require_external_torque(self, config: Config) -> None:
-        """An admittance needs it. Raises :class:`ConfigError` where nothing is measured."""
-        if not config.admittance.enabled or self._output.drive.yields:
-            return
-        if not self._joints.measures_external_torque:
-            raise ConfigError("admittance.enabled = true: set the parameter external_torque_topic, which it needs")
-        self._joints.needs_external_torque = True
 
     def _connect(self) -> None:
         self._targets.subscribe(self._take_target, self._supervisor.release_target)
@@ -165,15 +156,11 @@ class CartesianControllerNode(ManagedNode):
         elif self._commanding and state is not None:
             self._output.end(state, now)
         self._commanding = step.reference is not None
-        self._tell_events()
-
-    def _tell_events(self) -> None:
-        if not self._supervisor.events:
-            return
-        for event in self._supervisor.events:
-            self.get_logger().warning(sentence(event))
-        self._supervisor.events.clear()
-        self.report_health()
+        if events := self._supervisor.events:
+            for event in events:
+                self.get_logger().warning(sentence(event))
+            events.clear()
+            self.report_health()
 
     def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         self._supervisor.pause(request.data)
@@ -207,7 +194,7 @@ class CartesianControllerNode(ManagedNode):
             age = supervisor.target_age(arm, now)
             values[f"{arm}_target_age_s"] = round(age, 3) if age < 1e6 else "none"
             values[f"{arm}_targets_rejected"] = rejected
-            values[f"{arm}_targets_from"] = self._targets.publishers(arm)
+            values[f"{arm}_targets_from"] = self._targets.publishers.of(self._targets.topics[arm])
             values[f"{arm}_gripper_held_by"] = self._grippers.held.get(arm, "")
         for arm, holds in self._loop.holding.items():
             values[f"{arm}_holds_object"] = holds

@@ -29,14 +29,12 @@ _MODES = {
 class SimulationInput(BaseNode):
     """Plays a scripted trajectory. It presses and releases the lower buttons, early on, to engage the arms.
 
-    So the script starts only when every hand that it plays has a subscriber, unless ``wait_for_subscribers`` is false.
-    The hands rest until the arms' nodes that listen say that they can be engaged. Then the buttons are pressed, and
-    again where an arm is not engaged by the time the hands would move. From then on, and after an arm's ``~/pause``,
-    nothing is pressed again: it takes a person to go on.
+    The script starts when every hand that it plays has a subscriber, unless ``wait_for_subscribers`` is false. The
+    hands rest until the arms' nodes say that they can be engaged. Then the buttons are pressed, and again where an arm
+    is not engaged by the time the hands would move. From then on, and after an arm's ``~/pause``, it takes a person.
 
-    A user who starts the node asks for the motion, as an operator does with a button. A launch file that restarts the
-    node after a crash does not, and the arms that the crash has stopped must not move then. Use ``start_on_request``
-    there: after each start nothing is published until ``~/start`` is called.
+    A launch file that restarts the node after a crash asks for no motion: with ``start_on_request`` nothing is
+    published until ``~/start`` is called.
     """
 
     ticks = True
@@ -65,8 +63,7 @@ class SimulationInput(BaseNode):
         self._hand_publishers = HandPublishers(self, self._hands, _MODES[mode])
         self._samples = 0
         self._trajectory, self._rate, self._jitter = trajectory, rate, jitter
-        pressed = [f"q2r_{hand}_hand_inputs" for hand in self._hands] if MessageType.INPUTS in _MODES[mode] else []
-        self._listeners = HandListeners(self, pressed)
+        self._listeners = HandListeners(self, self._hands if MessageType.INPUTS in _MODES[mode] else ())
         self._starts = True  # until nothing is pressed again to engage the arms
         self._moves = False  # whether the hands do
         self._not_to_press: set[str] | None = None  # hands; None: that is not decided yet
