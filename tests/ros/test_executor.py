@@ -22,7 +22,7 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from q2r2_control.ros.base_node import LATCHED_QOS, BaseNode
-from q2r2_control.ros.bridge.gripper_client import GripperServer, Stroke
+from q2r2_control.ros.bridge.gripper_server import GripperServer, Stroke
 from q2r2_control.ros.executor import TickExecutor
 
 PERIOD = 0.01  # of the node's tick [s]

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+import signal
 import time
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,7 +21,7 @@ pytest.importorskip("lifecycle_msgs", reason="needs lifecycle_msgs")
 
 from lifecycle_msgs.msg import Transition
 
-from tests.ros.cell import PATIENT, start_controller, start_robot
+from tests.ros.cell import PATIENT, SOFT, changed_cell, shifted, start_controller, start_robot
 from tests.ros.managed import STILL, Managed
 from tests.ros.waiting import wait_until
 
@@ -110,3 +112,30 @@ def test_a_robot_that_is_deactivated_takes_no_commands_and_stands(cell: Managed,
     assert cell.ask(Transition.TRANSITION_ACTIVATE, "mujoco_robot")
     cell.move_by_another(goal)
     assert abs(cell.q[0] - goal[0]) < 0.02
+
+
+@pytest.mark.parametrize("output", ["velocity", "torque"])
+def test_arms_that_are_commanded_speeds_or_torques_follow_are_left_at_rest_and_taken_over(
+    domain: int, processes: Processes, robot: Robot, output: str, tmp_path: Path
+) -> None:
+    config = changed_cell(tmp_path, impedance=SOFT)
+    with spun_node(domain) as node:
+        controller = start_controller(processes, *PATIENT, f"output:={output}", config=config)
+        cell = Managed(node, robot, start_robot(processes), controller)
+        cell.wait_until_active()
+        stream = cell.engage("left")
+        goal = shifted(stream.poses["left"], 0.0, 0.0, 0.1)
+        stream.move("left", (0.0, 0.0, 0.1), speed=0.1)
+        wait_until(lambda: np.linalg.norm(cell.tool("left").translation - goal.translation) < 4e-3, "the arm is there")
+        assert cell.state("mode", "mujoco_robot") == output
+        assert cell.ask(Transition.TRANSITION_DEACTIVATE)
+        stream.end()
+        at_rest = cell.joints.wait_for_rest()
+        cell.forget()
+        assert cell.ask(Transition.TRANSITION_ACTIVATE)
+        time.sleep(0.5)
+        assert np.abs(np.array(cell.postures) - at_rest).max() < 2.0 * STILL
+        os.kill(controller.pid, signal.SIGKILL)
+        wait_until(lambda: cell.state("mode", "mujoco_robot") == "holding", "the robot holds")
+        time.sleep(0.5)
+        assert np.abs(np.array(cell.postures) - at_rest).max() < 2.0 * STILL

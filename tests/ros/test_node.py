@@ -27,9 +27,7 @@ def test_a_node_in_simulated_time_says_that_no_clock_comes_until_one_does_and_wh
     diagnostics: list[Any] = []
     node.create_subscription(DiagnosticArray, "/diagnostics", lambda message: diagnostics.extend(message.status), 10)
     states = States(node, "simulation_input")
-    processes.start_module(
-        "q2r2_control.ros.nodes.simulation_input", "--ros-args", "-p", "use_sim_time:=true", "-p", "side:=left"
-    )
+    processes.start_node("SimulationInput", "use_sim_time:=true", "side:=left")
     state = states.wait_for("use_sim_time is set and nothing comes on /clock; waits for a subscriber of the left hand")
     assert state["level"] == "warn"
     wait_until(lambda: any("nothing comes on /clock" in status.message for status in diagnostics), "it is diagnosed")
@@ -55,9 +53,7 @@ def test_all_threads_of_a_node_that_ticks_have_its_real_time_priority_where_it_i
     if sys.platform != "linux":
         pytest.skip("only Linux has SCHED_FIFO")
     states = States(node, "simulation_input")
-    process = processes.start_module(
-        "q2r2_control.ros.nodes.simulation_input", "--ros-args", "-p", f"realtime_priority:={wanted}"
-    )
+    process = processes.start_node("SimulationInput", f"realtime_priority:={wanted}")
     states.wait_for("waits for a subscriber")
     refused = "no SCHED_FIFO" in process.output
     expected = (0, 0) if refused or not wanted else (os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, wanted)

@@ -5,9 +5,11 @@ from __future__ import annotations
 import time
 from dataclasses import replace
 from queue import Queue
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import pinocchio as pin
 import pytest
 
 from tests.ros.conftest import NEEDS_ROS
@@ -17,16 +19,19 @@ from tests.ros.waiting import wait_until
 pytest.importorskip("rclpy", reason=NEEDS_ROS)
 
 from std_msgs.msg import Float64MultiArray
+from trajectory_msgs.msg import JointTrajectory
 
 from q2r2_control import CartesianController, Robot, load_config
 from q2r2_control.drives.factory import make_drive
 from q2r2_control.drives.torque import TorqueDrive
+from q2r2_control.errors import ConfigError
 from q2r2_control.robot.kept_distances import kept_distances
-from q2r2_control.ros.base_node import COMMAND_QOS
-from q2r2_control.ros.bridge.joint_messages import PositionArray, TorqueArray
-from q2r2_control.ros.bridge.joint_outputs import Channel, JointOutput
+from q2r2_control.ros.base_node import COMMAND_QOS, BaseNode
+from q2r2_control.ros.bridge import joint_messages
+from q2r2_control.ros.bridge.joint_messages import JointCommand, LbrPosition, LbrTorque, PositionArray, TorqueArray
+from q2r2_control.ros.bridge.joint_outputs import Channel, JointOutput, make_output
 from q2r2_control.ros.monitoring.endpoints import WatchedPublisher
-from q2r2_control.types import CommandMode, RobotState
+from q2r2_control.types import Command, CommandMode, RobotState
 
 TIMEOUT = 0.5  # more than a busy machine takes to acknowledge [s]
 
@@ -115,3 +120,40 @@ def test_torques_that_are_sent_contain_the_wall_between_measured_links(node: Any
     assert abs(wall.tau[hardest]) > 1.0
     assert beyond_weight[hardest] * wall.tau[hardest] > 0.0
     assert abs(beyond_weight[hardest]) > 1.0
+
+
+def test_arms_with_a_topic_each_get_their_own_joints_there(node: Any, robot: Robot, context: Any) -> None:
+    # The right arm's topic is by the pattern for all, the left one's by itself.
+    given = ("output_topic:=/{arm}/commands", "left.output_topic:=/left/commands")
+    sender = BaseNode("sender", context=context, cli_args=["--ros-args", *(p for g in given for p in ("-p", g))])
+    output = make_output("trajectory", sender, robot, load_config("config/dual_iiwa7.yaml"), 0.004)
+    assert set(output.sent) == {"/left/commands", "/right/commands"}
+    taken: Queue[Any] = Queue()
+    node.create_subscription(JointTrajectory, "/right/commands", taken.put, COMMAND_QOS)
+    q, zero = robot.home, np.zeros_like(robot.home)
+    state = RobotState(q, zero, zero, None, 0.0)
+    command = Command(CommandMode.POSITION, q, zero, zero, {})
+    wait_until(lambda: sender.count_subscribers("/right/commands"), "the listener is found")
+    wait_until(lambda: output.send(command, state, 0.0, time.monotonic()) or not taken.empty(), "it arrives")
+    message = taken.get()
+    assert message.joint_names == [name for name in robot.joint_names if name.startswith("right")]
+    assert list(message.points[0].positions) == q[robot.arms["right"].joints].tolist()
+    sender.destroy_node()
+
+
+def test_torques_for_an_lbr_are_without_gravity_and_come_with_its_measured_positions(
+    robot: Robot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(ConfigError, match="lbr_fri_idl cannot be imported"):
+        LbrTorque(0.004, robot)
+    monkeypatch.setattr(joint_messages, "_lbr_message", lambda name: SimpleNamespace)
+    q, zero = robot.home + 0.1, np.zeros_like(robot.home)
+    gravity = pin.computeGeneralizedGravity(robot.model, robot.model.createData(), q)
+    command = Command(CommandMode.TORQUE, robot.home, zero, gravity + 1.0, {})
+    joints = robot.arms["left"].joints
+    to_send = JointCommand(command, RobotState(q, zero, zero, None, 0.0), 0.0)
+    sent = LbrTorque(0.004, robot).encode(to_send, [], joints)
+    np.testing.assert_allclose(sent.torque, 1.0)
+    np.testing.assert_array_equal(sent.joint_position, q[joints])
+    sent = LbrPosition(0.004, robot).encode(to_send, [], joints)
+    np.testing.assert_array_equal(sent.joint_position, robot.home[joints])

@@ -43,7 +43,7 @@ class Program(NodeProcess):
     def command(self):
         return [sys.executable, "-c", {PROGRAM!r}]
 
-programs = [Program(name, "q2r2_control.ros.nodes.recorder") for name in ("first", "second")]
+programs = [Program(name) for name in ("first", "second")]
 sys.exit(run_together(programs, lambda line: print(line, flush=True)))
 """
 
@@ -187,7 +187,7 @@ def test_every_node_of_a_set_is_an_executable(tmp_path: Path) -> None:
         for node in itertools.chain(*sets):
             module, _, function = scripts[node.name].partition(":")
             assert module == executables.__name__
-            assert node.module == f"q2r2_control.ros.nodes.{executables.MODULES[node.name]}"
+            assert node.name in executables.NODES
             assert callable(getattr(executables, function))
 
 

@@ -46,8 +46,9 @@ def test_the_documented_subclass_teleoperates_its_arm_in_its_robots_frame(
     rig.follows = False
     (code,) = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "ros.md").read_text(), re.DOTALL)
     (file := tmp_path / "right_arm.py").write_text(code)
-    arguments = patient({"world_frame_id": "world", "teleop.leash.distance": 0.0})
-    process = processes.start(sys.executable, str(file), *arguments, name="right_arm")
+    given = patient({"world_frame_id": "world", "teleop.leash.distance": 0.0})
+    arguments = [part for parameter in given for part in ("-p", parameter)]
+    process = processes.start(sys.executable, str(file), "--ros-args", *arguments, name="right_arm")
     rig.wait_until_connected()
     rig.engage()
     rig.wait(lambda: rig.targets, "targets come")

@@ -76,7 +76,7 @@ def _check_figures(node: Any, listener: SetListener) -> None:
 
 def test_the_command_watches_nodes_and_subscribes_to_no_command_and_no_hand(node: Any, processes: Processes) -> None:
     processes.start_node("left_arm_controller")
-    processes.start_node("simulation_input")
+    processes.start_node("SimulationInput")
     States(node, "left_q2r2_arm_controller").wait_for("not known")
     states = States(node, "simulation_input")
     states.wait_for("waits for a subscriber of the right hand")
@@ -124,10 +124,7 @@ def test_the_doctor_finds_two_inputs_and_an_arm_without_its_robot_and_says_what_
 ) -> None:
     processes.start_node("left_arm_controller")
     for number in (1, 2):
-        processes.start_module(
-            *("q2r2_control.ros.nodes.simulation_input", "--ros-args", "-r", f"__node:=input_{number}"),
-            *("-p", "side:=left"),
-        )
+        processes.run_node("SimulationInput", "-r", f"__node:=input_{number}", "-p", "side:=left")
     States(node, "left_q2r2_arm_controller").wait_for("not known")
     States(node, "input_1").wait_for("")
     States(node, "input_2").wait_for("")

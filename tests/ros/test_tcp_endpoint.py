@@ -26,7 +26,6 @@ from tests.support.fake_headset import DIALECTS, KEEPALIVE, FakeHeadset, Sensor,
 pytest.importorskip("rclpy", reason=NEEDS_ROS)
 pytestmark = pytest.mark.usefixtures("interfaces")
 
-MODULE = "q2r2_control.ros.nodes.tcp_endpoint"
 IDENTITY = (0.0, 0.0, 0.0, -1.0)
 ROOT = Path(__file__).resolve().parents[2]
 CDR = b"\0\1\0\0"
@@ -36,8 +35,7 @@ every_dialect = pytest.mark.parametrize("dialect", DIALECTS)
 
 def start_endpoint(processes: Processes, *parameters: str) -> tuple[RosProcess, tuple[str, int]]:
     """The running node, and where it listens."""
-    arguments = [argument for parameter in ("port:=0", *parameters) for argument in ("-p", parameter)]
-    process = processes.start_module(MODULE, "--ros-args", *arguments)
+    process = processes.start_node("tcp_endpoint", "port:=0", *parameters)
     host, port = process.wait_for("listening on ").rsplit(" ", 1)[-1].split(":")
     return process, (host, int(port))
 
@@ -188,7 +186,7 @@ def test_only_networks_that_the_cell_or_a_parameter_allows_are_served(processes:
         headset.send(headset.registrations())
         headset.read_until("__topic_list")
     assert process.interrupt() == 0
-    refused = processes.start_module(MODULE, "--ros-args", "-p", "port:=0", "-p", "allow:='the lab'")
+    refused = processes.start_node("tcp_endpoint", "port:=0", "allow:='the lab'")
     assert refused.wait() == 2
     assert "parameter allow: 'the lab' is neither an address nor a network" in refused.output
 
@@ -296,7 +294,7 @@ def test_an_address_that_cannot_be_bound_and_a_port_out_of_range_are_one_line(pr
             f"port:={taken}": f"cannot listen on 127.0.0.1:{taken}",
             "port:=65536": "allowed is 0 .. 65535",
         }
-        started = [processes.start_module(MODULE, "--ros-args", "-p", parameter) for parameter in complaints]
+        started = [processes.start_node("tcp_endpoint", parameter) for parameter in complaints]
         assert [process.wait(2.0 * PATIENCE) for process in started] == [2, 2]
     for process, complaint in zip(started, complaints.values(), strict=True):
         (line,) = process.output.splitlines()

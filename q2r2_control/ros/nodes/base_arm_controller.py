@@ -45,8 +45,8 @@ class BaseArmController(BaseNode):
     The node is ``<arm_name>_<robot_name>_arm_controller``; the other arguments are the defaults of parameters of that
     name. ``preset`` names the terms of the controller that is driven: topic, rate, speeds, what it needs in pauses.
     ``filter_window_size``, in samples of a 75 Hz headset, sets ``teleop.filter.smoothing_delay``. ``partner`` is the
-    node of the other arm in this process, see :func:`q2r2_control.ros.nodes.arm_controllers.run_arms`: both arms then are one teleoperation, as in
-    ``q2r2 run``. Without it a fault pauses this node's own arm only.
+    node of the other arm in this process, see ``run_arms`` of :mod:`arm_controllers`: both arms then are one
+    teleoperation, as in ``q2r2 run``. Without it a fault pauses this node's own arm only.
 
     Steps to override: :meth:`setup_parameters`, :meth:`setup_state`, :meth:`setup_interfaces`, :meth:`current_pose`,
     :meth:`pose_callback`, :meth:`inputs_callback`, :meth:`toggle_gripper`.
@@ -297,5 +297,5 @@ class BaseArmController(BaseNode):
         return response
 
 
-def _rounded(duration: float) -> float | None:
-    return round(duration, 3) if math.isfinite(duration) else None
+def _rounded(age: float) -> float | None:
+    return round(age, 3) if math.isfinite(age) else None
