@@ -18,12 +18,11 @@ pytest.importorskip("quest2ros", reason="needs q2r2 ros build-interfaces")
 
 
 from geometry_msgs.msg import TransformStamped
-from q2r2_control.ros.monitoring.frame_senders import ReadTransform, read_transforms
 from rclpy.serialization import serialize_message
 from tf2_msgs.msg import TFMessage
 
 from q2r2_control.ros.base_node import LATCHED_QOS
-from q2r2_control.ros.bridge.frames import FrameListener, FrameTree
+from q2r2_control.ros.bridge.frames import FrameListener, FrameTree, ReadTransform, read_transforms
 from tests.ros.arm_rig import stamped_transform
 from tests.ros.waiting import wait_until
 

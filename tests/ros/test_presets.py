@@ -11,7 +11,6 @@ import signal
 import sys
 import types
 from collections.abc import Iterator
-from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -207,24 +206,23 @@ def test_moveit_servo_is_told_to_take_poses_after_each_of_its_starts(monkeypatch
     messages.ServoCommandType = types.SimpleNamespace(Request=types.SimpleNamespace)
     monkeypatch.setitem(sys.modules, "moveit_msgs.srv", messages)
     command_type = CommandType(servo, "/servo/switch_command_type")
-    for now in (0.0, 0.5, 1.2):
-        command_type.step(0, now)
-        assert command_type.unready is not None  # it has refused so far
+
+    def agreed(starts: int, now: float) -> bool:
+        command_type.step(starts, now)
+        return command_type.unready is None
+
+    assert [agreed(0, now) for now in (0.0, 0.5, 1.2)] == [False] * 3  # it refuses
     servo.success = True
-    for now in (2.4, 2.5, 9.0):
-        command_type.step(0, now)
-    assert command_type.unready is None
-    command_type.step(1, 10.0)  # it was started again
-    assert command_type.unready is not None
+    assert [agreed(0, now) for now in (2.4, 2.5, 9.0)] == [False, True, True]
+    assert not agreed(1, 10.0)  # it was started again
     assert servo.asked == [2, 2, 2, 2]
 
 
 @pytest.mark.parametrize("name", ["fzi", "mayr", "crisp", "kuka_lbr_clik"])
 def test_a_preset_that_is_not_run_differs_from_the_one_that_is_in_names_and_what_it_asks_for(name: str) -> None:
     preset, run = PRESETS[name], PRESETS[PRESET]
-    names = {"name": run.name, "topic": run.topic, "activation": run.activation, "frame": run.frame}
-    rates = {"rate": run.rate, "lowest_rate": run.lowest_rate, "zero_wrench": run.zero_wrench}
-    assert replace(preset, **names, **rates) == run
+    assert (preset.hold, preset.guard, preset.takes_poses) == (run.hold, run.guard, run.takes_poses)
+    assert preset.command_type is None
 
 
 def test_the_presets_have_the_topics_of_their_controllers() -> None:

@@ -129,9 +129,7 @@ def test_the_script_waits_for_an_arm_that_is_not_ready_and_presses_until_it_foll
     assert not any(message.button_lower for message in drained(left["inputs"]))
 
 
-def test_an_arm_that_a_person_pauses_before_the_hands_move_is_not_engaged_again(
-    node: Any, processes: Processes
-) -> None:
+def test_an_arm_that_a_person_pauses_early_is_not_engaged_again(node: Any, processes: Processes) -> None:
     arm = speaking_arm(node, ready=True, message="ready to engage")
     left = subscribe(node, "left")
     start(processes, side="left", trajectory="line")
