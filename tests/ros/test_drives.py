@@ -15,12 +15,10 @@ import pytest
 
 from q2r2_control import Robot
 from q2r2_control.types import Array
-from tests.ros.conftest import NEEDS_ROS
+from tests.ros.conftest import need_ros
 from tests.ros.processes import Processes
 
-pytest.importorskip("rclpy", reason=NEEDS_ROS)
-pytest.importorskip("control_msgs", reason="needs control_msgs: q2r2 ros build-interfaces")
-pytest.importorskip("tf2_msgs", reason="needs tf2_msgs: q2r2 ros build-interfaces")
+need_ros()
 
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from trajectory_msgs.msg import JointTrajectory

@@ -2,25 +2,24 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import threading
 import time
 from collections.abc import Iterator
+from typing import Any
 
 import pytest
 
 from q2r2_control import Robot
-from tests.ros.conftest import NEEDS_ROS, spun_node
+from tests.ros.conftest import need_ros
 from tests.ros.processes import Processes
 
-pytest.importorskip("rclpy", reason=NEEDS_ROS)
-pytest.importorskip("quest2ros", reason="needs q2r2 ros build-interfaces")
-pytestmark = [pytest.mark.usefixtures("interfaces"), pytest.mark.alone]
+need_ros()
+pytestmark = pytest.mark.alone
 
-from tests.ros.cockpit import ARMS, CONTROLLER, ROBOT, Cockpit  # noqa: E402
-from tests.ros.joint_recorder import JointRecorder  # noqa: E402
-from tests.ros.waiting import call, wait_until  # noqa: E402
+from tests.ros.cockpit import ARMS, CONTROLLER, ROBOT, Cockpit
+from tests.ros.joint_recorder import JointRecorder
+from tests.ros.waiting import call, wait_until
 
 MOVING = 0.2  # an arm that moves has a joint this fast [rad/s]
 STILL = 0.005  # a joint that stands moves no farther [rad]
@@ -32,11 +31,8 @@ FROZEN = 2.0  # longer than any timeout [s]
 
 
 @pytest.fixture(scope="module")
-def started(domain: int, robot: Robot, interfaces: None, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cockpit]:
-    processes = Processes(tmp_path_factory.mktemp("faults"), os.environ)
-    with spun_node(domain) as node:
-        yield Cockpit(node, robot, processes, {"teleop.gate.timeout": 1.0, "rate": 100.0})
-        processes.end_all()
+def started(module_node: Any, module_processes: Processes, robot: Robot) -> Cockpit:
+    return Cockpit(module_node, robot, module_processes, {"teleop.gate.timeout": 1.0, "rate": 100.0})
 
 
 @pytest.fixture

@@ -10,11 +10,9 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from tests.ros.conftest import NEEDS_ROS, spun_node
+from tests.ros.conftest import need_ros, spun_node
 
-pytest.importorskip("rclpy", reason=NEEDS_ROS)
-pytest.importorskip("tf2_msgs", reason="needs q2r2 ros build-interfaces")
-pytest.importorskip("quest2ros", reason="needs q2r2 ros build-interfaces")
+need_ros()
 
 
 from geometry_msgs.msg import TransformStamped

@@ -5,19 +5,17 @@ from __future__ import annotations
 import os
 import signal
 import time
-from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from q2r2_control import Robot
-from tests.ros.conftest import NEEDS_ROS, spun_node
+from tests.ros.conftest import need_ros, spun_node
 from tests.ros.processes import Processes
 
-pytest.importorskip("rclpy", reason=NEEDS_ROS)
-pytest.importorskip("control_msgs", reason="needs control_msgs: q2r2 ros build-interfaces")
-pytest.importorskip("lifecycle_msgs", reason="needs lifecycle_msgs")
+need_ros()
 
 from lifecycle_msgs.msg import Transition
 
@@ -29,18 +27,11 @@ pytestmark = pytest.mark.alone
 
 
 @pytest.fixture(scope="module")
-def running(domain: int, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Processes]:
-    processes = Processes(tmp_path_factory.mktemp("managed"), os.environ)
-    yield processes
-    processes.end_all()
-
-
-@pytest.fixture(scope="module")
-def cell(domain: int, running: Processes, robot: Robot) -> Iterator[Managed]:
-    with spun_node(domain) as node:
-        cell = Managed(node, robot, start_robot(running), start_controller(running, *PATIENT))
-        cell.wait_until_active()
-        yield cell
+def cell(module_node: Any, module_processes: Processes, robot: Robot) -> Managed:
+    started = start_robot(module_processes), start_controller(module_processes, *PATIENT)
+    cell = Managed(module_node, robot, *started)
+    cell.wait_until_active()
+    return cell
 
 
 def test_it_starts_active_and_comes_to_rest_before_it_answers_that_it_is_not(cell: Managed, robot: Robot) -> None:

@@ -3,24 +3,21 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 import pytest
 
-from tests.ros.conftest import NEEDS_ROS, spun_node
+from tests.ros.conftest import need_ros
 from tests.ros.processes import Processes
 from tests.ros.waiting import wait_until
 
-pytest.importorskip("rclpy", reason=NEEDS_ROS)
-pytest.importorskip("quest2ros", reason="needs q2r2 ros build-interfaces")
-pytestmark = pytest.mark.usefixtures("interfaces")
+need_ros()
 
-from rclpy.parameter import Parameter  # noqa: E402
-from rclpy.parameter_client import AsyncParameterClient  # noqa: E402
+from rclpy.parameter import Parameter
+from rclpy.parameter_client import AsyncParameterClient
 
-from tests.ros.arm_rig import ArmRig, assert_same, offset, steps  # noqa: E402
+from tests.ros.arm_rig import ArmRig, assert_same, offset, steps
 
 
 class Settable(ArmRig):
@@ -46,13 +43,19 @@ class Settable(ArmRig):
         return float(future.result().values[0].double_value)
 
 
+@pytest.fixture(scope="module")
+def started(module_node: Any, module_processes: Processes) -> Settable:
+    rig = Settable(module_node)
+    rig.start(module_processes)
+    return rig
+
+
 @pytest.fixture
-def rig(domain: int, processes: Processes) -> Iterator[Settable]:
-    with spun_node(domain) as node:
-        rig = Settable(node)
-        rig.start(processes)
-        rig.engage()
-        yield rig
+def rig(started: Settable) -> Settable:
+    if not started.state["engaged"]:
+        started.engage()
+    started.wait_for_rest()
+    return started
 
 
 def test_a_scale_that_is_set_in_motion_counts_from_then_on_and_nothing_jumps(rig: Settable) -> None:
@@ -63,6 +66,7 @@ def test_a_scale_that_is_set_in_motion_counts_from_then_on_and_nothing_jumps(rig
     assert rig.state["engaged"]
     assert max(steps(rig.targets)) < 0.01
     assert rig.get("position_scale") == 0.5
+    assert rig.set(position_scale=1.0).successful
 
 
 def test_what_cannot_be_set_is_refused_with_the_reason_and_changes_nothing(rig: Settable) -> None:

@@ -24,21 +24,20 @@ from q2r2_control import Robot
 from q2r2_control.config.presets import BUILTIN, PRESETS, Mode, preset_of
 from q2r2_control.config.resources import find_resource
 from q2r2_control.errors import ConfigError
-from tests.ros.conftest import NEEDS_ROS, spun_node
+from tests.ros.conftest import need_ros, spun_node
 from tests.ros.processes import CONFIG, Processes, RosProcess
 
-pytest.importorskip("rclpy", reason=NEEDS_ROS)
-pytest.importorskip("quest2ros", reason="needs q2r2 ros build-interfaces")
-pytestmark = [pytest.mark.usefixtures("interfaces"), pytest.mark.alone]
+need_ros()
+pytestmark = pytest.mark.alone
 
-from geometry_msgs.msg import PoseStamped, WrenchStamped  # noqa: E402
+from geometry_msgs.msg import PoseStamped, WrenchStamped
 
-from q2r2_control.ros.base_node import COMMAND_QOS, LATCHED_QOS  # noqa: E402
-from q2r2_control.ros.bridge.arm_outputs import CommandType  # noqa: E402
-from q2r2_control.ros.bridge.messages import pose_of, seconds  # noqa: E402
-from tests.ros.arm_rig import ArmRig, ArmRigs, patient  # noqa: E402
-from tests.ros.cell import NODE_RATE, PATIENT, Cell, start_controller, start_robot  # noqa: E402
-from tests.ros.waiting import wait_until  # noqa: E402
+from q2r2_control.ros.base_node import COMMAND_QOS, LATCHED_QOS
+from q2r2_control.ros.bridge.arm_outputs import CommandType
+from q2r2_control.ros.bridge.messages import pose_of, seconds
+from tests.ros.arm_rig import ArmRig, ArmRigs, patient
+from tests.ros.cell import NODE_RATE, PATIENT, Cell, start_controller, start_robot
+from tests.ros.waiting import wait_until
 
 PRESET = "kuka_lbr_impedance"
 STILL = 4e-3  # how far a tool at rest may move [m]

@@ -19,13 +19,13 @@ import yaml
 
 from q2r2_control.ros.launch import executables
 from q2r2_control.ros.launch.processes import NO_INPUT, NodeProcess, nodes_of
-from tests.ros.conftest import NEEDS_ROS
+from tests.ros.conftest import need_ros
 from tests.ros.processes import CONFIG, PATIENCE, ROOT, Processes, RosProcess
 from tests.support.external_cell import external
 from tests.support.processes import alive, children
 
-pytest.importorskip("rclpy", reason=NEEDS_ROS)
-pytestmark = [pytest.mark.usefixtures("interfaces"), pytest.mark.alone]
+need_ros()
+pytestmark = pytest.mark.alone
 
 # Two programs instead of nodes, through the same function as the command.
 PROGRAM = """

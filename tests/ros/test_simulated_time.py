@@ -5,16 +5,12 @@ from __future__ import annotations
 import time
 from typing import Any
 
-import pytest
-
-from tests.ros.conftest import NEEDS_ROS
+from tests.ros.conftest import need_ros
 from tests.ros.processes import Processes
 
-pytest.importorskip("rclpy", reason=NEEDS_ROS)
-pytest.importorskip("quest2ros", reason="needs q2r2 ros build-interfaces")
-pytestmark = pytest.mark.usefixtures("interfaces")
+need_ros()
 
-from tests.ros.arm_rig import ArmRig  # noqa: E402
+from tests.ros.arm_rig import ArmRig
 
 
 def test_an_arm_without_time_cannot_be_engaged_and_one_whose_time_stops_is_paused(

@@ -8,18 +8,16 @@ from queue import Queue
 from typing import Any
 
 import numpy as np
-import pytest
 
 from q2r2_control.inputs.scripted import ScriptedInput
 from q2r2_control.types import Array
-from tests.ros.conftest import NEEDS_ROS
+from tests.ros.conftest import need_ros
 from tests.ros.processes import PATIENCE, Processes
 from tests.ros.waiting import States, drained, wait_until
 
-pytest.importorskip("rclpy", reason=NEEDS_ROS)
-pytestmark = pytest.mark.usefixtures("interfaces")
+need_ros()
 
-from std_msgs.msg import String  # noqa: E402
+from std_msgs.msg import String
 
 RATE = 50.0  # [Hz]
 
