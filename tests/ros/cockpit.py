@@ -51,7 +51,11 @@ class Cockpit:
         return sent
 
     def restart(self, name: str) -> None:
-        """Start a node that was killed."""
+        """Start a node that was killed; what it said before does not count any more."""
+        self.cell.states.pop(name, None)
+        if name == ARMS:
+            for rig in self.rigs.rigs:
+                rig.state = {}
         self.running[name] = self._starts[name]()
 
     def go_home(self) -> None:

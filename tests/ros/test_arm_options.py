@@ -23,33 +23,12 @@ from q2r2_control.errors import ConfigError
 from q2r2_control.ros import BaseArmController
 from q2r2_control.ros.bridge.messages import stamped_pose
 from q2r2_control.ros.nodes.arm_controllers import RightArmController
-from q2r2_control.teleop.haptics import PAUSED
 from tests.ros.arm_rig import TOOL, ArmRig, assert_same, first, offset
 
 
 @pytest.fixture
 def rig(node: Any) -> ArmRig:
     return ArmRig(node)
-
-
-def test_triggers_and_stick_are_bound_by_parameters_and_a_dead_man_is_no_fault_when_it_is_let_go(
-    rig: ArmRig, processes: Processes
-) -> None:
-    bindings = {"lower": "none", "grip": "dead_man"}
-    rig.start(processes, {f"teleop.bindings.{control}": action for control, action in bindings.items()})
-    rig.wait(lambda: rig.state.get("level") == "ok", "nothing keeps the arm from being engaged")
-    rig.press()
-    assert rig.state["state"] == "idle"
-    rig.grip = 1.0
-    rig.wait(lambda: rig.state["engaged"], "the arm is engaged")
-    rig.move((0.0, 0.05, 0.0))
-    assert_same(rig.wait_for_rest(), offset(TOOL, (0.0, 0.05, 0.0)), 1e-3)
-    rig.pulses.clear()
-    rig.grip = 0.0
-    rig.wait(lambda: rig.state["state"] == "paused", "the arm is paused")
-    assert rig.state["last_event_kind"] == "dead_man_released"
-    rig.wait(lambda: len(rig.pulses) == 2, "it is felt")
-    assert rig.pulses[0] == PAUSED[:2]
 
 
 def test_a_cells_yaml_names_the_external_controller_and_parameters_change_that(context: Any, tmp_path: Path) -> None:

@@ -135,19 +135,6 @@ def test_a_node_that_stood_still_in_the_middle_of_a_tick_sends_no_target_of_the_
     assert_same(rig.wait_for_rest(), offset(held, (0.0, 0.05, 0.0)), 1e-3)
 
 
-def test_a_button_that_was_held_from_the_first_message_on_engages_nothing_until_it_is_let_go(
-    rig: ArmRig, processes: Processes
-) -> None:
-    """As Quest2ROS2's SimulationInput does."""
-    rig.lower = True
-    rig.start(processes)
-    rig.wait(lambda: "lower held since the hand was first heard of: let go first" in rig.state["last_event"], "is told")
-    assert not rig.state["engaged"]
-    rig.lower, rig.sent = False, 0
-    rig.wait(lambda: rig.sent > 3, "it is let go")
-    rig.engage()
-
-
 def test_without_its_tools_pose_an_arm_is_not_engaged_nor_a_gripper_closed_without_server(
     rig: ArmRig, processes: Processes
 ) -> None:

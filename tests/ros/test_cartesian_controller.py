@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import json
 import math
+import os
+import signal
 import time
 from collections.abc import Iterator
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -22,18 +25,21 @@ import pinocchio as pin
 from geometry_msgs.msg import PoseStamped
 from rclpy.parameter import Parameter
 from rclpy.parameter_client import AsyncParameterClient
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import SetBool
+from trajectory_msgs.msg import JointTrajectory
 
 from q2r2_control.ros.base_node import COMMAND_QOS
 from q2r2_control.ros.bridge.messages import pose_message, stamped_pose, time_message
-from tests.ros.cell import PATIENT, STILL, Cell, Stream, shifted, start_controller, start_robot
+from tests.ros.cell import NODE_RATE, PATIENT, STILL, Cell, Stream, shifted, start_controller, start_robot
 from tests.ros.waiting import wait_until
 
 pytestmark = pytest.mark.alone
 
+EVERY_COMMAND = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
 # How far the simulated arms lag behind their reference at the speeds of these tests, between two arms.
 TRACKING = 0.01  # [m]
 
@@ -164,6 +170,29 @@ def test_pause_stop_and_home(cell: Cell, robot: Robot, streams: list[Stream]) ->
     assert cell.call("/cartesian_controller/stop").success
     wait_until(lambda: cell.state("phase") == "stopped", "the controller is stopped")
     wait_until(lambda: cell.state("mode", "mujoco_robot") == "holding", "nothing is commanded")
+
+
+def test_a_controller_that_stood_still_in_motion_publishes_no_jump(
+    cell: Cell, robot: Robot, streams: list[Stream]
+) -> None:
+    commands: list[tuple[int, Any]] = []  # their numbers, and the positions
+
+    def take(message: JointTrajectory, info: Any) -> None:
+        order = [message.joint_names.index(name) for name in robot.joint_names]
+        commands.append((info["publication_sequence_number"], np.array(message.points[0].positions)[order]))
+
+    subscription = cell.node.create_subscription(JointTrajectory, "/joint_trajectory", take, EVERY_COMMAND)
+    stream = engage(cell, streams, "left")
+    for way in (0.2, -0.2, 0.2):
+        stream.poses["left"] = shifted(stream.poses["left"], 0.0, 0.0, way)
+        wait_until(lambda: cell.joints.speeds(0.05).max() > 0.5, "the arm is fast")
+        os.kill(cell.processes[1].pid, signal.SIGSTOP)
+        time.sleep(0.05)  # less than what would start over
+        os.kill(cell.processes[1].pid, signal.SIGCONT)
+        time.sleep(0.7)
+    for (before, start), (number, end) in pairwise(commands):
+        assert (np.abs(end - start) <= (number - before) * robot.velocity_limit / NODE_RATE * (1.0 + 1e-6)).all()
+    cell.node.destroy_subscription(subscription)
 
 
 def test_invalid_joint_states_stop_the_arms_with_one_diagnostic(
