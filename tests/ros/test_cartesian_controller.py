@@ -17,14 +17,12 @@ import pytest
 from q2r2_control import Robot, load_config
 from q2r2_control.robot.kept_distances import kept_distances
 from tests.ros.conftest import need_ros, spun_node
-from tests.ros.processes import CONFIG, PATIENCE, Processes
+from tests.ros.processes import CONFIG, Processes
 
 need_ros()
 
 import pinocchio as pin
 from geometry_msgs.msg import PoseStamped
-from rclpy.parameter import Parameter
-from rclpy.parameter_client import AsyncParameterClient
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
@@ -102,20 +100,6 @@ def test_crossing_targets_never_bring_the_arms_nearer_than_the_least_distance(
     time.sleep(1.0)
     margin = min(float((robot.distance_values(q) - kept).min()) for q in cell.postures)
     assert -TRACKING <= margin < 0.02  # they did meet
-
-
-def test_safe_targets_are_the_tool_poses_of_the_reference(cell: Cell, streams: list[Stream]) -> None:
-    poses: list[PoseStamped] = []
-    subscription = cell.node.create_subscription(
-        PoseStamped, "/cartesian_controller/safe_target/left", poses.append, 10
-    )
-    engage(cell, streams, "left").move("left", (0.0, 0.0, 0.05))
-    wait_until(lambda: poses, "safe targets come")
-    cell.joints.wait_for_rest()
-    position = poses[-1].pose.position
-    assert poses[-1].header.frame_id == "world"
-    assert np.allclose([position.x, position.y, position.z], cell.tool("left").translation, atol=3e-3)
-    cell.node.destroy_subscription(subscription)
 
 
 def test_a_bad_target_moves_nothing_and_is_reported_once(cell: Cell) -> None:
@@ -243,34 +227,6 @@ def test_a_second_publisher_of_targets_in_mid_motion_stops_the_arm_and_is_named(
     time.sleep(1.5)  # longer than two publishers count
     stream.poses["left"] = cell.tool("left")
     wait_until(lambda: cell.state("left_state") == "following", "the stream that is left begins anew")
-
-
-def test_distances_and_gains_are_set_in_motion_and_what_home_does_not_allow_is_refused(
-    cell: Cell, robot: Robot, streams: list[Stream]
-) -> None:
-    client = AsyncParameterClient(cell.node, "/cartesian_controller")
-    assert client.wait_for_services(PATIENCE)
-
-    def set_to(**values: float) -> Any:
-        sent = client.set_parameters_atomically([Parameter(f"control.{name}", value=to) for name, to in values.items()])
-        wait_until(sent.done, "the parameters are answered")
-        return sent.result().result
-
-    stream = engage(cell, streams, "left", "right")
-    stream.move("left", (0.03, 0.0, 0.0))
-    assert set_to(min_distance=0.03, position_gain=4.0, separation_gain=5.0, stretch_gain=20.0).successful
-    refused = set_to(min_distance=0.045, position_gain=8.0)
-    assert not refused.successful
-    assert "hand_e_envelope_0 are 41.6 mm apart" in refused.reason
-    assert not set_to(posture_gain=1000.0).successful
-    assert "separation_gain = 0.0" in set_to(separation_gain=0.0).reason
-    goal = stream.poses["left"]
-    wait_until(lambda: np.linalg.norm(cell.tool("left").translation - goal.translation) < 2e-3, "the arm is there")
-    assert cell.state("left_state") == "following"
-    read = client.get_parameters([f"control.{name}" for name in ("min_distance", "position_gain", "separation_gain")])
-    wait_until(read.done, "the parameters are read")
-    assert [value.double_value for value in read.result().values] == [0.03, 4.0, 5.0]
-    assert set_to(min_distance=0.02, position_gain=8.0, separation_gain=10.0, stretch_gain=10.0).successful
 
 
 def test_it_follows_in_another_layout_and_frame_with_another_output_and_on_simulated_time(

@@ -13,15 +13,12 @@ from tests.ros.processes import PATIENCE
 
 need_ros()
 
-from control_msgs.action import GripperCommand
-from rclpy.action import ActionClient
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from q2r2_control.ros.base_node import LATCHED_QOS, BaseNode
-from q2r2_control.ros.bridge.gripper_server import GripperServer, Stroke
 from q2r2_control.ros.executor import TickExecutor
 
 PERIOD = 0.01  # of the node's tick [s]
@@ -117,18 +114,6 @@ def test_a_subscription_that_a_message_destroys_gets_none_that_had_come_before(
     assert ticking.log == ["one"]
 
 
-def test_what_is_made_in_a_tick_runs_too(ticking: Ticking, executor: TickExecutor) -> None:
-    publishers: list[Any] = []
-
-    def make() -> None:
-        if not publishers:
-            publishers.append(ticking.listen())
-        publishers[0].publish(String(data="word"))
-
-    ticking.create_tick(PERIOD, make)
-    spin_until(executor, lambda: ticking.log)
-
-
 def test_services_are_answered_and_coroutines_run(ticking: Ticking, executor: TickExecutor) -> None:
     def serve(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         response.success = True
@@ -147,28 +132,6 @@ def test_services_are_answered_and_coroutines_run(ticking: Ticking, executor: Ti
     timer = ticking.create_timer(PERIOD, ask)
     spin_until(executor, lambda: len(ticking.log) == 2)
     assert ticking.log == ["asks", "success: True"]
-
-
-def test_a_goal_that_ends_at_a_tick_has_its_result_sent(ticking: Ticking, executor: TickExecutor) -> None:
-    opening = 1.0
-
-    def tick() -> None:
-        nonlocal opening
-        opening = max(opening - 0.02, 0.0)
-        server.update(time.monotonic(), opening, effort=1.0)
-
-    server = GripperServer(ticking, "gripper", Stroke(0.0, 0.05), lambda _: None, lambda _: None)
-    client = ActionClient(ticking, GripperCommand, "gripper")
-    ticking.create_tick(PERIOD, tick)
-    spin_until(executor, client.server_is_ready)
-    goal = GripperCommand.Goal()
-    goal.command.position = 0.05
-    sent = client.send_goal_async(goal)
-    spin_until(executor, sent.done)
-    result = sent.result().get_result_async()
-    spin_until(executor, result.done)
-    assert result.result().result.reached_goal
-    client.destroy()
 
 
 @pytest.mark.parametrize("make", [BaseNode.create_tick, BaseNode.create_timer], ids=["a tick's", "a slow timer's"])

@@ -16,11 +16,11 @@ need_ros()
 from rclpy.parameter import Parameter
 from rclpy.parameter_client import AsyncParameterClient
 
-from q2r2_control import Robot
+from q2r2_control import CartesianController, Robot
 from q2r2_control.compliance.impedance import ImpedanceController
 from q2r2_control.config.control import ImpedanceSettings
 from q2r2_control.ros.base_node import BaseNode
-from q2r2_control.ros.bridge.live_parameters import make_impedance_live
+from q2r2_control.ros.bridge.live_parameters import make_control_live, make_impedance_live
 from q2r2_control.ros.nodes.arm_controllers import LeftArmController
 from q2r2_control.types import RobotState
 from tests.ros.arm_rig import ArmRig, assert_same, offset, steps
@@ -76,6 +76,23 @@ def test_what_cannot_be_set_is_refused_with_the_reason_and_changes_nothing(conte
         assert node.parameters == before
     assert set_in(node, mirror=True, mirror_reflected=True).successful
     assert (node.hand, node.health()[2]["stance"]) == ("right", "mirror_reflected")
+    node.destroy_node()
+
+
+def test_distances_and_gains_of_the_controller_are_set_together_or_not_at_all(context: Any, robot: Robot) -> None:
+    node, controller = BaseNode("controller", context=context), CartesianController(robot)
+    make_control_live(node, controller)
+    assert set_in(node, control__min_distance=0.03, control__position_gain=4.0, control__stretch_gain=20.0).successful
+    for values, reason in (
+        ({"control__min_distance": 0.045, "control__position_gain": 8.0}, "hand_e_envelope_0 are 41.6 mm apart"),
+        ({"control__posture_gain": 1000.0}, "posture_gain"),
+        ({"control__separation_gain": 0.0}, "separation_gain = 0.0"),
+    ):
+        refused = set_in(node, **values)
+        assert not refused.successful
+        assert reason in refused.reason
+    names = ("min_distance", "position_gain", "stretch_gain")
+    assert [node.get_parameter(f"control.{name}").value for name in names] == [0.03, 4.0, 20.0]
     node.destroy_node()
 
 

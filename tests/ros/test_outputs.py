@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from dataclasses import replace
 from queue import Queue
 from types import SimpleNamespace
 from typing import Any
@@ -13,7 +12,6 @@ import pinocchio as pin
 import pytest
 
 from tests.ros.conftest import need_ros
-from tests.ros.processes import PATIENCE
 from tests.ros.waiting import wait_until
 
 need_ros()
@@ -21,11 +19,9 @@ need_ros()
 from std_msgs.msg import Float64MultiArray
 from trajectory_msgs.msg import JointTrajectory
 
-from q2r2_control import CartesianController, Robot, load_config
+from q2r2_control import Robot, load_config
 from q2r2_control.drives.factory import make_drive
-from q2r2_control.drives.torque import TorqueDrive
 from q2r2_control.errors import ConfigError
-from q2r2_control.robot.kept_distances import kept_distances
 from q2r2_control.ros.base_node import COMMAND_QOS, BaseNode
 from q2r2_control.ros.bridge import joint_messages
 from q2r2_control.ros.bridge.joint_messages import JointCommand, LbrPosition, LbrTorque, PositionArray, TorqueArray
@@ -88,38 +84,6 @@ def test_a_new_receiver_of_positions_is_noticed_where_the_arms_are_off_their_ref
     commands.listen()
     fault = commands.send(0.2, off_reference)
     assert (fault is not None and "new receiver" in fault) == (positions and off_reference)
-
-
-def test_torques_that_are_sent_contain_the_wall_between_measured_links(node: Any, robot: Robot) -> None:
-    config = load_config("config/dual_iiwa7.yaml")
-    kept = kept_distances(robot, config.control).values
-    random = np.random.default_rng(3)
-    q = robot.home
-    while not (robot.distance_values(q).min() > 0.0 and (robot.distance_values(q) - kept).min() < -0.01):
-        q = random.uniform(robot.position_lower, robot.position_upper)
-    at_rest = np.zeros_like(q)
-    state = RobotState(q, at_rest, at_rest, None, 0.0)
-    reference = replace(CartesianController(robot, config.control).step({}, 0.004), q=q, v=at_rest, a=at_rest)
-    taken: Queue[Any] = Queue()
-    publisher = WatchedPublisher(node, Float64MultiArray, "/torques", TIMEOUT)
-    node.create_subscription(Float64MultiArray, "/torques", taken.put, COMMAND_QOS)
-    wait_until(lambda: publisher.listeners, "the listener is found")
-    drive = make_drive(CommandMode.TORQUE, robot, config, has_servos=False)
-    assert isinstance(drive, TorqueDrive)
-    channel = Channel(list(robot.joint_names), np.arange(len(q)), publisher)
-    output = JointOutput(drive, TorqueArray(0.004, robot), [channel])
-    drive.reset(state)
-    output.send(drive.command(reference, state, {}, 0.004), state, 0.0, decided=time.monotonic())
-    torque = np.array(taken.get(timeout=PATIENCE).data)
-    wall = drive.report.wall
-    assert wall is not None
-    assert wall.pressing
-    # The spring is about where the arms are, so the rest bears their weight.
-    hardest = int(np.abs(wall.tau).argmax())
-    beyond_weight = torque - drive.gravity(q)
-    assert abs(wall.tau[hardest]) > 1.0
-    assert beyond_weight[hardest] * wall.tau[hardest] > 0.0
-    assert abs(beyond_weight[hardest]) > 1.0
 
 
 def test_arms_with_a_topic_each_get_their_own_joints_there(node: Any, robot: Robot, context: Any) -> None:
