@@ -152,7 +152,7 @@ def test_an_arm_pauses_when_its_controller_follows_no_more_or_not_in_time_but_no
     context: Any,
 ) -> None:
     node = BaseNode("arm", context=context)
-    watch = FollowWatch(node, "/controller/following/left", "left", 0.3)
+    watch = FollowWatch(node, "/controller", "left", 0.3)
     following, states = Arrivals(node, "/controller/following/left"), Arrivals(node, "/controller/state")
     assert watch.refusal(True, 0.0) is None
     assert watch.refusal(True, 9.0) is None  # a controller that says nothing is taken to follow

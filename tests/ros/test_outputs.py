@@ -24,7 +24,7 @@ from q2r2_control.drives.factory import make_drive
 from q2r2_control.errors import ConfigError
 from q2r2_control.ros.base_node import COMMAND_QOS, BaseNode
 from q2r2_control.ros.bridge import joint_messages
-from q2r2_control.ros.bridge.joint_messages import JointCommand, LbrPosition, LbrTorque, PositionArray, TorqueArray
+from q2r2_control.ros.bridge.joint_messages import LbrPosition, LbrTorque, PositionArray, TorqueArray
 from q2r2_control.ros.bridge.joint_outputs import Channel, JointOutput, make_output
 from q2r2_control.ros.monitoring.endpoints import WatchedPublisher
 from q2r2_control.types import Command, CommandMode, RobotState
@@ -117,9 +117,9 @@ def test_torques_for_an_lbr_are_without_gravity_and_come_with_its_measured_posit
     gravity = pin.computeGeneralizedGravity(robot.model, robot.model.createData(), q)
     command = Command(CommandMode.TORQUE, robot.home, zero, gravity + 1.0, {})
     joints = robot.arms["left"].joints
-    to_send = JointCommand(command, RobotState(q, zero, zero, None, 0.0), 0.0)
-    sent = LbrTorque(0.004, robot).encode(to_send, [], joints)
+    to_send = command, RobotState(q, zero, zero, None, 0.0), 0.0
+    sent = LbrTorque(0.004, robot).encode(*to_send, [], joints)
     np.testing.assert_allclose(sent.torque, 1.0)
     np.testing.assert_array_equal(sent.joint_position, q[joints])
-    sent = LbrPosition(0.004, robot).encode(to_send, [], joints)
+    sent = LbrPosition(0.004, robot).encode(*to_send, [], joints)
     np.testing.assert_array_equal(sent.joint_position, robot.home[joints])

@@ -39,9 +39,9 @@ class ArmOutputs:
     through pauses, so that the arm comes to rest as the built-in controller does.
     """
 
-    def __init__(self, node: BaseNode, values: ArmParameters, safe_target: PoseTopic) -> None:
+    def __init__(self, node: BaseNode, arm: str, values: ArmParameters, safe_target: PoseTopic) -> None:
         preset, self._filtered = values.preset, values.mode is Mode.FILTERED
-        self._safe_target, self._safe_topic = safe_target, values.safe_target_topic
+        self._safe_target = safe_target
         self._last: TargetOutput | None = None
         if self._filtered:
             topic = BUILTIN.topic.format(ctrl=values.builtin_prefix)
@@ -56,8 +56,7 @@ class ArmOutputs:
         self._follows: FollowWatch | None = None
         if self.first.preset is BUILTIN:
             # Twice the usual timeout: the targets have to arrive first, and then the answer.
-            arm = values.following_topic.rpartition("/")[2]
-            self._follows = FollowWatch(node, values.following_topic, arm, 2.0 * values.listener_timeout)
+            self._follows = FollowWatch(node, values.builtin_node, arm, 2.0 * values.listener_timeout)
         self._all = [self.first] if self._last is None else [self.first, self._last]
         self._command_type: CommandType | None = None
         if preset.command_type is not None:
@@ -148,7 +147,9 @@ class ArmOutputs:
         safe, fault = self._safe_target.at(now), None
         self._safe_problem = self._safe_target.problem if safe is None else None
         if safe is not None and tool is not None and not near(safe, tool, *MAX_OFFSET):
-            self._safe_problem = f"{self._safe_topic} is not where the tool is: the arm moves, or tool_frame is wrong"
+            self._safe_problem = (
+                f"{self._safe_target.topic} is not where the tool is: the arm moves, or tool_frame is wrong"
+            )
         if not self._relaying and engaged:
             self._relaying, fault = self._safe_problem is None and tool is not None, self._safe_problem
         self._relaying = self._relaying and safe is not None
@@ -171,16 +172,16 @@ class FollowWatch:
     new stream. A controller that publishes nothing here is taken to follow.
     """
 
-    def __init__(self, node: Node, topic: str, arm: str, timeout: float) -> None:
-        self._topic, self._timeout = topic, timeout
-        self.controller, self._arm = topic.partition("/following/")[0], arm
+    def __init__(self, node: Node, controller: str, arm: str, timeout: float) -> None:
+        self.controller, self._arm, self._timeout = controller, arm, timeout
+        self._topic = f"{controller}/following/{arm}"
         self._follows: bool | None = None
         self._since = math.inf  # targets have been sent and not followed [s]
         self._followed_since = math.inf  # targets have been sent and followed [s]
         self.unready: str | None = None  # why the controller would follow no stream of targets now
         self.homing, self.homing_ended = False, ""  # whether it says that it goes home; how the last way ended
         self.gripper_held = ""  # what keeps the gripper from going farther
-        node.create_subscription(Bool, topic, self._on_following, LATCHED_QOS)
+        node.create_subscription(Bool, self._topic, self._on_following, LATCHED_QOS)
         node.create_subscription(String, f"{self.controller}/state", self._on_state, 1)
 
     def refusal(self, sending: bool, now: float) -> str | None:

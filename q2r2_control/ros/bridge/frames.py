@@ -209,25 +209,25 @@ class PoseTopic:
         self._tree, self._world, self._timeout = tree, world, timeout
         self._newest: tuple[str, int, float] | None = None  # its frame, its stamp [ns], and when it was received [s]
         self._pose: pin.SE3 | None = None  # of the newest, in the message's frame
-        self._topic, self._publishers = topic, Publishers(node, [topic])
+        self.topic, self._publishers = topic, Publishers(node, [topic])
         self.problem: str | None = None
         node.create_subscription(PoseStamped, topic, lambda message: self._take(message, node.now), STREAM_QOS)
 
     def at(self, now: float) -> pin.SE3 | None:
         """The newest pose at ``now`` [s]; None if it is not known, and then ``problem`` says why."""
         if self._newest is None:
-            self.problem = f"nothing on {self._topic}"
+            self.problem = f"nothing on {self.topic}"
             return None
         frame, _, received = self._newest
         if now - received > self._timeout:
-            source = self._publishers.source(self._topic)
-            self.problem = f"{self._topic}{source} is silent for {now - received:.2f} s"
+            source = self._publishers.source(self.topic)
+            self.problem = f"{self.topic}{source} is silent for {now - received:.2f} s"
             return None
         placement = self._tree.find(frame, self._world) if frame else Placement(pin.SE3.Identity(), math.inf)
         if self._pose is None:
-            self.problem = f"{self._topic}: not finite or not a rotation"
+            self.problem = f"{self.topic}: not finite or not a rotation"
         elif placement is None:
-            self.problem = f"no transform from {frame} of {self._topic} to {self._world} on /tf"
+            self.problem = f"no transform from {frame} of {self.topic} to {self._world} on /tf"
         else:
             self.problem = None
             return placement.pose * self._pose

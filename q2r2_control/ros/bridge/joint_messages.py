@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from importlib import import_module
 from typing import Any, ClassVar
 
@@ -22,15 +21,6 @@ NONE = "none"
 _LBR_JOINTS = 7
 
 
-@dataclass(frozen=True, slots=True)
-class JointCommand:
-    """What is to be sent: the drive's command, the state it was made for, and the time [s] of the node's clock."""
-
-    command: Command
-    state: RobotState
-    t: float
-
-
 class Kind:
     """One kind of message. Made with the control loop's period [s] and the robot."""
 
@@ -43,8 +33,11 @@ class Kind:
         self._due = Duration(sec=int(period), nanosec=int(1e9 * (period % 1.0)))
         self._model = robot.model
 
-    def encode(self, command: JointCommand, names: list[str], joints: np.ndarray) -> Any:
-        """A message about the joints with these names and velocity indices."""
+    def encode(self, command: Command, state: RobotState, t: float, names: list[str], joints: np.ndarray) -> Any:
+        """A message about the joints with these names and velocity indices.
+
+        ``command`` was made for ``state`` at ``t`` [s] of the node's clock.
+        """
         raise NotImplementedError
 
 
@@ -54,9 +47,11 @@ class TrajectoryOutput(Kind):
     topic = "joint_trajectory"
     message = JointTrajectory
 
-    def encode(self, command: JointCommand, names: list[str], joints: np.ndarray) -> JointTrajectory:
+    def encode(
+        self, command: Command, state: RobotState, t: float, names: list[str], joints: np.ndarray
+    ) -> JointTrajectory:
         """See :class:`Kind`. A stamp of 0 means now, whatever the receiver's clock says."""
-        q, v = command.command.q[joints].tolist(), command.command.v[joints].tolist()
+        q, v = command.q[joints].tolist(), command.v[joints].tolist()
         point = JointTrajectoryPoint(positions=q, velocities=v, time_from_start=self._due)
         return JointTrajectory(joint_names=names, points=[point])
 
@@ -68,9 +63,9 @@ class PositionArray(Kind):
     message = Float64MultiArray
     field: ClassVar[str] = "q"
 
-    def encode(self, command: JointCommand, names: list[str], joints: np.ndarray) -> Any:
+    def encode(self, command: Command, state: RobotState, t: float, names: list[str], joints: np.ndarray) -> Any:
         """See :class:`Kind`."""
-        return Float64MultiArray(data=getattr(command.command, self.field)[joints].tolist())
+        return Float64MultiArray(data=getattr(command, self.field)[joints].tolist())
 
 
 class VelocityArray(PositionArray):
@@ -91,10 +86,10 @@ class JointStates(Kind):
     topic = "joint_commands"
     message = JointState
 
-    def encode(self, command: JointCommand, names: list[str], joints: np.ndarray) -> Any:
+    def encode(self, command: Command, state: RobotState, t: float, names: list[str], joints: np.ndarray) -> Any:
         """See :class:`Kind`."""
-        q, v = command.command.q[joints], command.command.v[joints]
-        return joint_state_message(names, q, v, np.zeros(0), command.t)
+        q, v = command.q[joints], command.v[joints]
+        return joint_state_message(names, q, v, np.zeros(0), t)
 
 
 class LbrPosition(Kind):
@@ -106,9 +101,9 @@ class LbrPosition(Kind):
         super().__init__(period, robot)
         self.message = _lbr_message("LBRJointPositionCommand")
 
-    def encode(self, command: JointCommand, names: list[str], joints: np.ndarray) -> Any:
+    def encode(self, command: Command, state: RobotState, t: float, names: list[str], joints: np.ndarray) -> Any:
         """See :class:`Kind`."""
-        return self.message(joint_position=command.command.q[joints].tolist())
+        return self.message(joint_position=command.q[joints].tolist())
 
 
 class LbrTorque(Kind):
@@ -124,10 +119,10 @@ class LbrTorque(Kind):
         self.message = _lbr_message("LBRTorqueCommand")
         self._data = robot.model.createData()
 
-    def encode(self, command: JointCommand, names: list[str], joints: np.ndarray) -> Any:
+    def encode(self, command: Command, state: RobotState, t: float, names: list[str], joints: np.ndarray) -> Any:
         """See :class:`Kind`."""
-        q = command.state.q
-        overlay = command.command.tau - pin.computeGeneralizedGravity(self._model, self._data, q)
+        q = state.q
+        overlay = command.tau - pin.computeGeneralizedGravity(self._model, self._data, q)
         return self.message(joint_position=q[joints].tolist(), torque=overlay[joints].tolist())
 
 

@@ -52,8 +52,7 @@ class ArmParameters:
     prefix: str  # for the preset's {ctrl}
     target_topic: str
     current_pose_topic: str  # "": from /tf
-    safe_target_topic: str
-    following_topic: str
+    builtin_node: str  # name of the built-in controller's node
     builtin_prefix: str
     tool_timeout: float  # [s]
     listener_timeout: float  # [s]
@@ -64,11 +63,6 @@ class ArmParameters:
     gripper: GripperSettings
     guard: GuardSettings
     teleop: TeleopSettings
-
-    @property
-    def builtin_node(self) -> str:
-        """Name of the built-in controller's node."""
-        return self.following_topic.partition("/following/")[0]
 
 
 def arm_parameters(node: BaseNode, given: ArmDefaults) -> ArmParameters:
@@ -97,12 +91,7 @@ def arm_parameters(node: BaseNode, given: ArmDefaults) -> ArmParameters:
         prefix=prefix,
         target_topic=topic or preset.topic.format(ctrl=prefix),
         current_pose_topic=declare("current_pose_topic", "", 'PoseStamped of the tool; "": from /tf'),
-        safe_target_topic=declare(
-            "safe_target_topic", f"{BUILTIN_NODE}/safe_target/{arm}", "safe target of the built-in controller"
-        ),
-        following_topic=declare(
-            "following_topic", f"{BUILTIN_NODE}/following/{arm}", "whether the built-in controller follows"
-        ),
+        builtin_node=declare("builtin_node", BUILTIN_NODE, "the built-in controller's node"),
         builtin_prefix=declare("builtin_prefix", f"/q2r2/{arm}", "where mode filtered sends the hand's target"),
         tool_timeout=_timeout(
             node, "tool_timeout", "an older pose of the tool, or safe target, does not count", 0.01, 2.0
@@ -112,8 +101,8 @@ def arm_parameters(node: BaseNode, given: ArmDefaults) -> ArmParameters:
         preset=preset,
         mode=mode,
         gripper_topic=declare("gripper_action_topic", given.gripper_action_topic, "action or topic"),
-        gripper=settings_from_parameters(node, "gripper", given.gripper, frozenset()),
-        guard=settings_from_parameters(node, "guard", given.limits.over(preset.guard), frozenset(), read_only=False),
+        gripper=settings_from_parameters(node, "gripper", given.gripper),
+        guard=settings_from_parameters(node, "guard", given.limits.over(preset.guard), read_only=False),
         teleop=_teleop_settings(node, given.teleop),
     )
 
@@ -194,7 +183,7 @@ def stance_of(mirror: bool, reflected: bool) -> Stance:
 
 
 def settings_from_parameters(
-    node: BaseNode, prefix: str, default: Model, leave_out: frozenset[str], *, read_only: bool = True
+    node: BaseNode, prefix: str, default: Model, leave_out: frozenset[str] = frozenset(), *, read_only: bool = True
 ) -> Model:
     """Declare ``prefix.field`` for every field of ``default`` but those left out; returns the settings they make.
 

@@ -13,7 +13,7 @@ from q2r2_control.config.teleop import GuardSettings
 from q2r2_control.ros.base_node import LATCHED_QOS, SENT_COMMAND_QOS, BaseNode
 from q2r2_control.ros.bridge.messages import ended_topic, stamped_pose, time_message
 from q2r2_control.ros.bridge.parameters import ArmParameters
-from q2r2_control.ros.monitoring.endpoints import PublisherCount, WatchedPublisher, node_of
+from q2r2_control.ros.monitoring.endpoints import WatchedPublisher, node_of
 from q2r2_control.supervision.pose_rate_limiter import PoseRateLimiter
 from q2r2_control.supervision.target_stream import apart
 from q2r2_control.teleop.arm_states import ArmState
@@ -51,7 +51,6 @@ class TargetOutput:
         self._node, self._controller, self._frame = node, controller, frame
         self._publisher = WatchedPublisher(node, PoseStamped, topic, values.listener_timeout)
         self._topic = self._publisher.topic_name  # as the graph knows it: asked in each tick, without a look at names
-        self._publishers = PublisherCount(node, self._topic)
         self._wrench = None
         if preset.zero_wrench is not None:
             wrench = preset.zero_wrench.format(ctrl=values.prefix)
@@ -81,7 +80,7 @@ class TargetOutput:
     @property
     def conflict(self) -> str | None:
         """One line if there are other publishers of the same topic."""
-        if (count := self._publishers.count) <= 1:
+        if (count := self._node.handle.get_count_publishers(self._topic)) <= 1:
             return None
         return f"{count} publishers of {self.topic}, allowed is one (a killed one counts for some seconds)"
 

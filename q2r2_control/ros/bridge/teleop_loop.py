@@ -55,7 +55,7 @@ class TeleopLoop:
             ("teleop, mirror and mirror_reflected", ours.teleop != theirs.teleop),
             ("rate", ours.rate != theirs.rate),
             ("mode", ours.mode != theirs.mode),
-            ("following_topic", ours.builtin_node != theirs.builtin_node),
+            ("builtin_node", ours.builtin_node != theirs.builtin_node),
         ):
             if differ:
                 raise ConfigError(f"{what}: {first.get_name()} and {node.get_name()} differ; allowed: the same in both")

@@ -16,7 +16,6 @@ from rclpy.serialization import serialize_message
 from q2r2_control.ros.base_node import SENT_COMMAND_QOS
 
 _MAX_AGE = 0.1  # of the graph's answer, before it is asked again [s]
-_COUNT_AGE = 0.05  # of a number of publishers [s]
 _PERIOD = 0.5  # of asking the graph where no other code asks [s]
 _NO_WAIT = Duration(nanoseconds=0)
 # A subscriber may take 5 ms to acknowledge, longer than the period of a fast stream. So messages are left out every
@@ -67,21 +66,6 @@ class Publishers:
         names = {node_of(endpoint) for endpoint in self._node.get_publishers_info_by_topic(topic)}
         if known := sorted(name for name in names if name is not None):
             self._names[topic] = " and ".join(known)
-
-
-class PublisherCount:
-    """How many publishers a topic has, for a node that needs to know at every tick: the graph is asked now and then."""
-
-    def __init__(self, node: Node, topic: str) -> None:
-        self._node, self._topic = node, topic
-        self._count, self._asked_at = 0, -math.inf
-
-    @property
-    def count(self) -> int:
-        now = time.monotonic()
-        if now - self._asked_at > _COUNT_AGE:
-            self._asked_at, self._count = now, self._node.count_publishers(self._topic)
-        return self._count
 
 
 def publish_in_time(publisher: Any, message: Any, decided: float) -> bool:

@@ -118,10 +118,11 @@ class BaseArmController(BaseNode):
             self._tool = PoseTopic(self, values.current_pose_topic, tree, world, values.tool_timeout)
         else:
             self._tool = ToolFrame(self, tree, values.tool_frame, world, values.tool_timeout)
-        self._safe_target = PoseTopic(self, values.safe_target_topic, tree, world, values.tool_timeout)
+        topic = f"{values.builtin_node}/safe_target/{self.arm_name}"
+        self._safe_target = PoseTopic(self, topic, tree, world, values.tool_timeout)
         timeout = values.teleop.gate.timeout
         self.intake = HandIntake(self, self.hand, timeout, self.pose_callback, self.inputs_callback)
-        self.outputs = ArmOutputs(self, values, self._safe_target)
+        self.outputs = ArmOutputs(self, self.arm_name, values, self._safe_target)
         self.feedback = ArmFeedback(self, self.arm_name, values, self.intake)
         grants = None
         if (controller := self.outputs.builtin) is not None:

@@ -6,8 +6,6 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from std_srvs.srv import Trigger
-
 from q2r2_control.inputs.messages import HandTwist, MessageType
 from q2r2_control.inputs.scripted import ScriptedInput
 from q2r2_control.inputs.trajectories import FIRST_PRESS, START, TRAJECTORIES
@@ -32,9 +30,6 @@ class SimulationInput(BaseNode):
     The script starts when every hand that it plays has a subscriber, unless ``wait_for_subscribers`` is false. The
     hands rest until the arms' nodes say that they can be engaged. Then the buttons are pressed, and again where an arm
     is not engaged by the time the hands would move. From then on, and after an arm's ``~/pause``, it takes a person.
-
-    A launch file that restarts the node after a crash asks for no motion: with ``start_on_request`` nothing is
-    published until ``~/start`` is called.
     """
 
     ticks = True
@@ -55,9 +50,6 @@ class SimulationInput(BaseNode):
         self._waits_for_subscribers = self.parameter(
             "wait_for_subscribers", True, "Start when every hand has a subscriber."
         )
-        self._waits_for_request = self.parameter(
-            "start_on_request", False, "Start when ~/start is called, and not before."
-        )
         self._hands = SIDES if side == "both" else (side,)
         self._title = f"{trajectory} of {' and '.join(self._hands)}"
         self._hand_publishers = HandPublishers(self, self._hands, _MODES[mode])
@@ -68,14 +60,11 @@ class SimulationInput(BaseNode):
         self._moves = False  # whether the hands do
         self._not_to_press: set[str] | None = None  # hands; None: that is not decided yet
         self._rewind(self.now)
-        self.create_service(Trigger, "~/start", self._on_start)
         self._timer = self.create_tick(_LONGEST, self._tick)
 
     def health(self) -> tuple[bytes, str, Mapping[str, Any]]:
         """What is played, or which subscriber is missing."""
         values = {"samples": self._samples, "sent": self._hand_publishers.sent}
-        if self._waits_for_request:
-            return WARN, "waits for a call of ~/start", values
         if self._waits_for_subscribers:
             return WARN, f"waits for a subscriber of {' and '.join(self._missing())}", values
         if self._starts and (unready := self._listeners.unready()) is not None:
@@ -85,13 +74,6 @@ class SimulationInput(BaseNode):
     def _missing(self) -> list[str]:
         return [f"the {hand} hand" for hand in self._hands if not self._hand_publishers.subscribers(hand)]
 
-    def _on_start(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        response.success = self._waits_for_request
-        response.message = "starts" if self._waits_for_request else "has started before"
-        self._waits_for_request = False
-        self._rewind(self.now)
-        return response
-
     def _tick(self) -> None:
         """Play, and come again when the next sample is due."""
         self._play()
@@ -100,8 +82,6 @@ class SimulationInput(BaseNode):
         self._timer.reset()
 
     def _play(self) -> None:
-        if self._waits_for_request:
-            return
         if self._waits_for_subscribers:
             if self._missing():
                 return
