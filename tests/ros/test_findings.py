@@ -21,7 +21,7 @@ def node(name: str, **values: Any) -> NodeView:
 
 
 def topic(name: str, publishers: tuple[str, ...], subscribers: tuple[str, ...], *types: str) -> TopicView:
-    return TopicView(name, types or ("some/msg/Type",), publishers, subscribers, None, None)
+    return TopicView(name, types or ("some/msg/Type",), publishers, subscribers, None)
 
 
 def arm(name: str, **values: Any) -> NodeView:

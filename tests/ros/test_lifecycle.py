@@ -153,8 +153,9 @@ def test_a_robot_that_is_deactivated_takes_no_commands_and_stands(cell: Managed,
 
 @pytest.mark.parametrize("output", ["velocity", "torque"])
 def test_arms_that_are_commanded_speeds_or_torques_follow_are_left_at_rest_and_taken_over(
-    domain: int, processes: Processes, robot: Robot, output: str, tmp_path: Path
+    domain: int, module_processes: Processes, processes: Processes, robot: Robot, output: str, tmp_path: Path
 ) -> None:
+    module_processes.end_all()  # whose nodes have the same names
     config = changed_cell(tmp_path, impedance=SOFT)
     with spun_node(domain) as node:
         controller = start_controller(processes, *PATIENT, f"output:={output}", config=config)

@@ -17,7 +17,7 @@ from q2r2_control.errors import ConfigError
 from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.ros.base_node import LATCHED_QOS, BaseNode
 from q2r2_control.ros.bridge.frames import PoseTopic
-from q2r2_control.ros.bridge.parameters import BUILTIN_NODE, ArmParameters
+from q2r2_control.ros.bridge.parameters import ArmParameters
 from q2r2_control.ros.bridge.target_output import TargetOutput, near
 from q2r2_control.teleop.arm_states import ArmState
 from q2r2_control.teleop.steady_state_offset import MAX_OFFSET
@@ -45,7 +45,9 @@ class ArmOutputs:
         self._last: TargetOutput | None = None
         if self._filtered:
             topic = BUILTIN.topic.format(ctrl=values.builtin_prefix)
-            self.first = TargetOutput(node, values, BUILTIN, BUILTIN_NODE, topic, values.world_frame, BUILTIN.guard)
+            self.first = TargetOutput(
+                node, values, BUILTIN, values.builtin_node, topic, values.world_frame, BUILTIN.guard
+            )
         if not self._filtered or (preset.takes_poses and preset is not BUILTIN):
             terms = values.controller, values.target_topic, values.base_frame, values.guard
             theirs = TargetOutput(node, values, preset, *terms)

@@ -73,7 +73,6 @@ class TopicView:
     publishers: tuple[str, ...]  # full names of nodes
     subscribers: tuple[str, ...]
     rate: float | None  # [Hz]; None: not known
-    age: float | None  # of the newest message [s]; None: not known, or none has come
 
 
 @dataclass(frozen=True, slots=True)
