@@ -21,8 +21,8 @@ def set_tables(view: SetView, domain: str) -> Group:
     others = (f"others in this domain: {', '.join(view.others)}",) if view.others else ()
     columns = ("node", "rate [Hz]", "age [s]", "level", "says")
     nodes = figure_table("nodes", columns, map(_node_cells, view.nodes), others)
-    columns = ("topic", "rate [Hz]", "from", "to")
-    return Group(arms, nodes, figure_table("topics", columns, map(_topic_cells, view.topics), (_NOTE,)))
+    topics = figure_table("topics", ("topic", "rate [Hz]", "from", "to"), map(_topic_cells, view.topics), (_NOTE,))
+    return Group(arms, nodes, topics)
 
 
 def arm_lines(view: SetView) -> list[str]:

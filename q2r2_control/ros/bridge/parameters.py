@@ -18,7 +18,6 @@ from q2r2_control.errors import ConfigError
 from q2r2_control.ros.base_node import BaseNode
 
 Model = TypeVar("Model", bound=BaseModel)
-BUILTIN_NODE = "/cartesian_controller"
 _NONE = 0.0  # stands for no number; no field that may be none allows zero
 
 
@@ -82,16 +81,17 @@ def arm_parameters(node: BaseNode, given: ArmDefaults) -> ArmParameters:
     base = declare("base_frame_id", given.base_frame_id, "frame_id of targets")
     world = declare("world_frame_id", given.world_frame_id, 'whose axes the hand\'s are; "": base_frame_id')
     topic = declare("target_topic", given.target_topic, 'where targets go; "": as the preset says')
+    builtin = declare("builtin_node", "/cartesian_controller", "the built-in controller's node")
     controller = declare("controller_node", "", 'whose restart pauses the arm; "": ctrl_prefix')
     return ArmParameters(
         base_frame=base,
         world_frame=world or base,
         tool_frame=declare("end_effector_link_name", given.end_effector_link_name, "frame that the operator moves"),
-        controller=controller or (BUILTIN_NODE if preset is BUILTIN else prefix),
+        controller=controller or (builtin if preset is BUILTIN else prefix),
         prefix=prefix,
         target_topic=topic or preset.topic.format(ctrl=prefix),
         current_pose_topic=declare("current_pose_topic", "", 'PoseStamped of the tool; "": from /tf'),
-        builtin_node=declare("builtin_node", BUILTIN_NODE, "the built-in controller's node"),
+        builtin_node=builtin,
         builtin_prefix=declare("builtin_prefix", f"/q2r2/{arm}", "where mode filtered sends the hand's target"),
         tool_timeout=_timeout(
             node, "tool_timeout", "an older pose of the tool, or safe target, does not count", 0.01, 2.0
