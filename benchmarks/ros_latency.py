@@ -85,14 +85,10 @@ def measure_latency(config: str, duration: float, rate: float) -> LatencyReport:
     limit = Robot.from_config(cell).capped_acceleration(cell.control.acceleration_limit)
     filters = {f"teleop.filter.{name}": value for name, value in _SHORTEST_FILTER.items()}
     nodes = [
-        NodeProcess("mujoco_robot", "q2r2_control.ros.nodes.mujoco_robot", {"config": config}),
-        NodeProcess(
-            "cartesian_controller",
-            "q2r2_control.ros.nodes.cartesian_controller",
-            {"config": config, "rate": float(rate)},
-        ),
+        NodeProcess("mujoco_robot", {"config": config}),
+        NodeProcess("cartesian_controller", {"config": config, "rate": float(rate)}),
     ]
-    arm = NodeProcess("left_arm_controller", "q2r2_control.ros.nodes.left_arm_controller", filters)
+    arm = NodeProcess("left_arm_controller", filters)
     with private_domain(), started(nodes), _Probe() as probe:
         print_progress("waiting for the controller")
         probe.wait_for_tool()

@@ -30,7 +30,7 @@ from ros_processes import private_domain, processor_time, started
 _START_TIMEOUT = 300.0  # kernels may have to be compiled [s]
 _SETTLE = 3.0  # after the nodes have begun, and after the hands have [s]
 _JITTER = 0.002  # of a headset's samples: each comes later by up to this [s]
-_SCRIPT = NodeProcess("SimulationInput", "q2r2_control.ros.nodes.simulation_input", {"jitter": _JITTER})
+_SCRIPT = NodeProcess("SimulationInput", {"jitter": _JITTER})
 
 
 @dataclass(frozen=True, slots=True)

@@ -155,6 +155,11 @@ class Reason:
         """The reason of this ``kind`` with its ``detail`` by name."""
         return cls(kind, detail, cause)
 
+    @classmethod
+    def in_words(cls, text: str) -> Reason:
+        """A sentence that nothing decides by."""
+        return cls(ReasonKind.OTHER, {"text": text})
+
     @property
     def root(self) -> Reason:
         """The first cause."""

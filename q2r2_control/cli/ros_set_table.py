@@ -9,7 +9,7 @@ from q2r2_control.cli.figure_table import Cell, figure_table
 from q2r2_control.ros.watching.set_view import SILENT, ArmView, NodeView, SetView, TopicView
 
 _COLOURS = {"ok": "green", "warn": "yellow", "error": "red"}
-_NOTE = "rates without an age are what the sender says: commands and hands are not listened to"
+_NOTE = "rates are what the senders say"
 
 
 def set_tables(view: SetView, domain: str) -> Group:
@@ -21,8 +21,8 @@ def set_tables(view: SetView, domain: str) -> Group:
     others = (f"others in this domain: {', '.join(view.others)}",) if view.others else ()
     columns = ("node", "rate [Hz]", "age [s]", "level", "says")
     nodes = figure_table("nodes", columns, map(_node_cells, view.nodes), others)
-    columns = ("topic", "rate [Hz]", "age [s]", "from", "to")
-    return Group(arms, nodes, figure_table("topics", columns, map(_topic_cells, view.topics), (_NOTE,)))
+    topics = figure_table("topics", ("topic", "rate [Hz]", "from", "to"), map(_topic_cells, view.topics), (_NOTE,))
+    return Group(arms, nodes, topics)
 
 
 def arm_lines(view: SetView) -> list[str]:
@@ -49,8 +49,7 @@ def _node_cells(node: NodeView) -> tuple[Cell, ...]:
 
 def _topic_cells(topic: TopicView) -> tuple[Cell, ...]:
     rate = "" if topic.rate is None else f"{topic.rate:.0f}"
-    age = "" if topic.age is None else f"{topic.age:.2f}"
-    return topic.name, rate, age, _joined(topic.publishers), _joined(topic.subscribers)
+    return topic.name, rate, _joined(topic.publishers), _joined(topic.subscribers)
 
 
 def _joined(names: tuple[str, ...]) -> str:

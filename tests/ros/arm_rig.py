@@ -6,7 +6,7 @@ import json
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from itertools import pairwise
 from typing import Any
@@ -31,12 +31,9 @@ TOOL = pin.SE3(pin.exp3(np.array([3.0, 0.2, 0.1])), np.array([0.5, 0.25, 0.38]))
 PATIENT = {"teleop.gate.timeout": 2.0, "tool_timeout": 2.0, "listener_timeout": 3.0}
 
 
-def patient(parameters: dict[str, Any]) -> list[str]:
-    """Arguments of an arm's node: parameters, with timeouts that an overloaded machine keeps to."""
-    return [
-        "--ros-args",
-        *(part for name, value in (PATIENT | parameters).items() for part in ("-p", f"{name}:={value}")),
-    ]
+def patient(parameters: Mapping[str, Any]) -> list[str]:
+    """Parameters of an arm's node, with timeouts that an overloaded machine keeps to."""
+    return [f"{name}:={value}" for name, value in (PATIENT | dict(parameters)).items()]
 
 
 HOLDING = ("paused", "lost")  # states of an arm that was engaged
@@ -89,8 +86,7 @@ class ArmRig:
 
     def start(self, processes: Processes, parameters: dict[str, Any] | None = None) -> RosProcess:
         """Start the arm's controller; returns when it receives the hand."""
-        module = f"q2r2_control.ros.nodes.{self.arm}_arm_controller"
-        process = processes.start_module(module, *patient(parameters or {}))
+        process = processes.start_node(f"{self.arm}_arm_controller", *patient(parameters or {}))
         self.wait_until_connected()
         return process
 

@@ -19,9 +19,8 @@ from tf2_msgs.msg import TFMessage
 from q2r2_control import Robot
 from q2r2_control.robot.compose import WORLD
 from q2r2_control.ros.base_node import COMMAND_QOS, LATCHED_QOS, STREAM_QOS
-from q2r2_control.ros.bridge.frames import FrameTree
+from q2r2_control.ros.bridge.frames import FrameTree, ReadTransform
 from q2r2_control.ros.bridge.messages import pose_message
-from q2r2_control.ros.monitoring.frame_senders import ReadTransform
 from q2r2_control.types import Array
 from tests.ros import waiting
 from tests.ros.joint_recorder import JointRecorder
@@ -170,9 +169,9 @@ class Stream:
                 self._cell.send(arm, pose)
 
 
-def start_robot(processes: Processes) -> RosProcess:
+def start_robot(processes: Processes, *parameters: str, config: str = CONFIG) -> RosProcess:
     """Start the simulated robot."""
-    return processes.start_node("mujoco_robot", f"config:={CONFIG}", f"rate:={NODE_RATE}")
+    return processes.start_node("mujoco_robot", f"config:={config}", f"rate:={NODE_RATE}", *parameters)
 
 
 def start_controller(processes: Processes, *parameters: str, config: str = CONFIG, **environment: str) -> RosProcess:

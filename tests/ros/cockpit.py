@@ -1,9 +1,11 @@
-"""Two hands that drive the simulated arms through all their nodes."""
+"""Two hands that drive the simulated arms through all their nodes, which tests kill, freeze and start again."""
 
 from __future__ import annotations
 
+import os
+import signal
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -11,29 +13,60 @@ import numpy as np
 from q2r2_control import Robot
 from tests.ros.arm_rig import ArmRig, ArmRigs, patient
 from tests.ros.cell import PATIENT, Cell, start_controller, start_robot
-from tests.ros.processes import Processes
+from tests.ros.processes import Processes, RosProcess
 from tests.ros.waiting import wait_until
+
+ROBOT, CONTROLLER, ARMS = "mujoco_robot", "cartesian_controller", "arm_controllers"
 
 
 class Cockpit:
-    """Two hands that drive the simulated arms through their nodes."""
+    """The processes, by the names of their executables, and the hands."""
 
-    def __init__(
-        self, node: Any, robot: Robot, processes: Processes, bindings: Mapping[str, str], apart: bool = False
-    ) -> None:
-        """``apart``: each arm's node is a process of its own."""
-        nodes = start_robot(processes), start_controller(processes, *PATIENT)
-        self.cell = Cell(node, robot, *nodes, targets="/not_used/{arm}")  # the arms' nodes publish targets
+    def __init__(self, node: Any, robot: Robot, processes: Processes, parameters: Mapping[str, Any]) -> None:
+        """``parameters``: of the arms' nodes."""
+        self._starts: dict[str, Callable[[], RosProcess]] = {
+            ROBOT: lambda: start_robot(processes, "max_jump:=1.0"),  # a jump is to be seen
+            CONTROLLER: lambda: start_controller(processes, *PATIENT),
+            ARMS: lambda: processes.start_node(ARMS, *patient(parameters)),
+        }
+        self.running = {name: start() for name, start in self._starts.items()}
+        self.cell = Cell(node, robot, targets="/not_used/{arm}")  # the arms' nodes publish targets
         self.left, self.right = ArmRig(node, "left"), ArmRig(node, "right")
         self.rigs = ArmRigs([self.left, self.right])
         for rig in self.rigs.rigs:
             rig.sends_tool = rig.follows = False
-        names = ("left_arm_controller", "right_arm_controller") if apart else ("arm_controllers",)
-        self.arms = [
-            processes.start_module(f"q2r2_control.ros.nodes.{name}", *patient(dict(bindings))) for name in names
-        ]
+        self.wait_until_up()
+
+    def wait_until_up(self) -> None:
+        """Wait until all nodes hear each other."""
         self.rigs.wait(lambda rig: rig.state.get("hand_age") is not None, "its node receives the hand")
-        wait_until(lambda: self.cell.state("phase") == "active", "the controller is active")
+        wait_until(lambda: self.cell.state("phase") == "active", "the controller is active", lambda: self.cell.states)
+
+    def signal(self, name: str, number: signal.Signals) -> float:
+        """Send a node a signal; when that was [s]."""
+        sent = time.monotonic()
+        os.kill(self.running[name].pid, number)
+        if number is signal.SIGKILL:
+            self.running[name].wait()
+        return sent
+
+    def restart(self, name: str) -> None:
+        """Start a node that was killed; what it said before does not count any more."""
+        self.cell.states.pop(name, None)
+        if name == ARMS:
+            for rig in self.rigs.rigs:
+                rig.state = {}
+        self.running[name] = self._starts[name]()
+
+    def go_home(self) -> None:
+        """Put the arms at home by the simulation, at rest and not engaged."""
+        assert self.cell.call("/cartesian_controller/stop").success
+        wait_until(lambda: self.cell.state("phase") == "stopped", "the controller is stopped")
+        self.cell.call("/mujoco_robot/reset")
+        self.cell.wait_until_home()
+        assert self.cell.call("/cartesian_controller/reset").success
+        self.wait_until_up()
+        self.rigs.wait(lambda rig: not rig.state["engaged"], "no arm is engaged")
 
     def go_away(self) -> None:
         """Both arms are moved a way from home by their hands."""
@@ -53,12 +86,8 @@ class Cockpit:
         self.rigs.wait(lambda rig: rig.state["state"] == "homing", "both arms are on their way home")
         self.left.grip = 0.0
 
-    def hold_lower(self, rig: ArmRig) -> None:
-        rig.lower = True
+    def hold(self, rig: ArmRig, button: str) -> None:
+        """A press that is a long one."""
+        setattr(rig, button, True)
         time.sleep(1.0)
-        rig.lower = False
-
-    def hold_upper(self, rig: ArmRig) -> None:
-        rig.upper = True
-        time.sleep(1.0)
-        rig.upper = False
+        setattr(rig, button, False)

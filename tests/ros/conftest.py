@@ -1,10 +1,11 @@
 """ROS 2 in tests: a private domain for each worker, processes and nodes in it, and the message packages they need.
 
-Modules that need ROS say ``pytest.importorskip("rclpy", reason=...)`` on top or use one of these fixtures, which skip.
+Modules that need ROS call :func:`need_ros` on top, or use one of these fixtures, which skip.
 """
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import sys
 from collections.abc import Generator, Iterator
@@ -18,12 +19,20 @@ import pytest
 from q2r2_control import CartesianController, Robot, load_config
 from q2r2_control.compliance.impedance import ImpedanceController
 from q2r2_control.ros.launch.build import interface_packages, missing_tools
-from tests.ros.built_interfaces import build_interfaces
 from tests.ros.processes import CONFIG, Processes, environment_of
 
 NEEDS_ROS = "needs ROS 2 Jazzy: pip install 'q2r2_control[ros]', or source an install"
 _NICE = -10
 _PROCESSES = pytest.StashKey[Processes]()
+
+
+def need_ros() -> None:
+    """On top of a module: skip it without ROS; fail where only ``q2r2 ros build-interfaces`` has not been run."""
+    pytest.importorskip("rclpy", reason=NEEDS_ROS)
+    if absent := [package.name for package in interface_packages() if importlib.util.find_spec(package.name) is None]:
+        if missing := missing_tools(Path(sys.prefix)):
+            pytest.skip(f"{absent} cannot be built here: missing {'; '.join(missing)}", allow_module_level=True)
+        raise ImportError(f"{', '.join(absent)} not built: run q2r2 ros build-interfaces")
 
 
 @pytest.fixture(scope="session")
@@ -63,23 +72,19 @@ def kernels(robot: Robot) -> None:
     ImpedanceController(robot, config.impedance)
 
 
-@pytest.fixture(scope="session")
-def interfaces() -> None:
-    """The interface packages can be imported; where they are not built the test fails, or skips for lack of tools."""
-    pytest.importorskip("rclpy", reason=NEEDS_ROS)
-    absent = [package.name for package in interface_packages() if package.found_in() is None]
-    if absent:
-        if missing := missing_tools(Path(sys.prefix)):
-            pytest.skip(f"{', '.join(absent)} cannot be built here: missing {'; '.join(missing)}")
-        pytest.fail(f"{', '.join(absent)} not built: run q2r2 ros build-interfaces")
+@pytest.fixture(scope="module")
+def module_processes(domain: int, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Processes]:
+    """Processes that outlive one test, since each takes seconds to start."""
+    started = Processes(tmp_path_factory.mktemp("processes"), os.environ)
+    yield started
+    started.end_all()
 
 
-@pytest.fixture(scope="session")
-def other_interfaces(domain: int, tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
-    """Variables for processes that import moveit_msgs or lbr_fri_idl, built once for all workers."""
-    folder = tmp_path_factory.getbasetemp()
-    shared = folder.parent if "PYTEST_XDIST_WORKER" in os.environ else folder
-    return build_interfaces(shared, "moveit_msgs", "lbr_fri_idl")
+@pytest.fixture(scope="module")
+def module_node(domain: int) -> Iterator[Any]:
+    """A node that outlives one test."""
+    with spun_node(domain) as made:
+        yield made
 
 
 @pytest.fixture

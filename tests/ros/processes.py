@@ -14,6 +14,7 @@ from q2r2_control.ros.launch.middleware import set_up_middleware
 from tests.ros.warm_start import WarmProcess
 
 ROOT = Path(__file__).resolve().parents[2]
+EXECUTABLES = "q2r2_control.ros.launch.executables"
 CONFIG = "config/dual_iiwa7.yaml"
 PATIENCE = 30.0  # for starting Python and discovery on an overloaded machine [s]
 
@@ -96,7 +97,7 @@ class Processes:
 
     def start_module(self, module: str, *arguments: str, **environment: str) -> RosProcess:
         """Start ``python -m module``, unbuffered."""
-        name = module.split(".")[-1]
+        name = arguments[0] if module == EXECUTABLES else module.split(".")[-1]
         if "LD_LIBRARY_PATH" in environment or "PYTHONPATH" in environment:  # which an interpreter reads at its start
             return self.start(sys.executable, "-u", "-m", module, *arguments, name=name, **environment)
         (log := self._new_log(name)).touch()
@@ -104,9 +105,13 @@ class Processes:
         return self._started(name, process, log)
 
     def start_node(self, name: str, *parameters: str, **environment: str) -> RosProcess:
-        """Start one of the package's nodes with ``parameters``, each as ``name:=value``."""
+        """Start an executable of the package with ``parameters``, each as ``name:=value``."""
         arguments = [part for parameter in parameters for part in ("-p", parameter)]
-        return self.start_module(f"q2r2_control.ros.nodes.{name}", "--ros-args", *arguments, **environment)
+        return self.run_node(name, *arguments, **environment)
+
+    def run_node(self, name: str, *arguments: str, **environment: str) -> RosProcess:
+        """The same with any arguments of ROS."""
+        return self.start_module(EXECUTABLES, name, "--ros-args", *arguments, **environment)
 
     def end_all(self) -> None:
         """Last started, first ended."""

@@ -13,10 +13,10 @@ import pytest
 from q2r2_control import CartesianController, Robot
 from q2r2_control.loop.arm_conditions import ArmConditions
 from q2r2_control.types import SIDES, ActiveLimit, LimitKind, RobotState
-from tests.ros.conftest import NEEDS_ROS
+from tests.ros.conftest import need_ros
 from tests.ros.waiting import wait_until
 
-pytest.importorskip("rclpy", reason=NEEDS_ROS)
+need_ros()
 
 from q2r2_control.ros.bridge.arm_conditions import ConditionPublishers, listen_to_condition
 from q2r2_control.teleop.haptics import ArmCondition

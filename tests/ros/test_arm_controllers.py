@@ -2,26 +2,22 @@
 
 from __future__ import annotations
 
-import os
-import sys
 import time
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
 import pytest
 
 from q2r2_control import Robot
-from tests.ros.conftest import NEEDS_ROS, spun_node
+from tests.ros.conftest import need_ros
 from tests.ros.processes import Processes
 
-pytest.importorskip("rclpy", reason=NEEDS_ROS)
-pytest.importorskip("control_msgs", reason="needs control_msgs: q2r2 ros build-interfaces")
-pytest.importorskip("tf2_msgs", reason="needs tf2_msgs: q2r2 ros build-interfaces")
+need_ros()
 
 from q2r2_control.errors import ConfigError
-from q2r2_control.ros.nodes.left_arm_controller import LeftArmController
-from q2r2_control.ros.nodes.right_arm_controller import RightArmController
+from q2r2_control.ros.nodes.arm_controllers import LeftArmController, RightArmController
 from q2r2_control.types import Array
 from tests.ros.arm_rig import HOLDING, ArmRigs, offset
 from tests.ros.cockpit import Cockpit
@@ -39,11 +35,8 @@ HOME, STILL = 0.01, 0.005  # [rad]
 
 
 @pytest.fixture(scope="module")
-def started(domain: int, robot: Robot, interfaces: None, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cockpit]:
-    processes = Processes(tmp_path_factory.mktemp("cockpit"), os.environ)
-    with spun_node(domain) as node:
-        yield Cockpit(node, robot, processes, BINDINGS)
-        processes.end_all()
+def started(module_node: Any, module_processes: Processes, robot: Robot) -> Cockpit:
+    return Cockpit(module_node, robot, module_processes, BINDINGS)
 
 
 @pytest.fixture
@@ -96,18 +89,14 @@ def test_the_way_home_that_one_hand_asks_for_is_of_both_and_a_press_of_the_other
     assert np.abs(cockpit.cell.q - rest).max() > HOME
 
 
-@pytest.mark.parametrize("by", ["the other hand", "a service"])
-def test_a_stop_of_one_hand_stops_both_arms_until_it_is_taken_back(by: str, cockpit: Cockpit) -> None:
-    cockpit.hold_lower(cockpit.left)
+def test_a_stop_of_one_hand_stops_both_arms_until_it_is_taken_back(cockpit: Cockpit) -> None:
+    cockpit.hold(cockpit.left, "lower")
     cockpit.rigs.wait(lambda rig: rig.state["state"] == "stopped", "both arms are stopped")
     rest = cockpit.cell.joints.wait_for_rest()
     cockpit.right.press()
     cockpit.rigs.move((0.1, 0.0, 0.0), 0.5)
     assert np.abs(cockpit.cell.q - rest).max() < STILL
-    if by == "a service":
-        assert call(cockpit.cell.node, "/left_q2r2_arm_controller/reset").success
-    else:
-        cockpit.hold_lower(cockpit.right)
+    cockpit.hold(cockpit.right, "lower")
     cockpit.rigs.wait(lambda rig: rig.state["state"] == "paused", "it is taken back for both")
     assert np.abs(cockpit.cell.q - rest).max() < STILL
 
@@ -115,7 +104,7 @@ def test_a_stop_of_one_hand_stops_both_arms_until_it_is_taken_back(by: str, cock
 def test_hands_that_are_swapped_drive_the_other_arm(cockpit: Cockpit) -> None:
     left, right = cockpit.left, cockpit.right
     cockpit.rigs.pause()
-    cockpit.hold_upper(left)
+    cockpit.hold(left, "upper")
     cockpit.rigs.wait(lambda rig: rig.state["hand"] != rig.arm and rig.state["ready"], "the hands are swapped")
     rest = cockpit.cell.joints.wait_for_rest()
     hand = ArmRigs([left])
@@ -125,7 +114,7 @@ def test_hands_that_are_swapped_drive_the_other_arm(cockpit: Cockpit) -> None:
     wait_until(lambda: np.abs(cockpit.cell.q - rest)[joints["right"].joints].max() > 0.03, "the right arm follows")
     assert np.abs(cockpit.cell.q - rest)[joints["left"].joints].max() < STILL
     hand.press_until(lambda _: right.state["state"] in HOLDING, "and pauses it")
-    cockpit.hold_upper(right)
+    cockpit.hold(right, "upper")
     cockpit.rigs.wait(lambda rig: rig.state["hand"] == rig.arm, "the hands are swapped back")
 
 
@@ -140,12 +129,9 @@ def test_one_hand_moves_both_tools_which_keep_their_relation_and_needs_no_other_
         cockpit.left.wait(lambda: cockpit.right.state["state"] == "carried", "the right arm is carried")
         cockpit.left.trigger = 0.0
         start = cockpit.cell.joints.wait_for_rest()
-        cockpit.cell.forget()
         cockpit.left.move((0.03, -0.03, -0.05), 1.5, 0.25)
-        errors = np.array([apart(robot, start, q) for q in cockpit.cell.postures])
         rest = cockpit.cell.joints.wait_for_rest()
         time.sleep(1.0)
-        print(f"\nrelation of the tools in motion: mean {errors.mean(axis=0)}, most {errors.max(axis=0)} [m, rad]")
         moved = robot.tool_pose(rest, "right").translation - robot.tool_pose(start, "right").translation
         assert np.linalg.norm(moved) > 0.03
         way, turn = apart(robot, start, cockpit.cell.q)
@@ -187,10 +173,6 @@ def test_a_parameter_of_the_teleoperation_that_is_set_in_one_node_is_set_in_both
 
 
 def test_a_wrong_parameter_of_one_arm_ends_both_in_one_line(processes: Processes) -> None:
-    process = processes.start(
-        *(sys.executable, "-m", "q2r2_control.ros.nodes.arm_controllers"),
-        *("--ros-args", "-p", "right_q2r2_arm_controller:rate:=-1.0"),
-        name="arm_controllers",
-    )
+    process = processes.start_node("arm_controllers", "right_q2r2_arm_controller:rate:=-1.0")
     assert process.wait() == 2
     assert "parameter rate: " in process.output.splitlines()[-1]

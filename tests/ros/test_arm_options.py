@@ -10,18 +10,20 @@ import numpy as np
 import pytest
 import yaml
 
-from tests.ros.conftest import NEEDS_ROS
+from tests.ros.conftest import need_ros
 from tests.ros.processes import PATIENCE, Processes
 from tests.support.external_cell import external
 
-pytest.importorskip("rclpy", reason=NEEDS_ROS)
-pytest.importorskip("quest2ros", reason="needs q2r2 ros build-interfaces")
-pytestmark = pytest.mark.usefixtures("interfaces")
+need_ros()
 
-from q2r2_control.errors import ConfigError  # noqa: E402
-from q2r2_control.ros.bridge.messages import stamped_pose  # noqa: E402
-from q2r2_control.teleop.haptics import PAUSED  # noqa: E402
-from tests.ros.arm_rig import TOOL, ArmRig, assert_same, first, offset  # noqa: E402
+from geometry_msgs.msg import PoseStamped
+from std_msgs.msg import Float64MultiArray
+
+from q2r2_control.errors import ConfigError
+from q2r2_control.ros import BaseArmController
+from q2r2_control.ros.bridge.messages import stamped_pose
+from q2r2_control.ros.nodes.arm_controllers import RightArmController
+from tests.ros.arm_rig import TOOL, ArmRig, assert_same, first, offset
 
 
 @pytest.fixture
@@ -29,51 +31,17 @@ def rig(node: Any) -> ArmRig:
     return ArmRig(node)
 
 
-def test_a_cells_yaml_gives_stance_and_scale(node: Any, processes: Processes, tmp_path: Path) -> None:
-    cell = external() | {"controller": "builtin"}
-    del cell["external"]
-    cell["teleop"] |= {"stance": "mirror_reflected", "position_scale": 0.5}
-    config = tmp_path / "cell.yaml"
-    config.write_text(yaml.safe_dump(cell))
-    rig = ArmRig(node, "left", hand="right")
-    rig.start(processes, {"config": config})
-    rig.engage()
-    rig.move((0.08, 0.12, 0.0))
-    assert_same(rig.wait_for_rest(), offset(TOOL, (0.04, -0.06, 0.0)), 1e-3)
-    assert rig.state["stance"] == "mirror_reflected"
-
-
-def test_triggers_and_stick_are_bound_by_parameters_and_a_dead_man_is_no_fault_when_it_is_let_go(
-    rig: ArmRig, processes: Processes
-) -> None:
-    bindings = {"lower": "none", "grip": "dead_man"}
-    rig.start(processes, {f"teleop.bindings.{control}": action for control, action in bindings.items()})
-    rig.wait(lambda: rig.state.get("level") == "ok", "nothing keeps the arm from being engaged")
-    rig.press()
-    assert rig.state["state"] == "idle"
-    rig.grip = 1.0
-    rig.wait(lambda: rig.state["engaged"], "the arm is engaged")
-    rig.move((0.0, 0.05, 0.0))
-    assert_same(rig.wait_for_rest(), offset(TOOL, (0.0, 0.05, 0.0)), 1e-3)
-    rig.pulses.clear()
-    rig.grip = 0.0
-    rig.wait(lambda: rig.state["state"] == "paused", "the arm is paused")
-    assert rig.state["last_event_kind"] == "dead_man_released"
-    rig.wait(lambda: len(rig.pulses) == 2, "it is felt")
-    assert rig.pulses[0] == PAUSED[:2]
-
-
 def test_a_cells_yaml_names_the_external_controller_and_parameters_change_that(context: Any, tmp_path: Path) -> None:
-    from q2r2_control.ros.nodes.right_arm_controller import RightArmController
-
     cell = external()
     cell["external"] |= {"preset": "fzi", "rate": 60.0, "limits": {"max_velocity": 0.2}}
+    cell["teleop"] |= {"stance": "mirror_reflected", "position_scale": 0.5}
     config = tmp_path / "cell.yaml"
     config.write_text(yaml.safe_dump(cell))
     arguments = ["--ros-args", "-p", f"config:={config}", "-p", "guard.max_acceleration:=1.0"]
     made = RightArmController(context=context, cli_args=arguments)
     values = made.parameters
     assert (values.preset.name, values.mode, values.rate) == ("fzi", "raw", 60.0)
+    assert (values.teleop.stance, values.teleop.position_scale) == ("mirror_reflected", 0.5)
     assert values.target_topic == "/bh_robot/right_arm_clik_controller/target_frame"
     assert (values.base_frame, values.world_frame, values.tool_frame) == (
         "bh_robot_base",
@@ -92,8 +60,6 @@ def test_a_cells_yaml_names_the_external_controller_and_parameters_change_that(c
 
 
 def test_a_subclass_may_mirror_its_arm_and_give_its_filter_in_samples(context: Any) -> None:
-    from q2r2_control.ros import BaseArmController
-
     made = BaseArmController("right", "bh_robot", mirror=True, filter_window_size=4, context=context)
     assert made.get_name() == "right_bh_robot_arm_controller"
     assert (made.parameters.teleop.stance, made.hand) == ("mirror", "left")
@@ -104,14 +70,9 @@ def test_a_subclass_may_mirror_its_arm_and_give_its_filter_in_samples(context: A
 def test_a_tool_on_a_topic_is_engaged_where_it_is_and_paused_when_the_topic_ends(
     rig: ArmRig, node: Any, processes: Processes
 ) -> None:
-    from geometry_msgs.msg import PoseStamped
-
     rig.sends_tool = False
     publisher = node.create_publisher(PoseStamped, "/left/current_pose", 10)
-    now = node.get_clock().now
-    timer = node.create_timer(
-        0.01, lambda: publisher.publish(stamped_pose(rig.tool, "world", 1e-9 * now().nanoseconds))
-    )
+    timer = node.create_timer(0.01, lambda: publisher.publish(stamped_pose(rig.tool, "world", 0.0)))
     rig.start(processes, {"current_pose_topic": "/left/current_pose"})
     rig.engage()
     rig.wait(lambda: rig.targets, "targets come")
@@ -126,12 +87,9 @@ def test_a_tool_on_a_topic_is_engaged_where_it_is_and_paused_when_the_topic_ends
 def test_an_arm_is_not_engaged_while_the_built_in_controllers_tool_is_elsewhere(
     rig: ArmRig, node: Any, processes: Processes
 ) -> None:
-    from geometry_msgs.msg import PoseStamped
-
     safe = offset(TOOL, (0.0, 0.0, 0.15))  # as with a tool_frame that is not the cell's
     publisher = node.create_publisher(PoseStamped, "/cartesian_controller/safe_target/left", 10)
-    now = node.get_clock().now
-    timer = node.create_timer(0.01, lambda: publisher.publish(stamped_pose(safe, "world", 1e-9 * now().nanoseconds)))
+    timer = node.create_timer(0.01, lambda: publisher.publish(stamped_pose(safe, "world", 0.0)))
     node.create_subscription(PoseStamped, "/theirs/target_frame", lambda _: None, 10)
     rig.start(processes, {"mode": "filtered", "preset": "fzi", "target_topic": "/theirs/target_frame"})
     rig.wait(lambda: rig.state.get("kind") == "controller_refuses", "the arm is not ready")
@@ -145,8 +103,6 @@ def test_an_arm_is_not_engaged_while_the_built_in_controllers_tool_is_elsewhere(
 
 
 def test_a_gripper_behind_a_topic_gets_its_positions(rig: ArmRig, node: Any, processes: Processes) -> None:
-    from std_msgs.msg import Float64MultiArray
-
     commands: Queue[list[float]] = Queue()
     node.create_subscription(Float64MultiArray, "/left/fingers", lambda message: commands.put(list(message.data)), 10)
     given = {"action_type": "Float64MultiArray", "open_position": 0.1, "closed_position": 0.8}

@@ -8,6 +8,7 @@ import os
 import signal
 import time
 from collections.abc import Iterator
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -15,49 +16,40 @@ import pytest
 
 from q2r2_control import Robot, load_config
 from q2r2_control.robot.kept_distances import kept_distances
-from tests.ros.conftest import NEEDS_ROS, spun_node
-from tests.ros.processes import CONFIG, PATIENCE, Processes
+from tests.ros.conftest import need_ros, spun_node
+from tests.ros.processes import CONFIG, Processes
 
-pytest.importorskip("rclpy", reason=NEEDS_ROS)
-pytest.importorskip("control_msgs", reason="needs control_msgs: q2r2 ros build-interfaces")
-pytest.importorskip("tf2_msgs", reason="needs tf2_msgs: q2r2 ros build-interfaces")
+need_ros()
 
 import pinocchio as pin
 from geometry_msgs.msg import PoseStamped
-from rclpy.parameter import Parameter
-from rclpy.parameter_client import AsyncParameterClient
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import SetBool
+from trajectory_msgs.msg import JointTrajectory
 
 from q2r2_control.ros.base_node import COMMAND_QOS
 from q2r2_control.ros.bridge.messages import pose_message, stamped_pose, time_message
-from tests.ros.cell import PATIENT, STILL, Cell, Stream, shifted, start_controller, start_robot
+from tests.ros.cell import NODE_RATE, PATIENT, STILL, Cell, Stream, shifted, start_controller, start_robot
 from tests.ros.waiting import wait_until
 
 pytestmark = pytest.mark.alone
 
+EVERY_COMMAND = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
 # How far the simulated arms lag behind their reference at the speeds of these tests, between two arms.
 TRACKING = 0.01  # [m]
 
 
 @pytest.fixture(scope="module")
-def running(domain: int, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Processes]:
-    """Processes that outlive one test, since each takes seconds to start."""
-    processes = Processes(tmp_path_factory.mktemp("cell"), os.environ)
-    yield processes
-    processes.end_all()
-
-
-@pytest.fixture(scope="module")
-def started(domain: int, running: Processes, robot: Robot) -> Iterator[Cell]:
-    with spun_node(domain) as node:
-        yield Cell(node, robot, start_robot(running), start_controller(running, *PATIENT))
+def started(module_node: Any, module_processes: Processes, robot: Robot) -> Cell:
+    started = start_robot(module_processes), start_controller(module_processes, *PATIENT)
+    return Cell(module_node, robot, *started)
 
 
 @pytest.fixture
-def cell(started: Cell, running: Processes) -> Cell:
+def cell(started: Cell) -> Cell:
     """At home, active, without targets."""
     started.call("/cartesian_controller/stop")
     wait_until(lambda: started.state("phase") == "stopped", "the controller is stopped")
@@ -110,49 +102,21 @@ def test_crossing_targets_never_bring_the_arms_nearer_than_the_least_distance(
     assert -TRACKING <= margin < 0.02  # they did meet
 
 
-def test_safe_targets_are_the_tool_poses_of_the_reference(cell: Cell, streams: list[Stream]) -> None:
-    poses: list[PoseStamped] = []
-    subscription = cell.node.create_subscription(
-        PoseStamped, "/cartesian_controller/safe_target/left", poses.append, 10
-    )
-    engage(cell, streams, "left").move("left", (0.0, 0.0, 0.05))
-    wait_until(lambda: poses, "safe targets come")
-    cell.joints.wait_for_rest()
-    position = poses[-1].pose.position
-    assert poses[-1].header.frame_id == "world"
-    assert np.allclose([position.x, position.y, position.z], cell.tool("left").translation, atol=3e-3)
-    cell.node.destroy_subscription(subscription)
-
-
-def bad_target(kind: str, pose: pin.SE3) -> PoseStamped:
-    message = PoseStamped(pose=pose_message(pose))
-    message.header.frame_id = "elsewhere" if kind == "wrong frame" else "world"
-    if kind == "not a number":
-        message.pose.position.x = math.nan
-    return message
-
-
-@pytest.mark.parametrize(
-    ("kind", "said"),
-    [
-        ("wrong frame", "frame_id 'elsewhere'"),
-        ("not a number", "not a finite pose"),
-        ("far from the tool", "the stream is 0.1"),
-    ],
-)
-def test_a_bad_target_moves_nothing_and_is_reported_once(cell: Cell, kind: str, said: str) -> None:
+def test_a_bad_target_moves_nothing_and_is_reported_once(cell: Cell) -> None:
     wait_until(lambda: cell.state("level") == "ok", "nothing is wrong")
-    before, output = cell.q, cell.processes[1].output
-    pose = shifted(cell.tool("left"), 0.1, 0.0, 0.0) if kind == "far from the tool" else cell.tool("left")
-    for _ in range(30):
-        cell.send_message("left", bad_target(kind, pose))
-        time.sleep(0.01)
+    before, begin, process = cell.q, len(cell.processes[1].output), cell.processes[1]
+    far, odd = shifted(cell.tool("left"), 0.1, 0.0, 0.0), PoseStamped(pose=pose_message(cell.tool("left")))
+    odd.header.frame_id = "elsewhere"
+    kinds = {"frame_id 'elsewhere'": odd, "the stream is 0.1": stamped_pose(far, "world", 0.0)}
+    for said, message in kinds.items():
+        for _ in range(30):
+            cell.send_message("left", message)
+            time.sleep(0.01)
+        process.wait_for(said)
+        assert process.output[begin:].count(said) == 1
     wait_until(lambda: cell.state("level") == "warn", "it is in the diagnostics")
     assert "target of left not used" in cell.state("message")
     assert all(np.abs(q - before).max() < STILL for q in cell.postures)
-    added = cell.processes[1].output[len(output) :]
-    assert added.count("target of left not used") == added.count(said) == 1
-    assert cell.processes[1].running
 
 
 def test_an_arm_holds_without_targets_and_follows_only_a_stream_that_begins_at_its_tool(
@@ -192,88 +156,77 @@ def test_pause_stop_and_home(cell: Cell, robot: Robot, streams: list[Stream]) ->
     wait_until(lambda: cell.state("mode", "mujoco_robot") == "holding", "nothing is commanded")
 
 
-def test_arms_stop_when_their_controller_is_killed_and_stay_when_it_is_restarted(
-    started: Cell, cell: Cell, running: Processes, streams: list[Stream]
+def test_a_controller_that_stood_still_in_motion_publishes_no_jump(
+    cell: Cell, robot: Robot, streams: list[Stream]
 ) -> None:
-    stream = engage(cell, streams, "left", "right")
-    begin = stream.poses["left"]
-    stream.poses["left"] = shifted(begin, 0.25, 0.0, 0.1)
-    wait_until(lambda: np.linalg.norm(cell.tool("left").translation - begin.translation) > 0.05, "the arm moves")
-    os.kill(cell.processes[1].pid, signal.SIGKILL)
-    rest = cell.joints.wait_for_rest()  # how soon is measured by test_faults
-    back = start_controller(running, *PATIENT)
-    started.processes = (started.processes[0], back)
-    started.states.pop("cartesian_controller", None)
-    cell.wait_until_active()
-    time.sleep(0.5)  # targets still come, but no new stream
-    assert np.abs(cell.q - rest).max() < STILL
-    assert cell.state("left_state") == "holding"
+    commands: list[tuple[int, Any]] = []  # their numbers, and the positions
+
+    def take(message: JointTrajectory, info: Any) -> None:
+        order = [message.joint_names.index(name) for name in robot.joint_names]
+        commands.append((info["publication_sequence_number"], np.array(message.points[0].positions)[order]))
+
+    subscription = cell.node.create_subscription(JointTrajectory, "/joint_trajectory", take, EVERY_COMMAND)
+    stream = engage(cell, streams, "left")
+    for way in (0.2, -0.2, 0.2):
+        stream.poses["left"] = shifted(stream.poses["left"], 0.0, 0.0, way)
+        wait_until(lambda: cell.joints.speeds(0.05).max() > 0.5, "the arm is fast")
+        os.kill(cell.processes[1].pid, signal.SIGSTOP)
+        time.sleep(0.05)  # less than what would start over
+        os.kill(cell.processes[1].pid, signal.SIGCONT)
+        time.sleep(0.7)
+    for (before, start), (number, end) in pairwise(commands):
+        assert (np.abs(end - start) <= (number - before) * robot.velocity_limit / NODE_RATE * (1.0 + 1e-6)).all()
+    cell.node.destroy_subscription(subscription)
 
 
-@pytest.mark.parametrize(
-    ("kind", "said"),
-    [
-        ("not a number", "position of left_A4 is not finite"),
-        ("a jump", "left_A4 jumped by 0."),
-        ("a stall", "no joint states from /mujoco_robot for"),
-    ],
-)
 def test_invalid_joint_states_stop_the_arms_with_one_diagnostic(
-    cell: Cell, robot: Robot, streams: list[Stream], kind: str, said: str
+    cell: Cell, robot: Robot, streams: list[Stream]
 ) -> None:
-    output = cell.processes[1].output
+    process, said = cell.processes[1], "joint states: position of left_A4 is not finite"
+    begin = len(process.output)
     stream = engage(cell, streams, "left")
     stream.move("left", (0.0, 0.0, 0.03))
-    if kind == "a stall":
-        os.kill(cell.processes[0].pid, signal.SIGSTOP)
-        time.sleep(1.0)
-        os.kill(cell.processes[0].pid, signal.SIGCONT)
-    else:
-        publisher = cell.node.create_publisher(JointState, "/joint_states", 10)
-        q = cell.q.copy()
-        q[robot.joint_names.index("left_A4")] += 0.5 if kind == "a jump" else math.nan
-        message = JointState(name=list(robot.joint_names), position=q.tolist())
-        # A controller that was killed before is listed as a subscriber for a while: only the report counts.
-        wait_until(
-            lambda: publisher.publish(message) or said in cell.processes[1].output[len(output) :], "it is reported"
-        )
-        cell.node.destroy_publisher(publisher)
-    wait_until(lambda: f"joint states: {said}" in cell.processes[1].output[len(output) :], "it is reported")
-    wait_until(lambda: "active: " in cell.processes[1].output[len(output) :], "the controller is active again")
+    publisher = cell.node.create_publisher(JointState, "/joint_states", 10)
+    q = cell.q.copy()
+    q[robot.joint_names.index("left_A4")] = math.nan
+    message = JointState(name=list(robot.joint_names), position=q.tolist())
+    wait_until(lambda: publisher.publish(message) or said in process.output[begin:], "it is reported")
+    cell.node.destroy_publisher(publisher)
+    wait_until(lambda: "active: " in process.output[begin:], "the controller is active again")
     stream.move("left", (0.05, 0.0, 0.0))
-    assert cell.processes[1].output[len(output) :].count(f"joint states: {said}") == 1
+    assert process.output[begin:].count(said) == 1
     wait_until(lambda: cell.state("left_state") == "holding", "the arm holds")
     rest = cell.joints.wait_for_rest()
     time.sleep(0.3)
     assert np.abs(cell.q - rest).max() < STILL
 
 
-def test_distances_and_gains_are_set_in_motion_and_what_home_does_not_allow_is_refused(
-    cell: Cell, robot: Robot, streams: list[Stream]
+def test_a_second_publisher_of_targets_in_mid_motion_stops_the_arm_and_is_named(
+    cell: Cell, streams: list[Stream], domain: int
 ) -> None:
-    client = AsyncParameterClient(cell.node, "/cartesian_controller")
-    assert client.wait_for_services(PATIENCE)
+    stream = engage(cell, streams, "left")
+    begin, elsewhere = stream.poses["left"], shifted(cell.tool("left"), 0.0, 0.0, 0.2)
+    with spun_node(domain, "sender") as other:
+        publisher = other.create_publisher(PoseStamped, "/q2r2/left/target_frame", COMMAND_QOS)
+        timer = other.create_timer(0.01, lambda: publisher.publish(stamped_pose(elsewhere, "world", 0.0)))
 
-    def set_to(**values: float) -> Any:
-        sent = client.set_parameters_atomically([Parameter(f"control.{name}", value=to) for name, to in values.items()])
-        wait_until(sent.done, "the parameters are answered")
-        return sent.result().result
+        def named() -> bool:
+            stream.move("left", (0.0, 0.01, 0.0), speed=0.1)
+            stream.move("left", (0.0, -0.01, 0.0), speed=0.1)
+            return "two publishers at a time from /sender and /test; allowed: one" in str(cell.state("message"))
 
-    stream = engage(cell, streams, "left", "right")
-    stream.move("left", (0.03, 0.0, 0.0))
-    assert set_to(min_distance=0.03, position_gain=4.0, separation_gain=5.0, stretch_gain=20.0).successful
-    refused = set_to(min_distance=0.045, position_gain=8.0)
-    assert not refused.successful
-    assert "hand_e_envelope_0 are 41.6 mm apart" in refused.reason
-    assert not set_to(posture_gain=1000.0).successful
-    assert "separation_gain = 0.0" in set_to(separation_gain=0.0).reason
-    goal = stream.poses["left"]
-    wait_until(lambda: np.linalg.norm(cell.tool("left").translation - goal.translation) < 2e-3, "the arm is there")
-    assert cell.state("left_state") == "following"
-    read = client.get_parameters([f"control.{name}" for name in ("min_distance", "position_gain", "separation_gain")])
-    wait_until(read.done, "the parameters are read")
-    assert [value.double_value for value in read.result().values] == [0.03, 4.0, 5.0]
-    assert set_to(min_distance=0.02, position_gain=8.0, separation_gain=10.0, stretch_gain=10.0).successful
+        wait_until(named, "both are named", lambda: cell.state("message"))
+        wait_until(lambda: cell.state("left_state") == "holding", "the arm holds")
+        rest = cell.joints.wait_for_rest()
+        time.sleep(0.5)
+        assert np.abs(cell.q - rest).max() < STILL
+        other.destroy_timer(timer)
+    tools = [cell.robot.tool_pose(q, "left").translation for q in cell.postures]
+    assert max(np.linalg.norm(tool - begin.translation) for tool in tools) < 0.03  # nothing but its own 1 cm
+    stream.poses["left"] = shifted(begin, 0.0, 0.0, 0.2)
+    time.sleep(1.5)  # longer than two publishers count
+    stream.poses["left"] = cell.tool("left")
+    wait_until(lambda: cell.state("left_state") == "following", "the stream that is left begins anew")
 
 
 def test_it_follows_in_another_layout_and_frame_with_another_output_and_on_simulated_time(
@@ -282,8 +235,7 @@ def test_it_follows_in_another_layout_and_frame_with_another_output_and_on_simul
     cell.call("/cartesian_controller/stop")
     layout = ("left.target_topic:=/left/target_pose", "left.target_frame_id:=left_link_0", "output:=joint_state")
     arguments = [part for parameter in (*layout, *PATIENT, "use_sim_time:=true") for part in ("-p", parameter)]
-    module = "q2r2_control.ros.nodes.cartesian_controller"
-    processes.start_module(module, "--ros-args", *arguments, "-r", "__node:=second")
+    processes.run_node("cartesian_controller", *arguments, "-r", "__node:=second")
     states: list[dict[str, Any]] = []
     node = cell.node
     subscription = node.create_subscription(String, "/second/state", lambda m: states.append(json.loads(m.data)), 10)

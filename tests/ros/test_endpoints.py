@@ -10,11 +10,11 @@ from typing import Any
 
 import pytest
 
-from tests.ros.conftest import NEEDS_ROS
+from tests.ros.conftest import need_ros
 from tests.ros.processes import Processes, RosProcess
 from tests.ros.waiting import wait_until
 
-pytest.importorskip("rclpy", reason=NEEDS_ROS)
+need_ros()
 
 from geometry_msgs.msg import PoseStamped
 

@@ -9,7 +9,7 @@ import tomllib
 
 import pytest
 
-from q2r2_control.ros.launch.executables import MODULES
+from q2r2_control.ros.launch.executables import NODES
 from tests.ros.processes import ROOT
 
 # Runs an entry point and presses Ctrl-C when a module is about to be imported.
@@ -31,7 +31,7 @@ SCRIPTS: dict[str, str] = tomllib.loads((ROOT / "pyproject.toml").read_text())["
 
 @pytest.mark.parametrize("name", ["q2r2", "arm_controllers", "mujoco_robot"])
 def test_ctrl_c_while_importing_ends_a_command_and_prints_nothing(name: str) -> None:
-    at = f"q2r2_control.ros.nodes.{MODULES[name]}" if name in MODULES else "q2r2_control.cli.app"
+    at = f"q2r2_control.ros.nodes.{NODES[name][0]}" if name in NODES else "q2r2_control.cli.app"
     code = RUN.format(at=at, entry=SCRIPTS[name])
     run = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=120)
     assert (run.stdout, run.stderr) == ("", "")

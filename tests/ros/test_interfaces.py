@@ -9,10 +9,9 @@ from pathlib import Path
 import pytest
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from tests.ros.conftest import NEEDS_ROS
+from tests.ros.conftest import need_ros
 
-pytest.importorskip("rclpy", reason=NEEDS_ROS)
-pytestmark = pytest.mark.usefixtures("interfaces")
+need_ros()
 
 # ros2 topic info --verbose /tf says so on ROS 2 Jazzy.
 TF_HASH = "RIHS01_e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087"

@@ -3,42 +3,81 @@
 from __future__ import annotations
 
 import os
+import signal
 import time
-from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from q2r2_control import Robot
-from tests.ros.conftest import NEEDS_ROS, spun_node
+from tests.ros.conftest import need_ros, spun_node
 from tests.ros.processes import Processes
 
-pytest.importorskip("rclpy", reason=NEEDS_ROS)
-pytest.importorskip("control_msgs", reason="needs control_msgs: q2r2 ros build-interfaces")
-pytest.importorskip("lifecycle_msgs", reason="needs lifecycle_msgs")
+need_ros()
 
 from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState, GetState
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from tests.ros.cell import PATIENT, start_controller, start_robot
-from tests.ros.managed import STILL, Managed
+from q2r2_control.ros.base_node import STREAM_QOS
+from tests.ros.cell import PATIENT, SOFT, Cell, changed_cell, shifted, start_controller, start_robot
 from tests.ros.waiting import wait_until
 
 pytestmark = pytest.mark.alone
 
 
-@pytest.fixture(scope="module")
-def running(domain: int, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Processes]:
-    processes = Processes(tmp_path_factory.mktemp("managed"), os.environ)
-    yield processes
-    processes.end_all()
+STILL = 5e-3  # [rad]
+
+
+class Managed(Cell):
+    """A cell whose nodes' states can be changed, and the joint commands that come."""
+
+    def __init__(self, node: Any, robot: Robot, *processes: Any) -> None:
+        super().__init__(node, robot, *processes)
+        self.commands: list[JointTrajectory] = []
+        node.create_subscription(JointTrajectory, "/joint_trajectory", self.commands.append, STREAM_QOS)
+        self.commander = node.create_publisher(JointTrajectory, "/joint_trajectory", 1)
+        self._clients = {
+            name: (
+                node.create_client(ChangeState, f"/{name}/change_state"),
+                node.create_client(GetState, f"/{name}/get_state"),
+            )
+            for name in ("cartesian_controller", "mujoco_robot")
+        }
+
+    def ask(self, transition: int, name: str = "cartesian_controller") -> bool:
+        """Whether the node says that it did it."""
+        change = self._clients[name][0]
+        wait_until(change.service_is_ready, "the lifecycle's services are there")
+        future = change.call_async(ChangeState.Request(transition=Transition(id=transition)))
+        wait_until(future.done, "the transition is answered")
+        return bool(future.result().success)
+
+    def lifecycle(self, name: str = "cartesian_controller") -> str:
+        future = self._clients[name][1].call_async(GetState.Request())
+        wait_until(future.done, "the state is answered")
+        return str(future.result().current_state.label)
+
+    def command(self, q: Any) -> None:
+        point = JointTrajectoryPoint(positions=[float(value) for value in q])
+        self.commander.publish(JointTrajectory(joint_names=list(self.robot.joint_names), points=[point]))
+
+    def move_by_another(self, q: Any, seconds: float = 1.0) -> None:
+        """Joint commands of another node to ``q`` [rad], evenly."""
+        start, began = self.q.copy(), time.monotonic()
+        while (share := (time.monotonic() - began) / seconds) < 1.5:
+            self.command(start + min(share, 1.0) * (q - start))
+            time.sleep(0.01)
 
 
 @pytest.fixture(scope="module")
-def cell(domain: int, running: Processes, robot: Robot) -> Iterator[Managed]:
-    with spun_node(domain) as node:
-        cell = Managed(node, robot, start_robot(running), start_controller(running, *PATIENT))
-        cell.wait_until_active()
-        yield cell
+def cell(module_node: Any, module_processes: Processes, robot: Robot) -> Managed:
+    started = start_robot(module_processes), start_controller(module_processes, *PATIENT)
+    cell = Managed(module_node, robot, *started)
+    cell.wait_until_active()
+    return cell
 
 
 def test_it_starts_active_and_comes_to_rest_before_it_answers_that_it_is_not(cell: Managed, robot: Robot) -> None:
@@ -110,3 +149,31 @@ def test_a_robot_that_is_deactivated_takes_no_commands_and_stands(cell: Managed,
     assert cell.ask(Transition.TRANSITION_ACTIVATE, "mujoco_robot")
     cell.move_by_another(goal)
     assert abs(cell.q[0] - goal[0]) < 0.02
+
+
+@pytest.mark.parametrize("output", ["velocity", "torque"])
+def test_arms_that_are_commanded_speeds_or_torques_follow_are_left_at_rest_and_taken_over(
+    domain: int, module_processes: Processes, processes: Processes, robot: Robot, output: str, tmp_path: Path
+) -> None:
+    module_processes.end_all()  # whose nodes have the same names
+    config = changed_cell(tmp_path, impedance=SOFT)
+    with spun_node(domain) as node:
+        controller = start_controller(processes, *PATIENT, f"output:={output}", config=config)
+        cell = Managed(node, robot, start_robot(processes), controller)
+        cell.wait_until_active()
+        stream = cell.engage("left")
+        goal = shifted(stream.poses["left"], 0.0, 0.0, 0.1)
+        stream.move("left", (0.0, 0.0, 0.1), speed=0.1)
+        wait_until(lambda: np.linalg.norm(cell.tool("left").translation - goal.translation) < 4e-3, "the arm is there")
+        assert cell.state("mode", "mujoco_robot") == output
+        assert cell.ask(Transition.TRANSITION_DEACTIVATE)
+        stream.end()
+        at_rest = cell.joints.wait_for_rest()
+        cell.forget()
+        assert cell.ask(Transition.TRANSITION_ACTIVATE)
+        time.sleep(0.5)
+        assert np.abs(np.array(cell.postures) - at_rest).max() < 2.0 * STILL
+        os.kill(controller.pid, signal.SIGKILL)
+        wait_until(lambda: cell.state("mode", "mujoco_robot") == "holding", "the robot holds")
+        time.sleep(0.5)
+        assert np.abs(np.array(cell.postures) - at_rest).max() < 2.0 * STILL

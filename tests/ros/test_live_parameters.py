@@ -3,109 +3,119 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-import pytest
 
-from tests.ros.conftest import NEEDS_ROS, spun_node
+from tests.ros.conftest import need_ros
 from tests.ros.processes import Processes
 from tests.ros.waiting import wait_until
 
-pytest.importorskip("rclpy", reason=NEEDS_ROS)
-pytest.importorskip("quest2ros", reason="needs q2r2 ros build-interfaces")
-pytestmark = pytest.mark.usefixtures("interfaces")
+need_ros()
 
-from rclpy.parameter import Parameter  # noqa: E402
-from rclpy.parameter_client import AsyncParameterClient  # noqa: E402
+from rclpy.parameter import Parameter
+from rclpy.parameter_client import AsyncParameterClient
 
-from tests.ros.arm_rig import ArmRig, assert_same, offset, steps  # noqa: E402
+from q2r2_control import CartesianController, Robot
+from q2r2_control.compliance.impedance import ImpedanceController
+from q2r2_control.config.control import ImpedanceSettings
+from q2r2_control.ros.base_node import BaseNode
+from q2r2_control.ros.bridge.live_parameters import make_control_live, make_impedance_live
+from q2r2_control.ros.nodes.arm_controllers import LeftArmController
+from q2r2_control.types import RobotState
+from tests.ros.arm_rig import ArmRig, assert_same, offset, steps
 
 
-class Settable(ArmRig):
-    """An arm whose node's parameters can be set and read."""
+def set_in(node: Any, **values: Any) -> Any:
+    """The result; ``__`` in a name stands for a dot."""
+    parameters = [Parameter(name.replace("__", "."), value=value) for name, value in values.items()]
+    return node.set_parameters_atomically(parameters)
 
-    def __init__(self, node: Any, arm: str = "left") -> None:
-        super().__init__(node, arm)
-        self._client = AsyncParameterClient(node, f"{arm}_q2r2_arm_controller")
 
-    def set(self, **values: Any) -> Any:
-        """Of ``teleop`` all together, ``__`` stands for a dot; the result, with ``successful`` and ``reason``."""
-        return self.set_named({"teleop." + name.replace("__", "."): value for name, value in values.items()})
+def test_scale_and_guard_that_are_set_in_motion_count_from_then_on_and_nothing_jumps(
+    node: Any, processes: Processes
+) -> None:
+    rig = ArmRig(node)
+    rig.start(processes)
+    client = AsyncParameterClient(node, "left_q2r2_arm_controller")
 
-    def set_named(self, values: dict[str, Any]) -> Any:
-        parameters = [Parameter(name, value=value) for name, value in values.items()]
-        future = self._client.set_parameters_atomically(parameters)
+    def set_to(values: dict[str, Any]) -> Any:
+        future = client.set_parameters_atomically([Parameter(name, value=value) for name, value in values.items()])
         wait_until(future.done, "the parameters are answered")
         return future.result().result
 
-    def get(self, name: str) -> float:
-        future = self._client.get_parameters([f"teleop.{name}"])
-        wait_until(future.done, "the parameters are answered")
-        return float(future.result().values[0].double_value)
-
-
-@pytest.fixture
-def rig(domain: int, processes: Processes) -> Iterator[Settable]:
-    with spun_node(domain) as node:
-        rig = Settable(node)
-        rig.start(processes)
-        rig.engage()
-        yield rig
-
-
-def test_a_scale_that_is_set_in_motion_counts_from_then_on_and_nothing_jumps(rig: Settable) -> None:
+    rig.engage()
     before = rig.wait_for_rest()
-    assert rig.set(position_scale=0.5, filter__smoothing_delay=0.05).successful
+    assert set_to({"teleop.position_scale": 0.5, "teleop.filter.smoothing_delay": 0.05}).successful
+    refused = set_to({"teleop.position_scale": 1.0, "teleop.chord_window": 0.2})
+    assert "may be changed while both arms hold" in refused.reason
     rig.move((0.1, 0.0, 0.0))
     assert_same(rig.wait_for_rest(), offset(before, (0.05, 0.0, 0.0)), 1e-3)
     assert rig.state["engaged"]
     assert max(steps(rig.targets)) < 0.01
-    assert rig.get("position_scale") == 0.5
+    assert set_to({"guard.max_velocity": 0.05, "guard.max_acceleration": 2.0}).successful
+    began, before = time.monotonic(), rig.newest()
+    rig.move((0.12, 0.0, 0.0))
+    way = np.linalg.norm(rig.newest().translation - before.translation)
+    assert way < 0.05 * (time.monotonic() - began)  # of 0.06 m that are asked for
+    assert_same(rig.wait_for_rest(), offset(before, (0.06, 0.0, 0.0)), 1e-3)
 
 
-def test_what_cannot_be_set_is_refused_with_the_reason_and_changes_nothing(rig: Settable) -> None:
-    before = rig.wait_for_rest()
+def test_what_cannot_be_set_is_refused_with_the_reason_and_changes_nothing(context: Any) -> None:
+    node = LeftArmController(context=context)
     for values, reason in (
-        ({"position_scale": 0.5, "chord_window": 0.2}, "may be changed while both arms hold"),
-        ({"position_scale": 0.5, "precision_scale": 7.0}, "precision_scale"),
-        ({"position_scale": 0.5, "axis_scales": [1.0, 2.0]}, "teleop.axis_scales"),
+        ({"teleop__position_scale": 0.5, "teleop__precision_scale": 7.0}, "precision_scale"),
+        ({"teleop__position_scale": 0.5, "teleop__axis_scales": [1.0, 2.0]}, "teleop.axis_scales"),
+        ({"guard__max_velocity": 0.3, "guard__max_angular_velocity": 0.0}, "guard.max_angular_velocity"),
+        ({"mirror_reflected": True}, "allowed with mirror = True only"),
     ):
-        result = rig.set(**values)
+        before = node.parameters
+        result = set_in(node, **values)
         assert not result.successful
         assert reason in result.reason
-        assert rig.get("position_scale") == 1.0
-    rig.move((0.05, 0.0, 0.0))
-    assert_same(rig.wait_for_rest(), offset(before, (0.05, 0.0, 0.0)), 1e-3)
+        assert node.parameters == before
+    assert set_in(node, mirror=True, mirror_reflected=True).successful
+    assert (node.hand, node.health()[2]["stance"]) == ("right", "mirror_reflected")
+    node.destroy_node()
 
 
-def test_a_target_is_as_slow_as_the_guard_is_set_to_in_motion(rig: Settable) -> None:
-    before = rig.wait_for_rest()
-    assert rig.set_named({"guard.max_velocity": 0.05, "guard.max_acceleration": 2.0}).successful
-    began = time.monotonic()
-    rig.move((0.06, 0.0, 0.0))
-    way = np.linalg.norm(rig.newest().translation - before.translation)
-    assert way < 0.05 * (time.monotonic() - began)  # of 0.06 m, which the hand has gone
-    goal = offset(before, (0.06, 0.0, 0.0)).translation
-    rig.wait(lambda: np.linalg.norm(rig.newest().translation - goal) < 1e-3, "the target is where the hand is")
-    refused = rig.set_named({"guard.max_velocity": 0.5, "guard.max_angular_velocity": 0.0})
-    assert not refused.successful
-    assert "guard.max_angular_velocity" in refused.reason
+def test_distances_and_gains_of_the_controller_are_set_together_or_not_at_all(context: Any, robot: Robot) -> None:
+    node, controller = BaseNode("controller", context=context), CartesianController(robot)
+    make_control_live(node, controller)
+    assert set_in(node, control__min_distance=0.03, control__position_gain=4.0, control__stretch_gain=20.0).successful
+    for values, reason in (
+        ({"control__min_distance": 0.045, "control__position_gain": 8.0}, "hand_e_envelope_0 are 41.6 mm apart"),
+        ({"control__posture_gain": 1000.0}, "posture_gain"),
+        ({"control__separation_gain": 0.0}, "separation_gain = 0.0"),
+    ):
+        refused = set_in(node, **values)
+        assert not refused.successful
+        assert reason in refused.reason
+    names = ("min_distance", "position_gain", "stretch_gain")
+    assert [node.get_parameter(f"control.{name}").value for name in names] == [0.03, 4.0, 20.0]
+    node.destroy_node()
 
 
-def test_mirror_is_set_while_the_arm_is_paused_and_gives_it_the_other_hand(rig: Settable) -> None:
-    refused = rig.set_named({"mirror": True})
-    assert not refused.successful
-    assert "may be changed while both arms hold" in refused.reason
-    rig.pause()
-    refused = rig.set_named({"mirror_reflected": True})
-    assert not refused.successful
-    assert "allowed with mirror = True only" in refused.reason
-    assert rig.state["hand"] == "left"
-    assert rig.set_named({"mirror": True, "mirror_reflected": True}).successful
-    rig.wait(lambda: rig.state["stance"] == "mirror_reflected", "the stance is told")
-    assert rig.state["hand"] == "right"
-    assert rig.set_named({"mirror": False, "mirror_reflected": False}).successful
-    rig.wait(lambda: rig.state["hand"] == "left", "the hand is its own again")
-    rig.engage()
+def test_an_impedance_that_is_set_counts_for_both_arms_and_what_is_not_allowed_changes_nothing(
+    context: Any, robot: Robot
+) -> None:
+    impedance = ImpedanceController(robot, ImpedanceSettings(ramp_time=0.1))
+    zero = np.zeros(robot.model.nv)
+    at_home = RobotState(robot.home, zero, zero, None, 0.0)
+    impedance.reset(at_home)
+    node = BaseNode("torques", context=context)
+    make_impedance_live(node, impedance)
+    before = impedance.in_force("left")
+    asked = {
+        **{"translational_stiffness": 500.0, "rotational_stiffness": 50.0, "damping_ratio": 0.5},
+        **{"nullspace_stiffness": 10.0, "nullspace_damping_ratio": 0.7},
+    }
+    assert set_in(node, **asked).successful
+    for name, value in {"translational_stiffness": 9000.0, "damping_ratio": 0.0}.items():
+        refused = set_in(node, nullspace_stiffness=20.0, **{name: value})
+        assert not refused.successful
+        assert name in refused.reason
+    node.destroy_node()
+    assert [impedance.in_force(arm) for arm in robot.arms] == [before] * 2  # until the arms are commanded
+    impedance.reset(at_home)
+    assert [impedance.in_force(arm) for arm in robot.arms] == [asked] * 2

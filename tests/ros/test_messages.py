@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.ros.conftest import NEEDS_ROS
+from tests.ros.conftest import need_ros
 
-pytest.importorskip("rclpy", reason=NEEDS_ROS)
-pytest.importorskip("quest2ros", reason="needs q2r2 ros build-interfaces")
+need_ros()
 
 from geometry_msgs.msg import Point, Pose, Quaternion
 from sensor_msgs.msg import JointState

@@ -3,30 +3,31 @@
 from __future__ import annotations
 
 import time
-from dataclasses import replace
 from queue import Queue
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import pinocchio as pin
 import pytest
 
-from tests.ros.conftest import NEEDS_ROS
-from tests.ros.processes import PATIENCE
+from tests.ros.conftest import need_ros
 from tests.ros.waiting import wait_until
 
-pytest.importorskip("rclpy", reason=NEEDS_ROS)
+need_ros()
 
 from std_msgs.msg import Float64MultiArray
+from trajectory_msgs.msg import JointTrajectory
 
-from q2r2_control import CartesianController, Robot, load_config
+from q2r2_control import Robot, load_config
 from q2r2_control.drives.factory import make_drive
-from q2r2_control.drives.torque import TorqueDrive
-from q2r2_control.robot.kept_distances import kept_distances
-from q2r2_control.ros.base_node import COMMAND_QOS
-from q2r2_control.ros.bridge.joint_messages import PositionArray, TorqueArray
-from q2r2_control.ros.bridge.joint_outputs import Channel, JointOutput
+from q2r2_control.errors import ConfigError
+from q2r2_control.ros.base_node import COMMAND_QOS, BaseNode
+from q2r2_control.ros.bridge import joint_messages
+from q2r2_control.ros.bridge.joint_messages import LbrPosition, LbrTorque, PositionArray, TorqueArray
+from q2r2_control.ros.bridge.joint_outputs import Channel, JointOutput, make_output
 from q2r2_control.ros.monitoring.endpoints import WatchedPublisher
-from q2r2_control.types import CommandMode, RobotState
+from q2r2_control.types import Command, CommandMode, RobotState
 
 TIMEOUT = 0.5  # more than a busy machine takes to acknowledge [s]
 
@@ -85,33 +86,40 @@ def test_a_new_receiver_of_positions_is_noticed_where_the_arms_are_off_their_ref
     assert (fault is not None and "new receiver" in fault) == (positions and off_reference)
 
 
-def test_torques_that_are_sent_contain_the_wall_between_measured_links(node: Any, robot: Robot) -> None:
-    config = load_config("config/dual_iiwa7.yaml")
-    kept = kept_distances(robot, config.control).values
-    random = np.random.default_rng(3)
-    q = robot.home
-    while not (robot.distance_values(q).min() > 0.0 and (robot.distance_values(q) - kept).min() < -0.01):
-        q = random.uniform(robot.position_lower, robot.position_upper)
-    at_rest = np.zeros_like(q)
-    state = RobotState(q, at_rest, at_rest, None, 0.0)
-    reference = replace(CartesianController(robot, config.control).step({}, 0.004), q=q, v=at_rest, a=at_rest)
+def test_arms_with_a_topic_each_get_their_own_joints_there(node: Any, robot: Robot, context: Any) -> None:
+    # The right arm's topic is by the pattern for all, the left one's by itself.
+    given = ("output_topic:=/{arm}/commands", "left.output_topic:=/left/commands")
+    sender = BaseNode("sender", context=context, cli_args=["--ros-args", *(p for g in given for p in ("-p", g))])
+    output = make_output("trajectory", sender, robot, load_config("config/dual_iiwa7.yaml"), 0.004)
+    assert set(output.sent) == {"/left/commands", "/right/commands"}
     taken: Queue[Any] = Queue()
-    publisher = WatchedPublisher(node, Float64MultiArray, "/torques", TIMEOUT)
-    node.create_subscription(Float64MultiArray, "/torques", taken.put, COMMAND_QOS)
-    wait_until(lambda: publisher.listeners, "the listener is found")
-    drive = make_drive(CommandMode.TORQUE, robot, config, has_servos=False)
-    assert isinstance(drive, TorqueDrive)
-    channel = Channel(list(robot.joint_names), np.arange(len(q)), publisher)
-    output = JointOutput(drive, TorqueArray(0.004, robot), [channel])
-    drive.reset(state)
-    output.send(drive.command(reference, state, {}, 0.004), state, 0.0, decided=time.monotonic())
-    torque = np.array(taken.get(timeout=PATIENCE).data)
-    wall = drive.report.wall
-    assert wall is not None
-    assert wall.pressing
-    # The spring is about where the arms are, so the rest bears their weight.
-    hardest = int(np.abs(wall.tau).argmax())
-    beyond_weight = torque - drive.gravity(q)
-    assert abs(wall.tau[hardest]) > 1.0
-    assert beyond_weight[hardest] * wall.tau[hardest] > 0.0
-    assert abs(beyond_weight[hardest]) > 1.0
+    node.create_subscription(JointTrajectory, "/right/commands", taken.put, COMMAND_QOS)
+    q, zero = robot.home, np.zeros_like(robot.home)
+    state = RobotState(q, zero, zero, None, 0.0)
+    command = Command(CommandMode.POSITION, q, zero, zero, {})
+    wait_until(lambda: sender.count_subscribers("/right/commands"), "the listener is found")
+    while taken.empty():
+        output.send(command, state, 0.0, time.monotonic())
+        time.sleep(0.02)
+    message = taken.get()
+    assert message.joint_names == [name for name in robot.joint_names if name.startswith("right")]
+    assert list(message.points[0].positions) == q[robot.arms["right"].joints].tolist()
+    sender.destroy_node()
+
+
+def test_torques_for_an_lbr_are_without_gravity_and_come_with_its_measured_positions(
+    robot: Robot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(ConfigError, match="lbr_fri_idl cannot be imported"):
+        LbrTorque(0.004, robot)
+    monkeypatch.setattr(joint_messages, "_lbr_message", lambda name: SimpleNamespace)
+    q, zero = robot.home + 0.1, np.zeros_like(robot.home)
+    gravity = pin.computeGeneralizedGravity(robot.model, robot.model.createData(), q)
+    command = Command(CommandMode.TORQUE, robot.home, zero, gravity + 1.0, {})
+    joints = robot.arms["left"].joints
+    to_send = command, RobotState(q, zero, zero, None, 0.0), 0.0
+    sent = LbrTorque(0.004, robot).encode(*to_send, [], joints)
+    np.testing.assert_allclose(sent.torque, 1.0)
+    np.testing.assert_array_equal(sent.joint_position, q[joints])
+    sent = LbrPosition(0.004, robot).encode(*to_send, [], joints)
+    np.testing.assert_array_equal(sent.joint_position, robot.home[joints])

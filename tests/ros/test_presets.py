@@ -1,16 +1,22 @@
-"""Every preset on the simulated arms, moved by a strict controller that prints each rule which a target breaks.
+"""Another project's controller moves the arms: what it gets keeps its rules, in both modes.
 
-The left arm's controller gets the hand's target itself, the right arm's what the built-in controller makes of it; all
-are processes. What is asserted of the arms is asserted at every joint state.
+The program of this package's own controller stands in for it, under another name and with topics of its own. The left
+arm's node sends it the hand's target itself, the right arm's what the built-in controller makes of that.
 """
 
 from __future__ import annotations
 
 import os
+import signal
+import sys
+import types
 from collections.abc import Iterator
-from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
+import numpy as np
+import pinocchio as pin
 import pytest
 import yaml
 
@@ -18,101 +24,216 @@ from q2r2_control import Robot
 from q2r2_control.config.presets import BUILTIN, PRESETS, Mode, preset_of
 from q2r2_control.config.resources import find_resource
 from q2r2_control.errors import ConfigError
-from tests.ros.conftest import NEEDS_ROS, spun_node
-from tests.ros.processes import CONFIG, Processes
+from tests.ros.conftest import need_ros, spun_node
+from tests.ros.processes import CONFIG, Processes, RosProcess
 
-pytest.importorskip("rclpy", reason=NEEDS_ROS)
-pytest.importorskip("quest2ros", reason="needs q2r2 ros build-interfaces")
-pytestmark = [pytest.mark.usefixtures("interfaces"), pytest.mark.alone]
+need_ros()
+pytestmark = pytest.mark.alone
 
-from geometry_msgs.msg import PoseStamped  # noqa: E402
+from geometry_msgs.msg import PoseStamped, WrenchStamped
 
-from tests.ros.preset_bench import PresetBench, StrictControllers, arm_controllers, run_through  # noqa: E402
-from tests.ros.programs.strict_controllers import Terms  # noqa: E402
+from q2r2_control.ros.base_node import COMMAND_QOS, LATCHED_QOS
+from q2r2_control.ros.bridge.arm_outputs import CommandType
+from q2r2_control.ros.bridge.messages import pose_of, seconds
+from tests.ros.arm_rig import ArmRig, ArmRigs, patient
+from tests.ros.cell import NODE_RATE, PATIENT, Cell, start_controller, start_robot
+from tests.ros.waiting import wait_until
 
-POSES = {
-    "builtin": Terms("target_frame", lowest_rate=20.0, fastest=3.3, fastest_turn=13.0),  # it has limits of its own
-    "kuka_lbr_clik": Terms("target_frame"),
-    "kuka_lbr_impedance": Terms("target_frame", lowest_rate=100.0, wrench=True),
-    "fzi": Terms("target_frame"),
-    "mayr": Terms("reference_pose"),
-    "crisp": Terms("target_pose", frame="ignored"),
-    "moveit_servo": Terms("pose_target_cmds", frame="any", lowest_rate=10.0, longest_age=0.1, command_type=True),
+PRESET = "kuka_lbr_impedance"
+STILL = 4e-3  # how far a tool at rest may move [m]
+NEAR = 6e-3  # a tool this near has arrived [m]
+SETTLED = 4e-3  # from a tool or a target that rests [m]
+LONGEST_GAP = 0.3  # in a stream, on a machine with other load [s]
+NAMES = {
+    **{"builtin": "target_frame", "kuka_lbr_clik": "target_frame", "kuka_lbr_impedance": "target_frame"},
+    **{"fzi": "target_frame", "mayr": "reference_pose", "crisp": "target_pose", "moveit_servo": "pose_target_cmds"},
+    **{"lbr_position": "command/joint_position", "forward_position": "commands", "jtc": "joint_trajectory"},
 }
-RUN = ("builtin", "kuka_lbr_impedance", "moveit_servo")  # the others ask for less, or have other names
-JOINTS = {
-    "lbr_position": Terms("command/joint_position", message="lbr", lowest_rate=100.0),
-    "forward_position": Terms("commands", message="array", lowest_rate=100.0),
-    "jtc": Terms("joint_trajectory", message="trajectory", lowest_rate=20.0),
-}
+JOINTS = ("lbr_position", "forward_position", "jtc")
 
 
-@pytest.fixture(scope="module")
-def bench(domain: int, robot: Robot, tmp_path_factory: pytest.TempPathFactory) -> Iterator[PresetBench]:
-    folder = tmp_path_factory.mktemp("bench")
-    running, right_arm = Processes(folder, os.environ), folder / "right_arm.yaml"
+class Theirs:
+    """The controller of both arms that stands in for another project's, and all targets that it gets."""
+
+    def __init__(self, node: Any, processes: Processes, robot: Robot) -> None:
+        self._processes, self.robot = processes, robot
+        self.targets: dict[str, list[tuple[PoseStamped, pin.SE3]]] = {arm: [] for arm in robot.arms}  # and the tool
+        self.wrenches: list[WrenchStamped] = []
+        self.cell = Cell(node, robot, targets="/not_used/{arm}")
+        for arm in robot.arms:
+            topic = f"/robot/{arm}_ctrl/target_frame"
+            node.create_subscription(PoseStamped, topic, lambda m, arm=arm: self._take(arm, m), COMMAND_QOS)
+        node.create_subscription(WrenchStamped, "/robot/left_ctrl/target_wrench", self.wrenches.append, LATCHED_QOS)
+        self.start()
+
+    def start(self) -> None:
+        topics = [f"{arm}.target_topic:=/robot/{arm}_ctrl/target_frame" for arm in self.robot.arms]
+        frames = [f"{arm}.target_frame_id:={arm}_link_0" for arm in self.robot.arms]
+        given = (f"config:={CONFIG}", f"rate:={NODE_RATE}", *PATIENT, *topics, *frames)
+        arguments = [part for parameter in given for part in ("-p", parameter)]
+        self.process: RosProcess = self._processes.run_node("cartesian_controller", *arguments, "-r", "__node:=theirs")
+        self.process.wait_for("active: ")
+
+    def _take(self, arm: str, message: PoseStamped) -> None:
+        self.targets[arm].append((message, self.cell.joints.tool(arm)))
+
+    def assert_rules_kept(self) -> None:
+        """Unit quaternions in the arm's own frame; streams that begin at the tool, no faster than the preset says."""
+        fastest = PRESETS[PRESET].guard.max_velocity * 1.1
+        for arm, targets in self.targets.items():
+            assert len(targets) > 100
+            base = self.robot.model.frames[self.robot.model.getFrameId(f"{arm}_link_0")].placement
+            stream = [(seconds(message.header.stamp), base * pose_in(message), tool) for message, tool in targets]
+            assert {message.header.frame_id for message, _ in targets} == {f"{arm}_link_0"}
+            assert distance(stream[0][1], stream[0][2]) < SETTLED
+            for (t, before, _), (now, target, tool) in pairwise(stream):
+                gap = now - t
+                at_the_tool = gap > LONGEST_GAP and distance(target, tool) < SETTLED
+                assert at_the_tool or distance(before, target) < fastest * min(gap, LONGEST_GAP) + SETTLED, (arm, gap)
+
+
+def pose_in(message: PoseStamped) -> pin.SE3:
+    turned = message.pose.orientation
+    assert abs(np.linalg.norm([turned.x, turned.y, turned.z, turned.w]) - 1.0) < 1e-6
+    pose = pose_of(message.pose)
+    assert pose is not None
+    return pose
+
+
+def distance(one: pin.SE3, other: pin.SE3) -> float:
+    return float(np.linalg.norm(one.translation - other.translation))
+
+
+@pytest.fixture
+def theirs(domain: int, robot: Robot, processes: Processes, tmp_path: Path) -> Iterator[Theirs]:
+    """Robot and both controllers; the built-in one has the right arm alone, as it moves neither."""
     cell = yaml.safe_load(find_resource(CONFIG).read_text())
     del cell["arms"]["left"]
-    right_arm.write_text(yaml.safe_dump(cell))
+    (right_arm := tmp_path / "right_arm.yaml").write_text(yaml.safe_dump(cell))
     with spun_node(domain) as node:
-        yield PresetBench(domain, node, robot, running, right_arm)
-        running.end_all()
+        start_robot(processes)
+        theirs = Theirs(node, processes, robot)
+        start_controller(processes, *PATIENT, "output:=none", "deviation_time:=2.0", config=str(right_arm))
+        wait_until(lambda: theirs.cell.state("phase") == "active", "the built-in controller is active")
+        yield theirs
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", RUN)
-def test_targets_keep_the_rules_of_a_controller_in_both_modes_and_its_arm_moves_smoothly(
-    name: str, bench: PresetBench, processes: Processes, other_interfaces: dict[str, str]
+def start_arm(node: Any, processes: Processes, arm: str, mode: str) -> ArmRig:
+    rig = ArmRig(node, arm, topic="/unused/target_frame")
+    rig.sends_tool = rig.follows = False
+    prefix = f"/robot/{arm}_ctrl"
+    given = {
+        **{"preset": PRESET, "mode": mode, "ctrl_prefix": prefix, "controller_node": "/theirs"},
+        **{"base_frame_id": f"{arm}_link_0", "world_frame_id": "world", "teleop.linked": False},
+        **{"teleop.leash.distance": 0.0},  # an arm that lags on a machine with other load is not held up
+    }
+    processes.start_node(f"{arm}_arm_controller", *patient(given))
+    return rig
+
+
+def test_a_controller_gets_targets_by_its_rules_in_both_modes_and_its_arms_never_jump(
+    theirs: Theirs, processes: Processes, domain: int
 ) -> None:
-    bench.reset("output:=none")
-    environment = other_interfaces if POSES[name].command_type else {}
-    controllers = StrictControllers(processes, POSES[name], environment)
-    controllers.start()
-    modes = {"left": "raw", "right": "raw" if name == "builtin" else "filtered"}
-    with arm_controllers(bench, processes, name, modes, environment) as rigs:
-        run_through(bench, rigs, controllers, PRESETS[name].guard)
+    joints = theirs.cell.joints
+
+    def move(by: tuple[float, float, float]) -> None:
+        goals = {rig.arm: joints.tool(rig.arm).translation + np.array(by) for rig in rigs.rigs}
+        rigs.move(by, 0.4)
+        ways = lambda: [np.linalg.norm(joints.tool(arm).translation - goal) for arm, goal in goals.items()]  # noqa: E731
+        wait_until(lambda: max(ways()) < NEAR, "the arms arrive", lambda: (ways(), [rig.state for rig in rigs.rigs]))
+        joints.wait_for_rest()
+
+    with spun_node(domain, "hands") as node:
+        rigs = ArmRigs(
+            [start_arm(node, processes, arm, mode) for arm, mode in (("left", "raw"), ("right", "filtered"))]
+        )
+        rigs.wait(lambda rig: rig.state.get("hand_age") is not None, "the arm's node receives the hand")
+        with joints.tools_rest(STILL, "it is engaged"):
+            rigs.wait_until_ready(3)
+            rigs.engage()
+        move((0.06, 0.0, 0.04))
+        with joints.tools_rest(STILL, "it is paused and engaged again"):
+            rigs.pause()
+            rigs.move((-0.5, 0.2, 0.0), 0.05, turn=1.0)
+            rigs.engage()
+        with joints.tools_rest(STILL, "its hand data are lost and come back"):
+            rigs.interrupt_hand_data()
+            rigs.engage()
+        move((0.0, 0.0, 0.06))
+        os.kill(theirs.process.pid, signal.SIGKILL)
+        theirs.process.wait()
+        rigs.move((0.1, 0.0, 0.0), 0.3)  # the restarted controller must not be asked to catch up with that
+        rigs.wait_for_pause()
+        joints.wait_for_rest()
+        with joints.tools_rest(STILL, "its controller is restarted"):
+            theirs.start()
+            rigs.wait_until_ready(3)
+            rigs.engage()
+        move((-0.05, 0.0, 0.0))
+    theirs.assert_rules_kept()
+    wrench = theirs.wrenches[-1]
+    assert wrench.header.frame_id == "left_link_0"
+    assert (wrench.wrench.force.x, wrench.wrench.force.z, wrench.wrench.torque.x) == (0.0, 0.0, 0.0)
 
 
-@pytest.mark.parametrize("name", ["lbr_position", "forward_position"])
-def test_joint_commands_of_the_built_in_controller_keep_the_rules_of_a_controller_of_joints(
-    name: str, bench: PresetBench, processes: Processes, other_interfaces: dict[str, str]
-) -> None:
-    terms, preset = JOINTS[name], PRESETS[name]
-    topic = f"right.output_topic:=/robot/right_ctrl/{terms.topic}"
-    environment = other_interfaces if terms.message == "lbr" else {}
-    bench.reset(f"output:={preset.output}", topic, f"rate:={preset.rate}", **environment)
-    controllers = StrictControllers(processes, terms, environment)
-    controllers.start()
-    with arm_controllers(bench, processes, name, {"right": "filtered"}, environment) as rigs:
-        run_through(bench, rigs, controllers, BUILTIN.guard)
+class Servo:
+    """The service of MoveIt Servo that agrees to poses, and the node that calls it."""
+
+    def __init__(self) -> None:
+        self.asked: list[int] = []
+        self.success = False
+
+    def create_client(self, kind: type, service: str) -> Servo:
+        return self
+
+    def service_is_ready(self) -> bool:
+        return True
+
+    def call_async(self, request: Any) -> Any:
+        self.asked.append(request.command_type)
+        answer = types.SimpleNamespace(success=self.success)
+        return types.SimpleNamespace(done=lambda: True, result=lambda: answer)
 
 
-def test_where_moveit_msgs_is_missing_the_user_is_told_to_switch_to_poses(
-    bench: PresetBench, node: Any, processes: Processes
-) -> None:
-    node.create_subscription(PoseStamped, "/robot/left_ctrl/pose_target_cmds", lambda _: None, 1)
-    with arm_controllers(bench, processes, "moveit_servo", {"left": "raw"}, {}) as rigs:
-        text = "moveit_msgs cannot be imported: call /robot/left_ctrl/switch_command_type with 2 yourself"
-        rigs.wait(lambda rig: rig.state.get("message") == text, "the user is informed")
+def test_moveit_servo_is_told_to_take_poses_after_each_of_its_starts(monkeypatch: pytest.MonkeyPatch) -> None:
+    servo: Any = Servo()
+    monkeypatch.setitem(sys.modules, "moveit_msgs.srv", None)
+    with pytest.raises(ConfigError, match="moveit_msgs, which cannot be imported"):
+        CommandType(servo, "/servo/switch_command_type")
+    monkeypatch.setitem(sys.modules, "moveit_msgs", types.ModuleType("moveit_msgs"))
+    messages: Any = types.ModuleType("moveit_msgs.srv")
+    messages.ServoCommandType = types.SimpleNamespace(Request=types.SimpleNamespace)
+    monkeypatch.setitem(sys.modules, "moveit_msgs.srv", messages)
+    command_type = CommandType(servo, "/servo/switch_command_type")
+
+    def agreed(starts: int, now: float) -> bool:
+        command_type.step(starts, now)
+        return command_type.unready is None
+
+    assert [agreed(0, now) for now in (0.0, 0.5, 1.2)] == [False] * 3  # it refuses
+    servo.success = True
+    assert [agreed(0, now) for now in (2.4, 2.5, 9.0)] == [False, True, True]
+    assert not agreed(1, 10.0)  # it was started again
+    assert servo.asked == [2, 2, 2, 2]
 
 
-@pytest.mark.parametrize("name", ["fzi", "mayr", "crisp"])
-def test_a_preset_that_is_not_run_differs_from_one_that_is_in_names_and_what_it_asks_for(name: str) -> None:
-    preset, other = PRESETS[name], PRESETS["kuka_lbr_clik"]
-    alike = replace(preset, name=other.name, topic=other.topic, activation=other.activation, frame=other.frame)
-    assert alike == other
-    impedance = PRESETS["kuka_lbr_impedance"]
-    assert (other.hold, other.guard) == (impedance.hold, impedance.guard)
+@pytest.mark.parametrize("name", ["fzi", "mayr", "crisp", "kuka_lbr_clik"])
+def test_a_preset_that_is_not_run_differs_from_the_one_that_is_in_names_and_what_it_asks_for(name: str) -> None:
+    preset, run = PRESETS[name], PRESETS[PRESET]
+    assert (preset.hold, preset.guard, preset.takes_poses) == (run.hold, run.guard, run.takes_poses)
+    assert preset.command_type is None
 
 
-def test_the_presets_are_those_whose_rules_are_tested() -> None:
-    assert PRESETS.keys() == POSES.keys() | JOINTS.keys()
-    assert {name for name, preset in PRESETS.items() if not preset.takes_poses} == JOINTS.keys()
-    for name, terms in (POSES | JOINTS).items():
+def test_the_presets_have_the_topics_of_their_controllers() -> None:
+    assert PRESETS.keys() == NAMES.keys()
+    assert {name for name, preset in PRESETS.items() if not preset.takes_poses} == set(JOINTS)
+    for name, topic in NAMES.items():
         preset = PRESETS[name]
-        assert preset.topic.format(ctrl="/robot/left_ctrl") == f"/robot/left_ctrl/{terms.topic}"
-        assert preset.rate >= preset.lowest_rate >= terms.lowest_rate
-        assert (preset.zero_wrench is not None, preset.command_type is not None) == (terms.wrench, terms.command_type)
+        assert preset.topic.format(ctrl="/robot/left_ctrl") == f"/robot/left_ctrl/{topic}"
+        assert preset.rate >= preset.lowest_rate
+        assert (preset.zero_wrench is not None) == (name == "kuka_lbr_impedance")
+        assert (preset.command_type is not None) == (name == "moveit_servo")
+    assert PRESETS["builtin"] is BUILTIN
 
 
 @pytest.mark.parametrize("name", JOINTS)

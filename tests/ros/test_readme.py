@@ -13,18 +13,17 @@ import pytest
 
 from q2r2_control import Robot
 from q2r2_control.types import Array
-from tests.ros.conftest import NEEDS_ROS
+from tests.ros.conftest import need_ros
 from tests.ros.processes import PATIENCE, ROOT, Processes
 
-pytest.importorskip("rclpy", reason=NEEDS_ROS)
-pytest.importorskip("quest2ros", reason="needs q2r2 ros build-interfaces")
-pytestmark = [pytest.mark.usefixtures("interfaces"), pytest.mark.alone]
+need_ros()
+pytestmark = pytest.mark.alone
 
-from q2r2_control.ros.base_node import LATCHED_QOS  # noqa: E402
-from q2r2_control.ros.bridge.messages import pose_of  # noqa: E402
-from tests.ros.arm_rig import TOOL, ArmRig, assert_same, first, offset, patient, stamped_transform  # noqa: E402
-from tests.ros.joint_recorder import JointRecorder  # noqa: E402
-from tests.ros.waiting import wait_until  # noqa: E402
+from q2r2_control.ros.base_node import LATCHED_QOS
+from q2r2_control.ros.bridge.messages import pose_of
+from tests.ros.arm_rig import TOOL, ArmRig, assert_same, first, offset, patient, stamped_transform
+from tests.ros.joint_recorder import JointRecorder
+from tests.ros.waiting import wait_until
 
 MOVED = 0.05  # [rad]
 
@@ -46,8 +45,9 @@ def test_the_documented_subclass_teleoperates_its_arm_in_its_robots_frame(
     rig.follows = False
     (code,) = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "ros.md").read_text(), re.DOTALL)
     (file := tmp_path / "right_arm.py").write_text(code)
-    arguments = patient({"world_frame_id": "world", "teleop.leash.distance": 0.0})
-    process = processes.start(sys.executable, str(file), *arguments, name="right_arm")
+    given = patient({"world_frame_id": "world", "teleop.leash.distance": 0.0})
+    arguments = [part for parameter in given for part in ("-p", parameter)]
+    process = processes.start(sys.executable, str(file), "--ros-args", *arguments, name="right_arm")
     rig.wait_until_connected()
     rig.engage()
     rig.wait(lambda: rig.targets, "targets come")

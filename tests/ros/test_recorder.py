@@ -14,11 +14,10 @@ from typing import Any
 import pytest
 
 from q2r2_control.events import Event, ReasonKind
-from tests.ros.conftest import NEEDS_ROS
+from tests.ros.conftest import need_ros
 from tests.ros.processes import CONFIG, Processes
 
-pytest.importorskip("rclpy", reason=NEEDS_ROS)
-pytest.importorskip("quest2ros", reason="needs quest2ros: q2r2 ros build-interfaces")
+need_ros()
 
 from geometry_msgs.msg import PoseStamped
 from rclpy.qos import QoSProfile, ReliabilityPolicy
@@ -228,7 +227,6 @@ def test_a_folder_that_cannot_be_written_is_an_error_and_the_node_goes_on(
 
 @pytest.mark.slow
 @pytest.mark.alone
-@pytest.mark.usefixtures("interfaces")
 def test_a_whole_set_is_recorded_judged_and_ends_at_ctrl_c(node: Any, processes: Processes, tmp_path: Path) -> None:
     process = processes.start(
         *(sys.executable, "-m", "q2r2_control", "ros", "up", CONFIG, "--record", str(tmp_path), "--operator", "Ada"),

@@ -5,38 +5,37 @@ from __future__ import annotations
 import time
 from typing import Any
 
-import pytest
-
-from tests.ros.conftest import NEEDS_ROS
+from tests.ros.conftest import need_ros
 from tests.ros.processes import Processes
 
-pytest.importorskip("rclpy", reason=NEEDS_ROS)
-pytest.importorskip("quest2ros", reason="needs q2r2 ros build-interfaces")
-pytestmark = pytest.mark.usefixtures("interfaces")
+need_ros()
 
-from tests.ros.arm_rig import ArmRig  # noqa: E402
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from rosgraph_msgs.msg import Clock
+
+from q2r2_control.ros.bridge.messages import time_message
+from tests.ros.arm_rig import ArmRig
 
 
 def test_an_arm_without_time_cannot_be_engaged_and_one_whose_time_stops_is_paused(
     node: Any, processes: Processes
 ) -> None:
-    from builtin_interfaces.msg import Time
-    from rosgraph_msgs.msg import Clock
-
+    diagnostics: list[DiagnosticStatus] = []
+    node.create_subscription(DiagnosticArray, "/diagnostics", lambda message: diagnostics.extend(message.status), 10)
     rig = ArmRig(node)
     rig.start(processes, {"use_sim_time": True})
     rig.wait(lambda: rig.state["message"].startswith("use_sim_time is set and nothing comes"), "it says so")
+    rig.wait(lambda: diagnostics and "nothing comes on /clock" in diagnostics[-1].message, "so do the diagnostics")
+    assert {(one.name, one.level) for one in diagnostics} == {("/left_q2r2_arm_controller", DiagnosticStatus.WARN)}
     for _ in range(3):
         rig.press()
     assert (rig.state["engaged"], rig.state["ready"], rig.targets) == (False, False, [])
 
     publisher, began = node.create_publisher(Clock, "/clock", 1), time.monotonic()
 
-    def tick() -> None:
-        elapsed = time.monotonic() - began
-        publisher.publish(Clock(clock=Time(sec=1 + int(elapsed), nanosec=int(elapsed % 1.0 * 1e9))))
-
-    timer = node.create_timer(0.01, tick)
+    timer = node.create_timer(
+        0.01, lambda: publisher.publish(Clock(clock=time_message(1.0 + time.monotonic() - began)))
+    )
     rig.wait(lambda: rig.state["ready"], "it is ready when time comes")
     rig.engage()
     node.destroy_timer(timer)

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
 import re
-from collections.abc import Iterator
 from typing import Any
 from xml.etree import ElementTree
 
@@ -17,12 +15,11 @@ from rosbags.typesys import Stores, get_typestore
 from q2r2_control import Robot
 from q2r2_control.recording.topics import Topic, Topics
 from tests.ros.cell import PATIENT, start_controller, start_robot
-from tests.ros.conftest import NEEDS_ROS
+from tests.ros.conftest import need_ros
 from tests.ros.processes import ROOT, Processes
 from tests.ros.waiting import wait_until
 
-pytest.importorskip("rclpy", reason=NEEDS_ROS)
-pytestmark = pytest.mark.usefixtures("interfaces")
+need_ros()
 
 VIEWS = ROOT / "views"
 # The types that RViz's displays and Foxglove's panels take.
@@ -113,24 +110,13 @@ def recorded_by_hand() -> list[str]:
     return list(command.split())
 
 
-@pytest.fixture(scope="module")
-def running_set(
-    domain: int, robot: Robot, interfaces: None, tmp_path_factory: pytest.TempPathFactory
-) -> Iterator[None]:
-    """Robot, controller and arms."""
-    started = Processes(tmp_path_factory.mktemp("set"), os.environ)
-    start_robot(started)
-    start_controller(started, *PATIENT)
-    started.start_node("arm_controllers", "rate:=50.0")
-    yield
-    started.end_all()
-
-
 @pytest.mark.alone
-@pytest.mark.usefixtures("running_set")
-def test_every_display_shows_what_the_set_publishes(node: Any, robot: Robot) -> None:
+def test_every_display_shows_what_the_set_publishes(node: Any, robot: Robot, processes: Processes) -> None:
     from visualization_msgs.msg import Marker
 
+    start_robot(processes)
+    start_controller(processes, *PATIENT)
+    processes.start_node("arm_controllers", "rate:=50.0")
     wanted = rviz_topics() | foxglove_topics()
 
     def missing() -> dict[str, str]:

@@ -15,7 +15,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-_NODES = ("cartesian_controller", "mujoco_robot", "left_arm_controller", "tcp_endpoint", "simulation_input")
+_NODES = ("cartesian_controller", "mujoco_robot", "arm_controllers", "tcp_endpoint", "simulation_input")
 _CONTEXT = multiprocessing.get_context("forkserver")
 _CONTEXT.set_forkserver_preload([f"q2r2_control.ros.nodes.{name}" for name in _NODES])
 

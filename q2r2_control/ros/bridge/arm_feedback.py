@@ -7,7 +7,7 @@ from visualization_msgs.msg import Marker
 
 from q2r2_control.events import Event
 from q2r2_control.ros.base_node import BaseNode
-from q2r2_control.ros.bridge.grippers import GripperClient
+from q2r2_control.ros.bridge.gripper_client import GripperClient
 from q2r2_control.ros.bridge.hand_intake import HandIntake
 from q2r2_control.ros.bridge.markers import TargetMarkers
 from q2r2_control.ros.bridge.parameters import ArmParameters

@@ -13,10 +13,11 @@ from std_msgs.msg import Bool, String
 
 from q2r2_control.config.presets import BUILTIN, Mode
 from q2r2_control.config.teleop import GuardSettings
+from q2r2_control.errors import ConfigError
 from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.ros.base_node import LATCHED_QOS, BaseNode
 from q2r2_control.ros.bridge.frames import PoseTopic
-from q2r2_control.ros.bridge.parameters import BUILTIN_NODE, ArmParameters
+from q2r2_control.ros.bridge.parameters import ArmParameters
 from q2r2_control.ros.bridge.target_output import TargetOutput, near
 from q2r2_control.teleop.arm_states import ArmState
 from q2r2_control.teleop.steady_state_offset import MAX_OFFSET
@@ -38,34 +39,18 @@ class ArmOutputs:
     through pauses, so that the arm comes to rest as the built-in controller does.
     """
 
-    def __init__(self, node: BaseNode, values: ArmParameters, safe_target: PoseTopic) -> None:
+    def __init__(self, node: BaseNode, arm: str, values: ArmParameters, safe_target: PoseTopic) -> None:
         preset, self._filtered = values.preset, values.mode is Mode.FILTERED
-        self._safe_target, self._safe_topic = safe_target, values.safe_target_topic
+        self._safe_target = safe_target
         self._last: TargetOutput | None = None
         if self._filtered:
             topic = BUILTIN.topic.format(ctrl=values.builtin_prefix)
             self.first = TargetOutput(
-                node,
-                BUILTIN,
-                BUILTIN_NODE,
-                topic,
-                values.world_frame,
-                BUILTIN.guard,
-                values.listener_timeout,
-                values.rate,
+                node, values, BUILTIN, values.builtin_node, topic, values.world_frame, BUILTIN.guard
             )
         if not self._filtered or (preset.takes_poses and preset is not BUILTIN):
-            theirs = TargetOutput(
-                node,
-                preset,
-                values.controller,
-                values.target_topic,
-                values.base_frame,
-                values.guard,
-                values.listener_timeout,
-                values.rate,
-                values.prefix,
-            )
+            terms = values.controller, values.target_topic, values.base_frame, values.guard
+            theirs = TargetOutput(node, values, preset, *terms)
             if self._filtered:
                 self._last = theirs
             else:
@@ -73,8 +58,7 @@ class ArmOutputs:
         self._follows: FollowWatch | None = None
         if self.first.preset is BUILTIN:
             # Twice the usual timeout: the targets have to arrive first, and then the answer.
-            arm = values.following_topic.rpartition("/")[2]
-            self._follows = FollowWatch(node, values.following_topic, arm, 2.0 * values.listener_timeout)
+            self._follows = FollowWatch(node, values.builtin_node, arm, 2.0 * values.listener_timeout)
         self._all = [self.first] if self._last is None else [self.first, self._last]
         self._command_type: CommandType | None = None
         if preset.command_type is not None:
@@ -104,7 +88,7 @@ class ArmOutputs:
             line = self._follows.unready
         if line is None and self._command_type is not None:
             line = self._command_type.unready
-        return None if line is None else Reason.of(ReasonKind.CONTROLLER_REFUSES, text=line)
+        return _refused(line)
 
     @property
     def builtin(self) -> str | None:
@@ -132,12 +116,7 @@ class ArmOutputs:
         """How many targets went out on each topic."""
         return {output.topic: output.sent for output in self._all}
 
-    @property
-    def advice(self) -> str | None:
-        """What the user has to do by hand."""
-        return None if self._command_type is None else self._command_type.advice
-
-    def take_fault(self, now: float) -> str | None:
+    def take_fault(self, now: float) -> Reason | None:
         """Check the controllers; returns once why the arm has to pause because of one."""
         faults = [output.take_fault(now) for output in reversed(self._all)]
         if self._last is not None and faults[0] is not None:
@@ -146,7 +125,7 @@ class ArmOutputs:
             self._command_type.step(self._all[-1].starts, now)
         if self._follows is not None:
             faults += [self._safe_target.take_silence(now), self._follows.refusal(self.first.following, now)]
-        return next((fault for fault in faults if fault), None)
+        return _refused(next((fault for fault in faults if fault), None))
 
     def step(
         self,
@@ -163,20 +142,22 @@ class ArmOutputs:
 
     def relay(
         self, engaged: bool, tool: pin.SE3 | None, base: pin.SE3 | None, now: float, decided: float
-    ) -> str | None:
+    ) -> Reason | None:
         """Pass on the safe target of the built-in controller; returns why the arm has to pause."""
         if self._last is None:
             return None
         safe, fault = self._safe_target.at(now), None
         self._safe_problem = self._safe_target.problem if safe is None else None
         if safe is not None and tool is not None and not near(safe, tool, *MAX_OFFSET):
-            self._safe_problem = f"{self._safe_topic} is not where the tool is: the arm moves, or tool_frame is wrong"
+            self._safe_problem = (
+                f"{self._safe_target.topic} is not where the tool is: the arm moves, or tool_frame is wrong"
+            )
         if not self._relaying and engaged:
             self._relaying, fault = self._safe_problem is None and tool is not None, self._safe_problem
         self._relaying = self._relaying and safe is not None
         # A stream starts at the measured tool: the safe target may differ from it by the arm's steady-state offset.
         self._last.step(safe if self._relaying else None, tool, base, now, decided, start=tool)
-        return fault
+        return _refused(fault)
 
     def forget(self, now: float) -> None:
         """Drop all held targets."""
@@ -193,16 +174,16 @@ class FollowWatch:
     new stream. A controller that publishes nothing here is taken to follow.
     """
 
-    def __init__(self, node: Node, topic: str, arm: str, timeout: float) -> None:
-        self._topic, self._timeout = topic, timeout
-        self.controller, self._arm = topic.partition("/following/")[0], arm
+    def __init__(self, node: Node, controller: str, arm: str, timeout: float) -> None:
+        self.controller, self._arm, self._timeout = controller, arm, timeout
+        self._topic = f"{controller}/following/{arm}"
         self._follows: bool | None = None
         self._since = math.inf  # targets have been sent and not followed [s]
         self._followed_since = math.inf  # targets have been sent and followed [s]
         self.unready: str | None = None  # why the controller would follow no stream of targets now
         self.homing, self.homing_ended = False, ""  # whether it says that it goes home; how the last way ended
         self.gripper_held = ""  # what keeps the gripper from going farther
-        node.create_subscription(Bool, topic, self._on_following, LATCHED_QOS)
+        node.create_subscription(Bool, self._topic, self._on_following, LATCHED_QOS)
         node.create_subscription(String, f"{self.controller}/state", self._on_state, 1)
 
     def refusal(self, sending: bool, now: float) -> str | None:
@@ -242,47 +223,33 @@ class FollowWatch:
 class CommandType:
     """Tells MoveIt Servo that targets are poses, after each of its starts: it takes none before. Never waits.
 
-    Without moveit_msgs the service cannot be called. Then ``advice`` says what the user has to call, and engaging is
-    the user's decision.
+    Raises :class:`ConfigError` where moveit_msgs cannot be imported.
     """
 
     def __init__(self, node: BaseNode, service: str) -> None:
-        self._service, self._client = service, None
-        self.advice: str | None = None
         try:
             self._kind: Any = import_module("moveit_msgs.srv").ServoCommandType
-        except ImportError:
-            self.advice = f"moveit_msgs cannot be imported: call {service} with {_POSE} yourself"
-            return
-        self._client = node.create_client(self._kind, service)
-        self._starts, self._agreed = -1, False
-        self._asked = float("-inf")
-        self._answer: Any = None  # future
+        except ImportError as error:
+            raise ConfigError(f"{service} is a service of moveit_msgs, which cannot be imported: {error}") from None
+        self._service, self._client = service, node.create_client(self._kind, service)
+        self._starts, self._agreed, self._asked = -1, False, -math.inf
+        self._answer: Any = None  # future of the last call
 
     @property
     def unready(self) -> str | None:
         """One line while the service has not agreed to poses."""
-        if self._client is None or self._agreed:
-            return None
-        return f"{self._service} has not agreed to poses yet"
+        return None if self._agreed else f"{self._service} has not agreed to poses yet"
 
     def step(self, starts: int, now: float) -> None:
         """Call the service if that is due; ``starts``: how often the controller has appeared."""
-        if self._client is None:
-            return
         if starts != self._starts:
-            self._starts, self._agreed, self._asked = starts, False, float("-inf")
-            self._drop_answer()
+            self._starts, self._agreed, self._asked, self._answer = starts, False, -math.inf, None
         if self._answer is not None and self._answer.done():
-            self._agreed = bool(self._answer.result().success)
-            self._answer = None
+            self._agreed, self._answer = bool(self._answer.result().success), None
         if not self._agreed and now - self._asked > _RETRY and self._client.service_is_ready():
-            self._drop_answer()
             self._asked = now
             self._answer = self._client.call_async(self._kind.Request(command_type=_POSE))
 
-    def _drop_answer(self) -> None:
-        """A late answer belongs to an earlier call."""
-        if self._answer is not None and self._client is not None:
-            self._client.remove_pending_request(self._answer)
-        self._answer = None
+
+def _refused(line: str | None) -> Reason | None:
+    return None if line is None else Reason.of(ReasonKind.CONTROLLER_REFUSES, text=line)

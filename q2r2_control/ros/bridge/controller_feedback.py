@@ -4,22 +4,26 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from geometry_msgs.msg import PoseStamped
-from std_msgs.msg import Bool
+import numpy as np
+from geometry_msgs.msg import Point, PoseStamped
+from std_msgs.msg import Bool, ColorRGBA
 from visualization_msgs.msg import Marker
 
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.loop.arm_conditions import ArmConditions
+from q2r2_control.robot.compose import WORLD
 from q2r2_control.ros.base_node import LATCHED_QOS, SENT_COMMAND_QOS, BaseNode
 from q2r2_control.ros.bridge.arm_conditions import ConditionPublishers
-from q2r2_control.ros.bridge.distance_marker import DistanceMarker
 from q2r2_control.ros.bridge.intakes import TargetIntake
-from q2r2_control.ros.bridge.messages import stamped_pose
+from q2r2_control.ros.bridge.messages import stamped_pose, time_message
 from q2r2_control.ros.bridge.reports import TickReport
 from q2r2_control.ros.monitoring.endpoints import publish_in_time
-from q2r2_control.types import Reference, RobotState
+from q2r2_control.types import Array, Reference, RobotState
 
 _MARKER_PERIOD = 0.1  # [s]
+_WIDTH = 0.006  # [m]
+_FAR, _NEAR = 0.10, 0.02  # green beyond the first distance, red below the second [m]
+_LIFETIME = 1  # after which RViz drops the marker [s]
 
 
 class ControllerFeedback:
@@ -30,7 +34,6 @@ class ControllerFeedback:
         self._node, self._controller, self._targets, self._every = node, controller, targets, every
         self._ticks = 0
         self._reference: Reference | None = None
-        self._marker = DistanceMarker(controller.robot)
         self._safe_targets = {
             arm: node.create_publisher(PoseStamped, f"~/safe_target/{arm}", SENT_COMMAND_QOS) for arm in targets.topics
         }
@@ -67,6 +70,19 @@ class ControllerFeedback:
     def _show_distance(self) -> None:
         if self._reference is not None and self._distances.get_subscription_count():
             now = self._node.now
-            marker = self._marker.at(self._reference.q, self._reference.report.closest_pair, now)
-            if marker is not None:
-                self._distances.publish(marker)
+            points = self._controller.robot.closest_points(self._reference.q, self._reference.report.closest_pair)
+            if points is not None:
+                self._distances.publish(distance_marker(points, now))
+
+
+def distance_marker(points: Array, now: float) -> Marker:
+    """A line between two points (2, 3) [m] of the world at ``now`` [s]: green if they are far apart, red if near."""
+    share = float(np.clip((np.linalg.norm(points[1] - points[0]) - _NEAR) / (_FAR - _NEAR), 0.0, 1.0))
+    marker = Marker(ns="closest_pair", type=Marker.LINE_LIST, action=Marker.ADD)
+    marker.header.frame_id, marker.header.stamp = WORLD, time_message(now)
+    marker.pose.orientation.w = 1.0
+    marker.scale.x = _WIDTH
+    marker.color = ColorRGBA(r=1.0 - share, g=share, b=0.0, a=1.0)
+    marker.points = [Point(x=float(x), y=float(y), z=float(z)) for x, y, z in points]
+    marker.lifetime.sec = _LIFETIME
+    return marker

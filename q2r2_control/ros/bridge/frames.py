@@ -4,23 +4,54 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import pinocchio as pin
-from geometry_msgs.msg import PoseStamped
+from geometry_msgs.msg import PoseStamped, TransformStamped
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.serialization import deserialize_message
 from tf2_msgs.msg import TFMessage
 
 from q2r2_control.ros.base_node import STREAM_QOS, BaseNode
 from q2r2_control.ros.bridge.messages import are_a_pose, nanoseconds, pose_of, pose_of_numbers
 from q2r2_control.ros.monitoring.endpoints import Publishers
-from q2r2_control.ros.monitoring.frame_senders import FrameSenders, ReadTransform, read_transforms
+from q2r2_control.supervision.sequence_watch import SequenceWatch
 from q2r2_control.supervision.target_stream import apart
 
 # Two publishers whose poses of a frame differ by more do not tell of the same robot [m], [rad].
 _SAME = 0.05, 0.1
 _REMEMBERED = 2.0  # such a difference [s]
+_PAUSE = 1.0  # after a silence of this long a publisher may have been restarted [s]
+_KEPT = 16  # messages that one node of a process has read and another may still have to
+
+
+class ReadTransform(NamedTuple):
+    """One transform of a message on /tf."""
+
+    child_frame_id: str
+    frame_id: str
+    numbers: Sequence[float]  # position [m] and quaternion x y z w
+
+
+@lru_cache(maxsize=_KEPT)
+def read_transforms(message: bytes) -> Sequence[ReadTransform]:
+    """The transforms in a serialized TFMessage; none where it is no message.
+
+    A robot's message has dozens of transforms, fifty times a second; each is read once for all nodes of a process.
+    """
+    try:
+        transforms = deserialize_message(message, TFMessage).transforms
+    except rclpy_implementation.RMWError:
+        return ()  # which is some other node's fault
+    return tuple(_read(one) for one in transforms)
+
+
+def _read(transform: TransformStamped) -> ReadTransform:
+    p, o = transform.transform.translation, transform.transform.rotation
+    return ReadTransform(transform.child_frame_id, transform.header.frame_id, (p.x, p.y, p.z, o.x, o.y, o.z, o.w))
 
 
 class _Edge:
@@ -102,27 +133,21 @@ class FrameTree:
 
 
 class FrameListener:
-    """Keeps a :class:`FrameTree` up to date for a node, and notices a second publisher of a frame on /tf."""
+    """Keeps a :class:`FrameTree` up to date for a node, and notices two publishers that disagree about a frame.
+
+    Publishers are told apart by the numbers of their messages, which some middleware does not give. Two that send the
+    same poses, such as robot_state_publisher beside a simulation, are as good as one.
+    """
 
     def __init__(self, node: Any) -> None:
         self.tree = FrameTree()
         self._node = node
-        self._senders, self._publishers = FrameSenders(), Publishers(node, ["/tf"])
+        self._numbers: dict[str, SequenceWatch] = {}  # of the messages that a frame comes in
+        self._publishers = Publishers(node, ["/tf"])
         self._disagree: dict[str, float] = {}  # frames of which two publishers say different things, and when [s]
-        self._told = False
         latched = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         node.create_subscription(TFMessage, "/tf", self._take, 100, raw=True)
         node.create_subscription(TFMessage, "/tf_static", self._take_fixed, latched, raw=True)
-
-    @property
-    def advice(self) -> str | None:
-        """One line while two publishers send the same frames."""
-        shared = self._senders.shared(time.monotonic())
-        if not shared:
-            self._told = False
-            return None
-        more = f" and {len(shared) - 1} more frames" if len(shared) > 1 else ""
-        return f"{shared[0]}{more} on /tf come from two publishers; on /tf are {self._publishers.of('/tf')}"
 
     def conflict(self, frame: str) -> str | None:
         """One line while two publishers disagree about ``frame`` or what it hangs on."""
@@ -139,21 +164,18 @@ class FrameListener:
         received, now, number = self._node.now, time.monotonic(), info["publication_sequence_number"]
         for transform in read_transforms(message):
             frame = _name(transform.child_frame_id)
-            if self._senders.take(frame, number, now):
-                if self.tree.moves_far(transform):
-                    self._disagree[frame] = now
-                self._tell()
+            if number is not None and self._sent_by_two(frame, number, now) and self.tree.moves_far(transform):
+                self._disagree[frame] = now
             self.tree.set(transform, received)
+
+    def _sent_by_two(self, frame: str, number: int, now: float) -> bool:
+        if (watch := self._numbers.get(frame)) is None:
+            watch = self._numbers[frame] = SequenceWatch()
+        return watch.take(number, now, _PAUSE) >= 2
 
     def _take_fixed(self, message: bytes) -> None:
         for transform in read_transforms(message):
             self.tree.set(transform, math.inf)
-
-    def _tell(self) -> None:
-        """Log it once, until it is over."""
-        if not self._told and (line := self.advice) is not None:
-            self._told = True
-            self._node.get_logger().warning(line)
 
 
 def _name(frame: str) -> str:
@@ -166,7 +188,6 @@ class ToolFrame:
     def __init__(self, node: BaseNode, tree: FrameTree, frame: str, world: str, timeout: float) -> None:
         self._tree, self._frame, self._world, self._timeout = tree, frame, world, timeout
         self._publishers = Publishers(node, ["/tf"])
-        self._publishers.look_steadily()
         self.problem: str | None = None
 
     def at(self, now: float) -> pin.SE3 | None:
@@ -188,26 +209,25 @@ class PoseTopic:
         self._tree, self._world, self._timeout = tree, world, timeout
         self._newest: tuple[str, int, float] | None = None  # its frame, its stamp [ns], and when it was received [s]
         self._pose: pin.SE3 | None = None  # of the newest, in the message's frame
-        self._topic, self._publishers = topic, Publishers(node, [topic])
-        self._publishers.look_steadily()
+        self.topic, self._publishers = topic, Publishers(node, [topic])
         self.problem: str | None = None
         node.create_subscription(PoseStamped, topic, lambda message: self._take(message, node.now), STREAM_QOS)
 
     def at(self, now: float) -> pin.SE3 | None:
         """The newest pose at ``now`` [s]; None if it is not known, and then ``problem`` says why."""
         if self._newest is None:
-            self.problem = f"nothing on {self._topic}"
+            self.problem = f"nothing on {self.topic}"
             return None
         frame, _, received = self._newest
         if now - received > self._timeout:
-            source = self._publishers.source(self._topic)
-            self.problem = f"{self._topic}{source} is silent for {now - received:.2f} s"
+            source = self._publishers.source(self.topic)
+            self.problem = f"{self.topic}{source} is silent for {now - received:.2f} s"
             return None
         placement = self._tree.find(frame, self._world) if frame else Placement(pin.SE3.Identity(), math.inf)
         if self._pose is None:
-            self.problem = f"{self._topic}: not finite or not a rotation"
+            self.problem = f"{self.topic}: not finite or not a rotation"
         elif placement is None:
-            self.problem = f"no transform from {frame} of {self._topic} to {self._world} on /tf"
+            self.problem = f"no transform from {frame} of {self.topic} to {self._world} on /tf"
         else:
             self.problem = None
             return placement.pose * self._pose

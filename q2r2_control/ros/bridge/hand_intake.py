@@ -13,8 +13,8 @@ from quest2ros.msg import OVR2ROSHapticFeedback, OVR2ROSInputs
 from q2r2_control.inputs.samples import SampleQueue
 from q2r2_control.inputs.session import HAPTIC_TOPICS
 from q2r2_control.ros.base_node import COMMAND_QOS, STREAM_QOS, BaseNode
-from q2r2_control.ros.bridge.hand_topics import HandWatch
 from q2r2_control.ros.bridge.messages import age, hand_sample
+from q2r2_control.ros.monitoring.endpoints import Publishers
 from q2r2_control.types import HandSample, HapticFeedback
 
 
@@ -35,7 +35,7 @@ class HandIntake:
     ) -> None:
         self._node, self._timeout = node, timeout
         self._callbacks = (PoseStamped, "pose", on_pose), (OVR2ROSInputs, "inputs", on_inputs)
-        self._watches: dict[str, HandWatch] = {}
+        self._publishers: dict[str, Publishers] = {}  # of each hand
         self._haptics: dict[str, Any] = {}
         self._samples = SampleQueue()
         self._received = -math.inf  # the message that is being taken was [s]
@@ -47,13 +47,13 @@ class HandIntake:
         self._samples.take()
         self._pose: tuple[PoseStamped, float] | None = None
         self._inputs: tuple[OVR2ROSInputs | None, float] = (None, -math.inf)
-        if hand in self._watches:
+        if hand in self._publishers:
             return
-        self._watches[hand] = HandWatch(self._node, hand, self._timeout)
+        self._publishers[hand] = Publishers(self._node, (_topic(hand, "pose"), _topic(hand, "inputs")))
         self._haptics[hand] = self._node.create_publisher(OVR2ROSHapticFeedback, HAPTIC_TOPICS[hand], COMMAND_QOS)
         for kind, what, callback in self._callbacks:
             take = partial(self._take, hand, callback)
-            self._node.create_subscription(kind, f"q2r_{hand}_hand_{what}", take, STREAM_QOS)
+            self._node.create_subscription(kind, _topic(hand, what), take, STREAM_QOS)
 
     def put_pose(self, message: PoseStamped) -> None:
         """Take a pose of the hand."""
@@ -75,8 +75,16 @@ class HandIntake:
         return -math.inf if self._pose is None else self._pose[1], self._inputs[1]
 
     def silence(self, now: float) -> str | None:
-        """See :meth:`HandWatch.silence`."""
-        return self._watches[self.hand].silence(now, *self.stamps)
+        """One line if data are missing, and from which node: poses are needed to move, buttons to stop."""
+        ages = {what: now - stamp for what, stamp in zip(("pose", "inputs"), self.stamps, strict=True)}
+        missing = {what: age for what, age in ages.items() if age > self._timeout}
+        if not missing:
+            return None
+        first = next(iter(missing))
+        what = "data" if len(missing) == len(ages) else {"pose": "pose", "inputs": "button data"}[first]
+        source = self._publishers[self.hand].source(_topic(self.hand, first))
+        age = min(missing.values())
+        return f"no {what} of the {self.hand} hand{source} " + (f"for {age:.2f} s" if age < math.inf else "yet")
 
     def feel(self, pulse: HapticFeedback) -> None:
         """Let a hand that drives this arm, or did, feel something."""
@@ -91,3 +99,7 @@ class HandIntake:
     def _put(self) -> None:
         if self._pose is not None:
             self._samples.put(hand_sample(self.hand, *self._pose, *self._inputs))
+
+
+def _topic(hand: str, what: str) -> str:
+    return f"q2r_{hand}_hand_{what}"

@@ -1,18 +1,17 @@
-"""The topics of a headset's hands: publishers, subscriptions, and a watch for missing data."""
+"""The topics of a headset's hands: publishers and subscriptions."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable
 from typing import Any
 
 from geometry_msgs.msg import PoseStamped, Twist
-from quest2ros.msg import OVR2ROSInputs
+from quest2ros.msg import OVR2ROSHapticFeedback, OVR2ROSInputs
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
 from q2r2_control.inputs.messages import HandMessage, HandPose, HandTwist, MessageType
-from q2r2_control.inputs.session import HAND_TOPICS
+from q2r2_control.inputs.session import HAND_TOPICS, HAPTIC_TOPICS
 from q2r2_control.recording.ros_topics import RECORDER
 from q2r2_control.ros.base_node import STREAM_QOS
 from q2r2_control.ros.bridge.messages import (
@@ -23,7 +22,8 @@ from q2r2_control.ros.bridge.messages import (
     hand_twist_message,
     inputs_message,
 )
-from q2r2_control.ros.monitoring.endpoints import Publishers, node_of
+from q2r2_control.ros.monitoring.endpoints import node_of
+from q2r2_control.types import SIDES, HandSample, HapticFeedback
 
 # Reliable, so that any subscriber matches: a best-effort publisher does not match reliable subscribers.
 PUBLISHED_QOS = QoSProfile(
@@ -43,11 +43,13 @@ _READERS: dict[MessageType, Callable[[Any], HandMessage]] = {
 class HandPublishers:
     """Publishes the messages of a headset on topics of the same names. May be used by any single thread."""
 
-    def __init__(self, node: Node, topics: Iterable[str]) -> None:
-        """``topics`` are of :data:`HAND_TOPICS`."""
+    def __init__(self, node: Node, hands: Iterable[str] = SIDES, kinds: Iterable[MessageType] = tuple(_TYPES)) -> None:
         self._node = node
+        wanted = {(hand, kind) for kind in kinds for hand in hands}
+        topics = {name: topic for name, topic in HAND_TOPICS.items() if (topic.hand, topic.kind) in wanted}
+        self._topics = {(topic.hand, topic.kind): name for name, topic in topics.items()}
         self._publishers = {
-            topic: node.create_publisher(_TYPES[HAND_TOPICS[topic].kind], topic, PUBLISHED_QOS) for topic in topics
+            name: node.create_publisher(_TYPES[topic.kind], name, PUBLISHED_QOS) for name, topic in topics.items()
         }
         self.sent: dict[str, int] = {publisher.topic_name: 0 for publisher in self._publishers.values()}
 
@@ -62,6 +64,16 @@ class HandPublishers:
         else:
             publisher.publish(inputs_message(message))
 
+    def publish_sample(self, sample: HandSample, frame: str = "", twist: HandTwist | None = None) -> None:
+        """Publish a sample's messages on those topics that there are; a pose with a fault is left out."""
+        messages: dict[MessageType, HandMessage | None] = {MessageType.INPUTS: sample.inputs, MessageType.TWIST: twist}
+        if sample.fault is None:
+            messages[MessageType.POSE] = HandPose(sample.position, sample.quaternion, sample.pose_stamp, frame)
+        for kind, message in messages.items():
+            topic = self._topics.get((sample.hand, kind))
+            if topic is not None and message is not None:
+                self.publish(topic, message, frame, sample.pose_stamp)
+
     def subscribers(self, hand: str) -> int:
         """How many subscribers the topics of ``hand`` have, a recorder aside."""
         publishers = [publisher for topic, publisher in self._publishers.items() if HAND_TOPICS[topic].hand == hand]
@@ -70,28 +82,6 @@ class HandPublishers:
             return 0
         listed = (self._node.get_subscriptions_info_by_topic(publisher.topic_name) for publisher in publishers)
         return min(matched, sum(node_of(info) not in (None, RECORDER) for infos in listed for info in infos))
-
-
-class HandWatch:
-    """Says which data of a hand are missing, and from which node. Both are needed: poses to move, buttons to stop."""
-
-    def __init__(self, node: Node, hand: str, timeout: float) -> None:
-        self._hand, self._timeout = hand, timeout
-        self._topics = {"pose": f"q2r_{hand}_hand_pose", "button data": f"q2r_{hand}_hand_inputs"}
-        self._publishers = Publishers(node, self._topics.values())
-        self._publishers.look_steadily()
-
-    def silence(self, now: float, pose_stamp: float, inputs_stamp: float) -> str | None:
-        """One line if data are missing; the stamps are the receipt times of the newest, -inf before the first [s]."""
-        ages = {"pose": now - pose_stamp, "button data": now - inputs_stamp}
-        missing = [what for what, age in ages.items() if age > self._timeout]
-        if not missing:
-            return None
-        what = "data" if len(missing) == len(ages) else missing[0]
-        source = self._publishers.source(self._topics[missing[0]])
-        age = min(ages[what] for what in missing)
-        since = f"for {age:.2f} s" if age < math.inf else "yet"
-        return f"no {what} of the {self._hand} hand{source} {since}"
 
 
 def subscribe_to_hands(node: Node, listener: Callable[[str, HandMessage], None]) -> None:
@@ -103,3 +93,13 @@ def subscribe_to_hands(node: Node, listener: Callable[[str, HandMessage], None])
             listener(name, read(message))
 
         node.create_subscription(_TYPES[topic.kind], name, hear, STREAM_QOS)
+
+
+def subscribe_to_haptics(node: Node, vibrate: Callable[[HapticFeedback], None]) -> None:
+    """Call ``vibrate`` with what either hand is to feel."""
+    for hand, topic in HAPTIC_TOPICS.items():
+
+        def feel(message: OVR2ROSHapticFeedback, hand: str = hand) -> None:
+            vibrate(HapticFeedback(hand, message.frequency, message.amplitude))
+
+        node.create_subscription(OVR2ROSHapticFeedback, topic, feel, STREAM_QOS)

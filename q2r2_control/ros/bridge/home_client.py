@@ -73,5 +73,5 @@ class HomeClient:
 
     def _end(self, teleop: Teleop, now: float, outcome: str, arrived: bool = False) -> None:
         self._since = self._answer = None
-        reason = Reason.of(ReasonKind.OTHER, text=outcome)
+        reason = Reason.in_words(outcome)
         teleop.end_homing(now, reason if arrived else Reason(ReasonKind.NOT_HOMING, cause=reason), arrived)

@@ -61,7 +61,7 @@ class TargetIntake:
             if topic in self.topics.values():
                 raise ConfigError(f"{arm}.target_topic = {topic!r:.80}: another arm has it; allowed: one of its own")
             self.topics[arm] = topic
-        self._publishers = Publishers(node, self.topics.values())
+        self.publishers = Publishers(node, self.topics.values())
         self._delays = {arm: DelayWatch(STREAM_TIMEOUT) for arm in robot.arms}
         self._stamps = {arm: DelayWatch(_LATEST) for arm in robot.arms}  # the delays since targets were made
         self._refused: dict[str, tuple[Reason, float]] = {}  # why an arm's last target was not used, and when [s]
@@ -72,20 +72,11 @@ class TargetIntake:
         for arm, topic in self.topics.items():
             on_target = partial(self._on_target, take, arm)
             self._node.create_subscription(PoseStamped, topic, on_target, COMMAND_QOS)
-            on_end = partial(self._on_end, release, arm)
-            self._node.create_subscription(Empty, ended_topic(topic), on_end, COMMAND_QOS)
-
-    def look(self) -> None:
-        """Ask the graph which nodes publish."""
-        self._publishers.look()
-
-    def publishers(self, arm: str) -> str:
-        """Nodes that publish an arm's targets."""
-        return self._publishers.of(self.topics[arm])
+            self._node.create_subscription(Empty, ended_topic(topic), partial(_on_end, release, arm), COMMAND_QOS)
 
     def source(self, arm: str) -> str:
-        """The same for the middle of a sentence."""
-        return self._publishers.source(self.topics[arm])
+        """The nodes that publish an arm's targets, for the middle of a sentence."""
+        return self.publishers.source(self.topics[arm])
 
     def faults(self) -> list[str]:
         """A line for each arm whose targets were refused lately."""
@@ -111,9 +102,6 @@ class TargetIntake:
         else:
             self._refused.pop(arm, None)
 
-    def _on_end(self, release: Callable[[str], None], arm: str, _: Empty) -> None:
-        release(arm)
-
     def _due(self, arm: str, made: int, received: float) -> float | None:
         """When a target is due that was received then [s], by its stamp [ns]; None where the stamp does not say.
 
@@ -131,6 +119,10 @@ class TargetIntake:
         if before is None or before[0].kind != refusal.kind:
             self._node.get_logger().warning(f"target of {arm} not used: {sentence(refusal)}")
             self._changed()
+
+
+def _on_end(release: Callable[[str], None], arm: str, _: Empty) -> None:
+    release(arm)
 
 
 def _frame_of(node: BaseNode, robot: Robot, arm: str) -> TargetFrame:
@@ -155,8 +147,9 @@ class JointIntake:
     The state is as old as the oldest of its parts.
     """
 
-    def __init__(self, node: BaseNode, robot: Robot) -> None:
-        self._node = node
+    def __init__(self, node: BaseNode, robot: Robot, needs_external_torque: bool = False) -> None:
+        """``needs_external_torque``: no state is good without it. Raises :class:`ConfigError` without its topic."""
+        self._node, self._needs_external_torque = node, needs_external_torque
         self._topics: dict[str, list[str]] = {}  # the arms whose joints each topic carries
         for arm in robot.arms:
             topic = node.parameter(f"{arm}.joint_states_topic", "joint_states", "carries all joints of this arm")
@@ -167,7 +160,8 @@ class JointIntake:
         self._expected = {topic: set(names) for topic, names in self._names.items()}
         what = 'external torques of all joints, for admittance and vibrations: effort of a JointState; "": none'
         self._external_topic = node.parameter("external_torque_topic", "", what)
-        self.needs_external_torque = False  # without it no state is good
+        if needs_external_torque and not self._external_topic:
+            raise ConfigError("admittance.enabled = true: set the parameter external_torque_topic, which it needs")
         self._external: Array | None = None  # newest (nv,) [Nm]
         self._external_stamp = -math.inf
         self._joint_names = list(robot.joint_names)
@@ -185,15 +179,6 @@ class JointIntake:
             self._node.create_subscription(JointState, topic, on_message, STREAM_QOS)
         if self._external_topic:
             self._node.create_subscription(JointState, self._external_topic, self._on_external, STREAM_QOS)
-
-    @property
-    def measures_external_torque(self) -> bool:
-        """Whether there is a topic of external torques."""
-        return bool(self._external_topic)
-
-    def look(self) -> None:
-        """Ask the graph which nodes publish."""
-        self._publishers.look()
 
     def source(self) -> str:
         """The publishers of the oldest joint states, for the middle of a sentence."""
@@ -216,7 +201,7 @@ class JointIntake:
         part = robot_state(message, names, now)
         if isinstance(part, str):
             text = part if len(self._topics) == 1 else f"{topic}: {part}"
-            take(Reason.of(ReasonKind.OTHER, text=text), now)
+            take(Reason.of(ReasonKind.BAD_JOINT_STATES, text=text), now)
             return
         self._stamps[topic] = now
         oldest = min(self._stamps.values())
@@ -229,8 +214,8 @@ class JointIntake:
             silent = now - self._external_stamp > STREAM_TIMEOUT
             external = None if silent else self._external
             self.state = RobotState(q=q, v=v, tau=tau, tau_external=external, stamp=oldest)
-            if silent and self.needs_external_torque:
-                take(Reason.of(ReasonKind.OTHER, text=f"no external torques on {self._external_topic}"), now)
+            if silent and self._needs_external_torque:
+                take(Reason.of(ReasonKind.BAD_JOINT_STATES, text=f"no external torques on {self._external_topic}"), now)
             else:
                 take(self.state, now)
 

@@ -19,7 +19,7 @@ from q2r2_control.drives.factory import make_drive
 from q2r2_control.errors import ConfigError
 from q2r2_control.robot.robot import Robot
 from q2r2_control.ros.base_node import BaseNode
-from q2r2_control.ros.bridge.joint_messages import KINDS, NONE, JointCommand, Kind
+from q2r2_control.ros.bridge.joint_messages import KINDS, NONE, Kind
 from q2r2_control.ros.monitoring.command_watch import CommandWatch
 from q2r2_control.ros.monitoring.endpoints import WatchedPublisher
 from q2r2_control.types import Command, CommandMode, RobotState
@@ -50,8 +50,9 @@ class JointOutput:
 
     def send(self, command: Command, state: RobotState, t: float, decided: float) -> None:
         """Send a command of the tick at ``t`` [s] of the node's clock; ``decided``: see :func:`publish_in_time`."""
-        if self._channels:
-            self._publish(JointCommand(command, state, t), decided)
+        for channel in self._channels:
+            message = self._kind.encode(command, state, t, channel.names, channel.joints)
+            channel.publisher.publish(message, decided)
 
     @property
     def sent(self) -> dict[str, int]:
@@ -61,9 +62,8 @@ class JointOutput:
     def end(self, state: RobotState, t: float) -> None:
         """What holds the arms where no more commands come, for drives that need it."""
         command = self.drive.last_command(state, {})
-        if command is None or command.mode is not self.drive.mode:
-            return
-        self._publish(JointCommand(command, state, t), time.monotonic())
+        if command is not None and command.mode is self.drive.mode:
+            self.send(command, state, t, time.monotonic())
 
     def waits(self) -> bool:
         """Whether nothing should be sent now, so that the last command can be acknowledged; to be asked once a tick.
@@ -89,10 +89,6 @@ class JointOutput:
         if self._listeners > before:
             return "a new receiver takes the commands, and the arms are not where these are"
         return next((line for publisher in publishers if (line := publisher.silence())), None)
-
-    def _publish(self, command: JointCommand, decided: float) -> None:
-        for channel in self._channels:
-            channel.publisher.publish(self._kind.encode(command, channel.names, channel.joints), decided)
 
 
 def joints_of(robot: Robot, arms: Iterable[str]) -> np.ndarray:

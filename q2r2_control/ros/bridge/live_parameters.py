@@ -28,18 +28,18 @@ if TYPE_CHECKING:  # arms' nodes have no controller, and need not wait for its k
 
 # Of the controller's watching: field, parameter, what it is, least and greatest value.
 _Table = tuple[tuple[str, str, str, float, float], ...]
-_STREAM_PARAMETERS: _Table = (
+_STREAMS: _Table = (
     ("timeout", "target_timeout", "an arm without targets for this long holds [s]", 0.02, 2.0),
     ("engage_distance", "engage_distance", "targets have to begin this near to the tool [m]", 0.0, 0.2),
     ("engage_angle", "engage_angle", "and turned from it by no more [rad]", 0.0, 1.5),
 )
-_WATCH_PARAMETERS: _Table = (
+_WATCH: _Table = (
     ("timeout", "joint_state_timeout", "without joint states for this long the arms brake [s]", 0.01, 1.0),
     ("settle_time", "settle_time", "joint states have to be good and at rest before activation [s]", 0.02, 10.0),
     ("deviation", "max_deviation", "of a joint from its reference [rad]", 0.01, 3.0),
     ("deviation_time", "deviation_time", "for this long stops the arms [s]", 0.05, 10.0),
 )
-_EXTERNAL_PARAMETERS: _Table = (
+_EXTERNAL: _Table = (
     ("tolerance", "distance_tolerance", "output none: measured pairs may be closer than min_distance [m]", 0.0, 0.1),
 )
 _DONE = SetParametersResult(successful=True)
@@ -80,70 +80,59 @@ class LiveArmParameters:
         return _DONE
 
 
-class LiveControl:
+def make_control_live(node: BaseNode, controller: CartesianController) -> None:
     """Parameters ``control.*``: what of a controller's settings may change, of which its own method decides."""
+    for name in LIVE:
+        field = ControllerSettings.model_fields[name]
+        value, bounds = getattr(controller.settings, name), bounds_of(field)
+        if name == "min_distance":
+            # Pydantic keeps the bounds of an annotated type elsewhere.
+            bounds = {"at_least": 0.0, "at_most": max(CLEARANCE, value)}
+        node.parameter(f"control.{name}", value, field.description or name, read_only=False, **bounds)
 
-    def __init__(self, node: BaseNode, controller: CartesianController) -> None:
-        self._controller = controller
-        for name in LIVE:
-            field = ControllerSettings.model_fields[name]
-            value, bounds = getattr(controller.settings, name), bounds_of(field)
-            if name == "min_distance":
-                # Pydantic keeps the bounds of an annotated type elsewhere.
-                bounds = {"at_least": 0.0, "at_most": max(CLEARANCE, value)}
-            node.parameter(f"control.{name}", value, field.description or name, read_only=False, **bounds)
-        node.add_on_set_parameters_callback(self._on_set)
-
-    def _on_set(self, parameters: Sequence[Parameter]) -> SetParametersResult:
-        values = {one.name.removeprefix("control."): one.value for one in parameters if one.name.startswith("control.")}
-        problem = self._controller.change(values) if values else None
+    def on_set(parameters: Sequence[Parameter]) -> SetParametersResult:
+        values = _within("control", {one.name: one.value for one in parameters})
+        problem = controller.change(values) if values else None
         return _DONE if problem is None else SetParametersResult(successful=False, reason=problem)
 
+    node.add_on_set_parameters_callback(on_set)
 
-class LiveImpedance:
+
+def make_impedance_live(node: BaseNode, impedance: ImpedanceController) -> None:
     """Parameters of the impedance in torque mode, which ramps to what is set."""
+    for name in LIVE_IMPEDANCE:
+        field = ImpedanceSettings.model_fields[name]
+        value, bounds = getattr(impedance.settings, name), bounds_of(field)
+        # Ends of a parameter's range are allowed, and none of these may be 0.
+        bounds["at_least"] = max(bounds["at_least"], min(0.1, value))
+        node.parameter(name, value, f"{field.description}; changes over ramp_time", read_only=False, **bounds)
 
-    def __init__(self, node: BaseNode, impedance: ImpedanceController) -> None:
-        self._impedance = impedance
-        for name in LIVE_IMPEDANCE:
-            field = ImpedanceSettings.model_fields[name]
-            value, bounds = getattr(impedance.settings, name), bounds_of(field)
-            # Ends of a parameter's range are allowed, and none of these may be 0.
-            bounds["at_least"] = max(bounds["at_least"], min(0.1, value))
-            node.parameter(name, value, f"{field.description}; changes over ramp_time", read_only=False, **bounds)
-        node.add_post_set_parameters_callback(self._on_set)
+    def on_set(parameters: Sequence[Parameter]) -> None:
+        if values := {one.name: one.value for one in parameters if one.name in LIVE_IMPEDANCE}:
+            impedance.change(values)
 
-    def _on_set(self, parameters: Sequence[Parameter]) -> None:
-        values = {one.name: one.value for one in parameters if one.name in LIVE_IMPEDANCE}
-        if values:
-            self._impedance.change(values)
+    node.add_post_set_parameters_callback(on_set)
 
 
-class LiveWatching:
+def make_watching_live(
+    node: BaseNode, streams: StreamSettings, watch: WatchSettings, external: ExternalSettings
+) -> None:
     """Timeouts and tolerances of the controller's node, which are read at every tick."""
+    settings: dict[str, tuple[Any, str]] = {}
+    for target, table in ((streams, _STREAMS), (watch, _WATCH), (external, _EXTERNAL)):
+        for field, name, what, least, greatest in table:
+            default = getattr(target, field)
+            value = node.parameter(name, default, what, at_least=least, at_most=greatest, read_only=False)
+            setattr(target, field, value)
+            settings[name] = target, field
 
-    def __init__(
-        self, node: BaseNode, streams: StreamSettings, watch: WatchSettings, external: ExternalSettings
-    ) -> None:
-        self._settings: dict[str, tuple[Any, str]] = {}
-        for target, table in (
-            (streams, _STREAM_PARAMETERS),
-            (watch, _WATCH_PARAMETERS),
-            (external, _EXTERNAL_PARAMETERS),
-        ):
-            for field, name, description, least, greatest in table:
-                value = node.parameter(
-                    name, getattr(target, field), description, at_least=least, at_most=greatest, read_only=False
-                )
-                setattr(target, field, value)
-                self._settings[name] = (target, field)
-        node.add_post_set_parameters_callback(self._on_set)
-
-    def _on_set(self, parameters: Sequence[Parameter]) -> None:
+    def on_set(parameters: Sequence[Parameter]) -> None:
         for parameter in parameters:
-            if parameter.name in self._settings:
-                target, field = self._settings[parameter.name]
+            if parameter.name in settings:
+                target, field = settings[parameter.name]
                 setattr(target, field, parameter.value)
+
+    node.add_post_set_parameters_callback(on_set)
 
 
 def is_of_teleop(name: str) -> bool:

@@ -101,11 +101,11 @@ def hand_sample(
     hand: str, pose: PoseStamped, pose_stamp: float, inputs: OVR2ROSInputs | None, inputs_stamp: float
 ) -> HandSample:
     """One reading of a hand, unchecked, from its newest messages and their receipt times [s]."""
-    position = pose.pose.position
+    placed = hand_pose(pose)
     return HandSample(
         hand=hand,
-        position=np.array([position.x, position.y, position.z]),
-        quaternion=_quaternion(pose.pose),
+        position=placed.position,
+        quaternion=placed.quaternion,
         pose_stamp=pose_stamp,
         inputs=HandInputs() if inputs is None else hand_inputs(inputs),
         inputs_stamp=inputs_stamp,
@@ -114,10 +114,10 @@ def hand_sample(
 
 def hand_pose(message: PoseStamped) -> HandPose:
     """A hand's pose, unchecked."""
-    position = message.pose.position
+    p, o = message.pose.position, message.pose.orientation
     return HandPose(
-        position=np.array([position.x, position.y, position.z]),
-        quaternion=_quaternion(message.pose),
+        position=np.array([p.x, p.y, p.z]),
+        quaternion=np.array([o.x, o.y, o.z, o.w]),
         stamp=seconds(message.header.stamp),
         frame_id=message.header.frame_id,
     )
@@ -155,11 +155,10 @@ def inputs_message(inputs: HandInputs) -> OVR2ROSInputs:
     return OVR2ROSInputs(**{name: getattr(inputs, name) for name in HandInputs.__slots__})
 
 
-def joint_state_message(names: Sequence[str], q: Array, v: Array, tau: Array, t: float, frame: str = "") -> JointState:
+def joint_state_message(names: Sequence[str], q: Array, v: Array, tau: Array, t: float) -> JointState:
     """Joint positions [rad], velocities [rad/s] and torques [Nm] at ``t`` [s]."""
     message = JointState(name=list(names), position=q.tolist(), velocity=v.tolist(), effort=tau.tolist())
     message.header.stamp = time_message(t)
-    message.header.frame_id = frame
     return message
 
 
@@ -196,8 +195,3 @@ def _order(given: tuple[str, ...], names: tuple[str, ...]) -> Array | str:
     if missing:
         return f"no joint {missing[0]}" + (f" and {len(missing) - 1} more" if len(missing) > 1 else "")
     return np.array([columns[name] for name in names], dtype=np.intp)
-
-
-def _quaternion(message: Pose) -> Array:
-    orientation = message.orientation
-    return np.array([orientation.x, orientation.y, orientation.z, orientation.w])

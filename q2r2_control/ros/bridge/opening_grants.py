@@ -8,7 +8,6 @@ from rclpy.node import Node
 from std_msgs.msg import Float64MultiArray
 
 from q2r2_control.ros.base_node import LATCHED_QOS
-from q2r2_control.ros.monitoring.endpoints import PublisherCount
 
 
 def wanted_topic(target_topic: str) -> str:
@@ -28,14 +27,13 @@ class OpeningGrants:
         self._wanted, self._commanded = math.nan, math.nan
         self._answer: tuple[float, float] | None = None  # what was wanted, and what is granted of it
         self._publisher = node.create_publisher(Float64MultiArray, wanted_topic(target_topic), LATCHED_QOS)
-        topic = f"{controller}/opening/{arm}"
-        node.create_subscription(Float64MultiArray, topic, self._on_answer, LATCHED_QOS)
-        self._answering = PublisherCount(node, topic)
+        self._node, self._topic = node, f"{controller}/opening/{arm}"
+        node.create_subscription(Float64MultiArray, self._topic, self._on_answer, LATCHED_QOS)
 
     @property
     def answered(self) -> bool:
         """Whether there is a controller that answers."""
-        return self._answering.count > 0
+        return int(self._node.count_publishers(self._topic)) > 0
 
     @property
     def granted(self) -> float | None:

@@ -18,59 +18,14 @@ from q2r2_control.errors import ConfigError
 from q2r2_control.ros.base_node import BaseNode
 
 Model = TypeVar("Model", bound=BaseModel)
-BUILTIN_NODE = "/cartesian_controller"
 _NONE = 0.0  # stands for no number; no field that may be none allows zero
 
 
 @dataclass(frozen=True, slots=True)
 class ArmDefaults:
-    """What a subclass of :class:`BaseArmController` passes to its constructor."""
+    """Defaults of an arm's parameters: of the constructor of :class:`BaseArmController`, then of the cell."""
 
     arm_name: str  # left or right
-    robot_name: str
-    mirror: bool
-    base_frame_id: str
-    end_effector_link_name: str
-    ctrl_prefix: str
-    gripper_action_topic: str
-    filter_window_size: int | None = None
-    preset: str = BUILTIN.name
-
-
-@dataclass(frozen=True, slots=True)
-class ArmParameters:
-    """The checked parameters of an arm controller."""
-
-    base_frame: str  # that the controller reads its targets in
-    world_frame: str  # whose axes the hand's are
-    tool_frame: str
-    controller: str  # name of the controller's node
-    prefix: str  # for the preset's {ctrl}
-    target_topic: str
-    current_pose_topic: str  # "": from /tf
-    safe_target_topic: str
-    following_topic: str
-    builtin_prefix: str
-    tool_timeout: float  # [s]
-    listener_timeout: float  # [s]
-    rate: float  # [Hz]
-    preset: Preset
-    mode: Mode
-    gripper_topic: str
-    gripper: GripperSettings
-    guard: GuardSettings
-    teleop: TeleopSettings
-
-    @property
-    def builtin_node(self) -> str:
-        """Name of the built-in controller's node."""
-        return self.following_topic.partition("/following/")[0]
-
-
-@dataclass(frozen=True, slots=True)
-class _Defaults:
-    """Defaults of the parameters, of the cell or of the subclass."""
-
     ctrl_prefix: str
     base_frame_id: str
     end_effector_link_name: str
@@ -85,14 +40,39 @@ class _Defaults:
     limits: GuardLimits = field(default_factory=GuardLimits)
 
 
-def arm_parameters(node: BaseNode, subclass: ArmDefaults) -> ArmParameters:
+@dataclass(frozen=True, slots=True)
+class ArmParameters:
+    """The checked parameters of an arm controller."""
+
+    base_frame: str  # that the controller reads its targets in
+    world_frame: str  # whose axes the hand's are
+    tool_frame: str
+    controller: str  # name of the controller's node
+    prefix: str  # for the preset's {ctrl}
+    target_topic: str
+    current_pose_topic: str  # "": from /tf
+    builtin_node: str  # name of the built-in controller's node
+    builtin_prefix: str
+    tool_timeout: float  # [s]
+    listener_timeout: float  # [s]
+    rate: float  # [Hz]
+    preset: Preset
+    mode: Mode
+    gripper_topic: str
+    gripper: GripperSettings
+    guard: GuardSettings
+    teleop: TeleopSettings
+
+
+def arm_parameters(node: BaseNode, given: ArmDefaults) -> ArmParameters:
     """Declare all parameters and check them together. Raises :class:`ConfigError` for what is not allowed.
 
-    Defaults are the cell's where the parameter ``config`` names one, and else the subclass's.
+    Defaults are the cell's where the parameter ``config`` names one, and else the ones that are ``given``.
     """
-    arm, declare = subclass.arm_name, node.parameter
+    arm, declare = given.arm_name, node.parameter
     config = declare("config", "", 'YAML of the cell, whose teleop and external are defaults of these; "": none')
-    given = _of_cell(subclass, config) if config else _of_subclass(subclass)
+    if config:
+        given = _of_cell(given, config)
     preset, mode = preset_of(
         declare("preset", given.preset, "terms of the controller that is driven, by its name"),
         declare("mode", given.mode.value, "raw: the hand's target; filtered: through the built-in controller"),
@@ -101,21 +81,17 @@ def arm_parameters(node: BaseNode, subclass: ArmDefaults) -> ArmParameters:
     base = declare("base_frame_id", given.base_frame_id, "frame_id of targets")
     world = declare("world_frame_id", given.world_frame_id, 'whose axes the hand\'s are; "": base_frame_id')
     topic = declare("target_topic", given.target_topic, 'where targets go; "": as the preset says')
+    builtin = declare("builtin_node", "/cartesian_controller", "the built-in controller's node")
     controller = declare("controller_node", "", 'whose restart pauses the arm; "": ctrl_prefix')
     return ArmParameters(
         base_frame=base,
         world_frame=world or base,
         tool_frame=declare("end_effector_link_name", given.end_effector_link_name, "frame that the operator moves"),
-        controller=controller or (BUILTIN_NODE if preset is BUILTIN else prefix),
+        controller=controller or (builtin if preset is BUILTIN else prefix),
         prefix=prefix,
         target_topic=topic or preset.topic.format(ctrl=prefix),
         current_pose_topic=declare("current_pose_topic", "", 'PoseStamped of the tool; "": from /tf'),
-        safe_target_topic=declare(
-            "safe_target_topic", f"{BUILTIN_NODE}/safe_target/{arm}", "safe target of the built-in controller"
-        ),
-        following_topic=declare(
-            "following_topic", f"{BUILTIN_NODE}/following/{arm}", "whether the built-in controller follows"
-        ),
+        builtin_node=builtin,
         builtin_prefix=declare("builtin_prefix", f"/q2r2/{arm}", "where mode filtered sends the hand's target"),
         tool_timeout=_timeout(
             node, "tool_timeout", "an older pose of the tool, or safe target, does not count", 0.01, 2.0
@@ -125,8 +101,8 @@ def arm_parameters(node: BaseNode, subclass: ArmDefaults) -> ArmParameters:
         preset=preset,
         mode=mode,
         gripper_topic=declare("gripper_action_topic", given.gripper_action_topic, "action or topic"),
-        gripper=settings_from_parameters(node, "gripper", given.gripper, frozenset()),
-        guard=settings_from_parameters(node, "guard", given.limits.over(preset.guard), frozenset(), read_only=False),
+        gripper=settings_from_parameters(node, "gripper", given.gripper),
+        guard=settings_from_parameters(node, "guard", given.limits.over(preset.guard), read_only=False),
         teleop=_teleop_settings(node, given.teleop),
     )
 
@@ -136,49 +112,41 @@ def _timeout(node: BaseNode, name: str, description: str, at_least: float, at_mo
     return float(value)
 
 
-def _of_subclass(subclass: ArmDefaults) -> _Defaults:
-    teleop = TeleopSettings(stance=Stance.MIRROR if subclass.mirror else Stance.SIDE_BY_SIDE)
-    if subclass.filter_window_size is not None:
-        # A mean over n samples of a 75 Hz headset comes (n - 1) / 2 periods late.
-        delay = min(max((subclass.filter_window_size - 1) / 2 / 75.0, 0.0), 0.2)
-        teleop = teleop.model_copy(update={"filter": teleop.filter.model_copy(update={"smoothing_delay": delay})})
-    return _Defaults(
-        subclass.ctrl_prefix,
-        subclass.base_frame_id,
-        subclass.end_effector_link_name,
-        subclass.gripper_action_topic,
-        teleop,
-        preset=subclass.preset,
-    )
+def teleop_defaults(mirror: bool, filter_window_size: int | None) -> TeleopSettings:
+    """What Quest2ROS2's two arguments of an arm's constructor ask for."""
+    teleop = TeleopSettings(stance=Stance.MIRROR if mirror else Stance.SIDE_BY_SIDE)
+    if filter_window_size is None:
+        return teleop
+    # A mean over n samples of a 75 Hz headset comes (n - 1) / 2 periods late.
+    delay = min(max((filter_window_size - 1) / 2 / 75.0, 0.0), 0.2)
+    return teleop.model_copy(update={"filter": teleop.filter.model_copy(update={"smoothing_delay": delay})})
 
 
-def _of_cell(subclass: ArmDefaults, path: str) -> _Defaults:
-    """The cell's, and the subclass's where the cell says nothing."""
-    cell, side = load_config(path), subclass.arm_name
-    arm = next((arm for name, arm in cell.arms.items() if name == side), None)
-    if arm is None:
+def _of_cell(given: ArmDefaults, path: str) -> ArmDefaults:
+    """The cell's, and the ones given where the cell says nothing."""
+    cell, side = load_config(path), given.arm_name
+    if side not in cell.arms:
         raise ConfigError(f"parameter config: {path} has no arm {side}; allowed: {', '.join(cell.arms)}")
-    given = replace(_of_subclass(subclass), teleop=cell.teleop)
-    if (tool_frame := cell.named_tool_frame(side)) is not None:
-        given = replace(given, end_effector_link_name=tool_frame)
+    tool_frame = cell.named_tool_frame(side) or given.end_effector_link_name
+    given = replace(given, teleop=cell.teleop, end_effector_link_name=tool_frame)
     if cell.external is None:
         return given
     external, theirs = cell.external, cell.external.arm(side)
-    given = replace(
+    takes_poses = external.terms.takes_poses  # else rate and topic are those of joint commands, of another node
+    return replace(
         given,
         preset=external.preset,
         mode=external.mode,
         ctrl_prefix=theirs.ctrl_prefix,
         base_frame_id=theirs.base_frame,
         world_frame_id=external.world_frame or "",
-        end_effector_link_name=theirs.tool_frame or given.end_effector_link_name,
+        end_effector_link_name=theirs.tool_frame or tool_frame,
         gripper_action_topic=theirs.gripper.topic or given.gripper_action_topic,
         gripper=theirs.gripper.settings(),
         limits=external.limits,
+        rate=external.rate if takes_poses else None,
+        target_topic=(theirs.target_topic or "") if takes_poses else "",
     )
-    if not external.terms.takes_poses:
-        return given  # rate and topic are those of joint commands, which another node sends
-    return replace(given, rate=external.rate, target_topic=theirs.target_topic or "")
 
 
 def _rate(node: BaseNode, preset: Preset, wanted: float | None) -> float:
@@ -215,7 +183,7 @@ def stance_of(mirror: bool, reflected: bool) -> Stance:
 
 
 def settings_from_parameters(
-    node: BaseNode, prefix: str, default: Model, leave_out: frozenset[str], *, read_only: bool = True
+    node: BaseNode, prefix: str, default: Model, leave_out: frozenset[str] = frozenset(), *, read_only: bool = True
 ) -> Model:
     """Declare ``prefix.field`` for every field of ``default`` but those left out; returns the settings they make.
 

@@ -12,7 +12,8 @@ from q2r2_control.config.presets import BUILTIN, Hold, Preset
 from q2r2_control.config.teleop import GuardSettings
 from q2r2_control.ros.base_node import LATCHED_QOS, SENT_COMMAND_QOS, BaseNode
 from q2r2_control.ros.bridge.messages import ended_topic, stamped_pose, time_message
-from q2r2_control.ros.monitoring.endpoints import PublisherCount, WatchedPublisher, node_of
+from q2r2_control.ros.bridge.parameters import ArmParameters
+from q2r2_control.ros.monitoring.endpoints import WatchedPublisher, node_of
 from q2r2_control.supervision.pose_rate_limiter import PoseRateLimiter
 from q2r2_control.supervision.target_stream import apart
 from q2r2_control.teleop.arm_states import ArmState
@@ -38,24 +39,22 @@ class TargetOutput:
     def __init__(
         self,
         node: BaseNode,
+        values: ArmParameters,
         preset: Preset,
         controller: str,
         topic: str,
         frame: str,
         guard: GuardSettings,
-        listener_timeout: float,
-        rate: float,
-        prefix: str = "",
     ) -> None:
         self.preset = preset
-        self.guard = PoseRateLimiter(guard, 1.0 / rate)
+        self.guard = PoseRateLimiter(guard, 1.0 / values.rate)
         self._node, self._controller, self._frame = node, controller, frame
-        self._publisher = WatchedPublisher(node, PoseStamped, topic, listener_timeout)
+        self._publisher = WatchedPublisher(node, PoseStamped, topic, values.listener_timeout)
         self._topic = self._publisher.topic_name  # as the graph knows it: asked in each tick, without a look at names
-        self._publishers = PublisherCount(node, self._topic)
         self._wrench = None
         if preset.zero_wrench is not None:
-            self._wrench = node.create_publisher(WrenchStamped, preset.zero_wrench.format(ctrl=prefix), LATCHED_QOS)
+            wrench = preset.zero_wrench.format(ctrl=values.prefix)
+            self._wrench = node.create_publisher(WrenchStamped, wrench, LATCHED_QOS)
         self.following = False  # a hand's target
         self.last_sent: pin.SE3 | None = None  # what the controller was asked for last, world frame; None: nothing
         self._ends = node.create_publisher(Empty, ended_topic(topic), SENT_COMMAND_QOS) if preset is BUILTIN else None
@@ -79,17 +78,11 @@ class TargetOutput:
         return self._publisher.sent
 
     @property
-    def others(self) -> int:
-        """Publishers of the same topic besides this one."""
-        return max(0, self._publishers.count - 1)
-
-    @property
     def conflict(self) -> str | None:
         """One line if there are other publishers of the same topic."""
-        others = self.others
-        if others == 0:
+        if (count := self._node.handle.get_count_publishers(self._topic)) <= 1:
             return None
-        return f"{others + 1} publishers of {self.topic}, allowed is one (a killed one counts for some seconds)"
+        return f"{count} publishers of {self.topic}, allowed is one (a killed one counts for some seconds)"
 
     @property
     def unready(self) -> str | None:

@@ -55,7 +55,7 @@ class TeleopLoop:
             ("teleop, mirror and mirror_reflected", ours.teleop != theirs.teleop),
             ("rate", ours.rate != theirs.rate),
             ("mode", ours.mode != theirs.mode),
-            ("following_topic", ours.builtin_node != theirs.builtin_node),
+            ("builtin_node", ours.builtin_node != theirs.builtin_node),
         ):
             if differ:
                 raise ConfigError(f"{what}: {first.get_name()} and {node.get_name()} differ; allowed: the same in both")
@@ -91,7 +91,7 @@ class TeleopLoop:
         inputs = {node.arm_name: node.inputs for node in nodes}
         references = {one.reference for one in inputs.values()}
         targets = teleop.update(
-            [sample for node in nodes for sample in node.take_samples()],
+            [sample for node in nodes for sample in node.intake.take()],
             {arm: one.tool for arm, one in inputs.items() if one.tool is not None},
             now,
             {arm: one.commanded for arm, one in inputs.items() if one.commanded is not None} or None,
@@ -105,8 +105,6 @@ class TeleopLoop:
             if (fault := node.follow(targets[node.arm_name], now, decided)) is not None:
                 teleop.pause(now, fault, node.arm_name)
         self._publish_events()
-        for node in nodes:
-            node.publish_feedback(now)
 
     def change(self, settings: TeleopSettings) -> Reason | None:
         """See :meth:`Teleop.change`."""
@@ -125,7 +123,7 @@ class TeleopLoop:
         timeout = self.teleop.settings.gate.timeout
         if (line := self.nodes[0].clock_problem(timeout)) is None:
             return
-        problem = Reason.of(ReasonKind.OTHER, text=line)
+        problem = Reason.in_words(line)
         for node in self.nodes:
             node.refuse(problem)
         self._pause(self.nodes[0].now, problem)

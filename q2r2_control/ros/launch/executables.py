@@ -11,17 +11,18 @@ import sys
 from collections.abc import Callable
 from importlib import import_module
 
-MODULES = {
-    "tcp_endpoint": "tcp_endpoint",
-    "SimulationInput": "simulation_input",
-    "hand_input": "hand_input",
-    "CheckTCPconnection": "check_tcp_connection",
-    "cartesian_controller": "cartesian_controller",
-    "mujoco_robot": "mujoco_robot",
-    "recorder": "recorder",
-    "left_arm_controller": "left_arm_controller",
-    "right_arm_controller": "right_arm_controller",
-    "arm_controllers": "arm_controllers",
+# Module of ``nodes``, and in it the class of a node, or the function that runs more than one.
+NODES = {
+    "tcp_endpoint": ("tcp_endpoint", "TcpEndpoint"),
+    "SimulationInput": ("simulation_input", "SimulationInput"),
+    "hand_input": ("hand_input", "HandInput"),
+    "CheckTCPconnection": ("check_tcp_connection", "CheckTcpConnection"),
+    "cartesian_controller": ("cartesian_controller", "CartesianControllerNode"),
+    "mujoco_robot": ("mujoco_robot", "MujocoRobot"),
+    "recorder": ("recorder", "RecorderNode"),
+    "left_arm_controller": ("arm_controllers", "LeftArmController"),
+    "right_arm_controller": ("arm_controllers", "RightArmController"),
+    "arm_controllers": ("arm_controllers", "run_both_arms"),
 }
 
 
@@ -31,8 +32,13 @@ def _executable(name: str) -> Callable[[], int]:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
         # q2r2 ros up blocks it, so that the interpreter's own start is not interrupted either.
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
-        code: int = import_module(f"q2r2_control.ros.nodes.{MODULES[name]}").main()
-        return code
+        module, made = NODES[name]
+        node_or_run = getattr(import_module(f"q2r2_control.ros.nodes.{module}"), made)
+        if not isinstance(node_or_run, type):
+            return int(node_or_run())
+        from q2r2_control.ros.base_node import run_node
+
+        return run_node(node_or_run)
 
     return run
 

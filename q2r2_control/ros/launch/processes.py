@@ -34,15 +34,18 @@ _EXECUTABLES = "q2r2_control.ros.launch.executables"
 
 @dataclass(frozen=True, slots=True)
 class NodeProcess:
-    """One process to start: its executable's name, its module, and the parameters of its nodes."""
+    """One process to start: its executable's name, and the parameters of its nodes."""
 
     name: str
-    module: str
     parameters: Mapping[str, str | float] = field(default_factory=dict)
 
     def command(self) -> list[str]:
-        """The command that starts it with this Python."""
-        parameters = [part for key, value in self.parameters.items() for part in ("-p", f"{key}:={_yaml(value)}")]
+        """The command that starts it with this Python; a text that looks like a number, as "3", stays one."""
+        parameters = [
+            part
+            for key, value in self.parameters.items()
+            for part in ("-p", f"{key}:={json.dumps(value, ensure_ascii=False)}")
+        ]
         return [sys.executable, "-u", "-m", _EXECUTABLES, self.name, "--ros-args", *parameters]
 
 
@@ -68,34 +71,25 @@ def nodes_of(
     if source != NO_INPUT:
         check_installed(INPUTS, source)
     config: dict[str, str | float] = {"config": path}
-    nodes = [] if recording is None else [_node("recorder", {**config, **recording})]
+    nodes = [] if recording is None else [NodeProcess("recorder", {**config, **recording})]
     felt: dict[str, str | float] = {}
     if robot == "mujoco" or (robot == "auto" and cell.controller is ControllerKind.BUILTIN):
-        nodes.append(_node("mujoco_robot", config))
+        nodes.append(NodeProcess("mujoco_robot", config))
         felt["external_torque_topic"] = "/mujoco_robot/external_torque"
     if cell.external is None:
-        nodes.append(_node("cartesian_controller", config | felt))
+        nodes.append(NodeProcess("cartesian_controller", config | felt))
     elif cell.external.filtered:
-        nodes.append(_node("cartesian_controller", config | _relayed(cell.external)))
+        nodes.append(NodeProcess("cartesian_controller", config | _relayed(cell.external)))
     arms = [f"{arm}_arm_controller" for arm in SIDES if arm in cell.arms]
     together = not separate and len(arms) == len(SIDES)
-    nodes += [_node(name, config) for name in (["arm_controllers"] if together else arms)]
+    nodes += [NodeProcess(name, config) for name in (["arm_controllers"] if together else arms)]
     if source == "scripted":
-        nodes.append(NodeProcess("SimulationInput", "q2r2_control.ros.nodes.simulation_input"))
+        nodes.append(NodeProcess("SimulationInput"))
     elif source == "headset":
-        nodes.append(_node("tcp_endpoint", config))
+        nodes.append(NodeProcess("tcp_endpoint", config))
     elif source != NO_INPUT:
-        nodes.append(_node("hand_input", config | {"input": source}))
+        nodes.append(NodeProcess("hand_input", config | {"input": source}))
     return nodes
-
-
-def _yaml(value: str | float) -> str:
-    """As ROS reads it on a command line: a text that looks like something else, as "3", stays one."""
-    return json.dumps(value, ensure_ascii=False)
-
-
-def _node(name: str, parameters: Mapping[str, str | float]) -> NodeProcess:
-    return NodeProcess(name, f"q2r2_control.ros.nodes.{name}", parameters)
 
 
 def _relayed(external: ExternalConfig) -> dict[str, str | float]:
@@ -124,7 +118,7 @@ def run_together(nodes: Sequence[NodeProcess], say: Callable[[str], None]) -> in
     this process is killed, Linux interrupts them all: arms must not move in a teleoperation that cannot be ended.
     ``say`` is called by several threads, one at a time. Raises :class:`UpError`.
     """
-    _check(nodes)
+    check_rclpy()
     stop, lock = StopRequest(), threading.Lock()
     running: dict[str, subprocess.Popen[str]] = {}
     readers: list[threading.Thread] = []
@@ -153,13 +147,6 @@ def check_rclpy() -> None:
     """Raise :class:`UpError` where there is no ROS."""
     if importlib.util.find_spec("rclpy") is None:
         raise UpError("rclpy cannot be imported: pip install 'q2r2_control[ros]', or source a ROS 2 Jazzy")
-
-
-def _check(nodes: Sequence[NodeProcess]) -> None:
-    check_rclpy()
-    missing = [node.module for node in nodes if importlib.util.find_spec(node.module) is None]
-    if missing:
-        raise UpError(f"no such module: {', '.join(missing)}")
 
 
 def _start(node: NodeProcess) -> subprocess.Popen[str]:

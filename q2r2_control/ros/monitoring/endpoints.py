@@ -16,8 +16,7 @@ from rclpy.serialization import serialize_message
 from q2r2_control.ros.base_node import SENT_COMMAND_QOS
 
 _MAX_AGE = 0.1  # of the graph's answer, before it is asked again [s]
-_COUNT_AGE = 0.05  # of a number of publishers [s]
-_PERIOD = 1.0  # of asking the graph where no other code asks [s]
+_PERIOD = 0.5  # of asking the graph where no other code asks [s]
 _NO_WAIT = Duration(nanoseconds=0)
 # A subscriber may take 5 ms to acknowledge, longer than the period of a fast stream. So messages are left out every
 # _CHECK seconds, until the one before has been acknowledged, or for at most _GAP seconds.
@@ -50,15 +49,8 @@ class Publishers:
         self._node = node
         self._names: dict[str, str] = dict.fromkeys(topics, "")
         self._asked_at = dict.fromkeys(self._names, -math.inf)
-
-    def look_steadily(self) -> None:
-        """Ask the graph by a timer, for a node that has no other occasion."""
-        self._node.create_timer(_PERIOD, self.look, clock=Clock(clock_type=ClockType.STEADY_TIME))
-
-    def look(self) -> None:
-        """Ask the graph about all topics."""
-        for topic in self._names:
-            self._ask(topic)
+        # While /clock stands still, too.
+        node.create_timer(_PERIOD, self._look, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def of(self, topic: str) -> str:
         """Full names of the nodes that publish on ``topic``, or of the last ones that did; "" if there were none."""
@@ -71,30 +63,15 @@ class Publishers:
         names = self.of(topic)
         return f" from {names}" if names else ""
 
+    def _look(self) -> None:
+        for topic in self._names:
+            self._ask(topic)
+
     def _ask(self, topic: str) -> None:
         self._asked_at[topic] = time.monotonic()
         names = {node_of(endpoint) for endpoint in self._node.get_publishers_info_by_topic(topic)}
         if known := sorted(name for name in names if name is not None):
             self._names[topic] = " and ".join(known)
-
-
-class PublisherCount:
-    """How many publishers a topic has, for a node that needs to know at every tick: the graph is asked now and then."""
-
-    def __init__(self, node: Node, topic: str) -> None:
-        self._node, self._topic = node, topic
-        self._count, self._asked_at = 0, -math.inf
-
-    @property
-    def count(self) -> int:
-        now = time.monotonic()
-        if now - self._asked_at > _COUNT_AGE:
-            self._asked_at, self._count = now, self._node.count_publishers(self._topic)
-        return self._count
-
-    def ask_anew(self) -> None:
-        """A message shows that there is one: the next count is the graph's of then."""
-        self._asked_at = -math.inf
 
 
 def publish_in_time(publisher: Any, message: Any, decided: float) -> bool:

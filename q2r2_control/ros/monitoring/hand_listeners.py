@@ -1,11 +1,10 @@
-"""Who follows a hand: the arms' nodes that listen to its topics, and what they say of themselves."""
+"""The arms that follow a hand, by what their nodes say of themselves."""
 
 from __future__ import annotations
 
 import json
-import math
 import time
-from collections.abc import Mapping
+from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
@@ -13,86 +12,64 @@ from rclpy.node import Node
 from std_msgs.msg import String
 
 from q2r2_control.events import ReasonKind
-from q2r2_control.ros.monitoring.endpoints import node_of
 
-_PERIOD = 0.1  # of asking the graph [s]
-_DISCOVERY = 1.0  # the graph knows one endpoint of a node before another, by less than this [s]
-_SILENT = 2.0  # nodes say what they do twice a second [s]
-_STARTING = "has not said yet what it does"
+_PERIOD = 0.3  # of asking the graph for nodes that report [s]
+_DISCOVERY = 2.0  # an arm that is there has said so by then: nodes report twice a second [s]
+_SILENT, _GONE = 2.0, 5.0  # without a report [s]
 
 
 class HandListeners:
-    """The nodes that listen to some topics of hands. Those that say on ``~/state`` which hand they follow are arms."""
+    """The nodes that say on ``~/state`` that they follow one of some hands."""
 
-    def __init__(self, node: Node, topics: Mapping[str, str]) -> None:
-        """``topics``: hand -> the topic of its buttons."""
-        self._node, self._topics = node, topics
-        self._asked_at = 0.0
-        self._unnamed_since = math.inf  # the graph knows a listener and not its node yet [s]
-        self._found: dict[str, float] = {}  # full name of a node -> when it was found [s]
-        self._subscriptions: dict[str, Any] = {}
-        self._states: dict[str, tuple[dict[str, Any], float]] = {}  # full name -> what it said last, and when [s]
+    def __init__(self, node: Node, hands: Sequence[str]) -> None:
+        self._node, self._hands = node, hands
+        self._began = self._asked_at = 0.0  # [s]
+        self._heard: set[str] = set()  # topics
+        self._states: dict[str, tuple[dict[str, Any], float]] = {}  # topic -> what an arm said last, and when [s]
 
     def look(self) -> None:
-        """Ask the graph who listens, now and then."""
+        """Ask the graph who reports, now and then."""
         now = time.monotonic()
         if now - self._asked_at < _PERIOD:
             return
-        self._asked_at = now
-        names = {
-            node_of(endpoint)
-            for topic in self._topics.values()
-            for endpoint in self._node.get_subscriptions_info_by_topic(topic)
-        }
-        self._unnamed_since = min(self._unnamed_since, now) if None in names else math.inf
-        listeners = {name for name in names if name is not None}
-        for name in self._found.keys() - listeners:
-            del self._found[name]
-            self._states.pop(name, None)
-            if (subscription := self._subscriptions.pop(name, None)) is not None:
-                self._node.destroy_subscription(subscription)
-        for name in listeners:
-            self._found.setdefault(name, now)
-            if name not in self._subscriptions and self._node.count_publishers(f"{name}/state"):
-                listen = partial(self._on_state, name)
-                self._subscriptions[name] = self._node.create_subscription(String, f"{name}/state", listen, 10)
+        self._began, self._asked_at = self._began or now, now
+        for topic, types in self._node.get_topic_names_and_types():
+            if topic.endswith("/state") and types == ["std_msgs/msg/String"] and topic not in self._heard:
+                self._heard.add(topic)
+                self._node.create_subscription(String, topic, partial(self._on_state, topic), 10)
 
     def unready(self) -> str | None:
         """One line if some arm cannot be engaged yet, or may be one that has not said so; else None."""
         now = time.monotonic()
-        if 0.0 <= now - self._unnamed_since < _SILENT:
-            return f"a listener {_STARTING}"
-        for name, found in self._found.items():
-            state, said = self._states.get(name, ({}, found))
-            if not state and now - found < (_SILENT if name in self._subscriptions else _DISCOVERY):
-                return f"{name} {_STARTING}"
-            if _is_arm(state) and not state["engaged"]:
-                if now - said > _SILENT:
-                    return f"{name} is silent for {now - said:.0f} s"
-                if not state["ready"]:
-                    return f"{name}: {state['message']}"
+        if now - self._began < _DISCOVERY and any(self.engaged(hand) is None for hand in self._hands):
+            return "an arm may be there that has not said yet what it does"
+        for topic, (state, said) in self._states.items():
+            if state["engaged"] or now - said > _GONE:
+                continue
+            name = topic.removesuffix("/state")
+            if now - said > _SILENT:
+                return f"{name} is silent for {now - said:.0f} s"
+            if not state["ready"]:
+                return f"{name}: {state['message']}"
         return None
 
     def engaged(self, hand: str) -> bool | None:
         """Whether all arms that follow a hand are engaged; None if no arm follows it."""
-        arms = [state for state, _ in self._states.values() if _is_arm(state) and state["hand"] == hand]
+        now = time.monotonic()
+        arms = [state for state, said in self._states.values() if state["hand"] == hand and now - said <= _GONE]
         return all(state["engaged"] for state in arms) if arms else None
 
     def paused_by_a_person(self) -> bool:
         """Whether some arm's ``~/pause`` was called."""
-        return any(
-            _is_arm(state) and state.get("last_event_kind") == ReasonKind.PAUSE_SERVICE
-            for state, _ in self._states.values()
-        )
+        return any(state.get("last_event_kind") == ReasonKind.PAUSE_SERVICE for state, _ in self._states.values())
 
-    def _on_state(self, name: str, message: String) -> None:
+    def _on_state(self, topic: str, message: String) -> None:
         try:
             state = json.loads(message.data)
         except ValueError:
             return  # some other node's
-        if isinstance(state, dict) and name in self._found:
-            self._states[name] = state, time.monotonic()
-
-
-def _is_arm(state: Mapping[str, Any]) -> bool:
-    return {"engaged", "ready", "hand", "message", "last_event"} <= state.keys()
+        is_arm = isinstance(state, dict) and {"engaged", "ready", "hand", "message", "last_event"} <= state.keys()
+        if is_arm and state["hand"] in self._hands:
+            self._states[topic] = state, time.monotonic()
+        else:
+            self._states.pop(topic, None)

@@ -1,18 +1,42 @@
-"""Both arms of this project's cell in one process and one teleoperation."""
+"""The arms of this project's cell; a model for the arms of other robots."""
 
 from __future__ import annotations
 
-import sys
+from collections.abc import Callable
+from typing import Any
 
-from q2r2_control.ros.nodes.base_arm_controller import run_arms
-from q2r2_control.ros.nodes.left_arm_controller import LeftArmController
-from q2r2_control.ros.nodes.right_arm_controller import RightArmController
+from q2r2_control.ros.base_node import run_nodes
+from q2r2_control.ros.nodes.base_arm_controller import BaseArmController
 
 
-def main() -> int:
-    """The executable."""
+class LeftArmController(BaseArmController):
+    """Drives the left arm's built-in controller, in the frame of its cell."""
+
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__("left", **kwargs)
+
+
+class RightArmController(BaseArmController):
+    """Drives the right arm's built-in controller, in the frame of its cell."""
+
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__("right", **kwargs)
+
+
+def run_arms(left: Callable[..., BaseArmController], right: Callable[..., BaseArmController]) -> int:
+    """Main function of an executable of both arms, whose nodes share one teleoperation; see :func:`run_node`.
+
+    Each argument is a class of nodes that passes keyword arguments on, or makes such a node.
+    """
+    made: list[BaseArmController] = []
+
+    def make_left() -> BaseArmController:
+        made.append(left())
+        return made[0]
+
+    return run_nodes([make_left, lambda: right(partner=made[0])])
+
+
+def run_both_arms() -> int:
+    """Both arms in one process and one teleoperation."""
     return run_arms(LeftArmController, RightArmController)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

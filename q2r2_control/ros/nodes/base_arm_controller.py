@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -18,22 +18,22 @@ from q2r2_control.config.presets import BUILTIN
 from q2r2_control.config.teleop import GuardSettings, TeleopSettings
 from q2r2_control.errors import ConfigError
 from q2r2_control.events import Reason, ReasonKind
-from q2r2_control.ros.base_node import ERROR, OK, WARN, BaseNode, run_nodes
+from q2r2_control.ros.base_node import ERROR, OK, WARN, BaseNode
 from q2r2_control.ros.bridge.arm_conditions import listen_to_condition
 from q2r2_control.ros.bridge.arm_feedback import ArmFeedback
 from q2r2_control.ros.bridge.arm_outputs import ArmOutputs
 from q2r2_control.ros.bridge.frames import FrameListener, PoseTopic, ToolFrame
-from q2r2_control.ros.bridge.grippers import GripperClient
+from q2r2_control.ros.bridge.gripper_client import GripperClient
 from q2r2_control.ros.bridge.hand_intake import HandIntake
 from q2r2_control.ros.bridge.live_parameters import LiveArmParameters, is_of_teleop
 from q2r2_control.ros.bridge.opening_grants import OpeningGrants
-from q2r2_control.ros.bridge.parameters import ArmDefaults, ArmParameters, arm_parameters
+from q2r2_control.ros.bridge.parameters import ArmDefaults, ArmParameters, arm_parameters, teleop_defaults
 from q2r2_control.ros.bridge.target_output import near
 from q2r2_control.ros.bridge.teleop_loop import TeleopLoop, TickInputs
 from q2r2_control.teleop.arm import OPEN
 from q2r2_control.teleop.arm_states import AT_REST, HOLDING, ArmState
 from q2r2_control.teleop.steady_state_offset import MAX_OFFSET
-from q2r2_control.types import SIDES, ArmTarget, HandSample
+from q2r2_control.types import SIDES, ArmTarget
 from q2r2_control.wording import sentence
 
 _WITHOUT_HAND = ArmState.CARRIED, ArmState.HOMING  # where the arm's hand need not be there
@@ -45,8 +45,8 @@ class BaseArmController(BaseNode):
     The node is ``<arm_name>_<robot_name>_arm_controller``; the other arguments are the defaults of parameters of that
     name. ``preset`` names the terms of the controller that is driven: topic, rate, speeds, what it needs in pauses.
     ``filter_window_size``, in samples of a 75 Hz headset, sets ``teleop.filter.smoothing_delay``. ``partner`` is the
-    node of the other arm in this process, see :func:`run_arms`: both arms then are one teleoperation, as in
-    ``q2r2 run``. Without it a fault pauses this node's own arm only.
+    node of the other arm in this process, see ``run_arms`` of :mod:`arm_controllers`: both arms then are one
+    teleoperation, as in ``q2r2 run``. Without it a fault pauses this node's own arm only.
 
     Steps to override: :meth:`setup_parameters`, :meth:`setup_state`, :meth:`setup_interfaces`, :meth:`current_pose`,
     :meth:`pose_callback`, :meth:`inputs_callback`, :meth:`toggle_gripper`.
@@ -75,13 +75,11 @@ class BaseArmController(BaseNode):
         self.arm_name, self.robot_name = arm_name, robot_name
         self.defaults = ArmDefaults(
             arm_name=arm_name,
-            robot_name=robot_name,
-            mirror=mirror,
+            ctrl_prefix=ctrl_prefix or f"/{robot_name}/{arm_name}",
             base_frame_id=base_frame_id,
             end_effector_link_name=end_effector_link_name or f"{arm_name}_tool_frame",
-            ctrl_prefix=ctrl_prefix or f"/{robot_name}/{arm_name}",
             gripper_action_topic=gripper_action_topic or f"/{robot_name}/{arm_name}_gripper/gripper_cmd",
-            filter_window_size=filter_window_size,
+            teleop=teleop_defaults(mirror, filter_window_size),
             preset=preset,
         )
         self._partner = partner
@@ -104,9 +102,10 @@ class BaseArmController(BaseNode):
         self.loop: TeleopLoop = TeleopLoop() if self._partner is None else self._partner.loop
         self.loop.join(self)
         self._has_analog_gripper = self.parameters.teleop.bindings.words_of(Action.GRIPPER_ANALOG) is not None
-        self._target, self._sent = ArmTarget(None, OPEN), None
-        not_begun = _in_words("has not begun yet")
-        self._refusal: tuple[bytes, Reason] | None = WARN, not_begun  # where time stands still it never does
+        self._target = ArmTarget(None, OPEN)
+        # Until the first tick, which where time stands still never comes.
+        not_begun = Reason.of(ReasonKind.NO_TOOL_POSE, text="the node has not begun yet")
+        self._refusal: tuple[bytes, Reason] | None = WARN, not_begun
         self.inputs = TickInputs(None, None, None, None)
 
     def setup_interfaces(self) -> None:
@@ -114,14 +113,17 @@ class BaseArmController(BaseNode):
         values = self.parameters
         self._frames = FrameListener(self)
         tree, world = self._frames.tree, values.world_frame
-        self._tool: ToolFrame | PoseTopic = ToolFrame(self, tree, values.tool_frame, world, values.tool_timeout)
+        self._tool: ToolFrame | PoseTopic
         if values.current_pose_topic:
             self._tool = PoseTopic(self, values.current_pose_topic, tree, world, values.tool_timeout)
-        self._safe_target = PoseTopic(self, values.safe_target_topic, tree, world, values.tool_timeout)
+        else:
+            self._tool = ToolFrame(self, tree, values.tool_frame, world, values.tool_timeout)
+        topic = f"{values.builtin_node}/safe_target/{self.arm_name}"
+        self._safe_target = PoseTopic(self, topic, tree, world, values.tool_timeout)
         timeout = values.teleop.gate.timeout
-        self._hand = HandIntake(self, self.hand, timeout, self.pose_callback, self.inputs_callback)
-        self.outputs = ArmOutputs(self, values, self._safe_target)
-        self.feedback = ArmFeedback(self, self.arm_name, values, self._hand)
+        self.intake = HandIntake(self, self.hand, timeout, self.pose_callback, self.inputs_callback)
+        self.outputs = ArmOutputs(self, self.arm_name, values, self._safe_target)
+        self.feedback = ArmFeedback(self, self.arm_name, values, self.intake)
         grants = None
         if (controller := self.outputs.builtin) is not None:
             listen_to_condition(self, controller, self.arm_name, self.feedback.haptics.notice)
@@ -139,11 +141,11 @@ class BaseArmController(BaseNode):
 
     def pose_callback(self, message: PoseStamped) -> None:
         """Take a pose of the hand."""
-        self._hand.put_pose(message)
+        self.intake.put_pose(message)
 
     def inputs_callback(self, message: OVR2ROSInputs) -> None:
         """Take buttons, triggers and stick of the hand."""
-        self._hand.put_inputs(message)
+        self.intake.put_inputs(message)
 
     def toggle_gripper(self) -> None:
         """The upper button was pressed."""
@@ -153,47 +155,37 @@ class BaseArmController(BaseNode):
         """Renew :attr:`inputs` at ``now`` [s]; returns why the arm has to hold, its hand aside, or None."""
         tool, base, controlled = self.current_pose(), self._base(), self._safe_target.at(now)
         obstacle = self._obstacle(tool, base)
-        silence = None if self.state in _WITHOUT_HAND else self._hand.silence(now)
-        self._refusal = obstacle or (
-            None if silence is None else (WARN, Reason.of(ReasonKind.HAND_SILENT, text=silence))
-        )
+        silence = None if self.state in _WITHOUT_HAND else self.intake.silence(now)
+        silent = None if silence is None else (WARN, Reason.of(ReasonKind.HAND_SILENT, text=silence))
+        self._refusal = obstacle or silent
         reference = None if controlled is None else self._safe_target.stamp
         commanded = None if tool is None else self._commanded(tool, controlled)
         self._base_pose = base
         self.inputs = TickInputs(tool, commanded, reference, None if obstacle is None else obstacle[1])
-        line = self.outputs.take_fault(now)
+        fault = self.outputs.take_fault(now)
         if self.state in HOLDING:
             return None
-        if line is not None:
-            return _in_words(line)
-        return None if self._refusal is None else self._refusal[1]
-
-    def take_samples(self) -> list[HandSample]:
-        """All samples of the hand since the last call, oldest first."""
-        return self._hand.take()
+        return fault or (None if self._refusal is None else self._refusal[1])
 
     def follow(self, target: ArmTarget, now: float, decided: float) -> Reason | None:
         """Publish the ``target`` of this tick, and command the gripper; returns why the arm has to hold, or None.
 
         ``decided``: see :func:`publish_in_time`.
         """
-        if self._hand.hand != self.hand:
-            self._hand.follow(self.hand)
+        if self.intake.hand != self.hand:
+            self.intake.follow(self.hand)
         toggled, self._target = target.gripper != self._target.gripper, target
         tool, base = self.inputs.tool, self._base_pose
         # If this process was frozen meanwhile, the target is out of date: it is not sent, and the next tick pauses.
-        self._sent = self.outputs.step(target.command, tool, base, now, decided, self.state)
+        sent = self.outputs.step(target.command, tool, base, now, decided, self.state)
         fault = self.outputs.relay(self.engaged, tool, base, now, decided)
         if self._has_analog_gripper:
             self.gripper.move(target.gripper, now)
         elif toggled:
             self.toggle_gripper()
         self.gripper.check(now)
-        return None if fault is None else _in_words(fault)
-
-    def publish_feedback(self, now: float) -> None:
-        """What the operator feels and sees of this tick."""
-        self.feedback.publish(self.engaged, self._target, self._sent, self.inputs.tool, self.gripper, self.hand, now)
+        self.feedback.publish(self.engaged, target, sent, tool, self.gripper, self.hand, now)
+        return fault
 
     def refuse(self, problem: Reason) -> None:
         """The arm may not be engaged until the next tick."""
@@ -223,8 +215,8 @@ class BaseArmController(BaseNode):
             "engaged": self.engaged,
             "ready": self._refusal is None and self.state not in (ArmState.STOPPED, ArmState.HOMING),  # to be engaged
             "hand": self.hand,
-            "hand_age": _rounded(self.now - self._hand.stamps[0]),
-            "inputs_age": _rounded(self.now - self._hand.stamps[1]),
+            "hand_age": _rounded(self.now - self.intake.stamps[0]),
+            "inputs_age": _rounded(self.now - self.intake.stamps[1]),
             "stance": str(self.parameters.teleop.stance),
             "preset": self.parameters.preset.name,
             "mode": str(self.parameters.mode),
@@ -240,7 +232,7 @@ class BaseArmController(BaseNode):
         if self._refusal is not None:
             level, reason = self._refusal
             return level, sentence(reason), values | {"kind": str(reason.kind)}
-        for problem in (self.gripper.problem, self.outputs.gripper_held, self.outputs.advice, self._frames.advice):
+        for problem in (self.gripper.problem, self.outputs.gripper_held):
             if problem is not None:
                 return WARN, problem, values
         if self.state in AT_REST:
@@ -306,23 +298,5 @@ class BaseArmController(BaseNode):
         return response
 
 
-def run_arms(left: Callable[..., BaseArmController], right: Callable[..., BaseArmController]) -> int:
-    """Main function of an executable of both arms, whose nodes share one teleoperation; see :func:`run_node`.
-
-    Each argument is a class of nodes that passes keyword arguments on, or makes such a node.
-    """
-    made: list[BaseArmController] = []
-
-    def make_left() -> BaseArmController:
-        made.append(left())
-        return made[0]
-
-    return run_nodes([make_left, lambda: right(partner=made[0])])
-
-
-def _in_words(text: str) -> Reason:
-    return Reason.of(ReasonKind.OTHER, text=text)
-
-
-def _rounded(duration: float) -> float | None:
-    return round(duration, 3) if math.isfinite(duration) else None
+def _rounded(age: float) -> float | None:
+    return round(age, 3) if math.isfinite(age) else None

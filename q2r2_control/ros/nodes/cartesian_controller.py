@@ -9,31 +9,27 @@ namespace an arm (``/left/joint_states``) both work. With output ``none`` anothe
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
 import pinocchio as pin
-from rclpy.clock import Clock
-from rclpy.clock_type import ClockType
 from std_srvs.srv import SetBool, Trigger
 
-from q2r2_control.config.cell import Config, load_config
+from q2r2_control.config.cell import load_config
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.drives.base import permitted
 from q2r2_control.drives.torque import TorqueDrive
-from q2r2_control.errors import ConfigError
 from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.loop.control_loop import ControlLoop
 from q2r2_control.robot.robot import Robot
-from q2r2_control.ros.base_node import ERROR, OK, WARN, run_node
+from q2r2_control.ros.base_node import ERROR, OK, WARN
 from q2r2_control.ros.bridge.controller_feedback import ControllerFeedback
 from q2r2_control.ros.bridge.gripper_limits import GRIPPER_DELAY, GripperLimits
 from q2r2_control.ros.bridge.intakes import JointIntake, TargetIntake
 from q2r2_control.ros.bridge.joint_outputs import NONE, make_output, output_name
-from q2r2_control.ros.bridge.live_parameters import LiveControl, LiveImpedance, LiveWatching
+from q2r2_control.ros.bridge.live_parameters import make_control_live, make_impedance_live, make_watching_live
 from q2r2_control.ros.executor import TickExecutor
 from q2r2_control.ros.managed_node import ManagedNode
 from q2r2_control.supervision.external_arms import ExternalArms, ExternalSettings, settings_for_external_arms
@@ -49,7 +45,6 @@ _QUIET = 0.3  # nobody else commands the arms for so long before this node does 
 _LONGEST_ACTIVATION = 2.0  # besides the settle time [s]
 _DEACTIVATED = "deactivated"
 _CURE = "ros2 lifecycle set /cartesian_controller activate takes over where the arms are"
-_LOOK_PERIOD = 0.5  # between two looks at the graph [s]
 _SAFE_TARGET_PERIOD = 0.008  # [s]
 
 
@@ -70,17 +65,17 @@ class CartesianControllerNode(ManagedNode):
         self._period = 1.0 / rate
         self._output = make_output(output, self, robot, config, self._period)
         self._targets = TargetIntake(self, robot, self.report_health)
-        self._joints = JointIntake(self, robot)
+        feels = config.admittance.enabled and not self._output.drive.yields
+        self._joints = JointIntake(self, robot, needs_external_torque=feels)
         streams, external = StreamSettings(linked=config.teleop.linked), ExternalSettings()
         watch = watch_settings(config.supervision, self._output.drive.yields)
         # A message with a bad number among good ones is another publisher's: no reason to bridge it.
         watch.unusable_time = 0.0
-        self._watching = LiveWatching(self, streams, watch, external)
+        make_watching_live(self, streams, watch, external)
         if isinstance(self._output.drive, TorqueDrive):
-            self._live_impedance = LiveImpedance(self, self._output.drive.impedance)
-        self._require_external_torque(config)
+            make_impedance_live(self, self._output.drive.impedance)
         self._controller = CartesianController(robot, permitted(config.control, self._output.drive))
-        self._live = LiveControl(self, self._controller)
+        make_control_live(self, self._controller)
         self._loop = ControlLoop(
             self._controller,
             self._output.drive,
@@ -109,14 +104,6 @@ class CartesianControllerNode(ManagedNode):
         self.start_active()
         self.get_logger().info(f"{config.name}: {', '.join(robot.arms)}; waits for joint states")
 
-    def _require_external_torque(self, config: Config) -> None:
-        """An admittance needs it. Raises :class:`ConfigError` where nothing is measured."""
-        if not config.admittance.enabled or self._output.drive.yields:
-            return
-        if not self._joints.measures_external_torque:
-            raise ConfigError("admittance.enabled = true: set the parameter external_torque_topic, which it needs")
-        self._joints.needs_external_torque = True
-
     def _connect(self) -> None:
         self._targets.subscribe(self._take_target, self._supervisor.release_target)
         self._joints.subscribe(self._loop.observe, self._grippers.take_joint_state)
@@ -130,8 +117,6 @@ class CartesianControllerNode(ManagedNode):
         for name, act in services.items():
             self.create_service(Trigger, f"~/{name}", partial(self._serve, act))
         self.create_tick(self._period, self._tick)
-        # Looks even while /clock stands still.
-        self.create_timer(_LOOK_PERIOD, self._look, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def _take_target(
         self, arm: str, pose: pin.SE3 | None, now: float, number: int | None, due: float | None
@@ -160,7 +145,7 @@ class CartesianControllerNode(ManagedNode):
             return
         # Commands that the arms do not follow are not for a receiver that has just come.
         if fault := self._output.listener_fault(self._supervisor.off_reference):
-            self._supervisor.let_go(_in_words(fault), now)
+            self._supervisor.let_go(Reason.in_words(fault), now)
         state, openings = self._joints.state, self._grippers.openings(now)
         step = self._loop.step(state, {}, now, dt, self._grippers.wanted, openings)
         self._grippers.answer()
@@ -171,20 +156,11 @@ class CartesianControllerNode(ManagedNode):
         elif self._commanding and state is not None:
             self._output.end(state, now)
         self._commanding = step.reference is not None
-        self._tell_events()
-
-    def _tell_events(self) -> None:
-        if not self._supervisor.events:
-            return
-        for event in self._supervisor.events:
-            self.get_logger().warning(sentence(event))
-        self._supervisor.events.clear()
-        self.report_health()
-
-    def _look(self) -> None:
-        """Remember who publishes what."""
-        self._targets.look()
-        self._joints.look()
+        if events := self._supervisor.events:
+            for event in events:
+                self.get_logger().warning(sentence(event))
+            events.clear()
+            self.report_health()
 
     def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         self._supervisor.pause(request.data)
@@ -193,7 +169,7 @@ class CartesianControllerNode(ManagedNode):
 
     def _serve(self, act: Callable[[], Reason | None], request: Any, response: Any) -> Any:
         active = self.is_active or act == self._stop
-        refusal = act() if active else _in_words(f"{_DEACTIVATED}: {_CURE}")
+        refusal = act() if active else Reason.in_words(f"{_DEACTIVATED}: {_CURE}")
         self.report_health()
         return _answer(response, refusal)
 
@@ -218,7 +194,7 @@ class CartesianControllerNode(ManagedNode):
             age = supervisor.target_age(arm, now)
             values[f"{arm}_target_age_s"] = round(age, 3) if age < 1e6 else "none"
             values[f"{arm}_targets_rejected"] = rejected
-            values[f"{arm}_targets_from"] = self._targets.publishers(arm)
+            values[f"{arm}_targets_from"] = self._targets.publishers.of(self._targets.topics[arm])
             values[f"{arm}_gripper_held_by"] = self._grippers.held.get(arm, "")
         for arm, holds in self._loop.holding.items():
             values[f"{arm}_holds_object"] = holds
@@ -257,8 +233,8 @@ class CartesianControllerNode(ManagedNode):
         problem = None if active else "the arms do not stand still" if fault is None else sentence(fault)
         # Nothing was commanded yet: that begins with the next tick.
         if (problem := self._others.commander(_QUIET) or problem) is not None:
-            self._supervisor.let_go(_in_words(problem), self.now)
-            self._supervisor.stop(_in_words(_CURE))
+            self._supervisor.let_go(Reason.in_words(problem), self.now)
+            self._supervisor.stop(Reason.in_words(_CURE))
             return problem
         self._others.end()
         return None
@@ -279,7 +255,7 @@ class CartesianControllerNode(ManagedNode):
         self._come_to_rest("ending", spin)
 
     def _come_to_rest(self, why: str, go_on: Callable[[], None]) -> None:
-        self._supervisor.stop(_in_words(why))
+        self._supervisor.stop(Reason.in_words(why))
         deadline = last = time.monotonic()
         deadline += _LONGEST_STOP
         advances = self._advances
@@ -314,16 +290,3 @@ class CartesianControllerNode(ManagedNode):
 def _answer(response: Any, refusal: Reason | None) -> Any:
     response.success, response.message = refusal is None, "done" if refusal is None else sentence(refusal)
     return response
-
-
-def _in_words(text: str) -> Reason:
-    return Reason.of(ReasonKind.OTHER, text=text)
-
-
-def main() -> int:
-    """The executable ``cartesian_controller``."""
-    return run_node(CartesianControllerNode)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Mapping
 from typing import Any
@@ -15,7 +14,7 @@ from q2r2_control.inputs.headset_check import SILENCE
 from q2r2_control.inputs.messages import HandMessage
 from q2r2_control.inputs.session import HAND_TOPICS
 from q2r2_control.inputs.statistics import TopicRecorder, TopicStatistics
-from q2r2_control.ros.base_node import ERROR, OK, WARN, BaseNode, run_node
+from q2r2_control.ros.base_node import ERROR, OK, WARN, BaseNode
 from q2r2_control.ros.bridge.hand_topics import subscribe_to_hands
 from q2r2_control.viewer.topic_table import topic_line, topic_table
 
@@ -30,14 +29,14 @@ class CheckTcpConnection(BaseNode):
     After ``duration`` it ends, with exit code 1 when every topic has timed out.
     """
 
-    def __init__(self, console: Console, **kwargs: Any) -> None:
+    def __init__(self, console: Console | None = None, **kwargs: Any) -> None:
         super().__init__("check_tcp_connection", **kwargs)
         duration = self.parameter(
             "duration", 0.0, "Ends after this time; 0: on Ctrl-C [s].", at_least=0.0, at_most=86400.0
         )
         self._recorders: dict[str, TopicRecorder] = {}
         self._start = time.monotonic()
-        self._console = console
+        self._console = console = console or Console()
         self._live = Live(console=console, auto_refresh=False) if console.is_terminal else None
         if self._live is not None:
             self._live.start()
@@ -87,12 +86,3 @@ class CheckTcpConnection(BaseNode):
     def _finish(self) -> None:
         topics = self._topics()
         self.exit_code = int(len(self._silent(topics)) == len(topics))
-
-
-def main() -> int:
-    """Run the node."""
-    return run_node(lambda: CheckTcpConnection(Console()))
-
-
-if __name__ == "__main__":
-    sys.exit(main())

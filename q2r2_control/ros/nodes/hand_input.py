@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
-
-from quest2ros.msg import OVR2ROSHapticFeedback
 
 from q2r2_control.config.cell import load_config
 from q2r2_control.inputs.base import make_input
-from q2r2_control.inputs.messages import HandMessage, HandPose, MessageType
-from q2r2_control.inputs.session import HAND_TOPICS, HAPTIC_TOPICS
-from q2r2_control.ros.base_node import OK, STREAM_QOS, WARN, BaseNode, run_node
-from q2r2_control.ros.bridge.hand_topics import HandPublishers
-from q2r2_control.types import HandSample, HapticFeedback
+from q2r2_control.inputs.messages import MessageType
+from q2r2_control.ros.base_node import OK, WARN, BaseNode
+from q2r2_control.ros.bridge.hand_topics import HandPublishers, subscribe_to_haptics
 
 _PERIOD = 0.002  # between two polls [s]
 
@@ -35,17 +30,14 @@ class HandInput(BaseNode):
         self._input = make_input(name, config)
         config.teleop.bindings.check_device(self._input.controls)
         self._title, self._samples = name, 0
-        kinds = MessageType.POSE, MessageType.INPUTS
-        self._topics = {(topic.hand, topic.kind): name for name, topic in HAND_TOPICS.items() if topic.kind in kinds}
-        self._publishers_of_hands = HandPublishers(self, self._topics.values())
-        for hand, topic in HAPTIC_TOPICS.items():
-            self.create_subscription(OVR2ROSHapticFeedback, topic, self._vibrate(hand), STREAM_QOS)
+        self._hand_publishers = HandPublishers(self, kinds=(MessageType.POSE, MessageType.INPUTS))
+        subscribe_to_haptics(self, self._input.send_haptic)
         self._input.start()
         self.create_timer(_PERIOD, self._tick)
 
     def health(self) -> tuple[bytes, str, Mapping[str, Any]]:
         """Whether the input is connected."""
-        values = {"samples": self._samples, "sent": self._publishers_of_hands.sent}
+        values = {"samples": self._samples, "sent": self._hand_publishers.sent}
         connected = self._input.connected
         return OK if connected else WARN, self._title if connected else f"{self._title} is not connected", values
 
@@ -55,27 +47,5 @@ class HandInput(BaseNode):
 
     def _tick(self) -> None:
         for sample in self._input.poll(self.now):
-            self._publish(sample)
-
-    def _publish(self, sample: HandSample) -> None:
-        messages: dict[MessageType, HandMessage] = {MessageType.INPUTS: sample.inputs}
-        if sample.fault is None:
-            messages[MessageType.POSE] = HandPose(sample.position, sample.quaternion, sample.pose_stamp, "")
-        for kind, message in messages.items():
-            self._publishers_of_hands.publish(self._topics[sample.hand, kind], message, "", sample.pose_stamp)
-        self._samples += 1
-
-    def _vibrate(self, hand: str) -> Callable[[OVR2ROSHapticFeedback], None]:
-        def vibrate(message: OVR2ROSHapticFeedback) -> None:
-            self._input.send_haptic(HapticFeedback(hand, message.frequency, message.amplitude))
-
-        return vibrate
-
-
-def main() -> int:
-    """Run the node."""
-    return run_node(HandInput)
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+            self._hand_publishers.publish_sample(sample)
+            self._samples += 1

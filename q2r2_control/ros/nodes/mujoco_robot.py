@@ -8,8 +8,6 @@ the arms brake, and after ``hold_after`` they stand on their position servos, wh
 
 from __future__ import annotations
 
-import math
-import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -27,19 +25,19 @@ from trajectory_msgs.msg import JointTrajectory
 
 from q2r2_control.config.cell import load_config
 from q2r2_control.config.timeouts import STREAM_TIMEOUT
-from q2r2_control.errors import ConfigError
 from q2r2_control.plants.simulated_cell import JointSetpoint, SimulatedCell
 from q2r2_control.robot.robot import Robot
-from q2r2_control.ros.base_node import LATCHED_QOS, OK, WARN, run_node
-from q2r2_control.ros.bridge.grippers import GripperServer, Stroke
+from q2r2_control.ros.base_node import LATCHED_QOS, OK, WARN
+from q2r2_control.ros.bridge.gripper_server import GripperServer, Stroke
 from q2r2_control.ros.bridge.link_frames import LinkFrames
 from q2r2_control.ros.bridge.messages import age, delay, joint_state_message, seconds
 from q2r2_control.ros.managed_node import ManagedNode
 from q2r2_control.supervision.delay_watch import DelayWatch
 from q2r2_control.types import Array, RobotState
 
-_LOG_PERIOD = 1.0  # of lines about one topic [s]
+_LOG_PERIOD = 1.0  # of lines about refusals [s]
 _TRAJECTORY = "joint_trajectory"
+_STROKE = Stroke(open_position=0.0, closed_position=0.05)  # in goals, as Quest2ROS2 has them [m]
 
 
 class MujocoRobot(ManagedNode):
@@ -55,30 +53,21 @@ class MujocoRobot(ManagedNode):
         tf_rate = self.parameter("tf_rate", 50.0, "transforms per second [Hz]", at_least=1, at_most=1000)
         # Hands feel it fifty times a second; an admittance needs it in every tick.
         felt = rate if config.admittance.enabled else 50.0
-        what = "external torques per second, as often as joint states at most [Hz]"
-        self._external_period = 1.0 / self.parameter("external_torque_rate", felt, what, at_least=20, at_most=1000)
+        self._external_period = 1.0 / felt
         self._external_due = 0.0  # [s]
         hold_after = self.parameter("hold_after", 0.1, "without commands [s]", at_least=0.01, at_most=1)
         max_jump = self.parameter("max_jump", 0.1, "of a commanded position [rad]", at_least=0.001, at_most=7)
-        stroke = Stroke(
-            self.parameter("gripper_open_position", 0.0, "in goals, fully open [m]", at_least=-0.2, at_most=0.2),
-            self.parameter("gripper_closed_position", 0.05, "in goals, closed [m]", at_least=-0.2, at_most=0.2),
-        )
-        if stroke.open_position == stroke.closed_position:
-            raise ConfigError("gripper_open_position, gripper_closed_position: allowed: two different numbers")
         self._robot = Robot.from_config(config)
         self._cell = SimulatedCell(self._robot, config, hold_after, max_jump)
         self._period = 1.0 / rate
         self._received = 0.0  # when the command that is being taken was [s]
         self._refused: dict[str, str] = {}
-        self._said: set[str] = set()  # topics whose refusal is in the log
-        self._logged: dict[str, float] = {}  # when a topic's refusal last was [s]
         self._refusals = 0
         self._delays: dict[tuple[str, ...], DelayWatch] = {}  # by topic and first joint
         self._ticks, self._reported_at = 0, time.monotonic()
         self._make_publishers()
         self._make_subscriptions()
-        self._grippers = {arm: self._gripper(arm, stroke) for arm in self._cell.plant.gripper_openings()}
+        self._grippers = {arm: self._gripper(arm) for arm in self._cell.plant.gripper_openings()}
         self.create_service(Trigger, "~/reset", self._reset)
         steady = Clock(clock_type=ClockType.STEADY_TIME)  # the simulation makes its own time, whatever /clock says
         self.create_tick(self._period, self._tick, clock=steady)
@@ -109,11 +98,11 @@ class MujocoRobot(ManagedNode):
         ):
             self.create_subscription(kind, topic, partial(self._take, topic, callback), commands)
 
-    def _gripper(self, arm: str, stroke: Stroke) -> GripperServer:
+    def _gripper(self, arm: str) -> GripperServer:
         return GripperServer(
             self,
             f"/q2r2/{arm}_gripper/gripper_cmd",
-            stroke,
+            _STROKE,
             lambda opening: self._cell.command_gripper(arm, opening),
             lambda fault: self._note(f"{arm}_gripper", fault),
         )
@@ -152,8 +141,7 @@ class MujocoRobot(ManagedNode):
         self._follow("position_commands", self._robot.joint_names, message.data, ())
 
     def _on_velocities(self, message: Float64MultiArray) -> None:
-        fault = self._cell.command_velocities(np.array(message.data, float), self._received)
-        self._note("velocity_commands", fault)
+        self._note("velocity_commands", self._cell.command_velocities(np.array(message.data, float), self._received))
 
     def _on_torques(self, message: Float64MultiArray) -> None:
         self._note("torque_commands", self._cell.command_torques(np.array(message.data, float), self._received))
@@ -164,18 +152,15 @@ class MujocoRobot(ManagedNode):
         self._note(topic, self._cell.command_positions(setpoint, self._received))
 
     def _note(self, topic: str, fault: str | None) -> None:
-        """Say what was refused: once, until the topic brings something good again, and not more than once a second."""
+        """Say what was refused, until the topic brings something good again."""
         if fault is None:
             self._refused.pop(topic, None)
-            self._said.discard(topic)
             return
         self._refusals += 1
-        self._refused.setdefault(topic, fault)
-        now = time.monotonic()
-        if topic not in self._said and now - self._logged.get(topic, -math.inf) >= _LOG_PERIOD:
-            self._logged[topic] = now
-            self._said.add(topic)
-            self.get_logger().warning(f"{topic}: refused: {fault} ({self._refusals} refused so far)")
+        if topic not in self._refused:
+            self._refused[topic] = fault
+            line = f"{topic}: refused: {fault} ({self._refusals} refused so far)"
+            self.get_logger().warning(line, throttle_duration_sec=_LOG_PERIOD)
             self.report_health()
 
     def _tick(self) -> None:
@@ -236,12 +221,3 @@ class MujocoRobot(ManagedNode):
     def close(self) -> None:
         """Give the plant back."""
         self._cell.plant.close()
-
-
-def main() -> int:
-    """The executable ``mujoco_robot``."""
-    return run_node(MujocoRobot)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -9,7 +9,6 @@ receivers, so it listens there too. Streams reach it by best effort, so no sende
 from __future__ import annotations
 
 import json
-import sys
 import time
 from collections.abc import Mapping
 from functools import partial
@@ -33,7 +32,7 @@ from q2r2_control.recording.message_recorder import ROOM, ROOM_WITH_PICTURES, Me
 from q2r2_control.recording.ros_topics import RECORDER_EVENTS, arm_events, heard_on, is_latched, is_reliable, ros_topics
 from q2r2_control.recording.topics import Topic
 from q2r2_control.robot.robot import Robot
-from q2r2_control.ros.base_node import ERROR, LATCHED_QOS, OK, RECORDED_QOS, WARN, BaseNode, run_node
+from q2r2_control.ros.base_node import ERROR, LATCHED_QOS, OK, RECORDED_QOS, WARN, BaseNode
 from q2r2_control.ros.bridge.messages import age
 from q2r2_control.teleop.episode_marks import EpisodeMarks
 from q2r2_control.wording import sentence
@@ -203,12 +202,3 @@ def _class_of(name: str) -> Any:
     """The Python class of a type such as std_msgs/msg/String."""
     package, _, kind = name.split("/")
     return getattr(import_module(f"{package}.msg"), kind)
-
-
-def main() -> int:
-    """The executable ``recorder``."""
-    return run_node(RecorderNode)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

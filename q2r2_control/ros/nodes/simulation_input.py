@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from std_srvs.srv import Trigger
-
-from q2r2_control.inputs.messages import HandMessage, HandPose, HandTwist, MessageType
+from q2r2_control.inputs.messages import HandTwist, MessageType
 from q2r2_control.inputs.scripted import ScriptedInput
-from q2r2_control.inputs.session import HAND_TOPICS
 from q2r2_control.inputs.trajectories import FIRST_PRESS, START, TRAJECTORIES
-from q2r2_control.ros.base_node import OK, WARN, BaseNode, run_node
+from q2r2_control.ros.base_node import OK, WARN, BaseNode
 from q2r2_control.ros.bridge.hand_topics import HandPublishers
 from q2r2_control.ros.monitoring.hand_listeners import HandListeners
 from q2r2_control.types import SIDES, HandSample
@@ -21,10 +17,6 @@ from q2r2_control.types import SIDES, HandSample
 _SHORTEST, _LONGEST = 0.001, 0.02  # between two looks at what has come due [s]
 # Of the script, when it is decided whether the buttons are pressed, and whether the hands move [s].
 _BEFORE_PRESS, _BEFORE_MOTION = FIRST_PRESS - 0.1, START - 0.05
-# An arm that stops within this time of a motion's begin is engaged again, if it is ready within the same time [s], and
-# if that has not happened too often: then something else than a busy machine stops it.
-_SETTLES = 3.0
-_EARLY_STOPS = 5
 _MODES = {
     "all": (MessageType.POSE, MessageType.INPUTS, MessageType.TWIST),
     "teleop": (MessageType.POSE, MessageType.INPUTS),
@@ -35,14 +27,9 @@ _MODES = {
 class SimulationInput(BaseNode):
     """Plays a scripted trajectory. It presses and releases the lower buttons, early on, to engage the arms.
 
-    So the script starts only when every hand that it plays has a subscriber, unless ``wait_for_subscribers`` is false.
-    The hands rest until the arms' nodes that listen say that they can be engaged. Then the buttons are pressed, and
-    again where an arm is not engaged by the time the hands would move, or stops within the first three seconds of the
-    motion. From then on, and after an arm's ``~/pause``, nothing is pressed again: it takes a person to go on.
-
-    A user who starts the node asks for the motion, as an operator does with a button. A launch file that restarts the
-    node after a crash does not, and the arms that the crash has stopped must not move then. Use ``start_on_request``
-    there: after each start nothing is published until ``~/start`` is called.
+    The script starts when every hand that it plays has a subscriber, unless ``wait_for_subscribers`` is false. The
+    hands rest until the arms' nodes say that they can be engaged. Then the buttons are pressed, and again where an arm
+    is not engaged by the time the hands would move. From then on, and after an arm's ``~/pause``, it takes a person.
     """
 
     ticks = True
@@ -63,37 +50,21 @@ class SimulationInput(BaseNode):
         self._waits_for_subscribers = self.parameter(
             "wait_for_subscribers", True, "Start when every hand has a subscriber."
         )
-        self._waits_for_request = self.parameter(
-            "start_on_request", False, "Start when ~/start is called, and not before."
-        )
         self._hands = SIDES if side == "both" else (side,)
         self._title = f"{trajectory} of {' and '.join(self._hands)}"
-        self._topics = {
-            (topic.hand, topic.kind): name
-            for name, topic in HAND_TOPICS.items()
-            if topic.hand in self._hands and topic.kind in _MODES[mode]
-        }
-        self._publishers_of_hands = HandPublishers(self, self._topics.values())
+        self._hand_publishers = HandPublishers(self, self._hands, _MODES[mode])
         self._samples = 0
         self._trajectory, self._rate, self._jitter = trajectory, rate, jitter
-        self._listeners = HandListeners(
-            self, {hand: topic for (hand, kind), topic in self._topics.items() if kind is MessageType.INPUTS}
-        )
+        self._listeners = HandListeners(self, self._hands if MessageType.INPUTS in _MODES[mode] else ())
         self._starts = True  # until nothing is pressed again to engage the arms
         self._moves = False  # whether the hands do
-        self._moved_at: float | None = None  # since when they do [s]
-        self._stopped_at: float | None = None  # when no arm followed any more, soon after that [s]
-        self._early_stops = 0
         self._not_to_press: set[str] | None = None  # hands; None: that is not decided yet
         self._rewind(self.now)
-        self.create_service(Trigger, "~/start", self._on_start)
         self._timer = self.create_tick(_LONGEST, self._tick)
 
     def health(self) -> tuple[bytes, str, Mapping[str, Any]]:
         """What is played, or which subscriber is missing."""
-        values = {"samples": self._samples, "sent": self._publishers_of_hands.sent}
-        if self._waits_for_request:
-            return WARN, "waits for a call of ~/start", values
+        values = {"samples": self._samples, "sent": self._hand_publishers.sent}
         if self._waits_for_subscribers:
             return WARN, f"waits for a subscriber of {' and '.join(self._missing())}", values
         if self._starts and (unready := self._listeners.unready()) is not None:
@@ -101,16 +72,7 @@ class SimulationInput(BaseNode):
         return OK, self._title, values
 
     def _missing(self) -> list[str]:
-        return [f"the {hand} hand" for hand in self._hands if not self._publishers_of_hands.subscribers(hand)]
-
-    def _on_start(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        response.success, response.message = (
-            self._waits_for_request,
-            "starts" if self._waits_for_request else "has started before",
-        )
-        self._waits_for_request = False
-        self._rewind(self.now)
-        return response
+        return [f"the {hand} hand" for hand in self._hands if not self._hand_publishers.subscribers(hand)]
 
     def _tick(self) -> None:
         """Play, and come again when the next sample is due."""
@@ -120,8 +82,6 @@ class SimulationInput(BaseNode):
         self._timer.reset()
 
     def _play(self) -> None:
-        if self._waits_for_request:
-            return
         if self._waits_for_subscribers:
             if self._missing():
                 return
@@ -140,59 +100,28 @@ class SimulationInput(BaseNode):
         t = now - self._began
         if t < _BEFORE_PRESS or (self._not_to_press is not None and t < _BEFORE_MOTION):
             return
+        following = {hand for hand in self._hands if self._listeners.engaged(hand) is not False}
         if self._not_to_press is None:
             if self._listeners.unready() is None:
                 # A press would pause those that are engaged already.
-                self._not_to_press = {hand for hand in self._hands if self._listeners.engaged(hand)}
-            elif self._stopped_at is not None and (
-                now - self._stopped_at > _SETTLES or self._listeners.paused_by_a_person()
-            ):
-                self._give_up()
+                self._not_to_press = {hand for hand in following if self._listeners.engaged(hand)}
             else:
                 self._rewind(now)
-            return
-        follow = [self._listeners.engaged(hand) is not False for hand in self._hands]
-        # Once the hands move they do not go back while an arm follows, which would be a jump.
-        if any(follow) if self._moves else all(follow):
-            self._moves, self._moved_at = True, now if self._moved_at is None else self._moved_at
-            self._starts = now - self._moved_at < _SETTLES
-        elif self._listeners.paused_by_a_person() or self._early_stops >= _EARLY_STOPS:
-            self._give_up()
+        elif len(following) == len(self._hands):
+            self._starts, self._moves = False, True
+        elif self._listeners.paused_by_a_person():
+            self._starts, self._not_to_press = False, set(self._hands)
         else:
-            if self._moves:
-                self._stopped_at = now
-                self._early_stops += 1
             self._rewind(now)
-
-    def _give_up(self) -> None:
-        """From here on a person engages arms, or nobody does."""
-        self._starts, self._not_to_press = False, set(self._hands)
 
     def _rewind(self, now: float) -> None:
         self._script = ScriptedInput(self._trajectory, self._hands, rate_hz=self._rate, jitter=self._jitter)
         self._script.start()
-        self._began, self._not_to_press, self._moves, self._moved_at = now, None, False, None
+        self._began, self._not_to_press = now, None
 
     def _publish(self, sample: HandSample) -> None:
-        twist = self._script.hand_twist(sample.hand, sample.pose_stamp)
-        inputs = sample.inputs
         if not self._moves and sample.hand in (self._not_to_press or ()):
-            inputs = replace(inputs, button_lower=False)
-        messages: dict[MessageType, HandMessage] = {
-            MessageType.POSE: HandPose(sample.position, sample.quaternion, sample.pose_stamp, self._frame),
-            MessageType.INPUTS: inputs,
-            MessageType.TWIST: HandTwist(twist.linear, twist.angular),
-        }
-        for kind, message in messages.items():
-            if (topic := self._topics.get((sample.hand, kind))) is not None:
-                self._publishers_of_hands.publish(topic, message, self._frame, sample.pose_stamp)
+            sample = replace(sample, inputs=replace(sample.inputs, button_lower=False))
+        twist = self._script.hand_twist(sample.hand, sample.pose_stamp)
+        self._hand_publishers.publish_sample(sample, self._frame, HandTwist(twist.linear, twist.angular))
         self._samples += 1
-
-
-def main() -> int:
-    """Run the node."""
-    return run_node(SimulationInput)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

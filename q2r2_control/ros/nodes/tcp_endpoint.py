@@ -7,12 +7,10 @@ that the app sends apart, and drop twists.
 from __future__ import annotations
 
 import logging
-import sys
 from collections.abc import Callable, Mapping
 from typing import Any
 
 from geometry_msgs.msg import Twist
-from quest2ros.msg import OVR2ROSHapticFeedback
 
 from q2r2_control.config.cell import HeadsetConfig, load_config
 from q2r2_control.config.networks import Network, network_of
@@ -24,11 +22,10 @@ from q2r2_control.inputs.hands_watch import HandsWatch, Watched
 from q2r2_control.inputs.headset import HeadsetServer
 from q2r2_control.inputs.headset_check import SILENCE
 from q2r2_control.inputs.messages import PROP_TOPICS, HandPose, PropTwist
-from q2r2_control.inputs.session import HAND_TOPICS, HAPTIC_TOPICS
-from q2r2_control.ros.base_node import OK, STREAM_QOS, WARN, BaseNode, run_node
-from q2r2_control.ros.bridge.hand_topics import HandPublishers
+from q2r2_control.ros.base_node import OK, STREAM_QOS, WARN, BaseNode
+from q2r2_control.ros.bridge.hand_topics import HandPublishers, subscribe_to_haptics
 from q2r2_control.ros.bridge.messages import hand_twist
-from q2r2_control.types import SIDES, HandFault, HapticFeedback
+from q2r2_control.types import SIDES, HandFault
 from q2r2_control.wording import sentence
 
 _SERVER_LOG = logging.getLogger("q2r2_control.inputs.headset")
@@ -64,7 +61,7 @@ class TcpEndpoint(BaseNode):
             hand: self.parameter(f"{hand}_frame_id", "", f"Frame of {hand} poses; empty: what the headset says.")
             for hand in SIDES
         }
-        self._publishers_of_hands = HandPublishers(self, HAND_TOPICS)
+        self._hand_publishers = HandPublishers(self)
         frozen_time = self.parameter(
             "frozen_time",
             headset.frozen_time or 0.0,
@@ -76,8 +73,7 @@ class TcpEndpoint(BaseNode):
         watch = HandsWatch(frozen_time or None, frame, gate.timeout)
         self._faults: dict[str, HandFault | None] = dict.fromkeys(SIDES)
         self._server = HeadsetServer(host, port, listener=self._publish, allow=networks, watch=watch)
-        for hand, topic in HAPTIC_TOPICS.items():
-            self.create_subscription(OVR2ROSHapticFeedback, topic, self._vibrate(hand), STREAM_QOS)
+        subscribe_to_haptics(self, self._server.send_haptic)
         for topic in PROP_TOPICS:
             self.create_subscription(Twist, topic, self._move(topic), STREAM_QOS)
         self._log = _ToRosLog(self.get_logger())
@@ -98,7 +94,7 @@ class TcpEndpoint(BaseNode):
             "dialect": statistics.dialect,
             "connections": statistics.connections,
             "last_disconnect": statistics.last_disconnect,
-            "sent": self._publishers_of_hands.sent,
+            "sent": self._hand_publishers.sent,
             "rate_hz": {name: topic.rate for name, topic in statistics.topics.items()},
             "unknown_topics": statistics.unknown_topics,
         }
@@ -124,10 +120,7 @@ class TcpEndpoint(BaseNode):
                     )
                 return
         frame = self._frames[reception.hand] or (message.frame_id if isinstance(message, HandPose) else "")
-        self._publishers_of_hands.publish(reception.topic, message, frame, self.now)
-
-    def _vibrate(self, hand: str) -> Callable[[OVR2ROSHapticFeedback], None]:
-        return lambda message: self._server.send_haptic(HapticFeedback(hand, message.frequency, message.amplitude))
+        self._hand_publishers.publish(reception.topic, message, frame, self.now)
 
     def _move(self, topic: str) -> Callable[[Twist], None]:
         def send(message: Twist) -> None:
@@ -157,12 +150,3 @@ class _ToRosLog(logging.Handler):
             self._logger.warning(self.format(record))
         else:
             self._logger.info(self.format(record))
-
-
-def main() -> int:
-    """Run the node."""
-    return run_node(TcpEndpoint)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -10,7 +10,6 @@ import json
 import subprocess
 import sys
 from collections.abc import Mapping
-from pathlib import Path
 
 from q2r2_control.ros.launch.build import interface_packages
 from q2r2_control.ros.launch.middleware import set_up_middleware
@@ -18,13 +17,7 @@ from q2r2_control.ros.watching.findings import Finding, error, warning
 
 # What the nodes import, besides the packages under ``interfaces``.
 PACKAGES = (
-    *(
-        "rclpy",
-        "builtin_interfaces",
-        "diagnostic_msgs",
-        "geometry_msgs",
-        "rcl_interfaces",
-    ),
+    *("rclpy", "builtin_interfaces", "diagnostic_msgs", "geometry_msgs", "rcl_interfaces"),
     *("sensor_msgs", "std_msgs", "std_srvs", "trajectory_msgs", "visualization_msgs"),
 )
 _GREATEST_DOMAIN = 232
@@ -43,7 +36,6 @@ for name, proof in json.loads(sys.argv[1]).items():
 print(get_rmw_implementation_identifier())
 """
 _INSTALL = "pip install 'q2r2_control[ros]', or source a ROS 2 Jazzy"
-_RANGES = ("SUBNET", "LOCALHOST", "SYSTEM_DEFAULT", "OFF")
 
 
 def examine_environment(environment: Mapping[str, str]) -> tuple[dict[str, str], list[Finding]]:
@@ -81,27 +73,15 @@ def _variable_findings(environment: Mapping[str, str]) -> list[Finding]:
         findings.append(error(f"ROS_DOMAIN_ID is {domain!r:.40}", cure))
     if (distribution := environment.get("ROS_DISTRO", "jazzy")) != "jazzy":
         findings.append(warning(f"ROS {distribution} is sourced; the nodes are made for jazzy", "source a ROS 2 Jazzy"))
-    profiles = environment.get("FASTRTPS_DEFAULT_PROFILES_FILE")
-    if profiles and not Path(profiles).is_file():
-        cure = "unset FASTRTPS_DEFAULT_PROFILES_FILE, or name a file"
-        findings.append(warning(f"FASTRTPS_DEFAULT_PROFILES_FILE: no file {profiles}", cure))
-    reach = environment.get("ROS_AUTOMATIC_DISCOVERY_RANGE")
-    if reach and reach not in _RANGES:
-        what = f"ROS_AUTOMATIC_DISCOVERY_RANGE is {reach!r:.40}, which counts as LOCALHOST"
-        findings.append(warning(what, f"allowed are {', '.join(_RANGES)}"))
     return findings
 
 
 def _reach(environment: Mapping[str, str]) -> str:
-    """Whom nodes find, in words."""
-    peers = environment.get("ROS_STATIC_PEERS")
-    others = f", and {peers}" if peers else ""
+    """Whom nodes find, as the variables say it."""
     if environment.get("ROS_LOCALHOST_ONLY") == "1":
         return "this machine only (ROS_LOCALHOST_ONLY)"
-    reach = environment.get("ROS_AUTOMATIC_DISCOVERY_RANGE") or "SUBNET"
-    if reach in ("SUBNET", "SYSTEM_DEFAULT"):
-        return f"the local network{others}"
-    return f"{'nobody' if reach == 'OFF' else 'this machine only'} (ROS_AUTOMATIC_DISCOVERY_RANGE){others}"
+    peers = environment.get("ROS_STATIC_PEERS")
+    return (environment.get("ROS_AUTOMATIC_DISCOVERY_RANGE") or "SUBNET") + (f", and {peers}" if peers else "")
 
 
 def _try_ros(environment: Mapping[str, str], packages: Mapping[str, str]) -> list[str] | Finding:

@@ -58,7 +58,6 @@ def examine_set(view: SetView, expected: Collection[str]) -> list[Finding]:
         *_node_findings(view.nodes),
         *_senders(view),
         *_takers(view),
-        *_shared_frames(view),
         *_arm_findings(view.arms, view.nodes),
     ]
 
@@ -124,14 +123,6 @@ def _takers(view: SetView) -> Iterator[Finding]:
         else:
             what = f"{topic.name} has {len(topic.subscribers)} takers: {names}"
             yield warning(what, "end those that only look: a listener counts as a controller or driver")
-
-
-def _shared_frames(view: SetView) -> Iterator[Finding]:
-    if view.shared_frames:
-        senders = ", ".join(_publishers(view, "tf"))
-        frames = ", ".join(view.shared_frames[:4]) + (" ..." if len(view.shared_frames) > 4 else "")
-        what = f"{len(view.shared_frames)} frames on /tf come from two publishers ({frames}); on /tf are {senders}"
-        yield warning(what, "end one of them, unless both publish the same robot's own joint states")
 
 
 def _arm_findings(arms: Iterable[ArmView], nodes: Iterable[NodeView]) -> Iterator[Finding]:

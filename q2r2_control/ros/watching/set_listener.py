@@ -1,8 +1,7 @@
-"""Listens to a set of nodes without taking part in it.
+"""Listens to what nodes of a set say on ``~/state``, and so takes no part in it.
 
-No command is listened to, and no hand: an arm that has no controller would take a listener for one and could be
-engaged, SimulationInput would play to nobody, and a controller lets arms go whose commands get a new receiver. What
-goes over those topics is counted by who sends it, and said on ``~/state``.
+An arm that has no controller would take a listener of its targets for one and could be engaged, and a controller lets
+arms go whose commands get a new receiver. How much goes over a topic is counted by who sends it, and said there.
 """
 
 from __future__ import annotations
@@ -12,7 +11,7 @@ import math
 import os
 import time
 from collections import defaultdict, deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -20,24 +19,17 @@ import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
-from sensor_msgs.msg import JointState
 from std_msgs.msg import String
-from tf2_msgs.msg import TFMessage
-from visualization_msgs.msg import Marker
 
 from q2r2_control.config.cell import Config
 from q2r2_control.errors import Q2R2Error
-from q2r2_control.inputs.statistics import Arrivals
 from q2r2_control.ros.base_node import STREAM_QOS
 from q2r2_control.ros.launch.middleware import set_up_middleware
 from q2r2_control.ros.monitoring.endpoints import node_of
-from q2r2_control.ros.monitoring.frame_senders import FrameSenders, read_transforms
 from q2r2_control.ros.watching.set_view import NodeView, SetView, TopicView, arm_views
 
 _LOOK_PERIOD = 0.5  # between two looks at the graph [s]
 _STATE = "/state"
-# What may be listened to: anything may, and does, come and go there. Commands have other names.
-_HEARD = {"joint_states": JointState, "visualization_marker": Marker, "tf": TFMessage}
 _OWN = ("/rosout", "/parameter_events")  # every node has them
 _COUNTS = 8  # of what a sender says, over which its rate is taken
 
@@ -81,9 +73,7 @@ class SetListener:
 
     def __init__(self, node: Node, cell: Config) -> None:
         self._node, self._cell = node, cell
-        self._senders = FrameSenders()
         self._said: dict[str, _Said] = {}  # by full name of a node
-        self._arrivals: dict[str, Arrivals] = {}
         self._topics: dict[str, tuple[str, ...]] = {}  # with their types
         self._publishers: dict[str, tuple[str, ...]] = {}
         self._subscribers: dict[str, tuple[str, ...]] = {}
@@ -110,28 +100,15 @@ class SetListener:
             if said.newest
         )
         members = {node.name for node in nodes}
-        topics = tuple(self._topic(name, now) for name in sorted(self._topics) if self._is_shown(name, members))
-        shared = self._senders.shared(now)
-        return SetView(nodes, topics, self._names, arm_views(nodes, self._cell), shared)
+        topics = tuple(self._topic(name) for name in sorted(self._topics) if self._is_shown(name, members))
+        return SetView(nodes, topics, self._names, arm_views(nodes, self._cell))
 
     def _listen(self, topic: str) -> None:
-        if topic in self._arrivals or not self._publishers[topic]:
-            return
-        base = topic.rpartition("/")[2]
-        if topic.endswith(_STATE) and self._topics[topic] == ("std_msgs/msg/String",):
-            said = self._said.setdefault(topic.removesuffix(_STATE), _Said())
-            self._arrivals[topic] = Arrivals()
-            self._node.create_subscription(String, topic, said.take, STREAM_QOS)
-        elif (kind := _HEARD.get(base)) is not None and self._topics[topic] == (_type_name(kind),):
-            self._arrivals[topic] = arrivals = Arrivals()
-            hear = partial(self._hear_frames if topic == "/tf" else _note, arrivals)
-            self._node.create_subscription(kind, topic, hear, STREAM_QOS, raw=True)
-
-    def _hear_frames(self, arrivals: Arrivals, message: bytes, info: Mapping[str, int | None]) -> None:
-        _note(arrivals, message)
-        now, number = time.monotonic(), info["publication_sequence_number"]
-        for transform in read_transforms(message):
-            self._senders.take(transform.child_frame_id, number, now)
+        name = topic.removesuffix(_STATE)
+        states = topic.endswith(_STATE) and self._topics[topic] == ("std_msgs/msg/String",)
+        if states and name not in self._said and self._publishers[topic]:
+            self._said[name] = _Said()
+            self._node.create_subscription(String, topic, self._said[name].take, STREAM_QOS)
 
     def _is_shown(self, topic: str, members: set[str]) -> bool:
         """Whether some node of the set awaits it, or sends it and somebody counts or takes it.
@@ -142,27 +119,15 @@ class SetListener:
             return False
         if members.intersection(self._publishers[topic]):
             counted = any(topic in said.sent for said in self._said.values())
-            return bool(topic in self._arrivals or counted or self._subscribers[topic])
+            return bool(counted or self._subscribers[topic])
         takers = members.intersection(self._subscribers[topic])
         return any(self._publishers[topic] or _awaits(self._said[taker].newest) for taker in takers)
 
-    def _topic(self, topic: str, now: float) -> TopicView:
-        rate: float | None
-        age: float | None
-        if (arrivals := self._arrivals.get(topic)) is not None:
-            rate, age = arrivals.rate(now), arrivals.age(now)
-        else:
-            rates = [self._said[name].rate(topic) for name in self._publishers[topic] if name in self._said]
-            known = [value for value in rates if value is not None]
-            rate, age = sum(known) if known else None, None
-        return TopicView(
-            topic,
-            self._topics[topic],
-            self._publishers[topic],
-            self._subscribers[topic],
-            rate,
-            None if age is None or math.isinf(age) else age,
-        )
+    def _topic(self, topic: str) -> TopicView:
+        rates = [self._said[name].rate(topic) for name in self._publishers[topic] if name in self._said]
+        known = [rate for rate in rates if rate is not None]
+        rate = sum(known) if known else None
+        return TopicView(topic, self._topics[topic], self._publishers[topic], self._subscribers[topic], rate)
 
 
 def watch_set(
@@ -204,12 +169,3 @@ def _names(endpoints: list[Any], own: str) -> tuple[str, ...]:
     """Full names of the nodes of ``endpoints`` without this one, once for each endpoint."""
     names = (node_of(endpoint) or "a node not known yet" for endpoint in endpoints)
     return tuple(sorted(name for name in names if name != own))
-
-
-def _note(arrivals: Arrivals, _: bytes) -> None:
-    arrivals.note(time.monotonic())
-
-
-def _type_name(kind: Any) -> str:
-    package, _, _ = kind.__module__.partition(".")
-    return f"{package}/msg/{kind.__name__}"

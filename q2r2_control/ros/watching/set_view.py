@@ -73,7 +73,6 @@ class TopicView:
     publishers: tuple[str, ...]  # full names of nodes
     subscribers: tuple[str, ...]
     rate: float | None  # [Hz]; None: not known
-    age: float | None  # of the newest message [s]; None: not known, or none has come
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +94,6 @@ class SetView:
     topics: tuple[TopicView, ...]
     names: tuple[str, ...]  # of all nodes in the domain, one that runs twice twice
     arms: tuple[ArmView, ...]
-    shared_frames: tuple[str, ...] = ()  # that two publishers send on /tf
 
     @property
     def others(self) -> tuple[str, ...]:

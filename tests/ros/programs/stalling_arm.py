@@ -8,7 +8,7 @@ import time
 from typing import Any
 
 from q2r2_control.ros.base_node import run_node
-from q2r2_control.ros.nodes.left_arm_controller import LeftArmController
+from q2r2_control.ros.nodes.arm_controllers import LeftArmController
 
 STALL = 3.0  # more than the timeouts of the tests' arm rig [s]
 

@@ -1,0 +1,174 @@
+"""What nodes take of messages and what not: late ones, joint states in parts, torques, a controller's refusals.
+
+No program can be made to send late at will, so the subscriptions' callbacks get what the middleware would tell them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from q2r2_control import Robot
+from q2r2_control.errors import ConfigError
+from tests.ros.conftest import need_ros
+
+need_ros()
+
+import rclpy
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Bool, String
+
+from q2r2_control.ros.base_node import WARN, BaseNode
+from q2r2_control.ros.bridge.arm_outputs import FollowWatch
+from q2r2_control.ros.bridge.intakes import JointIntake, TargetIntake
+from q2r2_control.ros.bridge.messages import stamped_pose
+from q2r2_control.ros.nodes.mujoco_robot import MujocoRobot
+from q2r2_control.types import RobotState
+from q2r2_control.wording import sentence
+
+USUAL, LATE = 1_000_000, 1_000_000_000  # from sending to receipt [ns]
+
+
+class Arrivals:
+    """Calls the callback of a node's subscription as the executor does."""
+
+    def __init__(self, node: Any, topic: str) -> None:
+        self._subscription = next(one for one in node.subscriptions if one.topic_name == topic)
+        self._number = 0
+
+    def arrive(self, message: Any, took: int | None = None) -> None:
+        """``took``: time on the way [ns], of callbacks that look at it."""
+        if took is None:
+            self._subscription.callback(message)
+            return
+        self._number += 1
+        received = 1_700_000_000_000_000_000 + self._number * 10_000_000
+        times = {"source_timestamp": received - took, "received_timestamp": received}
+        self._subscription.callback(message, {"publication_sequence_number": self._number, **times})
+
+
+@pytest.fixture
+def default_context(domain: int) -> Iterator[None]:
+    rclpy.init(domain_id=domain)
+    yield
+    rclpy.try_shutdown()
+
+
+def test_a_late_target_is_passed_on_as_none_and_reported(context: Any, robot: Robot) -> None:
+    node = BaseNode("intake", context=context)
+    intake = TargetIntake(node, robot, lambda: None)
+    taken: list[bool] = []
+    intake.subscribe(lambda arm, pose, *_: taken.append(pose is not None), lambda arm: None)
+    targets = Arrivals(node, "/q2r2/left/target_frame")
+    for took in (USUAL, USUAL, LATE, USUAL):
+        targets.arrive(stamped_pose(pin.SE3.Identity(), "world", 0.0), took)
+        if took == LATE:
+            assert intake.faults() == ["target of left not used: 1.00 s late; its sender or this node stood still"]
+    assert taken == [True, True, False, True]
+    assert intake.rejected["left"] == 1
+    assert intake.faults() == []
+    node.destroy_node()
+
+
+def test_a_late_command_does_not_move_the_simulated_robot_and_is_reported(default_context: None, robot: Robot) -> None:
+    node = MujocoRobot()
+    commands = Arrivals(node, "/joint_commands")
+    command = JointState(name=list(robot.joint_names), position=robot.home.tolist())
+    for took in (USUAL, USUAL):
+        commands.arrive(command, took)
+    assert node.health()[2]["refused_commands"] == 0
+    commands.arrive(command, LATE)
+    level, line, values = node.health()
+    assert (level, values["refused_commands"]) == (WARN, 1)
+    assert line == "joint_commands: refused: 1.00 s late; its sender or this node stood still"
+    commands.arrive(command, USUAL)
+    assert node.health()[2]["refused_commands"] == 1
+    node.close()
+    node.destroy_node()
+
+
+def test_joint_states_of_an_arm_each_are_merged_by_name_and_one_that_misses_a_joint_is_refused(
+    context: Any, robot: Robot
+) -> None:
+    given = [part for arm in robot.arms for part in ("-p", f"{arm}.joint_states_topic:=/{arm}/joint_states")]
+    node = BaseNode("intake", context=context, cli_args=["--ros-args", *given])
+    intake = JointIntake(node, robot)
+    taken: list[Any] = []
+    intake.subscribe(lambda state, now: taken.append(state), lambda message: None)
+    q = robot.home + 0.01 * np.arange(len(robot.home))
+
+    def part(arm: str, without: str = "") -> None:
+        joints = [(name, at) for name, at in zip(robot.joint_names, q, strict=True) if name.startswith(arm)]
+        names, values = zip(*[joint for joint in reversed(joints) if joint[0] != without], strict=True)
+        Arrivals(node, f"/{arm}/joint_states").arrive(JointState(name=list(names), position=list(values)))
+
+    part("left")
+    assert taken == []  # nothing is known of the right arm yet
+    part("right")
+    (state,) = taken
+    assert isinstance(state, RobotState)
+    np.testing.assert_allclose(state.q, q)
+    part("right", without="right_A3")
+    assert sentence(taken[-1]) == "/right/joint_states: no joint right_A3"
+    for _ in range(2):
+        part("left")
+    assert taken[-2].stamp == taken[-1].stamp > state.stamp  # as old as the oldest of its parts, which is the right's
+    node.destroy_node()
+
+
+def test_states_have_the_external_torques_without_which_an_admittance_has_no_good_state(
+    context: Any, robot: Robot
+) -> None:
+    node = BaseNode("intake", context=context)
+    with pytest.raises(ConfigError, match=r"admittance.enabled = true: set the parameter external_torque_topic"):
+        JointIntake(node, robot, needs_external_torque=True)
+    node.destroy_node()
+    arguments = ["--ros-args", "-p", "external_torque_topic:=/felt"]
+    node = BaseNode("intake", context=context, cli_args=arguments)
+    intake = JointIntake(node, robot, needs_external_torque=True)
+    taken: list[Any] = []
+    intake.subscribe(lambda state, now: taken.append(state), lambda message: None)
+    names, torques = list(robot.joint_names), np.arange(len(robot.home), dtype=float)
+    states, felt = Arrivals(node, "/joint_states"), Arrivals(node, "/felt")
+    states.arrive(JointState(name=names, position=robot.home.tolist()))
+    assert sentence(taken[-1]) == "no external torques on /felt"
+    felt.arrive(JointState(name=names[::-1], effort=torques[::-1].tolist()))
+    states.arrive(JointState(name=names, position=robot.home.tolist()))
+    assert isinstance(taken[-1], RobotState)
+    np.testing.assert_array_equal(taken[-1].tau_external, torques)
+    felt.arrive(JointState(name=names, effort=[math.nan] * len(names)))
+    states.arrive(JointState(name=names, position=robot.home.tolist()))
+    assert isinstance(taken[-1], RobotState)
+    np.testing.assert_array_equal(taken[-1].tau_external, torques)
+    node.destroy_node()
+
+
+def test_an_arm_pauses_when_its_controller_follows_no_more_or_not_in_time_but_not_on_its_way_home(
+    context: Any,
+) -> None:
+    node = BaseNode("arm", context=context)
+    watch = FollowWatch(node, "/controller", "left", 0.3)
+    following, states = Arrivals(node, "/controller/following/left"), Arrivals(node, "/controller/state")
+    assert watch.refusal(True, 0.0) is None
+    assert watch.refusal(True, 9.0) is None  # a controller that says nothing is taken to follow
+    following.arrive(Bool(data=False))
+    assert watch.refusal(False, 10.0) is None
+    assert watch.refusal(True, 10.1) is None
+    assert watch.refusal(True, 10.5) == "/controller/following/left says that targets are not followed"
+    following.arrive(Bool(data=True))
+    assert watch.refusal(True, 11.0) is None
+    assert watch.refusal(True, 11.5) is None
+    following.arrive(Bool(data=False))
+    assert watch.refusal(True, 11.6) == "/controller/following/left says that targets are not followed any more"
+    for text in ("no JSON", "[]", "{}"):
+        states.arrive(String(data=text))
+    states.arrive(String(data='{"left_state": "homing", "message": "active"}'))
+    assert (watch.homing, watch.unready, watch.refusal(True, 20.0)) == (True, None, None)
+    states.arrive(String(data='{"left_state": "stopped", "message": "by ~/stop"}'))
+    assert watch.unready == "/controller is stopped: by /controller/stop; call /controller/reset"
+    node.destroy_node()
