@@ -6,8 +6,9 @@ from collections.abc import Iterator
 from enum import StrEnum
 from typing import NamedTuple
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
+from q2r2_control.config.strict import StrictModel
 from q2r2_control.errors import ConfigError
 from q2r2_control.types import DeviceControls
 
@@ -16,7 +17,7 @@ class Action(StrEnum):
     """What a hand can do with its controls."""
 
     NONE = "none"
-    # Once, when a control was tapped, held for a while or tapped twice.
+    # Once, when a control was tapped, or held for a while.
     PAUSE_TOGGLE = "pause_toggle"  # engage, or pause
     GRIPPER_TOGGLE = "gripper_toggle"
     HOME = "home"  # both arms
@@ -47,7 +48,6 @@ class Gesture(StrEnum):
     DOWN = "down"
     TAP = "tap"
     HOLD = "hold"
-    DOUBLE = "double"
 
 
 # What an operator reads of each action.
@@ -85,11 +85,8 @@ _DEVICE_NAMES = {
     "stick_left": "thumb_stick_horizontal",
     "stick_right": "thumb_stick_horizontal",
 }
-_WORDS = {Gesture.TAP: "", Gesture.HOLD: " held", Gesture.DOUBLE: " tapped twice"}
-_SUFFIXES = {Gesture.TAP: "", Gesture.HOLD: "_hold", Gesture.DOUBLE: "_double"}
-
-_HOLD = "held for hold_time: what is done once, but pause_toggle; or none"
-_DOUBLE = "tapped twice within double_tap_window, the same"
+_WORDS = {Gesture.TAP: "", Gesture.HOLD: " held"}
+_SUFFIXES = {Gesture.TAP: "", Gesture.HOLD: "_hold"}
 
 
 class Binding(NamedTuple):
@@ -110,39 +107,31 @@ class Binding(NamedTuple):
         return self.control + _WORDS[self.gesture]
 
 
-class BindingSettings(BaseModel):
+class BindingSettings(StrictModel):
     """The controls of each hand. An action is bound to one gesture at most, and something has to engage the arm."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
     lower: Action = Field(Action.PAUSE_TOGGLE, description="A or X, tapped: what is done once, but stop; or none")
-    lower_hold: Action = Field(Action.NONE, description=_HOLD)
-    lower_double: Action = Field(Action.NONE, description=_DOUBLE)
+    lower_hold: Action = Field(
+        Action.NONE, description="held for hold_time: what is done once, but pause_toggle; or none"
+    )
     upper: Action = Field(Action.GRIPPER_TOGGLE, description="B or Y, as lower")
     upper_hold: Action = Field(Action.NONE, description="as lower_hold")
-    upper_double: Action = Field(Action.NONE, description="as lower_double")
     trigger: Action = Field(
         Action.NONE,
         description="index finger; while held: dead_man, precision, rotation_lock, translation_lock, gripper_analog; "
         "tapped: what is done once; or none",
     )
     trigger_hold: Action = Field(Action.NONE, description="as lower_hold, where trigger is not for what lasts")
-    trigger_double: Action = Field(Action.NONE, description="as lower_double, likewise")
     grip: Action = Field(Action.NONE, description="middle finger, as trigger")
     grip_hold: Action = Field(Action.NONE, description="as trigger_hold")
-    grip_double: Action = Field(Action.NONE, description="as trigger_double")
     stick_up: Action = Field(Action.NONE, description="thumb stick forward, as trigger, but no gripper_analog")
     stick_up_hold: Action = Field(Action.NONE, description="as trigger_hold")
-    stick_up_double: Action = Field(Action.NONE, description="as trigger_double")
     stick_down: Action = Field(Action.NONE, description="as stick_up")
     stick_down_hold: Action = Field(Action.NONE, description="as trigger_hold")
-    stick_down_double: Action = Field(Action.NONE, description="as trigger_double")
     stick_left: Action = Field(Action.NONE, description="as stick_up")
     stick_left_hold: Action = Field(Action.NONE, description="as trigger_hold")
-    stick_left_double: Action = Field(Action.NONE, description="as trigger_double")
     stick_right: Action = Field(Action.NONE, description="as stick_up")
     stick_right_hold: Action = Field(Action.NONE, description="as trigger_hold")
-    stick_right_double: Action = Field(Action.NONE, description="as trigger_double")
 
     @model_validator(mode="after")
     def _mean_one_thing(self) -> BindingSettings:
@@ -174,7 +163,7 @@ class BindingSettings(BaseModel):
         if action is Action.STOP and control in BUTTONS and gesture is Gesture.TAP:
             raise ValueError(
                 f"{control} is stop, and the headset's alignment presses it too; allowed: {control}_hold, "
-                f"{control}_double, or another control"
+                "or another control"
             )
         if action in LASTING and (gesture is not Gesture.TAP or control in BUTTONS):
             raise ValueError(f"{binding.field} is {action}, which lasts; allowed: {', '.join(HELD)}")

@@ -102,7 +102,7 @@ def test_where_moveit_msgs_is_missing_the_user_is_told_to_switch_to_poses(
 @pytest.mark.parametrize("name", ["fzi", "mayr", "crisp"])
 def test_a_preset_that_is_not_run_differs_from_one_that_is_in_names_and_what_it_asks_for(name: str) -> None:
     preset, other = PRESETS[name], PRESETS["kuka_lbr_clik"]
-    alike = replace(preset, name=other.name, topic=other.topic, activation=other.activation, frame=other.frame)
+    alike = replace(preset, name=other.name, topic=other.topic, activation=other.activation)
     assert alike == other
     impedance = PRESETS["kuka_lbr_impedance"]
     assert (other.hold, other.guard) == (impedance.hold, impedance.guard)

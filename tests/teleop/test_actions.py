@@ -136,12 +136,6 @@ class TestTheWayHome:
             push(driver, "stick_down", hand="left")
             assert driver.states == states
 
-    def test_may_be_asked_for_by_arms_that_were_never_engaged(self) -> None:
-        driver = squeezing(bindings=BINDINGS)
-        driver.run(0.1)
-        push(driver, "stick_down")
-        assert driver.states == HOMING
-
     @pytest.mark.parametrize("hand", SIDES)
     @pytest.mark.parametrize("control", ["lower", "upper", "stick_down", "stick_left"])
     def test_is_ended_by_any_press_which_does_nothing_else(self, control: str, hand: str) -> None:
@@ -154,15 +148,6 @@ class TestTheWayHome:
         assert driver.states == PAUSED
         assert [driver.targets[arm].gripper for arm in SIDES] == [1.0, 1.0]
         assert driver.teleop.hand_of("left") == "left"
-
-    def test_is_ended_by_the_alignment_chord(self) -> None:
-        driver = engaged()
-        push(driver, "stick_down")
-        driver.lower, driver.upper = {"right"}, {"right"}
-        driver.run(0.1)
-        driver.lower, driver.upper = set(), set()
-        driver.run(0.3)
-        assert driver.states == PAUSED
 
     def test_ends_as_a_fault_when_the_hand_that_asked_is_lost_and_not_for_the_other(self) -> None:
         driver = engaged()
