@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import math
 import socket
-from collections.abc import Mapping
 
 from q2r2_control.errors import ProtocolError
+from q2r2_control.inputs.admission import Peer
 from q2r2_control.inputs.framing import FrameDecoder, WireFrame
 from q2r2_control.inputs.messages import HandPose
 from q2r2_control.inputs.rate_limits import RateLimit
@@ -17,29 +16,21 @@ from q2r2_control.inputs.statistics import TopicRecorder
 MAX_FRAMES_PER_SECOND = 2000  # the app sends about 450; more would take processor time from the control loop
 
 
-class Client:
-    """A connected client. Implements :class:`~q2r2_control.inputs.admission.Peer`."""
+class Client(Peer):
+    """A connected client."""
 
     def __init__(self, connection: socket.socket, host: str, peer: str, now: float) -> None:
-        self.socket = connection
-        self.host = host
-        self.peer = peer
         self.session = HeadsetSession()
+        registrations = self.session.published, self.session.subscribed
+        super().__init__(peer, host, since=now, last_frame=now, registrations=registrations)
+        self.socket = connection
         self.decoder = FrameDecoder()
         self.tracker = HandTracker()
         self.recorders: dict[str, TopicRecorder] = {}
         self.refused_hosts: set[str] = set()
         self.announced = False  # in the log
-        self.since = now
-        self.last_frame = now
-        self.last_pose = -math.inf
         self.last_sent = now
         self._frames = RateLimit(MAX_FRAMES_PER_SECOND)
-
-    @property
-    def registrations(self) -> tuple[Mapping[str, str], Mapping[str, str]]:
-        """Topics with types that it publishes, and topics that it listens to."""
-        return self.session.published, self.session.subscribed
 
     def receive(self, frame: WireFrame, now: float) -> Reception | None:
         """Take one frame; the hand's message if it was one.

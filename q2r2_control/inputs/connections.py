@@ -16,9 +16,9 @@ from q2r2_control.inputs.admission import Admission, decide, is_allowed
 from q2r2_control.inputs.client import Client
 from q2r2_control.inputs.framing import WireFrame
 from q2r2_control.inputs.listener import TcpListener
-from q2r2_control.inputs.messages import AppMessage
 from q2r2_control.inputs.rate_limits import MAX_HOSTS_NAMED, HostLog
 from q2r2_control.inputs.session import log_frame
+from q2r2_control.types import HapticFeedback
 
 KEEPALIVE_AFTER = 1.0  # of own silence [s]
 SILENCE_ALLOWED = 2.0  # without a whole frame [s]; the app sends a keepalive after 1 s
@@ -36,7 +36,7 @@ class Handlers:
     admitted: Callable[[Client], None]  # a client drives from now on
     lost: Callable[[str], None]  # the driver is gone, for a reason
     receive: Callable[[Client, WireFrame, float], None]  # a frame of the driver, at a time [s]; may raise ProtocolError
-    due: Callable[[], Iterable[AppMessage]]  # what to send to the driver
+    due: Callable[[], Iterable[HapticFeedback]]  # what to send to the driver
 
 
 class Connections:
@@ -194,8 +194,8 @@ class Connections:
         outgoing = client.session.outgoing
         if not outgoing and client is self._driver:
             # Encoded only now, so that a client that does not read gets the newest vibration and not all of them.
-            for message in self._handlers.due():
-                client.session.queue_message(message)
+            for vibration in self._handlers.due():
+                client.session.queue_haptic(vibration)
             if not outgoing and now - client.last_sent > KEEPALIVE_AFTER:
                 client.session.queue_keepalive()
         try:

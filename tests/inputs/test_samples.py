@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from q2r2_control.inputs.messages import HandPose, HandTwist
+from q2r2_control.inputs.messages import HandPose
 from q2r2_control.inputs.samples import SAMPLES_KEPT, HandTracker, SampleQueue
 from q2r2_control.types import HandFault, HandInputs, HandSample
 
@@ -48,26 +48,6 @@ def test_inputs_before_the_first_pose_wait_for_it() -> None:
     assert (joined.inputs, joined.inputs_stamp) == (PRESSED, 1.0)
 
 
-def test_hands_do_not_mix() -> None:
-    tracker = HandTracker()
-    tracker.update("left", PRESSED, now=1.0)
-    right = tracker.update("right", pose(0.0), now=2.0)
-    assert right is not None
-    assert right.inputs == HandInputs()
-
-
-def test_a_twist_makes_no_sample() -> None:
-    assert HandTracker().update("left", HandTwist(np.zeros(3), np.zeros(3)), now=0.0) is None
-
-
-def test_samples_come_out_once_and_in_order() -> None:
-    queue = SampleQueue()
-    for index in range(10):
-        queue.put(sample(float(index), hand=("left", "right")[index % 2]))
-    assert [one.pose_stamp for one in queue.take()] == [float(index) for index in range(10)]
-    assert queue.take() == []
-
-
 def test_a_full_queue_keeps_the_newest_samples() -> None:
     queue = SampleQueue()
     for index in range(1000):
@@ -91,15 +71,6 @@ def test_no_press_or_release_is_lost_when_a_loop_that_stalled_polls_at_last() ->
     assert len(samples) <= SAMPLES_KEPT
     assert presses(samples) == 3000 // 150
     assert samples[-1].pose_stamp == 2999.0
-
-
-def test_even_endless_presses_leave_a_bounded_queue_with_the_newest_sample() -> None:
-    queue = SampleQueue()
-    for index in range(1001):
-        queue.put(sample(float(index), lower=index % 2 == 0))
-    samples = queue.take()
-    assert len(samples) == SAMPLES_KEPT
-    assert samples[-1].pose_stamp == 1000.0
 
 
 def test_after_a_cut_nothing_of_the_lost_connection_comes_out() -> None:

@@ -11,7 +11,6 @@ import sys
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from geometry_msgs.msg import Twist
 from quest2ros.msg import OVR2ROSHapticFeedback
 
 from q2r2_control.config.cell import HeadsetConfig, load_config
@@ -23,11 +22,10 @@ from q2r2_control.inputs.addresses import access_lines, written
 from q2r2_control.inputs.hands_watch import HandsWatch, Watched
 from q2r2_control.inputs.headset import HeadsetServer
 from q2r2_control.inputs.headset_check import SILENCE
-from q2r2_control.inputs.messages import PROP_TOPICS, HandPose, PropTwist
+from q2r2_control.inputs.messages import HandPose
 from q2r2_control.inputs.session import HAND_TOPICS, HAPTIC_TOPICS
 from q2r2_control.ros.base_node import OK, STREAM_QOS, WARN, BaseNode, run_node
 from q2r2_control.ros.bridge.hand_topics import HandPublishers
-from q2r2_control.ros.bridge.messages import hand_twist
 from q2r2_control.types import SIDES, HandFault, HapticFeedback
 from q2r2_control.wording import sentence
 
@@ -78,8 +76,6 @@ class TcpEndpoint(BaseNode):
         self._server = HeadsetServer(host, port, listener=self._publish, allow=networks, watch=watch)
         for hand, topic in HAPTIC_TOPICS.items():
             self.create_subscription(OVR2ROSHapticFeedback, topic, self._vibrate(hand), STREAM_QOS)
-        for topic in PROP_TOPICS:
-            self.create_subscription(Twist, topic, self._move(topic), STREAM_QOS)
         self._log = _ToRosLog(self.get_logger())
         _SERVER_LOG.addHandler(self._log)
         _SERVER_LOG.setLevel(logging.INFO)
@@ -128,13 +124,6 @@ class TcpEndpoint(BaseNode):
 
     def _vibrate(self, hand: str) -> Callable[[OVR2ROSHapticFeedback], None]:
         return lambda message: self._server.send_haptic(HapticFeedback(hand, message.frequency, message.amplitude))
-
-    def _move(self, topic: str) -> Callable[[Twist], None]:
-        def send(message: Twist) -> None:
-            twist = hand_twist(message)
-            self._server.send_twist(PropTwist(topic, twist.linear, twist.angular))
-
-        return send
 
 
 def _networks(allow: str) -> tuple[Network, ...] | None:
