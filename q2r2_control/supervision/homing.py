@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Protocol
-
 import pinocchio as pin
 
 from q2r2_control.control.controller import CartesianController
@@ -12,46 +10,6 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.supervision.joint_homing import JointHoming, JointWay
 from q2r2_control.supervision.tool_homing import ToolHoming
 from q2r2_control.types import Array, Reference
-
-
-class LedWay(Protocol):
-    """A way that all arms are led along; the controller follows as its promises allow."""
-
-    @property
-    def outcome(self) -> ReasonKind | None:
-        """How it ended, or None while it goes on."""
-        ...
-
-    def targets(self, last: Reference | None, dt: float) -> dict[str, pin.SE3 | None]:
-        """What each tool is asked for after another ``dt`` [s] from the ``last`` reference, None: before the first."""
-        ...
-
-    def end(self) -> None:
-        """Lead nothing any more."""
-        ...
-
-
-class LedJoints:
-    """Asks no tool for anything: the controller holds the joint positions of a :class:`JointWay`."""
-
-    def __init__(self, controller: CartesianController, way: JointWay) -> None:
-        self._controller, self._way = controller, way
-        self._arms = tuple(controller.robot.arms)
-
-    @property
-    def outcome(self) -> ReasonKind | None:
-        """See :attr:`LedWay.outcome`."""
-        return self._way.outcome
-
-    def targets(self, last: Reference | None, dt: float) -> dict[str, pin.SE3 | None]:
-        """See :meth:`LedWay.targets`."""
-        if last is not None:
-            self._controller.hold_at(self._way.step(last.q, last.v, dt))
-        return dict.fromkeys(self._arms)
-
-    def end(self) -> None:
-        """See :meth:`LedWay.end`."""
-        self._controller.hold_at(None)
 
 
 class Homing:
@@ -63,7 +21,7 @@ class Homing:
     def __init__(self, robot: Robot, controller: CartesianController, tools_only: bool) -> None:
         self._robot, self._controller, self._tools_only = robot, controller, tools_only
         self._home = {arm: robot.tool_pose(robot.home, arm) for arm in robot.arms}
-        self._way: LedWay | None = None
+        self._way: JointWay | ToolHoming | None = None
         self.outcome: Reason | None = None  # how the last way home ended, where it did by itself
 
     @property
@@ -85,11 +43,18 @@ class Homing:
 
     def follow(self, way: JointWay) -> None:
         """Lead the joints along ``way`` until it has an outcome."""
-        self._way = LedJoints(self._controller, way)
+        self._way = way
 
     def targets(self, last: Reference | None, dt: float) -> dict[str, pin.SE3 | None]:
-        """See :meth:`LedWay.targets`; no way: nothing is asked for."""
-        return dict.fromkeys(self._robot.arms) if self._way is None else self._way.targets(last, dt)
+        """What each tool is asked for after another ``dt`` [s] from the ``last`` reference, None: before the first.
+
+        Where the joints are led, no tool is asked for anything: the controller holds joint positions.
+        """
+        if isinstance(self._way, ToolHoming):
+            return self._way.targets(dt)
+        if self._way is not None and last is not None:
+            self._controller.hold_at(self._way.step(last.q, last.v, dt))
+        return dict.fromkeys(self._robot.arms)
 
     def check(self, reference: Reference) -> Reason | None:
         """End the way where it has an outcome at the tick's ``reference``; returns that, or None."""
@@ -104,7 +69,7 @@ class Homing:
     def end(self) -> None:
         """The arms hold where they come to rest."""
         if self._way is not None:
-            self._way.end()
+            self._controller.hold_at(None)
         self._way = None
 
     def hold(self) -> Reason | None:

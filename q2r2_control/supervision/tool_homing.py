@@ -8,7 +8,6 @@ import numpy as np
 import pinocchio as pin
 
 from q2r2_control.events import ReasonKind
-from q2r2_control.types import Reference
 
 _LINEAR_SPEED, _ANGULAR_SPEED = 0.1, 0.3  # [m/s], [rad/s]
 _ARRIVED, _TURNED = 0.003, 0.01  # [m], [rad]
@@ -17,8 +16,6 @@ _PATIENCE = 5.0  # after the targets have arrived [s]
 
 class ToolHoming:
     """Targets on a straight line from where the tools are to where they are at home, all arms at once.
-
-    Implements :class:`LedWay`.
 
     The QP keeps limits and distances on the way, and the posture's pull brings the elbows home; where it holds the
     tools up the homing ends there.
@@ -31,7 +28,7 @@ class ToolHoming:
         self._duration = max(self._needed(arm) for arm in home)
         self._time = 0.0
 
-    def targets(self, last: Reference | None, dt: float) -> dict[str, pin.SE3 | None]:
+    def targets(self, dt: float) -> dict[str, pin.SE3 | None]:
         """Where the tools have to be after another ``dt`` [s]."""
         self._time += dt
         share = min(self._time / self._duration, 1.0)
@@ -42,17 +39,11 @@ class ToolHoming:
         """How the homing ended, or None while it goes on."""
         if self._time < self._duration:
             return None
-        far = []
-        for arm, home in self._home.items():
-            error = self._tool_pose(arm).actInv(home)
-            if np.linalg.norm(error.translation) > _ARRIVED or np.linalg.norm(pin.log3(error.rotation)) > _TURNED:
-                far.append(arm)
-        if not far:
+        errors = [self._tool_pose(arm).actInv(home) for arm, home in self._home.items()]
+        ways = [(np.linalg.norm(error.translation), np.linalg.norm(pin.log3(error.rotation))) for error in errors]
+        if all(way <= _ARRIVED and turn <= _TURNED for way, turn in ways):
             return ReasonKind.HOMING_ARRIVED
         return ReasonKind.HOMING_HELD_UP if self._time > self._duration + _PATIENCE else None
-
-    def end(self) -> None:
-        """Nothing was set in the controller that would last."""
 
     def _needed(self, arm: str) -> float:
         start, home = self._start[arm], self._home[arm]
