@@ -47,7 +47,6 @@ from q2r2_control.config.teleop import (
     GateSettings,
     HapticSettings,
     LeashSettings,
-    SpeedLimitSettings,
     TeleopSettings,
     WorkspaceSettings,
 )
@@ -104,7 +103,6 @@ class TestTheShippedCellShowsAllThereIsToTune:
         ContactPair,
         HeldObjectConfig,
         NamedPairDistance,
-        SpeedLimitSettings,
         WorkspaceSettings,
     )
     # A tool's mount and an obstacle's rpy are placements as an arm's mount is, which shows the keys.

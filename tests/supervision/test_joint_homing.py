@@ -191,12 +191,3 @@ def test_an_arm_that_is_held_up_is_waited_for_and_then_it_says_so(robot: Robot) 
             break
     assert homing.outcome is ReasonKind.HOMING_HELD_UP
     assert 0.05 < farthest < 0.13  # or it would set off fast when it is free again
-
-
-def test_it_begins_where_the_arms_come_to_rest_and_not_while_they_move(robot: Robot) -> None:
-    homing = JointHoming(robot, kept_distances(robot, load_config(CONFIG).control).values, robot.home)
-    q = robot.home + 0.1
-    assert homing.step(q, np.full_like(q, 0.1), DT) is None
-    at = homing.step(q + 0.01, np.zeros_like(q), DT)
-    assert at is not None
-    assert np.array_equal(at, q + 0.01)

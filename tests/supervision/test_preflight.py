@@ -21,10 +21,6 @@ def controller(robot: Robot) -> CartesianController:
     return CartesianController(robot, SETTINGS)
 
 
-def test_a_good_cell_has_no_fault(robot: Robot, controller: CartesianController) -> None:
-    assert preflight_faults(robot, SETTINGS, controller) == ()
-
-
 def test_a_home_outside_a_limit_is_named_with_what_is_allowed(robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
     home = robot.home.copy()
     home[1] = 2.09

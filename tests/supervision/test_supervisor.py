@@ -140,13 +140,6 @@ def test_a_stream_that_its_sender_ends_stops_its_own_arm_only(world: World, cont
     assert [world.supervisor.arm_state(arm) for arm in ("left", "right")] == ["holding", "following"]
 
 
-def test_arms_that_are_not_linked_end_their_streams_alone(world: World, controller: CartesianController) -> None:
-    world.streams.linked = False
-    _, right = engage_both(world, controller)
-    world.run(0.5, right=right)
-    assert [world.supervisor.arm_state(arm) for arm in ("left", "right")] == ["holding", "following"]
-
-
 def test_a_loop_that_stood_still_commands_nothing_of_the_past_and_follows_no_target_that_waited(
     world: World, controller: CartesianController
 ) -> None:
@@ -219,16 +212,6 @@ def test_homing_ends_at_home_and_takes_no_targets(world: World, robot: Robot, co
     assert "homing_outcome: homing_arrived" in map(kinds, world.supervisor.events)
     assert np.linalg.norm(controller.tool_pose("left").translation - tool.translation) < 3e-3
     assert world.supervisor.arm_state("left") == "holding"
-
-
-def test_a_stream_that_begins_at_the_tool_is_followed_until_it_ceases() -> None:
-    stream = TargetStream(StreamSettings())
-    assert stream.offer(TOOL, [TOOL], 0.0) is None
-    assert stream.offer(raised(TOOL, 0.5), [TOOL], 0.1) is None
-    assert not stream.expire(0.25)
-    assert stream.expire(0.26)
-    assert stream.pose is None
-    assert not stream.expire(1.0)
 
 
 def test_a_stream_that_was_followed_goes_on_anywhere_and_after_a_silence_only_from_the_tool() -> None:
