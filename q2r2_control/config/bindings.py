@@ -22,7 +22,6 @@ class Action(StrEnum):
     GRIPPER_TOGGLE = "gripper_toggle"
     HOME = "home"  # both arms
     STOP = "stop"  # both arms, until it is done once more
-    SWAP_HANDS = "swap_hands"  # each hand drives the other arm
     CARRY = "carry"  # this hand moves both tools as one body
     RECORD_TOGGLE = "record_toggle"  # an episode begins, or ends
     RECORD_DISCARD = "record_discard"  # the episode is not worth keeping
@@ -56,7 +55,6 @@ MEANINGS: dict[str, str] = {
     Action.GRIPPER_TOGGLE: "closes the gripper, or opens it",
     Action.HOME: "brings both arms home; any press on the way stops them",
     Action.STOP: "stops both arms until it is done once more",
-    Action.SWAP_HANDS: "lets each hand drive the other arm, while both are paused",
     Action.CARRY: "lets this hand move both tools as one body, or ends that",
     Action.RECORD_TOGGLE: "begins an episode of the recording, or ends it",
     Action.RECORD_DISCARD: "throws away the episode, or the last one if it has ended",
@@ -74,16 +72,16 @@ BUTTONS = ("lower", "upper")
 TRIGGERS = ("trigger", "grip")
 HELD = (*TRIGGERS, "stick_up", "stick_down", "stick_left", "stick_right")
 CONTROLS = (*BUTTONS, *HELD)
-# The button or axis of a device that each control is.
-_DEVICE_NAMES = {
-    "lower": "button_lower",
-    "upper": "button_upper",
-    "trigger": "press_index",
-    "grip": "press_middle",
-    "stick_up": "thumb_stick_vertical",
-    "stick_down": "thumb_stick_vertical",
-    "stick_left": "thumb_stick_horizontal",
-    "stick_right": "thumb_stick_horizontal",
+# The button or axis of a device that each control is, and the way it goes.
+DEVICE_NAMES: dict[str, tuple[str, float]] = {
+    "lower": ("button_lower", 1.0),
+    "upper": ("button_upper", 1.0),
+    "trigger": ("press_index", 1.0),
+    "grip": ("press_middle", 1.0),
+    "stick_up": ("thumb_stick_vertical", 1.0),
+    "stick_down": ("thumb_stick_vertical", -1.0),
+    "stick_left": ("thumb_stick_horizontal", -1.0),
+    "stick_right": ("thumb_stick_horizontal", 1.0),
 }
 _WORDS = {Gesture.TAP: "", Gesture.HOLD: " held"}
 _SUFFIXES = {Gesture.TAP: "", Gesture.HOLD: "_hold"}
@@ -177,12 +175,11 @@ class BindingSettings(StrictModel):
     def check_device(self, controls: DeviceControls) -> None:
         """Raise :class:`ConfigError` for a binding to a control that an input device does not have."""
         names = (*controls.buttons, *controls.axes)
+        allowed = [control for control, (name, _) in DEVICE_NAMES.items() if name in names]
         for binding in self.bound():
-            name = _DEVICE_NAMES[binding.control]
-            if name not in names:
-                has = (
-                    ", ".join(control for control, its in _DEVICE_NAMES.items() if its in names) or "no control at all"
-                )
+            if binding.control not in allowed:
+                name, _ = DEVICE_NAMES[binding.control]
+                has = ", ".join(allowed) or "no control at all"
                 raise ConfigError(
                     f"teleop.bindings.{binding.field} = {binding.action}: this input has no {name}; allowed: {has}"
                 )

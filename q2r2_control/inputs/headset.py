@@ -13,8 +13,7 @@ from q2r2_control.config.cell import Config
 from q2r2_control.config.networks import Network
 from q2r2_control.errors import InputError
 from q2r2_control.inputs.addresses import written
-from q2r2_control.inputs.client import Client
-from q2r2_control.inputs.connections import TURN, Connections, Handlers
+from q2r2_control.inputs.connections import TURN, Client, Connections, Handlers
 from q2r2_control.inputs.framing import WireFrame
 from q2r2_control.inputs.hands_watch import HandsWatch, Watched
 from q2r2_control.inputs.listener import TcpListener

@@ -1,4 +1,4 @@
-"""What is for both arms, whichever hand asks for it: the stop, the way home, swapped hands, carrying, the recording."""
+"""What is for both arms, whichever hand asks for it: the stop, the way home, carrying, the recording."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from q2r2_control.teleop.steady_state_offset import Anchor, ArmMeasurements
 
 # Why arms do not carry.
 _ENGAGE, _UNKNOWN = Reason(ReasonKind.ENGAGE_FIRST), Reason(ReasonKind.TOOL_UNKNOWN)
-_ALONE = Reason(ReasonKind.ONE_ARM)  # why hands are not swapped, and arms do not carry
+_ALONE = Reason(ReasonKind.ONE_ARM)
 
 
 class BothArms:
@@ -36,9 +36,8 @@ class BothArms:
         self._bindings, self._leash = settings.bindings, settings.leash.carried()
 
     def assign_hands(self, stance: Stance) -> None:
-        """Let the hands drive the arms as ``stance`` says, not swapped."""
+        """Let the hands drive the arms as ``stance`` says."""
         same = stance is Stance.SIDE_BY_SIDE
-        self.swapped = False
         self.arm_of_hand = {name if same else _other(name): name for name in self.arms}
 
     def hand_of(self, name: str) -> str:
@@ -106,23 +105,6 @@ class BothArms:
                 arm.change(
                     Cause.HOME, now, Reason(ReasonKind.HOMING) if asked_by is None else self._reason(Action.HOME)
                 )
-
-    def swap_hands(self, presses: Mapping[str, Sequence[Press]], now: float) -> None:
-        """If it is asked for, each hand drives the other arm."""
-        if not any(presses.values()) or self._asked(presses, Action.SWAP_HANDS) is None:
-            return
-        problem = _ALONE if len(self.arms) < 2 else None
-        if not self.all_in(AT_REST):
-            problem = Reason(ReasonKind.PAUSE_FIRST)
-        if problem is None:
-            self.swapped = not self.swapped
-            self.arm_of_hand = {_other(hand): name for hand, name in self.arm_of_hand.items()}
-        for arm in self.arms.values():
-            if problem is None:
-                arm.forget()  # its hand has to be seen anew before it drives the arm
-            hand = self.hand_of(arm.arm)
-            driven = Reason.of(ReasonKind.DRIVEN_BY, hand=hand)
-            arm.record_event(now, driven if problem is None else Reason(ReasonKind.NOT_SWAPPED, cause=problem))
 
     def end_carry(self, now: float, reason: Reason) -> None:
         """If two arms carry, both hold."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from q2r2_control.config.bindings import BUTTONS, HELD, LASTING, Action, BindingSettings, Gesture
+from q2r2_control.config.bindings import BUTTONS, DEVICE_NAMES, HELD, LASTING, Action, BindingSettings, Gesture
 from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.types import HandInputs
@@ -24,22 +24,8 @@ class Press(NamedTuple):
 
 def travel(control: str, inputs: HandInputs) -> float:
     """How far a control is pressed or pushed, 0 at rest and 1 at its end."""
-    match control:
-        case "lower":
-            return 1.0 if inputs.button_lower else 0.0
-        case "upper":
-            return 1.0 if inputs.button_upper else 0.0
-        case "trigger":
-            return inputs.press_index
-        case "grip":
-            return inputs.press_middle
-        case "stick_up":
-            return inputs.thumb_stick_vertical
-        case "stick_down":
-            return -inputs.thumb_stick_vertical
-        case "stick_right":
-            return inputs.thumb_stick_horizontal
-    return -inputs.thumb_stick_horizontal
+    name, way = DEVICE_NAMES[control]
+    return way * float(getattr(inputs, name))
 
 
 def _is_held(control: str, inputs: HandInputs, was_held: bool) -> bool:

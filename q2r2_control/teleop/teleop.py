@@ -143,9 +143,7 @@ class Teleop:
         chord = self.aligning
         for name, arm in self._arms.items():
             arm.act(presses[name], around, now, chord)
-        targets = self._targets(now, around)
-        self._pair.swap_hands(presses, now)
-        return targets
+        return self._targets(now, around)
 
     def _targets(self, now: float, around: ArmMeasurements) -> dict[str, ArmTarget]:
         """Of every arm, by its state."""

@@ -13,7 +13,7 @@ import pytest
 from q2r2_control.inputs import moved_frame
 from q2r2_control.inputs.hands_watch import HandsWatch, Watched
 from q2r2_control.inputs.messages import HandPose
-from q2r2_control.inputs.rigid_motion import Tolerance
+from q2r2_control.inputs.moved_frame import Move
 from q2r2_control.inputs.session import Reception
 from q2r2_control.types import SIDES, HandFault, HandInputs
 from tests.support.two_hands import PERIOD, TwoHands, carry, hand_pose, rest
@@ -154,7 +154,7 @@ def test_human_hands_that_carry_a_light_box_are_no_frame_with_a_margin_of_two(
 ) -> None:
     for name in ("_CARRIED_TOLERANCE", "_STEP_TOLERANCE"):
         distance, angle = getattr(moved_frame, name)
-        monkeypatch.setattr(moved_frame, name, Tolerance(2.0 * distance, 2.0 * angle))
+        monkeypatch.setattr(moved_frame, name, Move(2.0 * distance, 2.0 * angle))
     assert faults(handed_on(TwoHands(carry, seed, tremor=tremor).samples(6.4))) == set()
 
 

@@ -18,7 +18,7 @@ import pytest
 from q2r2_control.config.cell import load_config
 from q2r2_control.errors import InputError
 from q2r2_control.inputs.base import make_input
-from q2r2_control.inputs.client import MAX_FRAMES_PER_SECOND
+from q2r2_control.inputs.connections import MAX_FRAMES_PER_SECOND
 from q2r2_control.inputs.hands_watch import Watched
 from q2r2_control.inputs.headset import HeadsetServer
 from q2r2_control.inputs.messages import Dialect, HandPose
