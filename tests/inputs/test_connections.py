@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import logging
 import socket
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import partial
 from ipaddress import ip_network
 from typing import Any
 
@@ -245,26 +243,6 @@ def was_greeted(connection: socket.socket) -> bool:
             return False
 
 
-def test_garbage_again_and_again_is_one_line_a_second_with_a_count_of_what_was_left_out(
-    server: HeadsetServer, clock: HandClock, caplog: pytest.LogCaptureFixture
-) -> None:
-    caplog.set_level(logging.INFO)
-    for count in range(1, 9):
-        with connect(server) as headset:
-            headset.send(b"GET / HTTP/1.1\r\n\r\n")
-        eventually(partial(has_connected, server, count))
-        eventually(lambda: server.statistics.peer is None)
-    assert len(caplog.messages) == 1
-    clock.advance(A_LINE_LATER)
-    eventually(lambda: len(caplog.messages) == 2)
-    assert caplog.messages[1].endswith("(6 more left out)")
-    assert all("bytes announced" in line for line in caplog.messages)
-
-
-def has_connected(server: HeadsetServer, count: int) -> bool:
-    return server.statistics.connections == count
-
-
 def test_only_the_first_eight_hosts_that_are_refused_are_named(
     server: HeadsetServer, clock: HandClock, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -304,17 +282,6 @@ def test_only_hosts_of_allowed_networks_are_served(clock: HandClock, caplog: pyt
 
 
 needs_ipv6 = pytest.mark.skipif(not socket.has_dualstack_ipv6(), reason="this machine has no IPv6")
-
-
-@needs_ipv6
-def test_every_network_of_ipv6_is_every_network_of_ipv4_too(clock: HandClock) -> None:
-    with listening(clock, "::") as server:
-        for host, written in (("::1", "[::1]:"), (HERE, "127.0.0.1:")):
-            with FakeHeadset((host, server.address[1])) as headset:
-                headset.read_until("__handshake")
-                eventually(lambda: server.statistics.peer)
-                assert str(server.statistics.peer).startswith(written)
-            eventually(lambda: server.statistics.peer is None)
 
 
 @needs_ipv6

@@ -54,20 +54,6 @@ def test_stamps_are_on_the_callers_clock_and_never_in_its_future() -> None:
             last[sample.hand] = sample.pose_stamp
 
 
-def test_a_human_hand_trembles_by_a_millimetre_and_some_tenths_of_a_degree_between_8_and_12_hz() -> None:
-    script = ScriptedInput("line", hands=("left",), human=True, seed=1)
-    samples = [s for s in play(script, 1.0) if s.pose_stamp < 1.0]
-    home = script.hand_pose("left", 0.0)
-    t = np.array([s.pose_stamp for s in samples])
-    shift = np.array([s.position for s in samples]) - home.translation
-    turn = np.array([pin.log3(pin.Quaternion(s.quaternion).toRotationMatrix() @ home.rotation.T) for s in samples])
-    assert 0.4e-3 < np.abs(shift).max() < 2e-3
-    assert 0.1 < np.degrees(np.abs(turn).max()) < 0.6
-    frequencies = np.arange(2.0, 30.0, 0.5)
-    power = np.abs(np.exp(-2j * np.pi * frequencies[:, None] * t) @ shift).sum(axis=1)
-    assert 7.5 <= frequencies[power.argmax()] <= 12.5
-
-
 @EVERY
 @pytest.mark.parametrize("hand", SIDES)
 def test_hands_move_smoothly_calmly_and_within_reach(trajectory: str, hand: str) -> None:
@@ -95,24 +81,6 @@ def test_the_hands_are_still_from_the_first_press_until_the_arm_is_engaged(traje
     assert not samples[0].inputs.button_lower
     assert not samples[-1].inputs.button_lower
     assert np.ptp([s.position for s in of("left", samples)], axis=0).max() < 1e-12
-
-
-def test_hands_that_meet_grip_low_come_together_high_and_let_go_where_they_gripped() -> None:
-    script = ScriptedInput("meet")
-    samples = play(script, 20.0)
-    for hand in SIDES:
-        own = of(hand, samples)
-        start = script.hand_pose(hand, 0.0).translation
-        upper = np.diff([int(s.inputs.button_upper) for s in own])
-        lower = np.diff([int(s.inputs.button_lower) for s in own])
-        assert [(upper == 1).sum(), (lower == 1).sum()] == [2, 2]
-        grip, release = (own[index + 1].position - start for index in np.flatnonzero(upper == 1))
-        np.testing.assert_allclose(grip, release, atol=1e-9)
-        np.testing.assert_allclose(grip, [0.05, 0.0, -0.137], atol=1e-9)
-        inwards = -1.0 if hand == "left" else 1.0
-        np.testing.assert_allclose(script.hand_pose(hand, 10.7).translation - start, [0.05, inwards * 0.185, 0.02])
-        assert own[-1].inputs.press_index == 0.0
-        np.testing.assert_allclose(own[-1].position, start, atol=1e-9)
 
 
 def test_the_right_hand_mirrors_the_left() -> None:

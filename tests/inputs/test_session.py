@@ -186,30 +186,25 @@ def test_a_command_may_have_16_kilobytes_and_no_more(session: HeadsetSession, ex
 
 
 @every_dialect
-@pytest.mark.parametrize("name", ["__publish", "__remove_subscriber"])
-@pytest.mark.parametrize("topic", [{}, {"topic": " "}, {"topic": None}], ids=str)
-def test_a_blank_topic_is_answered_with_an_error_and_the_session_goes_on(
-    session: HeadsetSession, dialect: Dialect, name: str, topic: dict[str, object]
+@pytest.mark.parametrize(
+    ("name", "given", "missing"),
+    [
+        ("__publish", {"topic": " ", "message_name": "std_msgs/Empty"}, "topic"),
+        ("__subscribe", {"topic": None, "message_name": "std_msgs/Empty"}, "topic"),
+        ("__remove_subscriber", {}, "topic"),
+        ("__subscribe", {"topic": "dice"}, "message_name of dice"),
+        ("__publish", {"topic": "dice", "message_name": ""}, "message_name of dice"),
+    ],
+)
+def test_a_blank_topic_or_type_is_answered_with_an_error_and_the_session_goes_on(
+    session: HeadsetSession, dialect: Dialect, name: str, given: dict[str, object], missing: str
 ) -> None:
-    session.receive(command(dialect, name, message_name="std_msgs/Empty", **topic))
+    session.receive(command(dialect, name, **given))
     ((answer, payload),) = answers(session)
     assert answer == "__error"
-    assert json.loads(payload)["text"] == f"{name}: topic is empty; this registration is left out"
+    assert json.loads(payload)["text"] == f"{name}: {missing} is empty; this registration is left out"
     assert (session.published, session.subscribed) == ({}, {})
     assert session.receive(pose(dialect)) is not None
-
-
-@pytest.mark.parametrize("name", ["__publish", "__subscribe"])
-@pytest.mark.parametrize("kind", [{}, {"message_name": ""}], ids=str)
-def test_a_missing_type_is_answered_with_an_error_and_the_session_goes_on(
-    session: HeadsetSession, name: str, kind: dict[str, object]
-) -> None:
-    session.receive(command(Dialect.ROS2, name, topic="dice", **kind))
-    ((answer, payload),) = answers(session)
-    assert answer == "__error"
-    assert "message_name of dice is empty" in json.loads(payload)["text"]
-    assert (session.published, session.subscribed) == ({}, {})
-    assert session.receive(pose(Dialect.ROS2)) is not None
 
 
 def test_a_flood_of_blank_topics_ends_the_session_though_every_answer_is_read(session: HeadsetSession) -> None:

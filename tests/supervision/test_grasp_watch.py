@@ -9,9 +9,8 @@ import pytest
 
 from q2r2_control import CartesianController, Robot
 from q2r2_control.supervision.grasp_watch import GraspWatch, Grip
+from tests.supervision.conftest import unhurried
 from tests.support.object_cell import BLOCK, cell
-
-NO_CLOCK = {"solve_time_limit": None}  # whether a solution is late depends on the machine
 
 DT = 0.004
 CELL = cell(BLOCK)
@@ -19,7 +18,7 @@ CELL = cell(BLOCK)
 
 @pytest.fixture(scope="module")
 def built() -> CartesianController:
-    return CartesianController(Robot.from_config(CELL), CELL.control.model_copy(update=NO_CLOCK))
+    return CartesianController(Robot.from_config(CELL), unhurried(CELL))
 
 
 @pytest.fixture
@@ -83,7 +82,7 @@ def test_where_no_opening_is_measured_a_closed_gripper_holds() -> None:
     data = CELL.model_dump()
     data["arms"]["left"]["gripper"]["joints"] = ()
     bare = type(CELL).model_validate(data)
-    controller = CartesianController(Robot.from_config(bare), bare.control.model_copy(update=NO_CLOCK))
+    controller = CartesianController(Robot.from_config(bare), unhurried(bare))
     watch = GraspWatch(controller)
     held = []
     for wanted in (1.0, 0.0, 0.0, 1.0):

@@ -6,31 +6,16 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from q2r2_control import CartesianController, Robot, load_config
-from q2r2_control.config.supervision import SupervisionSettings
+from q2r2_control import CartesianController, Robot
 from q2r2_control.events import Reason, ReasonKind
-from q2r2_control.supervision.joint_watch import watch_settings
 from q2r2_control.supervision.supervisor import Phase, Supervisor
 from q2r2_control.supervision.target_stream import StreamSettings, TargetStream
 from q2r2_control.types import Array, RobotState
+from tests.supervision.conftest import STRICT
 from tests.support.reasons import kinds
-
-NO_CLOCK = {"solve_time_limit": None}  # whether a solution is late depends on the machine
-
-STRICT = SupervisionSettings(unusable_time=0.0)  # a state that is not finite is a fault at once
 
 DT = 0.004
 TOOL = pin.SE3(np.eye(3), np.array([0.5, 0.2, 0.4]))
-
-
-@pytest.fixture(scope="module")
-def robot() -> Robot:
-    return Robot.from_config(load_config("config/dual_iiwa7.yaml"))
-
-
-@pytest.fixture(scope="module")
-def controller(robot: Robot) -> CartesianController:
-    return CartesianController(robot, load_config("config/dual_iiwa7.yaml").control.model_copy(update=NO_CLOCK))
 
 
 class World:
@@ -38,7 +23,7 @@ class World:
 
     def __init__(self, robot: Robot, controller: CartesianController) -> None:
         self.streams = StreamSettings()
-        self.supervisor = Supervisor(robot, controller, self.streams, watch_settings(STRICT, yields=False))
+        self.supervisor = Supervisor(robot, controller, self.streams, STRICT)
         self.q, self.now, self.blocked = robot.home.copy(), 0.0, False
         self.v, self.lag = np.zeros_like(self.q), DT  # [s]
         self.commanded: list[Array | None] = []

@@ -200,22 +200,6 @@ def test_every_control_moves_from_0_to_1_and_no_other_with_it(control: str) -> N
     assert all(travel(other, inputs) <= 0.0 for other in HELD if other != control)
 
 
-def test_the_buttons_can_change_places() -> None:
-    driver = squeezing(bindings={"lower": "gripper_toggle", "upper": "pause_toggle"})
-    driver.run(0.05)
-    driver.press(*SIDES, button="upper")
-    assert driver.states == ENGAGED
-    driver.press("left")
-    assert [driver.targets[arm].gripper for arm in SIDES] == [0.0, 1.0]
-    assert driver.states == ENGAGED
-    driver.upper = {"left"}
-    driver.tick(driver.samples())
-    assert driver.states["left"] == "pausing"
-    driver.run(0.2)
-    assert driver.states["left"] == "paused"
-    assert not any(map(is_fault, driver.events))
-
-
 @pytest.mark.parametrize(
     ("given", "said"),
     [

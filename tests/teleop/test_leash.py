@@ -103,21 +103,6 @@ def test_a_taut_leash_holds_the_target_at_its_length_and_counts_what_slipped(mot
     assert tied.leash.rotation.slip == pytest.approx(max(angle - 0.5, 0.0), abs=1e-9)
 
 
-@pytest.mark.parametrize("motion", MOTIONS.values(), ids=MOTIONS.keys())
-def test_what_slipped_is_a_new_anchor(motion: RelativeMotion) -> None:
-    tied = Tied(motion, distance=0.1, angle=0.5)
-    tied.go(along(0.001, 0.0005, 0, 0, 0.002, 0.002), 900)
-    held, hand = tied.target, tied.hand
-    assert tied.leash.position.slip > 0.0
-    assert tied.leash.rotation.slip > 0.0
-    # Across both leashes, by less than what drops the slack.
-    across = along(0.0002, -0.0004, 0.0002, 0.004, 0.002, -0.002)
-    motion.anchor(hand, held)
-    expected = motion.target(moved(hand, across))
-    assert np.linalg.norm(expected.translation - held.translation) > 1e-4
-    np.testing.assert_allclose(tied.tick(moved(hand, across)).homogeneous, expected.homogeneous, atol=1e-4)
-
-
 @pytest.mark.parametrize("sign", [1.0, -1.0], ids=["a quaternion", "the other one of the same rotation"])
 @pytest.mark.parametrize("turning", [False, True], ids=["position", "rotation"])
 def test_a_target_is_held_from_the_end_of_the_leash_on_and_not_before(turning: bool, sign: float) -> None:
@@ -303,13 +288,3 @@ def test_dropping_the_slack_makes_no_lurch(name: str) -> None:
     # The hand comes back at 0.04 m/s.
     assert run.speed[after].max() < 0.05
     assert run.moved(HELD, HELD + 0.45) > -2.0 * BACK
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", OUT)
-def test_tremor_does_not_make_an_arm_held_up_chatter(name: str) -> None:
-    run = loop(name, leash=True, tremor=0.2e-3)
-    resting = (run.t > HELD - 0.5) & (run.t < HELD)
-    # An arm that is free has 0.39.
-    assert np.sqrt(np.mean(run.acceleration[resting] ** 2)) < 0.2
-    assert run.speed[resting].max() < 0.01

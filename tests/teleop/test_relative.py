@@ -118,19 +118,6 @@ def test_the_tool_turns_steadily_while_the_hand_makes_three_turns(scale: float, 
     assert max(turns) < 4.0 * scale * step
 
 
-@pytest.mark.parametrize("frame", FRAMES)
-def test_a_thousand_anchors_with_the_hand_turning_in_between_do_not_drift(frame: str) -> None:
-    random = np.random.default_rng(0)
-    tool = pose(0.5, 0.1, 0.4, (3.0, 0.2, 0.1))
-    motion, carried = RelativeMotion(rotation_frame=frame), tool
-    for _ in range(1000):
-        hand = pin.SE3(pin.exp3(random.uniform(-3, 3, 3)), random.uniform(-1, 1, 3))
-        motion.anchor(hand, carried)
-        carried = motion.target(hand)
-    assert_same(carried, tool)
-    np.testing.assert_allclose(carried.rotation @ carried.rotation.T, np.eye(3), atol=1e-14)
-
-
 AXES = [
     tuple(sign + axis for sign, axis in zip(signs, order, strict=True))
     for order in permutations("xyz")
@@ -182,11 +169,3 @@ def test_a_setting_that_is_not_allowed_is_named_with_what_is(arguments: dict[str
 def test_a_target_without_an_anchor_is_refused() -> None:
     with pytest.raises(Q2R2Error, match="anchor"):
         RelativeMotion().target(pose())
-
-
-def test_anchoring_copies_what_it_is_given() -> None:
-    hand, tool = pose(), pose(1.0)
-    motion = anchored(hand, tool)
-    hand.translation[:] = 5.0
-    tool.translation[:] = 7.0
-    np.testing.assert_allclose(motion.target(pose(0.1)).translation, [1.1, 0.0, 0.0])
