@@ -58,32 +58,15 @@ def pose_with_frame(dialect: Dialect, frame_id: bytes) -> bytes:
 
 
 @every_dialect
-def test_a_pose_is_read_as_sent_with_its_stamp_and_w_of_minus_one(dialect: Dialect) -> None:
-    pose = decode(MessageType.POSE, POSES[dialect], dialect)
+def test_messages_are_read_as_sent_with_their_stamp_and_w_of_minus_one(dialect: Dialect) -> None:
+    pose, twist, inputs = (decode(kind, payload[dialect], dialect) for kind, payload in PAYLOADS.items())
     assert isinstance(pose, HandPose)
-    assert pose.position.tolist() == [1.0, 2.0, 0.5]
-    assert pose.quaternion.tolist() == [0.0, 0.0, 0.0, -1.0]
-    assert (pose.stamp, pose.frame_id) == (12.5, "")
-
-
-@every_dialect
-def test_a_twist_is_read_as_sent(dialect: Dialect) -> None:
-    twist = decode(MessageType.TWIST, TWISTS[dialect], dialect)
     assert isinstance(twist, HandTwist)
-    assert twist.linear.tolist() == [1.0, 2.0, 0.5]
-    assert twist.angular.tolist() == [0.0, 0.0, -1.0]
-
-
-@every_dialect
-def test_inputs_are_read_in_the_order_of_their_fields(dialect: Dialect) -> None:
-    inputs = decode(MessageType.INPUTS, INPUTS[dialect], dialect)
+    assert (pose.position.tolist(), pose.quaternion.tolist()) == ([1.0, 2.0, 0.5], [0.0, 0.0, 0.0, -1.0])
+    assert (pose.stamp, pose.frame_id) == (12.5, "")
+    assert (twist.linear.tolist(), twist.angular.tolist()) == ([1.0, 2.0, 0.5], [0.0, 0.0, -1.0])
     assert inputs == HandInputs(
-        button_upper=True,
-        button_lower=False,
-        thumb_stick_horizontal=1.0,
-        thumb_stick_vertical=-1.0,
-        press_index=0.5,
-        press_middle=0.0,
+        button_upper=True, thumb_stick_horizontal=1.0, thumb_stick_vertical=-1.0, press_index=0.5
     )
 
 

@@ -35,41 +35,45 @@ def play(
     return found
 
 
-@pytest.mark.parametrize(
-    ("script", "expected"),
-    [
-        ("l" * 12, [(LOWER_DOWN, 0.0), (LOWER, 0.08)]),
-        ("lll.....", [(LOWER_DOWN, 0.0), (LOWER, 0.03)]),
-        (
-            "uu.uu.",
-            [(UPPER_DOWN, 0.0), (UPPER, 0.02), (UPPER_DOWN, 0.03), (UPPER, 0.05)],
-        ),
-        ("b" * 20 + "....", []),
-        ("uuu" + "b" * 20 + "....", [(UPPER_DOWN, 0.0)]),
-        ("bbb" + "uuu.....", []),
-        ("bbb" + "lll" + "bbb" + "uuu" + "." * 10, []),
-        ("bb." + "u" * 9, [(UPPER_DOWN, 0.03), (UPPER, 0.11)]),
-        ("l" * 10 + "b" * 10 + "l" * 10 + ".", [(LOWER_DOWN, 0.0), (LOWER, 0.08)]),
-        (
-            "uu.ll.",
-            [(UPPER_DOWN, 0.0), (UPPER, 0.02), (LOWER_DOWN, 0.03), (LOWER, 0.05)],
-        ),
-    ],
-    ids=[
-        "a held lower button is reported at once and confirmed once after the window",
-        "a short press is confirmed at release",
-        "two short presses are two",
-        "both in one reading are a chord",
-        "the lower following the upper is a chord, of which only the stop was reported",
-        "a chord let go finger by finger stays silent",
-        "a finger that comes back during a chord stays silent",
-        "a press after the chord was released counts",
-        "a late second button adds nothing after the lower was confirmed",
-        "one after the other is not a chord",
-    ],
-)
-def test_buttons(script: str, expected: list[tuple[Press, float]]) -> None:
-    assert play(script) == expected
+HOLDS = {"lower_hold": "home"}
+HELD_FOR = Press("lower", Gesture.HOLD)
+TWO_PRESSES = [(UPPER_DOWN, 0.0), (UPPER, 0.02), (UPPER_DOWN, 0.03), (UPPER, 0.05)]
+SCRIPTS: dict[str, tuple[dict[str, str], str, list[tuple[Press, float]]]] = {
+    "a held button is reported at once and confirmed once after the window": (
+        {},
+        "l" * 12,
+        [(LOWER_DOWN, 0.0), (LOWER, 0.08)],
+    ),
+    "a short press is confirmed at release": ({}, "lll.....", [(LOWER_DOWN, 0.0), (LOWER, 0.03)]),
+    "two short presses are two": ({}, "uu.uu.", TWO_PRESSES),
+    "both in one reading are a chord": ({}, "b" * 20 + "....", []),
+    "of a chord that begins with one only the stop is reported": ({}, "uuu" + "b" * 20 + "....", [(UPPER_DOWN, 0.0)]),
+    "a chord let go finger by finger stays silent": ({}, "bbb" + "uuu.....", []),
+    "a finger that comes back during a chord stays silent": ({}, "bbb" + "lll" + "bbb" + "uuu" + "." * 10, []),
+    "a press after the chord was released counts": ({}, "bb." + "u" * 9, [(UPPER_DOWN, 0.03), (UPPER, 0.11)]),
+    "a late second button adds nothing": (
+        {},
+        "l" * 10 + "b" * 10 + "l" * 10 + ".",
+        [(LOWER_DOWN, 0.0), (LOWER, 0.08)],
+    ),
+    "one after the other is not a chord": (
+        {},
+        "uu.ll.",
+        [(UPPER_DOWN, 0.0), (UPPER, 0.02), (LOWER_DOWN, 0.03), (LOWER, 0.05)],
+    ),
+    "held long enough is a hold, and no tap at its end": (
+        HOLDS,
+        "l" * 80 + "." * 10,
+        [(LOWER_DOWN, 0.0), (HELD_FOR, 0.6)],
+    ),
+    "let go before is a tap": (HOLDS, "l" * 40 + "." * 60, [(LOWER_DOWN, 0.0), (LOWER, 0.4)]),
+    "a chord is no hold": (HOLDS, "l" * 40 + "b" * 60, [(LOWER_DOWN, 0.0)]),
+}
+
+
+@pytest.mark.parametrize(("bindings", "script", "expected"), SCRIPTS.values(), ids=SCRIPTS)
+def test_one_gesture_is_one(bindings: dict[str, str], script: str, expected: list[tuple[Press, float]]) -> None:
+    assert play(script, bindings) == expected
 
 
 def test_a_button_held_from_the_first_reading_does_not_count_until_released() -> None:
@@ -123,27 +127,6 @@ def test_cancelling_drops_everything_but_a_stop_that_has_begun() -> None:
     gestures.receive(HandInputs(button_lower=True), 1.3)
     gestures.cancel()
     assert gestures.due(3.0) == []
-
-
-HOLDS = {"lower_hold": "home"}
-HELD_FOR = Press("lower", Gesture.HOLD)
-
-
-@pytest.mark.parametrize(
-    ("bindings", "script", "expected"),
-    [
-        (HOLDS, "l" * 80 + "." * 10, [(LOWER_DOWN, 0.0), (HELD_FOR, 0.6)]),
-        (HOLDS, "l" * 40 + "." * 60, [(LOWER_DOWN, 0.0), (LOWER, 0.4)]),
-        (HOLDS, "l" * 40 + "b" * 60, [(LOWER_DOWN, 0.0)]),
-    ],
-    ids=[
-        "held long enough is a hold, and no tap at its end",
-        "let go before is a tap",
-        "a chord is no hold",
-    ],
-)
-def test_one_gesture_is_one(bindings: dict[str, str], script: str, expected: list[tuple[Press, float]]) -> None:
-    assert play(script, bindings) == expected
 
 
 def test_readings_that_come_late_and_at_once_are_told_by_their_own_times() -> None:
