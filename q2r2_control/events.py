@@ -21,8 +21,6 @@ class ReasonKind(StrEnum):
     CARRY_BEGAN = "carry_began"  # this arm's hand moves both tools
     CARRIED_BY = "carried_by"
     CARRY_ENDED = "carry_ended"
-    HANDS_SWAPPED = "hands_swapped"
-    DRIVEN_BY = "driven_by"
     RESET_SERVICE = "reset_service"
     PAUSE_SERVICE = "pause_service"
 
@@ -55,7 +53,6 @@ class ReasonKind(StrEnum):
     NOT_ENGAGED = "not_engaged"
     NOT_HOMING = "not_homing"
     NOT_CARRIED = "not_carried"
-    NOT_SWAPPED = "not_swapped"
     NOT_CHANGED = "not_changed"
     NO_RECORDING = "no_recording"
     RECORDING_ENDED = "recording_ended"
@@ -89,7 +86,6 @@ class ReasonKind(StrEnum):
     ALIGNING = "aligning"
     CARRYING = "carrying"
     ENGAGE_FIRST = "engage_first"
-    PAUSE_FIRST = "pause_first"
     ONE_ARM = "one_arm"
     OTHER_ARM_BUSY = "other_arm_busy"
     TOOL_HELD_UP = "tool_held_up"
@@ -136,7 +132,7 @@ class ReasonKind(StrEnum):
 
 REFUSALS = frozenset(
     {
-        *(ReasonKind.NOT_ENGAGED, ReasonKind.NOT_HOMING, ReasonKind.NOT_CARRIED, ReasonKind.NOT_SWAPPED),
+        *(ReasonKind.NOT_ENGAGED, ReasonKind.NOT_HOMING, ReasonKind.NOT_CARRIED),
         *(ReasonKind.NOT_CHANGED, ReasonKind.NO_RECORDING, ReasonKind.RECORDING_ENDED, ReasonKind.NO_EPISODE),
     }
 )

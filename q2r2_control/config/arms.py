@@ -6,8 +6,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationInfo, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, ValidationInfo, model_validator
 
+from q2r2_control.config.strict import StrictModel
 from q2r2_control.errors import ConfigError
 
 Side = Literal["left", "right"]
@@ -47,24 +48,18 @@ LocalPath = Annotated[str, AfterValidator(_beside_the_file)]
 XacroArgs = Annotated[dict[str, str | bool | int | float], Field(description="of a .xacro model, by name")]
 
 
-class CellModel(BaseModel):
-    """What every block of a cell has in common: no unknown keys, no change, finite numbers."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-
-class PoseConfig(CellModel):
+class PoseConfig(StrictModel):
     """A fixed placement in the parent frame."""
 
     position: Metres3 = (0.0, 0.0, 0.0)
     rpy: Radians3 = (0.0, 0.0, 0.0)
 
 
-class FlangeConfig(CellModel):
+class FlangeConfig(StrictModel):
     """What is between an arm's last link and its tool: a model, or a cylinder of these sizes; by default nothing."""
 
     model: LocalPath | None = Field(None, description="a file of robots/ without .urdf, or a path")
-    xacro_args: XacroArgs = {}
+    xacro_args: XacroArgs = Field({})
     frame: str | None = Field(None, description="link of the model that carries the tool; default: the last link")
     thickness: float | None = Field(None, gt=0, le=0.5, description="of a cylinder instead of a model, along z [m]")
     radius: float | None = Field(None, gt=0, le=0.5, description="of that cylinder [m]")
@@ -88,17 +83,17 @@ class FlangeConfig(CellModel):
         return self.model is None and self.thickness is None
 
 
-class ToolConfig(CellModel):
+class ToolConfig(StrictModel):
     """What is mounted on an arm's last link or flange."""
 
     model: LocalPath | None = Field(None, description="a file of robots/ without .urdf, or a path; none: bare flange")
-    xacro_args: XacroArgs = {}
+    xacro_args: XacroArgs = Field({})
     link: str | None = Field(None, description="arm link that carries the tool; default: the arm's tip")
     mount: PoseConfig = PoseConfig()
     frame: str | None = Field(None, description="link of the tool that the operator moves; default: the last link")
 
 
-class HeldObjectConfig(CellModel):
+class HeldObjectConfig(StrictModel):
     """What a gripper holds when it holds something: a box or a ball, fixed to the tool."""
 
     box: tuple[ObjectSize, ObjectSize, ObjectSize] | None = Field(None, description="x y z [m]")
@@ -119,7 +114,7 @@ class HeldObjectConfig(CellModel):
         return _USUAL_RADIUS if self.sphere is None else self.sphere
 
 
-class GripperConfig(CellModel):
+class GripperConfig(StrictModel):
     """How an opening of 0..1 becomes finger joint positions."""
 
     joints: tuple[str, ...] = Field((), description="finger joints of the tool, all driven alike")
@@ -136,24 +131,24 @@ class GripperConfig(CellModel):
         return self
 
 
-class RobotConfig(CellModel):
+class RobotConfig(StrictModel):
     """One model that several arms are parts of. Its links and joints keep their names."""
 
     model: LocalPath = Field(description="as an arm's model")
-    xacro_args: XacroArgs = {}
+    xacro_args: XacroArgs = Field({})
     mount: PoseConfig = PoseConfig()
     home: dict[str, float] = Field(
         default_factory=dict, description="where joints of no arm are locked, by name; the others as near 0 as allowed"
     )
 
 
-class ArmConfig(CellModel):
+class ArmConfig(StrictModel):
     """One arm: model and mount, unless it is part of the cell's ``robot``; tip, tool, home posture."""
 
     model: LocalPath | None = Field(
         None, description="a file of robots/ without .urdf, example-robot-data:NAME, or a path"
     )
-    xacro_args: XacroArgs = {}
+    xacro_args: XacroArgs = Field({})
     mount: PoseConfig = PoseConfig()
     tip: str | None = Field(None, description="last link of the arm; none: found, where there is no doubt")
     joints: tuple[str, ...] = Field((), description="of the arm, base to tip; none: all from base to tip")

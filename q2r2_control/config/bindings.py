@@ -6,8 +6,9 @@ from collections.abc import Iterator
 from enum import StrEnum
 from typing import NamedTuple
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
+from q2r2_control.config.strict import StrictModel
 from q2r2_control.errors import ConfigError
 from q2r2_control.types import DeviceControls
 
@@ -16,12 +17,11 @@ class Action(StrEnum):
     """What a hand can do with its controls."""
 
     NONE = "none"
-    # Once, when a control was tapped, held for a while or tapped twice.
+    # Once, when a control was tapped, or held for a while.
     PAUSE_TOGGLE = "pause_toggle"  # engage, or pause
     GRIPPER_TOGGLE = "gripper_toggle"
     HOME = "home"  # both arms
     STOP = "stop"  # both arms, until it is done once more
-    SWAP_HANDS = "swap_hands"  # each hand drives the other arm
     CARRY = "carry"  # this hand moves both tools as one body
     RECORD_TOGGLE = "record_toggle"  # an episode begins, or ends
     RECORD_DISCARD = "record_discard"  # the episode is not worth keeping
@@ -47,7 +47,6 @@ class Gesture(StrEnum):
     DOWN = "down"
     TAP = "tap"
     HOLD = "hold"
-    DOUBLE = "double"
 
 
 # What an operator reads of each action.
@@ -56,7 +55,6 @@ MEANINGS: dict[str, str] = {
     Action.GRIPPER_TOGGLE: "closes the gripper, or opens it",
     Action.HOME: "brings both arms home; any press on the way stops them",
     Action.STOP: "stops both arms until it is done once more",
-    Action.SWAP_HANDS: "lets each hand drive the other arm, while both are paused",
     Action.CARRY: "lets this hand move both tools as one body, or ends that",
     Action.RECORD_TOGGLE: "begins an episode of the recording, or ends it",
     Action.RECORD_DISCARD: "throws away the episode, or the last one if it has ended",
@@ -74,22 +72,19 @@ BUTTONS = ("lower", "upper")
 TRIGGERS = ("trigger", "grip")
 HELD = (*TRIGGERS, "stick_up", "stick_down", "stick_left", "stick_right")
 CONTROLS = (*BUTTONS, *HELD)
-# The button or axis of a device that each control is.
-_DEVICE_NAMES = {
-    "lower": "button_lower",
-    "upper": "button_upper",
-    "trigger": "press_index",
-    "grip": "press_middle",
-    "stick_up": "thumb_stick_vertical",
-    "stick_down": "thumb_stick_vertical",
-    "stick_left": "thumb_stick_horizontal",
-    "stick_right": "thumb_stick_horizontal",
+# The button or axis of a device that each control is, and the way it goes.
+DEVICE_NAMES: dict[str, tuple[str, float]] = {
+    "lower": ("button_lower", 1.0),
+    "upper": ("button_upper", 1.0),
+    "trigger": ("press_index", 1.0),
+    "grip": ("press_middle", 1.0),
+    "stick_up": ("thumb_stick_vertical", 1.0),
+    "stick_down": ("thumb_stick_vertical", -1.0),
+    "stick_left": ("thumb_stick_horizontal", -1.0),
+    "stick_right": ("thumb_stick_horizontal", 1.0),
 }
-_WORDS = {Gesture.TAP: "", Gesture.HOLD: " held", Gesture.DOUBLE: " tapped twice"}
-_SUFFIXES = {Gesture.TAP: "", Gesture.HOLD: "_hold", Gesture.DOUBLE: "_double"}
-
-_HOLD = "held for hold_time: what is done once, but pause_toggle; or none"
-_DOUBLE = "tapped twice within double_tap_window, the same"
+_WORDS = {Gesture.TAP: "", Gesture.HOLD: " held"}
+_SUFFIXES = {Gesture.TAP: "", Gesture.HOLD: "_hold"}
 
 
 class Binding(NamedTuple):
@@ -110,39 +105,31 @@ class Binding(NamedTuple):
         return self.control + _WORDS[self.gesture]
 
 
-class BindingSettings(BaseModel):
+class BindingSettings(StrictModel):
     """The controls of each hand. An action is bound to one gesture at most, and something has to engage the arm."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
     lower: Action = Field(Action.PAUSE_TOGGLE, description="A or X, tapped: what is done once, but stop; or none")
-    lower_hold: Action = Field(Action.NONE, description=_HOLD)
-    lower_double: Action = Field(Action.NONE, description=_DOUBLE)
+    lower_hold: Action = Field(
+        Action.NONE, description="held for hold_time: what is done once, but pause_toggle; or none"
+    )
     upper: Action = Field(Action.GRIPPER_TOGGLE, description="B or Y, as lower")
     upper_hold: Action = Field(Action.NONE, description="as lower_hold")
-    upper_double: Action = Field(Action.NONE, description="as lower_double")
     trigger: Action = Field(
         Action.NONE,
         description="index finger; while held: dead_man, precision, rotation_lock, translation_lock, gripper_analog; "
         "tapped: what is done once; or none",
     )
     trigger_hold: Action = Field(Action.NONE, description="as lower_hold, where trigger is not for what lasts")
-    trigger_double: Action = Field(Action.NONE, description="as lower_double, likewise")
     grip: Action = Field(Action.NONE, description="middle finger, as trigger")
     grip_hold: Action = Field(Action.NONE, description="as trigger_hold")
-    grip_double: Action = Field(Action.NONE, description="as trigger_double")
     stick_up: Action = Field(Action.NONE, description="thumb stick forward, as trigger, but no gripper_analog")
     stick_up_hold: Action = Field(Action.NONE, description="as trigger_hold")
-    stick_up_double: Action = Field(Action.NONE, description="as trigger_double")
     stick_down: Action = Field(Action.NONE, description="as stick_up")
     stick_down_hold: Action = Field(Action.NONE, description="as trigger_hold")
-    stick_down_double: Action = Field(Action.NONE, description="as trigger_double")
     stick_left: Action = Field(Action.NONE, description="as stick_up")
     stick_left_hold: Action = Field(Action.NONE, description="as trigger_hold")
-    stick_left_double: Action = Field(Action.NONE, description="as trigger_double")
     stick_right: Action = Field(Action.NONE, description="as stick_up")
     stick_right_hold: Action = Field(Action.NONE, description="as trigger_hold")
-    stick_right_double: Action = Field(Action.NONE, description="as trigger_double")
 
     @model_validator(mode="after")
     def _mean_one_thing(self) -> BindingSettings:
@@ -174,7 +161,7 @@ class BindingSettings(BaseModel):
         if action is Action.STOP and control in BUTTONS and gesture is Gesture.TAP:
             raise ValueError(
                 f"{control} is stop, and the headset's alignment presses it too; allowed: {control}_hold, "
-                f"{control}_double, or another control"
+                "or another control"
             )
         if action in LASTING and (gesture is not Gesture.TAP or control in BUTTONS):
             raise ValueError(f"{binding.field} is {action}, which lasts; allowed: {', '.join(HELD)}")
@@ -188,12 +175,11 @@ class BindingSettings(BaseModel):
     def check_device(self, controls: DeviceControls) -> None:
         """Raise :class:`ConfigError` for a binding to a control that an input device does not have."""
         names = (*controls.buttons, *controls.axes)
+        allowed = [control for control, (name, _) in DEVICE_NAMES.items() if name in names]
         for binding in self.bound():
-            name = _DEVICE_NAMES[binding.control]
-            if name not in names:
-                has = (
-                    ", ".join(control for control, its in _DEVICE_NAMES.items() if its in names) or "no control at all"
-                )
+            if binding.control not in allowed:
+                name, _ = DEVICE_NAMES[binding.control]
+                has = ", ".join(allowed) or "no control at all"
                 raise ConfigError(
                     f"teleop.bindings.{binding.field} = {binding.action}: this input has no {name}; allowed: {has}"
                 )

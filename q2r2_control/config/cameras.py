@@ -6,14 +6,15 @@ from typing import Annotated
 
 from pydantic import Field, StringConstraints, model_validator
 
-from q2r2_control.config.arms import CellModel, Metres3, Radians3
+from q2r2_control.config.arms import Metres3, Radians3
+from q2r2_control.config.strict import StrictModel
 
 # It becomes a part of a topic's name and of a feature's.
 CameraName = Annotated[str, StringConstraints(pattern=r"^[A-Za-z][A-Za-z0-9_]*$", max_length=40)]
 _LEAST_DISTANCE = 1e-6  # [m]
 
 
-class CameraConfig(CellModel):
+class CameraConfig(StrictModel):
     """A camera of the simulated cell, or one whose pictures come on a ROS topic.
 
     The former is fixed in the world or on a link. Its own frame has x the way it looks, and z up in the picture.

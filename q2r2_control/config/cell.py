@@ -16,7 +16,6 @@ from pydantic import Field, ValidationError, field_validator, model_validator
 
 from q2r2_control.config.arms import (
     ArmConfig,
-    CellModel,
     Colour,
     Coordinate,
     Extent,
@@ -33,12 +32,13 @@ from q2r2_control.config.external import ControllerKind, ExternalConfig, check_e
 from q2r2_control.config.judge import JudgeSettings
 from q2r2_control.config.networks import Network, network_of
 from q2r2_control.config.resources import find_resource
+from q2r2_control.config.strict import StrictModel
 from q2r2_control.config.supervision import SupervisionSettings
 from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.errors import ConfigError
 
 
-class ObstacleConfig(CellModel):
+class ObstacleConfig(StrictModel):
     """A fixed body of the cell. Cylinders and capsules stand along z; a capsule's length is its segment's."""
 
     shape: Literal["box", "cylinder", "sphere", "capsule"]
@@ -59,7 +59,7 @@ class ObstacleConfig(CellModel):
         return self
 
 
-class HeadsetConfig(CellModel):
+class HeadsetConfig(StrictModel):
     """The TCP server that the Quest2ROS app connects to."""
 
     host: str = Field("127.0.0.1", description="address to bind; 0.0.0.0 admits the network, :: that of IPv6 too")
@@ -86,7 +86,7 @@ class HeadsetConfig(CellModel):
         return None if self.allow is None else tuple(map(network_of, self.allow))
 
 
-class ObjectConfig(CellModel):
+class ObjectConfig(StrictModel):
     """A loose box in the simulated cell, to be grasped. The controller does not know of it."""
 
     size: tuple[Extent, Extent, Extent] = Field(description="x y z [m]")
@@ -95,7 +95,7 @@ class ObjectConfig(CellModel):
     colour: Colour = (0.2, 0.45, 0.8, 1.0)
 
 
-class MujocoConfig(CellModel):
+class MujocoConfig(StrictModel):
     """The simulated cell."""
 
     timestep: float = Field(0.001, gt=0, le=0.001, description="physics step [s]")
@@ -113,7 +113,7 @@ class MujocoConfig(CellModel):
     objects: dict[str, ObjectConfig] = Field(default_factory=dict, description="loose boxes by name")
 
 
-class Config(CellModel):
+class Config(StrictModel):
     """One cell: everything a user tunes."""
 
     name: str = Field(min_length=1)

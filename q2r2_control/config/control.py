@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import Field, ValidationError
 
+from q2r2_control.config.strict import StrictModel
 from q2r2_control.errors import ConfigError
 
 EQUAL = "equal"
@@ -41,7 +42,7 @@ ObjectDistance = Annotated[
 LinkPattern = Annotated[str, Field(min_length=1)]
 
 
-class DistanceSettings(BaseModel):
+class DistanceSettings(StrictModel):
     """How far pairs of bodies stay apart, by what they are; left out: ``min_distance``.
 
     A finger is what a gripper's joints move, a tool what carries it (the hand), an obstacle what stands in the cell,
@@ -49,8 +50,6 @@ class DistanceSettings(BaseModel):
     against itself and against the robot that it is a part of, its own object included; the other classes without
     obstacles are about different arms.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     arm_arm: Distance | None = Field(None, description="links of two arms, bases included [m]")
     arm_self: Distance | None = Field(None, description="one arm with tool and fingers, among themselves [m]")
@@ -68,10 +67,8 @@ class DistanceSettings(BaseModel):
     object_obstacle: ObjectDistance | None = Field(0.0, description="a held object and obstacles [m]")
 
 
-class NamedPairDistance(BaseModel):
+class NamedPairDistance(StrictModel):
     """How far pairs of bodies stay apart, by their names."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     pair: tuple[LinkPattern, LinkPattern] = Field(
         description="links, * stands for any letters and ? for one; in either order"
@@ -79,23 +76,19 @@ class NamedPairDistance(BaseModel):
     distance: Distance = Field(description="[m]")
 
 
-class ContactPair(BaseModel):
+class ContactPair(StrictModel):
     """Bodies that may touch in torque mode, by their names. In the other modes they keep their distance.
 
     The reference may get inside by ``depth``, so that the impedance presses with at most its stiffness times that.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     pair: tuple[LinkPattern, LinkPattern] = Field(description="as in control.pairs")
     depth: float = Field(0.015, ge=0.001, le=0.03, description="how far the reference may get inside [m]")
     speed: float = Field(0.03, ge=0.005, le=0.2, description="closing speed before and in contact [m/s]")
 
 
-class ControllerSettings(BaseModel):
+class ControllerSettings(StrictModel):
     """Settings of :class:`CartesianController`; every range is checked when the object is made."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     solver: str = Field("daqp", description="daqp, or the name of any solver that qpsolvers has installed")
     solve_time_limit: float | None = Field(
@@ -174,21 +167,17 @@ def check_priority(priority: str, arms: Collection[str]) -> None:
         raise ConfigError(f"control.priority = {priority!r:.60}: allowed here: {', '.join((EQUAL, *arms))}")
 
 
-class WallSettings(BaseModel):
+class WallSettings(StrictModel):
     """The wall between measured links; its depth is the distance that each pair keeps."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     stiffness: float = Field(10000.0, gt=0, le=100000, description="force per depth below a pair's distance [N/m]")
     damping_ratio: float = Field(1.0, ge=0.2, le=2, description="at each pair's effective mass")
     maximum_force: float = Field(400.0, gt=0, le=2000, description="of each pair of links [N]")
 
 
-class ImpedanceSettings(BaseModel):
+class ImpedanceSettings(StrictModel):
     """Settings of :class:`ImpedanceController`. Nothing here may be zero or negative: a stiffness or a damping of -1,
     meant as "automatic", would drive an arm instead of holding it."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     translational_stiffness: float = Field(2000.0, gt=0, le=5000, description="of the tool, all directions [N/m]")
     rotational_stiffness: float = Field(200.0, gt=0, le=300, description="of the tool, all axes [Nm/rad]")
@@ -206,10 +195,8 @@ class ImpedanceSettings(BaseModel):
     wall: WallSettings = WallSettings()
 
 
-class AdmittanceSettings(BaseModel):
+class AdmittanceSettings(StrictModel):
     """The impedance that a tool shows in position mode, on plants that report external torque."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     enabled: bool = Field(False, description="needs a plant that measures external torque")
     stiffness: float = Field(1000.0, ge=10, le=20000, description="[N/m]")

@@ -7,9 +7,10 @@ from collections.abc import Iterable, Mapping
 from enum import StrEnum
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from q2r2_control.config.presets import BUILTIN, PRESETS, Mode, Preset, preset_of
+from q2r2_control.config.strict import StrictModel
 from q2r2_control.config.teleop import GuardSettings
 from q2r2_control.errors import ConfigError
 
@@ -48,11 +49,7 @@ class GripperType(StrEnum):
     FLOAT64_MULTI_ARRAY = "Float64MultiArray"
 
 
-class _Model(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-
-class GripperSettings(_Model):
+class GripperSettings(StrictModel):
     """How a gripper is told to open and close."""
 
     action_type: GripperType = Field(
@@ -80,7 +77,7 @@ class ExternalGripper(GripperSettings):
         return GripperSettings(**self.model_dump(exclude={"topic"}))
 
 
-class GuardLimits(_Model):
+class GuardLimits(StrictModel):
     """How fast a target may move; none: as the preset says."""
 
     max_velocity: float | None = Field(None, gt=0, le=5, description="of the target's position [m/s]")
@@ -93,7 +90,7 @@ class GuardLimits(_Model):
         return guard.model_copy(update=self.model_dump(exclude_none=True))
 
 
-class ExternalArm(_Model):
+class ExternalArm(StrictModel):
     """One arm's controller."""
 
     ctrl_prefix: AbsoluteName = Field(description="name of the controller's node, with its namespace")
@@ -107,7 +104,7 @@ class ExternalArm(_Model):
 _EXTERNAL = tuple(name for name in PRESETS if name != BUILTIN.name)
 
 
-class ExternalConfig(_Model):
+class ExternalConfig(StrictModel):
     """What drives the arms instead of the built-in controller, and what it is sent."""
 
     preset: str = Field(description=f"its terms: {', '.join(_EXTERNAL)}")

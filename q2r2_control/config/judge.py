@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
+
+from q2r2_control.config.strict import StrictModel
 
 Share = Annotated[float, Field(ge=0, le=1)]
 Seconds = Annotated[float, Field(ge=0, le=10)]
@@ -12,14 +14,12 @@ Metres = Annotated[float, Field(ge=0, le=2)]
 Radians = Annotated[float, Field(ge=0, le=3.15)]
 
 
-class JudgeSettings(BaseModel):
+class JudgeSettings(StrictModel):
     """Thresholds of ``q2r2 judge``: an episode beyond any of them is discarded. None: that number is not judged.
 
     Shares are of the time for which an arm is engaged, unless said otherwise, so that no threshold is a matter of how
     long an episode is. The numbers are those of ``q2r2_control.judging``.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     min_pose_rate: Annotated[float, Field(ge=0, le=1000)] | None = Field(
         30.0, description="poses received of a hand that leads an engaged arm [Hz]"

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
+
+from q2r2_control.config.strict import StrictModel
 
 
-class SupervisionSettings(BaseModel):
+class SupervisionSettings(StrictModel):
     """Limits of what a plant may measure, and of what a stream of targets may be."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     state_timeout: float = Field(0.1, ge=0.01, le=1, description="without a measured state for this long: stop [s]")
     unusable_time: float = Field(0.05, ge=0, le=0.5, description="states that are not finite are bridged for this [s]")

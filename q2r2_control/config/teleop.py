@@ -3,17 +3,40 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from enum import StrEnum
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+import numpy as np
+from pydantic import Field, field_validator, model_validator
 
-from q2r2_control.config.axes import axes_matrix
 from q2r2_control.config.bindings import BindingSettings
+from q2r2_control.config.strict import StrictModel
 from q2r2_control.config.timeouts import STREAM_TIMEOUT
-from q2r2_control.types import Interval
+from q2r2_control.types import Array, Interval
 
 _Scale = Annotated[float, Field(ge=0, le=10)]
+
+
+_AXES = ("x", "y", "z")
+_ALLOWED = "three of +x -x +y -y +z -z that use x, y and z once each, e.g. [+z, -x, +y]"
+
+
+def axes_matrix(axes: Sequence[str]) -> Array:
+    """Signed permutation M, (3, 3): a position p of the input becomes M p in the world, a rotation R becomes M R M'.
+
+    ``axes[i]`` is the input's axis that becomes the world's i-th. A determinant of -1 says that the input counts in a
+    left-handed frame, as raw Unity does; M R M' is a proper rotation then too.
+    Raises :class:`ValueError` that names the value and what is allowed.
+    """
+    matrix = np.zeros((3, 3))
+    for row, axis in enumerate(axes):
+        if len(axes) != 3 or len(axis) != 2 or axis[0] not in "+-" or axis[1] not in _AXES:
+            raise ValueError(f"axes {list(axes)} are not {_ALLOWED}")
+        matrix[row, _AXES.index(axis[1])] = 1.0 if axis[0] == "+" else -1.0
+    if abs(round(float(np.linalg.det(matrix)))) != 1:
+        raise ValueError(f"axes {list(axes)} are not {_ALLOWED}")
+    return matrix
 
 
 class Stance(StrEnum):
@@ -31,13 +54,11 @@ class RotationFrame(StrEnum):
     TOOL = "tool"
 
 
-class FilterSettings(BaseModel):
+class FilterSettings(StrictModel):
     """Interpolation between samples, then a One-Euro filter (Casiez, Roussel, Vogel, CHI 2012).
 
     The hand's delay is interpolation_delay + smoothing_delay, at any speed.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     interpolation_delay: float = Field(0.02, ge=0.005, le=0.2, description="1.5 periods of a 75 Hz headset [s]")
     smoothing_delay: float = Field(0.025, ge=0, le=0.2, description="of a motion at constant speed [s]")
@@ -45,13 +66,10 @@ class FilterSettings(BaseModel):
     beta: float = Field(10.0, ge=0, le=1000, description="cutoff added per speed [Hz s/m]")
     rotation_beta: float = Field(3.0, ge=0, le=1000, description="cutoff added per speed [Hz s/rad]")
     derivative_cutoff: float = Field(2.0, gt=0, le=100, description="cutoff of the speed estimate [Hz]")
-    average_at_rest: bool = Field(True, description="a hand that rests is where its samples are on average")
 
 
-class GateSettings(BaseModel):
+class GateSettings(StrictModel):
     """What makes a hand sample unfit to move an arm."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     timeout: float = Field(STREAM_TIMEOUT, gt=0, le=2, description="no pose for this long disengages [s]")
     max_jump: float = Field(0.15, gt=0, le=2, description="position change between two samples [m]")
@@ -60,10 +78,8 @@ class GateSettings(BaseModel):
     max_angular_speed: float = Field(30.0, gt=0, le=100, description="of a hand, over at least 50 ms [rad/s]")
 
 
-class LeashSettings(BaseModel):
+class LeashSettings(StrictModel):
     """How far a target may be from its tool; beyond that it slips along. None: as far as the hand goes."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     distance: float | None = Field(0.1, ge=0.02, le=2, description="of positions [m]; none: no leash")
     angle: float | None = Field(0.5, ge=0.1, le=2, description="of rotations [rad]; none: no leash")
@@ -77,48 +93,29 @@ class LeashSettings(BaseModel):
         return self.model_copy(update=shorter)
 
 
-class HapticSettings(BaseModel):
+class HapticSettings(StrictModel):
     """What the hands feel of their arms."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     strength: float = Field(1.0, ge=0, le=1, description="of all vibrations; 0: none")
 
 
-class WorkspaceSettings(BaseModel):
+class WorkspaceSettings(StrictModel):
     """A box in the world that one arm's targets stay in."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     x: Interval = Field(description="least and greatest of the target's position [m]")
     y: Interval = Field(description="the same [m]")
     z: Interval = Field(description="the same [m]")
-    soft_edge: float = Field(0.05, gt=0, le=0.5, description="this near to a side the target slows down [m]")
 
     @model_validator(mode="after")
     def _have_room(self) -> WorkspaceSettings:
         for name, (least, greatest) in (("x", self.x), ("y", self.y), ("z", self.z)):
-            if not greatest - least >= 2.0 * self.soft_edge:
-                raise ValueError(
-                    f"{name} = [{least:g}, {greatest:g}]: allowed: least first, and twice soft_edge in between, "
-                    f"{2.0 * self.soft_edge:g} m"
-                )
+            if not least < greatest:
+                raise ValueError(f"{name} = [{least:g}, {greatest:g}]: allowed: least first")
         return self
 
 
-class SpeedLimitSettings(BaseModel):
-    """How fast one arm's target may move, however fast the hand does. None: as fast as the hand."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-    linear: float | None = Field(None, ge=0.01, le=5, description="of the target's position [m/s]")
-    angular: float | None = Field(None, ge=0.05, le=20, description="of the target's rotation [rad/s]")
-
-
-class TeleopSettings(BaseModel):
+class TeleopSettings(StrictModel):
     """Settings of the teleop layer; every range is checked when the object is made."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     stance: Stance = Field(Stance.SIDE_BY_SIDE, description="side_by_side, mirror or mirror_reflected")
     position_scale: float = Field(1.0, gt=0, le=10, description="tool metres per hand metre")
@@ -137,9 +134,6 @@ class TeleopSettings(BaseModel):
     hold_time: float = Field(
         0.6, ge=0.2, le=3, description="after which a control counts as held, where that is bound [s]"
     )
-    double_tap_window: float = Field(
-        0.3, ge=0.1, le=1, description="a tap waits this long for another, where two are bound [s]"
-    )
     linked: bool = Field(True, description="a fault of one hand disengages both arms")
     precision_scale: float = Field(0.25, gt=0, le=1, description="of all motion while precision is held")
     gripper_speed: float = Field(
@@ -147,9 +141,6 @@ class TeleopSettings(BaseModel):
     )
     workspace: dict[Literal["left", "right"], WorkspaceSettings] = Field(
         default_factory=dict, description="arm -> box that its targets stay in"
-    )
-    speed_limit: dict[Literal["left", "right"], SpeedLimitSettings] = Field(
-        default_factory=dict, description="arm -> how fast its targets may move"
     )
     bindings: BindingSettings = Field(default_factory=BindingSettings)
     filter: FilterSettings = Field(default_factory=FilterSettings)
@@ -164,10 +155,8 @@ class TeleopSettings(BaseModel):
         return axes
 
 
-class GuardSettings(BaseModel):
+class GuardSettings(StrictModel):
     """How fast a target may move, whatever the hand does."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     max_velocity: float = Field(0.5, gt=0, le=5, description="of the target's position [m/s]")
     max_acceleration: float = Field(5.0, gt=0, le=100, description="of the target's position [m/s^2]")

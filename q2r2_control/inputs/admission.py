@@ -20,9 +20,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from enum import Enum
 from ipaddress import ip_address
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 from q2r2_control.config.networks import Network
 
@@ -31,46 +32,24 @@ POSES_ALLOWED = 5.0  # without a hand pose, against a client that sends them [s]
 WAIT_ALLOWED = 2.0  # for a newcomer to show what gives it the place [s]
 
 
-class Peer(Protocol):
+@dataclass
+class Peer:
     """What is known of a connected client."""
 
-    @property
-    def peer(self) -> str:
-        """Its address and port, for people."""
-        ...
-
-    @property
-    def host(self) -> str:
-        """Its address."""
-        ...
-
-    @property
-    def since(self) -> float:
-        """When it connected [s]."""
-        ...
-
-    @property
-    def last_frame(self) -> float:
-        """When its last whole frame was received [s]."""
-        ...
-
-    @property
-    def last_pose(self) -> float:
-        """When its last hand pose was received, -inf before the first [s]."""
-        ...
-
-    @property
-    def registrations(self) -> Sequence[Mapping[str, str]]:
-        """What it has registered."""
-        ...
+    peer: str  # address and port, for people
+    host: str  # address
+    since: float  # when it connected [s]
+    last_frame: float  # when its last whole frame was received [s]
+    last_pose: float = -math.inf  # when its last hand pose was received [s]
+    registrations: Sequence[Mapping[str, str]] = ({}, {})  # topics that it publishes, and that it listens to
 
 
 class Admission(Enum):
     """What becomes of a newcomer."""
 
-    ADMIT = "drives from now on, instead of the driver if there is one"
-    WAIT = "may stay, unheard, until more is known"
-    REFUSE = "is sent away"
+    ADMIT = "admit"  # drives from now on, instead of the driver if there is one
+    WAIT = "wait"  # may stay, unheard, until more is known
+    REFUSE = "refuse"
 
 
 class Decision(NamedTuple):

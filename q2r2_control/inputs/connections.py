@@ -12,13 +12,15 @@ from functools import partial
 
 from q2r2_control.config.networks import Network
 from q2r2_control.errors import ProtocolError
-from q2r2_control.inputs.admission import Admission, decide, is_allowed
-from q2r2_control.inputs.client import Client
-from q2r2_control.inputs.framing import WireFrame
+from q2r2_control.inputs.admission import Admission, Peer, decide, is_allowed
+from q2r2_control.inputs.framing import FrameDecoder, WireFrame
 from q2r2_control.inputs.listener import TcpListener
-from q2r2_control.inputs.messages import AppMessage
-from q2r2_control.inputs.rate_limits import MAX_HOSTS_NAMED, HostLog
-from q2r2_control.inputs.session import log_frame
+from q2r2_control.inputs.messages import HandPose
+from q2r2_control.inputs.rate_limits import MAX_HOSTS_NAMED, HostLog, RateLimit
+from q2r2_control.inputs.samples import HandTracker
+from q2r2_control.inputs.session import HeadsetSession, Reception, log_frame
+from q2r2_control.inputs.statistics import TopicRecorder
+from q2r2_control.types import HapticFeedback
 
 KEEPALIVE_AFTER = 1.0  # of own silence [s]
 SILENCE_ALLOWED = 2.0  # without a whole frame [s]; the app sends a keepalive after 1 s
@@ -26,7 +28,43 @@ MAX_WAITING = 4  # newcomers of which it is not yet known whether they may drive
 TURN = 0.05  # longest wait for the network; timeouts are looked at this often [s]
 _RECEIVE_BYTES = 1 << 12  # some 40 messages: the control loop gets the interpreter between two such portions
 
+MAX_FRAMES_PER_SECOND = 2000  # the app sends about 450; more would take processor time from the control loop
+
 _LOG = logging.getLogger("q2r2_control.inputs.headset")
+
+
+class Client(Peer):
+    """A connected client."""
+
+    def __init__(self, connection: socket.socket, host: str, peer: str, now: float) -> None:
+        self.session = HeadsetSession()
+        registrations = self.session.published, self.session.subscribed
+        super().__init__(peer, host, since=now, last_frame=now, registrations=registrations)
+        self.socket = connection
+        self.decoder = FrameDecoder()
+        self.tracker = HandTracker()
+        self.recorders: dict[str, TopicRecorder] = {}
+        self.refused_hosts: set[str] = set()
+        self.announced = False  # in the log
+        self.last_sent = now
+        self._frames = RateLimit(MAX_FRAMES_PER_SECOND)
+
+    def receive(self, frame: WireFrame, now: float) -> Reception | None:
+        """Take one frame; the hand's message if it was one.
+
+        Raises :class:`ProtocolError` when the client breaks the protocol or floods.
+        """
+        self.last_frame = now
+        if not self._frames.take(now):
+            raise ProtocolError(f"more than {MAX_FRAMES_PER_SECOND} frames in a second")
+        reception = self.session.receive(frame)
+        if reception is not None and isinstance(reception.message, HandPose):
+            self.last_pose = now
+        return reception
+
+    def record(self, reception: Reception, now: float) -> None:
+        """Count a message for people to see."""
+        self.recorders.setdefault(reception.topic, TopicRecorder()).record(reception.message, now)
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +74,7 @@ class Handlers:
     admitted: Callable[[Client], None]  # a client drives from now on
     lost: Callable[[str], None]  # the driver is gone, for a reason
     receive: Callable[[Client, WireFrame, float], None]  # a frame of the driver, at a time [s]; may raise ProtocolError
-    due: Callable[[], Iterable[AppMessage]]  # what to send to the driver
+    due: Callable[[], Iterable[HapticFeedback]]  # what to send to the driver
 
 
 class Connections:
@@ -194,8 +232,8 @@ class Connections:
         outgoing = client.session.outgoing
         if not outgoing and client is self._driver:
             # Encoded only now, so that a client that does not read gets the newest vibration and not all of them.
-            for message in self._handlers.due():
-                client.session.queue_message(message)
+            for vibration in self._handlers.due():
+                client.session.queue_haptic(vibration)
             if not outgoing and now - client.last_sent > KEEPALIVE_AFTER:
                 client.session.queue_keepalive()
         try:

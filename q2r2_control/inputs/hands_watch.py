@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from q2r2_control.config.timeouts import STREAM_TIMEOUT
-from q2r2_control.inputs.frozen_pose import FrozenPose
 from q2r2_control.inputs.messages import HandPose
 from q2r2_control.inputs.moved_frame import MovedFrame, PoseVerdict
 from q2r2_control.inputs.session import Reception
@@ -20,6 +19,22 @@ class Watched(NamedTuple):
     reception: Reception
     stamp: float  # receipt time [s]
     fault: HandFault | None = None  # of a pose
+
+
+class FrozenPose:
+    """Finds a pose of one hand that is the copy of an old one: sensor noise changes those of a hand at rest."""
+
+    def __init__(self, allowed: float | None) -> None:
+        """``allowed``: a pose may stay the same for this long [s]; None: for ever."""
+        self._allowed = allowed
+        self._numbers, self._since = b"", 0.0
+
+    def receive(self, pose: HandPose, now: float) -> bool:
+        """Whether ``pose``, received at ``now`` [s], has been the same for too long. Stamp and frame do not count."""
+        numbers = pose.position.tobytes() + pose.quaternion.tobytes()
+        if numbers != self._numbers:
+            self._numbers, self._since = numbers, now
+        return self._allowed is not None and now - self._since >= self._allowed
 
 
 class HandsWatch:

@@ -9,21 +9,17 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 
-import numpy as np
-
 from q2r2_control.config.cell import Config
 from q2r2_control.config.networks import Network
 from q2r2_control.errors import InputError
 from q2r2_control.inputs.addresses import written
-from q2r2_control.inputs.client import Client
-from q2r2_control.inputs.connections import TURN, Connections, Handlers
+from q2r2_control.inputs.connections import TURN, Client, Connections, Handlers
 from q2r2_control.inputs.framing import WireFrame
 from q2r2_control.inputs.hands_watch import HandsWatch, Watched
 from q2r2_control.inputs.listener import TcpListener
-from q2r2_control.inputs.messages import PROP_TOPICS, AppMessage, PropTwist, warm_up
-from q2r2_control.inputs.rate_limits import HostLog, log_writer
+from q2r2_control.inputs.messages import warm_up
+from q2r2_control.inputs.rate_limits import HostLog
 from q2r2_control.inputs.samples import SampleQueue
-from q2r2_control.inputs.session import topic_of
 from q2r2_control.inputs.statistics import HeadsetStatistics
 from q2r2_control.types import QUEST_CONTROLS, SIDES, HandSample, HapticFeedback
 
@@ -67,7 +63,7 @@ class HeadsetServer:
         self._thread: threading.Thread | None = None
         self._stop = threading.Event()
         self._samples = SampleQueue()
-        self._owed: dict[str, AppMessage] = {}  # the newest message of each topic
+        self._owed: dict[str, HapticFeedback] = {}  # the newest of each hand
         self._owed_lock = threading.Lock()
         self._statistics_lock = threading.Lock()  # never taken by poll or what sends
         self._client: Client | None = None
@@ -87,7 +83,7 @@ class HeadsetServer:
             raise InputError(f"headset: already listening on {written(*self._address)}")
         warm_up()
         host, port = self._address
-        log = HostLog(log_writer(_LOG))
+        log = HostLog(_LOG)
         try:
             door = TcpListener(host, port, log)
         except (OSError, OverflowError, ValueError) as error:
@@ -116,14 +112,12 @@ class HeadsetServer:
     def send_haptic(self, feedback: HapticFeedback) -> None:
         """Vibrate, values clipped to 0..1; nothing happens unless a headset listens, or when a value is not finite."""
         values = (feedback.frequency, feedback.amplitude)
-        if feedback.hand in SIDES and all(map(math.isfinite, values)):
-            frequency, amplitude = (min(max(float(value), 0.0), 1.0) for value in values)
-            self._owe(HapticFeedback(feedback.hand, frequency, amplitude))
-
-    def send_twist(self, twist: PropTwist) -> None:
-        """Move a thing in the app; nothing happens unless a headset listens, or when a value is not finite."""
-        if twist.topic in PROP_TOPICS and np.isfinite([twist.linear, twist.angular]).all():
-            self._owe(twist)
+        if feedback.hand not in SIDES or not all(map(math.isfinite, values)) or self._client is None:
+            return
+        frequency, amplitude = (min(max(float(value), 0.0), 1.0) for value in values)
+        with self._owed_lock:
+            self._owed[feedback.hand] = HapticFeedback(feedback.hand, frequency, amplitude)
+        self._connections.wake()
 
     @property
     def statistics(self) -> HeadsetStatistics:
@@ -152,12 +146,6 @@ class HeadsetServer:
         self._connections.wake()
         self._thread.join()
         self._thread = None
-
-    def _owe(self, message: AppMessage) -> None:
-        if self._client is not None:
-            with self._owed_lock:
-                self._owed[topic_of(message)] = message
-            self._connections.wake()
 
     def _run(self, connections: Connections) -> None:
         while not self._stop.is_set():
@@ -203,7 +191,7 @@ class HeadsetServer:
         elif (sample := client.tracker.update(hand, message, watched.stamp, watched.fault)) is not None:
             self._samples.put(sample)
 
-    def _take_owed(self) -> Iterable[AppMessage]:
+    def _take_owed(self) -> Iterable[HapticFeedback]:
         with self._owed_lock:
             owed, self._owed = self._owed, {}
         return owed.values()

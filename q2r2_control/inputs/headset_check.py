@@ -10,9 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from q2r2_control.config.axes import axes_matrix
 from q2r2_control.config.cell import Config
-from q2r2_control.config.teleop import Stance
+from q2r2_control.config.teleop import Stance, axes_matrix
 from q2r2_control.inputs.addresses import ONLY_THIS_MACHINE, app_settings, written
 from q2r2_control.inputs.headset import HeadsetServer
 from q2r2_control.inputs.messages import MessageType

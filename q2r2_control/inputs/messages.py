@@ -6,7 +6,7 @@ Strict checks distinguish the dialects: read with the wrong one, a pose is noise
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from enum import StrEnum
 from functools import cache
 from typing import Any
@@ -63,19 +63,7 @@ class HandTwist:
     angular: Array  # (3,) [rad/s]
 
 
-@dataclass(frozen=True, slots=True)
-class PropTwist:
-    """A velocity for one of the things that the app shows."""
-
-    topic: str  # of PROP_TOPICS
-    linear: Array  # (3,) [m/s]
-    angular: Array  # (3,) [rad/s]
-
-
 HandMessage = HandPose | HandTwist | HandInputs
-AppMessage = HapticFeedback | PropTwist
-
-PROP_TOPICS = ("dice_twist", "q2r_twist")
 
 # quest2ros/msg/OVR2ROSInputs and OVR2ROSHapticFeedback of the public Quest2ROS repository.
 _INPUTS_FIELDS = """
@@ -119,14 +107,7 @@ def decode(kind: MessageType, payload: bytes, dialect: Dialect) -> HandMessage:
         case MessageType.TWIST:
             return HandTwist(_vector(message.linear), _vector(message.angular))
         case _:
-            return HandInputs(
-                button_upper=message.button_upper,
-                button_lower=message.button_lower,
-                thumb_stick_horizontal=message.thumb_stick_horizontal,
-                thumb_stick_vertical=message.thumb_stick_vertical,
-                press_index=message.press_index,
-                press_middle=message.press_middle,
-            )
+            return HandInputs(**{field.name: getattr(message, field.name) for field in fields(HandInputs)})
 
 
 def fits(kind: MessageType, payload: bytes, dialect: Dialect) -> bool:
@@ -138,19 +119,11 @@ def fits(kind: MessageType, payload: bytes, dialect: Dialect) -> bool:
     return True
 
 
-def encode(message: AppMessage, dialect: Dialect) -> bytes:
-    """Serialise a vibration as two float32, frequency and amplitude, or a twist as six float64, linear first."""
-    store = message_types(dialect)
-    if isinstance(message, HapticFeedback):
-        kind = MessageType.HAPTIC
-        content: Any = store.types[kind.full_name](frequency=message.frequency, amplitude=message.amplitude)
-    else:
-        kind = MessageType.TWIST
-        vector = store.types["geometry_msgs/msg/Vector3"]
-        linear, angular = (vector(*values.tolist()) for values in (message.linear, message.angular))
-        content = store.types[kind.full_name](linear=linear, angular=angular)
+def encode(vibration: HapticFeedback, dialect: Dialect) -> bytes:
+    """Serialise a vibration as two float32, frequency and amplitude."""
+    store, name = message_types(dialect), MessageType.HAPTIC.full_name
     write = store.serialize_ros1 if dialect is Dialect.ROS1 else store.serialize_cdr
-    return bytes(write(content, kind.full_name))
+    return bytes(write(store.types[name](frequency=vibration.frequency, amplitude=vibration.amplitude), name))
 
 
 def warm_up() -> None:
@@ -164,8 +137,8 @@ def warm_up() -> None:
 def message_types(dialect: Dialect) -> Typestore:
     """The message types of ROS 1 Noetic or ROS 2 Jazzy, and those of quest2ros."""
     store = get_typestore(Stores.ROS1_NOETIC if dialect is Dialect.ROS1 else Stores.ROS2_JAZZY)
-    for kind, fields in ((MessageType.INPUTS, _INPUTS_FIELDS), (MessageType.HAPTIC, _HAPTIC_FIELDS)):
-        store.register(get_types_from_msg(fields, kind.full_name))
+    for kind, text in ((MessageType.INPUTS, _INPUTS_FIELDS), (MessageType.HAPTIC, _HAPTIC_FIELDS)):
+        store.register(get_types_from_msg(text, kind.full_name))
     return store
 
 

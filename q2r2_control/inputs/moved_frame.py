@@ -1,7 +1,8 @@
 """Notices when not the hands moved but the frame that they are measured in: then both move as one.
 
 A frame moves at once, when the headset is recentred, or for as long as something carries it along, such as the
-operator's head. Either looks like a motion of both hands, and no arm may follow it.
+operator's head. Either looks like a motion of both hands, and no arm may follow it. Human hands do not move as one
+rigid body: they tremble and turn, each on its own.
 """
 
 from __future__ import annotations
@@ -9,17 +10,83 @@ from __future__ import annotations
 import math
 from collections import deque
 from enum import Enum
+from typing import NamedTuple
+
+import numpy as np
+import pinocchio as pin
 
 from q2r2_control.inputs.messages import HandPose
-from q2r2_control.inputs.rigid_motion import HandPair, Move, Place, Tolerance, moved_as_one
-from q2r2_control.types import SIDES, HandInputs
+from q2r2_control.types import SIDES, Array, HandInputs
+
+_QUATERNION_LENGTHS = (0.5, 2.0)
+_FARTHEST = 1e3  # of a coordinate: no tracking system reaches as far [m]
+
+
+class Move(NamedTuple):
+    """From one place to another, or how much that may be."""
+
+    distance: float  # [m]
+    angle: float  # [rad]
+
+
+class Place(NamedTuple):
+    """Where one hand is."""
+
+    position: Array  # (3,) [m]
+    rotation: Array  # (3, 3)
+
+    @classmethod
+    def of(cls, pose: HandPose) -> Place | None:
+        """None where the pose is none."""
+        quaternion = pose.quaternion
+        length = math.sqrt(float(quaternion @ quaternion))
+        if not (_QUATERNION_LENGTHS[0] <= length <= _QUATERNION_LENGTHS[1]):
+            return None
+        if not float(np.abs(pose.position).max()) <= _FARTHEST:
+            return None
+        return cls(pose.position, pin.Quaternion(quaternion / length).toRotationMatrix())
+
+    def move_from(self, other: Place) -> Move:
+        """How it got here from another place."""
+        angle = math.hypot(*pin.log3(other.rotation.T @ self.rotation))
+        return Move(math.dist(self.position, other.position), angle)
+
+
+class HandPair(NamedTuple):
+    """Both hands at a time, and what a motion of both as one rigid body does not change."""
+
+    t: float  # [s]
+    left: Place
+    right: Place
+    seen: Array  # (3,) the right hand's position in the left hand's axes [m]
+    apart: float  # distance of the hands [m]
+    turn: Array  # (3, 3) the right hand's rotation in the left hand's axes
+
+    @classmethod
+    def of(cls, t: float, left: Place, right: Place) -> HandPair:
+        between = right.position - left.position
+        return cls(t, left, right, left.rotation.T @ between, math.hypot(*between), left.rotation.T @ right.rotation)
+
+
+def moved_as_one(before: HandPair, after: HandPair, tolerance: Move) -> bool:
+    """Whether what a rigid motion keeps is kept: distance, relative rotation, and the direction to the other hand.
+
+    An angle's tolerance moves the other hand, as seen from this one, by that angle times the distance of the hands. So
+    that direction may change by as much; a smaller bound would demand less noise of the rotations than is allowed.
+    """
+    if abs(after.apart - before.apart) > tolerance.distance:
+        return False
+    if math.dist(after.seen, before.seen) > tolerance.distance + tolerance.angle * after.apart:
+        return False
+    return 0.5 * (float(np.vdot(before.turn, after.turn)) - 1.0) >= math.cos(tolerance.angle)
+
 
 # A step: from one sample to the next by more than this, and by more than _STANDS_OUT times any of the _BEFORE samples
 # before. From rest that is 0.7 m/s within one sample, more than 30 m/s^2.
 _STEP = Move(0.010, math.radians(2.0))
 _STANDS_OUT, _BEFORE = 3.0, 4
 _PERIOD = 1.0 / 72.0  # of samples; closer ones were held up on the way [s]
-_STEP_TOLERANCE = Tolerance(0.002, math.radians(0.75))
+_STEP_TOLERANCE = Move(0.002, math.radians(0.75))
 # Over a longer gap hands get farther by themselves, from rest with its square: at 20 m/s^2 and 70 rad/s^2 by _STEP [s].
 _STEP_GAP = 0.032
 
@@ -27,7 +94,7 @@ _STEP_GAP = 0.032
 _WINDOW = 1.5  # [s]
 _CARRIED = 0.15  # of both hands [m]
 _NEAR = 0.4 * _CARRIED
-_CARRIED_TOLERANCE = Tolerance(0.001, math.radians(0.5))
+_CARRIED_TOLERANCE = Move(0.001, math.radians(0.5))
 
 _SAME_TIME = 0.01  # the two hands' messages of one time come within this [s]
 _ALIVE = 0.05  # a hand without a pose for longer is not waited for [s]

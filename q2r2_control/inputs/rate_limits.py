@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
 from dataclasses import dataclass
 
 LINES_PERIOD = 1.0  # between two lines about one host [s]
@@ -48,8 +47,8 @@ class HostLog:
     written, with the number of those left out.
     """
 
-    def __init__(self, write: Callable[[int, str], None]) -> None:
-        self._write = write
+    def __init__(self, logger: logging.Logger) -> None:
+        self._logger = logger
         self._hosts: dict[str, _Host] = {}
 
     def write(self, host: str, level: int, text: str, now: float) -> None:
@@ -80,7 +79,5 @@ class HostLog:
         """Write all that was held back."""
         self.flush(float("inf"))
 
-
-def log_writer(logger: logging.Logger) -> Callable[[int, str], None]:
-    """What :class:`HostLog` writes with. The text is no format: it may quote what a client sent."""
-    return lambda level, text: logger.log(level, "%s", text)
+    def _write(self, level: int, text: str) -> None:
+        self._logger.log(level, "%s", text)  # the text is no format: it may quote what a client sent

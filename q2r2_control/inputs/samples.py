@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import threading
-from itertools import pairwise
+from collections import deque
 
 from q2r2_control.inputs.messages import HandMessage, HandPose
 from q2r2_control.types import SIDES, HandFault, HandInputs, HandSample
 
-SAMPLES_KEPT = 64  # of each hand between two polls: over 0.4 s of pose and inputs at 75 Hz each
+# Between two polls: 0.8 s of poses and inputs of two hands at 75 Hz; a loop that stalls for longer pauses all arms.
+SAMPLES_KEPT = 256
 
 
 class HandTracker:
@@ -40,10 +41,7 @@ class HandTracker:
 
 
 class SampleQueue:
-    """Bounded queue between two threads that keeps the newest samples and every button edge, and shows a cut.
-
-    A full queue drops the oldest sample whose buttons equal those of the same hand's next one: poses are lost, but no
-    press or release. Only a hand that pressed ``SAMPLES_KEPT`` times between two polls loses the oldest press.
+    """Bounded queue between two threads that keeps the newest samples, and shows a cut.
 
     After :meth:`cut` the next two takes are empty and :attr:`is_cut` stays true from the cut until the second: a loop
     that checks once a tick, before or after it takes, cannot miss that a connection was lost and made again in between,
@@ -52,7 +50,7 @@ class SampleQueue:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._samples: list[HandSample] = []
+        self._samples: deque[HandSample] = deque(maxlen=SAMPLES_KEPT)
         self._takes_owed = 0
 
     @property
@@ -63,8 +61,6 @@ class SampleQueue:
         """Append the newest sample."""
         with self._lock:
             self._samples.append(sample)
-            if sum(other.hand == sample.hand for other in self._samples) > SAMPLES_KEPT:
-                del self._samples[self._expendable(sample.hand)]
 
     def take(self) -> list[HandSample]:
         """All samples since the last take, oldest first."""
@@ -72,7 +68,8 @@ class SampleQueue:
             if self._takes_owed:
                 self._takes_owed -= 1
                 return []
-            samples, self._samples = self._samples, []
+            samples = list(self._samples)
+            self._samples.clear()
             return samples
 
     def cut(self) -> None:
@@ -80,14 +77,3 @@ class SampleQueue:
         with self._lock:
             self._samples.clear()
             self._takes_owed = 2
-
-    def _expendable(self, hand: str) -> int:
-        indices = [index for index, sample in enumerate(self._samples) if sample.hand == hand]
-        for index, successor in pairwise(indices):
-            if _buttons(self._samples[index]) == _buttons(self._samples[successor]):
-                return index
-        return indices[0]
-
-
-def _buttons(sample: HandSample) -> tuple[bool, bool]:
-    return sample.inputs.button_upper, sample.inputs.button_lower

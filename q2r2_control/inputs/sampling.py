@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from typing import Protocol
+from itertools import count
 
 import numpy as np
 import pinocchio as pin
@@ -18,45 +18,39 @@ _RECEIPT_JITTER = 0.0015  # [s], scale of an exponential distribution
 _ROTATION_NOISE = math.radians(0.03)
 
 
-class SampleTiming(Protocol):
-    """How the samples of one hand come about. For each of ``times`` ``measured`` is asked first, then ``lateness``."""
+class SampleTiming:
+    """How the samples of one hand come about: exact and at once, unless a subclass says otherwise.
+
+    For each of ``times`` ``measured`` is asked first, then ``lateness``.
+    """
 
     def times(self) -> Iterator[float]:
         """Times [s] of all samples, from 0 on without end."""
-        ...
+        raise NotImplementedError
 
     def measured(self, pose: pin.SE3, t: float) -> pin.SE3:
         """What is measured of a hand that is at ``pose`` at ``t`` [s]."""
-        ...
+        return pose
 
     def lateness(self) -> float:
         """Receipt of a sample after its measurement [s]."""
-        ...
+        return 0.0
 
 
-class EvenSampling:
+class EvenSampling(SampleTiming):
     """Exact poses at an even rate [Hz], received at once, or each later by up to ``jitter`` [s], from ``seed``."""
 
     def __init__(self, rate_hz: float, jitter: float = 0.0, seed: int | tuple[int, ...] = 0) -> None:
         self._rate, self._jitter, self._random = rate_hz, jitter, np.random.default_rng(seed)
 
     def times(self) -> Iterator[float]:
-        """See :class:`SampleTiming`."""
-        count = 0
-        while True:
-            yield count / self._rate
-            count += 1
-
-    def measured(self, pose: pin.SE3, t: float) -> pin.SE3:
-        """See :class:`SampleTiming`."""
-        return pose
+        return (index / self._rate for index in count())
 
     def lateness(self) -> float:
-        """See :class:`SampleTiming`."""
         return float(self._random.uniform(0.0, self._jitter))
 
 
-class HeadsetSampling:
+class HeadsetSampling(SampleTiming):
     """A headset's samples, all from ``seed``: uneven at 72-76 Hz, received late, with sensor noise.
 
     ``position_noise`` is the noise's standard deviation along each axis [m]. ``tremor`` adds that of a human hand, 8-12
@@ -80,14 +74,12 @@ class HeadsetSampling:
         self._amplitudes = 0.5 * tremor * np.array([1e-3] * 3 + [math.radians(0.3)] * 3)
 
     def times(self) -> Iterator[float]:
-        """See :class:`SampleTiming`."""
         t = 0.0
         while True:
             yield t
             t += self._interval()
 
     def measured(self, pose: pin.SE3, t: float) -> pin.SE3:
-        """See :class:`SampleTiming`."""
         tones = np.sin(2.0 * math.pi * self._frequencies * t + self._phases).sum(axis=1)
         tremor: Array = self._amplitudes * tones
         shift = tremor[:3] + self._random.normal(0.0, self._position_noise, 3)
@@ -95,7 +87,7 @@ class HeadsetSampling:
         return pin.SE3(pin.exp3(turn) @ pose.rotation, pose.translation + shift)
 
     def lateness(self) -> float:
-        """See :class:`SampleTiming`; short of a sample's period, so that the order is kept."""
+        """Short of a sample's period, so that the order is kept."""
         return min(float(self._random.exponential(_RECEIPT_JITTER)), 0.01)
 
     def _interval(self) -> float:

@@ -11,8 +11,6 @@ from typing import Any, NamedTuple
 from q2r2_control.errors import ProtocolError
 from q2r2_control.inputs.framing import KEEPALIVE, WireFrame, encode_frame
 from q2r2_control.inputs.messages import (
-    PROP_TOPICS,
-    AppMessage,
     Dialect,
     HandMessage,
     MessageType,
@@ -46,7 +44,6 @@ HAPTIC_TOPICS = {hand: f"q2r_{hand}_hand_haptic_feedback" for hand in SIDES}
 _TOPIC_TYPES: dict[str, str] = {
     **{name: topic.kind.value for name, topic in HAND_TOPICS.items()},
     **dict.fromkeys(HAPTIC_TOPICS.values(), MessageType.HAPTIC.value),
-    **dict.fromkeys(PROP_TOPICS, MessageType.TWIST.value),
 }
 _TOPIC_NAME = re.compile(r"[A-Za-z~_][A-Za-z0-9_~/]{0,255}")
 
@@ -57,11 +54,6 @@ class Reception(NamedTuple):
     topic: str  # without leading slash
     hand: str
     message: HandMessage
-
-
-def topic_of(message: AppMessage) -> str:
-    """The topic that carries ``message`` to the app."""
-    return HAPTIC_TOPICS[message.hand] if isinstance(message, HapticFeedback) else message.topic
 
 
 def log_frame(level: str, text: str) -> bytes:
@@ -129,11 +121,11 @@ class HeadsetSession:
         """Tell the client that the server is alive."""
         self.outgoing += KEEPALIVE
 
-    def queue_message(self, message: AppMessage) -> None:
-        """Send a vibration or a twist, if the client listens; otherwise nothing happens."""
-        destination = self.subscribed.get(topic_of(message))
+    def queue_haptic(self, vibration: HapticFeedback) -> None:
+        """Send a vibration, if the client listens; otherwise nothing happens."""
+        destination = self.subscribed.get(HAPTIC_TOPICS[vibration.hand])
         if destination is not None and self.dialect is not None:
-            self.outgoing += encode_frame(destination, encode(message, self.dialect))
+            self.outgoing += encode_frame(destination, encode(vibration, self.dialect))
 
     def _agree_on_dialect(self, frame: WireFrame) -> None:
         dialect = Dialect.ROS2 if frame.terminated else Dialect.ROS1
@@ -180,10 +172,8 @@ class HeadsetSession:
                 types = _TOPIC_TYPES | self.published
                 names = [f"/{name}" for name in types]  # as in the ROS graph
                 self._answer("__topic_list", {"topics": names, "types": list(types.values())})
-            case "__ros_service" | "__unity_service":
-                self._answer("__warn", {"text": f"{command} {_topic(command, parameters)}: q2r2 offers no services"})
-            case "__remove_ros_service" | "__remove_unity_service":
-                pass  # none was registered
+            case "__ros_service" | "__unity_service" | "__remove_ros_service" | "__remove_unity_service":
+                pass  # there are none
             case "__request":
                 self._skip_body = True
                 self._answer("__error", {"text": "__request: q2r2 offers no services"})

@@ -56,7 +56,7 @@ class OperatorFeedback:
             self._due += self._wait
             self._inspect(next(self._turns), tick)
         for arm, pulses in self._pulses.items():
-            if not pulses.idle and (feedback := pulses.at(now, self._hand_of(arm))) is not None:
+            if (feedback := pulses.at(now, self._hand_of(arm))) is not None:
                 self._send(feedback)
 
     def _inspect(self, arm: str, tick: Tick) -> None:

@@ -8,20 +8,10 @@ import numpy as np
 import pinocchio as pin
 
 from q2r2_control.config.teleop import GuardSettings
-from q2r2_control.quaternions import (
-    IDENTITY,
-    Vector,
-    floats_of,
-    normalized,
-    se3_of,
-    turn_between,
-    turned_by,
-)
 from q2r2_control.supervision.tick_pacer import TickPacer
-from q2r2_control.types import LONGEST_DT, Pose
+from q2r2_control.types import LONGEST_DT, Array
 
 _REST = 1e-9  # slower than this is at rest [m/s, rad/s]
-_ZERO: Vector = (0.0, 0.0, 0.0)
 
 
 class PoseRateLimiter:
@@ -45,8 +35,7 @@ class PoseRateLimiter:
         self.pose: pin.SE3 | None = None
         self.clipped = 0  # steps in which a limit held the pose back, since the start
         self._linear, self._angular = _Limited(), _Limited()
-        self._at: Pose = _ZERO, IDENTITY  # of ``pose``, in floats: they take a fraction of the time of NumPy's arrays
-        self._target: Pose | None = None
+        self._target: pin.SE3 | None = None
         self._now, self._period = -math.inf, period
         self.change(settings)
 
@@ -67,11 +56,7 @@ class PoseRateLimiter:
 
     def reset(self, pose: pin.SE3 | None, now: float) -> None:
         """Rest at ``pose``, or at none, from ``now`` [s] on."""
-        self.pose, self._target, self._now = None, None, now
-        if pose is not None:
-            position, rotation = floats_of(pose)
-            self._at = position, normalized(rotation)
-            self.pose = se3_of(self._at)
+        self.pose, self._target, self._now = pose, None, now
         self._linear.stop()
         self._angular.stop()
 
@@ -90,34 +75,27 @@ class PoseRateLimiter:
         if gap > self._period:
             dt = self._pacer.step(gap, np.array([self._linear.speed, self._angular.speed]))
         self._now = now
-        at, faces = self._at
-        wanted = None if target is None else floats_of(target)
-        if wanted is None or not _is_finite(wanted):
-            limited = False
-            self._target = None
+        at = self.pose
+        if target is None or not np.isfinite(target.homogeneous).all():
+            self._target, limited = None, False
             shift, turn = self._linear.brake(dt), self._angular.brake(dt)
         else:
-            last, self._target = self._target or self._at, wanted
-            lag, way = _sum(last[0], at, -1.0), _sum(wanted[0], last[0], -1.0)
-            angle_lag, angle_way = turn_between(faces, last[1]), turn_between(last[1], wanted[1])
+            last, self._target = self._target or at, target
             # Of a late step only the part that is moved now counts as the target's own motion; the rest is lag.
-            now_share, late_share = dt / gap, 1.0 - dt / gap
-            shift, slow = self._linear.follow(_sum(lag, way, late_share), _scaled(way, now_share), dt)
-            turn, slow_turn = self._angular.follow(
-                _sum(angle_lag, angle_way, late_share), _scaled(angle_way, now_share), dt
-            )
+            share = dt / gap
+            lag, way = last.translation - at.translation, target.translation - last.translation
+            shift, slow = self._linear.follow(lag + (1.0 - share) * way, share * way, dt)
+            lag, way = _turn(at, last), _turn(last, target)
+            turn, slow_turn = self._angular.follow(lag + (1.0 - share) * way, share * way, dt)
             limited = slow or slow_turn
         self.clipped += limited
-        self._at = _sum(at, shift), normalized(turned_by(faces, turn))
-        self.pose = se3_of(self._at)
+        rotation = pin.Quaternion(pin.exp3(turn) @ at.rotation).normalized()
+        self.pose = pin.SE3(rotation, at.translation + shift)
         return self.pose
 
 
 class _Limited:
-    """Velocity of a position or a rotation that is bounded together with its change.
-
-    In every tick, where sums of three floats take a tenth of the time that NumPy takes for arrays of three.
-    """
+    """Velocity of a position or a rotation that is bounded together with its change."""
 
     def __init__(self) -> None:
         self.limit(0.0, 0.0)
@@ -131,51 +109,40 @@ class _Limited:
         return math.hypot(*self._velocity)
 
     def stop(self) -> None:
-        self._velocity = _ZERO
+        self._velocity = np.zeros(3)
 
-    def brake(self, dt: float) -> Vector:
+    def brake(self, dt: float) -> Array:
         """What to move in ``dt`` [s] while coming to rest."""
-        return self._towards(_ZERO, dt)[0]
+        return self._towards(np.zeros(3), dt)[0]
 
-    def follow(self, lag: Vector, way: Vector, dt: float) -> tuple[Vector, bool]:
+    def follow(self, lag: Array, way: Array, dt: float) -> tuple[Array, bool]:
         """What to move in ``dt`` [s], and whether that is less than asked for.
 
         ``lag`` is from the pose to the last target, ``way`` from that to this one.
         """
-        own = _scaled(way, 1.0 / dt)
+        own = way / dt
         if math.hypot(*own) > self._max:
-            lag, own = _sum(lag, way), _ZERO
-        distance = math.hypot(*lag)
-        wanted = own
+            lag, own = lag + way, np.zeros(3)
+        distance, wanted = math.hypot(*lag), own
         if distance > 0.0:
             a = self._acceleration
             speed = min(distance / dt, a * (-0.5 * dt + math.sqrt(0.25 * dt * dt + 2.0 * distance / a)))
-            wanted = _sum(own, lag, speed / distance)
+            wanted = own + (speed / distance) * lag
         shift, limited = self._towards(wanted, dt)
         return shift, limited or distance > self._max * dt
 
-    def _towards(self, wanted: Vector, dt: float) -> tuple[Vector, bool]:
-        change = _sum(_at_most(wanted, self._max), self._velocity, -1.0)
-        self._velocity = _sum(self._velocity, _at_most(change, self._acceleration * dt))
-        return _scaled(self._velocity, dt), math.dist(self._velocity, wanted) > _REST
+    def _towards(self, wanted: Array, dt: float) -> tuple[Array, bool]:
+        change = _at_most(wanted, self._max) - self._velocity
+        self._velocity = self._velocity + _at_most(change, self._acceleration * dt)
+        return self._velocity * dt, math.dist(self._velocity, wanted) > _REST
 
 
-def _at_most(vector: Vector, length: float) -> Vector:
+def _at_most(vector: Array, length: float) -> Array:
     norm = math.hypot(*vector)
-    return vector if norm <= length else _scaled(vector, length / norm)
+    return vector if norm <= length else vector * (length / norm)
 
 
-def _scaled(a: Vector, factor: float) -> Vector:
-    x, y, z = a
-    return factor * x, factor * y, factor * z
-
-
-def _sum(a: Vector, b: Vector, factor: float = 1.0) -> Vector:
-    """a + factor b."""
-    (x, y, z), (dx, dy, dz) = a, b
-    return x + factor * dx, y + factor * dy, z + factor * dz
-
-
-def _is_finite(pose: Pose) -> bool:
-    # A sum with NaN or infinity in it is not finite; nor is the quaternion of a matrix with one.
-    return math.isfinite(sum(pose[0]) + sum(pose[1]))
+def _turn(start: pin.SE3, end: pin.SE3) -> Array:
+    """The rotation vector from one pose to another, in the axes that both are told in [rad]."""
+    turn: Array = pin.log3(end.rotation @ start.rotation.T)
+    return turn

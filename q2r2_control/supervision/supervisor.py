@@ -11,7 +11,6 @@ are passed in.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from enum import StrEnum
 
@@ -122,21 +121,13 @@ class Supervisor:
             self.events.append(Reason(ReasonKind.JOINT_STATES, cause=fault))
 
     def update_target(
-        self,
-        arm: str,
-        pose: pin.SE3 | None,
-        now: float,
-        number: int | None = None,
-        due: float | None = None,
+        self, arm: str, pose: pin.SE3 | None, now: float, number: int | None = None, due: float | None = None
     ) -> Reason | None:
         """A target in the world frame, or None for one that was no pose; returns why it is not followed, or None.
 
         ``number`` is the one among its publisher's messages, where the middleware tells; ``due``: when the
         target is to be reached [s], None: at once, and until the next one comes.
         """
-        plain = number is None and pose is not None and self.no_targets is None
-        if plain and self._targets.go_on(arm, pose, now, due):
-            return None
         tools: list[pin.SE3] = []
         if not self._targets.follows_on(arm, now):
             tools.append(self._controller.tool_pose(arm))
@@ -228,8 +219,6 @@ class Supervisor:
         state = self._watch.state
         if self.phase is not Phase.ACTIVE or self._last is None or state is None:
             return False
-        if math.dist(state.q.tolist(), self._last.q.tolist()) <= _OFF_REFERENCE:
-            return False  # none is, as in most ticks, which this tells in a third of the time
         return bool(((np.abs(state.q - self._last.q) > _OFF_REFERENCE) & (np.abs(state.v) < _STILL)).any())
 
     def let_go(self, fault: Reason, now: float) -> None:

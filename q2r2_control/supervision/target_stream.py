@@ -69,13 +69,6 @@ class TargetStream:
         self.reset()
         return was_following
 
-    def goes_on(self, pose: pin.SE3, now: float) -> bool:
-        """Take the next target of the followed stream. Returns False and changes nothing if none is followed."""
-        if self.pose is None or not self._is_recent(now):
-            return False
-        self.pose, self._last, self.stamp = pose, pose, now
-        return True
-
     def _is_recent(self, now: float) -> bool:
         """Whether the last target came within the timeout."""
         return now - self.stamp <= self._settings.timeout
@@ -86,7 +79,8 @@ class TargetStream:
         ``tools`` are the poses that count as the tool's: the reference's, and the measured one where it is known. An
         arm that was pushed away from its reference is engaged where it is. An arm that follows a stream needs none.
         """
-        if self.goes_on(pose, now):
+        if self.following and self._is_recent(now):
+            self.pose, self._last, self.stamp = pose, pose, now
             return None
         self.expire(now)
         last, self._last, self.stamp = self._last, pose, now

@@ -29,7 +29,7 @@ class TargetStreams:
         self._newly_ended: list[Reason] = []
 
     def at(self, now: float) -> dict[str, pin.SE3 | None]:
-        """What each arm follows at ``now`` [s], see :mod:`target_line`; None: it holds."""
+        """What each arm follows at ``now`` [s], see :class:`TargetExtrapolator`; None: it holds."""
         lines = self._lines
         return {arm: None if stream.pose is None else lines[arm].at(now) for arm, stream in self._streams.items()}
 
@@ -46,16 +46,6 @@ class TargetStreams:
         """Whether an arm follows its targets, and a target at ``now`` [s] still belongs to them."""
         self._expire(arm, now)
         return self._streams[arm].following
-
-    def go_on(self, arm: str, pose: pin.SE3, now: float, due: float | None = None) -> bool:
-        """Take the next target of a stream that an arm follows. Returns False and changes nothing if it follows none.
-
-        What :meth:`offer` does at most ticks, where nothing forbids it and its message has no number.
-        """
-        if not self._streams[arm].goes_on(pose, now):
-            return False
-        self._lines[arm].put(pose, due)
-        return True
 
     def age(self, arm: str, now: float) -> float:
         """Time since the last target of an arm that was a pose [s]."""

@@ -16,8 +16,6 @@ Then the reference goes on too, by the time that passed, up to 0.1 s; what is co
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from q2r2_control.types import LONGEST_DT, Array
@@ -35,7 +33,6 @@ class TickPacer:
         self.stretched = 0.0  # time by which the motion is late for it [s]
         self._way = velocity_limit * period  # in one period [rad]
         self._acceleration = acceleration_limit
-        self._shortest, self._fastest = float(self._way.min()), float(acceleration_limit.max())
         self._coasts = coasts
 
     def step(self, gap: float, v: Array) -> float:
@@ -49,12 +46,7 @@ class TickPacer:
             return gap
         # Half a period late is jitter; from there on a command is missing.
         self.missed_ticks += max(round(gap / self.period) - 1, 0)
-        if self._coasts:
-            step = min(gap, LONGEST_DT)
-        elif math.hypot(*v.tolist()) * gap + 0.5 * self._fastest * gap * gap <= self._shortest:
-            step = gap  # not even all joints' speeds in one could use up the shortest way: told in a fifth of the time
-        else:
-            step = min(gap, max(self.period, self._longest(v)))
+        step = min(gap, LONGEST_DT if self._coasts else max(self.period, self._longest(v)))
         self.stretched += gap - step
         return step
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from q2r2_control.config.bindings import Action, BindingSettings
-from q2r2_control.teleop.held_controls import travel
+from q2r2_control.teleop.gestures import travel
 from q2r2_control.types import HandInputs
 
 _SLACK = 0.05  # of a trigger's way at both ends, which not every controller reaches
@@ -24,9 +24,8 @@ class AnalogGripper:
         """``speed``: greatest, in openings a second."""
         bound = (binding.control for binding in bindings.bound() if binding.action is Action.GRIPPER_ANALOG)
         self._control = next(bound, None)
-        self.bound = self._control is not None  # a trigger moves the gripper at all
         self._speed = speed
-        self._stamp, self._at = -math.inf, -math.inf
+        self._at = -math.inf
         self.forget()
 
     def forget(self) -> None:
@@ -34,21 +33,16 @@ class AnalogGripper:
         self._wanted: float | None = None
         self._picked_up = False
 
-    def receive(self, inputs: HandInputs, stamp: float, now: float, opening: float) -> None:
-        """Process one reading received at ``stamp`` [s] while the gripper is commanded to ``opening``."""
-        stamp = min(stamp, now)
-        if self._control is None or not self._stamp <= stamp or stamp == -math.inf:
-            return
-        self._stamp = stamp
-        value = travel(self._control, inputs)
-        if not math.isfinite(value):
+    def receive(self, inputs: HandInputs, opening: float) -> None:
+        """Process a new reading while the gripper is commanded to ``opening``."""
+        if self._control is None or not math.isfinite(value := travel(self._control, inputs)):
             return
         wanted = 1.0 - min(max((value - _SLACK) / (1.0 - 2.0 * _SLACK), 0.0), 1.0)
+        before = wanted if self._wanted is None else self._wanted
         if not self._picked_up:
-            before = wanted if self._wanted is None else self._wanted
             self._picked_up = min(before, wanted) - _PICK_UP <= opening <= max(before, wanted) + _PICK_UP
             self._wanted = wanted
-        elif self._wanted is None or abs(wanted - self._wanted) >= _HYSTERESIS or wanted in (0.0, 1.0):
+        elif abs(wanted - before) >= _HYSTERESIS or wanted in (0.0, 1.0):
             self._wanted = wanted
 
     def opening(self, opening: float, now: float) -> float:

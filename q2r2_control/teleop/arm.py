@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+import math
+from collections.abc import Iterable
 
 import numpy as np
 import pinocchio as pin
@@ -13,17 +14,13 @@ from q2r2_control.events import Event, Reason, ReasonKind
 from q2r2_control.quaternions import floats_of
 from q2r2_control.teleop.analog_gripper import AnalogGripper
 from q2r2_control.teleop.arm_states import ArmState, Cause, next_state
-from q2r2_control.teleop.carry import CarriedTools
 from q2r2_control.teleop.gate import PoseGate
-from q2r2_control.teleop.gestures import GestureRecognizer, Press
+from q2r2_control.teleop.gestures import GestureRecognizer, HeldControls, Press
 from q2r2_control.teleop.hand_motion import HandMotion, Shares
-from q2r2_control.teleop.held_controls import HeldControls
-from q2r2_control.teleop.steady_state_offset import Anchor
-from q2r2_control.teleop.workspace import Workspace
-from q2r2_control.types import Array, HandSample, Pose
+from q2r2_control.teleop.steady_state_offset import ArmMeasurements
+from q2r2_control.types import Array, HandInputs, HandSample, Pose
 
 OPEN, CLOSED = 1.0, 0.0
-_WHOLE: Shares = (1.0, 1.0)
 
 
 class ArmTeleop:
@@ -38,18 +35,16 @@ class ArmTeleop:
         self.gripper = OPEN
         self.offset: Array | None = None  # of the tool when the arm was last engaged (3,) [m]; None: none
         self.events: list[Event] = []
-        self._settings, self._precision = settings, settings.precision_scale
-        self._timeout = settings.gate.timeout
+        self.motion = HandMotion(arm, settings)
+        self._settings = settings
         self._gate = PoseGate(settings.gate)
-        self._motion = HandMotion(arm, settings)
-        self._use(settings)
+        self._use_controls(settings)
+        self._inputs_stamp = -math.inf  # of the newest reading of the controls [s]
         self._presses: list[Press] = []
         self._gripped: bool | None = None  # the dead man was just held, or let go
         self._aligned_at = 0.0
-        self._obstacle: Reason | None = None
 
-    def _use(self, settings: TeleopSettings) -> None:
-        self._bindings = settings.bindings
+    def _use_controls(self, settings: TeleopSettings) -> None:
         self._has_dead_man = settings.bindings.words_of(Action.DEAD_MAN) is not None
         self._held = HeldControls(settings.bindings)
         self._analog = AnalogGripper(settings.bindings, settings.gripper_speed)
@@ -61,47 +56,48 @@ class ArmTeleop:
         Those of the controls may be changed while the arm holds only: what is pressed now is forgotten.
         """
         if of_controls(settings) != of_controls(self._settings):
-            self._use(settings)
-        self._settings, self._precision = settings, settings.precision_scale
-        self._timeout = settings.gate.timeout
+            self._use_controls(settings)
+        self._settings = settings
         self._gate.settings = settings.gate
-        self._motion.change(settings)
+        self.motion.configure(settings)
         if self.state is ArmState.ENGAGED and self._gate.pose is not None and last is not None:
-            self._motion.anchor(self._gate.pose, floats_of(last), self._shares(), now)
+            self.motion.anchor(self._gate.pose, floats_of(last), self._shares(), now)
 
     @property
     def chord(self) -> bool:
         """Whether this hand's alignment chord is held."""
         return self._gestures.chord
 
-    @property
-    def held(self) -> frozenset[Action]:
-        """What the hand's triggers and stick are held for."""
-        return self._held.actions
-
     def receive(self, sample: HandSample, now: float) -> Reason | None:
         """Process one sample of this arm's hand; returns the fault that forbids to follow it any longer, or None."""
-        self._presses += self._gestures.receive(sample.inputs, sample.inputs_stamp, now)
-        held = self.held
-        self._held.receive(sample.inputs, sample.inputs_stamp, now)
-        self._analog.receive(sample.inputs, sample.inputs_stamp, now, self.gripper)
-        if Action.DEAD_MAN in held ^ self.held:
-            self._gripped = Action.DEAD_MAN in self.held
+        stamp = min(sample.inputs_stamp, now)
+        if -math.inf < stamp and self._inputs_stamp <= stamp:  # an older reading was overtaken, and says nothing
+            self._inputs_stamp = stamp
+            self._read_controls(sample.inputs, stamp)
         usable, fault = self._gate.receive(sample, now)
         if usable and fault is None and self._gate.pose is not None:
-            self._motion.note(self._gate.pose)
+            self.motion.observe(self._gate.pose)
             if self.state is ArmState.ENGAGED:
-                self._motion.add(self._gate.pose, self._gate.stamp, now)
+                self.motion.add(self._gate.pose, self._gate.stamp, now)
         if usable and self.state is ArmState.ALIGNING:
             return None  # realigning makes the pose jump, and the arm is not following
         return fault
 
+    def _read_controls(self, inputs: HandInputs, stamp: float) -> None:
+        self._presses += self._gestures.receive(inputs, stamp)
+        before = self._held.actions
+        self._held.receive(inputs)
+        self._analog.receive(inputs, self.gripper)
+        if Action.DEAD_MAN in before ^ self._held.actions:
+            self._gripped = Action.DEAD_MAN in self._held.actions
+
     def watchdog(self, now: float) -> Reason | None:
         """The fault of a stream that has stopped, or None."""
+        timeout = self._settings.gate.timeout
         if self._gate.stale(now):
-            return Reason.of(ReasonKind.POSE_SILENT, timeout=self._timeout)
-        if self._gestures.stale(now, self._timeout):
-            return Reason.of(ReasonKind.INPUTS_SILENT, timeout=self._timeout)
+            return Reason.of(ReasonKind.POSE_SILENT, timeout=timeout)
+        if now - self._inputs_stamp > timeout:  # the operator could not stop the arm by a button
+            return Reason.of(ReasonKind.INPUTS_SILENT, timeout=timeout)
         return None
 
     def change(self, cause: Cause, now: float, reason: Reason) -> None:
@@ -120,11 +116,6 @@ class ArmTeleop:
         """What the operator should know while the state stays."""
         self.events.append(Event(now, self.arm, self.state, self.state, reason))
 
-    @property
-    def settled(self) -> bool:
-        """Whether this hand's controls can cause nothing before its next sample, so that :meth:`act` can wait."""
-        return self._gestures.settled and not self._analog.bound
-
     def take_presses(self, now: float) -> list[Press]:
         """Gestures since the last call; those that nobody gives to :meth:`act` are lost."""
         presses = self._presses + self._gestures.due(now)
@@ -141,38 +132,27 @@ class ArmTeleop:
     def forget(self) -> None:
         """Drop everything received: poses are forgotten, buttons count as held until they are seen released."""
         self._gate.reset()
-        self._motion.forget()
+        self.motion.forget()
+        self._inputs_stamp = -math.inf
         self._gestures.forget()
         self._held.forget()
         self._analog.forget()
         self._presses.clear()
         self._gripped = None
 
-    def act(
-        self,
-        presses: Iterable[Press],
-        anchor: Callable[[], Anchor | None],
-        now: float,
-        chord: bool,
-        obstacle: Reason | None = None,
-    ) -> None:
-        """Change the state by this hand's gestures, and by chords.
-
-        ``anchor``: gives what to anchor to, None if not known, and is only asked where the arm is engaged;
-        ``chord``: whether a hand holds the alignment chord; ``obstacle``: why the arm may not be engaged now, or None.
-        """
-        self._obstacle = obstacle
+    def act(self, presses: Iterable[Press], around: ArmMeasurements, now: float, chord: bool) -> None:
+        """Change the state by this hand's gestures, and by chords; ``chord``: whether a hand holds one."""
         if self._gripped is False:
             self._go(Cause.LET_GO, now, Reason(ReasonKind.DEAD_MAN_RELEASED))
         if chord:
             self._align(now)
         elif self.state is ArmState.ALIGNING and self._gate.pose is not None and self._gate.stamp >= self._aligned_at:
-            self._engage(Cause.ALIGNED, anchor(), now, Reason(ReasonKind.ALIGNED))
+            self._engage(Cause.ALIGNED, around, now, Reason(ReasonKind.ALIGNED))
         elif self._gripped:
-            self._engage(Cause.ENGAGE, anchor(), now, Reason(ReasonKind.DEAD_MAN_HELD))
+            self._engage(Cause.ENGAGE, around, now, Reason(ReasonKind.DEAD_MAN_HELD))
         self._gripped = None
         for press in presses:
-            self._press(press, anchor, now)
+            self._press(press, around, now)
         if self.state is not ArmState.STOPPED:
             self.gripper = self._analog.opening(self.gripper, now)
 
@@ -182,35 +162,17 @@ class ArmTeleop:
         ``expected``: where it is to be measured by the controller's reference, from which no target is farther than
         the leash.
         """
-        return self._motion.target(self._gate.pose, expected, self._shares(), now)
-
-    @property
-    def slip(self) -> tuple[float, float]:
-        """See :attr:`HandMotion.slip`."""
-        return self._motion.slip
-
-    @property
-    def filtered_hand(self) -> Pose | None:
-        """The pose of its hand, filtered, that the last :meth:`target` was made of; None before the first."""
-        return self._motion.filtered
-
-    def workspace(self) -> Workspace:
-        """The box of its targets."""
-        return self._motion.workspace()
-
-    def lead(self, tools: CarriedTools, other: str, box: Workspace, now: float) -> None:
-        """Move the frame of ``tools``, of this arm and the ``other`` with its ``box``, until the next engagement."""
-        self._motion.carry(tools, other, box, now)
+        return self.motion.target(self._gate.pose, expected, self._shares(), now)
 
     def _align(self, now: float) -> None:
         self._aligned_at = now
         if self.state is not ArmState.PAUSING or self.chord:  # the other hand's chord does not say what this press is
             self._go(Cause.CHORD, now, Reason(ReasonKind.ALIGNMENT_CHORD))
 
-    def _press(self, press: Press, anchor: Callable[[], Anchor | None], now: float) -> None:
+    def _press(self, press: Press, around: ArmMeasurements, now: float) -> None:
         control, gesture = press
-        action = self._bindings.action_of(control, gesture)
-        pauses = self._bindings.action_of(control, Gesture.TAP) is Action.PAUSE_TOGGLE
+        action = self._settings.bindings.action_of(control, gesture)
+        pauses = self._settings.bindings.action_of(control, Gesture.TAP) is Action.PAUSE_TOGGLE
         reason = pressed(control)
         if gesture is Gesture.DOWN:
             if pauses:
@@ -220,14 +182,14 @@ class ArmTeleop:
         elif action is Action.GRIPPER_TOGGLE:
             self.gripper = CLOSED if self.gripper == OPEN else OPEN
         elif action is Action.PAUSE_TOGGLE:
-            self._engage(Cause.ENGAGE, anchor(), now, reason)
+            self._engage(Cause.ENGAGE, around, now, reason)
 
-    def _engage(self, cause: Cause, anchor: Anchor | None, now: float, reason: Reason) -> None:
+    def _engage(self, cause: Cause, around: ArmMeasurements, now: float, reason: Reason) -> None:
         """Engage where ``cause`` would, if nothing is in the way; else say what is."""
         if next_state(self.state, cause) is self.state:
             return
-        obstacle = self._obstacle or self.watchdog(now)
-        if self._has_dead_man and Action.DEAD_MAN not in self.held:
+        obstacle, anchor = around.obstacles.get(self.arm) or self.watchdog(now), around.anchor(self.arm)
+        if self._has_dead_man and Action.DEAD_MAN not in self._held.actions:
             obstacle = obstacle or Reason(ReasonKind.DEAD_MAN_NOT_HELD)
         if self._gate.pose is None:
             obstacle = obstacle or self._gate.problem
@@ -235,7 +197,7 @@ class ArmTeleop:
             obstacle = obstacle or Reason(ReasonKind.TOOL_UNKNOWN)
         else:
             self.offset = anchor.offset
-            self._motion.anchor(self._gate.pose, floats_of(anchor.tool), self._shares(), now)
+            self.motion.anchor(self._gate.pose, floats_of(anchor.tool), self._shares(), now)
         if obstacle is None:
             self._go(cause, now, reason)
         elif self.state is ArmState.ALIGNING:
@@ -246,9 +208,7 @@ class ArmTeleop:
     def _shares(self) -> Shares:
         """Of the scales, by what is held."""
         held = self._held.actions
-        if not held:
-            return _WHOLE  # as at most ticks
-        share = self._precision if Action.PRECISION in held else 1.0
+        share = self._settings.precision_scale if Action.PRECISION in held else 1.0
         return 0.0 if Action.TRANSLATION_LOCK in held else share, 0.0 if Action.ROTATION_LOCK in held else share
 
     def _go(self, cause: Cause, now: float, reason: Reason) -> None:
@@ -265,5 +225,4 @@ def pressed(control: str) -> Reason:
 
 def of_controls(settings: TeleopSettings) -> tuple[object, ...]:
     """What the hands' controls mean."""
-    times = settings.chord_window, settings.hold_time, settings.double_tap_window, settings.gripper_speed
-    return settings.bindings, *times
+    return settings.bindings, settings.chord_window, settings.hold_time, settings.gripper_speed

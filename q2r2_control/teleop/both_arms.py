@@ -1,12 +1,9 @@
-"""What is for both arms, whichever hand asks for it: the stop, the way home, swapped hands, carrying, the recording."""
+"""What is for both arms, whichever hand asks for it: the stop, the way home, carrying, the recording."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
-
-import pinocchio as pin
 
 from q2r2_control.config.bindings import Action, Gesture
 from q2r2_control.config.teleop import Stance, TeleopSettings
@@ -16,42 +13,11 @@ from q2r2_control.teleop.arm_states import AT_REST, ArmState, Cause
 from q2r2_control.teleop.carry_mode import CarryMode
 from q2r2_control.teleop.episode_marks import EpisodeMarks
 from q2r2_control.teleop.gestures import Press
-from q2r2_control.teleop.steady_state_offset import Anchor, anchor_of, expected
-from q2r2_control.types import Pose
+from q2r2_control.teleop.steady_state_offset import Anchor, ArmMeasurements
 
 # Why arms do not carry.
 _ENGAGE, _UNKNOWN = Reason(ReasonKind.ENGAGE_FIRST), Reason(ReasonKind.TOOL_UNKNOWN)
-_ALONE = Reason(ReasonKind.ONE_ARM)  # why hands are not swapped, and arms do not carry
-
-
-@dataclass(slots=True)  # not frozen: that would cost half a microsecond a tick
-class ArmMeasurements:
-    """What of the arms themselves counts in one tick; poses are in the world."""
-
-    tools: Mapping[str, pin.SE3]  # measured
-    targets: Mapping[str, pin.SE3]  # the last ones
-    commanded: Mapping[str, pin.SE3] | None = None  # by the controller's reference
-    obstacles: Mapping[str, Reason] = field(default_factory=dict)  # arm -> why it may not be engaged
-    in_step: bool = True  # ``commanded`` is of one moment
-
-    def anchor(self, arm: str) -> Anchor | None:
-        """The tool's pose for an anchor: measured position, commanded orientation. None: not known."""
-        measured = self.tools.get(arm)
-        if measured is None:
-            return None
-        commanded = (self.commanded or {}).get(arm)
-        reference = (self.commanded or self.targets).get(arm, measured)
-        return anchor_of(measured, commanded, reference.rotation)
-
-    def expected(self, arm: ArmTeleop) -> Pose | None:
-        """Where the tool of an arm that follows is to be measured, by what is commanded. None: not known."""
-        commanded = None if self.commanded is None else self.commanded.get(arm.arm)
-        return None if commanded is None else expected(commanded, arm.offset)
-
-    def lag(self, arm: ArmTeleop) -> float:
-        """From where the controller has a tool to its last target [m]."""
-        pose, target = self.expected(arm), self.targets.get(arm.arm)
-        return 0.0 if pose is None or target is None else math.dist(pose[0], target.translation)
+_ALONE = Reason(ReasonKind.ONE_ARM)
 
 
 class BothArms:
@@ -70,9 +36,8 @@ class BothArms:
         self._bindings, self._leash = settings.bindings, settings.leash.carried()
 
     def assign_hands(self, stance: Stance) -> None:
-        """Let the hands drive the arms as ``stance`` says, not swapped."""
+        """Let the hands drive the arms as ``stance`` says."""
         same = stance is Stance.SIDE_BY_SIDE
-        self.swapped = False
         self.arm_of_hand = {name if same else _other(name): name for name in self.arms}
 
     def hand_of(self, name: str) -> str:
@@ -81,10 +46,7 @@ class BothArms:
 
     def any_in(self, *states: ArmState) -> bool:
         """Whether an arm is in one of these states."""
-        for arm in self.arms.values():  # noqa: SIM110, since any() of a generator takes three times as long
-            if arm.state in states:
-                return True
-        return False
+        return any(arm.state in states for arm in self.arms.values())
 
     def all_in(self, states: Collection[ArmState]) -> bool:
         """Whether every arm is in one of these states."""
@@ -144,23 +106,6 @@ class BothArms:
                     Cause.HOME, now, Reason(ReasonKind.HOMING) if asked_by is None else self._reason(Action.HOME)
                 )
 
-    def swap_hands(self, presses: Mapping[str, Sequence[Press]], now: float) -> None:
-        """If it is asked for, each hand drives the other arm."""
-        if not any(presses.values()) or self._asked(presses, Action.SWAP_HANDS) is None:
-            return
-        problem = _ALONE if len(self.arms) < 2 else None
-        if not self.all_in(AT_REST):
-            problem = Reason(ReasonKind.PAUSE_FIRST)
-        if problem is None:
-            self.swapped = not self.swapped
-            self.arm_of_hand = {_other(hand): name for hand, name in self.arm_of_hand.items()}
-        for arm in self.arms.values():
-            if problem is None:
-                arm.forget()  # its hand has to be seen anew before it drives the arm
-            hand = self.hand_of(arm.arm)
-            driven = Reason.of(ReasonKind.DRIVEN_BY, hand=hand)
-            arm.record_event(now, driven if problem is None else Reason(ReasonKind.NOT_SWAPPED, cause=problem))
-
     def end_carry(self, now: float, reason: Reason) -> None:
         """If two arms carry, both hold."""
         if self.carry is not None:
@@ -175,7 +120,7 @@ class BothArms:
             if arm.arm in around.obstacles:
                 return around.obstacles[arm.arm]
             return around.anchor(arm.arm) or _UNKNOWN
-        if around.lag(arm) >= (self._leash.distance or math.inf):
+        if around.lag(arm.arm, arm.offset) >= (self._leash.distance or math.inf):
             return Reason(ReasonKind.TOOL_HELD_UP)
         target = around.targets.get(arm.arm)
         return _UNKNOWN if target is None else Anchor(target, arm.offset)

@@ -74,11 +74,6 @@ class RelationKeeper:
         self._shift, self._turn = np.zeros(3), np.eye(3)
         self._now: float | None = None
 
-    @property
-    def begun(self) -> bool:
-        """Whether anything is known of the relation."""
-        return self._now is not None
-
     def note(self, leading: pin.SE3, carried: pin.SE3, now: float) -> None:
         """Where the controller's reference has the frame of either tool at ``now`` [s], world frame."""
         dt = 0.0 if self._now is None else min(max(now - self._now, 0.0), LONGEST_DT)
@@ -121,12 +116,6 @@ class CarriedWorkspace:
                 shift = np.where(np.abs(back) > np.abs(shift), back, shift)
         if not shift.any():
             return None
-        for arm, box in self._boxes.items():
-            box.move_to(_shifted(tools[arm][0], shift))
         self.slip += float(np.linalg.norm(shift))
-        return _shifted(frame[0], shift)
-
-
-def _shifted(position: Vector, shift: Array) -> Vector:
-    x, y, z = (position + shift).tolist()
-    return x, y, z
+        x, y, z = (frame[0] + shift).tolist()
+        return x, y, z

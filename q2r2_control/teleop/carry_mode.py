@@ -12,7 +12,6 @@ from q2r2_control.teleop.arm import ArmTeleop
 from q2r2_control.teleop.arm_states import ArmState, Cause
 from q2r2_control.teleop.carry import CarriedTools, RelationKeeper
 
-CARRIES = "carries both tools"  # event of the arm that leads
 _Poses = Mapping[str, pin.SE3]
 
 
@@ -24,9 +23,9 @@ class CarryMode:
         self._leader, self._follower = leader, follower
         self._tools = CarriedTools(tools)
         self._keeper = RelationKeeper()
-        self._box = follower.workspace()
-        follower.change(Cause.CARRY, now, carried_by(leader.arm))
-        leader.lead(self._tools, follower.arm, self._box, now)
+        self._box = follower.motion.workspace()
+        follower.change(Cause.CARRY, now, Reason.of(ReasonKind.CARRIED_BY, arm=leader.arm))
+        leader.motion.carry(self._tools, follower.arm, self._box, now)
         leader.record_event(now, Reason(ReasonKind.CARRY_BEGAN))
 
     @property
@@ -51,17 +50,11 @@ class CarryMode:
         targets = tools.at(frame)
         if len(frames := tools.frames_of(at_once)) == len(targets):
             self._keeper.note(frames[leader], frames[follower], now)
-        if self._keeper.begun:
-            position, rotation = floats_of(tools.tool_at(follower, self._keeper.frame(frame)))
-            targets[follower] = se3_of((self._box.clip(position), rotation))
+        position, rotation = floats_of(tools.tool_at(follower, self._keeper.frame(frame)))
+        targets[follower] = se3_of((self._box.clip(position), rotation))
         return targets
 
     @property
     def slip(self) -> tuple[float, float]:
         """Of the targets, see :attr:`HandMotion.slip`."""
-        return self._leader.slip
-
-
-def carried_by(leader: str) -> Reason:
-    """Why an arm is carried."""
-    return Reason.of(ReasonKind.CARRIED_BY, arm=leader)
+        return self._leader.motion.slip

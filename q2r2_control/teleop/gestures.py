@@ -1,17 +1,18 @@
-"""What a hand does with its controls: taps, holds and double taps, told from the headset's alignment chord."""
+"""What a hand does with its controls: taps and holds, told from the headset's alignment chord, and what is held."""
 
 from __future__ import annotations
 
 import math
 from typing import NamedTuple
 
-from q2r2_control.config.bindings import BUTTONS, HELD, LASTING, Action, Gesture
+from q2r2_control.config.bindings import BUTTONS, DEVICE_NAMES, HELD, LASTING, Action, BindingSettings, Gesture
 from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.events import Reason, ReasonKind
-from q2r2_control.teleop.held_controls import is_held
 from q2r2_control.types import HandInputs
 
 _STUCK_AFTER = 1.0  # that a control is held from the first reading on before somebody is told [s]
+# A control is held from the first of these on and let go below the second, so that noise in between changes nothing.
+_HELD, _LET_GO = 0.6, 0.4
 
 
 class Press(NamedTuple):
@@ -21,37 +22,76 @@ class Press(NamedTuple):
     gesture: Gesture
 
 
+def travel(control: str, inputs: HandInputs) -> float:
+    """How far a control is pressed or pushed, 0 at rest and 1 at its end."""
+    name, way = DEVICE_NAMES[control]
+    return way * float(getattr(inputs, name))
+
+
+def _is_held(control: str, inputs: HandInputs, was_held: bool) -> bool:
+    """Whether a control is far enough from rest; what is not a number is let go."""
+    return travel(control, inputs) >= (_LET_GO if was_held else _HELD)
+
+
+class HeldControls:
+    """The actions of one hand that are held.
+
+    A control counts as held only once it was seen let go, so that one that is held while the connection comes up, or
+    was lost, does nothing. A reading that is not a number lets go.
+    """
+
+    def __init__(self, bindings: BindingSettings) -> None:
+        self._controls = [
+            (binding.control, binding.action)
+            for binding in bindings.bound()
+            if binding.action in LASTING and binding.action is not Action.GRIPPER_ANALOG
+        ]
+        self.forget()
+
+    def forget(self) -> None:
+        """Nothing is held, and what is has to be let go before it counts."""
+        self._seen_let_go: set[str] = set()
+        self.actions: frozenset[Action] = frozenset()
+
+    def receive(self, inputs: HandInputs) -> None:
+        """Process a new reading."""
+        held = set()
+        for control, action in self._controls:
+            if not _is_held(control, inputs, action in self.actions):
+                self._seen_let_go.add(control)
+            elif control in self._seen_let_go:
+                held.add(action)
+        self.actions = frozenset(held)
+
+
 class GestureRecognizer:
     """Turns the levels of buttons, triggers and stick into gestures, each reported once.
 
     The two buttons of a chord never go down in the same sample, so a tap of a button is delayed by ``chord_window`` [s]
     (or until release, if that is earlier): when the other button follows, it was a chord and neither tap is reported.
-    Where a control is bound to a hold too, a tap is over at release, and a hold after ``hold_time``; where it is
-    bound to a double tap, the first tap waits for the second for ``double_tap_window``. Only stopping must not wait:
-    ``DOWN`` reports a control at once, and may only be used to stop motion, which a chord does as well.
+    Where a control is bound to a hold too, a tap is over at release, and a hold after ``hold_time``. Only stopping must
+    not wait: ``DOWN`` reports a control at once, and may only be used to stop motion, which a chord does as well.
 
     A button that goes down while the other one is held makes a chord at any time. After a chord both buttons have to be
     released before either counts again; a control that is held from the first reading on, likewise.
     """
 
     def __init__(self, settings: TeleopSettings) -> None:
-        bindings = settings.bindings
-        bound = {(binding.control, binding.gesture) for binding in bindings.bound()}
-        lasting = {binding.control for binding in bindings.bound() if binding.action in LASTING}
-        stops = {binding.control: binding.gesture for binding in bindings.bound() if binding.action is Action.STOP}
+        bound = list(settings.bindings.bound())
+        holds = {binding.control for binding in bound if binding.gesture is Gesture.HOLD}
+        lasting = {binding.control for binding in bound if binding.action in LASTING}
+        stops = {binding.control: binding.gesture for binding in bound if binding.action is Action.STOP}
+        others = {binding.control for binding in bound} - lasting
         self._controls = {
             control: _Control(
-                settings,
                 waits=settings.chord_window if control in BUTTONS else 0.0,
-                has_hold=(control, Gesture.HOLD) in bound,
-                has_double=(control, Gesture.DOUBLE) in bound,
+                hold=settings.hold_time if control in holds else math.inf,
                 stops=stops.get(control),
             )
             for control in (*BUTTONS, *HELD)
-            if control in BUTTONS or (control not in lasting and any(name == control for name, _ in bound))
+            if control in BUTTONS or control in others
         }
         self._buttons = [self._controls[control] for control in BUTTONS]
-        self._open = False  # whether time alone may end a gesture; at most ticks it cannot
         self.forget()
 
     def cancel(self) -> None:
@@ -62,32 +102,18 @@ class GestureRecognizer:
     def forget(self) -> None:
         """Drop everything, and treat all controls as held until they are seen released."""
         self.chord = False  # both buttons were pressed together, and not all released since
-        self._stamp = self._first = -math.inf  # of the readings since then
+        self._first = -math.inf  # of the readings since then [s]
         self._told_stuck = False
         for control in self._controls.values():
             control.forget()
 
-    @property
-    def settled(self) -> bool:
-        """Whether nothing is going on, and nothing can begin before the next reading."""
-        return not self._open and not self.chord and (self._told_stuck or self._first == -math.inf)
-
-    def stale(self, now: float, timeout: float) -> bool:
-        """Whether no inputs were received for ``timeout`` [s]: the operator could not stop the arm by a button."""
-        return now - self._stamp > timeout
-
-    def receive(self, inputs: HandInputs, stamp: float, now: float) -> list[Press]:
-        """Process one reading received at ``stamp`` [s]; one that is older than the last is ignored."""
-        stamp = min(stamp, now)
-        if not self._stamp <= stamp or stamp == -math.inf:
-            return []
+    def receive(self, inputs: HandInputs, stamp: float) -> list[Press]:
+        """Process a new reading, received at ``stamp`` [s]."""
         if self._first == -math.inf:
             self._first = stamp
-        self._stamp = stamp
-        self._open = True
         found, rose = [], False
         for name, control in self._controls.items():
-            level = is_held(name, inputs, control.down)
+            level = _is_held(name, inputs, control.down)
             rises = level and not control.down
             rose |= rises and name in BUTTONS
             gesture = control.released(stamp) if control.down and not level else None
@@ -97,8 +123,7 @@ class GestureRecognizer:
                 found.append(Press(name, gesture))
             # With the other button it is a chord, or the rest of one.
             if rises and not (name in BUTTONS and (self.chord or (inputs.button_upper and inputs.button_lower))):
-                if (late := control.begin(stamp)) is not None:
-                    found.append(Press(name, late))
+                control.begin(stamp)
                 found.append(Press(name, Gesture.DOWN))
         both = all(button.down for button in self._buttons)
         if self.chord:
@@ -120,25 +145,16 @@ class GestureRecognizer:
 
     def due(self, now: float) -> list[Press]:
         """Gestures that are over because time has passed."""
-        if not self._open:
-            return []
-        self._open = any(control.open for control in self._controls.values())
-        return [
-            Press(name, gesture)
-            for name, control in self._controls.items()
-            if (gesture := control.due(now)) is not None
-        ]
+        begun = [(name, control) for name, control in self._controls.items() if control.began is not None]
+        return [Press(name, gesture) for name, control in begun if (gesture := control.due(now)) is not None]
 
 
 class _Control:
-    """One control's level, and its gesture while that may still become another one."""
+    """One control's level, and its press while that may still become another gesture."""
 
-    def __init__(
-        self, settings: TeleopSettings, waits: float, has_hold: bool, has_double: bool, stops: Gesture | None
-    ) -> None:
+    def __init__(self, waits: float, hold: float, stops: Gesture | None) -> None:
         self._waits = waits  # for the other button [s]
-        self._hold = settings.hold_time if has_hold else math.inf
-        self._double = settings.double_tap_window if has_double else None
+        self._hold = hold  # so long a press is a hold [s]; inf: it is bound to none
         self._stops = stops  # the gesture that does
         self.forget()
 
@@ -155,63 +171,26 @@ class _Control:
 
     def cancel(self) -> None:
         self._muted = False
-        self._began: float | None = None  # of a press that is not over [s]
-        self._tapped: float | None = None  # when a tap that may become a double one was over [s]
+        self.began: float | None = None  # of a press that is not over [s]
 
-    @property
-    def open(self) -> bool:
-        """Whether a press, or what may become a double tap, has begun and is not over."""
-        return self._began is not None or self._tapped is not None
-
-    def begin(self, stamp: float) -> Gesture | None:
-        """A press begins; returns the tap before it, where that was not the first of two."""
-        tap = self.due(stamp)
-        self._began = stamp
-        self._muted = self._muted and self._tapped is not None
-        return tap
+    def begin(self, stamp: float) -> None:
+        self.began, self._muted = stamp, False
 
     def released(self, stamp: float) -> Gesture | None:
-        """A press ends; returns the gesture that it was, if that is over."""
-        return self._audible(self._end(stamp))
+        """A press ends; returns the gesture that it was, if that is not over already."""
+        if self.began is None:
+            return None
+        return self._end(Gesture.HOLD if stamp - self.began >= self._hold else Gesture.TAP)
 
     def due(self, now: float) -> Gesture | None:
         """The gesture that is over at ``now`` [s] because time has passed, or None."""
-        return self._audible(self._timed(now))
-
-    def _audible(self, gesture: Gesture | None) -> Gesture | None:
-        return None if self._muted and gesture is not self._stops else gesture
-
-    def _end(self, stamp: float) -> Gesture | None:
-        if self._began is None:
+        if self.began is None:
             return None
-        if (gesture := self._timed(stamp)) is not None:
-            return gesture
-        self._began = None
-        if self._double is None:
-            return Gesture.TAP
-        if self._tapped is not None:
-            self._tapped = None
-            return Gesture.DOUBLE
-        self._tapped = stamp
-        return None
-
-    def _timed(self, now: float) -> Gesture | None:
-        if self._began is None:
-            if self._tapped is not None and self._double is not None and now - self._tapped >= self._double:
-                self._tapped = None
-                return Gesture.TAP
-            return None
-        held = now - self._began
-        if held >= self._hold:
-            self._began = self._tapped = None
-            return Gesture.HOLD
+        held = now - self.began
         if self._hold < math.inf:
-            return None
-        # A tap, or the second one; or too long for the first of two.
-        single = self._double is None or self._tapped is not None
-        if held < (self._waits if single or self._double is None else self._double):
-            return None
-        self._began = None
-        gesture = Gesture.TAP if self._tapped is None else Gesture.DOUBLE
-        self._tapped = None
-        return gesture
+            return self._end(Gesture.HOLD) if held >= self._hold else None
+        return self._end(Gesture.TAP) if held >= self._waits else None
+
+    def _end(self, gesture: Gesture) -> Gesture | None:
+        self.began = None
+        return None if self._muted and gesture is not self._stops else gesture

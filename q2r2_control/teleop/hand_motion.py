@@ -9,7 +9,6 @@ from q2r2_control.teleop.filters import PoseFilter
 from q2r2_control.teleop.leash import Leash
 from q2r2_control.teleop.relative import RelativeMotion
 from q2r2_control.teleop.rest import RestingPose
-from q2r2_control.teleop.speed_limit import SpeedLimit
 from q2r2_control.teleop.workspace import Workspace
 from q2r2_control.types import Pose
 
@@ -19,19 +18,20 @@ Shares = tuple[float, float]  # of the scales of positions and rotations
 class HandMotion:
     """One hand's motion as that of a tool, or of the frame between two tools that carry.
 
-    :meth:`anchor` anchors hand and tool at their current poses and starts the filter at rest there. So there is no
-    catch-up motion: no state holds what the hand did before.
+    :meth:`anchor` anchors hand and tool at their current poses and starts the filter at rest there. There is no
+    catch-up motion, because no state holds what the hand did before.
     """
 
     def __init__(self, arm: str, settings: TeleopSettings) -> None:
         self._arm = arm
-        self._use(settings)
+        self.configure(settings)
 
-    def _use(self, settings: TeleopSettings) -> None:
+    def configure(self, settings: TeleopSettings) -> None:
+        """Other settings from now on. Before the next target there has to be an anchor."""
         self._settings = settings
         self._filter = PoseFilter(settings.filter)
-        self._rest = RestingPose(settings.filter.average_at_rest)
-        self._motion, self._unslipped = (RelativeMotion.of(settings) for _ in range(2))
+        self._rest = RestingPose()
+        self._motion, self._unslipped = RelativeMotion.of(settings), RelativeMotion.of(settings)
         self._shares: Shares = (1.0, 1.0)
         self.filtered: Pose | None = None  # the hand's pose that the last target was made of
         # The newest hand pose, and where it would have the tool if nothing had slipped.
@@ -40,11 +40,9 @@ class HandMotion:
 
     def _bound_one_tool(self) -> None:
         """Targets are those of this arm's tool from now on, and nothing has slipped."""
-        settings, arm = self._settings, self._arm
         self._carried: CarriedTools | None = None
-        self._leash = Leash(settings.leash)
+        self._leash = Leash(self._settings.leash)
         self._workspace: Workspace | CarriedWorkspace = self.workspace()
-        self._speed = SpeedLimit([settings.speed_limit.get(arm)])  # type: ignore[call-overload]
 
     def workspace(self) -> Workspace:
         """The box of this arm's targets."""
@@ -55,21 +53,17 @@ class HandMotion:
         """How far the target has slipped along since the anchor, with the tool or along its workspace [m, rad]."""
         return self._leash.position.slip + self._workspace.slip, self._leash.rotation.slip
 
-    def note(self, hand: Pose) -> None:
+    def observe(self, hand: Pose) -> None:
         """A usable pose of the hand, whether its arm is engaged or not."""
         self._rest.add(hand)
-
-    def add(self, hand: Pose, stamp: float, now: float) -> None:
-        """A pose that may be followed, received at ``stamp`` [s]; an anchor has to come first."""
-        self._filter.add(hand, stamp, now)
 
     def forget(self) -> None:
         """Forget how the hand rested."""
         self._rest.forget()
 
-    def change(self, settings: TeleopSettings) -> None:
-        """Other settings from now on. Before the next target there has to be an anchor."""
-        self._use(settings)
+    def add(self, hand: Pose, stamp: float, now: float) -> None:
+        """A pose that may be followed, received at ``stamp`` [s]; an anchor has to come first."""
+        self._filter.add(hand, stamp, now)
 
     def anchor(self, hand: Pose, tool: Pose, shares: Shares, now: float) -> None:
         """The newest pose of the ``hand`` and ``tool``, in the world, correspond from now on."""
@@ -80,15 +74,12 @@ class HandMotion:
         self._rescale(hand, tool, shares)
         self._leash.reset()
         self._workspace.reset()
-        self._speed.reset()
 
     def carry(self, tools: CarriedTools, other: str, box: Workspace, now: float) -> None:
         """Move the frame of ``tools`` from now on, until the next anchor; ``box``: that of the ``other`` arm."""
         self._carried = tools
         self._leash = Leash(self._settings.leash.carried())
         self._workspace = CarriedWorkspace(tools, {self._arm: self.workspace(), other: box})
-        limits = self._settings.speed_limit
-        self._speed = SpeedLimit(limits.values(), tools.lever)
         self._rescale(self._hand(now), floats_of(tools.frame), self._shares)
 
     def target(self, newest: Pose | None, expected: Pose | None, shares: Shares, now: float) -> Pose:
@@ -110,7 +101,7 @@ class HandMotion:
         if self._shares != shares:
             self._rescale(hand, target, shares)  # from here on, so the target does not jump
             self._leash.anchor_anew()
-        return self._speed.limit(target, now)
+        return target
 
     def _hand(self, now: float) -> Pose:
         return self._rest.draw(self._filter.at(now), now)

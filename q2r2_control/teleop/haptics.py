@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
 from typing import NamedTuple
 
 from q2r2_control.config.teleop import HapticSettings
@@ -15,50 +14,37 @@ from q2r2_control.types import HapticFeedback
 class Pulse(NamedTuple):
     """One vibration."""
 
+    meaning: str
     frequency: float  # 0..1
     amplitude: float  # 0..1
     duration: float  # [s]
-
-
-class Word(NamedTuple):
-    """What a vibration tells."""
-
-    meaning: str
-    pulse: Pulse
     strongest: float | None = None  # amplitude that it grows to
 
+    def grown(self, share: float) -> Pulse:
+        """The same at a share of the way to its strongest."""
+        most = self.amplitude if self.strongest is None else self.strongest
+        return self._replace(amplitude=self.amplitude + (most - self.amplitude) * min(share, 1.0))
 
-ENGAGED = Pulse(0.5, 0.4, 0.08)
-PAUSED = Pulse(0.3, 0.3, 0.08)
-FAULT = Pulse(1.0, 1.0, 0.3)
-SLIP = Pulse(0.2, 0.2, 0.05)
-LIMIT = Pulse(0.8, 0.25, 0.05)
-NEAR = Pulse(0.6, 0.1, 0.04)
-CONTACT = Pulse(0.1, 0.2, 0.06)
-GRASP = Pulse(0.7, 0.5, 0.12)
-HOMING = Pulse(0.4, 0.55, 0.2)
-STOPPED = Pulse(0.9, 0.9, 0.25)
-EPISODE_BEGINS, EPISODE_ENDS = Pulse(0.6, 0.45, 0.15), Pulse(0.35, 0.35, 0.15)
-EPISODE_DISCARDED = Pulse(0.2, 0.65, 0.25)
-EPISODE_KEPT, EPISODE_REJECTED = Pulse(0.75, 0.42, 0.4), Pulse(0.15, 0.7, 0.5)
-_NEAREST, _HARDEST = 0.6, 0.8  # amplitudes that NEAR and CONTACT grow to
+
+NEAR = Pulse("another 5 mm nearer to what the arm has to keep away from, from 50 mm to spare on", 0.6, 0.1, 0.04, 0.6)
+SLIP = Pulse("the target has slipped along by another 20 mm or 0.1 rad", 0.2, 0.2, 0.05)
+CONTACT = Pulse("the tool's contact force has grown by another 5 N", 0.1, 0.2, 0.06, 0.8)
+LIMIT = Pulse("a joint has come to its position limit", 0.8, 0.25, 0.05)
+PAUSED = Pulse("paused, by its control or the alignment chord; home, or interrupted on the way", 0.3, 0.3, 0.08)
+EPISODE_ENDS = Pulse("an episode of the recording ends, or succeeded", 0.35, 0.35, 0.15)
+ENGAGED = Pulse("engaged; both arms carry", 0.5, 0.4, 0.08)
+EPISODE_KEPT = Pulse("the verdict on an episode: keep", 0.75, 0.42, 0.4)
+EPISODE_BEGINS = Pulse("an episode of the recording begins; a mark", 0.6, 0.45, 0.15)
+GRASP = Pulse("the gripper has closed on something", 0.7, 0.5, 0.12)
+HOMING = Pulse("on the way home", 0.4, 0.55, 0.2)
+EPISODE_DISCARDED = Pulse("an episode is discarded, or failed", 0.2, 0.65, 0.25)
+EPISODE_REJECTED = Pulse("the verdict on an episode: discard", 0.15, 0.7, 0.5)
+STOPPED = Pulse("stopped, by the control that stops", 0.9, 0.9, 0.25)
+FAULT = Pulse("lost: stopped by a fault (lost data, a jump, a stop), or a press that was refused", 1.0, 1.0, 0.3)
 # The weakest first: where two are due at once, the stronger one is felt. The docs' table is this one.
 VOCABULARY = (
-    Word("another 5 mm nearer to what the arm has to keep away from, from 50 mm to spare on", NEAR, _NEAREST),
-    Word("the target has slipped along by another 20 mm or 0.1 rad", SLIP),
-    Word("the tool's contact force has grown by another 5 N", CONTACT, _HARDEST),
-    Word("a joint has come to its position limit", LIMIT),
-    Word("paused, by its control or the alignment chord; home, or interrupted on the way", PAUSED),
-    Word("an episode of the recording ends, or succeeded", EPISODE_ENDS),
-    Word("engaged; both arms carry", ENGAGED),
-    Word("the verdict on an episode: keep", EPISODE_KEPT),
-    Word("an episode of the recording begins; a mark", EPISODE_BEGINS),
-    Word("the gripper has closed on something", GRASP),
-    Word("on the way home", HOMING),
-    Word("an episode is discarded, or failed", EPISODE_DISCARDED),
-    Word("the verdict on an episode: discard", EPISODE_REJECTED),
-    Word("stopped, by the control that stops", STOPPED),
-    Word("lost: stopped by a fault (lost data, a jump, a stop), or a press that was refused", FAULT),
+    *(NEAR, SLIP, CONTACT, LIMIT, PAUSED, EPISODE_ENDS, ENGAGED, EPISODE_KEPT, EPISODE_BEGINS, GRASP, HOMING),
+    *(EPISODE_DISCARDED, EPISODE_REJECTED, STOPPED, FAULT),
 )
 
 _BEGINS = {
@@ -130,40 +116,21 @@ class HapticPulses:
             self._want(SLIP)
 
     def notice(self, condition: ArmCondition) -> None:
-        """All of the next three."""
-        self.near(condition.spare)
-        self.limits(condition.limits)
-        if condition.force is not None:
-            self.contact(condition.force)
-
-    def near(self, spare: float) -> None:
-        """How much nearer the arm may come to what it has to keep away from [m]."""
-        nearness = max(_NEAR_FROM - spare, 0.0)
+        """What the arm comes near to, touches, and is limited by."""
+        nearness = max(_NEAR_FROM - condition.spare, 0.0)
         if self._nearness.grew(nearness):
-            self._want(_grown(NEAR, _NEAREST, nearness / _NEAR_FROM))
-
-    def contact(self, force: float) -> None:
-        """The contact force at the tool [N]."""
-        if self._force.grew(force):
-            self._want(_grown(CONTACT, _HARDEST, force / _FORCE_TO))
-
-    def limits(self, joints: Iterable[str]) -> None:
-        """The joints of the arm that are at a position limit."""
-        held = frozenset(joints)
-        if held - self._limits:
+            self._want(NEAR.grown(nearness / _NEAR_FROM))
+        if condition.limits - self._limits:
             self._want(LIMIT)
-        self._limits = held
+        self._limits = condition.limits
+        if condition.force is not None and self._force.grew(condition.force):
+            self._want(CONTACT.grown(condition.force / _FORCE_TO))
 
     def grasps(self, holds: bool) -> None:
         """Whether the gripper is closed on something."""
         if holds and not self._grasps:
             self._want(GRASP)
         self._grasps = holds
-
-    @property
-    def idle(self) -> bool:
-        """Whether nothing vibrates and nothing waits, so that :meth:`at` has nothing to send."""
-        return self._ends is None and self._waiting is None
 
     def at(self, now: float, hand: str) -> HapticFeedback | None:
         """What to send to ``hand``, which drives the arm at ``now`` [s], or None."""
@@ -201,7 +168,3 @@ class _Steps:
         if value <= max((self._counted - 2) * self._step, 0.0):
             self._counted = steps
         return False
-
-
-def _grown(pulse: Pulse, strongest: float, share: float) -> Pulse:
-    return pulse._replace(amplitude=pulse.amplitude + (strongest - pulse.amplitude) * min(share, 1.0))

@@ -9,8 +9,7 @@ import numpy as np
 import pinocchio as pin
 from pydantic import ValidationError
 
-from q2r2_control.config.axes import axes_matrix
-from q2r2_control.config.teleop import RotationFrame, Stance, TeleopSettings
+from q2r2_control.config.teleop import RotationFrame, Stance, TeleopSettings, axes_matrix
 from q2r2_control.errors import ConfigError, Q2R2Error
 from q2r2_control.quaternions import (
     IDENTITY,

@@ -28,10 +28,9 @@ _Sample = Sequence[float]  # position [m] and rotation vector from the origin [r
 
 
 class RestingPose:
-    """Draws a filtered pose towards the mean of a hand that rests; not ``enabled``, it leaves every pose as it is."""
+    """Draws a filtered pose towards the mean of a hand that rests."""
 
-    def __init__(self, enabled: bool = True) -> None:
-        self._enabled = enabled
+    def __init__(self) -> None:
         self.forget()
 
     def forget(self) -> None:
@@ -47,8 +46,6 @@ class RestingPose:
 
     def add(self, pose: Pose) -> None:
         """A sample of the hand."""
-        if not self._enabled:
-            return
         position, rotation = pose
         turn = turn_between(self._origin, rotation)
         known = self._count > 0 and math.hypot(*turn) <= _TURNED

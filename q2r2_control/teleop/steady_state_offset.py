@@ -16,10 +16,13 @@ begins at the tool.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import pinocchio as pin
 
+from q2r2_control.events import Reason
 from q2r2_control.quaternions import floats_of
 from q2r2_control.types import Array, Pose, moved_by
 
@@ -33,24 +36,43 @@ class Anchor(NamedTuple):
     offset: Array | None = None  # (3,) [m]; None: none
 
 
-def anchor_of(measured: pin.SE3, commanded: pin.SE3 | None, rotation: Array) -> Anchor:
-    """The anchor of a tool; ``commanded``: by the controller's reference, None: not known; ``rotation`` (3, 3)."""
-    tool = pin.SE3(rotation, measured.translation)
-    if commanded is None:
-        return Anchor(tool)
-    offset = measured.translation - commanded.translation
-    return Anchor(tool, offset if math.hypot(*offset) <= MAX_OFFSET[0] else None)
+@dataclass(slots=True)  # not frozen: that would cost half a microsecond a tick
+class ArmMeasurements:
+    """What of the arms themselves counts in one tick; poses are in the world."""
+
+    tools: Mapping[str, pin.SE3]  # measured
+    targets: Mapping[str, pin.SE3]  # the last ones
+    commanded: Mapping[str, pin.SE3] | None = None  # by the controller's reference
+    obstacles: Mapping[str, Reason] = field(default_factory=dict)  # arm -> why it may not be engaged
+    in_step: bool = True  # ``commanded`` is of one moment
+
+    def anchor(self, arm: str) -> Anchor | None:
+        """Where the tool is, or None where that is not known."""
+        measured = self.tools.get(arm)
+        if measured is None:
+            return None
+        reference = (self.commanded or self.targets).get(arm, measured)
+        tool, commanded = pin.SE3(reference.rotation, measured.translation), (self.commanded or {}).get(arm)
+        offset = None if commanded is None else measured.translation - commanded.translation
+        return Anchor(tool, offset if offset is not None and math.hypot(*offset) <= MAX_OFFSET[0] else None)
+
+    def expected(self, arm: str, offset: Array | None) -> Pose | None:
+        """Where a tool with this offset is to be measured, by what is commanded. None: not known."""
+        commanded = None if self.commanded is None else self.commanded.get(arm)
+        if commanded is None:
+            return None
+        (x, y, z), rotation = pose = floats_of(commanded)
+        if offset is None:
+            return pose
+        by_x, by_y, by_z = offset.tolist()
+        return (x + by_x, y + by_y, z + by_z), rotation
+
+    def lag(self, arm: str, offset: Array | None) -> float:
+        """From where the controller has a tool to its last target [m]."""
+        pose, target = self.expected(arm, offset), self.targets.get(arm)
+        return 0.0 if pose is None or target is None else math.dist(pose[0], target.translation)
 
 
 def with_offset(commanded: pin.SE3, offset: Array | None) -> pin.SE3:
     """Where a tool is to be measured that is commanded to be at ``commanded``."""
     return commanded if offset is None else moved_by(commanded, offset)
-
-
-def expected(commanded: pin.SE3, offset: Array | None) -> Pose:
-    """The same as :func:`with_offset`, in floats."""
-    (x, y, z), rotation = pose = floats_of(commanded)
-    if offset is None:
-        return pose
-    by_x, by_y, by_z = offset.tolist()
-    return (x + by_x, y + by_y, z + by_z), rotation

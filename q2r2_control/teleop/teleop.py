@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from functools import partial
 
 import pinocchio as pin
 
@@ -13,8 +12,9 @@ from q2r2_control.events import Event, Reason, ReasonKind
 from q2r2_control.quaternions import se3_of
 from q2r2_control.teleop.arm import of_controls
 from q2r2_control.teleop.arm_states import FOLLOWING, HOLDING, ArmState, Cause
-from q2r2_control.teleop.both_arms import ArmMeasurements, BothArms
+from q2r2_control.teleop.both_arms import BothArms
 from q2r2_control.teleop.episode_marks import EpisodeMarks
+from q2r2_control.teleop.steady_state_offset import ArmMeasurements
 from q2r2_control.types import ArmTarget, HandSample
 
 _BY_HANDS = ArmState.ENGAGED, ArmState.CARRIED
@@ -100,13 +100,6 @@ class Teleop:
 
     def take_events(self) -> list[Event]:
         """State changes and refused presses since the last call, in order of time."""
-        # At most ticks there is none.
-        for arm in self._arms.values():
-            if arm.events:
-                return self._sorted_events()
-        return []
-
-    def _sorted_events(self) -> list[Event]:
         events = sorted((event for arm in self._arms.values() for event in arm.events), key=lambda event: event.t)
         for arm in self._arms.values():
             arm.events.clear()
@@ -146,26 +139,11 @@ class Teleop:
         if faults:
             self._disengage(faults, now)
         around = ArmMeasurements(tools, self._commanded, commanded, obstacles or {}, in_step)
-        for arm in self._arms.values():
-            if samples or not arm.settled:
-                return self._act(around, now)
-        return self._targets(now, around)  # as at most ticks
-
-    def _act(self, around: ArmMeasurements, now: float) -> dict[str, ArmTarget]:
-        """Do what the hands ask for; every arm's target after it."""
         presses = self._pair.act(around, now)
         chord = self.aligning
         for name, arm in self._arms.items():
-            arm.act(
-                presses[name],
-                partial(around.anchor, name),
-                now,
-                chord,
-                around.obstacles.get(name),
-            )
-        targets = self._targets(now, around)
-        self._pair.swap_hands(presses, now)
-        return targets
+            arm.act(presses[name], around, now, chord)
+        return self._targets(now, around)
 
     def _targets(self, now: float, around: ArmMeasurements) -> dict[str, ArmTarget]:
         """Of every arm, by its state."""
@@ -175,9 +153,9 @@ class Teleop:
         for name, arm in self._arms.items():
             pose = hand = None
             if arm.state is ArmState.ENGAGED:
-                self._commanded[name] = pose = se3_of(arm.target(now, around.expected(arm)))
-                hand = arm.filtered_hand
-            slip, slip_angle = arm.slip
+                self._commanded[name] = pose = se3_of(arm.target(now, around.expected(name, arm.offset)))
+                hand = arm.motion.filtered
+            slip, slip_angle = arm.motion.slip
             targets[name] = ArmTarget(pose, arm.gripper, slip, slip_angle, arm.offset, hand)
         return targets
 
@@ -187,16 +165,15 @@ class Teleop:
         if not self._pair.carry.lasts:
             self._pair.end_carry(now, Reason(ReasonKind.CARRY_ENDED))
             return self._targets(now, around)
-        expected = {
-            name: se3_of(pose) for name, arm in self._arms.items() if (pose := around.expected(arm)) is not None
-        }
+        poses = {name: around.expected(name, arm.offset) for name, arm in self._arms.items()}
+        expected = {name: se3_of(pose) for name, pose in poses.items() if pose is not None}
         carried = self._pair.carry.targets(now, expected, expected if around.in_step else {})
         (slip, slip_angle), targets = self._pair.carry.slip, {}
         for name, arm in self._arms.items():
             pose = carried.get(name)
             if pose is not None:
                 self._commanded[name] = pose
-            hand = arm.filtered_hand if arm.state is ArmState.ENGAGED else None
+            hand = arm.motion.filtered if arm.state is ArmState.ENGAGED else None
             targets[name] = ArmTarget(pose, arm.gripper, slip, slip_angle, arm.offset, hand)
         return targets
 

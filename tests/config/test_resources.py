@@ -31,15 +31,10 @@ def test_a_file_in_the_working_folder_comes_first(tmp_path: Path, monkeypatch: p
     assert load_config("config/dual_iiwa7.yaml").name == "mine"
 
 
-def test_an_absolute_path_is_taken_as_it_is(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="no such file"):
-        find_resource(tmp_path / "config" / "dual_iiwa7.yaml")
-
-
 @pytest.mark.parametrize(
     "path",
-    ["config", ".", "", "config/triple.yaml", "x\0y", "n" * 5000, "~nobody_of_this_name/x.yaml", "/dev/null/x.yaml"],
-    ids=["a folder", "here", "nothing", "a misspelling", "a zero byte", "too long", "unknown home", "below a file"],
+    ["config", "", "config/triple.yaml", "x\0y", "~nobody_of_this_name/x.yaml"],
+    ids=["a folder", "nothing", "a misspelling", "a zero byte", "unknown home"],
 )
 def test_what_is_no_file_ends_in_one_line(path: str) -> None:
     with pytest.raises(ConfigError) as caught:

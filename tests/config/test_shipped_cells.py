@@ -3,53 +3,16 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 import pytest
 import yaml
 from pydantic import BaseModel
 
-from q2r2_control.config.arms import (
-    ArmConfig,
-    FlangeConfig,
-    GripperConfig,
-    HeldObjectConfig,
-    PoseConfig,
-    RobotConfig,
-    ToolConfig,
-)
-from q2r2_control.config.bindings import BindingSettings
 from q2r2_control.config.cameras import CameraConfig
-from q2r2_control.config.cell import (
-    Config,
-    HeadsetConfig,
-    MujocoConfig,
-    ObjectConfig,
-    ObstacleConfig,
-    load_config,
-)
-from q2r2_control.config.control import (
-    AdmittanceSettings,
-    ContactPair,
-    ControllerSettings,
-    DistanceSettings,
-    ImpedanceSettings,
-    NamedPairDistance,
-    WallSettings,
-)
-from q2r2_control.config.external import ExternalArm, ExternalConfig, ExternalGripper, GuardLimits
-from q2r2_control.config.judge import JudgeSettings
-from q2r2_control.config.supervision import SupervisionSettings
-from q2r2_control.config.teleop import (
-    FilterSettings,
-    GateSettings,
-    HapticSettings,
-    LeashSettings,
-    SpeedLimitSettings,
-    TeleopSettings,
-    WorkspaceSettings,
-)
+from q2r2_control.config.cell import Config, load_config
 from q2r2_control.robot.kept_distances import kept_distances
 from q2r2_control.robot.robot import Robot
 from tests.config.cell_files import CELL, SHIPPED, changed
@@ -63,97 +26,68 @@ def test_every_shipped_cell_loads_and_composes(file: Path) -> None:
     assert Robot.from_config(config).model.nv == 14
 
 
+def models_in(annotation: object) -> Iterator[type[BaseModel]]:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        yield annotation
+    for inner in get_args(annotation):
+        yield from models_in(inner)
+
+
+def shown(model: type[BaseModel], data: dict[str, Any], place: str = "") -> Iterator[tuple[str, type[BaseModel], Any]]:
+    """Every block of a file, with its place and its model; of blocks by name the first one."""
+    yield place, model, data
+    for key, field in model.model_fields.items():
+        value, path = data.get(key), f"{place}.{key}".lstrip(".")
+        for inner in models_in(field.annotation):
+            if isinstance(value, dict) and value and not set(value) <= set(inner.model_fields):
+                name, value = next(iter(value.items()))
+                path = f"{path}.{name}"
+            if isinstance(value, dict) and value:
+                yield from shown(inner, value, path)
+
+
 class TestTheShippedCellShowsAllThereIsToTune:
-    # Models at every place where they occur, each with one example of it in the file.
-    PLACES: tuple[tuple[str, type[BaseModel]], ...] = (
-        ("", Config),
-        ("robot", RobotConfig),
-        ("arms.left", ArmConfig),
-        ("arms.left.mount", PoseConfig),
-        ("arms.left.flange", FlangeConfig),
-        ("arms.left.tool", ToolConfig),
-        ("arms.left.gripper", GripperConfig),
-        ("obstacles.table", ObstacleConfig),
-        ("supervision", SupervisionSettings),
-        ("headset", HeadsetConfig),
-        ("control", ControllerSettings),
-        ("control.distances", DistanceSettings),
-        ("impedance", ImpedanceSettings),
-        ("impedance.wall", WallSettings),
-        ("admittance", AdmittanceSettings),
-        ("teleop", TeleopSettings),
-        ("teleop.filter", FilterSettings),
-        ("teleop.leash", LeashSettings),
-        ("teleop.haptics", HapticSettings),
-        ("teleop.bindings", BindingSettings),
-        ("teleop.gate", GateSettings),
-        ("mujoco", MujocoConfig),
-        ("mujoco.objects.blue_block", ObjectConfig),
-        ("judge", JudgeSettings),
-        ("external", ExternalConfig),
-        ("external.limits", GuardLimits),
-        ("external.arms.left", ExternalArm),
-        ("external.arms.left.gripper", ExternalGripper),
-    )
     # Not the default, and the file says so.
     CHOSEN = ("control.solve_time_limit", "control.distances", "mujoco.objects")
-    IN_A_COMMENT = (
-        CameraConfig,
-        ContactPair,
-        HeldObjectConfig,
-        NamedPairDistance,
-        SpeedLimitSettings,
-        WorkspaceSettings,
-    )
-    # A tool's mount and an obstacle's rpy are placements as an arm's mount is, which shows the keys.
-    SHOWN_ELSEWHERE = ("arms.left.tool.mount", "obstacles.table.rpy")
+    IN_A_COMMENT = ("CameraConfig", "ContactPair", "HeldObjectConfig", "NamedPairDistance", "WorkspaceSettings")
+    # Placements, as an arm's mount is, which shows the keys.
+    SHOWN_ELSEWHERE = ("arms.left.tool.mount", "obstacles.table.rpy", "robot.mount.rpy", "external")
+
+    @pytest.mark.parametrize("text", [external_text(), robot_text()], ids=["arms of their own", "one robot"])
+    def test_every_key_is_written_and_commented(self, text: str) -> None:
+        lines = text.splitlines()
+        for place, model, data in shown(Config, yaml.safe_load(text)):
+            if place == "arms.left" and "robot:" in text:
+                continue  # whose model is the robot's
+            for key in model.model_fields:
+                path = f"{place}.{key}".lstrip(".")
+                if path in self.SHOWN_ELSEWHERE:
+                    continue
+                assert key in data, path
+                if not isinstance(data[key], dict) and path != "name":
+                    at = [index for index, line in enumerate(lines) if re.match(rf"\s*{key}:", line)]
+                    assert any("#" in lines[index] or "#" in lines[index - 1] for index in at), f"{path} has no comment"
 
     def test_no_model_was_forgotten_here(self) -> None:
-        known = {model for _, model in self.PLACES} | set(self.IN_A_COMMENT)
-        found: set[type[BaseModel]] = set()
-
-        def visit(annotation: object) -> None:
-            for inner in get_args(annotation):
-                visit(inner)
-            if isinstance(annotation, type) and issubclass(annotation, BaseModel) and annotation not in found:
-                found.add(annotation)
-                for field in annotation.model_fields.values():
-                    visit(field.annotation)
-
-        visit(Config)
-        assert found == known
-
-    @pytest.mark.parametrize(("place", "model"), PLACES, ids=lambda value: value if isinstance(value, str) else "")
-    def test_every_key_is_written_and_commented(self, place: str, model: type[BaseModel]) -> None:
-        text = robot_text() if place == "robot" else external_text()
-        data, lines = yaml.safe_load(text), text.splitlines()
-        for part in filter(None, place.split(".")):
-            data = data[part]
-        for key in model.model_fields:
-            path = f"{place}.{key}".lstrip(".")
-            if path in self.SHOWN_ELSEWHERE:
-                continue
-            assert key in data, path
-            if not isinstance(data[key], dict) and path != "name":
-                explained = [index for index, line in enumerate(lines) if re.match(rf"\s*{key}:.*#", line)]
-                above = [i for i, line in enumerate(lines) if re.match(rf"\s*{key}:", line) and "#" in lines[i - 1]]
-                assert explained or above, f"{path} has no comment"
+        found: set[str] = set()
+        for text in (external_text(), robot_text()):
+            found |= {model.__name__ for _, model, _ in shown(Config, yaml.safe_load(text))}
+        known: set[str] = set()
+        waiting: list[type[BaseModel]] = [Config]
+        while waiting:
+            model = waiting.pop()
+            if model.__name__ not in known:
+                known.add(model.__name__)
+                waiting += [inner for field in model.model_fields.values() for inner in models_in(field.annotation)]
+        assert known - found == set(self.IN_A_COMMENT)
 
     @pytest.mark.parametrize(
-        ("place", "model"),
-        [
-            ("headset", HeadsetConfig),
-            ("control", ControllerSettings),
-            ("impedance", ImpedanceSettings),
-            ("admittance", AdmittanceSettings),
-            ("teleop", TeleopSettings),
-            ("mujoco", MujocoConfig),
-            ("judge", JudgeSettings),
-        ],
+        "place", ["headset", "control", "impedance", "admittance", "supervision", "teleop", "mujoco", "judge"]
     )
-    def test_what_is_written_is_the_default(self, place: str, model: type[BaseModel]) -> None:
-        written, default = getattr(load_config(CELL), place), model()
-        for key in model.model_fields:
+    def test_what_is_written_is_the_default(self, place: str) -> None:
+        written = getattr(load_config(CELL), place)
+        default = type(written)()
+        for key in type(written).model_fields:
             if f"{place}.{key}" not in self.CHOSEN:
                 assert getattr(written, key) == getattr(default, key), f"{place}.{key}"
         for key in ("loop_rate_hz", "controller"):

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import logging
 import socket
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import partial
 from ipaddress import ip_network
 from typing import Any
 
@@ -89,19 +87,6 @@ def test_a_second_headset_is_refused_with_a_reason_and_one_line_while_one_drives
     assert "refused: 127.0.0.1:" in line
 
 
-@pytest.mark.parametrize("source", [HERE, ELSEWHERE])
-def test_a_second_headset_that_registers_the_same_cannot_push_out_one_that_is_alive(
-    server: HeadsetServer, clock: HandClock, source: str
-) -> None:
-    with driving(server) as first:
-        clock.advance(0.4)
-        with FakeHeadset(server.address, source=source) as second:
-            second.send(second.registrations() + second.pose("right", (7.0, 7.0, 7.0), IDENTITY))
-            assert_refused(second, b"drives")
-        move(first, server, 1.0)
-        assert server.statistics.connections == 1
-
-
 def test_a_peer_that_comes_back_after_a_silently_lost_link_takes_its_place_at_once_and_as_a_new_connection(
     server: HeadsetServer, clock: HandClock, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -122,15 +107,6 @@ def test_a_peer_that_comes_back_after_a_silently_lost_link_takes_its_place_at_on
     assert not any("refused" in line for line in warnings(caplog))
 
 
-def test_another_host_does_not_take_the_place_of_a_quiet_headset(server: HeadsetServer, clock: HandClock) -> None:
-    with driving(server) as first:
-        clock.advance(0.6)
-        with FakeHeadset(server.address, source=ELSEWHERE) as second:
-            second.send(second.registrations())
-            assert_refused(second, b"drives")
-        move(first, server)
-
-
 def test_a_quiet_headset_that_is_heard_again_keeps_its_place(server: HeadsetServer, clock: HandClock) -> None:
     with driving(server) as first:
         clock.advance(0.6)
@@ -139,21 +115,6 @@ def test_a_quiet_headset_that_is_heard_again_keeps_its_place(server: HeadsetServ
             move(first, server)
             assert_ended(second, b"drives")
         move(first, server)
-
-
-def test_other_registrations_from_the_same_host_wait_until_the_quiet_headset_is_given_up(
-    server: HeadsetServer, clock: HandClock
-) -> None:
-    with driving(server) as first:
-        clock.advance(0.6)
-        with connect(server) as second:
-            second.send(second.command("__publish", topic="dice", message_name="geometry_msgs/Twist"))
-            second.send(second.command("__topic_list"))
-            second.read_until("__topic_list")
-            clock.advance(0.6)
-            assert drives(server, first)
-            clock.advance(0.9)
-            eventually(lambda: drives(server, second), "no frame of the first for 2 s")
 
 
 # The place belongs to who sends poses --------------------------------------------------------------------------------
@@ -179,23 +140,6 @@ def test_a_peer_that_only_keeps_alive_gives_way_to_a_headset_that_sends_poses(
 def keep_alive(headset: FakeHeadset, server: HeadsetServer, clock: HandClock) -> None:
     headset.send(KEEPALIVE)
     eventually(lambda: server._client is not None and server._client.last_frame == clock.now)
-
-
-def test_poses_in_the_last_five_seconds_hold_the_place(server: HeadsetServer, clock: HandClock) -> None:
-    with driving(server) as idle:
-        for _ in range(4):
-            clock.advance(1.0)
-            keep_alive(idle, server, clock)
-        with FakeHeadset(server.address, source=ELSEWHERE) as second:
-            second.send(second.registrations() + second.pose("left", (5.0, 0.0, 0.0), IDENTITY))
-            assert_refused(second, b"drives")
-
-
-def test_a_peer_that_never_sent_a_pose_holds_nothing(server: HeadsetServer) -> None:
-    with connect(server) as idle, connect(server, source=ELSEWHERE) as second:
-        assert drives(server, idle)
-        second.send(second.pose("left", (5.0, 0.0, 0.0), IDENTITY))
-        eventually(lambda: drives(server, second))
 
 
 def test_a_newcomer_that_shows_nothing_is_refused_after_two_seconds(server: HeadsetServer, clock: HandClock) -> None:
@@ -299,26 +243,6 @@ def was_greeted(connection: socket.socket) -> bool:
             return False
 
 
-def test_garbage_again_and_again_is_one_line_a_second_with_a_count_of_what_was_left_out(
-    server: HeadsetServer, clock: HandClock, caplog: pytest.LogCaptureFixture
-) -> None:
-    caplog.set_level(logging.INFO)
-    for count in range(1, 9):
-        with connect(server) as headset:
-            headset.send(b"GET / HTTP/1.1\r\n\r\n")
-        eventually(partial(has_connected, server, count))
-        eventually(lambda: server.statistics.peer is None)
-    assert len(caplog.messages) == 1
-    clock.advance(A_LINE_LATER)
-    eventually(lambda: len(caplog.messages) == 2)
-    assert caplog.messages[1].endswith("(6 more left out)")
-    assert all("bytes announced" in line for line in caplog.messages)
-
-
-def has_connected(server: HeadsetServer, count: int) -> bool:
-    return server.statistics.connections == count
-
-
 def test_only_the_first_eight_hosts_that_are_refused_are_named(
     server: HeadsetServer, clock: HandClock, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -358,17 +282,6 @@ def test_only_hosts_of_allowed_networks_are_served(clock: HandClock, caplog: pyt
 
 
 needs_ipv6 = pytest.mark.skipif(not socket.has_dualstack_ipv6(), reason="this machine has no IPv6")
-
-
-@needs_ipv6
-def test_every_network_of_ipv6_is_every_network_of_ipv4_too(clock: HandClock) -> None:
-    with listening(clock, "::") as server:
-        for host, written in (("::1", "[::1]:"), (HERE, "127.0.0.1:")):
-            with FakeHeadset((host, server.address[1])) as headset:
-                headset.read_until("__handshake")
-                eventually(lambda: server.statistics.peer)
-                assert str(server.statistics.peer).startswith(written)
-            eventually(lambda: server.statistics.peer is None)
 
 
 @needs_ipv6

@@ -25,12 +25,9 @@ def frames(*chunks: bytes) -> list[WireFrame]:
     return found
 
 
-def test_a_frame_is_read_as_written_by_hand() -> None:
+def test_a_frame_is_read_and_written_as_by_hand_and_the_server_writes_no_nul() -> None:
+    assert encode_frame("/abc", b"xyz") == ABC
     assert frames(ABC) == [WireFrame("/abc", b"xyz", terminated=False)]
-
-
-def test_the_nul_of_a_ros2_destination_is_told_and_taken_off() -> None:
-    assert frames(ABC_NUL) == [WireFrame("/abc", b"xyz", terminated=True)]
 
 
 def test_only_one_nul_is_taken_off() -> None:
@@ -43,27 +40,16 @@ def test_eight_zero_bytes_are_a_keepalive() -> None:
     assert not frames(ABC)[0].is_keepalive
 
 
-def test_the_server_writes_no_nul() -> None:
-    assert encode_frame("/abc", b"xyz") == ABC
+def test_a_stream_split_at_any_byte_gives_the_same_frames() -> None:
+    stream = ABC_NUL + KEEPALIVE + ABC
+    whole = frames(stream)
+    assert [frame.terminated for frame in whole] == [True, False, False]
+    assert frames(*(bytes([byte]) for byte in stream)) == whole
+    for split in range(1, len(stream)):
+        assert frames(stream[:split], stream[split:]) == whole
 
 
-@pytest.mark.parametrize("split", range(1, 2 * len(ABC_NUL) + 8))
-def test_a_stream_split_at_any_byte_gives_the_same_frames(split: int) -> None:
-    stream = ABC_NUL + KEEPALIVE + ABC_NUL
-    assert frames(stream[:split], stream[split:]) == frames(stream)
-
-
-def test_a_stream_byte_by_byte_gives_the_same_frames() -> None:
-    stream = ABC + KEEPALIVE + ABC_NUL
-    assert frames(*(bytes([byte]) for byte in stream)) == frames(stream)
-
-
-def test_coalesced_frames_come_out_in_order() -> None:
-    stream = b"".join(encode_frame(f"topic_{index}", bytes([index])) for index in range(100))
-    assert [frame.destination for frame in frames(stream)] == [f"topic_{index}" for index in range(100)]
-
-
-@pytest.mark.parametrize("length", range(1, len(ABC)))
+@pytest.mark.parametrize("length", [1, len(ABC) - 1])
 def test_a_stream_that_ends_inside_a_frame_is_truncated(length: int) -> None:
     with pytest.raises(ProtocolError, match=f"ended inside a frame, {length} bytes"):
         frames(ABC[:length])
@@ -78,9 +64,7 @@ def test_a_frame_of_exactly_one_mebibyte_is_allowed() -> None:
     "announcement",
     [
         pytest.param(struct.pack("<I", MAX_FRAME_BYTES - 7), id="destination that leaves no room for lengths"),
-        pytest.param(struct.pack("<I", 0xFFFFFFFF), id="destination of 4 GiB"),
         pytest.param(struct.pack("<I3sI", 3, b"big", MAX_FRAME_BYTES - 10), id="payload one byte too long"),
-        pytest.param(struct.pack("<I3sI", 3, b"big", 0xFFFFFFFF), id="payload of 4 GiB"),
         pytest.param(b"GET / HTTP/1.1\r\n\r\n", id="another protocol"),
     ],
 )

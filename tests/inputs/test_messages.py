@@ -15,7 +15,6 @@ from q2r2_control.inputs.messages import (
     HandPose,
     HandTwist,
     MessageType,
-    PropTwist,
     decode,
     encode,
     fits,
@@ -58,48 +57,16 @@ def pose_with_frame(dialect: Dialect, frame_id: bytes) -> bytes:
     return CDR + text + b"\xaa" * (-len(text) % 8) + NUMBERS
 
 
-@pytest.mark.parametrize(
-    ("payload", "size"),
-    [
-        pytest.param(POSES[ROS1], 72, id="PoseStamped in ROS1"),
-        pytest.param(POSES[ROS2], 76, id="PoseStamped in ROS2"),
-        pytest.param(TWISTS[ROS1], 48, id="Twist in ROS1"),
-        pytest.param(TWISTS[ROS2], 52, id="Twist in ROS2"),
-        pytest.param(INPUTS[ROS1], 18, id="OVR2ROSInputs in ROS1"),
-        pytest.param(INPUTS[ROS2], 24, id="OVR2ROSInputs in ROS2"),
-    ],
-)
-def test_the_bytes_written_by_hand_have_the_size_that_the_app_sends(payload: bytes, size: int) -> None:
-    assert len(payload) == size
-
-
 @every_dialect
-def test_a_pose_is_read_as_sent_with_its_stamp_and_w_of_minus_one(dialect: Dialect) -> None:
-    pose = decode(MessageType.POSE, POSES[dialect], dialect)
+def test_messages_are_read_as_sent_with_their_stamp_and_w_of_minus_one(dialect: Dialect) -> None:
+    pose, twist, inputs = (decode(kind, payload[dialect], dialect) for kind, payload in PAYLOADS.items())
     assert isinstance(pose, HandPose)
-    assert pose.position.tolist() == [1.0, 2.0, 0.5]
-    assert pose.quaternion.tolist() == [0.0, 0.0, 0.0, -1.0]
-    assert (pose.stamp, pose.frame_id) == (12.5, "")
-
-
-@every_dialect
-def test_a_twist_is_read_as_sent(dialect: Dialect) -> None:
-    twist = decode(MessageType.TWIST, TWISTS[dialect], dialect)
     assert isinstance(twist, HandTwist)
-    assert twist.linear.tolist() == [1.0, 2.0, 0.5]
-    assert twist.angular.tolist() == [0.0, 0.0, -1.0]
-
-
-@every_dialect
-def test_inputs_are_read_in_the_order_of_their_fields(dialect: Dialect) -> None:
-    inputs = decode(MessageType.INPUTS, INPUTS[dialect], dialect)
+    assert (pose.position.tolist(), pose.quaternion.tolist()) == ([1.0, 2.0, 0.5], [0.0, 0.0, 0.0, -1.0])
+    assert (pose.stamp, pose.frame_id) == (12.5, "")
+    assert (twist.linear.tolist(), twist.angular.tolist()) == ([1.0, 2.0, 0.5], [0.0, 0.0, -1.0])
     assert inputs == HandInputs(
-        button_upper=True,
-        button_lower=False,
-        thumb_stick_horizontal=1.0,
-        thumb_stick_vertical=-1.0,
-        press_index=0.5,
-        press_middle=0.0,
+        button_upper=True, thumb_stick_horizontal=1.0, thumb_stick_vertical=-1.0, press_index=0.5
     )
 
 
@@ -115,13 +82,7 @@ def test_haptics_are_packed_as_two_floats_and_not_as_doubles(dialect: Dialect, e
 
 
 @every_dialect
-def test_a_twist_for_the_app_has_the_bytes_of_one_that_the_app_sends(dialect: Dialect) -> None:
-    twist = PropTwist("dice_twist", np.array([1.0, 2.0, 0.5]), np.array([0.0, 0.0, -1.0]))
-    assert encode(twist, dialect) == TWISTS[dialect]
-
-
-@every_dialect
-@pytest.mark.parametrize("name", ["w", "map", "world", "a_rather_long_frame_name", "träume"])
+@pytest.mark.parametrize("name", ["map", "träume"])
 def test_a_frame_id_shifts_the_pose_and_is_kept(dialect: Dialect, name: str) -> None:
     wire_name = name.encode() + (b"\0" if dialect is ROS2 else b"")
     pose = decode(MessageType.POSE, pose_with_frame(dialect, wire_name), dialect)
@@ -158,14 +119,14 @@ def test_a_short_payload_is_refused_at_every_length(kind: MessageType, dialect: 
 
 @every_dialect
 @every_kind
-@pytest.mark.parametrize("spare", [1, 2, 3, 4, 8])
+@pytest.mark.parametrize("spare", [1, 8])
 def test_spare_bytes_behind_a_message_are_refused(kind: MessageType, dialect: Dialect, spare: int) -> None:
     with pytest.raises(ProtocolError, match="bytes"):
         decode(kind, PAYLOADS[kind][dialect] + bytes(spare), dialect)
 
 
 @every_kind
-@pytest.mark.parametrize("encapsulation", ["00000000", "00030000", "00010001", "01000000"])
+@pytest.mark.parametrize("encapsulation", ["00000000", "00010001"])
 def test_other_encapsulations_than_plain_little_endian_are_refused(kind: MessageType, encapsulation: str) -> None:
     with pytest.raises(ProtocolError):
         decode(kind, bytes.fromhex(encapsulation) + PAYLOADS[kind][ROS2][4:], ROS2)
@@ -181,7 +142,7 @@ def test_a_button_that_is_neither_0_nor_1_is_refused(dialect: Dialect, button: i
 
 
 @every_dialect
-@pytest.mark.parametrize("length", [9, 0x7FFFFFFF, 0xFFFFFFFF])
+@pytest.mark.parametrize("length", [9, 0xFFFFFFFF])
 def test_a_string_length_that_lies_is_refused(dialect: Dialect, length: int) -> None:
     payload = POSES[dialect][:12] + struct.pack("<I", length) + POSES[dialect][16:]
     with pytest.raises(ProtocolError):
@@ -195,7 +156,7 @@ def test_a_frame_id_that_is_not_utf8_is_refused(dialect: Dialect) -> None:
 
 
 @every_dialect
-@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize("value", [math.nan, math.inf])
 def test_numbers_that_are_not_finite_pass_for_the_teleop_layer_to_reject(dialect: Dialect, value: float) -> None:
     payload = POSES[dialect][:-56] + struct.pack("<7d", *[value] * 7)
     pose = decode(MessageType.POSE, payload, dialect)

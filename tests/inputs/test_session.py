@@ -5,19 +5,17 @@ from __future__ import annotations
 import json
 import re
 
-import numpy as np
 import pytest
 
 from q2r2_control.errors import ProtocolError
-from q2r2_control.inputs.framing import KEEPALIVE, FrameDecoder, WireFrame
-from q2r2_control.inputs.messages import PROP_TOPICS, Dialect, PropTwist
+from q2r2_control.inputs.framing import FrameDecoder, WireFrame
+from q2r2_control.inputs.messages import Dialect
 from q2r2_control.inputs.session import (
     MAX_COMMAND_BYTES,
     MAX_INCOMPLETE,
     MAX_OUTGOING_BYTES,
     MAX_TOPICS,
     HeadsetSession,
-    Reception,
 )
 from q2r2_control.types import HapticFeedback
 from tests.support.fake_headset import pack_inputs, pack_pose, pack_twist
@@ -75,33 +73,11 @@ def test_the_dialect_is_told_by_the_first_system_command(session: HeadsetSession
 
 
 @every_dialect
-def test_a_keepalive_tells_no_dialect(session: HeadsetSession, dialect: Dialect) -> None:
-    session.receive(WireFrame("", b"", terminated=False))
-    assert session.dialect is None
-    session.receive(command(dialect, "__topic_list"))
-    assert session.dialect is dialect
-
-
-@every_dialect
-def test_data_before_any_registration_tells_the_dialect_too(session: HeadsetSession, dialect: Dialect) -> None:
-    assert isinstance(session.receive(pose(dialect)), Reception)
-    assert session.dialect is dialect
-
-
-@every_dialect
 @pytest.mark.parametrize("slash", ["", "/"])
 def test_topics_are_known_with_and_without_leading_slash(session: HeadsetSession, dialect: Dialect, slash: str) -> None:
     reception = session.receive(pose(dialect, slash + "q2r_right_hand_pose"))
     assert reception is not None
     assert (reception.topic, reception.hand) == ("q2r_right_hand_pose", "right")
-
-
-@every_dialect
-def test_buttons_of_the_other_dialect_are_never_read_as_pressed(session: HeadsetSession, dialect: Dialect) -> None:
-    session.receive(command(dialect, "__topic_list"))
-    wrong = pack_inputs(dialect.other.lower(), False, False, (0.0,) * 4)
-    with pytest.raises(ProtocolError, match=f"message of the {dialect.other} dialect.*as in {dialect}"):
-        session.receive(frame(dialect, "q2r_left_hand_inputs", wrong))
 
 
 @every_dialect
@@ -125,22 +101,6 @@ def test_a_change_of_dialect_ends_the_session(session: HeadsetSession, dialect: 
         session.receive(pose(dialect.other))
 
 
-def test_the_nul_after_json_is_no_fault(session: HeadsetSession) -> None:
-    session.receive(frame(Dialect.ROS2, "__subscribe", b'{"topic":"/%s","message_name":"x/Y"}\0' % HAPTIC.encode()))
-    assert session.subscribed == {HAPTIC: "/" + HAPTIC}
-
-
-@every_dialect
-def test_registering_twice_is_registering_once(session: HeadsetSession, dialect: Dialect) -> None:
-    for _ in range(2):
-        session.receive(
-            command(dialect, "__publish", topic="a", message_name="std_msgs/Empty", queue_size=1, latch=False)
-        )
-        session.receive(command(dialect, "__subscribe", topic="/b", message_name="std_msgs/Empty"))
-    assert session.published == {"a": "std_msgs/Empty"}
-    assert session.subscribed == {"b": "/b"}
-
-
 @every_dialect
 def test_removing_takes_a_registration_away_and_may_come_without_one(session: HeadsetSession, dialect: Dialect) -> None:
     session.receive(command(dialect, "__publish", topic="a", message_name="std_msgs/Empty"))
@@ -162,7 +122,7 @@ def test_the_topic_list_has_a_type_of_two_parts_for_each_topic(session: HeadsetS
     assert types["/q2r_left_hand_pose"] == "geometry_msgs/PoseStamped"
     assert types["/q2r_right_hand_inputs"] == "quest2ros/OVR2ROSInputs"
     assert types["/" + HAPTIC] == "quest2ros/OVR2ROSHapticFeedback"
-    assert types["/dice"] == types["/dice_twist"] == types["/q2r_twist"] == "geometry_msgs/Twist"
+    assert types["/dice"] == "geometry_msgs/Twist"
     assert all(re.fullmatch(r"/\w+", topic) for topic in types), "as in the ROS graph: one slash before each"
     assert all(re.fullmatch(r"\w+/\w+", kind) for kind in types.values())
 
@@ -186,11 +146,11 @@ def test_a_request_is_answered_with_an_error(session: HeadsetSession) -> None:
 @pytest.mark.parametrize("name", ["__ros_service", "__unity_service", "__remove_ros_service", "__remove_unity_service"])
 def test_registering_services_is_survived(session: HeadsetSession, name: str) -> None:
     session.receive(command(Dialect.ROS2, name, topic="reset", message_name="std_srvs/Empty"))
-    assert all(answer == "__warn" for answer, _ in answers(session))
+    assert answers(session) == []
 
 
 @every_dialect
-@pytest.mark.parametrize("name", ["__ping", "__", "__handshake", "__PUBLISH", "__publish\0"])
+@pytest.mark.parametrize("name", ["__ping", "__", "__publish\0"])
 def test_an_unknown_system_command_ends_the_session(session: HeadsetSession, dialect: Dialect, name: str) -> None:
     with pytest.raises(ProtocolError, match="unknown system command"):
         session.receive(command(dialect, name))
@@ -200,11 +160,7 @@ def test_an_unknown_system_command_ends_the_session(session: HeadsetSession, dia
     "payload",
     [
         pytest.param(b"{", id="half an object"),
-        pytest.param(b"[]", id="a list"),
-        pytest.param(b"null", id="null"),
         pytest.param(b'{"topic":3,"message_name":"a/B"}', id="a topic that is a number"),
-        pytest.param(b'{"topic":"a","message_name":3}', id="a type that is a number"),
-        pytest.param(b'{"topic":"a b","message_name":"a/B"}', id="a topic with a space"),
         pytest.param(b'{"topic":"\\ud800","message_name":"a/B"}', id="half a surrogate"),
         pytest.param(b'{"topic":"a","message_name":"a/B"}\0\0', id="two NULs"),
         pytest.param(b"\xff\xfe", id="not UTF-8"),
@@ -230,30 +186,25 @@ def test_a_command_may_have_16_kilobytes_and_no_more(session: HeadsetSession, ex
 
 
 @every_dialect
-@pytest.mark.parametrize("name", ["__publish", "__subscribe", "__remove_publisher", "__remove_subscriber"])
-@pytest.mark.parametrize("topic", [{}, {"topic": ""}, {"topic": " "}, {"topic": None}], ids=str)
-def test_a_blank_topic_is_answered_with_an_error_and_the_session_goes_on(
-    session: HeadsetSession, dialect: Dialect, name: str, topic: dict[str, object]
+@pytest.mark.parametrize(
+    ("name", "given", "missing"),
+    [
+        ("__publish", {"topic": " ", "message_name": "std_msgs/Empty"}, "topic"),
+        ("__subscribe", {"topic": None, "message_name": "std_msgs/Empty"}, "topic"),
+        ("__remove_subscriber", {}, "topic"),
+        ("__subscribe", {"topic": "dice"}, "message_name of dice"),
+        ("__publish", {"topic": "dice", "message_name": ""}, "message_name of dice"),
+    ],
+)
+def test_a_blank_topic_or_type_is_answered_with_an_error_and_the_session_goes_on(
+    session: HeadsetSession, dialect: Dialect, name: str, given: dict[str, object], missing: str
 ) -> None:
-    session.receive(command(dialect, name, message_name="std_msgs/Empty", **topic))
+    session.receive(command(dialect, name, **given))
     ((answer, payload),) = answers(session)
     assert answer == "__error"
-    assert json.loads(payload)["text"] == f"{name}: topic is empty; this registration is left out"
+    assert json.loads(payload)["text"] == f"{name}: {missing} is empty; this registration is left out"
     assert (session.published, session.subscribed) == ({}, {})
     assert session.receive(pose(dialect)) is not None
-
-
-@pytest.mark.parametrize("name", ["__publish", "__subscribe"])
-@pytest.mark.parametrize("kind", [{}, {"message_name": ""}], ids=str)
-def test_a_missing_type_is_answered_with_an_error_and_the_session_goes_on(
-    session: HeadsetSession, name: str, kind: dict[str, object]
-) -> None:
-    session.receive(command(Dialect.ROS2, name, topic="dice", **kind))
-    ((answer, payload),) = answers(session)
-    assert answer == "__error"
-    assert "message_name of dice is empty" in json.loads(payload)["text"]
-    assert (session.published, session.subscribed) == ({}, {})
-    assert session.receive(pose(Dialect.ROS2)) is not None
 
 
 def test_a_flood_of_blank_topics_ends_the_session_though_every_answer_is_read(session: HeadsetSession) -> None:
@@ -283,7 +234,7 @@ def test_registrations_are_bounded(session: HeadsetSession) -> None:
         session.receive(command(Dialect.ROS2, "__subscribe", topic="one_more", message_name="a/B"))
 
 
-@pytest.mark.parametrize("name", ["GET / HTTP", "q2r left", "-", "//a", "a" * 300, "\n", "é"])
+@pytest.mark.parametrize("name", ["q2r left", "//a", "a" * 300, "\n", "é"])
 def test_a_destination_that_no_topic_can_have_ends_the_session(session: HeadsetSession, name: str) -> None:
     with pytest.raises(ProtocolError, match="not a topic name"):
         session.receive(frame(Dialect.ROS1, name, b"x"))
@@ -303,34 +254,15 @@ def test_haptics_go_to_the_subscribed_spelling_in_the_clients_dialect(
     session: HeadsetSession, dialect: Dialect
 ) -> None:
     session.receive(command(dialect, "__subscribe", topic="/" + HAPTIC, message_name="quest2ros/OVR2ROSHapticFeedback"))
-    session.queue_message(HapticFeedback("left", 0.5, 1.0))
+    session.queue_haptic(HapticFeedback("left", 0.5, 1.0))
     header = b"\0\1\0\0" if dialect is Dialect.ROS2 else b""
     assert answers(session) == [("/" + HAPTIC, header + bytes.fromhex("0000003f 0000803f"))]
 
 
 def test_no_haptics_go_to_a_client_that_did_not_subscribe_or_no_longer_listens(session: HeadsetSession) -> None:
-    session.queue_message(HapticFeedback("left", 0.5, 1.0))
+    session.queue_haptic(HapticFeedback("left", 0.5, 1.0))
     session.receive(command(Dialect.ROS2, "__subscribe", topic=HAPTIC, message_name="a/B"))
-    session.queue_message(HapticFeedback("right", 0.5, 1.0))
+    session.queue_haptic(HapticFeedback("right", 0.5, 1.0))
     session.receive(command(Dialect.ROS2, "__remove_subscriber", topic=HAPTIC))
-    session.queue_message(HapticFeedback("left", 0.5, 1.0))
+    session.queue_haptic(HapticFeedback("left", 0.5, 1.0))
     assert answers(session) == []
-
-
-@every_dialect
-@pytest.mark.parametrize("topic", PROP_TOPICS)
-@pytest.mark.parametrize("slash", ["", "/"])
-def test_a_twist_goes_to_the_subscribed_spelling_in_the_clients_dialect(
-    session: HeadsetSession, dialect: Dialect, topic: str, slash: str
-) -> None:
-    twist = PropTwist(topic, np.array(POSITION), -np.array(POSITION))
-    session.queue_message(twist)
-    session.receive(command(dialect, "__subscribe", topic=slash + topic, message_name="geometry_msgs/Twist"))
-    session.queue_message(twist)
-    payload = pack_twist(dialect.lower(), POSITION, (-0.1, -0.2, -0.3))
-    assert answers(session) == [(slash + topic, payload)]
-
-
-def test_a_keepalive_is_eight_zero_bytes(session: HeadsetSession) -> None:
-    session.queue_keepalive()
-    assert bytes(session.outgoing) == KEEPALIVE

@@ -19,7 +19,7 @@ need_ros()
 from q2r2_control.errors import ConfigError
 from q2r2_control.ros.nodes.arm_controllers import LeftArmController, RightArmController
 from q2r2_control.types import Array
-from tests.ros.arm_rig import HOLDING, ArmRigs, offset
+from tests.ros.arm_rig import offset
 from tests.ros.cockpit import Cockpit
 from tests.ros.waiting import call, wait_until
 
@@ -28,7 +28,6 @@ pytestmark = pytest.mark.alone
 BINDINGS = {
     "teleop.bindings.grip": "home",
     "teleop.bindings.lower_hold": "stop",
-    "teleop.bindings.upper_hold": "swap_hands",
     "teleop.bindings.trigger": "carry",
 }
 HOME, STILL = 0.01, 0.005  # [rad]
@@ -99,23 +98,6 @@ def test_a_stop_of_one_hand_stops_both_arms_until_it_is_taken_back(cockpit: Cock
     cockpit.hold(cockpit.right, "lower")
     cockpit.rigs.wait(lambda rig: rig.state["state"] == "paused", "it is taken back for both")
     assert np.abs(cockpit.cell.q - rest).max() < STILL
-
-
-def test_hands_that_are_swapped_drive_the_other_arm(cockpit: Cockpit) -> None:
-    left, right = cockpit.left, cockpit.right
-    cockpit.rigs.pause()
-    cockpit.hold(left, "upper")
-    cockpit.rigs.wait(lambda rig: rig.state["hand"] != rig.arm and rig.state["ready"], "the hands are swapped")
-    rest = cockpit.cell.joints.wait_for_rest()
-    hand = ArmRigs([left])
-    hand.press_until(lambda _: right.state["engaged"], "the left hand engages the right arm")
-    left.move((0.0, 0.0, 0.06), 0.6)
-    joints = cockpit.cell.robot.arms
-    wait_until(lambda: np.abs(cockpit.cell.q - rest)[joints["right"].joints].max() > 0.03, "the right arm follows")
-    assert np.abs(cockpit.cell.q - rest)[joints["left"].joints].max() < STILL
-    hand.press_until(lambda _: right.state["state"] in HOLDING, "and pauses it")
-    cockpit.hold(right, "upper")
-    cockpit.rigs.wait(lambda rig: rig.state["hand"] == rig.arm, "the hands are swapped back")
 
 
 def test_one_hand_moves_both_tools_which_keep_their_relation_and_needs_no_other_hand(cockpit: Cockpit) -> None:

@@ -12,18 +12,13 @@ import yaml
 from q2r2_control import CartesianController, Robot, load_config
 from q2r2_control.config.cell import Config
 from q2r2_control.config.resources import find_resource
-from q2r2_control.config.supervision import SupervisionSettings
 from q2r2_control.events import ReasonKind
 from q2r2_control.supervision.external_arms import ExternalArms, ExternalSettings, settings_for_external_arms
-from q2r2_control.supervision.joint_watch import watch_settings
 from q2r2_control.supervision.supervisor import Phase, Supervisor
 from q2r2_control.supervision.target_stream import StreamSettings
 from q2r2_control.types import Array, Reference, RobotState
+from tests.supervision.conftest import STRICT, unhurried
 from tests.support.reasons import kinds
-
-NO_CLOCK = {"solve_time_limit": None}  # whether a solution is late depends on the machine
-
-STRICT = SupervisionSettings(unusable_time=0.0)  # a state that is not finite is a fault at once
 
 CONFIG = "config/dual_iiwa7.yaml"
 DT = 0.005  # [s]
@@ -71,8 +66,8 @@ class World:
 
     def __init__(self, config: Config) -> None:
         self.robot = Robot.from_config(config)
-        self.controller = CartesianController(self.robot, config.control.model_copy(update=NO_CLOCK))
-        streams, watch = StreamSettings(), watch_settings(STRICT, yields=False)
+        self.controller = CartesianController(self.robot, unhurried(config))
+        streams, watch = StreamSettings(), STRICT
         settings = ExternalSettings(tolerance=TOLERANCE)
         external = ExternalArms(self.robot, self.controller, settings, streams, watch)
         self.supervisor = Supervisor(self.robot, self.controller, streams, watch, external=external)

@@ -130,15 +130,6 @@ def test_without_a_measurement_that_can_be_believed_a_gripper_stays_commanded_as
     assert controller.openings == openings
 
 
-def test_a_gripper_that_is_forced_wider_than_commanded_counts_as_wide_as_it_is_measured(
-    controller: CartesianController,
-) -> None:
-    cell = Cell(controller)
-    cell.run(0.0, 0.5)
-    cell.tick(0.0, {"left": 0.3, "right": 1.0})
-    assert controller.openings["left"][1] >= 0.3 + TOLERANCE / STROKE
-
-
 def test_one_that_is_forced_into_what_is_near_is_named_and_may_close(controller: CartesianController) -> None:
     cell = Cell(controller)
     cell.run(0.0, 1.6, BESIDE)

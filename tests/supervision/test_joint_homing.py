@@ -6,20 +6,15 @@ import numpy as np
 import pytest
 
 from q2r2_control import CartesianController, Robot, load_config
-from q2r2_control.config.supervision import SupervisionSettings
 from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.robot.kept_distances import kept_distances
 from q2r2_control.supervision.joint_homing import JointHoming
-from q2r2_control.supervision.joint_watch import watch_settings
 from q2r2_control.supervision.supervisor import Supervisor
 from q2r2_control.supervision.target_stream import StreamSettings
 from q2r2_control.types import Array, Reference, RobotState
 from q2r2_control.verification.contract import Contract
+from tests.supervision.conftest import STRICT
 from tests.support.reasons import kinds
-
-NO_CLOCK = {"solve_time_limit": None}  # whether a solution is late depends on the machine
-
-STRICT = SupervisionSettings(unusable_time=0.0)  # a state that is not finite is a fault at once
 
 CONFIG = "config/dual_iiwa7.yaml"
 DT = 0.004  # [s]
@@ -27,22 +22,12 @@ POSTURES, REACHED = 50, 48
 LONGEST = 60.0  # [s]
 
 
-@pytest.fixture(scope="module")
-def robot() -> Robot:
-    return Robot.from_config(load_config(CONFIG))
-
-
-@pytest.fixture(scope="module")
-def controller(robot: Robot) -> CartesianController:
-    return CartesianController(robot, load_config(CONFIG).control.model_copy(update=NO_CLOCK))
-
-
 class World:
     """A supervisor whose arms are where its references are; its contract is checked at every tick that is asked for."""
 
     def __init__(self, robot: Robot, controller: CartesianController, q: Array, checked: bool = False) -> None:
         self.controller = controller
-        self.supervisor = Supervisor(robot, controller, StreamSettings(), watch_settings(STRICT, yields=False))
+        self.supervisor = Supervisor(robot, controller, StreamSettings(), STRICT)
         self.state = RobotState(q.copy(), np.zeros_like(q), np.zeros_like(q), None, 0.0)
         self.supervisor.activate(self.state, 0.0)
         self.contract = Contract(controller, q) if checked else None
@@ -191,12 +176,3 @@ def test_an_arm_that_is_held_up_is_waited_for_and_then_it_says_so(robot: Robot) 
             break
     assert homing.outcome is ReasonKind.HOMING_HELD_UP
     assert 0.05 < farthest < 0.13  # or it would set off fast when it is free again
-
-
-def test_it_begins_where_the_arms_come_to_rest_and_not_while_they_move(robot: Robot) -> None:
-    homing = JointHoming(robot, kept_distances(robot, load_config(CONFIG).control).values, robot.home)
-    q = robot.home + 0.1
-    assert homing.step(q, np.full_like(q, 0.1), DT) is None
-    at = homing.step(q + 0.01, np.zeros_like(q), DT)
-    assert at is not None
-    assert np.array_equal(at, q + 0.01)

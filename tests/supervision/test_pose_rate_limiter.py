@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from q2r2_control.config.teleop import GuardSettings
 from q2r2_control.supervision.pose_rate_limiter import PoseRateLimiter
 from q2r2_control.supervision.tick_pacer import TickPacer
-from q2r2_control.types import LONGEST_DT, Array
+from q2r2_control.types import LONGEST_DT
 from tests.teleop.hands import pose
 
 DT = 0.01
@@ -54,10 +54,7 @@ class Watched:
         )
         bounds = (
             (LIMITS.max_velocity, LIMITS.max_acceleration),
-            (
-                LIMITS.max_angular_velocity,
-                LIMITS.max_angular_acceleration,
-            ),
+            (LIMITS.max_angular_velocity, LIMITS.max_angular_acceleration),
         )
         for velocity, previous, (fastest, acceleration) in zip(self.velocity, last, bounds, strict=True):
             assert math.hypot(*velocity) <= fastest * (1 + 1e-6) + 1e-9
@@ -90,12 +87,6 @@ def test_what_was_left_to_brake_on_is_not_moved_after_a_gap_in_which_all_came_to
     assert watched.step(None).isApprox(held, 1e-12)
 
 
-def test_without_a_reset_there_is_no_pose() -> None:
-    guard = PoseRateLimiter(LIMITS, DT)
-    assert guard.step(pose(1.0), 1.0) is None
-    assert guard.at_rest
-
-
 def test_the_first_pose_is_that_of_the_reset_exactly() -> None:
     start = pose(0.3, -0.2, 0.7, (0.1, 2.0, -0.4))
     guard = PoseRateLimiter(LIMITS, DT)
@@ -114,7 +105,7 @@ def test_a_motion_within_the_limits_is_followed_without_lag() -> None:
     assert watched.guard.clipped == 0
 
 
-@pytest.mark.parametrize("dt", [0.002, 0.005, 0.01, 0.02])
+@pytest.mark.parametrize("dt", [0.002, 0.02])
 def test_a_step_is_reached_without_overshoot_in_the_time_that_the_limits_take(dt: float) -> None:
     watched, goal = Watched(period=dt), pose(0.4, 0.0, 0.0, (0.0, 0.0, 1.0))
     fastest = 0.4 / LIMITS.max_velocity + LIMITS.max_velocity / LIMITS.max_acceleration
@@ -139,42 +130,15 @@ def test_without_a_target_it_brakes_and_rests() -> None:
         np.testing.assert_array_equal(watched.step(None).homogeneous, rest.homogeneous)
 
 
-def test_a_target_that_returns_elsewhere_is_approached_and_not_jumped_to() -> None:
-    watched = Watched()
-    watched.step(None)
-    for _ in range(300):
-        after = watched.step(pose(0.0, 0.6, 0.0))
-    np.testing.assert_allclose(after.translation, [0.0, 0.6, 0.0], atol=1e-6)
-
-
-@pytest.mark.parametrize("bad", [math.nan, math.inf])
-def test_a_target_that_is_not_finite_is_held_off(bad: float) -> None:
-    watched = Watched()
+@pytest.mark.parametrize("entry", [(0, 3), (2, 1)], ids=["of its position", "of its rotation"])
+def test_a_target_with_one_number_that_is_not_finite_is_held_off(entry: tuple[int, int]) -> None:
+    watched, matrix = Watched(), pose(0.1, 0.0, 0.0, (0.3, -2.0, 1.0)).homogeneous
+    matrix[entry] = math.nan
     for tick in range(1, 50):
         watched.step(pose(0.004 * tick))
     for _ in range(50):
-        watched.step(pose(bad))
+        watched.step(pin.SE3(matrix[:3, :3], matrix[:3, 3]))
     assert watched.guard.at_rest
-
-
-@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
-@pytest.mark.parametrize("entry", range(9))
-def test_one_number_of_a_rotation_that_is_not_finite_is_enough(entry: int, bad: float) -> None:
-    watched = Watched()
-    rotation = pose(0.0, 0.0, 0.0, (0.3, -2.0, 1.0)).rotation.copy()
-    rotation.flat[entry] = bad
-    held = watched.step(pose(0.0))
-    for _ in range(50):
-        assert watched.step(pin.SE3(rotation, np.array([0.1, 0.0, 0.0]))).isApprox(held, 1e-12)
-
-
-def test_a_loop_that_stalled_makes_up_for_nothing() -> None:
-    watched = Watched()
-    for tick in range(1, 50):
-        watched.step(pose(0.004 * tick))
-    before = watched.pose
-    watched.step(pose(3.0), dt=5.0)
-    assert np.linalg.norm(watched.pose.translation - before.translation) <= LIMITS.max_velocity * 0.1 + 1e-9
 
 
 def test_a_clock_that_does_not_advance_returns_the_same_pose() -> None:
@@ -202,16 +166,6 @@ def test_no_sequence_of_targets_breaks_a_limit(
     for _ in range(60):
         watched.step(None)
     assert watched.guard.at_rest
-
-
-def test_a_target_that_stays_is_where_it_ends() -> None:
-    watched, goal = Watched(), pose(0.3, -0.5, 0.2, (1.0, -2.0, 0.5))
-    velocities: list[Array] = []
-    for _ in range(400):
-        watched.step(goal)
-        velocities.append(watched.velocity[0])
-    np.testing.assert_allclose(watched.pose.homogeneous, goal.homogeneous, atol=1e-6)
-    assert np.abs(velocities[-50:]).max() < 1e-6
 
 
 def test_limits_that_are_lowered_in_motion_brake_the_pose_at_the_acceleration_and_count_from_then_on() -> None:

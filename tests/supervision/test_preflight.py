@@ -5,24 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from q2r2_control import CartesianController, ControllerSettings, Robot, load_config
+from q2r2_control import CartesianController, ControllerSettings, Robot
 from q2r2_control.supervision.preflight import preflight_faults
 
 SETTINGS = ControllerSettings()
-
-
-@pytest.fixture(scope="module")
-def robot() -> Robot:
-    return Robot.from_config(load_config("config/dual_iiwa7.yaml"))
-
-
-@pytest.fixture(scope="module")
-def controller(robot: Robot) -> CartesianController:
-    return CartesianController(robot, SETTINGS)
-
-
-def test_a_good_cell_has_no_fault(robot: Robot, controller: CartesianController) -> None:
-    assert preflight_faults(robot, SETTINGS, controller) == ()
 
 
 def test_a_home_outside_a_limit_is_named_with_what_is_allowed(robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:

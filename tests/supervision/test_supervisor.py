@@ -6,31 +6,16 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from q2r2_control import CartesianController, Robot, load_config
-from q2r2_control.config.supervision import SupervisionSettings
+from q2r2_control import CartesianController, Robot
 from q2r2_control.events import Reason, ReasonKind
-from q2r2_control.supervision.joint_watch import watch_settings
 from q2r2_control.supervision.supervisor import Phase, Supervisor
 from q2r2_control.supervision.target_stream import StreamSettings, TargetStream
 from q2r2_control.types import Array, RobotState
+from tests.supervision.conftest import STRICT
 from tests.support.reasons import kinds
-
-NO_CLOCK = {"solve_time_limit": None}  # whether a solution is late depends on the machine
-
-STRICT = SupervisionSettings(unusable_time=0.0)  # a state that is not finite is a fault at once
 
 DT = 0.004
 TOOL = pin.SE3(np.eye(3), np.array([0.5, 0.2, 0.4]))
-
-
-@pytest.fixture(scope="module")
-def robot() -> Robot:
-    return Robot.from_config(load_config("config/dual_iiwa7.yaml"))
-
-
-@pytest.fixture(scope="module")
-def controller(robot: Robot) -> CartesianController:
-    return CartesianController(robot, load_config("config/dual_iiwa7.yaml").control.model_copy(update=NO_CLOCK))
 
 
 class World:
@@ -38,7 +23,7 @@ class World:
 
     def __init__(self, robot: Robot, controller: CartesianController) -> None:
         self.streams = StreamSettings()
-        self.supervisor = Supervisor(robot, controller, self.streams, watch_settings(STRICT, yields=False))
+        self.supervisor = Supervisor(robot, controller, self.streams, STRICT)
         self.q, self.now, self.blocked = robot.home.copy(), 0.0, False
         self.v, self.lag = np.zeros_like(self.q), DT  # [s]
         self.commanded: list[Array | None] = []
@@ -140,13 +125,6 @@ def test_a_stream_that_its_sender_ends_stops_its_own_arm_only(world: World, cont
     assert [world.supervisor.arm_state(arm) for arm in ("left", "right")] == ["holding", "following"]
 
 
-def test_arms_that_are_not_linked_end_their_streams_alone(world: World, controller: CartesianController) -> None:
-    world.streams.linked = False
-    _, right = engage_both(world, controller)
-    world.run(0.5, right=right)
-    assert [world.supervisor.arm_state(arm) for arm in ("left", "right")] == ["holding", "following"]
-
-
 def test_a_loop_that_stood_still_commands_nothing_of_the_past_and_follows_no_target_that_waited(
     world: World, controller: CartesianController
 ) -> None:
@@ -219,16 +197,6 @@ def test_homing_ends_at_home_and_takes_no_targets(world: World, robot: Robot, co
     assert "homing_outcome: homing_arrived" in map(kinds, world.supervisor.events)
     assert np.linalg.norm(controller.tool_pose("left").translation - tool.translation) < 3e-3
     assert world.supervisor.arm_state("left") == "holding"
-
-
-def test_a_stream_that_begins_at_the_tool_is_followed_until_it_ceases() -> None:
-    stream = TargetStream(StreamSettings())
-    assert stream.offer(TOOL, [TOOL], 0.0) is None
-    assert stream.offer(raised(TOOL, 0.5), [TOOL], 0.1) is None
-    assert not stream.expire(0.25)
-    assert stream.expire(0.26)
-    assert stream.pose is None
-    assert not stream.expire(1.0)
 
 
 def test_a_stream_that_was_followed_goes_on_anywhere_and_after_a_silence_only_from_the_tool() -> None:

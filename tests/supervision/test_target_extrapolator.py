@@ -58,11 +58,6 @@ def test_the_way_is_the_targets_own() -> None:
         assert abs(turned) < 2e-3
 
 
-def test_a_target_that_rests_is_followed_to_the_bit() -> None:
-    rest = circling(0.3)
-    assert all((found.homogeneous == rest.homogeneous).all() for found in played(lambda _: rest, 0.5, lines=True))
-
-
 def test_a_step_is_no_motion_that_goes_on() -> None:
     line, low = TargetExtrapolator(), pin.SE3.Identity()
     high = pin.SE3(np.eye(3), np.array([0.0, 0.0, 0.002]))

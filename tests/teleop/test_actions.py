@@ -1,4 +1,4 @@
-"""What is for both arms: stop, the way home, hands that are swapped; and a gripper that follows a trigger."""
+"""What is for both arms: stop, the way home, and a gripper that follows a trigger."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import math
 import numpy as np
 import pytest
 
-from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.teleop.arm_states import is_fault, is_refusal
 from q2r2_control.types import SIDES, HandInputs
@@ -21,14 +20,12 @@ from tests.teleop.hands import (
     STOPPED,
     Squeezing,
     assert_holds,
-    assert_smooth,
-    pose,
     spoilt,
     squeezing,
     waving,
 )
 
-BINDINGS = {"grip": "stop", "stick_down": "home", "stick_left": "swap_hands"}
+BINDINGS = {"grip": "stop", "stick_down": "home"}
 
 
 def engaged(**bindings: str) -> Squeezing:
@@ -58,9 +55,8 @@ class TestAStop:
     def test_lets_nothing_move_until_it_is_taken_back_and_then_a_press_engages(self) -> None:
         driver = engaged()
         push(driver, "grip")
-        for control in ("stick_down", "stick_left"):
-            push(driver, control)
-            assert driver.states == STOPPED
+        push(driver, "stick_down")
+        assert driver.states == STOPPED
         driver.press(*SIDES)
         driver.press(*SIDES, button="upper")
         assert driver.states == STOPPED
@@ -136,14 +132,8 @@ class TestTheWayHome:
             push(driver, "stick_down", hand="left")
             assert driver.states == states
 
-    def test_may_be_asked_for_by_arms_that_were_never_engaged(self) -> None:
-        driver = squeezing(bindings=BINDINGS)
-        driver.run(0.1)
-        push(driver, "stick_down")
-        assert driver.states == HOMING
-
     @pytest.mark.parametrize("hand", SIDES)
-    @pytest.mark.parametrize("control", ["lower", "upper", "stick_down", "stick_left"])
+    @pytest.mark.parametrize("control", ["lower", "upper", "stick_down"])
     def test_is_ended_by_any_press_which_does_nothing_else(self, control: str, hand: str) -> None:
         driver = engaged()
         push(driver, "stick_down")
@@ -153,16 +143,6 @@ class TestTheWayHome:
             push(driver, control, hand=hand)
         assert driver.states == PAUSED
         assert [driver.targets[arm].gripper for arm in SIDES] == [1.0, 1.0]
-        assert driver.teleop.hand_of("left") == "left"
-
-    def test_is_ended_by_the_alignment_chord(self) -> None:
-        driver = engaged()
-        push(driver, "stick_down")
-        driver.lower, driver.upper = {"right"}, {"right"}
-        driver.run(0.1)
-        driver.lower, driver.upper = set(), set()
-        driver.run(0.3)
-        assert driver.states == PAUSED
 
     def test_ends_as_a_fault_when_the_hand_that_asked_is_lost_and_not_for_the_other(self) -> None:
         driver = engaged()
@@ -200,53 +180,6 @@ class TestTheWayHome:
         driver.run(0.1)
         assert driver.states == IDLE
         assert {kinds(event.reason) for event in driver.events} == {"not_homing: pose_silent"}
-
-
-class TestSwappedHands:
-    def test_drive_the_other_arm_after_a_new_press_and_swap_back(self) -> None:
-        driver = engaged()
-        driver.press(*SIDES)
-        for left in ("right", "left"):
-            push(driver, "stick_left")
-            assert (driver.teleop.hand_of("left"), driver.states) == (left, PAUSED)
-            assert_holds(driver)
-            driver.press(left)
-            assert driver.states == {"left": "engaged", "right": "paused"}
-            driver.press(left)
-        told = [event.reason for event in driver.events if event.kind is ReasonKind.DRIVEN_BY]
-        assert {reason.detail["hand"] for reason in told} == set(SIDES)
-
-    def test_do_not_jump(self) -> None:
-        driver = engaged()
-        driver.hands["right"] = pose(1.0, -1.0, 1.0, (1.0, 0.0, 0.0))
-        driver.teleop.pause(driver.now, Reason(ReasonKind.TOOL_UNKNOWN))
-        push(driver, "stick_left")
-        driver.press(*SIDES)
-        assert driver.states == ENGAGED
-        first = driver.targets["left"].pose
-        assert first is not None
-        np.testing.assert_allclose(first.translation, driver.tools["left"].translation, atol=1e-9)
-        assert_smooth(driver.run(0.5, waving(driver)))
-
-    def test_are_refused_while_an_arm_is_engaged(self) -> None:
-        driver = engaged()
-        push(driver, "stick_left")
-        assert driver.states == ENGAGED
-        assert driver.teleop.hand_of("left") == "left"
-        assert {kinds(event.reason) for event in driver.events if is_refusal(event)} == {"not_swapped: pause_first"}
-
-
-class TestTheHandOfOneArmAlone:
-    def driver(self) -> Squeezing:
-        driver = Squeezing(TeleopSettings.model_validate({"bindings": BINDINGS}), ("left",))
-        driver.run(0.1)
-        return driver
-
-    def test_is_not_swapped(self) -> None:
-        driver = self.driver()
-        push(driver, "stick_left")
-        assert [kinds(event.reason) for event in driver.events] == ["not_swapped: one_arm"]
-        assert driver.teleop.hand_of("left") == "left"
 
 
 class TestAGripperThatFollowsATrigger:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,6 @@ from tests.teleop.hands import ENGAGED, PAUSED, Squeezing, assert_holds, assert_
 
 BINDINGS = {"grip": "carry", "stick_down": "home", "stick_left": "stop"}
 CARRYING = {"left": "engaged", "right": "carried"}
-LIMITS = {"left": {"linear": 0.1, "angular": 0.2}, "right": {"linear": 0.05}}
 
 
 def push(driver: Squeezing, control: str, hand: str = "left") -> None:
@@ -124,7 +122,7 @@ class TestBothTools:
         assert raised > 0.003 if in_step else abs(raised) < 1e-9
 
     def test_both_stay_in_their_boxes(self) -> None:
-        box = {"x": [0.4, 0.6], "y": [-0.7, 0.7], "z": [0.35, 0.6], "soft_edge": 0.02}
+        box = {"x": [0.4, 0.6], "y": [-0.7, 0.7], "z": [0.35, 0.6]}
         driver = carrying(workspace={"right": box})
         history = driver.run(2.0, turning(driver))
         assert_smooth(history)
@@ -134,17 +132,6 @@ class TestBothTools:
             assert right.translation[0] < 0.6 + 1e-9
             assert right.translation[2] > 0.35 - 1e-9
         assert relation(history[-1]).isApprox(relation(history[0]), 1e-9)
-
-    def test_neither_goes_faster_than_its_arm_may(self) -> None:
-        driver = carrying(speed_limit=LIMITS)
-        history = driver.run(2.0, turning(driver))
-        for before, after in pairwise(history):
-            for arm in SIDES:
-                a, b = before[arm].pose, after[arm].pose
-                assert a is not None
-                assert b is not None
-                assert np.linalg.norm(b.translation - a.translation) < 0.05 * 0.001 + 1e-9
-                assert np.linalg.norm(pin.log3(a.rotation.T @ b.rotation)) < 0.2 * 0.001 + 1e-9
 
 
 class TestItEnds:

@@ -14,13 +14,10 @@ from tests.teleop.hands import ENGAGED, Operator, assert_smooth, engaged, waving
 BOX = {"x": [0.3, 0.7], "y": [0.2, 0.6], "z": [0.2, 0.6]}
 CHANGES = {
     "scales": {"position_scale": 0.3, "rotation_scale": 0.5, "axis_scales": (1.0, 0.5, 2.0)},
-    "precision": {"precision_scale": 0.1},
     "rotation frame": {"rotation_frame": "tool"},
     "filter": {"filter": {"smoothing_delay": 0.1, "interpolation_delay": 0.05}},
     "leash": {"leash": {"distance": 0.05}},
     "workspace": {"workspace": {"left": BOX}},
-    "speed limit": {"speed_limit": {"left": {"linear": 0.05}}},
-    "gate": {"gate": {"max_jump": 0.05}},
 }
 
 

@@ -124,17 +124,6 @@ def test_a_button_held_through_a_fault_does_not_engage_again_until_released_and_
     assert driver.states == ENGAGED
 
 
-def test_a_press_that_a_fault_interrupts_does_not_engage() -> None:
-    driver = engaged()
-    driver.press("left")
-    driver.lower = {"left"}
-    driver.run(0.03)
-    driver.alter = lambda s: spoilt(s, quaternion=np.zeros(4)) if s.hand == "right" else s
-    driver.run(0.03)
-    driver.alter = lambda s: s
-    assert_holds(driver)
-
-
 def test_a_lost_connection_pauses_every_arm_and_wants_fresh_poses_and_a_new_press() -> None:
     driver = engaged()
     driver.run(0.2, waving(driver))
@@ -174,16 +163,6 @@ def test_engaging_is_refused_when_the_tools_pose_is(tools: dict[str, pin.SE3]) -
     driver.engage()
     assert driver.states == IDLE
     assert {kinds(event.reason) for event in driver.events} == {"not_engaged: tool_unknown"}
-
-
-def test_silence_during_a_chord_disengages_for_good() -> None:
-    driver = engaged()
-    driver.lower = driver.upper = {"left"}
-    driver.run(0.1)
-    driver.silent = {"left"}
-    driver.run(0.3)
-    driver.silent, driver.lower, driver.upper = set(), set(), set()
-    assert_holds(driver)
 
 
 def test_a_stalled_loop_disengages_instead_of_catching_up() -> None:

@@ -44,8 +44,8 @@ def errors(path: Path, since: float, dt: float = 0.002, **options: float) -> tup
     return math.sqrt(np.mean(np.square(distances))), math.sqrt(np.mean(np.square(angles)))
 
 
-@pytest.mark.parametrize("dt", [0.001, 0.005, 0.02], ids="loop of {} s".format)
-@pytest.mark.parametrize("speed", [0.02, 0.1, 0.5, 2.0], ids="{} per second".format)
+@pytest.mark.parametrize("dt", [0.001, 0.02], ids="loop of {} s".format)
+@pytest.mark.parametrize("speed", [0.02, 2.0], ids="{} per second".format)
 def test_a_steady_motion_comes_out_late_by_exactly_the_stated_delay_at_any_speed(speed: float, dt: float) -> None:
     def path(t: float) -> pin.SE3:
         return pose(speed * t, 0.0, 0.0, (0.0, 0.0, speed * t))
@@ -56,11 +56,7 @@ def test_a_steady_motion_comes_out_late_by_exactly_the_stated_delay_at_any_speed
     assert angle < speed * tolerance
 
 
-def test_the_default_delay_is_below_50_milliseconds() -> None:
-    assert 0.0 < PoseFilter(FilterSettings()).delay <= 0.05
-
-
-@pytest.mark.parametrize("frequency", [0.25, 0.5], ids="{} Hz".format)
+@pytest.mark.parametrize("frequency", [0.5], ids="{} Hz".format)
 def test_a_circle_keeps_its_shape_to_a_millimetre(frequency: float) -> None:
     def path(t: float) -> pin.SE3:
         phase = 2 * math.pi * frequency * t
@@ -69,15 +65,7 @@ def test_a_circle_keeps_its_shape_to_a_millimetre(frequency: float) -> None:
     assert errors(path, since=0.7)[0] < 1e-3
 
 
-@pytest.mark.parametrize("frequency", [0.25, 0.5], ids="{} Hz".format)
-def test_a_rotation_of_30_degrees_keeps_its_shape_to_half_a_degree(frequency: float) -> None:
-    def path(t: float) -> pin.SE3:
-        return pose(turn=(0.0, math.radians(30) * math.sin(2 * math.pi * frequency * t), 0.0))
-
-    assert math.degrees(errors(path, since=0.5)[1]) < 0.5
-
-
-@pytest.mark.parametrize("frequency", [8.0, 10.0, 12.0], ids="{} Hz".format)
+@pytest.mark.parametrize("frequency", [8.0, 12.0], ids="{} Hz".format)
 def test_tremor_of_a_resting_hand_is_reduced_to_less_than_two_fifths(frequency: float) -> None:
     def path(t: float) -> pin.SE3:
         wave = math.sin(2 * math.pi * frequency * t)
@@ -171,8 +159,3 @@ def test_a_rotation_that_is_filtered_for_long_stays_one() -> None:
             pose_filter.add(floats_of(pose(turn=turn)), now, now)
         _, rotation = pose_filter.at(now)
         assert math.hypot(*rotation) == pytest.approx(1.0, abs=4e-15)
-
-
-def test_the_delay_stated_follows_the_settings() -> None:
-    settings = FilterSettings(interpolation_delay=0.05, smoothing_delay=0.1)
-    assert PoseFilter(settings).delay == pytest.approx(0.15)

@@ -27,6 +27,7 @@ from q2r2_control.teleop.haptics import (
     SLIP,
     STOPPED,
     VOCABULARY,
+    ArmCondition,
     HapticPulses,
     Pulse,
 )
@@ -116,12 +117,15 @@ def felt(haptics: HapticPulses, since: float, until: float) -> list[HapticFeedba
     return [sent for tick in ticks if (sent := haptics.at(since + 0.001 * tick, "left")) is not None]
 
 
+def condition(spare: float = 1.0, limits: tuple[str, ...] = (), force: float | None = None) -> ArmCondition:
+    return ArmCondition(spare, frozenset(limits), force)
+
+
 def test_coming_near_is_felt_at_every_5_mm_and_stronger_the_nearer_and_leaving_is_not() -> None:
     haptics = HapticPulses()
     pulses: list[float] = []
-    for tick in range(200):  # from 60 mm to spare to 0, and back
-        spare = abs(0.06 - 0.0006 * tick)
-        haptics.near(spare)
+    for tick in range(200):  # from 60 mm to spare to 0, where the distance trembles, and back
+        haptics.notice(condition(abs(0.06 - 0.0006 * tick) + (0.004 * (tick % 2) if tick < 100 else 0.0)))
         pulses += [sent.amplitude for sent in felt(haptics, tick, tick + 1.0) if sent.amplitude > 0.0]
         if tick == 100:
             approaching = len(pulses)
@@ -130,20 +134,11 @@ def test_coming_near_is_felt_at_every_5_mm_and_stronger_the_nearer_and_leaving_i
     assert NEAR.amplitude < pulses[0] < pulses[-1] == pytest.approx(0.6)
 
 
-def test_an_arm_that_stays_near_is_silent_though_the_distance_trembles() -> None:
-    haptics = HapticPulses()
-    haptics.near(0.0174)
-    assert len(felt(haptics, 0.0, 1.0)) == 2
-    for tick in range(100):
-        haptics.near(0.0174 + 0.004 * (tick % 2))
-        assert felt(haptics, tick, tick + 1.0) == []
-
-
 def test_a_contact_is_felt_at_every_5_newtons_and_stronger_the_harder() -> None:
     haptics = HapticPulses()
     pulses = []
     for tick in range(80):
-        haptics.contact(float(tick))
+        haptics.notice(condition(force=float(tick)))
         pulses += [sent.amplitude for sent in felt(haptics, tick, tick + 1.0) if sent.amplitude > 0.0]
     assert len(pulses) == 15
     assert CONTACT.amplitude < pulses[0] < pulses[5] < pulses[-1] == pytest.approx(0.8)
@@ -153,7 +148,7 @@ def test_a_joint_at_its_limit_and_a_grasp_are_each_felt_once_for_as_long_as_they
     haptics = HapticPulses()
     sent = []
     for tick in range(10):
-        haptics.limits(["left_A2", "left_A4"] if tick > 4 else ["left_A4"])
+        haptics.notice(condition(limits=("left_A2", "left_A4") if tick > 4 else ("left_A4",)))
         sent += felt(haptics, tick, tick + 1.0)
     assert [one for one in sent if one.amplitude] == [feedback(LIMIT)] * 2
     for tick in range(10, 20):
@@ -167,7 +162,7 @@ def test_two_vibrations_are_felt_as_two_and_a_fault_waits_for_none() -> None:
     haptics.tell(press("paused", "engaged"))
     first = felt(haptics, 1.0, 1.0 + ENGAGED.duration + 0.002)
     assert [one.amplitude for one in first] == [ENGAGED.amplitude, 0.0]
-    haptics.limits(["left_A4"])
+    haptics.notice(condition(limits=("left_A4",)))
     assert felt(haptics, 1.09, 1.12) == []
     assert felt(haptics, 1.12, 1.2)[0] == feedback(LIMIT)
     haptics.tell(JUMPED)
@@ -182,18 +177,18 @@ def test_the_strength_of_all_is_a_setting_and_0_sends_nothing(strength: float, e
 
 
 def test_of_two_at_once_the_one_that_stands_later_in_the_vocabulary_is_felt() -> None:
-    amplitudes = [word.pulse.amplitude for word in VOCABULARY]
+    amplitudes = [pulse.amplitude for pulse in VOCABULARY]
     assert amplitudes == sorted(amplitudes)
     haptics = HapticPulses()
     haptics.grasps(True)
-    haptics.limits(["left_A4"])
+    haptics.notice(condition(limits=("left_A4",)))
     assert haptics.at(0.0, "left") == feedback(GRASP)
 
 
 def test_the_table_in_the_docs_is_the_vocabulary() -> None:
     table = (Path(__file__).resolve().parents[2] / "docs" / "operator.md").read_text()
-    for word in VOCABULARY:
-        amplitude = f"{word.pulse.amplitude:g}" + (f" to {word.strongest:g}" if word.strongest else "")
-        row = f"| {word.meaning} | {word.pulse.frequency:g} | {amplitude} | {1e3 * word.pulse.duration:.0f} |"
+    for pulse in VOCABULARY:
+        amplitude = f"{pulse.amplitude:g}" + (f" to {pulse.strongest:g}" if pulse.strongest else "")
+        row = f"| {pulse.meaning} | {pulse.frequency:g} | {amplitude} | {1e3 * pulse.duration:.0f} |"
         assert row in table
     assert len(re.findall(r"^\|.*\| \d+ \|$", table, re.MULTILINE)) == len(VOCABULARY)

@@ -64,19 +64,6 @@ def test_a_hand_can_be_put_where_the_target_is_any_pose_that_is_wanted(
     assert_same(motion.target(motion.hand(wanted)), wanted)
 
 
-def test_where_no_hand_turns_the_tool_it_is_put_in_place_alone() -> None:
-    hand, tool = pose(0.1, 0.2, 0.3, (0.4, 0.0, 0.0)), pose(0.5, 0.0, 0.4, (3.0, 0.0, 0.0))
-    wanted = pose(0.6, 0.1, 0.4, (0.0, 1.0, 0.0))
-    found = anchored(hand, tool, rotation_scale=0.0).hand(wanted)
-    np.testing.assert_allclose(found.rotation, hand.rotation)
-    np.testing.assert_allclose(found.translation - hand.translation, [0.1, 0.1, 0.0], atol=1e-12)
-
-
-def test_before_an_anchor_there_is_no_place_for_the_hand() -> None:
-    with pytest.raises(Q2R2Error, match="call anchor"):
-        RelativeMotion().hand(pose())
-
-
 @quick
 @given(hand=poses, tool=poses, moved=poses)
 def test_in_the_base_frame_the_tool_translates_and_turns_as_the_hand_does(
@@ -98,13 +85,6 @@ def test_in_the_tool_frame_the_tool_turns_about_its_own_axes_as_the_hand_does_ab
 
 
 @quick
-@given(hand=poses, tool=poses, moved=poses, frame=st.sampled_from(FRAMES))
-def test_the_mirror_keeps_the_rooms_axes(hand: pin.SE3, tool: pin.SE3, moved: pin.SE3, frame: str) -> None:
-    beside, mirror = (anchored(hand, tool, stance=stance, rotation_frame=frame) for stance in STANCES[:2])
-    assert_same(beside.target(moved), mirror.target(moved))
-
-
-@quick
 @given(hand=poses, tool=poses, moved=poses)
 def test_the_reflected_mirror_reflects_translation_and_rotation(hand: pin.SE3, tool: pin.SE3, moved: pin.SE3) -> None:
     target = anchored(hand, tool, stance="mirror_reflected").target(moved)
@@ -112,16 +92,6 @@ def test_the_reflected_mirror_reflects_translation_and_rotation(hand: pin.SE3, t
     np.testing.assert_allclose(way, REFLECTION @ (moved.translation - hand.translation), atol=1e-9)
     turn = moved.rotation @ hand.rotation.T
     np.testing.assert_allclose(target.rotation @ tool.rotation.T, REFLECTION @ turn @ REFLECTION, atol=1e-9)
-
-
-@pytest.mark.parametrize(
-    ("turn", "expected"),
-    [((0.4, 0, 0), (-0.4, 0, 0)), ((0, 0.4, 0), (0, 0.4, 0)), ((0, 0, 0.4), (0, 0, -0.4))],
-    ids=["roll changes sign", "pitch stays", "yaw changes sign"],
-)
-def test_in_the_reflected_mirror(turn: tuple[float, float, float], expected: tuple[float, float, float]) -> None:
-    target = anchored(pose(), pose(), stance="mirror_reflected").target(pose(turn=turn))
-    np.testing.assert_allclose(pin.log3(target.rotation), expected, atol=1e-12)
 
 
 @pytest.mark.parametrize("frame", FRAMES)
@@ -132,15 +102,9 @@ def test_scales_multiply_the_way_and_the_rotation_vector(frame: str) -> None:
     np.testing.assert_allclose(pin.log3(target.rotation), [0.2, 0.4, -0.6], atol=1e-12)
 
 
-def test_a_rotation_scale_of_zero_keeps_the_orientation() -> None:
-    tool = pose(turn=(1.0, 2.0, 0.5))
-    target = anchored(pose(), tool, rotation_scale=0.0).target(pose(0.1, 0, 0, (2.0, -1.0, 0.5)))
-    np.testing.assert_allclose(target.rotation, tool.rotation, atol=1e-12)
-
-
 @pytest.mark.parametrize("frame", FRAMES)
 @pytest.mark.parametrize("wobble", [0.0, 0.2], ids=["about one axis", "with a wobble"])
-@pytest.mark.parametrize("scale", [0.3, 0.5, 1.0, 1.5, 2.0])
+@pytest.mark.parametrize("scale", [0.3, 1.0, 2.0])
 def test_the_tool_turns_steadily_while_the_hand_makes_three_turns(scale: float, wobble: float, frame: str) -> None:
     motion = anchored(pose(), pose(), rotation_scale=scale, rotation_frame=frame)
     step = 0.02
@@ -152,27 +116,6 @@ def test_the_tool_turns_steadily_while_the_hand_makes_three_turns(scale: float, 
     targets = [motion.target(hand(angle)) for angle in np.arange(0.0, 6.0 * math.pi, step)]
     turns = [float(np.linalg.norm(pin.log3(a.rotation.T @ b.rotation))) for a, b in pairwise(targets)]
     assert max(turns) < 4.0 * scale * step
-
-
-@pytest.mark.parametrize("frame", FRAMES)
-def test_a_half_scaled_rotation_past_half_a_turn_goes_on_instead_of_flipping(frame: str) -> None:
-    motion = anchored(pose(), pose(), rotation_scale=0.5, rotation_frame=frame)
-    for angle in np.arange(0.0, 4.0, 0.05):
-        target = motion.target(pose(turn=(0.0, 0.0, angle)))
-        assert pin.log3(target.rotation)[2] == pytest.approx(0.5 * angle)
-
-
-@pytest.mark.parametrize("frame", FRAMES)
-def test_a_thousand_anchors_with_the_hand_turning_in_between_do_not_drift(frame: str) -> None:
-    random = np.random.default_rng(0)
-    tool = pose(0.5, 0.1, 0.4, (3.0, 0.2, 0.1))
-    motion, carried = RelativeMotion(rotation_frame=frame), tool
-    for _ in range(1000):
-        hand = pin.SE3(pin.exp3(random.uniform(-3, 3, 3)), random.uniform(-1, 1, 3))
-        motion.anchor(hand, carried)
-        carried = motion.target(hand)
-    assert_same(carried, tool)
-    np.testing.assert_allclose(carried.rotation @ carried.rotation.T, np.eye(3), atol=1e-14)
 
 
 AXES = [
@@ -209,13 +152,10 @@ def test_raw_unity_arrives_as_the_connectors_own_conversion_would_send_it() -> N
     ("arguments", "message"),
     [
         ({"axes": ("+x", "+x", "+z")}, "axes .* use x, y and z once each"),
-        ({"axes": ("x", "y", "z")}, "axes .* use x, y and z once each"),
         ({"axes": ("+x", "+y")}, "axes"),
-        ({"axes": ("+x", "+y", "+w")}, "axes"),
         ({"stance": "behind"}, "stance = 'behind'.*side_by_side"),
         ({"rotation_frame": "hand"}, "rotation_frame = 'hand'.*base"),
         ({"scale": 0.0}, "position_scale = 0.0.*greater than 0"),
-        ({"scale": math.nan}, "position_scale = nan"),
         ({"rotation_scale": -1.0}, "rotation_scale = -1.0"),
     ],
     ids=lambda value: str(value) if isinstance(value, dict) else "",
@@ -229,11 +169,3 @@ def test_a_setting_that_is_not_allowed_is_named_with_what_is(arguments: dict[str
 def test_a_target_without_an_anchor_is_refused() -> None:
     with pytest.raises(Q2R2Error, match="anchor"):
         RelativeMotion().target(pose())
-
-
-def test_anchoring_copies_what_it_is_given() -> None:
-    hand, tool = pose(), pose(1.0)
-    motion = anchored(hand, tool)
-    hand.translation[:] = 5.0
-    tool.translation[:] = 7.0
-    np.testing.assert_allclose(motion.target(pose(0.1)).translation, [1.1, 0.0, 0.0])

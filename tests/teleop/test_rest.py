@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import pairwise
 
 import numpy as np
 import pinocchio as pin
@@ -25,9 +24,9 @@ NOISE, TURN_NOISE = 2e-4, 5e-4  # of a headset, standard deviation of each axis 
 class Filtered:
     """A filter with and without the mean at rest, fed with a hand along x."""
 
-    def __init__(self, noise: float = 0.0, enabled: bool = True) -> None:
+    def __init__(self, noise: float) -> None:
         self._random, self._noise = np.random.default_rng(4), noise
-        self._filter, self._rest = PoseFilter(FilterSettings()), RestingPose(enabled)
+        self._filter, self._rest = PoseFilter(FilterSettings()), RestingPose()
         start = self._sample(0.0)
         self._filter.reset(start, 0.0)
         self._rest.begin(start, 0.0)
@@ -70,7 +69,7 @@ def test_noise_of_a_resting_hand_is_a_third_of_what_the_filter_leaves_of_it_or_l
 
 
 @pytest.mark.parametrize("noise", [0.0, NOISE])
-@pytest.mark.parametrize("speed", [0.0005, 0.002, 0.01, 0.03, 0.1, 0.3, 1.0])
+@pytest.mark.parametrize("speed", [0.0005, 0.01, 0.03, 0.3])
 def test_a_hand_that_sets_off_is_followed_without_a_jump_and_at_once(speed: float, noise: float) -> None:
     filtered = Filtered(noise)
     filtered.run(2.0)
@@ -85,19 +84,6 @@ def test_a_hand_that_sets_off_is_followed_without_a_jump_and_at_once(speed: floa
         moving = slice(round(2.3 / TICK), round(2.95 / TICK))
         assert np.array_equal(filtered.drawn[moving], filtered.plain[moving])
     assert np.linalg.norm(filtered.drawn[-1] - np.array([moved, 0.0, 0.0])) < 0.1e-3
-
-
-def test_a_hand_without_noise_is_drawn_nowhere() -> None:
-    filtered = Filtered()
-    moved = filtered.run(1.0, 0.1, filtered.run(1.0))
-    filtered.run(2.0, 0.0, moved)
-    np.testing.assert_allclose(filtered.drawn[-1], filtered.plain[-1], atol=1e-12)
-
-
-def test_switched_off_every_pose_stays_as_it_is() -> None:
-    filtered = Filtered(NOISE, enabled=False)
-    filtered.run(3.0)
-    assert np.array_equal(filtered.drawn, filtered.plain)
 
 
 class NoisyOperator(Operator):
@@ -119,9 +105,8 @@ class NoisyOperator(Operator):
         self.tools |= {arm: target.pose for arm, target in self.targets.items() if target.pose is not None}
 
 
-@pytest.mark.parametrize("average", [True, False])
-def test_a_hundred_pauses_of_a_resting_hand_with_noise_hardly_displace_the_tool(average: bool) -> None:
-    driver = NoisyOperator(operator(filter={"average_at_rest": average}).settings)
+def test_a_hundred_pauses_of_a_resting_hand_with_noise_hardly_displace_the_tool() -> None:
+    driver = NoisyOperator(operator().settings)
     start = dict(driver.tools)
     after_engaging = []
     for _ in range(100):
@@ -134,12 +119,9 @@ def test_a_hundred_pauses_of_a_resting_hand_with_noise_hardly_displace_the_tool(
         assert driver.states == PAUSED
     drift = [float(np.linalg.norm(driver.tools[arm].translation - start[arm].translation)) for arm in SIDES]
     turned = [float(np.linalg.norm(pin.log3(driver.tools[arm].rotation @ start[arm].rotation.T))) for arm in SIDES]
-    if average:
-        assert max(drift) < 0.5e-3
-        assert max(turned) < 1e-3
-        assert np.mean(after_engaging) < 0.05e-3
-    else:
-        assert max(drift) > 1e-3  # which is what the average is for
+    assert max(drift) < 0.5e-3
+    assert max(turned) < 1e-3
+    assert np.mean(after_engaging) < 0.05e-3
 
 
 def turning(speed: float, seconds: float, then: float) -> tuple[list[pin.SE3], list[pin.SE3]]:
@@ -168,16 +150,8 @@ def angle(one: pin.SE3, other: pin.SE3) -> float:
     return float(np.linalg.norm(pin.log3(one.rotation.T @ other.rotation)))
 
 
-@pytest.mark.parametrize("speed", [0.1, 1.0, 0.5 * np.pi, 6.0])
+@pytest.mark.parametrize("speed", [0.1, 6.0])
 def test_a_hand_that_has_turned_however_far_is_known_as_well_as_any_when_it_rests(speed: float) -> None:
     drawn, real = turning(speed, seconds=2.0, then=4.0)
     settled = [angle(*both) for both in zip(drawn[-250:], real[-250:], strict=True)]
     assert max(settled) < TURN_NOISE / 2.0, "a mean of 150 samples; the filter alone leaves more than that"
-
-
-def test_a_hand_that_creeps_out_of_what_rotation_vectors_can_tell_is_followed_without_a_jump() -> None:
-    drawn, real = turning(1.5e-3, seconds=250.0, then=1.0)
-    assert angle(real[0], real[-1]) > 0.3, "it has left the origin of its rest"
-    assert max(angle(*both) for both in zip(drawn[25:], real[25:], strict=True)) < 4e-3
-    # With 25 steps in the time in which a mean comes and goes, what it counts for changes by a share of 0.08 at each.
-    assert max(angle(*both) for both in pairwise(drawn[25:])) < 5e-4

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pinocchio as pin
 
-from q2r2_control.quaternions import se3_of
-from q2r2_control.teleop.steady_state_offset import MAX_OFFSET, expected, with_offset
+from q2r2_control.teleop.steady_state_offset import MAX_OFFSET
 from q2r2_control.types import SIDES, Array
 from tests.teleop.hands import Operator, engaged, operator, squeezing, waving
 
@@ -40,14 +39,6 @@ def test_the_target_begins_at_the_tool_and_the_command_where_it_was() -> None:
     np.testing.assert_allclose(command(driver), driver.commanded["left"].translation, atol=1e-9)
     driver.run(0.5, waving(driver))
     np.testing.assert_allclose(target(driver) - command(driver), SAG, atol=1e-12)
-
-
-def test_where_a_tool_hangs_is_the_same_in_floats() -> None:
-    tool = operator().tools["right"]
-    for offset in (np.array([0.005, 0.01, -0.02]), None):
-        np.testing.assert_allclose(
-            se3_of(expected(tool, offset)).homogeneous, with_offset(tool, offset).homogeneous, atol=1e-15
-        )
 
 
 def test_a_tool_that_is_farther_from_its_command_was_pushed_there_and_the_command_begins_at_it() -> None:

@@ -13,8 +13,6 @@ from q2r2_control.teleop.teleop import Teleop
 from q2r2_control.types import SIDES
 from tests.teleop.hands import (
     ENGAGED,
-    TICK,
-    Operator,
     assert_holds,
     assert_smooth,
     engaged,
@@ -38,7 +36,7 @@ def test_it_starts_idle_and_the_first_press_of_the_lower_button_engages_that_arm
 def test_a_target_tells_the_hand_that_it_is_made_of_and_none_while_the_arm_holds() -> None:
     driver = engaged()
     driver.run(0.3, waving(driver))
-    driver.run(0.5)
+    driver.run(1.5)
     for arm in SIDES:
         hand = driver.targets[arm].hand
         assert hand is not None
@@ -104,17 +102,6 @@ def test_resuming_anchors_hand_and_tool_anew_and_carries_the_orientation_on() ->
         np.testing.assert_allclose(first.rotation, carried[arm], atol=1e-9)
 
 
-def test_the_orientation_carried_on_is_the_controllers_where_it_is_given() -> None:
-    driver = engaged()
-    driver.run(0.5, waving(driver))
-    driver.press(*SIDES)
-    driver.commanded = {arm: pose(9.0, 9.0, 9.0, (0.1, 0.2, 0.3)) for arm in SIDES}
-    driver.lower = set(SIDES)
-    first = first_targets(driver.run(0.2), "left")
-    np.testing.assert_allclose(first.translation, driver.tools["left"].translation, atol=1e-9)
-    np.testing.assert_allclose(first.rotation, driver.commanded["left"].rotation, atol=1e-9)
-
-
 def test_a_thousand_pauses_with_the_hand_turning_in_between_do_not_drift() -> None:
     teleop, tool, now = Teleop(TeleopSettings(), ("left",)), pose(0.5, 0.1, 0.4, (3.0, 0.2, 0.1)), 0.0
     random, hand, firsts = np.random.default_rng(0), pose(), []
@@ -142,8 +129,7 @@ def test_the_upper_button_toggles_its_own_gripper_once_a_press() -> None:
     assert driver.states == ENGAGED
 
 
-@pytest.mark.parametrize("first", ["lower", "upper"])
-@pytest.mark.parametrize("delay", [0.0, 0.03, 0.06], ids="{} s apart".format)
+@pytest.mark.parametrize(("first", "delay"), [("lower", 0.0), ("lower", 0.06), ("upper", 0.03)])
 def test_a_chord_moves_no_gripper_stops_both_arms_and_anchors_anew_when_released(first: str, delay: float) -> None:
     driver = engaged()
     driver.run(0.2, waving(driver))
@@ -175,15 +161,3 @@ def test_a_chord_on_paused_arms_engages_nothing() -> None:
     driver.lower = driver.upper = set()
     assert_holds(driver)
     assert driver.events == []
-
-
-def test_one_arm_may_be_driven_alone() -> None:
-    driver = Operator(arms=("right",))
-    driver.engage()
-    assert driver.states == {"right": "engaged"}
-    assert set(driver.targets) == {"right"}
-
-
-def test_the_delay_is_stated() -> None:
-    assert Teleop(TeleopSettings(), SIDES).delay == pytest.approx(0.045)
-    assert TICK < Teleop(TeleopSettings(), SIDES).delay < 0.05

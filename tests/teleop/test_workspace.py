@@ -1,4 +1,4 @@
-"""The box that targets stay in: never left, slower towards its sides, left inwards at once; and scales of axes."""
+"""The box that targets stay in: never left, left inwards at once; and scales of axes."""
 
 from __future__ import annotations
 
@@ -14,9 +14,8 @@ from q2r2_control.teleop.workspace import Workspace
 from q2r2_control.types import SIDES
 from tests.teleop.hands import ENGAGED, TICK, Operator, assert_smooth, operator
 
-EDGE = 0.05
 # About the left tool of the operator's tests, at (0.5, 0.4, 0.4).
-BOX = {"x": [0.4, 0.65], "y": [0.3, 0.6], "z": [0.3, 0.5], "soft_edge": EDGE}
+BOX = {"x": [0.4, 0.65], "y": [0.3, 0.6], "z": [0.3, 0.5]}
 
 
 def engaged(**changes: object) -> Operator:
@@ -42,28 +41,12 @@ def shift(driver: Operator, way: tuple[float, float, float], duration: float) ->
 def test_a_target_never_leaves_its_box_and_comes_back_with_the_hand_at_once() -> None:
     driver = engaged(workspace={"left": BOX})
     out = shift(driver, (0.3, 0.0, 0.0), 1.0)
-    assert max(position[0] for position in out) < 0.65
-    assert out[-1][0] > 0.65 - EDGE
+    assert max(position[0] for position in out) <= 0.65
+    assert out[-1][0] > 0.64  # at the side, but for what the filter swings back when the hand stops
     assert driver.targets["left"].slip > 0.1
     assert driver.targets["right"].slip == 0.0
-    back = shift(driver, (-0.1, 0.0, 0.0), 0.5)
-    np.testing.assert_allclose(back[-1] - out[-1], (-0.1, 0.0, 0.0), atol=1e-3)
-
-
-def test_the_way_along_a_side_is_made_whole() -> None:
-    driver = engaged(workspace={"left": BOX})
-    out = shift(driver, (0.3, 0.0, 0.0), 1.0)
-    along = shift(driver, (0.1, 0.05, -0.05), 0.5)
-    np.testing.assert_allclose((along[-1] - out[-1])[1:], (0.05, -0.05), atol=1e-3)
-
-
-def test_the_target_slows_down_towards_the_side_by_the_share_of_the_edge_that_is_left() -> None:
-    driver = engaged(workspace={"left": BOX})
-    positions = np.array(shift(driver, (0.3, 0.0, 0.0), 3.0))[:, 0]
-    speeds, room = np.diff(positions) / TICK, 0.65 - positions[:-1]
-    steady = slice(500, 2900)
-    expected = 0.1 * np.clip(room / EDGE, 0.0, 1.0)
-    np.testing.assert_allclose(speeds[steady], expected[steady], atol=0.004)
+    back = shift(driver, (-0.1, 0.05, -0.05), 0.5)
+    np.testing.assert_allclose(back[-1] - out[-1], (-0.1, 0.05, -0.05), atol=1e-3)
 
 
 def test_an_arm_that_is_engaged_outside_does_not_jump_and_may_only_come_in() -> None:
@@ -77,7 +60,7 @@ def test_an_arm_that_is_engaged_outside_does_not_jump_and_may_only_come_in() -> 
     assert shift(driver, (0.2, 0.0, 0.0), 0.5)[-1][0] == pytest.approx(0.7, abs=5e-3)
 
 
-@pytest.mark.parametrize("at", [0.62, 0.6499, 0.66])
+@pytest.mark.parametrize("at", [0.6499, 0.66])
 def test_a_hand_that_trembles_at_a_side_does_not_creep_away_from_it(at: float) -> None:
     workspace = Workspace(WorkspaceSettings.model_validate(BOX))
     position, way = (at, 0.4, 0.4), 0.0
@@ -102,7 +85,7 @@ def test_no_steps_of_any_size_lead_outside(steps: list[tuple[float, float, float
         held = workspace.hold(((x, y, z), IDENTITY))
         position = (x, y, z) if held is None else held
         for value, side in zip(position, (BOX["x"], BOX["y"], BOX["z"]), strict=True):
-            assert side[0] - 1e-12 <= value <= side[1] + 1e-12  # type: ignore[index]
+            assert side[0] <= value <= side[1]
 
 
 def test_axes_have_scales_of_their_own_and_a_scale_of_0_locks_one() -> None:

@@ -171,7 +171,7 @@ def _teleop_settings(node: BaseNode, default: TeleopSettings) -> TeleopSettings:
         read_only=False,
     )
     default = default.model_copy(update={"stance": stance_of(mirror, reflected)})
-    left_out = frozenset({"stance", "workspace", "speed_limit"})
+    left_out = frozenset({"stance", "workspace"})
     return settings_from_parameters(node, "teleop", default, left_out, read_only=False)
 
 

@@ -7,10 +7,8 @@ that the app sends apart, and drop twists.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
-
-from geometry_msgs.msg import Twist
 
 from q2r2_control.config.cell import HeadsetConfig, load_config
 from q2r2_control.config.networks import Network, network_of
@@ -21,10 +19,9 @@ from q2r2_control.inputs.addresses import access_lines, written
 from q2r2_control.inputs.hands_watch import HandsWatch, Watched
 from q2r2_control.inputs.headset import HeadsetServer
 from q2r2_control.inputs.headset_check import SILENCE
-from q2r2_control.inputs.messages import PROP_TOPICS, HandPose, PropTwist
-from q2r2_control.ros.base_node import OK, STREAM_QOS, WARN, BaseNode
+from q2r2_control.inputs.messages import HandPose
+from q2r2_control.ros.base_node import OK, WARN, BaseNode
 from q2r2_control.ros.bridge.hand_topics import HandPublishers, subscribe_to_haptics
-from q2r2_control.ros.bridge.messages import hand_twist
 from q2r2_control.types import SIDES, HandFault
 from q2r2_control.wording import sentence
 
@@ -74,8 +71,6 @@ class TcpEndpoint(BaseNode):
         self._faults: dict[str, HandFault | None] = dict.fromkeys(SIDES)
         self._server = HeadsetServer(host, port, listener=self._publish, allow=networks, watch=watch)
         subscribe_to_haptics(self, self._server.send_haptic)
-        for topic in PROP_TOPICS:
-            self.create_subscription(Twist, topic, self._move(topic), STREAM_QOS)
         self._log = _ToRosLog(self.get_logger())
         _SERVER_LOG.addHandler(self._log)
         _SERVER_LOG.setLevel(logging.INFO)
@@ -121,13 +116,6 @@ class TcpEndpoint(BaseNode):
                 return
         frame = self._frames[reception.hand] or (message.frame_id if isinstance(message, HandPose) else "")
         self._hand_publishers.publish(reception.topic, message, frame, self.now)
-
-    def _move(self, topic: str) -> Callable[[Twist], None]:
-        def send(message: Twist) -> None:
-            twist = hand_twist(message)
-            self._server.send_twist(PropTwist(topic, twist.linear, twist.angular))
-
-        return send
 
 
 def _networks(allow: str) -> tuple[Network, ...] | None:

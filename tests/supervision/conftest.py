@@ -1,0 +1,28 @@
+"""The shipped cell for tests of what stops its arms."""
+
+from __future__ import annotations
+
+import pytest
+
+from q2r2_control import CartesianController, ControllerSettings, Robot, load_config
+from q2r2_control.config.cell import Config
+from q2r2_control.config.supervision import SupervisionSettings
+from q2r2_control.supervision.joint_watch import watch_settings
+
+# A state that is not finite is a fault at once.
+STRICT = watch_settings(SupervisionSettings(unusable_time=0.0), yields=False)
+
+
+def unhurried(config: Config) -> ControllerSettings:
+    """Settings with which no solution is late, which depends on the machine."""
+    return config.control.model_copy(update={"solve_time_limit": None})
+
+
+@pytest.fixture(scope="module")
+def robot() -> Robot:
+    return Robot.from_config(load_config("config/dual_iiwa7.yaml"))
+
+
+@pytest.fixture(scope="module")
+def controller(robot: Robot) -> CartesianController:
+    return CartesianController(robot, unhurried(load_config("config/dual_iiwa7.yaml")))
