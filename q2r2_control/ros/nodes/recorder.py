@@ -46,7 +46,7 @@ _SERVICES = {
     "failure": ReasonKind.EPISODE_FAILED,
     "mark": ReasonKind.MARK,
 }
-_PERIOD = 0.02  # between two looks at what has arrived [s]
+HANDOVER_PERIOD = 0.02  # between two looks at what has arrived; a message waits for two of them at most [s]
 _STREAM_QOS = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
@@ -89,7 +89,7 @@ class RecorderNode(BaseNode):
             self.create_subscription(_class_of(topic.type), heard_on(topic.name), take, qos, raw=True)
         for name, kind in _SERVICES.items():
             self.create_service(Trigger, f"~/{name}", partial(self._serve, kind))
-        self.create_tick(_PERIOD, self._write, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self.create_tick(HANDOVER_PERIOD, self._write, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self._marks.recorded = self._recorder.fault is None
         if self._marks.recorded:
             self.get_logger().info(f"records to {self._recorder.file}")
