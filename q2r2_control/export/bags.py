@@ -15,10 +15,10 @@ from q2r2_control.errors import RecordingError
 from q2r2_control.export.episodes import EpisodePart, parts_to_export
 from q2r2_control.recording.about import CUT_OUT_OF, Conclusion
 from q2r2_control.recording.bag import BagWriter
+from q2r2_control.recording.messages import Message
 from q2r2_control.recording.reader import Recording
 from q2r2_control.recording.ros_recording import open_recording
 from q2r2_control.recording.ros_topics import is_latched
-from q2r2_control.recording.rows import at_time, channel_of, log_time
 from q2r2_control.recording.topics import STATE, Topic
 
 
@@ -52,28 +52,25 @@ def _write(recording: Recording, part: EpisodePart, path: Path) -> None:
     topics = recording.declared_topics
     notes = {**about.notes, CUT_OUT_OF: recording.file.name, "episode": str(part.number)}
     with BagWriter(path, topics.values(), replace(about, notes=notes)) as bag:
-        for records in _within(recording, topics, start, end):
-            bag.write(records)
+        for messages in _within(recording, topics, start, end):
+            bag.write(messages)
             bag.flush()
         bag.close(conclusion)
 
 
-def _within(recording: Recording, topics: dict[int, Topic], start: int, end: int | None) -> Iterator[list[bytes]]:
+def _within(recording: Recording, topics: dict[int, Topic], start: int, end: int | None) -> Iterator[list[Message]]:
     """The messages from ``start`` to ``end`` [ns] of day, chunk by chunk.
 
     At the start there is what lasts of what was said before.
     """
-    lasting: dict[int, bytes] = {}
+    lasting: dict[int, Message] = {}
     begun = False
-    for records in recording.messages():
-        inside = []
-        for record in records:
-            time, topic = log_time(record), topics[channel_of(record)]
-            if time < start:
-                if is_latched(topic.name) or topic.name == STATE:
-                    lasting[topic.channel] = at_time(record, start)
-            elif end is None or time <= end:
-                inside.append(record)
+    for messages in recording.messages():
+        inside = [one for one in messages if start <= one.time and (end is None or one.time <= end)]
+        for one in messages:
+            name = topics[one.channel].name
+            if one.time < start and (is_latched(name) or name == STATE):
+                lasting[one.channel] = one._replace(time=start, sent=start)
         if inside and not begun:
             begun = True
             inside = [*lasting.values(), *inside]

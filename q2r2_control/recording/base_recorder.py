@@ -60,7 +60,7 @@ class BaseRecorder:
         """Have a batch written; False where there is no room for it now. ``wait`` for room."""
         if self.writer is None or self.fault is not None:
             return False
-        sent = self.writer.send(batch, sum(map(len, batch[0])), wait=wait)
+        sent = self.writer.send(batch, batch.size, wait=wait)
         self._check_writer()
         return sent
 

@@ -1,30 +1,19 @@
-"""Records messages as they come, serialized already: it puts a head before each, and another process writes them."""
+"""Records messages as they come, serialized already: another process writes them."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import NamedTuple
 
 from q2r2_control.recording.about import About, Conclusion
 from q2r2_control.recording.base_recorder import BaseRecorder
-from q2r2_control.recording.rows import message_record
+from q2r2_control.recording.messages import Message
 from q2r2_control.recording.topics import Topic
 from q2r2_control.recording.writer import MessageBatch
 
 ROOM = 8 << 20  # for messages that wait to be written [bytes]; both arms' nodes send some 0.6 MB a second
 ROOM_WITH_PICTURES = 64 << 20  # of cameras, which have a megabyte each where they are not compressed
 _LAST_NUMBER = 2**32 - 1
-
-
-class ReceivedMessage(NamedTuple):
-    """A message of a ROS topic."""
-
-    received: int  # [ns] of day
-    topic: Topic
-    number: int  # at its sender
-    sent: int  # [ns] of day, by its sender's clock
-    payload: bytes  # CDR
 
 
 class MessageRecorder(BaseRecorder):
@@ -41,20 +30,19 @@ class MessageRecorder(BaseRecorder):
         self._begun = self._open(about, None, topics)
         self._last = about.epoch
 
-    def record(self, messages: Iterable[ReceivedMessage]) -> None:
+    def record(self, messages: Iterable[Message]) -> None:
         """Have messages written, in the order of their receipt.
 
         One that was received before the last one counts as received with it, since a file is in the order of time.
         """
-        records = []
-        for message in sorted(messages, key=lambda one: one.received):
+        batch = []
+        for message in sorted(messages, key=lambda one: one.time):
             self.count += 1
-            self._last = max(message.received, self._last)
-            number, sent = message.number & _LAST_NUMBER, max(message.sent, 0)
-            records.append(message_record(message.topic.channel, number, self._last, sent, message.payload))
+            self._last = max(message.time, self._last)
+            batch.append(message._replace(number=message.number & _LAST_NUMBER, time=self._last))
         self._check_writer()
-        if records and self._begun and self.fault is None and not self._send(MessageBatch(records)):
-            self.overflows += len(records)
+        if batch and self._begun and self.fault is None and not self._send(MessageBatch(batch)):
+            self.overflows += len(batch)
 
     def finish(self) -> None:
         """Write what there is, and close the file."""

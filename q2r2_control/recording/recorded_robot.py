@@ -5,10 +5,10 @@ from __future__ import annotations
 from functools import lru_cache
 
 import numpy as np
-import pinocchio as pin
 
 from q2r2_control.config.cell import Config, parse_config
 from q2r2_control.errors import Q2R2Error, RecordingError
+from q2r2_control.recording.encoder import RecordedRobot
 from q2r2_control.recording.reader import Recording
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
@@ -48,10 +48,4 @@ def check_tools(positions: Array, tools: Array, robot: Robot) -> None:
 
 def tool_poses(positions: Array, robot: Robot) -> Array:
     """(n, arms, 7) x y z [m] qx qy qz qw of the tools in the world, at joint positions (n, joints)."""
-    model, data = robot.model, robot.model.createData()
-    poses = np.empty((len(positions), len(robot.arms), 7))
-    for q, pose in zip(positions, poses, strict=True):
-        pin.forwardKinematics(model, data, q)
-        for index, arm in enumerate(robot.arms.values()):
-            pose[index] = pin.SE3ToXYZQUATtuple(pin.updateFramePlacement(model, data, arm.frame_id))
-    return poses
+    return RecordedRobot.of(robot).tool_poses(positions)

@@ -95,8 +95,8 @@ def replay(
     """
     recording, cell, robot = opened(path, config)
     about = recording.about
-    comparison = Comparison(robot, recording.topics, about.epoch) if compare or plant is None else None
-    ticks = RecordedTicks(recording) if comparison is None else RecordedTicks(recording, comparison.expect)
+    ticks = RecordedTicks(recording)
+    comparison = Comparison(about, ticks) if compare or plant is None else None
     moves = _Plant(ticks, about.plant_modes) if plant is None else make_plant(plant, robot, cell)
     if plant is not None and comparison is not None and about.notes.get("plant") != type(moves).__name__:
         recorded = about.notes.get("plant", "another plant")
@@ -116,7 +116,7 @@ def replay(
     except PlantError as error:
         ended_by = str(error)
     if comparison is not None:
-        comparison.finish(whole=not ticks.missing)
+        comparison.finish()
     return Replay(
         ticks.count,
         summary,

@@ -7,10 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
-from mcap.data_stream import RecordBuilder
-from mcap.records import DataEnd, Footer
-from mcap.stream_reader import StreamReader
-from mcap.writer import MCAP0_MAGIC
 
 from q2r2_control.inputs.played import PlayedInput
 from q2r2_control.inputs.sampling import HeadsetSampling, SampleTiming
@@ -18,7 +14,6 @@ from q2r2_control.inputs.scripted import HANDS_AT_REST
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.recording.about import About
 from q2r2_control.recording.recorder import Recorder
-from q2r2_control.recording.rows import HEAD, MESSAGE
 from q2r2_control.types import QUEST_CONTROLS, SIDES, HandInputs, HandSample
 from tests.recording.runs import file_of, rewrite
 from tests.support.watch import cell
@@ -169,29 +164,9 @@ def record_episode(folder: Path, source: object, duration: float = DURATION, **c
 
 def without_ticks(file: Path, target: Path, first: int, count: int) -> Path:
     """A copy without the messages of some ticks."""
-    return rewrite(file, target, lambda content: _keep(content, lambda tick: not first <= tick < first + count))
+    return rewrite(file, target, lambda _, message: None if first <= message.number < first + count else message)
 
 
 def killed(file: Path, target: Path, ticks: int) -> Path:
     """What is left of a recording whose process was killed after some ticks: no index."""
-    builder = RecordBuilder()
-    with rewrite(file, target, lambda content: _keep(content, lambda tick: tick < ticks)).open("rb") as stream:
-        for record in StreamReader(stream, emit_chunks=True).records:
-            if isinstance(record, DataEnd):
-                break
-            record.write(builder)
-    DataEnd(0).write(builder)
-    Footer(summary_start=0, summary_offset_start=0, summary_crc=0).write(builder)
-    target.write_bytes(MCAP0_MAGIC + builder.end() + MCAP0_MAGIC)
-    return target
-
-
-def _keep(content: bytearray, keeps: Callable[[int], bool]) -> None:
-    kept, begin = bytearray(), 0
-    while begin < len(content):
-        opcode, length, _, number, *_ = HEAD.unpack_from(content, begin)
-        end = begin + 9 + length
-        if opcode != MESSAGE or keeps(number):
-            kept += content[begin:end]
-        begin = end
-    content[:] = kept
+    return rewrite(file, target, lambda _, message: message if message.number < ticks else None, whole=False)

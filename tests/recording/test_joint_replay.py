@@ -10,13 +10,14 @@ import pytest
 
 from q2r2_control.config.cell import Config
 from q2r2_control.recording.joint_replay import JointReplay, replay_joints
+from q2r2_control.recording.messages import Message
 from q2r2_control.recording.reader import Recording
 from q2r2_control.recording.recorded_ticks import RecordedTicks
-from q2r2_control.recording.rows import HEAD, MESSAGE
-from q2r2_control.recording.topics import REFERENCE
+from q2r2_control.recording.tick_rows import tick_type
+from q2r2_control.recording.topics import TICK
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
-from tests.recording.runs import RATE, file_of, pipeline, record, rewrite
+from tests.recording.runs import ARMS, JOINTS, RATE, file_of, pipeline, record, rewrite
 from tests.support.watch import Watch, cell
 
 pytestmark = pytest.mark.slow
@@ -37,20 +38,17 @@ def robot() -> Robot:
 
 def edited(file: Path, target: Path, change: Change) -> Path:
     """A copy whose references were changed: ``change`` gets each one's number, positions and velocities."""
-    topic = Recording(file).topics.by_name[REFERENCE]
-    assert topic.row is not None
-    dtype = topic.row.dtype
 
-    def change_chunk(chunk: bytearray) -> None:
-        at = 0
-        while at < len(chunk):
-            opcode, length, channel, number, *_ = HEAD.unpack_from(chunk.ljust(at + HEAD.size), at)
-            if opcode == MESSAGE and channel == topic.channel:
-                row = np.frombuffer(chunk, dtype=dtype, count=1, offset=at)[0]
-                change(number, row["positions"], row["velocities"])
-            at += 9 + length
+    def change_message(topic: str, message: Message) -> Message:
+        if topic != TICK:
+            return message
+        kind = tick_type(len(ARMS), len(JOINTS))
+        numbers = bytearray(message.payload[-kind.itemsize :])
+        (row,) = np.frombuffer(numbers, dtype=kind)
+        change(message.number, row["reference_q"], row["reference_v"])
+        return message._replace(payload=message.payload[: -kind.itemsize] + bytes(numbers))
 
-    return rewrite(file, target, change_chunk)
+    return rewrite(file, target, change_message)
 
 
 def played(file: Path, plant: str = "kinematic", config: Config | None = None) -> tuple[JointReplay, Watch]:

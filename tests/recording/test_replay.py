@@ -16,14 +16,16 @@ from q2r2_control.errors import ConfigError, PlantError, RecordingError
 from q2r2_control.inputs.scripted import ScriptedInput
 from q2r2_control.judging.judge import judge
 from q2r2_control.plants.kinematic import KinematicPlant
+from q2r2_control.recording.messages import Message
 from q2r2_control.recording.reader import Recording
 from q2r2_control.recording.recorder import Recorder
 from q2r2_control.recording.replay import replay
-from q2r2_control.recording.rows import HEAD, MESSAGE
+from q2r2_control.recording.tick_rows import SAMPLE_FIELDS
+from q2r2_control.recording.topics import SAMPLES, TICK
 from q2r2_control.robot.robot import Robot
 from q2r2_control.summary.tick import Tick
 from q2r2_control.types import HandFault, HandSample, RobotState
-from tests.recording.runs import RATE, file_of, pipeline, record, rewrite
+from tests.recording.runs import RATE, file_of, number_of, pipeline, record, rewrite
 from tests.support.object_cell import cell as object_cell
 from tests.support.reasons import kinds
 from tests.support.watch import cell
@@ -206,22 +208,17 @@ def test_solutions_that_came_too_late_are_too_late_again(tmp_path: Path) -> None
     assert result.summary.fallback_ticks > 50
 
 
-def flip(file: Path, target: Path, topic: str, label: str) -> Path:
+def flip(file: Path, target: Path, topic: str, place: int) -> Path:
     """A copy in which a low bit of one number is flipped, in the first message of a topic after one second."""
-    row = Recording(file).topics.by_name[topic]
-    assert row.row is not None
-    assert row.row.dtype.fields is not None
-    begin = row.row.dtype.fields["data"][1] + 8 * row.labels["data"].index(label)
     flipped: list[int] = []
 
-    def change(chunk: bytearray) -> None:
-        at = 0
-        while at < len(chunk) and not flipped:
-            opcode, length, channel, number, *_ = HEAD.unpack_from(chunk.ljust(at + HEAD.size), at)
-            if opcode == MESSAGE and channel == row.channel and number >= 1.0 * RATE:
-                chunk[at + begin + 1] ^= 1
-                flipped.append(number)
-            at += 9 + length
+    def change(name: str, message: Message) -> Message:
+        if name != topic or message.number < 1.0 * RATE or flipped:
+            return message
+        flipped.append(message.number)
+        payload = bytearray(message.payload)
+        payload[20 + 8 * place + 1] ^= 1
+        return message._replace(payload=bytes(payload))
 
     copy = rewrite(file, target, change)
     assert flipped
@@ -229,18 +226,18 @@ def flip(file: Path, target: Path, topic: str, label: str) -> Path:
 
 
 def test_a_flipped_bit_in_a_sample_is_the_first_difference(tmp_path: Path, circle: Path) -> None:
-    result = replay(flip(circle, tmp_path / "flipped.mcap", "/q2r2/hand_samples", "x"))
+    result = replay(flip(circle, tmp_path / "flipped.mcap", SAMPLES, SAMPLE_FIELDS.index("x")))
     assert result.difference is not None
     time, _, rest = result.difference.partition(" s: ")
     assert float(time) == pytest.approx(1.0, abs=0.02)
-    assert rest.startswith("/q2r_left_hand_pose: position[x]: recorded ")
+    assert rest.startswith("left.filtered_hand.x: recorded ")
     assert "replayed" in rest
 
 
 def test_a_flipped_bit_in_the_time_of_a_tick_is_the_first_difference(tmp_path: Path, circle: Path) -> None:
-    result = replay(flip(circle, tmp_path / "flipped.mcap", "/q2r2/tick", "dt"))
+    result = replay(flip(circle, tmp_path / "flipped.mcap", TICK, number_of("dt")))
     assert result.difference is not None
-    assert result.difference.startswith("1.002000 s: /q2r2/tick: data[step]: recorded 0.002, replayed 0.00199")
+    assert result.difference.startswith("1.002000 s: step: recorded 0.002, replayed 0.00199")
 
 
 def changed_filter(config: Config) -> Config:
@@ -256,7 +253,7 @@ def test_another_filter_is_named_and_so_is_the_first_difference(circle: Path) ->
     assert result.difference is not None
     time, _, rest = result.difference.partition(" s: ")
     assert 1.2 < float(time) < 1.4  # where the hand begins to move
-    assert rest.startswith("/q2r2/left/filtered_hand_pose: position")
+    assert rest.startswith("left.filtered_hand.")
 
 
 def test_a_file_that_is_no_recording_is_one_line(tmp_path: Path, circle: Path) -> None:

@@ -21,8 +21,6 @@ from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.recording.reader import Recording
 from q2r2_control.recording.recorder import Recorder
 from q2r2_control.recording.replay import replay
-from q2r2_control.recording.rows import sequence_of
-from q2r2_control.recording.topics import STATE, TICK
 from q2r2_control.summary.tick import Tick
 from q2r2_control.teleop.haptics import FAULT
 from q2r2_control.types import HapticFeedback
@@ -78,8 +76,8 @@ def test_while_the_writer_is_stopped_the_loop_goes_on_and_what_is_lost_is_counte
     found = read_elsewhere(file, tmp_path)
     assert found["/q2r2/tick"]["count"] == summary.ticks
     chunks = list(Recording(file).chunks())
-    numbers = np.concatenate([chunk.rows[TICK]["sequence"] for chunk in chunks if TICK in chunk.rows]).astype(int)
-    with_states = {sequence_of(text) for chunk in chunks for text in chunk.texts.get(STATE, ())}
+    numbers = np.concatenate([chunk.numbers for chunk in chunks])
+    with_states = {number for chunk in chunks for number in chunk.states}
     assert {*numbers[1:][np.diff(numbers) > 1].tolist()} <= with_states, "the state is there again behind each gap"
     result = replay(file)
     assert result.difference is None
@@ -204,7 +202,7 @@ def started(*command: str, cwd: Path = ROOT, env: Mapping[str, str] = PATH) -> I
 def has_ticks(folder: Path) -> bool:
     """Whether a chunk of the recording in it is there already."""
     try:
-        return any(chunk.rows for file in folder.glob("*/*.mcap") for chunk in Recording(file).chunks())
+        return any(len(chunk.rows) for file in folder.glob("*/*.mcap") for chunk in Recording(file).chunks())
     except RecordingError:
         return False
 
@@ -231,7 +229,7 @@ def test_what_a_killed_run_leaves_opens_and_is_replayed(tmp_path: Path, both: bo
     assert "its process was killed" in result.ended_by
     if not both:
         found = read_elsewhere(file.parent, tmp_path)
-        assert set(found) >= {"/joint_states", "/robot_description", "/q2r2/run_start"}
+        assert set(found) >= {"/joint_states", "/robot_description", "/q2r2/state"}
         assert found["/q2r2/tick"]["count"] == result.ticks
 
 

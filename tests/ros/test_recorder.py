@@ -29,10 +29,10 @@ from std_msgs.msg import String
 from q2r2_control.errors import RecordingError
 from q2r2_control.judging.judge import judge
 from q2r2_control.recording.episode_spans import read_spans
+from q2r2_control.recording.messages import Message
 from q2r2_control.recording.reader import Recording
 from q2r2_control.recording.ros_recording import open_recording
 from q2r2_control.recording.ros_topics import RECORDER_EVENTS
-from q2r2_control.recording.rows import HEAD, channel_of
 from q2r2_control.recording.writer import FLUSH_PERIOD
 from q2r2_control.ros.base_node import RECORDED_QOS, STREAM_QOS
 from q2r2_control.ros.nodes.recorder import HANDOVER_PERIOD
@@ -82,17 +82,16 @@ class RunningRecorder:
     def _newest(self, topic: str) -> bytes:
         """The newest message in the file; empty while there is none."""
         records = self._records(topic)
-        return records[-1][HEAD.size :] if records else b""
+        return records[-1].payload if records else b""
 
     def count(self, topic: str) -> int:
         """How many messages are in the file, while it is being written."""
         return len(self._records(topic))
 
-    def _records(self, topic: str) -> list[bytes]:
+    def _records(self, topic: str) -> list[Message]:
         try:
             recording = open_recording(self._folder)
-            channels = [one.channel for one in recording.declared_topics.values() if one.name == topic]
-            return [record for chunk in recording.messages() for record in chunk if channel_of(record) in channels]
+            return [message for messages in recording.messages((topic,)) for message in messages]
         except RecordingError:  # in the middle of a write
             return []
 
