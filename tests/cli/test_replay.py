@@ -38,7 +38,7 @@ def test_with_another_cell_it_says_what_differs_then_and_now_and_exits_1(recorde
     result = q2r2("replay", str(recorded), "--compare", "--config", other)
     assert result.exit_code == 1
     assert result.stdout.startswith("first difference at ")
-    assert "target_frame: position[" in result.stdout
+    assert ".target." in result.stdout
     assert "teleop.position_scale: 1.0 when recorded, now 1.5" in result.stderr
 
 
