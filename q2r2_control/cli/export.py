@@ -41,19 +41,11 @@ def lerobot(
     workers: Workers = 1,
     skip_bad: SkipBad = False,
     no_pictures: NoPictures = False,
-    ray: Annotated[
-        str | None, typer.Option(metavar="ADDRESS", help="Of a Ray cluster that makes the episodes: HOST:PORT or auto.")
-    ] = None,
 ) -> None:
-    """Make a LeRobotDataset of recordings: an episode each, with a video of each camera.
-
-    Needs the extra `lerobot`; with --ray, whose workers see the same files, the extra `ray` as well.
-    """
-    if ray is not None and workers != 1:
-        raise ConfigError("--workers and --ray exclude each other: the cluster has its own")
+    """Make a LeRobotDataset of recordings: an episode each, with a video of each camera. Needs the extra `lerobot`."""
     require_lerobot()
     sampling = FrameSampling(fps, trim, pictures=not no_pictures)
-    _export(recordings, sampling, output, workers, skip_bad, write_shard, join_shards, ray)
+    _export(recordings, sampling, output, workers, skip_bad, write_shard, join_shards)
 
 
 @app.command(epilog="Example: q2r2 export hdf5 recordings --output datasets/circle-act --fps 50")
@@ -130,7 +122,6 @@ def _export(
     skip_bad: bool,
     write: Write,
     join: Callable[[Sequence[Path], Path], None],
-    ray: str | None = None,
 ) -> None:
     """``write`` keeps each episode, and ``join`` makes the output of what was kept."""
     console = stderr_console()
@@ -145,7 +136,6 @@ def _export(
                 write,
                 output.episodes(),
                 workers=workers,
-                ray=ray,
                 skip_bad=skip_bad,
                 progress=lambda done: progress.update(bar, completed=done, total=max(done, len(files))),
             )

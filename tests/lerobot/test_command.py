@@ -1,11 +1,8 @@
-"""``q2r2 export lerobot`` as a user types it; any number of processes and a Ray cluster make the same."""
+"""``q2r2 export lerobot`` as a user types it; any number of processes make the same."""
 
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -59,26 +56,6 @@ def test_a_dataset_has_the_features_that_the_docs_name(made: dict[str, bytes]) -
 
 def test_several_processes_make_the_same_bytes(recordings: Path, made: dict[str, bytes], tmp_path: Path) -> None:
     assert same(export(recordings, tmp_path / "out", "--workers", "2"), made)
-
-
-def test_a_ray_cluster_makes_the_same_bytes(recordings: Path, made: dict[str, bytes], tmp_path: Path) -> None:
-    ray = pytest.importorskip("ray", reason="the extra ray is not installed")
-    path = os.pathsep.join([str(ROOT), *os.environ.get("PYTHONPATH", "").split(os.pathsep)])
-    ray.init(
-        num_cpus=1,
-        _node_ip_address="127.0.0.1",
-        include_dashboard=False,
-        log_to_driver=False,
-        logging_level="ERROR",
-        runtime_env={"env_vars": {"PYTHONPATH": path}},
-    )
-    try:
-        address = ray.get_runtime_context().gcs_address
-        command = [sys.executable, "-m", "q2r2_control", "export", "lerobot", str(recordings), "--ray", address]
-        subprocess.run([*command, "--output", str(tmp_path / "out")], cwd=ROOT, check=True, timeout=600)
-    finally:
-        ray.shutdown()
-    assert same(contents(tmp_path / "out"), made)
 
 
 def test_nothing_is_written_of_a_recording_that_is_none(recordings: Path, tmp_path: Path) -> None:
