@@ -12,7 +12,7 @@ from rich.progress import Progress
 from q2r2_control.cli.output import stderr_console
 from q2r2_control.errors import ConfigError, RecordingError
 from q2r2_control.export.bags import write_bags
-from q2r2_control.export.csv_tables import write_table, write_tables, write_vectors
+from q2r2_control.export.csv_tables import gather_tables, move_table, write_table
 from q2r2_control.export.episodes import FASTEST, FrameSampling
 from q2r2_control.export.hdf5 import gather_files, require_h5py, write_file
 from q2r2_control.export.kept_episodes import Write, keep_episodes
@@ -75,12 +75,12 @@ def csv(
     workers: Workers = 1,
     skip_bad: SkipBad = False,
 ) -> None:
-    """Make tables of recordings: a line a frame, the columns of the dataset of q2r2 export lerobot."""
+    """Make tables of recordings: a line a frame, the numbers of the dataset of q2r2 export lerobot."""
     one_file = output.suffix == ".csv"
     if one_file and (count := len(recordings_in(recordings))) > 1:
         raise ConfigError(f"--output {output}: for {count} recordings; allowed: a folder, or one recording")
-    join = write_table if one_file else write_tables
-    _export(recordings, FrameSampling(fps, trim), output, workers, skip_bad, write_vectors, join)
+    join = move_table if one_file else gather_tables
+    _export(recordings, FrameSampling(fps, trim), output, workers, skip_bad, write_table, join)
 
 
 @app.command(epilog="Example: q2r2 export mcap recordings --output episodes")

@@ -31,7 +31,7 @@ def write_bags(file: Path, folder: Path) -> int:
     made: list[Path] = []
     try:
         for part in parts_to_export(file):
-            bag = folder / (recording.file.stem + (f"-{part.number}" if part.number else ""))
+            bag = folder / part.name_in(recording.file)
             if bag.exists():
                 raise RecordingError(f"{file}: two recordings have this name; allowed: each one once")
             bag.mkdir()

@@ -47,7 +47,7 @@ def keep_episodes(
     unless ``skip_bad``, and :class:`ConfigError` where nothing can be written or a worker was killed.
     """
     jobs: list[_Job] = [
-        (file, sampling, part, write, folder / _key(file, sampling, part, write))
+        (file, sampling, part, write, folder / f"{part.name_in(file)}.{_key(file, sampling, part, write)}")
         for file in files
         for part in parts_to_export(file)
     ]
@@ -87,7 +87,7 @@ def _keep(job: _Job) -> str | None:
     file, sampling, part, write, target = job
     if target.exists():
         return None
-    unfinished = target.with_suffix(".unfinished")
+    unfinished = target.with_name(f"{target.name}.unfinished")
     try:
         write(make_episode(file, sampling, part), unfinished)
         _flush(unfinished)

@@ -10,7 +10,6 @@ import pytest
 
 from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.events import ReasonKind
-from q2r2_control.export.csv_tables import load_vectors, write_vectors
 from q2r2_control.export.episodes import FrameSampling, make_episode
 from q2r2_control.export.kept_episodes import keep_episodes
 from q2r2_control.judging.episode import read_episode
@@ -19,6 +18,7 @@ from q2r2_control.judging.page import page_of
 from q2r2_control.recording.reader import Recording
 from q2r2_control.recording.replay import replay
 from q2r2_control.types import HandInputs
+from tests.export.vectors import load_vectors, write_vectors
 from tests.judging.runs import hands, loop_of, press, record_episode
 
 pytestmark = pytest.mark.slow
@@ -108,7 +108,7 @@ def test_those_that_are_kept_become_episodes_of_a_dataset_with_frames_of_their_o
     made = keep_episodes([file], FrameSampling(fps=50), write_vectors, tmp_path)
     assert made.skipped == []
     episodes = [load_vectors(kept) for kept in made.kept]
-    assert [episode.name for episode in episodes] == [f"{file.stem}-1", f"{file.stem}-3"]
+    assert [kept.stem for kept in made.kept] == [f"{file.stem}-1", f"{file.stem}-3"]
     assert [episode.success for episode in episodes] == [True, None]
     succeeded = [np.flatnonzero(episode.outcome()["next.success"]).tolist() for episode in episodes]
     assert succeeded == [[episodes[0].frames - 1], []]
