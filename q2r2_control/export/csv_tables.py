@@ -5,8 +5,10 @@ from __future__ import annotations
 import csv
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from q2r2_control.errors import RecordingError
 from q2r2_control.export.episodes import EpisodeVectors
@@ -15,7 +17,7 @@ from q2r2_control.export.episodes import EpisodeVectors
 def write_table(episode: EpisodeVectors, path: Path) -> None:
     """Write one episode."""
     frames = np.arange(episode.frames)
-    columns = {
+    columns: dict[str, npt.NDArray[Any]] = {
         f"{name}.{label}": episode.vectors[name][:, at]
         for name, labels in episode.names.items()
         for at, label in enumerate(labels)

@@ -55,7 +55,6 @@ COLUMNS = (
     FigureColumn("delay", "ms", 0, lambda of: _worst([arm.hand_to_tool_ms for arm in of.arms.values()])),
     FigureColumn("error", "mm RMS", 1, lambda of: _worst([arm.position_error_mm_rms for arm in of.arms.values()])),
     FigureColumn("leashed", "%", 0, lambda of: _percent(_worst([arm.leashed_share for arm in of.arms.values()]))),
-    FigureColumn("SPARC", "", 2, lambda of: _worst([arm.sparc for arm in of.arms.values()], min)),
     FigureColumn("LDLJ", "", 1, lambda of: _worst([arm.ldlj for arm in of.arms.values()], min)),
     FigureColumn("nearest", "mm", 1, lambda of: of.min_distance_mm),
     FigureColumn("faults", "", 0, lambda of: float(len(of.faults))),
@@ -91,7 +90,7 @@ def _row(judged: Judged, number: int) -> str:
         for column in COLUMNS
     )
     return (
-        f'<tr {_filtered_by(judged)}><td class="number" data-value="{number}">{number}</td>'
+        f'<tr><td class="number" data-value="{number}">{number}</td>'
         f'<td><a href="#episode-{number}">{escape(judged.figures.name)}</a></td><td>{_badge(word)}</td>{cells}</tr>'
     )
 
@@ -102,15 +101,9 @@ def _section(judged: Judged, number: int) -> str:
     task = f'<p class="task">{escape(figures.task)}</p>' if figures.task else ""
     why = f"<ul>{reasons}</ul>" if reasons else ""
     return (
-        f'<section id="episode-{number}" {_filtered_by(judged)}>'
+        f'<section id="episode-{number}">'
         f"<h2>{number}. {escape(judged.figures.name)} {_badge(word)}</h2>{task}{why}{_picture(judged)}</section>"
     )
-
-
-def _filtered_by(judged: Judged) -> str:
-    """What the page's filter goes by."""
-    success = {None: "", True: "succeeded", False: "failed"}[judged.figures.success]
-    return f'data-verdict="{judged.verdict.word}" data-success="{success}"'
 
 
 def _picture(judged: Judged) -> str:
@@ -141,7 +134,7 @@ th[data-order="1"]::after { content: " \\25b2"; } th[data-order="-1"]::after { c
 .keep, .discard { font-weight: 600; white-space: nowrap; } .keep { color: #1f6fb2; } .discard { color: #b04a00; }
 section { background: white; border: 1px solid #ddd; border-radius: 6px; margin: 1.2rem 0; padding: .9rem 1.1rem; }
 section ul { margin: .3rem 0; color: #b04a00; } section img { width: 100%; height: auto; }
-.task { margin: 0; color: #555; } .filter { margin: .8rem 0; } [hidden] { display: none; }
+.task { margin: 0; color: #555; }
 @media print { section { break-inside: avoid; } }
 """
 
@@ -165,11 +158,6 @@ heads.forEach((head, column) => head.addEventListener("click", () => {
   rows.sort(([a], [b]) => a === null || b === null ? (a === null) - (b === null) : order * compare(a, b));
   body.append(...rows.map(([, row]) => row));
 }));
-document.querySelector("select").addEventListener("change", event => {
-  for (const item of document.querySelectorAll("[data-verdict]"))
-    item.hidden = event.target.value !== "all" &&
-      ![item.dataset.verdict, item.dataset.success].includes(event.target.value);
-});
 """
 
 _PAGE = """<!DOCTYPE html>
@@ -183,9 +171,7 @@ _PAGE = """<!DOCTYPE html>
 <body>
 <h1>{title}</h1>
 <p>{count}</p>
-<p class="filter"><label>show <select><option>all</option><option>keep</option><option>discard</option>
-<option>succeeded</option><option>failed</option></select></label>
-&ensp;a click on a heading sorts; of several hands or arms the worst number counts</p>
+<p>a click on a heading sorts; of several hands or arms the worst number counts</p>
 <div class="table"><table>
 <thead><tr><th>#</th><th>episode</th><th>verdict</th>{headings}</tr></thead>
 <tbody>

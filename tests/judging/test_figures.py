@@ -177,7 +177,7 @@ class TestArms:
     def test_an_arm_that_is_never_engaged_has_no_figures(self) -> None:
         found = arm_figures(episode(engaged=np.zeros(2000, dtype=bool)), "left")
         assert found.engaged_s == 0.0
-        assert found.position_error_mm_rms is found.leashed_share is found.sparc is found.hand_to_tool_ms is None
+        assert found.position_error_mm_rms is found.leashed_share is found.ldlj is found.hand_to_tool_ms is None
 
 
 class TestIdle:

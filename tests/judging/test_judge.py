@@ -200,7 +200,6 @@ def test_where_the_operator_rests_changes_nothing(folder: Path) -> None:
     assert first.figures.idle_share == pytest.approx(last.figures.idle_share, abs=0.05)
     for arm, one in first.figures.arms.items():
         other = last.figures.arms[arm]
-        assert one.sparc == pytest.approx(other.sparc, abs=0.3)
         assert one.ldlj == pytest.approx(other.ldlj, abs=0.8)
         assert one.hand_to_tool_ms == pytest.approx(other.hand_to_tool_ms, abs=3.0)
         assert one.position_error_mm_rms == pytest.approx(other.position_error_mm_rms, rel=0.1)

@@ -62,10 +62,10 @@ def test_nothing_is_fetched_from_elsewhere() -> None:
     assert "http" not in outside
 
 
-def test_each_episode_has_a_row_and_a_section_that_the_filter_finds() -> None:
+def test_each_episode_has_a_row_with_its_verdict_and_a_section() -> None:
     page = Page(page_of([moving(), judged(episode())], "recordings"))
-    assert [row.get("data-verdict") for row in page.all("tr")] == [None, "keep", "discard"]
-    assert [section["data-verdict"] for section in page.all("section")] == ["keep", "discard"]
+    assert [badge["class"] for badge in page.all("span")] == 2 * ["keep", "discard"]  # in the table, and below
+    assert [section["id"] for section in page.all("section")] == ["episode-1", "episode-2"]
     assert [link["href"] for link in page.all("a")] == ["#episode-1", "#episode-2"]
     assert len(page.all("td")) == 2 * (3 + len(COLUMNS))
 

@@ -98,7 +98,6 @@ CASES = [
         arm(rotation_error_deg_p99=5.8),
         "p99 5.8 deg (at most 5.73)",
     ),
-    ("min_sparc", -2.0, arm(sparc=-2.0), arm(sparc=-2.5), "SPARC -2.5 (at least -2)"),
     ("min_ldlj", -9.0, arm(ldlj=-9.0), arm(ldlj=-9.5), "LDLJ -9.5 (at least -9)"),
     (
         "max_idle_share",
@@ -182,8 +181,8 @@ def test_a_failure_is_discarded_unless_failures_are_kept_and_a_run_that_a_fault_
 
 
 def test_a_number_that_is_none_is_not_judged_and_one_that_is_no_number_is_discarded() -> None:
-    assert verdict_of(arm(sparc=None, hand_to_tool_ms=None), JudgeSettings()).keep
-    assert not verdict_of(arm(sparc=float("nan")), JudgeSettings()).keep
+    assert verdict_of(arm(ldlj=None, hand_to_tool_ms=None), JudgeSettings()).keep
+    assert not verdict_of(arm(ldlj=float("nan")), JudgeSettings()).keep
     assert not verdict_of(arm(position_error_mm_rms=float("nan")), JudgeSettings()).keep
 
 

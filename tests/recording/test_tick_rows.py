@@ -27,15 +27,15 @@ from q2r2_control.recording.tick_rows import numbers_in, tick_labels, tick_type
 
 ARMS, NAMES = ("left", "right"), ("left_A1", "left_A2", "right_A1_with_a_longer_name")
 STAMPS = np.array([1_500_000_000, (2**31 - 1) * 10**9])
-LISTS = tuple(np.arange(first, first + 3, dtype=np.float64) for first in (1, 4, 7))
+POSITIONS, VELOCITIES, EFFORTS = (np.arange(first, first + 3, dtype=np.float64) for first in (1, 4, 7))
 
 
 @pytest.mark.parametrize(
     ("kind", "example"),
     [
-        (ARRAY, float_array(np.arange(1, 10))),
-        (JOINTS, joint_state(list(NAMES), *LISTS)),
-        (TRAJECTORY, joint_trajectory(list(NAMES), *LISTS)),
+        (ARRAY, float_array(np.arange(1.0, 10.0))),
+        (JOINTS, joint_state(list(NAMES), POSITIONS, VELOCITIES, EFFORTS)),
+        (TRAJECTORY, joint_trajectory(list(NAMES), POSITIONS, VELOCITIES, EFFORTS)),
     ],
     ids=["array", "joint state", "trajectory"],
 )
@@ -78,7 +78,7 @@ def test_every_number_of_a_tick_has_a_name_of_its_own_and_its_place() -> None:
 
 def test_arrays_and_texts_are_read_as_they_were_written_and_no_others() -> None:
     numbers = np.array([[0.5, np.nan, -0.0], [1.0, np.inf, 2.0]])
-    payloads = MessageTemplate(ARRAY, float_array(np.arange(1, 4)), 3).filled(numbers, STAMPS)
+    payloads = MessageTemplate(ARRAY, float_array(np.arange(1.0, 4.0)), 3).filled(numbers, STAMPS)
     assert numbers_of(payloads, 3).tobytes() == numbers.tobytes()
     with pytest.raises(ValueError, match="has not 4 numbers"):
         numbers_of(payloads, 4)
