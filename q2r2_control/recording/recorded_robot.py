@@ -16,16 +16,23 @@ from q2r2_control.types import Array
 _SAME_POSE = 1e-6  # [m], and of a quaternion
 
 
-def cell_and_robot_of(recording: Recording) -> tuple[Config, Robot]:
-    """Raises :class:`RecordingError`, which names the file, where its cell cannot be built or is another robot now."""
+def cell_and_robot_of(recording: Recording, config: Config | None = None) -> tuple[Config, Robot]:
+    """The recorded cell, or ``config``, with its robot.
+
+    Raises :class:`RecordingError`, which names the file, where the recorded cell cannot be built or either has other arms
+    or joints, and :class:`Q2R2Error` where ``config`` cannot be built.
+    """
     about = recording.about
-    try:
-        config, robot = _built(about.cell)
-    except Q2R2Error as error:
-        raise RecordingError(f"{recording.file}: {error}") from error
+    if config is not None:
+        cell, robot = config, Robot.from_config(config)
+    else:
+        try:
+            cell, robot = _built(about.cell)
+        except Q2R2Error as error:
+            raise RecordingError(f"{recording.file}: {error}") from error
     if tuple(robot.arms) != about.arms or tuple(robot.joint_names) != about.joints:
-        raise RecordingError(f"{recording.file}: recorded with other arms or joints than its cell has")
-    return config, robot
+        raise RecordingError(f"{recording.file}: recorded with other arms or joints than {cell.name} has")
+    return cell, robot
 
 
 @lru_cache(maxsize=4)

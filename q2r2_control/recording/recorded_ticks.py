@@ -1,4 +1,4 @@
-"""The ticks of a recording, with all that each of them took and what reference came of it."""
+"""The ticks of a recording, with all that each of them took."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from q2r2_control.types import SIDES, Array, HandInputs, HandSample, RobotState
 
 @dataclass(frozen=True, slots=True)
 class RecordedTick:
-    """What one tick took, and the reference that came of it."""
+    """What one tick took."""
 
     number: int
     now: float
@@ -31,9 +31,6 @@ class RecordedTick:
     openings: dict[str, float]
     unsolved: int
     events: list[Event]
-    reference_q: Array  # (nv,) [rad]
-    reference_v: Array  # (nv,) [rad/s]
-    grippers: dict[str, float]  # openings that were wanted
     packed: PackedTick  # all of it
 
 
@@ -82,7 +79,6 @@ class RecordedTicks:
             if not self._starts and state:
                 self._starts.append(_start_of(json.loads(state)["start"]))
             samples, openings = chunk.samples[first:end], row["arms"]["opening"].tolist()
-            wanted = row["arms"]["wanted"].tolist()
             external = row["tau_external"].copy() if row["external"] else None
             yield RecordedTick(
                 number=number,
@@ -99,9 +95,6 @@ class RecordedTicks:
                 },
                 unsolved=int(row["unsolved"]),
                 events=events.get(number, []),
-                reference_q=row["reference_q"].copy(),
-                reference_v=row["reference_v"].copy(),
-                grippers=dict(zip(self._arms, wanted, strict=True)),
                 packed=PackedTick(row.tobytes(), samples.tobytes(), state),
             )
 

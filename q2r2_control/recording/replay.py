@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from q2r2_control.config.cell import Config, parse_config
+from q2r2_control.config.cell import Config
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.control.qp import QpProblem, QpSolution, Solver, make_solver
 from q2r2_control.drives.base import permitted
@@ -19,6 +19,7 @@ from q2r2_control.recording.about import ROS
 from q2r2_control.recording.comparison import Comparison, changes
 from q2r2_control.recording.plant_difference import ArmDifference, PlantDifference
 from q2r2_control.recording.reader import Recording
+from q2r2_control.recording.recorded_robot import cell_and_robot_of
 from q2r2_control.recording.recorded_ticks import NoMoreTicksError, RecordedTick, RecordedTicks
 from q2r2_control.robot.robot import Robot
 from q2r2_control.summary.run_summary import RunSummary
@@ -60,22 +61,6 @@ class Replay:
     arms: dict[str, ArmDifference] = field(default_factory=dict)  # with a plant: where the tools were elsewhere
 
 
-def opened(path: Path, config: Config | None) -> tuple[Recording, Config, Robot]:
-    """A recording, and the cell to run it in: its own or ``config``. Raises as :func:`replay` does."""
-    recording = Recording(path)
-    about = recording.about
-    if about.source == ROS:
-        raise RecordingError(
-            f"{recording.file}: recorded from ROS nodes, which keeps messages and not what each loop took, so there is "
-            "nothing to replay to the bit; ros2 bag play plays it, q2r2 judge and q2r2 export read it"
-        )
-    cell = config or parse_config(about.cell, f"{recording.file}: its cell")
-    robot = Robot.from_config(cell)
-    if tuple(robot.arms) != about.arms or tuple(robot.joint_names) != about.joints:
-        raise RecordingError(f"{recording.file}: recorded with other arms or joints than {cell.name} has")
-    return recording, cell, robot
-
-
 def replay(
     path: Path,
     config: Config | None = None,
@@ -93,8 +78,14 @@ def replay(
     Raises :class:`RecordingError` for a file that is none or is damaged, and :class:`Q2R2Error` for a cell that cannot
     be built or whose arms and joints have other names, and for a plant that does not have the recorded mode.
     """
-    recording, cell, robot = opened(path, config)
+    recording = Recording(path)
     about = recording.about
+    if about.source == ROS:
+        raise RecordingError(
+            f"{recording.file}: recorded from ROS nodes, which keeps messages and not what each loop took, so there is "
+            "nothing to replay to the bit; ros2 bag play plays it, q2r2 judge and q2r2 export read it"
+        )
+    cell, robot = cell_and_robot_of(recording, config)
     ticks = RecordedTicks(recording)
     comparison = Comparison(about, ticks) if compare or plant is None else None
     moves = _Plant(ticks, about.plant_modes) if plant is None else make_plant(plant, robot, cell)

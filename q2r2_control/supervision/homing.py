@@ -9,9 +9,9 @@ import pinocchio as pin
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.robot.robot import Robot
-from q2r2_control.supervision.joint_homing import JointHoming, JointWay
+from q2r2_control.supervision.joint_homing import JointHoming
 from q2r2_control.supervision.tool_homing import ToolHoming
-from q2r2_control.types import Array, Reference
+from q2r2_control.types import Reference
 
 
 class LedWay(Protocol):
@@ -32,9 +32,9 @@ class LedWay(Protocol):
 
 
 class LedJoints:
-    """Asks no tool for anything: the controller holds the joint positions of a :class:`JointWay`."""
+    """Asks no tool for anything: the controller holds the joint positions of a :class:`JointHoming`."""
 
-    def __init__(self, controller: CartesianController, way: JointWay) -> None:
+    def __init__(self, controller: CartesianController, way: JointHoming) -> None:
         self._controller, self._way = controller, way
         self._arms = tuple(controller.robot.arms)
 
@@ -77,15 +77,8 @@ class Homing:
         if self._tools_only:
             self._way = ToolHoming(self._home, self._controller.tool_pose)
         else:
-            self.follow(self.way_to(self._robot.home))
-
-    def way_to(self, q: Array) -> JointHoming:
-        """A way of all joints to ``q`` (nv,) [rad]."""
-        return JointHoming(self._robot, self._controller.kept_distances, q)
-
-    def follow(self, way: JointWay) -> None:
-        """Lead the joints along ``way`` until it has an outcome."""
-        self._way = LedJoints(self._controller, way)
+            way = JointHoming(self._robot, self._controller.kept_distances, self._robot.home)
+            self._way = LedJoints(self._controller, way)
 
     def targets(self, last: Reference | None, dt: float) -> dict[str, pin.SE3 | None]:
         """See :meth:`LedWay.targets`; no way: nothing is asked for."""
