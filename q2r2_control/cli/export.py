@@ -11,7 +11,6 @@ from rich.progress import Progress
 
 from q2r2_control.cli.output import stderr_console
 from q2r2_control.errors import ConfigError, RecordingError
-from q2r2_control.export.bags import write_bags
 from q2r2_control.export.csv_tables import gather_tables, move_table, write_table
 from q2r2_control.export.episodes import FASTEST, FrameSampling
 from q2r2_control.export.hdf5 import gather_files, require_h5py, write_file
@@ -81,37 +80,6 @@ def csv(
         raise ConfigError(f"--output {output}: for {count} recordings; allowed: a folder, or one recording")
     join = move_table if one_file else gather_tables
     _export(recordings, FrameSampling(fps, trim), output, workers, skip_bad, write_table, join)
-
-
-@app.command(epilog="Example: q2r2 export mcap recordings --output episodes")
-def mcap(
-    recordings: Recordings,
-    output: Annotated[Path, typer.Option(metavar="OUT", help="A folder that does not exist yet.")],
-    skip_bad: SkipBad = False,
-) -> None:
-    """Cut recordings into episodes: a bag of rosbag2 each, for tools that take an episode for a file."""
-    console, files, counts = stderr_console(), recordings_in(recordings), list[int]()
-    target = Output(output)
-
-    def write(folder: Path) -> None:
-        folder.mkdir(parents=True)
-        with Progress(console=console, disable=not console.is_terminal, transient=True) as progress:
-            for file in progress.track(files, description="recordings"):
-                try:
-                    counts.append(write_bags(file, folder))
-                except RecordingError as error:
-                    if not skip_bad:
-                        raise
-                    console.print(f"skipped: {error}", style="yellow", soft_wrap=True, highlight=False, markup=False)
-        if not sum(counts):
-            raise RecordingError("none of the recordings can be exported")
-
-    try:
-        target.write(write)
-    except RecordingError:
-        target.drop()
-        raise
-    print(f"{output}: {sum(counts)} episodes of {len(files)} recordings")
 
 
 def _export(

@@ -23,7 +23,6 @@ if TYPE_CHECKING:  # the writer's process does without them
 FORMAT = "3"  # of topics and fields; another one cannot be replayed
 LOOP, ROS = "loop", "ros"  # sources: one loop's ticks, or what nodes published
 ABOUT, CONCLUSION = "q2r2_control", "q2r2_control_end"  # metadata records
-CUT_OUT_OF = "cut_out_of"  # a note of a bag of one episode: the file that has all of the run
 CELL, ROBOT, FIELDS = "cell.yaml", "robot.urdf", "fields.json"
 _GIT_TIME = 2.0  # [s]
 

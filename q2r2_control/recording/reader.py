@@ -23,7 +23,7 @@ from zstandard import ZstdError
 
 from q2r2_control.errors import RecordingError
 from q2r2_control.events import Event
-from q2r2_control.recording.about import ABOUT, CELL, CONCLUSION, CUT_OUT_OF, ROBOT, About, Conclusion
+from q2r2_control.recording.about import ABOUT, CELL, CONCLUSION, ROBOT, About, Conclusion
 from q2r2_control.recording.messages import Message, jpeg_of, numbers_of, text_of
 from q2r2_control.recording.tick_rows import SAMPLE_FIELDS, Rows, tick_type
 from q2r2_control.recording.topics import SAMPLES, STATE, TICK, Topic, picture_topic
@@ -78,8 +78,6 @@ class Recording:
         """``path``: the file, or the folder that it is alone in."""
         self.file = _file_of(path)
         self.about = self._read_about()
-        if (whole := self.about.notes.get(CUT_OUT_OF)) is not None:
-            raise RecordingError(f"{self.file}: one episode, cut out of {whole}; allowed: the recording that has all")
         self.since = 0  # time of day [ns]; what is known to be before it is left out
 
     def chunks(self) -> Iterator[TickChunk]:

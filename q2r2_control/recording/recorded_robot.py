@@ -19,8 +19,8 @@ _SAME_POSE = 1e-6  # [m], and of a quaternion
 def cell_and_robot_of(recording: Recording, config: Config | None = None) -> tuple[Config, Robot]:
     """The recorded cell, or ``config``, with its robot.
 
-    Raises :class:`RecordingError`, which names the file, where the recorded cell cannot be built or either has other arms
-    or joints, and :class:`Q2R2Error` where ``config`` cannot be built.
+    Raises :class:`RecordingError`, which names the file, where the recorded cell cannot be built or either one has
+    other arms or joints, and :class:`Q2R2Error` where ``config`` cannot be built.
     """
     about = recording.about
     if config is not None:
