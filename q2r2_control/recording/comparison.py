@@ -27,23 +27,24 @@ class Comparison:
         self._labels = tick_labels(about.arms, about.joints)
         left_out = [any(name in label.split(".") for name in NOT_REPLAYED) for label in self._labels]
         self._compared = np.flatnonzero(~np.array(left_out))
-        self.difference: str | None = None  # the first one; None: none so far
+        self._difference: str | None = None
 
     def __call__(self, tick: Tick) -> None:
         """Take one tick of the replay."""
         recorded = self._ticks.current
         assert recorded is not None
         replayed = self._packer.pack(recorded.number, tick)
-        if self.difference is None:
+        if self._difference is None:
             found = self._difference_of_rows(recorded.packed.row, replayed.row)
             found = found or _difference_of_states(recorded.packed.state, replayed.state)
             if found is not None:
-                self.difference = f"{tick.now - self._ticks.start.now:.6f} s: {found}"
+                self._difference = f"{tick.now - self._ticks.start.now:.6f} s: {found}"
 
-    def finish(self) -> None:
-        """After the replay: nothing may be left."""
-        if self.difference is None and self._ticks.next is not None:
-            self.difference = f"{self._ticks.next.now - self._ticks.start.now:.6f} s: a tick was recorded only"
+    def finish(self) -> str | None:
+        """The first difference, after the replay, of which nothing may be left; None: there is none."""
+        if self._difference is None and self._ticks.next is not None:
+            return f"{self._ticks.next.now - self._ticks.start.now:.6f} s: a tick was recorded only"
+        return self._difference
 
     def _difference_of_rows(self, recorded: bytes, replayed: bytes) -> str | None:
         """The first number that is not the same to the bit."""
