@@ -87,25 +87,6 @@ class Thinned:
         return self._inner.lateness()
 
 
-class Slow:
-    """Even samples with the noise of a headset."""
-
-    def __init__(self, inner: SampleTiming, rate: float) -> None:
-        self._inner, self._rate = inner, rate
-
-    def times(self) -> Iterator[float]:
-        count = 0
-        while True:
-            yield count / self._rate
-            count += 1
-
-    def measured(self, pose: pin.SE3, t: float) -> pin.SE3:
-        return self._inner.measured(pose, t)
-
-    def lateness(self) -> float:
-        return self._inner.lateness()
-
-
 class Held:
     """An input whose samples the loop gets later than they were received."""
 
