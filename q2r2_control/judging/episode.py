@@ -112,43 +112,42 @@ def read_episode(recording: Recording) -> Episode:
     Raises :class:`RecordingError` where its cell cannot be built.
     """
     config, robot = cell_and_robot_of(recording)
-    reader = _Reader(recording)
-    damage = reader.read()
-    ticks, frames = reader.ticks(), reader.frames()
-    if len(frames.at) and damage is None:
-        try:
-            check_tools(reader.first_reference, frames.reference[0], robot)
-        except RecordingError as error:
-            raise RecordingError(f"{recording.file}: {error}") from error
-    swapped = config.teleop.stance is not Stance.SIDE_BY_SIDE
-    arms = {SIDES[1 - SIDES.index(arm)] if swapped else arm: arm for arm in recording.about.arms}
-    hands = {hand: reader.hand(hand, arm, ticks) for hand, arm in arms.items()}
-    tools = tool_poses(frames.q, robot)
-    said = Conclusion()
+    read = _Read(recording)
+    damage, said = read.all_chunks(), Conclusion()
+    ticks, frames = _joined(Ticks, read.ticks), _joined(Frames, read.frames)
     if damage is None:
+        if len(frames.at):
+            try:
+                check_tools(read.first_reference, frames.reference[0], robot)
+            except RecordingError as error:
+                raise RecordingError(f"{recording.file}: {error}") from error
         try:
             said = recording.conclusion
         except RecordingError as error:
             damage = str(error)
-    return Episode(recording, config, ticks, frames, tools, hands, reader.events, damage, said.ended_by, said.success)
+    swapped = config.teleop.stance is not Stance.SIDE_BY_SIDE
+    arms = {SIDES[1 - SIDES.index(arm)] if swapped else arm: arm for arm in recording.about.arms}
+    hands = {hand: read.hand(hand, arm, ticks) for hand, arm in arms.items()}
+    tools = tool_poses(frames.q, robot)
+    return Episode(recording, config, ticks, frames, tools, hands, read.events, damage, said.ended_by, said.success)
 
 
-class _Reader:
-    """Gathers arrays chunk by chunk."""
+class _Read:
+    """What was read so far, chunk by chunk."""
 
     def __init__(self, recording: Recording) -> None:
         self._recording = recording
         about = recording.about
         nothing = np.empty(0, dtype=tick_type(len(about.arms), len(about.joints)))
-        self._ticks = [_ticks(nothing, np.empty(0))]
-        self._frames = [_frames(nothing, np.empty(0, dtype=np.int64))]
+        self.ticks = [_ticks(nothing, np.empty(0))]
+        self.frames = [_frames(nothing, np.empty(0, dtype=np.int64))]
+        self.events: list[Event] = []
+        self.first_reference: Array = np.empty(0)
         self._samples = [np.empty((0, len(SAMPLE_FIELDS)))]
         self._count, self._slot = 0, -1
         self._origin = 0.0  # of the loop's clock [s]
-        self.events: list[Event] = []
-        self.first_reference: Array = np.empty(0)
 
-    def read(self) -> str | None:
+    def all_chunks(self) -> str | None:
         """All there is; returns what is damaged."""
         try:
             for chunk in self._recording.chunks():
@@ -158,20 +157,6 @@ class _Reader:
         except (ValueError, KeyError, IndexError, TypeError) as error:
             return f"damaged: {error!r:.200}"
         return None
-
-    def ticks(self) -> Ticks:
-        return _joined(Ticks, self._ticks)
-
-    def frames(self) -> Frames:
-        return _joined(Frames, self._frames)
-
-    def hand(self, hand: str, arm: str, ticks: Ticks) -> Hand:
-        rows = np.concatenate(self._samples)
-        rows = rows[rows[:, 1] == SIDES.index(hand)]
-        at = np.searchsorted(ticks.number, rows[:, 0])
-        known = at < len(ticks.number)
-        rows, at = rows[known], at[known]
-        return Hand(arm, rows[:, 2] - self._origin, ticks.t[at], rows[:, 4:7])
 
     def _add(self, chunk: TickChunk) -> None:
         self.events += [event for events in chunk.events().values() for event in events]
@@ -184,9 +169,15 @@ class _Reader:
             self.first_reference = chunk.rows["reference_q"][0].copy()
         slots = np.floor(t / FRAME).astype(np.int64)
         at = np.flatnonzero(np.diff(slots, prepend=self._slot) > 0)
-        self._ticks.append(_ticks(chunk.rows, t))
-        self._frames.append(_frames(chunk.rows[at], self._count + at))
+        self.ticks.append(_ticks(chunk.rows, t))
+        self.frames.append(_frames(chunk.rows[at], self._count + at))
         self._count, self._slot = self._count + len(t), int(slots[-1])
+
+    def hand(self, hand: str, arm: str, ticks: Ticks) -> Hand:
+        rows = np.concatenate(self._samples)
+        rows = rows[(rows[:, 1] == SIDES.index(hand)) & (rows[:, 0] <= ticks.number.max(initial=-1))]
+        polled = ticks.t[np.searchsorted(ticks.number, rows[:, 0])]
+        return Hand(arm, rows[:, 2] - self._origin, polled, rows[:, 4:7])
 
 
 def _ticks(rows: Rows, t: Array) -> Ticks:
