@@ -213,3 +213,9 @@ def _joined(kind: type[_Table], parts: list[_Table]) -> _Table:
         field.name: np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(kind)
     }
     return kind(**columns)
+
+
+def stretches(flags: Flags) -> list[tuple[int, int]]:
+    """Beginning and end (exclusive) of each run of true ``flags`` (n,)."""
+    edges = np.flatnonzero(np.diff(np.concatenate(([False], flags, [False]))))
+    return [(int(begin), int(end)) for begin, end in edges.reshape(-1, 2)]

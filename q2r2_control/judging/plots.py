@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from q2r2_control.judging.episode import stretches
 from q2r2_control.judging.judge import Judged
 from q2r2_control.judging.motion import tracking_errors
-from q2r2_control.judging.stretches import stretches
 from q2r2_control.types import Array
 from q2r2_control.viewer.plot_style import COLOURS, LINE_STYLES, MARGIN_COLOUR, draw_limit
 

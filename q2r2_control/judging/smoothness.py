@@ -11,8 +11,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d
 
-from q2r2_control.judging.episode import FRAME, Flags
-from q2r2_control.judging.stretches import stretches
+from q2r2_control.judging.episode import FRAME, Flags, stretches
 from q2r2_control.types import Array
 
 PIECE = 1.0  # [s]

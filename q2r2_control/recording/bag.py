@@ -167,17 +167,6 @@ def _write_metadata(
     }
     target = file.with_name(METADATA_FILE)
     part = target.with_suffix(".part")
-    text = _Dumper.text({"rosbag2_bagfile_information": information})
-    part.write_text(text, encoding="utf-8")
+    plain = json.loads(json.dumps({"rosbag2_bagfile_information": information}))  # nothing twice, so no references
+    part.write_text(yaml.safe_dump(plain, sort_keys=False), encoding="utf-8")
     os.replace(part, target)
-
-
-class _Dumper(yaml.SafeDumper):
-    """Without references, which yaml-cpp follows but people do not like to read."""
-
-    def ignore_aliases(self, data: Any) -> bool:
-        return True
-
-    @classmethod
-    def text(cls, data: Any) -> str:
-        return str(yaml.dump(data, Dumper=cls, sort_keys=False))

@@ -11,24 +11,9 @@ import numpy as np
 import numpy.typing as npt
 import pinocchio as pin
 
+from q2r2_control.recording import messages
 from q2r2_control.recording import topics as names
-from q2r2_control.recording.messages import (
-    ARRAY,
-    HAND_INPUTS,
-    JOINTS,
-    NANOSECONDS,
-    POSE,
-    TRAJECTORY,
-    Message,
-    MessageTemplate,
-    float_array,
-    joint_state,
-    joint_trajectory,
-    make,
-    pose_stamped,
-    serialized,
-    text,
-)
+from q2r2_control.recording.messages import NANOSECONDS, Message, MessageTemplate
 from q2r2_control.recording.tick_rows import POSE_FIELDS, SAMPLE_FIELDS, PackedTick, numbers_in, tick_type
 from q2r2_control.recording.topics import Topic
 from q2r2_control.types import SIDES, Array, HandInputs
@@ -77,7 +62,10 @@ class TickEncoder:
         self._start: float | None = None  # of the loop's clock [s]
         self._stamps: dict[tuple[float, int], float] = {}  # the last of each hand's poses and inputs
         self._templates = _templates(list(robot.joints), topics[names.TICK])
-        self._poses = {frame: MessageTemplate(POSE, pose_stamped(_numbers(7), frame), 7) for frame in ("", names.WORLD)}
+        self._poses = {
+            frame: MessageTemplate(messages.POSE, messages.pose_stamped(_numbers(7), frame), 7)
+            for frame in ("", names.WORLD)
+        }
 
     def encode(self, batch: Sequence[PackedTick]) -> list[Message]:
         """Messages of packed ticks that follow the last ones, tick by tick, as readers without an index expect."""
@@ -109,14 +97,14 @@ class TickEncoder:
         ):
             made.add(topic, every, self._filled(topic, np.hstack([rows[name] for name in columns]), made.times))
         told = [at for at, tick in enumerate(batch) if tick.state]
-        made.add(names.STATE, told, [text(batch[at].state) for at in told])
+        made.add(names.STATE, told, [messages.text(batch[at].state) for at in told])
         return first + made.in_order()
 
     def _first_message(self, tick: PackedTick) -> list[Message]:
         """The robot for viewers."""
         self._start = float(json.loads(tick.state)["start"]["now"])
         channel = self._topics[names.DESCRIPTION].channel
-        return [Message(channel, 0, self._epoch, self._epoch, text(self._robot.urdf))]
+        return [Message(channel, 0, self._epoch, self._epoch, messages.text(self._robot.urdf))]
 
     def _filled(self, topic: str, numbers: Array, stamps: npt.NDArray[np.int64]) -> list[bytes]:
         return self._templates[topic].filled(numbers, stamps)
@@ -131,15 +119,15 @@ class TickEncoder:
         """Samples of a tick as the loop got them; poses and inputs that are new as messages of the nodes too."""
         for sample in samples:
             hand = SIDES[int(sample[_HAND])]
-            made.add(names.SAMPLES, [at], [serialized(ARRAY, float_array(sample))])
+            made.add(names.SAMPLES, [at], [messages.serialized(messages.ARRAY, messages.float_array(sample))])
             if self._is_new(sample, _POSE_STAMP):
                 (stamp,) = self._times(sample[_POSE_STAMP : _POSE_STAMP + 1]).tolist()
-                pose = pose_stamped(sample[_X : _X + len(POSE_FIELDS)], stamp=stamp)
-                made.add(names.hand_pose(hand), [at], [serialized(POSE, pose)])
+                pose = messages.pose_stamped(sample[_X : _X + len(POSE_FIELDS)], stamp=stamp)
+                made.add(names.hand_pose(hand), [at], [messages.serialized(messages.POSE, pose)])
             if self._is_new(sample, _INPUTS_STAMP):
                 upper, lower, *values = sample[_BUTTONS : _BUTTONS + len(HandInputs.__slots__)].tolist()
-                inputs = make(HAND_INPUTS, bool(upper), bool(lower), *values)
-                made.add(names.hand_buttons(hand), [at], [serialized(HAND_INPUTS, inputs)])
+                inputs = messages.make(messages.HAND_INPUTS, bool(upper), bool(lower), *values)
+                made.add(names.hand_buttons(hand), [at], [messages.serialized(messages.HAND_INPUTS, inputs)])
 
     def _is_new(self, sample: Array, stamp: int) -> bool:
         """Whether a sample of a hand has another stamp than the one before."""
@@ -164,7 +152,7 @@ class _Batch:
 
     def in_order(self) -> list[Message]:
         """All, tick by tick."""
-        return [message for messages in self._messages for message in messages]
+        return [message for of_tick in self._messages for message in of_tick]
 
 
 def _numbers(count: int, first: int = 1) -> Array:
@@ -175,12 +163,12 @@ def _templates(joints: list[str], tick: Topic) -> dict[str, MessageTemplate]:
     """Of the topics that every tick has."""
     n, none = len(joints), np.empty(0)
     lists = _numbers(n), _numbers(n, n + 1), _numbers(n, 2 * n + 1)
-    numbers: Any = float_array(_numbers(len(tick.labels)))
-    states = MessageTemplate(JOINTS, joint_state(joints, *lists), 3 * n)
+    numbers: Any = messages.float_array(_numbers(len(tick.labels)))
+    states = MessageTemplate(messages.JOINTS, messages.joint_state(joints, *lists), 3 * n)
     return {
-        names.TICK: MessageTemplate(ARRAY, numbers, len(tick.labels)),
+        names.TICK: MessageTemplate(messages.ARRAY, numbers, len(tick.labels)),
         names.JOINT_STATES: states,
         names.JOINT_COMMANDS: states,
-        names.EXTERNAL_TORQUE: MessageTemplate(JOINTS, joint_state(joints, none, none, lists[0]), n),
-        names.REFERENCE: MessageTemplate(TRAJECTORY, joint_trajectory(joints, *lists), 3 * n),
+        names.EXTERNAL_TORQUE: MessageTemplate(messages.JOINTS, messages.joint_state(joints, none, none, lists[0]), n),
+        names.REFERENCE: MessageTemplate(messages.TRAJECTORY, messages.joint_trajectory(joints, *lists), 3 * n),
     }

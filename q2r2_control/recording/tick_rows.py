@@ -110,7 +110,7 @@ class TickPacker:
         self._arms = tuple(arms)
         self._row = struct.Struct(f"<{len(tick_labels(arms, joints))}d")
         self._not_measured = [0.0] * len(joints)
-        self._state: tuple[Any, ...] | None = None  # in names, as it was told last
+        self._state: dict[str, Any] | None = None  # as it was told last
 
     def repeat_state(self) -> None:
         """Tell the state and the start again with the next tick: the last one was lost."""
@@ -150,10 +150,6 @@ class TickPacker:
     def _state_text(self, tick: Tick) -> str:
         """What has names, as JSON; empty where it is what it was."""
         report = tick.reference.report
-        words = (tick.connected, report.status, report.closest_pair, report.tightest_pair)
-        named = (*words, tick.states, tick.held_grippers, tick.holding)
-        if named == self._state and not tick.events:
-            return ""
         state: dict[str, Any] = {
             "states": tick.states,
             "connected": tick.connected,
@@ -163,11 +159,13 @@ class TickPacker:
             "held_grippers": tick.held_grippers,
             "holding": tick.holding,
         }
+        if state == self._state and not tick.events:
+            return ""
+        before, self._state = self._state, dict(state)
         if tick.events:
             state["events"] = [event.as_json() for event in tick.events]
-        if self._state is None:
+        if before is None:
             state["start"] = {"now": tick.start.now, **_plain(tick.start.state)}
-        self._state = named
         return json.dumps(state)
 
 
