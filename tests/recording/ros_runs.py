@@ -15,7 +15,7 @@ from q2r2_control.config.cell import Config
 from q2r2_control.events import Event, Reason, ReasonKind
 from q2r2_control.recording import topics as names
 from q2r2_control.recording.about import ROS, About, as_yaml
-from q2r2_control.recording.message_recorder import ROOM, MessageRecorder
+from q2r2_control.recording.base_recorder import ROOM, MessageRecorder
 from q2r2_control.recording.messages import (
     TEXT,
     Message,

@@ -129,16 +129,6 @@ def test_pictures_that_are_not_taken_in_time_are_lost_and_counted(tmp_path: Path
     assert len(list(Recording(Path(summary.file)).pictures("front"))) == summary.pictures
 
 
-def test_pictures_that_are_due_between_two_ticks_are_lost_and_counted(tmp_path: Path) -> None:
-    needs_opengl()
-    loop = pipeline("circle", "mujoco", loop_rate_hz=100.0, cameras={"front": FRONT.model_copy(update={"rate": 240.0})})
-    observed = Observed(loop)
-    loop.listeners.append(observed)
-    summary = record(tmp_path, loop, 0.1)
-    assert summary.pictures == len(observed.times)
-    assert summary.pictures + summary.lost_pictures == int(observed.times[-1] * 240.0 + 1e-6) + 1
-
-
 def test_when_the_run_is_killed_its_processes_end_and_the_file_is_closed(tmp_path: Path) -> None:
     needs_opengl()
     program = """

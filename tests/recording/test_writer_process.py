@@ -24,7 +24,7 @@ from q2r2_control.recording.replay import replay
 from q2r2_control.summary.tick import Tick
 from q2r2_control.teleop.haptics import FAULT
 from q2r2_control.types import HapticFeedback
-from tests.recording.runs import ROOT, file_of, pipeline, read_elsewhere, record, writer_of
+from tests.recording.runs import ROOT, pipeline, read_elsewhere, record, writer_of
 from tests.support.processes import alive, children, wait_until
 
 pytestmark = pytest.mark.slow
@@ -155,14 +155,6 @@ def test_a_writer_that_hangs_at_the_end_is_not_waited_for_longer_than_that(
     assert not alive(pids[0])
 
 
-def test_a_writer_that_is_not_needed_ends(tmp_path: Path) -> None:
-    with Recorder(tmp_path, "test") as recorder:
-        pid = writer_of(recorder).pid
-    assert not alive(pid)
-    assert list(tmp_path.iterdir()) == []
-    assert recorder.summary.fault is None
-
-
 def file_in(folder: Path) -> Path:
     (file,) = folder.glob("*/*.mcap")
     return file
@@ -265,18 +257,3 @@ def test_ctrl_c_ends_a_run_of_a_script_somewhere_else_and_the_recording_is_whole
     assert summary["recording"]["ticks"] == summary["ticks"]
     assert not alive(writer)
     assert replay(Path(summary["recording"]["file"])).ended_by is None
-
-
-def test_the_file_of_a_run_that_raises_is_whole(tmp_path: Path) -> None:
-    recorders: list[Recorder] = []
-
-    def fail(recorder: Recorder) -> Iterator[None]:
-        recorders.append(recorder)
-        for _ in range(50):
-            yield
-        raise ZeroDivisionError("of another listener")
-
-    loop = pipeline()
-    with pytest.raises(ZeroDivisionError):
-        record(tmp_path, loop, 1.0, during=Script(loop, fail))
-    assert replay(file_of(recorders[0].summary)).difference is None
