@@ -6,6 +6,7 @@ import io
 import logging
 import os
 import signal
+import textwrap
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -23,8 +24,7 @@ from q2r2_control.recording.recorder import Recorder
 from q2r2_control.recording.replay import replay
 from q2r2_control.summary.tick import Tick
 from tests.recording.runs import RATE, file_of, pipeline, read_elsewhere, record
-from tests.recording.test_recorder import run_program
-from tests.recording.test_writer_process import Script
+from tests.recording.test_writer_process import Script, started
 from tests.support.pictures import needs_opengl
 from tests.support.processes import alive, wait_until
 
@@ -145,9 +145,10 @@ def test_when_the_run_is_killed_its_processes_end_and_the_file_is_closed(tmp_pat
             print(recorder.writer.pid, recorder.cameras.pid, flush=True)
         record(Path(sys.argv[1]), loop, 1.0, during=tell)
     """
-    result = run_program(program, str(tmp_path))
-    assert result.returncode == -signal.SIGKILL, result.stderr
-    helpers = [int(pid) for pid in result.stdout.split()]
+    with started("-c", textwrap.dedent(program), str(tmp_path)) as running:
+        stdout, stderr = running.communicate()
+    assert running.returncode == -signal.SIGKILL, stderr
+    helpers = [int(pid) for pid in stdout.split()]
     wait_until(lambda: not any(map(alive, helpers)))
     (file,) = tmp_path.glob("*/*.mcap")
     assert Recording(file).closed
@@ -163,6 +164,10 @@ def test_when_the_process_that_takes_pictures_is_killed_the_recording_goes_on(
         while cameras_of(recorder).due < 4:
             yield
         wait_until(lambda: recorder.written.messages)
+        os.kill(cameras_of(recorder).pid, signal.SIGSTOP)
+        due = cameras_of(recorder).due
+        while cameras_of(recorder).due == due:
+            yield
         os.kill(cameras_of(recorder).pid, signal.SIGKILL)
         wait_until(lambda: not alive(cameras_of(recorder).pid))
         while not caplog.records:

@@ -4,10 +4,6 @@ from __future__ import annotations
 
 import json
 import logging
-import os
-import subprocess
-import sys
-import textwrap
 import time
 import tracemalloc
 from dataclasses import replace as changed
@@ -126,26 +122,9 @@ def test_a_folder_that_cannot_be_written_is_one_line_and_the_run_goes_on(
     assert summary.lost_ticks >= 0.2 * RATE
 
 
-def run_program(program: str, *arguments: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-c", textwrap.dedent(program), *arguments],
-        cwd=ROOT, env={**os.environ, "PYTHONPATH": str(ROOT)}, capture_output=True, text=True, timeout=300,
-    )  # fmt: skip
-
-
-def test_two_processes_that_record_at_once_get_a_folder_each(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    program = """
-        import sys, time
-        time.time_ns = lambda: 1_700_000_000_000_000_000
-        from pathlib import Path
-        from tests.recording.runs import pipeline, record
-        print(record(Path(sys.argv[1]), pipeline(), 0.2).file)
-    """
+def test_runs_that_begin_within_one_second_get_a_folder_each(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(time, "time_ns", lambda: 1_700_000_000_000_000_000)
-    files = [file_of(record(tmp_path, pipeline(), 0.2)) for _ in range(2)]
-    result = run_program(program, str(tmp_path))
-    assert result.returncode == 0, result.stderr
-    files.append(Path(result.stdout.strip()))
+    files = [file_of(record(tmp_path, pipeline(), 0.2)) for _ in range(3)]
     assert len({file.parent for file in files}) == len(list(tmp_path.iterdir())) == 3
     for file in files:
         assert replay(file).difference is None
