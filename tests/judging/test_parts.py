@@ -85,7 +85,7 @@ def test_its_events_are_by_its_own_time(judged: list[Judged]) -> None:
 def test_they_have_names_of_their_own_on_the_page(file: Path, judged: list[Judged]) -> None:
     page = page_of(judged, "Recordings")
     for number in (1, 2, 3):
-        assert f">{file.stem} #{number}</a>" in page
+        assert f" {file.stem} #{number}</a>" in page
 
 
 def test_the_run_is_replayed_to_the_bit(file: Path) -> None:
