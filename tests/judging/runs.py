@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
 
+from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.inputs.played import PlayedInput
 from q2r2_control.inputs.sampling import HeadsetSampling, SampleTiming
 from q2r2_control.inputs.scripted import HANDS_AT_REST
@@ -22,6 +24,8 @@ RATE = 250.0  # [Hz], with longer substeps than by default, since most of a test
 DURATION = 4.0  # [s]
 PRESS, START = 0.2, 0.5  # [s]
 _PRESSED = 0.1  # [s]
+_BINDINGS = {"trigger": "toggle", "grip": "discard", "stick_up": "mark", "stick_down": "success"}
+EPISODES = TeleopSettings.model_validate({"bindings": {name: f"record_{does}" for name, does in _BINDINGS.items()}})
 
 Pose = Callable[[str, float], pin.SE3]
 
@@ -64,6 +68,25 @@ class Work:
 def press(hand: str, t: float) -> HandInputs:
     """Engages; the gripper closes later."""
     return HandInputs(button_lower=PRESS <= t < PRESS + _PRESSED, button_upper=2.0 <= t < 2.0 + _PRESSED)
+
+
+def operator(
+    toggled: Sequence[float], discarded: float, marked: float | None = None, succeeded: float | None = None
+) -> Callable[[str, float], HandInputs]:
+    """Controls of an operator whose left hand tells of episodes at these times [s], by :data:`EPISODES`."""
+
+    def held(hand: str, t: float, *begin: float | None) -> float:
+        return float(hand == "left" and any(at <= t < at + _PRESSED for at in begin if at is not None))
+
+    def controls(hand: str, t: float) -> HandInputs:
+        return replace(
+            press(hand, t),
+            press_index=held(hand, t, *toggled),
+            press_middle=held(hand, t, discarded),
+            thumb_stick_vertical=held(hand, t, marked) - held(hand, t, succeeded),
+        )
+
+    return controls
 
 
 def headset(hand: str, seed: int) -> SampleTiming:

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.events import ReasonKind
 from q2r2_control.export.episodes import FrameSampling, make_episode
 from q2r2_control.export.kept_episodes import keep_episodes
@@ -17,39 +15,20 @@ from q2r2_control.judging.judge import Judged, judge
 from q2r2_control.judging.page import page_of
 from q2r2_control.recording.reader import Recording
 from q2r2_control.recording.replay import replay
-from q2r2_control.types import HandInputs
 from tests.export.vectors import load_vectors, write_vectors
-from tests.judging.runs import hands, loop_of, press, record_episode
+from tests.judging.runs import EPISODES, hands, loop_of, operator, record_episode
 
 pytestmark = pytest.mark.slow
 
-BINDINGS = {
-    "trigger": "record_toggle",
-    "grip": "record_discard",
-    "stick_up": "record_mark",
-    "stick_down": "record_success",
-}
 # Three episodes, 1 to 2.5, 3 to 4.5 and from 5 s on, of which the first succeeded and the second is discarded.
 TOGGLED, SUCCEEDED, DISCARDED, MARKED = (1.0, 2.5, 3.0, 4.5, 5.0), 2.7, 4.7, 1.7
 DURATION = 7.0
-
-
-def controls(hand: str, t: float) -> HandInputs:
-    def held(*begin: float) -> float:
-        return float(hand == "left" and any(at <= t < at + 0.1 for at in begin))
-
-    return replace(
-        press(hand, t),
-        press_index=held(*TOGGLED),
-        press_middle=held(DISCARDED),
-        thumb_stick_vertical=held(MARKED) - held(SUCCEEDED),
-    )
+CONTROLS = operator(TOGGLED, DISCARDED, MARKED, SUCCEEDED)
 
 
 @pytest.fixture(scope="module")
 def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    teleop = TeleopSettings.model_validate({"bindings": BINDINGS})
-    return record_episode(tmp_path_factory.mktemp("parts"), hands(5, inputs=controls), DURATION, teleop=teleop)
+    return record_episode(tmp_path_factory.mktemp("parts"), hands(5, inputs=CONTROLS), DURATION, teleop=EPISODES)
 
 
 @pytest.fixture(scope="module")
@@ -124,7 +103,6 @@ def test_those_that_are_kept_become_episodes_of_a_dataset_with_frames_of_their_o
 
 
 def test_where_nothing_is_recorded_the_controls_say_so() -> None:
-    teleop = TeleopSettings.model_validate({"bindings": BINDINGS})
-    loop = loop_of(hands(3, inputs=controls), teleop=teleop)
+    loop = loop_of(hands(3, inputs=CONTROLS), teleop=EPISODES)
     summary = loop.run(1.5, realtime=False)
     assert [event.kind for event in summary.events].count(ReasonKind.NO_RECORDING) == 1
