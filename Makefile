@@ -55,7 +55,7 @@ test-lerobot: $(LEROBOT)/.installed
 $(LEROBOT)/.installed: pyproject.toml setup.py
 	$(PYTHON) -m venv $(LEROBOT)
 	$(LEROBOT)/bin/python -m pip install --quiet --upgrade pip
-	$(LEROBOT)/bin/python -m pip install --quiet --editable '.[lerobot,ray]' 'pytest>=8' 'hypothesis>=6.100'
+	$(LEROBOT)/bin/python -m pip install --quiet --editable '.[lerobot]' 'pytest>=8' 'hypothesis>=6.100'
 	touch $@
 
 lint: setup

@@ -60,7 +60,7 @@ def test_every_dependency_is_imported_by_the_package(dependency: str) -> None:
 
 
 def test_everything_that_is_imported_outside_ros_is_a_dependency() -> None:
-    optional = modules("bench", "xacro", "export", "lerobot", "ray")
+    optional = modules("bench", "xacro", "export", "lerobot")
     assert imported(OTHERS) - modules() - optional - WITH_OTHERS == set()
 
 

@@ -11,8 +11,7 @@ from rich.progress import Progress
 
 from q2r2_control.cli.output import stderr_console
 from q2r2_control.errors import ConfigError, RecordingError
-from q2r2_control.export.bags import write_bags
-from q2r2_control.export.csv_tables import write_table, write_tables, write_vectors
+from q2r2_control.export.csv_tables import gather_tables, move_table, write_table
 from q2r2_control.export.episodes import FASTEST, FrameSampling
 from q2r2_control.export.hdf5 import gather_files, require_h5py, write_file
 from q2r2_control.export.kept_episodes import Write, keep_episodes
@@ -41,19 +40,11 @@ def lerobot(
     workers: Workers = 1,
     skip_bad: SkipBad = False,
     no_pictures: NoPictures = False,
-    ray: Annotated[
-        str | None, typer.Option(metavar="ADDRESS", help="Of a Ray cluster that makes the episodes: HOST:PORT or auto.")
-    ] = None,
 ) -> None:
-    """Make a LeRobotDataset of recordings: an episode each, with a video of each camera.
-
-    Needs the extra `lerobot`; with --ray, whose workers see the same files, the extra `ray` as well.
-    """
-    if ray is not None and workers != 1:
-        raise ConfigError("--workers and --ray exclude each other: the cluster has its own")
+    """Make a LeRobotDataset of recordings: an episode each, with a video of each camera. Needs the extra `lerobot`."""
     require_lerobot()
     sampling = FrameSampling(fps, trim, pictures=not no_pictures)
-    _export(recordings, sampling, output, workers, skip_bad, write_shard, join_shards, ray)
+    _export(recordings, sampling, output, workers, skip_bad, write_shard, join_shards)
 
 
 @app.command(epilog="Example: q2r2 export hdf5 recordings --output datasets/circle-act --fps 50")
@@ -83,43 +74,12 @@ def csv(
     workers: Workers = 1,
     skip_bad: SkipBad = False,
 ) -> None:
-    """Make tables of recordings: a line a frame, the columns of the dataset of q2r2 export lerobot."""
+    """Make tables of recordings: a line a frame, the numbers of the dataset of q2r2 export lerobot."""
     one_file = output.suffix == ".csv"
     if one_file and (count := len(recordings_in(recordings))) > 1:
         raise ConfigError(f"--output {output}: for {count} recordings; allowed: a folder, or one recording")
-    join = write_table if one_file else write_tables
-    _export(recordings, FrameSampling(fps, trim), output, workers, skip_bad, write_vectors, join)
-
-
-@app.command(epilog="Example: q2r2 export mcap recordings --output episodes")
-def mcap(
-    recordings: Recordings,
-    output: Annotated[Path, typer.Option(metavar="OUT", help="A folder that does not exist yet.")],
-    skip_bad: SkipBad = False,
-) -> None:
-    """Cut recordings into episodes: a bag of rosbag2 each, for tools that take an episode for a file."""
-    console, files, counts = stderr_console(), recordings_in(recordings), list[int]()
-    target = Output(output)
-
-    def write(folder: Path) -> None:
-        folder.mkdir(parents=True)
-        with Progress(console=console, disable=not console.is_terminal, transient=True) as progress:
-            for file in progress.track(files, description="recordings"):
-                try:
-                    counts.append(write_bags(file, folder))
-                except RecordingError as error:
-                    if not skip_bad:
-                        raise
-                    console.print(f"skipped: {error}", style="yellow", soft_wrap=True, highlight=False, markup=False)
-        if not sum(counts):
-            raise RecordingError("none of the recordings can be exported")
-
-    try:
-        target.write(write)
-    except RecordingError:
-        target.drop()
-        raise
-    print(f"{output}: {sum(counts)} episodes of {len(files)} recordings")
+    join = move_table if one_file else gather_tables
+    _export(recordings, FrameSampling(fps, trim), output, workers, skip_bad, write_table, join)
 
 
 def _export(
@@ -130,7 +90,6 @@ def _export(
     skip_bad: bool,
     write: Write,
     join: Callable[[Sequence[Path], Path], None],
-    ray: str | None = None,
 ) -> None:
     """``write`` keeps each episode, and ``join`` makes the output of what was kept."""
     console = stderr_console()
@@ -145,7 +104,6 @@ def _export(
                 write,
                 output.episodes(),
                 workers=workers,
-                ray=ray,
                 skip_bad=skip_bad,
                 progress=lambda done: progress.update(bar, completed=done, total=max(done, len(files))),
             )

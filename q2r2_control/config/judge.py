@@ -39,9 +39,6 @@ class JudgeSettings(StrictModel):
     max_rotation_error_rms: Radians | None = Field(0.15, description="target to measured tool [rad]")
     max_rotation_error_p99: Radians | None = Field(0.4, description="target to measured tool [rad]")
     max_idle_share: Share | None = Field(0.5, description="of the whole run: no arm engaged, or none of those moves")
-    min_sparc: Annotated[float, Field(ge=-100, le=-1)] | None = Field(
-        -3.0, description="smoothness of the tool: spectral arc length, the nearer to -1 the smoother"
-    )
     min_ldlj: Annotated[float, Field(ge=-100, le=0)] | None = Field(
         -11.0, description="smoothness of the tool: log dimensionless jerk, the nearer to 0 the smoother"
     )

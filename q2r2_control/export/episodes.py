@@ -49,11 +49,6 @@ class EpisodeVectors:
     cameras: Mapping[str, CameraFrames] = field(default_factory=dict)  # pictures by camera, one a frame
 
     @property
-    def name(self) -> str:
-        """Of the file, and which of several episodes in it."""
-        return Path(self.recording).stem + (f"-{self.part}" if self.part else "")
-
-    @property
     def frames(self) -> int:
         """Their number."""
         return len(next(iter(self.vectors.values())))
@@ -70,6 +65,10 @@ class EpisodePart:
 
     number: int = 0  # from 1 on
     span: EpisodeSpan = WHOLE
+
+    def name_in(self, file: Path) -> str:
+        """The name of an episode of this recording."""
+        return file.stem + (f"-{self.number}" if self.number else "")
 
 
 def make_episode(file: Path, sampling: FrameSampling, part: EpisodePart | None = None) -> EpisodeVectors:

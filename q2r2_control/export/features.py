@@ -10,15 +10,14 @@ import numpy.typing as npt
 import pinocchio as pin
 
 from q2r2_control.errors import RecordingError
-from q2r2_control.recording.packing import NOT_MEASURED
 from q2r2_control.recording.recorded_robot import check_tools, tool_poses
+from q2r2_control.recording.tick_rows import NOT_MEASURED, POSE_FIELDS
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 
 Vectors = dict[str, npt.NDArray[np.float32]]
 Names = dict[str, tuple[str, ...]]
 
-POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
 MOTION = ("x", "y", "z", "rx", "ry", "rz")
 
 
@@ -35,7 +34,7 @@ def features(frames: Mapping[str, Array], robot: Robot) -> tuple[Vectors, Names]
     commanded = _known(frames, "gripper", arms)
     tools = _continuous(tool_poses(frames["position"], robot))
     targets = _continuous(frames["target"], tools[0])
-    poses = tuple(f"{arm}_{number}" for arm in arms for number in POSE)
+    poses = tuple(f"{arm}_{number}" for arm in arms for number in POSE_FIELDS)
     count = len(tools)
     made: dict[str, tuple[Array, tuple[str, ...]]] = {
         "observation.state": (

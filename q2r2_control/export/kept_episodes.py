@@ -5,13 +5,17 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Callable, Sequence
+import signal
+from collections.abc import Callable, Generator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import closing
 from dataclasses import asdict, dataclass
+from multiprocessing import get_context
 from pathlib import Path
 
 from q2r2_control.errors import ConfigError, RecordingError
 from q2r2_control.export.episodes import EpisodePart, EpisodeVectors, FrameSampling, make_episode, parts_to_export
-from q2r2_control.export.workers import here, in_processes, on_ray
 
 Write = Callable[[EpisodeVectors, Path], None]  # an episode as a new file or folder; importable, for other processes
 _Job = tuple[Path, FrameSampling, EpisodePart, Write, Path]
@@ -33,29 +37,23 @@ def keep_episodes(
     folder: Path,
     *,
     workers: int = 1,
-    ray: str | None = None,
     skip_bad: bool = False,
     progress: Callable[[int], None] = lambda done: None,
 ) -> Exported:
     """``write`` the episodes of recordings into ``folder``; those that are there already are not made again.
 
-    Those that an operator discarded while recording are left out. The same comes out for any number of ``workers``, and
-    of a cluster at the address ``ray``. ``progress`` is called with how many are through. Raises the
-    :class:`RecordingError` of the first bad recording unless ``skip_bad``, and :class:`ConfigError` where nothing can
-    be written.
+    Those that an operator discarded while recording are left out. The same comes out for any number of ``workers``.
+    ``progress`` is called with how many are through. Raises the :class:`RecordingError` of the first bad recording
+    unless ``skip_bad``, and :class:`ConfigError` where nothing can be written or a worker was killed.
     """
     jobs: list[_Job] = [
-        (file, sampling, part, write, folder / _key(file, sampling, part, write))
+        (file, sampling, part, write, folder / f"{part.name_in(file)}.{_key(file, sampling, part, write)}")
         for file in files
         for part in parts_to_export(file)
     ]
-    if ray is not None:
-        mapping = on_ray(ray, _keep)
-    else:
-        mapping = in_processes(workers, _keep) if min(workers, len(jobs)) > 1 else here(_keep)
     exported = Exported([], [])
-    with mapping as run:
-        for done, (job, fault) in enumerate(zip(jobs, run(jobs), strict=True), start=1):
+    with closing(_results(jobs, min(workers, len(jobs)))) as results:
+        for done, (job, fault) in enumerate(zip(jobs, results, strict=True), start=1):
             if fault is not None and not skip_bad:
                 raise RecordingError(fault)
             if fault is None:
@@ -66,12 +64,30 @@ def keep_episodes(
     return exported
 
 
+def _results(jobs: Sequence[_Job], workers: int) -> Generator[str | None]:
+    """What :func:`_keep` returns of each job, in their order."""
+    if workers <= 1:
+        yield from map(_keep, jobs)
+        return
+    # Spawned, not forked: this process may have threads. Ctrl-C reaches all of them, and this process ends the others.
+    ignored = (signal.SIGINT, signal.SIG_IGN)
+    pool = ProcessPoolExecutor(workers, get_context("spawn"), initializer=signal.signal, initargs=ignored)
+    try:
+        yield from pool.map(_keep, jobs)
+    except (BrokenProcessPool, OSError) as error:  # OSError: of a pool that breaks while it is given its jobs
+        raise ConfigError(
+            "a process of --workers was killed, as for want of memory; the same command goes on with what is made"
+        ) from error
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
 def _keep(job: _Job) -> str | None:
     """Write one episode unless it is there, where a whole one only ever is; returns what was wrong."""
     file, sampling, part, write, target = job
     if target.exists():
         return None
-    unfinished = target.with_suffix(".unfinished")
+    unfinished = target.with_name(f"{target.name}.unfinished")
     try:
         write(make_episode(file, sampling, part), unfinished)
         _flush(unfinished)

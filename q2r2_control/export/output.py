@@ -49,10 +49,6 @@ class Output:
         except OSError as error:
             raise ConfigError(f"--output {self._path}: {error.strerror or error}") from error
 
-    def drop(self) -> None:
-        """Forget all that was made so far."""
-        shutil.rmtree(self._partial, ignore_errors=True)
-
     def _refuse_existing(self) -> None:
         if not self._path.name:
             raise ConfigError(f"--output {self._path}: allowed: a name that does not exist yet")

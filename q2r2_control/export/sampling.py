@@ -8,22 +8,22 @@ never knows the future, and a command was decided on no earlier than what was ob
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from q2r2_control.errors import RecordingError
-from q2r2_control.recording import topics as names
 from q2r2_control.recording.episode_spans import WHOLE, EpisodeSpan
-from q2r2_control.recording.reader import Recording
-from q2r2_control.recording.ticks import ChunkTicks, Column, ticks_of
+from q2r2_control.recording.messages import NANOSECONDS
+from q2r2_control.recording.reader import Recording, TickChunk
+from q2r2_control.recording.tick_rows import targets_or_tools
 from q2r2_control.types import Array
 
-Columns = dict[str, Column]
+Columns = dict[str, npt.NDArray[Any]]
 
 OBSERVED = ("position", "velocity", "effort", "opening")
 COMMANDED = ("reference", "gripper", "target", "reference_tool")
-_NANOSECONDS = 1_000_000_000
 _MOVING = 0.01  # fastest joint of a reference that moves [rad/s]
 
 
@@ -40,7 +40,7 @@ def sample(recording: Recording, fps: int, trim: bool = False, span: EpisodeSpan
     :class:`RecordingError` for a damaged file, one without a tick to take, and one in which ticks were lost for longer
     than a frame.
     """
-    picked: dict[str, list[Column]] = {name: [] for name in ("time", *OBSERVED, *COMMANDED)}
+    picked: dict[str, list[npt.NDArray[Any]]] = {name: [] for name in ("time", *OBSERVED, *COMMANDED)}
     start, end, count = None, 0, 0
     previous: Columns | None = None
     for columns in _ticks(recording, fps):
@@ -48,7 +48,7 @@ def sample(recording: Recording, fps: int, trim: bool = False, span: EpisodeSpan
         if previous is not None:
             known = {name: np.concatenate((previous[name], columns[name])) for name in columns}
         previous = {name: values[-1:] for name, values in columns.items()}
-        passed = (columns["time"] - recording.about.epoch) / _NANOSECONDS
+        passed = (columns["time"] - recording.about.epoch) / NANOSECONDS
         inside = (span.start <= passed) & (passed <= span.end)
         counting = np.flatnonzero(inside & columns["active"] if trim else inside)
         if len(counting):
@@ -75,54 +75,48 @@ def sample(recording: Recording, fps: int, trim: bool = False, span: EpisodeSpan
     kept = frames["time"] <= end
     frames = {name: values[kept] for name, values in frames.items()}
     frames["stamp"] = frames["time"]
-    frames["time"] = (frames["stamp"] - start) / _NANOSECONDS
+    frames["time"] = (frames["stamp"] - start) / NANOSECONDS
     return frames
 
 
 def _times_until(last: int, start: int, fps: int, first_frame: int) -> npt.NDArray[np.int64]:
     """Times [ns] of the frames from ``first_frame`` on that are not after ``last``, rounded."""
-    beyond = max((last - start) * fps // _NANOSECONDS + 2, first_frame)
+    beyond = max((last - start) * fps // NANOSECONDS + 2, first_frame)
     frames = np.arange(first_frame, beyond, dtype=np.int64)
-    times = start + (frames * _NANOSECONDS + fps // 2) // fps
+    times = start + (frames * NANOSECONDS + fps // 2) // fps
     return times[times <= last]
 
 
 def _ticks(recording: Recording, fps: int) -> Iterator[Columns]:
     """Columns of the ticks, some half a second at a time; checks that none are missing for longer than a frame."""
-    last: ChunkTicks | None = None
-    for ticks in ticks_of(recording):
-        numbers, times = ticks.numbers, ticks.times
-        if last is not None:
-            numbers, times = np.append(last.numbers[-1], numbers), np.append(last.times[-1], times)
-        lost = (np.diff(numbers) > 1) & (np.diff(times) * fps > _NANOSECONDS)
+    numbers = times = np.empty(0, dtype=np.int64)
+    for chunk in recording.chunks():
+        if not len(chunk.rows):
+            continue
+        numbers, times = np.append(numbers[-1:], chunk.numbers), np.append(times[-1:], chunk.times)
+        lost = (np.diff(numbers) > 1) & (np.diff(times) * fps > NANOSECONDS)
         if lost.any():
             gap = int(np.argmax(lost))
-            when = (int(times[gap]) - recording.about.epoch) / _NANOSECONDS
+            when = (int(times[gap]) - recording.about.epoch) / NANOSECONDS
             raise RecordingError(
                 f"{recording.file}: {int(numbers[gap + 1] - numbers[gap]) - 1} ticks were lost after {when:.3f} s when "
                 f"it was recorded; allowed: none for longer than a frame, 1/{fps} s"
             )
-        last = ticks
-        try:
-            yield _columns(ticks)
-        except ValueError as error:
-            raise RecordingError(f"{recording.file}: damaged: {error}") from error
+        yield _columns(chunk)
 
 
-def _columns(ticks: ChunkTicks) -> Columns:
+def _columns(chunk: TickChunk) -> Columns:
     """One row of each for every tick of a chunk."""
-    states, reference = ticks.rows(names.JOINT_STATES), ticks.rows(names.REFERENCE)
-    engaged = ticks.of_arms(names.FLAGS, "engaged").any(axis=1)
-    reference_tool = ticks.reference_tools()
+    rows, arms = chunk.rows, chunk.rows["arms"]
     return {
-        "time": ticks.times,
-        "active": engaged | (np.abs(reference["velocities"]).max(axis=1) > _MOVING),
-        "position": states["position"],
-        "velocity": states["velocity"],
-        "effort": states["effort"],
-        "opening": ticks.of_arms(names.TICK, "opening"),
-        "reference": reference["positions"],
-        "gripper": ticks.of_arms(names.GRIPPERS, "commanded"),
-        "target": ticks.targets(otherwise=reference_tool),
-        "reference_tool": reference_tool,
+        "time": chunk.times,
+        "active": (arms["engaged"] > 0.5).any(axis=1) | (np.abs(rows["reference_v"]).max(axis=1) > _MOVING),
+        "position": rows["q"],
+        "velocity": rows["v"],
+        "effort": rows["tau"],
+        "opening": arms["opening"],
+        "reference": rows["reference_q"],
+        "gripper": arms["commanded"],
+        "target": targets_or_tools(rows),
+        "reference_tool": arms["tool"],
     }

@@ -8,8 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import pinocchio as pin
 
-from q2r2_control.judging.episode import Episode
-from q2r2_control.judging.stretches import stretches
+from q2r2_control.judging.episode import Episode, stretches
 from q2r2_control.teleop.relative import RelativeMotion
 from q2r2_control.types import Array
 

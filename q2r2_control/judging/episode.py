@@ -12,16 +12,14 @@ from q2r2_control.config.cell import Config
 from q2r2_control.config.teleop import Stance
 from q2r2_control.errors import RecordingError
 from q2r2_control.events import Event
-from q2r2_control.recording import topics as names
 from q2r2_control.recording.about import Conclusion
-from q2r2_control.recording.episode_spans import events_of
-from q2r2_control.recording.reader import Recording
+from q2r2_control.recording.messages import NANOSECONDS
+from q2r2_control.recording.reader import Recording, TickChunk
 from q2r2_control.recording.recorded_robot import cell_and_robot_of, check_tools, tool_poses
-from q2r2_control.recording.ticks import ChunkTicks, Column, ticks_of
+from q2r2_control.recording.tick_rows import SAMPLE_FIELDS, Rows, targets_or_tools, tick_type
 from q2r2_control.types import SIDES, Array
 
 FRAME = 0.01  # the time between two frames, at least [s]
-_NANOSECONDS = 1_000_000_000
 
 Flags = npt.NDArray[np.bool_]
 
@@ -114,135 +112,110 @@ def read_episode(recording: Recording) -> Episode:
     Raises :class:`RecordingError` where its cell cannot be built.
     """
     config, robot = cell_and_robot_of(recording)
-    reader = _Reader(recording)
-    damage = reader.read()
-    ticks, frames = reader.ticks(), reader.frames()
-    if len(frames.at) and damage is None:
-        try:
-            check_tools(reader.first_reference, frames.reference[0], robot)
-        except RecordingError as error:
-            raise RecordingError(f"{recording.file}: {error}") from error
-    swapped = config.teleop.stance is not Stance.SIDE_BY_SIDE
-    arms = {SIDES[1 - SIDES.index(arm)] if swapped else arm: arm for arm in recording.about.arms}
-    hands = {hand: reader.hand(hand, arm, ticks) for hand, arm in arms.items()}
-    tools = tool_poses(frames.q, robot)
-    said = Conclusion()
+    read = _Read(recording)
+    damage, said = read.all_chunks(), Conclusion()
+    ticks, frames = _joined(Ticks, read.ticks), _joined(Frames, read.frames)
     if damage is None:
+        if len(frames.at):
+            try:
+                check_tools(read.first_reference, frames.reference[0], robot)
+            except RecordingError as error:
+                raise RecordingError(f"{recording.file}: {error}") from error
         try:
             said = recording.conclusion
         except RecordingError as error:
             damage = str(error)
-    return Episode(recording, config, ticks, frames, tools, hands, reader.events, damage, said.ended_by, said.success)
+    swapped = config.teleop.stance is not Stance.SIDE_BY_SIDE
+    arms = {SIDES[1 - SIDES.index(arm)] if swapped else arm: arm for arm in recording.about.arms}
+    hands = {hand: read.hand(hand, arm, ticks) for hand, arm in arms.items()}
+    tools = tool_poses(frames.q, robot)
+    return Episode(recording, config, ticks, frames, tools, hands, read.events, damage, said.ended_by, said.success)
 
 
-class _Reader:
-    """Gathers arrays chunk by chunk."""
+class _Read:
+    """What was read so far, chunk by chunk."""
 
     def __init__(self, recording: Recording) -> None:
         self._recording = recording
-        self._ticks: list[Ticks] = []
-        self._frames: list[Frames] = []
-        self._samples: list[Column] = []
-        self._count, self._slot = 0, -1
-        self._origin: float | None = None  # of the loop's clock [s]
+        about = recording.about
+        nothing = np.empty(0, dtype=tick_type(len(about.arms), len(about.joints)))
+        self.ticks = [_ticks(nothing, np.empty(0))]
+        self.frames = [_frames(nothing, np.empty(0, dtype=np.int64))]
         self.events: list[Event] = []
         self.first_reference: Array = np.empty(0)
+        self._samples = [np.empty((0, len(SAMPLE_FIELDS)))]
+        self._count, self._slot = 0, -1
+        self._origin = 0.0  # of the loop's clock [s]
 
-    def read(self) -> str | None:
+    def all_chunks(self) -> str | None:
         """All there is; returns what is damaged."""
         try:
-            for ticks in ticks_of(self._recording):
-                self._add(ticks)
+            for chunk in self._recording.chunks():
+                self._add(chunk)
         except RecordingError as error:
             return str(error).removeprefix(f"{self._recording.file}: ")
         except (ValueError, KeyError, IndexError, TypeError) as error:
             return f"damaged: {error!r:.200}"
         return None
 
-    def ticks(self) -> Ticks:
-        return _joined(Ticks, self._ticks, _no_ticks(len(self._recording.about.arms)))
-
-    def frames(self) -> Frames:
-        about = self._recording.about
-        return _joined(Frames, self._frames, _no_frames(len(about.arms), len(about.joints)))
+    def _add(self, chunk: TickChunk) -> None:
+        self.events += [event for events in chunk.events().values() for event in events]
+        self._samples.append(chunk.samples)
+        if not len(chunk.rows):
+            return
+        t = (chunk.times - self._recording.about.epoch) / NANOSECONDS
+        if not self._count:
+            self._origin = float(chunk.rows["now"][0]) - float(t[0])
+            self.first_reference = chunk.rows["reference_q"][0].copy()
+        slots = np.floor(t / FRAME).astype(np.int64)
+        at = np.flatnonzero(np.diff(slots, prepend=self._slot) > 0)
+        self.ticks.append(_ticks(chunk.rows, t))
+        self.frames.append(_frames(chunk.rows[at], self._count + at))
+        self._count, self._slot = self._count + len(t), int(slots[-1])
 
     def hand(self, hand: str, arm: str, ticks: Ticks) -> Hand:
-        rows = np.concatenate(self._samples) if self._samples else np.empty((0, len(names.SAMPLE_FIELDS)))
-        rows = rows[rows[:, 1] == SIDES.index(hand)]
-        at = np.searchsorted(ticks.number, rows[:, 0])
-        known = at < len(ticks.number)
-        rows, at = rows[known], at[known]
-        return Hand(arm, rows[:, 2] - (self._origin or 0.0), ticks.t[at], rows[:, 4:7])
-
-    def _add(self, chunk: ChunkTicks) -> None:
-        ticks = _ticks(chunk, self._recording.about.epoch)
-        if self._origin is None:
-            self._origin = float(chunk.number(names.TICK, "now")[0]) - float(ticks.t[0])
-            self.first_reference = chunk.rows(names.REFERENCE)["positions"][0].copy()
-        slots = np.floor(ticks.t / FRAME).astype(np.int64)
-        at = np.flatnonzero(np.diff(slots, prepend=self._slot) > 0)
-        frames = _frames(chunk, at, self._count)
-        events = list(events_of(chunk.chunk))
-        if names.SAMPLES in chunk.chunk.rows:
-            self._samples.append(chunk.chunk.rows[names.SAMPLES]["data"])
-        self._ticks.append(ticks)
-        self._frames.append(frames)
-        self.events += events
-        self._count, self._slot = self._count + len(ticks.t), int(slots[-1])
+        rows = np.concatenate(self._samples)
+        rows = rows[(rows[:, 1] == SIDES.index(hand)) & (rows[:, 0] <= ticks.number.max(initial=-1))]
+        polled = ticks.t[np.searchsorted(ticks.number, rows[:, 0])]
+        return Hand(arm, rows[:, 2] - self._origin, polled, rows[:, 4:7])
 
 
-def _ticks(chunk: ChunkTicks, epoch: int) -> Ticks:
-    def flag(name: str) -> Flags:
-        return chunk.number(names.FLAGS, name) > 0.5
-
+def _ticks(rows: Rows, t: Array) -> Ticks:
+    arms = rows["arms"]
     return Ticks(
-        number=chunk.numbers,
-        t=(chunk.times - epoch) / _NANOSECONDS,
-        dt=chunk.number(names.TICK, "dt"),
-        compute_time=chunk.number(names.TICK, "compute_time"),
-        following=chunk.number(names.TICK, "following") > 0.5,
-        certified=flag("certified"),
-        fallback=flag("fallback"),
-        distance=chunk.number(names.FLAGS, "closest_distance"),
-        margin=chunk.number(names.FLAGS, "margin"),
-        engaged=chunk.of_arms(names.FLAGS, "engaged") > 0.5,
-        rejected=chunk.of_arms(names.FLAGS, "rejected") > 0.5,
-        slip=chunk.of_arms(names.FLAGS, "slip"),
-        slip_angle=chunk.of_arms(names.FLAGS, "slip_angle"),
-        gripper=chunk.of_arms(names.GRIPPERS, "wanted"),
+        number=rows["index"].astype(np.int64),
+        t=t,
+        dt=rows["dt"],
+        compute_time=rows["compute_time"],
+        following=rows["following"] > 0.5,
+        certified=rows["certified"] > 0.5,
+        fallback=rows["fallback"] > 0.5,
+        distance=rows["closest_distance"],
+        margin=rows["margin"],
+        engaged=arms["engaged"] > 0.5,
+        rejected=arms["rejected"] > 0.5,
+        slip=arms["slip"],
+        slip_angle=arms["slip_angle"],
+        gripper=arms["wanted"],
     )
 
 
-def _frames(chunk: ChunkTicks, at: npt.NDArray[np.int64], before: int) -> Frames:
-    reference = chunk.reference_tools()
-    return Frames(
-        at=before + at,
-        q=chunk.rows(names.JOINT_STATES)["position"][at],
-        target=chunk.targets(otherwise=reference)[at],
-        reference=reference[at],
-    )
-
-
-def _no_ticks(arms: int) -> Ticks:
-    none, flags = np.empty(0), np.empty(0, dtype=bool)
-    of_arms, arm_flags = np.empty((0, arms)), np.empty((0, arms), dtype=bool)
-    return Ticks(
-        *(np.empty(0, dtype=np.int64), none, none, none, flags, flags, flags, none, none),
-        *(arm_flags, arm_flags, of_arms, of_arms, of_arms),
-    )
-
-
-def _no_frames(arms: int, joints: int) -> Frames:
-    poses = np.empty((0, arms, 7))
-    return Frames(np.empty(0, dtype=np.int64), np.empty((0, joints)), poses, poses)
+def _frames(rows: Rows, at: npt.NDArray[np.int64]) -> Frames:
+    return Frames(at, rows["q"], targets_or_tools(rows), rows["arms"]["tool"])
 
 
 _Table = TypeVar("_Table", Ticks, Frames)
 
 
-def _joined(kind: type[_Table], parts: list[_Table], nothing: _Table) -> _Table:
+def _joined(kind: type[_Table], parts: list[_Table]) -> _Table:
     """All parts one after the other."""
     columns: dict[str, Any] = {
-        field.name: np.concatenate([getattr(part, field.name) for part in (nothing, *parts)]) for field in fields(kind)
+        field.name: np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(kind)
     }
     return kind(**columns)
+
+
+def stretches(flags: Flags) -> list[tuple[int, int]]:
+    """Beginning and end (exclusive) of each run of true ``flags`` (n,)."""
+    edges = np.flatnonzero(np.diff(np.concatenate(([False], flags, [False]))))
+    return [(int(begin), int(end)) for begin, end in edges.reshape(-1, 2)]

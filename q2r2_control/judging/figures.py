@@ -11,9 +11,10 @@ from q2r2_control.events import ReasonKind
 from q2r2_control.judging.episode import Episode
 from q2r2_control.judging.hands import HandFigures, hand_figures
 from q2r2_control.judging.motion import ArmFigures, arm_figures, idle_share
-from q2r2_control.judging.timing import TimingFigures, timing_figures
 from q2r2_control.teleop.arm_states import is_fault, is_refusal
 from q2r2_control.wording import sentence
+
+_LATE = 1.5  # periods
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,6 +24,22 @@ class Fault:
     t: float  # since the run began [s]
     arm: str
     reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class TimingFigures:
+    """Of all ticks, the end of the run included; None: there are none."""
+
+    ticks: int  # that are in the file
+    lost_ticks: int  # that are not, between the first and the last
+    lost_share: float | None
+    longest_lost_s: float  # of which no tick is in the file
+    late_ticks: int  # more than 1.5 periods after the one before
+    missed_ticks: int  # whole periods that passed meanwhile
+    missed_share: float | None  # of those that were due
+    longest_tick_s: float | None  # between two ticks of the loop
+    compute_time_us_p99: float | None
+    ended: bool  # the arms came to rest and the file was closed
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,3 +115,32 @@ def _faults(episode: Episode) -> list[Fault]:
 def _least_mm(distances: np.ndarray) -> float | None:
     known = distances[np.isfinite(distances)]
     return 1e3 * float(known.min()) if len(known) else None
+
+
+def timing_figures(episode: Episode) -> TimingFigures:
+    """Figures of an episode's ticks.
+
+    A tick that was lost is one whose number is not in the file; the time of which no tick is in the file is what lies
+    between its neighbours, less a period. Missed ticks are those of the loop, told from the time that each tick says
+    has passed since the one before, which lost ticks do not change.
+    """
+    ticks = episode.ticks
+    count = len(ticks.t)
+    if not count:
+        return TimingFigures(0, 0, None, 0.0, 0, 0, None, None, None, episode.ended)
+    period = 1.0 / episode.config.loop_rate_hz
+    lost = np.diff(ticks.number, prepend=-1) - 1  # the first tick of a run is number 0
+    gaps = np.diff(ticks.t, prepend=0.0) - ticks.dt
+    missed = int(np.maximum(np.round(ticks.dt / period) - 1, 0).sum())
+    return TimingFigures(
+        ticks=count,
+        lost_ticks=int(lost.sum()),
+        lost_share=float(lost.sum() / (lost.sum() + count)),
+        longest_lost_s=float(gaps[lost > 0].max(initial=0.0)),
+        late_ticks=int((ticks.dt > _LATE * period).sum()),
+        missed_ticks=missed,
+        missed_share=missed / (missed + count),
+        longest_tick_s=float(ticks.dt.max()),
+        compute_time_us_p99=1e6 * float(np.percentile(ticks.compute_time, 99)),
+        ended=episode.ended,
+    )

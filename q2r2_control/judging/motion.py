@@ -30,7 +30,6 @@ class ArmFigures:
     leashed_share: float | None  # of the ticks: the leash dragged the target
     slip_mm: float  # by how much, in all
     slip_deg: float
-    sparc: float | None
     ldlj: float | None
     gripper_changes: int  # of the opening that is wanted
 
@@ -45,7 +44,7 @@ def arm_figures(episode: Episode, arm: str) -> ArmFigures:
     hand = next(hand for hand, samples in episode.hands.items() if samples.arm == arm)
     to_target, to_tool = delays(episode, hand)
     slips = [_rise(slip[:, index], engaged) for slip in (ticks.slip, ticks.slip_angle)]
-    sparc, ldlj = smoothness(episode.frame_t, episode.tools[:, index, :3], episode.engaged[:, index])
+    ldlj = smoothness(episode.frame_t, episode.tools[:, index, :3], episode.engaged[:, index])
     return ArmFigures(
         engaged_s=float(ticks.dt[engaged].sum()),
         position_error_mm_rms=_rms(1e3 * position),
@@ -58,7 +57,6 @@ def arm_figures(episode: Episode, arm: str) -> ArmFigures:
         leashed_share=_share((slips[0] > 0.0) | (slips[1] > 0.0), engaged),
         slip_mm=1e3 * float(slips[0].sum()),
         slip_deg=float(np.degrees(slips[1].sum())),
-        sparc=sparc,
         ldlj=ldlj,
         gripper_changes=int((np.diff(ticks.gripper[ticks.following, index]) != 0.0).sum()),
     )

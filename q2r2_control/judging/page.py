@@ -1,8 +1,7 @@
-"""One HTML page of judged episodes that needs nothing else: styles, script and pictures are in it."""
+"""One HTML page of judged episodes that needs nothing else: styles and pictures are in it."""
 
 from __future__ import annotations
 
-import math
 from base64 import b64encode
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -55,7 +54,6 @@ COLUMNS = (
     FigureColumn("delay", "ms", 0, lambda of: _worst([arm.hand_to_tool_ms for arm in of.arms.values()])),
     FigureColumn("error", "mm RMS", 1, lambda of: _worst([arm.position_error_mm_rms for arm in of.arms.values()])),
     FigureColumn("leashed", "%", 0, lambda of: _percent(_worst([arm.leashed_share for arm in of.arms.values()]))),
-    FigureColumn("SPARC", "", 2, lambda of: _worst([arm.sparc for arm in of.arms.values()], min)),
     FigureColumn("LDLJ", "", 1, lambda of: _worst([arm.ldlj for arm in of.arms.values()], min)),
     FigureColumn("nearest", "mm", 1, lambda of: of.min_distance_mm),
     FigureColumn("faults", "", 0, lambda of: float(len(of.faults))),
@@ -68,49 +66,22 @@ def page_of(episodes: Sequence[Judged], title: str, progress: Callable[[int], No
     """The page; ``progress`` is told how many episodes are drawn."""
     rows, sections = [], []
     for number, judged in enumerate(episodes, 1):
-        rows.append(_row(judged, number))
-        sections.append(_section(judged, number))
+        name, badge = f"{number}. {escape(judged.figures.name)}", _badge(judged)
+        cells = "".join(f"<td>{column.text(judged.figures)}</td>" for column in COLUMNS)
+        rows.append(f'<tr><th><a href="#episode-{number}">{name}</a></th><td>{badge}</td>{cells}</tr>')
+        reasons = "".join(f"<li>{escape(reason.text)}</li>" for reason in judged.verdict.reasons)
+        about = f"<p>{escape(judged.figures.task)}</p><ul>{reasons}</ul>"
+        sections.append(f'<section id="episode-{number}"><h2>{name} {badge}</h2>{about}{_picture(judged)}</section>')
         progress(number)
     kept = sum(judged.verdict.keep for judged in episodes)
-    headings = "".join(f'<th class="number">{escape(column.heading)}</th>' for column in COLUMNS)
     return _PAGE.format(
         title=escape(title),
         count=f"episodes: {len(episodes)}, of which {kept} kept and {len(episodes) - kept} discarded",
         style=_STYLE,
-        headings=headings,
+        headings="".join(f"<th>{escape(column.heading)}</th>" for column in COLUMNS),
         rows="\n".join(rows),
         sections="\n".join(sections),
-        script=_SCRIPT,
     )
-
-
-def _row(judged: Judged, number: int) -> str:
-    word = judged.verdict.word
-    cells = "".join(
-        f'<td class="number" data-value="{_sortable(column.value(judged.figures))}">{column.text(judged.figures)}</td>'
-        for column in COLUMNS
-    )
-    return (
-        f'<tr {_filtered_by(judged)}><td class="number" data-value="{number}">{number}</td>'
-        f'<td><a href="#episode-{number}">{escape(judged.figures.name)}</a></td><td>{_badge(word)}</td>{cells}</tr>'
-    )
-
-
-def _section(judged: Judged, number: int) -> str:
-    figures, word = judged.figures, judged.verdict.word
-    reasons = "".join(f"<li>{escape(reason.text)}</li>" for reason in judged.verdict.reasons)
-    task = f'<p class="task">{escape(figures.task)}</p>' if figures.task else ""
-    why = f"<ul>{reasons}</ul>" if reasons else ""
-    return (
-        f'<section id="episode-{number}" {_filtered_by(judged)}>'
-        f"<h2>{number}. {escape(judged.figures.name)} {_badge(word)}</h2>{task}{why}{_picture(judged)}</section>"
-    )
-
-
-def _filtered_by(judged: Judged) -> str:
-    """What the page's filter goes by."""
-    success = {None: "", True: "succeeded", False: "failed"}[judged.figures.success]
-    return f'data-verdict="{judged.verdict.word}" data-success="{success}"'
 
 
 def _picture(judged: Judged) -> str:
@@ -120,56 +91,16 @@ def _picture(judged: Judged) -> str:
     return f'<img alt="{alt}" width="1248" height="806" src="data:image/svg+xml;base64,{data}">'
 
 
-def _badge(word: str) -> str:
-    return f'<span class="{word}">{"&#10003;" if word == "keep" else "&#10007;"} {word}</span>'
-
-
-def _sortable(value: float | None) -> str:
-    return "" if value is None or not math.isfinite(value) else repr(value)
+def _badge(judged: Judged) -> str:
+    word = judged.verdict.word
+    return f'<b class="{word}">{"&#10003;" if judged.verdict.keep else "&#10007;"} {word}</b>'
 
 
 _STYLE = """
-body { font: 15px/1.45 system-ui, sans-serif; color: #222; background: #fafafa; margin: 1.5rem auto; max-width: 1280px;
-  padding: 0 1rem; }
-h1 { font-size: 1.5rem; margin: 0; } h2 { font-size: 1.15rem; margin: 0 0 .3rem; overflow-wrap: anywhere; }
-.table { overflow-x: auto; background: white; border: 1px solid #ddd; border-radius: 6px; }
-table { border-collapse: collapse; width: 100%; font-size: 13px; }
-th, td { padding: .35rem .55rem; text-align: left; border-bottom: 1px solid #eee; white-space: nowrap; }
-th { background: #f0f2f5; cursor: pointer; white-space: normal; vertical-align: bottom; user-select: none; }
-th[data-order="1"]::after { content: " \\25b2"; } th[data-order="-1"]::after { content: " \\25bc"; }
-.number { text-align: right; font-variant-numeric: tabular-nums; }
-.keep, .discard { font-weight: 600; white-space: nowrap; } .keep { color: #1f6fb2; } .discard { color: #b04a00; }
-section { background: white; border: 1px solid #ddd; border-radius: 6px; margin: 1.2rem 0; padding: .9rem 1.1rem; }
-section ul { margin: .3rem 0; color: #b04a00; } section img { width: 100%; height: auto; }
-.task { margin: 0; color: #555; } .filter { margin: .8rem 0; } [hidden] { display: none; }
-@media print { section { break-inside: avoid; } }
-"""
-
-_SCRIPT = """
-const table = document.querySelector("table"), body = table.tBodies[0];
-const heads = [...table.tHead.rows[0].cells];
-function valueOf(row, column) {
-  const cell = row.cells[column];
-  if (!("value" in cell.dataset)) return cell.textContent;
-  return cell.dataset.value === "" ? null : Number(cell.dataset.value);
-}
-function compare(a, b) {
-  return typeof a === "number" ? a - b : a.localeCompare(b);
-}
-heads.forEach((head, column) => head.addEventListener("click", () => {
-  const order = head.dataset.order === "1" ? -1 : 1;
-  heads.forEach(other => delete other.dataset.order);
-  head.dataset.order = order;
-  const rows = [...body.rows].map(row => [valueOf(row, column), row]);
-  // Numbers that there are none of come last, whichever way.
-  rows.sort(([a], [b]) => a === null || b === null ? (a === null) - (b === null) : order * compare(a, b));
-  body.append(...rows.map(([, row]) => row));
-}));
-document.querySelector("select").addEventListener("change", event => {
-  for (const item of document.querySelectorAll("[data-verdict]"))
-    item.hidden = event.target.value !== "all" &&
-      ![item.dataset.verdict, item.dataset.success].includes(event.target.value);
-});
+body { font: 15px/1.45 system-ui, sans-serif; max-width: 1280px; margin: 1.5rem auto; padding: 0 1rem; }
+table { border-collapse: collapse; font-size: 13px; } tbody tr:nth-child(odd) { background: #f4f5f7; }
+th, td { padding: .3rem .5rem; text-align: right; } th { text-align: left; } section img { width: 100%; height: auto; }
+.keep { color: #1f6fb2; } .discard, li { color: #b04a00; }
 """
 
 _PAGE = """<!DOCTYPE html>
@@ -182,17 +113,13 @@ _PAGE = """<!DOCTYPE html>
 </head>
 <body>
 <h1>{title}</h1>
-<p>{count}</p>
-<p class="filter"><label>show <select><option>all</option><option>keep</option><option>discard</option>
-<option>succeeded</option><option>failed</option></select></label>
-&ensp;a click on a heading sorts; of several hands or arms the worst number counts</p>
-<div class="table"><table>
-<thead><tr><th>#</th><th>episode</th><th>verdict</th>{headings}</tr></thead>
+<p>{count}; of several hands or arms the worst number counts</p>
+<table>
+<thead><tr><th>episode</th><th>verdict</th>{headings}</tr></thead>
 <tbody>
 {rows}
-</tbody></table></div>
+</tbody></table>
 {sections}
-<script>{script}</script>
 </body>
 </html>
 """

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from q2r2_control.judging.episode import stretches
 from q2r2_control.judging.judge import Judged
 from q2r2_control.judging.motion import tracking_errors
-from q2r2_control.judging.stretches import stretches
 from q2r2_control.types import Array
 from q2r2_control.viewer.plot_style import COLOURS, LINE_STYLES, MARGIN_COLOUR, draw_limit
 
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 _POINTS = 500  # of a line, at most
 _SPEED_OVER = 5  # frames
 _SHADE: dict[str, Any] = {"color": "#b0b0b0", "alpha": 0.35, "linewidth": 0.0}
+_LOST: dict[str, Any] = {"color": "#b3202c", "alpha": 0.4, "linewidth": 0.0}
 _FAULT: dict[str, Any] = {"color": "#6a4c93", "linestyle": "-.", "linewidth": 1.4}
 
 
@@ -32,14 +33,11 @@ def draw_episode(judged: Judged) -> str:
     figure = Figure(figsize=(13.0, 8.4), layout="constrained")
     canvas = FigureCanvasSVG(figure)
     grid = figure.subplots(3, 2, sharex=True)
-    _draw_speed(grid[0, 0], judged)
-    _draw_errors(grid[0, 1], judged)
-    _draw_hands(grid[1, 0], judged)
-    _draw_margin(grid[1, 1], judged)
-    _draw_leash(grid[2, 0], judged)
-    _draw_timing(grid[2, 1], judged)
     end = float(judged.episode.ticks.t[-1]) if len(judged.episode.ticks.t) else 1.0
-    for axes in grid.flat:
+    for axes, (draw, title, unit) in zip(grid.flat, _PLOTS, strict=True):
+        draw(axes, judged)
+        axes.set_title(title)
+        axes.set_ylabel(unit)
         axes.grid(alpha=0.3)
         axes.set_xlim(0.0, max(end, 1e-3))
         if axes.get_legend_handles_labels()[0]:
@@ -70,16 +68,10 @@ def _draw_speed(axes: Axes, judged: Judged) -> None:
             passed = np.maximum(t[_SPEED_OVER:] - t[:-_SPEED_OVER], 1e-6)
             speed = np.linalg.norm(position[_SPEED_OVER:] - position[:-_SPEED_OVER], axis=1) / passed
             _draw(axes, arm, 0.5 * (t[_SPEED_OVER:] + t[:-_SPEED_OVER]), 1e3 * speed)
-    label: str | None = "no arm engaged"
-    for begin, stop in stretches(np.asarray(~episode.engaged.any(axis=1))):
-        axes.axvspan(t[begin], t[min(stop, len(t) - 1)], label=label, **_SHADE)
-        label = None
-    label = "fault"
-    for fault in judged.figures.faults:
-        axes.axvline(fault.t, label=label, **_FAULT)
-        label = None
-    axes.set_title("speed of the measured tools")
-    axes.set_ylabel("speed [mm/s]")
+    for number, (begin, stop) in enumerate(stretches(np.asarray(~episode.engaged.any(axis=1)))):
+        axes.axvspan(t[begin], t[min(stop, len(t) - 1)], label=None if number else "no arm engaged", **_SHADE)
+    for number, fault in enumerate(judged.figures.faults):
+        axes.axvline(fault.t, label=None if number else "fault", **_FAULT)
     axes.set_ylim(0.0, max(10.0, axes.get_ylim()[1]))  # of arms at rest not the rounding
 
 
@@ -89,8 +81,6 @@ def _draw_errors(axes: Axes, judged: Judged) -> None:
     limit = judged.settings.max_position_error_p99
     if limit is not None:
         draw_limit(axes, 1e3 * limit, "p99 at most")
-    axes.set_title("tracking: measured tool from target, while engaged")
-    axes.set_ylabel("error [mm]")
     axes.set_ylim(bottom=0.0)
 
 
@@ -104,8 +94,6 @@ def _draw_hands(axes: Axes, judged: Judged) -> None:
     axes.axhline(1e3 * judged.settings.dropout, color="black", linestyle=":", linewidth=1.2, label="dropout")
     if judged.settings.max_pose_gap is not None:
         draw_limit(axes, 1e3 * judged.settings.max_pose_gap, "at most")
-    axes.set_title("hands: time between two poses")
-    axes.set_ylabel("time [ms]")
     axes.set_ylim(bottom=0.0)
 
 
@@ -114,8 +102,6 @@ def _draw_margin(axes: Axes, judged: Judged) -> None:
     margin = np.where(np.isfinite(ticks.margin), 1e3 * ticks.margin, np.nan)
     axes.plot(*thinned(ticks.t, margin, np.fmin), color=MARGIN_COLOUR, label="tightest pair")
     draw_limit(axes, 0.0, "limit")
-    axes.set_title("distance of monitored pairs beyond what they keep")
-    axes.set_ylabel("to spare [mm]")
     axes.set_ylim(bottom=min(-2.0, float(np.nanmin(margin, initial=0.0))))
 
 
@@ -133,8 +119,6 @@ def _draw_leash(axes: Axes, judged: Judged) -> None:
         if flags.any():
             t, some = thinned(ticks.t, np.where(flags, height * highest, np.nan), np.fmax)
             axes.plot(t, some, linestyle="none", marker="|", markersize=6, color=colour, label=label)
-    axes.set_title("limits: how far the leash has dragged the targets")
-    axes.set_ylabel("slip [mm]")
     axes.set_ylim(-0.03 * highest, highest)
 
 
@@ -145,20 +129,21 @@ def _draw_timing(axes: Axes, judged: Judged) -> None:
     if judged.episode.recording.about.realtime:  # in simulated time it is nobody's matter
         compute = thinned(ticks.t, 1e3 * ticks.compute_time, np.fmax)
         axes.plot(*compute, color=COLOURS["left"], linewidth=0.8, alpha=0.7, label="computing")
-    label: str | None = "lost ticks"
-    for at in np.flatnonzero(np.diff(ticks.number) > 1)[:_POINTS]:
-        axes.axvspan(ticks.t[at], ticks.t[at + 1], color="#b3202c", alpha=0.4, linewidth=0.0, label=label)
-        label = None
-    axes.set_title("timing of the loop")
-    axes.set_ylabel("time [ms]")
+    for number, at in enumerate(np.flatnonzero(np.diff(ticks.number) > 1)[:_POINTS]):
+        axes.axvspan(ticks.t[at], ticks.t[at + 1], label=None if number else "lost ticks", **_LOST)
     axes.set_ylim(bottom=0.0)
 
 
 def _draw(axes: Axes, arm: str, t: Array, values: Array) -> None:
-    axes.plot(
-        *thinned(t, values, np.fmax),
-        color=COLOURS[arm],
-        linestyle=LINE_STYLES[arm],
-        linewidth=1.4,
-        label=f"{arm} arm",
-    )
+    style = {"color": COLOURS[arm], "linestyle": LINE_STYLES[arm], "linewidth": 1.4, "label": f"{arm} arm"}
+    axes.plot(*thinned(t, values, np.fmax), **style)
+
+
+_PLOTS = (
+    (_draw_speed, "speed of the measured tools", "speed [mm/s]"),
+    (_draw_errors, "tracking: measured tool from target, while engaged", "error [mm]"),
+    (_draw_hands, "hands: time between two poses", "time [ms]"),
+    (_draw_margin, "distance of monitored pairs beyond what they keep", "to spare [mm]"),
+    (_draw_leash, "limits: how far the leash has dragged the targets", "slip [mm]"),
+    (_draw_timing, "timing of the loop", "time [ms]"),
+)

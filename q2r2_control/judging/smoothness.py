@@ -1,7 +1,7 @@
-"""How smooth a tool's motion is, by two measures of the literature, in pieces of equal length.
+"""How smooth a tool's motion is, by a measure of the literature, in pieces of equal length.
 
-Both measures are made for one movement that begins and ends at rest: they fall with its duration and with every
-repetition, so of a whole episode they would say how long it is. So they are taken of pieces of :data:`PIECE` in which
+The measure is made for one movement that begins and ends at rest: it falls with its duration and with every
+repetition, and of a whole episode it would say how long that is. So it is taken of pieces of :data:`PIECE` in which
 the arm is engaged and its tool moves, and the median of those counts.
 """
 
@@ -11,8 +11,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d
 
-from q2r2_control.judging.episode import FRAME, Flags
-from q2r2_control.judging.stretches import stretches
+from q2r2_control.judging.episode import FRAME, Flags, stretches
 from q2r2_control.types import Array
 
 PIECE = 1.0  # [s]
@@ -20,14 +19,11 @@ _HOP = 0.25  # from one piece to the next [s]
 _FEWEST = 8  # pieces
 _SLOWEST = 0.02  # mean speed of a piece that counts [m/s]
 _LONGEST_GAP = 0.05  # between two frames [s]
-_HIGHEST = 10.0  # frequency that counts [Hz]
-_FAINTEST = 0.05  # amplitude that counts, of the one at 0 Hz
 _SMOOTHING = 0.02  # standard deviation of the Gaussian before jerk is taken, which halves the power at 6.6 Hz [s]
-_PADDING = 16  # of the spectrum, times the length of a piece
 
 
-def smoothness(t: Array, position: Array, engaged: Flags) -> tuple[float | None, float | None]:
-    """Medians of :func:`sparc` and, of smoothed positions, :func:`ldlj` over the pieces of a tool's motion.
+def smoothness(t: Array, position: Array, engaged: Flags) -> float | None:
+    """Median of :func:`ldlj`, of smoothed positions, over the pieces of a tool's motion.
 
     ``position`` (n, 3) [m] is at the times ``t`` (n,) [s]. None: fewer than eight pieces, 2.75 s in
     all, move at 20 mm/s on average; the median of so few says little.
@@ -36,10 +32,8 @@ def smoothness(t: Array, position: Array, engaged: Flags) -> tuple[float | None,
     for begin, end in stretches(engaged & np.isfinite(position).all(axis=1)):
         moving += _pieces(t[begin:end], position[begin:end])
     if len(moving) < _FEWEST:
-        return None, None
-    return float(np.median([sparc(piece, FRAME) for piece in moving])), float(
-        np.median([ldlj(_smoothed(piece), FRAME) for piece in moving])
-    )
+        return None
+    return float(np.median([ldlj(_smoothed(piece), FRAME) for piece in moving]))
 
 
 def _smoothed(position: Array) -> Array:
@@ -60,8 +54,8 @@ def _pieces(t: Array, position: Array) -> list[Array]:
     t, first = np.unique(t, return_index=True)
     when = np.arange(t[0], t[-1], FRAME)
     even = CubicSpline(t, position[first])(when)
-    gaps = t[np.clip(np.searchsorted(t, when, side="right"), 1, len(t) - 1)]
-    gaps = gaps - t[np.clip(np.searchsorted(t, when, side="right"), 1, len(t) - 1) - 1]
+    after = np.clip(np.searchsorted(t, when, side="right"), 1, len(t) - 1)
+    gaps = t[after] - t[after - 1]
     speed = np.linalg.norm(np.diff(even, axis=0), axis=1) / FRAME
     return [
         even[begin : begin + count]
@@ -70,31 +64,13 @@ def _pieces(t: Array, position: Array) -> list[Array]:
     ]
 
 
-def sparc(position: Array, dt: float) -> float:
-    """Spectral arc length of the speed along positions (k, 3) [m] that are ``dt`` [s] apart.
-
-    SPARC = -integral over [0, w_c] of sqrt((1 / w_c)^2 + (dV/dw)^2) dw, where V is the magnitude of the speed's Fourier
-    transform over its value at 0, and w_c the least frequency, of 10 Hz at most, above which V stays below 0.05
-    (Balasubramanian, Melendez-Calderon, Roby-Brami, Burdet, On the analysis of movement smoothness, JNER 2015). About
-    -1.4 for one reach of minimum jerk, more negative where the speed goes up and down. Whatever is cut out of a motion
-    begins and ends at speed, so the mean of the ends is not taken away: a constant speed has about -3.
-    """
-    speed = np.linalg.norm(np.diff(position, axis=0), axis=1) / dt
-    count = _PADDING * len(speed)
-    spectrum = np.abs(np.fft.rfft(speed, count))
-    frequencies = np.fft.rfftfreq(count, dt)
-    spectrum = spectrum[frequencies <= _HIGHEST] / max(spectrum[0], np.finfo(float).tiny)
-    last = int(np.flatnonzero(spectrum >= _FAINTEST)[-1])
-    heard = spectrum[: last + 1]
-    return -float(np.hypot(1.0 / max(last, 1), np.diff(heard)).sum())
-
-
 def ldlj(position: Array, dt: float) -> float:
     """Log dimensionless jerk along positions (k, 3) [m] that are ``dt`` [s] apart.
 
-    LDLJ = -ln(T^3 / v_peak^2 * integral of |d^3 x / dt^3|^2 dt) over the duration T (the same authors, 2015, of the
-    dimensionless jerk of Hogan and Sternad, Sensitivity of smoothness measures to movement duration, 2009). About -5.3
-    for one reach of minimum jerk.
+    LDLJ = -ln(T^3 / v_peak^2 * integral of |d^3 x / dt^3|^2 dt) over the duration T (Balasubramanian,
+    Melendez-Calderon, Roby-Brami, Burdet, On the analysis of movement smoothness, JNER 2015, of the dimensionless jerk
+    of Hogan and Sternad, Sensitivity of smoothness measures to movement duration, 2009). About -5.3 for one reach of
+    minimum jerk.
     """
     velocity = np.diff(position, axis=0) / dt
     jerk = np.diff(velocity, n=2, axis=0) / dt**2

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple
 
 from q2r2_control.config.judge import JudgeSettings
 from q2r2_control.judging.figures import EpisodeFigures
-
-_MM, _MS, _PERCENT, _DEGREES = 1e3, 1e3, 1e2, 57.29577951308232
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,25 +42,82 @@ class Verdict:
         return f"{self.word}: {reasons}" if reasons else self.word
 
 
+class _Unit(NamedTuple):
+    """How a number is shown."""
+
+    name: str = ""
+    scale: float = 1.0  # from the threshold's own unit, of the SI
+
+
+_PLAIN = _Unit()
+
+
+@dataclass(frozen=True, slots=True)
+class _Threshold:
+    """A limit of a number of an episode, or of each of its hands or arms."""
+
+    name: str  # min_...: at least; max_...: at most
+    of: Literal["episode", "hand", "arm", "timing"]
+    figure: str
+    words: str
+    unit: _Unit = _PLAIN
+    figure_in_unit: bool = False  # and not in the threshold's
+
+    def reason(self, value: float | None, limit: float | None, whose: str) -> Rejection | None:
+        """Why a value is beyond the limit; what is None is not judged."""
+        if value is None or limit is None:
+            return None
+        scale, at_least = self.unit.scale, self.name.startswith("min_")
+        found = value / scale if self.figure_in_unit else value
+        if found >= limit if at_least else found <= limit:
+            return None
+        shown = f"{whose}{self.words} {scale * found:.1f} {self.unit.name}".strip()
+        bound = "at least" if at_least else "at most"
+        return Rejection(self.name, f"{shown} ({bound} {scale * limit:.4g})")
+
+
+_MM, _MS, _DEGREES = _Unit("mm", 1e3), _Unit("ms", 1e3), _Unit("deg", math.degrees(1.0))
+_PERCENT, _OF_TIME, _OF_TICKS = (_Unit(f"%{of}", 1e2) for of in ("", " of the time", " of the ticks"))
+_THRESHOLDS = (
+    _Threshold("min_pose_rate", "hand", "pose_rate_hz", "poses at", _Unit("Hz")),
+    _Threshold("max_dropout_share", "hand", "dropout_share", "dropouts", _OF_TIME),
+    _Threshold("max_pose_gap", "hand", "longest_gap_s", "no pose for", _MS),
+    _Threshold("max_sample_age", "hand", "sample_age_ms_p99", "poses are old when they are used, p99", _MS, True),
+    _Threshold("max_delay", "arm", "hand_to_tool_ms", "moves later than its hand by", _MS, True),
+    _Threshold("max_rejected_share", "arm", "rejected_share", "unusable targets", _PERCENT),
+    _Threshold("max_leashed_share", "arm", "leashed_share", "leash dragged", _OF_TIME),
+    _Threshold("max_position_error_rms", "arm", "position_error_mm_rms", "tracking error RMS", _MM, True),
+    _Threshold("max_position_error_p99", "arm", "position_error_mm_p99", "tracking error p99", _MM, True),
+    _Threshold("max_rotation_error_rms", "arm", "rotation_error_deg_rms", "tracking error RMS", _DEGREES, True),
+    _Threshold("max_rotation_error_p99", "arm", "rotation_error_deg_p99", "tracking error p99", _DEGREES, True),
+    _Threshold("min_ldlj", "arm", "ldlj", "not smooth, LDLJ"),
+    _Threshold("max_idle_share", "episode", "idle_share", "idle: no engaged arm moves", _PERCENT),
+    _Threshold("max_fallback_share", "episode", "fallback_share", "certified stops executed", _OF_TICKS),
+    _Threshold("max_uncertified_share", "episode", "uncertified_share", "without a certified stop", _OF_TICKS),
+    _Threshold("min_margin", "episode", "min_margin_mm", "nearer than a pair may be: margin", _MM, True),
+    _Threshold("max_lost_share", "timing", "lost_share", "ticks lost in the recording", _OF_TICKS),
+    _Threshold("max_lost_gap", "timing", "longest_lost_s", "ticks lost in the recording, at once", _MS),
+    _Threshold("max_missed_share", "timing", "missed_share", "loop was late: missed", _OF_TICKS),
+    _Threshold("max_tick_gap", "timing", "longest_tick_s", "loop stood still for", _MS),
+)
+
+
 def verdict_of(figures: EpisodeFigures, settings: JudgeSettings) -> Verdict:
     """Hold an episode's numbers to thresholds; a number that is None is not judged."""
     reasons = list(_unreadable(figures, settings))
     if not figures.engaged_s > 0.0:
         return Verdict((*reasons, Rejection("never_engaged", "no arm was ever engaged")))
-    found = _Limits(settings, reasons)
-    _add_hands(found, figures)
-    _add_arms(found, figures)
-    found.above("max_idle_share", "idle: no engaged arm moves", figures.idle_share, _PERCENT, "%")
-    found.above("max_fallback_share", "certified stops executed", figures.fallback_share, _PERCENT, "% of the ticks")
-    uncertified = figures.uncertified_share
-    found.above("max_uncertified_share", "without a certified stop", uncertified, _PERCENT, "% of the ticks")
-    margin = None if figures.min_margin_mm is None else figures.min_margin_mm / _MM
-    found.below("min_margin", "nearer than a pair may be: margin", margin, _MM, "mm")
-    timing = figures.timing
-    found.above("max_lost_share", "ticks lost in the recording", timing.lost_share, _PERCENT, "% of the ticks")
-    found.above("max_lost_gap", "ticks lost in the recording, at once", timing.longest_lost_s, _MS, "ms")
-    found.above("max_missed_share", "loop was late: missed", timing.missed_share, _PERCENT, "% of the ticks")
-    found.above("max_tick_gap", "loop stood still for", timing.longest_tick_s, _MS, "ms")
+    groups: dict[str, dict[str, Any]] = {
+        "hand": {f"{name} hand: ": hand for name, hand in figures.hands.items()},
+        "arm": {f"{name} arm: ": arm for name, arm in figures.arms.items()},
+        "episode": {"": figures},
+        "timing": {"": figures.timing},
+    }
+    for threshold in _THRESHOLDS:
+        for whose, found in groups[threshold.of].items():
+            value, limit = getattr(found, threshold.figure), getattr(settings, threshold.name)
+            if (reason := threshold.reason(value, limit, whose)) is not None:
+                reasons.append(reason)
     if settings.max_faults is not None and len(figures.faults) > settings.max_faults:
         first = figures.faults[0]
         also = f", and {len(figures.faults) - 1} more" if len(figures.faults) > 1 else ""
@@ -80,54 +137,3 @@ def _unreadable(figures: EpisodeFigures, settings: JudgeSettings) -> Iterator[Re
         yield Rejection("damaged", f"after {figures.duration_s:.2f} s {figures.damage}")
     elif settings.needs_end and not figures.timing.ended:
         yield Rejection("needs_end", "the recording has no end: its process was killed, or the disk was full")
-
-
-def _add_hands(found: _Limits, figures: EpisodeFigures) -> None:
-    for name, hand in figures.hands.items():
-        found.below("min_pose_rate", f"{name} hand: poses at", hand.pose_rate_hz, 1.0, "Hz")
-        found.above("max_dropout_share", f"{name} hand: dropouts", hand.dropout_share, _PERCENT, "% of the time")
-        found.above("max_pose_gap", f"{name} hand: no pose for", hand.longest_gap_s, _MS, "ms")
-        age = None if hand.sample_age_ms_p99 is None else hand.sample_age_ms_p99 / _MS
-        found.above("max_sample_age", f"{name} hand: poses are old when they are used, p99", age, _MS, "ms")
-
-
-def _add_arms(found: _Limits, figures: EpisodeFigures) -> None:
-    for name, arm in figures.arms.items():
-        delay = None if arm.hand_to_tool_ms is None else arm.hand_to_tool_ms / _MS
-        found.above("max_delay", f"{name} arm: moves later than its hand by", delay, _MS, "ms")
-        found.above("max_rejected_share", f"{name} arm: unusable targets", arm.rejected_share, _PERCENT, "%")
-        leashed = arm.leashed_share
-        found.above("max_leashed_share", f"{name} arm: leash dragged", leashed, _PERCENT, "% of the time")
-        for threshold, what, value, unit, scale in (
-            ("position_error_rms", "tracking error RMS", arm.position_error_mm_rms, "mm", _MM),
-            ("position_error_p99", "tracking error p99", arm.position_error_mm_p99, "mm", _MM),
-            ("rotation_error_rms", "tracking error RMS", arm.rotation_error_deg_rms, "deg", _DEGREES),
-            ("rotation_error_p99", "tracking error p99", arm.rotation_error_deg_p99, "deg", _DEGREES),
-        ):
-            given = None if value is None else value / scale
-            found.above(f"max_{threshold}", f"{name} arm: {what}", given, scale, unit)
-        found.below("min_sparc", f"{name} arm: not smooth, SPARC", arm.sparc, 1.0, "")
-        found.below("min_ldlj", f"{name} arm: not smooth, LDLJ", arm.ldlj, 1.0, "")
-
-
-class _Limits:
-    """Adds a reason for every number beyond its threshold."""
-
-    def __init__(self, settings: JudgeSettings, reasons: list[Rejection]) -> None:
-        self._settings, self._reasons = settings, reasons
-
-    def above(self, name: str, what: str, value: float | None, scale: float, unit: str) -> None:
-        """Of a number that is to be ``name`` at most."""
-        limit = getattr(self._settings, name)
-        if limit is not None and value is not None and not value <= limit:
-            self._add(name, what, value, limit, scale, unit, "at most")
-
-    def below(self, name: str, what: str, value: float | None, scale: float, unit: str) -> None:
-        """Of a number that is to be ``name`` at least."""
-        limit = getattr(self._settings, name)
-        if limit is not None and value is not None and not value >= limit:
-            self._add(name, what, value, limit, scale, unit, "at least")
-
-    def _add(self, name: str, what: str, value: float, limit: float, scale: float, unit: str, bound: str) -> None:
-        with_unit = f"{scale * value:.1f} {unit}".strip()
-        self._reasons.append(Rejection(name, f"{what} {with_unit} ({bound} {scale * limit:.4g})"))

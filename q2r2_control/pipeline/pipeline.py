@@ -180,10 +180,6 @@ class Pipeline:
         """The clock of a run, which begins now; a replay has one of its own."""
         return LoopClock(1.0 / self.config.loop_rate_hz, realtime)
 
-    def make_operator(self) -> OperatorSide:
-        """The side of a run that asks for motion; a replay of joints has one of its own."""
-        return OperatorSide(self.teleop, self.input, self.supervisor, self.controller, self.requests)
-
     def _prepare(self, realtime: bool) -> None:
         """Nothing of an earlier run may move an arm: every run starts paused and with open grippers, as the plant."""
         # Whether a solution is late depends on the machine; a repeatable run must not.
@@ -212,7 +208,7 @@ class Pipeline:
         self.loop.activate(self._state, self._clock.now)
         self.supervisor.events.clear()
         self._recorder = RunRecorder(self.robot, self.config.control, self.listeners, self.stop)
-        self._operator = self.make_operator()
+        self._operator = OperatorSide(self.teleop, self.input, self.supervisor, self.controller, self.requests)
         self.teleop.marks.recorded = self._recorder.keeps_episodes
 
     def _run_until(self, duration: float) -> RunSummary:

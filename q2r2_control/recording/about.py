@@ -14,16 +14,15 @@ from typing import TYPE_CHECKING
 
 import yaml
 
-from q2r2_control.recording.topics import Topics
+from q2r2_control.recording.topics import Topic, run_topics
 
 if TYPE_CHECKING:  # the writer's process does without them
     from q2r2_control.config.cell import Config
     from q2r2_control.pipeline.pipeline import Pipeline
 
-FORMAT = "2"  # of topics and fields; another one cannot be replayed
+FORMAT = "3"  # of topics and fields; another one cannot be replayed
 LOOP, ROS = "loop", "ros"  # sources: one loop's ticks, or what nodes published
 ABOUT, CONCLUSION = "q2r2_control", "q2r2_control_end"  # metadata records
-CUT_OUT_OF = "cut_out_of"  # a note of a bag of one episode: the file that has all of the run
 CELL, ROBOT, FIELDS = "cell.yaml", "robot.urdf", "fields.json"
 _GIT_TIME = 2.0  # [s]
 
@@ -62,42 +61,23 @@ class About:
 
     def texts(self) -> dict[str, str]:
         """For the metadata record; cell and robot are attachments."""
-        return {
-            "format": FORMAT,
-            "arms": json.dumps(self.arms),
-            "joints": json.dumps(self.joints),
-            "mode": self.mode,
-            "plant_modes": json.dumps(self.plant_modes),
-            "epoch_ns": str(self.epoch),
-            "realtime": json.dumps(self.realtime),
-            "cameras": json.dumps(self.cameras),
-            "source": self.source,
-            **self.notes,
-        }
+        run = {name: value for name, value in vars(self).items() if name not in ("cell", "robot", "notes")}
+        return {"format": FORMAT, "run": json.dumps(run), **self.notes}
 
     @classmethod
     def from_texts(cls, texts: Mapping[str, str], cell: str, robot: str) -> About:
-        """Raises :class:`KeyError` and :class:`ValueError` for what is not one."""
-        rest = dict(texts)
-        if rest.pop("format") != FORMAT:
+        """Raises :class:`KeyError`, :class:`ValueError` and :class:`TypeError` for what is not one."""
+        notes = dict(texts)
+        if notes.pop("format") != FORMAT:
             raise ValueError(f"its format is {texts['format']}, this version reads {FORMAT}")
-        return cls(
-            arms=tuple(json.loads(rest.pop("arms"))),
-            joints=tuple(json.loads(rest.pop("joints"))),
-            mode=rest.pop("mode"),
-            plant_modes=tuple(json.loads(rest.pop("plant_modes"))),
-            epoch=int(rest.pop("epoch_ns")),
-            realtime=bool(json.loads(rest.pop("realtime"))),
-            cell=cell,
-            robot=robot,
-            cameras=tuple(json.loads(rest.pop("cameras", "[]"))),  # older files do not say that there are none
-            source=rest.pop("source", LOOP),
-            notes=rest,
-        )
+        run = json.loads(notes.pop("run"))
+        for name in ("arms", "joints", "plant_modes", "cameras"):
+            run[name] = tuple(run[name])
+        return cls(**run, cell=cell, robot=robot, notes=notes)
 
-    def topics(self) -> Topics:
-        """All that is in the file."""
-        return Topics(self.arms, self.joints, self.cameras)
+    def topics(self) -> dict[str, Topic]:
+        """All that is in the file of a loop's run, by name."""
+        return run_topics(self.arms, self.joints, self.cameras)
 
 
 @dataclass(frozen=True)

@@ -21,9 +21,8 @@ from mcap.data_stream import RecordBuilder
 from mcap.records import DataEnd, Footer
 from mcap.writer import MCAP0_MAGIC, Writer
 
-from q2r2_control.inputs.messages import Dialect, message_types
 from q2r2_control.recording.about import ABOUT, CELL, CONCLUSION, FIELDS, ROBOT, About, Conclusion
-from q2r2_control.recording.rows import HEAD
+from q2r2_control.recording.messages import STORE, Message
 from q2r2_control.recording.topics import Topic
 
 METADATA_FILE = "metadata.yaml"
@@ -71,15 +70,14 @@ class BagWriter:
         self._channels = self._register()
         self.flush()
 
-    def write(self, records: Iterable[bytes]) -> None:
-        """Write records of messages of whole ticks, in the order of time; the file has them after :meth:`flush`."""
-        for record in records:
-            _, _, channel, sequence, time, published = HEAD.unpack_from(record)
-            self._writer.add_message(self._channels[channel], time, record[HEAD.size :], published, sequence)
+    def write(self, messages: Iterable[Message]) -> None:
+        """Write messages of whole ticks, in the order of time; the file has them after :meth:`flush`."""
+        for channel, number, time, sent, payload in messages:
+            self._writer.add_message(self._channels[channel], time, payload, sent, number)
             self._first = min(self._first, time) if self._counts else time
             self._last = max(self._last, time)
             self._counts[channel] += 1
-            self._unflushed += len(record)
+            self._unflushed += len(payload)
         if self._unflushed > _LARGEST_CHUNK:
             self.flush()
 
@@ -113,11 +111,10 @@ class BagWriter:
 
     def _register(self) -> dict[int, int]:
         """Declare the topics; returns the number of each one's channel in the file."""
-        store = message_types(Dialect.ROS2)
         qos = {"offered_qos_profiles": str(yaml.safe_dump([_QOS], sort_keys=False)).strip()}
         schemas: dict[str, int] = {}
         for kind in dict.fromkeys(topic.type for topic in self._topics):
-            definition, _ = store.generate_msgdef(kind, ros_version=2)
+            definition, _ = STORE.generate_msgdef(kind, ros_version=2)
             schemas[kind] = self._writer.register_schema(kind, "ros2msg", definition.encode())
         return {
             topic.channel: self._writer.register_channel(topic.name, "cdr", schemas[topic.type], qos)
@@ -139,7 +136,6 @@ def _write_metadata(
     file: Path, topics: Iterable[Topic], counts: Mapping[int, int], first: int, last: int, custom: Mapping[str, str]
 ) -> None:
     """Write metadata.yaml beside ``file``, whose messages are from ``first`` to ``last`` [ns]. Raises OSError."""
-    store = message_types(Dialect.ROS2)
     times: dict[str, Any] = {
         "starting_time": {"nanoseconds_since_epoch": first},
         "duration": {"nanoseconds": last - first},
@@ -157,7 +153,7 @@ def _write_metadata(
                     "type": topic.type,
                     "serialization_format": "cdr",
                     "offered_qos_profiles": [_QOS],
-                    "type_description_hash": store.hash_rihs01(topic.type),
+                    "type_description_hash": STORE.hash_rihs01(topic.type),
                 },
                 "message_count": counts.get(topic.channel, 0),
             }
@@ -171,17 +167,6 @@ def _write_metadata(
     }
     target = file.with_name(METADATA_FILE)
     part = target.with_suffix(".part")
-    text = _Dumper.text({"rosbag2_bagfile_information": information})
-    part.write_text(text, encoding="utf-8")
+    plain = json.loads(json.dumps({"rosbag2_bagfile_information": information}))  # nothing twice, so no references
+    part.write_text(yaml.safe_dump(plain, sort_keys=False), encoding="utf-8")
     os.replace(part, target)
-
-
-class _Dumper(yaml.SafeDumper):
-    """Without references, which yaml-cpp follows but people do not like to read."""
-
-    def ignore_aliases(self, data: Any) -> bool:
-        return True
-
-    @classmethod
-    def text(cls, data: Any) -> str:
-        return str(yaml.dump(data, Dumper=cls, sort_keys=False))

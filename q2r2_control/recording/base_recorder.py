@@ -1,9 +1,9 @@
-"""What recorders have in common: a new folder for each run, the process that writes there, and one line if it fails."""
+"""Recorders: a new folder for each run, the process that writes there, and one line if it fails."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from datetime import datetime
 from pathlib import Path
 
@@ -13,10 +13,14 @@ from q2r2_control.process.folders import new_folder
 from q2r2_control.recording.about import About, Conclusion
 from q2r2_control.recording.encoder import RecordedRobot
 from q2r2_control.recording.helper_process import HelperProcess, reason_of
+from q2r2_control.recording.messages import Message
 from q2r2_control.recording.topics import Topic
 from q2r2_control.recording.writer import FLUSH_PERIOD, MessageBatch, RecordingSetup, TickBatch, Written
 
 PATIENCE = 10.0  # with a disk that hangs, at the end of a run [s]
+ROOM = 8 << 20  # for messages that wait to be written [bytes]; both arms' nodes send some 0.6 MB a second
+ROOM_WITH_PICTURES = 64 << 20  # of cameras, which have a megabyte each where they are not compressed
+_LAST_NUMBER = 2**32 - 1
 
 _logger = logging.getLogger(__name__)
 
@@ -60,7 +64,7 @@ class BaseRecorder:
         """Have a batch written; False where there is no room for it now. ``wait`` for room."""
         if self.writer is None or self.fault is not None:
             return False
-        sent = self.writer.send(batch, sum(map(len, batch[0])), wait=wait)
+        sent = self.writer.send(batch, batch.size, wait=wait)
         self._check_writer()
         return sent
 
@@ -84,3 +88,36 @@ class BaseRecorder:
             self.fault = f"{self.file}: {reason}" if self.file is not None else reason
             _logger.warning("recording ended, the run goes on: %s", self.fault)
             self.record_outcome(Reason.of(ReasonKind.RECORDING_ENDED, text=self.fault))
+
+
+class MessageRecorder(BaseRecorder):
+    """Writes one file. It never waits: messages for which there is no room are lost, and counted."""
+
+    def __init__(self, parent: Path, name: str, room: int = ROOM) -> None:
+        super().__init__(parent, name, room)
+        self.count = self.overflows = 0  # messages that came; those of them for which there was no room
+        self._last = 0
+        self._begun = False
+
+    def begin(self, about: About, topics: tuple[Topic, ...]) -> None:
+        """Take messages of these topics from now on."""
+        self._begun = self._open(about, None, topics)
+        self._last = about.epoch
+
+    def record(self, messages: Iterable[Message]) -> None:
+        """Have messages written, in the order of their receipt.
+
+        One that was received before the last one counts as received with it, since a file is in the order of time.
+        """
+        batch = []
+        for message in sorted(messages, key=lambda one: one.time):
+            self.count += 1
+            self._last = max(message.time, self._last)
+            batch.append(message._replace(number=message.number & _LAST_NUMBER, time=self._last))
+        self._check_writer()
+        if batch and self._begun and self.fault is None and not self._send(MessageBatch(batch)):
+            self.overflows += len(batch)
+
+    def finish(self) -> None:
+        """Write what there is, and close the file."""
+        self._end(Conclusion())

@@ -16,7 +16,7 @@ from PIL import Image
 from q2r2_control.config.cameras import CameraConfig
 from q2r2_control.errors import PlantError
 from q2r2_control.recording.helper_process import reason_of
-from q2r2_control.recording.rows import picture_record
+from q2r2_control.recording.messages import Message, picture
 
 if TYPE_CHECKING:
     from q2r2_control.plants.mujoco_cameras import CellPictures
@@ -43,8 +43,8 @@ class PictureRequest(NamedTuple):
     qpos: bytes  # float64, where everything is
 
 
-def main(requests: Iterator[Any], answer: Callable[[bytes], None]) -> None:
-    """Answer an empty record when ready, and then the record of each picture.
+def main(requests: Iterator[Any], answer: Callable[[Message | None], None]) -> None:
+    """Answer None when ready, and then the message of each picture.
 
     Raises :class:`PlantError`, one line, where OpenGL is missing.
     """
@@ -54,12 +54,12 @@ def main(requests: Iterator[Any], answer: Callable[[bytes], None]) -> None:
     if setup is None:
         return
     cell = _cell_of(setup)
-    answer(b"")
+    answer(None)
     for request in requests:
         cell.place(np.frombuffer(request.qpos))
         for name in request.cameras:
-            jpeg = _jpeg(cell, name)
-            answer(picture_record(setup.channels[name], request.number, request.time, name, jpeg))
+            payload = picture(name, request.time, _jpeg(cell, name))
+            answer(Message(setup.channels[name], request.number, request.time, request.time, payload))
 
 
 def _cell_of(setup: CameraSetup) -> CellPictures:

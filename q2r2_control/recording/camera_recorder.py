@@ -15,7 +15,8 @@ from q2r2_control.config.cameras import CameraConfig
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.recording.camera_process import CameraSetup, PictureRequest
 from q2r2_control.recording.helper_process import HelperProcess
-from q2r2_control.recording.topics import Topics, picture
+from q2r2_control.recording.messages import Message
+from q2r2_control.recording.topics import Topic, picture_topic
 from q2r2_control.summary.tick import Tick
 
 ROOM = 128 << 10  # for copies that wait [bytes]; of the shipped cell, some seconds of a camera at 30 Hz
@@ -26,8 +27,8 @@ _READY = 10.0  # for the process to be ready, before the run [s]
 class CameraRecorder:
     """Its process begins with its imports at once. To be ended by :meth:`finish`."""
 
-    def __init__(self, write: Callable[[bytes], None], room: int = ROOM) -> None:
-        """``write`` gets the record of each picture, in another thread; ``room`` [bytes] is for copies that wait.
+    def __init__(self, write: Callable[[Message], None], room: int = ROOM) -> None:
+        """``write`` gets the message of each picture, in another thread; ``room`` [bytes] is for copies that wait.
 
         Raises :class:`OSError` where there can be no such process.
         """
@@ -48,9 +49,9 @@ class CameraRecorder:
         self._last: list[int] = []  # number of each one's last picture
         self._next = -math.inf  # when a picture is due, since the start of the run [s]
 
-    def _on_answer(self, record: bytes) -> None:
-        if record:
-            self._write(record)
+    def _on_answer(self, picture: Message | None) -> None:
+        if picture is not None:
+            self._write(picture)
         else:
             self._ready.set()
 
@@ -59,9 +60,9 @@ class CameraRecorder:
         """Why no more pictures are taken."""
         return self._process.fault
 
-    def prepare(self, plant: MujocoPlant, cameras: Mapping[str, CameraConfig], topics: Topics) -> None:
+    def prepare(self, plant: MujocoPlant, cameras: Mapping[str, CameraConfig], topics: Mapping[str, Topic]) -> None:
         """Make ready for pictures of ``plant``, for messages of ``topics``; waits for that, some seconds at most."""
-        channels = {name: topics.by_name[picture(name)].channel for name in cameras}
+        channels = {name: topics[picture_topic(name)].channel for name in cameras}
         self._process.send(CameraSetup(pickle.dumps(plant.model), dict(cameras), channels))
         waited = 0.0
         while self._process.alive and waited < _READY and not self._ready.wait(0.1):

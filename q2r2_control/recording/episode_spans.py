@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import json
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 from q2r2_control.errors import RecordingError
 from q2r2_control.events import Event, ReasonKind
-from q2r2_control.recording import topics as names
 from q2r2_control.recording.about import LOOP
-from q2r2_control.recording.reader import RecordedChunk, Recording
-from q2r2_control.recording.rows import sequence_of, text_of
+from q2r2_control.recording.reader import Recording
 from q2r2_control.teleop.episode_marks import EpisodeMarks
 
 
@@ -63,29 +60,13 @@ def spans_of(events: Iterable[Event], run_succeeded: bool | None = None) -> list
     return [replace(span, marks=tuple(t for t in marks if span.start <= t <= span.end)) for span in spans or [whole]]
 
 
-def events_of_ticks(chunk: RecordedChunk) -> dict[int, list[Event]]:
-    """What happened to the arms' states, by the number of the tick.
-
-    Raises :class:`ValueError`, :class:`KeyError` and :class:`TypeError` for what is no such thing.
-    """
-    return {
-        sequence_of(record): [Event.from_json(event) for event in json.loads(text_of(record)).get("events", ())]
-        for record in chunk.texts.get(names.STATE, ())
-    }
-
-
-def events_of(chunk: RecordedChunk) -> Iterator[Event]:
-    """The same in the order of time."""
-    for events in events_of_ticks(chunk).values():
-        yield from events
-
-
 def read_spans(recording: Recording) -> list[EpisodeSpan]:
     """The episodes of a recording. Raises :class:`RecordingError` for a damaged one."""
     about, success = recording.about, recording.conclusion.success
     if about.source == LOOP and not any(action in about.cell for action in EpisodeMarks.actions):
         return spans_of((), success)  # without reading all of it; of nodes, a service tells episodes too
     try:
-        return spans_of((event for chunk in recording.chunks() for event in events_of(chunk)), success)
+        told = (events for chunk in recording.chunks() for events in chunk.events().values())
+        return spans_of((event for events in told for event in events), success)
     except (ValueError, KeyError, TypeError) as error:
         raise RecordingError(f"{recording.file}: damaged: {error!r:.200}") from error

@@ -2,39 +2,64 @@
 
 from __future__ import annotations
 
+import json
 import struct
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 from mcap.exceptions import EndOfFile, McapError
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, Chunk, DataEnd, McapRecord, Metadata, MetadataIndex, Schema
+from mcap.reader import SeekingReader
+from mcap.records import Attachment, Channel, Chunk, DataEnd, McapRecord, Metadata, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk, get_chunk_data_stream
-from mcap.writer import MCAP0_MAGIC
+from mcap.summary import Summary
+from rosbags.serde import SerdeError
 from zstandard import ZstdError
 
 from q2r2_control.errors import RecordingError
-from q2r2_control.recording.about import ABOUT, CELL, CONCLUSION, CUT_OUT_OF, ROBOT, About, Conclusion
-from q2r2_control.recording.rows import HEAD, MESSAGE, Rows, jpeg_of
-from q2r2_control.recording.topics import PICTURE, Topic, picture
+from q2r2_control.events import Event
+from q2r2_control.recording.about import ABOUT, CELL, CONCLUSION, ROBOT, About, Conclusion
+from q2r2_control.recording.messages import Message, jpeg_of, numbers_of, text_of
+from q2r2_control.recording.tick_rows import SAMPLE_FIELDS, Rows, tick_type
+from q2r2_control.recording.topics import SAMPLES, STATE, TICK, Topic, picture_topic
+from q2r2_control.types import Array
 
 _LARGEST = 1 << 30  # of a record [bytes]
 _OPCODE_AND_LENGTH = 9
-_FOOTER_LENGTH = 20
-_FOOTER = struct.Struct("<BQQQI8s")  # opcode, length, starts of summary and its offsets, checksum; then the magic
-_BROKEN = (McapError, ZstdError, ValueError, KeyError, IndexError, struct.error, OverflowError, MemoryError)
+# Of a message: opcode, length, channel, sequence, log and publish time. The package mcap takes ten times as long.
+_HEAD = struct.Struct("<BQHIQQ")
+_BROKEN = (
+    *(McapError, ZstdError, SerdeError, ValueError, KeyError, IndexError),
+    *(struct.error, TypeError, OverflowError, MemoryError, AssertionError),
+)
 
 
 @dataclass(frozen=True)
-class RecordedChunk:
-    """Messages of some ticks: rows of each topic, and the records of those that are texts."""
+class TickChunk:
+    """The n ticks of one chunk, which may be none."""
 
-    rows: dict[str, Rows]
-    texts: dict[str, list[bytes]]
+    rows: Rows  # (n,) of tick_type
+    times: npt.NDArray[np.int64]  # (n,) of day [ns]
+    samples: Array  # (m, numbers of SAMPLE_FIELDS)
+    states: dict[int, str]  # JSON, by the number of the tick
+
+    @property
+    def numbers(self) -> npt.NDArray[np.int64]:
+        """(n,) of the ticks, from 0 on."""
+        return np.asarray(self.rows["index"].astype(np.int64))
+
+    def events(self) -> dict[int, list[Event]]:
+        """What happened to the arms' states, by the number of the tick.
+
+        Raises :class:`ValueError`, :class:`KeyError` and :class:`TypeError` for what is no such thing.
+        """
+        found = {number: json.loads(text).get("events", ()) for number, text in self.states.items()}
+        return {number: [Event.from_json(event) for event in events] for number, events in found.items()}
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,27 +78,42 @@ class Recording:
         """``path``: the file, or the folder that it is alone in."""
         self.file = _file_of(path)
         self.about = self._read_about()
-        if (whole := self.about.notes.get(CUT_OUT_OF)) is not None:
-            raise RecordingError(f"{self.file}: one episode, cut out of {whole}; allowed: the recording that has all")
-        self.topics = self.about.topics()
         self.since = 0  # time of day [ns]; what is known to be before it is left out
-        self._cameras = {topic.channel for topic in self.topics.all if topic.type == PICTURE}
 
-    def chunks(self) -> Iterator[RecordedChunk]:
-        """All messages but pictures, some half a second at a time."""
-        with self._faults():
-            for data in self._chunk_data():
-                yield self._split(data)
+    def chunks(self) -> Iterator[TickChunk]:
+        """All ticks, some half a second at a time; some may be missing in between, where they were lost."""
+        kind, labels = tick_type(len(self.about.arms), len(self.about.joints)), len(SAMPLE_FIELDS)
+        last_number, last_time = -1, 0
+        for messages in self.messages((TICK, SAMPLES, STATE)):
+            found: dict[str, list[Message]] = {TICK: [], SAMPLES: [], STATE: []}
+            for message in messages:
+                found[self.declared_topics[message.channel].name].append(message)
+            with self._faults():
+                rows = numbers_of([message.payload for message in found[TICK]], kind.itemsize // 8)
+                chunk = TickChunk(
+                    rows=rows.reshape(-1).view(kind),
+                    times=np.array([message.time for message in found[TICK]], dtype=np.int64),
+                    samples=numbers_of([message.payload for message in found[SAMPLES]], labels),
+                    states={message.number: text_of(message.payload) for message in found[STATE]},
+                )
+                if (np.diff(chunk.numbers, prepend=last_number) < 1).any():
+                    raise ValueError("ticks are not in the order of their numbers")
+                if (np.diff(chunk.times, prepend=last_time) < 0).any():
+                    raise ValueError("ticks are not in the order of time")
+            if len(rows):
+                last_number, last_time = int(chunk.numbers[-1]), int(chunk.times[-1])
+            yield chunk
 
     def pictures(self, camera: str) -> Iterator[Picture]:
         """All pictures of a camera, in the order of time."""
-        channel = self.topics.by_name[picture(camera)].channel
-        with self._faults():
-            for data in self._chunk_data():
-                for found, at, end in messages_in(data):
-                    if found == channel:
-                        _, _, _, tick, time, _ = HEAD.unpack_from(data, at)
-                        yield Picture(time, tick, jpeg_of(data[at:end]))
+        yield from self._pictures_on(picture_topic(camera))
+
+    def _pictures_on(self, topic: str) -> Iterator[Picture]:
+        for messages in self.messages((topic,)):
+            for message in messages:
+                with self._faults():
+                    picture = Picture(message.time, message.number, jpeg_of(message.payload))
+                yield picture
 
     @cached_property
     def declared_topics(self) -> dict[int, Topic]:
@@ -89,11 +129,20 @@ class Recording:
                     found[record.id] = Topic(record.id, record.topic, types[record.schema_id])
         return found
 
-    def messages(self) -> Iterator[list[bytes]]:
-        """The records of all messages as they are, chunk by chunk."""
+    def messages(self, topics: Container[str] | None = None) -> Iterator[list[Message]]:
+        """All messages, or those of some ``topics``, chunk by chunk."""
         with self._faults():
-            for data in self._chunk_data():
-                yield [data[at:end] for _, at, end in messages_in(data)]
+            for record in self._records():
+                if isinstance(record, DataEnd):
+                    return
+                if isinstance(record, Chunk) and record.message_end_time >= self.since:
+                    channels = {
+                        channel
+                        for channel, topic in self.declared_topics.items()
+                        if topics is None or topic.name in topics
+                    }
+                    stream, size = get_chunk_data_stream(record, validate_crc=True)
+                    yield list(_messages_in(stream.read(size), channels))
 
     @contextmanager
     def _faults(self) -> Iterator[None]:
@@ -105,47 +154,32 @@ class Recording:
         except _BROKEN as error:
             raise RecordingError(f"{self.file}: damaged: {_line(error)}") from error
 
-    def _chunk_data(self) -> Iterator[bytes]:
-        """The messages of each chunk."""
-        self._check_topics()
-        for record in self._records():
-            if isinstance(record, Chunk) and record.message_end_time >= self.since:
-                stream, size = get_chunk_data_stream(record, validate_crc=True)
-                yield stream.read(size)
-            elif isinstance(record, DataEnd):
-                return
-
     @property
     def closed(self) -> bool:
         """Whether the file has an index, which is written last: not where its process was killed or the disk full."""
-        return self._index_start() > 0
+        return self._summary() is not None
 
     @property
     def conclusion(self) -> Conclusion:
         """What was said at the end of the run; nothing where the file has no index."""
-        start = self._index_start()
-        if not start:
-            return Conclusion()
-        with self._faults():
-            for record in self._records(start):
-                if isinstance(record, MetadataIndex) and record.name == CONCLUSION:
-                    metadata = next(self._records(record.offset), None)
-                    if isinstance(metadata, Metadata):
-                        return Conclusion.from_texts(metadata.metadata)
+        summary = self._summary()
+        places = [] if summary is None else [one.offset for one in summary.metadata_indexes if one.name == CONCLUSION]
+        for place in places:
+            with self._faults():
+                record = next(self._records(place), None)
+                if isinstance(record, Metadata):
+                    return Conclusion.from_texts(record.metadata)
         return Conclusion()
 
-    def _index_start(self) -> int:
-        """Where the index begins in the file; 0: there is none."""
+    def _summary(self) -> Summary | None:
+        """The index of the file."""
         try:
             with self.file.open("rb") as stream:
-                stream.seek(max(self.file.stat().st_size - _FOOTER.size, 0))
-                end = stream.read()
+                return SeekingReader(stream, record_size_limit=_LARGEST).get_summary()
         except OSError as error:
             raise RecordingError(f"{self.file}: cannot be read: {error.strerror}") from error
-        if len(end) != _FOOTER.size:
-            return 0
-        opcode, length, summary, _, _, magic = _FOOTER.unpack(end)
-        return int(summary) if opcode == Opcode.FOOTER and length == _FOOTER_LENGTH and magic == MCAP0_MAGIC else 0
+        except (EndOfFile, StopIteration, *_BROKEN):
+            return None
 
     def _records(self, start: int = 0) -> Iterator[McapRecord]:
         """All from the beginning, or from a record that starts at ``start``."""
@@ -182,47 +216,18 @@ class Recording:
         except ValueError as error:
             raise RecordingError(f"{self.file}: {_line(error)}") from error
 
-    def _check_topics(self) -> None:
-        for topic in self.declared_topics.values():
-            known = self.topics.by_channel.get(topic.channel)
-            if known is None or known.name != topic.name:
-                raise ValueError(f"unknown topic {topic.name}")
 
-    def _split(self, data: bytes) -> RecordedChunk:
-        """The messages of a chunk by topic."""
-        records: dict[int, list[bytes]] = {}
-        for channel, at, end in messages_in(data):
-            if channel not in self._cameras:
-                records.setdefault(channel, []).append(data[at:end])
-        rows, texts = {}, {}
-        for channel, found in records.items():
-            topic = self.topics.by_channel[channel]
-            if topic.row is None:
-                texts[topic.name] = found
-            else:
-                rows[topic.name] = _as_rows(topic, found)
-        return RecordedChunk(rows, texts)
-
-
-def messages_in(data: bytes) -> Iterator[tuple[int, int, int]]:
-    """Channel, begin and end of each message of a chunk."""
+def _messages_in(data: bytes, channels: Container[int]) -> Iterator[Message]:
+    """The messages of a chunk, of some channels."""
     at = 0
     while at < len(data):
-        opcode, length, channel, *_ = HEAD.unpack_from(data, at)
+        opcode, length, channel, number, time, sent = _HEAD.unpack_from(data, at)
         end = at + _OPCODE_AND_LENGTH + length
         if end > len(data):
             raise ValueError("a chunk that does not end with a message")
-        if opcode == MESSAGE:  # and not the schema or the channel of one
-            yield channel, at, end
+        if opcode == Opcode.MESSAGE and channel in channels:  # and not the schema or the channel of one
+            yield Message(channel, number, time, sent, data[at + _HEAD.size : end])
         at = end
-
-
-def _as_rows(topic: Topic, records: list[bytes]) -> Rows:
-    assert topic.row is not None
-    dtype = topic.row.dtype
-    if any(len(record) != dtype.itemsize for record in records):
-        raise ValueError(f"a message of {topic.name} has a size that it cannot have")
-    return np.frombuffer(b"".join(records), dtype=dtype)
 
 
 def _file_of(path: Path) -> Path:

@@ -5,10 +5,10 @@ from __future__ import annotations
 from functools import lru_cache
 
 import numpy as np
-import pinocchio as pin
 
 from q2r2_control.config.cell import Config, parse_config
 from q2r2_control.errors import Q2R2Error, RecordingError
+from q2r2_control.recording.encoder import RecordedRobot
 from q2r2_control.recording.reader import Recording
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
@@ -16,16 +16,23 @@ from q2r2_control.types import Array
 _SAME_POSE = 1e-6  # [m], and of a quaternion
 
 
-def cell_and_robot_of(recording: Recording) -> tuple[Config, Robot]:
-    """Raises :class:`RecordingError`, which names the file, where its cell cannot be built or is another robot now."""
+def cell_and_robot_of(recording: Recording, config: Config | None = None) -> tuple[Config, Robot]:
+    """The recorded cell, or ``config``, with its robot.
+
+    Raises :class:`RecordingError`, which names the file, where the recorded cell cannot be built or either one has
+    other arms or joints, and :class:`Q2R2Error` where ``config`` cannot be built.
+    """
     about = recording.about
-    try:
-        config, robot = _built(about.cell)
-    except Q2R2Error as error:
-        raise RecordingError(f"{recording.file}: {error}") from error
+    if config is not None:
+        cell, robot = config, Robot.from_config(config)
+    else:
+        try:
+            cell, robot = _built(about.cell)
+        except Q2R2Error as error:
+            raise RecordingError(f"{recording.file}: {error}") from error
     if tuple(robot.arms) != about.arms or tuple(robot.joint_names) != about.joints:
-        raise RecordingError(f"{recording.file}: recorded with other arms or joints than its cell has")
-    return config, robot
+        raise RecordingError(f"{recording.file}: recorded with other arms or joints than {cell.name} has")
+    return cell, robot
 
 
 @lru_cache(maxsize=4)
@@ -48,10 +55,4 @@ def check_tools(positions: Array, tools: Array, robot: Robot) -> None:
 
 def tool_poses(positions: Array, robot: Robot) -> Array:
     """(n, arms, 7) x y z [m] qx qy qz qw of the tools in the world, at joint positions (n, joints)."""
-    model, data = robot.model, robot.model.createData()
-    poses = np.empty((len(positions), len(robot.arms), 7))
-    for q, pose in zip(positions, poses, strict=True):
-        pin.forwardKinematics(model, data, q)
-        for index, arm in enumerate(robot.arms.values()):
-            pose[index] = pin.SE3ToXYZQUATtuple(pin.updateFramePlacement(model, data, arm.frame_id))
-    return poses
+    return RecordedRobot.of(robot).tool_poses(positions)

@@ -19,8 +19,9 @@ from q2r2_control.recording.base_recorder import PATIENCE, BaseRecorder
 from q2r2_control.recording.camera_recorder import CameraRecorder
 from q2r2_control.recording.encoder import RecordedRobot
 from q2r2_control.recording.helper_process import reason_of
-from q2r2_control.recording.packing import TickPacker
-from q2r2_control.recording.topics import Topics
+from q2r2_control.recording.messages import Message
+from q2r2_control.recording.tick_rows import PackedTick, TickPacker
+from q2r2_control.recording.topics import run_topics
 from q2r2_control.recording.writer import MessageBatch, TickBatch
 from q2r2_control.robot.robot import Robot
 from q2r2_control.summary.tick import Tick
@@ -63,7 +64,7 @@ class Recorder(BaseRecorder):
         self._count = 0  # ticks
         self.overflows = 0  # ticks for which there was no room
         self._packer: TickPacker | None = None  # None: not begun
-        self._batch: list[bytes] = []
+        self._batch: list[PackedTick] = []
         self._epoch = 0
         self.success: bool | None = None  # of the run, where its task has a check of its own, set before the end
         self.cameras: CameraRecorder | None = None
@@ -78,15 +79,15 @@ class Recorder(BaseRecorder):
     def prepare(self, plant: MujocoPlant, robot: Robot, cameras: Mapping[str, CameraConfig]) -> None:
         """Make ready to take pictures of a run of ``plant``, just before :meth:`begin`; some seconds at most."""
         if self.cameras is not None:
-            topics = Topics(tuple(robot.arms), tuple(robot.joint_names), tuple(cameras))
+            topics = run_topics(tuple(robot.arms), tuple(robot.joint_names), tuple(cameras))
             self.cameras.prepare(plant, cameras, topics)
             self._check_cameras()
 
     def begin(self, about: About, robot: Robot) -> None:
         """Take ticks from now on, of a run that begins at ``about.epoch``."""
         topics = about.topics()
-        if self._open(about, RecordedRobot.of(robot), tuple(topics.all)):
-            self._packer, self._epoch = TickPacker(topics), about.epoch
+        if self._open(about, RecordedRobot.of(robot), tuple(topics.values())):
+            self._packer, self._epoch = TickPacker(about.arms, about.joints), about.epoch
 
     def __call__(self, tick: Tick) -> None:
         """Take one tick; never raises, and waits in simulated time only."""
@@ -117,10 +118,10 @@ class Recorder(BaseRecorder):
             self._fail_pictures(reason_of(error))
         self._check_cameras()
 
-    def _write_picture(self, record: bytes) -> None:
+    def _write_picture(self, picture: Message) -> None:
         """Called in the thread that hears of the cameras, which may wait for room."""
         if self.writer is not None:
-            self.writer.send(MessageBatch([record]), len(record), wait=True)
+            self.writer.send(batch := MessageBatch([picture]), batch.size, wait=True)
 
     def __enter__(self) -> Recorder:
         return self

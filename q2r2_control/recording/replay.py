@@ -2,50 +2,40 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
-from q2r2_control.config.cell import Config, parse_config
+import numpy as np
+import pinocchio as pin
+
+from q2r2_control.config.cell import Config
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.control.qp import QpProblem, QpSolution, Solver, make_solver
 from q2r2_control.drives.base import permitted
 from q2r2_control.errors import ConfigError, PlantError, RecordingError
-from q2r2_control.events import Event
 from q2r2_control.pipeline.loop_clock import LoopClock
 from q2r2_control.pipeline.pipeline import Pipeline
-from q2r2_control.plants.base import Plant, make_plant
-from q2r2_control.recording.about import ROS
+from q2r2_control.plants.base import make_plant
+from q2r2_control.recording.about import ROS, About
 from q2r2_control.recording.comparison import Comparison, changes
-from q2r2_control.recording.plant_difference import ArmDifference, PlantDifference
 from q2r2_control.recording.reader import Recording
+from q2r2_control.recording.recorded_robot import cell_and_robot_of
 from q2r2_control.recording.recorded_ticks import NoMoreTicksError, RecordedTick, RecordedTicks
 from q2r2_control.robot.robot import Robot
 from q2r2_control.summary.run_summary import RunSummary
+from q2r2_control.summary.tick import Tick
 from q2r2_control.types import QUEST_CONTROLS, Array, Command, CommandMode, HandSample, HapticFeedback, RobotState
 
 
-class ReplayPipeline(Pipeline):
-    """Runs the loop with the clock and input of a recording, and its solver as late as it was then."""
+@dataclass(frozen=True, slots=True)
+class ArmDifference:
+    """How far an arm's measured tool is from where it was at the same ticks."""
 
-    def __init__(self, config: Config, robot: Robot, ticks: RecordedTicks, plant: Plant, mode: str) -> None:
-        super().__init__(config, robot, _Input(ticks, self._wish_again), plant, mode)
-        self._recorded = ticks
-
-    def make_clock(self, realtime: bool) -> LoopClock:
-        """See :meth:`Pipeline.make_clock`."""
-        return _Clock(1.0 / self.config.loop_rate_hz, self._recorded)
-
-    def _wish_again(self, events: list[Event]) -> None:
-        """What a program asked of the run at this tick; both arms were told of it, so it is asked twice."""
-        for event in events:
-            self.requests.repeat(event.reason, self.teleop.settings)
-
-    def _prepare(self, realtime: bool) -> None:
-        settings = permitted(self.config.control.model_copy(update={"solve_time_limit": None}), self.drive)
-        inner = make_solver(settings.solver, self.robot.model.nv, None)
-        self.controller = CartesianController(self.robot, settings, solver=_Solver(inner, self._recorded))
-        super()._prepare(realtime)
+    position_mm_rms: float
+    position_mm_max: float
+    rotation_deg_max: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,23 +47,7 @@ class Replay:
     ended_by: str | None  # that fault, or why it ended before the recording did
     difference: str | None  # the first one; None: identical
     notes: list[str]  # what is not as it was when it was recorded
-    arms: dict[str, ArmDifference] = field(default_factory=dict)  # with a plant: where the tools were elsewhere
-
-
-def opened(path: Path, config: Config | None) -> tuple[Recording, Config, Robot]:
-    """A recording, and the cell to run it in: its own or ``config``. Raises as :func:`replay` does."""
-    recording = Recording(path)
-    about = recording.about
-    if about.source == ROS:
-        raise RecordingError(
-            f"{recording.file}: recorded from ROS nodes, which keeps messages and not what each loop took, so there is "
-            "nothing to replay to the bit; ros2 bag play plays it, q2r2 judge and q2r2 export read it"
-        )
-    cell = config or parse_config(about.cell, f"{recording.file}: its cell")
-    robot = Robot.from_config(cell)
-    if tuple(robot.arms) != about.arms or tuple(robot.joint_names) != about.joints:
-        raise RecordingError(f"{recording.file}: recorded with other arms or joints than {cell.name} has")
-    return recording, cell, robot
+    arms: dict[str, ArmDifference]  # with a plant: where the tools were elsewhere
 
 
 def replay(
@@ -93,19 +67,26 @@ def replay(
     Raises :class:`RecordingError` for a file that is none or is damaged, and :class:`Q2R2Error` for a cell that cannot
     be built or whose arms and joints have other names, and for a plant that does not have the recorded mode.
     """
-    recording, cell, robot = opened(path, config)
+    recording = Recording(path)
     about = recording.about
-    comparison = Comparison(robot, recording.topics, about.epoch) if compare or plant is None else None
-    ticks = RecordedTicks(recording) if comparison is None else RecordedTicks(recording, comparison.expect)
-    moves = _Plant(ticks, about.plant_modes) if plant is None else make_plant(plant, robot, cell)
-    if plant is not None and comparison is not None and about.notes.get("plant") != type(moves).__name__:
-        recorded = about.notes.get("plant", "another plant")
-        raise ConfigError(f"--plant {plant}: recorded with {recorded}; --compare is allowed with the recorded plant")
-    pipeline = ReplayPipeline(cell, robot, ticks, moves, about.mode)
+    if about.source == ROS:
+        raise RecordingError(
+            f"{recording.file}: recorded from ROS nodes, which keeps messages and not what each loop took, so there is "
+            "nothing to replay to the bit; ros2 bag play plays it, q2r2 judge and q2r2 export read it"
+        )
+    cell, robot = cell_and_robot_of(recording, config)
+    ticks = RecordedTicks(recording)
+    pipeline = ReplayPipeline(cell, robot, ticks, about, plant)
+    comparison = Comparison(about, ticks) if compare or plant is None else None
     if comparison is not None:
+        recorded, moves = about.notes.get("plant", "another plant"), type(pipeline.plant).__name__
+        if plant is not None and recorded != moves:
+            raise ConfigError(
+                f"--plant {plant}: recorded with {recorded}; --compare is allowed with the recorded plant"
+            )
         pipeline.listeners.append(comparison)
-    difference = None if plant is None else PlantDifference(robot, ticks)
-    if difference is not None:
+    difference = _PlantDifference(robot, ticks)
+    if plant is not None:
         pipeline.listeners.append(difference)
     prepare(pipeline)
     summary, ended_by = None, None
@@ -115,16 +96,8 @@ def replay(
         ended_by = _end_of(ticks)
     except PlantError as error:
         ended_by = str(error)
-    if comparison is not None:
-        comparison.finish(whole=not ticks.missing)
-    return Replay(
-        ticks.count,
-        summary,
-        ended_by,
-        None if comparison is None else comparison.difference,
-        changes(about, cell, robot),
-        {} if difference is None else difference.arms(),
-    )
+    found = None if comparison is None else comparison.finish()
+    return Replay(ticks.count, summary, ended_by, found, changes(about, cell, robot), difference.arms())
 
 
 def _end_of(ticks: RecordedTicks) -> str:
@@ -134,6 +107,32 @@ def _end_of(ticks: RecordedTicks) -> str:
     if ticks.current is not None and ticks.current.following:
         return "the recording has no end: its process was killed, or the disk was full"
     return "the arms were at rest here when it was recorded, and are not now"
+
+
+class ReplayPipeline(Pipeline):
+    """Runs the loop with the clock and input of a recording, and its solver as late as it was then."""
+
+    def __init__(self, config: Config, robot: Robot, ticks: RecordedTicks, about: About, plant: str | None) -> None:
+        """``plant`` by its name; None: the recorded one, which no command moves."""
+        recorded = _Recorded(ticks, about.plant_modes, self._ask_again)
+        moves = recorded if plant is None else make_plant(plant, robot, config)
+        super().__init__(config, robot, recorded, moves, about.mode)
+        self._recorded = ticks
+
+    def make_clock(self, realtime: bool) -> LoopClock:
+        """See :meth:`Pipeline.make_clock`."""
+        return _Clock(1.0 / self.config.loop_rate_hz, self._recorded)
+
+    def _ask_again(self, tick: RecordedTick) -> None:
+        """What a program asked of the run at this tick; both arms were told of it, so it is asked twice."""
+        for event in tick.events:
+            self.requests.repeat(event.reason, self.teleop.settings)
+
+    def _prepare(self, realtime: bool) -> None:
+        settings = permitted(self.config.control.model_copy(update={"solve_time_limit": None}), self.drive)
+        inner = make_solver(settings.solver, self.robot.model.nv, None)
+        self.controller = CartesianController(self.robot, settings, solver=_Solver(inner, self._recorded))
+        super()._prepare(realtime)
 
 
 class _Clock(LoopClock):
@@ -155,40 +154,36 @@ class _Clock(LoopClock):
         return self._recorded.next is not None and not self._recorded.next.following
 
 
-class _Input:
-    """The samples of the recorded tick. Implements :class:`Input`."""
+class _Recorded:
+    """Samples and measured states of the recorded tick; commands move nothing. Implements Input and Plant."""
 
     controls = QUEST_CONTROLS
 
-    def __init__(self, ticks: RecordedTicks, tell: Callable[[list[Event]], None]) -> None:
-        self._ticks, self._tell = ticks, tell
+    def __init__(self, ticks: RecordedTicks, modes: tuple[str, ...], on_tick: Callable[[RecordedTick], None]) -> None:
+        self._ticks, self._on_tick = ticks, on_tick
+        self.modes = tuple(CommandMode(mode) for mode in modes)
 
     @property
     def connected(self) -> bool:
         return self._ticks.current is not None and self._ticks.current.connected
 
-    def start(self) -> None:
-        pass
-
     def poll(self, now: float) -> list[HandSample]:
         if self._ticks.current is None:
             return []
-        self._tell(self._ticks.current.events)
+        self._on_tick(self._ticks.current)
         return self._ticks.current.samples
+
+    def state(self) -> RobotState:
+        return self._ticks.start.state if self._ticks.current is None else self._ticks.current.state
+
+    def gripper_openings(self) -> dict[str, float]:
+        return {} if self._ticks.current is None else self._ticks.current.openings
+
+    def start(self) -> None:
+        pass
 
     def send_haptic(self, feedback: HapticFeedback) -> None:
         pass
-
-    def close(self) -> None:
-        pass
-
-
-class _Plant:
-    """What was measured at the recorded tick; commands move nothing. Implements :class:`Plant`."""
-
-    def __init__(self, ticks: RecordedTicks, modes: tuple[str, ...]) -> None:
-        self._ticks = ticks
-        self.modes = tuple(CommandMode(mode) for mode in modes)
 
     def reset(self, q: Array | None = None) -> None:
         pass
@@ -198,12 +193,6 @@ class _Plant:
 
     def advance(self, dt: float) -> None:
         pass
-
-    def state(self) -> RobotState:
-        return self._ticks.start.state if self._ticks.current is None else self._ticks.current.state
-
-    def gripper_openings(self) -> dict[str, float]:
-        return {} if self._ticks.current is None else self._ticks.current.openings
 
     def close(self) -> None:
         pass
@@ -224,3 +213,35 @@ class _Solver:
         if tick is not None and tick.unsolved >> self._substep & 1:
             return QpSolution(None, 0.0)
         return self._solver.solve(problem)
+
+
+class _PlantDifference:
+    """A listener of a replay on a plant: how far its tools are from where they were when the run was recorded."""
+
+    keeps_episodes = True  # as when it was recorded
+
+    def __init__(self, robot: Robot, ticks: RecordedTicks) -> None:
+        self._robot, self._ticks = robot, ticks
+        self._data = robot.model.createData()
+        self._off: dict[str, list[tuple[float, float]]] = {name: [] for name in robot.arms}  # [m], [rad]
+
+    def __call__(self, tick: Tick) -> None:
+        """Take one tick of the replay."""
+        recorded = self._ticks.current
+        if recorded is None or not np.isfinite(recorded.state.q).all():
+            return
+        pin.forwardKinematics(self._robot.model, self._data, recorded.state.q)
+        for name, arm in self._robot.arms.items():
+            off = pin.updateFramePlacement(self._robot.model, self._data, arm.frame_id).actInv(tick.tools[name])
+            distance, angle = (float(np.linalg.norm(part)) for part in (off.translation, pin.log3(off.rotation)))
+            self._off[name].append((distance, angle))
+
+    def arms(self) -> dict[str, ArmDifference]:
+        """Of each arm; empty where no tick was compared."""
+        found = {}
+        for name, off in self._off.items():
+            if off:
+                distances, angles = np.array(off).T
+                rms = 1e3 * math.sqrt(float(np.mean(distances**2)))
+                found[name] = ArmDifference(rms, 1e3 * float(distances.max()), math.degrees(float(angles.max())))
+        return found

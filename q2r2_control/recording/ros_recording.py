@@ -1,20 +1,46 @@
-"""A recording of the ROS nodes, read as if one loop had made it, so that whoever reads recordings reads it as well."""
+"""A recording of the ROS nodes, read as if one loop had made it, so that whoever reads recordings reads it as well.
+
+A tick is one of the controller's node. With it counts what had been received by then: the newest joint states, flags of
+the arms, and targets. The reference is the one with the same time.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import json
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from q2r2_control.config.cell import parse_config
 from q2r2_control.config.external import ControllerKind
+from q2r2_control.config.timeouts import STREAM_TIMEOUT
 from q2r2_control.errors import RecordingError
+from q2r2_control.events import Event
 from q2r2_control.recording import topics as names
-from q2r2_control.recording.about import ROS
-from q2r2_control.recording.reader import Picture, RecordedChunk, Recording, messages_in
-from q2r2_control.recording.recorded_robot import cell_and_robot_of
-from q2r2_control.recording.ros_ticks import Message, RosTicks
-from q2r2_control.recording.ros_topics import is_compressed
-from q2r2_control.recording.rows import HEAD, jpeg_of
+from q2r2_control.recording.about import ROS, About
+from q2r2_control.recording.messages import NANOSECONDS, STORE, Message, pose_of
+from q2r2_control.recording.reader import Picture, Recording, TickChunk
+from q2r2_control.recording.recorded_robot import cell_and_robot_of, tool_poses
+from q2r2_control.recording.ros_topics import (
+    ARM_FIELDS,
+    CONTROLLER_TICK,
+    RECORDER_EVENTS,
+    arm_events,
+    arm_flags,
+    is_compressed,
+    ros_topics,
+    tick_fields,
+)
+from q2r2_control.recording.tick_rows import SAMPLE_FIELDS, Rows, tick_type
+from q2r2_control.robot.robot import Robot
+from q2r2_control.types import SIDES, Array
+
+_SAME = 1e-6  # times of one tick may differ by their rounding [s]
 
 
 def open_recording(path: Path) -> Recording:
@@ -26,7 +52,7 @@ def open_recording(path: Path) -> Recording:
 class RosRecording(Recording):
     """Raises :class:`RecordingError` for any other recording, and where another controller moved the arms."""
 
-    def chunks(self) -> Iterator[RecordedChunk]:
+    def chunks(self) -> Iterator[TickChunk]:
         """See :meth:`Recording.chunks`."""
         config, robot = cell_and_robot_of(self)
         if config.controller is not ControllerKind.BUILTIN:
@@ -34,18 +60,17 @@ class RosRecording(Recording):
                 f"{self.file}: recorded with controller: {config.controller}, so there is no reference of the built-in "
                 "controller to judge or export; ros2 bag, Foxglove and mcap tools open it"
             )
-        ticks = RosTicks(self.about, self.topics, robot)
-        previous: RecordedChunk | None = None
-        with self._faults():
-            for data in self._chunk_data():
-                chunk = ticks.take(self._messages(data))
-                if names.TICK in chunk.rows:
-                    if previous is not None:
-                        yield previous
-                    previous = chunk
+        ticks = RosTicks(self.about, robot)
+        previous: TickChunk | None = None
+        for messages in self.messages():
+            with self._faults():
+                chunk = ticks.take((self.declared_topics[one.channel].name, one) for one in messages)
+            if len(chunk.rows):
+                if previous is not None:
+                    yield previous
+                previous = chunk
         if previous is not None and self.closed:  # the recorder was told to end, and the last tick is the run's
-            labels = self.topics.by_name[names.TICK].labels["data"]
-            previous.rows[names.TICK]["data"][-1, labels.index("following")] = 0.0
+            previous.rows["following"][-1] = 0.0
         yield ticks.rest(previous)
 
     def pictures(self, camera: str) -> Iterator[Picture]:
@@ -56,17 +81,151 @@ class RosRecording(Recording):
                 f"{self.file}: pictures of camera {camera} are sensor_msgs/Image on {topic}; allowed to export: "
                 "CompressedImage; --no-pictures leaves them out"
             )
-        with self._faults():
-            for data in self._chunk_data():
-                for channel, at, end in messages_in(data):
-                    if self.declared_topics[channel].name == topic:
-                        _, _, _, number, time, _ = HEAD.unpack_from(data, at)
-                        yield Picture(time, number, jpeg_of(data[at:end]))
+        yield from self._pictures_on(topic)
 
-    def _check_topics(self) -> None:
-        """Any topic may be in it."""
 
-    def _messages(self, data: bytes) -> Iterator[Message]:
-        for channel, at, end in messages_in(data):
-            time = HEAD.unpack_from(data, at)[4]
-            yield Message(self.declared_topics[channel].name, time, data[at + HEAD.size : end])
+@dataclass(slots=True)
+class _Tick:
+    """A tick of the controller."""
+
+    time: int  # of its receipt [ns of day]
+    now: float  # of the controller [s]
+    row: Rows  # (1,), filled with what was known by then
+    samples: list[Array]  # numbers of SAMPLE_FIELDS, received since the last tick
+    events: list[Event]  # since the last tick
+
+
+class RosTicks:
+    """Takes the messages of a recording in their order, and gives ticks."""
+
+    def __init__(self, about: About, robot: Robot) -> None:
+        self._robot, self._epoch, self._arms, self._joint_names = robot, about.epoch, about.arms, about.joints
+        self._fields, self._type = tick_fields(about.arms), tick_type(len(about.arms), len(about.joints))
+        self._types = {topic.name: topic.type for topic in ros_topics(about.arms, {})}
+        self._joints = np.full((3, len(about.joints)), np.nan)
+        self._flags = np.full((len(about.arms), len(ARM_FIELDS)), np.nan)
+        self._targets: dict[int, tuple[int, Array]] = {}  # by the arm's place: when it came [ns], and the pose
+        self._samples: list[Array] = []
+        self._events: list[Event] = []
+        self._due: deque[_Tick] = deque()  # wait for their references
+        self._references: deque[tuple[float, Array]] = deque()  # by the controller's time [s]
+        self._last_index, self._number = 0, -1  # of the newest tick
+        self._take: dict[str, Callable[[Any, int], None]] = {
+            names.JOINT_STATES: self._on_joints,
+            names.REFERENCE: self._on_reference,
+            CONTROLLER_TICK: self._on_tick,
+            RECORDER_EVENTS: self._on_event,
+        }
+        for place, arm in enumerate(about.arms):
+            self._take[names.target(arm)] = partial(self._on_target, place)
+            self._take[arm_flags(arm)] = partial(self._on_flags, place)
+            self._take[arm_events(arm)] = self._on_event
+        for side, hand in enumerate(SIDES):
+            self._take[names.hand_pose(hand)] = partial(self._on_hand, side)
+
+    def take(self, messages: Iterable[tuple[str, Message]]) -> TickChunk:
+        """The ticks that are known after some more messages, with their topics; there may be none."""
+        for topic, message in messages:
+            if (take := self._take.get(topic)) is not None:
+                take(STORE.deserialize_cdr(message.payload, self._types[topic]), message.time)
+        return self._chunk(list(self._whole_ticks()))
+
+    def rest(self, last: TickChunk | None) -> TickChunk:
+        """The ``last`` chunk, or one without a tick, with what happened after it."""
+        chunk = self._chunk([]) if last is None else last
+        if events := [*(event for tick in self._due for event in tick.events), *self._events]:
+            number = max(self._number, 0)
+            before = chunk.events().get(number, [])
+            chunk.states[number] = _state([*before, *events])
+        return chunk
+
+    def _on_joints(self, message: Any, _: int) -> None:
+        columns = {name: column for column, name in enumerate(message.name)}
+        for index, name in enumerate(self._joint_names):
+            if (column := columns.get(name)) is not None:
+                for row, values in enumerate((message.position, message.velocity, message.effort)):
+                    self._joints[row, index] = values[column] if len(values) else 0.0
+
+    def _on_reference(self, message: Any, _: int) -> None:
+        stamp, point = message.header.stamp, message.points[0]
+        values = np.array([point.positions, point.velocities, point.accelerations])
+        self._references.append((stamp.sec + stamp.nanosec / NANOSECONDS, values))
+
+    def _on_target(self, place: int, message: Any, time: int) -> None:
+        self._targets[place] = time, pose_of(message)
+
+    def _on_flags(self, place: int, message: Any, _: int) -> None:
+        self._flags[place] = message.data
+
+    def _on_event(self, message: Any, time: int) -> None:
+        told = json.loads(message.data) | {"t": (time - self._epoch) / NANOSECONDS}  # its sender's clock is another
+        self._events.append(Event.from_json(told))
+
+    def _on_hand(self, side: int, message: Any, time: int) -> None:
+        sample = np.zeros(len(SAMPLE_FIELDS))
+        received = (time - self._epoch) / NANOSECONDS
+        sample[1:4] = side, received, received
+        sample[4:11] = pose_of(message)
+        self._samples.append(sample)
+
+    def _on_tick(self, message: Any, time: int) -> None:
+        if np.isnan(self._joints).any() or np.isnan(self._flags[:, 0]).any():
+            return  # nothing can be said of it yet
+        values = dict(zip(self._fields, message.data.tolist(), strict=True))
+        row = np.zeros(1, dtype=self._type)
+        for name in set(values) & set(self._type.names or ()):
+            row[name] = values[name]
+        row["now"] = row["state_stamp"] = (time - self._epoch) / NANOSECONDS
+        row["following"] = row["connected"] = 1.0
+        row["q"], row["v"], row["tau"] = self._joints
+        arms = row["arms"][0]
+        for place, (arm, flags) in enumerate(zip(self._arms, self._flags, strict=True)):
+            for name, value in zip(ARM_FIELDS, flags.tolist(), strict=True):
+                arms["opening" if name == "measured" else name][place] = value
+            arms["commanded"][place] = arms["wanted"][place]
+            arms["rejected"][place] = values[f"rejected_{arm}"]
+            received, pose = self._targets.get(place, (0, None))
+            if pose is not None and arms["engaged"][place] > 0.5 and time - received <= STREAM_TIMEOUT * NANOSECONDS:
+                arms["target"][place] = pose
+        self._due.append(_Tick(time, values["now"], row, self._samples, self._events))
+        self._samples, self._events = [], []
+
+    def _whole_ticks(self) -> Iterator[_Tick]:
+        """Those whose reference is there; what came with one whose reference was lost is the next one's."""
+        while self._due and self._references:
+            tick, (now, reference) = self._due[0], self._references[0]
+            if now < tick.now - _SAME:
+                self._references.popleft()
+                continue
+            self._due.popleft()
+            if now > tick.now + _SAME:
+                following = self._due[0] if self._due else None
+                samples = following.samples if following else self._samples
+                events = following.events if following else self._events
+                samples[:0], events[:0] = tick.samples, tick.events
+                continue
+            self._references.popleft()
+            row, index = tick.row, int(tick.row["index"][0])
+            row["reference_q"], row["reference_v"], row["reference_a"] = reference
+            # A controller that was started again begins anew.
+            self._number += index - self._last_index if 0 < self._last_index < index else 1
+            self._last_index = index
+            row["index"] = self._number
+            yield tick
+
+    def _chunk(self, ticks: Sequence[_Tick]) -> TickChunk:
+        rows = np.concatenate([np.empty(0, dtype=self._type), *(tick.row for tick in ticks)])
+        rows["arms"]["tool"] = tool_poses(rows["reference_q"], self._robot)
+        states, samples = {}, [np.empty((0, len(SAMPLE_FIELDS)))]
+        for tick, number in zip(ticks, rows["index"].astype(int).tolist(), strict=True):
+            for sample in tick.samples:
+                sample[0] = number
+                samples.append(sample[None])
+            if tick.events:
+                states[number] = _state(tick.events)
+        times = np.array([tick.time for tick in ticks], dtype=np.int64)
+        return TickChunk(rows, times, np.concatenate(samples), states)
+
+
+def _state(events: Sequence[Event]) -> str:
+    return json.dumps({"events": [event.as_json() for event in events]})

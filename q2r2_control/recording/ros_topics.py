@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+from q2r2_control.recording.messages import ARRAY, HAND_INPUTS, JOINTS, PICTURE, POSE, TEXT, TRAJECTORY
 from q2r2_control.recording.topics import (
     DESCRIPTION,
     JOINT_STATES,
-    PICTURE,
     REFERENCE,
     Topic,
     hand_buttons,
     hand_pose,
+    numbered,
     safe_target,
     target,
 )
@@ -29,9 +30,9 @@ TICK_FIELDS = (
 )
 ARM_FIELDS = ("engaged", "slip", "slip_angle", "wanted", "measured")  # the last two are openings, 0 closed .. 1 open
 
-_ARRAY, _TEXT, _BOOL = "std_msgs/msg/Float64MultiArray", "std_msgs/msg/String", "std_msgs/msg/Bool"
-_POSE, _JOINTS, _TWIST = "geometry_msgs/msg/PoseStamped", "sensor_msgs/msg/JointState", "geometry_msgs/msg/Twist"
-_TRANSFORMS, _IMAGE = "tf2_msgs/msg/TFMessage", "sensor_msgs/msg/Image"
+_BOOL, _TWIST, _IMAGE = "std_msgs/msg/Bool", "geometry_msgs/msg/Twist", "sensor_msgs/msg/Image"
+_TRANSFORMS, _DIAGNOSTICS = "tf2_msgs/msg/TFMessage", "diagnostic_msgs/msg/DiagnosticArray"
+_HAPTIC = "quest2ros/msg/OVR2ROSHapticFeedback"
 
 
 def tick_fields(arms: Sequence[str]) -> tuple[str, ...]:
@@ -65,23 +66,19 @@ def heard_on(topic: str) -> str:
 
 def ros_topics(arms: Sequence[str], cameras: Mapping[str, str]) -> tuple[Topic, ...]:
     """All topics of a recording of the nodes; ``cameras``: name -> topic of its pictures."""
-    types: dict[str, str] = {DESCRIPTION: _TEXT, JOINT_STATES: _JOINTS, "/mujoco_robot/external_torque": _JOINTS}
-    types |= {"/tf": _TRANSFORMS, "/tf_static": _TRANSFORMS, "/diagnostics": "diagnostic_msgs/msg/DiagnosticArray"}
+    types: dict[str, str] = {DESCRIPTION: TEXT, JOINT_STATES: JOINTS, "/mujoco_robot/external_torque": JOINTS}
+    types |= {"/tf": _TRANSFORMS, "/tf_static": _TRANSFORMS, "/diagnostics": _DIAGNOSTICS}
     for hand in SIDES:
-        types |= {hand_pose(hand): _POSE, hand_buttons(hand): "quest2ros/msg/OVR2ROSInputs"}
-        types |= {f"/q2r_{hand}_hand_twist": _TWIST}
-        types |= {f"/q2r_{hand}_hand_haptic_feedback": "quest2ros/msg/OVR2ROSHapticFeedback"}
-    types |= {CONTROLLER_TICK: _ARRAY, REFERENCE: "trajectory_msgs/msg/JointTrajectory", RECORDER_EVENTS: _TEXT}
+        types |= {hand_pose(hand): POSE, hand_buttons(hand): HAND_INPUTS}
+        types |= {f"/q2r_{hand}_hand_twist": _TWIST, f"/q2r_{hand}_hand_haptic_feedback": _HAPTIC}
+    types |= {CONTROLLER_TICK: ARRAY, REFERENCE: TRAJECTORY, RECORDER_EVENTS: TEXT}
     for arm in arms:
-        types |= {target(arm): _POSE, safe_target(arm): _POSE, f"/cartesian_controller/following/{arm}": _BOOL}
-        types |= {arm_flags(arm): _ARRAY, arm_events(arm): _TEXT}
-    types |= {f"/{node}/state": _TEXT for node in (*_NODES, *(f"{arm}_q2r2_arm_controller" for arm in arms))}
+        types |= {target(arm): POSE, safe_target(arm): POSE, f"/cartesian_controller/following/{arm}": _BOOL}
+        types |= {arm_flags(arm): ARRAY, arm_events(arm): TEXT}
+    types |= {f"/{node}/state": TEXT for node in (*_NODES, *(f"{arm}_q2r2_arm_controller" for arm in arms))}
     types |= {topic: PICTURE if is_compressed(topic) else _IMAGE for topic in cameras.values()}
     labels = {CONTROLLER_TICK: tick_fields(arms)} | {arm_flags(arm): ARM_FIELDS for arm in arms}
-    return tuple(
-        Topic(channel, name, kind, None, {"data": labels[name]} if name in labels else {})
-        for channel, (name, kind) in enumerate(types.items(), start=1)
-    )
+    return tuple(numbered(types, labels).values())
 
 
 def is_compressed(topic: str) -> bool:
@@ -96,7 +93,7 @@ def is_latched(topic: str) -> bool:
 
 def is_reliable(topic: Topic) -> bool:
     """Whether all of its messages are to arrive, at no one's cost: none that commands, and none of a stream."""
-    return topic.type in (_ARRAY, _TEXT) or topic.name == REFERENCE or heard_on(topic.name) != topic.name
+    return topic.type in (ARRAY, TEXT) or topic.name == REFERENCE or heard_on(topic.name) != topic.name
 
 
 def _arm_of(topic: str) -> str:

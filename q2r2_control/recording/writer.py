@@ -15,7 +15,9 @@ from typing import Any, NamedTuple
 
 from q2r2_control.recording.about import About, Conclusion
 from q2r2_control.recording.bag import BagWriter
-from q2r2_control.recording.encoder import RecordedRobot, TickEncoder, in_order
+from q2r2_control.recording.encoder import RecordedRobot, TickEncoder
+from q2r2_control.recording.messages import Message
+from q2r2_control.recording.tick_rows import PackedTick
 from q2r2_control.recording.topics import Topic
 
 FLUSH_PERIOD = 0.5  # of the file; what is lost at most where this process is killed [s]
@@ -35,13 +37,23 @@ class RecordingSetup:
 class TickBatch(NamedTuple):
     """Ticks one after the other, packed by :class:`TickPacker`."""
 
-    ticks: list[bytes]
+    ticks: list[PackedTick]
+
+    @property
+    def size(self) -> int:
+        """Of all [bytes]."""
+        return sum(tick.size for tick in self.ticks)
 
 
 class MessageBatch(NamedTuple):
-    """Records of messages, to be written as they are."""
+    """Messages, to be written as they are."""
 
-    records: list[bytes]
+    messages: list[Message]
+
+    @property
+    def size(self) -> int:
+        """Of all [bytes]."""
+        return sum(len(message.payload) for message in self.messages)
 
 
 class Written(NamedTuple):
@@ -67,11 +79,11 @@ def main(requests: Iterator[Any], answer: Callable[[Written], None]) -> None:
             if isinstance(request, Conclusion):
                 conclusion = request
             elif isinstance(request, MessageBatch):
-                bag.write(request.records)
-                received = received._replace(messages=received.messages + len(request.records))
+                bag.write(request.messages)
+                received = received._replace(messages=received.messages + len(request.messages))
             elif isinstance(request, TickBatch):
                 assert encoder is not None
-                bag.write(in_order(encoder.encode(request.ticks)))
+                bag.write(encoder.encode(request.ticks))
                 received = received._replace(ticks=received.ticks + len(request.ticks))
             if time.monotonic() >= due:
                 bag.flush()

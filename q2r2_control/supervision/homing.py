@@ -10,8 +10,8 @@ import pinocchio as pin
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.robot.robot import Robot
-from q2r2_control.supervision.joint_homing import JointHoming, JointWay
-from q2r2_control.types import Array, Reference
+from q2r2_control.supervision.joint_homing import JointHoming
+from q2r2_control.types import Reference
 
 _LINEAR_SPEED, _ANGULAR_SPEED = 0.1, 0.3  # [m/s], [rad/s]
 _ARRIVED, _TURNED = 0.003, 0.01  # [m], [rad]
@@ -71,7 +71,7 @@ class Homing:
     def __init__(self, robot: Robot, controller: CartesianController, tools_only: bool) -> None:
         self._robot, self._controller, self._tools_only = robot, controller, tools_only
         self._home = {arm: robot.tool_pose(robot.home, arm) for arm in robot.arms}
-        self._way: JointWay | ToolHoming | None = None
+        self._way: JointHoming | ToolHoming | None = None
         self.outcome: Reason | None = None  # how the last way home ended, where it did by itself
 
     @property
@@ -85,15 +85,7 @@ class Homing:
         if self._tools_only:
             self._way = ToolHoming(self._home, self._controller.tool_pose)
         else:
-            self.follow(self.way_to(self._robot.home))
-
-    def way_to(self, q: Array) -> JointHoming:
-        """A way of all joints to ``q`` (nv,) [rad]."""
-        return JointHoming(self._robot, self._controller.kept_distances, q)
-
-    def follow(self, way: JointWay) -> None:
-        """Lead the joints along ``way`` until it has an outcome."""
-        self._way = way
+            self._way = JointHoming(self._robot, self._controller.kept_distances, self._robot.home)
 
     def targets(self, last: Reference | None, dt: float) -> dict[str, pin.SE3 | None]:
         """What each tool is asked for after another ``dt`` [s] from the ``last`` reference, None: before the first.

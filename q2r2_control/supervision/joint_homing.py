@@ -14,7 +14,6 @@ from __future__ import annotations
 
 from collections.abc import Generator, Iterator
 from itertools import pairwise
-from typing import Protocol
 
 import numpy as np
 
@@ -35,21 +34,8 @@ _SPREAD = 0.6  # of random way points [rad]
 _INSIDE = 0.02  # of joint limits [rad]
 
 
-class JointWay(Protocol):
-    """Leads all joints; the controller follows as its promises allow."""
-
-    outcome: ReasonKind | None  # how it ended
-
-    def step(self, q: Array, v: Array, dt: float) -> Array | None:
-        """Where the joints shall be (nv,) after another ``dt`` [s], with the reference at ``q`` and ``v`` (nv,).
-
-        None: where they come to rest.
-        """
-        ...
-
-
 class JointHoming:
-    """Leads all joints to a goal, from where they come to rest. Implements :class:`JointWay`."""
+    """Leads all joints to a goal, from where they come to rest."""
 
     def __init__(self, robot: Robot, kept: Array, goal: Array) -> None:
         """``kept`` (pairs,) [m]: what each monitored pair keeps; ``goal`` (nv,) [rad]."""
@@ -65,7 +51,10 @@ class JointHoming:
         self.outcome: ReasonKind | None = None  # how it ended
 
     def step(self, q: Array, v: Array, dt: float) -> Array | None:
-        """See :meth:`JointWay.step`."""
+        """Where the joints shall be (nv,) after another ``dt`` [s], with the reference at ``q`` and ``v`` (nv,).
+
+        None: where they come to rest.
+        """
         if self._search is None:
             if float(np.abs(v).max()) > _AT_REST:
                 return None

@@ -22,7 +22,6 @@ from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.robot.robot import Robot
 from q2r2_control.supervision.external_arms import ExternalArms
 from q2r2_control.supervision.homing import Homing
-from q2r2_control.supervision.joint_homing import JointWay
 from q2r2_control.supervision.joint_watch import JointWatch, WatchSettings
 from q2r2_control.supervision.target_stream import Origins, StreamSettings
 from q2r2_control.supervision.targets import TargetStreams
@@ -263,11 +262,6 @@ class Supervisor:
         self._forget_targets()
         self.homing.begin()
         return None
-
-    def lead(self, way: JointWay) -> None:
-        """Let active arms go where ``way`` leads until it has an outcome, as on the way home."""
-        self._forget_targets()
-        self.homing.follow(way)
 
     def activate(self, state: RobotState, now: float) -> None:
         """Start at once at ``state``, at which the arms are known to be at rest. Raises :class:`RobotError`."""

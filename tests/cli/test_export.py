@@ -73,7 +73,7 @@ def test_an_interrupted_export_leaves_nothing_half_and_the_next_one_ends_it(
 
     arguments = ("export", "csv", *map(str, recordings), "--output")
     with monkeypatch.context() as patch:
-        patch.setattr(command, "write_tables", interrupted)
+        patch.setattr(command, "gather_tables", interrupted)
         assert q2r2(*arguments, str(tmp_path / "out")).exit_code == 130
     assert [path.name for path in tmp_path.iterdir()] == ["out.partial"]
     for name in ("out", "at_once"):

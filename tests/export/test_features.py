@@ -9,8 +9,8 @@ import pinocchio as pin
 import pytest
 
 from q2r2_control.errors import RecordingError
-from q2r2_control.export.features import MOTION, POSE, features
-from q2r2_control.recording.packing import NOT_MEASURED
+from q2r2_control.export.features import MOTION, features
+from q2r2_control.recording.tick_rows import NOT_MEASURED, POSE_FIELDS
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 from tests.support.watch import cell
@@ -72,7 +72,7 @@ def test_tools_are_where_the_measured_joints_put_them() -> None:
     given = frames()
     vectors, names = features(given, robot())
     for arm in robot().arms:
-        at = [names["observation.tool"].index(f"{arm}_{number}") for number in POSE]
+        at = [names["observation.tool"].index(f"{arm}_{number}") for number in POSE_FIELDS]
         for q, pose in zip(given["position"], vectors["observation.tool"][:, at], strict=True):
             off = robot().tool_pose(q, arm).actInv(pin.XYZQUATToSE3(pose.astype(np.float64)))
             assert np.linalg.norm(pin.log6(off).vector) < 1e-5
@@ -81,7 +81,7 @@ def test_tools_are_where_the_measured_joints_put_them() -> None:
 def test_tool_deltas_lead_from_each_target_to_the_next_and_nowhere_from_the_last() -> None:
     vectors, names = features(frames(), robot())
     for arm in robot().arms:
-        targets = vectors["action.tool"][:, [names["action.tool"].index(f"{arm}_{number}") for number in POSE]]
+        targets = vectors["action.tool"][:, [names["action.tool"].index(f"{arm}_{number}") for number in POSE_FIELDS]]
         at = [names["action.tool_delta"].index(f"{arm}_{number}") for number in MOTION]
         deltas = vectors["action.tool_delta"][:, at].astype(np.float64)
         places = [pin.XYZQUATToSE3(pose.astype(np.float64)) for pose in targets]
@@ -99,7 +99,7 @@ def test_quaternions_do_not_jump_and_targets_are_on_the_side_of_the_tools() -> N
         first = {}
         for feature in ("observation.tool", "action.tool"):
             for arm in robot().arms:
-                at = [names[feature].index(f"{arm}_{number}") for number in POSE[3:]]
+                at = [names[feature].index(f"{arm}_{number}") for number in POSE_FIELDS[3:]]
                 quaternions = vectors[feature][:, at]
                 assert (np.sum(quaternions[1:] * quaternions[:-1], axis=1) > 0.0).all()
                 first[feature, arm] = quaternions[0]

@@ -10,7 +10,6 @@ import pytest
 
 from q2r2_control.export.episodes import EpisodeVectors
 from q2r2_control.export.hdf5 import gather_files, write_file
-from tests.export.runs import contents
 from tests.export.vectors import CAMERA, EPISODES, HEIGHT, WIDTH, with_pictures
 
 h5py = pytest.importorskip("h5py", reason="the extra export is not installed")
@@ -65,8 +64,3 @@ def test_a_file_says_what_its_numbers_are(tmp_path: Path) -> None:
         about = dict(file.attrs)
     assert (about["fps"], about["task"], about["cell"], about["note_operator"]) == (30, "stack", "two_arms", "Ada")
     assert (about["recording"], about["sim"], about["action_ahead_frames"]) == ("run-1.mcap", True, 1)
-
-
-def test_the_same_episodes_give_the_same_bytes(tmp_path: Path) -> None:
-    one, two = (contents(export(act_episodes(), tmp_path / name)) for name in ("one", "two"))
-    assert one == two

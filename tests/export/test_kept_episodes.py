@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 
 from q2r2_control.errors import ConfigError, RecordingError
-from q2r2_control.export.csv_tables import load_vectors, write_vectors
 from q2r2_control.export.episodes import FrameSampling
 from q2r2_control.export.kept_episodes import keep_episodes
 from tests.export.runs import Run, contents, record_step
+from tests.export.vectors import load_vectors, write_vectors
 
 pytestmark = pytest.mark.slow
 
@@ -51,7 +51,7 @@ def test_an_interrupted_export_goes_on_with_what_it_had(run: Run, tmp_path: Path
     assert made.kept[0] == first
     assert first.stat().st_mtime_ns == made_at
     # An episode that was not finished, and other options, are made anew.
-    first.rename(first.with_suffix(".unfinished"))
+    first.rename(first.with_name(f"{first.name}.unfinished"))
     keep_episodes(files, FrameSampling(), write_vectors, kept)
     assert load_vectors(first).frames == load_vectors(made.kept[1]).frames
     other = keep_episodes(files[:1], FrameSampling(fps=10), write_vectors, kept)
@@ -65,7 +65,8 @@ def test_a_worker_that_is_killed_is_one_line_and_the_next_export_goes_on(run: Ru
     *others, last = keep_episodes(files, FrameSampling(), write_vectors, kept).kept
     last.unlink()
     made_at = [other.stat().st_mtime_ns for other in others]
-    os.mkfifo(last.with_suffix(".unfinished"))  # nobody reads it, so a worker is in the middle of its episode for good
+    unfinished = last.with_name(f"{last.name}.unfinished")
+    os.mkfifo(unfinished)  # nobody reads it, so a worker is in the middle of its episode for good
 
     def kill(done: int) -> None:
         if done == len(others):
@@ -75,7 +76,7 @@ def test_a_worker_that_is_killed_is_one_line_and_the_next_export_goes_on(run: Ru
     with pytest.raises(ConfigError, match="a process of --workers was killed") as fault:
         keep_episodes(files, FrameSampling(), write_vectors, kept, workers=2, progress=kill)
     assert "\n" not in str(fault.value)
-    last.with_suffix(".unfinished").unlink()
+    unfinished.unlink()
     assert keep_episodes(files, FrameSampling(), write_vectors, kept, workers=2).kept == [*others, last]
     assert [other.stat().st_mtime_ns for other in others] == made_at
 

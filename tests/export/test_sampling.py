@@ -10,7 +10,6 @@ import pytest
 
 from q2r2_control.errors import RecordingError
 from q2r2_control.export.sampling import sample
-from q2r2_control.recording import topics as names
 from q2r2_control.recording.reader import Recording
 from tests.export.files import write_recording
 
@@ -108,7 +107,7 @@ def test_a_recording_without_a_tick_is_an_error(tmp_path: Path) -> None:
 
 def test_openings_are_of_the_arms_they_are_named_by(tmp_path: Path) -> None:
     times = [MS * place for place in range(3)]
-    grippers = [(0.1, 0.2, 0.3, 0.4, 0.5, 0.6)] * 3  # of each arm wanted, commanded, measured
-    file = write_recording(tmp_path / "a.mcap", times, changes={(names.GRIPPERS, "data"): grippers})
-    frames = sample(Recording(file), fps=1000)
+    openings = {"wanted": (0.1, 0.4), "commanded": (0.2, 0.5), "opening": (0.3, 0.6)}
+    frames = sample(Recording(write_recording(tmp_path / "a.mcap", times, openings=openings)), fps=1000)
     assert frames["gripper"].tolist() == [[0.2, 0.5]] * 3
+    assert frames["opening"].tolist() == [[0.3, 0.6]] * 3

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
@@ -44,3 +46,14 @@ class Waves:
 def with_pictures(plain: EpisodeVectors, seed: int) -> EpisodeVectors:
     """The same episode, seen by a camera."""
     return replace(plain, cameras={CAMERA: Waves(plain.frames, seed)})  # type: ignore[dict-item]
+
+
+def write_vectors(episode: EpisodeVectors, path: Path) -> None:
+    """Keep an episode, as the formats do."""
+    path.write_bytes(pickle.dumps(replace(episode, cameras={})))
+
+
+def load_vectors(path: Path) -> EpisodeVectors:
+    """An episode that was kept so."""
+    episode: EpisodeVectors = pickle.loads(path.read_bytes())
+    return episode

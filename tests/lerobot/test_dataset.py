@@ -17,7 +17,6 @@ import pytest
 pytest.importorskip("lerobot", reason="make test-lerobot installs it")
 
 import pyarrow.parquet
-import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from q2r2_control.export.episodes import EpisodeVectors
@@ -85,38 +84,18 @@ def test_every_episode_has_its_frames_its_task_and_its_recording(dataset: Path) 
     ]
 
 
-def test_statistics_are_those_of_all_frames(dataset: Path) -> None:
-    found = json.loads((dataset / "meta" / "stats.json").read_text())["action"]
-    everything = np.concatenate([episode.vectors["action"] for episode in EPISODES]).astype(np.float64)
-    assert found["count"] == [125]
-    for name in ("min", "max", "mean", "std"):
-        np.testing.assert_allclose(found[name], getattr(everything, name)(axis=0), atol=1e-5)
-
-
-def test_the_loader_reads_every_frame_and_its_neighbours(dataset: Path) -> None:
+def test_the_loader_reads_every_frame_its_neighbours_the_ends_and_the_successes(dataset: Path) -> None:
     ahead = [(index + 1) / FPS for index in range(4)]
     loaded = LeRobotDataset("q2r2/test", root=dataset, delta_timestamps={"action": ahead})
     assert (loaded.num_episodes, loaded.num_frames, loaded.fps) == (3, 125, FPS)
     item = loaded[41]
     assert item["task"] == "circle"
     np.testing.assert_array_equal(item["action"].numpy(), EPISODES[1].vectors["action"][2:6])
-    assert loaded[64]["action_is_pad"].all()
-
-
-def test_batches_come_out_of_a_dataloader_with_the_ends_and_the_successes(dataset: Path) -> None:
-    batches = list(torch.utils.data.DataLoader(LeRobotDataset("q2r2/test", root=dataset), batch_size=50))
-    assert [len(batch["index"]) for batch in batches] == [50, 50, 25]
-    for name in NAMES:
-        found = torch.cat([batch[name] for batch in batches]).numpy()
-        np.testing.assert_array_equal(found, np.concatenate([episode.vectors[name] for episode in EPISODES]))
-    done, success = (torch.cat([batch[name] for batch in batches]).flatten() for name in ("next.done", "next.success"))
-    assert torch.nonzero(done).flatten().tolist() == [39, 64, 124]
-    assert torch.nonzero(success).flatten().tolist() == [39]
-
-
-def test_one_episode_of_them_can_be_loaded(dataset: Path) -> None:
-    loaded = LeRobotDataset("q2r2/test", root=dataset, episodes=[1])
-    assert (len(loaded), int(loaded[0]["index"])) == (25, 40)
+    items = [loaded[index] for index in range(125)]
+    found = np.stack([item["observation.state"].numpy() for item in items])
+    np.testing.assert_array_equal(found, np.concatenate([one.vectors["observation.state"] for one in EPISODES]))
+    assert [index for index, item in enumerate(items) if item["next.done"]] == [39, 64, 124]
+    assert [index for index, item in enumerate(items) if item["next.success"]] == [39]
 
 
 def test_the_loader_gives_every_frame_its_picture(film: Path) -> None:

@@ -13,10 +13,19 @@ import numpy as np
 from q2r2_control import Robot
 from q2r2_control.config.cell import Config
 from q2r2_control.events import Event, Reason, ReasonKind
-from q2r2_control.inputs.messages import Dialect, message_types
 from q2r2_control.recording import topics as names
 from q2r2_control.recording.about import ROS, About, as_yaml
-from q2r2_control.recording.message_recorder import ROOM, MessageRecorder, ReceivedMessage
+from q2r2_control.recording.base_recorder import ROOM, MessageRecorder
+from q2r2_control.recording.messages import (
+    TEXT,
+    Message,
+    float_array,
+    joint_state,
+    joint_trajectory,
+    make,
+    pose_stamped,
+    serialized,
+)
 from q2r2_control.recording.ros_topics import (
     CONTROLLER_TICK,
     RECORDER_EVENTS,
@@ -30,7 +39,6 @@ from tests.support.watch import cell
 
 PERIOD = 4_000_000  # of ticks [ns]
 LATENCY = 100_000  # from a tick to the receipt of what it sends [ns]
-STORE = message_types(Dialect.ROS2)
 
 
 class NodesOnFile:
@@ -61,11 +69,9 @@ class NodesOnFile:
         return self.recorder.file
 
     def put(self, topic: str, at: int, message: Any) -> None:
-        payload = bytes(STORE.serialize_cdr(message, self.topics[topic].type))
         self._number += 1
-        self.recorder.record(
-            [ReceivedMessage(self.epoch + at, self.topics[topic], self._number, self.epoch + at, payload)]
-        )
+        time, payload = self.epoch + at, serialized(self.topics[topic].type, message)
+        self.recorder.record([Message(self.topics[topic].channel, self._number, time, time, payload)])
 
     def joint_states(self, at: int, q: Array, extra: Iterable[str] = ("left_finger_joint_1",)) -> None:
         """Joints in another order than the robot's, and some that are not its own."""
@@ -75,37 +81,31 @@ class NodesOnFile:
         self.put(
             names.JOINT_STATES,
             at,
-            _make("sensor_msgs/msg/JointState", _header(self.epoch + at), order, position, 0 * position, 0 * position),
+            joint_state(order, position, 0 * position, 0 * position),
         )
 
     def tick(self, at: int, index: int, q: Array, v: Array | None = None, **values: float) -> None:
         """A tick of the controller: its reference, and what it says of it."""
         now = (self.epoch + at) * 1e-9
         zero = np.zeros(len(self.joints))
-        none = np.empty(0)
-        point = _make(
-            "trajectory_msgs/msg/JointTrajectoryPoint",
-            *(q, zero if v is None else v, zero, none, _make("builtin_interfaces/msg/Duration", 0, 0)),
-        )
-        stamp = _header(round(now * 1e9))
-        self.put(
-            names.REFERENCE,
-            at + LATENCY,
-            _make("trajectory_msgs/msg/JointTrajectory", stamp, list(self.joints), [point]),
-        )
+        reference = joint_trajectory(list(self.joints), q, zero if v is None else v, zero, round(now * 1e9))
+        self.put(names.REFERENCE, at + LATENCY, reference)
         numbers = dict.fromkeys(tick_fields(self.arms), 0.0)
         numbers |= {"index": index, "now": now, "dt": PERIOD * 1e-9, "step": PERIOD * 1e-9, "certified": 1.0}
         numbers |= {"closest_distance": 0.2, "margin": 0.18} | values
-        self.put(CONTROLLER_TICK, at + LATENCY, _array([float(number) for number in numbers.values()]))
+        self.put(CONTROLLER_TICK, at + LATENCY, float_array(np.array(list(numbers.values()))))
 
     def flags(self, at: int, arm: str, engaged: bool, wanted: float = 1.0, measured: float = 1.0) -> None:
-        self.put(arm_flags(arm), at, _array([float(engaged), 0.0, 0.0, wanted, measured]))
+        self.put(arm_flags(arm), at, float_array(np.array([engaged, 0.0, 0.0, wanted, measured])))
 
     def target(self, at: int, arm: str, x: float) -> None:
-        self.put(names.target(arm), at, _pose(self.epoch + at, x))
+        self.put(names.target(arm), at, self._pose(at, x))
 
     def hand(self, at: int, hand: str, x: float) -> None:
-        self.put(names.hand_pose(hand), at, _pose(self.epoch + at, x))
+        self.put(names.hand_pose(hand), at, self._pose(at, x))
+
+    def _pose(self, at: int, x: float) -> Any:
+        return pose_stamped(np.array([x, 0.0, 0.5, 0.0, 0.0, 0.0, 1.0]), stamp=self.epoch + at)
 
     def event(
         self, at: int, kind: ReasonKind, arm: str | None = "left", source: str = "", destination: str = ""
@@ -113,23 +113,4 @@ class NodesOnFile:
         """Of an arm, or of the recorder's services."""
         topic = RECORDER_EVENTS if arm is None else arm_events(arm)
         event = Event(123.0, arm or "", source, destination, Reason(kind))  # its sender's clock is not used
-        self.put(topic, at, _make("std_msgs/msg/String", json.dumps(event.as_json())))
-
-
-def _make(kind: str, *values: Any) -> Any:
-    return STORE.types[kind](*values)
-
-
-def _header(stamp: int) -> Any:
-    seconds, rest = divmod(stamp, 1_000_000_000)
-    return _make("std_msgs/msg/Header", _make("builtin_interfaces/msg/Time", seconds, rest), "world")
-
-
-def _array(numbers: list[float]) -> Any:
-    return _make("std_msgs/msg/Float64MultiArray", _make("std_msgs/msg/MultiArrayLayout", [], 0), np.array(numbers))
-
-
-def _pose(stamp: int, x: float) -> Any:
-    place = _make("geometry_msgs/msg/Point", x, 0.0, 0.5)
-    pose = _make("geometry_msgs/msg/Pose", place, _make("geometry_msgs/msg/Quaternion", 0.0, 0.0, 0.0, 1.0))
-    return _make("geometry_msgs/msg/PoseStamped", _header(stamp), pose)
+        self.put(topic, at, make(TEXT, json.dumps(event.as_json())))

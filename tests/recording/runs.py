@@ -5,17 +5,9 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-import zlib
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
-
-import zstandard
-from mcap.data_stream import RecordBuilder
-from mcap.records import Chunk, DataEnd, Footer, McapRecord, Metadata, MetadataIndex
-from mcap.stream_reader import StreamReader, get_chunk_data_stream
-from mcap.writer import MCAP0_MAGIC
 
 from q2r2_control.inputs.base import Input
 from q2r2_control.inputs.scripted import ScriptedInput
@@ -23,11 +15,17 @@ from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.plants.base import Plant
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.recording.about import About
+from q2r2_control.recording.bag import BagWriter
 from q2r2_control.recording.helper_process import HelperProcess
+from q2r2_control.recording.messages import Message
+from q2r2_control.recording.reader import Recording
 from q2r2_control.recording.recorder import ROOM, Recorder, RecordingSummary
+from q2r2_control.recording.tick_rows import tick_labels
 from tests.support.watch import cell
 
 ROOT = Path(__file__).resolve().parents[2]
+ARMS = ("left", "right")
+JOINTS = tuple(f"{arm}_A{number}" for arm in ARMS for number in range(1, 8))
 RATE = 500.0  # [Hz], the lowest with one substep a tick, since most of a test's time goes by ticks
 
 
@@ -114,35 +112,23 @@ def file_of(summary: RecordingSummary) -> Path:
     return Path(summary.file)
 
 
-def rewrite(file: Path, target: Path, change: Callable[[bytearray], None]) -> Path:
-    """A copy whose messages were changed, with checksums that fit, and an end of the run that is found."""
-    written, builder = bytearray(MCAP0_MAGIC), RecordBuilder()
-    places: dict[str, int] = {}
-    summary = 0
-    with file.open("rb") as stream:
-        for record in StreamReader(stream, emit_chunks=True).records:
-            changed: McapRecord = record
-            if isinstance(record, Chunk):
-                data, size = get_chunk_data_stream(record)
-                content = bytearray(data.read(size))
-                change(content)
-                changed = Chunk(
-                    "zstd",
-                    zstandard.compress(bytes(content)),
-                    record.message_end_time,
-                    record.message_start_time,
-                    zlib.crc32(content),
-                    size,
-                )
-            elif isinstance(record, Metadata):
-                places[record.name] = len(written)
-            elif isinstance(record, MetadataIndex):
-                changed = replace(record, offset=places[record.name])
-            elif isinstance(record, Footer) and record.summary_start:
-                changed = replace(record, summary_start=summary)
-            changed.write(builder)
-            written += builder.end()
-            if isinstance(record, DataEnd):
-                summary = len(written)
-    target.write_bytes(written + MCAP0_MAGIC)
+def rewrite(file: Path, target: Path, change: Callable[[str, Message], Message | None], *, whole: bool = True) -> Path:
+    """A copy in which each message is what ``change`` makes of it and its topic; None: it is not there.
+
+    Not ``whole``: it ends as where its writer was killed.
+    """
+    recording = Recording(file)
+    topics = recording.declared_topics
+    with BagWriter(target, topics.values(), recording.about) as bag:
+        for messages in recording.messages():
+            changed = (change(topics[message.channel].name, message) for message in messages)
+            bag.write(message for message in changed if message is not None)
+            bag.flush()
+        if whole:
+            bag.close(recording.conclusion)
     return target
+
+
+def number_of(label: str) -> int:
+    """The place of a number in the rows of the cell's ticks."""
+    return tick_labels(ARMS, JOINTS).index(label)

@@ -4,10 +4,6 @@ from __future__ import annotations
 
 import json
 import logging
-import os
-import subprocess
-import sys
-import textwrap
 import time
 import tracemalloc
 from dataclasses import replace as changed
@@ -20,14 +16,14 @@ import yaml
 
 from q2r2_control.config.cell import parse_config
 from q2r2_control.recording.about import About
-from q2r2_control.recording.packing import TickPacker
 from q2r2_control.recording.reader import Recording
 from q2r2_control.recording.recorder import Recorder
 from q2r2_control.recording.replay import replay
-from q2r2_control.recording.topics import Topics, filtered_hand, target
+from q2r2_control.recording.tick_rows import PackedTick, TickPacker
+from q2r2_control.recording.topics import run_topics
 from q2r2_control.recording.writer import TickBatch
 from q2r2_control.summary.tick import Tick
-from tests.recording.runs import RATE, file_of, pipeline, read_elsewhere, record, writer_of
+from tests.recording.runs import ARMS, JOINTS, RATE, file_of, pipeline, read_elsewhere, record, writer_of
 
 pytestmark = pytest.mark.slow
 
@@ -46,10 +42,11 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Tick]
 def test_every_topic_opens_with_rosbags_in_another_process(tmp_path: Path, recorded: tuple[Path, list[Tick]]) -> None:
     file, ticks = recorded
     found = read_elsewhere(file.parent, tmp_path)
-    topics = Topics(("left", "right"), ())
-    assert {name: entry["type"] for name, entry in found.items()} == {topic.name: topic.type for topic in topics.all}
+    assert {name: entry["type"] for name, entry in found.items()} == {
+        name: topic.type for name, topic in run_topics(ARMS, JOINTS).items()
+    }
     every = len(ticks)
-    for name in ("/q2r2/tick", "/joint_states", "/q2r2/external_torque", "/joint_commands", "/q2r2/flags"):
+    for name in ("/q2r2/tick", "/joint_states", "/q2r2/external_torque", "/joint_commands", "/q2r2/reference"):
         assert found[name]["count"] == every
     samples = [sample for tick in ticks for sample in tick.samples]
     assert found["/q2r2/hand_samples"]["count"] == len(samples)
@@ -66,10 +63,9 @@ def test_every_topic_opens_with_rosbags_in_another_process(tmp_path: Path, recor
 
 def test_the_filtered_hand_is_recorded_that_each_target_is_made_of(recorded: tuple[Path, list[Tick]]) -> None:
     file, ticks = recorded
-    poses, targets = (
-        np.concatenate([chunk.rows[topic]["position"] for chunk in Recording(file).chunks() if topic in chunk.rows])
-        for topic in (filtered_hand("left"), target("left"))
-    )
+    arms = np.concatenate([chunk.rows["arms"] for chunk in Recording(file).chunks()])[:, 0]
+    asked = arms["target"].any(axis=1)
+    poses, targets = arms["filtered_hand"][asked, :3], arms["target"][asked, :3]
     led = [tick.targets["left"] for tick in ticks if tick.targets["left"].pose is not None]
     assert len(poses) == len(led) > 50
     np.testing.assert_array_equal(poses, [one.hand.translation for one in led if one.hand is not None])
@@ -85,7 +81,7 @@ def test_a_clock_that_is_set_back_during_a_run_changes_no_time_in_the_file(
     hours = count(1_700_000_000_000_000_000, -3_600_000_000_000)
     monkeypatch.setattr(time, "time_ns", lambda: next(hours))
     file = file_of(record(tmp_path, pipeline(), 0.5))
-    times = np.concatenate([chunk.rows["/q2r2/tick"]["log_time"] * 1e-9 for chunk in Recording(file).chunks()])
+    times = np.concatenate([chunk.times * 1e-9 for chunk in Recording(file).chunks()])
     np.testing.assert_allclose(np.diff(times), 1.0 / RATE, atol=1e-6)
 
 
@@ -126,26 +122,9 @@ def test_a_folder_that_cannot_be_written_is_one_line_and_the_run_goes_on(
     assert summary.lost_ticks >= 0.2 * RATE
 
 
-def run_program(program: str, *arguments: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-c", textwrap.dedent(program), *arguments],
-        cwd=ROOT, env={**os.environ, "PYTHONPATH": str(ROOT)}, capture_output=True, text=True, timeout=300,
-    )  # fmt: skip
-
-
-def test_two_processes_that_record_at_once_get_a_folder_each(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    program = """
-        import sys, time
-        time.time_ns = lambda: 1_700_000_000_000_000_000
-        from pathlib import Path
-        from tests.recording.runs import pipeline, record
-        print(record(Path(sys.argv[1]), pipeline(), 0.2).file)
-    """
+def test_runs_that_begin_within_one_second_get_a_folder_each(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(time, "time_ns", lambda: 1_700_000_000_000_000_000)
-    files = [file_of(record(tmp_path, pipeline(), 0.2)) for _ in range(2)]
-    result = run_program(program, str(tmp_path))
-    assert result.returncode == 0, result.stderr
-    files.append(Path(result.stdout.strip()))
+    files = [file_of(record(tmp_path, pipeline(), 0.2)) for _ in range(3)]
     assert len({file.parent for file in files}) == len(list(tmp_path.iterdir())) == 3
     for file in files:
         assert replay(file).difference is None
@@ -155,7 +134,7 @@ class Broken(TickPacker):
     def __init__(self) -> None:
         pass
 
-    def pack(self, number: int, tick: Tick) -> bytes:
+    def pack(self, number: int, tick: Tick) -> PackedTick:
         raise ZeroDivisionError("of the packer")
 
 
@@ -165,7 +144,7 @@ def test_a_recorder_that_fails_inside_does_not_end_the_run(
 ) -> None:
     def spoil(recorder: Recorder) -> None:
         if side == "the writer's":
-            writer_of(recorder).send(TickBatch([b"no tick"]))
+            writer_of(recorder).send(TickBatch([PackedTick(b"no tick", b"", "")]))
         else:
             recorder._packer = Broken()
 

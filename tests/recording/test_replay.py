@@ -4,28 +4,27 @@ from __future__ import annotations
 
 from dataclasses import replace as changed
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
-from q2r2_control.config.cell import Config
 from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.control.qp import QpProblem, QpSolution, Solver, make_solver
 from q2r2_control.errors import ConfigError, PlantError, RecordingError
 from q2r2_control.inputs.scripted import ScriptedInput
 from q2r2_control.judging.judge import judge
 from q2r2_control.plants.kinematic import KinematicPlant
+from q2r2_control.recording.messages import Message
 from q2r2_control.recording.reader import Recording
 from q2r2_control.recording.recorder import Recorder
 from q2r2_control.recording.replay import replay
-from q2r2_control.recording.rows import HEAD, MESSAGE
+from q2r2_control.recording.tick_rows import SAMPLE_FIELDS
+from q2r2_control.recording.topics import SAMPLES, STATE, TICK
 from q2r2_control.robot.robot import Robot
 from q2r2_control.summary.tick import Tick
 from q2r2_control.types import HandFault, HandSample, RobotState
-from tests.recording.runs import RATE, file_of, pipeline, record, rewrite
+from tests.recording.runs import RATE, file_of, number_of, pipeline, record, rewrite
 from tests.support.object_cell import cell as object_cell
-from tests.support.reasons import kinds
 from tests.support.watch import cell
 
 pytestmark = pytest.mark.slow
@@ -122,7 +121,7 @@ def test_what_a_gripper_holds_is_replayed(tmp_path: Path) -> None:
 
 
 class FaultyHands(ScriptedInput):
-    """Loses its connection for a moment, and sends what is no pose, and hands that nobody has."""
+    """Loses its connection for a moment, sends no poses, hands that nobody has, and a fault of its left hand."""
 
     @property
     def connected(self) -> bool:
@@ -133,32 +132,22 @@ class FaultyHands(ScriptedInput):
         samples = super().poll(now)
         if 0.9 <= now < 0.95:
             samples = [changed(sample, position=np.array([np.nan, np.inf, -0.0])) for sample in samples]
+        faults = {"left": HandFault.FROZEN if now > 1.1 else None}
+        samples = [changed(sample, fault=faults.get(sample.hand)) for sample in samples]
         return samples + [changed(sample, hand="third") for sample in samples]
 
     _now = 0.0
 
 
-def test_lost_connections_and_numbers_that_are_none_are_replayed(tmp_path: Path) -> None:
-    result = replay(file_of(record(tmp_path, pipeline(source=FaultyHands("circle")), 1.2)))
+def test_lost_connections_numbers_that_are_none_and_faults_that_the_input_found_are_replayed(tmp_path: Path) -> None:
+    file = file_of(record(tmp_path, pipeline(source=FaultyHands("circle")), 1.3))
+    result = replay(file)
     assert result.difference is None
     assert result.summary is not None
+    samples = np.concatenate([chunk.samples for chunk in Recording(file).chunks()])
+    assert set(samples[:, SAMPLE_FIELDS.index("fault")]) == {0.0, 1.0}
+    assert np.isnan(samples[:, SAMPLE_FIELDS.index("x")]).any()
     assert "pose_unusable" in [event.kind for event in result.summary.events if event.destination == "lost"]
-
-
-class FrozenHands(ScriptedInput):
-    """Finds a fault in its own left hand."""
-
-    def poll(self, now: float) -> list[HandSample]:
-        faults = {"left": HandFault.FROZEN if now > 0.9 else None}
-        return [changed(sample, fault=faults.get(sample.hand)) for sample in super().poll(now)]
-
-
-def test_a_fault_that_the_input_found_is_replayed(tmp_path: Path) -> None:
-    result = replay(file_of(record(tmp_path, pipeline(source=FrozenHands("circle")), 1.2)))
-    assert result.difference is None
-    assert result.summary is not None
-    lost = [kinds(event.reason) for event in result.summary.events if event.destination == "lost"]
-    assert lost == ["hand_frozen", "linked: hand_frozen"]
 
 
 class LosesItsSensors(KinematicPlant):
@@ -206,57 +195,40 @@ def test_solutions_that_came_too_late_are_too_late_again(tmp_path: Path) -> None
     assert result.summary.fallback_ticks > 50
 
 
-def flip(file: Path, target: Path, topic: str, label: str) -> Path:
+def flip(file: Path, target: Path, topic: str, place: int) -> Path:
     """A copy in which a low bit of one number is flipped, in the first message of a topic after one second."""
-    row = Recording(file).topics.by_name[topic]
-    assert row.row is not None
-    assert row.row.dtype.fields is not None
-    begin = row.row.dtype.fields["data"][1] + 8 * row.labels["data"].index(label)
     flipped: list[int] = []
 
-    def change(chunk: bytearray) -> None:
-        at = 0
-        while at < len(chunk) and not flipped:
-            opcode, length, channel, number, *_ = HEAD.unpack_from(chunk.ljust(at + HEAD.size), at)
-            if opcode == MESSAGE and channel == row.channel and number >= 1.0 * RATE:
-                chunk[at + begin + 1] ^= 1
-                flipped.append(number)
-            at += 9 + length
+    def change(name: str, message: Message) -> Message:
+        if name != topic or message.number < 1.0 * RATE or flipped:
+            return message
+        flipped.append(message.number)
+        payload = bytearray(message.payload)
+        payload[20 + 8 * place + 1] ^= 1
+        return message._replace(payload=bytes(payload))
 
     copy = rewrite(file, target, change)
     assert flipped
     return copy
 
 
-def test_a_flipped_bit_in_a_sample_is_the_first_difference(tmp_path: Path, circle: Path) -> None:
-    result = replay(flip(circle, tmp_path / "flipped.mcap", "/q2r2/hand_samples", "x"))
+@pytest.mark.parametrize(
+    ("topic", "place", "at", "said"),
+    [
+        (SAMPLES, SAMPLE_FIELDS.index("x"), 1.0, "left.filtered_hand.x: recorded "),
+        (TICK, number_of("dt"), 1.002, "step: recorded 0.002, replayed 0.00199"),
+        (STATE, 1, 1.4, "states: recorded {'left': 'dngaged', "),  # its first letter
+    ],
+    ids=["a sample", "the time of a tick", "the state in words"],
+)
+def test_a_flipped_bit_is_the_first_difference(
+    tmp_path: Path, circle: Path, topic: str, place: int, at: float, said: str
+) -> None:
+    result = replay(flip(circle, tmp_path / "flipped.mcap", topic, place))
     assert result.difference is not None
     time, _, rest = result.difference.partition(" s: ")
-    assert float(time) == pytest.approx(1.0, abs=0.02)
-    assert rest.startswith("/q2r_left_hand_pose: position[x]: recorded ")
-    assert "replayed" in rest
-
-
-def test_a_flipped_bit_in_the_time_of_a_tick_is_the_first_difference(tmp_path: Path, circle: Path) -> None:
-    result = replay(flip(circle, tmp_path / "flipped.mcap", "/q2r2/tick", "dt"))
-    assert result.difference is not None
-    assert result.difference.startswith("1.002000 s: /q2r2/tick: data[step]: recorded 0.002, replayed 0.00199")
-
-
-def changed_filter(config: Config) -> Config:
-    teleop: Any = config.teleop
-    smoother = teleop.filter.model_copy(update={"smoothing_delay": teleop.filter.smoothing_delay + 0.02})
-    return config.model_copy(update={"teleop": teleop.model_copy(update={"filter": smoother})})
-
-
-def test_another_filter_is_named_and_so_is_the_first_difference(circle: Path) -> None:
-    config = changed_filter(cell().model_copy(update={"loop_rate_hz": RATE}))
-    result = replay(circle, config)
-    assert [note.split(" ")[1] for note in result.notes] == ["teleop.filter.smoothing_delay:"]
-    assert result.difference is not None
-    time, _, rest = result.difference.partition(" s: ")
-    assert 1.2 < float(time) < 1.4  # where the hand begins to move
-    assert rest.startswith("/q2r2/left/filtered_hand_pose: position")
+    assert float(time) == pytest.approx(at, abs=0.4 if topic == STATE else 0.02)
+    assert rest.startswith(said)
 
 
 def test_a_file_that_is_no_recording_is_one_line(tmp_path: Path, circle: Path) -> None:

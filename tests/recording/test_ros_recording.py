@@ -20,10 +20,10 @@ from q2r2_control.export.episodes import FrameSampling, make_episode
 from q2r2_control.judging.judge import judge
 from q2r2_control.recording import topics as names
 from q2r2_control.recording.episode_spans import read_spans
+from q2r2_control.recording.reader import TickChunk
 from q2r2_control.recording.replay import replay
 from q2r2_control.recording.ros_recording import open_recording
 from q2r2_control.recording.ros_topics import arm_flags
-from q2r2_control.recording.ticks import ChunkTicks, ticks_of
 from tests.recording.ros_runs import PERIOD, NodesOnFile
 from tests.recording.runs import read_elsewhere
 from tests.support.external_cell import external
@@ -47,8 +47,8 @@ def play(nodes: NodesOnFile, count: int = 250, first: int = 5, index: int = 1, e
         nodes.tick(at, index + place - first, home + 1e-3 * place)
 
 
-def ticks_in(path: Path) -> list[ChunkTicks]:
-    return list(ticks_of(open_recording(path)))
+def ticks_in(path: Path) -> list[TickChunk]:
+    return [chunk for chunk in open_recording(path).chunks() if len(chunk.rows)]
 
 
 def wait_for(condition: Callable[[], bool]) -> None:
@@ -89,13 +89,13 @@ def test_a_tick_has_the_reference_of_its_time_and_what_had_been_received_by_then
     (ticks,) = ticks_in(nodes.close())
     assert ticks.numbers.tolist() == list(range(100))
     places = np.arange(5, 105)
-    assert ticks.rows(names.REFERENCE)["positions"] == pytest.approx(home + 1e-3 * places[:, None])
-    assert ticks.rows(names.JOINT_STATES)["position"] == pytest.approx(home + 1e-3 * (places[:, None] - 1))
-    engaged = ticks.of_arms(names.FLAGS, "engaged")[:, 0] > 0.5
+    assert ticks.rows["reference_q"] == pytest.approx(home + 1e-3 * places[:, None])
+    assert ticks.rows["q"] == pytest.approx(home + 1e-3 * (places[:, None] - 1))
+    engaged = ticks.rows["arms"]["engaged"][:, 0] > 0.5
     assert np.flatnonzero(engaged).tolist() == list(range(35, 55))
-    targets = ticks.targets(otherwise=np.full((100, 2, 7), -1.0))[:, 0, 0]
+    targets = ticks.rows["arms"]["target"][:, 0, 0]
     assert targets[engaged].tolist() == list(range(40, 60))
-    assert (targets[~engaged] == -1.0).all()
+    assert not targets[~engaged].any()
 
 
 def test_a_tick_whose_reference_was_lost_counts_as_lost_and_what_happened_in_it_does_not(nodes: NodesOnFile) -> None:
@@ -108,7 +108,7 @@ def test_a_tick_whose_reference_was_lost_counts_as_lost_and_what_happened_in_it_
     play(nodes, 10, first=16, index=12)
     (ticks,) = ticks_in(nodes.close())
     assert ticks.numbers.tolist() == [*range(10), *range(11, 21)]
-    assert len(ticks.chunk.texts[names.STATE]) == 1
+    assert len(ticks.states) == 1
 
 
 def test_a_controller_that_was_started_again_begins_with_the_next_number(nodes: NodesOnFile) -> None:

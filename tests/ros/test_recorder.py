@@ -28,11 +28,13 @@ from std_msgs.msg import String
 from q2r2_control.errors import RecordingError
 from q2r2_control.judging.judge import judge
 from q2r2_control.recording.episode_spans import read_spans
+from q2r2_control.recording.messages import Message
 from q2r2_control.recording.reader import Recording
 from q2r2_control.recording.ros_recording import open_recording
 from q2r2_control.recording.ros_topics import RECORDER_EVENTS
-from q2r2_control.recording.rows import HEAD, channel_of
+from q2r2_control.recording.writer import FLUSH_PERIOD
 from q2r2_control.ros.base_node import RECORDED_QOS, STREAM_QOS
+from q2r2_control.ros.nodes.recorder import HANDOVER_PERIOD
 from q2r2_control.teleop.haptics import (
     EPISODE_BEGINS,
     EPISODE_DISCARDED,
@@ -77,14 +79,20 @@ class RunningRecorder:
         wait_until(lambda: self._newest(topic).startswith(begin), "the last message is in the file")
 
     def _newest(self, topic: str) -> bytes:
-        """The newest message in the file, which is being written; empty while there is none."""
+        """The newest message in the file; empty while there is none."""
+        records = self._records(topic)
+        return records[-1].payload if records else b""
+
+    def count(self, topic: str) -> int:
+        """How many messages are in the file, while it is being written."""
+        return len(self._records(topic))
+
+    def _records(self, topic: str) -> list[Message]:
         try:
             recording = open_recording(self._folder)
-            channels = [one.channel for one in recording.declared_topics.values() if one.name == topic]
-            records = [record for chunk in recording.messages() for record in chunk if channel_of(record) in channels]
+            return [message for messages in recording.messages((topic,)) for message in messages]
         except RecordingError:  # in the middle of a write
-            return b""
-        return records[-1][HEAD.size :] if records else b""
+            return []
 
     @property
     def folder(self) -> Path:
@@ -199,12 +207,20 @@ def felt(rig: ArmRig, pulse: Pulse) -> None:
 
 @pytest.mark.alone
 def test_a_killed_recorder_leaves_a_file_that_its_writer_closes(recorder: RunningRecorder, node: Any) -> None:
-    """A kill costs the newest messages, which the recorder has not handed to its writer."""
+    """A kill costs what the node has not handed over yet, and with the writer the chunk that it has not written yet."""
     record_poses(recorder, node, 100)
-    folder = recorder.folder
+    folder, written = recorder.folder, recorder.count(HAND)
+    publisher = node.create_publisher(PoseStamped, HAND, STREAM_QOS)
+    sent = time.time_ns()
+    while time.time_ns() - sent < 1_000_000_000:
+        publisher.publish(PoseStamped())
+        time.sleep(0.002)
+    killed = time.time_ns()
     os.kill(recorder.process.pid, signal.SIGKILL)
     wait_until(lambda: is_closed(folder), "the file is closed")
-    assert read_elsewhere(folder, folder.parent)[HAND]["count"] >= 50
+    poses = read_elsewhere(folder, folder.parent)[HAND]
+    assert poses["count"] > written
+    assert poses["last"] > killed - 1e9 * (2 * HANDOVER_PERIOD + FLUSH_PERIOD)
 
 
 def is_closed(folder: Path) -> bool:

@@ -13,7 +13,7 @@ import yaml
 from rosbags.typesys import Stores, get_typestore
 
 from q2r2_control import Robot
-from q2r2_control.recording.topics import Topic, Topics
+from q2r2_control.recording.topics import Topic, run_topics
 from tests.ros.cell import PATIENT, start_controller, start_robot
 from tests.ros.conftest import need_ros
 from tests.ros.processes import ROOT, Processes
@@ -66,7 +66,7 @@ def foxglove_paths() -> list[str]:
 
 @pytest.fixture(scope="module")
 def recorded(robot: Robot) -> dict[str, Topic]:
-    return Topics(tuple(robot.arms), robot.joint_names).by_name
+    return run_topics(tuple(robot.arms), robot.joint_names)
 
 
 def check_field(topic: Topic, fields: list[str]) -> None:
@@ -77,7 +77,7 @@ def check_field(topic: Topic, fields: list[str]) -> None:
         name, _, index = field.partition("[")
         detail = dict(store.fielddefs[kind][1])[name][1]
         if index:
-            assert name not in topic.labels or int(index.rstrip("]")) < len(topic.labels[name])
+            assert not topic.labels or int(index.rstrip("]")) < len(topic.labels)
             detail = detail[0][1]
         kind = detail if isinstance(detail, str) else detail[0]
     assert kind == "float64"

@@ -28,7 +28,8 @@ from q2r2_control.errors import ConfigError
 from q2r2_control.events import Event, Reason, ReasonKind
 from q2r2_control.judging.episode_judge import EpisodeJudge
 from q2r2_control.recording.about import ROS, About, as_yaml, program
-from q2r2_control.recording.message_recorder import ROOM, ROOM_WITH_PICTURES, MessageRecorder, ReceivedMessage
+from q2r2_control.recording.base_recorder import ROOM, ROOM_WITH_PICTURES, MessageRecorder
+from q2r2_control.recording.messages import Message
 from q2r2_control.recording.ros_topics import RECORDER_EVENTS, arm_events, heard_on, is_latched, is_reliable, ros_topics
 from q2r2_control.recording.topics import Topic
 from q2r2_control.robot.robot import Robot
@@ -45,7 +46,7 @@ _SERVICES = {
     "failure": ReasonKind.EPISODE_FAILED,
     "mark": ReasonKind.MARK,
 }
-_PERIOD = 0.02  # between two looks at what has arrived [s]
+HANDOVER_PERIOD = 0.02  # between two looks at what has arrived; a message waits for two of them at most [s]
 _STREAM_QOS = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
@@ -75,7 +76,7 @@ class RecorderNode(BaseNode):
         self._marks = EpisodeMarks()
         self._served = 0
         self._served_last: Reason | None = None
-        self._waiting: list[ReceivedMessage] = []
+        self._waiting: list[Message] = []
         self._events = self.create_publisher(String, RECORDER_EVENTS, RECORDED_QOS)
         topics = ros_topics(tuple(robot.arms), cameras)
         self._begun = time.monotonic_ns()
@@ -88,7 +89,7 @@ class RecorderNode(BaseNode):
             self.create_subscription(_class_of(topic.type), heard_on(topic.name), take, qos, raw=True)
         for name, kind in _SERVICES.items():
             self.create_service(Trigger, f"~/{name}", partial(self._serve, kind))
-        self.create_tick(_PERIOD, self._write, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self.create_tick(HANDOVER_PERIOD, self._write, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self._marks.recorded = self._recorder.fault is None
         if self._marks.recorded:
             self.get_logger().info(f"records to {self._recorder.file}")
@@ -114,7 +115,7 @@ class RecorderNode(BaseNode):
         """Keep a message until :meth:`_write`; ``told``: it is an arm's event, which may be about an episode."""
         received = self._day() - round(age(info) * 1e9)
         number, sent = info["publication_sequence_number"] or 0, info["source_timestamp"]
-        self._waiting.append(ReceivedMessage(received, topic, number, sent, bytes(payload)))
+        self._waiting.append(Message(topic.channel, number, received, max(sent, 0), bytes(payload)))
         if told:
             event = Event.from_json(json.loads(deserialize_message(payload, String).data))
             self._marks.follow(event.kind)
@@ -131,8 +132,8 @@ class RecorderNode(BaseNode):
         Topics are taken one after the other: of what came since, an older message may not have been taken yet.
         """
         until, self._looked = self._looked, self._day()
-        self._recorder.record([one for one in self._waiting if one.received <= until])
-        self._waiting = [one for one in self._waiting if one.received > until]
+        self._recorder.record([one for one in self._waiting if one.time <= until])
+        self._waiting = [one for one in self._waiting if one.time > until]
         self._judge.look()
         if self._marks.recorded and self._recorder.fault is not None:
             self._marks.recorded = False

@@ -1,0 +1,182 @@
+"""A tick as one row of float64, which the topic ``tick`` has, and what only some ticks have beside it.
+
+The loop's own thread packs it, so this is some microseconds of work. Fields are in the order in which a tick computes
+them, so that of a replay the first difference in a row is nearest to its cause.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import struct
+from collections.abc import Sequence
+from operator import attrgetter
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import pinocchio as pin
+
+from q2r2_control.types import SIDES, Array, CommandMode, HandFault, HandInputs, HandSample, RobotState, StepStatus
+
+if TYPE_CHECKING:  # the writer's process does without the loop's modules
+    from q2r2_control.summary.tick import Tick
+
+Rows = npt.NDArray[np.void]
+
+NOT_MEASURED = -math.inf  # in place of the opening of a gripper that the plant does not measure
+COMMAND_MODES, STATUSES = tuple(CommandMode), tuple(StepStatus)
+HAND_FAULTS = (None, *HandFault)
+UNSOLVED_MAX = 2**53  # more substeps than a float64 has bits for cannot be told apart
+SAMPLE_FIELDS = (
+    *("tick", "hand", "pose_stamp", "inputs_stamp", "x", "y", "z", "qx", "qy", "qz", "qw", "button_upper"),
+    *("button_lower", "thumb_stick_horizontal", "thumb_stick_vertical", "press_index", "press_middle"),
+    "fault",
+)
+POSE_FIELDS = ("x", "y", "z", "qx", "qy", "qz", "qw")
+ARM_FIELDS = (
+    *("opening", "engaged", "slip", "slip_angle", "wanted", "commanded", "rejected", "gripper_held", "holding"),
+)
+ARM_POSES = ("filtered_hand", "target", "tool")  # zeros: none; the tool is at the reference
+NOT_REPLAYED = ("compute_time", "solve_time", "tool")  # the writer adds the tool, which follows from the reference
+_LOOP = ("index", "now", "dt", "connected", "following", "samples", "state_stamp", "external")
+_MEASURED = ("q", "v", "tau", "tau_external")
+_CONTROLLER = ("step", "unsolved", "status", "certified", "fallback", "closest_distance", "margin", "slack")
+_REFERENCE = ("reference_q", "reference_v", "reference_a")
+_COMMAND = ("command_q", "command_v", "command_tau")
+_LAST = ("command_mode", "compute_time", "solve_time")
+
+_MODE_NUMBERS = {mode: number for number, mode in enumerate(COMMAND_MODES)}
+_STATUS_NUMBERS = {status: number for number, status in enumerate(STATUSES)}
+_values_of = attrgetter(*HandInputs.__slots__)
+_NO_POSE = (0.0,) * len(POSE_FIELDS)  # whose quaternion is none
+
+
+class PackedTick(NamedTuple):
+    """One tick, on its way to the process that writes it."""
+
+    row: bytes  # of tick_type
+    samples: bytes  # float64 of SAMPLE_FIELDS, one after the other
+    state: str  # JSON where it changed, else empty
+
+    @property
+    def size(self) -> int:
+        """Of all [bytes]."""
+        return len(self.row) + len(self.samples) + len(self.state)
+
+
+def tick_type(arms: int, joints: int) -> np.dtype[np.void]:
+    """A row for so many arms and joints; all numbers are float64."""
+    number = np.dtype("<f8")
+    poses = [(name, number, (len(POSE_FIELDS),)) for name in ARM_POSES]
+    arm = np.dtype([*((name, number) for name in ARM_FIELDS), *poses])
+    of_joints = {name: (name, number, (joints,)) for name in (*_MEASURED, *_REFERENCE, *_COMMAND)}
+    return np.dtype(
+        [
+            *((name, number) for name in _LOOP),
+            *(of_joints[name] for name in _MEASURED),
+            ("arms", arm, (arms,)),
+            *((name, number) for name in _CONTROLLER),
+            *(of_joints[name] for name in (*_REFERENCE, *_COMMAND)),
+            *((name, number) for name in _LAST),
+        ]
+    )
+
+
+def tick_labels(arms: Sequence[str], joints: Sequence[str]) -> tuple[str, ...]:
+    """The names of a row's numbers."""
+    poses = [f"{name}.{number}" for name in ARM_POSES for number in POSE_FIELDS]
+    names = [*_LOOP, *(f"{name}.{joint}" for name in _MEASURED for joint in joints)]
+    names += [f"{arm}.{name}" for arm in arms for name in (*ARM_FIELDS, *poses)]
+    names += [*_CONTROLLER, *(f"{name}.{joint}" for name in (*_REFERENCE, *_COMMAND) for joint in joints)]
+    return (*names, *_LAST)
+
+
+def numbers_in(rows: Rows) -> Array:
+    """(n, numbers of a row) of rows (n,)."""
+    return np.ascontiguousarray(rows).view(np.float64).reshape(len(rows), rows.dtype.itemsize // 8)
+
+
+def targets_or_tools(rows: Rows) -> Array:
+    """(n, arms, 7) what the operator asks for, and while that is nothing the tools at the reference."""
+    targets, tools = rows["arms"]["target"], rows["arms"]["tool"]
+    return np.where(targets.any(axis=2, keepdims=True), targets, tools)
+
+
+class TickPacker:
+    """Packs the ticks of one run, one after the other."""
+
+    def __init__(self, arms: Sequence[str], joints: Sequence[str]) -> None:
+        self._arms = tuple(arms)
+        self._row = struct.Struct(f"<{len(tick_labels(arms, joints))}d")
+        self._not_measured = [0.0] * len(joints)
+        self._state: dict[str, Any] | None = None  # as it was told last
+
+    def repeat_state(self) -> None:
+        """Tell the state and the start again with the next tick: the last one was lost."""
+        self._state = None
+
+    def pack(self, number: int, tick: Tick) -> PackedTick:
+        """One tick, the ``number``-th from 0 on."""
+        reference, state, command = tick.reference, tick.state, tick.command
+        report, external = reference.report, state.tau_external
+        samples = [sample for sample in tick.samples if sample.hand in SIDES] if tick.samples else []
+        row = [number, tick.now, tick.dt, tick.connected, tick.following, len(samples), state.stamp]
+        row += (external is not None, *state.q.tolist(), *state.v.tolist(), *state.tau.tolist())
+        row += self._not_measured if external is None else external.tolist()
+        for arm in self._arms:
+            row += self._of_arm(arm, tick)
+        row += (tick.step, min(report.unsolved, UNSOLVED_MAX), _STATUS_NUMBERS[report.status], report.certified)
+        row += (report.fallback, report.closest_distance, report.margin, report.slack)
+        for joints in (reference.q, reference.v, reference.a, command.q, command.v, command.tau):
+            row += joints.tolist()
+        row += (_MODE_NUMBERS[command.mode], tick.compute_time, report.solve_time)
+        packed_samples = b"".join([_packed_sample(number, sample) for sample in samples])
+        return PackedTick(self._row.pack(*row), packed_samples, self._state_text(tick))
+
+    def _of_arm(self, arm: str, tick: Tick) -> tuple[float, ...]:
+        target, opening = tick.targets[arm], tick.openings.get(arm, NOT_MEASURED)
+        commanded = tick.command.grippers.get(arm, NOT_MEASURED)
+        position, rotation = target.filtered_hand or (_NO_POSE[:3], _NO_POSE[3:])
+        return (
+            *(opening, tick.engaged[arm], target.slip, target.slip_angle, target.gripper, commanded),
+            *(arm in tick.reference.report.rejected, arm in tick.held_grippers, tick.holding.get(arm, False)),
+            *position,
+            *rotation,
+            *(_NO_POSE if target.command is None else pin.SE3ToXYZQUATtuple(target.command)),
+            *_NO_POSE,
+        )
+
+    def _state_text(self, tick: Tick) -> str:
+        """What has names, as JSON; empty where it is what it was."""
+        report = tick.reference.report
+        state: dict[str, Any] = {
+            "states": tick.states,
+            "connected": tick.connected,
+            "status": report.status,
+            "closest_pair": report.closest_pair,
+            "tightest_pair": report.tightest_pair,
+            "held_grippers": tick.held_grippers,
+            "holding": tick.holding,
+        }
+        if state == self._state and not tick.events:
+            return ""
+        before, self._state = self._state, dict(state)
+        if tick.events:
+            state["events"] = [event.as_json() for event in tick.events]
+        if before is None:
+            state["start"] = {"now": tick.start.now, **_plain(tick.start.state)}
+        return json.dumps(state)
+
+
+def _plain(state: RobotState) -> dict[str, Any]:
+    external = None if state.tau_external is None else state.tau_external.tolist()
+    joints = {"q": state.q.tolist(), "v": state.v.tolist(), "tau": state.tau.tolist()}
+    return {**joints, "tau_external": external, "stamp": state.stamp}
+
+
+def _packed_sample(number: int, sample: HandSample) -> bytes:
+    side, stamps = SIDES.index(sample.hand), (sample.pose_stamp, sample.inputs_stamp)
+    pose, fault = (*sample.position.tolist(), *sample.quaternion.tolist()), HAND_FAULTS.index(sample.fault)
+    values = (number, side, *stamps, *pose, *_values_of(sample.inputs), fault)
+    return struct.pack(f"<{len(SAMPLE_FIELDS)}d", *values)
