@@ -16,7 +16,8 @@ import mujoco
 import numpy as np
 import typer
 
-from q2r2_control.benchmark.motion_run import arrival_time, nearest_pair, without_pairs
+from q2r2_control.benchmark.motion_run import arrival_time, nearest_pair
+from q2r2_control.benchmark.own_controller import without_pairs
 from q2r2_control.benchmark.work_hands import MOVES, WorkHands
 from q2r2_control.benchmark.work_motions import ARMS, WORK_MOTIONS, WorkMotion, motions_named
 from q2r2_control.cli.figure_table import record_table

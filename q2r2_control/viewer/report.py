@@ -67,16 +67,17 @@ def _headline(summary: RunSummary) -> str:
 
 def _draw_path(axes: Axes, history: History, arm: str) -> None:
     """Displacement from where the tool started, and while the gripper is closed."""
-    colour, start = COLOURS[arm], history.tool(arm)[:1]
-    measured, target = 1e3 * (history.tool(arm) - start), 1e3 * (history.target(arm) - start)
+    colour, rows = COLOURS[arm], history.rows[arm]
+    start, t = rows["tool"][:1], history.rows["t"]
+    measured, target = 1e3 * (rows["tool"] - start), 1e3 * (rows["target"] - start)
     for index, (name, opacity) in enumerate(_AXES_STYLE):
-        axes.plot(history.t, measured[:, index], color=colour, alpha=opacity, linewidth=2.0, label=f"{name} measured")
-        axes.plot(history.t, target[:, index], **_TARGET_STYLE)
+        axes.plot(t, measured[:, index], color=colour, alpha=opacity, linewidth=2.0, label=f"{name} measured")
+        axes.plot(t, target[:, index], **_TARGET_STYLE)
     for index, (name, _) in enumerate(_AXES_STYLE):
         farthest = int(np.abs(measured[:, index]).argmax())
         axes.annotate(
             name,
-            (history.t[farthest], measured[farthest, index]),
+            (t[farthest], measured[farthest, index]),
             xytext=(0, 4),
             textcoords="offset points",
             ha="center",
@@ -88,20 +89,19 @@ def _draw_path(axes: Axes, history: History, arm: str) -> None:
     axes.set_title(f"{arm} tool: way from its start")
     axes.set_ylabel("displacement [mm]")
     axes.margins(y=0.12)
-    closed = history.gripper(arm) < _CLOSED
+    closed = rows["gripper"] < _CLOSED
     if closed.any():
         band = axes.get_xaxis_transform()
-        axes.fill_between(
-            history.t, 0, 1, where=closed, transform=band, color="grey", alpha=0.12, lw=0, label="gripper closed"
-        )
+        axes.fill_between(t, 0, 1, where=closed, transform=band, color="grey", alpha=0.12, lw=0, label="gripper closed")
     axes.legend(loc="best", fontsize=8, ncols=2)
 
 
 def _draw_errors(axes: Axes, history: History, arms: list[str], kind: str) -> None:
     """Measured tool against the target, where engaged."""
     for arm in arms:
-        error = 1e3 * history.position_error(arm) if kind == "position" else np.degrees(history.rotation_error(arm))
-        axes.plot(history.t, error, color=COLOURS[arm], linestyle=LINE_STYLES[arm], label=arm)
+        rows = history.rows[arm]
+        error = 1e3 * rows["position_error"] if kind == "position" else np.degrees(rows["rotation_error"])
+        axes.plot(history.rows["t"], error, color=COLOURS[arm], linestyle=LINE_STYLES[arm], label=arm)
     axes.set_title(f"{kind} error of the measured tool, while engaged")
     axes.set_ylabel("error [mm]" if kind == "position" else "error [deg]")
     axes.set_ylim(bottom=0.0)
@@ -109,9 +109,10 @@ def _draw_errors(axes: Axes, history: History, arms: list[str], kind: str) -> No
 
 
 def _draw_margin(axes: Axes, history: History) -> None:
-    margin = np.where(np.isfinite(history.margin), 1e3 * history.margin, np.nan)
+    rows = history.rows
+    margin = np.where(np.isfinite(rows["margin"]), 1e3 * rows["margin"], np.nan)
     lowest = float(np.nanmin(margin, initial=0.0))
-    axes.plot(history.t, margin, color=MARGIN_COLOUR, label="tightest monitored pair")
+    axes.plot(rows["t"], margin, color=MARGIN_COLOUR, label="tightest monitored pair")
     draw_limit(axes, 0.0, "limit")
     axes.set_title("distance of monitored pairs beyond what they keep")
     axes.set_ylabel("distance to spare [mm]")
@@ -120,8 +121,9 @@ def _draw_margin(axes: Axes, history: History) -> None:
 
 
 def _draw_ratios(axes: Axes, history: History) -> None:
-    axes.plot(history.t, history.velocity_ratio, color="#6a4c93", label="velocity, worst joint")
-    axes.plot(history.t, history.acceleration_ratio, color="#8d8d8d", linewidth=1.0, label="acceleration, worst joint")
+    rows = history.rows
+    axes.plot(rows["t"], rows["velocity_ratio"], color="#6a4c93", label="velocity, worst joint")
+    axes.plot(rows["t"], rows["acceleration_ratio"], color="#8d8d8d", linewidth=1.0, label="acceleration, worst joint")
     draw_limit(axes, 1.0, "limit")
     axes.set_title("reference velocity and acceleration, as part of their limits")
     axes.set_ylabel("ratio [1]")
@@ -133,10 +135,10 @@ def _draw_joints(axes: Axes, history: History, arm: str) -> None:
     robot = history.robot
     joints = robot.arms[arm].joints
     lower, upper = robot.position_lower[joints], robot.position_upper[joints]
-    place: Array = (2.0 * history.q[:, joints] - lower - upper) / (upper - lower)
+    place: Array = (2.0 * history.rows["q"][:, joints] - lower - upper) / (upper - lower)
     for number in range(len(joints)):
         opacity = 1.0 - 0.75 * number / max(len(joints) - 1, 1)
-        axes.plot(history.t, place[:, number], color=COLOURS[arm], alpha=opacity)
+        axes.plot(history.rows["t"], place[:, number], color=COLOURS[arm], alpha=opacity)
     for number, height in enumerate(_spread(place[-1])):
         name = robot.joint_names[joints[number]].removeprefix(f"{arm}_")
         axes.annotate(

@@ -77,7 +77,7 @@ def test_lateness_and_overruns_are_counted(monkeypatch: pytest.MonkeyPatch) -> N
     loop = LoopClock(PERIOD, realtime=True)
     for _ in range(6):
         loop.wait()
-    late = loop.lateness.percentiles()
+    late = loop.lateness.percentiles(1e-3)
     # The third tick is 25 ms late; the fourth follows at once, and on the grid that begins anew there it is not late.
     assert loop.overruns == 1
     assert (late.p50, late.max) == (pytest.approx(0.0, abs=2e-3), pytest.approx(25.0))
@@ -89,4 +89,4 @@ def test_simulated_time_is_never_late() -> None:
     for _ in range(3):
         loop.wait()
     assert loop.overruns == 0
-    assert loop.lateness.percentiles().max is None
+    assert loop.lateness.percentiles(1e-3).max is None

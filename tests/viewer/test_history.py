@@ -13,7 +13,7 @@ from q2r2_control.drives.base import position_command
 from q2r2_control.robot.robot import Robot
 from q2r2_control.summary.tick import RunStart, Tick
 from q2r2_control.types import ArmTarget, Reference, RobotState, StepReport, StepStatus
-from q2r2_control.viewer.history import History, tracking_error
+from q2r2_control.viewer.history import History
 
 
 @pytest.fixture(scope="module")
@@ -60,38 +60,25 @@ def test_peaks_between_rows_are_kept_however_long_the_run_and_rows_stay_bounded(
     calm, peak = tick_at(robot, 0.0), tick_at(robot, 0.0, acceleration=-7.0, distance=0.021)
     for index in range(20_000):
         history(replace(peak if index in (1234, 15_001) else calm, t=1e-3 * index))
-    assert 25 <= len(history.t) <= 50
-    assert np.all(np.diff(history.t) > 0.0)
-    assert history.t[-1] > 19.0
+    rows = history.rows
+    assert 25 <= len(rows) <= 50
+    assert np.all(np.diff(rows["t"]) > 0.0)
+    assert rows["t"][-1] > 19.0
     for index in (1234, 15_001):
-        row = int(np.searchsorted(history.t, 1e-3 * index))
-        assert history.acceleration_ratio[row] == pytest.approx(0.7)
-        assert history.margin[row] == pytest.approx(0.003)
-    assert (history.acceleration_ratio > 0.0).sum() == 2
+        row = rows[int(np.searchsorted(rows["t"], 1e-3 * index))]
+        assert row["acceleration_ratio"] == pytest.approx(0.7)
+        assert row["margin"] == pytest.approx(0.003)
+    assert (rows["acceleration_ratio"] > 0.0).sum() == 2
 
 
-def test_a_row_has_the_tools_their_targets_and_errors(robot: Robot) -> None:
+@pytest.mark.parametrize("engaged", [True, False])
+def test_a_row_has_the_tools_and_of_arms_that_are_engaged_targets_and_errors(robot: Robot, engaged: bool) -> None:
     history = History(robot, LIMIT)
-    history(tick_at(robot, 0.0))
-    np.testing.assert_allclose(history.tool("right")[0], robot.tool_pose(robot.home, "right").translation)
-    np.testing.assert_allclose(history.position_error("left"), 0.003)
-    np.testing.assert_allclose(history.rotation_error("left"), 0.1)
-    np.testing.assert_allclose(history.q[0], robot.home)
-    assert history.gripper("left")[0] == 0.5
-    assert history.engaged("right")[0] == 1.0
-
-
-def test_an_arm_that_is_not_engaged_has_no_error(robot: Robot) -> None:
-    history = History(robot, LIMIT)
-    history(tick_at(robot, 0.0, engaged=False))
-    assert np.isnan(history.position_error("left")).all()
-    assert np.isnan(history.target("left")).all()
-    assert np.isnan(tracking_error(tick_at(robot, 0.0, engaged=False), "left")).all()
-
-
-@pytest.mark.parametrize("angle", [0.0, 1e-7, 0.5, 3.0, np.pi], ids="{:g} rad".format)
-def test_the_angle_of_a_rotation_error_is_exact_from_none_to_half_a_turn(robot: Robot, angle: float) -> None:
-    tick = tick_at(robot, 0.0)
-    turned = tick.tools["left"] * pin.SE3(pin.exp3(np.array([0.0, 0.0, angle])), np.zeros(3))
-    error = tracking_error(replace(tick, targets={"left": ArmTarget(turned, 1.0)}), "left")
-    assert error[1] == pytest.approx(angle, abs=1e-9)
+    history(tick_at(robot, 0.0, engaged=engaged))
+    (row,) = history.rows
+    np.testing.assert_allclose(row["q"], robot.home)
+    np.testing.assert_allclose(row["right"]["tool"], robot.tool_pose(robot.home, "right").translation)
+    assert (row["left"]["gripper"], row["left"]["engaged"]) == (0.5, float(engaged))
+    expected = (0.003, 0.1) if engaged else (np.nan, np.nan)
+    np.testing.assert_allclose([row["left"]["position_error"], row["left"]["rotation_error"]], expected)
+    assert np.isnan(row["left"]["target"]).all() == (not engaged)
