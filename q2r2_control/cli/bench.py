@@ -20,8 +20,8 @@ from q2r2_control.errors import ConfigError
 
 _ROUNDS = 3
 _NOTES = (
-    "p50, p99, max: time of a tick",
-    "RMS, max: distance of the worse tool from its target, from approach to rest; free: RMS of ours in free air",
+    "p50, p99: time of a tick",
+    "RMS: distance of the worse tool from its target, from approach to rest; free: RMS of ours in free air",
     "there: time until both tools are within 10 mm of the goal for good; no: they are not at the end",
     "held: ticks in which ours executes the certified stop, or a peer has no solution and stands still",
     "near: nearest monitored pair; |a|: greatest acceleration of a joint [rad/s^2]",
@@ -62,7 +62,7 @@ def bench_table(report: BenchReport) -> Table:
     return figure_table(
         f"{report.cell}: ticks of 1 ms, {report.pairs} pairs, rounds: {report.rounds}",
         (
-            *("controller", "p50 [us]", "p99 [us]", "max [us]", "RMS [mm]", "max [mm]", "free [mm]", "there [s]"),
+            *("controller", "p50 [us]", "p99 [us]", "RMS [mm]", "free [mm]", "there [s]"),
             *("held [%]", "near [mm]", "|a| [s-2]", "rest [s-2]"),
         ),
         _rows(report),
@@ -87,9 +87,8 @@ def _cells(row: BenchRow, figures: MotionFigures) -> tuple[Cell, ...]:
     misses = figures.arrival_s is None and row.free_air.arrival_s is not None
     return (
         f"  {figures.controller}{unlimited}",
-        *(figures.times_us or (None, None, None)),
+        *(figures.times_us or (None, None))[:2],
         figures.rms_error_mm,
-        figures.max_error_mm,
         row.free_air.rms_error_mm if figures is row.figures[0] else "",
         "no" if misses else figures.arrival_s,
         held,

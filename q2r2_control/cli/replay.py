@@ -11,7 +11,7 @@ import typer
 from rich.console import Console
 
 from q2r2_control.cli.options import Json
-from q2r2_control.cli.output import as_json_text, notice_of_compiling, stderr_console
+from q2r2_control.cli.output import as_json_text, notice_of_compiling, say, stderr_console
 from q2r2_control.cli.summary_table import summary_table
 from q2r2_control.cli.window import check_window, show_window
 from q2r2_control.config.cell import Config, load_config
@@ -73,21 +73,17 @@ def replay(
 def _replay(file: Path, cell: Config | None, plant: str | None, compare: bool, json: bool, prepare: Prepare) -> None:
     with notice_of_compiling(stderr_console()):
         result = replay_recording(file, cell, plant, compare=compare, prepare=prepare)
-    lines = [] if result.ended_by is None else [f"ended after {result.ticks} ticks: {result.ended_by}"]
-    _say(result.notes, lines)
-    verdict = "identical" if result.difference is None else f"first difference at {result.difference}"
+    _say(result.notes, [] if result.ended_by is None else [f"ended after {result.ticks} ticks: {result.ended_by}"])
     if json:
         data = {"ticks": result.ticks, "ended_by": result.ended_by, "notes": result.notes}
-        summary = None if result.summary is None else result.summary.as_json()
         difference = {"difference": result.difference} if compare else {}
-        found = {name: asdict(arm) for name, arm in result.arms.items()}
-        arms = {} if plant is None else {"plant": plant, "arms": found}
-        print(as_json_text({**data, **difference, **arms, "summary": summary}))
-    elif compare:
-        print(verdict)
-    elif result.summary is not None:
-        Console().print(summary_table(result.summary))
-    if not json:
+        arms = {} if plant is None else {"plant": plant, "arms": result.arms}
+        print(as_json_text({**data, **difference, **arms, "summary": result.summary and result.summary.as_json()}))
+    else:
+        if compare:
+            print("identical" if result.difference is None else f"first difference at {result.difference}")
+        elif result.summary is not None:
+            Console().print(summary_table(result.summary))
         for name, arm in result.arms.items():
             off = f"{arm.position_mm_rms:.3f} mm RMS, {arm.position_mm_max:.3f} mm and {arm.rotation_deg_max:.3f} deg"
             print(f"{name} arm: tool {off} at most from where it was when recorded")
@@ -105,7 +101,7 @@ def _replay_joints(file: Path, cell: Config | None, plant: str, json: bool, prep
         lines.append(f"ended after {result.references} references: {result.ended_by}")
     _say(result.notes, lines)
     if json:
-        summary = None if result.summary is None else result.summary.as_json()
+        summary = result.summary and result.summary.as_json()
         print(as_json_text({**asdict(result), "plant": plant, "summary": summary}))
     else:
         if result.summary is not None:
@@ -118,9 +114,7 @@ def _replay_joints(file: Path, cell: Config | None, plant: str, json: bool, prep
 
 
 def _say(notes: Sequence[str], lines: Sequence[str]) -> None:
-    """On stderr."""
-    console = stderr_console()
     for note in notes:
-        console.print(note, style="yellow", soft_wrap=True, highlight=False, markup=False)
+        say(note, style="yellow")
     for line in lines:
-        console.print(line, soft_wrap=True, highlight=False, markup=False)
+        say(line)

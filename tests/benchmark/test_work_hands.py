@@ -9,12 +9,12 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from q2r2_control.benchmark.work_hands import MOVES, WorkHands
 from q2r2_control.benchmark.work_motions import ARMS, WORK_MOTIONS
 from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.teleop.teleop import Teleop
 from q2r2_control.types import SIDES, HandSample
 from tests.teleop.hands import pose
+from work_hands import MOVES, WorkHands
 
 DT = 0.004
 TOOLS = {"left": pose(0.5, 0.25, 0.38, (np.pi, 0.0, 0.0)), "right": pose(0.5, -0.25, 0.38, (0.0, np.pi, 0.0))}

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from rosbags.highlevel import AnyReader
 
-from tests.cli.test_app import FAST, changed_cell, one_object, q2r2
+from tests.cli.command import FAST, changed_cell, one_object, q2r2
 from tests.judging.runs import hands, record_episode
 
 IDLE = "max_idle_share: 0.5 "

@@ -12,7 +12,7 @@ from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.errors import RecordingError
 from q2r2_control.recording.episode_spans import read_spans
 from q2r2_control.recording.reader import Recording
-from tests.cli.test_app import q2r2
+from tests.cli.command import q2r2
 from tests.judging.runs import RATE, hands, record_episode
 from tests.judging.test_parts import BINDINGS, DURATION, controls
 from tests.recording.runs import read_elsewhere

@@ -13,7 +13,7 @@ import pytest
 pytest.importorskip("lerobot", reason="make test-lerobot installs it")
 
 from q2r2_control.recording.files import recordings_in
-from tests.cli.test_app import q2r2
+from tests.cli.command import q2r2
 from tests.export.runs import contents, record_two
 
 ROOT = Path(__file__).resolve().parents[2]

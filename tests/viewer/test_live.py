@@ -18,9 +18,7 @@ from q2r2_control.config.bindings import BindingSettings
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import ActiveLimit, LimitKind
 from q2r2_control.viewer.live import LiveTable
-from tests.viewer.test_history import robot, tick_at
-
-__all__ = ["robot"]
+from tests.viewer.ticks import tick_at
 
 JOINTS = {side: [f"{side}_A{number}" for number in range(1, 8)] for side in ("left", "right")}
 
