@@ -172,6 +172,8 @@ def test_a_broken_promise_is_found_at_its_tick(change: Callable[[Reference], Ref
     found = {violation.promise: violation for violation in report.broken}
     assert found[promise].tick == 12
     assert min(violation.tick for violation in report.broken) == 12
+    assert found[promise].q.shape == found[promise].v.shape == (14,)
+    assert found[promise].segment
     assert next(margin for margin in report.margins if margin.name == promise).tick is not None
 
 
@@ -203,13 +205,6 @@ def test_a_solver_fault_is_recognised_by_the_controller_it_is_given_to() -> None
     stopped = next(margin for margin in report.margins if margin.name == "solver failed: off the stop")
     assert stopped.checked > 0
     assert stopped.violations == 0
-
-
-def test_what_is_found_comes_with_the_request_and_the_state() -> None:
-    found = soak(_faster, first=40, ticks=100).broken[0]
-    assert found.q.shape == found.v.shape == (14,)
-    assert found.dt
-    assert found.segment
 
 
 @pytest.mark.parametrize(("ticks", "seed", "named"), [(99, 0, "ticks = 99"), (100, -1, "seed = -1")])
