@@ -21,6 +21,7 @@ class ReasonKind(StrEnum):
     CARRY_BEGAN = "carry_began"  # this arm's hand moves both tools
     CARRIED_BY = "carried_by"
     CARRY_ENDED = "carry_ended"
+    HANDS_SWAPPED = "hands_swapped"
     DRIVEN_BY = "driven_by"
     RESET_SERVICE = "reset_service"
     PAUSE_SERVICE = "pause_service"

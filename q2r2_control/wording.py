@@ -25,6 +25,7 @@ SENTENCES: dict[ReasonKind, str] = {
     _K.CARRY_BEGAN: "carries both tools",
     _K.CARRIED_BY: "carries with the {arm} arm",
     _K.CARRY_ENDED: "the other arm was stopped",
+    _K.HANDS_SWAPPED: "the hands were swapped",
     _K.DRIVEN_BY: "driven by the {hand} hand",
     _K.RESET_SERVICE: "the reset service",
     _K.PAUSE_SERVICE: "the pause service",

@@ -7,8 +7,9 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from rich.progress import Progress
 
-from q2r2_control.cli.output import counting, say
+from q2r2_control.cli.output import stderr_console
 from q2r2_control.errors import ConfigError, RecordingError
 from q2r2_control.export.bags import write_bags
 from q2r2_control.export.csv_tables import write_table, write_tables, write_vectors
@@ -24,7 +25,6 @@ app = typer.Typer(rich_markup_mode=None, help="Recordings of q2r2 run --record a
 Recordings = Annotated[
     list[Path], typer.Argument(metavar="DIR_OR_FILES...", help="Recordings, or folders of them, in this order.")
 ]
-Out = Annotated[Path, typer.Option("--output", metavar="OUT", help="A folder that does not exist yet.")]
 Fps = Annotated[int, typer.Option(help=f"Frames per second: 1 .. {FASTEST}.")]
 Trim = Annotated[bool, typer.Option("--trim", help="Leave out what is before and after any arm is engaged or moving.")]
 Workers = Annotated[int, typer.Option(min=1, help="Processes; the result is the same for any number.")]
@@ -35,7 +35,7 @@ SkipBad = Annotated[bool, typer.Option("--skip-bad", help="Say which recordings 
 @app.command(epilog="Example: q2r2 export lerobot recordings --output datasets/circle --fps 30")
 def lerobot(
     recordings: Recordings,
-    output: Out,
+    output: Annotated[Path, typer.Option(metavar="OUT", help="A folder that does not exist yet.")],
     fps: Fps = 30,
     trim: Trim = False,
     workers: Workers = 1,
@@ -59,7 +59,7 @@ def lerobot(
 @app.command(epilog="Example: q2r2 export hdf5 recordings --output datasets/circle-act --fps 50")
 def hdf5(
     recordings: Recordings,
-    output: Out,
+    output: Annotated[Path, typer.Option(metavar="OUT", help="A folder that does not exist yet.")],
     fps: Fps = 30,
     trim: Trim = False,
     workers: Workers = 1,
@@ -92,21 +92,25 @@ def csv(
 
 
 @app.command(epilog="Example: q2r2 export mcap recordings --output episodes")
-def mcap(recordings: Recordings, output: Out, skip_bad: SkipBad = False) -> None:
+def mcap(
+    recordings: Recordings,
+    output: Annotated[Path, typer.Option(metavar="OUT", help="A folder that does not exist yet.")],
+    skip_bad: SkipBad = False,
+) -> None:
     """Cut recordings into episodes: a bag of rosbag2 each, for tools that take an episode for a file."""
-    files, counts, target = recordings_in(recordings), list[int](), Output(output)
+    console, files, counts = stderr_console(), recordings_in(recordings), list[int]()
+    target = Output(output)
 
     def write(folder: Path) -> None:
         folder.mkdir(parents=True)
-        with counting("recordings") as progress:
-            for number, file in enumerate(files):
-                progress("", number, len(files))
+        with Progress(console=console, disable=not console.is_terminal, transient=True) as progress:
+            for file in progress.track(files, description="recordings"):
                 try:
                     counts.append(write_bags(file, folder))
                 except RecordingError as error:
                     if not skip_bad:
                         raise
-                    say(f"skipped: {error}", style="yellow")
+                    console.print(f"skipped: {error}", style="yellow", soft_wrap=True, highlight=False, markup=False)
         if not sum(counts):
             raise RecordingError("none of the recordings can be exported")
 
@@ -129,9 +133,12 @@ def _export(
     ray: str | None = None,
 ) -> None:
     """``write`` keeps each episode, and ``join`` makes the output of what was kept."""
-    output, files = Output(path), recordings_in(recordings)
+    console = stderr_console()
+    output = Output(path)
+    files = recordings_in(recordings)
     try:
-        with counting("recordings") as progress:
+        with Progress(console=console, disable=not console.is_terminal, transient=True) as progress:
+            bar = progress.add_task("recordings", total=len(files))
             made = keep_episodes(
                 files,
                 sampling,
@@ -140,12 +147,12 @@ def _export(
                 workers=workers,
                 ray=ray,
                 skip_bad=skip_bad,
-                progress=lambda done: progress("", done, max(done, len(files))),
+                progress=lambda done: progress.update(bar, completed=done, total=max(done, len(files))),
             )
     finally:
         output.tidy()
     for fault in made.skipped:
-        say(f"skipped: {fault}", style="yellow")
+        console.print(f"skipped: {fault}", style="yellow", soft_wrap=True, highlight=False, markup=False)
     if not made.kept:
         raise RecordingError("none of the recordings can be exported")
     output.write(lambda target: join(made.kept, target))

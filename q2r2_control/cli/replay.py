@@ -11,7 +11,7 @@ import typer
 from rich.console import Console
 
 from q2r2_control.cli.options import Json
-from q2r2_control.cli.output import as_json_text, notice_of_compiling, say, stderr_console
+from q2r2_control.cli.output import as_json_text, notice_of_compiling, stderr_console
 from q2r2_control.cli.summary_table import summary_table
 from q2r2_control.cli.window import check_window, show_window
 from q2r2_control.config.cell import Config, load_config
@@ -73,17 +73,21 @@ def replay(
 def _replay(file: Path, cell: Config | None, plant: str | None, compare: bool, json: bool, prepare: Prepare) -> None:
     with notice_of_compiling(stderr_console()):
         result = replay_recording(file, cell, plant, compare=compare, prepare=prepare)
-    _say(result.notes, [] if result.ended_by is None else [f"ended after {result.ticks} ticks: {result.ended_by}"])
+    lines = [] if result.ended_by is None else [f"ended after {result.ticks} ticks: {result.ended_by}"]
+    _say(result.notes, lines)
+    verdict = "identical" if result.difference is None else f"first difference at {result.difference}"
     if json:
         data = {"ticks": result.ticks, "ended_by": result.ended_by, "notes": result.notes}
+        summary = None if result.summary is None else result.summary.as_json()
         difference = {"difference": result.difference} if compare else {}
-        arms = {} if plant is None else {"plant": plant, "arms": result.arms}
-        print(as_json_text({**data, **difference, **arms, "summary": result.summary and result.summary.as_json()}))
-    else:
-        if compare:
-            print("identical" if result.difference is None else f"first difference at {result.difference}")
-        elif result.summary is not None:
-            Console().print(summary_table(result.summary))
+        found = {name: asdict(arm) for name, arm in result.arms.items()}
+        arms = {} if plant is None else {"plant": plant, "arms": found}
+        print(as_json_text({**data, **difference, **arms, "summary": summary}))
+    elif compare:
+        print(verdict)
+    elif result.summary is not None:
+        Console().print(summary_table(result.summary))
+    if not json:
         for name, arm in result.arms.items():
             off = f"{arm.position_mm_rms:.3f} mm RMS, {arm.position_mm_max:.3f} mm and {arm.rotation_deg_max:.3f} deg"
             print(f"{name} arm: tool {off} at most from where it was when recorded")
@@ -101,7 +105,7 @@ def _replay_joints(file: Path, cell: Config | None, plant: str, json: bool, prep
         lines.append(f"ended after {result.references} references: {result.ended_by}")
     _say(result.notes, lines)
     if json:
-        summary = result.summary and result.summary.as_json()
+        summary = None if result.summary is None else result.summary.as_json()
         print(as_json_text({**asdict(result), "plant": plant, "summary": summary}))
     else:
         if result.summary is not None:
@@ -114,7 +118,9 @@ def _replay_joints(file: Path, cell: Config | None, plant: str, json: bool, prep
 
 
 def _say(notes: Sequence[str], lines: Sequence[str]) -> None:
+    """On stderr."""
+    console = stderr_console()
     for note in notes:
-        say(note, style="yellow")
+        console.print(note, style="yellow", soft_wrap=True, highlight=False, markup=False)
     for line in lines:
-        say(line)
+        console.print(line, soft_wrap=True, highlight=False, markup=False)

@@ -147,8 +147,8 @@ CASES = [
     (
         "max_faults",
         1,
-        changed(faults=[Fault(1.0, "left", "a jump")]),
-        changed(faults=[Fault(1.0, "left", "a jump")] * 2),
+        changed(faults=[Fault(1.0, "left", "hand_jumped", "a jump")]),
+        changed(faults=[Fault(1.0, "left", "hand_jumped", "a jump")] * 2),
         "left arm at 1.00 s: a jump, and 1 more (at most 1)",
     ),
 ]
