@@ -51,7 +51,7 @@ _ALL = (
         "handover",
         "the left hand gives a bar of 120 mm to the right one, in the air",
         ("bar",),
-        lambda parts: (HandoverJudge(*parts, Toucher.LEFT_FINGER, Toucher.RIGHT_FINGER),),
+        lambda parts: (HandoverJudge(next(iter(parts)), Toucher.LEFT_FINGER, Toucher.RIGHT_FINGER),),
     ),
     AssemblyTask(
         "stack",

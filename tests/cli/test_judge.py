@@ -51,15 +51,6 @@ def test_another_cells_thresholds_can_be_used(recordings: Path, tmp_path: Path) 
     assert [episode["verdict"] for episode in episodes] == ["keep", "keep"]
 
 
-@pytest.mark.parametrize("value", [".nan", "1.5"])
-def test_thresholds_that_are_none_end_in_one_line(value: str, recordings: Path, tmp_path: Path) -> None:
-    bad = changed_cell(tmp_path, IDLE, f"max_idle_share: {value} ")
-    result = q2r2("judge", str(recordings), "--config", bad)
-    assert (result.exit_code, result.stdout) == (2, "")
-    assert result.stderr.count("\n") == 1
-    assert "judge.max_idle_share" in result.stderr
-
-
 @pytest.mark.parametrize("command", [("judge",), ("report", "--output", "page.html")])
 def test_what_is_no_recording_is_one_line_and_exit_code_2(command: tuple[str, ...], tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()

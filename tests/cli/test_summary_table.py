@@ -55,8 +55,8 @@ def test_late_and_missed_ticks_are_told_and_what_held_a_gripper(summary: RunSumm
     assert "ticks late by" not in text_of(summary)
     assert "gripper held" not in text_of(summary)
     held = replace(summary.arms["left"], gripper_held_s=1.25, gripper_held_by=("left_finger_0", "block_0"))
-    late = {"missed_ticks": 7, "stretched_s": 0.123, "lateness_us": Percentiles(60.0, 310.0, 1204.0), "overruns": 3}
-    text = text_of(replace(summary, arms=summary.arms | {"left": held}, **late))
+    late = replace(summary, lateness_us=Percentiles(60.0, 310.0, 1204.0), overruns=3, missed_ticks=7, stretched_s=0.123)
+    text = text_of(replace(late, arms=summary.arms | {"left": held}))
     assert "7, which made the motion 0.12 s late in all" in text
     assert "median 60 us, p99 310, max 1204; 3 by more than a period" in text
     (row,) = (line for line in text.splitlines() if "left gripper held for" in line)
