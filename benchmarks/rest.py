@@ -14,8 +14,7 @@ import pinocchio as pin
 import typer
 
 from q2r2_control.benchmark.motion_measures import JOLT, count_jolts, rest_acceleration
-from q2r2_control.benchmark.motion_run import own_controller
-from q2r2_control.benchmark.timed_run import Poses
+from q2r2_control.benchmark.own_controller import OwnController
 from q2r2_control.cli.figure_table import record_table
 from q2r2_control.cli.options import DEMO_CONFIG, Json
 from q2r2_control.cli.output import print_progress, print_report
@@ -60,7 +59,7 @@ class RestFigures:
 def run_rest(config: Config, seed: int, runs: int = RUNS) -> list[RestFigures]:
     """Ask for ``runs`` pairs of targets of each kind; the same ones for the same ``seed``."""
     robot = Robot.from_config(config)
-    controller = own_controller(robot, config)
+    controller = OwnController(robot, config)
     figures = []
     for number, kind in enumerate(KINDS):
         random = np.random.default_rng((seed, number))
@@ -73,7 +72,7 @@ def run_rest(config: Config, seed: int, runs: int = RUNS) -> list[RestFigures]:
             for tick in range(len(v)):
                 v[tick] = controller.step(targets, DT)[1]
             rest[run], jolts[run] = rest_acceleration(v, DT), count_jolts(v, DT, STARTED)
-            fallbacks += controller.fallbacks
+            fallbacks += sum(controller.stopped)
         figures.append(
             RestFigures(
                 kind=kind,
@@ -89,7 +88,7 @@ def run_rest(config: Config, seed: int, runs: int = RUNS) -> list[RestFigures]:
     return figures
 
 
-def draw_targets(robot: Robot, kind: str, random: np.random.Generator) -> Poses:
+def draw_targets(robot: Robot, kind: str, random: np.random.Generator) -> dict[str, pin.SE3]:
     """A pose for each tool, turned a little from how it is at home."""
     home = {arm: robot.tool_pose(robot.home, arm) for arm in robot.arms}
     middle = np.mean([pose.translation for pose in home.values()], axis=0)

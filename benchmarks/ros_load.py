@@ -16,7 +16,6 @@ from rclpy.executors import SingleThreadedExecutor
 from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory
 
-from q2r2_control.benchmark.motion_measures import speed_ripple
 from q2r2_control.cli.figure_table import figure_table
 from q2r2_control.cli.options import DEMO_CONFIG, Json
 from q2r2_control.cli.output import print_progress, print_report
@@ -30,6 +29,7 @@ from ros_processes import private_domain, processor_time, started
 _START_TIMEOUT = 300.0  # kernels may have to be compiled [s]
 _SETTLE = 3.0  # after the nodes have begun, and after the hands have [s]
 _JITTER = 0.002  # of a headset's samples: each comes later by up to this [s]
+_TREND = 0.15  # a slower motion is the hand's own, a faster one is ripple [s]
 _SCRIPT = NodeProcess("SimulationInput", {"jitter": _JITTER})
 
 
@@ -60,6 +60,20 @@ class LoadReport:
 
 class LoadError(Q2R2Error):
     """The nodes did not begin in time; the message says what was waited for."""
+
+
+def speed_ripple(times: Array, q: Array) -> float:
+    """RMS of the speeds between joint positions about their trend, as a share of the trend's RMS.
+
+    ``times`` (n,) [s], ascending; ``q`` (n, nv) [rad]. The trend is a mean over 0.15 s, weighted by a Hann window.
+    """
+    dt = np.diff(times)
+    v = np.diff(q, axis=0) / dt[:, None]
+    window = np.hanning(2 * max(round(_TREND / float(np.median(dt)) / 2.0), 1) + 1)
+    trend = np.apply_along_axis(lambda column: np.convolve(column, window / window.sum(), "valid"), 0, v)
+    margin = len(window) // 2
+    ripple = v[margin : len(v) - margin] - trend
+    return float(np.sqrt((ripple**2).sum() / (trend**2).sum()))
 
 
 def measure_load(config: str, duration: float) -> LoadReport:

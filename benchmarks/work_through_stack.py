@@ -16,8 +16,8 @@ import mujoco
 import numpy as np
 import typer
 
-from q2r2_control.benchmark.motion_run import arrival_time, nearest_pair, without_pairs
-from q2r2_control.benchmark.work_hands import MOVES, WorkHands
+from q2r2_control.benchmark.motion_run import arrival_time, nearest_pair
+from q2r2_control.benchmark.own_controller import without_pairs
 from q2r2_control.benchmark.work_motions import ARMS, WORK_MOTIONS, WorkMotion, motions_named
 from q2r2_control.cli.figure_table import record_table
 from q2r2_control.cli.options import DEMO_CONFIG, Json
@@ -34,6 +34,7 @@ from q2r2_control.teleop.arm_states import AT_REST
 from q2r2_control.types import Array, CommandMode
 from q2r2_control.verification.contract import Contract
 from q2r2_control.wording import sentence
+from work_hands import MOVES, WorkHands
 
 _TAIL = 0.5  # [s]
 _ROUNDING = 1e-9  # of the ticks' times [s]

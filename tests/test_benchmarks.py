@@ -11,7 +11,8 @@ from pathlib import Path
 import pytest
 
 FOLDER = Path(__file__).resolve().parents[1] / "benchmarks"
-SCRIPTS = sorted(file.name for file in FOLDER.glob("*.py") if file.name != "ros_processes.py")
+SHARED = ("ros_processes.py", "work_hands.py")
+SCRIPTS = sorted(file.name for file in FOLDER.glob("*.py") if file.name not in SHARED)
 
 
 def run(script: str, *options: str) -> str:

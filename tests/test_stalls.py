@@ -137,7 +137,7 @@ def test_states_that_are_lost_while_the_arms_brake_drive_them_no_more(mode: str,
 
     def lose_and_stop(tick: Tick) -> None:
         # Velocities brake within 0.1 s from less, which is as long as states may be missing.
-        if speed(tick) > (0.8 if mode == "torque" else 1.1) and not loop.stopping:
+        if speed(tick) > (0.8 if mode == "torque" else 1.1) and tick.following:
             last = measure()
             loop.plant.state = lambda: last  # type: ignore[method-assign]
             loop.stop()

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import gc
 import math
+import time
 from dataclasses import dataclass
 
 import numpy as np
+import pinocchio as pin
 
 from q2r2_control.benchmark.motion_measures import rest_acceleration
+from q2r2_control.benchmark.own_controller import OwnController
 from q2r2_control.benchmark.peers.base import BenchController
-from q2r2_control.benchmark.timed_run import OwnController, TimedRun, timed_run
 from q2r2_control.benchmark.work_motions import WorkMotion
-from q2r2_control.config.cell import Config
-from q2r2_control.control.controller import CartesianController
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 
@@ -40,20 +41,68 @@ class MotionFigures:
     closest_pair: tuple[str, str] | None = None
     max_acceleration: float | None = None  # of a joint [rad/s^2]
     rest_acceleration: float | None = None  # RMS over the last 0.5 s, norm over the joints [rad/s^2]
-    median_us: float | None = None  # of a tick
-    p99_us: float | None = None
+    times_us: tuple[float, float, float] | None = None  # of a tick: median, p99, max
+
+
+@dataclass(frozen=True, slots=True)
+class MotionRun:
+    """The ticks of a run, those of the approach first."""
+
+    times: Array  # (n,) [s]
+    q: Array  # (n, nv) [rad]
+    v: Array  # (n, nv) [rad/s]
+    asked: list[dict[str, pin.SE3]]  # n
+    failed: Array  # (n,) bool
 
 
 def run_motion(
     controller: BenchController, robot: Robot, motion: WorkMotion, patience: float = math.inf, dt: float = DT
 ) -> MotionFigures:
-    """Run ``motion`` from home in ticks of ``dt`` [s].
+    """Run ``motion`` from home in ticks of ``dt`` [s]; see :func:`play_motion` and :func:`figures_of`."""
+    run = play_motion(controller, robot, motion, patience, dt)
+    return figures_of(run, controller, robot, motion, dt)
+
+
+def play_motion(controller: BenchController, robot: Robot, motion: WorkMotion, patience: float, dt: float) -> MotionRun:
+    """Run ``motion`` from home. A tick without a solution leaves the arms where they are.
+
+    A controller that takes ``patience`` times the motion's own time of this process is not waited for any longer.
+    """
+    start = {arm: robot.tool_pose(robot.home, arm) for arm in robot.arms}
+    asked = [motion.targets(tick * dt, start) for tick in range(round(motion.ends / dt))]
+    times, failed = np.empty(len(asked)), np.zeros(len(asked), dtype=bool)
+    q, v = np.empty((len(asked), robot.model.nv)), np.empty((len(asked), robot.model.nv))
+    done, deadline = 0, time.process_time() + patience * motion.ends
+    controller.reset(robot.home)
+    gc.collect()
+    gc.disable()
+    try:
+        while done < len(asked) and time.process_time() <= deadline:
+            began = time.perf_counter()
+            try:
+                q[done], v[done] = controller.step(asked[done], dt)
+                solved = True
+            except Exception:  # each peer has exceptions of its own
+                solved = False
+            times[done] = time.perf_counter() - began
+            if not (solved and np.isfinite(np.sum(q[done]) + np.sum(v[done]))):
+                failed[done] = True
+                q[done], v[done] = controller.hold()
+            done += 1
+    finally:
+        gc.enable()
+    return MotionRun(times[:done], q[:done], v[:done], asked[:done], failed[:done])
+
+
+def figures_of(
+    run: MotionRun, controller: BenchController, robot: Robot, motion: WorkMotion, dt: float
+) -> MotionFigures:
+    """Figures of the ticks after the approach.
 
     ``robot`` says which pairs are measured, and may be another one than the controller's; its arms have to be left and
-    right. A controller that takes ``patience`` times the motion's own time is not waited for any longer.
+    right.
     """
     began, rests, ends = (round(time / dt) for time in (motion.begins, motion.rests, motion.ends))
-    run = timed_run(controller, robot, motion.targets, ends - began, dt, warm_up=began, patience=patience * motion.ends)
     ticks, finished = len(run.q), len(run.q) == ends
     if ticks <= began + 1:
         return MotionFigures(motion.name, controller.name, ticks / ends)
@@ -62,6 +111,7 @@ def run_motion(
     moving = errors[: rests - began]
     stopped = controller.stopped[began:] if isinstance(controller, OwnController) else None
     a = np.diff(run.v, axis=0)[began:] / dt
+    median, p99, longest = (1e6 * np.percentile(run.times[began:], (50, 99, 100))).tolist()
     return MotionFigures(
         motion=motion.name,
         controller=controller.name,
@@ -77,27 +127,11 @@ def run_motion(
         closest_pair=pair,
         max_acceleration=float(np.abs(a).max()),
         rest_acceleration=rest_acceleration(run.v, dt) if finished else None,
-        median_us=float(np.median(run.times_us)),
-        p99_us=float(np.percentile(run.times_us, 99)),
+        times_us=(median, p99, longest),
     )
 
 
-def without_pairs(config: Config) -> Robot:
-    """The robot of a cell in free air: no pair is monitored, so that the arms go through each other and all else."""
-    robot = Robot.from_config(config)
-    robot.collision_model.removeAllCollisionPairs()
-    return robot
-
-
-def own_controller(robot: Robot, config: Config, name: str = OwnController.name) -> OwnController:
-    """Our controller with a cell's settings but the time limit, so that a slow machine computes the same motion."""
-    settings = config.control.model_copy(update={"solve_time_limit": None})
-    controller = OwnController(CartesianController(robot, settings))
-    controller.name = name
-    return controller
-
-
-def _errors(run: TimedRun, robot: Robot, motion: WorkMotion, began: int) -> tuple[Array, Array]:
+def _errors(run: MotionRun, robot: Robot, motion: WorkMotion, began: int) -> tuple[Array, Array]:
     """Distances (n, arms) [m] of the tools from their targets, and from their last targets, at each tick measured."""
     start = {arm: robot.tool_pose(robot.home, arm) for arm in robot.arms}
     goal = motion.targets(motion.ends, start)

@@ -30,6 +30,7 @@ _SETTLE = 0.5  # between the approach and the motion [s]
 # Positions of both tools in the world, (2, 3) [m], the left one's first: those of a motion by the time since it began
 # [s] and by where the tools are at home.
 Path = Callable[[float, Array], Array]
+Stop = Array | Callable[[Array], Array]  # places (2, 3) [m], or such by where the tools are at home
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -103,9 +104,31 @@ def _between(first: Array, last: Array, fraction: float) -> Array:
     return first + minimum_jerk(fraction) * (last - first)
 
 
-def _way(first: Array, last: Array, duration: float) -> Path:
-    """Straight from place to place (2, 3)."""
-    return lambda t, home: _between(first, last, t / duration)
+def _home(home: Array) -> Array:
+    return home
+
+
+def _to(
+    name: str,
+    about: str,
+    *stops: tuple[float, Stop],
+    approach: tuple[Array, ...] = (),
+    tilt: tuple[float, float] = (0.0, 0.0),
+    reachable: bool = False,
+) -> WorkMotion:
+    """A motion with a goal, straight from stop to stop, in the time [s] beside each."""
+
+    def path(t: float, home: Array) -> Array:
+        here = approach[-1] if approach else home
+        for seconds, stop in stops:
+            there = stop(home) if callable(stop) else stop
+            if t < seconds:
+                return _between(here, there, t / seconds)
+            t, here = t - seconds, there
+        return here
+
+    duration = sum(seconds for seconds, _ in stops)
+    return WorkMotion(name, about, duration, path, approach, tilt, has_goal=True, reachable=reachable)
 
 
 def _uniform(t: float, way: float, speed: float, ramp: float) -> float:
@@ -120,6 +143,7 @@ def _uniform(t: float, way: float, speed: float, ramp: float) -> float:
 
 _CARRY_CENTRE, _CARRY_RADIUS, _CARRY_RISE = (0.52, 0.36), 0.08, 0.04  # x and z [m], of x, of z [m]
 _CARRY_RAMP, _CARRY_SHORTEST = 0.5, 3.0  # [s]
+_LEAST_GAP = 0.18  # between tools at one height, for wrists 20 mm apart [m]
 
 
 def carry(gap: float, speed: float, shortest: float = _CARRY_SHORTEST) -> WorkMotion:
@@ -146,42 +170,30 @@ def carry(gap: float, speed: float, shortest: float = _CARRY_SHORTEST) -> WorkMo
     )
 
 
-_LEAST_GAP = 0.18  # between tools at one height, for wrists 20 mm apart [m]
-_MEETING_GAP = 0.12  # that is asked for [m]
-_MEETING_WAY, _MEETING_STAY = 1.5, 2.0  # [s]
+def _between_tools(home: Array, gap: float) -> Array:
+    """Both tools moved sideways to the middle, ``gap`` [m] apart."""
+    return np.column_stack((home[:, 0], 0.5 * gap * np.sign(home[:, 1]), home[:, 2]))
 
 
-def _meet(t: float, home: Array) -> Array:
-    """The tools meet in the middle, 30 mm nearer than each can, stay, and part again."""
-    nearest = home.copy()
-    nearest[:, 1] = 0.5 * _MEETING_GAP * np.sign(home[:, 1])
-    if t < _MEETING_WAY + _MEETING_STAY:
-        return _between(home, nearest, t / _MEETING_WAY)
-    return _between(nearest, home, (t - _MEETING_WAY - _MEETING_STAY) / _MEETING_WAY)
+def _ahead(home: Array) -> Array:
+    """Straight ahead to 0.80 m; 0.73 m can be reached."""
+    return np.column_stack((np.full(2, 0.80), home[:, 1:]))
+
+
+def _met(home: Array) -> Array:
+    """In the middle, 30 mm nearer than each can."""
+    return _between_tools(home, 0.12)
 
 
 # Side by side, and past each other: the left tool behind the right one's arm, above its elbow's way.
 _APART = _places((0.30, 0.25, 0.40), (0.58, -0.25, 0.26))
 _PAST = _places((0.30, -0.05, 0.40), (0.58, 0.05, 0.26))
-_PASSING = 2.0  # [s]
-
+# At one depth, where the tools cannot pass.
 _FACING = _places((0.44, 0.25, 0.33), (0.44, -0.25, 0.33))
 _CROSSED = _places((0.44, -0.05, 0.33), (0.44, 0.05, 0.33))
-
-
-def _cross(t: float, home: Array) -> Array:
-    """Sideways at one depth, where the tools cannot pass, and only then apart to where they can."""
-    if t < _PASSING:
-        return _between(_FACING, _CROSSED, t / _PASSING)
-    return _between(_CROSSED, _PAST, t / _PASSING - 1.0)
-
-
-def _swap(t: float, home: Array) -> Array:
-    return _between(home, home[::-1], t / _PASSING)
-
-
 _BEFORE_REACHING = _places((0.50, 0.05, 0.47), (0.50, -0.25, 0.30))
 _REACHED_UNDER = _places((0.50, 0.05, 0.47), (0.50, 0.08, 0.30))
+_PASSING = 2.0  # [s]
 
 _OSCILLATION, _PERIODS = 0.5, 3  # [Hz]
 _LEAST_OSCILLATING_GAP = 0.06  # [m]
@@ -190,9 +202,7 @@ _LEAST_OSCILLATING_GAP = 0.06  # [m]
 def _oscillate(t: float, home: Array) -> Array:
     """Sideways, from home until the targets are 0.06 m apart, and back."""
     share = 0.5 * (1.0 - math.cos(2.0 * math.pi * _OSCILLATION * t))
-    places = home.copy()
-    places[:, 1] -= share * (home[:, 1] - 0.5 * _LEAST_OSCILLATING_GAP * np.sign(home[:, 1]))
-    return places
+    return home + share * (_between_tools(home, _LEAST_OSCILLATING_GAP) - home)
 
 
 _SLIDING_HEIGHT = 0.2045  # 10 mm lower than the millimetre that fingers keep from the table allows [m]
@@ -207,71 +217,40 @@ def _slide(t: float, home: Array) -> Array:
     return _places((_SLIDE_FROM[0], y, _SLIDING_HEIGHT), _RIGHT_ASIDE)
 
 
-_FARTHEST_AHEAD = 0.80  # that is asked for; 0.73 can be reached [m]
-_STRETCHING, _STRETCHED = 2.0, 0.5  # [s]
-
-
-def _stretch(t: float, home: Array) -> Array:
-    """Straight ahead until the arms are stretched out, 70 mm farther than they reach, and back."""
-    ahead = home.copy()
-    ahead[:, 0] = _FARTHEST_AHEAD
-    if t < _STRETCHING + _STRETCHED:
-        return _between(home, ahead, t / _STRETCHING)
-    return _between(ahead, home, (t - _STRETCHING - _STRETCHED) / _STRETCHING)
-
-
 _ALL = (
     *(carry(gap, speed) for gap in (0.40, 0.20, 0.16) for speed in (0.15, 0.30, 0.50)),
     carry(0.16, 0.04),
-    WorkMotion(
-        name="meet",
-        about="the tools meet, asked for 30 mm more than each can, stay 2 s and part",
-        duration=2.0 * _MEETING_WAY + _MEETING_STAY,
-        path=_meet,
-        has_goal=True,
-        reachable=False,
+    _to(
+        "meet",
+        "the tools meet, asked for 30 mm more than each can, stay 2 s and part",
+        *((1.5, _met), (2.0, _met), (1.5, _home)),
     ),
-    WorkMotion(
-        name="pass",
-        about="the arms get past each other, at different depths and heights",
-        duration=_PASSING,
-        path=_way(_APART, _PAST, _PASSING),
+    _to(
+        "pass",
+        "the arms get past each other, at different depths and heights",
+        (_PASSING, _PAST),
         approach=(_APART,),
-        has_goal=True,
+        reachable=True,
     ),
-    WorkMotion(
-        name="pass-back",
-        about="the same, back",
-        duration=_PASSING,
-        path=_way(_PAST, _APART, _PASSING),
-        approach=(_APART, _PAST),
-        has_goal=True,
-    ),
-    WorkMotion(
-        name="cross",
-        about="the tools change sides; the targets go through each other, a small detour leads there",
-        duration=2.0 * _PASSING,
-        path=_cross,
+    _to("pass-back", "the same, back", (_PASSING, _APART), approach=(_APART, _PAST), reachable=True),
+    _to(
+        "cross",
+        "the tools change sides; the targets go through each other, a small detour leads there",
+        *((_PASSING, _CROSSED), (_PASSING, _PAST)),
         approach=(_FACING,),
-        has_goal=True,
-        reachable=False,
     ),
-    WorkMotion(
-        name="swap",
-        about="each tool is asked for the other one's home, where neither arm reaches and both are in the way",
-        duration=_PASSING,
-        path=_swap,
-        has_goal=True,
-        reachable=False,
+    _to(
+        "swap",
+        "each tool is asked for the other one's home, where neither arm reaches and both are in the way",
+        (_PASSING, lambda home: home[::-1]),
     ),
-    WorkMotion(
-        name="reach-under",
-        about="the right tool, tilted by 0.9 rad, reaches under the left one",
-        duration=_PASSING,
-        path=_way(_BEFORE_REACHING, _REACHED_UNDER, _PASSING),
+    _to(
+        "reach-under",
+        "the right tool, tilted by 0.9 rad, reaches under the left one",
+        (_PASSING, _REACHED_UNDER),
         approach=(_BEFORE_REACHING,),
         tilt=(0.0, 0.9),
-        has_goal=True,
+        reachable=True,
     ),
     WorkMotion(
         name="oscillate",
@@ -288,13 +267,29 @@ _ALL = (
         approach=(_slide(0.0, np.empty((2, 3))),),
         reachable=False,
     ),
-    WorkMotion(
-        name="stretch",
-        about="both tools are asked for 70 mm more than they reach, and back",
-        duration=2.0 * _STRETCHING + _STRETCHED,
-        path=_stretch,
-        has_goal=True,
-        reachable=False,
+    _to(
+        "stretch",
+        "both tools are asked for 70 mm more than they reach, and back",
+        *((2.0, _ahead), (0.5, _ahead), (2.0, _home)),
     ),
 )
 WORK_MOTIONS: dict[str, WorkMotion] = {motion.name: motion for motion in _ALL}
+
+
+def _circle(t: float, home: Array) -> Array:
+    phase = math.pi * t
+    return home + np.array([0.0, 0.1 * math.sin(phase), 0.1 * (1.0 - math.cos(phase))])
+
+
+# Those that ticks are timed in.
+TIMED_MOTIONS = (
+    WorkMotion("free motion", "circles of 0.1 m radius at 0.5 Hz in free space", 3.0, _circle, rest=0.0),
+    WorkMotion(
+        "contact",
+        "each target jumps to where the other tool started: the arms block each other",
+        duration=3.0,
+        path=lambda t, home: home[::-1],
+        reachable=False,
+        rest=0.0,
+    ),
+)

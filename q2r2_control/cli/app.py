@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import atexit
 import logging
+import queue
 import sys
+from contextlib import suppress
+from logging.handlers import QueueHandler, QueueListener
 
 import typer
 
@@ -40,16 +44,21 @@ app.add_typer(ros_app, name="ros")
 
 
 class _StderrHandler(logging.Handler):
-    """Writes to what stderr is at the time, so that lines appear above a live table and not across it."""
+    """Writes to the stderr of that moment, so that lines appear above a live table and not across it."""
 
     def emit(self, record: logging.LogRecord) -> None:
-        print(self.format(record), file=sys.stderr)
+        with suppress(OSError):  # the terminal is gone
+            print(self.format(record), file=sys.stderr)
 
 
 @app.callback()
 def main() -> None:
-    """Set up what all commands share."""
+    """Let a thread write what is logged: a control loop must not wait for a terminal."""
     logger = logging.getLogger("q2r2_control")
     if not logger.handlers:
-        logger.addHandler(_StderrHandler())
+        records: queue.SimpleQueue[logging.LogRecord] = queue.SimpleQueue()
+        listener = QueueListener(records, _StderrHandler())
+        logger.addHandler(QueueHandler(records))
         logger.setLevel(logging.INFO)
+        listener.start()
+        atexit.register(listener.stop)

@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from q2r2_control.config.arms import FlangeConfig, HeldObjectConfig
 from q2r2_control.config.cell import Config, ObstacleConfig
 from q2r2_control.config.control import ContactPair
 from q2r2_control.config.external import describe
 from q2r2_control.control.controller import CartesianController
-from q2r2_control.errors import ConfigError
 from q2r2_control.plugins import INPUTS, PLANTS, check_installed, load_class
 from q2r2_control.robot.kept_distances import kept_distances
-from q2r2_control.robot.model_srdf import model_srdfs
-from q2r2_control.robot.reachability import PairReach, Progress, nearest_approaches, srdf_of
 from q2r2_control.robot.robot import Robot
 from q2r2_control.robot.stop_torque import StopTorque, stop_torques
 from q2r2_control.supervision.preflight import preflight_faults
@@ -80,27 +79,19 @@ class CellCheck:
     controls: dict[str, str]  # what those of each hand do
 
     @property
-    def notes(self) -> tuple[str, ...]:
+    def notes(self) -> list[str]:
         """One line for each thing that a user should know of and that is no fault."""
-        held = (
-            f"{arm.name} arm: while its gripper holds, its tool includes {arm.object}"
-            for arm in self.arms
-            if arm.object
-        )
-        touch = (
-            f"{' and '.join(allowed.pair)} may touch in torque mode: the reference gets inside by up to "
-            f"{1e3 * allowed.depth:g} mm, and closes in at {1e3 * allowed.speed:g} mm/s"
-            for allowed in self.contacts
-        )
-        return (*held, *touch, *(_stop_note(stop) for stop in self.stop_torques if stop.stop.ratio > 1.0))
+        notes = [f"{arm.name} arm: its tool includes {arm.object} that it holds" for arm in self.arms if arm.object]
+        for allowed in self.contacts:
+            inside = f"the reference gets inside by up to {1e3 * allowed.depth:g} mm at {1e3 * allowed.speed:g} mm/s"
+            notes.append(f"{' and '.join(allowed.pair)} may touch in torque mode: {inside}")
+        return notes + [_stop_note(stop) for stop in self.stop_torques if stop.stop.ratio > 1.0]
 
     def as_json(self) -> dict[str, Any]:
         """Plain data and dataclasses for the JSON writer."""
-        data = {name: getattr(self, name) for name in self.__slots__}
-        data["notes"] = self.notes
+        data = {name: getattr(self, name) for name in self.__slots__} | {"notes": self.notes}
         data["obstacles"] = {name: obstacle.model_dump(mode="json") for name, obstacle in self.obstacles.items()}
-        data["contacts"] = [allowed.model_dump(mode="json") for allowed in self.contacts]
-        return data
+        return data | {"contacts": [allowed.model_dump(mode="json") for allowed in self.contacts]}
 
 
 def check_cell(config: Config, compiling: AbstractContextManager[None] | None = None) -> CellCheck:
@@ -135,117 +126,50 @@ def check_cell(config: Config, compiling: AbstractContextManager[None] | None = 
     )
 
 
-@dataclass(frozen=True, slots=True)
-class PairsWritten:
-    """What sampling says of the monitored pairs of links; distances in metres."""
-
-    file: str
-    samples: int
-    clearance: float
-    never: tuple[PairReach, ...]  # farther apart than the clearance, farthest last
-    watched: tuple[PairReach, ...]  # the others, nearest first
-
-
-def write_pairs(
-    config: Config, file: Path, samples: int, clearance: float, seed: int = 0, progress: Progress | None = None
-) -> PairsWritten:
-    """Sample which pairs of a cell can meet and write those that cannot as an SRDF to ``file``, which is not replaced.
-
-    Raises :class:`ConfigError` for a clearance that is not above every distance in ``control``, and for a file that
-    exists.
-    """
-    _check_clearance(config, clearance)
-    if file.exists():
-        raise ConfigError(f"{file}: exists; give the name of a new file")
-    robot = Robot.from_config(config)
-    approaches = nearest_approaches(robot, samples, seed, progress)
-    _write(file, srdf_of(robot, approaches, clearance, samples))
-    return PairsWritten(
-        file=str(file),
-        samples=samples,
-        clearance=clearance,
-        never=tuple(pair for pair in approaches if pair.nearest > clearance),
-        watched=tuple(pair for pair in approaches if pair.nearest <= clearance),
-    )
-
-
-def write_model_pairs(
-    config: Config, folder: Path, samples: int, clearance: float, seed: int = 0, progress: Progress | None = None
-) -> dict[str, bool]:
-    """Write the SRDF of each model of a cell to ``folder``; returns by path whether the file is new.
-
-    Raises :class:`ConfigError` as :func:`write_pairs` does, and before anything is written for a file that exists and
-    says something else.
-    """
-    _check_clearance(config, clearance)
-    if not folder.is_dir():
-        raise ConfigError(f"{folder}: no such folder")
-    files = {folder / name: text for name, text in model_srdfs(config, clearance, samples, seed, progress).items()}
-    for file, text in files.items():
-        if file.exists() and file.read_bytes() != text.encode():
-            raise ConfigError(f"{file}: exists and says something else; remove it to have it written anew")
-    new = {str(file): not file.exists() for file in files}
-    for file, text in files.items():
-        if new[str(file)]:
-            _write(file, text)
-    return new
-
-
-def _check_clearance(config: Config, clearance: float) -> None:
-    key, least = config.control.largest_distance
-    if not least < clearance <= 1.0:
-        raise ConfigError(f"clearance = {clearance:g} m: allowed: above control.{key}, {least:g}, up to 1")
-
-
-def _write(file: Path, text: str) -> None:
-    try:
-        file.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise ConfigError(f"{file}: cannot be written: {error}") from error
-
-
 def _stop_note(stop: StopTorque) -> str:
-    """What asks a joint of the arm for more torque than it has, where, how often, and what helps."""
+    """Which joint of an arm is asked for more torque than it has, how often, and what helps."""
     heavy = stop.gravity.ratio > 1.0
     worst = stop.gravity if heavy else stop.stop
-    posture = " ".join(f"{position:.2f}" for position in worst.posture)
-    most = f"{worst.joint} is asked for up to {worst.ratio:.2f} times its torque limit, at {posture} rad"
-    often = (
-        f"In {100 * worst.share_over:.1f} % of {stop.postures} random postures (seed {stop.seed}) a joint is asked for "
-        "more than it has"
-    )
-    if heavy:
-        return (
-            f"{stop.arm} arm: by gravity alone, at rest, {most}. {often}, with a full stop in "
-            f"{100 * stop.stop.share_over:.1f} %. No acceleration limit changes the former, only the model's torque "
-            "limits, masses and ranges of positions"
-        )
+    where = "at rest, by gravity alone" if heavy else "in a full stop from low speed, with the worst signs"
+    helps = "the model's torque limits, masses and position limits"
+    if not heavy:
+        share = f"{math.floor(100 * stop.bearable) / 100:.2f}"
+        helps = f"{share} times these limits in arms.{stop.arm}.acceleration_limit or control.acceleration_limit"
     return (
-        f"{stop.arm} arm: where all joints stop at their acceleration limits from low speed, with the worst signs, "
-        f"{most}. {often}; with {math.floor(100 * stop.bearable) / 100:.2f} times these limits, in none of them: "
-        f"arms.{stop.arm}.acceleration_limit, control.acceleration_limit"
+        f"{stop.arm} arm: {where} {worst.joint} needs up to {worst.ratio:.2f} times its torque limit, at "
+        f"{_numbers(worst.posture, '.2f')} rad; some joint does in {100 * worst.share_over:.1f} % of {stop.postures} "
+        f"random postures (seed {stop.seed}); to change: {helps}"
     )
+
+
+def _numbers(values: Iterable[float], form: str = "g") -> str:
+    return " ".join(f"{value:{form}}" for value in values)
+
+
+def _millimetres(*values: float) -> str:
+    return _numbers(1e3 * value for value in values) + " mm"
 
 
 def _flange_of(config: FlangeConfig) -> str | None:
     if config.thickness is None or config.radius is None:
         return config.model
-    return f"{1e3 * config.thickness:g} mm thick, radius {1e3 * config.radius:g} mm"
+    return f"{_millimetres(config.thickness)} thick, radius {_millimetres(config.radius)}"
 
 
 def _object_of(config: HeldObjectConfig | None) -> str | None:
     if config is None:
         return None
-    shape = f"a ball of radius {1e3 * config.radius:g} mm"
-    if config.box is not None:
-        shape = f"a box of {' x '.join(f'{1e3 * side:g}' for side in config.box)} mm"
-    place = " ".join(f"{1e3 * value:g}" for value in config.at)
-    return f"{shape}, {config.mass:g} kg, at {place} mm in the tool frame"
+    ball = config.box is None
+    shape = f"a ball of radius {_millimetres(config.radius)}" if ball else f"a box of {_millimetres(*config.box or ())}"
+    return f"{shape}, {config.mass:g} kg, at {_millimetres(*config.at)} in the tool frame"
 
 
 def _arm_check(config: Config, robot: Robot, name: str) -> ArmCheck:
-    arm = robot.arms[name]
-    settings = next(settings for side, settings in config.arms.items() if side == name)
+    arm, settings = robot.arms[name], next(arm for side, arm in config.arms.items() if side == name)
+    columns = (
+        *(np.array(robot.joint_names), robot.position_lower, robot.home, robot.position_upper),
+        *(robot.velocity_limit, robot.torque_limit),
+    )
     return ArmCheck(
         name=name,
         model=config.model_of(name),
@@ -253,16 +177,6 @@ def _arm_check(config: Config, robot: Robot, name: str) -> ArmCheck:
         tool_model=settings.tool.model,
         tool_frame=arm.tool_frame,
         tool_position=tuple(robot.tool_pose(robot.home, name).translation.tolist()),
-        joints=tuple(
-            JointCheck(
-                name=robot.joint_names[index],
-                lower=float(robot.position_lower[index]),
-                home=float(robot.home[index]),
-                upper=float(robot.position_upper[index]),
-                velocity=float(robot.velocity_limit[index]),
-                torque=float(robot.torque_limit[index]),
-            )
-            for index in arm.joints
-        ),
+        joints=tuple(map(JointCheck, *(column[list(arm.joints)].tolist() for column in columns))),
         object=_object_of(settings.gripper.object),
     )

@@ -1,18 +1,17 @@
-"""A run as the command line offers it: pipeline, live table, window, report."""
+"""A run as the command line offers it: pipeline, live table, window, recording."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, nullcontext
 from dataclasses import asdict, dataclass, field
-from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 
 from q2r2_control.cli.headset_server import AnnouncedHeadset
-from q2r2_control.cli.output import as_json_text, notice_of_compiling, stderr_console
+from q2r2_control.cli.output import as_json_text, notice_of_compiling, say
 from q2r2_control.cli.summary_table import recording_line, summary_table, task_line, verdict_markup
 from q2r2_control.cli.window import check_window, show_window
 from q2r2_control.config.cell import Config
@@ -25,7 +24,6 @@ from q2r2_control.judging.episode_judge import EpisodeJudge
 from q2r2_control.judging.judge import Judged, judge, keep_verdicts
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.plants.mujoco import MujocoPlant
-from q2r2_control.process.folders import new_folder
 from q2r2_control.process.scheduling import real_time
 from q2r2_control.recording.about import About
 from q2r2_control.recording.reader import Recording
@@ -33,19 +31,17 @@ from q2r2_control.recording.recorder import Recorder, RecordingSummary
 from q2r2_control.summary.run_summary import RunSummary
 from q2r2_control.supervision.preflight import preflight_faults
 from q2r2_control.teleop.episode_marks import EpisodeMarks
-from q2r2_control.viewer.history import History
 from q2r2_control.viewer.live import LiveTable
-from q2r2_control.viewer.report import draw_report
 
 
 @dataclass(frozen=True, slots=True)
 class RunOptions:
     """What to run and what to show of it."""
 
-    name: str  # of the run, for its report's folder and title
-    input: str  # scripted or headset
-    plant: str  # mujoco or kinematic
-    mode: str  # position or torque
+    name: str  # of the run, for its recording's folder and title
+    input: str
+    plant: str
+    mode: str
     duration: float | None  # [s]; None: until Ctrl-C
     fast: bool  # simulated time
     trajectory: str  # of the scripted input
@@ -53,7 +49,6 @@ class RunOptions:
     seed: int
     table: bool
     window: bool
-    report: bool
     force: bool  # run although q2r2 check finds faults
     real_time: bool  # ask the system for locked memory and SCHED_FIFO
     tasks: tuple[AssemblyTask, ...] = ()  # to be judged
@@ -82,9 +77,8 @@ class CellRun:
 def run_cell(config: Config, options: RunOptions, console: Console) -> CellRun:
     """Run a cell and tell ``console`` about it. Raises :class:`Q2R2Error` where that is not possible as asked."""
     if config.controller is ControllerKind.EXTERNAL:
-        raise ConfigError(
-            f"{config.name}: controller: external is driven by q2r2 ros up; this command runs controller: builtin only"
-        )
+        builtin = "this command runs controller: builtin only"
+        raise ConfigError(f"{config.name}: controller: external is driven by q2r2 ros up; {builtin}")
     if options.window:
         check_window(options.plant)
     if options.record is None:
@@ -106,9 +100,6 @@ def _run_cell(config: Config, options: RunOptions, recorder: Recorder | None, co
             source = _input_of(config, options, console)
             pipeline = Pipeline.from_config(config, input=source, plant=options.plant, mode=options.mode)
             _refuse_faults(pipeline, options.force, console)
-        history = History(pipeline.robot, pipeline.robot.capped_acceleration(config.control.acceleration_limit))
-        if options.report:
-            pipeline.listeners.append(history)
         watch = None
         if options.tasks and isinstance(pipeline.plant, MujocoPlant):
             watch = TaskWatch(options.tasks, pipeline.plant, pipeline.robot, config)
@@ -116,12 +107,8 @@ def _run_cell(config: Config, options: RunOptions, recorder: Recorder | None, co
         summary = _run(pipeline, options, recorder, console)
         if recorder is not None and watch is not None:
             recorder.success = all(task.succeeded for task in watch.results())
-    recording = None if recorder is None else recorder.summary
-    run = CellRun(summary, watch.results() if watch is not None else (), recording)
-    if options.report:
-        folder = _write_report(config, options, history, run)
-        console.print(f"report: {folder / 'report.png'}", soft_wrap=True, highlight=False)
-    return run
+    results = () if watch is None else watch.results()
+    return CellRun(summary, results, None if recorder is None else recorder.summary)
 
 
 def print_summary(run: CellRun, json: bool) -> None:
@@ -156,7 +143,7 @@ def _judge_recording(recording: RecordingSummary | None) -> list[Judged]:
         judged = judge(Recording(Path(recording.file)))
         keep_verdicts(judged)
     except RecordingError as error:
-        stderr_console().print(f"not judged: {error}", soft_wrap=True, highlight=False, markup=False)
+        say(f"not judged: {error}")
         return []
     return judged
 
@@ -170,7 +157,7 @@ def _refuse_faults(pipeline: Pipeline, force: bool, console: Console) -> None:
     if not force:
         raise ConfigError(f"{config.name}: {'; '.join(faults)}; --force runs it all the same")
     for fault in faults:
-        console.print(f"FAULT {fault}", style="red", soft_wrap=True, highlight=False, markup=False)
+        say(f"FAULT {fault}", console, "red")
 
 
 def _input_of(config: Config, options: RunOptions, console: Console) -> Input:
@@ -194,14 +181,14 @@ def _run(pipeline: Pipeline, options: RunOptions, recorder: Recorder | None, con
             pipeline.listeners.append(table)
             stack.enter_context(table.shown(console))
         if options.real_time and (refused := stack.enter_context(real_time())):
-            console.print(refused, style="yellow", soft_wrap=True, highlight=False, markup=False)
+            say(refused, console, "yellow")
         if recorder is not None:
             cameras = pipeline.config.simulated_cameras
             if cameras and isinstance(pipeline.plant, MujocoPlant):
                 recorder.prepare(pipeline.plant, pipeline.robot, cameras)
             elif cameras:
-                line = f"no pictures are recorded: the {options.plant} plant has none; allowed: --plant mujoco"
-                console.print(line, style="yellow", soft_wrap=True, highlight=False, markup=False)
+                none = f"no pictures are recorded: the {options.plant} plant has none; allowed: --plant mujoco"
+                say(none, console, "yellow")
             recorder.record_outcome = pipeline.record_outcome
             recorder.begin(_about(pipeline, options), pipeline.robot)
             pipeline.listeners.append(recorder)
@@ -218,12 +205,3 @@ def _about(pipeline: Pipeline, options: RunOptions) -> About:
         notes |= {"trajectory": options.trajectory, "human": str(options.human).lower(), "seed": str(options.seed)}
     cameras = tuple(pipeline.config.simulated_cameras) if isinstance(pipeline.plant, MujocoPlant) else ()
     return About.of(pipeline, not options.fast, notes, cameras)
-
-
-def _write_report(config: Config, options: RunOptions, history: History, run: CellRun) -> Path:
-    folder = new_folder(Path("runs"), f"{datetime.now():%Y%m%d-%H%M%S}-{options.name}", "report folder")
-    (folder / "summary.json").write_text(as_json_text(run.as_json()) + "\n", encoding="utf-8")
-    what = options.trajectory if options.input == "scripted" else options.input
-    title = f"{config.name}: {what}, {options.plant} plant"
-    draw_report(history, run.summary, title, folder / "report.png")
-    return folder

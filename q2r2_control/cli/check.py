@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import asdict
+from dataclasses import asdict, astuple
 from pathlib import Path
 from typing import Annotated
 
@@ -11,14 +11,13 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from q2r2_control.cli.cell_report import ArmCheck, CellCheck, PairsWritten, check_cell, write_model_pairs, write_pairs
-from q2r2_control.cli.figure_table import Cell, figure_table
+from q2r2_control.cli.cell_report import CellCheck, check_cell
+from q2r2_control.cli.figure_table import figure_table
 from q2r2_control.cli.options import ConfigFile, Json
-from q2r2_control.cli.output import as_json_text, notice_of_compiling, print_report, stderr_console
-from q2r2_control.cli.progress_lines import ProgressLines
+from q2r2_control.cli.output import as_json_text, counting, notice_of_compiling, print_report, stderr_console
+from q2r2_control.cli.pair_files import PairsWritten, write_model_pairs, write_pairs
 from q2r2_control.config.cell import load_config
 from q2r2_control.errors import ConfigError
-from q2r2_control.robot.stop_torque import StopTorque
 
 
 def check(
@@ -40,13 +39,15 @@ def check(
     """Validate a cell and print its arms, limits, obstacles and distances at home; exit 1 where home is unsafe."""
     if pairs is not None and model_pairs is not None:
         raise ConfigError("--pairs and --model-pairs exclude each other")
-    cell, progress = load_config(config), ProgressLines(stderr_console())
+    cell = load_config(config)
     if pairs is not None:
-        found = write_pairs(cell, pairs, samples, clearance, progress=progress)
-        print_report(asdict(found), (pair_reach_table(found),), json)
+        with counting() as progress:
+            found = write_pairs(cell, pairs, samples, clearance, progress)
+        print_report(asdict(found), (_pair_table(found),), json)
         return
     if model_pairs is not None:
-        files = write_model_pairs(cell, model_pairs, samples, clearance, progress=progress)
+        with counting() as progress:
+            files = write_model_pairs(cell, model_pairs, samples, clearance, progress)
         rows = ((file, "new" if new else "as it was") for file, new in files.items())
         title = "pairs of the models' links that need no watching"
         print_report(files, (figure_table(title, ("file", "is"), rows),), json)
@@ -59,82 +60,55 @@ def check(
     raise typer.Exit(1 if result.faults else 0)
 
 
-def _print_cell(result: CellCheck) -> None:
-    console = Console()
-    console.print(f"cell {result.name}", highlight=False)
-    for table in cell_tables(result):
-        console.print(table)
-    for arm, line in (result.driven or {"arms": "the built-in controller"}).items():
-        console.print(f"{arm} driven by {line}", highlight=False, markup=False, soft_wrap=True)
-    for note in result.notes:
-        console.print(f"NOTE {note}", highlight=False, markup=False, soft_wrap=True)
-    for fault in result.faults:
-        console.print(f"FAULT {fault}", style="red", highlight=False, markup=False, soft_wrap=True)
-
-
-def cell_tables(check: CellCheck) -> Iterator[Table]:
-    """Arms, what a stop asks of them, obstacles, the nearest pairs, and what the hands' controls do."""
-    yield from map(arm_table, check.arms)
-    yield from map(_stop_table, check.stop_torques)
-    obstacles: list[tuple[Cell, ...]] = [
-        (name, obstacle.shape, _numbers(obstacle.size), _numbers(obstacle.position))
-        for name, obstacle in check.obstacles.items()
+def cell_tables(cell: CellCheck) -> Iterator[Table]:
+    """Arms and what a stop asks of them, obstacles, the nearest pairs, and what the hands' controls do."""
+    for arm in cell.arms:
+        flange = "" if arm.flange is None else f", flange {arm.flange}"
+        at = " ".join(f"{value:.3f}" for value in arm.tool_position)
+        yield figure_table(
+            f"{arm.name} arm: {arm.model}{flange}, tool {arm.tool_model or 'none'}; {arm.tool_frame} at home at {at} m",
+            ("joint", "min [rad]", "home [rad]", "max [rad]", "speed [rad/s]", "torque [Nm]"),
+            ((joint.name, *(f"{value:.3f}" for value in astuple(joint)[1:])) for joint in arm.joints),
+        )
+    for stop in cell.stop_torques:
+        yield figure_table(
+            f"{stop.arm} arm: most torque in {stop.postures} random postures, of each joint's limit",
+            ("joint", "stops at [rad/s^2]", "gravity [%]", "full stop [%]"),
+            ((joint.joint, joint.acceleration, 100 * joint.gravity, 100 * joint.stop) for joint in stop.joints),
+        )
+    bodies: list[tuple[str, ...]] = [
+        (name, body.shape, " ".join(map(str, body.size)), " ".join(map(str, body.position)))
+        for name, body in cell.obstacles.items()
     ]
-    floor: list[tuple[Cell, ...]] = [] if check.floor is None else [("floor", "plane", "", f"0 0 {check.floor:g}")]
-    title = "obstacles" if obstacles or floor else "no obstacles, no floor"
-    yield figure_table(title, ("name", "shape", "size [m]", "centre [m]"), obstacles + floor)
-    yield pair_table(check)
-    yield figure_table("controls of each hand", ("control", "does"), check.controls.items())
-
-
-def arm_table(arm: ArmCheck) -> Table:
-    """One arm's joints and limits."""
-    position = " ".join(f"{value:.3f}" for value in arm.tool_position)
-    flange = "" if arm.flange is None else f", flange {arm.flange}"
-    tool = f"tool {arm.tool_model or 'none'}; {arm.tool_frame} at home at {position} m"
-    return figure_table(
-        f"{arm.name} arm: {arm.model}{flange}, {tool}",
-        ("joint", "min [rad]", "home [rad]", "max [rad]", "speed [rad/s]", "torque [Nm]"),
-        (
-            (joint.name, *map("{:.3f}".format, (joint.lower, joint.home, joint.upper, joint.velocity, joint.torque)))
-            for joint in arm.joints
-        ),
-    )
-
-
-def _stop_table(stop: StopTorque) -> Table:
-    """Torques that a full stop of one arm needs."""
-    return figure_table(
-        f"{stop.arm} arm: most torque in {stop.postures} random postures, of each joint's limit",
-        ("joint", "stops at [rad/s^2]", "gravity [%]", "full stop [%]"),
-        (
-            (joint.joint, joint.acceleration, f"{100 * joint.gravity:.0f}", f"{100 * joint.stop:.0f}")
-            for joint in stop.joints
-        ),
-    )
-
-
-def pair_table(check: CellCheck) -> Table:
-    """The nearest pairs at home."""
-    return figure_table(
-        f"nearest of {check.monitored_pairs} monitored pairs at home, min_distance {1e3 * check.min_distance:g} mm",
+    if cell.floor is not None:
+        bodies.append(("floor", "plane", "", f"0 0 {cell.floor:g}"))
+    title = "obstacles" if bodies else "no obstacles, no floor"
+    yield figure_table(title, ("name", "shape", "size [m]", "centre [m]"), bodies)
+    yield figure_table(
+        f"nearest of {cell.monitored_pairs} monitored pairs at home, min_distance {1e3 * cell.min_distance:g} mm",
         ("pair", "distance [mm]", "kept [mm]"),
-        (
-            (f"{pair.name_a} | {pair.name_b}", f"{1e3 * pair.distance:.1f}", f"{1e3 * pair.kept:g}")
-            for pair in check.nearest
-        ),
+        ((f"{pair.name_a} | {pair.name_b}", 1e3 * pair.distance, 1e3 * pair.kept) for pair in cell.nearest),
     )
+    yield figure_table("controls of each hand", ("control", "does"), cell.controls.items())
 
 
-def pair_reach_table(pairs: PairsWritten) -> Table:
-    """Which pairs of links cannot meet."""
+def _print_cell(cell: CellCheck) -> None:
+    console = Console(highlight=False, soft_wrap=True)
+    console.print(f"cell {cell.name}")
+    for table in cell_tables(cell):
+        console.print(table, soft_wrap=False)
+    for arm, line in (cell.driven or {"arms": "the built-in controller"}).items():
+        console.print(f"{arm} driven by {line}", markup=False)
+    for note in cell.notes:
+        console.print(f"NOTE {note}", markup=False)
+    for fault in cell.faults:
+        console.print(f"FAULT {fault}", style="red", markup=False)
+
+
+def _pair_table(pairs: PairsWritten) -> Table:
     return figure_table(
         f"{pairs.file}: {len(pairs.never)} of {len(pairs.never) + len(pairs.watched)} pairs of links stay more than "
         f"{1e3 * pairs.clearance:g} mm apart",
         ("pair", "nearest found [mm]"),
-        ((f"{pair.link_a} | {pair.link_b}", f"{1e3 * pair.nearest:.0f}") for pair in pairs.never),
+        ((f"{pair.link_a} | {pair.link_b}", 1e3 * pair.nearest) for pair in pairs.never),
     )
-
-
-def _numbers(values: tuple[float, ...]) -> str:
-    return " ".join(f"{value:g}" for value in values)

@@ -52,7 +52,7 @@ def demo(
     """Two simulated arms hand a bar to each other and stack blocks, led by nothing but the samples of scripted hands.
 
     Ends with a line for each task, as the simulation measured it, and exit code 1 where one did not succeed.
-    Writes plots and a summary to a folder under runs/. With --record, whether all succeeded is in the recording.
+    With --record, whether all succeeded is in the recording, of which q2r2 report makes plots.
     """
     if fast and rt:
         raise ConfigError("--rt and --fast exclude each other, since simulated time is never late")
@@ -70,7 +70,6 @@ def demo(
         seed=seed,
         table=shows_table(headless, viewer),
         window=viewer,
-        report=True,
         force=False,
         real_time=rt,
         tasks=chosen,

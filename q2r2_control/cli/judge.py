@@ -9,12 +9,11 @@ from typing import Annotated
 import typer
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import Progress
 from rich.table import Table
 
 from q2r2_control.cli.figure_table import figure_table
 from q2r2_control.cli.options import Json
-from q2r2_control.cli.output import as_json_text, stderr_console
+from q2r2_control.cli.output import as_json_text, counting
 from q2r2_control.cli.summary_table import verdict_markup
 from q2r2_control.config.cell import load_config
 from q2r2_control.config.judge import JudgeSettings
@@ -36,7 +35,7 @@ def judge(recordings: Recordings, config: Thresholds = None, json: Json = False)
 
     Thresholds are those of the recorded cell, its block `judge`. Exit code 2 for a file that is no recording.
     """
-    judged = list(_judged(recordings, config))
+    judged = _judged(recordings, config)
     if json:
         print(as_json_text({"episodes": [one.as_json() for one in judged]}))
         return
@@ -56,12 +55,9 @@ def report(
     """Write one HTML page of recorded episodes: verdicts, numbers and plots. It needs no network to be looked at."""
     if output.is_dir() or not output.parent.is_dir():
         raise ConfigError(f"--output {output}: allowed: a file in a folder that exists")
-    judged = list(_judged(recordings, config))
-    console = stderr_console()
-    with Progress(console=console, disable=not console.is_terminal, transient=True) as progress:
-        bar = progress.add_task("plots", total=len(judged))
-        names = ", ".join(map(str, recordings))
-        page = page_of(judged, f"Recordings: {names}", lambda done: progress.update(bar, completed=done))
+    judged, names = _judged(recordings, config), ", ".join(map(str, recordings))
+    with counting("plots") as progress:
+        page = page_of(judged, f"Recordings: {names}", lambda done: progress("", done, len(judged)))
     try:
         output.write_text(page, encoding="utf-8")
     except OSError as error:
@@ -72,10 +68,12 @@ def report(
 
 def _judged(recordings: Sequence[Path], config: str | None) -> list[Judged]:
     settings: JudgeSettings | None = None if config is None else load_config(config).judge
-    files = recordings_in(recordings)
-    console = stderr_console()
-    with Progress(console=console, disable=not console.is_terminal, transient=True) as progress:
-        return list(progress.track(judge_all(files, settings), total=len(files), description="recordings"))
+    files, judged = recordings_in(recordings), list[Judged]()
+    with counting("recordings") as progress:
+        for one in judge_all(files, settings):
+            judged.append(one)
+            progress("", len(judged), max(len(judged), len(files)))
+    return judged
 
 
 def _table(judged: Sequence[Judged]) -> Table:

@@ -5,13 +5,14 @@ from __future__ import annotations
 import json
 import math
 import threading
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, is_dataclass
 from typing import Any
 
 import numpy as np
 from rich.console import Console
+from rich.progress import Progress
 from rich.table import Table
 
 _NOTICE_AFTER = 3.0  # [s]
@@ -49,6 +50,24 @@ def print_report(data: Any, tables: Iterable[Table], json: bool) -> None:
     console = Console()
     for table in tables:
         console.print(table)
+
+
+def say(line: str, console: Console | None = None, style: str = "") -> None:
+    """Print one line on stderr as it is, however long."""
+    console = console or stderr_console()
+    console.print(line, style=style, soft_wrap=True, highlight=False, markup=False)
+
+
+@contextmanager
+def counting(what: str = "") -> Iterator[Callable[[str, int, int], None]]:
+    """Show how far a long work has got, where stderr is a terminal.
+
+    The function that it yields takes what is counted (``what`` by default), how many are done, and how many there are.
+    """
+    console = stderr_console()
+    with Progress(console=console, disable=not console.is_terminal, transient=True) as progress:
+        task = progress.add_task(what, total=None)
+        yield lambda of, done, total: progress.update(task, description=of or what, completed=done, total=total)
 
 
 def print_progress(what: str) -> None:

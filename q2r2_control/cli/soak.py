@@ -15,7 +15,7 @@ from q2r2_control.cli.options import DEMO_CONFIG, Json
 from q2r2_control.cli.output import notice_of_compiling, print_progress, print_report, stderr_console
 from q2r2_control.config.cell import load_config
 from q2r2_control.verification.contact_cells import FINGERS, with_contact
-from q2r2_control.verification.soak import MEMORY_ALLOWED, SoakReport, run_soak
+from q2r2_control.verification.soak import COUNTED, MEMORY_ALLOWED, SoakReport, run_soak
 
 _TICKS = 1_000_000
 
@@ -58,13 +58,7 @@ def _rows(report: SoakReport) -> Iterator[tuple[Cell, ...]]:
 
 
 def _notes(report: SoakReport, options: str) -> Iterator[str]:
-    yield (
-        f"{report.segments} segments, {report.resets} resets, {report.solver_faults} ticks with a failing solver "
-        f"({report.attacks} with one that works against the arms), "
-        f"{report.fallbacks} stops ({report.fallbacks_healthy} with a healthy solver), "
-        f"{report.openings} openings of grippers ({report.openings_refused} refused), "
-        f"{report.grasps} grasps and releases, {report.changes} changes of settings"
-    )
+    yield ", ".join(f"{report.counts[name]} {what}" for name, what in COUNTED.items())
     for found in report.broken:
         error = f": {found.error}" if found.error else ""
         where = f"tick {found.since_segment} of: {found.segment}; dt {found.dt}"

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 from q2r2_control.config.cell import Config
-from q2r2_control.demo.part_judges import AllJudges, HandoverJudge, Judge, LiftJudge, StackJudge
+from q2r2_control.demo.part_judges import HandoverJudge, Judge, LiftJudge, StackJudge
 from q2r2_control.demo.touch_watch import Toucher, TouchWatch
 from q2r2_control.errors import ConfigError
 from q2r2_control.plants.mujoco import MujocoPlant
@@ -31,11 +31,7 @@ class AssemblyTask:
     name: str
     about: str
     parts: tuple[str, ...]
-    judge: Callable[[Config], Judge]
-
-
-def _tower(config: Config, *parts: str) -> StackJudge:
-    return StackJudge({name: config.mujoco.objects[name].size[2] for name in parts})
+    judges: Callable[[dict[str, float]], tuple[Judge, ...]]  # of parts and their heights [m]
 
 
 _ALL = (
@@ -43,25 +39,25 @@ _ALL = (
         "meet",
         "each hand lifts a block, both meet in the middle, each puts its block back",
         ("blue_block", "yellow_block"),
-        lambda config: AllJudges({"blue": LiftJudge("blue_block"), "yellow": LiftJudge("yellow_block")}),
+        lambda parts: tuple(map(LiftJudge, parts)),
     ),
     AssemblyTask(
         "grasp",
         "a block of 15 mm is taken from the table and put back",
         ("flat_block",),
-        lambda config: LiftJudge("flat_block"),
+        lambda parts: tuple(map(LiftJudge, parts)),
     ),
     AssemblyTask(
         "handover",
         "the left hand gives a bar of 120 mm to the right one, in the air",
         ("bar",),
-        lambda config: HandoverJudge("bar", Toucher.LEFT_FINGER, Toucher.RIGHT_FINGER),
+        lambda parts: (HandoverJudge(next(iter(parts)), Toucher.LEFT_FINGER, Toucher.RIGHT_FINGER),),
     ),
     AssemblyTask(
         "stack",
         "three blocks on each other, one by the left hand and one by the right",
         ("green_block", "blue_block", "yellow_block"),
-        lambda config: _tower(config, "green_block", "blue_block", "yellow_block"),
+        lambda parts: (StackJudge(parts),),
     ),
 )
 TASKS: dict[str, AssemblyTask] = {task.name: task for task in _ALL}
@@ -87,21 +83,27 @@ class TaskWatch:
         for task in tasks:
             if missing := [part for part in task.parts if part not in config.mujoco.objects]:
                 raise ConfigError(f"task {task.name}: {config.name} has no {missing[0]} under mujoco.objects")
-        self._judges = {task.name: task.judge(config) for task in tasks}
+        heights = {name: item.size[2] for name, item in config.mujoco.objects.items()}
+        self._judges = {task.name: task.judges({part: heights[part] for part in task.parts}) for task in tasks}
         parts = tuple(part for task in tasks for part in task.parts)
         self._touches = TouchWatch(plant, robot, parts, tuple(config.mujoco.objects))
 
     def __call__(self, tick: Tick) -> None:
         """See what this tick has made of the parts."""
         parts = self._touches.look(tick.t)
-        for judge in self._judges.values():
-            judge.see(tick.dt, parts)
+        for judges in self._judges.values():
+            for judge in judges:
+                judge.see(tick.dt, parts)
 
     def results(self) -> tuple[TaskResult, ...]:
         """What has become of each task. Arms that touch anything but what they grasp spoil all."""
         touches = [f"{one} touched {other} at {t:.1f} s" for (one, other), t in self._touches.forbidden.items()]
         results = []
-        for name, judge in self._judges.items():
-            faults = [*judge.faults(), *touches]
-            results.append(TaskResult(name, not faults, judge.measured(), "; ".join(faults)))
+        for name, judges in self._judges.items():
+            faults = [*(fault for judge in judges for fault in judge.faults()), *touches]
+            measured: dict[str, float] = {}
+            for judge in judges:
+                prefix = f"{judge.parts[0]}_" if len(judges) > 1 else ""
+                measured |= {f"{prefix}{what}": value for what, value in judge.measured().items()}
+            results.append(TaskResult(name, not faults, measured, "; ".join(faults)))
         return tuple(results)

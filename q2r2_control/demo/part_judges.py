@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from itertools import pairwise
-from typing import Protocol
 
 from q2r2_control.demo.touch_watch import FINGERS, PartState, Toucher
 
@@ -22,50 +21,40 @@ _UPRIGHT = math.radians(2.0)
 _FINGERS = int(FINGERS)  # an IntFlag takes ten times as long for an "and", and several judges ask at every tick
 
 
-class Judge(Protocol):
-    """Follows one task through a run."""
+class Judge:
+    """Follows one task through a run. By itself it says how deep a part fell without a finger on it."""
+
+    def __init__(self, *parts: str) -> None:
+        self.parts = parts
+        self._held_at: dict[str, float] = {}  # height at which a finger last was on a part [m]
+        self._fell = dict.fromkeys(parts, 0.0)  # deepest [m]
 
     def see(self, dt: float, parts: Mapping[str, PartState]) -> None:
         """Take the state of all parts, ``dt`` [s] after the last."""
-        ...
+        for name in self.parts:
+            height = parts[name].place[2]
+            if parts[name].touched & _FINGERS:
+                self._held_at[name] = height
+            self._fell[name] = max(self._fell[name], self._held_at.get(name, height) - height)
 
     def measured(self) -> dict[str, float]:
         """Figures so far, by what they are, with the unit at the end."""
-        ...
+        return {"fall_mm": 1e3 * max(self._fell.values())}
 
     def faults(self) -> list[str]:
         """What falls short of success so far."""
-        ...
+        return [f"{name}: fell {1e3 * depth:.0f} mm" for name, depth in self._fell.items() if depth > _FALL]
 
 
-class _Fall:
-    """How deep a part fell without a finger on it."""
-
-    def __init__(self) -> None:
-        self._held_at: float | None = None
-        self.depth = 0.0  # [m]
-
-    def see(self, part: PartState) -> None:
-        height = part.place[2]
-        if part.touched & _FINGERS:
-            self._held_at = height
-        elif self._held_at is not None:
-            self.depth = max(self.depth, self._held_at - height)
-
-    def faults(self) -> list[str]:
-        return [f"fell {1e3 * self.depth:.0f} mm"] if self.depth > _FALL else []
-
-
-class LiftJudge:
+class LiftJudge(Judge):
     """A part is lifted, held up for a second and put back to where it lay, without a fall.
 
     Once it has lain there for a second nobody holds it to this any more: other work may go on with it.
     """
 
     def __init__(self, part: str) -> None:
-        self._part = part
+        super().__init__(part)
         self._start: tuple[float, float, float] | None = None
-        self._fall = _Fall()
         self._held = self._longest = self._height = self._lain = 0.0
         self._away = (0.0, 0.0)  # from the start, sideways and in height [m]
 
@@ -73,11 +62,10 @@ class LiftJudge:
         """See :meth:`Judge.see`."""
         if self._lain >= HELD_TIME:
             return
-        part = parts[self._part]
-        if self._start is None:
-            self._start = part.place
+        super().see(dt, parts)
+        part = parts[self.parts[0]]
+        self._start = self._start or part.place
         self._away = math.dist(part.place[:2], self._start[:2]), part.place[2] - self._start[2]
-        self._fall.see(part)
         up = part.touched and not part.touched & ~_FINGERS and self._away[1] >= _LIFT
         self._held = self._held + dt if up else 0.0
         self._longest = max(self._longest, self._held)
@@ -91,38 +79,33 @@ class LiftJudge:
 
     def measured(self) -> dict[str, float]:
         """See :meth:`Judge.measured`."""
-        return {
-            "lifted_mm": 1e3 * self._height,
-            "held_s": self._longest,
-            "put_back_mm": 1e3 * math.hypot(*self._away),
-            "fall_mm": 1e3 * self._fall.depth,
-        }
+        away = 1e3 * math.hypot(*self._away)
+        found = {"lifted_mm": 1e3 * self._height, "held_s": self._longest, "put_back_mm": away}
+        return found | super().measured()
 
     def faults(self) -> list[str]:
         """See :meth:`Judge.faults`."""
-        faults = self._fall.faults()
+        faults, part = super().faults(), self.parts[0]
         if self._longest < HELD_TIME:
-            faults.append(f"held {1e3 * _LIFT:.0f} mm up for {self._longest:.1f} s, not {HELD_TIME:g} s")
+            faults.append(f"{part}: held {1e3 * _LIFT:.0f} mm up for {self._longest:.1f} s, not {HELD_TIME:g} s")
         if not self._is_back:
-            faults.append(f"ended {1e3 * math.hypot(*self._away):.0f} mm from where it lay")
-        return [f"{self._part}: {fault}" for fault in faults]
+            faults.append(f"{part}: ended {1e3 * math.hypot(*self._away):.0f} mm from where it lay")
+        return faults
 
 
-class StackJudge:
+class StackJudge(Judge):
     """Parts rest on each other, upright and touched by no finger, for the last second."""
 
     def __init__(self, parts: Mapping[str, float]) -> None:
         """``parts``: from the lowest to the highest, with their heights [m]."""
-        self._names = tuple(parts)
+        super().__init__(*parts)
         self._rest = [0.5 * (low + high) for low, high in pairwise(parts.values())]  # from centre to centre [m]
-        self._falls = {name: _Fall() for name in parts}
         self._stood = self._sideways = self._tilt = 0.0
 
     def see(self, dt: float, parts: Mapping[str, PartState]) -> None:
         """See :meth:`Judge.see`."""
-        tower = [parts[name] for name in self._names]
-        for name, fall in self._falls.items():
-            fall.see(parts[name])
+        super().see(dt, parts)
+        tower = [parts[name] for name in self.parts]
         self._tilt = max(part.tilt for part in tower)
         self._sideways = max(math.dist(upper.place[:2], lower.place[:2]) for lower, upper in pairwise(tower))
         gaps = [upper.place[2] - lower.place[2] for lower, upper in pairwise(tower)]
@@ -133,36 +116,31 @@ class StackJudge:
 
     def measured(self) -> dict[str, float]:
         """See :meth:`Judge.measured`."""
-        return {
-            "stood_s": self._stood,
-            "off_centre_mm": 1e3 * self._sideways,
-            "tilt_deg": math.degrees(self._tilt),
-            "fall_mm": 1e3 * max(fall.depth for fall in self._falls.values()),
-        }
+        tilt = math.degrees(self._tilt)
+        return {"stood_s": self._stood, "off_centre_mm": 1e3 * self._sideways, "tilt_deg": tilt} | super().measured()
 
     def faults(self) -> list[str]:
         """See :meth:`Judge.faults`."""
-        faults = [f"{name}: {fault}" for name, judge in self._falls.items() for fault in judge.faults()]
+        faults = super().faults()
         if self._stood < HELD_TIME:
-            tower = " on ".join(reversed(self._names))
+            tower = " on ".join(reversed(self.parts))
             faults.append(f"{tower} for the last {self._stood:.1f} s, not {HELD_TIME:g} s")
         return faults
 
 
-class HandoverJudge:
+class HandoverJudge(Judge):
     """One hand holds a part in the air, then both, then the other one alone, 100 mm away for a second."""
 
     def __init__(self, part: str, giver: Toucher, taker: Toucher) -> None:
-        self._part, self._giver, self._taker = part, giver, taker
-        self._fall = _Fall()
+        super().__init__(part)
+        self._giver, self._taker = giver, taker
         self._by_giver = self._by_both = self._alone = self._longest = self._farthest = 0.0
         self._given: tuple[float, float, float] | None = None  # where the giver let go
 
     def see(self, dt: float, parts: Mapping[str, PartState]) -> None:
         """See :meth:`Judge.see`."""
-        part = parts[self._part]
-        self._fall.see(part)
-        away = 0.0
+        super().see(dt, parts)
+        part, away = parts[self.parts[0]], 0.0
         if part.touched == self._giver:
             self._by_giver += dt
         elif part.touched == FINGERS and self._by_giver:
@@ -176,42 +154,14 @@ class HandoverJudge:
 
     def measured(self) -> dict[str, float]:
         """See :meth:`Judge.measured`."""
-        return {
-            "held_by_giver_s": self._by_giver,
-            "held_by_both_s": self._by_both,
-            "carried_mm": 1e3 * self._farthest,
-            "held_by_taker_s": self._longest,
-            "fall_mm": 1e3 * self._fall.depth,
-        }
+        held = {"held_by_giver_s": self._by_giver, "held_by_both_s": self._by_both}
+        carried = {"carried_mm": 1e3 * self._farthest, "held_by_taker_s": self._longest}
+        return held | carried | super().measured()
 
     def faults(self) -> list[str]:
         """See :meth:`Judge.faults`."""
-        faults = self._fall.faults()
+        faults = super().faults()
         if self._longest < HELD_TIME:
-            faults.append(
-                f"held by the taker alone, {1e3 * _CARRY:.0f} mm away, for {self._longest:.1f} s, not {HELD_TIME:g} s"
-            )
-        return [f"{self._part}: {fault}" for fault in faults]
-
-
-class AllJudges:
-    """A task that has to please several judges."""
-
-    def __init__(self, judges: Mapping[str, Judge]) -> None:
-        """``judges`` by what they look at, which their figures are named after."""
-        self._judges = judges
-
-    def see(self, dt: float, parts: Mapping[str, PartState]) -> None:
-        """See :meth:`Judge.see`."""
-        for judge in self._judges.values():
-            judge.see(dt, parts)
-
-    def measured(self) -> dict[str, float]:
-        """See :meth:`Judge.measured`."""
-        return {
-            f"{name}_{what}": value for name, judge in self._judges.items() for what, value in judge.measured().items()
-        }
-
-    def faults(self) -> list[str]:
-        """See :meth:`Judge.faults`."""
-        return [fault for judge in self._judges.values() for fault in judge.faults()]
+            held = f"held by the taker alone, {1e3 * _CARRY:.0f} mm away, for {self._longest:.1f} s"
+            faults.append(f"{self.parts[0]}: {held}, not {HELD_TIME:g} s")
+        return faults

@@ -23,7 +23,8 @@ class Fault:
 
     t: float  # since the run began [s]
     arm: str
-    reason: str
+    kind: str  # of the event's reason
+    reason: str  # in words
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,7 +107,7 @@ def figures_of(episode: Episode, dropout: float) -> EpisodeFigures:
 def _faults(episode: Episode) -> list[Fault]:
     """Refused presses are none, since nothing moved; nor is the pause of the other arm that follows from a fault."""
     return [
-        Fault(event.t, event.arm, sentence(event.reason))
+        Fault(event.t, event.arm, str(event.reason.root.kind), sentence(event.reason))
         for event in episode.events
         if is_fault(event) and not is_refusal(event) and event.kind is not ReasonKind.LINKED
     ]

@@ -11,10 +11,9 @@ import pinocchio as pin
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.drives.base import Drive, DriveReport
 from q2r2_control.events import Reason
-from q2r2_control.loop.geometry_updates import GeometryUpdates
 from q2r2_control.supervision.external_arms import ExternalArms
 from q2r2_control.supervision.grasp_watch import STALL, GraspWatch
-from q2r2_control.supervision.gripper_limiter import REMEMBERED
+from q2r2_control.supervision.gripper_limiter import REMEMBERED, GripperLimiter
 from q2r2_control.supervision.joint_watch import WatchSettings
 from q2r2_control.supervision.supervisor import Phase, Supervisor
 from q2r2_control.supervision.target_stream import Origins, StreamSettings
@@ -69,19 +68,16 @@ class ControlLoop:
         self.pacer = TickPacer(period, velocity_limit, self.acceleration_limit, drive.coasts)
         self._delay = max(gripper_delay, REMEMBERED)
         self._grasps = GraspWatch(controller, STALL + gripper_delay)
-        self._geometry: GeometryUpdates | None = None  # while the controller's reference is where the arms are
+        self._limiter: GripperLimiter | None = None  # while the controller's reference is where the arms are
+        self._kept: Array = controller.kept_distances  # that the drive was told of [m]
+        self.holding: dict[str, bool] = {}  # of each arm that has an object, whether its gripper holds it
         self._granted: dict[str, tuple[float, float]] = {}  # arm -> opening that was wanted, and that was granted
         self._velocity = np.zeros(robot.model.nv)  # of the last reference [rad/s]
 
     @property
     def held_grippers(self) -> dict[str, tuple[str, str]]:
         """Arm -> pair of bodies that keeps its gripper from being commanded as wanted."""
-        return {} if self._geometry is None else self._geometry.held_grippers
-
-    @property
-    def holding(self) -> dict[str, bool]:
-        """Of each arm that has an object, whether its gripper holds it."""
-        return {} if self._geometry is None else self._geometry.holding
+        return {} if self._limiter is None else self._limiter.held
 
     @property
     def granted_openings(self) -> dict[str, tuple[float, float]]:
@@ -106,8 +102,8 @@ class ControlLoop:
     ) -> None:
         """Let a gripper that was ``commanded`` to an opening by another program stay as it is."""
         self._granted[arm] = wanted, commanded
-        if self._geometry is not None:
-            self._geometry.resume({arm: commanded}, openings, now)
+        if self._limiter is not None:
+            self._limiter.resume({arm: commanded}, openings, now)
 
     def step(
         self,
@@ -133,8 +129,9 @@ class ControlLoop:
             self._begin(state, openings, now)
         if reference is None and self._owns_plant:
             reference = self.controller.step({}, dt)  # the rest of the arms' motion
-        if self._geometry is not None:
-            self._geometry.after_step()
+        if self.controller.kept_distances is not self._kept:  # the step may have taken up others
+            self._kept = self.controller.kept_distances
+            self.drive.set_kept_distances(self._kept)
         trusted = supervisor.state_fault is None if self._owns_plant else supervisor.trusted
         command = None
         if reference is not None and state is not None:
@@ -145,20 +142,28 @@ class ControlLoop:
     def limit_grippers(
         self, wanted: Mapping[str, float], measured: Mapping[str, float], now: float
     ) -> dict[str, float]:
-        """The openings to be commanded; see :meth:`GeometryUpdates.limit_grippers`.
+        """The openings to be commanded; also finds out whether the grippers hold something.
 
         While the arms do not move, nothing is proven: a gripper gets what it wants, for instance to let go of
         something. But one that was held does not go on in that direction because the arms were stopped.
         """
         if not self._owns_plant and self.supervisor.phase not in _PROVEN:
-            self._geometry = None
-        if self._geometry is not None:
-            commanded = self._geometry.limit_grippers(wanted, measured, now)
-        else:
+            self._limiter, self.holding = None, {}
+        if self._limiter is None:
             commanded = {arm: without_proof(opening, self._granted.get(arm)) for arm, opening in wanted.items()}
+        else:
+            commanded = self._limiter.limit(wanted, measured, now)
+            if self._limiter.changed:
+                self.drive.set_openings(self.controller.openings)
+            if self._grasps.update(commanded, measured, now):
+                self._tell_holding()
         for arm, opening in commanded.items():
             self._granted[arm] = wanted[arm], opening
         return commanded
+
+    def _tell_holding(self) -> None:
+        self.holding = self.controller.holding
+        self.drive.set_holding(self.holding)
 
     def _update_targets(self, targets: Mapping[str, pin.SE3 | None], now: float) -> dict[str, Reason]:
         refusals = {}
@@ -170,12 +175,15 @@ class ControlLoop:
         return refusals
 
     def _begin(self, state: RobotState, openings: Mapping[str, float], now: float) -> None:
-        """The controller was reset at ``state``: bodies and drive begin there too."""
+        """The controller was reset at ``state``: bodies and drive begin there too, with the weight of what is held."""
         self._grasps.tell_again()
-        self._geometry = GeometryUpdates(self.controller, self.drive, self._delay, self._grasps)
+        self._limiter = GripperLimiter(self.controller, self._delay)
+        self._tell_holding()
         self.drive.reset(state)
-        self._geometry.resume({arm: granted for arm, (_, granted) in self._granted.items()}, openings, now)
-        self._geometry.begin()
+        self._limiter.resume({arm: granted for arm, (_, granted) in self._granted.items()}, openings, now)
+        self._kept = self.controller.kept_distances
+        self.drive.set_openings(self.controller.openings)
+        self.drive.set_kept_distances(self._kept)
 
 
 def without_proof(wanted: float, before: tuple[float, float] | None) -> float:

@@ -7,7 +7,6 @@ import math
 import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
 
 import numpy as np
 import pinocchio as pin
@@ -36,7 +35,7 @@ from q2r2_control.supervision.supervisor import Phase, Supervisor
 from q2r2_control.supervision.target_stream import StreamSettings
 from q2r2_control.teleop.arm import OPEN
 from q2r2_control.teleop.teleop import Teleop
-from q2r2_control.types import LONGEST_DT, ArmTarget, CommandMode, HandSample, RobotState
+from q2r2_control.types import LONGEST_DT, ArmTarget, CommandMode, RobotState
 from q2r2_control.wording import sentence
 
 STOPPING = "stopping"  # state of every arm while the run ends
@@ -47,25 +46,12 @@ _REST = 1e-6  # of the reference [rad/s]
 _logger = logging.getLogger(__name__)
 
 
-@dataclass(slots=True)
-class _Measured:
-    """What came in for one tick."""
-
-    samples: list[HandSample]
-    state: RobotState
-    openings: dict[str, float]  # of the grippers, 0 closed .. 1 fully open
-    tools: dict[str, pin.SE3]  # world frame
-
-
 class Pipeline:
     """Runs a cell. ``listeners`` are called with every :class:`Tick`; they must not take long.
 
-    Whatever ends a run, the arms are brought to rest before input and plant are closed. A listener that raises is not
-    called again; it ends the run like :meth:`stop`, and then its exception goes to the caller. A plant that measures
-    what cannot be, or does not follow, ends it with a :class:`PlantError`: see ``supervision``.
-
-    ``realtime``: the loop follows the clock, and a late tick moves no joint farther than a period allows. Otherwise
-    time is simulated, as fast as the machine can, and the run is repeatable.
+    The arms are brought to rest before input and plant are closed, for whatever reason a run ends. A listener that
+    raises ends the run like :meth:`stop`, and its exception goes to the caller. A plant that measures nonsense or does
+    not follow ends it with a :class:`PlantError`: see ``supervision``.
     """
 
     def __init__(
@@ -77,10 +63,7 @@ class Pipeline:
         mode: CommandMode | str = CommandMode.POSITION,
     ) -> None:
         config.teleop.bindings.check_device(input.controls)
-        self.config = config
-        self.robot = robot
-        self.input = input
-        self.plant = plant
+        self.config, self.robot, self.input, self.plant = config, robot, input, plant
         self.drive = make_drive(check_mode(mode, plant), robot, config, CommandMode.POSITION in plant.modes)
         self.controller = CartesianController(robot, permitted(config.control, self.drive))
         self._data = robot.model.createData()
@@ -99,12 +82,11 @@ class Pipeline:
         plant: Plant | str | None = None,
         mode: CommandMode | str = CommandMode.POSITION,
     ) -> Pipeline:
-        """Build a pipeline with an input (such as ``headset``) and a plant (such as ``kinematic``).
+        """Build a pipeline with an ``input`` (such as ``headset``) and a ``plant`` (such as ``kinematic``).
 
-        Either is the name of an entry point, see :mod:`q2r2_control.plugins`, or an object of one's own; None: the one
-        that the cell names. ``mode``: the plant gets joint positions (``position``), velocities (``velocity``), or the
-        torques of a Cartesian impedance (``torque``). Raises :class:`ConfigError` for an unknown name, for a mode that
-        the plant does not have, and for a binding to a control that the input does not have.
+        Either is the name of an entry point, see :mod:`q2r2_control.plugins`, an object, or None: the cell's. ``mode``:
+        the plant gets joint positions, velocities, or the torques of a Cartesian impedance. Raises :class:`ConfigError`
+        for an unknown name, a mode that the plant lacks, and a binding to a control that the input lacks.
         """
         robot = Robot.from_config(config)
         source = make_input(config.input if input is None else input, config)
@@ -115,28 +97,19 @@ class Pipeline:
         """The supervisor of this run."""
         return self.loop.supervisor
 
-    @property
-    def stopping(self) -> bool:
-        """Whether :meth:`stop` was called, until the run has ended."""
-        return self._stopping
-
     def stop(self) -> None:
         """Bring the arms to rest and end the run, or the next one if none runs; from any thread or signal handler."""
         self._stopping = True
 
     def go_home(self) -> None:
-        """Bring both arms home, as an operator may; from any thread. Without effect while the arms stop or are stopped.
-
-        Any press of an operator's ends it. How it went is in the events of the run.
-        """
+        """Bring both arms home, as an operator may; from any thread. Any press ends it; events say how it went."""
         self.requests.home = True
 
     def change_teleop(self, settings: TeleopSettings) -> None:
-        """Other settings of the operator's from the next tick on, without a jump; from any thread.
+        """Other settings of the operator's for the rest of this run, without a jump; from any thread.
 
-        What can be changed when: see :meth:`Teleop.change`. Whether it was is in the events of the run; the next run
-        begins with the settings of the cell. Raises :class:`ConfigError` for a binding to a control that the input
-        does not have.
+        :meth:`Teleop.change` says when they count, and an event whether they did. Raises :class:`ConfigError` for a
+        binding to a control that the input lacks.
         """
         settings.bindings.check_device(self.input.controls)
         self.requests.settings = settings
@@ -146,11 +119,10 @@ class Pipeline:
         self.requests.of_recording.append(reason)
 
     def change_control(self, values: Mapping[str, float]) -> None:
-        """Other settings of the controller from the next tick on, by name, without a jump; from any thread.
+        """Other settings of the controller, by name, for the rest of this run, without a jump; from any thread.
 
-        What can be changed, and how a greater distance comes to count: see :meth:`CartesianController.change`. Whether
-        it was is in the events of the run; the next run begins with the settings of the cell. Raises
-        :class:`ConfigError` for a name or a value that is not allowed at all.
+        :meth:`CartesianController.change` says how they come to count, and an event whether they did. Raises
+        :class:`ConfigError` for a name or a value that is never allowed.
         """
         self.config.control.changed(values)
         self.requests.control = dict(values)
@@ -158,7 +130,8 @@ class Pipeline:
     def run(self, duration: float | None = None, realtime: bool = True) -> RunSummary:
         """Run for ``duration`` [s], or until :meth:`stop`, Ctrl-C or SIGTERM; the arms are brought to rest first.
 
-        Raises :class:`ConfigError` for a duration that is not positive.
+        ``realtime``: the loop follows the clock, and a late tick moves no joint farther than a period allows. Otherwise
+        time is simulated and the run is repeatable. Raises :class:`ConfigError` for a duration that is not positive.
         """
         if duration is not None and not (math.isfinite(duration) and duration > 0.0):
             raise ConfigError(f"duration = {duration!r}: allowed: a positive number of seconds")
@@ -251,73 +224,39 @@ class Pipeline:
         gap = self._clock.wait()
         dt, now = self.loop.pace(gap), self._clock.now
         began = time.perf_counter()
-        measured = self._measure(now)
-        step = self._control(measured, now, dt)
-        assert step.command is not None  # the plant is the loop's own
-        self.plant.apply(step.command)
-        compute_time = time.perf_counter() - began
-        self._recorder.add_latency(measured.samples, self._clock.read())
-        # A plant that is simulated lets no more time pass at once, as if the computer had stood still.
-        advance = min(gap, LONGEST_DT)
-        self.plant.advance(advance)
-        self._plant_clock.give(advance)
-        return self._record(gap, dt, measured, step, compute_time)
-
-    def _measure(self, now: float) -> _Measured:
-        """The samples of the hands, and where the plant is."""
         samples = self._operator.poll(now) if self._following else []
         state = self._state = self.plant.state()
         seen, passed = self._plant_clock.stamped(state, now)
         self.loop.observe(seen, now, passed)
-        return _Measured(samples, state, self.plant.gripper_openings(), self._measured_tools(state))
-
-    def _measured_tools(self, state: RobotState) -> dict[str, pin.SE3]:
-        """Measured tool poses, world frame."""
-        model = self.robot.model
-        pin.forwardKinematics(model, self._data, state.q)
-        return {
-            name: pin.updateFramePlacement(model, self._data, arm.frame_id).copy()
-            for name, arm in self.robot.arms.items()
-        }
-
-    def _control(self, measured: _Measured, now: float, dt: float) -> LoopStep:
-        """From measurements to a command. While a run ends, the operator asks for nothing."""
-        poses: dict[str, pin.SE3 | None] = {}
+        openings, tools = self.plant.gripper_openings(), self._measured_tools(state)
         if self._following:
-            self._targets = self._operator.targets(measured.samples, measured.tools, now)
-            poses = {arm: target.command for arm, target in self._targets.items()}
-        wanted = {arm: target.gripper for arm, target in self._targets.items()}
-        step = self.loop.step(measured.state, poses, now, dt, wanted, measured.openings)
-        self._grippers = step.grippers
-        for refusal in step.refusals.values():
-            # Or the operator would think that the arm follows.
-            self.teleop.pause(now, refusal)
-        for reason in self.supervisor.events:
-            _logger.warning(sentence(reason))
-        self.supervisor.events.clear()
-        return step
-
-    def _record(self, gap: float, dt: float, measured: _Measured, step: LoopStep, compute_time: float) -> Tick:
-        """Make the tick's record, and hand it to the summary, the hands and the listeners."""
-        assert step.reference is not None
+            self._targets = self._operator.targets(samples, tools, now)
+        step = self._control(state, openings, now, dt)
+        assert step.reference is not None  # the plant is the loop's own
         assert step.command is not None
-        teleop, now, following = self.teleop, self._clock.now, self._following
+        self.plant.apply(step.command)
+        compute_time = time.perf_counter() - began
+        self._recorder.add_latency(samples, self._clock.read())
+        # A plant that is simulated lets no more time pass at once, as if the computer had stood still.
+        advance = min(gap, LONGEST_DT)
+        self.plant.advance(advance)
+        self._plant_clock.give(advance)
         tick = Tick(
             t=now - self._clock.start,
             start=self._start,
             now=now,
             dt=gap,
             step=dt,
-            following=following,
+            following=self._following,
             connected=self._operator.connected,
-            samples=measured.samples,
+            samples=samples,
             targets=self._targets,
-            engaged=teleop.engaged if following else dict.fromkeys(self._targets, False),
-            states={arm: str(value) if following else STOPPING for arm, value in teleop.states.items()},
+            engaged=self.teleop.engaged if self._following else dict.fromkeys(self._targets, False),
+            states={arm: str(value) if self._following else STOPPING for arm, value in self.teleop.states.items()},
             reference=step.reference,
-            state=measured.state,
-            openings=measured.openings,
-            tools=measured.tools,
+            state=state,
+            openings=openings,
+            tools=tools,
             command=step.command,
             events=self._operator.take_events(self._clock.start),
             grippers=self.plant.gripper_openings(),
@@ -328,7 +267,29 @@ class Pipeline:
             wall=step.report.wall,
             admittance=step.report.admittance,
         )
-        if following:
+        if self._following:
             self._operator.feedback.update(tick)
         self._recorder.add(tick)
         return tick
+
+    def _measured_tools(self, state: RobotState) -> dict[str, pin.SE3]:
+        """Measured tool poses, world frame."""
+        model = self.robot.model
+        pin.forwardKinematics(model, self._data, state.q)
+        return {
+            name: pin.updateFramePlacement(model, self._data, arm.frame_id).copy()
+            for name, arm in self.robot.arms.items()
+        }
+
+    def _control(self, state: RobotState, openings: Mapping[str, float], now: float, dt: float) -> LoopStep:
+        """From measurements and targets to a command. While a run ends, the operator asks for nothing."""
+        poses = {arm: target.command for arm, target in self._targets.items()} if self._following else {}
+        grippers = {arm: target.gripper for arm, target in self._targets.items()}
+        step = self.loop.step(state, poses, now, dt, grippers, openings)
+        self._grippers = step.grippers
+        for refusal in step.refusals.values():
+            self.teleop.pause(now, refusal)  # or the operator would think that the arm follows
+        for reason in self.supervisor.events:
+            _logger.warning(sentence(reason))
+        self.supervisor.events.clear()
+        return step

@@ -52,5 +52,5 @@ class RunRecorder:
         if self._failure is not None:
             raise self._failure
         return self._statistics.summary(
-            clock.wall_time(), pacer.missed_ticks, pacer.stretched, clock.lateness.percentiles(), clock.overruns
+            clock.wall_time(), pacer.missed_ticks, pacer.stretched, clock.lateness.percentiles(1e-6), clock.overruns
         )

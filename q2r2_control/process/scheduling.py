@@ -8,13 +8,12 @@ from __future__ import annotations
 import ctypes
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
 # Below 50, at which Linux with PREEMPT_RT runs the interrupts that the loop itself waits for.
 _PRIORITY = 40
-_ONLY_LINUX = "no SCHED_FIFO: only asked for on Linux"
 _CURRENT, _FUTURE = 1, 2  # of mlockall on Linux
 _ADVICE = (
     "to permit it, give the user 'rtprio 40' and 'memlock unlimited' in /etc/security/limits.conf and log in anew, or "
@@ -29,12 +28,13 @@ def real_time() -> Iterator[str | None]:
     Yields None, or one line that says what was refused and how to permit it. Threads and processes that are started
     meanwhile do not inherit the scheduler: one that draws or listens must not keep the loop waiting.
     """
-    refused = [line for line in (_lock_memory(), _schedule_first()) if line]
+    refused = [line for line in (_lock_memory(), _schedule_first([0], _PRIORITY)) if line]
     try:
         yield f"real time: {'; '.join(refused)}; the run goes on without; {_ADVICE}" if refused else None
     finally:
-        _unlock_memory()
-        _schedule_as_others()
+        if sys.platform == "linux":
+            ctypes.CDLL(None).munlockall()
+        _schedule_as_others([0])
 
 
 def schedule_process_first(priority: int) -> str | None:
@@ -43,23 +43,17 @@ def schedule_process_first(priority: int) -> str | None:
     For a process whose other threads bring and take what its loop waits for. Returns None, or one line that says why
     that is not permitted, and how to permit it. Threads and processes that are started later do not inherit it.
     """
-    if sys.platform != "linux":
-        return _ONLY_LINUX
-    scheduler, parameters = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(priority)
-    try:
-        for thread in Path("/proc/self/task").iterdir():
-            with suppress(ProcessLookupError):  # it has ended meanwhile
-                os.sched_setscheduler(int(thread.name), scheduler, parameters)
-    except OSError as error:
-        return f"no SCHED_FIFO: {error.strerror}; {_ADVICE}"
-    return None
+    refused = _schedule_first(_threads(), priority)
+    return refused if refused is None or sys.platform != "linux" else f"{refused}; {_ADVICE}"
 
 
 def schedule_process_as_others() -> None:
     """Take back what :func:`schedule_process_first` did."""
-    if sys.platform == "linux":
-        for thread in Path("/proc/self/task").iterdir():
-            _schedule_as_others(int(thread.name))
+    _schedule_as_others(_threads())
+
+
+def _threads() -> list[int]:
+    return [int(thread.name) for thread in Path("/proc/self/task").iterdir()] if sys.platform == "linux" else []
 
 
 def _lock_memory() -> str | None:
@@ -77,28 +71,24 @@ def _lock_memory() -> str | None:
     return f"memory is not locked: {os.strerror(ctypes.get_errno())}"
 
 
-def _unlock_memory() -> None:
-    if sys.platform == "linux":
-        ctypes.CDLL(None).munlockall()
-
-
-def _schedule_first() -> str | None:
-    """Why the calling thread does not get SCHED_FIFO, or None."""
+def _schedule_first(threads: Iterable[int], priority: int) -> str | None:
+    """Why threads do not get SCHED_FIFO, or None; 0 is the calling thread."""
     if sys.platform != "linux":
-        return _ONLY_LINUX
+        return "no SCHED_FIFO: only asked for on Linux"
     try:
-        os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(_PRIORITY))
+        for thread in threads:
+            with suppress(ProcessLookupError):  # it has ended meanwhile
+                os.sched_setscheduler(thread, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(priority))
     except OSError as error:
         return f"no SCHED_FIFO: {error.strerror}"
     return None
 
 
-def _schedule_as_others(thread: int = 0) -> None:
-    """Of a thread of this process; 0: the calling one."""
+def _schedule_as_others(threads: Iterable[int]) -> None:
     if sys.platform != "linux":
         return
     # Only a privileged process may take the flag back; others keep it, where it does nothing more.
-    with suppress(OSError):
-        os.sched_setscheduler(thread, os.SCHED_OTHER | os.SCHED_RESET_ON_FORK, os.sched_param(0))
-    with suppress(OSError):
-        os.sched_setscheduler(thread, os.SCHED_OTHER, os.sched_param(0))
+    for thread in threads:
+        for policy in (os.SCHED_OTHER | os.SCHED_RESET_ON_FORK, os.SCHED_OTHER):
+            with suppress(OSError):
+                os.sched_setscheduler(thread, policy, os.sched_param(0))

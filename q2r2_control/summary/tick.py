@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 import pinocchio as pin
@@ -49,6 +50,14 @@ class Tick:
     admittance: AdmittanceReport | None = None  # of position mode, where it is enabled
     # arm -> pair of bodies that keeps its gripper from being commanded as wanted
     held_grippers: dict[str, tuple[str, str]] = field(default_factory=dict)
-    holding: dict[str, bool] = field(
-        default_factory=dict
-    )  # of arms whose grippers have an object, whether they hold it
+    # arm whose gripper has an object -> whether it holds it
+    holding: dict[str, bool] = field(default_factory=dict)
+
+    def tracking_error(self, arm: str) -> tuple[float, float]:
+        """Distance [m] and angle [rad] of an arm's tool from its target; NaN where it has none."""
+        target = self.targets[arm].pose
+        if target is None:
+            return math.nan, math.nan
+        tool, asked = pin.SE3ToXYZQUATtuple(self.tools[arm]), pin.SE3ToXYZQUATtuple(target)
+        apart = min(math.dist(tool[3:], asked[3:]), math.dist(tool[3:], [-value for value in asked[3:]]))
+        return math.dist(tool[:3], asked[:3]), 4.0 * math.asin(min(0.5 * apart, 1.0))  # q and -q are one rotation

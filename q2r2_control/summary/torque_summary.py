@@ -2,70 +2,38 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 from q2r2_control.compliance.impedance import ImpedanceReport
 from q2r2_control.compliance.repulsion import WallReport
 
 
-@dataclass(frozen=True, slots=True)
-class TorqueSummary:
-    """A run in torque mode."""
-
-    min_measured_distance_mm: float | None  # None: no monitored pair
-    measured_closest_pair: tuple[str, str] | None
-    pressed_pairs: list[tuple[str, str]]  # that the wall pushed apart at some time
-    max_wall_force_n: float  # on one pair
-    saturated_ticks: int  # some joint would have needed more torque than its limit
-    rate_limited_ticks: int  # some joint's torque could not change as fast as it should
-    held_ticks: int  # without a usable measurement: the last gravity torque was held
-    off_reference_s: dict[str, float]  # of each arm: further from its reference than the impedance's error clip
-
-
 @dataclass(slots=True)
-class TorqueStatistics:
-    """Gathers a :class:`TorqueSummary`."""
+class TorqueSummary:
+    """A run in torque mode, gathered tick by tick."""
 
-    _off: dict[str, float]
-    _ticks: int = 0
-    _distance: float = float("inf")
-    _pair: tuple[str, str] | None = None
-    _pressed: set[tuple[str, str]] = field(default_factory=set)
-    _force: float = 0.0
-    _saturated: int = 0
-    _rate_limited: int = 0
-    _held: int = 0
-
-    @classmethod
-    def of(cls, arms: tuple[str, ...]) -> TorqueStatistics:
-        """Before the first tick, for the arms named."""
-        return cls(dict.fromkeys(arms, 0.0))
+    off_reference_s: dict[str, float]  # of each arm: further from its reference than the impedance's error clip
+    min_measured_distance_mm: float | None = None  # None: no monitored pair
+    measured_closest_pair: tuple[str, str] | None = None
+    pressed_pairs: list[tuple[str, str]] = field(default_factory=list)  # that the wall pushed apart at some time
+    max_wall_force_n: float = 0.0  # on one pair
+    saturated_ticks: int = 0  # some joint would have needed more torque than its limit
+    rate_limited_ticks: int = 0  # some joint's torque could not change as fast as it should
+    held_ticks: int = 0  # without a usable measurement: the last gravity torque was held
 
     def add(self, dt: float, impedance: ImpedanceReport, wall: WallReport) -> None:
         """Count one tick of ``dt`` [s]."""
-        self._ticks += 1
+        least = math.inf if self.min_measured_distance_mm is None else self.min_measured_distance_mm
         # A NaN distance, where nothing was measured, compares as not less; such a tick counts as held.
-        if wall.closest_distance < self._distance:
-            self._distance, self._pair = wall.closest_distance, wall.closest_pair
-        self._pressed.update(wall.pressing)
-        self._force = max(self._force, wall.force)
-        self._saturated += bool(impedance.saturated)
-        self._rate_limited += bool(impedance.rate_limited)
-        self._held += impedance.held
+        if 1e3 * wall.closest_distance < least:
+            self.min_measured_distance_mm = 1e3 * wall.closest_distance
+            self.measured_closest_pair = wall.closest_pair
+        if wall.pressing:
+            self.pressed_pairs = sorted({*self.pressed_pairs, *wall.pressing})
+        self.max_wall_force_n = max(self.max_wall_force_n, wall.force)
+        self.saturated_ticks += bool(impedance.saturated)
+        self.rate_limited_ticks += bool(impedance.rate_limited)
+        self.held_ticks += impedance.held
         for arm in impedance.clipped:
-            self._off[arm] += dt
-
-    def summary(self) -> TorqueSummary | None:
-        """The run so far; None: not in torque mode."""
-        if not self._ticks:
-            return None
-        return TorqueSummary(
-            min_measured_distance_mm=1e3 * self._distance if self._pair else None,
-            measured_closest_pair=self._pair,
-            pressed_pairs=sorted(self._pressed),
-            max_wall_force_n=self._force,
-            saturated_ticks=self._saturated,
-            rate_limited_ticks=self._rate_limited,
-            held_ticks=self._held,
-            off_reference_s=dict(self._off),
-        )
+            self.off_reference_s[arm] += dt

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
 
 from q2r2_control.benchmark.work_motions import ARMS, WORK_MOTIONS
-from q2r2_control.config.control import ControllerSettings
+from q2r2_control.control.controller import CartesianController
 from q2r2_control.robot.pairs import CLEARANCE
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import ALL_OF_THE_WAY, Array, Interval
@@ -244,47 +244,35 @@ class Adversary:
         return stream
 
 
-class HostileGrippers:
-    """Draws what a controller is told of openings: grippers that leap, and want to open at the worst moment."""
+class HostileChanges:
+    """Draws what changes in mid-motion: openings of grippers, grasps, and settings. Each draw may be None: nothing."""
 
-    def __init__(self, arms: Iterable[str], random: np.random.Generator) -> None:
-        self._arms, self._random = tuple(arms), random
+    def __init__(self, controller: CartesianController, seed: int) -> None:
+        self._settings = controller.settings
+        self._arms, self._with_object = tuple(controller.robot.arms), tuple(controller.robot.objects.by_arm)
+        self._openings, self._grasps, self._changes = (np.random.default_rng([seed, stream]) for stream in (3, 4, 5))
 
-    def draw(self) -> tuple[str, Interval] | None:
-        """An arm and an interval for this tick, or None; most follow each other closely, so that many are to grow."""
-        if self._random.random() > 0.05:
+    def opening(self) -> tuple[str, Interval] | None:
+        """An arm and the interval of its opening; most follow each other closely, so that many are to grow."""
+        random = self._openings
+        if random.random() > 0.05:
             return None
-        arm, kind = str(self._random.choice(self._arms)), int(self._random.integers(4))
-        first, second = np.sort(self._random.random(2)).tolist()
+        arm, kind = str(random.choice(self._arms)), int(random.integers(4))
+        first, second = np.sort(random.random(2)).tolist()
         return arm, (ALL_OF_THE_WAY, (0.0, 0.0), (first, second), (0.0, second))[kind]
 
-
-class HostileGrasps:
-    """Draws when objects are gripped and let go: at any speed, anywhere, some for a moment and some for long."""
-
-    def __init__(self, arms: Iterable[str], random: np.random.Generator) -> None:
-        """``arms`` are those whose grippers have an object."""
-        self._arms, self._random = tuple(arms), random
-
-    def draw(self) -> tuple[str, bool] | None:
-        """An arm and whether it holds from this tick on, or None."""
-        if not self._arms or self._random.random() > 0.02:
+    def grasp(self) -> tuple[str, bool] | None:
+        """An arm and whether it holds its object from this tick on: at any speed, for a moment or for long."""
+        if not self._with_object or self._grasps.random() > 0.02:
             return None
-        return str(self._random.choice(self._arms)), bool(self._random.random() < 0.7)
+        return str(self._grasps.choice(self._with_object)), bool(self._grasps.random() < 0.7)
 
-
-class HostileChanges:
-    """Draws settings that change in mid-motion: distances up and down by any amount, and gains."""
-
-    def __init__(self, settings: ControllerSettings, random: np.random.Generator) -> None:
-        self._settings, self._random = settings, random
-
-    def draw(self) -> dict[str, float] | None:
-        """Settings for this tick by name, or None."""
-        if self._random.random() > 0.01:
+    def settings(self) -> dict[str, float] | None:
+        """Settings by name: distances up and down by any amount, and gains."""
+        random = self._changes
+        if random.random() > 0.01:
             return None
-        if self._random.random() < 0.7:
-            return {"min_distance": float(self._random.choice([0.0, self._settings.min_distance, CLEARANCE]))}
-        name = str(self._random.choice(list(_GAIN_SHARES)))
-        share = float(self._random.choice(_GAIN_SHARES[name]))
-        return {name: share * float(getattr(self._settings, name))}
+        if random.random() < 0.7:
+            return {"min_distance": float(random.choice([0.0, self._settings.min_distance, CLEARANCE]))}
+        name = str(random.choice(list(_GAIN_SHARES)))
+        return {name: float(random.choice(_GAIN_SHARES[name])) * float(getattr(self._settings, name))}

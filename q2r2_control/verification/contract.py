@@ -9,16 +9,15 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Mapping
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from q2r2_control.config.control import ControllerSettings
+from q2r2_control.control.controller import CartesianController
 from q2r2_control.control.safety.safety_model import ROUNDING
 from q2r2_control.robot.kept_distances import kept_by_objects, kept_distances
-from q2r2_control.robot.pairs import pair_names
-from q2r2_control.robot.robot import Robot
 from q2r2_control.types import LONGEST_DT, Array, Interval, Reference, StepReport
 from q2r2_control.verification.measured_distances import MeasuredDistances
 from q2r2_control.verification.promises import PROMISES, RELATIVE, Margin
@@ -28,24 +27,6 @@ _ROUNDING = 4.0 * np.finfo(np.float64).eps  # of a difference, relative to the n
 _BETWEEN_SHARE, _BETWEEN_SAMPLES = 0.02, 4  # share of the ticks that are sampled, and postures in each
 _STOP_SHARE, _STOP_SAMPLES = 0.005, 41
 _NEAR, _NEAR_SHARE = 1e-3, 10.0  # with less margin [m] so many times as many ticks are sampled
-
-
-class Checked(Protocol):
-    """What a contract has to know of its controller."""
-
-    robot: Robot
-
-    @property
-    def settings(self) -> ControllerSettings: ...
-
-    @property
-    def stop_deceleration(self) -> Array: ...
-
-    @property
-    def object_distances(self) -> Array: ...
-
-    @property
-    def kept_distances(self) -> Array: ...
 
 
 def time_of(dt: Any) -> float:
@@ -66,7 +47,7 @@ class Contract:
 
     def __init__(
         self,
-        controller: Checked,
+        controller: CartesianController,
         q: Array | None = None,
         v: Array | None = None,
         *,
@@ -85,17 +66,14 @@ class Contract:
         self._lower = robot.position_lower + settings.position_margin
         self._upper = robot.position_upper - settings.position_margin
         self._ask(settings)
-        self._measured = MeasuredDistances(robot, self._asked)
-        self._pairs = [frozenset(pair) for pair in pair_names(robot.collision_model)]
-        self._take_kept()
-        self._objects = [frozenset(pair) for pair in robot.objects.pair_names()]
+        self._measured = MeasuredDistances(robot, controller.kept_distances)
         self._substep = settings.max_substep
         self.start(robot.home if q is None else q, v)
 
     def start(self, q: Array, v: Array | None = None) -> None:
         """The controller was reset to ``q`` [rad], ``v`` [rad/s], (nv,) each; without ``v`` at rest."""
         v = np.zeros_like(q) if v is None else v
-        self._take_kept()
+        self._measured.kept = self._controller.kept_distances
         self._q, self._v, self._stop = q.copy(), v.copy(), self._controller.stop_deceleration
         self._measured.forget()
         self._outside = np.maximum(np.maximum(self._lower - q, q - self._upper), 0.0)
@@ -124,11 +102,6 @@ class Contract:
         self._asked = kept_distances(self._robot, settings).values
         self._asked_of_objects = kept_by_objects(self._robot, settings).values
 
-    def _take_kept(self) -> None:
-        """Take over what pairs keep since this tick began, for which it has to be proven."""
-        self._measured.kept = self._controller.kept_distances
-        self._kept_by_name = dict(zip(self._pairs, self._measured.kept.tolist(), strict=True))
-
     def _note_kept(self) -> None:
         """What pairs keep may fall to what is asked for, and no farther."""
         before, kept, settings = self._measured.kept, self._controller.kept_distances, self._controller.settings
@@ -136,8 +109,7 @@ class Contract:
             self._ask(settings)
         if len(before):
             self._note("withdrawn", float((np.minimum(before, self._asked) - kept).max()))
-        if kept is not before:
-            self._take_kept()
+        self._measured.kept = kept  # for which this tick has to be proven
 
     def _note_objects(self) -> None:
         """Take over what pairs of objects keep, which never falls while they count but to what is asked for."""
@@ -182,7 +154,7 @@ class Contract:
                 if failed:
                     self._check_stopped(q, v, h, report.fallback)
             self._check_limits(q, v)
-            self._check_distance(self._margin_of(report), report.certified)
+            self._check_distance(self._measured.reported_margin(report), report.certified)
             stop = self._controller.stop_deceleration
             self._note("deceleration", float((stop / self._a).max()))
             self._note_objects()
@@ -274,14 +246,6 @@ class Contract:
         inside = (np.minimum(q, end) >= self._lower) & (np.maximum(q, end) <= self._upper)
         return np.asarray(inside, dtype=np.bool_)
 
-    def _margin_of(self, report: StepReport) -> float:
-        """Least margin that a report tells of, the nearest pair judged by what it has to keep here [m]."""
-        closest = frozenset(report.closest_pair)
-        if closest in self._objects:
-            return report.margin
-        nearest = report.closest_distance - self._kept_by_name.get(closest, 0.0)
-        return min(report.margin, nearest)
-
     def _check_distance(self, least: float, certified: bool) -> None:
         """``least`` is the least margin of a pair [m]."""
         if self._certain or (self._from_rest and self._least >= 0.0):
@@ -299,15 +263,9 @@ class Contract:
         if report.margin < _NEAR:
             draw /= _NEAR_SHARE
         if draw < _BETWEEN_SHARE:
-            values, kept = self._measured.values(q), self._measured.kept
-            margins = self._measured.less_kept(values)
-            of_object = {frozenset(report.closest_pair), frozenset(report.tightest_pair)} & set(self._objects)
-            if len(values) and values.min() > 0.0 and not of_object:  # Coal's penetration depth is another quantity
-                # Boxes that may be touched are rounded for the controller.
-                if kept[int(values.argmin())] >= 0.0 <= self._kept_by_name[frozenset(report.closest_pair)]:
-                    self._note("coal", abs(float(values.min()) - report.closest_distance))
-                if kept[int(margins.argmin())] >= 0.0 <= self._kept_by_name[frozenset(report.tightest_pair)]:
-                    self._note("coal", abs(float(margins.min()) - report.margin))
+            margins, wrong = self._measured.compare(q, report)
+            for error in wrong:
+                self._note("coal", error)
             if not self._certain and self._apart.any():
                 self._note("bystanders", float(margins[self._apart].min()))
             if self._certain and 0.0 < h <= self._substep:

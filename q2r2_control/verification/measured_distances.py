@@ -10,8 +10,9 @@ import pinocchio as pin
 from q2r2_control.control.geometry.collision import collision_model_of
 from q2r2_control.control.geometry.rounded_boxes import deeper_at_corners
 from q2r2_control.robot.finger_openings import collision_model_at
+from q2r2_control.robot.pairs import pair_names
 from q2r2_control.robot.robot import Robot
-from q2r2_control.types import Array, Interval
+from q2r2_control.types import Array, Interval, StepReport
 
 
 class MeasuredDistances:
@@ -21,13 +22,26 @@ class MeasuredDistances:
     """
 
     def __init__(self, robot: Robot, kept: Array) -> None:
-        self.kept = kept
+        self._pairs = [frozenset(pair) for pair in pair_names(robot.collision_model)]
+        self._objects = {frozenset(pair) for pair in robot.objects.pair_names()}
+        self._kept, self._kept_by_name = kept, dict(zip(self._pairs, kept.tolist(), strict=True))
         self._robot, self._data = robot, robot.model.createData()
         self._at_corners = deeper_at_corners(collision_model_of(robot), kept)
         self._fingers: tuple[pin.GeometryModel, pin.GeometryData] | None = None  # None: all of their way
         self._held_model = robot.objects.geometry
         self._held_data: pin.GeometryData = self._held_model.createData()
         self.forget()
+
+    @property
+    def kept(self) -> Array:
+        """(p,) [m]"""
+        return self._kept
+
+    @kept.setter
+    def kept(self, kept: Array) -> None:
+        if kept is not self._kept:
+            self._kept = kept
+            self._kept_by_name = dict(zip(self._pairs, kept.tolist(), strict=True))
 
     def forget(self) -> None:
         """Fingers may be anywhere on their way, and no object counts."""
@@ -48,11 +62,30 @@ class MeasuredDistances:
 
     def margins(self, q: Array) -> Array:
         """How much farther apart than it has to be every pair is (p,) [m]."""
-        return self.less_kept(self.values(q))
+        return np.asarray(self._values(q) - self.kept + self._at_corners)
 
-    def less_kept(self, values: Array) -> Array:
-        """The same of distances that were measured (p,) [m]."""
-        return np.asarray(values - self.kept + self._at_corners)
+    def reported_margin(self, report: StepReport) -> float:
+        """Least margin that a report tells of, the nearest pair judged by what it has to keep here [m]."""
+        closest = frozenset(report.closest_pair)
+        if closest in self._objects:
+            return report.margin
+        return min(report.margin, report.closest_distance - self._kept_by_name.get(closest, 0.0))
+
+    def compare(self, q: Array, report: StepReport) -> tuple[Array, list[float]]:
+        """The margins (p,) [m], and by how much the least distance and margin of a report are wrong [m].
+
+        Not compared are penetrations, whose depth is another quantity for Coal, pairs of objects, and boxes that may be
+        touched, which are rounded for the controller.
+        """
+        values = self._values(q)
+        margins = np.asarray(values - self.kept + self._at_corners)
+        closest, tightest = frozenset(report.closest_pair), frozenset(report.tightest_pair)
+        wrong: list[float] = []
+        if len(values) and values.min() > 0.0 and not {closest, tightest} & self._objects:
+            for found, told, pair in ((values, report.closest_distance, closest), (margins, report.margin, tightest)):
+                if self.kept[int(found.argmin())] >= 0.0 <= self._kept_by_name[pair]:
+                    wrong.append(abs(float(found.min()) - told))
+        return margins, wrong
 
     def _object_margins(self, q: Array) -> Array:
         """The same of the pairs of held objects that are apart, or have to be [m]."""
@@ -65,7 +98,7 @@ class MeasuredDistances:
         seen = np.isfinite(self.held) & ((values > 0.0) | (self.held >= 0.0))  # Coal's depth is another quantity
         return (values - self.held)[seen]
 
-    def values(self, q: Array) -> Array:
+    def _values(self, q: Array) -> Array:
         """As :meth:`Robot.distance_values`, with fingers at the openings that the controller counts with."""
         if self._fingers is None:
             return self._robot.distance_values(q)

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import gc
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -18,45 +19,28 @@ from q2r2_control.control.qp import make_solver
 from q2r2_control.errors import ConfigError
 from q2r2_control.robot.kept_distances import kept_distances
 from q2r2_control.robot.robot import Robot
-from q2r2_control.types import Array, Interval, Reference
-from q2r2_control.verification.adversary import HostileChanges, HostileGrasps, HostileGrippers, Request
-from q2r2_control.verification.contract import Checked, Contract, time_of
+from q2r2_control.types import Array
+from q2r2_control.verification.adversary import HostileChanges, Request
+from q2r2_control.verification.contract import Contract, time_of
 from q2r2_control.verification.fault_injection import STOPPING_FAULTS, FaultySolver, Segment, segments
 from q2r2_control.verification.promises import Margin
 from q2r2_control.verification.worst_solver import ATTACKS, WorstSolver
 
 FEWEST_TICKS = 100
+COUNTED = {
+    "segments": "segments",
+    "resets": "resets",
+    "solver_faults": "ticks with a failing solver, attacks among them",
+    "attacks": "ticks with a solver that works against the arms",
+    "fallbacks": "certified stops executed",
+    "fallbacks_healthy": "of these with a healthy solver",
+    "openings": "openings of grippers",
+    "openings_refused": "of these refused",
+    "grasps": "grasps and releases",
+    "changes": "changes of settings",
+}
 _SETTLED = 0.1  # share of the ticks after which memory should have stopped growing
 MEMORY_ALLOWED = 5.0  # [MB]
-_COUNTED = (
-    "segments",
-    "resets",
-    "solver_faults",
-    "attacks",
-    "openings",
-    "openings_refused",
-    "grasps",
-    "changes",
-    "fallbacks",
-    "fallbacks_healthy",
-)
-
-
-class Steppable(Checked, Protocol):
-    """What a soak needs of a controller: that of :class:`CartesianController`."""
-
-    def reset(self, q: Array, v: Array | None = None) -> None: ...
-
-    def step(self, targets: Any, dt: Any) -> Reference: ...
-
-    def set_opening(self, arm: str, least: float, greatest: float) -> tuple[str, str] | None: ...
-
-    @property
-    def openings(self) -> Mapping[str, Interval]: ...
-
-    def set_holding(self, arm: str, holds: bool) -> None: ...
-
-    def change(self, values: Mapping[str, Any]) -> str | None: ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,16 +66,7 @@ class SoakReport:
     seed: int
     ticks: int
     simulated_s: float
-    segments: int
-    resets: int
-    solver_faults: int  # ticks, attacks among them
-    attacks: int  # ticks with a solver that works against the arms
-    openings: int  # of grippers that were told
-    openings_refused: int
-    grasps: int  # of objects, and releases
-    changes: int  # of settings
-    fallbacks: int  # ticks, of all
-    fallbacks_healthy: int  # ticks, of those with a healthy solver
+    counts: dict[str, int]  # see :data:`COUNTED`
     margins: list[Margin]
     memory_growth_mb: float | None  # None where the system does not tell
     broken: list[Violation]  # the first of each promise, in the order of their ticks
@@ -104,7 +79,8 @@ class SoakReport:
 
     def as_json(self) -> dict[str, Any]:
         """Data for ``json.dumps``."""
-        return asdict(self) | {"passed": self.passed}
+        data = asdict(self)
+        return data | data.pop("counts") | {"passed": self.passed}
 
 
 def run_soak(config: Config, ticks: int, seed: int, progress: Callable[[str], None] = lambda what: None) -> SoakReport:
@@ -129,7 +105,7 @@ class Soak:
     def __init__(
         self,
         cell: str,
-        controller: Steppable,
+        controller: CartesianController,
         solver: FaultySolver,
         seed: int,
         progress: Callable[[str], None] = lambda what: None,
@@ -138,11 +114,9 @@ class Soak:
         self._progress = progress
         self._contract = Contract(controller, random=np.random.default_rng([seed, 2]))
         self._broken: dict[str, Violation] = {}
-        self._counts = dict.fromkeys(_COUNTED, 0)
+        self._counts = Counter(dict.fromkeys(COUNTED, 0))
         self._simulated = 0.0
-        self._grippers = HostileGrippers(controller.robot.arms, np.random.default_rng([seed, 3]))
-        self._objects = HostileGrasps(controller.robot.objects.by_arm, np.random.default_rng([seed, 4]))
-        self._changes = HostileChanges(controller.settings, np.random.default_rng([seed, 5]))
+        self._hostile = HostileChanges(controller, seed)
 
     def run(self, ticks: int) -> SoakReport:
         """Run ``ticks`` ticks."""
@@ -161,8 +135,8 @@ class Soak:
             simulated_s=self._simulated,
             margins=list(self._contract.margins.values()),
             memory_growth_mb=None if before is None or after is None else after - before,
+            counts=dict(self._counts),
             broken=list(self._broken.values()),
-            **self._counts,
         )
 
     def _ticks(self, ticks: int) -> Iterator[tuple[Segment, int]]:
@@ -190,10 +164,7 @@ class Soak:
         fault, dt = segment.fault_at(since), segment.dt()
         request = segment.stream(since, self._q)
         self._solver.fault, self._solver.q, self._solver.kept = fault, self._q, self._controller.kept_distances
-        self._tell_opening()
-        self._tell_holding()
-        if (values := self._changes.draw()) is not None:
-            self._counts["changes"] += self._controller.change(values) is None
+        self._change_cell()
         try:
             reference = self._controller.step(request.targets, dt)
         except Exception as error:  # the contract promises none
@@ -214,21 +185,18 @@ class Soak:
         self._counts["fallbacks"] += reference.report.fallback
         self._counts["fallbacks_healthy"] += reference.report.fallback and fault is None
 
-    def _tell_opening(self) -> None:
-        told = self._grippers.draw()
-        if told is None:
-            return
-        arm, interval = told
-        self._counts["openings"] += 1
-        self._counts["openings_refused"] += self._controller.set_opening(arm, *interval) is not None
-        self._contract.set_openings(self._controller.openings)
-
-    def _tell_holding(self) -> None:
-        told = self._objects.draw()
-        if told is None:
-            return
-        self._counts["grasps"] += 1
-        self._controller.set_holding(*told)
+    def _change_cell(self) -> None:
+        """Openings of grippers, grasps and settings change as they like."""
+        if (opening := self._hostile.opening()) is not None:
+            arm, interval = opening
+            self._counts["openings"] += 1
+            self._counts["openings_refused"] += self._controller.set_opening(arm, *interval) is not None
+            self._contract.set_openings(self._controller.openings)
+        if (grasp := self._hostile.grasp()) is not None:
+            self._counts["grasps"] += 1
+            self._controller.set_holding(*grasp)
+        if (values := self._hostile.settings()) is not None:
+            self._counts["changes"] += self._controller.change(values) is None
 
     def _keep(
         self, tick: int, segment: Segment, since: int, request: Request, dt: Any, broken: Iterable[str], error: str

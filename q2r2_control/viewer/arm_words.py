@@ -11,7 +11,6 @@ from q2r2_control.events import REFUSALS, Event
 from q2r2_control.summary.tick import Tick
 from q2r2_control.teleop.arm_states import ArmState
 from q2r2_control.types import ActiveLimit, LimitKind
-from q2r2_control.viewer.history import tracking_error
 from q2r2_control.wording import sentence
 
 # A tool nearer to its target than this follows; what holds it back beyond that is said [m], [rad].
@@ -32,7 +31,7 @@ def why(tick: Tick, arm: str, joints: Collection[str], binding: Collection[Activ
         if last is None:
             return "not engaged yet"
         return sentence(last.reason) if last.kind in REFUSALS else f"{tick.states[arm]}: {sentence(last.reason)}"
-    distance, angle = tracking_error(tick, arm)
+    distance, angle = tick.tracking_error(arm)
     if not (distance > _FOLLOWS or angle > _TURNED):
         return "goes with the other arm" if tick.states[arm] == ArmState.CARRIED else "follows the hand"
     return _held_by(tick, arm, joints, binding) or ("catches up" if np.isfinite(distance) else "holds")

@@ -1,13 +1,15 @@
-"""The live table of a run."""
+"""The live table of a run, which a thread draws: a tick only stores a reference."""
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Collection, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 
 import numpy as np
 from rich.console import Console
+from rich.live import Live
 from rich.markup import escape
 from rich.table import Table
 
@@ -16,17 +18,18 @@ from q2r2_control.events import Event
 from q2r2_control.summary.tick import Tick
 from q2r2_control.types import ActiveLimit
 from q2r2_control.viewer.arm_words import next_press, why
-from q2r2_control.viewer.drawing import drawn
-from q2r2_control.viewer.history import tracking_error
 from q2r2_control.wording import limit_name
 
 _REFRESH_RATE = 6.0  # [Hz]
+# Drawing takes milliseconds of Python at a time. The loop gets the interpreter back within this time, as it has to
+# after each kernel of a tick [s].
+_SWITCH_INTERVAL = 2e-5
 _LIMITS_SHOWN = 4
 _NEAR = 0.01  # a pair with less to spare is coloured [m]
 
 
 class LiveTable:
-    """Shows the newest tick of a run. A thread draws; a tick only stores a reference."""
+    """Shows the newest tick of a run."""
 
     def __init__(self, title: str, joints: Mapping[str, Collection[str]], bindings: BindingSettings) -> None:
         """``joints``: names of those that move each arm; ``bindings``: what the hands' controls do."""
@@ -51,9 +54,35 @@ class LiveTable:
 
     @contextmanager
     def shown(self, console: Console) -> Iterator[None]:
-        """Show the table on ``console`` for as long as the context lasts."""
-        with drawn(self.render, console, _REFRESH_RATE):
+        """Show the table on ``console`` for as long as the context lasts, if it is a terminal.
+
+        What is printed meanwhile comes above the table. The loop must print nothing: it would wait for the terminal.
+        """
+        if not console.is_terminal:
             yield
+            return
+        before = sys.getswitchinterval()
+        sys.setswitchinterval(min(before, _SWITCH_INTERVAL))
+        live = Live(
+            console=console,
+            get_renderable=self._drawn_table,
+            refresh_per_second=_REFRESH_RATE,
+            transient=True,
+            redirect_stdout=sys.stdout.isatty(),
+        )
+        live.start()
+        try:
+            yield
+        finally:
+            sys.setswitchinterval(before)
+            with suppress(OSError):  # the terminal is gone
+                live.stop()
+
+    def _drawn_table(self) -> Table | str:
+        try:
+            return self.render()
+        except Exception as error:
+            return f"no live table: {type(error).__name__}: {error}"
 
     def render(self) -> Table:
         """The table at this moment."""
@@ -97,7 +126,7 @@ class LiveTable:
 
 
 def _arm_rows(tick: Tick, arms: list[str]) -> list[tuple[str, list[str]]]:
-    errors = {arm: tracking_error(tick, arm) for arm in arms}
+    errors = {arm: tick.tracking_error(arm) for arm in arms}
     return [
         ("teleop", [f"[green]{tick.states[arm]}[/]" if tick.engaged[arm] else tick.states[arm] for arm in arms]),
         ("position error", [_figure(1e3 * errors[arm][0], "mm", 1) for arm in arms]),

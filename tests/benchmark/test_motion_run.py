@@ -9,7 +9,8 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from q2r2_control.benchmark.motion_run import DT, MotionFigures, own_controller, run_motion, without_pairs
+from q2r2_control.benchmark.motion_run import DT, MotionFigures, play_motion, run_motion
+from q2r2_control.benchmark.own_controller import OwnController, without_pairs
 from q2r2_control.benchmark.work_motions import WORK_MOTIONS
 from q2r2_control.config.cell import load_config
 from q2r2_control.robot.robot import Robot
@@ -29,16 +30,18 @@ class Standing:
 
     name, limitations = "standing", "everything"
 
-    def __init__(self, jerked: int, failing: int) -> None:
-        self._jerked, self._failing = jerked, failing
+    def __init__(self, jerked: int = -1, failing: int = -1, raises: bool = True) -> None:
+        self._jerked, self._failing, self._raises = jerked, failing, raises
 
     def reset(self, q: Array) -> None:
         self._q, self._tick = q, -1
 
     def step(self, targets: Mapping[str, pin.SE3], dt: float) -> tuple[Array, Array]:
         self._tick += 1
-        if self._tick == self._failing:
+        if self._tick == self._failing and self._raises:
             raise RuntimeError("no solution")
+        if self._tick == self._failing:
+            return np.full(len(self._q), np.nan), np.zeros(len(self._q))
         v = np.zeros(len(self._q))
         v[3] = 0.002 if self._tick == self._jerked else 0.0
         return self._q.copy(), v
@@ -69,6 +72,14 @@ def test_figures_of_a_controller_that_stands_still_are_those_of_the_targets(robo
     assert figures.closest_pair == (nearest.name_a, nearest.name_b)
 
 
+@pytest.mark.parametrize("raises", [True, False])
+def test_the_arms_stand_still_in_a_tick_without_a_solution(robot: Robot, raises: bool) -> None:
+    run = play_motion(Standing(failing=3, raises=raises), robot, SHORT, np.inf, DT)
+    assert np.flatnonzero(run.failed).tolist() == [3]
+    np.testing.assert_array_equal(run.q[3], run.q[2])
+    assert not run.v[3].any()
+
+
 def test_what_happens_during_the_approach_is_not_measured(robot: Robot) -> None:
     began = round(SHORT.begins / DT)
     figures = run_motion(Standing(jerked=began - 100, failing=began - 50), robot, SHORT)
@@ -78,29 +89,29 @@ def test_what_happens_during_the_approach_is_not_measured(robot: Robot) -> None:
 @pytest.mark.parametrize(("goal", "arrival"), [(0.0099, 0.0), (0.0101, None)])
 def test_who_is_within_10_mm_of_the_goal_has_arrived(robot: Robot, goal: float, arrival: float | None) -> None:
     away = replace(SHORT, path=lambda t, home: home + np.array([[0.0, goal, 0.0], [0.0, 0.0, 0.0]]))
-    assert run_motion(Standing(-1, -1), robot, away).arrival_s == arrival
-    assert run_motion(Standing(-1, -1), robot, replace(away, has_goal=False)).arrival_s is None
+    assert run_motion(Standing(), robot, away).arrival_s == arrival
+    assert run_motion(Standing(), robot, replace(away, has_goal=False)).arrival_s is None
 
 
 def test_who_leaves_the_goal_has_arrived_when_it_is_back_for_good(robot: Robot) -> None:
     there_and_back = replace(
         SHORT, path=lambda t, home: home + 0.2 * min(t, 0.2 - t) * np.array([[1.0, 0, 0], [0, 0, 0]])
     )
-    figures = run_motion(own_controller(robot, CONFIG), robot, there_and_back)
+    figures = run_motion(OwnController(robot, CONFIG), robot, there_and_back)
     assert figures.max_error_mm is not None
     assert figures.arrival_s is not None
     assert 0.1 < figures.arrival_s < 0.4
 
 
 def test_a_controller_that_is_too_slow_to_wait_for_says_how_far_it_got(robot: Robot) -> None:
-    figures = run_motion(Standing(-1, -1), robot, SHORT, patience=0.0)
+    figures = run_motion(Standing(), robot, SHORT, patience=0.0)
     assert figures.done < 0.01
     assert figures == MotionFigures("short", "standing", figures.done)
 
 
 def test_free_air_follows_what_the_pairs_forbid() -> None:
     free = without_pairs(CONFIG)
-    figures = run_motion(own_controller(free, CONFIG), Robot.from_config(CONFIG), WORK_MOTIONS["slide"])
+    figures = run_motion(OwnController(free, CONFIG), Robot.from_config(CONFIG), WORK_MOTIONS["slide"])
     assert figures.rms_error_mm is not None
     assert figures.rms_error_mm < 2.0
     # The slide asks for 10 mm less than the millimetre that fingers keep.

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from q2r2_control.cli import export as command
-from tests.cli.test_app import q2r2
+from tests.cli.command import q2r2
 from tests.export.runs import DURATION, contents, record_two
 
 
@@ -89,10 +89,3 @@ def test_an_output_that_exists_is_left_alone(recordings: Sequence[Path], tmp_pat
     assert "out.csv: exists; allowed: a name that does not exist yet" in result.stderr
     assert (tmp_path / "out.csv").read_text() == "mine"
     assert not (tmp_path / "out.csv.partial").exists()
-
-
-@pytest.mark.parametrize("form", ["lerobot", "csv"])
-def test_the_help_has_an_example(form: str) -> None:
-    result = q2r2("export", form, "--help")
-    assert result.exit_code == 0
-    assert f"Example: q2r2 export {form}" in result.stdout

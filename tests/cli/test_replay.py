@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.cli.test_app import FAST, changed_cell, one_object, q2r2
+from tests.cli.command import FAST, changed_cell, one_object, q2r2
 
 pytestmark = pytest.mark.slow
 

@@ -51,15 +51,16 @@ def test_an_arm_that_was_paused_by_something_else_than_its_button_is_named_with_
     assert f"{sentence(refusal)}, at 6.00 s" in text
 
 
-def test_missed_ticks_are_told(summary: RunSummary) -> None:
-    text = text_of(replace(summary, missed_ticks=7, stretched_s=0.123))
-    assert "7, which made the motion 0.12 s late in all" in text
-
-
-def test_how_late_ticks_were_is_told_where_time_was_real(summary: RunSummary) -> None:
+def test_late_and_missed_ticks_are_told_and_what_held_a_gripper(summary: RunSummary) -> None:
     assert "ticks late by" not in text_of(summary)
-    text = text_of(replace(summary, lateness_us=Percentiles(60.0, 310.0, 1204.0), overruns=3))
+    assert "gripper held" not in text_of(summary)
+    held = replace(summary.arms["left"], gripper_held_s=1.25, gripper_held_by=("left_finger_0", "block_0"))
+    late = replace(summary, lateness_us=Percentiles(60.0, 310.0, 1204.0), overruns=3, missed_ticks=7, stretched_s=0.123)
+    text = text_of(replace(late, arms=summary.arms | {"left": held}))
+    assert "7, which made the motion 0.12 s late in all" in text
     assert "median 60 us, p99 310, max 1204; 3 by more than a period" in text
+    (row,) = (line for line in text.splitlines() if "left gripper held for" in line)
+    assert "1.25 s, by left_finger_0 | block_0" in row
 
 
 @pytest.mark.parametrize(
@@ -80,14 +81,6 @@ def test_a_task_is_told_in_one_line_with_what_was_measured_and_what_fell_short(r
     file = console.file
     assert isinstance(file, StringIO)
     assert file.getvalue() == f"{line}\n"
-
-
-def test_a_gripper_that_was_held_is_named_with_what_held_it(summary: RunSummary) -> None:
-    assert "gripper held" not in text_of(summary)
-    held = replace(summary.arms["left"], gripper_held_s=1.25, gripper_held_by=("left_finger_0", "block_0"))
-    text = text_of(replace(summary, arms=summary.arms | {"left": held}))
-    (row,) = (line for line in text.splitlines() if "left gripper held for" in line)
-    assert "1.25 s, by left_finger_0 | block_0" in row
 
 
 def test_lost_pictures_are_said_with_the_reason() -> None:

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from q2r2_control import CartesianController, Robot, load_config
-from q2r2_control.benchmark.motion_run import MotionFigures, own_controller, run_motion, without_pairs
+from q2r2_control.benchmark.motion_run import MotionFigures, run_motion
+from q2r2_control.benchmark.own_controller import OwnController, without_pairs
 from q2r2_control.benchmark.work_motions import WORK_MOTIONS, WorkMotion
 from q2r2_control.verification.contract import Contract
 
@@ -29,7 +30,7 @@ def robot_of(free: bool) -> Robot:
 def figures_of(name: str, free: bool = False) -> MotionFigures:
     """Our figures in a work motion, or in free air on the same path."""
     robot = robot_of(free)
-    return run_motion(own_controller(robot, CONFIG), robot, WORK_MOTIONS[name])
+    return run_motion(OwnController(robot, CONFIG), robot, WORK_MOTIONS[name])
 
 
 def rms(name: str, free: bool = False) -> float:

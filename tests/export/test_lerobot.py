@@ -11,7 +11,7 @@ import pytest
 from q2r2_control.errors import RecordingError
 from q2r2_control.export import lerobot
 from q2r2_control.export.lerobot import SOURCES, join_shards, video_key
-from tests.cli.test_app import q2r2
+from tests.cli.command import q2r2
 from tests.export.vectors import CAMERA
 
 ACTION = {"dtype": "float32", "shape": [2], "names": ["left_A1", "left_A2"]}

@@ -9,7 +9,7 @@ import pytest
 
 pytest.importorskip("lerobot", reason="make test-lerobot installs it")
 
-from tests.cli.test_app import q2r2
+from tests.cli.command import q2r2
 from tests.export.runs import record_two
 
 ROOT = Path(__file__).resolve().parents[2]

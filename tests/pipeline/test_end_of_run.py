@@ -3,15 +3,11 @@
 from __future__ import annotations
 
 import gc
-import json
 import os
 import signal
 import socket
-import subprocess
-import sys
 import threading
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -26,8 +22,6 @@ from q2r2_control.summary.run_summary import RunSummary
 from q2r2_control.types import SIDES, Command
 from tests.pipeline.loops import pipeline, when_moving
 from tests.support.watch import Watch, assert_torque_bounds, cell, speed
-
-CHECKOUT = Path(__file__).resolve().parents[2]
 
 
 class RecordingPlant(KinematicPlant):
@@ -117,32 +111,6 @@ class TestStop:
         assert loop.run(10.0, realtime=False).ticks == 1
         assert loop.run(0.1, realtime=False).ticks > 50
 
-    @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
-    def test_of_a_process_by_a_signal_returns_its_summary(self, name: str) -> None:
-        script = (
-            "import json\n"
-            "from tests.pipeline.loops import pipeline, when_moving\n"
-            "from tests.support.watch import Watch\n"
-            "loop = pipeline(plant='mujoco')\n"
-            "watch = Watch(loop)\n"
-            "loop.listeners.append(when_moving(lambda: print('moving', flush=True)))\n"
-            "print(json.dumps(loop.run(10.0).as_json()), flush=True)\n"
-        )
-        for _ in range(10):
-            with subprocess.Popen(
-                [sys.executable, "-c", script], cwd=CHECKOUT, stdout=subprocess.PIPE, text=True
-            ) as run:
-                assert run.stdout is not None
-                if run.stdout.readline() != "moving\n":
-                    continue  # other load on the machine has paused the arms before they moved
-                run.send_signal(getattr(signal, name))
-                summary = json.loads(run.stdout.readline())
-                assert run.wait(60.0) == 0
-                break
-        assert summary["at_rest"]
-        assert summary["max_velocity_ratio"] > 0.0
-        assert summary["max_acceleration_ratio"] <= 1.0 + 1e-9
-
 
 def assert_braked(loop: Pipeline, watch: Watch, summary: RunSummary) -> None:
     """The run ended at rest, without input from the stop on; the contract was checked at every tick."""
@@ -157,7 +125,6 @@ def assert_braked(loop: Pipeline, watch: Watch, summary: RunSummary) -> None:
     # Slower motion than that is the last correction of a posture that is held.
     rest = next(tick for tick in stopping if speed(tick) < 1e-3)
     assert rest.t - stopping[0].t <= 1.5 * braking + 0.05 + 3.0 * max(tick.dt for tick in stopping)
-    assert not loop.stopping
 
 
 @pytest.mark.slow

@@ -1,28 +1,23 @@
-"""What an operator's hands feel of a run: in the simulated loop, and as bytes on the headset's connection."""
+"""What an operator's hands feel of a run."""
 
 from __future__ import annotations
 
-import struct
-import threading
 from collections.abc import Callable
 from itertools import pairwise
 from typing import ClassVar
 
 import numpy as np
-import pytest
 
 from q2r2_control.events import Reason, ReasonKind
-from q2r2_control.inputs.headset import HeadsetServer
 from q2r2_control.inputs.scripted import ScriptedInput
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.summary.tick import Tick
-from q2r2_control.teleop.haptics import CONTACT, ENGAGED, FAULT, GRASP, LIMIT, NEAR, PAUSED, SLIP, Pulse
+from q2r2_control.teleop.haptics import CONTACT, ENGAGED, FAULT, GRASP, LIMIT, NEAR, SLIP, Pulse
 from q2r2_control.types import Array, HapticFeedback
-from tests.support.fake_headset import RATE_HZ, FakeHeadset, Sensor
 from tests.support.hands_input import ENGAGED as BEGIN
 from tests.support.hands_input import HandsInput, Path
-from tests.support.operator_script import HANDS, START
+from tests.support.operator_script import HANDS
 from tests.support.watch import cell
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -126,56 +121,6 @@ def test_a_gripper_that_closes_on_a_block_is_felt_once_and_an_empty_one_is_not()
     config = cell().model_copy(update={"loop_rate_hz": 500.0})
     Pipeline.from_config(config, input=script, plant="mujoco").run(14.0, realtime=False)
     assert script.grasps == {"right": 1}
-
-
-@pytest.mark.parametrize("dialect", ["ros1", "ros2"])
-def test_a_headset_gets_the_vibrations_over_its_connection(dialect: str) -> None:
-    server = HeadsetServer(port=0)
-    config = cell()
-    patient = config.teleop.gate.model_copy(update={"timeout": 2.0})  # a busy machine is no fault
-    config = config.model_copy(update={"teleop": config.teleop.model_copy(update={"gate": patient})})
-    loop = Pipeline.from_config(config, input=server, plant="kinematic")
-    listening, ended = threading.Event(), threading.Event()
-    loop.listeners.append(lambda _: listening.set())
-    runs = threading.Thread(target=loop.run)
-    runs.start()
-    try:
-        assert listening.wait(60.0)
-        with FakeHeadset(server.address, dialect) as headset:
-            headset.send(headset.registrations())
-            lower = threading.Event()
-
-            def stream() -> None:
-                sensor = Sensor()
-                while not ended.wait(1.0 / RATE_HZ):
-                    for hand in HANDS:
-                        headset.send(headset.pose(hand, sensor.measured(START[hand]), (0.0, 0.0, 0.0, 1.0)))
-                        headset.send(headset.inputs(hand, lower=lower.is_set()))
-
-            streams = threading.Thread(target=stream)
-            streams.start()
-
-            def next_pulse() -> tuple[float, float]:
-                payload = headset.read_until("q2r_left_hand_haptic_feedback", 30.0)
-                frequency, amplitude = struct.unpack("<ff", payload[-8:])
-                return round(frequency, 3), round(amplitude, 3)
-
-            try:
-                threading.Event().wait(0.3)
-                lower.set()
-                assert next_pulse() == ENGAGED[:2]
-                assert next_pulse() == (0.0, 0.0)
-                lower.clear()
-                threading.Event().wait(0.3)
-                lower.set()
-                assert next_pulse() == PAUSED[:2]
-                assert next_pulse() == (0.0, 0.0)
-            finally:
-                ended.set()
-                streams.join()
-    finally:
-        loop.stop()
-        runs.join()
 
 
 def test_a_refused_press_is_felt_as_a_fault_is() -> None:

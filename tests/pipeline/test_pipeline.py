@@ -22,14 +22,12 @@ from tests.support.watch import Watch, assert_torque_bounds, cell, changes, spee
     ("trajectory", "human", "plant", "mode", "millimetres", "degrees"),
     [
         ("circle", False, "mujoco", "position", 2.0, 0.3),
-        ("line", False, "kinematic", "position", 2.0, 0.3),
-        ("rotate", False, "mujoco", "position", 2.0, 0.5),
         ("meet", False, "kinematic", "position", 2.0, 0.3),
         ("circle", True, "mujoco", "position", 2.0, 0.5),
         ("circle", True, "mujoco", "torque", 2.0, 0.5),
         ("rotate", False, "mujoco", "torque", 2.0, 0.5),
     ],
-    ids=["circle", "line", "rotate", "meet", "a human's circle", "a human's circle by torque", "rotate by torque"],
+    ids=["circle", "meet", "a human's circle", "a human's circle by torque", "rotate by torque"],
 )
 def test_both_arms_follow_within_every_limit(
     trajectory: str, human: bool, plant: str, mode: str, millimetres: float, degrees: float
@@ -124,17 +122,6 @@ def test_a_run_takes_as_many_ticks_as_its_duration_has_periods(rate: float) -> N
     assert summary.duration_s == pytest.approx(summary.ticks / rate)
 
 
-@pytest.mark.parametrize("rate", [50.0, 200.0])
-def test_a_slow_loop_keeps_the_limits_too(rate: float) -> None:
-    loop = pipeline(plant="mujoco", loop_rate_hz=rate)
-    watch = Watch(loop)
-    summary = loop.run(3.0, realtime=False)
-    error = summary.arms["left"].position_error_mm_rms
-    assert error is not None
-    assert error < 15.0
-    assert len(watch.ticks) == summary.ticks
-
-
 def test_by_the_clock_a_run_lasts_as_long_as_it_is_asked_to() -> None:
     loop = pipeline(loop_rate_hz=100.0)
     watch = Watch(loop)
@@ -154,8 +141,6 @@ def test_a_duration_that_is_no_time_is_refused(duration: float) -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"input": "mouse"}, "input 'mouse': allowed are headset, scripted"),
-        ({"plant": "gazebo"}, "plant 'gazebo': allowed are kinematic, mujoco"),
         ({"mode": "jerk"}, "mode jerk: MujocoPlant follows position, velocity, torque commands only"),
         (
             {"plant": "kinematic", "mode": "torque"},
@@ -163,9 +148,7 @@ def test_a_duration_that_is_no_time_is_refused(duration: float) -> None:
         ),
     ],
 )
-def test_an_unknown_input_or_plant_and_a_mode_that_the_plant_does_not_have_are_refused(
-    arguments: dict[str, str], message: str
-) -> None:
+def test_a_mode_that_the_plant_does_not_have_is_refused(arguments: dict[str, str], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         Pipeline.from_config(cell(), **arguments)
 

@@ -10,7 +10,6 @@ import pinocchio as pin
 import pytest
 
 from q2r2_control.benchmark.motion_measures import rest_acceleration
-from q2r2_control.benchmark.work_hands import MOVES, WorkHands
 from q2r2_control.benchmark.work_motions import ARMS, WORK_MOTIONS, WorkMotion, carry
 from q2r2_control.config.cell import Config, load_config
 from q2r2_control.pipeline.pipeline import Pipeline
@@ -20,6 +19,7 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.summary.tick import Tick
 from q2r2_control.types import Array
 from q2r2_control.verification.contract import Contract
+from work_hands import MOVES, WorkHands
 
 pytestmark = pytest.mark.slow
 

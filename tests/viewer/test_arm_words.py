@@ -13,9 +13,7 @@ from q2r2_control.summary.tick import Tick
 from q2r2_control.types import ActiveLimit, ArmTarget, LimitKind
 from q2r2_control.viewer.arm_words import next_press, why
 from q2r2_control.wording import SENTENCES
-from tests.viewer.test_history import robot, tick_at
-
-__all__ = ["robot"]
+from tests.viewer.ticks import tick_at
 
 JOINTS = ("left_A2", "left_A4")
 

@@ -67,7 +67,6 @@ class Mink:
                 collision_detection_distance=DETECTION_DISTANCE,
             ),
         ]
-        self.pairs: int = self._limits[2].max_num_contacts
         self.reset(robot.home)
 
     def _full(self, q: Array) -> Array:

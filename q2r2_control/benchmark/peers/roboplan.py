@@ -81,8 +81,6 @@ class Roboplan:
                 ),
             )
         ]
-        every = optimal_ik.SelfCollisionBarrierOptions(n_collision_pairs=10**6)
-        self.pairs: int = optimal_ik.SelfCollisionBarrier(self._ik, self._scene, dt, every).n_collision_pairs
         self.reset(robot.home)
 
     def _frame_task(self, setup: PeerSettings, arm: str) -> optimal_ik.FrameTask:

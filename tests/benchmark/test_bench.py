@@ -1,4 +1,4 @@
-"""The work bench runs ours in free air, ours, and whatever peers there are, all through the same motions."""
+"""The bench runs ours in free air, ours, and the peers that there are, all through the same motions."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
+from q2r2_control.benchmark.bench import run_bench
 from q2r2_control.benchmark.motion_run import run_motion
 from q2r2_control.benchmark.peers.base import INSTALL, PEERS, PeerSettings, is_installed, make_peer
 from q2r2_control.benchmark.peers.leading import Leading
-from q2r2_control.benchmark.work_bench import WORK_PEERS, run_work_bench
-from q2r2_control.benchmark.work_motions import WORK_MOTIONS, motions_named
+from q2r2_control.benchmark.work_motions import TIMED_MOTIONS, WORK_MOTIONS, motions_named
 from q2r2_control.config.cell import load_config
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
@@ -40,20 +40,32 @@ class Listening:
 
 def test_a_row_has_ours_in_free_air_and_near_the_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(PEERS, "missing", "no_such_package_anywhere")
+    monkeypatch.setitem(PEERS, "broken", "json")
     said: list[str] = []
-    report = run_work_bench(CONFIG, motions_named(["slide"]), ("missing",), said.append)
+    report = run_bench(CONFIG, motions_named(["slide"]), ("missing", "broken"), 2, said.append)
     (row,) = report.rows
     (ours,) = row.figures
-    assert said == ["slide (1 of 1), free air", "slide (1 of 1), q2r2_control"]
-    assert report.notes == [f"missing: not installed; {INSTALL}"]
-    assert ours.controller == "q2r2_control"
+    turns = [(turn, name) for turn in (1, 2) for name in ("free air", "q2r2_control")]
+    assert said == [f"slide (1 of 1), round {turn}, {name}" for turn, name in turns]
+    assert report.notes[0] == f"missing: not installed; {INSTALL}"
+    assert report.notes[1].startswith("broken: cannot be built for this cell: ModuleNotFoundError")
     assert ours.min_distance_mm is not None
     assert ours.min_distance_mm >= 1.0  # fingers and obstacles
     assert row.free_air.rms_error_mm is not None
     assert ours.rms_error_mm is not None
     # It is asked for 10 mm that the table does not allow.
     assert row.free_air.rms_error_mm < 2.0 < 9.0 < ours.rms_error_mm
+    assert ours.times_us is not None
+    assert list(ours.times_us) == sorted(ours.times_us)
     assert report.as_json()["rows"][0]["figures"][0]["motion"] == "slide"
+
+
+def test_ticks_are_timed_in_free_motion_and_in_contact() -> None:
+    free, contact = run_bench(CONFIG, TIMED_MOTIONS, ()).rows
+    assert free.figures[0].rms_error_mm == pytest.approx(free.free_air.rms_error_mm, rel=1e-3)
+    assert contact.figures[0].min_distance_mm is not None
+    assert free.figures[0].min_distance_mm is not None
+    assert 1.0 <= contact.figures[0].min_distance_mm < 4.0 < 25.0 < free.figures[0].min_distance_mm
 
 
 def test_a_peer_is_given_its_target_ahead_by_speed_over_gain() -> None:
@@ -74,7 +86,7 @@ def test_a_peer_is_given_its_target_ahead_by_speed_over_gain() -> None:
     assert peer.given[0].isApprox(pose, 1e-15)
 
 
-@pytest.mark.parametrize("name", WORK_PEERS)
+@pytest.mark.parametrize("name", PEERS)
 def test_a_peer_follows_in_free_motion_as_well_as_its_gain_allows(name: str) -> None:
     if not is_installed(name):
         pytest.skip(f"{PEERS[name]} is not installed; {INSTALL}")

@@ -1,0 +1,44 @@
+"""The q2r2 command, run as a user or a script runs it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner, Result
+
+from q2r2_control.cli.app import app
+from q2r2_control.config.resources import find_resource
+from tests.support.external_cell import external_text
+
+CELL = "config/dual_iiwa7.yaml"
+FAST = ("run", CELL, "--plant", "kinematic", "--fast", "--json", "--headless")
+
+
+def q2r2(*arguments: str) -> Result:
+    return CliRunner().invoke(app, arguments)
+
+
+def one_object(text: str) -> dict[str, Any]:
+    """The one JSON object on the one line that stdout has to be."""
+    assert text.count("\n") == 1
+    found = json.loads(text, parse_constant=pytest.fail)
+    assert isinstance(found, dict)
+    return found
+
+
+def changed_cell(folder: Path, old: str, new: str) -> str:
+    """The shipped cell in a file of its own, with another text in it."""
+    text = find_resource(CELL).read_text(encoding="utf-8")
+    assert old in text
+    file = folder / "cell.yaml"
+    file.write_text(text.replace(old, new, 1), encoding="utf-8")
+    return str(file)
+
+
+def external_cell(folder: Path, old: str = "mode: raw", new: str = "mode: raw") -> str:
+    file = folder / "external.yaml"
+    file.write_text(external_text().replace(old, new, 1), encoding="utf-8")
+    return str(file)

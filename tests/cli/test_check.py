@@ -1,0 +1,155 @@
+"""q2r2 check: what a cell consists of, what is wrong with it, and the pairs that it finds."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from q2r2_control.cli.cell_report import check_cell
+from q2r2_control.cli.pair_files import write_model_pairs
+from q2r2_control.config.cell import load_config
+from q2r2_control.config.resources import find_resource
+from q2r2_control.errors import ConfigError
+from q2r2_control.verification.contact_cells import FINGERS, with_contact
+from tests.cli.command import CELL, changed_cell, external_cell, one_object, q2r2
+from tests.robot.conftest import one_arm
+
+ARM = one_arm()
+
+
+def test_check_prints_arms_limits_obstacles_and_the_nearest_pairs_of_a_good_cell() -> None:
+    result = q2r2("check", CELL)
+    assert result.exit_code == 0
+    for expected in ("left_A1", "right_A7", "hand_e", "left_tool_frame", "table", "monitored pairs", "min_distance 20"):
+        assert expected in result.stdout
+    assert "FAULT" not in result.stdout
+
+
+@pytest.mark.parametrize(
+    ("mode", "source"),
+    [("raw", "the hand's target"), ("filtered", "what the built-in controller makes of the hand's target")],
+)
+def test_check_says_what_drives_the_arms_and_how(tmp_path: Path, mode: str, source: str) -> None:
+    assert "arms driven by the built-in controller\n" in q2r2("check", CELL).stdout
+    file = external_cell(tmp_path, new=f"mode: {mode}")
+    topic = "/bh_robot/right_arm_clik_controller/target_frame"
+    takes = "it takes: active; keeps the last target for ever"
+    line = f"kuka_lbr_clik: PoseStamped in bh_robot_base on {topic} at 100 Hz, {source}; {takes}"
+    assert f"right driven by {line}\n" in q2r2("check", file).stdout
+    assert one_object(q2r2("check", file, "--json").stdout)["driven"]["right"] == line
+
+
+def test_check_as_json_has_limits_and_distances_in_order() -> None:
+    cell = one_object(q2r2("check", CELL, "--json").stdout)
+    assert [arm["name"] for arm in cell["arms"]] == ["left", "right"]
+    joint = cell["arms"][0]["joints"][0]
+    assert joint["name"] == "left_A1"
+    assert joint["lower"] == pytest.approx(-2.967, abs=1e-3)
+    assert joint["velocity"] == pytest.approx(1.71, abs=0.01)
+    distances = [pair["distance"] for pair in cell["nearest"]]
+    assert distances == sorted(distances)
+    assert cell["monitored_pairs"] > len(distances) > 3
+    assert cell["faults"] == []
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "fault"),
+    [
+        pytest.param("home: [0.0204, 0.348,", "home: [0.0204, 1.0,", "left_hand_e_envelope_0 and table_0", id="table"),
+        pytest.param("0.0204, 0.348,", "0.0204, 2.09,", "left_A2 = 2.09; allowed: -2.0844 .. 2.0844", id="limits"),
+        pytest.param("floor: 0.0 ", "floor: 0.37 ", "left_hand_e_finger_1_envelope_0 and floor_0 are", id="floor"),
+        pytest.param(
+            "[0.0, 0.4, 0.0]", "[0.0, 0.4, -0.6]", "left_hand_e_finger_1_envelope_0 and floor_0 are", id="a low mount"
+        ),
+    ],
+)
+def test_check_lists_what_is_wrong_at_home_and_exits_with_1(tmp_path: Path, old: str, new: str, fault: str) -> None:
+    file = changed_cell(tmp_path, old, new)
+    result = q2r2("check", file)
+    assert result.exit_code == 1
+    assert f"FAULT home: {fault}" in result.stdout
+    result = q2r2("check", file, "--json")
+    assert result.exit_code == 1
+    assert any(fault in line for line in one_object(result.stdout)["faults"])
+
+
+def test_check_says_how_to_do_without_the_floor_that_is_in_the_way(tmp_path: Path) -> None:
+    low = changed_cell(tmp_path, "[0.0, 0.4, 0.0]", "[0.0, 0.4, -0.6]")
+    lines = [line for line in q2r2("check", low).stdout.splitlines() if line.startswith("FAULT") and "floor_0" in line]
+    assert lines
+    assert all(line.endswith("; the key floor takes another height, or null for no floor") for line in lines)
+    text = Path(low).read_text(encoding="utf-8").replace("floor: 0.0 ", "floor: null ")
+    Path(low).write_text(text.replace("position: [0.75, 0.0, 0.1]", "position: [0.75, 0.0, -0.6]"), encoding="utf-8")
+    result = q2r2("check", low)
+    assert (result.exit_code, "floor" in result.stdout) == (0, False)
+
+
+def test_check_notes_where_a_stop_asks_for_more_torque_than_there_is_and_that_is_no_fault(tmp_path: Path) -> None:
+    fast = changed_cell(tmp_path, "acceleration_limit: {} ", "acceleration_limit: {A1: 10.0, A2: 10.0, A3: 10.0} ")
+    result = q2r2("check", fast)
+    (note,) = (line for line in result.stdout.splitlines() if line.startswith("NOTE "))
+    assert re.search(
+        r"^NOTE left arm: in a full stop .* left_A2 needs up to 1\.09 times its torque limit, at (-?\d\.\d\d ){7}rad; "
+        r"some joint does in 9\.\d % of 5000 random postures \(seed 0\); to change: 0\.86 times these limits in "
+        r"arms\.left\.acceleration_limit or control\.acceleration_limit$",
+        note,
+    )
+    assert result.exit_code == 0
+    cell = one_object(q2r2("check", fast, "--json").stdout)
+    assert [f"NOTE {note}" for note in cell["notes"]] == [note]
+    assert cell["stop_torques"][0]["stop"]["share_over"] > 0.09
+    assert cell["stop_torques"][1]["stop"]["share_over"] == 0.0
+
+
+def test_check_shows_for_each_joint_what_gravity_and_a_full_stop_ask_of_it() -> None:
+    cell = one_object(q2r2("check", CELL, "--json").stdout)
+    assert cell["notes"] == []
+    joint, other = (cell["stop_torques"][1]["joints"][index] for index in (1, 3))
+    assert (joint["joint"], joint["acceleration"]) == ("right_A2", 5.44)
+    assert other["acceleration"] == 10.0, "the smaller one of the joint's and control.acceleration_limit"
+    assert 0.0 < joint["gravity"] < joint["stop"] < 1.0
+
+
+def test_where_gravity_alone_is_too_much_the_note_says_so_and_promises_nothing_of_slower_stops(tmp_path: Path) -> None:
+    urdf = find_resource("robots/iiwa7.urdf").read_text(encoding="utf-8")
+    assert urdf.count('velocity="2.268928" effort="110"') == 1  # of A4
+    (tmp_path / "arm.urdf").write_text(urdf.replace('velocity="2.268928" effort="110"', 'velocity="2.2" effort="12"'))
+    (note,) = check_cell(one_arm(model=str(tmp_path / "arm.urdf"))).notes
+    assert re.search(
+        r"^left arm: at rest, by gravity alone left_A4 needs up to \d\.\d\d times its torque limit, at "
+        r"(-?\d\.\d\d ){7}rad; .*; to change: the model's torque limits, masses and position limits$",
+        note,
+    )
+
+
+def test_what_may_touch_is_said() -> None:
+    cell = with_contact(load_config("config/dual_iiwa7.yaml"), FINGERS)
+    report = check_cell(cell)
+    notes = [note for note in report.notes if "may touch in torque mode" in note]
+    assert len(notes) == len(cell.control.contact_allowed) == len(report.as_json()["contacts"])
+    for note, allowed in zip(notes, cell.control.contact_allowed, strict=True):
+        assert all(name in note for name in allowed.pair)
+        assert f"inside by up to {1e3 * allowed.depth:g} mm" in note
+
+
+@pytest.mark.slow
+def test_pairs_that_can_never_meet_are_written_to_new_files(tmp_path: Path) -> None:
+    file = tmp_path / "cell.srdf"
+    assert q2r2("check", CELL, "--pairs", str(file), "--samples", "300").exit_code == 0
+    assert "disable_collisions" in file.read_text(encoding="utf-8")
+    again = q2r2("check", CELL, "--pairs", str(file))
+    assert (again.exit_code, "exists; give the name of a new file" in again.stderr) == (2, True)
+
+
+def test_model_pairs_are_written_once_and_nothing_else_is_replaced(tmp_path: Path) -> None:
+    file = tmp_path / "iiwa7.srdf"
+    assert write_model_pairs(ARM, tmp_path, 100, 0.05) == {str(file): True}
+    assert write_model_pairs(ARM, tmp_path, 100, 0.05) == {str(file): False}
+    file.write_text("mine")
+    with pytest.raises(ConfigError, match=r"iiwa7\.srdf: exists and says something else; remove it"):
+        write_model_pairs(ARM, tmp_path, 100, 0.05)
+    assert file.read_text() == "mine"
+    with pytest.raises(ConfigError, match=r"clearance = 0\.02 m: allowed: above control\.min_distance"):
+        write_model_pairs(ARM, tmp_path, 100, 0.02)
