@@ -125,6 +125,13 @@ def test_a_stream_that_its_sender_ends_stops_its_own_arm_only(world: World, cont
     assert [world.supervisor.arm_state(arm) for arm in ("left", "right")] == ["holding", "following"]
 
 
+def test_arms_that_are_not_linked_end_their_streams_alone(world: World, controller: CartesianController) -> None:
+    world.streams.linked = False
+    _, right = engage_both(world, controller)
+    world.run(0.5, right=right)
+    assert [world.supervisor.arm_state(arm) for arm in ("left", "right")] == ["holding", "following"]
+
+
 def test_a_loop_that_stood_still_commands_nothing_of_the_past_and_follows_no_target_that_waited(
     world: World, controller: CartesianController
 ) -> None:
