@@ -76,7 +76,7 @@ def headset(hand: str, seed: int) -> SampleTiming:
     return HeadsetSampling(hand, seed, tremor=True, dropout_probability=0.002)
 
 
-class Thinned:
+class Thinned(SampleTiming):
     """Samples of a headset, without those at times that ``missing`` tells."""
 
     def __init__(self, inner: SampleTiming, missing: Callable[[float], bool]) -> None:
@@ -92,7 +92,7 @@ class Thinned:
         return self._inner.lateness()
 
 
-class Slow:
+class Slow(SampleTiming):
     """Even samples with the noise of a headset."""
 
     def __init__(self, inner: SampleTiming, rate: float) -> None:
