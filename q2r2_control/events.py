@@ -79,7 +79,6 @@ class ReasonKind(StrEnum):
     LINKED = "linked"  # the other arm has a fault, which is the cause
 
     # Obstacles to a request.
-    DEAD_MAN_NOT_HELD = "dead_man_not_held"
     TOOL_UNKNOWN = "tool_unknown"
     CONTROLS_HELD = "controls_held"
     STOPPED = "stopped"

@@ -71,7 +71,6 @@ SENTENCES: dict[ReasonKind, str] = {
     _K.CLOCK_NOT_FINITE: "the clock is not finite",
     _K.CLOCK_WENT_BACK: "the clock went back by {duration:.3f} s",
     _K.LINKED: "linked to {arm}: {cause}",
-    _K.DEAD_MAN_NOT_HELD: "the dead man is not held",
     _K.TOOL_UNKNOWN: "the tool's pose is not known",
     _K.CONTROLS_HELD: "{controls} held since the hand was first heard of: let go first",
     _K.STOPPED: "stopped, {control} goes on",

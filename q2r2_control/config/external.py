@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from enum import StrEnum
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, field_validator, model_validator
 
@@ -177,15 +177,11 @@ def check_external(kind: ControllerKind, external: ExternalConfig | None, arms: 
 
 def _check_apart(external: ExternalConfig) -> None:
     """Two arms that share a topic would be pulled to and fro."""
-    topics = {arm: external.topic(arm) for arm in external.arms}
-    frames = {arm: made.tool_frame for arm, made in external.arms.items() if made.tool_frame is not None}
+    topics = [external.topic(arm) for arm in external.arms]
+    frames = [made.tool_frame for made in external.arms.values() if made.tool_frame is not None]
     for what, values in (("commands", topics), ("tool_frame", frames)):
-        if (value := _twice(values)) is not None:
-            raise ConfigError(f"external.arms: both have {what} {value}; allowed: one of its own for each arm")
-
-
-def _twice(values: Mapping[Any, str]) -> str | None:
-    return next((value for value in values.values() if list(values.values()).count(value) > 1), None)
+        if len(set(values)) < len(values):
+            raise ConfigError(f"external.arms: both have {what} {values[0]}; allowed: one of its own for each arm")
 
 
 def describe(external: ExternalConfig) -> dict[str, str]:

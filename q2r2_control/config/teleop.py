@@ -55,10 +55,7 @@ class RotationFrame(StrEnum):
 
 
 class FilterSettings(StrictModel):
-    """Interpolation between samples, then a One-Euro filter (Casiez, Roussel, Vogel, CHI 2012).
-
-    The hand's delay is interpolation_delay + smoothing_delay, at any speed.
-    """
+    """Interpolation between samples, then a One-Euro filter (Casiez, Roussel, Vogel, CHI 2012)."""
 
     interpolation_delay: float = Field(0.02, ge=0.005, le=0.2, description="1.5 periods of a 75 Hz headset [s]")
     smoothing_delay: float = Field(0.025, ge=0, le=0.2, description="of a motion at constant speed [s]")
@@ -66,6 +63,11 @@ class FilterSettings(StrictModel):
     beta: float = Field(10.0, ge=0, le=1000, description="cutoff added per speed [Hz s/m]")
     rotation_beta: float = Field(3.0, ge=0, le=1000, description="cutoff added per speed [Hz s/rad]")
     derivative_cutoff: float = Field(2.0, gt=0, le=100, description="cutoff of the speed estimate [Hz]")
+
+    @property
+    def delay(self) -> float:
+        """From the receipt of a hand's sample to what the filter makes of it, at low frequencies [s]."""
+        return self.interpolation_delay + self.smoothing_delay
 
 
 class GateSettings(StrictModel):

@@ -10,10 +10,8 @@ What decides, in this order:
    connection looks alive for seconds.
 4. Everybody else is refused while somebody drives.
 
-All headsets register alike, so that in rule 3 the address is what tells them apart. Behind one address (a router that
-translates addresses, two apps on one PC) a second headset could take the place of one that is quiet, but never of one
-that drives: ``QUIET_ALLOWED`` is 37 periods of the app's poses, and three times as long as what pauses the arms
-(``STREAM_TIMEOUT``). Whoever takes the place finds all arms paused, since the loop is told of a lost connection.
+Behind one address a second headset could take the place of one that is quiet by rule 3, but never of one that drives:
+``QUIET_ALLOWED`` is 37 periods of the app's poses, and three times as long as what pauses the arms.
 """
 
 from __future__ import annotations

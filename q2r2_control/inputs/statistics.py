@@ -58,19 +58,15 @@ class Arrivals:
         return now - self._stamps[-1] if self._stamps else math.inf
 
 
-class TopicRecorder:
+class TopicRecorder(Arrivals):
     """Counts the messages of one topic, and keeps the last."""
 
-    def __init__(self) -> None:
-        self._arrivals = Arrivals()
-        self._last: HandMessage | None = None
+    _last: HandMessage
 
     def record(self, message: HandMessage, now: float) -> None:
-        self._arrivals.note(now)
+        self.note(now)
         self._last = message
 
     def snapshot(self, now: float) -> TopicStatistics:
         """The figures at ``now`` [s]; only after the first :meth:`record`."""
-        assert self._last is not None
-        arrivals = self._arrivals
-        return TopicStatistics(arrivals.count, arrivals.rate(now), arrivals.age(now), self._last)
+        return TopicStatistics(self.count, self.rate(now), self.age(now), self._last)

@@ -169,7 +169,7 @@ class ControlLoop:
         refusals = {}
         for arm, pose in targets.items():
             if pose is None:
-                self.supervisor.release_target(arm)
+                self.supervisor.targets.release(arm)
             elif refusal := self.supervisor.update_target(arm, pose, now):
                 refusals[arm] = refusal
         return refusals

@@ -81,14 +81,14 @@ class JointWatch:
             return
         (last, last_q), (self.state, self._q) = (self.state, self._q), (state, q)
         if last is None or self._still_since == math.inf:
-            self._begin(q, now)
+            self._still_since, self._still_at = now, q
             return
         # If the distance of all joints is below the limit, so is that of every joint. What is not a number is far.
         far = not math.dist(q, last_q) < _JUMP_ALLOWANCE
         if far and (fault := self._jump(q, last_q, max(now - last.stamp, passed, 0.0))):
             self._fail(fault)
         elif not _all_within(q, self._still_at, _REST):
-            self._begin(q, now)
+            self._still_since, self._still_at = now, q
 
     def settled(self, now: float) -> bool:
         """Whether states have been good and at rest for the settle time."""
@@ -132,7 +132,7 @@ class JointWatch:
     def accept_at_once(self, state: RobotState, now: float) -> None:
         """Believe ``state`` without waiting: the arms are known to be at rest there."""
         self.state, self._q = state, state.q.tolist()
-        self._begin(self._q, now)
+        self._still_since, self._still_at = now, self._q
         self.accept()
 
     @property
@@ -162,9 +162,6 @@ class JointWatch:
             return None
         worst = int((moved - reach).argmax())
         return Reason.of(ReasonKind.STATE_JUMPED, joint=self._names[worst], distance=float(moved[worst]))
-
-    def _begin(self, q: list[float], now: float) -> None:
-        self._still_since, self._still_at = now, q
 
     def _fail(self, fault: Reason) -> None:
         self._still_since = math.inf

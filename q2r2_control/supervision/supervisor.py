@@ -63,7 +63,7 @@ class Supervisor:
         self._robot, self._controller, self._external = robot, controller, external
         self._displace = displace
         self._origins = origins or Origins()
-        self._targets = TargetStreams(robot.arms, streams, self._origins)
+        self.targets = TargetStreams(robot.arms, streams, self._origins)
         self._watch = JointWatch(robot.joint_names, robot.velocity_limit, watch, self._origins.joint_states)
         self.homing = Homing(robot, controller, tools_only=external is not None)
         self._stopped: Reason | None = None  # why it takes a reset
@@ -100,16 +100,7 @@ class Supervisor:
 
     def follows(self, arm: str) -> bool:
         """Whether an arm follows its targets."""
-        return self.phase is Phase.ACTIVE and self._targets.follows(arm)
-
-    def target_age(self, arm: str, now: float) -> float:
-        """Time since the last target of an arm that was a pose [s]."""
-        return self._targets.age(arm, now)
-
-    @property
-    def ended_targets(self) -> list[Reason]:
-        """One for each arm that holds since its targets ended."""
-        return list(self._targets.ended.values())
+        return self.phase is Phase.ACTIVE and self.targets.follows(arm)
 
     def update_state(self, state: RobotState | Reason, now: float, passed: float = 0.0) -> None:
         """A joint state, or what is wrong with it; ``passed`` [s]: see :meth:`JointWatch.observe`."""
@@ -128,15 +119,11 @@ class Supervisor:
         target is to be reached [s], None: at once, and until the next one comes.
         """
         tools: list[pin.SE3] = []
-        if not self._targets.follows_on(arm, now):
+        if not self.targets.follows_on(arm, now):
             tools.append(self._controller.tool_pose(arm))
             if self._external is None and self._watch.state is not None:
                 tools.append(self._robot.tool_pose(self._watch.state.q, arm))
-        return self._targets.offer(arm, pose, tools, now, number, self.no_targets, due)
-
-    def release_target(self, arm: str) -> None:
-        """The sender of an arm's targets ended them: the arm holds, and the next target begins a stream."""
-        self._targets.release(arm)
+        return self.targets.offer(arm, pose, tools, now, number, self.no_targets, due)
 
     @property
     def no_targets(self) -> Reason | None:
@@ -190,7 +177,7 @@ class Supervisor:
         elif too_close := self._external.too_close(state):
             self.stop(too_close)
         else:
-            holding = [arm for arm in self._targets.arms if not self._targets.follows(arm)]
+            holding = [arm for arm in self.targets.arms if not self.targets.follows(arm)]
             if behind := away or self._external.left_behind(state, holding, now):
                 self.start_over(behind, now)
 
@@ -247,7 +234,7 @@ class Supervisor:
         if self.phase is Phase.BRAKING:
             return Reason(ReasonKind.ARMS_BRAKING)
         self._stopped, self.paused = None, False
-        self._targets.reset()
+        self.targets.reset()
         self.homing.end()
         if self.phase is Phase.STOPPED:
             self.phase = Phase.INACTIVE
@@ -266,7 +253,7 @@ class Supervisor:
     def activate(self, state: RobotState, now: float) -> None:
         """Start at once at ``state``, at which the arms are known to be at rest. Raises :class:`RobotError`."""
         self._stopped, self.paused = None, False
-        self._targets.reset()
+        self.targets.reset()
         self._watch.accept_at_once(state, now)
         self._activate()
 
@@ -290,8 +277,8 @@ class Supervisor:
 
     def _forget_targets(self) -> None:
         self.homing.end()
-        self._targets.drop()
+        self.targets.drop()
 
     def _wanted(self, now: float, dt: float) -> dict[str, pin.SE3 | None]:
-        self.events += self._targets.expire(now)
-        return self.homing.targets(self._last, dt) if self.homing.active else self._targets.at(now)
+        self.events += self.targets.expire(now)
+        return self.homing.targets(self._last, dt) if self.homing.active else self.targets.at(now)

@@ -45,7 +45,6 @@ class ArmTeleop:
         self._aligned_at = 0.0
 
     def _use_controls(self, settings: TeleopSettings) -> None:
-        self._has_dead_man = settings.bindings.words_of(Action.DEAD_MAN) is not None
         self._held = HeldControls(settings.bindings)
         self._analog = AnalogGripper(settings.bindings, settings.gripper_speed)
         self._gestures = GestureRecognizer(settings)
@@ -189,8 +188,6 @@ class ArmTeleop:
         if next_state(self.state, cause) is self.state:
             return
         obstacle, anchor = around.obstacles.get(self.arm) or self.watchdog(now), around.anchor(self.arm)
-        if self._has_dead_man and Action.DEAD_MAN not in self._held.actions:
-            obstacle = obstacle or Reason(ReasonKind.DEAD_MAN_NOT_HELD)
         if self._gate.pose is None:
             obstacle = obstacle or self._gate.problem
         elif anchor is None or not np.isfinite(anchor.tool.homogeneous).all():

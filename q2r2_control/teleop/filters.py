@@ -118,8 +118,8 @@ class OneEuro:
 class PoseFilter:
     """Interpolation and One-Euro filter of one hand's pose.
 
-    A hand that moves at constant velocity comes out ``delay`` seconds late, whatever its speed: interpolation delay
-    plus smoothing delay. Velocity changes are followed within about 1 / (2 pi derivative_cutoff).
+    A hand that moves at constant velocity comes out :attr:`FilterSettings.delay` late, whatever its speed. Velocity
+    changes are followed within about 1 / (2 pi derivative_cutoff).
     """
 
     def __init__(self, settings: FilterSettings) -> None:
@@ -128,11 +128,6 @@ class PoseFilter:
         self._position = OneEuro(settings.min_cutoff, settings.beta, *smoothing)
         self._rotation = OneEuro(settings.min_cutoff, settings.rotation_beta, *smoothing)
         self.reset(((0.0, 0.0, 0.0), IDENTITY), 0.0)
-
-    @property
-    def delay(self) -> float:
-        """Low-frequency delay from a sample's receipt to the output [s]."""
-        return self._interpolator.delay + self._position.delay
 
     def reset(self, pose: Pose, now: float) -> None:
         """Rest at ``pose``; earlier samples are forgotten."""

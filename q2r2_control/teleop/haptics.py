@@ -14,10 +14,10 @@ from q2r2_control.types import HapticFeedback
 class Pulse(NamedTuple):
     """One vibration."""
 
-    meaning: str
     frequency: float  # 0..1
     amplitude: float  # 0..1
     duration: float  # [s]
+    meaning: str
     strongest: float | None = None  # amplitude that it grows to
 
     def grown(self, share: float) -> Pulse:
@@ -26,21 +26,21 @@ class Pulse(NamedTuple):
         return self._replace(amplitude=self.amplitude + (most - self.amplitude) * min(share, 1.0))
 
 
-NEAR = Pulse("another 5 mm nearer to what the arm has to keep away from, from 50 mm to spare on", 0.6, 0.1, 0.04, 0.6)
-SLIP = Pulse("the target has slipped along by another 20 mm or 0.1 rad", 0.2, 0.2, 0.05)
-CONTACT = Pulse("the tool's contact force has grown by another 5 N", 0.1, 0.2, 0.06, 0.8)
-LIMIT = Pulse("a joint has come to its position limit", 0.8, 0.25, 0.05)
-PAUSED = Pulse("paused, by its control or the alignment chord; home, or interrupted on the way", 0.3, 0.3, 0.08)
-EPISODE_ENDS = Pulse("an episode of the recording ends, or succeeded", 0.35, 0.35, 0.15)
-ENGAGED = Pulse("engaged; both arms carry", 0.5, 0.4, 0.08)
-EPISODE_KEPT = Pulse("the verdict on an episode: keep", 0.75, 0.42, 0.4)
-EPISODE_BEGINS = Pulse("an episode of the recording begins; a mark", 0.6, 0.45, 0.15)
-GRASP = Pulse("the gripper has closed on something", 0.7, 0.5, 0.12)
-HOMING = Pulse("on the way home", 0.4, 0.55, 0.2)
-EPISODE_DISCARDED = Pulse("an episode is discarded, or failed", 0.2, 0.65, 0.25)
-EPISODE_REJECTED = Pulse("the verdict on an episode: discard", 0.15, 0.7, 0.5)
-STOPPED = Pulse("stopped, by the control that stops", 0.9, 0.9, 0.25)
-FAULT = Pulse("lost: stopped by a fault (lost data, a jump, a stop), or a press that was refused", 1.0, 1.0, 0.3)
+NEAR = Pulse(0.6, 0.1, 0.04, "another 5 mm nearer to what the arm has to keep away from, from 50 mm to spare on", 0.6)
+SLIP = Pulse(0.2, 0.2, 0.05, "the target has slipped along by another 20 mm or 0.1 rad")
+CONTACT = Pulse(0.1, 0.2, 0.06, "the tool's contact force has grown by another 5 N", 0.8)
+LIMIT = Pulse(0.8, 0.25, 0.05, "a joint has come to its position limit")
+PAUSED = Pulse(0.3, 0.3, 0.08, "paused, by its control or the alignment chord; home, or interrupted on the way")
+EPISODE_ENDS = Pulse(0.35, 0.35, 0.15, "an episode of the recording ends, or succeeded")
+ENGAGED = Pulse(0.5, 0.4, 0.08, "engaged; both arms carry")
+EPISODE_KEPT = Pulse(0.75, 0.42, 0.4, "the verdict on an episode: keep")
+EPISODE_BEGINS = Pulse(0.6, 0.45, 0.15, "an episode of the recording begins; a mark")
+GRASP = Pulse(0.7, 0.5, 0.12, "the gripper has closed on something")
+HOMING = Pulse(0.4, 0.55, 0.2, "on the way home")
+EPISODE_DISCARDED = Pulse(0.2, 0.65, 0.25, "an episode is discarded, or failed")
+EPISODE_REJECTED = Pulse(0.15, 0.7, 0.5, "the verdict on an episode: discard")
+STOPPED = Pulse(0.9, 0.9, 0.25, "stopped, by the control that stops")
+FAULT = Pulse(1.0, 1.0, 0.3, "lost: stopped by a fault (lost data, a jump, a stop), or a press that was refused")
 # The weakest first: where two are due at once, the stronger one is felt. The docs' table is this one.
 VOCABULARY = (
     *(NEAR, SLIP, CONTACT, LIMIT, PAUSED, EPISODE_ENDS, ENGAGED, EPISODE_KEPT, EPISODE_BEGINS, GRASP, HOMING),

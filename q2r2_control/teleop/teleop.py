@@ -46,7 +46,7 @@ class Teleop:
     def _use(self, settings: TeleopSettings) -> None:
         self.settings = settings
         self._linked, self._stall = settings.linked, settings.gate.timeout
-        self.delay = settings.filter.interpolation_delay + settings.filter.smoothing_delay
+        self.delay = settings.filter.delay
 
     def change(self, settings: TeleopSettings, now: float) -> Reason | None:
         """Other settings from now on, without a jump; returns why that is not possible now, or None.

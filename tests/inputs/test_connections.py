@@ -23,6 +23,8 @@ from tests.support.headset_server import (
     collect,
     connect,
     eventually,
+    next_topic,
+    registered,
     warnings,
 )
 
@@ -32,9 +34,7 @@ HERE, ELSEWHERE = "127.0.0.1", "127.0.0.2"  # two hosts, as a server sees them
 @contextmanager
 def driving(server: HeadsetServer, source: str = HERE) -> Iterator[FakeHeadset]:
     """A headset that has registered and sent a pose."""
-    with connect(server, source=source) as headset:
-        headset.send(headset.registrations())
-        headset.read_until("__topic_list")
+    with registered(server, source=source) as headset:
         move(headset, server)
         yield headset
 
@@ -47,9 +47,7 @@ def move(headset: FakeHeadset, server: HeadsetServer, x: float = 0.0) -> None:
 
 def assert_refused(headset: FakeHeadset, because: bytes) -> None:
     """Greeted first, or the app takes the refusal for an endpoint of another version."""
-    greeting = headset.read_frame()
-    assert greeting is not None
-    assert greeting[0] == "__handshake"
+    assert next_topic(headset) == "__handshake"
     assert_ended(headset, because)
 
 
@@ -127,9 +125,7 @@ def test_a_peer_that_only_keeps_alive_gives_way_to_a_headset_that_sends_poses(
         for _ in range(6):
             clock.advance(1.0)
             keep_alive(idle, server, clock)
-        with connect(server, source=ELSEWHERE) as second:
-            second.send(second.registrations())
-            second.read_until("__topic_list")
+        with registered(server, source=ELSEWHERE) as second:
             assert drives(server, idle), "nothing is taken by who sends no poses either"
             second.send(second.pose("left", (5.0, 0.0, 0.0), IDENTITY))
             eventually(lambda: drives(server, second))

@@ -11,7 +11,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
-from typing import cast
+from unittest.mock import MagicMock
 
 import pytest
 
@@ -33,6 +33,8 @@ from tests.support.headset_server import (
     collect,
     connect,
     eventually,
+    next_topic,
+    registered,
     wait_until_dropped,
     warnings,
 )
@@ -53,9 +55,7 @@ def test_it_listens_on_this_machine_only_unless_told_otherwise() -> None:
 @pytest.mark.parametrize("slash", [False, True], ids=["bare names", "leading slash"])
 def test_a_headset_is_greeted_answered_and_its_hands_arrive(server: HeadsetServer, dialect: str, slash: bool) -> None:
     with FakeHeadset(server.address, dialect, slash) as headset:
-        first = headset.read_frame()
-        assert first is not None
-        assert first[0] == "__handshake"
+        assert next_topic(headset) == "__handshake"
         headset.send(headset.registrations())
         headset.read_until("__topic_list")
         headset.send(headset.inputs("left", lower=True, analog=(0.5, -0.5, 0.25, 1.0)))
@@ -103,9 +103,7 @@ def test_after_a_second_without_words_the_server_sends_a_keepalive(server: Heads
 
 @every_dialect
 def test_haptics_arrive_as_two_floats_clipped_to_their_range(server: HeadsetServer, dialect: str) -> None:
-    with connect(server, dialect) as headset:
-        headset.send(headset.registrations())
-        headset.read_until("__topic_list")
+    with registered(server, dialect) as headset:
         server.send_haptic(HapticFeedback("left", frequency=0.5, amplitude=7.0))
         payload = headset.read_until(HAPTIC)
         assert len(payload) == (8 if dialect == "ros1" else 12)
@@ -116,15 +114,11 @@ def test_haptics_arrive_as_two_floats_clipped_to_their_range(server: HeadsetServ
 
 @pytest.mark.parametrize("value", [math.nan, -math.inf])
 def test_haptics_that_are_not_finite_are_not_sent(server: HeadsetServer, value: float) -> None:
-    with connect(server) as headset:
-        headset.send(headset.registrations())
-        headset.read_until("__topic_list")
+    with registered(server) as headset:
         server.send_haptic(HapticFeedback("left", value, 1.0))
         server.send_haptic(HapticFeedback("left", 1.0, value))
         server.send_haptic(HapticFeedback("right", 1.0, 1.0))
-        frame = headset.read_frame()
-    assert frame is not None
-    assert frame[0] == "q2r_right_hand_haptic_feedback"
+        assert next_topic(headset) == "q2r_right_hand_haptic_feedback"
 
 
 def test_haptics_without_a_headset_or_a_subscription_do_nothing(server: HeadsetServer) -> None:
@@ -132,59 +126,36 @@ def test_haptics_without_a_headset_or_a_subscription_do_nothing(server: HeadsetS
     with connect(server) as headset:
         server.send_haptic(HapticFeedback("left", 1.0, 1.0))
         headset.send(headset.command("__topic_list"))
-        frame = headset.read_frame()
-        assert frame is not None
-        assert frame[0] == "__topic_list"
+        assert next_topic(headset) == "__topic_list"
     server.close()
     server.send_haptic(HapticFeedback("left", 1.0, 1.0))
 
 
-class FullNetwork:
-    """The server's end of a connection whose other end does not read: takes nothing until ``is_full`` is unset."""
-
-    def __init__(self, server: HeadsetServer) -> None:
-        client = server._client
-        assert client is not None
-        self.is_full = True
-        self._connection = client.socket
-        client.socket = cast(socket.socket, self)
-
-    def send(self, data: bytes) -> int:
-        if self.is_full:
-            raise BlockingIOError
-        return self._connection.send(data)
-
-    def recv(self, size: int) -> bytes:
-        return self._connection.recv(size)
-
-    def fileno(self) -> int:
-        return self._connection.fileno()
-
-    def __enter__(self) -> FullNetwork:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._connection.close()
-
-
-def test_a_headset_that_does_not_read_is_owed_only_the_newest_vibration(server: HeadsetServer) -> None:
-    with connect(server) as headset:
-        headset.send(headset.registrations())
-        headset.read_until("__topic_list")
-        network = FullNetwork(server)
+def test_a_headset_that_does_not_read_is_owed_only_the_newest_vibration_and_the_next_one_none(
+    server: HeadsetServer,
+) -> None:
+    with registered(server) as headset:
+        assert server._client is not None
+        network = server._client.socket = MagicMock(wraps=server._client.socket)
+        network.send.side_effect = BlockingIOError  # as while its other end does not read
         for step in range(51):
             server.send_haptic(HapticFeedback("left", step / 50.0, 1.0))
             time.sleep(0.001)  # time in which an unbounded queue would grow
         headset.send(headset.pose("left", (1.0, 2.0, 3.0), IDENTITY))
         assert collect(server, 1)[0].position.tolist() == [1.0, 2.0, 3.0]
-        network.is_full = False
+        network.send.side_effect = None
         received = [struct.unpack("<2f", headset.read_until(HAPTIC)[-8:])[0] for _ in range(2)]
+        assert received[0] < 1.0, "what was on its way"
+        assert received[1] == 1.0, "the newest"
+        network.send.side_effect = BlockingIOError
+        for _ in range(10):
+            server.send_haptic(HapticFeedback("left", 0.5, 0.5))
+            time.sleep(0.001)
+        headset.close()
+        eventually(lambda: server.statistics.peer is None)
+    with registered(server) as second:
         server.send_haptic(HapticFeedback("right", 1.0, 1.0))
-        last = headset.read_frame()
-    assert received[0] < 1.0, "what was on its way"
-    assert received[1] == 1.0, "the newest"
-    assert last is not None
-    assert last[0] == "q2r_right_hand_haptic_feedback"
+        assert next_topic(second) == "q2r_right_hand_haptic_feedback"
 
 
 # A listener ----------------------------------------------------------------------------------------------------------

@@ -94,7 +94,7 @@ def headset(hand: str, seed: int) -> SampleTiming:
     return HeadsetSampling(hand, seed, tremor=True, dropout_probability=0.002)
 
 
-class Thinned:
+class Thinned(SampleTiming):
     """Samples of a headset, without those at times that ``missing`` tells."""
 
     def __init__(self, inner: SampleTiming, missing: Callable[[float], bool]) -> None:

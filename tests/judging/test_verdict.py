@@ -13,7 +13,7 @@ from q2r2_control.judging.verdict import verdict_of
 from tests.judging.episodes import episode
 
 FIGURES = replace(figures_of(episode(), 0.06), idle_share=0.0)
-JUMP = Fault(1.0, "left", "a jump")
+JUMP = Fault(1.0, "left", "hand_jumped", "a jump")
 
 
 def changed(of: str = "episode", **changes: Any) -> EpisodeFigures:

@@ -90,14 +90,14 @@ def test_where_the_targets_of_one_linked_arm_cease_both_hold_until_a_stream_of_e
     _, right = engage_both(world, controller)
     world.run(0.3, right=raised(right, 0.01))
     assert not world.supervisor.follows("right")
-    assert [reason.root.kind for reason in world.supervisor.ended_targets] == ["targets_ceased"] * 2
+    assert [reason.root.kind for reason in world.supervisor.targets.ended.values()] == ["targets_ceased"] * 2
     rest = controller.tool_pose("right")
     world.run(1.0, right=raised(right, 0.02))  # the stream that goes on
     assert np.allclose(controller.tool_pose("right").translation, rest.translation, atol=1e-6)
     world.run(0.2)
     world.run(0.1, controller.tool_pose("left"), right=controller.tool_pose("right"))
     assert [world.supervisor.arm_state(arm) for arm in ("left", "right")] == ["following", "following"]
-    assert world.supervisor.ended_targets == []
+    assert world.supervisor.targets.ended == {}
 
 
 def test_a_target_that_comes_just_after_the_timeout_does_not_hide_that_targets_ceased(
@@ -120,7 +120,14 @@ def test_two_publishers_of_one_linked_arm_hold_both(world: World, controller: Ca
 
 def test_a_stream_that_its_sender_ends_stops_its_own_arm_only(world: World, controller: CartesianController) -> None:
     _, right = engage_both(world, controller)
-    world.supervisor.release_target("left")
+    world.supervisor.targets.release("left")
+    world.run(0.5, right=right)
+    assert [world.supervisor.arm_state(arm) for arm in ("left", "right")] == ["holding", "following"]
+
+
+def test_arms_that_are_not_linked_end_their_streams_alone(world: World, controller: CartesianController) -> None:
+    world.streams.linked = False
+    _, right = engage_both(world, controller)
     world.run(0.5, right=right)
     assert [world.supervisor.arm_state(arm) for arm in ("left", "right")] == ["holding", "following"]
 

@@ -74,6 +74,21 @@ def connect(server: HeadsetServer, dialect: str = "ros2", source: str = "") -> F
     return headset
 
 
+def registered(server: HeadsetServer, dialect: str = "ros2", source: str = "") -> FakeHeadset:
+    """The same, of a headset that has registered its topics."""
+    headset = connect(server, dialect, source)
+    headset.send(headset.registrations())
+    headset.read_until("__topic_list")
+    return headset
+
+
+def next_topic(headset: FakeHeadset) -> str:
+    """The topic of the next frame from the server."""
+    frame = headset.read_frame()
+    assert frame is not None
+    return frame[0]
+
+
 def warnings(caplog: pytest.LogCaptureFixture) -> list[str]:
     return [record.getMessage() for record in caplog.records if record.levelno >= logging.WARNING]
 

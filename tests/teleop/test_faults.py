@@ -124,6 +124,15 @@ def test_a_button_held_through_a_fault_does_not_engage_again_until_released_and_
     assert driver.states == ENGAGED
 
 
+def test_a_reading_of_the_buttons_that_was_overtaken_presses_nothing() -> None:
+    driver = engaged()
+    driver.tick(driver.samples())
+    late = replace(sample("left", driver.hands["left"], driver.now, lower=True), inputs_stamp=driver.now - 0.005)
+    driver.tick([late])
+    driver.run(0.2)
+    assert driver.states == ENGAGED
+
+
 def test_a_lost_connection_pauses_every_arm_and_wants_fresh_poses_and_a_new_press() -> None:
     driver = engaged()
     driver.run(0.2, waving(driver))

@@ -29,7 +29,7 @@ def follow(path: Path, duration: float = 3.0, dt: float = 0.002, period: float =
             pose_filter.add(floats_of(path(due)), due, now)
             due += period
         outputs.append(se3_of(pose_filter.at(now)))
-    return pose_filter.delay, outputs
+    return FilterSettings().delay, outputs
 
 
 def errors(path: Path, since: float, dt: float = 0.002, **options: float) -> tuple[float, float]:

@@ -89,6 +89,13 @@ def test_a_stamp_in_the_future_does_not_hold_the_watchdog_off() -> None:
     assert passed.receive(replace(GOOD, pose_stamp=1.02), 1.02) == (True, None)
 
 
+def test_an_overtaken_pose_is_passed_over() -> None:
+    passed = gate()
+    assert passed.receive(sample("left", pose(9.0), 0.99), 1.01) == (False, None)
+    assert passed.pose is not None
+    assert passed.pose[0][0] == 0.1
+
+
 def test_poses_too_far_apart_in_time_are_a_fault_even_when_they_arrive_together() -> None:
     assert kinds(gate().receive(replace(GOOD, pose_stamp=1.2), 1.2)[1]) == "pose_gap"
 

@@ -105,7 +105,7 @@ class CartesianControllerNode(ManagedNode):
         self.get_logger().info(f"{config.name}: {', '.join(robot.arms)}; waits for joint states")
 
     def _connect(self) -> None:
-        self._targets.subscribe(self._take_target, self._supervisor.release_target)
+        self._targets.subscribe(self._take_target, self._supervisor.targets.release)
         self._joints.subscribe(self._loop.observe, self._grippers.take_joint_state)
         self.create_service(SetBool, "~/pause", self._on_pause)
         services: dict[str, Callable[[], Reason | None]] = {
@@ -191,7 +191,7 @@ class CartesianControllerNode(ManagedNode):
         for arm, rejected in self._targets.rejected.items():
             state = "paused" if supervisor.paused else supervisor.arm_state(arm)
             values[f"{arm}_state"] = state if self.is_active else _DEACTIVATED
-            age = supervisor.target_age(arm, now)
+            age = supervisor.targets.age(arm, now)
             values[f"{arm}_target_age_s"] = round(age, 3) if age < 1e6 else "none"
             values[f"{arm}_targets_rejected"] = rejected
             values[f"{arm}_targets_from"] = self._targets.publishers.of(self._targets.topics[arm])
@@ -215,7 +215,7 @@ class CartesianControllerNode(ManagedNode):
             return WARN, _CURE if self._supervisor.fault is None else sentence(self._supervisor.fault)
         if self._supervisor.fault is not None:
             return ERROR, sentence(self._supervisor.fault)
-        ended = list(map(sentence, self._supervisor.ended_targets))
+        ended = list(map(sentence, self._supervisor.targets.ended.values()))
         if faults := self._targets.faults():
             return WARN, "; ".join(faults + ended)
         return OK, "; ".join(["paused" if self._supervisor.paused else "active", *ended])
