@@ -39,8 +39,8 @@ def played(pose: Callable[[float], pin.SE3], until: float, *, lines: bool, jitte
 
 
 def ripple(targets: list[pin.SE3]) -> float:
-    """RMS of the speed about its mean, as a share of it; the speed on the circle is constant."""
-    speeds = np.linalg.norm(np.diff([target.translation for target in targets], axis=0), axis=1)
+    """RMS of the speed about its mean, as a share of it, once it goes on evenly."""
+    speeds = np.linalg.norm(np.diff([target.translation for target in targets[20:]], axis=0), axis=1)
     return float(np.std(speeds) / np.mean(speeds))
 
 
