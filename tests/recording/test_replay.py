@@ -136,6 +136,7 @@ class FaultyHands(ScriptedInput):
         samples = super().poll(now)
         if 0.9 <= now < 0.95:
             samples = [changed(sample, position=np.array([np.nan, np.inf, -0.0])) for sample in samples]
+        samples = [changed(one, inputs=changed(one.inputs, thumb_stick_horizontal=1e300)) for one in samples]
         faults = {"left": HandFault.FROZEN if now > 1.1 else None}
         samples = [changed(sample, fault=faults.get(sample.hand)) for sample in samples]
         return samples + [changed(sample, hand="third") for sample in samples]
