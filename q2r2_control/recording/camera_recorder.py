@@ -44,9 +44,8 @@ class CameraRecorder:
         self.pid = self._process.pid
         self.due = 0  # pictures that should be there by now
         self._plant: MujocoPlant | None = None  # None: not begun
-        self._names: list[str] = []
-        self._rates: list[float] = []
-        self._last: list[int] = []  # number of each one's last picture
+        self._rates: dict[str, float] = {}  # of the cameras [Hz]
+        self._last: dict[str, int] = {}  # number of each one's last picture
         self._next = -math.inf  # when a picture is due, since the start of the run [s]
 
     def _on_answer(self, picture: Message | None) -> None:
@@ -67,9 +66,8 @@ class CameraRecorder:
         waited = 0.0
         while self._process.alive and waited < _READY and not self._ready.wait(0.1):
             waited += 0.1
-        self._plant, self._names = plant, list(cameras)
-        self._rates = [camera.rate for camera in cameras.values()]
-        self._last = [-1] * len(cameras)
+        self._plant, self._last = plant, dict.fromkeys(cameras, -1)
+        self._rates = {name: camera.rate for name, camera in cameras.items()}
 
     def take_pictures(self, number: int, tick: Tick, epoch: int, *, wait: bool) -> None:
         """Have those pictures taken that are due at a tick, the ``number``-th; ``wait`` for room, or lose them.
@@ -80,14 +78,13 @@ class CameraRecorder:
         if self._plant is None or since < self._next:
             return
         # Picture k is due at k / rate.
-        newest = [math.floor(since * rate + _ROUNDING) for rate in self._rates]
-        chosen = [name for name, now, last in zip(self._names, newest, self._last, strict=True) if now > last]
+        newest = {name: math.floor(since * rate + _ROUNDING) for name, rate in self._rates.items()}
+        chosen = [name for name, number_of in newest.items() if number_of > self._last[name]]
         request = PictureRequest(number, epoch + round(since * 1e9), chosen, self._plant.observed_qpos.tobytes())
         self._process.send(request, len(request.qpos), wait=wait)
-        self.due += sum(newest) - sum(self._last)
+        self.due += sum(newest.values()) - sum(self._last.values())
         self._last = newest
-        pairs = zip(newest, self._rates, strict=True)
-        self._next = min((last + 1 - _ROUNDING) / rate for last, rate in pairs)
+        self._next = min((last + 1 - _ROUNDING) / self._rates[name] for name, last in newest.items())
 
     def finish(self, patience: float) -> None:
         """Let it take the pictures that wait, and end.

@@ -125,8 +125,10 @@ class TickEncoder:
                 pose = messages.pose_stamped(sample[_X : _X + len(POSE_FIELDS)], stamp=stamp)
                 made.add(names.hand_pose(hand), [at], [messages.serialized(messages.POSE, pose)])
             if self._is_new(sample, _INPUTS_STAMP):
-                upper, lower, *values = sample[_BUTTONS : _BUTTONS + len(HandInputs.__slots__)].tolist()
-                inputs = messages.make(messages.HAND_INPUTS, bool(upper), bool(lower), *values)
+                with np.errstate(over="ignore"):  # float32, whatever an input sends
+                    values = sample[_BUTTONS : _BUTTONS + len(HandInputs.__slots__)].astype(np.float32)
+                upper, lower, *analog = values.tolist()
+                inputs = messages.make(messages.HAND_INPUTS, bool(upper), bool(lower), *analog)
                 made.add(names.hand_buttons(hand), [at], [messages.serialized(messages.HAND_INPUTS, inputs)])
 
     def _is_new(self, sample: Array, stamp: int) -> bool:

@@ -14,6 +14,7 @@ import yaml
 
 from q2r2_control.config.cameras import CameraConfig
 from q2r2_control.config.cell import parse_config
+from q2r2_control.config.timeouts import STREAM_TIMEOUT
 from q2r2_control.errors import RecordingError
 from q2r2_control.events import ReasonKind as K
 from q2r2_control.export.episodes import FrameSampling, make_episode
@@ -96,6 +97,16 @@ def test_a_tick_has_the_reference_of_its_time_and_what_had_been_received_by_then
     targets = ticks.rows["arms"]["target"][:, 0, 0]
     assert targets[engaged].tolist() == list(range(40, 60))
     assert not targets[~engaged].any()
+
+
+def test_a_target_that_ceased_is_none_of_a_later_tick(nodes: NodesOnFile) -> None:
+    play(nodes, 10, engaged=range(5, 15))
+    later = 15 * PERIOD + round(STREAM_TIMEOUT * SECOND)
+    nodes.flags(later - 1000, "left", True)
+    nodes.tick(later, 11, np.array(nodes.robot.home))
+    (ticks,) = ticks_in(nodes.close())
+    assert ticks.rows["arms"]["engaged"][:, 0].all()
+    assert ticks.rows["arms"]["target"][:, 0].any(axis=1).tolist() == [True] * 10 + [False]
 
 
 def test_a_tick_whose_reference_was_lost_counts_as_lost_and_what_happened_in_it_does_not(nodes: NodesOnFile) -> None:
