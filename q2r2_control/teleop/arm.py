@@ -74,8 +74,10 @@ class ArmTeleop:
             self._inputs_stamp = stamp
             self._read_controls(sample.inputs, stamp)
         usable, fault = self._gate.receive(sample, now)
-        if usable and fault is None and self._gate.pose is not None and self.state is ArmState.ENGAGED:
-            self.motion.add(self._gate.pose, self._gate.stamp, now)
+        if usable and fault is None and self._gate.pose is not None:
+            self.motion.note(self._gate.pose)
+            if self.state is ArmState.ENGAGED:
+                self.motion.add(self._gate.pose, self._gate.stamp, now)
         if usable and self.state is ArmState.ALIGNING:
             return None  # realigning makes the pose jump, and the arm is not following
         return fault
@@ -129,6 +131,7 @@ class ArmTeleop:
     def forget(self) -> None:
         """Drop everything received: poses are forgotten, buttons count as held until they are seen released."""
         self._gate.reset()
+        self.motion.forget()
         self._inputs_stamp = -math.inf
         self._gestures.forget()
         self._held.forget()

@@ -8,6 +8,7 @@ from q2r2_control.teleop.carry import CarriedTools, CarriedWorkspace
 from q2r2_control.teleop.filters import PoseFilter
 from q2r2_control.teleop.leash import Leash
 from q2r2_control.teleop.relative import RelativeMotion
+from q2r2_control.teleop.rest import RestingPose
 from q2r2_control.teleop.workspace import Workspace
 from q2r2_control.types import Pose
 
@@ -29,6 +30,7 @@ class HandMotion:
         """Other settings from now on. Before the next target there has to be an anchor."""
         self._settings = settings
         self._filter = PoseFilter(settings.filter)
+        self._rest = RestingPose()
         self._motion, self._unslipped = RelativeMotion.of(settings), RelativeMotion.of(settings)
         self._shares: Shares = (1.0, 1.0)
         self.filtered: Pose | None = None  # the hand's pose that the last target was made of
@@ -51,6 +53,14 @@ class HandMotion:
         """How far the target has slipped along since the anchor, with the tool or along its workspace [m, rad]."""
         return self._leash.position.slip + self._workspace.slip, self._leash.rotation.slip
 
+    def note(self, hand: Pose) -> None:
+        """A usable pose of the hand, whether its arm is engaged or not."""
+        self._rest.add(hand)
+
+    def forget(self) -> None:
+        """Forget how the hand rested."""
+        self._rest.forget()
+
     def add(self, hand: Pose, stamp: float, now: float) -> None:
         """A pose that may be followed, received at ``stamp`` [s]; an anchor has to come first."""
         self._filter.add(hand, stamp, now)
@@ -59,6 +69,7 @@ class HandMotion:
         """The newest pose of the ``hand`` and ``tool``, in the world, correspond from now on."""
         if self._carried is not None:
             self._bound_one_tool()
+        hand = self._rest.begin(hand, now)
         self._filter.reset(hand, now)
         self._rescale(hand, tool, shares)
         self._leash.reset()
@@ -69,7 +80,7 @@ class HandMotion:
         self._carried = tools
         self._leash = Leash(self._settings.leash.carried())
         self._workspace = CarriedWorkspace(tools, {self._arm: self.workspace(), other: box})
-        self._rescale(self._filter.at(now), floats_of(tools.frame), self._shares)
+        self._rescale(self._hand(now), floats_of(tools.frame), self._shares)
 
     def target(self, newest: Pose | None, expected: Pose | None, shares: Shares, now: float) -> Pose:
         """Where the tool, or the frame, should be at ``now`` [s] in the world.
@@ -77,7 +88,7 @@ class HandMotion:
         ``newest``: the hand's newest pose, or None; ``expected``: where the tool or the frame is to be measured by
         the controller's reference, from which no target is farther than the leash, or None: then there is none.
         """
-        hand = self.filtered = self._filter.at(now)
+        hand = self.filtered = self._hand(now)
         if expected is None or newest is None:
             target = self._motion.target_floats(hand)
         else:
@@ -91,6 +102,9 @@ class HandMotion:
             self._rescale(hand, target, shares)  # from here on, so the target does not jump
             self._leash.anchor_anew()
         return target
+
+    def _hand(self, now: float) -> Pose:
+        return self._rest.draw(self._filter.at(now), now)
 
     def _rescale(self, hand: Pose, tool: Pose, shares: Shares) -> None:
         """Anchor hand and tool, with the scales that hold from now on."""
