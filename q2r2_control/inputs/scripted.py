@@ -30,13 +30,9 @@ DEFAULT_TRAJECTORY = "meet"
 class ScriptedInput(PlayedInput):
     """Plays a trajectory of both hands, from the first poll on. Implements :class:`Input`.
 
-    ``human`` adds, all from ``seed``: tremor of 8-12 Hz with about 1 mm and 0.3 degrees, sensor noise, sampling at
-    72-76 Hz (``rate_hz`` and ``jitter`` then mean nothing) with late receipts and dropouts of up to 5 samples. Without
-    it samples are received at an even rate, or each later by up to ``jitter`` [s]. They do not depend on when they are
-    polled. Circle, line and rotate repeat ``frequency_hz`` times a second.
-
-    Raises :class:`ConfigError` for an unknown trajectory or hand, a rate that is not positive, or a jitter of more than
-    half of the time between two samples.
+    ``human`` hands are those of :class:`HeadsetSampling`, with tremor and dropouts. Others are sampled at an even rate,
+    and received each later by up to ``jitter`` [s]. Circle, line and rotate repeat ``frequency_hz`` times a second.
+    Raises :class:`ConfigError` for an unknown trajectory or hand, and for a number that is not allowed.
     """
 
     def __init__(

@@ -76,16 +76,13 @@ class HeadsetSession:
     """Protocol state of one client: frames in through :meth:`receive`, bytes out through :attr:`outgoing`.
 
     The server sends first, before the client's dialect is known. It uses ROS2, the one that Quest2ROS2's users
-    set; an app that is set to ROS1 logs an error on its own side and goes on.
+    set; an app that is set to ROS1 logs an error on its own side and goes on. The dialect is read from the NUL that
+    only ROS2 clients put behind every destination, then each payload has to fit it: no message is read by guessing.
 
-    The dialect is read from the NUL that only ROS2 clients put behind every destination, then each payload has to fit
-    it. Contradictory evidence ends the session: no message is read by guessing.
-
-    Data on topics outside ``HAND_TOPICS`` is counted and ignored, because an app that publishes more than we know
-    still has hands to follow. A registration with an empty topic or type is a field that the app's user has left empty:
-    as from Unity's own endpoint, the answer is an error for the app's console, ``MAX_INCOMPLETE`` times. An unknown
-    system command, a name that no topic can have, or a payload that its topic cannot have shows that the two sides do
-    not speak the same protocol: :class:`ProtocolError`.
+    Data on topics outside ``HAND_TOPICS`` is counted and ignored. A registration with an empty topic or type is a field
+    that the app's user has left empty: as from Unity's own endpoint, the answer is an error for the app's console.
+    An unknown command, a name that no topic can have, or a payload that its topic cannot have shows that the two sides
+    do not speak the same protocol: :class:`ProtocolError`.
     """
 
     def __init__(self) -> None:

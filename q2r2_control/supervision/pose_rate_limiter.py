@@ -24,10 +24,9 @@ class PoseRateLimiter:
         s(d) = min(d / dt, a (-dt/2 + sqrt(dt^2/4 + 2 d/a))).
 
     A step of the target faster than the limit is no motion of it; then u = 0. Rotations are limited the same way by
-    the rotation vector from pose to target. Poses are in one frame, whichever; quaternions stay of unit length over any
-    number of steps. Nothing but :meth:`reset` makes the pose jump, and a step that comes late moves it no farther than
-    the velocity limits allow in one period, see :mod:`tick_pacer`. After a gap of more than 0.1 s it begins from rest:
-    whatever followed it stands at the last pose, and the way that was left to brake on would move it once more.
+    the rotation vector from pose to target. Poses are in one frame, whichever. A step that comes late moves the pose no
+    farther than the velocity limits allow in one period, see :mod:`tick_pacer`. After a gap of more than 0.1 s it
+    begins from rest: whatever followed it stands at the last pose.
     """
 
     def __init__(self, settings: GuardSettings, period: float) -> None:

@@ -16,7 +16,7 @@ _PICK_UP = 0.05  # how near the trigger has to come to the gripper
 class AnalogGripper:
     """The opening that a trigger asks for, 0 closed .. 1 fully open.
 
-    After a new connection, a swap of hands or a stop, the trigger moves nothing until it has come to where the gripper
+    After a new connection, another stance or a stop, the trigger moves nothing until it has come to where the gripper
     is, or past it: a gripper that holds something does not open because nobody presses yet.
     """
 

@@ -39,10 +39,9 @@ class RestingPose:
         self._newest: deque[_Sample] = deque(maxlen=_NEWEST)
         self._mean: _Sample = (0.0,) * 6
         self._count = 0  # samples that are known of this rest
-        self._share = 0.0
         self._held: Pose = (0.0, 0.0, 0.0), IDENTITY  # the mean that is drawn to
-        self._of = self._episode = 0  # the rest that it is of, and the one that is going on
-        self._now = 0.0
+        self._leaving = False  # that mean is of a rest that is over
+        self._share, self._now = 0.0, 0.0
 
     def add(self, pose: Pose) -> None:
         """A sample of the hand."""
@@ -68,27 +67,21 @@ class RestingPose:
 
     def begin(self, newest: Pose, now: float) -> Pose:
         """Where the hand is at ``now`` [s]: at the mean if it rests, else at its ``newest`` pose."""
-        self._now, self._of = now, self._episode
-        self._share = min(max(self._trusted, 0.0), 1.0)
+        self._now, self._leaving, self._share = now, False, self._trusted
         self._held = self._mean_pose() if self._share > 0.0 else newest
         return self._held
 
     def draw(self, pose: Pose, now: float) -> Pose:
         """The filtered ``pose`` at ``now`` [s], drawn towards the mean as far as that is to be trusted."""
-        last, self._now = self._now, now
-        if self._share == 0.0 and self._count <= _TRUSTED[0]:
-            self._of = self._episode
-            return pose  # as while a hand moves
-        passed = max(now - last, 0.0) / _LEAVING
-        if self._of != self._episode and self._share == 0.0:
-            self._of = self._episode
-        if self._of == self._episode:
-            self._share = min(max(self._trusted, 0.0), 1.0, self._share + passed)
-        else:
+        passed, self._now = max(now - self._now, 0.0) / _LEAVING, now
+        if self._leaving:
             self._share = max(self._share - passed, 0.0)
+            self._leaving = self._share > 0.0
+        else:
+            self._share = min(self._trusted, self._share + passed)
         if self._share == 0.0:
-            return pose
-        if self._of == self._episode:
+            return pose  # as while a hand moves
+        if not self._leaving:
             self._held = self._mean_pose()
         share, ((x, y, z), rotation), ((to_x, to_y, to_z), to) = self._share, pose, self._held
         a, b, c = turn_between(rotation, to)
@@ -97,9 +90,9 @@ class RestingPose:
 
     @property
     def _trusted(self) -> float:
-        """The share that the mean may count for, if positive."""
+        """The share that the mean may count for."""
         least, most = _TRUSTED
-        return (self._count - least) / (most - least)
+        return min(max((self._count - least) / (most - least), 0.0), 1.0)
 
     def _mean_pose(self) -> Pose:
         x, y, z, a, b, c = self._mean
@@ -113,5 +106,5 @@ class RestingPose:
 
     def _leave(self, mean: _Sample, count: int) -> None:
         """A rest begins whose first ``count`` samples have this ``mean``."""
-        self._episode += 1
+        self._leaving = True
         self._mean, self._count = mean, count

@@ -47,7 +47,7 @@ class ArmMeasurements:
     in_step: bool = True  # ``commanded`` is of one moment
 
     def anchor(self, arm: str) -> Anchor | None:
-        """Where the tool is, or None where that is not known."""
+        """The measured position and the commanded orientation, or else that of the last target; None: not known."""
         measured = self.tools.get(arm)
         if measured is None:
             return None

@@ -116,11 +116,8 @@ class Teleop:
     ) -> dict[str, ArmTarget]:
         """One tick: process the samples and compute every arm's target.
 
-        ``tools``: measured tool poses in the world frame. ``commanded``: tool poses of the controller's reference; when
-        engaging, the position anchors to the measured tool and the orientation to the commanded one. How far the tool
-        is from its command then is the targets' :mod:`steady_state_offset`: their commands begin at ``commanded``.
-        Without ``commanded`` the orientation is the last target's, at first the measured one, and the offset is none.
-        ``commanded`` is also what the leash is tied to; without it there is none.
+        ``tools``: measured tool poses in the world frame. ``commanded``: those of the controller's reference, which the
+        leash is tied to; without it there is no leash. An arm is anchored as :class:`ArmMeasurements` says.
         ``obstacles``: why an arm may not be engaged now, for reasons outside of this layer.
         ``in_step``: whether ``commanded`` has all tools at one moment. While two arms carry, only such poses correct
         their relation: those of two moments show a motion.

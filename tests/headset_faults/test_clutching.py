@@ -19,6 +19,25 @@ ANEW = pin.SE3(pin.exp3(np.array([0.0, 0.0, math.radians(120.0)])), np.array([0.
 STILL = 5e-4  # [m]
 
 
+def aligned(op: Operator, shift: float, samples: int) -> Iterator[float]:
+    """By the left hand's chord, ``samples`` after which the frame moves by a share of the way to ``ANEW``."""
+    op.lower.add("left")
+    op.upper.add("left")
+    yield samples * op.period
+    op.frame = pin.SE3.Interpolate(pin.SE3.Identity(), ANEW, shift)
+    yield 0.2
+    op.lower.clear()
+    op.upper.clear()
+    yield 0.2
+
+
+def assert_still(run: InStepRun) -> None:
+    assert run.reasons("lost") == []
+    assert {tick.targets[arm].gripper for tick in run.ticks for arm in SIDES} == {1.0}
+    for arm in SIDES:
+        assert np.linalg.norm(run.tool(arm) - run.tool(arm)[0], axis=1).max() < STILL
+
+
 @pytest.mark.parametrize(
     ("first", "shift", "samples"),
     [("lower", 1.0, 0), ("upper", 0.1, 1)],
@@ -27,29 +46,17 @@ STILL = 5e-4  # [m]
 def test_an_alignment_within_30_ms_moves_no_arm_and_no_gripper_wherever_the_frame_goes(
     first: str, shift: float, samples: int
 ) -> None:
-    frame = pin.SE3.Interpolate(pin.SE3.Identity(), ANEW, shift)
-
     def script(op: Operator) -> Iterator[float]:
         yield from op.engage()
         yield 0.2
         (op.lower if first == "lower" else op.upper).add("left")
         yield 0.03
-        op.lower.add("left")
-        op.upper.add("left")
-        yield samples * op.period
-        op.frame = frame
-        yield 0.2
-        op.lower.clear()
-        op.upper.clear()
-        yield 0.2
+        yield from aligned(op, shift, samples)
 
     run = InStepRun(script)
-    assert run.reasons("lost") == []
+    assert_still(run)
     assert len(run.reasons("aligning")) == 2
     assert run.states == {"engaged"}
-    assert {tick.targets[arm].gripper for tick in run.ticks for arm in SIDES} == {1.0}
-    for arm in SIDES:
-        assert np.linalg.norm(run.tool(arm) - run.tool(arm)[0], axis=1).max() < STILL
 
 
 @pytest.mark.parametrize(
@@ -64,21 +71,12 @@ def test_an_alignment_by_one_hand_moves_no_arm_although_the_arms_are_not_linked(
         yield 0.1
         yield from op.press(*engaged)
         yield 0.2
-        op.lower.add("left")
-        op.upper.add("left")
-        yield op.period
-        op.frame = pin.SE3.Interpolate(pin.SE3.Identity(), ANEW, shift)
-        yield 0.2
-        op.lower.clear()
-        op.upper.clear()
-        yield 0.2
+        yield from aligned(op, shift, samples=1)
 
     run = InStepRun(script, linked=False)
-    assert run.reasons("lost") == []
+    assert_still(run)
     assert run.reasons("aligning") == ["alignment_chord"] * len(engaged)
     assert {arm for arm, state in run.ticks[-1].states.items() if state == "engaged"} == set(engaged)
-    for arm in SIDES:
-        assert np.linalg.norm(run.tool(arm) - run.tool(arm)[0], axis=1).max() < STILL
 
 
 def taps(op: Operator) -> Iterator[float]:

@@ -149,29 +149,6 @@ def test_an_arm_goes_by_when_poses_are_received_whatever_the_headsets_clock_says
 
 # What is no pose -----------------------------------------------------------------------------------------------------
 
-HOSTILE: dict[str, tuple[Array, Array]] = {
-    "not a number": (np.array([np.nan, 0.0, 0.0]), np.array([0.0, 0.0, 0.0, 1.0])),
-    "beyond the solar system": (np.array([0.0, 0.0, 1e300]), np.array([0.0, 0.0, 0.0, 1.0])),
-    "a rotation of no length": (np.zeros(3), np.array([0.0, 0.0, 0.0, 5e-324])),
-}
-
-
-@pytest.mark.parametrize("name", sorted(HOSTILE))
-def test_a_hand_that_sends_what_is_no_pose_stops_its_arm_while_the_other_one_works_on(name: str) -> None:
-    def script(op: Operator) -> Iterator[float]:
-        yield from op.engage()
-        op.send_pose = lambda hand, position, quaternion: (
-            op.pose(hand, *HOSTILE[name]) if hand == "left" else op.pose(hand, position, quaternion)
-        )
-        yield from op.move((0.0, 0.1, 0.0), seconds=0.5)
-        yield 0.3
-
-    run = InStepRun(script, linked=False)
-    assert run.ticks[-1].states == {"left": "lost", "right": "engaged"}
-    way = {arm: run.tool(arm)[-1] - run.tool(arm)[0] for arm in SIDES}
-    assert np.linalg.norm(way["left"]) < STILL
-    np.testing.assert_allclose(way["right"], [0.0, 0.09, 0.0], atol=2e-3)
-
 
 def test_a_frame_that_breaks_the_protocol_in_mid_motion_ends_the_connection_and_pauses_both_arms() -> None:
     def script(op: Operator) -> Iterator[float]:

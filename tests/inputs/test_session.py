@@ -73,14 +73,6 @@ def test_the_dialect_is_told_by_the_first_system_command(session: HeadsetSession
 
 
 @every_dialect
-@pytest.mark.parametrize("slash", ["", "/"])
-def test_topics_are_known_with_and_without_leading_slash(session: HeadsetSession, dialect: Dialect, slash: str) -> None:
-    reception = session.receive(pose(dialect, slash + "q2r_right_hand_pose"))
-    assert reception is not None
-    assert (reception.topic, reception.hand) == ("q2r_right_hand_pose", "right")
-
-
-@every_dialect
 @pytest.mark.parametrize("suffix", ["pose", "twist", "inputs"])
 def test_a_payload_of_the_wrong_dialect_ends_the_session(
     session: HeadsetSession, dialect: Dialect, suffix: str

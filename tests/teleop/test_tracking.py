@@ -37,10 +37,9 @@ def tracking_error(script: ScriptedInput, duration: float) -> tuple[float, float
     return 1e3 * math.sqrt(np.mean(np.square(distances))), math.degrees(math.sqrt(np.mean(np.square(angles))))
 
 
-@pytest.mark.parametrize("frequency", [0.25, 0.5], ids="{} Hz".format)
-@pytest.mark.parametrize("trajectory", ["circle", "line", "rotate"])
-def test_a_clean_hand_is_followed_to_a_millimetre_and_a_third_of_a_degree(trajectory: str, frequency: float) -> None:
-    distance, angle = tracking_error(ScriptedInput(trajectory, frequency_hz=frequency), 6.0)
+@pytest.mark.parametrize("trajectory", ["circle", "rotate"])
+def test_a_clean_hand_is_followed_to_a_millimetre_and_a_third_of_a_degree(trajectory: str) -> None:
+    distance, angle = tracking_error(ScriptedInput(trajectory, frequency_hz=0.5), 6.0)
     assert distance < 1.0
     assert angle < 0.33
 

@@ -36,7 +36,7 @@ class TickInputs(NamedTuple):
 class TeleopLoop:
     """Ticks the node of one arm, or of both: the same object of the package then decides for both at one moment.
 
-    Pausing both arms, the operator's stop, the alignment chord, swapped hands, the way home and two arms that carry
+    Pausing both arms, the operator's stop, the alignment chord, the way home and two arms that carry
     therefore need no messages between nodes. Timers and clock are the first node's.
     """
 
