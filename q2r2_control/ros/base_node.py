@@ -83,10 +83,7 @@ class BaseNode(Node):
         self.priority = self.parameter("realtime_priority", self.priority, what, at_least=0, at_most=98)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._state = self.create_publisher(String, "~/state", 10)
-        self._ros_time = (
-            0.0,
-            time.monotonic(),
-        )  # the newest ROS time, and the steady time at which it was first seen [s]
+        self._ros_time = 0.0, time.monotonic()  # the newest, and the steady time when it was first seen [s]
         # Steady time, since the diagnostics have to say it when ROS time stands still.
         self.create_timer(_DIAGNOSTICS_PERIOD, self.report_health, clock=Clock(clock_type=ClockType.STEADY_TIME))
 

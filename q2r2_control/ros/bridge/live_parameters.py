@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.parameter import Parameter
 
@@ -17,7 +17,7 @@ from q2r2_control.config.teleop import GuardSettings, TeleopSettings
 from q2r2_control.errors import ConfigError
 from q2r2_control.robot.pairs import CLEARANCE
 from q2r2_control.ros.base_node import BaseNode
-from q2r2_control.ros.bridge.parameters import Model, bounds_of, may_be_none, none_of_zero, stance_of
+from q2r2_control.ros.bridge.parameters import Model, bounds_of, may_be_none, none_of_zero, stance_of, validated
 
 if TYPE_CHECKING:  # arms' nodes have no controller, and need not wait for its kernels
     from q2r2_control.compliance.impedance import ImpedanceController
@@ -151,12 +151,7 @@ def _changed(settings: Model, prefix: str, changes: Mapping[str, Any]) -> Model:
     values = settings.model_dump()
     for name, value in changes.items():
         _put(values, type(settings), name.split("."), value)
-    try:
-        return type(settings).model_validate(values)
-    except ValidationError as error:
-        fault = error.errors()[0]
-        name = ".".join([prefix, *map(str, fault["loc"])])
-        raise ConfigError(f"{name} = {fault['input']!r:.60}: {fault['msg'].removeprefix('Value error, ')}") from error
+    return validated(type(settings), prefix, values)
 
 
 def _put(values: dict[str, Any], model: type[BaseModel], path: Sequence[str], value: Any) -> None:

@@ -190,14 +190,18 @@ def settings_from_parameters(
     Nested models become nested names; a number that may be none is none where the parameter is 0.
     Raises :class:`ConfigError` that names the parameter.
     """
+    return validated(type(default), prefix, _values(node, prefix, default, leave_out, read_only))
+
+
+def validated(model: type[Model], prefix: str, values: dict[str, Any]) -> Model:
+    """The settings of parameters under ``prefix``. Raises :class:`ConfigError` that names the parameter."""
     try:
-        return type(default).model_validate(_values(node, prefix, default, leave_out, read_only))
+        return model.model_validate(values)
     except ValidationError as error:
         fault = error.errors()[0]
         name = ".".join([prefix, *map(str, fault["loc"])])
-        raise ConfigError(
-            f"parameter {name} = {fault['input']!r:.60}: {fault['msg'].removeprefix('Value error, ')}"
-        ) from error
+        why = fault["msg"].removeprefix("Value error, ")
+        raise ConfigError(f"parameter {name} = {fault['input']!r:.60}: {why}") from error
 
 
 def _values(

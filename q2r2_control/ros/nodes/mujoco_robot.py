@@ -9,7 +9,7 @@ the arms brake, and after ``hold_after`` they stand on their position servos, wh
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
@@ -108,23 +108,19 @@ class MujocoRobot(ManagedNode):
         )
 
     def _take(self, topic: str, callback: Callable[[Any], None], message: Any, info: Mapping[str, Any]) -> None:
-        names = message.joint_names if topic == _TRAJECTORY else getattr(message, "name", ())
-        if self._may_take(topic, names, info):
-            callback(message)
-
-    def _may_take(self, topic: str, names: Sequence[str], info: Mapping[str, Any]) -> bool:
-        """Whether a message that names these joints may be used now; notes when it was received, or why not."""
+        """Use a message now, or note why not."""
         if not self.is_active:
             self._note(topic, "the robot is deactivated; ros2 lifecycle set /cartesian_controller activate")
-            return False
+            return
         # Two controllers of an arm each may send on one topic, from hosts with clocks of their own.
+        names = message.joint_names if topic == _TRAJECTORY else getattr(message, "name", ())
         delays = self._delays.setdefault((topic, *names[:1]), DelayWatch(STREAM_TIMEOUT))
         if late := delays.take(delay(info), time.monotonic()):
             self._note(topic, f"{late:.2f} s late; its sender or this node stood still")
-            return False
+            return
         # What came while this process stood still is as new as what came since the last tick.
         self._received = time.monotonic() - min(age(info), self._period)
-        return True
+        callback(message)
 
     def _on_trajectory(self, message: JointTrajectory) -> None:
         points = message.points
