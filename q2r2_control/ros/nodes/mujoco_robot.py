@@ -64,7 +64,6 @@ class MujocoRobot(ManagedNode):
         self._refused: dict[str, str] = {}
         self._refusals = 0
         self._delays: dict[tuple[str, ...], DelayWatch] = {}  # by topic and first joint
-        self._ticks, self._reported_at = 0, time.monotonic()
         self._make_publishers()
         self._make_subscriptions()
         self._grippers = {arm: self._gripper(arm) for arm in self._cell.plant.gripper_openings()}
@@ -162,7 +161,7 @@ class MujocoRobot(ManagedNode):
     def _tick(self) -> None:
         cell, now = self._cell, time.monotonic()
         state = cell.advance(now)
-        self._ticks += 1
+        self.ticked += 1
         stamp = self.now
         self._publish_measured(state, stamp)
         if state.tau_external is not None and now >= self._external_due:
@@ -198,11 +197,10 @@ class MujocoRobot(ManagedNode):
         values = {
             "mode": mode,
             "lifecycle": self.lifecycle_state,
-            "loop_rate_hz": round(self._ticks / max(now - self._reported_at, 1e-9), 1),
+            "loop_rate_hz": self.tick_rate(),
             "time_dropped_s": round(self._cell.dropped, 3),
             "refused_commands": self._refusals,
         }
-        self._ticks, self._reported_at = 0, now
         if self._refused:
             return WARN, "; ".join(f"{topic}: refused: {fault}" for topic, fault in self._refused.items()), values
         if not self.is_active:
