@@ -57,7 +57,7 @@ class CartesianControllerNode(ManagedNode):
     def __init__(self) -> None:
         super().__init__("cartesian_controller")
         config = load_config(self.parameter("config", "config/dual_iiwa7.yaml", "YAML of the cell"))
-        rate = self.parameter("rate", 250.0, "of the control loop [Hz]", at_least=20, at_most=1000)
+        rate = self.parameter("rate", 250.0, "of the control loop [Hz]", within=(20, 1000))
         output = output_name(self)
         if output == NONE:
             config = settings_for_external_arms(config)

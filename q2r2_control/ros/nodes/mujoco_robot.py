@@ -49,14 +49,14 @@ class MujocoRobot(ManagedNode):
     def __init__(self) -> None:
         super().__init__("mujoco_robot")
         config = load_config(self.parameter("config", "config/dual_iiwa7.yaml", "YAML of the cell"))
-        rate = self.parameter("rate", 250.0, "joint states per second [Hz]", at_least=20, at_most=1000)
-        tf_rate = self.parameter("tf_rate", 50.0, "transforms per second [Hz]", at_least=1, at_most=1000)
+        rate = self.parameter("rate", 250.0, "joint states per second [Hz]", within=(20, 1000))
+        tf_rate = self.parameter("tf_rate", 50.0, "transforms per second [Hz]", within=(1, 1000))
         # Hands feel it fifty times a second; an admittance needs it in every tick.
         felt = rate if config.admittance.enabled else 50.0
         self._external_period = 1.0 / felt
         self._external_due = 0.0  # [s]
-        hold_after = self.parameter("hold_after", 0.1, "without commands [s]", at_least=0.01, at_most=1)
-        max_jump = self.parameter("max_jump", 0.1, "of a commanded position [rad]", at_least=0.001, at_most=7)
+        hold_after = self.parameter("hold_after", 0.1, "without commands [s]", within=(0.01, 1))
+        max_jump = self.parameter("max_jump", 0.1, "of a commanded position [rad]", within=(0.001, 7))
         self._robot = Robot.from_config(config)
         self._cell = SimulatedCell(self._robot, config, hold_after, max_jump)
         self._period = 1.0 / rate

@@ -42,10 +42,8 @@ class SimulationInput(BaseNode):
             "mode", "all", "teleop: poses and inputs; velocity: twists; all: all three.", one_of=tuple(_MODES)
         )
         trajectory = self.parameter("trajectory", "circle", "What the hands do.", one_of=tuple(TRAJECTORIES))
-        rate = self.parameter("rate", 75.0, "Samples of each hand [Hz].", at_least=1.0, at_most=250.0)
-        jitter = self.parameter(
-            "jitter", 0.0, "Samples come later by up to this, at random [s].", at_least=0.0, at_most=0.01
-        )
+        rate = self.parameter("rate", 75.0, "Samples of each hand [Hz].", within=(1.0, 250.0))
+        jitter = self.parameter("jitter", 0.0, "Samples come later by up to this, at random [s].", within=(0.0, 0.01))
         self._frame = self.parameter("frame_id", "", "Frame of the poses; a headset gives none.")
         self._waits_for_subscribers = True
         self._hands = SIDES if side == "both" else (side,)

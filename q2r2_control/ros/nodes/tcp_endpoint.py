@@ -47,7 +47,7 @@ class TcpEndpoint(BaseNode):
         cell = load_config(config) if config else None
         headset, gate = (cell.headset, cell.teleop.gate) if cell else (HeadsetConfig(), GateSettings())
         host = self.parameter("host", headset.host, "Address to listen on; 0.0.0.0 admits the network.")
-        port = self.parameter("port", headset.port, "TCP port; 0 takes any free one.", at_least=0, at_most=65535)
+        port = self.parameter("port", headset.port, "TCP port; 0 takes any free one.", within=(0, 65535))
         allow = self.parameter(
             "allow", ",".join(headset.allow or ()), "Addresses and networks that may connect, by commas; empty: all."
         )
@@ -61,8 +61,7 @@ class TcpEndpoint(BaseNode):
             "frozen_time",
             headset.frozen_time or 0.0,
             "Poses the same to the last bit for this long are left out [s]; 0: never.",
-            at_least=0.0,
-            at_most=10.0,
+            within=(0.0, 10.0),
         )
         frame = self.parameter("watch_frame", headset.watch_frame, "Leave out poses of a frame that moved.")
         watch = HandsWatch(frozen_time or None, frame, gate.timeout)
