@@ -80,13 +80,10 @@ class BaseNode(Node):
         self.tick_group = TickGroup()
         super().__init__(name, **kwargs)
         what = "of SCHED_FIFO, where the system permits it; 0: as any other program; of nodes in a process the highest"
-        self.priority = self.parameter("realtime_priority", self.priority, what, at_least=0, at_most=98)
+        self.priority = self.parameter("realtime_priority", self.priority, what, within=(0, 98))
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._state = self.create_publisher(String, "~/state", 10)
-        self._ros_time = (
-            0.0,
-            time.monotonic(),
-        )  # the newest ROS time, and the steady time at which it was first seen [s]
+        self._ros_time = 0.0, time.monotonic()  # the newest, and the steady time when it was first seen [s]
         # Steady time, since the diagnostics have to say it when ROS time stands still.
         self.create_timer(_DIAGNOSTICS_PERIOD, self.report_health, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
@@ -116,32 +113,27 @@ class BaseNode(Node):
         default: Any,
         description: str,
         *,
-        at_least: float | None = None,
-        at_most: float | None = None,
+        within: tuple[float, float] | None = None,
         one_of: Sequence[str] = (),
         read_only: bool = True,
     ) -> Any:
         """Declare a parameter and return its value.
 
-        A range is enforced by rclpy, ``one_of`` only at the start. Raises :class:`ConfigError` for a value of
-        another type, outside the range or not in ``one_of``.
+        The range ``within`` is enforced by rclpy, ``one_of`` only at the start. Raises :class:`ConfigError` for a value
+        of another type, outside the range or not in ``one_of``.
         """
         descriptor = ParameterDescriptor(description=description, read_only=read_only)
         if one_of:
             descriptor.additional_constraints = f"one of {', '.join(one_of)}"
-        if at_least is not None and at_most is not None:
-            if isinstance(default, int) and not isinstance(default, bool):
-                descriptor.integer_range = [IntegerRange(from_value=int(at_least), to_value=int(at_most), step=0)]
-            else:
-                descriptor.floating_point_range = [
-                    FloatingPointRange(from_value=float(at_least), to_value=float(at_most), step=0.0)
-                ]
+        if within is not None and isinstance(default, int):
+            descriptor.integer_range = [IntegerRange(from_value=int(within[0]), to_value=int(within[1]), step=0)]
+        elif within is not None:
+            least, greatest = map(float, within)
+            descriptor.floating_point_range = [FloatingPointRange(from_value=least, to_value=greatest, step=0.0)]
         try:
             value = self.declare_parameter(name, default, descriptor).value
         except ParameterException as error:
-            allowed = (
-                f"; allowed is {at_least:g} .. {at_most:g}" if at_least is not None and at_most is not None else ""
-            )
+            allowed = "" if within is None else f"; allowed is {within[0]:g} .. {within[1]:g}"
             raise ConfigError(f"parameter {name}: {' '.join(str(error).split())}{allowed}") from None
         if one_of and value not in one_of:
             raise ConfigError(f"parameter {name}: {value!r}: allowed are {', '.join(one_of)}")
@@ -172,6 +164,9 @@ class BaseNode(Node):
             state["clock_problem"] = problem
         self._state.publish(String(data=json.dumps(state, default=str)))
 
+    def close(self) -> None:
+        """Called at the end, while the node can still publish."""
+
     def clock_problem(self, timeout: float = _CLOCK_TIMEOUT) -> str | None:
         """One line if ROS time is simulated and has stood still for ``timeout`` [s], as far as calls of this tell."""
         clock: Any = self.get_clock()
@@ -185,31 +180,27 @@ class BaseNode(Node):
         return "use_sim_time is set and the time on /clock stands still"
 
 
-def run_node(make: Callable[[], Node], args: Sequence[str] | None = None) -> int:
+def run_node(*makes: Callable[[], BaseNode]) -> int:
     """Main function of an executable: make the node, spin until Ctrl-C or SIGTERM, close it; the exit code.
 
-    A wrong configuration is one line on stderr and exit code 2. ``node.close()`` is called if there is one.
+    Several nodes share the process and its thread, and what ends one of them ends all. A wrong configuration is one
+    line on stderr and exit code 2.
     """
-    return run_nodes([make], args)
-
-
-def run_nodes(makes: Sequence[Callable[[], Node]], args: Sequence[str] | None = None) -> int:
-    """The same for several nodes in one process and thread: what ends one of them ends all."""
     name = sys.argv[0].rsplit("/", 1)[-1]
     set_up_middleware(os.environ)
     try:
-        rclpy.init(args=list(sys.argv if args is None else args), signal_handler_options=rclpy.SignalHandlerOptions.NO)
+        rclpy.init(args=list(sys.argv), signal_handler_options=rclpy.SignalHandlerOptions.NO)
     except rclpy_implementation.RCLError as error:  # such as arguments that cannot be parsed
         print(f"{name}: {error}", file=sys.stderr)
         return 2
     stop = StopRequest()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.ask())
-    nodes: list[Any] = []
+    nodes: list[BaseNode] = []
     try:
         for make in makes:
             nodes.append(make())
-        executor = TickExecutor() if all(getattr(node, "ticks", False) for node in nodes) else SingleThreadedExecutor()
+        executor = TickExecutor() if all(node.ticks for node in nodes) else SingleThreadedExecutor()
         for node in nodes:
             executor.add_node(node)
         for timer in [timer for node in nodes for timer in node.timers if not timer.is_canceled()]:
@@ -227,16 +218,15 @@ def run_nodes(makes: Sequence[Callable[[], Node]], args: Sequence[str] | None = 
         pass
     finally:
         for node in reversed(nodes):
-            if hasattr(node, "close"):
-                node.close()
+            node.close()
             node.destroy_node()
         rclpy.try_shutdown()
     return _exit_code(nodes) or 0
 
 
-def _take_priority(nodes: Sequence[Any]) -> None:
+def _take_priority(nodes: Sequence[BaseNode]) -> None:
     """From here on nodes tick; what takes long, such as compiling, is done, and did not keep other programs waiting."""
-    priority = max((getattr(node, "priority", 0) for node in nodes), default=0)
+    priority = max(node.priority for node in nodes)
     if not priority:
         return
     if problem := schedule_process_first(priority):
@@ -253,7 +243,6 @@ def _take_priority(nodes: Sequence[Any]) -> None:
     resource.setrlimit(resource.RLIMIT_RTTIME, (int(1e6 * _NEVER_IDLE), resource.getrlimit(resource.RLIMIT_RTTIME)[1]))
 
 
-def _exit_code(nodes: Sequence[Any]) -> int | None:
+def _exit_code(nodes: Sequence[BaseNode]) -> int | None:
     """That of the first node that wants to end."""
-    codes = (getattr(node, "exit_code", None) for node in nodes)
-    return next((code for code in codes if code is not None), None)
+    return next((node.exit_code for node in nodes if node.exit_code is not None), None)

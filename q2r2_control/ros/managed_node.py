@@ -6,6 +6,7 @@ answered when it is done: whoever deactivates a controller and then starts anoth
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -27,6 +28,14 @@ class ManagedNode(LifecycleNodeMixin, BaseNode):
         BaseNode.__init__(self, name, **kwargs)
         LifecycleNodeMixin.__init__(self)
         self._starting = False
+        self.ticked, self._counted_at = 0, time.monotonic()  # since the rate was last asked for, and when [s]
+
+    def tick_rate(self) -> float:
+        """Ticks in a second since this was last asked for [Hz]."""
+        now = time.monotonic()
+        rate = self.ticked / max(now - self._counted_at, 1e-9)
+        self.ticked, self._counted_at = 0, now
+        return round(rate, 1)
 
     def begin(self) -> str | None:
         """Become active; returns why that is not possible now, or None."""

@@ -13,13 +13,14 @@ import numpy as np
 import pinocchio as pin
 import yaml
 from geometry_msgs.msg import PoseStamped
+from rclpy.serialization import serialize_message
 from std_msgs.msg import String
 from tf2_msgs.msg import TFMessage
 
 from q2r2_control import Robot
 from q2r2_control.robot.compose import WORLD
 from q2r2_control.ros.base_node import COMMAND_QOS, LATCHED_QOS, STREAM_QOS
-from q2r2_control.ros.bridge.frames import FrameTree, ReadTransform
+from q2r2_control.ros.bridge.frames import FrameTree, read_transforms
 from q2r2_control.ros.bridge.messages import pose_message
 from q2r2_control.types import Array
 from tests.ros import waiting
@@ -59,9 +60,8 @@ class Cell:
     def _on_transforms(self, message: TFMessage) -> None:
         for transform in message.transforms:
             self.parents[transform.child_frame_id] = transform.header.frame_id
-            p, r = transform.transform.translation, transform.transform.rotation
-            names = transform.child_frame_id, transform.header.frame_id
-            self.frames.set(ReadTransform(*names, (p.x, p.y, p.z, r.x, r.y, r.z, r.w)), time.monotonic())
+        for read in read_transforms(serialize_message(message)):
+            self.frames.set(read, time.monotonic())
 
     def _on_state(self, name: str, message: String) -> None:
         self.states[name] = json.loads(message.data)

@@ -55,13 +55,6 @@ def test_the_shipped_packages_define_what_the_app_and_grippers_use() -> None:
     assert "from control_msgs.action import ParallelGripperCommand" in Interfaces(INTERFACES / "control_msgs").proof
 
 
-def test_what_can_be_imported_is_not_built_again() -> None:
-    run = build_interfaces()
-    assert (run.returncode, run.stderr) == (0, "")
-    folders = [Path(sys.prefix) / SITE_PACKAGES / name for name in NAMES]
-    assert run.stdout.splitlines() == [f"{folder.name}: already there ({folder})" for folder in folders]
-
-
 def test_a_sourced_install_is_left_alone_and_a_package_built_beside_it_is_used_after_sourcing_it_too(
     bare_environment: Path, sourced: dict[str, str], tmp_path: Path
 ) -> None:

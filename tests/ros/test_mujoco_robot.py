@@ -149,18 +149,6 @@ def test_commands_that_cannot_be_followed_move_nothing_and_are_reported_once(cel
     assert cell.processes[0].output.count("joint_trajectory: refused") == 1
 
 
-def test_without_further_torques_position_servos_take_over(cell: Cell, robot: Robot) -> None:
-    publisher = cell.node.create_publisher(Float64MultiArray, "torque_commands", COMMAND_QOS)
-    # With less than gravity's torque the arms begin to fall, slowly enough not to meet the table.
-    tau = 0.7 * pin.computeGeneralizedGravity(robot.model, robot.model.createData(), robot.home)
-    publish_steadily(publisher, [Float64MultiArray(data=tau.tolist())] * 15)
-    assert cell.state("mode", "mujoco_robot") is not None
-    wait_until(lambda: cell.state("mode", "mujoco_robot") == "holding", "the robot holds")
-    assert np.abs(cell.q - robot.home).max() > 0.01
-    cell.joints.wait_for_rest()
-    assert np.abs(cell.q - robot.home).max() < 0.3
-
-
 def test_a_gripper_closes_on_nothing_opens_and_refuses_what_it_cannot_reach(cell: Cell) -> None:
     client = ActionClient(cell.node, GripperCommand, "/q2r2/left_gripper/gripper_cmd")
     assert client.wait_for_server(PATIENCE)

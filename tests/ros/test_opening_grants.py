@@ -130,6 +130,18 @@ def test_a_press_without_a_server_ends_the_wish_before_it(bench: Bench) -> None:
     assert bench.asked[-1] == [0.4, 0.4]
 
 
+def test_a_gripper_follows_a_trigger_with_ten_wishes_a_second_at_most(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[float] = []
+    monkeypatch.setattr(bench.grants, "ask", asked.append)
+    for step in range(21):
+        bench.client.move(1.0 - 0.04 * step, 0.01 * step)
+    bench.client.move(0.0, 0.3)
+    bench.client.move(0.005, 0.5)  # too little to follow
+    assert asked == pytest.approx([0.96, 0.56, 0.0])
+
+
 def test_a_goal_that_is_refused_on_the_way_ends_the_wish(bench: Bench) -> None:
     bench.command(close=True)
     bench.grant(0.0, 0.0)

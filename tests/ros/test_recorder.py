@@ -22,7 +22,6 @@ need_ros()
 from geometry_msgs.msg import PoseStamped
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.serialization import serialize_message
-from sensor_msgs.msg import CompressedImage
 from std_msgs.msg import String
 
 from q2r2_control.errors import RecordingError
@@ -43,7 +42,6 @@ from q2r2_control.teleop.haptics import (
 )
 from tests.recording.runs import read_elsewhere
 from tests.ros.arm_rig import ArmRig
-from tests.ros.cell import changed_cell
 from tests.ros.waiting import States, call, wait_until
 
 HAND = "/q2r_left_hand_pose"
@@ -52,9 +50,9 @@ HAND = "/q2r_left_hand_pose"
 class RunningRecorder:
     """A recorder's process, as a test's node sees it."""
 
-    def __init__(self, node: Any, processes: Processes, folder: Path, config: str = CONFIG) -> None:
+    def __init__(self, node: Any, processes: Processes, folder: Path) -> None:
         self.node, self._states = node, States(node, "recorder")
-        self.process = processes.start_node("recorder", f"config:={config}", f"folder:={folder}", 'task:="3: blocks"')
+        self.process = processes.start_node("recorder", f"config:={CONFIG}", f"folder:={folder}", 'task:="3: blocks"')
         self._folder = Path(self.state()["file"] or folder).parent
 
     def state(self, text: str = "") -> dict[str, Any]:
@@ -147,24 +145,6 @@ def test_messages_are_in_the_file_to_the_byte_and_no_ros_is_needed_to_read_it(
     about = Recording(folder).about
     assert about.notes["task"] == "3: blocks"
     assert Recording(folder).closed
-
-
-def test_pictures_of_a_real_camera_are_kept_as_they_came(node: Any, processes: Processes, tmp_path: Path) -> None:
-    topic = "/front/image_raw/compressed"
-    camera = {"topic": topic, "width": 64, "height": 48, "rate": 30}
-    recorder = RunningRecorder(node, processes, tmp_path, changed_cell(tmp_path, cameras={"front": camera}))
-    publisher = node.create_publisher(CompressedImage, topic, 10)
-    first = CompressedImage(format="jpeg", data=b"first")
-    recorder.wait_until_heard(topic, lambda: publisher.publish(first))
-    sent = [bytes([number]) * (5_000 + number) for number in range(10)]  # of any length, as real ones
-    for number, picture in enumerate(sent):
-        message = CompressedImage(format="jpeg", data=picture)
-        message.header.stamp.sec = 1000 + number
-        publisher.publish(message)
-        time.sleep(0.02)
-    recorder.wait_for(topic, serialize_message(message)[:8])
-    pictures = [found.jpeg for found in open_recording(recorder.end()).pictures("front")]
-    assert [picture for picture in pictures if picture != b"first"] == sent
 
 
 def test_a_hand_and_services_tell_of_episodes_and_each_learns_of_the_others(

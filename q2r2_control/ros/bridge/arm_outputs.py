@@ -169,9 +169,8 @@ class ArmOutputs:
 class FollowWatch:
     """Whether the built-in controller follows the targets of an arm, as it publishes on ``~/following/<arm>``.
 
-    It drops a stream for reasons of its own, such as missing joint states, and then accepts only a new stream. The arm
-    has to be paused then: otherwise it would count as engaged, and the next press would pause it instead of starting a
-    new stream. A controller that publishes nothing here is taken to follow.
+    It drops a stream for reasons of its own, such as missing joint states, and then accepts only a new one, for which
+    the arm has to be paused. A controller that publishes nothing here is taken to follow.
     """
 
     def __init__(self, node: Node, controller: str, arm: str, timeout: float) -> None:

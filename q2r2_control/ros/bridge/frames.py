@@ -16,7 +16,7 @@ from rclpy.serialization import deserialize_message
 from tf2_msgs.msg import TFMessage
 
 from q2r2_control.ros.base_node import STREAM_QOS, BaseNode
-from q2r2_control.ros.bridge.messages import are_a_pose, nanoseconds, pose_of, pose_of_numbers
+from q2r2_control.ros.bridge.messages import nanoseconds, pose_of, pose_of_numbers
 from q2r2_control.ros.monitoring.endpoints import Publishers
 from q2r2_control.supervision.sequence_watch import SequenceWatch
 from q2r2_control.supervision.target_stream import apart
@@ -33,7 +33,7 @@ class ReadTransform(NamedTuple):
 
     child_frame_id: str
     frame_id: str
-    numbers: Sequence[float]  # position [m] and quaternion x y z w
+    pose: pin.SE3 | None  # None for numbers that are not finite, or no unit quaternion
 
 
 @lru_cache(maxsize=_KEPT)
@@ -51,25 +51,8 @@ def read_transforms(message: bytes) -> Sequence[ReadTransform]:
 
 def _read(transform: TransformStamped) -> ReadTransform:
     p, o = transform.transform.translation, transform.transform.rotation
-    return ReadTransform(transform.child_frame_id, transform.header.frame_id, (p.x, p.y, p.z, o.x, o.y, o.z, o.w))
-
-
-class _Edge:
-    """Pose of a child frame in its parent; computed when asked for, since most frames of a robot never are."""
-
-    __slots__ = ("_numbers", "_pose", "parent", "received")
-
-    def __init__(self, transform: ReadTransform, received: float) -> None:
-        self.parent, self.received = _name(transform.frame_id), received  # [s]; inf: static
-        self._numbers = transform.numbers
-        self._pose: pin.SE3 | None = None
-
-    @property
-    def pose(self) -> pin.SE3:
-        if self._pose is None:
-            self._pose = pose_of_numbers(self._numbers)
-            assert self._pose is not None  # which :class:`FrameTree` has asked
-        return self._pose
+    pose = pose_of_numbers((p.x, p.y, p.z, o.x, o.y, o.z, o.w))
+    return ReadTransform(_name(transform.child_frame_id), _name(transform.header.frame_id), pose)
 
 
 class Placement(NamedTuple):
@@ -83,13 +66,13 @@ class FrameTree:
     """Newest transforms by their receipt time; nothing is interpolated, and a history is not kept."""
 
     def __init__(self) -> None:
-        self._edges: dict[str, _Edge] = {}
+        self._edges: dict[str, tuple[str, Placement]] = {}  # of each frame its parent, and where it is there
         self._found: dict[tuple[str, str], Placement] = {}  # since a transform last came
 
     def set(self, transform: ReadTransform, received: float) -> None:
-        """Store one transform; one with numbers that are not finite, or without a unit quaternion, is ignored."""
-        if are_a_pose(transform.numbers):
-            self._edges[_name(transform.child_frame_id)] = _Edge(transform, received)
+        """Store one transform, received then [s], inf: static; one without a pose is ignored."""
+        if transform.pose is not None:
+            self._edges[transform.child_frame_id] = transform.frame_id, Placement(transform.pose, received)
             self._found.clear()
 
     def find(self, frame: str, within: str) -> Placement | None:
@@ -113,10 +96,10 @@ class FrameTree:
 
     def moves_far(self, transform: ReadTransform) -> bool:
         """Whether the frame is elsewhere in a transform than it was in the last one."""
-        before = self._edges.get(_name(transform.child_frame_id))
-        if before is None or not are_a_pose(transform.numbers):
+        before = self._edges.get(transform.child_frame_id)
+        if before is None or transform.pose is None:
             return False
-        distance, angle = apart(before.pose, _Edge(transform, before.received).pose)
+        distance, angle = apart(before[1].pose, transform.pose)
         return distance > _SAME[0] or angle > _SAME[1]
 
     def _upwards(self, frame: str) -> Iterator[tuple[str, Placement]]:
@@ -126,10 +109,10 @@ class FrameTree:
         while frame not in seen:
             yield frame, Placement(pose, received)
             seen.add(frame)
-            edge = self._edges.get(frame)
-            if edge is None:
+            if frame not in self._edges:
                 return
-            pose, received, frame = edge.pose * pose, min(received, edge.received), edge.parent
+            parent, placement = self._edges[frame]
+            pose, received, frame = placement.pose * pose, min(received, placement.received), parent
 
 
 class FrameListener:
@@ -163,7 +146,7 @@ class FrameListener:
     def _take(self, message: bytes, info: Mapping[str, int | None]) -> None:
         received, now, number = self._node.now, time.monotonic(), info["publication_sequence_number"]
         for transform in read_transforms(message):
-            frame = _name(transform.child_frame_id)
+            frame = transform.child_frame_id
             if number is not None and self._sent_by_two(frame, number, now) and self.tree.moves_far(transform):
                 self._disagree[frame] = now
             self.tree.set(transform, received)

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Mapping
-from functools import lru_cache, partial
+from functools import partial
 from typing import Any
 
 from sensor_msgs.msg import JointState
@@ -113,9 +113,10 @@ class FingerStates:
         """Note what a message says of fingers; what it says of other joints is not looked at."""
         if len(message.position) != len(message.name):
             return
+        positions = dict(zip(message.name, message.position, strict=True))
         for arm, (joints, closed, opened) in self._grippers.items():
-            if columns := _columns(tuple(message.name), joints):
-                position = sum(message.position[column] for column in columns) / len(joints)
+            if positions.keys() >= set(joints):
+                position = sum(positions[joint] for joint in joints) / len(joints)
                 self._measured[arm] = ((position - closed) / (opened - closed), now)
 
     def openings(self, now: float) -> dict[str, float]:
@@ -125,9 +126,3 @@ class FingerStates:
             for arm, (opening, at) in self._measured.items()
             if now - at <= STREAM_TIMEOUT and math.isfinite(opening)
         }
-
-
-@lru_cache(maxsize=64)  # publishers send the same names again and again
-def _columns(given: tuple[str, ...], joints: tuple[str, ...]) -> list[int]:
-    """Where ``joints`` are among the names of a message; empty where one is missing."""
-    return [given.index(joint) for joint in joints] if set(joints) <= set(given) else []

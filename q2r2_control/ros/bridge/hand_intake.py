@@ -19,9 +19,8 @@ from q2r2_control.types import HandSample, HapticFeedback
 
 
 class HandIntake:
-    """Topics of the hand that drives an arm.
+    """Topics of the hand that drives an arm; those of the other hand from when it first does.
 
-    Those of the other hand are subscribed to when it first drives the arm: what a node does not use costs it time.
     Messages come as ``on_pose`` and ``on_inputs``, which give them to :meth:`put_pose` and :meth:`put_inputs`.
     """
 

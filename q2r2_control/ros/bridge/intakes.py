@@ -21,14 +21,7 @@ from q2r2_control.robot.compose import WORLD
 from q2r2_control.robot.robot import Robot
 from q2r2_control.ros.base_node import COMMAND_QOS, STREAM_QOS, BaseNode
 from q2r2_control.ros.bridge.joint_outputs import joints_of
-from q2r2_control.ros.bridge.messages import (
-    age,
-    delay,
-    ended_topic,
-    nanoseconds,
-    pose_of,
-    robot_state,
-)
+from q2r2_control.ros.bridge.messages import age, delay, ended_topic, nanoseconds, pose_of, robot_state
 from q2r2_control.ros.monitoring.endpoints import Publishers
 from q2r2_control.supervision.delay_watch import DelayWatch
 from q2r2_control.types import Array, RobotState
@@ -157,7 +150,6 @@ class JointIntake:
         self._joints = {topic: joints_of(robot, arms) for topic, arms in self._topics.items()}
         self._stamps = dict.fromkeys(self._topics, -math.inf)
         self._names = {topic: [robot.joint_names[joint] for joint in joints] for topic, joints in self._joints.items()}
-        self._expected = {topic: set(names) for topic, names in self._names.items()}
         what = 'external torques of all joints, for admittance and vibrations: effort of a JointState; "": none'
         self._external_topic = node.parameter("external_torque_topic", "", what)
         if needs_external_torque and not self._external_topic:
@@ -195,7 +187,7 @@ class JointIntake:
     ) -> None:
         look(message)
         joints, names = self._joints[topic], self._names[topic]
-        if self._expected[topic].isdisjoint(message.name):
+        if set(names).isdisjoint(message.name):
             return  # of a gripper or another robot
         now = self._node.now
         part = robot_state(message, names, now)
@@ -205,11 +197,8 @@ class JointIntake:
             return
         self._stamps[topic] = now
         oldest = min(self._stamps.values())
-        if len(joints) == self._values.shape[1]:
-            q, v, tau = part.q, part.v, part.tau  # this topic carries all joints
-        else:
-            self._values[:, joints] = part.q, part.v, part.tau
-            q, v, tau = self._values.copy()
+        self._values[:, joints] = part.q, part.v, part.tau
+        q, v, tau = self._values.copy()
         if oldest > -math.inf:
             silent = now - self._external_stamp > STREAM_TIMEOUT
             external = None if silent else self._external

@@ -1,8 +1,4 @@
-"""Joint commands out: the drive's commands as messages, on one topic or one an arm.
-
-The parameter ``output`` says which kind: it chooses the drive, the same that the pipeline has, and the messages that
-its commands become. Whether anything still takes them is found out while they are sent.
-"""
+"""Joint commands out, on one topic or one an arm; the parameter ``output`` chooses the drive and its messages."""
 
 from __future__ import annotations
 
@@ -76,9 +72,8 @@ class JointOutput:
     def listener_fault(self, off_reference: bool) -> str | None:
         """One line where what took the commands is gone, or is not alone any more; to be asked before each is sent.
 
-        Asked only where the arms are ``off_reference``, since looking costs a message now and then. Arms that yield
-        are off their reference by design, and a torque for where they are is no jump to a new receiver: those are
-        not asked about.
+        Asked only where the arms are ``off_reference``, since looking costs a message now and then, and not of torques:
+        arms that yield are off their reference by design, and a torque for where they are is no jump.
         """
         publishers = [channel.publisher for channel in self._channels]
         before, self._listeners = self._listeners, sum(publisher.listeners for publisher in publishers)
@@ -109,7 +104,7 @@ def make_output(name: str, node: BaseNode, robot: Robot, config: Config, period:
     Raises :class:`ConfigError`.
     """
     what = "arms that do not follow and whose joint positions nobody acknowledges are given up after [s]"
-    listener_timeout = node.parameter("listener_timeout", STREAM_TIMEOUT, what, at_least=0.1, at_most=5.0)
+    listener_timeout = node.parameter("listener_timeout", STREAM_TIMEOUT, what, within=(0.1, 5.0))
     topics = _topics(name, node, robot)
     if name == NONE:
         return JointOutput(make_drive(CommandMode.POSITION, robot, config), KINDS["trajectory"](period, robot), [])

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.parameter import Parameter
 
@@ -17,7 +17,7 @@ from q2r2_control.config.teleop import GuardSettings, TeleopSettings
 from q2r2_control.errors import ConfigError
 from q2r2_control.robot.pairs import CLEARANCE
 from q2r2_control.ros.base_node import BaseNode
-from q2r2_control.ros.bridge.parameters import Model, bounds_of, may_be_none, none_of_zero, stance_of
+from q2r2_control.ros.bridge.parameters import Model, may_be_none, none_of_zero, range_of, stance_of, validated
 
 if TYPE_CHECKING:  # arms' nodes have no controller, and need not wait for its kernels
     from q2r2_control.compliance.impedance import ImpedanceController
@@ -84,11 +84,10 @@ def make_control_live(node: BaseNode, controller: CartesianController) -> None:
     """Parameters ``control.*``: what of a controller's settings may change, of which its own method decides."""
     for name in LIVE:
         field = ControllerSettings.model_fields[name]
-        value, bounds = getattr(controller.settings, name), bounds_of(field)
+        value, within = getattr(controller.settings, name), range_of(field)
         if name == "min_distance":
-            # Pydantic keeps the bounds of an annotated type elsewhere.
-            bounds = {"at_least": 0.0, "at_most": max(CLEARANCE, value)}
-        node.parameter(f"control.{name}", value, field.description or name, read_only=False, **bounds)
+            within = 0.0, max(CLEARANCE, value)  # pydantic keeps the bounds of an annotated type elsewhere
+        node.parameter(f"control.{name}", value, field.description or name, read_only=False, within=within)
 
     def on_set(parameters: Sequence[Parameter]) -> SetParametersResult:
         values = _within("control", {one.name: one.value for one in parameters})
@@ -102,10 +101,11 @@ def make_impedance_live(node: BaseNode, impedance: ImpedanceController) -> None:
     """Parameters of the impedance in torque mode, which ramps to what is set."""
     for name in LIVE_IMPEDANCE:
         field = ImpedanceSettings.model_fields[name]
-        value, bounds = getattr(impedance.settings, name), bounds_of(field)
+        value, bounds = getattr(impedance.settings, name), range_of(field)
+        assert bounds is not None
         # Ends of a parameter's range are allowed, and none of these may be 0.
-        bounds["at_least"] = max(bounds["at_least"], min(0.1, value))
-        node.parameter(name, value, f"{field.description}; changes over ramp_time", read_only=False, **bounds)
+        within = max(bounds[0], min(0.1, value)), bounds[1]
+        node.parameter(name, value, f"{field.description}; changes over ramp_time", read_only=False, within=within)
 
     def on_set(parameters: Sequence[Parameter]) -> None:
         if values := {one.name: one.value for one in parameters if one.name in LIVE_IMPEDANCE}:
@@ -122,7 +122,7 @@ def make_watching_live(
     for target, table in ((streams, _STREAMS), (watch, _WATCH), (external, _EXTERNAL)):
         for field, name, what, least, greatest in table:
             default = getattr(target, field)
-            value = node.parameter(name, default, what, at_least=least, at_most=greatest, read_only=False)
+            value = node.parameter(name, default, what, within=(least, greatest), read_only=False)
             setattr(target, field, value)
             settings[name] = target, field
 
@@ -151,12 +151,7 @@ def _changed(settings: Model, prefix: str, changes: Mapping[str, Any]) -> Model:
     values = settings.model_dump()
     for name, value in changes.items():
         _put(values, type(settings), name.split("."), value)
-    try:
-        return type(settings).model_validate(values)
-    except ValidationError as error:
-        fault = error.errors()[0]
-        name = ".".join([prefix, *map(str, fault["loc"])])
-        raise ConfigError(f"{name} = {fault['input']!r:.60}: {fault['msg'].removeprefix('Value error, ')}") from error
+    return validated(type(settings), prefix, values)
 
 
 def _put(values: dict[str, Any], model: type[BaseModel], path: Sequence[str], value: Any) -> None:

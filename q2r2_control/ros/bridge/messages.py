@@ -84,17 +84,12 @@ def pose_of(message: Pose) -> pin.SE3 | None:
 
 def pose_of_numbers(numbers: Sequence[float]) -> pin.SE3 | None:
     """The pose of a position and a quaternion x y z w; None as in :func:`pose_of`."""
-    if not are_a_pose(numbers):
+    # A sum or a norm with NaN or infinity in it is not finite.
+    if not (math.isfinite(sum(numbers[:3])) and abs(math.hypot(*numbers[3:]) - 1.0) <= _UNIT):
         return None
     pose = np.array(numbers)
     pose[3:] /= math.hypot(*numbers[3:])
     return pin.XYZQUATToSE3(pose)
-
-
-def are_a_pose(numbers: Sequence[float]) -> bool:
-    """Whether these are a finite position and a unit quaternion x y z w."""
-    # A sum or a norm with NaN or infinity in it is not finite.
-    return math.isfinite(sum(numbers[:3])) and abs(math.hypot(*numbers[3:]) - 1.0) <= _UNIT
 
 
 def hand_sample(

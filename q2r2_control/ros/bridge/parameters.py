@@ -107,9 +107,8 @@ def arm_parameters(node: BaseNode, given: ArmDefaults) -> ArmParameters:
     )
 
 
-def _timeout(node: BaseNode, name: str, description: str, at_least: float, at_most: float) -> float:
-    value = node.parameter(name, STREAM_TIMEOUT, f"{description} [s]", at_least=at_least, at_most=at_most)
-    return float(value)
+def _timeout(node: BaseNode, name: str, description: str, least: float, greatest: float) -> float:
+    return float(node.parameter(name, STREAM_TIMEOUT, f"{description} [s]", within=(least, greatest)))
 
 
 def teleop_defaults(mirror: bool, filter_window_size: int | None) -> TeleopSettings:
@@ -150,7 +149,7 @@ def _of_cell(given: ArmDefaults, path: str) -> ArmDefaults:
 
 
 def _rate(node: BaseNode, preset: Preset, wanted: float | None) -> float:
-    rate = float(node.parameter("rate", wanted or preset.rate, "of targets [Hz]", at_least=1.0, at_most=1000.0))
+    rate = float(node.parameter("rate", wanted or preset.rate, "of targets [Hz]", within=(1.0, 1000.0)))
     if rate < preset.lowest_rate:
         raise ConfigError(
             f"parameter rate = {rate:g}: preset {preset.name} needs at least {preset.lowest_rate:g}, "
@@ -190,14 +189,18 @@ def settings_from_parameters(
     Nested models become nested names; a number that may be none is none where the parameter is 0.
     Raises :class:`ConfigError` that names the parameter.
     """
+    return validated(type(default), prefix, _values(node, prefix, default, leave_out, read_only))
+
+
+def validated(model: type[Model], prefix: str, values: dict[str, Any]) -> Model:
+    """The settings of parameters under ``prefix``. Raises :class:`ConfigError` that names the parameter."""
     try:
-        return type(default).model_validate(_values(node, prefix, default, leave_out, read_only))
+        return model.model_validate(values)
     except ValidationError as error:
         fault = error.errors()[0]
         name = ".".join([prefix, *map(str, fault["loc"])])
-        raise ConfigError(
-            f"parameter {name} = {fault['input']!r:.60}: {fault['msg'].removeprefix('Value error, ')}"
-        ) from error
+        why = fault["msg"].removeprefix("Value error, ")
+        raise ConfigError(f"parameter {name} = {fault['input']!r:.60}: {why}") from error
 
 
 def _values(
@@ -224,7 +227,7 @@ def _value(node: BaseNode, name: str, default: Any, field: FieldInfo, read_only:
         return node.parameter(name, str(default.value), description, read_only=read_only)
     if isinstance(default, tuple):
         return tuple(node.parameter(name, list(default), description, read_only=read_only))
-    return node.parameter(name, default, description, read_only=read_only, **bounds_of(field))
+    return node.parameter(name, default, description, read_only=read_only, within=range_of(field))
 
 
 def may_be_none(field: FieldInfo) -> bool:
@@ -237,11 +240,8 @@ def none_of_zero(value: Any) -> Any:
     return None if value == _NONE else value
 
 
-def bounds_of(field: FieldInfo) -> dict[str, Any]:
-    """The closed range of a field; whether the ends are allowed is checked by the model."""
-    bounds: dict[str, Any] = {}
-    for entry in field.metadata:
-        for attribute, bound in (("ge", "at_least"), ("gt", "at_least"), ("le", "at_most"), ("lt", "at_most")):
-            if hasattr(entry, attribute):
-                bounds[bound] = float(getattr(entry, attribute))
-    return bounds if len(bounds) == 2 else {}
+def range_of(field: FieldInfo) -> tuple[float, float] | None:
+    """The closed range of a field, if it has one; whether the ends are allowed is checked by the model."""
+    least = [getattr(entry, name) for entry in field.metadata for name in ("ge", "gt") if hasattr(entry, name)]
+    greatest = [getattr(entry, name) for entry in field.metadata for name in ("le", "lt") if hasattr(entry, name)]
+    return (float(least[0]), float(greatest[0])) if least and greatest else None

@@ -62,7 +62,6 @@ class TargetOutput:
         self._restarted = False
         self._endpoints: set[bytes] = set()  # of the controller
         self._listeners = 0
-        self._counted = 0, -math.inf  # subscribers that are present, and when they were counted [s]
         self._unknown = False  # a subscriber's node is not known yet
         self._asked_at = self._appeared_at = -math.inf  # the graph, and a subscriber [s]
         self.starts = 0  # how often the controller has appeared
@@ -93,7 +92,7 @@ class TargetOutput:
 
     def take_fault(self, now: float) -> str | None:
         """Check the subscribers; returns once why the controller that is driven is not there any more."""
-        listeners = self._present(now)
+        listeners = self._present()
         if listeners > self._listeners or listeners == 0:
             self._appeared_at = now
             if not self.following:
@@ -133,7 +132,7 @@ class TargetOutput:
         ``state``: of the arm. The stream goes on while its operator may only begin to pause it, and then ends in order.
         A stream that stops in any other way has ceased, for which the built-in controller holds linked arms too.
         """
-        if self._unknown or self._present(now) > self._listeners:
+        if self._unknown or self._present() > self._listeners:
             return None
         idle = not self.following and self.guard.at_rest
         self.following = target is not None
@@ -165,12 +164,9 @@ class TargetOutput:
         self.following, self.last_sent, self._sent_at = False, None, -math.inf
         self.guard.reset(None, now)
 
-    def _present(self, now: float) -> int:
-        """Number of subscribers in the tick of ``now``; the graph lists one before the publisher can send to it."""
-        if self._counted[1] != now:
-            listed = self._node.handle.get_count_subscribers(self._topic)
-            self._counted = max(self._publisher.listeners, listed), now
-        return self._counted[0]
+    def _present(self) -> int:
+        """Number of subscribers; the graph lists one before the publisher can send to it."""
+        return max(self._publisher.listeners, self._node.handle.get_count_subscribers(self._topic))
 
     def _holds(self, tool: pin.SE3 | None, state: ArmState, now: float) -> bool:
         """Whether the last target may be repeated."""

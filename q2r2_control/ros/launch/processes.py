@@ -58,11 +58,10 @@ def nodes_of(
 ) -> list[NodeProcess]:
     """The processes for a cell's YAML, in the order of their start: one for both arms, one for each other node.
 
-    ``separate``: one for each arm, each with a teleoperation of its own: what one hand does is for its own arm only.
-
-    ``source`` of the hands: an installed input, "none", or None for the cell's. ``robot``: mujoco, none, or auto, which
-    is mujoco for ``controller: builtin`` only. ``recording``: parameters of the recorder, None without one; it starts
-    first, and so ends last. Raises :class:`ConfigError`.
+    ``separate``: one for each arm, each with a teleoperation of its own. ``source`` of the hands: an installed input,
+    "none", or None for the cell's. ``robot``: mujoco, none, or auto, which is mujoco for ``controller: builtin`` only.
+    ``recording``: parameters of the recorder, which starts first and so ends last; None without one.
+    Raises :class:`ConfigError`.
     """
     if robot not in ROBOTS:
         raise ConfigError(f"robot = {robot!r:.60}: allowed are {', '.join(ROBOTS)}")

@@ -39,10 +39,9 @@ def node_of(endpoint: Any) -> str | None:
 
 
 class Publishers:
-    """Which nodes publish on some topics. The names are kept after a node has ended and left the graph.
+    """Which nodes publish on some topics, asked now and then; names are kept after a node has left the graph.
 
-    The graph is asked now and then, never for each message. It cannot tell two publishers from one that was killed and
-    its successor: for some seconds it lists both.
+    The graph lists one that was killed for some seconds more, beside its successor.
     """
 
     def __init__(self, node: Node, topics: Iterable[str]) -> None:
@@ -75,13 +74,10 @@ class Publishers:
 
 
 def publish_in_time(publisher: Any, message: Any, decided: float) -> bool:
-    """Publish what was decided on at ``decided`` [s] of the steady clock, unless its lifespan is over since then.
+    """Publish what was decided on at ``decided`` [s] of the steady clock, unless its lifespan is over; whether it was.
 
-    Returns whether it was published.
-
-    The middleware counts the lifespan from the publishing. A process that is frozen between the two would send, when it
-    continues, one command of the past: a jump for a robot that has come to rest meanwhile. Serializing comes first: it
-    takes most of the time until the middleware notes when the message was sent; :mod:`delay_watch` covers the rest.
+    The middleware counts the lifespan from the publishing: a process that is frozen before would send a command of the
+    past, a jump. Serializing takes most of the time until the message is sent; :mod:`delay_watch` covers the rest.
     """
     data = message if isinstance(message, bytes) else serialize_message(message)
     in_time = time.monotonic() - decided <= _LIFESPAN

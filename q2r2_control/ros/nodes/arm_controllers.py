@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from q2r2_control.ros.base_node import run_nodes
+from q2r2_control.ros.base_node import run_node
 from q2r2_control.ros.nodes.base_arm_controller import BaseArmController
 
 
@@ -34,7 +34,7 @@ def run_arms(left: Callable[..., BaseArmController], right: Callable[..., BaseAr
         made.append(left())
         return made[0]
 
-    return run_nodes([make_left, lambda: right(partner=made[0])])
+    return run_node(make_left, lambda: right(partner=made[0]))
 
 
 def run_both_arms() -> int:

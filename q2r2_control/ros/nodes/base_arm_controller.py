@@ -259,10 +259,9 @@ class BaseArmController(BaseNode):
         return None if (unready := self.outputs.unready) is None else (WARN, unready)
 
     def _commanded(self, tool: pin.SE3, reference: pin.SE3 | None) -> pin.SE3:
-        """The commanded tool pose: the leash is measured from it, and an anchor takes its orientation and the offset.
+        """The commanded tool pose, for the leash and for anchors.
 
-        Another controller's is not known. Then the leash is measured from the tool, and the last target is what that
-        controller holds while the arm is paused.
+        Another controller's is not known: then the tool's, and while the arm is paused the last target counts.
         """
         if self.engaged:
             return self._target.command_for(tool) if reference is None else reference

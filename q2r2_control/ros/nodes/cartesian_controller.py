@@ -57,7 +57,7 @@ class CartesianControllerNode(ManagedNode):
     def __init__(self) -> None:
         super().__init__("cartesian_controller")
         config = load_config(self.parameter("config", "config/dual_iiwa7.yaml", "YAML of the cell"))
-        rate = self.parameter("rate", 250.0, "of the control loop [Hz]", at_least=20, at_most=1000)
+        rate = self.parameter("rate", 250.0, "of the control loop [Hz]", within=(20, 1000))
         output = output_name(self)
         if output == NONE:
             config = settings_for_external_arms(config)
@@ -98,7 +98,7 @@ class CartesianControllerNode(ManagedNode):
         # Another controller follows every safe target; arms that listen take a hundred a second.
         every = 1 if output == NONE else max(round(_SAFE_TARGET_PERIOD * rate), 1)
         self._feedback = ControllerFeedback(self, self._controller, self._targets, every)
-        self._ticks, self._reported_at, self._last_tick = 0, time.monotonic(), self.now
+        self._last_tick = self.now
         self._others = self._output.watch(self)
         self._connect()
         self.start_active()
@@ -134,7 +134,7 @@ class CartesianControllerNode(ManagedNode):
         if gap > LONGEST_DT:
             self._supervisor.stalled(gap, now)
         self._last_tick = now
-        self._ticks += 1
+        self.ticked += 1
         if dt > 0.0:
             self._advance(now, dt, decided)
         self._feedback.tell_followed(self._supervisor.follows)
@@ -178,16 +178,15 @@ class CartesianControllerNode(ManagedNode):
         return None
 
     def health(self) -> tuple[bytes, str, Mapping[str, Any]]:
-        supervisor, now, wall = self._supervisor, self.now, time.monotonic()
+        supervisor, now = self._supervisor, self.now
         values: dict[str, Any] = {
             "phase": supervisor.phase,
             "lifecycle": self.lifecycle_state,
             "homing_ended": "" if supervisor.homing.outcome is None else sentence(supervisor.homing.outcome),
-            "loop_rate_hz": round(self._ticks / max(wall - self._reported_at, 1e-9), 1),
+            "loop_rate_hz": self.tick_rate(),
             "missed_ticks": self._loop.pacer.missed_ticks,
             "sent": self._output.sent,
         }
-        self._ticks, self._reported_at = 0, wall
         for arm, rejected in self._targets.rejected.items():
             state = "paused" if supervisor.paused else supervisor.arm_state(arm)
             values[f"{arm}_state"] = state if self.is_active else _DEACTIVATED

@@ -31,9 +31,7 @@ class CheckTcpConnection(BaseNode):
 
     def __init__(self, console: Console | None = None, **kwargs: Any) -> None:
         super().__init__("check_tcp_connection", **kwargs)
-        duration = self.parameter(
-            "duration", 0.0, "Ends after this time; 0: on Ctrl-C [s].", at_least=0.0, at_most=86400.0
-        )
+        duration = self.parameter("duration", 0.0, "Ends after this time; 0: on Ctrl-C [s].", within=(0.0, 86400.0))
         self._recorders: dict[str, TopicRecorder] = {}
         self._start = time.monotonic()
         self._console = console = console or Console()

@@ -9,7 +9,7 @@ the arms brake, and after ``hold_after`` they stand on their position servos, wh
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
@@ -49,14 +49,14 @@ class MujocoRobot(ManagedNode):
     def __init__(self) -> None:
         super().__init__("mujoco_robot")
         config = load_config(self.parameter("config", "config/dual_iiwa7.yaml", "YAML of the cell"))
-        rate = self.parameter("rate", 250.0, "joint states per second [Hz]", at_least=20, at_most=1000)
-        tf_rate = self.parameter("tf_rate", 50.0, "transforms per second [Hz]", at_least=1, at_most=1000)
+        rate = self.parameter("rate", 250.0, "joint states per second [Hz]", within=(20, 1000))
+        tf_rate = self.parameter("tf_rate", 50.0, "transforms per second [Hz]", within=(1, 1000))
         # Hands feel it fifty times a second; an admittance needs it in every tick.
         felt = rate if config.admittance.enabled else 50.0
         self._external_period = 1.0 / felt
         self._external_due = 0.0  # [s]
-        hold_after = self.parameter("hold_after", 0.1, "without commands [s]", at_least=0.01, at_most=1)
-        max_jump = self.parameter("max_jump", 0.1, "of a commanded position [rad]", at_least=0.001, at_most=7)
+        hold_after = self.parameter("hold_after", 0.1, "without commands [s]", within=(0.01, 1))
+        max_jump = self.parameter("max_jump", 0.1, "of a commanded position [rad]", within=(0.001, 7))
         self._robot = Robot.from_config(config)
         self._cell = SimulatedCell(self._robot, config, hold_after, max_jump)
         self._period = 1.0 / rate
@@ -64,7 +64,6 @@ class MujocoRobot(ManagedNode):
         self._refused: dict[str, str] = {}
         self._refusals = 0
         self._delays: dict[tuple[str, ...], DelayWatch] = {}  # by topic and first joint
-        self._ticks, self._reported_at = 0, time.monotonic()
         self._make_publishers()
         self._make_subscriptions()
         self._grippers = {arm: self._gripper(arm) for arm in self._cell.plant.gripper_openings()}
@@ -108,23 +107,19 @@ class MujocoRobot(ManagedNode):
         )
 
     def _take(self, topic: str, callback: Callable[[Any], None], message: Any, info: Mapping[str, Any]) -> None:
-        names = message.joint_names if topic == _TRAJECTORY else getattr(message, "name", ())
-        if self._may_take(topic, names, info):
-            callback(message)
-
-    def _may_take(self, topic: str, names: Sequence[str], info: Mapping[str, Any]) -> bool:
-        """Whether a message that names these joints may be used now; notes when it was received, or why not."""
+        """Use a message now, or note why not."""
         if not self.is_active:
             self._note(topic, "the robot is deactivated; ros2 lifecycle set /cartesian_controller activate")
-            return False
+            return
         # Two controllers of an arm each may send on one topic, from hosts with clocks of their own.
+        names = message.joint_names if topic == _TRAJECTORY else getattr(message, "name", ())
         delays = self._delays.setdefault((topic, *names[:1]), DelayWatch(STREAM_TIMEOUT))
         if late := delays.take(delay(info), time.monotonic()):
             self._note(topic, f"{late:.2f} s late; its sender or this node stood still")
-            return False
+            return
         # What came while this process stood still is as new as what came since the last tick.
         self._received = time.monotonic() - min(age(info), self._period)
-        return True
+        callback(message)
 
     def _on_trajectory(self, message: JointTrajectory) -> None:
         points = message.points
@@ -166,7 +161,7 @@ class MujocoRobot(ManagedNode):
     def _tick(self) -> None:
         cell, now = self._cell, time.monotonic()
         state = cell.advance(now)
-        self._ticks += 1
+        self.ticked += 1
         stamp = self.now
         self._publish_measured(state, stamp)
         if state.tau_external is not None and now >= self._external_due:
@@ -202,11 +197,10 @@ class MujocoRobot(ManagedNode):
         values = {
             "mode": mode,
             "lifecycle": self.lifecycle_state,
-            "loop_rate_hz": round(self._ticks / max(now - self._reported_at, 1e-9), 1),
+            "loop_rate_hz": self.tick_rate(),
             "time_dropped_s": round(self._cell.dropped, 3),
             "refused_commands": self._refusals,
         }
-        self._ticks, self._reported_at = 0, now
         if self._refused:
             return WARN, "; ".join(f"{topic}: refused: {fault}" for topic, fault in self._refused.items()), values
         if not self.is_active:

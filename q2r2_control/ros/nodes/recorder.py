@@ -59,9 +59,7 @@ class RecorderNode(BaseNode):
         super().__init__("recorder")
         config = load_config(self.parameter("config", "config/dual_iiwa7.yaml", "YAML of the cell"))
         folder = self.parameter("folder", "recordings", "where each run gets a new folder")
-        rate = self.parameter(
-            "rate", 250.0, "of the controller's loop, as it is set there [Hz]", at_least=20, at_most=1000
-        )
+        rate = self.parameter("rate", 250.0, "of the controller's loop, as it is set there [Hz]", within=(20, 1000))
         notes = {
             name: self.parameter(name, "", f"{what}, noted in the recording; empty: not")
             for name, what in (("task", "what is done"), ("operator", "whose hands"))

@@ -27,9 +27,9 @@ _MODES = {
 class SimulationInput(BaseNode):
     """Plays a scripted trajectory. It presses and releases the lower buttons, early on, to engage the arms.
 
-    The script starts when every hand that it plays has a subscriber, unless ``wait_for_subscribers`` is false. The
-    hands rest until the arms' nodes say that they can be engaged. Then the buttons are pressed, and again where an arm
-    is not engaged by the time the hands would move. From then on, and after an arm's ``~/pause``, it takes a person.
+    The script starts when every hand that it plays has a subscriber. The hands rest until the arms' nodes say that they
+    can be engaged. Then the buttons are pressed, and again where an arm is not engaged by the time the hands would
+    move. From then on, and after an arm's ``~/pause``, it takes a person.
     """
 
     ticks = True
@@ -42,14 +42,10 @@ class SimulationInput(BaseNode):
             "mode", "all", "teleop: poses and inputs; velocity: twists; all: all three.", one_of=tuple(_MODES)
         )
         trajectory = self.parameter("trajectory", "circle", "What the hands do.", one_of=tuple(TRAJECTORIES))
-        rate = self.parameter("rate", 75.0, "Samples of each hand [Hz].", at_least=1.0, at_most=250.0)
-        jitter = self.parameter(
-            "jitter", 0.0, "Samples come later by up to this, at random [s].", at_least=0.0, at_most=0.01
-        )
+        rate = self.parameter("rate", 75.0, "Samples of each hand [Hz].", within=(1.0, 250.0))
+        jitter = self.parameter("jitter", 0.0, "Samples come later by up to this, at random [s].", within=(0.0, 0.01))
         self._frame = self.parameter("frame_id", "", "Frame of the poses; a headset gives none.")
-        self._waits_for_subscribers = self.parameter(
-            "wait_for_subscribers", True, "Start when every hand has a subscriber."
-        )
+        self._waits_for_subscribers = True
         self._hands = SIDES if side == "both" else (side,)
         self._title = f"{trajectory} of {' and '.join(self._hands)}"
         self._hand_publishers = HandPublishers(self, self._hands, _MODES[mode])

@@ -1,7 +1,6 @@
 """``tcp_endpoint``: the TCP server of the Quest2ROS app, between its connection and ROS topics.
 
-Each message is published by the thread that receives it, at once. Polling would add up to its period, merge messages
-that the app sends apart, and drop twists.
+Each message is published by the thread that receives it: polling would add its period, and drop twists.
 """
 
 from __future__ import annotations
@@ -29,14 +28,10 @@ _SERVER_LOG = logging.getLogger("q2r2_control.inputs.headset")
 
 
 class TcpEndpoint(BaseNode):
-    """Serves one headset at a time.
+    """Serves one headset at a time. Numbers are passed on unchanged, and so is the frame unless one is configured.
 
-    Poses are stamped with this node's clock when they are received, since the headset has a clock of its own. Numbers
-    are passed on unchanged, and so is the frame unless one is configured. Only what was received is published: after a
-    disconnect the topics are silent. What is sent to the app while none is connected is lost.
-
-    Poses that no arm may follow, frozen ones and those of a frame that moved, are left out, so that arms pause for
-    missing data; the log has a line where that begins.
+    Poses are stamped with this node's clock when they are received, since the headset has a clock of its own. Poses
+    that no arm may follow, frozen ones and those of a frame that moved, are left out, so that arms pause.
 
     Raises :class:`InputError` when host and port cannot be bound, :class:`ConfigError` for what ``allow`` cannot be.
     """
@@ -49,7 +44,7 @@ class TcpEndpoint(BaseNode):
         cell = load_config(config) if config else None
         headset, gate = (cell.headset, cell.teleop.gate) if cell else (HeadsetConfig(), GateSettings())
         host = self.parameter("host", headset.host, "Address to listen on; 0.0.0.0 admits the network.")
-        port = self.parameter("port", headset.port, "TCP port; 0 takes any free one.", at_least=0, at_most=65535)
+        port = self.parameter("port", headset.port, "TCP port; 0 takes any free one.", within=(0, 65535))
         allow = self.parameter(
             "allow", ",".join(headset.allow or ()), "Addresses and networks that may connect, by commas; empty: all."
         )
@@ -63,8 +58,7 @@ class TcpEndpoint(BaseNode):
             "frozen_time",
             headset.frozen_time or 0.0,
             "Poses the same to the last bit for this long are left out [s]; 0: never.",
-            at_least=0.0,
-            at_most=10.0,
+            within=(0.0, 10.0),
         )
         frame = self.parameter("watch_frame", headset.watch_frame, "Leave out poses of a frame that moved.")
         watch = HandsWatch(frozen_time or None, frame, gate.timeout)

@@ -6,30 +6,25 @@ arms go whose commands get a new receiver. How much goes over a topic is counted
 
 from __future__ import annotations
 
-import json
-import math
 import os
 import time
-from collections import defaultdict, deque
+from collections import deque
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
-from std_msgs.msg import String
 
 from q2r2_control.config.cell import Config
 from q2r2_control.errors import Q2R2Error
-from q2r2_control.ros.base_node import STREAM_QOS
 from q2r2_control.ros.launch.middleware import set_up_middleware
 from q2r2_control.ros.monitoring.endpoints import node_of
+from q2r2_control.ros.monitoring.node_states import NodeStates
 from q2r2_control.ros.watching.set_view import NodeView, SetView, TopicView, arm_views
 
 _LOOK_PERIOD = 0.5  # between two looks at the graph [s]
-_STATE = "/state"
 _OWN = ("/rosout", "/parameter_events")  # every node has them
 _COUNTS = 8  # of what a sender says, over which its rate is taken
 
@@ -38,42 +33,13 @@ class WatchError(Q2R2Error):
     """The middleware does not start; the message says why."""
 
 
-class _Said:
-    """What one node has said."""
-
-    def __init__(self) -> None:
-        self.newest: dict[str, Any] = {}
-        self.at = -math.inf  # [s]
-        self.sent: dict[str, deque[tuple[float, int]]] = defaultdict(partial(deque, maxlen=_COUNTS))
-
-    def take(self, message: String) -> None:
-        try:
-            said = json.loads(message.data)
-        except ValueError:
-            return
-        if not (isinstance(said, dict) and {"level", "message"} <= said.keys()):
-            return  # some other node's
-        self.newest, self.at = said, time.monotonic()
-        sent = said.get("sent")
-        for topic, count in sent.items() if isinstance(sent, dict) else ():
-            if isinstance(count, int):
-                self.sent[topic].append((self.at, count))
-
-    def rate(self, topic: str) -> float | None:
-        """How often it sends on ``topic``, as it says [Hz]."""
-        counts = self.sent.get(topic)
-        if counts is None or len(counts) < 2:
-            return None
-        (began, first), (ended, last) = counts[0], counts[-1]
-        return max(last - first, 0) / max(ended - began, 1e-9)
-
-
 class SetListener:
     """Looks at the graph of one domain, and hears nodes that report on ``~/state``. Has to be spun."""
 
     def __init__(self, node: Node, cell: Config) -> None:
         self._node, self._cell = node, cell
-        self._said: dict[str, _Said] = {}  # by full name of a node
+        self._states = NodeStates(node, self._note)
+        self._sent: dict[tuple[str, str], deque[tuple[float, int]]] = {}  # node and topic: when it was told, how many
         self._topics: dict[str, tuple[str, ...]] = {}  # with their types
         self._publishers: dict[str, tuple[str, ...]] = {}
         self._subscribers: dict[str, tuple[str, ...]] = {}
@@ -87,7 +53,7 @@ class SetListener:
         for topic in self._topics:
             self._publishers[topic] = _names(node.get_publishers_info_by_topic(topic), own)
             self._subscribers[topic] = _names(node.get_subscriptions_info_by_topic(topic), own)
-            self._listen(topic)
+        self._states.look()
         found = (f"{space.rstrip('/')}/{name}" for name, space in node.get_node_names_and_namespaces())
         self._names = tuple(sorted(name for name in found if name != own))
 
@@ -95,36 +61,42 @@ class SetListener:
         """All that is known now."""
         now = time.monotonic()
         nodes = tuple(
-            NodeView(name, said.newest["level"], said.newest["message"], now - said.at, said.newest)
-            for name, said in sorted(self._said.items())
-            if said.newest
+            NodeView(name, state["level"], state["message"], now - at, state)
+            for name, (state, at) in sorted(self._states.newest.items())
         )
         members = {node.name for node in nodes}
         topics = tuple(self._topic(name) for name in sorted(self._topics) if self._is_shown(name, members))
         return SetView(nodes, topics, self._names, arm_views(nodes, self._cell))
 
-    def _listen(self, topic: str) -> None:
-        name = topic.removesuffix(_STATE)
-        states = topic.endswith(_STATE) and self._topics[topic] == ("std_msgs/msg/String",)
-        if states and name not in self._said and self._publishers[topic]:
-            self._said[name] = _Said()
-            self._node.create_subscription(String, topic, self._said[name].take, STREAM_QOS)
+    def _note(self, name: str, state: dict[str, Any]) -> None:
+        sent = state.get("sent")
+        for topic, count in sent.items() if isinstance(sent, dict) else ():
+            if isinstance(count, int):
+                self._sent.setdefault((name, topic), deque(maxlen=_COUNTS)).append((time.monotonic(), count))
+
+    def _rate(self, name: str, topic: str) -> float | None:
+        """How often a node sends on ``topic``, as it says [Hz]."""
+        counts = self._sent.get((name, topic))
+        if counts is None or len(counts) < 2:
+            return None
+        (began, first), (ended, last) = counts[0], counts[-1]
+        return max(last - first, 0) / max(ended - began, 1e-9)
 
     def _is_shown(self, topic: str, members: set[str]) -> bool:
         """Whether some node of the set awaits it, or sends it and somebody counts or takes it.
 
         What every node has, and the parts of actions, are left out.
         """
-        if topic in _OWN or "/_action/" in topic or topic.removesuffix(_STATE) in members:
+        if topic in _OWN or "/_action/" in topic or topic.removesuffix("/state") in members:
             return False
         if members.intersection(self._publishers[topic]):
-            counted = any(topic in said.sent for said in self._said.values())
+            counted = any(topic == told for _, told in self._sent)
             return bool(counted or self._subscribers[topic])
         takers = members.intersection(self._subscribers[topic])
-        return any(self._publishers[topic] or _awaits(self._said[taker].newest) for taker in takers)
+        return any(self._publishers[topic] or _awaits(self._states.newest[taker][0]) for taker in takers)
 
     def _topic(self, topic: str) -> TopicView:
-        rates = [self._said[name].rate(topic) for name in self._publishers[topic] if name in self._said]
+        rates = [self._rate(name, topic) for name in self._publishers[topic]]
         known = [rate for rate in rates if rate is not None]
         rate = sum(known) if known else None
         return TopicView(topic, self._topics[topic], self._publishers[topic], self._subscribers[topic], rate)
