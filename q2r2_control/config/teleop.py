@@ -49,7 +49,7 @@ class FilterSettings(BaseModel):
 
 
 class GateSettings(BaseModel):
-    """What makes a hand sample unfit to move an arm."""
+    """Limits beyond which a hand sample moves no arm."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
@@ -78,7 +78,7 @@ class LeashSettings(BaseModel):
 
 
 class HapticSettings(BaseModel):
-    """What the hands feel of their arms."""
+    """Vibrations of the hand controllers."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
