@@ -72,7 +72,7 @@ QUEST_CONTROLS = DeviceControls(
 
 
 class HandFault(StrEnum):
-    """What an input finds wrong with a hand whose pose, by itself, is a pose: kinds of :mod:`events`."""
+    """Faults of a hand whose pose by itself is valid: kinds of :mod:`events`."""
 
     FROZEN = "hand_frozen"
     FRAME_MOVED = "hand_frame_moved"  # both hands moved as one, as when the frame moves that they are measured in
@@ -106,7 +106,7 @@ class HapticFeedback:
 
 @dataclass(slots=True)  # not frozen, as all that every tick makes anew: that would cost up to half a microsecond
 class RobotState:
-    """What the plant measured, in the joint order of ``Robot.model``."""
+    """Measurements of the plant, in the joint order of ``Robot.model``."""
 
     q: Array  # (nv,) [rad]
     v: Array  # (nv,) [rad/s]
@@ -125,7 +125,7 @@ class CommandMode(StrEnum):
 
 @dataclass(slots=True)  # not frozen, as above
 class Command:
-    """What goes to the plant, in the joint order of ``Robot.model``."""
+    """A command to the plant, in the joint order of ``Robot.model``."""
 
     mode: CommandMode
     q: Array  # (nv,) [rad]; in velocity and torque mode the reference, for plants that show it
@@ -135,7 +135,7 @@ class Command:
 
 
 class StepStatus(StrEnum):
-    """What one control tick did."""
+    """The outcome of one control tick."""
 
     OK = "ok"
     TARGET_REJECTED = "target_rejected"  # a bad target was held
@@ -145,7 +145,7 @@ class StepStatus(StrEnum):
 
 
 class LimitKind(StrEnum):
-    """What holds a step back."""
+    """Kinds of limits that hold a step back."""
 
     POSITION = "position"
     VELOCITY = "velocity"
@@ -162,7 +162,7 @@ class ActiveLimit(NamedTuple):
 
 @dataclass(slots=True)  # not frozen: that would cost a microsecond a tick
 class StepReport:
-    """What one control tick did and why. Distances in metres, joints by name."""
+    """Outcome and reasons of one control tick. Distances in metres, joints by name."""
 
     status: StepStatus
     rejected: tuple[str, ...]  # arms whose target was not usable and is held
@@ -195,7 +195,7 @@ class Reference:
 
 @dataclass(slots=True)  # not frozen, as above
 class ArmTarget:
-    """What the teleop layer asks of one arm."""
+    """The teleop layer's target for one arm."""
 
     pose: pin.SE3 | None  # tool pose in the world frame; None: hold
     gripper: float  # opening, 0 closed .. 1 fully open
@@ -214,9 +214,9 @@ class ArmTarget:
 
     @property
     def command(self) -> pin.SE3 | None:
-        """What the controller is to be asked for, so that the tool is at ``pose``."""
+        """The controller's target that brings the tool to ``pose``."""
         return None if self.pose is None else self.command_for(self.pose)
 
     def command_for(self, tool: pin.SE3) -> pin.SE3:
-        """What is commanded where the tool is at ``tool``, world frame."""
+        """The controller's target that brings the tool to ``tool``, world frame."""
         return tool if self.offset is None else moved_by(tool, -self.offset)

@@ -35,7 +35,7 @@ Stop = Array | Callable[[Array], Array]  # places (2, 3) [m], or such by where t
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WorkMotion:
-    """What both tools are asked to do over time."""
+    """Targets of both tools over time."""
 
     name: str
     about: str

@@ -1,4 +1,4 @@
-"""What a cell consists of, and what is wrong with it before anything moves."""
+"""The parts of a cell, and its faults, found before anything moves."""
 
 from __future__ import annotations
 

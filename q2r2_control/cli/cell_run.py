@@ -36,7 +36,7 @@ from q2r2_control.viewer.live import LiveTable
 
 @dataclass(frozen=True, slots=True)
 class RunOptions:
-    """What to run and what to show of it."""
+    """Choices of the command line."""
 
     name: str  # of the run, for its recording's folder and title
     input: str
@@ -58,7 +58,7 @@ class RunOptions:
 
 @dataclass(frozen=True, slots=True)
 class CellRun:
-    """What a run left behind."""
+    """Results of a run."""
 
     summary: RunSummary
     tasks: tuple[TaskResult, ...] = ()
@@ -199,7 +199,7 @@ def _run(pipeline: Pipeline, options: RunOptions, recorder: Recorder | None, con
 
 
 def _about(pipeline: Pipeline, options: RunOptions) -> About:
-    """What a recording says once, of a run that begins now."""
+    """Facts that a recording states once, of a run that begins now."""
     notes = {"cell": pipeline.config.name, "input": options.input, **options.notes}
     if options.input == "scripted":
         notes |= {"trajectory": options.trajectory, "human": str(options.human).lower(), "seed": str(options.seed)}

@@ -29,7 +29,7 @@ Operator = Annotated[str | None, typer.Option(help="With --record: whose hands, 
 
 
 def notes_of(task: str | None, operator: str | None, record: str | None) -> dict[str, str]:
-    """What is noted in a recording. Raises :class:`ConfigError` where there is none."""
+    """Notes for a recording. Raises :class:`ConfigError` where there is none."""
     notes = {name: text for name, text in (("task", task), ("operator", operator)) if text is not None}
     for name in notes:
         if record is None:

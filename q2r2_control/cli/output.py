@@ -1,4 +1,4 @@
-"""What commands print: JSON on stdout, and all else on stderr or as tables."""
+"""Output of commands: JSON on stdout, and all else on stderr or as tables."""
 
 from __future__ import annotations
 

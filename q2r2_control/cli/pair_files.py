@@ -15,7 +15,7 @@ from q2r2_control.robot.robot import Robot
 
 @dataclass(frozen=True, slots=True)
 class PairsWritten:
-    """What sampling says of the monitored pairs of links; distances in metres."""
+    """Sampled approaches of the monitored pairs of links; distances in metres."""
 
     file: str
     samples: int

@@ -20,7 +20,7 @@ app.command(epilog="Example: q2r2 ros doctor config/dual_iiwa7.yaml")(doctor)
 
 
 class RobotSource(StrEnum):
-    """What moves."""
+    """The robot behind the nodes."""
 
     AUTO = "auto"
     MUJOCO = "mujoco"

@@ -56,7 +56,7 @@ class PoseConfig(StrictModel):
 
 
 class FlangeConfig(StrictModel):
-    """What is between an arm's last link and its tool: a model, or a cylinder of these sizes; by default nothing."""
+    """The flange between an arm's last link and its tool: a model, or a cylinder of these sizes; by default nothing."""
 
     model: LocalPath | None = Field(None, description="a file of robots/ without .urdf, or a path")
     xacro_args: XacroArgs = Field({})
@@ -84,7 +84,7 @@ class FlangeConfig(StrictModel):
 
 
 class ToolConfig(StrictModel):
-    """What is mounted on an arm's last link or flange."""
+    """The tool on an arm's last link or flange."""
 
     model: LocalPath | None = Field(None, description="a file of robots/ without .urdf, or a path; none: bare flange")
     xacro_args: XacroArgs = Field({})
@@ -94,7 +94,7 @@ class ToolConfig(StrictModel):
 
 
 class HeldObjectConfig(StrictModel):
-    """What a gripper holds when it holds something: a box or a ball, fixed to the tool."""
+    """The object that a gripper holds: a box or a ball, fixed to the tool."""
 
     box: tuple[ObjectSize, ObjectSize, ObjectSize] | None = Field(None, description="x y z [m]")
     sphere: float | None = Field(None, gt=0, le=0.5, description="radius; with neither, 0.03 [m]")

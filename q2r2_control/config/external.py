@@ -105,7 +105,7 @@ _EXTERNAL = tuple(name for name in PRESETS if name != BUILTIN.name)
 
 
 class ExternalConfig(StrictModel):
-    """What drives the arms instead of the built-in controller, and what it is sent."""
+    """The controller that drives the arms instead of the built-in one, and the messages that it gets."""
 
     preset: str = Field(description=f"its terms: {', '.join(_EXTERNAL)}")
     mode: Mode = Field(

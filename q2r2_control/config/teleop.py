@@ -71,7 +71,7 @@ class FilterSettings(StrictModel):
 
 
 class GateSettings(StrictModel):
-    """What makes a hand sample unfit to move an arm."""
+    """Limits beyond which a hand sample moves no arm."""
 
     timeout: float = Field(STREAM_TIMEOUT, gt=0, le=2, description="no pose for this long disengages [s]")
     max_jump: float = Field(0.15, gt=0, le=2, description="position change between two samples [m]")
@@ -96,7 +96,7 @@ class LeashSettings(StrictModel):
 
 
 class HapticSettings(StrictModel):
-    """What the hands feel of their arms."""
+    """Vibrations of the hand controllers."""
 
     strength: float = Field(1.0, ge=0, le=1, description="of all vibrations; 0: none")
 

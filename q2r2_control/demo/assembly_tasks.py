@@ -16,7 +16,7 @@ from q2r2_control.summary.tick import Tick
 
 @dataclass(frozen=True, slots=True)
 class TaskResult:
-    """What became of one task."""
+    """The result of one task."""
 
     name: str
     succeeded: bool
@@ -96,7 +96,7 @@ class TaskWatch:
                 judge.see(tick.dt, parts)
 
     def results(self) -> tuple[TaskResult, ...]:
-        """What has become of each task. Arms that touch anything but what they grasp spoil all."""
+        """Results of all tasks. An arm that touches more than it grasps fails them all."""
         touches = [f"{one} touched {other} at {t:.1f} s" for (one, other), t in self._touches.forbidden.items()]
         results = []
         for name, judges in self._judges.items():

@@ -42,7 +42,7 @@ class Judge:
         return {"fall_mm": 1e3 * max(self._fell.values())}
 
     def faults(self) -> list[str]:
-        """What falls short of success so far."""
+        """Shortcomings so far; empty: success."""
         return [f"{name}: fell {1e3 * depth:.0f} mm" for name, depth in self._fell.items() if depth > _FALL]
 
 

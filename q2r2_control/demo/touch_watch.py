@@ -1,4 +1,4 @@
-"""What touches what in the simulated cell: which parts are held by which fingers, and whether arms touch anything else.
+"""Touches in the simulated cell: which fingers hold which parts, and whether arms touch anything else.
 
 Judged from MuJoCo's contacts alone, whatever the controller believes.
 """
@@ -15,7 +15,7 @@ from q2r2_control.robot.robot import Robot
 
 
 class Toucher(IntFlag):
-    """What may touch a part."""
+    """Bodies that may touch a part."""
 
     NOTHING = 0
     SURROUNDINGS = 1  # table, floor, and whatever else stands still

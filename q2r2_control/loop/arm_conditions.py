@@ -1,4 +1,4 @@
-"""What a hand is to feel of its arm besides its state: nearness, position limits, contact. For both loops."""
+"""Conditions of an arm that its hand feels: nearness, position limits, contact. For both loops."""
 
 from __future__ import annotations
 

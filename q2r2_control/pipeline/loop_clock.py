@@ -47,5 +47,5 @@ class LoopClock:
         return time.monotonic() if self._realtime else self.now
 
     def wall_time(self) -> float:
-        """What the run has taken so far, whatever time it simulated [s]."""
+        """Real time since the run began [s], in simulated time too."""
         return time.perf_counter() - self._wall_start

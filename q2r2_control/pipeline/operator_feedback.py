@@ -1,4 +1,4 @@
-"""What the hands feel of a run: each arm's state, what it comes near to or touches, and what holds it up."""
+"""Vibrations of a run: each arm's state, nearness, contact, and limits."""
 
 from __future__ import annotations
 

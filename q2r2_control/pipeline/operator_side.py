@@ -58,7 +58,7 @@ class OperatorSide:
         return targets
 
     def take_events(self, start: float) -> list[Event]:
-        """What happened to the arms' states since the last call, by the time since ``start`` [s]; it is logged."""
+        """Events of the arms since the last call, by the time since ``start`` [s]; they are logged."""
         events = self._teleop.take_events()
         if not events:
             return events  # as at most ticks

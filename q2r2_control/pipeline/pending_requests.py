@@ -1,4 +1,4 @@
-"""What a program asks of a run that goes on, and the events that record it, so that a replay can ask the same."""
+"""Requests of a program to a running loop, and the events that record them, so that a replay can repeat them."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class PendingRequests:
 
 
 def _difference(old: Mapping[str, Any], new: Mapping[str, Any]) -> dict[str, Any]:
-    """What of ``new`` is not as in ``old``; mappings with the same keys are gone into."""
+    """Values of ``new`` that differ from ``old``, also in mappings with the same keys."""
     found: dict[str, Any] = {}
     for name, value in new.items():
         before = old.get(name)

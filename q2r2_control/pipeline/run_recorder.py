@@ -1,4 +1,4 @@
-"""What a run leaves behind: every tick goes into the summary and, where there are any, to the listeners."""
+"""Every tick goes into the summary and to the listeners."""
 
 from __future__ import annotations
 

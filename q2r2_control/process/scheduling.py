@@ -1,4 +1,4 @@
-"""What an operating system does for a loop that must not be late: memory stays in RAM, and its threads go first.
+"""Real-time scheduling for a loop that must not be late: memory stays in RAM, and its threads go first.
 
 Both need a permission. Without it a run goes on as it would have, so what was refused is a line and no error.
 """

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 
 
 class StopRequest:
-    """What a signal handler sets and a loop asks.
+    """A flag that a signal handler sets and a loop reads.
 
     A plain attribute: the lock of a ``threading.Event`` is not reentrant, so a signal that comes in the middle of
     another one's handler would wait for it for ever, and the process with it.

@@ -16,7 +16,7 @@ from q2r2_control.types import ALL_OF_THE_WAY, Array, Interval
 
 
 class Request(NamedTuple):
-    """What one tick asks of the controller."""
+    """Targets of one tick."""
 
     targets: dict[str, Any]
     unusable: frozenset[str]  # arms whose target has to be reported as rejected
@@ -221,7 +221,7 @@ class Adversary:
         return stream
 
     def _work(self) -> Stream:
-        """What two arms do at work, from anywhere in the motion on, at up to three times its speed."""
+        """A work motion of two arms, from anywhere in it on, at up to three times its speed."""
         if self._arms != ARMS:
             return self._shaking()
         motion = tuple(WORK_MOTIONS.values())[int(self._random.integers(len(WORK_MOTIONS)))]

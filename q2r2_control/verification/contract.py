@@ -103,7 +103,7 @@ class Contract:
         self._asked_of_objects = kept_by_objects(self._robot, settings).values
 
     def _note_kept(self) -> None:
-        """What pairs keep may fall to what is asked for, and no farther."""
+        """Kept distances may fall to those that the settings ask for, and no farther."""
         before, kept, settings = self._measured.kept, self._controller.kept_distances, self._controller.settings
         if settings is not self._settings:
             self._ask(settings)

@@ -1,4 +1,4 @@
-"""What a soak feeds to a controller: segments of hostile targets, uneven ticks, hostile solvers and bad starts."""
+"""Input of a soak: segments of hostile targets, uneven ticks, hostile solvers and bad starts."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ class FaultySolver:
 
 @dataclass(frozen=True, slots=True)
 class Start:
-    """What a controller is reset to."""
+    """The state that a controller is reset to."""
 
     name: str
     q: Array  # (nv,) [rad]

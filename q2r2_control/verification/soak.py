@@ -60,7 +60,7 @@ class Violation:
 
 @dataclass(frozen=True, slots=True)
 class SoakReport:
-    """What a soak found."""
+    """Results of a soak."""
 
     cell: str
     seed: int

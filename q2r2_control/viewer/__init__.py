@@ -1,1 +1,1 @@
-"""What people see of a run or a headset. All of it listens; nothing waits for it, and none of it needs ROS."""
+"""Views of a run or a headset. They listen, nothing waits for them, and none needs ROS."""

@@ -38,7 +38,7 @@ def why(tick: Tick, arm: str, joints: Collection[str], binding: Collection[Activ
 
 
 def next_press(tick: Tick, arm: str, bindings: BindingSettings) -> str:
-    """What the buttons of the arm's hand do next, and its dead man."""
+    """The effect of the next press of each button of the arm's hand, and of its dead man."""
     state = tick.states[arm]
     if not tick.connected:
         return "nothing: no input is connected"

@@ -1,4 +1,4 @@
-"""What a headset sends, as a table: live or once."""
+"""The messages of a headset as a table: live or once."""
 
 from __future__ import annotations
 
