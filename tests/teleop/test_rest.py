@@ -155,5 +155,3 @@ def test_a_hand_that_has_turned_however_far_is_known_as_well_as_any_when_it_rest
     drawn, real = turning(speed, seconds=2.0, then=4.0)
     settled = [angle(*both) for both in zip(drawn[-250:], real[-250:], strict=True)]
     assert max(settled) < TURN_NOISE / 2.0, "a mean of 150 samples; the filter alone leaves more than that"
-
-
