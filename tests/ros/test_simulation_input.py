@@ -120,6 +120,15 @@ def test_the_script_waits_for_an_arm_that_is_not_ready_and_presses_until_it_foll
     arm["engaged"] = True
     rest = left["pose"].get(timeout=PATIENCE).pose.position.x
     wait_until(lambda: left["pose"].get(timeout=PATIENCE).pose.position.x > rest + 0.02, "the hand moves")
+    arm |= {"engaged": False, "ready": False}  # stopped by a fault at once, and not ready for a moment
+    wait_until(lambda: left["pose"].get(timeout=PATIENCE).pose.position.x == rest, "the hand is where it was")
+    drained(left["inputs"])
+    time.sleep(0.5)
+    assert not any(message.button_lower for message in drained(left["inputs"]))
+    arm["ready"] = True
+    wait_until(lambda: left["inputs"].get(timeout=PATIENCE).button_lower, "the button is pressed")
+    arm["engaged"] = True
+    time.sleep(7.0)
     arm["engaged"] = False  # from now on it takes a person
     time.sleep(0.5)
     drained(left["inputs"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
@@ -17,6 +18,8 @@ from q2r2_control.types import SIDES, HandSample
 _SHORTEST, _LONGEST = 0.001, 0.02  # between two looks at what has come due [s]
 # Of the script, when it is decided whether the buttons are pressed, and whether the hands move [s].
 _BEFORE_PRESS, _BEFORE_MOTION = FIRST_PRESS - 0.1, START - 0.05
+# After the hands have first moved: an arm that stops while other nodes still start is engaged again until then [s].
+_SETTLES = 6.0
 _MODES = {
     "all": (MessageType.POSE, MessageType.INPUTS, MessageType.TWIST),
     "teleop": (MessageType.POSE, MessageType.INPUTS),
@@ -29,7 +32,7 @@ class SimulationInput(BaseNode):
 
     The script starts when every hand that it plays has a subscriber. The hands rest until the arms' nodes say that they
     can be engaged. Then the buttons are pressed, and again where an arm is not engaged by the time the hands would
-    move. From then on, and after an arm's ``~/pause``, it takes a person.
+    move, or stops in the first six seconds. From then on, and after an arm's ``~/pause``, it takes a person.
     """
 
     ticks = True
@@ -54,6 +57,7 @@ class SimulationInput(BaseNode):
         self._listeners = HandListeners(self, self._hands if MessageType.INPUTS in _MODES[mode] else ())
         self._starts = True  # until nothing is pressed again to engage the arms
         self._moves = False  # whether the hands do
+        self._until = math.inf  # when it ends that arms are engaged again [s]
         self._not_to_press: set[str] | None = None  # hands; None: that is not decided yet
         self._rewind(self.now)
         self._timer = self.create_tick(_LONGEST, self._tick)
@@ -91,29 +95,33 @@ class SimulationInput(BaseNode):
             self._publish(sample)
 
     def _engage(self, now: float) -> None:
-        """Begin the script anew, where its hands still rest, until the arms are ready, and then until they follow."""
+        """Begin the script anew, where its hands rest, until the arms are ready, and then until they follow."""
         self._listeners.look()
         t = now - self._began
         if t < _BEFORE_PRESS or (self._not_to_press is not None and t < _BEFORE_MOTION):
             return
-        following = {hand for hand in self._hands if self._listeners.engaged(hand) is not False}
-        if self._not_to_press is None:
+        following = [hand for hand in self._hands if self._listeners.engaged(hand) is not False]
+        pressed = self._not_to_press is not None or self._until < math.inf
+        if now > self._until or (pressed and self._listeners.paused_by_a_person()):
+            self._starts = False
+            if not self._moves:
+                self._not_to_press = set(self._hands)
+        elif self._not_to_press is None:
             if self._listeners.unready() is None:
                 # A press would pause those that are engaged already.
                 self._not_to_press = {hand for hand in following if self._listeners.engaged(hand)}
             else:
                 self._rewind(now)
-        elif len(following) == len(self._hands):
-            self._starts, self._moves = False, True
-        elif self._listeners.paused_by_a_person():
-            self._starts, self._not_to_press = False, set(self._hands)
+        elif len(following) == len(self._hands) or (self._moves and following):
+            # Once the hands move they do not go back while an arm follows, which would be a jump.
+            self._moves, self._until = True, min(self._until, now + _SETTLES)
         else:
             self._rewind(now)
 
     def _rewind(self, now: float) -> None:
         self._script = ScriptedInput(self._trajectory, self._hands, rate_hz=self._rate, jitter=self._jitter)
         self._script.start()
-        self._began, self._not_to_press = now, None
+        self._began, self._not_to_press, self._moves = now, None, False
 
     def _publish(self, sample: HandSample) -> None:
         if not self._moves and sample.hand in (self._not_to_press or ()):
