@@ -11,12 +11,17 @@ from typing import Any
 from tests.ros.processes import PATIENCE
 
 
-def wait_until(condition: Callable[[], object], what: str, details: Callable[[], object] | None = None) -> None:
+def wait_until(
+    condition: Callable[[], object],
+    what: str,
+    details: Callable[[], object] | None = None,
+    patience: float = PATIENCE,
+) -> None:
     """Wait until ``condition`` holds; fails with ``what`` and ``details`` after a time far longer than it takes."""
-    deadline = time.monotonic() + PATIENCE
+    deadline = time.monotonic() + patience
     while not condition():
         if time.monotonic() > deadline:
-            raise AssertionError(f"not within {PATIENCE:g} s: {what}" + (f"; {details()}" if details else ""))
+            raise AssertionError(f"not within {patience:g} s: {what}" + (f"; {details()}" if details else ""))
         time.sleep(0.002)
 
 

@@ -168,10 +168,7 @@ class BaseArmController(BaseNode):
         return fault or (None if self._refusal is None else self._refusal[1])
 
     def follow(self, target: ArmTarget, now: float, decided: float) -> Reason | None:
-        """Publish the ``target`` of this tick, and command the gripper; returns why the arm has to hold, or None.
-
-        ``decided``: see :func:`publish_in_time`.
-        """
+        """Publish the ``target`` that was ``decided`` on then [s], command the gripper; why the arm has to hold."""
         if self.intake.hand != self.hand:
             self.intake.follow(self.hand)
         toggled, self._target = target.gripper != self._target.gripper, target
