@@ -230,9 +230,9 @@ def moving_headset(run: Live, dialect: str) -> subprocess.Popen[bytes]:
 
 @pytest.fixture(scope="module")
 def cuts() -> tuple[Live, dict[str, Cut]]:
-    """One run, two clients that end in mid-motion; the next one sends before it presses, and engages anew."""
+    """One run, three clients that end in mid-motion; each next one sends before it presses, and engages anew."""
     found: dict[str, Cut] = {}
-    ends = (("ros2", signal.SIGKILL), ("ros1", signal.SIGSTOP))
+    ends = (("ros2", signal.SIGKILL), ("ros1", signal.SIGSTOP), ("ros2", signal.SIGTERM))
     with live("kinematic") as run:
         marks = []
         for dialect, end in ends:
@@ -250,36 +250,51 @@ def cuts() -> tuple[Live, dict[str, Cut]]:
                 headset.kill()
                 headset.wait()
     ticks = run.watch.ticks
-    for name, mark in zip(("killed", "silent"), marks, strict=True):
+    for name, mark in zip(("killed", "silent", "cut"), marks, strict=True):
         last = max(index for index in range(mark + 1) if ticks[index].samples)
         until = next((i for i in range(mark, len(ticks)) if any(ticks[i].engaged.values())), len(ticks))
         found[name] = Cut(last, until)
     return run, found
 
 
-@pytest.mark.parametrize("name", ["killed", "silent"])
-def test_a_client_that_ends_in_mid_motion_leaves_both_arms_at_rest_in_time_until_engaged_anew(
-    cuts: tuple[Live, dict[str, Cut]], name: str
-) -> None:
-    run, found = cuts
-    cut, ticks = found[name], run.watch.ticks
-    received = max(sample.pose_stamp for sample in ticks[cut.last].samples)
-    rest = next(index for index in range(cut.last, cut.until) if speed(ticks[index]) < 1e-3)
-    moving = range(cut.last, rest + 1)
-    assert speed(ticks[cut.last]) > 0.05, "in mid-motion"
-    limit = run.loop.robot.capped_acceleration(run.loop.config.control.acceleration_limit)
-    braking = max(float((np.abs(ticks[index].reference.v) / limit).max()) for index in moving)
-    # A late tick sees the timeout late, and the end of the braking one tick later.
-    late = 3.0 * max(ticks[index].dt for index in moving)
-    assert run.server.times[rest] - received <= STREAM_TIMEOUT + braking + late + 0.005
-    still = ticks[rest : cut.until]
-    assert still[-1].t - still[0].t > 0.4
-    assert max(map(speed, still)) < 1e-3
-    assert np.ptp([tick.reference.q for tick in still], axis=0).max() < 1e-4
-    assert [sample for tick in still for sample in tick.samples], "hands went on sending"
-    assert run.summary is not None
-    silent = ("pose_silent", "pose_gap", "inputs_silent", "hand_jumped", "linked")
-    for arm in SIDES:
-        event = next(event for event in run.summary.events if event.arm == arm and event.t >= ticks[cut.last].t - 0.01)
-        assert (str(event.source), str(event.destination)) == ("engaged", "lost")
-        assert event.kind in (silent if name == "silent" else ("connection_lost",))
+@pytest.mark.parametrize("name", ["killed", "silent", "cut"])
+class TestConnectionEndsInMidMotion:
+    def test_both_arms_are_at_rest_within_150_ms_and_the_braking_time(
+        self, cuts: tuple[Live, dict[str, Cut]], name: str
+    ) -> None:
+        run, found = cuts
+        cut, ticks = found[name], run.watch.ticks
+        received = max(sample.pose_stamp for sample in ticks[cut.last].samples)
+        after = range(cut.last, cut.until)
+        rest = next(index for index in after if speed(ticks[index]) < 1e-3)
+        moving = range(cut.last, rest + 1)
+        assert speed(ticks[cut.last]) > 0.05, "in mid-motion"
+        limit = run.loop.robot.capped_acceleration(run.loop.config.control.acceleration_limit)
+        braking = max(float((np.abs(ticks[index].reference.v) / limit).max()) for index in moving)
+        # A late tick sees the timeout late, and the end of the braking one tick later.
+        late = 3.0 * max(ticks[index].dt for index in moving)
+        assert run.server.times[rest] - received <= STREAM_TIMEOUT + braking + late + 0.005
+
+    def test_they_stay_at_rest_until_engaged_anew_whatever_the_hands_do(
+        self, cuts: tuple[Live, dict[str, Cut]], name: str
+    ) -> None:
+        run, found = cuts
+        cut, ticks = found[name], run.watch.ticks
+        rest = next(index for index in range(cut.last, cut.until) if speed(ticks[index]) < 1e-3)
+        still = ticks[rest : cut.until]
+        assert still[-1].t - still[0].t > 0.4
+        assert max(map(speed, still)) < 1e-3
+        assert np.ptp([tick.reference.q for tick in still], axis=0).max() < 1e-4
+        received = [sample for tick in still for sample in tick.samples]
+        assert received or name == "cut", "hands went on sending"
+
+    def test_both_arms_are_told_why(self, cuts: tuple[Live, dict[str, Cut]], name: str) -> None:
+        run, found = cuts
+        assert run.summary is not None
+        begin = run.watch.ticks[found[name].last].t - 0.01
+        silent = ("pose_silent", "pose_gap", "inputs_silent", "hand_jumped", "linked")
+        expected = silent if name == "silent" else ("connection_lost",)
+        for arm in SIDES:
+            event = next(event for event in run.summary.events if event.arm == arm and event.t >= begin)
+            assert (str(event.source), str(event.destination)) == ("engaged", "lost")
+            assert event.kind in expected
