@@ -59,7 +59,7 @@ class TargetOutput:
         self.last_sent: pin.SE3 | None = None  # what the controller was asked for last, world frame; None: nothing
         self._ends = node.create_publisher(Empty, ended_topic(topic), SENT_COMMAND_QOS) if preset is BUILTIN else None
         self._sent_at = -math.inf  # the last target of a stream that has not ended yet [s]
-        self._restarted = False
+        self._fault: str | None = None  # why the controller that is driven is not the one of before
         self._endpoints: set[bytes] = set()  # of the controller
         self._listeners = 0
         self._unknown = False  # a subscriber's node is not known yet
@@ -105,9 +105,9 @@ class TargetOutput:
         if self._unknown and self.following and now - self._appeared_at > _NAME_TIMEOUT:
             self.forget(now)
             return self._unknown_node
-        restarted, self._restarted = self._restarted, False
-        if restarted:
-            return f"{self._controller} was restarted"
+        fault, self._fault = self._fault, None
+        if fault is not None:
+            return fault
         silence = self._publisher.silence() if self.following else None
         if silence is not None:
             self.forget(now)  # the controller is gone, and its successor must not get an old target
@@ -183,14 +183,17 @@ class TargetOutput:
         return f"{self.topic} has a subscriber whose node is not known yet"
 
     def _ask_graph(self, now: float) -> None:
-        """Notice a controller that has appeared."""
+        """Notice a controller that has appeared, or is gone: others that listen may acknowledge in its place."""
         found = [(node_of(info), info) for info in self._node.get_subscriptions_info_by_topic(self.topic)]
         self._unknown = len(found) < self._listeners or any(name is None for name, _ in found)
         endpoints = {bytes(info.endpoint_gid) for name, info in found if name == self._controller}
-        if endpoints - self._endpoints:
-            self.starts += 1
-            self._restarted = self.following
+        appeared, gone = endpoints - self._endpoints, self._endpoints and not endpoints
+        if self.following and (appeared or gone):
+            self._fault = f"{self._controller} was restarted" if appeared else f"{self._controller} has ended"
+        if appeared or gone:
             self.forget(now)
+        if appeared:
+            self.starts += 1
             self._send_zero_wrench(now)
         self._endpoints = endpoints
 
