@@ -170,8 +170,8 @@ MUTATIONS = (
     Mutation(
         "fingers that grow are proven at the reference",
         "safety_filter.py",
-        "            if is_too_close(model, data, p):\n                return p\n",
-        "            if False:\n                return p\n",
+        "if data.distance[p] < model.min_distance[p]:  # no rounding",
+        "if False:  # no rounding",
     ),
     Mutation(
         "a distance that grows leaves the way of the stop",

@@ -146,3 +146,17 @@ def test_what_is_no_opening_is_refused_by_name(
     with pytest.raises(RobotError, match=complaint):
         controller.set_opening(arm, least, greatest)
     assert controller.openings["left"] == ALL_OF_THE_WAY
+
+
+@pytest.mark.parametrize("below", [0.0, 1e-13, 5e-10])
+def test_fingers_at_their_distance_to_the_last_digits_part_again(robot: Robot, below: float) -> None:
+    run = Driven(CartesianController(robot, SETTINGS))
+    run.set_opening("left", 0.0, 0.0)
+    report = run.drive(2.0, {"left": BESIDE}).report
+    assert "finger" in report.closest_pair[0] + report.closest_pair[1]
+    kept = SETTINGS.distances.model_copy(update={"finger_obstacle": report.closest_distance + below})
+    near = Driven(CartesianController(robot, SETTINGS.model_copy(update={"distances": kept})), run.q)
+    near.set_opening("left", 0.0, 0.0)
+    reference = near.drive(2.0, {"left": ABOVE})
+    assert not reference.report.fallback
+    assert np.linalg.norm(near.controller.tool_pose("left").translation - ABOVE.translation) < 1e-3

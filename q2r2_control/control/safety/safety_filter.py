@@ -92,7 +92,7 @@ def certify_bodies(model: SafetyModel, data: SafetyData, grown: IntArray) -> int
     for p in range(pairs.first.shape[0]):
         if grown[pairs.first[p]] == 1 or grown[pairs.second[p]] == 1:
             any_grown = True
-            if is_too_close(model, data, p):
+            if data.distance[p] < model.min_distance[p]:  # no rounding: it could have grown less
                 return p
     if not any_grown:
         return -1
