@@ -17,6 +17,7 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from importlib import import_module
+from pathlib import Path
 from queue import Empty, SimpleQueue
 from threading import Lock, Thread
 from typing import Any
@@ -101,14 +102,17 @@ class HelperProcess:
     def finish(self, patience: float) -> None:
         """Wait until it has done what was sent, and has ended.
 
-        One that neither takes nor answers anything for ``patience`` [s] is killed, and has a fault.
+        One that neither takes nor answers anything for ``patience`` [s] is killed, and has a fault. Time in which other
+        programs keep it off the processors does not count.
         """
         self._ending = True
         self._queue.put(None)
         self._moved = time.monotonic()
         while self._listener.is_alive():
             self._listener.join(_LOOKS)
-            if self._listener.is_alive() and time.monotonic() - self._moved > patience:
+            if self._is_ready_to_run():
+                self._moved = time.monotonic()
+            elif self._listener.is_alive() and time.monotonic() - self._moved > patience:
                 self.fault = f"the process that {self._what} did nothing for {patience:g} s"
                 self.kill()
 
@@ -118,6 +122,13 @@ class HelperProcess:
         self._process.kill()
         self._queue.put(None)
         self._listener.join(_AFTER_KILL)
+
+    def _is_ready_to_run(self) -> bool:
+        """Whether one of its threads runs or could; only Linux says that."""
+        with suppress(OSError):  # of a thread that has ended
+            states = [file.read_text() for file in Path(f"/proc/{self.pid}/task").glob("*/stat")]
+            return any(state.rpartition(")")[2].split()[0] == "R" for state in states)
+        return False
 
     def _feed(self) -> None:
         stream = self._process.stdin
