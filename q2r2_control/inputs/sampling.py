@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from itertools import count
 
@@ -18,15 +19,15 @@ _RECEIPT_JITTER = 0.0015  # [s], scale of an exponential distribution
 _ROTATION_NOISE = math.radians(0.03)
 
 
-class SampleTiming:
+class SampleTiming(ABC):
     """How the samples of one hand come about: exact and at once, unless a subclass says otherwise.
 
     For each of ``times`` ``measured`` is asked first, then ``lateness``.
     """
 
+    @abstractmethod
     def times(self) -> Iterator[float]:
         """Times [s] of all samples, from 0 on without end."""
-        raise NotImplementedError
 
     def measured(self, pose: pin.SE3, t: float) -> pin.SE3:
         """What is measured of a hand that is at ``pose`` at ``t`` [s]."""

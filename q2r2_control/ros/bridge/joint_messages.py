@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from importlib import import_module
 from typing import Any, ClassVar
 
@@ -21,7 +22,7 @@ NONE = "none"
 _LBR_JOINTS = 7
 
 
-class Kind:
+class Kind(ABC):
     """One kind of message. Made with the control loop's period [s] and the robot."""
 
     topic: ClassVar[str]  # where no other is asked for
@@ -33,12 +34,12 @@ class Kind:
         self._due = Duration(sec=int(period), nanosec=int(1e9 * (period % 1.0)))
         self._model = robot.model
 
+    @abstractmethod
     def encode(self, command: Command, state: RobotState, t: float, names: list[str], joints: np.ndarray) -> Any:
         """A message about the joints with these names and velocity indices.
 
         ``command`` was made for ``state`` at ``t`` [s] of the node's clock.
         """
-        raise NotImplementedError
 
 
 class TrajectoryOutput(Kind):
