@@ -173,11 +173,12 @@ class BaseNode(Node):
         now, wall = self.now, time.monotonic()
         if now != self._ros_time[0]:
             self._ros_time = now, wall
-        if not clock.ros_time_is_active or wall - self._ros_time[1] < timeout:
+        if not clock.ros_time_is_active:
             return None
         if now == 0.0:
             return "use_sim_time is set and nothing comes on /clock"
-        return "use_sim_time is set and the time on /clock stands still"
+        stands = wall - self._ros_time[1] >= timeout
+        return "use_sim_time is set and the time on /clock stands still" if stands else None
 
 
 def run_node(*makes: Callable[[], BaseNode]) -> int:

@@ -118,6 +118,7 @@ def context(domain: int) -> Iterator[Any]:
 def spun_node(domain: int, name: str = "test") -> Iterator[Any]:
     """The same for fixtures that outlive one test."""
     import rclpy
+    from rclpy.action import ActionServer
     from rclpy.exceptions import InvalidHandle
     from rclpy.executors import SingleThreadedExecutor
 
@@ -142,6 +143,8 @@ def spun_node(domain: int, name: str = "test") -> Iterator[Any]:
         ended.set()
         executor.shutdown()
         thread.join()
+        for server in [one for one in made.waitables if isinstance(one, ActionServer)]:
+            server.destroy()  # which outlives its node, and would serve the next test on this domain
         made.destroy_node()
         context.try_shutdown()
 

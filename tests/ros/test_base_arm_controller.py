@@ -216,7 +216,6 @@ def test_a_gripper_is_closed_when_its_result_says_so_even_stalled(
         assert (command.position[0] if joint else command.position) == 0.04
         rig.wait(lambda: "neither stalled nor at its goal" in rig.state["message"], "the failure is reported")
         assert rig.state["gripper"] == "closed"
-        server.destroy()
 
 
 BAD_PARAMETERS = {

@@ -126,6 +126,7 @@ class TeleopLoop:
         problem = Reason.in_words(line)
         for node in self.nodes:
             node.refuse(problem)
+            node.intake.take()  # a press without time must not count when time comes
         self._pause(self.nodes[0].now, problem)
         self._publish_events()
 
