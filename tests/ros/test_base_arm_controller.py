@@ -199,7 +199,7 @@ def test_a_gripper_is_closed_when_its_result_says_so_even_stalled(
         return action.Result(stalled=stalls)
 
     with spun_node(domain, "gripper") as other:
-        server = ActionServer(other, action, "/q2r2/left_gripper/gripper_cmd", execute)
+        ActionServer(other, action, "/q2r2/left_gripper/gripper_cmd", execute)
         joint = {"gripper.joint_name": "finger"} if kind == "ParallelGripperCommand" else {}
         rig.start(processes, {"gripper.action_type": kind, "gripper.open_position": 0.04, **joint})
         while goals.empty():  # a press before the server is discovered has no effect
