@@ -17,9 +17,11 @@ from tests.ros.waiting import wait_until
 need_ros()
 
 from geometry_msgs.msg import PoseStamped
+from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from q2r2_control.ros.monitoring.endpoints import WatchedPublisher, node_of
 
+_LOST = "_NODE_NAME_UNKNOWN_"  # as rcl says
 TIMEOUT = 0.5  # longer than an acknowledgement takes on an overloaded machine [s]
 LISTENER = """
 import rclpy
@@ -88,6 +90,17 @@ def test_a_listener_that_ended_before_the_stream_is_not_reported(
     assert publisher.listeners == 1  # as the graph says
 
 
+def test_an_endpoint_keeps_the_name_of_its_node_where_the_graph_has_lost_it() -> None:
+    known, lost, other = (
+        TopicEndpointInfo(node_namespace=space, node_name=name, endpoint_gid=[number] * 16)
+        for space, name, number in (("/", "talker", 1), ("_NODE_NAMESPACE_UNKNOWN_", _LOST, 1), ("/", _LOST, 2))
+    )
+    assert [node_of(one) for one in (known, lost, other)] == ["/talker", "/talker", None]
+
+
+# How long Fast DDS takes to find it again is its own business, and once was more than 30 s.
+@pytest.mark.slow
+@pytest.mark.soak
 def test_a_node_that_was_frozen_until_the_graph_had_lost_it_is_known_when_it_comes_back(
     node: Any, listener: RosProcess
 ) -> None:
