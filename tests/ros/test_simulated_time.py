@@ -32,13 +32,18 @@ def test_an_arm_without_time_cannot_be_engaged_and_one_whose_time_stops_is_pause
 
     publisher, began = node.create_publisher(Clock, "/clock", 1), time.monotonic()
 
-    timer = node.create_timer(
-        0.01, lambda: publisher.publish(Clock(clock=time_message(1.0 + time.monotonic() - began)))
-    )
+    def send_time() -> None:
+        publisher.publish(Clock(clock=time_message(1.0 + time.monotonic() - began)))
+
+    timer = node.create_timer(0.01, send_time)
     rig.wait(lambda: rig.state["ready"], "it is ready when time comes")
-    assert (rig.state["engaged"], rig.targets) == (False, [])  # the press before is forgotten
+    assert (rig.state["engaged"], rig.targets) == (False, [])  # by the press before
     rig.engage()
     node.destroy_timer(timer)
     # On a machine with other load something else may have paused it before, so the reason is asked of what it says now.
     rig.wait(lambda: "time on /clock stands still" in rig.state["message"], "it says that time stops")
     rig.wait(lambda: not rig.state["engaged"] and not rig.state["ready"], "it is paused")
+    rig.press()
+    node.create_timer(0.01, send_time)
+    rig.wait(lambda: rig.state["ready"], "it is ready when time goes on")
+    assert not rig.state["engaged"]

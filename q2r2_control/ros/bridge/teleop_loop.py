@@ -69,6 +69,7 @@ class TeleopLoop:
         self._recorder = RecorderLink(node)
         self._home = HomeClient(node, node.outputs.home_controller)
         self._ticked = node.now
+        self._without_time: Reason | None = None
         node.create_tick(1.0 / node.parameters.rate, self.tick)
         # Without time there are no ticks, and so nothing else that would pause the arms.
         node.create_timer(_TIME_PERIOD, self._watch_time, clock=Clock(clock_type=ClockType.STEADY_TIME))
@@ -89,13 +90,16 @@ class TeleopLoop:
             if fault is not None:
                 teleop.pause(now, fault, arm)
         inputs = {node.arm_name: node.inputs for node in nodes}
+        # Presses made while time stood still are processed only now. They may stop an arm, and never engage one.
+        stood, self._without_time = self._without_time, None
+        obstacles = {arm: why for arm, one in inputs.items() if (why := one.obstacle or stood) is not None}
         references = {one.reference for one in inputs.values()}
         targets = teleop.update(
             [sample for node in nodes for sample in node.intake.take()],
             {arm: one.tool for arm, one in inputs.items() if one.tool is not None},
             now,
             {arm: one.commanded for arm, one in inputs.items() if one.commanded is not None} or None,
-            {arm: one.obstacle for arm, one in inputs.items() if one.obstacle is not None},
+            obstacles,
             in_step=len(references) == 1 and None not in references,
         )
         going_home = [node.outputs.homing for node in nodes]
@@ -126,7 +130,7 @@ class TeleopLoop:
         problem = Reason.in_words(line)
         for node in self.nodes:
             node.refuse(problem)
-            node.intake.take()  # a press without time must not count when time comes
+        self._without_time = problem
         self._pause(self.nodes[0].now, problem)
         self._publish_events()
 
