@@ -5,6 +5,7 @@ What is asserted about time allows for the machine's own delays, as measured; wh
 
 from __future__ import annotations
 
+import gc
 import json
 import signal
 import subprocess
@@ -93,6 +94,7 @@ def live(plant: str) -> Iterator[Live]:
     loop = Pipeline.from_config(config, input=server, plant=plant)
     run = Live(server, loop, Watch(loop), delay=loop.teleop.delay)
     thread = threading.Thread(target=run.run)
+    gc.disable()  # it would go through all ticks that the watch keeps, for up to 0.2 s
     thread.start()
     try:
         run.wait_for("the first tick", lambda: bool(run.watch.ticks))
@@ -100,6 +102,7 @@ def live(plant: str) -> Iterator[Live]:
     finally:
         loop.stop()
         thread.join(10.0)
+        gc.enable()
     assert not thread.is_alive()
     if run.failure is not None:
         raise run.failure
