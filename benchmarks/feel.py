@@ -18,16 +18,13 @@ import numpy as np
 import pinocchio as pin
 import typer
 
-from q2r2_control.cli.figure_table import record_table
-from q2r2_control.cli.options import DEMO_CONFIG, Json
-from q2r2_control.cli.output import print_progress, print_report
+from q2r2_control.cli.output import DEMO_CONFIG, Json, print_progress, print_report, record_table
 from q2r2_control.config.cell import Config, load_config
 from q2r2_control.config.teleop import FilterSettings
-from q2r2_control.inputs.played import PlayedInput
-from q2r2_control.inputs.sampling import HeadsetSampling
+from q2r2_control.inputs.assembly import minimum_jerk
+from q2r2_control.inputs.played import HeadsetSampling, PlayedInput
 from q2r2_control.inputs.scripted import HANDS_AT_REST
-from q2r2_control.inputs.way_points import minimum_jerk
-from q2r2_control.judging.delay import Track, delays_behind
+from q2r2_control.judging.motion import Track, delays_behind
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.robot.robot import Robot

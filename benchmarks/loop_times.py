@@ -19,9 +19,7 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from q2r2_control.cli.figure_table import figure_table
-from q2r2_control.cli.options import DEMO_CONFIG, Json
-from q2r2_control.cli.output import print_progress, print_report
+from q2r2_control.cli.output import DEMO_CONFIG, Json, figure_table, print_progress, print_report
 from q2r2_control.config.cell import Config, load_config
 from q2r2_control.inputs.scripted import ScriptedInput
 from q2r2_control.pipeline.pipeline import Pipeline

@@ -16,22 +16,19 @@ import numpy as np
 import pinocchio as pin
 import typer
 
-from q2r2_control.cli.figure_table import record_table
-from q2r2_control.cli.options import DEMO_CONFIG, Json
-from q2r2_control.cli.output import print_progress, print_report
+from q2r2_control.cli.output import DEMO_CONFIG, Json, print_progress, print_report, record_table
 from q2r2_control.config.cell import Config, load_config
 from q2r2_control.control.controller import CartesianController
-from q2r2_control.drives.torque import TorqueDrive
+from q2r2_control.drives.base import TorqueDrive
 from q2r2_control.errors import ConfigError
-from q2r2_control.inputs.way_points import minimum_jerk
+from q2r2_control.inputs.assembly import minimum_jerk
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.robot.kept_distances import kept_distances
-from q2r2_control.robot.link_roles import LinkClass, Role
-from q2r2_control.robot.pairs import link_of, pair_names
+from q2r2_control.robot.pairs import LinkClass, Role, link_of, pair_names
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
-from q2r2_control.verification.contact_cells import TABLE_ONLY, with_contact
 from q2r2_control.verification.contract import Contract
+from q2r2_control.verification.fault_injection import TABLE_ONLY, with_contact
 
 COMMANDED = 0.010  # inside the table [m]
 _ARM, _TABLE = "left", "table"

@@ -13,11 +13,8 @@ import numpy as np
 import pinocchio as pin
 import typer
 
-from q2r2_control.benchmark.motion_measures import JOLT, count_jolts, rest_acceleration
-from q2r2_control.benchmark.own_controller import OwnController
-from q2r2_control.cli.figure_table import record_table
-from q2r2_control.cli.options import DEMO_CONFIG, Json
-from q2r2_control.cli.output import print_progress, print_report
+from q2r2_control.benchmark.motion_run import JOLT, OwnController, count_jolts, rest_acceleration
+from q2r2_control.cli.output import DEMO_CONFIG, Json, print_progress, print_report, record_table
 from q2r2_control.config.cell import Config, load_config
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array

@@ -20,9 +20,7 @@ from quest2ros.msg import OVR2ROSInputs
 from rclpy.executors import SingleThreadedExecutor
 from trajectory_msgs.msg import JointTrajectory
 
-from q2r2_control.cli.figure_table import figure_table
-from q2r2_control.cli.options import DEMO_CONFIG, Json
-from q2r2_control.cli.output import print_progress, print_report
+from q2r2_control.cli.output import DEMO_CONFIG, Json, figure_table, print_progress, print_report
 from q2r2_control.config.cell import load_config
 from q2r2_control.errors import Q2R2Error
 from q2r2_control.robot.robot import Robot

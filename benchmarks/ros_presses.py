@@ -22,9 +22,7 @@ from rclpy.executors import SingleThreadedExecutor
 from std_msgs.msg import Float64MultiArray, String
 from trajectory_msgs.msg import JointTrajectory
 
-from q2r2_control.cli.figure_table import record_table
-from q2r2_control.cli.options import DEMO_CONFIG, Json
-from q2r2_control.cli.output import print_progress, print_report
+from q2r2_control.cli.output import DEMO_CONFIG, Json, print_progress, print_report, record_table
 from q2r2_control.errors import Q2R2Error
 from q2r2_control.recording.ros_topics import ARM_FIELDS, arm_flags, asked_target
 from q2r2_control.ros.base_node import RECORDED_QOS, STREAM_QOS

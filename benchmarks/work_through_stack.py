@@ -16,12 +16,9 @@ import mujoco
 import numpy as np
 import typer
 
-from q2r2_control.benchmark.motion_run import arrival_time, nearest_pair
-from q2r2_control.benchmark.own_controller import without_pairs
+from q2r2_control.benchmark.motion_run import arrival_time, nearest_pair, without_pairs
 from q2r2_control.benchmark.work_motions import ARMS, WORK_MOTIONS, WorkMotion, motions_named
-from q2r2_control.cli.figure_table import record_table
-from q2r2_control.cli.options import DEMO_CONFIG, Json
-from q2r2_control.cli.output import print_progress, print_report
+from q2r2_control.cli.output import DEMO_CONFIG, Json, print_progress, print_report, record_table
 from q2r2_control.config.cell import Config, load_config
 from q2r2_control.errors import PlantError
 from q2r2_control.events import Event

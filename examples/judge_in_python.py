@@ -5,9 +5,9 @@ import sys
 import tempfile
 from pathlib import Path
 
-from q2r2_control.config.judge import JudgeSettings
+from q2r2_control.config.recording import JudgeSettings
 from q2r2_control.judging.judge import judge_all
-from q2r2_control.recording.files import recordings_in
+from q2r2_control.recording.reader import recordings_in
 
 
 def record(folder: str) -> Path:

@@ -6,7 +6,7 @@ import tempfile
 from pathlib import Path
 
 from q2r2_control.export.episodes import FrameSampling, make_episode
-from q2r2_control.recording.files import recordings_in
+from q2r2_control.recording.reader import recordings_in
 
 
 def record(folder: str) -> Path:

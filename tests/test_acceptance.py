@@ -21,7 +21,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from q2r2_control.config.timeouts import STREAM_TIMEOUT
+from q2r2_control.config.strict import STREAM_TIMEOUT
 from q2r2_control.inputs.headset import HeadsetServer
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.summary.run_summary import RunSummary

@@ -12,10 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from q2r2_control.benchmark.motion_run import DT, PATIENCE, MotionFigures, run_motion
-from q2r2_control.benchmark.own_controller import OwnController, without_pairs
-from q2r2_control.benchmark.peers.base import BenchController, PeerSettings, build_peers
-from q2r2_control.benchmark.peers.leading import Leading
+from q2r2_control.benchmark.motion_run import DT, PATIENCE, MotionFigures, OwnController, run_motion, without_pairs
+from q2r2_control.benchmark.peers.base import BenchController, Leading, PeerSettings, build_peers
 from q2r2_control.benchmark.work_motions import WorkMotion
 from q2r2_control.config.cell import Config
 from q2r2_control.robot.robot import Robot

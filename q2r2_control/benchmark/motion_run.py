@@ -5,17 +5,78 @@ from __future__ import annotations
 import gc
 import math
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 import pinocchio as pin
 
-from q2r2_control.benchmark.motion_measures import rest_acceleration
-from q2r2_control.benchmark.own_controller import OwnController
 from q2r2_control.benchmark.peers.base import BenchController
 from q2r2_control.benchmark.work_motions import WorkMotion
+from q2r2_control.config.cell import Config
+from q2r2_control.control.controller import CartesianController
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
+
+_SHORTEST_DT = 1e-9  # a tick that moves nothing [s]
+
+
+class OwnController:
+    """:class:`CartesianController` as a :class:`BenchController`.
+
+    It has a cell's settings but the time limit, so that a slow machine computes the same motion.
+    """
+
+    limitations = ""
+
+    def __init__(self, robot: Robot, config: Config, name: str = "q2r2_control") -> None:
+        self.name = name
+        self._controller = CartesianController(robot, config.control.model_copy(update={"solve_time_limit": None}))
+        self.stopped: list[bool] = []  # of each tick since the reset: whether the certified stop was executed
+
+    def reset(self, q: Array) -> None:
+        """See :class:`BenchController`."""
+        self._controller.reset(q)
+        self.stopped.clear()
+
+    def step(self, targets: Mapping[str, pin.SE3], dt: float) -> tuple[Array, Array]:
+        """See :class:`BenchController`."""
+        reference = self._controller.step(targets, dt)
+        self.stopped.append(reference.report.fallback)
+        return reference.q, reference.v
+
+    def hold(self) -> tuple[Array, Array]:
+        """See :class:`BenchController`; only called after a step that raised, which the contract forbids."""
+        reference = self._controller.step({}, _SHORTEST_DT)
+        return reference.q, np.zeros_like(reference.v)
+
+
+def without_pairs(config: Config) -> Robot:
+    """The robot of a cell in free air: no pair is monitored, so that the arms go through each other and all else."""
+    robot = Robot.from_config(config)
+    robot.collision_model.removeAllCollisionPairs()
+    return robot
+
+
+JOLT = 5.0  # change of a joint's acceleration from one tick to the next [rad/s^2]
+_TAIL = 0.5  # [s]
+
+
+def rest_acceleration(v: Array, dt: float) -> float:
+    """RMS over the last 0.5 s of velocities (n, nv) [rad/s], of the acceleration's norm over the joints [rad/s^2]."""
+    a = np.diff(v, axis=0, prepend=0.0)[-round(_TAIL / dt) :] / dt
+    return float(np.sqrt(np.mean(np.sum(a**2, axis=1))))
+
+
+def count_jolts(v: Array, dt: float, since: float) -> int:
+    """Ticks of velocities (n, nv) [rad/s] after which a joint's acceleration changes by more than :data:`JOLT`.
+
+    Counts from ``since`` [s] on.
+    """
+    a = np.diff(v, axis=0, prepend=0.0) / dt
+    changes = np.abs(np.diff(a, axis=0)).max(axis=1)
+    return int((changes[round(since / dt) :] > JOLT).sum())
+
 
 DT = 0.001  # [s]
 ARRIVED = 0.01  # from the goal [m]

@@ -12,9 +12,16 @@ from q2r2_control.benchmark.bench import BenchReport, BenchRow, run_bench
 from q2r2_control.benchmark.motion_run import PATIENCE, MotionFigures
 from q2r2_control.benchmark.peers.base import PEERS, WITHOUT_ACCELERATION_LIMIT
 from q2r2_control.benchmark.work_motions import TIMED_MOTIONS, WORK_MOTIONS, motions_named
-from q2r2_control.cli.figure_table import Cell, figure_table
-from q2r2_control.cli.options import DEMO_CONFIG, Json
-from q2r2_control.cli.output import notice_of_compiling, print_progress, print_report, stderr_console
+from q2r2_control.cli.output import (
+    DEMO_CONFIG,
+    Cell,
+    Json,
+    figure_table,
+    notice_of_compiling,
+    print_progress,
+    print_report,
+    stderr_console,
+)
 from q2r2_control.config.cell import load_config
 from q2r2_control.errors import ConfigError
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, nullcontext
 from dataclasses import asdict, dataclass, field
@@ -10,10 +11,9 @@ from typing import Any
 
 from rich.console import Console
 
-from q2r2_control.cli.headset_server import AnnouncedHeadset
+from q2r2_control.cli.headset_check import AnnouncedHeadset
 from q2r2_control.cli.output import as_json_text, notice_of_compiling, say
 from q2r2_control.cli.summary_table import recording_line, summary_table, task_line, verdict_markup
-from q2r2_control.cli.window import check_window, show_window
 from q2r2_control.config.cell import Config
 from q2r2_control.config.external import ControllerKind
 from q2r2_control.demo.assembly_tasks import AssemblyTask, TaskResult, TaskWatch
@@ -29,9 +29,50 @@ from q2r2_control.recording.about import About
 from q2r2_control.recording.reader import Recording
 from q2r2_control.recording.recorder import Recorder, RecordingSummary
 from q2r2_control.summary.run_summary import RunSummary
+from q2r2_control.summary.tick import Tick
 from q2r2_control.supervision.preflight import preflight_faults
-from q2r2_control.teleop.episode_marks import EpisodeMarks
+from q2r2_control.teleop.both_arms import EpisodeMarks
 from q2r2_control.viewer.live import LiveTable
+
+_PERIOD = 1.0 / 30.0  # [s]
+
+
+def check_window(plant: str | None) -> None:
+    """Raises :class:`ConfigError` for a plant without a window."""
+    if plant != "mujoco":
+        which = "without --plant there is no window" if plant is None else f"the {plant} plant has no window"
+        raise ConfigError(f"--viewer: {which}; allowed: --plant mujoco")
+
+
+def show_window(pipeline: Pipeline, *, paced: bool = False) -> None:
+    """Open the window and keep it up to date while ``pipeline`` runs, which closing it ends.
+
+    ``paced``: simulated time passes no faster than that of the clock on the wall. Raises :class:`PlantError` where
+    there is no display.
+    """
+    if isinstance(pipeline.plant, MujocoPlant):
+        pipeline.plant.launch_viewer()
+        pipeline.listeners.append(_WindowListener(pipeline, pipeline.plant, paced))
+
+
+class _WindowListener:
+    """Shows the window some thirty times a second."""
+
+    def __init__(self, pipeline: Pipeline, plant: MujocoPlant, paced: bool) -> None:
+        self._pipeline, self._plant, self._paced = pipeline, plant, paced
+        self._due = 0.0
+        self._began: float | None = None
+
+    def __call__(self, tick: Tick) -> None:
+        if tick.t < self._due:
+            return
+        self._due = tick.t + _PERIOD
+        if self._paced:
+            now = time.monotonic()
+            self._began = now - tick.t if self._began is None else self._began
+            time.sleep(max(self._began + tick.t - now, 0.0))
+        if not self._plant.viewer_sync():
+            self._pipeline.stop()
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from q2r2_control.cli.cell_run import RunOptions, print_summary, run_cell
-from q2r2_control.cli.options import (
+from q2r2_control.cli.output import (
     DEMO_CONFIG,
     Headless,
     Human,
@@ -19,8 +19,8 @@ from q2r2_control.cli.options import (
     Viewer,
     positive,
     shows_table,
+    stderr_console,
 )
-from q2r2_control.cli.output import stderr_console
 from q2r2_control.config.cell import load_config
 from q2r2_control.demo.assembly_tasks import ALL_TASKS, TASKS, tasks_named
 from q2r2_control.errors import ConfigError

@@ -14,10 +14,9 @@ from q2r2_control.errors import ConfigError, RecordingError
 from q2r2_control.export.csv_tables import gather_tables, move_table, write_table
 from q2r2_control.export.episodes import FASTEST, FrameSampling
 from q2r2_control.export.hdf5 import gather_files, require_h5py, write_file
-from q2r2_control.export.kept_episodes import Write, keep_episodes
+from q2r2_control.export.kept_episodes import Output, Write, keep_episodes
 from q2r2_control.export.lerobot import join_shards, require_lerobot, write_shard
-from q2r2_control.export.output import Output
-from q2r2_control.recording.files import recordings_in
+from q2r2_control.recording.reader import recordings_in
 
 app = typer.Typer(rich_markup_mode=None, help="Recordings of q2r2 run --record as datasets to train on.")
 

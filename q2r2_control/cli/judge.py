@@ -11,16 +11,14 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from q2r2_control.cli.figure_table import figure_table
-from q2r2_control.cli.options import Json
-from q2r2_control.cli.output import as_json_text, counting
+from q2r2_control.cli.output import Json, as_json_text, counting, figure_table
 from q2r2_control.cli.summary_table import verdict_markup
 from q2r2_control.config.cell import load_config
-from q2r2_control.config.judge import JudgeSettings
+from q2r2_control.config.recording import JudgeSettings
 from q2r2_control.errors import ConfigError
 from q2r2_control.judging.judge import Judged, judge_all
 from q2r2_control.judging.page import COLUMNS, page_of
-from q2r2_control.recording.files import recordings_in
+from q2r2_control.recording.reader import recordings_in
 
 _SHOWN = ("success", "time", "idle", "gap", "delay", "error", "LDLJ")  # what a terminal has room for; the page has all
 

@@ -9,10 +9,9 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from q2r2_control.cli.options import Json
-from q2r2_control.cli.output import as_json_text, notice_of_compiling, stderr_console
+from q2r2_control.cli.cell_run import check_window, show_window
+from q2r2_control.cli.output import Json, as_json_text, notice_of_compiling, stderr_console
 from q2r2_control.cli.summary_table import summary_table
-from q2r2_control.cli.window import check_window, show_window
 from q2r2_control.config.cell import load_config
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.recording.replay import replay as replay_recording

@@ -2,17 +2,196 @@
 
 from __future__ import annotations
 
+import os
+import re
 import sys
+from collections.abc import Callable
 from enum import StrEnum
 from typing import Annotated
 
 import typer
+from rich.console import Console, Group
+from rich.live import Live
+from rich.text import Text
 
-from q2r2_control.cli.options import Operator, Task, notes_of
-from q2r2_control.cli.ros_doctor import doctor
-from q2r2_control.cli.ros_watch import watch
+from q2r2_control.cli.output import (
+    DEMO_CONFIG,
+    Cell,
+    Json,
+    Operator,
+    Task,
+    as_json_text,
+    figure_table,
+    notes_of,
+    positive,
+    stderr_console,
+)
+from q2r2_control.config.cell import Config, load_config
+from q2r2_control.process.scheduling import StopRequest, stop_on_signals
 from q2r2_control.ros.launch.build import BuildError, build_interfaces
-from q2r2_control.ros.launch.processes import nodes_of, run_together
+from q2r2_control.ros.launch.processes import check_rclpy, nodes_of, run_together
+from q2r2_control.ros.watching.environment import examine_environment
+from q2r2_control.ros.watching.findings import Finding, examine_set
+from q2r2_control.ros.watching.set_view import SILENT, ArmView, NodeView, SetView, TopicView
+
+_COLOURS = {"ok": "green", "warn": "yellow", "error": "red"}
+_NOTE = "rates are what the senders say"
+
+
+def set_tables(view: SetView, domain: str) -> Group:
+    """Why each arm moves or does not, what each node says, and what goes over each topic."""
+    title = f"ROS domain {domain}: {len(view.nodes)} nodes of a set"
+    arms = figure_table(title, ("arm", "state", "controller", "why"), map(_arm_cells, view.arms))
+    if not view.nodes:
+        return Group(arms)
+    others = (f"others in this domain: {', '.join(view.others)}",) if view.others else ()
+    columns = ("node", "rate [Hz]", "age [s]", "level", "says")
+    nodes = figure_table("nodes", columns, map(_node_cells, view.nodes), others)
+    topics = figure_table("topics", ("topic", "rate [Hz]", "from", "to"), map(_topic_cells, view.topics), (_NOTE,))
+    return Group(arms, nodes, topics)
+
+
+def arm_lines(view: SetView) -> list[str]:
+    """The same of the arms alone, in a line each."""
+    return [f"{arm.name}: {arm.state or 'no node'}: {arm.why}" for arm in view.arms]
+
+
+def _arm_cells(arm: ArmView) -> tuple[Cell, ...]:
+    colour = "green" if arm.state == "engaged" else "default"
+    return arm.name, Text(arm.state or "no node", style=colour if arm.node else "red"), arm.controller or "-", arm.why
+
+
+def _node_cells(node: NodeView) -> tuple[Cell, ...]:
+    rate = node.values.get("loop_rate_hz")
+    level = Text(node.level, style=_COLOURS.get(node.level, "default"))
+    return (
+        node.name.removeprefix("/"),
+        f"{rate:.0f}" if isinstance(rate, int | float) else "",
+        f"{node.age:.1f}",
+        Text("silent", style="red") if node.age > SILENT else level,
+        node.message,
+    )
+
+
+def _topic_cells(topic: TopicView) -> tuple[Cell, ...]:
+    rate = "" if topic.rate is None else f"{topic.rate:.0f}"
+    return topic.name, rate, _joined(topic.publishers), _joined(topic.subscribers)
+
+
+def _joined(names: tuple[str, ...]) -> str:
+    return ", ".join(name.removeprefix("/") for name in names) or "nobody"
+
+
+_ONCE = 3.0  # in which a set is found, and its nodes have spoken several times [s]
+
+
+def watch(
+    config: Annotated[str, typer.Argument(metavar="[CONFIG]", help="YAML of the cell that runs.")] = DEMO_CONFIG,
+    once: Annotated[bool, typer.Option("--once", help="Print one table after --duration, and end.")] = False,
+    duration: Annotated[
+        float | None, typer.Option(help=f"[s]; without it until Ctrl-C, with --once and --json {_ONCE:g} s.")
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Show nodes, topics, rates and ages of a running set, the state of each arm, and why it does not move.
+
+    It only listens, and to no command: a set runs as if nobody watched. Where stderr is no terminal it prints a line
+    for an arm whenever that changes. Exit 1 when no node of a set was heard.
+    """
+    cell = load_config(config)
+    if duration is not None:
+        positive("--duration", duration)
+    elif once or json:
+        duration = _ONCE
+    check_rclpy()
+    from q2r2_control.ros.watching.set_listener import watch_set
+
+    domain, stop = os.environ.get("ROS_DOMAIN_ID") or "0", StopRequest()
+    with stop_on_signals(stop.ask):
+        if once or json:
+            view = watch_set(cell, duration, lambda view: None, lambda: stop.asked)
+        else:
+            view = _watch_live(cell, domain, duration, lambda: stop.asked)
+    if json:
+        print(
+            as_json_text(
+                {"domain": domain, "arms": view.arms, "nodes": view.nodes, "topics": view.topics, "others": view.others}
+            )
+        )
+    else:
+        Console().print(set_tables(view, domain))
+    raise typer.Exit(0 if view.nodes else 1)
+
+
+def _watch_live(cell: Config, domain: str, duration: float | None, stop: Callable[[], bool]) -> SetView:
+    from q2r2_control.ros.watching.set_listener import watch_set
+
+    console = stderr_console()
+    if not console.is_terminal:
+        said: dict[int, str] = {}
+
+        def tell(view: SetView) -> None:
+            for index, line in enumerate(arm_lines(view)):
+                if said.get(index) != (words := re.sub(r"[\d.]+", "", line)):  # an age changes all the time
+                    said[index] = words
+                    console.print(line, soft_wrap=True, highlight=False, markup=False)
+
+        return watch_set(cell, duration, tell, stop)
+    with Live(console=console, auto_refresh=False, transient=True) as live:
+        return watch_set(cell, duration, lambda view: live.update(set_tables(view, domain), refresh=True), stop)
+
+
+_TIME = 4.0  # in which a set is found, and a second publisher too [s]
+
+
+def doctor(
+    config: Annotated[
+        str, typer.Argument(metavar="[CONFIG]", help="YAML of the cell that runs, or is to.")
+    ] = DEMO_CONFIG,
+    duration: Annotated[float, typer.Option(help="How long to listen to what runs [s].")] = _TIME,
+    json: Json = False,
+) -> None:
+    """Say what of ROS is missing, which domain and middleware are used, which nodes run and what is wrong with them.
+
+    Each finding stands with what helps. Like watch it takes part in nothing. Exit 1 when something was found that
+    stops the arms; where no node of a set runs, only the environment is judged.
+    """
+    positive("--duration", duration)
+    cell = load_config(config)
+    expected = [node.name for node in nodes_of(config, "none", separate=True)]
+    facts, findings = examine_environment(os.environ)
+    nodes: tuple[str, ...] = ()
+    others: tuple[str, ...] = ()
+    if not any(finding.stops_arms for finding in findings):
+        from q2r2_control.ros.watching.set_listener import watch_set
+
+        stop = StopRequest()
+        with stop_on_signals(stop.ask):
+            view = watch_set(cell, duration, lambda view: None, lambda: stop.asked)
+        nodes, others = tuple(node.name for node in view.nodes), view.others
+        findings += examine_set(view, expected)
+    stops = any(finding.stops_arms for finding in findings)
+    if json:
+        print(as_json_text({**facts, "nodes": nodes, "others": others, "findings": findings, "stops_arms": stops}))
+    else:
+        _print(
+            facts | {"nodes": ", ".join(nodes) or "none of a set runs", "others": ", ".join(others) or "none"}, findings
+        )
+    sys.stdout.flush()
+    raise typer.Exit(int(stops))
+
+
+def _print(facts: dict[str, str], findings: list[Finding]) -> None:
+    console = Console(highlight=False, soft_wrap=True)
+    for name, value in facts.items():
+        console.print(Text(f"{name:<11} {value}"))
+    if not findings:
+        console.print(Text("nothing is wrong", style="green"))
+    for finding in sorted(findings, key=lambda finding: not finding.stops_arms):
+        label, colour = ("stops arms", "red") if finding.stops_arms else ("warning", "yellow")
+        console.print(Text(f"{label:<11} ", style=colour) + Text(finding.what, style="default"))
+        console.print(Text(f"{'':<11} cure: {finding.cure}"))
+
 
 app = typer.Typer(rich_markup_mode=None, help="ROS 2 Jazzy, from apt or from the Python registry.")
 app.command(epilog="Example: q2r2 ros watch config/dual_iiwa7.yaml --once")(watch)

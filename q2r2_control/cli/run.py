@@ -8,8 +8,8 @@ from typing import Annotated
 import typer
 
 from q2r2_control.cli.cell_run import RunOptions, print_summary, run_cell
-from q2r2_control.cli.headset_server import Host, Port, with_address
-from q2r2_control.cli.options import (
+from q2r2_control.cli.headset_check import Host, Port, with_address
+from q2r2_control.cli.output import (
     ConfigFile,
     Headless,
     Human,
@@ -23,8 +23,8 @@ from q2r2_control.cli.options import (
     notes_of,
     positive,
     shows_table,
+    stderr_console,
 )
-from q2r2_control.cli.output import stderr_console
 from q2r2_control.config.cell import load_config
 from q2r2_control.errors import ConfigError
 from q2r2_control.inputs.scripted import DEFAULT_TRAJECTORY

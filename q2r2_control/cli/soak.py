@@ -10,11 +10,18 @@ import typer
 from rich.table import Table
 from rich.text import Text
 
-from q2r2_control.cli.figure_table import Cell, figure_table
-from q2r2_control.cli.options import DEMO_CONFIG, Json
-from q2r2_control.cli.output import notice_of_compiling, print_progress, print_report, stderr_console
+from q2r2_control.cli.output import (
+    DEMO_CONFIG,
+    Cell,
+    Json,
+    figure_table,
+    notice_of_compiling,
+    print_progress,
+    print_report,
+    stderr_console,
+)
 from q2r2_control.config.cell import load_config
-from q2r2_control.verification.contact_cells import FINGERS, with_contact
+from q2r2_control.verification.fault_injection import FINGERS, with_contact
 from q2r2_control.verification.soak import COUNTED, MEMORY_ALLOWED, SoakReport, run_soak
 
 _TICKS = 1_000_000

@@ -19,10 +19,65 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio as pin
 
-from q2r2_control.compliance.admittance_law import estimate_wrench, oscillate, rest_displacement, stop_at_limit
 from q2r2_control.config.control import AdmittanceSettings
+from q2r2_control.control.tasks.frame import ROTATION_LENGTH
 from q2r2_control.robot.robot import Arm, Robot
 from q2r2_control.types import Array, RobotState
+
+_METRES = np.array([1.0, 1.0, 1.0, *[ROTATION_LENGTH] * 3])
+# Of J with rotations times ROTATION_LENGTH: a direction below it counts as singular, since a torque error of 0.1 Nm
+# is worth 2 N there [m].
+_SINGULAR = 0.05
+
+
+def estimate_wrench(J: Array, tau: Array) -> Array:
+    """Least-squares wrench (6,) for the torques ``tau`` (n,) [Nm] of an arm's joints with the Jacobian J (6, n).
+
+    By J J' = V s^2 V', F = V f(s) V' J tau.
+    """
+    scaled = _METRES[:, None] * J
+    values, directions = np.linalg.eigh(scaled @ scaled.T)
+    values = np.maximum(values, 0.0)
+    deficit = np.maximum(1.0 - values / _SINGULAR**2, 0.0)
+    along = directions.T @ (scaled @ tau)
+    wrench: Array = _METRES * (directions @ (along / (values + (_SINGULAR * deficit) ** 2)))
+    return wrench
+
+
+def rest_displacement(force: Array, dead_band: float, stiffness: float, limit: float) -> Array:
+    """Displacement (3,) at which the spring bears a force or torque (3,), after the dead band, within ``limit``."""
+    size = math.hypot(*force)
+    if size <= dead_band:
+        return np.zeros(3)
+    return np.asarray(force * min((1.0 - (dead_band / size) ** 2) / stiffness, limit / size))
+
+
+def stop_at_limit(x: Array, v: Array, limit: float) -> tuple[Array, Array]:
+    """A displacement and its speed, (3,) each, no farther than ``limit``, and there without speed outwards."""
+    length = math.hypot(*x)
+    if length <= limit:
+        return x, v
+    out = x / length
+    return limit * out, v - max(float(out @ v), 0.0) * out
+
+
+def oscillate(x: Array, v: Array, frequency: float, damping_ratio: float, dt: float) -> tuple[Array, Array]:
+    """Exact x and v after ``dt`` [s] of  x'' + 2 xi w x' + w^2 x = 0,  w the undamped ``frequency`` [rad/s]."""
+    fall = damping_ratio * frequency
+    spread = frequency * math.sqrt(abs(damping_ratio**2 - 1.0))
+    # e^-fall t times cos or cosh, and sin or sinh over spread; written so that nothing overflows.
+    if spread * dt < 1e-6:
+        cosine = math.exp(-fall * dt)
+        sine = cosine * dt
+    elif damping_ratio < 1.0:
+        cosine = math.exp(-fall * dt) * math.cos(spread * dt)
+        sine = math.exp(-fall * dt) * math.sin(spread * dt) / spread
+    else:
+        slow, fast = math.exp((spread - fall) * dt), math.exp(-(spread + fall) * dt)
+        cosine = 0.5 * (slow + fast)
+        sine = 0.5 * (slow - fast) / spread
+    return (cosine + fall * sine) * x + sine * v, (cosine - fall * sine) * v - frequency**2 * sine * x
+
 
 # Below it a displacement counts as over [m, rad, per second].
 _NOTHING = 1e-9

@@ -14,8 +14,7 @@ import numpy.typing as npt
 
 from q2r2_control.control.geometry.kinematics import Chain, Placements, place
 from q2r2_control.control.jit import KernelPointer, numpy_kernel, pointee
-from q2r2_control.control.tasks.frame import rotation_vector, tool_jacobian, tool_pose
-from q2r2_control.control.tasks.tools import Tools
+from q2r2_control.control.tasks.frame import Tools, rotation_vector, tool_jacobian, tool_pose
 from q2r2_control.types import Array
 
 BoolArray = npt.NDArray[np.bool_]

@@ -26,14 +26,17 @@ from q2r2_control.config.arms import (
     Side,
     check_models,
 )
-from q2r2_control.config.cameras import CameraConfig, CameraName
-from q2r2_control.config.control import AdmittanceSettings, ControllerSettings, ImpedanceSettings, check_priority
+from q2r2_control.config.control import (
+    AdmittanceSettings,
+    ControllerSettings,
+    ImpedanceSettings,
+    SupervisionSettings,
+    check_priority,
+)
 from q2r2_control.config.external import ControllerKind, ExternalConfig, check_external
-from q2r2_control.config.judge import JudgeSettings
-from q2r2_control.config.networks import Network, network_of
+from q2r2_control.config.recording import CameraConfig, CameraName, JudgeSettings
 from q2r2_control.config.resources import find_resource
-from q2r2_control.config.strict import StrictModel
-from q2r2_control.config.supervision import SupervisionSettings
+from q2r2_control.config.strict import Network, StrictModel, network_of
 from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.errors import ConfigError
 

@@ -11,8 +11,7 @@ import numpy as np
 from pydantic import Field, field_validator, model_validator
 
 from q2r2_control.config.bindings import BindingSettings
-from q2r2_control.config.strict import StrictModel
-from q2r2_control.config.timeouts import STREAM_TIMEOUT
+from q2r2_control.config.strict import STREAM_TIMEOUT, StrictModel
 from q2r2_control.types import Array, Interval
 
 _Scale = Annotated[float, Field(ge=0, le=10)]

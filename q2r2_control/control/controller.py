@@ -14,18 +14,16 @@ from q2r2_control.control.geometry.finger_openings import FingerOpenings
 from q2r2_control.control.geometry.kinematics import IntArray
 from q2r2_control.control.held_objects import ObjectPairs
 from q2r2_control.control.jit import bound, pointer_to
-from q2r2_control.control.kernel_data import KernelData
-from q2r2_control.control.kernel_model import kernel_model_of
+from q2r2_control.control.kernel_model import KernelData, kernel_model_of
 from q2r2_control.control.live_settings import LiveSettings
 from q2r2_control.control.qp import QpProblem, Solver, make_solver
-from q2r2_control.control.qp_assembly import assemble
+from q2r2_control.control.qp_assembly import assemble, find_minimum_anew
 from q2r2_control.control.reference import move_reference, observe_bodies, spare_distance, start_reference
+from q2r2_control.control.safety.safety_data import ROUNDING
 from q2r2_control.control.safety.safety_filter import FOLLOWED, STOPPED
-from q2r2_control.control.safety.safety_model import ROUNDING
 from q2r2_control.control.step_report import LimitNames, StepSummary
 from q2r2_control.control.targets import TargetTracker
 from q2r2_control.control.tasks.external import add_costs, load_tasks
-from q2r2_control.control.unconstrained import find_minimum_anew
 from q2r2_control.errors import ConfigError, RobotError
 from q2r2_control.robot.pairs import pairs_with_others
 from q2r2_control.robot.robot import Robot

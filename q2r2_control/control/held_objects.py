@@ -19,9 +19,8 @@ import numpy as np
 import numpy.typing as npt
 
 from q2r2_control.config.control import ControllerSettings
-from q2r2_control.control.kernel_data import KernelData
-from q2r2_control.control.kernel_model import KernelModel, stop_buffer
-from q2r2_control.control.safety.provable_distances import provable_distances
+from q2r2_control.control.kernel_model import KernelData, KernelModel, stop_buffer
+from q2r2_control.control.safety.safety_data import provable_distances
 from q2r2_control.errors import RobotError
 from q2r2_control.robot.kept_distances import kept_by_objects
 from q2r2_control.robot.robot import Robot

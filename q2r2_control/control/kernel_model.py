@@ -8,10 +8,10 @@ import numpy as np
 
 from q2r2_control.config.control import ControllerSettings, check_priority
 from q2r2_control.control.geometry.collision import CollisionModel, collision_model_of, turning_bodies
-from q2r2_control.control.geometry.rounded_boxes import deepest, with_rounded_boxes
+from q2r2_control.control.geometry.pair_distance import deepest, with_rounded_boxes
 from q2r2_control.control.safety.joint_limits import JointLimits
-from q2r2_control.control.safety.safety_model import Approach, SafetyModel
-from q2r2_control.control.tasks.task_model import TaskModel, task_model_of
+from q2r2_control.control.safety.safety_data import Approach, SafetyData, SafetyModel
+from q2r2_control.control.tasks.task_data import TaskData, TaskModel, task_model_of
 from q2r2_control.errors import ConfigError
 from q2r2_control.robot.kept_distances import KeptDistances, kept_distances
 from q2r2_control.robot.pairs import pair_names
@@ -99,3 +99,16 @@ def _check_depths(robot: Robot, collision: CollisionModel, kept: KeptDistances) 
 def stop_buffer(min_distance: Array, settings: ControllerSettings) -> Array:
     """How much farther from each other pairs stop in the QP (p,) [m]."""
     return np.minimum(settings.distance_buffer, np.maximum(0.5 * min_distance, _LEAST_BUFFER))
+
+
+class KernelData(NamedTuple):
+    """What changes from tick to tick, by the rooms that write it."""
+
+    safety: SafetyData
+    tasks: TaskData
+
+    @classmethod
+    def empty(cls, model: KernelModel) -> KernelData:
+        """Arrays of the sizes that ``model`` needs."""
+        safety = SafetyData.empty(model.safety)
+        return cls(safety, TaskData.empty(model.tasks, safety.collision.placements))

@@ -26,10 +26,9 @@ import numpy as np
 
 from q2r2_control.config.control import ControllerSettings
 from q2r2_control.control.held_objects import ObjectPairs
-from q2r2_control.control.kernel_data import KernelData
-from q2r2_control.control.kernel_model import KernelModel, stop_buffer
-from q2r2_control.control.safety.provable_distances import provable_distances
-from q2r2_control.control.tasks.task_model import task_model_of
+from q2r2_control.control.kernel_model import KernelData, KernelModel, stop_buffer
+from q2r2_control.control.safety.safety_data import provable_distances
+from q2r2_control.control.tasks.task_data import task_model_of
 from q2r2_control.robot.kept_distances import kept_distances, too_close_at_home
 from q2r2_control.robot.pairs import CLEARANCE
 from q2r2_control.robot.robot import Robot

@@ -8,12 +8,9 @@ from q2r2_control.control.geometry.collision import update_placements
 from q2r2_control.control.geometry.kinematics import IntArray
 from q2r2_control.control.geometry.pair_distance import at_least, measure
 from q2r2_control.control.jit import KernelPointer, kernel, pointee
-from q2r2_control.control.kernel_data import KernelData
-from q2r2_control.control.kernel_model import KernelModel
-from q2r2_control.control.safety.pair_measures import measure_pairs
-from q2r2_control.control.safety.safety_data import SafetyData
-from q2r2_control.control.safety.safety_filter import apply_safety_filter, certify_bodies, certify_start
-from q2r2_control.control.safety.safety_model import SafetyModel
+from q2r2_control.control.kernel_model import KernelData, KernelModel
+from q2r2_control.control.safety.safety_data import SafetyData, SafetyModel
+from q2r2_control.control.safety.safety_filter import apply_safety_filter, certify_bodies, certify_start, measure_pairs
 from q2r2_control.control.safety.velocity_bounds import update_body_velocities
 from q2r2_control.control.tasks.frame import tool_pose
 from q2r2_control.types import Array

@@ -10,8 +10,7 @@ import pinocchio as pin
 from q2r2_control.config.control import ControllerSettings
 from q2r2_control.control.jit import KernelPointer, bound, kernel, pointee, pointer_to
 from q2r2_control.control.tasks.frame import rotation_vector
-from q2r2_control.control.tasks.task_data import PoseScratch, TaskTargets
-from q2r2_control.control.tasks.task_model import TaskModel
+from q2r2_control.control.tasks.task_data import PoseScratch, TaskModel, TaskTargets
 from q2r2_control.types import Array
 
 # Farther than any cell; keeps squares of what is merely far away finite.

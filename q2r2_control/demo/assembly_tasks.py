@@ -6,8 +6,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 from q2r2_control.config.cell import Config
-from q2r2_control.demo.part_judges import HandoverJudge, Judge, LiftJudge, StackJudge
-from q2r2_control.demo.touch_watch import Toucher, TouchWatch
+from q2r2_control.demo.part_judges import HandoverJudge, Judge, LiftJudge, StackJudge, Toucher, TouchWatch
 from q2r2_control.errors import ConfigError
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.robot.robot import Robot

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -9,10 +10,13 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio as pin
 
-from q2r2_control.compliance.admittance import AdmittanceReport
-from q2r2_control.compliance.impedance import ImpedanceReport
-from q2r2_control.compliance.repulsion import WallReport
+from q2r2_control.compliance.admittance import Admittance, AdmittanceReport
+from q2r2_control.compliance.impedance import ImpedanceController, ImpedanceReport
+from q2r2_control.compliance.repulsion import MeasuredSeparation, WallReport
+from q2r2_control.config.cell import Config
 from q2r2_control.config.control import ControllerSettings
+from q2r2_control.errors import ConfigError
+from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, Command, CommandMode, Interval, Reference, RobotState
 
 ToolTargets = dict[str, pin.SE3 | None]
@@ -86,3 +90,166 @@ def holding_command(q: Array, grippers: Openings) -> Command:
     """Stand still at ``q`` (nv,) [rad], held by the plant's own servos."""
     zero = np.zeros_like(q)
     return Command(CommandMode.POSITION, q, zero, zero, grippers)
+
+
+# Velocity mode: how fast the measured position is brought back to the reference [1/s]. A plant that answers with a
+# delay T is stable below about 1 / T; at 10 /s that leaves 100 ms.
+FEEDBACK_GAIN = 10.0
+# A measurement that did not change for more ticks than this is old: the arm has moved on since.
+_FRESH_TICKS = 3
+
+
+class PositionDrive(Drive):
+    """The reference is the command. With the admittance enabled, what the tools feel displaces their targets."""
+
+    mode = CommandMode.POSITION
+
+    def __init__(self, robot: Robot, config: Config) -> None:
+        self.admittance = Admittance(robot, config.admittance) if config.admittance.enabled else None
+        self.report = DriveReport()
+
+    def reset(self, state: RobotState) -> None:
+        """See :meth:`Drive.reset`."""
+        self.report = DriveReport()
+        if self.admittance is None:
+            return
+        if state.tau_external is None:
+            raise ConfigError("admittance.enabled = true: allowed with a plant that measures external torque only")
+        self.admittance.reset()
+
+    def displaced(self, targets: ToolTargets, state: RobotState, dt: float) -> ToolTargets:
+        """See :meth:`Drive.displaced`."""
+        if self.admittance is None:
+            return targets
+        displaced = self.admittance.update(targets, state, dt)
+        self.report = DriveReport(admittance=self.admittance.report())
+        return displaced
+
+    def command(
+        self, reference: Reference, state: RobotState, grippers: Openings, dt: float, trusted: bool = True
+    ) -> Command:
+        """See :meth:`Drive.command`: what was measured does not matter."""
+        return position_command(reference, grippers)
+
+
+class VelocityDrive(PositionDrive):
+    """The reference's velocity, and what brings the measured position back to it:  v = v_ref + k (q_ref - q).
+
+    Within the velocity limits. Without a state to trust, or with one that is some ticks old, there is no feedback, so
+    that an old measurement does not drive the arms.
+    """
+
+    mode = CommandMode.VELOCITY
+    coasts = True
+
+    def __init__(self, robot: Robot, config: Config) -> None:
+        super().__init__(robot, config)
+        self._limit: Array = robot.velocity_limit * config.control.velocity_scale
+        self._stamp, self._ticks = -math.inf, 0  # of the newest state, and since then
+
+    def reset(self, state: RobotState) -> None:
+        """See :meth:`Drive.reset`."""
+        super().reset(state)
+        self._stamp, self._ticks = state.stamp, 0
+
+    def command(
+        self, reference: Reference, state: RobotState, grippers: Openings, dt: float, trusted: bool = True
+    ) -> Command:
+        """See :meth:`Drive.command`."""
+        v = reference.v
+        self._ticks = 0 if state.stamp != self._stamp else self._ticks + 1
+        self._stamp = state.stamp
+        if trusted and self._ticks <= _FRESH_TICKS and np.isfinite(state.q).all():
+            v = v + FEEDBACK_GAIN * (reference.q - state.q)
+        bounded = np.minimum(np.maximum(v, -self._limit), self._limit)
+        return Command(self.mode, reference.q, bounded, np.zeros_like(reference.q), grippers)
+
+    def last_command(self, state: RobotState, grippers: Openings) -> Command | None:
+        """See :meth:`Drive.last_command`: a velocity outlives its sender on many plants, so the last one is zero."""
+        zero = np.zeros_like(self._limit)
+        return Command(self.mode, np.nan_to_num(state.q), zero, zero, grippers)
+
+
+_STILL = 1e-2  # of an arm on its spring [rad/s]
+
+
+class TorqueDrive(Drive):
+    """Turns references into torques. Targets stay as they are: the spring is the compliance.
+
+    **Without a state to trust.** A spring about a posture that was measured long ago could push anywhere. A plant with
+    position servos (``has_servos``), which measure by themselves, follows the reference by those, so that the arms come
+    to rest with it. Otherwise the command is gravity's torque at the newest measured posture: many drivers
+    repeat the last command for ever, and gravity's does no harm.
+    """
+
+    mode = CommandMode.TORQUE
+    yields = True
+
+    def __init__(self, robot: Robot, config: Config, has_servos: bool = True) -> None:
+        self.impedance = ImpedanceController(robot, config.impedance)
+        self.wall = MeasuredSeparation(robot, config.control, config.impedance.wall)
+        self.report = DriveReport()
+        self._has_servos = has_servos
+        self._believed = self._reference = robot.home  # the last posture and reference (nv,) [rad]
+
+    def reset(self, state: RobotState) -> None:
+        """See :meth:`Drive.reset`."""
+        self.report = DriveReport()
+        self._believed = self._reference = state.q
+        self.impedance.reset(state)
+
+    def set_openings(self, openings: Mapping[str, Interval]) -> None:
+        """See :meth:`Drive.set_openings`: the wall's fingers are the controller's."""
+        self.wall.set_openings(openings)
+
+    def set_holding(self, holding: Mapping[str, bool]) -> None:
+        """See :meth:`Drive.set_holding`: the impedance bears it. The wall knows no objects: they may touch."""
+        self.impedance.set_holding(holding)
+
+    def set_kept_distances(self, kept: Array) -> None:
+        """See :meth:`Drive.set_kept_distances`: the wall begins there."""
+        self.wall.set_kept_distances(kept)
+
+    def command(
+        self, reference: Reference, state: RobotState, grippers: Openings, dt: float, trusted: bool = True
+    ) -> Command:
+        """See :meth:`Drive.command`. A state that is not finite is bridged with the last gravity torque."""
+        self._reference = reference.q
+        if not trusted:
+            self.report = DriveReport()
+            if self._has_servos:
+                return position_command(reference, grippers)
+            return Command(self.mode, reference.q, reference.v, self.gravity(self._posture(state)), grippers)
+        wall = self.wall.update(state.q, state.v)
+        torque = self.impedance.step(reference, state, dt, wall.tau)
+        self.report = DriveReport(torque.report, wall)
+        if not torque.report.held:
+            self._believed = state.q
+        return Command(self.mode, reference.q, reference.v, torque.tau, grippers)
+
+    def gravity(self, q: Array) -> Array:
+        """What bears the arms at a posture ``q`` (nv,) [rad]: torques (nv,) [Nm]."""
+        return self.impedance.gravity(q)
+
+    def at_rest(self, state: RobotState) -> bool:
+        """See :meth:`Drive.at_rest`. What cannot be seen is not waited for."""
+        seen = np.isfinite(state.q).all() and np.isfinite(state.v).all()
+        return not seen or float(np.abs(state.v).max()) <= _STILL
+
+    def last_command(self, state: RobotState, grippers: Openings) -> Command | None:
+        """See :meth:`Drive.last_command`: a torque that nobody renews holds nothing, position servos do."""
+        if self._has_servos:
+            return holding_command(state.q if np.isfinite(state.q).all() else self._reference, grippers)
+        q = self._posture(state)
+        return Command(self.mode, q, np.zeros_like(q), self.gravity(q), grippers)
+
+    def _posture(self, state: RobotState) -> Array:
+        """The newest measured posture that was a posture."""
+        return state.q if np.isfinite(state.q).all() else self._believed
+
+
+def make_drive(mode: CommandMode, robot: Robot, config: Config, has_servos: bool = True) -> Drive:
+    """The drive of ``mode``; ``has_servos``: whether the plant follows positions too when torques are not safe."""
+    if mode is CommandMode.TORQUE:
+        return TorqueDrive(robot, config, has_servos)
+    return VelocityDrive(robot, config) if mode is CommandMode.VELOCITY else PositionDrive(robot, config)

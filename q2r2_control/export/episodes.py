@@ -11,10 +11,9 @@ import numpy.typing as npt
 
 from q2r2_control.errors import ConfigError, RecordingError
 from q2r2_control.export.features import Names, features
-from q2r2_control.export.pictures import CameraFrames
-from q2r2_control.export.sampling import sample
+from q2r2_control.export.sampling import CameraFrames, sample
 from q2r2_control.recording.episode_spans import WHOLE, EpisodeSpan, read_spans
-from q2r2_control.recording.recorded_robot import cell_and_robot_of
+from q2r2_control.recording.recorded_ticks import cell_and_robot_of
 from q2r2_control.recording.ros_recording import open_recording
 
 FASTEST = 1000  # [frames/s]

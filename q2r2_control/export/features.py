@@ -10,7 +10,7 @@ import numpy.typing as npt
 import pinocchio as pin
 
 from q2r2_control.errors import RecordingError
-from q2r2_control.recording.recorded_robot import check_tools, tool_poses
+from q2r2_control.recording.recorded_ticks import check_tools, tool_poses
 from q2r2_control.recording.tick_rows import NOT_MEASURED, POSE_FIELDS
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array

@@ -5,11 +5,12 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import shutil
 import signal
 from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import asdict, dataclass
 from multiprocessing import get_context
 from pathlib import Path
@@ -116,3 +117,56 @@ def _key(file: Path, sampling: FrameSampling, part: EpisodePart, write: Write) -
     made_of = [str(file.resolve()), status.st_size, status.st_mtime_ns, asdict(sampling), part.number]
     identity = json.dumps([*made_of, write.__module__, _FORMAT])
     return hashlib.sha256(identity.encode()).hexdigest()[:24]
+
+
+class Output:
+    """A file or folder that a command makes.
+
+    What an export that was interrupted had made so far stays in ``OUT.partial``, and the next one goes on with it.
+    Raises :class:`ConfigError` for an output that exists and one that cannot be written.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._partial = path.with_name(f"{path.name}.partial")
+        self._refuse_existing()
+
+    def episodes(self) -> Path:
+        """The folder in which episodes are kept until the output is whole."""
+        folder = self._partial / "episodes"
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise ConfigError(f"--output {self._path}: {error.strerror}: {error.filename}") from error
+        return folder
+
+    def tidy(self) -> None:
+        """Remove what is kept for the next export, if that is nothing."""
+        with suppress(OSError):
+            (self._partial / "episodes").rmdir()
+            self._partial.rmdir()
+
+    def write(self, write: Callable[[Path], None]) -> None:
+        """Let ``write`` make the file or folder, and put it into its place."""
+        made = self._partial / "output"
+        try:
+            _remove(made)
+            write(made)
+            self._refuse_existing()
+            made.rename(self._path)
+            shutil.rmtree(self._partial)
+        except OSError as error:
+            raise ConfigError(f"--output {self._path}: {error.strerror or error}") from error
+
+    def _refuse_existing(self) -> None:
+        if not self._path.name:
+            raise ConfigError(f"--output {self._path}: allowed: a name that does not exist yet")
+        if self._path.exists() or self._path.is_symlink():
+            raise ConfigError(f"--output {self._path}: exists; allowed: a name that does not exist yet")
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import socket
 from collections.abc import Sequence
 
-from q2r2_control.config.networks import Network
+from q2r2_control.config.strict import Network
 
 EVERY_NETWORK = ("", "0.0.0.0", "::")  # as hosts to listen on
 ONLY_THIS_MACHINE = ("127.0.0.1", "::1", "localhost")

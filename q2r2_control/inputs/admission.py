@@ -23,7 +23,7 @@ from enum import Enum
 from ipaddress import ip_address
 from typing import NamedTuple
 
-from q2r2_control.config.networks import Network
+from q2r2_control.config.strict import Network
 
 QUIET_ALLOWED = 0.5  # without a frame, against the same peer on a new connection [s]
 POSES_ALLOWED = 5.0  # without a hand pose, against a client that sends them [s]

@@ -10,16 +10,14 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 
-from q2r2_control.config.networks import Network
+from q2r2_control.config.strict import Network
 from q2r2_control.errors import ProtocolError
 from q2r2_control.inputs.admission import Admission, Peer, decide, is_allowed
 from q2r2_control.inputs.framing import FrameDecoder, WireFrame
-from q2r2_control.inputs.listener import TcpListener
+from q2r2_control.inputs.listener import MAX_HOSTS_NAMED, HostLog, RateLimit, TcpListener
 from q2r2_control.inputs.messages import HandPose
-from q2r2_control.inputs.rate_limits import MAX_HOSTS_NAMED, HostLog, RateLimit
 from q2r2_control.inputs.samples import HandTracker
-from q2r2_control.inputs.session import HeadsetSession, Reception, log_frame
-from q2r2_control.inputs.statistics import TopicRecorder
+from q2r2_control.inputs.session import HeadsetSession, Reception, TopicRecorder, log_frame
 from q2r2_control.types import HapticFeedback
 
 KEEPALIVE_AFTER = 1.0  # of own silence [s]

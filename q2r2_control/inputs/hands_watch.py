@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from q2r2_control.config.timeouts import STREAM_TIMEOUT
+from q2r2_control.config.strict import STREAM_TIMEOUT
 from q2r2_control.inputs.messages import HandPose
 from q2r2_control.inputs.moved_frame import MovedFrame, PoseVerdict
 from q2r2_control.inputs.session import Reception

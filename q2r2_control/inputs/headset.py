@@ -10,17 +10,16 @@ from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 
 from q2r2_control.config.cell import Config
-from q2r2_control.config.networks import Network
+from q2r2_control.config.strict import Network
 from q2r2_control.errors import InputError
 from q2r2_control.inputs.addresses import written
 from q2r2_control.inputs.connections import TURN, Client, Connections, Handlers
 from q2r2_control.inputs.framing import WireFrame
 from q2r2_control.inputs.hands_watch import HandsWatch, Watched
-from q2r2_control.inputs.listener import TcpListener
+from q2r2_control.inputs.listener import HostLog, TcpListener
 from q2r2_control.inputs.messages import warm_up
-from q2r2_control.inputs.rate_limits import HostLog
 from q2r2_control.inputs.samples import SampleQueue
-from q2r2_control.inputs.statistics import HeadsetStatistics
+from q2r2_control.inputs.session import HeadsetStatistics
 from q2r2_control.types import QUEST_CONTROLS, SIDES, HandSample, HapticFeedback
 
 _LOG = logging.getLogger(__name__)

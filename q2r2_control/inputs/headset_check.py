@@ -15,8 +15,7 @@ from q2r2_control.config.teleop import Stance, axes_matrix
 from q2r2_control.inputs.addresses import ONLY_THIS_MACHINE, app_settings, written
 from q2r2_control.inputs.headset import HeadsetServer
 from q2r2_control.inputs.messages import MessageType
-from q2r2_control.inputs.session import HAND_TOPICS
-from q2r2_control.inputs.statistics import HeadsetStatistics
+from q2r2_control.inputs.session import HAND_TOPICS, HeadsetStatistics
 from q2r2_control.types import SIDES, Array, HandSample
 
 SILENCE = 2.0  # without data before advice is given [s]

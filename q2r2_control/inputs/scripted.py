@@ -9,8 +9,7 @@ import pinocchio as pin
 
 from q2r2_control.config.cell import Config
 from q2r2_control.errors import ConfigError
-from q2r2_control.inputs.played import PlayedInput
-from q2r2_control.inputs.sampling import EvenSampling, HeadsetSampling, SampleTiming
+from q2r2_control.inputs.played import EvenSampling, HeadsetSampling, PlayedInput, SampleTiming
 from q2r2_control.inputs.trajectories import trajectory_named
 from q2r2_control.types import SIDES
 

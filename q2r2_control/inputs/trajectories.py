@@ -14,8 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from q2r2_control.errors import ConfigError
-from q2r2_control.inputs.assembly import HOME, WORKS, HandWork
-from q2r2_control.inputs.way_points import WayPoint, WayPoints, later, minimum_jerk
+from q2r2_control.inputs.assembly import HOME, WORKS, HandWork, WayPoint, WayPoints, later, minimum_jerk
 from q2r2_control.types import SIDES, Array, HandInputs
 
 PRESS_DURATION = 0.15  # [s]

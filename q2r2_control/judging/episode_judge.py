@@ -4,23 +4,104 @@ from __future__ import annotations
 
 import logging
 import math
+import os
+import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 
+from q2r2_control.errors import Q2R2Error, RecordingError
 from q2r2_control.events import Event, Reason, ReasonKind
-from q2r2_control.judging.judge_work import Answer, Question
-from q2r2_control.recording.episode_spans import spans_of
+from q2r2_control.judging.episode import Episode, read_episode
+from q2r2_control.judging.judge import judge_episode, part_of, parts_of
+from q2r2_control.recording.episode_spans import EpisodeSpan, spans_of
 from q2r2_control.recording.helper_process import HelperProcess, reason_of
+from q2r2_control.recording.ros_recording import open_recording
 from q2r2_control.summary.tick import Tick
 from q2r2_control.wording import sentence
+
+LONGEST_LINE = 300  # of a verdict [characters]
+_NICENESS = 10  # as the writer: the loop goes first
+_LOOKS = 0.3  # between two looks at the file, which grows twice a second [s]
+_PATIENCE = 30.0  # with a recorder that is behind [s]
+_BEFORE = 1_000_000_000  # of the beginning, where reading begins [ns]
+
+
+@dataclass(frozen=True)
+class Question:
+    """Which episode is to be judged."""
+
+    file: str
+    number: int  # of the episode, from 1 on
+    # Since the run began [s], so that no more has to be read. None: known to the file alone.
+    start: float | None = None
+    end: float | None = None
+    success: bool | None = None
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What became of it."""
+
+    number: int
+    keep: bool | None  # None: it could not be judged
+    line: str  # keep, discard and why, or why it could not be judged
+
+
+def main(requests: Iterator[Question], answer: Callable[[Answer], None]) -> None:
+    """Answer each question with the verdict on its episode."""
+    run = os.getppid()
+    with suppress(OSError):
+        os.nice(_NICENESS)
+    for question in requests:
+        try:
+            found = _answer(question, run)
+        except (Q2R2Error, OSError) as error:
+            found = _not_judged(question, reason_of(error))
+        answer(found)
+
+
+def _answer(question: Question, run: int) -> Answer:
+    """``run``: the process that asks, as long as there is somebody to answer."""
+    until = time.monotonic() + _PATIENCE
+    problem = f"it was not written within {_PATIENCE:g} s"
+    while time.monotonic() < until and os.getppid() == run:
+        try:
+            if (episode := written_episode(question)) is not None:
+                verdict = judge_episode(episode).verdict
+                return Answer(question.number, verdict.keep, verdict.line[:LONGEST_LINE])
+        except RecordingError as error:  # of a file whose beginning is not written yet, too
+            problem = str(error)
+        time.sleep(_LOOKS)
+    return _not_judged(question, problem)
+
+
+def _not_judged(question: Question, problem: str) -> Answer:
+    return Answer(question.number, None, f"not judged: {problem}"[:LONGEST_LINE])
+
+
+def written_episode(question: Question) -> Episode | None:
+    """The episode; None where it is not in the file as a whole yet."""
+    recording = open_recording(Path(question.file))
+    if question.start is None or question.end is None:
+        parts = parts_of(read_episode(recording))
+        found = parts[question.number - 1] if len(parts) >= question.number else None
+        return found if found is not None and found.ended_by_operator else None
+    recording.since = recording.about.epoch + round(question.start * 1e9) - _BEFORE
+    whole = read_episode(recording)
+    if not len(whole.ticks.t) or whole.ticks.t[-1] <= question.end:
+        return None
+    return part_of(whole, EpisodeSpan(question.start, question.end, success=question.success), question.number)
+
 
 _OF_EPISODES = {
     *(ReasonKind.EPISODE_BEGINS, ReasonKind.EPISODE_ENDS, ReasonKind.EPISODE_DISCARDED),
     *(ReasonKind.EPISODE_SUCCEEDED, ReasonKind.EPISODE_FAILED),
 }
-_LOOKS = 64  # ticks between two looks at whether a verdict is there
+_TICKS_BETWEEN_LOOKS = 64  # ticks between two looks at whether a verdict is there
 
 _logger = logging.getLogger(__name__)
 
@@ -48,7 +129,7 @@ class EpisodeJudge:
         """Start the process, which takes some milliseconds, unless the first question shall."""
         self._started = True
         try:
-            work = "q2r2_control.judging.judge_work"
+            work = "q2r2_control.judging.episode_judge"
             self._process = HelperProcess("judges episodes", work, self._answers.append)
         except OSError as error:
             self._fail(reason_of(error))
@@ -63,7 +144,7 @@ class EpisodeJudge:
         for event in tick.events:
             self.note(event)
         self._count += 1
-        if self._count % _LOOKS == 0:
+        if self._count % _TICKS_BETWEEN_LOOKS == 0:
             self.look()
 
     def note(self, event: Event) -> None:

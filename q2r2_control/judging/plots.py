@@ -11,10 +11,21 @@ from q2r2_control.judging.episode import stretches
 from q2r2_control.judging.judge import Judged
 from q2r2_control.judging.motion import tracking_errors
 from q2r2_control.types import Array
-from q2r2_control.viewer.plot_style import COLOURS, LINE_STYLES, MARGIN_COLOUR, draw_limit
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+
+
+COLOURS = {"left": "#1f6fb2", "right": "#d9722b"}
+LINE_STYLES: dict[str, Any] = {"left": "-", "right": (0, (4, 3))}  # where both share a plot, the right lies on top
+MARGIN_COLOUR = "#3b7d3b"
+_LIMIT = "#b3202c"
+
+
+def draw_limit(axes: Axes, value: float, label: str | None) -> None:
+    """A line that the plot is to stay on one side of."""
+    axes.axhline(value, color=_LIMIT, linestyle="--", linewidth=1.2, label=label)
+
 
 _POINTS = 500  # of a line, at most
 _SPEED_OVER = 5  # frames

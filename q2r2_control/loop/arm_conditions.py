@@ -8,7 +8,7 @@ from collections.abc import Mapping
 import numpy as np
 import pinocchio as pin
 
-from q2r2_control.compliance.admittance_law import estimate_wrench
+from q2r2_control.compliance.admittance import estimate_wrench
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.teleop.haptics import ArmCondition
 from q2r2_control.types import LimitKind, RobotState, StepReport

@@ -12,8 +12,7 @@ from q2r2_control.control.controller import CartesianController
 from q2r2_control.drives.base import Drive, DriveReport
 from q2r2_control.events import Reason
 from q2r2_control.supervision.external_arms import ExternalArms
-from q2r2_control.supervision.grasp_watch import STALL, GraspWatch
-from q2r2_control.supervision.gripper_limiter import REMEMBERED, GripperLimiter
+from q2r2_control.supervision.gripper_limiter import REMEMBERED, STALL, GraspWatch, GripperLimiter
 from q2r2_control.supervision.joint_watch import WatchSettings
 from q2r2_control.supervision.supervisor import Phase, Supervisor
 from q2r2_control.supervision.target_stream import Origins, StreamSettings

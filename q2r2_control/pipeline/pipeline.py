@@ -14,19 +14,17 @@ import pinocchio as pin
 from q2r2_control.config.cell import Config
 from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.control.controller import CartesianController
-from q2r2_control.drives.base import permitted
-from q2r2_control.drives.factory import make_drive
+from q2r2_control.drives.base import make_drive, permitted
 from q2r2_control.errors import ConfigError, PlantError
 from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.inputs.base import Input, make_input
 from q2r2_control.loop.control_loop import ControlLoop, LoopStep
-from q2r2_control.pipeline.loop_clock import LoopClock
+from q2r2_control.pipeline.loop_clock import LoopClock, PlantClock
 from q2r2_control.pipeline.operator_side import OperatorSide
 from q2r2_control.pipeline.pending_requests import PendingRequests
-from q2r2_control.pipeline.plant_clock import PlantClock
 from q2r2_control.pipeline.run_recorder import RunRecorder
 from q2r2_control.plants.base import Plant, check_mode, make_plant
-from q2r2_control.process.signals import few_garbage_collections, stop_on_signals
+from q2r2_control.process.scheduling import few_garbage_collections, stop_on_signals
 from q2r2_control.robot.robot import Robot
 from q2r2_control.summary.run_summary import RunSummary
 from q2r2_control.summary.tick import RunStart, Tick

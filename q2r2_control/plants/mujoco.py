@@ -11,8 +11,8 @@ import numpy as np
 from q2r2_control.config.cell import Config
 from q2r2_control.errors import PlantError
 from q2r2_control.plants.base import GripperMotion, check_command, check_duration, check_joints
+from q2r2_control.plants.mujoco_cameras import Window
 from q2r2_control.plants.mujoco_model import build_model, settle_mimics
-from q2r2_control.plants.mujoco_view import Window
 from q2r2_control.plants.servo import ReferenceLine, ServoGains, servo_gains
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, Command, CommandMode, RobotState

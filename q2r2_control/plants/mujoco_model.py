@@ -17,15 +17,18 @@ import numpy as np
 from q2r2_control.config.cell import Config, MujocoConfig
 from q2r2_control.errors import PlantError
 from q2r2_control.plants.mujoco_cameras import add_cameras
-from q2r2_control.plants.mujoco_obstacles import (
+from q2r2_control.plants.scene import (
+    COLLISION_GROUP,
+    ENVELOPE_GROUP,
     FRICTION_IMPEDANCE,
     PAD_PRIORITY,
     ROLLING,
     TORSION,
+    VISUAL_GROUP,
+    furnish,
     let_fingers_slide,
     set_obstacles,
 )
-from q2r2_control.plants.scene import COLLISION_GROUP, ENVELOPE_GROUP, VISUAL_GROUP, furnish
 from q2r2_control.robot.model_srdf import ENVELOPE
 from q2r2_control.robot.pairs import link_of, pair_names
 from q2r2_control.robot.robot import Robot

@@ -6,11 +6,16 @@ Both need a permission. Without it a run goes on as it would have, so what was r
 from __future__ import annotations
 
 import ctypes
+import gc
 import os
+import signal
 import sys
-from collections.abc import Iterable, Iterator
+import threading
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+
+from q2r2_control.errors import ConfigError
 
 # Below 50, at which Linux with PREEMPT_RT runs the interrupts that the loop itself waits for.
 _PRIORITY = 40
@@ -92,3 +97,67 @@ def _schedule_as_others(threads: Iterable[int]) -> None:
         for policy in (os.SCHED_OTHER | os.SCHED_RESET_ON_FORK, os.SCHED_OTHER):
             with suppress(OSError):
                 os.sched_setscheduler(thread, policy, os.sched_param(0))
+
+
+def new_folder(parent: Path, name: str, what: str) -> Path:
+    """A folder that did not exist before: ``name``, or numbered where several runs begin within one second.
+
+    Raises :class:`ConfigError` that begins with ``what``.
+    """
+    for suffix in ("", *(f"-{number}" for number in range(2, 100))):
+        folder = parent / (name + suffix)
+        try:
+            folder.mkdir(parents=True)
+        except FileExistsError as error:
+            if not folder.exists():  # a parent is a file
+                raise ConfigError(f"{what} {folder}: {error.strerror}") from error
+            continue
+        except OSError as error:
+            raise ConfigError(f"{what} {folder}: {error.strerror}") from error
+        return folder
+    raise ConfigError(f"{what} {parent / name}: exists, and so do 98 numbered ones")
+
+
+class StopRequest:
+    """A flag that a signal handler sets and a loop reads.
+
+    A plain attribute: the lock of a ``threading.Event`` is not reentrant, so a signal that comes in the middle of
+    another one's handler would wait for it for ever, and the process with it.
+    """
+
+    asked = False
+
+    def ask(self) -> None:
+        """Ask the loop to end."""
+        self.asked = True
+
+
+@contextmanager
+def stop_on_signals(stop: Callable[[], None]) -> Iterator[None]:
+    """Ctrl-C and SIGTERM call ``stop`` instead of interrupting the loop; only where this is the main thread."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    signals = (signal.SIGINT, signal.SIGTERM)
+    previous = [signal.signal(number, lambda *_: stop()) for number in signals]
+    try:
+        yield
+    finally:
+        for number, handler in zip(signals, previous, strict=True):
+            signal.signal(number, handler)
+
+
+def how_it_ended(what: str, code: int) -> str:
+    """In words, of a process ``what`` that ended with this exit ``code``, negative: by that signal."""
+    return f"{what} was ended by {signal.Signals(-code).name}" if code < 0 else f"{what} ended with exit code {code}"
+
+
+@contextmanager
+def few_garbage_collections() -> Iterator[None]:
+    """Exclude all existing objects from garbage collection, which would otherwise take several ticks each time."""
+    gc.collect()
+    gc.freeze()
+    try:
+        yield
+    finally:
+        gc.unfreeze()

@@ -9,13 +9,12 @@ from pathlib import Path
 
 from q2r2_control.errors import ConfigError
 from q2r2_control.events import Reason, ReasonKind
-from q2r2_control.process.folders import new_folder
+from q2r2_control.process.scheduling import new_folder
 from q2r2_control.recording.about import About, Conclusion
-from q2r2_control.recording.encoder import RecordedRobot
 from q2r2_control.recording.helper_process import HelperProcess, reason_of
 from q2r2_control.recording.messages import Message
 from q2r2_control.recording.topics import Topic
-from q2r2_control.recording.writer import FLUSH_PERIOD, MessageBatch, RecordingSetup, TickBatch, Written
+from q2r2_control.recording.writer import FLUSH_PERIOD, MessageBatch, RecordedRobot, RecordingSetup, TickBatch, Written
 
 PATIENCE = 10.0  # with a disk that hangs, at the end of a run [s]
 ROOM = 8 << 20  # for messages that wait to be written [bytes]; both arms' nodes send some 0.6 MB a second

@@ -10,7 +10,7 @@ from q2r2_control.errors import RecordingError
 from q2r2_control.events import Event, ReasonKind
 from q2r2_control.recording.about import LOOP
 from q2r2_control.recording.reader import Recording
-from q2r2_control.teleop.episode_marks import EpisodeMarks
+from q2r2_control.teleop.both_arms import EpisodeMarks
 
 
 @dataclass(frozen=True)

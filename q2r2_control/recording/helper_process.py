@@ -22,7 +22,7 @@ from queue import Empty, SimpleQueue
 from threading import Lock, Thread
 from typing import Any
 
-from q2r2_control.process.signals import how_it_ended
+from q2r2_control.process.scheduling import how_it_ended
 
 _LOOKS = 0.1  # between two looks at whether it gets on, at its end [s]
 _AFTER_KILL = 1.0  # for what handles the last answer [s]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Container, Iterator
+from collections.abc import Container, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
@@ -243,3 +243,23 @@ def _file_of(path: Path) -> Path:
 
 def _line(error: Exception) -> str:
     return " ".join((str(error) or repr(error)).split())[:200]
+
+
+def recordings_in(paths: Sequence[Path]) -> list[Path]:
+    """Files of recordings: those given, and all in folders given, by name; each once.
+
+    Raises :class:`RecordingError` for a path without any.
+    """
+    files: dict[Path, Path] = {}
+    for path in paths:
+        if path.is_dir():
+            found = sorted(path.rglob("*.mcap"))
+            if not found:
+                raise RecordingError(f"{path}: no file .mcap in it; allowed: recordings of q2r2 run --record")
+        elif path.exists():
+            found = [path]
+        else:
+            raise RecordingError(f"{path}: no such file or folder")
+        for file in found:
+            files.setdefault(file.resolve(), file)
+    return list(files.values())

@@ -12,17 +12,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 
-from q2r2_control.config.cameras import CameraConfig
+from q2r2_control.config.recording import CameraConfig
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.recording.about import About, Conclusion
 from q2r2_control.recording.base_recorder import PATIENCE, BaseRecorder
 from q2r2_control.recording.camera_recorder import CameraRecorder
-from q2r2_control.recording.encoder import RecordedRobot
 from q2r2_control.recording.helper_process import reason_of
 from q2r2_control.recording.messages import Message
 from q2r2_control.recording.tick_rows import PackedTick, TickPacker
 from q2r2_control.recording.topics import run_topics
-from q2r2_control.recording.writer import MessageBatch, TickBatch
+from q2r2_control.recording.writer import MessageBatch, RecordedRobot, TickBatch
 from q2r2_control.robot.robot import Robot
 from q2r2_control.summary.tick import Tick
 

@@ -21,8 +21,7 @@ from q2r2_control.plants.base import make_plant
 from q2r2_control.recording.about import ROS, About
 from q2r2_control.recording.comparison import Comparison, changes
 from q2r2_control.recording.reader import Recording
-from q2r2_control.recording.recorded_robot import cell_and_robot_of
-from q2r2_control.recording.recorded_ticks import NoMoreTicksError, RecordedTick, RecordedTicks
+from q2r2_control.recording.recorded_ticks import NoMoreTicksError, RecordedTick, RecordedTicks, cell_and_robot_of
 from q2r2_control.robot.robot import Robot
 from q2r2_control.summary.run_summary import RunSummary
 from q2r2_control.summary.tick import Tick

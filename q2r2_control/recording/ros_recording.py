@@ -18,14 +18,14 @@ import numpy as np
 
 from q2r2_control.config.cell import parse_config
 from q2r2_control.config.external import ControllerKind
-from q2r2_control.config.timeouts import STREAM_TIMEOUT
+from q2r2_control.config.strict import STREAM_TIMEOUT
 from q2r2_control.errors import RecordingError
 from q2r2_control.events import Event
 from q2r2_control.recording import topics as names
 from q2r2_control.recording.about import ROS, About
 from q2r2_control.recording.messages import NANOSECONDS, STORE, Message, pose_of
 from q2r2_control.recording.reader import Picture, Recording, TickChunk
-from q2r2_control.recording.recorded_robot import cell_and_robot_of, tool_poses
+from q2r2_control.recording.recorded_ticks import cell_and_robot_of, tool_poses
 from q2r2_control.recording.ros_topics import (
     ARM_FIELDS,
     CONTROLLER_TICK,

@@ -5,20 +5,186 @@ It imports none of the modules that compute: :class:`BaseRecorder` starts it.
 
 from __future__ import annotations
 
+import json
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
+import numpy as np
+import numpy.typing as npt
+import pinocchio as pin
+
+from q2r2_control.recording import messages
+from q2r2_control.recording import topics as names
 from q2r2_control.recording.about import About, Conclusion
 from q2r2_control.recording.bag import BagWriter
-from q2r2_control.recording.encoder import RecordedRobot, TickEncoder
-from q2r2_control.recording.messages import Message
-from q2r2_control.recording.tick_rows import PackedTick
+from q2r2_control.recording.messages import NANOSECONDS, Message, MessageTemplate
+from q2r2_control.recording.tick_rows import POSE_FIELDS, SAMPLE_FIELDS, PackedTick, numbers_in, tick_type
 from q2r2_control.recording.topics import Topic
+from q2r2_control.types import SIDES, Array, HandInputs
+
+if TYPE_CHECKING:
+    from q2r2_control.robot.robot import Robot
+
+
+_LAST_TIME = (2**31 - 1) * NANOSECONDS  # that a stamp can have [ns]
+_HAND, _POSE_STAMP, _INPUTS_STAMP, _X, _BUTTONS = (
+    SAMPLE_FIELDS.index(name) for name in ("hand", "pose_stamp", "inputs_stamp", "x", "button_upper")
+)
+
+
+@dataclass(frozen=True)
+class RecordedRobot:
+    """What messages need of a robot; unlike the robot itself it can be sent to another process."""
+
+    model: pin.Model
+    joints: tuple[str, ...]
+    arms: tuple[str, ...]
+    tools: tuple[int, ...]  # frames, arm by arm
+    urdf: str
+
+    @classmethod
+    def of(cls, robot: Robot) -> RecordedRobot:
+        tools = tuple(arm.frame_id for arm in robot.arms.values())
+        return cls(robot.model, tuple(robot.joint_names), tuple(robot.arms), tools, robot.urdf)
+
+    def tool_poses(self, postures: Array) -> Array:
+        """(n, arms, 7) x y z [m] qx qy qz qw of the tools in the world, at joint positions (n, joints)."""
+        data = self.model.createData()
+        poses = np.empty((len(postures), len(self.tools), len(POSE_FIELDS)))
+        for q, row in zip(postures, poses, strict=True):
+            pin.forwardKinematics(self.model, data, q)
+            for pose, frame in zip(row, self.tools, strict=True):
+                pose[:] = pin.SE3ToXYZQUATtuple(pin.updateFramePlacement(self.model, data, frame))
+        return poses
+
+
+class TickEncoder:
+    """Makes messages of ticks, in their order. ``epoch`` [ns] is the time of day at which the run began."""
+
+    def __init__(self, robot: RecordedRobot, topics: dict[str, Topic], epoch: int) -> None:
+        self._robot, self._topics, self._epoch = robot, topics, epoch
+        self._type = tick_type(len(robot.arms), len(robot.joints))
+        self._start: float | None = None  # of the loop's clock [s]
+        self._stamps: dict[tuple[float, int], float] = {}  # the last of each hand's poses and inputs
+        self._templates = _templates(list(robot.joints), topics[names.TICK])
+        self._poses = {
+            frame: MessageTemplate(messages.POSE, messages.pose_stamped(_numbers(7), frame), 7)
+            for frame in ("", names.WORLD)
+        }
+
+    def encode(self, batch: Sequence[PackedTick]) -> list[Message]:
+        """Messages of packed ticks that follow the last ones, tick by tick, as readers without an index expect."""
+        rows = np.frombuffer(b"".join(tick.row for tick in batch), dtype=self._type).copy()
+        rows["arms"]["tool"] = self._robot.tool_poses(rows["reference_q"])
+        first = self._first_message(batch[0]) if self._start is None else []
+        made = _Batch(self._topics, rows["index"].astype(np.int64), self._times(rows["now"]))
+        every, arms = np.arange(len(rows)), rows["arms"]
+        made.add(names.TICK, every, self._filled(names.TICK, numbers_in(rows), made.times))
+        for at, tick in enumerate(batch):
+            self._add_samples(made, at, np.frombuffer(tick.samples).reshape(-1, len(SAMPLE_FIELDS)))
+        measured = np.hstack((rows["q"], rows["v"], rows["tau"]))
+        made.add(names.JOINT_STATES, every, self._filled(names.JOINT_STATES, measured, made.times))
+        felt = np.flatnonzero(rows["external"])
+        external = self._filled(names.EXTERNAL_TORQUE, rows["tau_external"][felt], made.times[felt])
+        made.add(names.EXTERNAL_TORQUE, felt, external)
+        for index, arm in enumerate(self._robot.arms):
+            for topic, field, frame in (
+                (names.filtered_hand(arm), "filtered_hand", ""),
+                (names.target(arm), "target", names.WORLD),
+                (names.safe_target(arm), "tool", names.WORLD),
+            ):
+                poses = arms[field][:, index]
+                there = np.flatnonzero(poses.any(axis=1))
+                made.add(topic, there, self._poses[frame].filled(poses[there], made.times[there]))
+        for topic, columns in (
+            (names.REFERENCE, ("reference_q", "reference_v", "reference_a")),
+            (names.JOINT_COMMANDS, ("command_q", "command_v", "command_tau")),
+        ):
+            made.add(topic, every, self._filled(topic, np.hstack([rows[name] for name in columns]), made.times))
+        told = [at for at, tick in enumerate(batch) if tick.state]
+        made.add(names.STATE, told, [messages.text(batch[at].state) for at in told])
+        return first + made.in_order()
+
+    def _first_message(self, tick: PackedTick) -> list[Message]:
+        """The robot for viewers."""
+        self._start = float(json.loads(tick.state)["start"]["now"])
+        channel = self._topics[names.DESCRIPTION].channel
+        return [Message(channel, 0, self._epoch, self._epoch, messages.text(self._robot.urdf))]
+
+    def _filled(self, topic: str, numbers: Array, stamps: npt.NDArray[np.int64]) -> list[bytes]:
+        return self._templates[topic].filled(numbers, stamps)
+
+    def _times(self, seconds: Array) -> npt.NDArray[np.int64]:
+        """Times of the loop's clock [s] as times of day [ns]; any number of a sender gives some time."""
+        assert self._start is not None
+        passed = np.clip(np.nan_to_num(seconds - self._start) * NANOSECONDS, -_LAST_TIME, _LAST_TIME)
+        return np.clip(np.rint(passed).astype(np.int64) + self._epoch, 0, _LAST_TIME)
+
+    def _add_samples(self, made: _Batch, at: int, samples: Array) -> None:
+        """Samples of a tick as the loop got them; poses and inputs that are new as messages of the nodes too."""
+        for sample in samples:
+            hand = SIDES[int(sample[_HAND])]
+            made.add(names.SAMPLES, [at], [messages.serialized(messages.ARRAY, messages.float_array(sample))])
+            if self._is_new(sample, _POSE_STAMP):
+                (stamp,) = self._times(sample[_POSE_STAMP : _POSE_STAMP + 1]).tolist()
+                pose = messages.pose_stamped(sample[_X : _X + len(POSE_FIELDS)], stamp=stamp)
+                made.add(names.hand_pose(hand), [at], [messages.serialized(messages.POSE, pose)])
+            if self._is_new(sample, _INPUTS_STAMP):
+                with np.errstate(over="ignore"):  # float32, whatever an input sends
+                    values = sample[_BUTTONS : _BUTTONS + len(HandInputs.__slots__)].astype(np.float32)
+                upper, lower, *analog = values.tolist()
+                inputs = messages.make(messages.HAND_INPUTS, bool(upper), bool(lower), *analog)
+                made.add(names.hand_buttons(hand), [at], [messages.serialized(messages.HAND_INPUTS, inputs)])
+
+    def _is_new(self, sample: Array, stamp: int) -> bool:
+        """Whether a sample of a hand has another stamp than the one before."""
+        before = self._stamps.get((sample[_HAND], stamp))
+        self._stamps[sample[_HAND], stamp] = sample[stamp]
+        return bool(before != sample[stamp])
+
+
+class _Batch:
+    """Messages of some ticks, which have these numbers and times of day [ns]."""
+
+    def __init__(self, topics: dict[str, Topic], numbers: npt.NDArray[np.int64], times: npt.NDArray[np.int64]) -> None:
+        self._topics, self._numbers, self.times = topics, numbers.tolist(), times
+        self._messages: list[list[Message]] = [[] for _ in self._numbers]
+
+    def add(self, topic: str, at: Iterable[int], payloads: Iterable[bytes]) -> None:
+        """A message of each of the ticks ``at`` these places."""
+        channel = self._topics[topic].channel
+        for place, payload in zip(at, payloads, strict=True):
+            time = int(self.times[place])
+            self._messages[place].append(Message(channel, self._numbers[place], time, time, payload))
+
+    def in_order(self) -> list[Message]:
+        """All, tick by tick."""
+        return [message for of_tick in self._messages for message in of_tick]
+
+
+def _numbers(count: int, first: int = 1) -> Array:
+    return np.arange(first, first + count, dtype=np.float64)
+
+
+def _templates(joints: list[str], tick: Topic) -> dict[str, MessageTemplate]:
+    """Of the topics that every tick has."""
+    n, none = len(joints), np.empty(0)
+    lists = _numbers(n), _numbers(n, n + 1), _numbers(n, 2 * n + 1)
+    numbers: Any = messages.float_array(_numbers(len(tick.labels)))
+    states = MessageTemplate(messages.JOINTS, messages.joint_state(joints, *lists), 3 * n)
+    return {
+        names.TICK: MessageTemplate(messages.ARRAY, numbers, len(tick.labels)),
+        names.JOINT_STATES: states,
+        names.JOINT_COMMANDS: states,
+        names.EXTERNAL_TORQUE: MessageTemplate(messages.JOINTS, messages.joint_state(joints, none, none, lists[0]), n),
+        names.REFERENCE: MessageTemplate(messages.TRAJECTORY, messages.joint_trajectory(joints, *lists), 3 * n),
+    }
+
 
 FLUSH_PERIOD = 0.5  # of the file; what is lost at most where this process is killed [s]
 _NICENESS = 10  # the loop goes first where there are not enough processors

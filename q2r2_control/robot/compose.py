@@ -17,11 +17,16 @@ from q2r2_control.config.cell import Config
 from q2r2_control.errors import ConfigError
 from q2r2_control.robot.cell_parts import ArmAssembly, Model, check_position, load_model
 from q2r2_control.robot.floor import FLOOR, floor_link
-from q2r2_control.robot.joint_accelerations import set_acceleration_limit
-from q2r2_control.robot.link_roles import KnownParts
 from q2r2_control.robot.locking import lock_joints, resting_position
-from q2r2_control.robot.pairs import exclusions_of_file
-from q2r2_control.robot.urdf_parts import WORLD, fixed_joint, name_shapes, obstacle_link, renamed_exclusions
+from q2r2_control.robot.pairs import KnownParts, exclusions_of_file
+from q2r2_control.robot.urdf_parts import (
+    WORLD,
+    fixed_joint,
+    name_shapes,
+    obstacle_link,
+    renamed_exclusions,
+    set_acceleration_limit,
+)
 from q2r2_control.types import SIDES
 
 _OBSTACLE_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")

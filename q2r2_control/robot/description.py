@@ -14,9 +14,8 @@ from pathlib import Path
 
 from q2r2_control.config.resources import find_resource
 from q2r2_control.errors import ConfigError, RobotError
-from q2r2_control.robot.joint_accelerations import ATTRIBUTES
-from q2r2_control.robot.packages import package_file
-from q2r2_control.robot.xacro_model import expand_xacro
+from q2r2_control.robot.packages import expand_xacro, package_file
+from q2r2_control.robot.urdf_parts import ATTRIBUTES
 
 EXAMPLE_ROBOT_DATA = "example-robot-data:"
 

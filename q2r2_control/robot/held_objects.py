@@ -23,8 +23,7 @@ import pinocchio as pin
 from q2r2_control.config.arms import HeldObjectConfig
 from q2r2_control.robot.enclose import capsule_between
 from q2r2_control.robot.floor import FLOOR
-from q2r2_control.robot.link_roles import LinkClass, Role
-from q2r2_control.robot.pairs import link_of, pair_names
+from q2r2_control.robot.pairs import LinkClass, Role, link_of, pair_names
 from q2r2_control.types import Array
 
 

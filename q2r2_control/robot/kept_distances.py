@@ -10,8 +10,7 @@ import numpy as np
 from q2r2_control.config.control import ControllerSettings
 from q2r2_control.errors import ConfigError
 from q2r2_control.robot.floor import FLOOR
-from q2r2_control.robot.link_roles import LinkClass, Role
-from q2r2_control.robot.pairs import link_of, pair_names
+from q2r2_control.robot.pairs import LinkClass, Role, link_of, pair_names
 from q2r2_control.robot.robot import PairDistance, Robot
 from q2r2_control.types import Array
 

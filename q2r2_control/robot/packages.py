@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
-from q2r2_control.errors import ConfigError
+from q2r2_control.errors import ConfigError, RobotError
 
 _PLACES = "the key packages, AMENT_PREFIX_PATH or ROS_PACKAGE_PATH"
 
@@ -47,3 +49,61 @@ def _example_robot_data_share() -> Path:
     from example_robot_data.robots_loader import getModelPath
 
     return Path(getModelPath("panda_description")).parent.parent
+
+
+def expand_xacro(file: Path, arguments: Mapping[str, object], packages: Mapping[str, str]) -> str:
+    """URDF text of ``file`` with ``arguments`` by name; ``$(find NAME)`` is looked up as ``package://NAME`` is.
+
+    Raises :class:`ConfigError` where xacro is not installed or the file has no such argument, and
+    :class:`RobotError` where xacro cannot expand the file.
+    """
+    try:
+        import xacro
+        from xacro import substitution_args
+    except ImportError as error:
+        raise ConfigError(
+            f"{file}: needs the Python package xacro: pip install 'q2r2_control[xacro]', or expand it to .urdf"
+        ) from error
+    given = _Arguments({name: _as_text(value) for name, value in arguments.items()})
+    try:
+        with _packages_found_by(substitution_args, lambda name: str(package_folder(name, file.parent, packages))):
+            text: str = xacro.process_file(str(file), mappings=given).toxml()
+    # A file holds Python expressions, from which any exception can come.
+    except (Exception, SystemExit) as error:
+        inside = next((f" (in {name})" for name in reversed(xacro.filestack or []) if name != str(file)), "")
+        reason = " ".join(str(error).split())[:300] or type(error).__name__
+        raise RobotError(f"{file}: xacro cannot expand it: {reason}{inside}") from error
+    if unknown := sorted(set(arguments) - given.asked_for):
+        raise ConfigError(
+            f"xacro_args.{unknown[0]:.60}: {file} has no such argument; allowed: "
+            f"{', '.join(sorted(given.asked_for)) or 'none'}"
+        )
+    return text
+
+
+class _Arguments(dict[str, str]):
+    """Arguments by name, and which of them the file declares: xacro does not tell of those that it has no use for."""
+
+    def __init__(self, given: Mapping[str, str]) -> None:
+        super().__init__(given)
+        self.asked_for: set[str] = set()
+
+    def __contains__(self, name: object) -> bool:
+        self.asked_for.add(str(name))
+        return super().__contains__(name)
+
+
+def _as_text(value: object) -> str:
+    """As it would be written on xacro's command line."""
+    return str(value).lower() if isinstance(value, bool) else str(value)
+
+
+@contextmanager
+def _packages_found_by(substitution_args: Any, find: Callable[[str], str]) -> Iterator[None]:
+    """Let ``find`` answer ``$(find NAME)``: xacro asks ament's Python package only, which need not be installed."""
+    usual = substitution_args._eval_find
+    substitution_args._eval_find = substitution_args._eval_dict["find"] = find
+    try:
+        yield
+    finally:
+        substitution_args._eval_find = substitution_args._eval_dict["find"] = usual

@@ -10,8 +10,8 @@ import pinocchio as pin
 
 from q2r2_control.errors import RobotError
 from q2r2_control.robot.description import LinkTree, joint_limits
-from q2r2_control.robot.joint_accelerations import acceleration_limit
 from q2r2_control.robot.locking import lock_joints
+from q2r2_control.robot.urdf_parts import acceleration_limit
 
 # Inertia that the rotor of a geared drive adds to its joint where the URDF does not say [kg m^2]. Without any, light
 # wrist joints would need torques faster than a control loop gives them.

@@ -17,20 +17,21 @@ from q2r2_control.errors import ConfigError, RobotError
 from q2r2_control.robot.compose import compose
 from q2r2_control.robot.description import LinkTree, joint_limits, parse_srdf, parse_urdf
 from q2r2_control.robot.enclose import enclose_shapes
-from q2r2_control.robot.finger_bodies import sweep_fingers
-from q2r2_control.robot.finger_openings import FingerBody
+from q2r2_control.robot.finger_bodies import FingerBody, sweep_fingers
 from q2r2_control.robot.floor import remove_unreachable_floor_pairs, sink_boxes_into_floor
 from q2r2_control.robot.held_objects import HeldObjects, held_objects
-from q2r2_control.robot.joint_accelerations import acceleration_limit
-from q2r2_control.robot.link_roles import KnownParts, Role, roles_of
 from q2r2_control.robot.pairs import (
+    KnownParts,
+    Role,
     add_movable_pairs,
     pair_names,
     remove_disabled_pairs,
     remove_overlapping_own_pairs,
+    roles_of,
 )
 from q2r2_control.robot.pinocchio_models import build_models, checked_chain
 from q2r2_control.robot.turning_fingers import TurningBody
+from q2r2_control.robot.urdf_parts import acceleration_limit
 from q2r2_control.types import Array
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 import xml.etree.ElementTree as ET
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -86,3 +87,26 @@ def _shape(config: ObstacleConfig) -> ET.Element:
 
 def numbers(values: Sequence[float]) -> str:
     return " ".join(repr(float(value)) for value in values)
+
+
+ACCELERATION = "acceleration"
+ATTRIBUTES = (ACCELERATION, "deceleration", "{http://drake.mit.edu}acceleration")  # of limit
+
+
+def acceleration_limit(joint: ET.Element) -> float:
+    """The least of a joint's limits [rad/s^2, m/s^2 of a sliding joint]; infinity where it has none.
+
+    One number for both directions of both: to speed up as fast as the joint may brake costs little, and nothing here
+    knows of two.
+    """
+    limit = joint.find("limit")
+    written = [] if limit is None else [limit.get(attribute) for attribute in ATTRIBUTES]
+    return min((float(text) for text in written if text is not None), default=math.inf)
+
+
+def set_acceleration_limit(joint: ET.Element, value: float) -> None:
+    """Write ``value`` [rad/s^2, m/s^2] into a joint that has limits, in place of what it says of them."""
+    for limit in joint.findall("limit"):
+        for attribute in ATTRIBUTES:
+            limit.attrib.pop(attribute, None)
+        limit.set(ACCELERATION, repr(value))

@@ -26,8 +26,7 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 from std_msgs.msg import String
 
 from q2r2_control.errors import ConfigError, Q2R2Error
-from q2r2_control.process.scheduling import schedule_process_as_others, schedule_process_first
-from q2r2_control.process.signals import StopRequest
+from q2r2_control.process.scheduling import StopRequest, schedule_process_as_others, schedule_process_first
 from q2r2_control.ros.executor import TickExecutor, TickGroup
 from q2r2_control.ros.launch.middleware import set_up_middleware
 

@@ -3,20 +3,91 @@
 from __future__ import annotations
 
 import math
+from array import array
 from collections import deque
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
+from q2r2_control.compliance.impedance import ImpedanceReport
+from q2r2_control.compliance.repulsion import WallReport
 from q2r2_control.config.control import ControllerSettings
 from q2r2_control.events import Event
 from q2r2_control.robot.robot import Robot
-from q2r2_control.summary.histogram import NOTHING_MEASURED, Histogram, Percentiles
 from q2r2_control.summary.tick import Tick
-from q2r2_control.summary.torque_summary import TorqueSummary
 from q2r2_control.types import ArmTarget, HandSample, Reference
 from q2r2_control.wording import sentence
+
+_BINS = 100_000
+
+
+@dataclass(frozen=True, slots=True)
+class Percentiles:
+    """Of a duration; p50 and p99 to one part in a thousand of the histogram's unit, None: nothing was measured."""
+
+    p50: float | None
+    p99: float | None
+    max: float | None
+
+
+NOTHING_MEASURED = Percentiles(None, None, None)
+
+
+class Histogram:
+    """Counts durations in thousandths of ``unit`` [s], up to 100 units."""
+
+    def __init__(self, unit: float) -> None:
+        self._bin = unit * 1e-3
+        self._counts = array("q", bytes(8 * _BINS))
+        self._largest = 0.0
+
+    def add(self, duration: float) -> None:
+        """Count one duration [s]; one below zero counts as zero, one that is not finite does not count."""
+        if math.isfinite(duration):
+            self._counts[int(min(max(duration / self._bin, 0.0), _BINS - 1))] += 1
+            self._largest = max(self._largest, duration)
+
+    def percentiles(self, unit: float) -> Percentiles:
+        """In multiples of ``unit`` [s]."""
+        cumulative = np.cumsum(self._counts)
+        if not cumulative[-1]:
+            return NOTHING_MEASURED
+        bins = (int(np.searchsorted(cumulative, share * cumulative[-1])) for share in (0.5, 0.99))
+        values = (math.inf if index == _BINS - 1 else (index + 1) * self._bin for index in bins)
+        middle, high = (min(value, self._largest) / unit for value in values)
+        return Percentiles(middle, high, self._largest / unit)
+
+
+@dataclass(slots=True)
+class TorqueSummary:
+    """A run in torque mode, gathered tick by tick."""
+
+    off_reference_s: dict[str, float]  # of each arm: further from its reference than the impedance's error clip
+    min_measured_distance_mm: float | None = None  # None: no monitored pair
+    measured_closest_pair: tuple[str, str] | None = None
+    pressed_pairs: list[tuple[str, str]] = field(default_factory=list)  # that the wall pushed apart at some time
+    max_wall_force_n: float = 0.0  # on one pair
+    saturated_ticks: int = 0  # some joint would have needed more torque than its limit
+    rate_limited_ticks: int = 0  # some joint's torque could not change as fast as it should
+    held_ticks: int = 0  # without a usable measurement: the last gravity torque was held
+
+    def add(self, dt: float, impedance: ImpedanceReport, wall: WallReport) -> None:
+        """Count one tick of ``dt`` [s]."""
+        least = math.inf if self.min_measured_distance_mm is None else self.min_measured_distance_mm
+        # A NaN distance, where nothing was measured, compares as not less; such a tick counts as held.
+        if 1e3 * wall.closest_distance < least:
+            self.min_measured_distance_mm = 1e3 * wall.closest_distance
+            self.measured_closest_pair = wall.closest_pair
+        if wall.pressing:
+            self.pressed_pairs = sorted({*self.pressed_pairs, *wall.pressing})
+        self.max_wall_force_n = max(self.max_wall_force_n, wall.force)
+        self.saturated_ticks += bool(impedance.saturated)
+        self.rate_limited_ticks += bool(impedance.rate_limited)
+        self.held_ticks += impedance.held
+        for arm in impedance.clipped:
+            self.off_reference_s[arm] += dt
+
 
 EVENTS_KEPT = 10_000  # the newest ones; a broken button can cause more
 _REST = 1e-3  # [rad/s]

@@ -12,7 +12,7 @@ from operator import sub
 
 import numpy as np
 
-from q2r2_control.config.supervision import SupervisionSettings
+from q2r2_control.config.control import SupervisionSettings
 from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.types import Array, RobotState
 

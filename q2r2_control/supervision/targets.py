@@ -7,9 +7,8 @@ from collections.abc import Iterable, Sequence
 import pinocchio as pin
 
 from q2r2_control.events import Reason, ReasonKind
-from q2r2_control.supervision.sequence_watch import SequenceWatch
-from q2r2_control.supervision.target_extrapolator import TargetExtrapolator
-from q2r2_control.supervision.target_stream import Origins, StreamSettings, TargetStream
+from q2r2_control.supervision.message_watch import SequenceWatch
+from q2r2_control.supervision.target_stream import Origins, StreamSettings, TargetExtrapolator, TargetStream
 
 
 class TargetStreams:

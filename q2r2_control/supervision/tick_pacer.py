@@ -16,6 +16,8 @@ Then the reference goes on too, by the time that passed, up to 0.1 s; what is co
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from q2r2_control.types import LONGEST_DT, Array
@@ -54,3 +56,28 @@ class TickPacer:
         """The time in which the first joint can have used up its way."""
         a, speed = self._acceleration, np.abs(v)
         return float((2.0 * self._way / (speed + np.sqrt(speed * speed + 2.0 * a * self._way))).min())
+
+
+_SHARE = 0.02  # of what the even time is off is made up in a tick
+
+
+class TickClock:
+    """Turns the times at which ticks ran into the times for which they count, all in [s]."""
+
+    def __init__(self, period: float) -> None:
+        self._period = period
+        self._last = -math.inf
+
+    def at(self, now: float) -> float:
+        """The time for which a tick that runs at ``now`` counts: within half a period of it, or again the last one.
+
+        Time begins anew after more than 0.1 s, and where it was set back.
+        """
+        off = now - self._last - self._period
+        if not -2.0 * self._period < off < LONGEST_DT:
+            self._last = now
+            return now
+        missed = round(off / self._period)
+        if missed >= 0:
+            self._last += (1 + missed) * self._period + _SHARE * (off - missed * self._period)
+        return self._last

@@ -5,15 +5,112 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
 
+import pinocchio as pin
+
 from q2r2_control.config.bindings import Action, Gesture
 from q2r2_control.config.teleop import Stance, TeleopSettings
 from q2r2_control.events import Reason, ReasonKind
+from q2r2_control.quaternions import floats_of, se3_of
 from q2r2_control.teleop.arm import ArmTeleop, pressed
 from q2r2_control.teleop.arm_states import AT_REST, ArmState, Cause
-from q2r2_control.teleop.carry_mode import CarryMode
-from q2r2_control.teleop.episode_marks import EpisodeMarks
+from q2r2_control.teleop.carry import CarriedTools, RelationKeeper
 from q2r2_control.teleop.gestures import Press
-from q2r2_control.teleop.steady_state_offset import Anchor, ArmMeasurements
+from q2r2_control.teleop.hand_motion import Anchor, ArmMeasurements
+
+_OUTCOMES = {
+    Action.RECORD_SUCCESS: ReasonKind.EPISODE_SUCCEEDED,
+    Action.RECORD_FAILURE: ReasonKind.EPISODE_FAILED,
+}
+
+
+class EpisodeMarks:
+    """Turns the controls of the recording into events, which are in the recording as all events are."""
+
+    actions = (
+        Action.RECORD_DISCARD,
+        Action.RECORD_FAILURE,
+        Action.RECORD_SUCCESS,
+        Action.RECORD_TOGGLE,
+        Action.RECORD_MARK,
+    )
+
+    def __init__(self) -> None:
+        self.recorded = False  # whether there is a recording
+        self.open = False  # whether an episode has begun and not ended
+        self.any = False  # whether there is an episode that could be discarded
+
+    def apply(self, action: Action) -> ReasonKind:
+        """Follow a control; returns the event's kind. What became of an episode ends it."""
+        if not self.recorded:
+            return ReasonKind.NO_RECORDING
+        if action is Action.RECORD_MARK:
+            return ReasonKind.MARK
+        if action is Action.RECORD_DISCARD:
+            self.open = False
+            any_episode, self.any = self.any, False
+            return ReasonKind.EPISODE_DISCARDED if any_episode else ReasonKind.NO_EPISODE
+        if action in _OUTCOMES:
+            self.open = False
+            return _OUTCOMES[action]
+        self.open = not self.open
+        self.any = True
+        return ReasonKind.EPISODE_BEGINS if self.open else ReasonKind.EPISODE_ENDS
+
+    def follow(self, kind: ReasonKind) -> None:
+        """Follow an event that happened elsewhere."""
+        if kind in _OUTCOMES.values():
+            self.open = False
+        elif kind in (ReasonKind.EPISODE_BEGINS, ReasonKind.EPISODE_ENDS, ReasonKind.EPISODE_DISCARDED):
+            self.open, self.any = kind is ReasonKind.EPISODE_BEGINS, kind is not ReasonKind.EPISODE_DISCARDED
+
+
+_Poses = Mapping[str, pin.SE3]
+
+
+class CarryMode:
+    """One hand moves both tools. What ends it ends it for both arms, or the one would pull at what both hold."""
+
+    def __init__(self, leader: ArmTeleop, follower: ArmTeleop, tools: _Poses, now: float) -> None:
+        """``tools``: where both arms' tools are, or are asked to be; world frame."""
+        self._leader, self._follower = leader, follower
+        self._tools = CarriedTools(tools)
+        self._keeper = RelationKeeper()
+        self._box = follower.motion.workspace()
+        follower.change(Cause.CARRY, now, Reason.of(ReasonKind.CARRIED_BY, arm=leader.arm))
+        leader.motion.carry(self._tools, follower.arm, self._box, now)
+        leader.record_event(now, Reason(ReasonKind.CARRY_BEGAN))
+
+    @property
+    def lasts(self) -> bool:
+        """Whether both arms still carry."""
+        return self._leader.state is ArmState.ENGAGED and self._follower.state is ArmState.CARRIED
+
+    def end(self, now: float, reason: Reason) -> None:
+        """Whichever arm still follows holds."""
+        for arm in (self._leader, self._follower):
+            arm.change(Cause.CARRY_ENDS, now, reason)
+
+    def targets(self, now: float, expected: _Poses, at_once: _Poses) -> dict[str, pin.SE3]:
+        """Of both arms, in the world frame.
+
+        ``expected``: where the tools are to be by the controller's reference, world frame. ``at_once``: where it had
+        both at one moment, which corrects their relation; empty: not known.
+        """
+        tools, leader, follower = self._tools, self._leader.arm, self._follower.arm
+        slowest = tools.slowest(tools.frames_of(expected))
+        tools.frame = frame = se3_of(self._leader.target(now, None if slowest is None else floats_of(slowest)))
+        targets = tools.at(frame)
+        if len(frames := tools.frames_of(at_once)) == len(targets):
+            self._keeper.note(frames[leader], frames[follower], now)
+        position, rotation = floats_of(tools.tool_at(follower, self._keeper.frame(frame)))
+        targets[follower] = se3_of((self._box.clip(position), rotation))
+        return targets
+
+    @property
+    def slip(self) -> tuple[float, float]:
+        """Of the targets, see :attr:`HandMotion.slip`."""
+        return self._leader.motion.slip
+
 
 # Why arms do not carry.
 _ENGAGE, _UNKNOWN = Reason(ReasonKind.ENGAGE_FIRST), Reason(ReasonKind.TOOL_UNKNOWN)

@@ -14,7 +14,7 @@ import numpy as np
 import pinocchio as pin
 
 from q2r2_control.quaternions import Vector, floats_of, se3_of
-from q2r2_control.teleop.workspace import Workspace
+from q2r2_control.teleop.leash import Workspace
 from q2r2_control.types import LONGEST_DT, Array, Pose, pose_of
 
 # Of keeping the relation [1/s]. A loop of the first order that is late by T is stable with a gain below pi/(2 T): T may

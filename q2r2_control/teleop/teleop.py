@@ -12,9 +12,8 @@ from q2r2_control.events import Event, Reason, ReasonKind
 from q2r2_control.quaternions import se3_of
 from q2r2_control.teleop.arm import of_controls
 from q2r2_control.teleop.arm_states import FOLLOWING, HOLDING, ArmState, Cause
-from q2r2_control.teleop.both_arms import BothArms
-from q2r2_control.teleop.episode_marks import EpisodeMarks
-from q2r2_control.teleop.steady_state_offset import ArmMeasurements
+from q2r2_control.teleop.both_arms import BothArms, EpisodeMarks
+from q2r2_control.teleop.hand_motion import ArmMeasurements
 from q2r2_control.types import ArmTarget, HandSample
 
 _BY_HANDS = ArmState.ENGAGED, ArmState.CARRIED

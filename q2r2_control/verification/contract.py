@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from q2r2_control.config.control import ControllerSettings
 from q2r2_control.control.controller import CartesianController
-from q2r2_control.control.safety.safety_model import ROUNDING
+from q2r2_control.control.safety.safety_data import ROUNDING
 from q2r2_control.robot.kept_distances import kept_by_objects, kept_distances
 from q2r2_control.types import LONGEST_DT, Array, Interval, Reference, StepReport
 from q2r2_control.verification.measured_distances import MeasuredDistances

@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from q2r2_control.config.cell import Config
+from q2r2_control.config.control import ContactPair
 from q2r2_control.control.qp import QpProblem, QpSolution, Solver
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
@@ -211,3 +213,14 @@ class Starts:
             low, high = (low, share) if closer else (share, high)
         q: Array = self._robot.home + high * (far - self._robot.home)
         return q
+
+
+TABLE_ONLY = (ContactPair(pair=("*_finger_*", "table")),)
+FINGERS = (*TABLE_ONLY, ContactPair(pair=("left_*_finger_*", "right_*_finger_*"), depth=0.005))
+
+
+def with_contact(config: Config, pairs: tuple[ContactPair, ...]) -> Config:
+    """The cell as it is where it allows contact, else with ``pairs`` that may touch."""
+    if config.control.contact_allowed:
+        return config
+    return config.model_copy(update={"control": config.control.model_copy(update={"contact_allowed": pairs})})

@@ -8,8 +8,8 @@ import numpy as np
 import pinocchio as pin
 
 from q2r2_control.control.geometry.collision import collision_model_of
-from q2r2_control.control.geometry.rounded_boxes import deeper_at_corners
-from q2r2_control.robot.finger_openings import collision_model_at
+from q2r2_control.control.geometry.pair_distance import deeper_at_corners
+from q2r2_control.robot.finger_bodies import collision_model_at
 from q2r2_control.robot.pairs import pair_names
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, Interval, StepReport

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
-from q2r2_control.control.safety.safety_model import ROUNDING
+from q2r2_control.control.safety.safety_data import ROUNDING
 
 RELATIVE = 1e-9  # to which the contract promises limits
 COAL = 2e-6  # how exactly Coal measures a capsule from a box [m]

@@ -10,8 +10,7 @@ import pytest
 
 from q2r2_control.benchmark.bench import run_bench
 from q2r2_control.benchmark.motion_run import run_motion
-from q2r2_control.benchmark.peers.base import INSTALL, PEERS, PeerSettings, is_installed, make_peer
-from q2r2_control.benchmark.peers.leading import Leading
+from q2r2_control.benchmark.peers.base import INSTALL, PEERS, Leading, PeerSettings, is_installed, make_peer
 from q2r2_control.benchmark.work_motions import TIMED_MOTIONS, WORK_MOTIONS, motions_named
 from q2r2_control.config.cell import load_config
 from q2r2_control.robot.robot import Robot

@@ -9,8 +9,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from q2r2_control.benchmark.motion_run import DT, MotionFigures, play_motion, run_motion
-from q2r2_control.benchmark.own_controller import OwnController, without_pairs
+from q2r2_control.benchmark.motion_run import DT, MotionFigures, OwnController, play_motion, run_motion, without_pairs
 from q2r2_control.benchmark.work_motions import WORK_MOTIONS
 from q2r2_control.config.cell import load_config
 from q2r2_control.robot.robot import Robot

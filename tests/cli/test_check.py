@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 
 from q2r2_control.cli.cell_report import check_cell
-from q2r2_control.cli.pair_files import write_model_pairs
+from q2r2_control.cli.check import write_model_pairs
 from q2r2_control.config.cell import load_config
 from q2r2_control.config.resources import find_resource
 from q2r2_control.errors import ConfigError
-from q2r2_control.verification.contact_cells import FINGERS, with_contact
+from q2r2_control.verification.fault_injection import FINGERS, with_contact
 from tests.cli.command import CELL, changed_cell, external_cell, one_object, q2r2
 from tests.robot.conftest import one_arm
 

@@ -9,7 +9,7 @@ import pytest
 from rich.console import Console
 from rich.table import Table
 
-from q2r2_control.cli.figure_table import figure_table, record_table, short_figure
+from q2r2_control.cli.output import figure_table, record_table, short_figure
 
 LINK = "left_arm_left_gripper_left_finger_joint_with_a_long_name_indeed"
 

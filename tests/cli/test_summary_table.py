@@ -13,7 +13,7 @@ from q2r2_control.cli.summary_table import recording_line, summary_table, task_l
 from q2r2_control.demo.assembly_tasks import TaskResult
 from q2r2_control.events import Event, Reason, ReasonKind
 from q2r2_control.recording.recorder import RecordingSummary
-from q2r2_control.summary.histogram import Percentiles
+from q2r2_control.summary.run_summary import Percentiles
 from q2r2_control.wording import sentence
 from tests.support.hands_input import HandsInput
 from tests.support.watch import cell

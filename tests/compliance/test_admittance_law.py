@@ -4,7 +4,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from q2r2_control.compliance.admittance_law import estimate_wrench, oscillate
+from q2r2_control.compliance.admittance import estimate_wrench, oscillate
 from q2r2_control.control.tasks.frame import ROTATION_LENGTH
 from q2r2_control.types import Array
 from tests.control.cells import cell, random_posture

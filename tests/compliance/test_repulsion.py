@@ -13,7 +13,7 @@ from q2r2_control.compliance.repulsion import MeasuredSeparation, WallReport
 from q2r2_control.config.cell import load_config
 from q2r2_control.config.control import ControllerSettings, WallSettings
 from q2r2_control.plants.mujoco import MujocoPlant
-from q2r2_control.robot.finger_openings import collision_model_at
+from q2r2_control.robot.finger_bodies import collision_model_at
 from q2r2_control.robot.kept_distances import kept_distances
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, Command, CommandMode

@@ -11,8 +11,8 @@ import pytest
 import yaml
 from pydantic import BaseModel
 
-from q2r2_control.config.cameras import CameraConfig
 from q2r2_control.config.cell import Config, load_config
+from q2r2_control.config.recording import CameraConfig
 from q2r2_control.robot.kept_distances import kept_distances
 from q2r2_control.robot.robot import Robot
 from tests.config.cell_files import CELL, SHIPPED, changed

@@ -36,7 +36,7 @@ def sources(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     [
         "control/geometry/closest_points.py",
         "control/safety/stop_certificate.py",
-        "control/kernel_data.py",
+        "control/kernel_model.py",
         "control/jit.py",
         "compliance/impedance_law.py",
     ],

@@ -7,7 +7,7 @@ import pytest
 
 from q2r2_control import CartesianController, Robot
 from q2r2_control.errors import RobotError
-from q2r2_control.robot.finger_openings import collision_model_at
+from q2r2_control.robot.finger_bodies import collision_model_at
 from q2r2_control.robot.kept_distances import kept_distances
 from q2r2_control.types import ALL_OF_THE_WAY, Array
 from tests.support.block_cell import ABOVE, BESIDE, CELL, SETTINGS, at

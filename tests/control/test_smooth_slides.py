@@ -7,7 +7,7 @@ import pinocchio as pin
 import pytest
 
 from q2r2_control import CartesianController, Robot, load_config
-from q2r2_control.benchmark.motion_measures import JOLT, count_jolts
+from q2r2_control.benchmark.motion_run import JOLT, count_jolts
 from q2r2_control.types import Array
 from q2r2_control.verification.contract import Contract
 

@@ -8,7 +8,7 @@ import pytest
 
 from q2r2_control import CartesianController, Robot
 from q2r2_control.config.cell import Config
-from q2r2_control.robot.finger_openings import collision_model_at
+from q2r2_control.robot.finger_bodies import collision_model_at
 from q2r2_control.robot.kept_distances import kept_distances
 from q2r2_control.robot.turning_fingers import TurningBody
 from q2r2_control.types import ALL_OF_THE_WAY, Interval

@@ -10,10 +10,9 @@ import pinocchio as pin
 import pytest
 
 from q2r2_control import CartesianController, Robot, load_config
-from q2r2_control.control.kernel_data import KernelData
-from q2r2_control.control.kernel_model import kernel_model_of
+from q2r2_control.control.kernel_model import KernelData, kernel_model_of
 from q2r2_control.control.qp import DaqpSolver, QpProblem, QpSolution, SkipIfUnconstrained
-from q2r2_control.control.unconstrained import find_minimum
+from q2r2_control.control.qp_assembly import find_minimum
 from q2r2_control.types import Array
 
 CONFIG = load_config("config/dual_iiwa7.yaml")

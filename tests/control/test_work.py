@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from q2r2_control import CartesianController, Robot, load_config
-from q2r2_control.benchmark.motion_run import MotionFigures, run_motion
-from q2r2_control.benchmark.own_controller import OwnController, without_pairs
+from q2r2_control.benchmark.motion_run import MotionFigures, OwnController, run_motion, without_pairs
 from q2r2_control.benchmark.work_motions import WORK_MOTIONS, WorkMotion
 from q2r2_control.verification.contract import Contract
 

@@ -7,8 +7,7 @@ from collections.abc import Iterable
 
 import pytest
 
-from q2r2_control.demo.part_judges import HandoverJudge, Judge, LiftJudge, StackJudge
-from q2r2_control.demo.touch_watch import FINGERS, PartState, Toucher
+from q2r2_control.demo.part_judges import FINGERS, HandoverJudge, Judge, LiftJudge, PartState, StackJudge, Toucher
 
 DT = 0.1
 LEFT, RIGHT, TABLE = Toucher.LEFT_FINGER, Toucher.RIGHT_FINGER, Toucher.SURROUNDINGS

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from q2r2_control import Pipeline
-from q2r2_control.drives.position import FEEDBACK_GAIN, VelocityDrive
+from q2r2_control.drives.base import FEEDBACK_GAIN, VelocityDrive
 from q2r2_control.inputs.scripted import ScriptedInput
 from q2r2_control.types import CommandMode, Reference, RobotState, StepReport, StepStatus
 from tests.support.watch import Watch, cell

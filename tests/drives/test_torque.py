@@ -9,7 +9,7 @@ import pinocchio as pin
 import pytest
 
 from q2r2_control import CartesianController, Robot, load_config
-from q2r2_control.drives.torque import TorqueDrive
+from q2r2_control.drives.base import TorqueDrive
 from q2r2_control.robot.kept_distances import kept_distances
 from q2r2_control.types import CommandMode, Reference, RobotState
 

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image
 
-from q2r2_control.config.cameras import CameraConfig
+from q2r2_control.config.recording import CameraConfig
 from q2r2_control.recording.about import About, Conclusion, as_yaml
 from q2r2_control.recording.bag import BagWriter
 from q2r2_control.recording.messages import ARRAY, Message, float_array, picture, serialized

@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 
-from q2r2_control.inputs.played import PlayedInput
-from q2r2_control.inputs.sampling import EvenSampling
+from q2r2_control.inputs.played import EvenSampling, PlayedInput
 from q2r2_control.summary.tick import Tick
 from q2r2_control.types import SIDES, HandInputs
 from tests.recording.runs import file_of, pipeline, record

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from q2r2_control.config.cameras import CameraConfig
+from q2r2_control.config.recording import CameraConfig
 from q2r2_control.errors import ConfigError
 from q2r2_control.export.episodes import FrameSampling, make_episode
 from tests.export.runs import Run, record_step

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from q2r2_control.errors import ConfigError
-from q2r2_control.export.output import Output
+from q2r2_control.export.kept_episodes import Output
 
 
 def test_an_output_that_was_interrupted_is_not_there_and_a_second_try_is_whole(tmp_path: Path) -> None:

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from q2r2_control.config.cameras import CameraConfig
+from q2r2_control.config.recording import CameraConfig
 from q2r2_control.errors import RecordingError
-from q2r2_control.export.pictures import CameraFrames
+from q2r2_control.export.sampling import CameraFrames
 from q2r2_control.recording.reader import Recording
 from tests.export.files import EPOCH, brightness, write_recording
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from q2r2_control.export.episodes import EpisodeVectors
-from q2r2_control.export.pictures import Pixels
+from q2r2_control.export.sampling import Pixels
 
 NAMES = {"observation.state": ("left_A1", "left_gripper"), "action": ("left_A1", "left_gripper", "right_A1")}
 OUTCOMES = {1: True, 2: None, 3: False}

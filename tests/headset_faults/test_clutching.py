@@ -9,7 +9,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from q2r2_control.teleop.steady_state_offset import MAX_OFFSET
+from q2r2_control.teleop.hand_motion import MAX_OFFSET
 from q2r2_control.types import SIDES, CommandMode
 from tests.support.headset_in_step import InStepRun, Operator
 

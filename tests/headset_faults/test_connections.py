@@ -8,7 +8,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from q2r2_control.config.timeouts import STREAM_TIMEOUT
+from q2r2_control.config.strict import STREAM_TIMEOUT
 from q2r2_control.types import SIDES, Array
 from tests.support.fake_headset import KEEPALIVE, FakeHeadset
 from tests.support.headset_in_step import PERIOD, InStepRun, Operator

@@ -8,7 +8,7 @@ from ipaddress import ip_network
 
 import pytest
 
-from q2r2_control.config.timeouts import STREAM_TIMEOUT
+from q2r2_control.config.strict import STREAM_TIMEOUT
 from q2r2_control.inputs.admission import (
     POSES_ALLOWED,
     QUIET_ALLOWED,

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from q2r2_control.config.networks import Network
+from q2r2_control.config.strict import Network
 from q2r2_control.inputs import connections
 from q2r2_control.inputs.headset import HeadsetServer
 from q2r2_control.inputs.session import HeadsetSession

@@ -12,7 +12,7 @@ from q2r2_control.config.cell import Config, load_config
 from q2r2_control.config.teleop import Stance
 from q2r2_control.inputs.headset import HeadsetServer
 from q2r2_control.inputs.headset_check import HandMovement, HeadsetCheck, advice, needed_topics, watch_headset
-from q2r2_control.inputs.statistics import HeadsetStatistics
+from q2r2_control.inputs.session import HeadsetStatistics
 from q2r2_control.types import HandSample
 from tests.support.fake_headset import FakeHeadset
 from tests.support.headset_server import IDENTITY

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 
-from q2r2_control.inputs.rate_limits import MAX_HOSTS_NAMED, HostLog, RateLimit
+from q2r2_control.inputs.listener import MAX_HOSTS_NAMED, HostLog, RateLimit
 
 INFO, WARNING = logging.INFO, logging.WARNING
 

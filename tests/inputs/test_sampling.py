@@ -9,7 +9,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from q2r2_control.inputs.sampling import EvenSampling, HeadsetSampling, SampleTiming
+from q2r2_control.inputs.played import EvenSampling, HeadsetSampling, SampleTiming
 from q2r2_control.types import Array
 
 HAND = pin.SE3(pin.exp3(np.array([0.3, -0.2, 0.9])), np.array([0.4, 0.2, 1.1]))

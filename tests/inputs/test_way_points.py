@@ -6,7 +6,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from q2r2_control.inputs.way_points import WayPoints, minimum_jerk
+from q2r2_control.inputs.assembly import WayPoints, minimum_jerk
 
 WAY = WayPoints([(1.0, 0.0, 0.0, 0.0, 0.0, 0.0), (2.0, 0.1, 0.0, 0.2, 0.0, 0.0), (4.0, 0.1, -0.3, 0.2, 0.4, 1.2)])
 

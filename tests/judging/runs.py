@@ -10,8 +10,7 @@ import numpy as np
 import pinocchio as pin
 
 from q2r2_control.config.teleop import TeleopSettings
-from q2r2_control.inputs.played import PlayedInput
-from q2r2_control.inputs.sampling import HeadsetSampling, SampleTiming
+from q2r2_control.inputs.played import HeadsetSampling, PlayedInput, SampleTiming
 from q2r2_control.inputs.scripted import HANDS_AT_REST
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.recording.about import About

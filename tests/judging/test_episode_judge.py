@@ -12,9 +12,8 @@ import pytest
 
 from q2r2_control.events import Event, Reason
 from q2r2_control.events import ReasonKind as K
-from q2r2_control.judging.episode_judge import EpisodeJudge
+from q2r2_control.judging.episode_judge import EpisodeJudge, Question, written_episode
 from q2r2_control.judging.judge import judge
-from q2r2_control.judging.judge_work import Question, written_episode
 from q2r2_control.recording.about import About
 from q2r2_control.recording.reader import Recording
 from q2r2_control.recording.recorder import Recorder

@@ -10,10 +10,8 @@ import pytest
 
 from q2r2_control.config.teleop import Stance
 from q2r2_control.events import Event, Reason, ReasonKind
-from q2r2_control.judging.delay import delays
-from q2r2_control.judging.figures import figures_of, timing_figures
-from q2r2_control.judging.hands import hand_figures
-from q2r2_control.judging.motion import arm_figures, idle_share
+from q2r2_control.judging.figures import figures_of, hand_figures, timing_figures
+from q2r2_control.judging.motion import arm_figures, delays, idle_share
 from q2r2_control.types import Array
 from q2r2_control.wording import sentence
 from tests.judging.episodes import DT, episode, frame_times

@@ -11,7 +11,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from q2r2_control.config.judge import JudgeSettings
+from q2r2_control.config.recording import JudgeSettings
 from q2r2_control.errors import RecordingError
 from q2r2_control.inputs.base import Input
 from q2r2_control.judging.judge import VERDICT_FILE, Judged, judge, judge_all, keep_verdicts

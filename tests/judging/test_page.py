@@ -10,7 +10,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from q2r2_control.config.judge import JudgeSettings
+from q2r2_control.config.recording import JudgeSettings
 from q2r2_control.judging.episode import Episode
 from q2r2_control.judging.figures import figures_of
 from q2r2_control.judging.judge import Judged

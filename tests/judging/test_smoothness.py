@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from q2r2_control.inputs.way_points import minimum_jerk
-from q2r2_control.judging.smoothness import ldlj, smoothness
+from q2r2_control.inputs.assembly import minimum_jerk
+from q2r2_control.judging.motion import ldlj, smoothness
 from q2r2_control.types import Array
 
 DT = 0.01

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from q2r2_control.config.judge import JudgeSettings
+from q2r2_control.config.recording import JudgeSettings
 from q2r2_control.judging.figures import EpisodeFigures, Fault, figures_of
 from q2r2_control.judging.verdict import verdict_of
 from tests.judging.episodes import episode

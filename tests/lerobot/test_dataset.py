@@ -21,7 +21,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from q2r2_control.export.episodes import EpisodeVectors
 from q2r2_control.export.lerobot import SOURCES, join_shards, video_key, write_shard
-from q2r2_control.export.pictures import Pixels
+from q2r2_control.export.sampling import Pixels
 from tests.export.runs import contents
 from tests.export.vectors import CAMERA, EPISODES, HEIGHT, NAMES, WIDTH, with_pictures
 

@@ -7,7 +7,7 @@ import pinocchio as pin
 import pytest
 
 from q2r2_control.control.controller import CartesianController
-from q2r2_control.drives.factory import make_drive
+from q2r2_control.drives.base import make_drive
 from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.loop.control_loop import ControlLoop, LoopStep, without_proof
 from q2r2_control.robot.robot import Robot

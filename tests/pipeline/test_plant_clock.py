@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from q2r2_control.pipeline.plant_clock import PlantClock
+from q2r2_control.pipeline.loop_clock import PlantClock
 from q2r2_control.types import RobotState
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from q2r2_control.benchmark.motion_measures import rest_acceleration
+from q2r2_control.benchmark.motion_run import rest_acceleration
 from q2r2_control.benchmark.work_motions import ARMS, WORK_MOTIONS, WorkMotion, carry
 from q2r2_control.config.cell import Config, load_config
 from q2r2_control.pipeline.pipeline import Pipeline

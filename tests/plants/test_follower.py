@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from q2r2_control.plants.follower import JointFollower
+from q2r2_control.plants.simulated_cell import JointFollower
 
 LIMIT, ACCELERATION = np.array([1.5, 2.0]), np.array([10.0, 4.0])
 JOINTS, DT = np.array([0, 1]), 0.001

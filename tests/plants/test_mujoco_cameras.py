@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from q2r2_control.config.cameras import CameraConfig
+from q2r2_control.config.recording import CameraConfig
 from q2r2_control.errors import PlantError
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.robot.robot import Robot

@@ -7,7 +7,7 @@ import numpy as np
 
 from q2r2_control.config.cell import Config
 from q2r2_control.plants.mujoco import MujocoPlant
-from q2r2_control.plants.mujoco_obstacles import let_fingers_slide, set_obstacles
+from q2r2_control.plants.scene import let_fingers_slide, set_obstacles
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 

@@ -8,7 +8,7 @@ import sys
 # Sends a signal at every line that the first signal's handler runs, so each of them is interrupted by another handler.
 SCRIPT = """
 import os, signal, sys
-from q2r2_control.process.signals import StopRequest
+from q2r2_control.process.scheduling import StopRequest
 stop, sent = StopRequest(), []
 def trace(frame, event, arg):
     if event == "line" and len(sent) < 20:

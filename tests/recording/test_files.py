@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from q2r2_control.errors import RecordingError
-from q2r2_control.recording.files import recordings_in
+from q2r2_control.recording.reader import recordings_in
 
 
 def test_folders_are_searched_by_name_and_nothing_is_taken_twice(tmp_path: Path) -> None:

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 import yaml
 
-from q2r2_control.config.cameras import CameraConfig
 from q2r2_control.config.cell import parse_config
-from q2r2_control.config.timeouts import STREAM_TIMEOUT
+from q2r2_control.config.recording import CameraConfig
+from q2r2_control.config.strict import STREAM_TIMEOUT
 from q2r2_control.errors import RecordingError
 from q2r2_control.events import ReasonKind as K
 from q2r2_control.export.episodes import FrameSampling, make_episode

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from q2r2_control.cli.pair_files import PairsWritten, write_pairs
+from q2r2_control.cli.check import PairsWritten, write_pairs
 from q2r2_control.config.cell import Config, load_config
 from q2r2_control.errors import ConfigError
 from q2r2_control.robot.pairs import link_of

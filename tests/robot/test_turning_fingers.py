@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from q2r2_control.control.geometry.collision import collision_model_of
 from q2r2_control.control.geometry.finger_openings import FingerOpenings
-from q2r2_control.robot.finger_openings import collision_model_at
+from q2r2_control.robot.finger_bodies import collision_model_at
 from q2r2_control.robot.robot import Robot
 from q2r2_control.robot.turning_fingers import (
     Capsules,

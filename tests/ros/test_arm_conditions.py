@@ -18,7 +18,7 @@ from tests.ros.waiting import wait_until
 
 need_ros()
 
-from q2r2_control.ros.bridge.arm_conditions import ConditionPublishers, listen_to_condition
+from q2r2_control.ros.bridge.arm_feedback import ConditionPublishers, listen_to_condition
 from q2r2_control.teleop.haptics import ArmCondition
 
 PUSH = np.array([0.0, 0.0, 20.0])  # at the left tool [N]

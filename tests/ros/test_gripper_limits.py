@@ -24,8 +24,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
 from q2r2_control.ros.base_node import LATCHED_QOS, STREAM_QOS
-from q2r2_control.ros.bridge.gripper_client import GripperClient
-from q2r2_control.ros.bridge.opening_grants import OpeningGrants
+from q2r2_control.ros.bridge.gripper_client import GripperClient, OpeningGrants
 from tests.ros.cell import PATIENT, STILL, Cell, Stream, changed_cell, start_controller, start_robot
 from tests.ros.waiting import wait_until
 

@@ -19,8 +19,7 @@ from rclpy.action import ActionServer, GoalResponse
 from std_msgs.msg import Float64MultiArray
 
 from q2r2_control.ros.base_node import LATCHED_QOS
-from q2r2_control.ros.bridge.gripper_client import GripperClient
-from q2r2_control.ros.bridge.opening_grants import OpeningGrants
+from q2r2_control.ros.bridge.gripper_client import GripperClient, OpeningGrants
 from tests.ros.waiting import wait_until
 
 _CLOSED = 0.05  # [m]

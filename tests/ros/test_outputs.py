@@ -20,12 +20,19 @@ from std_msgs.msg import Float64MultiArray
 from trajectory_msgs.msg import JointTrajectory
 
 from q2r2_control import Robot, load_config
-from q2r2_control.drives.factory import make_drive
+from q2r2_control.drives.base import make_drive
 from q2r2_control.errors import ConfigError
 from q2r2_control.ros.base_node import COMMAND_QOS, BaseNode
-from q2r2_control.ros.bridge import joint_messages
-from q2r2_control.ros.bridge.joint_messages import LbrPosition, LbrTorque, PositionArray, TorqueArray
-from q2r2_control.ros.bridge.joint_outputs import Channel, JointOutput, make_output
+from q2r2_control.ros.bridge import joint_outputs
+from q2r2_control.ros.bridge.joint_outputs import (
+    Channel,
+    JointOutput,
+    LbrPosition,
+    LbrTorque,
+    PositionArray,
+    TorqueArray,
+    make_output,
+)
 from q2r2_control.ros.monitoring.endpoints import WatchedPublisher
 from q2r2_control.types import Command, CommandMode, RobotState
 
@@ -112,7 +119,7 @@ def test_torques_for_an_lbr_are_without_gravity_and_come_with_its_measured_posit
 ) -> None:
     with pytest.raises(ConfigError, match="lbr_fri_idl cannot be imported"):
         LbrTorque(0.004, robot)
-    monkeypatch.setattr(joint_messages, "_lbr_message", lambda name: SimpleNamespace)
+    monkeypatch.setattr(joint_outputs, "_lbr_message", lambda name: SimpleNamespace)
     q, zero = robot.home + 0.1, np.zeros_like(robot.home)
     gravity = pin.computeGeneralizedGravity(robot.model, robot.model.createData(), q)
     command = Command(CommandMode.TORQUE, robot.home, zero, gravity + 1.0, {})

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from q2r2_control.summary.histogram import NOTHING_MEASURED, Histogram
+from q2r2_control.summary.run_summary import NOTHING_MEASURED, Histogram
 
 
 @pytest.mark.parametrize("size", [1, 2, 99, 5000])

@@ -10,7 +10,7 @@ import pytest
 
 from q2r2_control.compliance.impedance import ImpedanceReport
 from q2r2_control.compliance.repulsion import WallReport
-from q2r2_control.summary.torque_summary import TorqueSummary
+from q2r2_control.summary.run_summary import TorqueSummary
 
 QUIET = ImpedanceReport({}, (), (), (), (), False)
 FREE = WallReport(np.zeros(14), (), 0.0, 0.0, ("left_a", "right_b"), 0.2)

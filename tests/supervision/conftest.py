@@ -6,7 +6,7 @@ import pytest
 
 from q2r2_control import CartesianController, ControllerSettings, Robot, load_config
 from q2r2_control.config.cell import Config
-from q2r2_control.config.supervision import SupervisionSettings
+from q2r2_control.config.control import SupervisionSettings
 from q2r2_control.supervision.joint_watch import watch_settings
 
 # A state that is not finite is a fault at once.

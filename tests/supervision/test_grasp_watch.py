@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from q2r2_control import CartesianController, Robot
-from q2r2_control.supervision.grasp_watch import GraspWatch, Grip
+from q2r2_control.supervision.gripper_limiter import GraspWatch, Grip
 from tests.supervision.conftest import unhurried
 from tests.support.object_cell import BLOCK, cell
 

@@ -8,7 +8,7 @@ import pytest
 from q2r2_control import CartesianController, Robot, load_config
 from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.robot.kept_distances import kept_distances
-from q2r2_control.supervision.joint_homing import JointHoming
+from q2r2_control.supervision.homing import JointHoming
 from q2r2_control.supervision.supervisor import Supervisor
 from q2r2_control.supervision.target_stream import StreamSettings
 from q2r2_control.types import Array, Reference, RobotState

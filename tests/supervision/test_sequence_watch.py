@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from q2r2_control.config.timeouts import STREAM_TIMEOUT
-from q2r2_control.supervision.sequence_watch import SequenceWatch
+from q2r2_control.config.strict import STREAM_TIMEOUT
+from q2r2_control.supervision.message_watch import SequenceWatch
 
 PERIOD = 0.01  # [s]
 

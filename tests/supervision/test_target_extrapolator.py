@@ -9,8 +9,8 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from q2r2_control.supervision.target_extrapolator import TargetExtrapolator
-from q2r2_control.supervision.tick_clock import TickClock
+from q2r2_control.supervision.target_stream import TargetExtrapolator
+from q2r2_control.supervision.tick_pacer import TickClock
 
 SENDER, LOOP = 0.005, 0.004  # periods [s]
 SPEED, RADIUS = 0.3, 0.1  # [m/s], [m]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from q2r2_control.supervision.tick_clock import TickClock
+from q2r2_control.supervision.tick_pacer import TickClock
 
 PERIOD = 0.004
 

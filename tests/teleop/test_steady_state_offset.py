@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pinocchio as pin
 
-from q2r2_control.teleop.steady_state_offset import MAX_OFFSET
+from q2r2_control.teleop.hand_motion import MAX_OFFSET
 from q2r2_control.types import SIDES, Array
 from tests.teleop.hands import Operator, engaged, operator, squeezing, waving
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from q2r2_control.config.teleop import WorkspaceSettings
 from q2r2_control.quaternions import IDENTITY
-from q2r2_control.teleop.workspace import Workspace
+from q2r2_control.teleop.leash import Workspace
 from q2r2_control.types import SIDES
 from tests.teleop.hands import ENGAGED, TICK, Operator, assert_smooth, operator
 

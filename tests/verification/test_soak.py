@@ -18,8 +18,7 @@ from q2r2_control.errors import ConfigError
 from q2r2_control.robot.kept_distances import kept_distances
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Reference
-from q2r2_control.verification.contact_cells import FINGERS, with_contact
-from q2r2_control.verification.fault_injection import FaultySolver
+from q2r2_control.verification.fault_injection import FINGERS, FaultySolver, with_contact
 from q2r2_control.verification.soak import Soak, SoakReport, run_soak
 from tests.support.object_cell import cell
 

@@ -11,7 +11,7 @@ from q2r2_control.events import Event, Reason, ReasonKind
 from q2r2_control.robot.robot import Robot
 from q2r2_control.summary.tick import Tick
 from q2r2_control.types import ActiveLimit, ArmTarget, LimitKind
-from q2r2_control.viewer.arm_words import next_press, why
+from q2r2_control.viewer.live import next_press, why
 from q2r2_control.wording import SENTENCES
 from tests.viewer.ticks import tick_at
 

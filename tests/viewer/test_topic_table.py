@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from q2r2_control.inputs.messages import HandPose, HandTwist
-from q2r2_control.inputs.statistics import TopicStatistics
+from q2r2_control.inputs.session import TopicStatistics
 from q2r2_control.types import HandInputs
-from q2r2_control.viewer.topic_table import short_text, topic_line, topic_table
+from q2r2_control.viewer.headset_table import short_text, topic_line, topic_table
 from tests.cli.test_figure_table import printed
 
 POSE = HandPose(np.array([0.1, -0.001, 2.0]), np.array([0.0, 0.0, 0.0, -1.0]), 0.0, "")

@@ -18,7 +18,7 @@ import numpy as np
 from q2r2_control.control.geometry.collision import CollisionBodies, turning_bodies
 from q2r2_control.control.geometry.kinematics import IntArray
 from q2r2_control.errors import RobotError
-from q2r2_control.robot.finger_openings import FingerBody, part_of_segment
+from q2r2_control.robot.finger_bodies import FingerBody, part_of_segment
 from q2r2_control.robot.robot import Robot
 from q2r2_control.robot.turning_fingers import Capsules, TurningBody, TurningSweeps, sticks_out
 from q2r2_control.types import ALL_OF_THE_WAY, Interval

@@ -8,10 +8,34 @@ import numpy as np
 
 from q2r2_control.control.geometry.collision import CollisionData, CollisionModel, Contact
 from q2r2_control.control.geometry.kinematics import IntArray, Placements
-from q2r2_control.control.safety.joint_limits import VelocityBox
-from q2r2_control.control.safety.safety_model import SafetyModel
+from q2r2_control.control.safety.joint_limits import JointLimits, VelocityBox
 from q2r2_control.control.safety.velocity_bounds import BodyVelocities
 from q2r2_control.types import Array
+
+# A pair that is closer than its distance by less than this is not too close: a difference of distances has no more
+# digits. Its proof then is that it comes no closer than it is, see stop_certificate.py.
+ROUNDING = 1e-9  # [m]
+
+
+class Approach(NamedTuple):
+    """How pairs may approach each other in the QP."""
+
+    stop_distance: Array  # (p,) min_distance + buffer [m]
+    gain: Array  # (1,), which may change between ticks, see separation_rows.py [1/s]
+    contact_speed: Array  # (p,) of pairs that may touch, in the contact zone [m/s]; of the others infinite
+    contact_zone: Array  # (p,) free distance from which on that holds [m]; of the others 0
+    recovery_speed: float  # [m/s]
+
+
+class SafetyModel(NamedTuple):
+    """What does not change in a tick; between ticks bodies of fingers, kept distances and the rows' gain may."""
+
+    collision: CollisionModel
+    limits: JointLimits
+    approach: Approach
+    min_distance: Array  # (p,) of every pair [m]; minus infinity: it does not count now
+    arm: IntArray  # (nv,) number of the arm that a joint belongs to; joints of none share the last number
+
 
 _DEEPEST = 6  # halvings of the stop: 64 intervals
 INSTANTS = (0, 20, 64)  # of 64, where a row looks at the stop: the start, half of the way, and the end
@@ -159,3 +183,15 @@ class SafetyData(NamedTuple):
             active=ActiveBounds.empty(pairs, nv),
             unproven=np.zeros(1, dtype=np.int64),
         )
+
+
+def provable_distances(model: SafetyModel, data: SafetyData) -> Array:
+    """d - S of every pair (p,) [m]: the stop that is at hand brings it no closer than that (stop_certificate.py).
+
+    Needs the distances at the reference as it is. A pair may be asked to keep as much from now on: then the stop at
+    hand is proven with that, as if it had always been so.
+    """
+    pairs, state = model.collision.pairs, data.state
+    travel = 0.5 * state.v**2 / data.certified
+    way = (pairs.reach * travel[pairs.joint - 1]).sum(axis=1)  # reach is 0 where there is no joint
+    return np.asarray(data.distance - way)

@@ -43,8 +43,7 @@ from q2r2_control.control.geometry.closest_points import segment_segment
 from q2r2_control.control.geometry.collision import CollisionData
 from q2r2_control.control.geometry.pair_distance import distance_row, measure, measure_part
 from q2r2_control.control.jit import inlined_kernel, kernel
-from q2r2_control.control.safety.safety_data import INSTANTS, SafetyData
-from q2r2_control.control.safety.safety_model import SafetyModel
+from q2r2_control.control.safety.safety_data import INSTANTS, SafetyData, SafetyModel
 from q2r2_control.control.safety.separating_plane import curvature
 from q2r2_control.control.safety.stop_rollout import begin_rollout, sample_of
 from q2r2_control.control.safety.velocity_bounds import BodyVelocities

@@ -32,8 +32,7 @@ than how fast the bodies close in. So pairs that share a joint are left to the o
 from __future__ import annotations
 
 from q2r2_control.control.jit import inlined_kernel, kernel
-from q2r2_control.control.safety.safety_data import SafetyData
-from q2r2_control.control.safety.safety_model import SafetyModel
+from q2r2_control.control.safety.safety_data import SafetyData, SafetyModel
 from q2r2_control.control.safety.velocity_bounds import fastest_approach
 from q2r2_control.types import Array
 

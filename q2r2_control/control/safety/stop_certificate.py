@@ -22,8 +22,7 @@ import numpy as np
 
 from q2r2_control.control.geometry.pair_distance import distance_row, measure
 from q2r2_control.control.jit import inlined_kernel, kernel
-from q2r2_control.control.safety.safety_data import SafetyData
-from q2r2_control.control.safety.safety_model import ROUNDING, SafetyModel
+from q2r2_control.control.safety.safety_data import ROUNDING, SafetyData, SafetyModel
 from q2r2_control.control.safety.separating_plane import stay_beyond, stays_beyond
 from q2r2_control.control.safety.speed_bound import least_distance, way, write_deviations
 from q2r2_control.control.safety.stop_rollout import begin_rollout, sample_of, write_piece

@@ -8,10 +8,57 @@ from __future__ import annotations
 from q2r2_control.control.geometry.collision import BodyPlacements, CollisionData, update_placements
 from q2r2_control.control.geometry.kinematics import Placements
 from q2r2_control.control.jit import inlined_kernel, kernel
-from q2r2_control.control.safety.safety_data import QuadraticPiece, SafetyData
-from q2r2_control.control.safety.safety_model import SafetyModel
-from q2r2_control.control.safety.stop_shapes import brake
+from q2r2_control.control.safety.joint_limits import JointLimits
+from q2r2_control.control.safety.safety_data import QuadraticPiece, SafetyData, SafetyModel
 from q2r2_control.types import Array
+
+TOGETHER, ARM_BY_ARM, OWN = 0, 1, 2
+SHAPES = 3
+
+
+@kernel
+def write_stop(model: SafetyModel, q: Array, v: Array, shape: int, deceleration: Array) -> None:
+    """Write the ``deceleration`` of a stop of the given shape from ``q`` [rad], ``v`` [rad/s], (nv,) each [rad/s^2]."""
+    a = model.limits.acceleration
+    for j in range(v.shape[0]):
+        deceleration[j] = a[j]
+    if shape == OWN:
+        return
+    for j in range(v.shape[0]):
+        leader = j
+        for i in range(v.shape[0]):
+            same = shape == TOGETHER or model.arm[i] == model.arm[j]
+            if same and abs(v[i]) * a[leader] > abs(v[leader]) * a[i]:
+                leader = i
+        speed = abs(v[j])
+        if leader == j or speed == 0.0:
+            continue
+        shared = speed * a[leader] / abs(v[leader])
+        deceleration[j] = min(max(shared, _least_deceleration(model.limits, j, q[j], v[j])), a[j])
+
+
+@kernel
+def _least_deceleration(limits: JointLimits, j: int, q: float, v: float) -> float:
+    """Least constant deceleration of joint ``j`` that keeps P until it rests; its limit where none does."""
+    room = (limits.upper[j] - q if v > 0.0 else q - limits.lower[j]) - limits.longest_step * abs(v)
+    if room <= 0.0:
+        return limits.acceleration[j]
+    return min(0.5 * v * v / room, limits.acceleration[j])
+
+
+@kernel
+def brake(q: Array, v: Array, deceleration: Array, t: float, q_out: Array, v_out: Array) -> None:
+    """State of the stop after ``t`` seconds, from (q, v) with decelerations > 0, (nv,) each."""
+    for j in range(q.shape[0]):
+        speed = abs(v[j])
+        sign = 1.0 if v[j] >= 0.0 else -1.0
+        if speed <= deceleration[j] * t:
+            q_out[j] = q[j] + sign * speed * speed / (2.0 * deceleration[j])
+            v_out[j] = 0.0
+        else:
+            q_out[j] = q[j] + v[j] * t - sign * 0.5 * deceleration[j] * t * t
+            v_out[j] = v[j] - sign * deceleration[j] * t
+
 
 # A joint that rests this much before the end of a piece of time counts as moving until then [s]; far more than
 # rounding, and the way that is counted wrong is d t^2 / 2, 1e-17 rad.

@@ -18,8 +18,7 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 
 if TYPE_CHECKING:  # these are made of what this module defines
-    from q2r2_control.control.tasks.task_data import TaskData, TaskTargets
-    from q2r2_control.control.tasks.task_model import TaskModel
+    from q2r2_control.control.tasks.task_data import TaskData, TaskModel, TaskTargets
 
 # A held arm is not pushed about by the other one's task, but may give way to recover separation.
 _HOLD_WEIGHT = 300.0

@@ -6,9 +6,70 @@ from typing import NamedTuple
 
 import numpy as np
 
-from q2r2_control.control.geometry.kinematics import IntArray, Placements
-from q2r2_control.control.tasks.task_model import TaskModel
+from q2r2_control.config.control import EQUAL, ControllerSettings
+from q2r2_control.control.geometry.kinematics import Chain, IntArray, Placements
+from q2r2_control.control.tasks.frame import Motion, Tools, motion_of, tools_of
+from q2r2_control.control.tasks.posture import Posture, posture_of
+from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
+
+
+class Priority(NamedTuple):
+    """Which arm gives way where two arms are in each other's way.
+
+    Arms meet in the QP only where separation rows couple their joints. There the costs decide: all costs of an arm that
+    gives way are multiplied by a small weight, so that a row that both arms need is paid for by its motion. Where no
+    row is active nothing changes, since the least of a sum of independent costs does not depend on their weights; that
+    is why posture and damping are scaled along with the tool's task.
+
+    An arm without a target holds its joints, and holding is never given up: it does not give way. The weights may
+    change between ticks.
+    """
+
+    weight: Array  # (n,) of an arm's costs while it follows a target: 1, less if it gives way
+    posture_weight: Array  # (nv,) the same for each joint, times the posture's own weight
+
+
+def priority_of(robot: Robot, settings: ControllerSettings) -> Priority:
+    """The weights of the arms' costs; ``settings.priority`` names an arm, or none."""
+    n, nv = len(robot.arms), robot.model.nv
+    priority = Priority(np.ones(n), np.full(nv, settings.posture_weight))
+    if settings.priority == EQUAL:
+        return priority
+    first = robot.arms[settings.priority].joints
+    for i, (name, arm) in enumerate(robot.arms.items()):
+        if name == settings.priority:
+            continue
+        priority.weight[i] = settings.yield_weight
+        # A joint that also moves the arm with priority keeps its full cost.
+        priority.posture_weight[np.setdiff1d(arm.joints, first)] = settings.yield_weight * settings.posture_weight
+    return priority
+
+
+class TaskModel(NamedTuple):
+    """What does not change in a tick, and between ticks but for gains and weights."""
+
+    chain: Chain
+    tools: Tools
+    motion: Motion
+    posture: Posture
+    priority: Priority
+
+    @property
+    def live(self) -> tuple[Array, ...]:
+        """Gains, speeds and weights, which may change between ticks: whatever is held, kernels read these arrays."""
+        return (*self.motion, self.posture.gain, *self.priority)
+
+
+def task_model_of(robot: Robot, settings: ControllerSettings, chain: Chain) -> TaskModel:
+    """The models of all tasks."""
+    return TaskModel(
+        chain=chain,
+        tools=tools_of(robot),
+        motion=motion_of(settings),
+        posture=posture_of(robot, settings),
+        priority=priority_of(robot, settings),
+    )
 
 
 class PoseScratch(NamedTuple):

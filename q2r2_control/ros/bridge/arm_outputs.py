@@ -20,7 +20,7 @@ from q2r2_control.ros.bridge.frames import PoseTopic
 from q2r2_control.ros.bridge.parameters import ArmParameters
 from q2r2_control.ros.bridge.target_output import TargetOutput, near
 from q2r2_control.teleop.arm_states import ArmState
-from q2r2_control.teleop.steady_state_offset import MAX_OFFSET
+from q2r2_control.teleop.hand_motion import MAX_OFFSET
 
 _POSE = 2  # of moveit_msgs/srv/ServoCommandType
 # What the built-in controller says of an arm that takes a stream of targets, and what helps where it takes none.

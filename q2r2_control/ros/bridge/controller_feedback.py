@@ -13,7 +13,7 @@ from q2r2_control.control.controller import CartesianController
 from q2r2_control.loop.arm_conditions import ArmConditions
 from q2r2_control.robot.compose import WORLD
 from q2r2_control.ros.base_node import LATCHED_QOS, SENT_COMMAND_QOS, BaseNode
-from q2r2_control.ros.bridge.arm_conditions import ConditionPublishers
+from q2r2_control.ros.bridge.arm_feedback import ConditionPublishers
 from q2r2_control.ros.bridge.intakes import TargetIntake
 from q2r2_control.ros.bridge.messages import stamped_pose, time_message
 from q2r2_control.ros.bridge.reports import TickReport

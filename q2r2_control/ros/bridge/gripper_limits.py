@@ -18,11 +18,11 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
 from q2r2_control.config.cell import Config
-from q2r2_control.config.timeouts import STREAM_TIMEOUT
+from q2r2_control.config.strict import STREAM_TIMEOUT
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.loop.control_loop import ControlLoop
 from q2r2_control.ros.base_node import LATCHED_QOS, BaseNode
-from q2r2_control.ros.bridge.opening_grants import wanted_topic
+from q2r2_control.ros.bridge.gripper_client import wanted_topic
 
 # Until a gripper does what was granted: the answer has to arrive, ten goals a second go out, and it may be slow [s].
 GRIPPER_DELAY = 0.3

@@ -12,8 +12,8 @@ from pydantic.fields import FieldInfo
 from q2r2_control.config.cell import load_config
 from q2r2_control.config.external import GripperSettings, GuardLimits
 from q2r2_control.config.presets import BUILTIN, Mode, Preset, preset_of
+from q2r2_control.config.strict import STREAM_TIMEOUT
 from q2r2_control.config.teleop import GuardSettings, Stance, TeleopSettings
-from q2r2_control.config.timeouts import STREAM_TIMEOUT
 from q2r2_control.errors import ConfigError
 from q2r2_control.ros.base_node import BaseNode
 

@@ -17,7 +17,7 @@ from q2r2_control.recording.ros_topics import CONTROLLER_TICK, RECORDER, arm_eve
 from q2r2_control.recording.topics import REFERENCE, WORLD
 from q2r2_control.ros.base_node import RECORDED_QOS
 from q2r2_control.ros.bridge.messages import stamped_pose, time_message
-from q2r2_control.teleop.episode_marks import EpisodeMarks
+from q2r2_control.teleop.both_arms import EpisodeMarks
 from q2r2_control.types import ArmTarget, Reference, StepStatus
 
 _STATUSES = tuple(StepStatus)

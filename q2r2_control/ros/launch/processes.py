@@ -19,7 +19,7 @@ from q2r2_control.config.cell import load_config
 from q2r2_control.config.external import ControllerKind, ExternalConfig
 from q2r2_control.errors import ConfigError, Q2R2Error
 from q2r2_control.plugins import INPUTS, check_installed
-from q2r2_control.process.signals import StopRequest, how_it_ended, stop_on_signals
+from q2r2_control.process.scheduling import StopRequest, how_it_ended, stop_on_signals
 from q2r2_control.types import SIDES
 
 NO_INPUT = "none"  # another node sends the hands

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterable
+from functools import partial
 from typing import Any
 
 from rclpy.clock import Clock
@@ -13,7 +14,7 @@ from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.serialization import serialize_message
 
-from q2r2_control.ros.base_node import SENT_COMMAND_QOS
+from q2r2_control.ros.base_node import SENT_COMMAND_QOS, STREAM_QOS, BaseNode
 
 _MAX_AGE = 0.1  # of the graph's answer, before it is asked again [s]
 _PERIOD = 0.5  # of asking the graph where no other code asks [s]
@@ -148,3 +149,42 @@ class WatchedPublisher:
         if self._acknowledged is None or now - self._acknowledged <= self._timeout:
             return None
         return f"messages on {self.topic_name} are not acknowledged for {now - self._acknowledged:.2f} s"
+
+
+class CommandWatch:
+    """Listens to a node's own command topics while the node itself sends nothing there.
+
+    Best effort, so that nobody waits for its acknowledgements or takes it for a robot's driver that does not answer.
+    """
+
+    def __init__(self, node: BaseNode, kind: type, topics: Iterable[str]) -> None:
+        self._node, self._kind = node, kind
+        self._heard = dict.fromkeys(topics, -math.inf)  # the last command on each [s]
+        self._subscriptions: list[Any] = []
+
+    def begin(self) -> None:
+        """Listen from now on."""
+        if not self._subscriptions:
+            self._subscriptions = [
+                self._node.create_subscription(self._kind, topic, partial(self._on_command, topic), STREAM_QOS)
+                for topic in self._heard
+            ]
+
+    def end(self) -> None:
+        """Listen no more: what comes from now on is the node's own."""
+        for subscription in self._subscriptions:
+            self._node.destroy_subscription(subscription)
+        self._subscriptions = []
+
+    def commander(self, within: float) -> str | None:
+        """One line if commands came within the last seconds, else None."""
+        now = time.monotonic()
+        for topic, heard in self._heard.items():
+            if now - heard <= within:
+                own = self._node.get_fully_qualified_name()
+                names = {node_of(info) or "a node" for info in self._node.get_publishers_info_by_topic(topic)} - {own}
+                return f"{', '.join(sorted(names)) or 'another node'} commands the arms on {topic}"
+        return None
+
+    def _on_command(self, topic: str, message: Any) -> None:
+        self._heard[topic] = time.monotonic()

@@ -19,20 +19,18 @@ from q2r2_control.config.teleop import GuardSettings, TeleopSettings
 from q2r2_control.errors import ConfigError
 from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.ros.base_node import ERROR, OK, WARN, BaseNode
-from q2r2_control.ros.bridge.arm_conditions import listen_to_condition
-from q2r2_control.ros.bridge.arm_feedback import ArmFeedback
+from q2r2_control.ros.bridge.arm_feedback import ArmFeedback, listen_to_condition
 from q2r2_control.ros.bridge.arm_outputs import ArmOutputs
 from q2r2_control.ros.bridge.frames import FrameListener, PoseTopic, ToolFrame
-from q2r2_control.ros.bridge.gripper_client import GripperClient
-from q2r2_control.ros.bridge.hand_intake import HandIntake
+from q2r2_control.ros.bridge.gripper_client import GripperClient, OpeningGrants
+from q2r2_control.ros.bridge.hand_topics import HandIntake
 from q2r2_control.ros.bridge.live_parameters import LiveArmParameters, is_of_teleop
-from q2r2_control.ros.bridge.opening_grants import OpeningGrants
 from q2r2_control.ros.bridge.parameters import ArmDefaults, ArmParameters, arm_parameters, teleop_defaults
 from q2r2_control.ros.bridge.target_output import near
 from q2r2_control.ros.bridge.teleop_loop import TeleopLoop, TickInputs
 from q2r2_control.teleop.arm import OPEN
 from q2r2_control.teleop.arm_states import AT_REST, HOLDING, ArmState
-from q2r2_control.teleop.steady_state_offset import MAX_OFFSET
+from q2r2_control.teleop.hand_motion import MAX_OFFSET
 from q2r2_control.types import SIDES, ArmTarget
 from q2r2_control.wording import sentence
 

@@ -19,8 +19,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from q2r2_control.config.cell import load_config
 from q2r2_control.control.controller import CartesianController
-from q2r2_control.drives.base import permitted
-from q2r2_control.drives.torque import TorqueDrive
+from q2r2_control.drives.base import TorqueDrive, permitted
 from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.loop.control_loop import ControlLoop
 from q2r2_control.robot.robot import Robot
@@ -36,7 +35,7 @@ from q2r2_control.supervision.external_arms import ExternalArms, ExternalSetting
 from q2r2_control.supervision.joint_watch import watch_settings
 from q2r2_control.supervision.supervisor import Phase
 from q2r2_control.supervision.target_stream import Origins, StreamSettings
-from q2r2_control.supervision.tick_clock import TickClock
+from q2r2_control.supervision.tick_pacer import TickClock
 from q2r2_control.types import LONGEST_DT, Reference
 from q2r2_control.wording import sentence
 

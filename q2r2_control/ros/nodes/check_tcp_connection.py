@@ -12,11 +12,10 @@ from rich.live import Live
 
 from q2r2_control.inputs.headset_check import SILENCE
 from q2r2_control.inputs.messages import HandMessage
-from q2r2_control.inputs.session import HAND_TOPICS
-from q2r2_control.inputs.statistics import TopicRecorder, TopicStatistics
+from q2r2_control.inputs.session import HAND_TOPICS, TopicRecorder, TopicStatistics
 from q2r2_control.ros.base_node import ERROR, OK, WARN, BaseNode
 from q2r2_control.ros.bridge.hand_topics import subscribe_to_hands
-from q2r2_control.viewer.topic_table import topic_line, topic_table
+from q2r2_control.viewer.headset_table import topic_line, topic_table
 
 _TABLE_PERIOD = 0.2  # [s]
 _LINES_PERIOD = 1.0  # [s]

@@ -24,15 +24,15 @@ from tf2_msgs.msg import TFMessage
 from trajectory_msgs.msg import JointTrajectory
 
 from q2r2_control.config.cell import load_config
-from q2r2_control.config.timeouts import STREAM_TIMEOUT
+from q2r2_control.config.strict import STREAM_TIMEOUT
 from q2r2_control.plants.simulated_cell import JointSetpoint, SimulatedCell
 from q2r2_control.robot.robot import Robot
 from q2r2_control.ros.base_node import LATCHED_QOS, OK, WARN
+from q2r2_control.ros.bridge.frames import LinkFrames
 from q2r2_control.ros.bridge.gripper_server import GripperServer, Stroke
-from q2r2_control.ros.bridge.link_frames import LinkFrames
 from q2r2_control.ros.bridge.messages import age, delay, joint_state_message, seconds
 from q2r2_control.ros.managed_node import ManagedNode
-from q2r2_control.supervision.delay_watch import DelayWatch
+from q2r2_control.supervision.message_watch import DelayWatch
 from q2r2_control.types import Array, RobotState
 
 _LOG_PERIOD = 1.0  # of lines about refusals [s]

@@ -35,7 +35,7 @@ from q2r2_control.recording.topics import Topic
 from q2r2_control.robot.robot import Robot
 from q2r2_control.ros.base_node import ERROR, LATCHED_QOS, OK, RECORDED_QOS, WARN, BaseNode
 from q2r2_control.ros.bridge.messages import age
-from q2r2_control.teleop.episode_marks import EpisodeMarks
+from q2r2_control.teleop.both_arms import EpisodeMarks
 from q2r2_control.wording import sentence
 
 _SERVICES = {

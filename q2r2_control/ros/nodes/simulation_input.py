@@ -12,7 +12,7 @@ from q2r2_control.inputs.scripted import ScriptedInput
 from q2r2_control.inputs.trajectories import FIRST_PRESS, START, TRAJECTORIES
 from q2r2_control.ros.base_node import OK, WARN, BaseNode
 from q2r2_control.ros.bridge.hand_topics import HandPublishers
-from q2r2_control.ros.monitoring.hand_listeners import HandListeners
+from q2r2_control.ros.monitoring.node_states import HandListeners
 from q2r2_control.types import SIDES, HandSample
 
 _SHORTEST, _LONGEST = 0.001, 0.02  # between two looks at what has come due [s]

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from q2r2_control.config.cell import HeadsetConfig, load_config
-from q2r2_control.config.networks import Network, network_of
+from q2r2_control.config.strict import Network, network_of
 from q2r2_control.config.teleop import GateSettings
 from q2r2_control.errors import ConfigError
 from q2r2_control.events import Reason, ReasonKind

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from q2r2_control.control.geometry.collision import CollisionData, CollisionModel, update_placements
-from q2r2_control.control.geometry.pair_distance import at_least, measure
-from q2r2_control.control.geometry.rounded_boxes import deepest, with_rounded_boxes
+from q2r2_control.control.geometry.pair_distance import at_least, deepest, measure, with_rounded_boxes
 from q2r2_control.robot.pairs import pair_names
 from q2r2_control.types import Array
 from tests.control.cells import cell, random_posture

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from q2r2_control.control.safety.stop_shapes import OWN, write_stop
+from q2r2_control.control.safety.stop_rollout import OWN, write_stop
 from q2r2_control.types import Array
 from tests.control.cells import kernel_model
 

@@ -6,7 +6,7 @@ import pytest
 from q2r2_control.control.safety.joint_limits import ACCELERATION, next_velocity_box
 from q2r2_control.control.safety.safety_data import SafetyData
 from q2r2_control.control.safety.safety_filter import FOLLOWED, STOPPED, apply_safety_filter, certify_start
-from q2r2_control.control.safety.stop_shapes import brake
+from q2r2_control.control.safety.stop_rollout import brake
 from q2r2_control.types import Array
 from tests.control.cells import cell, distances, kernel_data, kernel_model
 

@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from q2r2_control.control.safety.pair_measures import measure_pairs
+from q2r2_control.control.safety.safety_filter import measure_pairs
 from q2r2_control.control.safety.separation_rows import write_separation_rows
-from q2r2_control.control.safety.stop_shapes import TOGETHER, write_stop
+from q2r2_control.control.safety.stop_rollout import TOGETHER, write_stop
 from q2r2_control.control.safety.velocity_bounds import update_body_velocities
 from q2r2_control.types import Array
 from tests.control.cells import NAMES, cell, distances, kernel_data, kernel_model, random_posture

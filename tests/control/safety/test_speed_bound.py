@@ -7,8 +7,7 @@ import pytest
 from q2r2_control.control.safety.safety_data import SafetyData
 from q2r2_control.control.safety.speed_bound import least_distance, write_deviations
 from q2r2_control.control.safety.stop_certificate import write_step
-from q2r2_control.control.safety.stop_rollout import begin_rollout
-from q2r2_control.control.safety.stop_shapes import OWN, SHAPES, TOGETHER
+from q2r2_control.control.safety.stop_rollout import OWN, SHAPES, TOGETHER, begin_rollout
 from q2r2_control.types import Array
 from tests.control.cells import NAMES, cell, distances, kernel_data, kernel_model, random_posture
 from tests.control.safety.motions import ACCELERATION, H, Motion, motion_of

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from q2r2_control.control.safety.stop_certificate import certify, step_travel
-from q2r2_control.control.safety.stop_shapes import OWN, SHAPES, TOGETHER
+from q2r2_control.control.safety.stop_rollout import OWN, SHAPES, TOGETHER
 from q2r2_control.types import Array
 from tests.control.cells import NAMES, CellArrays, cell, distances, kernel_data, kernel_model, random_posture
 from tests.control.safety.motions import ACCELERATION, DENSE, H, Motion, motion_of

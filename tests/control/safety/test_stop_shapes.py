@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from q2r2_control.control.safety.joint_limits import next_velocity_box
 from q2r2_control.control.safety.safety_data import VelocityBox
-from q2r2_control.control.safety.stop_shapes import ARM_BY_ARM, SHAPES, TOGETHER, brake, write_stop
+from q2r2_control.control.safety.stop_rollout import ARM_BY_ARM, SHAPES, TOGETHER, brake, write_stop
 from q2r2_control.types import Array
 from tests.control.cells import cell, kernel_model
 

@@ -14,10 +14,10 @@ from q2r2_control.control.tasks.frame import (
     rotation_vector,
     tool_jacobian,
     tool_pose,
+    tools_of,
     wanted_twist,
 )
 from q2r2_control.control.tasks.task_data import TaskTargets
-from q2r2_control.control.tasks.tools import tools_of
 from q2r2_control.types import Array
 from tests.control.cells import NAMES, cell, kernel_data, kernel_model, placed, random_posture
 

@@ -9,6 +9,7 @@ usual one.
 from __future__ import annotations
 
 import math
+from collections import deque
 
 # The usual delay may grow this fast: clocks of two hosts drift apart by less, and a frozen sender's delay by far more.
 _DRIFT = 1e-3
@@ -46,3 +47,31 @@ class DelayWatch:
             return 0.0
         self._late_since = now if self._late_since is None else self._late_since
         return delay - usual
+
+
+# No publisher sends faster, and none is delivered later than that: a larger step is another one's [Hz], [s].
+_FASTEST, _LATEST = 2000.0, 0.1
+# Numbers have to go on without a break for this long before a stream counts as one publisher's again [s].
+_ALONE = 1.0
+
+
+class SequenceWatch:
+    """The numbers of one topic's messages. Times are receipt times [s]."""
+
+    def __init__(self) -> None:
+        self._number, self._stamp = 0, -math.inf
+        self._breaks: deque[float] = deque()
+
+    def take(self, number: int, now: float, timeout: float) -> int:
+        """Look at a message's number; returns the number of recent breaks, 0 for a single publisher.
+
+        Within a stream numbers rise. After a silence of ``timeout`` they may begin anywhere: a publisher that was
+        restarted counts from one. One break is a publisher that replaced another, two are two that take turns.
+        """
+        passed = now - self._stamp
+        if passed <= timeout and not 0 < number - self._number <= 1 + _FASTEST * (passed + _LATEST):
+            self._breaks.append(now)
+        self._number, self._stamp = number, now
+        while self._breaks and now - self._breaks[0] > _ALONE:
+            self._breaks.popleft()
+        return len(self._breaks)
