@@ -27,7 +27,7 @@ from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.summary.run_summary import RunSummary
 from q2r2_control.summary.tick import Tick
 from q2r2_control.types import SIDES, Array, HandSample
-from tests.support.watch import Watch, cell, changes, speed
+from tests.support.processes import Watch, cell, changes, speed
 
 pytestmark = pytest.mark.slow
 

@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.support.modules import ROOT, load_script
+
 FOLDER = Path(__file__).resolve().parents[1] / "benchmarks"
 SHARED = ("ros_processes.py", "work_hands.py")
 SCRIPTS = sorted(file.name for file in FOLDER.glob("*.py") if file.name not in SHARED)
@@ -35,3 +37,9 @@ def test_the_loop_s_benchmark_times_every_stage() -> None:
     assert set(cases) == {"kinematic position", "mujoco position", "mujoco torque"}
     for stage in ("inputs", "measured state", "teleop", "supervision", "control", "drive", "apply", "physics"):
         assert all(case[stage]["median_us"] > 0.0 for case in cases.values()), stage
+
+
+def test_every_line_of_the_table_stands_once_in_its_file() -> None:
+    for mutation in load_script("benchmarks/safety_mutations.py").MUTATIONS:
+        text = (ROOT / mutation.path).read_text(encoding="utf-8")
+        assert text.count(mutation.old) == 1, mutation.claim

@@ -18,7 +18,7 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.summary.tick import Tick
 from q2r2_control.types import Array, Command, RobotState
 from tests.support.hands_input import HandsInput
-from tests.support.watch import Watch, cell, speed
+from tests.support.processes import Watch, cell, speed
 
 pytestmark = pytest.mark.slow
 

@@ -16,7 +16,7 @@ from q2r2_control.recording.recorder import RecordingSummary
 from q2r2_control.summary.run_summary import Percentiles
 from q2r2_control.wording import sentence
 from tests.support.hands_input import HandsInput
-from tests.support.watch import cell
+from tests.support.processes import cell
 
 
 @pytest.fixture(scope="module")

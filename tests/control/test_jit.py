@@ -4,11 +4,13 @@ import ast
 import copy
 import gc
 import pickle
+import re
 import shutil
 import subprocess
 import sys
 from collections import namedtuple
 from pathlib import Path
+from typing import Any
 
 import numba
 import numpy as np
@@ -185,3 +187,19 @@ def test_bound_machine_code_is_the_kernel_s_and_has_run_once() -> None:
     double(pointer_to((others,)))
     np.testing.assert_array_equal(others, [0.0, 2.0, 4.0])
     assert bound(_one_over, 2.0)(4.0) == 0.25
+
+
+PAGE = Path(__file__).parents[2] / "docs" / "kernels.md"
+
+
+def test_the_template_compiles_and_sees_what_changes_in_the_model(tmp_path: Path) -> None:
+    (template,) = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
+    source = tmp_path / "spring.py"
+    source.write_text(template)
+    found: dict[str, Any] = {"__name__": "spring"}
+    exec(compile(template, str(source), "exec"), found)
+    found["model"].stiffness[0] = 10.0
+    assert found["torque"](found["pointer"], found["q"], found["tau"])
+    np.testing.assert_allclose(found["tau"], -1.0)
+    found["q"][3] = np.nan
+    assert not found["torque"](found["pointer"], found["q"], found["tau"])

@@ -20,7 +20,7 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.summary.run_summary import RunSummary
 from q2r2_control.summary.tick import Tick
 from q2r2_control.types import CommandMode, HandSample
-from tests.support.watch import Watch, assert_torque_bounds
+from tests.support.processes import Watch, assert_torque_bounds
 
 pytestmark = pytest.mark.slow
 

@@ -17,7 +17,7 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.summary.tick import Tick
 from q2r2_control.types import SIDES, Array, RobotState
 from tests.support.hands_input import HandsInput
-from tests.support.watch import Watch, assert_torque_bounds, cell
+from tests.support.processes import Watch, assert_torque_bounds, cell
 
 pytestmark = pytest.mark.slow
 

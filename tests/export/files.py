@@ -17,7 +17,7 @@ from q2r2_control.recording.messages import ARRAY, Message, float_array, picture
 from q2r2_control.recording.tick_rows import numbers_in, tick_type
 from q2r2_control.recording.topics import TICK, picture_topic
 from tests.recording.runs import ARMS, JOINTS
-from tests.support.watch import cell
+from tests.support.processes import cell
 
 EPOCH = 1_700_000_000_000_000_000  # [ns]
 CHUNK = 7  # ticks

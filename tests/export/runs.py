@@ -13,7 +13,7 @@ from q2r2_control.inputs.played import EvenSampling, PlayedInput
 from q2r2_control.summary.tick import Tick
 from q2r2_control.types import SIDES, HandInputs
 from tests.recording.runs import file_of, pipeline, record
-from tests.support.watch import Watch
+from tests.support.processes import Watch
 
 STEP_AT = 0.5  # [s]
 DURATION = 0.9  # [s]

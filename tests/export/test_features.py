@@ -13,7 +13,7 @@ from q2r2_control.export.features import MOTION, features
 from q2r2_control.recording.tick_rows import NOT_MEASURED, POSE_FIELDS
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
-from tests.support.watch import cell
+from tests.support.processes import cell
 
 pytestmark = pytest.mark.slow
 

@@ -15,7 +15,7 @@ from q2r2_control.events import Event
 from q2r2_control.judging.episode import Episode, Frames, Hand, Ticks
 from q2r2_control.recording.reader import Recording
 from q2r2_control.types import Array
-from tests.support.watch import cell
+from tests.support.processes import cell
 
 DT = 0.002  # of the loop [s]
 EVERY = 5  # ticks, a frame

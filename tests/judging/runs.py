@@ -17,7 +17,7 @@ from q2r2_control.recording.about import About
 from q2r2_control.recording.recorder import Recorder
 from q2r2_control.types import QUEST_CONTROLS, SIDES, HandInputs, HandSample
 from tests.recording.runs import file_of, rewrite
-from tests.support.watch import cell
+from tests.support.processes import cell
 
 RATE = 250.0  # [Hz], with longer substeps than by default, since most of a test's time goes by ticks
 DURATION = 4.0  # [s]

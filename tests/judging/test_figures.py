@@ -15,7 +15,7 @@ from q2r2_control.judging.motion import arm_figures, delays, idle_share
 from q2r2_control.types import Array
 from q2r2_control.wording import sentence
 from tests.judging.episodes import DT, episode, frame_times
-from tests.support.watch import cell
+from tests.support.processes import cell
 
 DROPOUT = 0.06
 

@@ -15,7 +15,7 @@ from q2r2_control.supervision.joint_watch import watch_settings
 from q2r2_control.supervision.supervisor import Phase
 from q2r2_control.supervision.target_stream import StreamSettings
 from q2r2_control.types import CommandMode, RobotState
-from tests.support.watch import cell
+from tests.support.processes import cell
 
 DT = 0.004
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from q2r2_control.inputs.scripted import ScriptedInput
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.summary.tick import Tick
-from tests.support.watch import cell, speed
+from tests.support.processes import cell, speed
 
 
 def pipeline(

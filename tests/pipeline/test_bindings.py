@@ -17,7 +17,7 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.summary.tick import Tick
 from q2r2_control.types import Array, HandInputs, HandSample
 from tests.support.hands_input import ENGAGED, HandsInput, Path
-from tests.support.watch import Watch, cell
+from tests.support.processes import Watch, cell
 
 pytestmark = pytest.mark.slow
 

@@ -21,7 +21,7 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.summary.run_summary import RunSummary
 from q2r2_control.types import SIDES, Command
 from tests.pipeline.loops import pipeline, when_moving
-from tests.support.watch import Watch, assert_torque_bounds, cell, speed
+from tests.support.processes import Watch, assert_torque_bounds, cell, speed
 
 
 class RecordingPlant(KinematicPlant):

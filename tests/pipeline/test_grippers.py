@@ -16,7 +16,7 @@ from q2r2_control.summary.tick import Tick
 from q2r2_control.supervision.gripper_limiter import GripperLimiter
 from q2r2_control.types import HandSample
 from tests.support.object_cell import cell as object_cell
-from tests.support.watch import Watch, cell
+from tests.support.processes import Watch, cell
 
 
 @pytest.mark.parametrize("plant", ["kinematic", "mujoco"])

@@ -10,7 +10,7 @@ import pytest
 from q2r2_control.errors import ConfigError
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.types import DeviceControls
-from tests.support.watch import cell
+from tests.support.processes import cell
 
 PACKAGE = """
 from q2r2_control.inputs.scripted import ScriptedInput

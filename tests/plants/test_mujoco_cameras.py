@@ -11,7 +11,7 @@ from q2r2_control.errors import PlantError
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
-from tests.support.watch import cell
+from tests.support.processes import cell
 
 
 def axes(**camera: object) -> tuple[Array, Array]:
@@ -46,3 +46,14 @@ def test_a_camera_that_looks_straight_down_has_x_up_in_its_picture() -> None:
 def test_a_camera_on_a_link_that_there_is_not_is_refused_with_those_that_there_are() -> None:
     with pytest.raises(PlantError, match=r"cameras\.one\.link = 'hand': no such link; allowed: left_link_0, "):
         axes(link="hand", position=(0, 0, 1), rpy=(0, 0, 0))
+
+
+def test_a_window_without_a_display_is_refused_with_the_reason(
+    plant: MujocoPlant, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    monkeypatch.setattr("sys.platform", "linux")
+    with pytest.raises(PlantError, match="needs a display"):
+        plant.launch_viewer()
+    assert plant.viewer_sync() is False

@@ -8,7 +8,7 @@ import pytest
 
 from q2r2_control import Robot
 from q2r2_control.config.cell import Config
-from q2r2_control.plants.simulated_cell import SimulatedCell
+from q2r2_control.plants.simulated_cell import JointFollower, SimulatedCell
 
 HOLD_AFTER = 0.1  # [s]
 
@@ -57,3 +57,60 @@ def test_after_a_time_without_torques_the_arms_stand_on_their_servos(cell: Simul
     assert cell.mode(1.0) == "holding"
     assert np.abs(cell.plant.state().v).max() < 1e-3
     assert cell.plant.data.time == pytest.approx(1.0 - HOLD_AFTER + 0.012, abs=0.01)
+
+
+LIMIT, ACCELERATION = np.array([1.5, 2.0]), np.array([10.0, 4.0])
+JOINTS, DT = np.array([0, 1]), 0.001
+
+
+def motion(t: float) -> tuple[np.ndarray, np.ndarray]:
+    """Posture and velocity of a smooth motion from rest."""
+    return np.array([0.5 * (1 - np.cos(t)), t**2 / 10]), np.array([0.5 * np.sin(t), t / 5])
+
+
+@pytest.mark.parametrize("with_velocity", [True, False])
+@pytest.mark.parametrize("period", [0.002, 0.004, 0.02])
+def test_it_keeps_to_a_motion_whose_commands_come_unevenly(with_velocity: bool, period: float) -> None:
+    random = np.random.default_rng(3)
+    follower = JointFollower(np.zeros(2), ACCELERATION, LIMIT)
+    due = np.arange(0.0, 2.0, period) + random.uniform(0.0, 0.3 * period, len(np.arange(0.0, 2.0, period)))
+    newest = 0
+    for tick in range(1, 2000):
+        now = tick * DT
+        while newest < len(due) and due[newest] <= now:
+            q, v = motion(due[newest])
+            follower.command(JOINTS, q, v if with_velocity else None, due[newest])
+            newest += 1
+        before = follower.q
+        follower.advance(now, DT)
+        assert (np.abs(follower.q - before) <= LIMIT * DT * (1 + 1e-9)).all()
+        if now > 0.3:
+            assert np.abs(follower.q - motion(now)[0]).max() < (0.001 if with_velocity else 0.4 * period + 0.001)
+
+
+def test_without_commands_it_coasts_shortly_and_brakes() -> None:
+    follower = JointFollower(np.zeros(2), ACCELERATION, LIMIT)
+    v = np.array([1.0, -2.0])
+    for tick in range(100):
+        follower.command(JOINTS, v * tick * DT, v, tick * DT)
+        follower.advance(tick * DT, DT)
+    last = 99 * DT
+    for tick in range(100, 700):
+        before_q, before_v = follower.q, follower.v
+        follower.advance(tick * DT, DT)
+        if tick * DT - last <= 0.01:
+            continue
+        assert (np.abs(follower.v - before_v) <= ACCELERATION * DT * (1 + 1e-9)).all()
+        assert np.allclose(follower.q - before_q, 0.5 * (follower.v + before_v) * DT)
+        rests = tick * DT - last > 0.03 + np.abs(v) / ACCELERATION
+        assert not follower.v[rests].any()
+        assert rests[1] or tick * DT - last > 0.45 or follower.v[1] != 0.0, "brakes at its own limit, not faster"
+    assert not follower.v.any()
+
+
+def test_a_command_names_some_joints_and_the_others_stay() -> None:
+    follower = JointFollower(np.array([0.1, 0.2]), ACCELERATION, LIMIT)
+    for tick in range(100):
+        follower.command(np.array([1]), np.array([0.25]), np.zeros(1), tick * DT)
+        follower.advance(tick * DT, DT)
+    assert follower.q.tolist() == pytest.approx([0.1, 0.25])

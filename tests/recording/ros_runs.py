@@ -35,7 +35,7 @@ from q2r2_control.recording.ros_topics import (
     tick_fields,
 )
 from q2r2_control.types import Array
-from tests.support.watch import cell
+from tests.support.processes import cell
 
 PERIOD = 4_000_000  # of ticks [ns]
 LATENCY = 100_000  # from a tick to the receipt of what it sends [ns]

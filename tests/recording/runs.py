@@ -21,7 +21,7 @@ from q2r2_control.recording.messages import Message
 from q2r2_control.recording.reader import Recording
 from q2r2_control.recording.recorder import ROOM, Recorder, RecordingSummary
 from q2r2_control.recording.tick_rows import tick_labels
-from tests.support.watch import cell
+from tests.support.processes import cell
 
 ROOT = Path(__file__).resolve().parents[2]
 ARMS = ("left", "right")

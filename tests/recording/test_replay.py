@@ -25,7 +25,7 @@ from q2r2_control.summary.tick import Tick
 from q2r2_control.types import HandFault, HandSample, RobotState
 from tests.recording.runs import RATE, file_of, number_of, pipeline, record, rewrite
 from tests.support.object_cell import cell as object_cell
-from tests.support.watch import cell
+from tests.support.processes import cell
 
 pytestmark = pytest.mark.slow
 

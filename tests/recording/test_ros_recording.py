@@ -28,7 +28,7 @@ from q2r2_control.recording.ros_topics import arm_flags
 from tests.recording.ros_runs import PERIOD, NodesOnFile
 from tests.recording.runs import read_elsewhere
 from tests.support.external_cell import external
-from tests.support.watch import cell
+from tests.support.processes import cell
 
 pytestmark = pytest.mark.slow
 

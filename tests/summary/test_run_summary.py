@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import replace
 from typing import Any
 
@@ -10,16 +11,18 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
+from q2r2_control.compliance.impedance import ImpedanceReport
+from q2r2_control.compliance.repulsion import WallReport
 from q2r2_control.config.cell import Config
 from q2r2_control.events import Event, Reason, ReasonKind
 from q2r2_control.inputs.scripted import ScriptedInput
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.plants.kinematic import KinematicPlant
 from q2r2_control.robot.robot import Robot
-from q2r2_control.summary.run_summary import EVENTS_KEPT, RunStatistics
+from q2r2_control.summary.run_summary import EVENTS_KEPT, NOTHING_MEASURED, Histogram, RunStatistics, TorqueSummary
 from q2r2_control.summary.tick import RunStart, Tick
 from q2r2_control.types import ArmTarget, Command, CommandMode, Reference, RobotState, StepReport, StepStatus
-from tests.support.watch import cell
+from tests.support.processes import cell
 
 # What scripts and dashboards rely on.
 KEYS: dict[str, type | set[str]] = {
@@ -237,3 +240,62 @@ def test_a_broken_button_cannot_fill_the_memory(statistics: RunStatistics) -> No
     events = statistics.summary(1.0).events
     assert len(events) == EVENTS_KEPT
     assert events[-1].t == EVENTS_KEPT + 9
+
+
+QUIET = ImpedanceReport({}, (), (), (), (), False)
+FREE = WallReport(np.zeros(14), (), 0.0, 0.0, ("left_a", "right_b"), 0.2)
+HANDS, ELBOWS = ("left_hand", "right_hand"), ("left_elbow", "right_elbow")
+
+
+@pytest.fixture
+def summary() -> TorqueSummary:
+    return TorqueSummary({"left": 0.0, "right": 0.0})
+
+
+def test_extremes_are_kept_and_ticks_are_counted_once_however_many_joints(summary: TorqueSummary) -> None:
+    pressed = replace(FREE, pressing=(HANDS, ELBOWS), force=30.0, closest_pair=HANDS, closest_distance=0.015)
+    summary.add(0.002, replace(QUIET, saturated=("left_A1", "left_A2"), clipped=("right",)), pressed)
+    summary.add(0.002, replace(QUIET, rate_limited=("left_A1",), clipped=("right",)), replace(pressed, force=20.0))
+    summary.add(0.002, QUIET, FREE)
+    assert summary.min_measured_distance_mm == pytest.approx(15.0)
+    assert summary.measured_closest_pair == HANDS
+    assert summary.pressed_pairs == [ELBOWS, HANDS]
+    assert summary.max_wall_force_n == 30.0
+    assert (summary.saturated_ticks, summary.rate_limited_ticks, summary.held_ticks) == (1, 1, 0)
+    assert summary.off_reference_s == {"left": 0.0, "right": pytest.approx(0.004)}
+
+
+@pytest.mark.parametrize("blind_first", [True, False])
+def test_a_distance_that_was_not_measured_is_no_distance(summary: TorqueSummary, blind_first: bool) -> None:
+    blind = (replace(QUIET, held=True), replace(FREE, closest_pair=("", ""), closest_distance=math.nan))
+    for impedance, wall in (blind, (QUIET, FREE)) if blind_first else ((QUIET, FREE), blind):
+        summary.add(0.001, impedance, wall)
+    assert (summary.min_measured_distance_mm, summary.held_ticks) == (pytest.approx(200.0), 1)
+
+
+def test_a_cell_without_pairs_has_no_distance(summary: TorqueSummary) -> None:
+    summary.add(0.001, QUIET, replace(FREE, closest_pair=("", ""), closest_distance=math.inf))
+    assert summary.min_measured_distance_mm is None
+    assert summary.measured_closest_pair is None
+
+
+@pytest.mark.parametrize("size", [1, 2, 99, 5000])
+def test_percentiles_are_numpy_s_to_a_thousandth_of_the_unit(size: int) -> None:
+    values = np.random.default_rng(size).exponential(3e-4, size)
+    histogram = Histogram(1e-3)
+    for value in values:
+        histogram.add(value)
+    found = histogram.percentiles(1e-6)
+    expected = 1e6 * np.percentile(values, [50, 99], method="inverted_cdf")
+    assert [found.p50, found.p99] == pytest.approx(expected, abs=1.001)
+    assert found.max == pytest.approx(1e6 * values.max(), rel=1e-12)
+
+
+def test_any_number_can_be_added_and_one_beyond_the_range_counts_as_the_largest() -> None:
+    histogram = Histogram(1e-3)
+    for value in (float("nan"), float("inf"), float("-inf")):
+        histogram.add(value)
+    assert histogram.percentiles(1e-3) == NOTHING_MEASURED
+    for value in (-1e300, 0.2, 0.5, 3.0, 1e300):
+        histogram.add(value)
+    assert histogram.percentiles(1e-3).p50 == pytest.approx(1e303)

@@ -21,8 +21,8 @@ from q2r2_control.types import QUEST_CONTROLS, SIDES, Array, CommandMode, HandSa
 from tests.support.fake_headset import FakeHeadset
 from tests.support.headset_server import eventually
 from tests.support.operator_script import START
+from tests.support.processes import Watch, cell
 from tests.support.reasons import kinds
-from tests.support.watch import Watch, cell
 
 PERIOD = 1.0 / 72.0  # of samples [s]
 PRESS = 0.12  # longer than a chord's window [s]

@@ -4,6 +4,16 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from functools import cache
+
+import numpy as np
+
+from q2r2_control.config.cell import Config, load_config
+from q2r2_control.events import Event
+from q2r2_control.pipeline.pipeline import Pipeline
+from q2r2_control.summary.tick import Tick
+from q2r2_control.verification.contract import Contract
+from tests.support.reasons import kinds
 
 _PATIENCE = 120.0  # [s], far longer than anything takes
 
@@ -28,3 +38,57 @@ def wait_until(condition: Callable[[], object]) -> None:
     while not condition():
         assert time.monotonic() < deadline, "waited in vain"
         time.sleep(2e-3)
+
+
+CELL = "config/dual_iiwa7.yaml"
+
+
+@cache
+def cell() -> Config:
+    """The shipped cell of two iiwa 7."""
+    return load_config(CELL)
+
+
+class Watch:
+    """A listener that keeps every tick, and fails the run at the first one that breaks the contract."""
+
+    def __init__(self, pipeline: Pipeline) -> None:
+        self.ticks: list[Tick] = []
+        self._pipeline = pipeline
+        self._contract: Contract | None = None
+        self._openings = pipeline.controller.openings
+        pipeline.listeners.append(self)
+
+    def __call__(self, tick: Tick) -> None:
+        if self._contract is None:
+            self._contract = Contract(self._pipeline.controller, self._pipeline.robot.home)
+        if (openings := self._pipeline.controller.openings) != self._openings:
+            self._openings = openings
+            self._contract.set_openings(openings, before_step=False)
+        self._contract.check(tick.reference, tick.step)
+        self.ticks.append(tick)
+
+    def engagements(self, arm: str) -> list[int]:
+        """Indices of the ticks in which ``arm`` became engaged."""
+        engaged = [tick.engaged[arm] for tick in self.ticks]
+        return [i for i, now in enumerate(engaged) if now and not (i and engaged[i - 1])]
+
+
+def assert_torque_bounds(pipeline: Pipeline, ticks: list[Tick]) -> None:
+    """The torque at every tick is within its limits, and so is its change between ticks."""
+    settings = pipeline.config.impedance
+    tau = np.array([tick.state.tau for tick in ticks])
+    dt = np.array([tick.dt for tick in ticks])
+    assert (np.abs(tau) <= settings.torque_scale * pipeline.robot.torque_limit).all()
+    assert (np.abs(np.diff(tau, axis=0)) <= settings.torque_rate_limit * dt[:-1, None] + 1e-6).all()
+    assert not any(tick.impedance is None or tick.impedance.held for tick in ticks)
+
+
+def speed(tick: Tick) -> float:
+    """Of the fastest joint's reference [rad/s]."""
+    return float(np.abs(tick.reference.v).max())
+
+
+def changes(events: list[Event], arm: str) -> list[tuple[str, str, str]]:
+    """State changes of ``arm``: from, to, and the kinds of the reason."""
+    return [(str(event.source), str(event.destination), kinds(event.reason)) for event in events if event.arm == arm]

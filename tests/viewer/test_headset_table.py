@@ -8,7 +8,7 @@ from q2r2_control.inputs.messages import HandPose, HandTwist
 from q2r2_control.inputs.session import TopicStatistics
 from q2r2_control.types import HandInputs
 from q2r2_control.viewer.headset_table import short_text, topic_line, topic_table
-from tests.cli.test_figure_table import printed
+from tests.cli.test_output import printed
 
 POSE = HandPose(np.array([0.1, -0.001, 2.0]), np.array([0.0, 0.0, 0.0, -1.0]), 0.0, "")
 TOPIC = TopicStatistics(count=12, rate=75.0, age=0.25, last=POSE)

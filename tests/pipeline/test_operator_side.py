@@ -18,7 +18,7 @@ from q2r2_control.types import Array, HapticFeedback
 from tests.support.hands_input import ENGAGED as BEGIN
 from tests.support.hands_input import HandsInput, Path
 from tests.support.operator_script import HANDS
-from tests.support.watch import cell
+from tests.support.processes import cell
 
 UP = np.array([0.0, 0.0, 1.0])
 
