@@ -58,7 +58,7 @@ MUTATIONS = (
     ),
     Mutation(
         "a stop keeps its position limits",
-        "stop_shapes.py",
+        "stop_rollout.py",
         "min(max(shared, _least_deceleration(model.limits, j, q[j], v[j])), a[j])",
         "min(shared, a[j])",
     ),
@@ -112,7 +112,7 @@ MUTATIONS = (
     ),
     Mutation(
         "rounding is no penetration",
-        "safety_model.py",
+        "safety_data.py",
         "ROUNDING = 1e-9",
         "ROUNDING = 0.0",
     ),
@@ -175,7 +175,7 @@ MUTATIONS = (
     ),
     Mutation(
         "a distance that grows leaves the way of the stop",
-        "provable_distances.py",
+        "safety_data.py",
         "np.asarray(data.distance - way)",
         "np.asarray(data.distance - 0.0 * way)",
     ),

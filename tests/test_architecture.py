@@ -60,7 +60,7 @@ def test_no_modules_import_each_other_in_a_circle() -> None:
         pytest.param("ros.nodes.tcp_endpoint", HEAVY, id="the headset's node"),
         pytest.param("teleop", HEAVY, id="teleop"),
         pytest.param("inputs", HEAVY, id="inputs"),
-        pytest.param("viewer.topic_table", HEAVY, id="a table of topics"),
+        pytest.param("viewer.headset_table", HEAVY, id="a table of topics"),
         pytest.param("plants", ("mujoco", "numba", "matplotlib"), id="plants"),
         pytest.param("recording.writer", (*HEAVY, f"{PACKAGE}.pipeline"), id="the process that writes recordings"),
         pytest.param("cli.app", ("matplotlib", "rclpy"), id="the command line"),

@@ -1,7 +1,7 @@
 """The certificate that a step and the full stop after it keep every pair apart, compiled.
 
 **Certificate.** A tick moves the reference along a parabola to (q+, v+) and must know that the parabola and a stop
-from (q+, v+), of one of the shapes in stop_shapes.py, keep every pair at its distance. Then by induction the robot is
+from (q+, v+), of one of the shapes in stop_rollout.py, keep every pair at its distance. Then by induction the robot is
 always safe: the last tick's certified stop can be executed now, and what is left of it needs no new check.
 
 **Between samples.** A point of a body is never farther than reach_j from joint j's axis, so while the joints travel
