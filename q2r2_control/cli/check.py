@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, astuple, dataclass
+from dataclasses import astuple, dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -18,9 +18,7 @@ from q2r2_control.cli.output import (
     as_json_text,
     counting,
     figure_table,
-    notice_of_compiling,
     print_report,
-    stderr_console,
 )
 from q2r2_control.config.cell import Config, load_config
 from q2r2_control.errors import ConfigError
@@ -115,25 +113,43 @@ def check(
     if pairs is not None:
         with counting() as progress:
             found = write_pairs(cell, pairs, samples, clearance, progress)
-        print_report(asdict(found), (_pair_table(found),), json)
-        return
-    if model_pairs is not None:
+        table = figure_table(
+            f"{pairs}: {len(found.never)} of {len(found.never) + len(found.watched)} pairs of links stay more than "
+            f"{1e3 * clearance:g} mm apart",
+            ("pair", "nearest found [mm]"),
+            ((f"{pair.link_a} | {pair.link_b}", 1e3 * pair.nearest) for pair in found.never),
+        )
+        print_report(found, (table,), json)
+    elif model_pairs is not None:
         with counting() as progress:
             files = write_model_pairs(cell, model_pairs, samples, clearance, progress)
         rows = ((file, "new" if new else "as it was") for file, new in files.items())
         title = "pairs of the models' links that need no watching"
         print_report(files, (figure_table(title, ("file", "is"), rows),), json)
-        return
-    result = check_cell(cell, notice_of_compiling(stderr_console()))
-    if json:
-        print(as_json_text(result.as_json()))
     else:
-        _print_cell(result)
-    raise typer.Exit(1 if result.faults else 0)
+        result = check_cell(cell)
+        if json:
+            print(as_json_text(result))
+        else:
+            _print_cell(result)
+        raise typer.Exit(1 if result.faults else 0)
 
 
-def cell_tables(cell: CellCheck) -> Iterator[Table]:
+def _print_cell(cell: CellCheck) -> None:
     """Arms and what a stop asks of them, obstacles, the nearest pairs, and what the hands' controls do."""
+    console = Console(highlight=False, soft_wrap=True)
+    console.print(f"cell {cell.name}")
+    for table in _cell_tables(cell):
+        console.print(table, soft_wrap=False)
+    for arm, line in (cell.driven or {"arms": "the built-in controller"}).items():
+        console.print(f"{arm} driven by {line}", markup=False)
+    for note in cell.notes:
+        console.print(f"NOTE {note}", markup=False)
+    for fault in cell.faults:
+        console.print(f"FAULT {fault}", style="red", markup=False)
+
+
+def _cell_tables(cell: CellCheck) -> Iterator[Table]:
     for arm in cell.arms:
         flange = "" if arm.flange is None else f", flange {arm.flange}"
         at = " ".join(f"{value:.3f}" for value in arm.tool_position)
@@ -162,25 +178,3 @@ def cell_tables(cell: CellCheck) -> Iterator[Table]:
         ((f"{pair.name_a} | {pair.name_b}", 1e3 * pair.distance, 1e3 * pair.kept) for pair in cell.nearest),
     )
     yield figure_table("controls of each hand", ("control", "does"), cell.controls.items())
-
-
-def _print_cell(cell: CellCheck) -> None:
-    console = Console(highlight=False, soft_wrap=True)
-    console.print(f"cell {cell.name}")
-    for table in cell_tables(cell):
-        console.print(table, soft_wrap=False)
-    for arm, line in (cell.driven or {"arms": "the built-in controller"}).items():
-        console.print(f"{arm} driven by {line}", markup=False)
-    for note in cell.notes:
-        console.print(f"NOTE {note}", markup=False)
-    for fault in cell.faults:
-        console.print(f"FAULT {fault}", style="red", markup=False)
-
-
-def _pair_table(pairs: PairsWritten) -> Table:
-    return figure_table(
-        f"{pairs.file}: {len(pairs.never)} of {len(pairs.never) + len(pairs.watched)} pairs of links stay more than "
-        f"{1e3 * pairs.clearance:g} mm apart",
-        ("pair", "nearest found [mm]"),
-        ((f"{pair.link_a} | {pair.link_b}", 1e3 * pair.nearest) for pair in pairs.never),
-    )

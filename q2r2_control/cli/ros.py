@@ -24,6 +24,7 @@ from q2r2_control.cli.output import (
     figure_table,
     notes_of,
     positive,
+    say,
     stderr_console,
 )
 from q2r2_control.config.cell import Config, load_config
@@ -32,10 +33,11 @@ from q2r2_control.ros.launch.build import BuildError, build_interfaces
 from q2r2_control.ros.launch.processes import check_rclpy, nodes_of, run_together
 from q2r2_control.ros.watching.environment import examine_environment
 from q2r2_control.ros.watching.findings import Finding, examine_set
-from q2r2_control.ros.watching.set_view import SILENT, ArmView, NodeView, SetView, TopicView
+from q2r2_control.ros.watching.set_view import SILENT, ArmView, NodeView, SetView
 
 _COLOURS = {"ok": "green", "warn": "yellow", "error": "red"}
-_NOTE = "rates are what the senders say"
+_ONCE = 3.0  # in which a set is found, and its nodes have spoken several times [s]
+_TIME = 4.0  # in which a set is found, and a second publisher too [s]
 
 
 def set_tables(view: SetView, domain: str) -> Group:
@@ -47,13 +49,12 @@ def set_tables(view: SetView, domain: str) -> Group:
     others = (f"others in this domain: {', '.join(view.others)}",) if view.others else ()
     columns = ("node", "rate [Hz]", "age [s]", "level", "says")
     nodes = figure_table("nodes", columns, map(_node_cells, view.nodes), others)
-    topics = figure_table("topics", ("topic", "rate [Hz]", "from", "to"), map(_topic_cells, view.topics), (_NOTE,))
-    return Group(arms, nodes, topics)
-
-
-def arm_lines(view: SetView) -> list[str]:
-    """The same of the arms alone, in a line each."""
-    return [f"{arm.name}: {arm.state or 'no node'}: {arm.why}" for arm in view.arms]
+    rows = (
+        (topic.name, _rounded(topic.rate), _joined(topic.publishers), _joined(topic.subscribers))
+        for topic in view.topics
+    )
+    notes = ("rates are what the senders say",)
+    return Group(arms, nodes, figure_table("topics", ("topic", "rate [Hz]", "from", "to"), rows, notes))
 
 
 def _arm_cells(arm: ArmView) -> tuple[Cell, ...]:
@@ -62,27 +63,22 @@ def _arm_cells(arm: ArmView) -> tuple[Cell, ...]:
 
 
 def _node_cells(node: NodeView) -> tuple[Cell, ...]:
-    rate = node.values.get("loop_rate_hz")
     level = Text(node.level, style=_COLOURS.get(node.level, "default"))
     return (
         node.name.removeprefix("/"),
-        f"{rate:.0f}" if isinstance(rate, int | float) else "",
+        _rounded(node.values.get("loop_rate_hz")),
         f"{node.age:.1f}",
         Text("silent", style="red") if node.age > SILENT else level,
         node.message,
     )
 
 
-def _topic_cells(topic: TopicView) -> tuple[Cell, ...]:
-    rate = "" if topic.rate is None else f"{topic.rate:.0f}"
-    return topic.name, rate, _joined(topic.publishers), _joined(topic.subscribers)
+def _rounded(rate: object) -> str:
+    return f"{rate:.0f}" if isinstance(rate, int | float) else ""
 
 
 def _joined(names: tuple[str, ...]) -> str:
     return ", ".join(name.removeprefix("/") for name in names) or "nobody"
-
-
-_ONCE = 3.0  # in which a set is found, and its nodes have spoken several times [s]
 
 
 def watch(
@@ -99,49 +95,41 @@ def watch(
     for an arm whenever that changes. Exit 1 when no node of a set was heard.
     """
     cell = load_config(config)
-    if duration is not None:
-        positive("--duration", duration)
-    elif once or json:
-        duration = _ONCE
+    duration = positive("--duration", duration) or (_ONCE if once or json else None)
     check_rclpy()
-    from q2r2_control.ros.watching.set_listener import watch_set
-
-    domain, stop = os.environ.get("ROS_DOMAIN_ID") or "0", StopRequest()
-    with stop_on_signals(stop.ask):
-        if once or json:
-            view = watch_set(cell, duration, lambda view: None, lambda: stop.asked)
-        else:
-            view = _watch_live(cell, domain, duration, lambda: stop.asked)
+    domain = os.environ.get("ROS_DOMAIN_ID") or "0"
+    view = _watched(cell, duration) if once or json else _watch_live(cell, domain, duration)
     if json:
-        print(
-            as_json_text(
-                {"domain": domain, "arms": view.arms, "nodes": view.nodes, "topics": view.topics, "others": view.others}
-            )
-        )
+        found = {"arms": view.arms, "nodes": view.nodes, "topics": view.topics, "others": view.others}
+        print(as_json_text({"domain": domain, **found}))
     else:
         Console().print(set_tables(view, domain))
     raise typer.Exit(0 if view.nodes else 1)
 
 
-def _watch_live(cell: Config, domain: str, duration: float | None, stop: Callable[[], bool]) -> SetView:
+def _watched(cell: Config, duration: float | None, show: Callable[[SetView], None] = lambda view: None) -> SetView:
     from q2r2_control.ros.watching.set_listener import watch_set
 
+    stop = StopRequest()
+    with stop_on_signals(stop.ask):
+        return watch_set(cell, duration, show, lambda: stop.asked)
+
+
+def _watch_live(cell: Config, domain: str, duration: float | None) -> SetView:
     console = stderr_console()
     if not console.is_terminal:
-        said: dict[int, str] = {}
+        said: dict[str, str] = {}
 
         def tell(view: SetView) -> None:
-            for index, line in enumerate(arm_lines(view)):
-                if said.get(index) != (words := re.sub(r"[\d.]+", "", line)):  # an age changes all the time
-                    said[index] = words
-                    console.print(line, soft_wrap=True, highlight=False, markup=False)
+            for arm in view.arms:
+                line = f"{arm.name}: {arm.state or 'no node'}: {arm.why}"
+                if said.get(arm.name) != (words := re.sub(r"[\d.]+", "", line)):  # an age changes all the time
+                    said[arm.name] = words
+                    say(line, console)
 
-        return watch_set(cell, duration, tell, stop)
+        return _watched(cell, duration, tell)
     with Live(console=console, auto_refresh=False, transient=True) as live:
-        return watch_set(cell, duration, lambda view: live.update(set_tables(view, domain), refresh=True), stop)
-
-
-_TIME = 4.0  # in which a set is found, and a second publisher too [s]
+        return _watched(cell, duration, lambda view: live.update(set_tables(view, domain), refresh=True))
 
 
 def doctor(
@@ -160,23 +148,17 @@ def doctor(
     cell = load_config(config)
     expected = [node.name for node in nodes_of(config, "none", separate=True)]
     facts, findings = examine_environment(os.environ)
-    nodes: tuple[str, ...] = ()
-    others: tuple[str, ...] = ()
+    nodes, others = list[str](), tuple[str, ...]()
     if not any(finding.stops_arms for finding in findings):
-        from q2r2_control.ros.watching.set_listener import watch_set
-
-        stop = StopRequest()
-        with stop_on_signals(stop.ask):
-            view = watch_set(cell, duration, lambda view: None, lambda: stop.asked)
-        nodes, others = tuple(node.name for node in view.nodes), view.others
+        view = _watched(cell, duration)
+        nodes, others = [node.name for node in view.nodes], view.others
         findings += examine_set(view, expected)
     stops = any(finding.stops_arms for finding in findings)
     if json:
         print(as_json_text({**facts, "nodes": nodes, "others": others, "findings": findings, "stops_arms": stops}))
     else:
-        _print(
-            facts | {"nodes": ", ".join(nodes) or "none of a set runs", "others": ", ".join(others) or "none"}, findings
-        )
+        running = {"nodes": ", ".join(nodes) or "none of a set runs", "others": ", ".join(others) or "none"}
+        _print({**facts, **running}, findings)
     sys.stdout.flush()
     raise typer.Exit(int(stops))
 

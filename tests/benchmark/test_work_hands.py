@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import pairwise
 
 import numpy as np
 import pinocchio as pin
@@ -12,7 +11,7 @@ import pytest
 from q2r2_control.benchmark.work_motions import ARMS, WORK_MOTIONS
 from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.teleop.teleop import Teleop
-from q2r2_control.types import SIDES, HandSample
+from q2r2_control.types import SIDES
 from tests.teleop.hands import pose
 from work_hands import MOVES, WorkHands
 
@@ -35,11 +34,6 @@ SETTINGS = {
 }
 
 
-def played(hands: WorkHands, until: float) -> list[HandSample]:
-    hands.start()
-    return [sample for tick in range(round(until / DT)) for sample in hands.poll(tick * DT)]
-
-
 @pytest.mark.parametrize("settings", SETTINGS.values(), ids=SETTINGS.keys())
 def test_they_engage_both_arms_and_ask_for_the_motion_s_poses(settings: TeleopSettings) -> None:
     hands, teleop = WorkHands(SHORT, TOOLS, settings), Teleop(settings, SIDES)
@@ -57,16 +51,5 @@ def test_they_engage_both_arms_and_ask_for_the_motion_s_poses(settings: TeleopSe
             assert found is not None
             assert np.linalg.norm(found.translation - asked.translation) < 4e-3
             assert np.linalg.norm(pin.log3(found.rotation @ asked.rotation.T)) < 0.025
-    goal = hands.asked(MOVES + SHORT.ends)
-    assert np.linalg.norm(goal["left"].translation - TOOLS["left"].translation) == pytest.approx(0.2)
-
-
-def test_samples_come_as_a_headset_sends_them_the_same_for_the_same_seed() -> None:
-    first, again, other = (played(WorkHands(SHORT, TOOLS, TeleopSettings(), seed), MOVES) for seed in (1, 1, 2))
-    positions = [np.array([sample.position for sample in samples]) for samples in (first, again, other)]
-    np.testing.assert_array_equal(positions[0], positions[1])
-    assert (positions[0][:60] != positions[2][:60]).any()
-    left = [sample for sample in first if sample.hand == "left"]
-    np.testing.assert_allclose(np.array([s.position for s in left]).std(axis=0), 2e-4, rtol=0.4)
-    gaps = [after.pose_stamp - before.pose_stamp for before, after in pairwise(left)]
-    assert np.mean(gaps) == pytest.approx(1.0 / 74.0, rel=0.03)
+    goal = hands.asked(MOVES + SHORT.ends)["left"]
+    assert np.linalg.norm(goal.translation - TOOLS["left"].translation) == pytest.approx(0.2)

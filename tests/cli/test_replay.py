@@ -72,19 +72,3 @@ def test_options_that_cannot_be_together_are_one_line_and_exit_code_2(
     result = q2r2("replay", str(recorded), *options)
     assert (result.exit_code, result.stdout, result.stderr.count("\n")) == (2, "", 1)
     assert said in result.stderr
-
-
-def test_a_file_that_is_no_recording_is_one_line_and_exit_code_2(tmp_path: Path) -> None:
-    (tmp_path / "notes.txt").write_text("no recording\n")
-    for file in (tmp_path / "notes.txt", tmp_path / "missing.mcap"):
-        result = q2r2("replay", str(file))
-        assert (result.exit_code, result.stdout) == (2, "")
-        assert result.stderr.count("\n") == 1
-        assert file.name in result.stderr
-
-
-@pytest.mark.parametrize("option", ["--task", "--operator"])
-def test_notes_need_a_recording(option: str, tmp_path: Path) -> None:
-    result = q2r2("run", changed_cell(tmp_path, "", ""), *OPTIONS, option, "something")
-    assert result.exit_code == 2
-    assert f"{option} needs --record" in result.stderr
